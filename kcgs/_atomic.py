@@ -1,0 +1,49 @@
+"""Files that appear whole or not at all."""
+
+import os
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a temporary path beside ``path`` that takes its place when the block ends well.
+
+    The temporary path has the suffix of ``path``, so writers that infer the format from the name do the
+    right thing. On any exception, Ctrl-C included, it is removed and whatever stood at ``path`` stays.
+
+    Args:
+        path: the file to write; its folder must exist.
+
+    Yields:
+        A path in the same folder that does not exist yet; the block must create a file there.
+
+    Raises:
+        FileNotFoundError: the folder of ``path`` does not exist, or the block wrote no file.
+        IsADirectoryError: ``path`` is a folder.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with atomic_path(f"{folder}/note.txt") as temporary:
+        ...         _ = temporary.write_text("whole")
+        ...     (Path(folder) / "note.txt").read_text()
+        'whole'
+    """
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {target}: the folder {target.parent} does not exist")
+    if target.is_dir():
+        raise IsADirectoryError(f"cannot write {target}: it is a folder, expected a file path")
+    # Not created here: the writer creates it, and so the file gets the permissions any new file would.
+    temporary = target.with_name(f".tmp-{uuid.uuid4().hex}{target.suffix}")
+    try:
+        yield temporary
+        if not temporary.is_file():
+            raise FileNotFoundError(f"nothing was written for {target}")
+        os.replace(temporary, target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise

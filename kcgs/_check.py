@@ -1,0 +1,75 @@
+"""Checks that public functions share; messages are built only when a check fails."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+_INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32)
+
+
+def check_tensor(name: str, value: object) -> Tensor:
+    """Return `value` if it is a dense tensor."""
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} must be a Tensor; got {type(value).__name__}")
+    if value.layout != torch.strided or value.is_quantized:
+        raise TypeError(f"{name} must be a dense tensor; got layout {value.layout}")
+    return value
+
+
+def check_floating(name: str, value: object, last: int | None = None, dims: Sequence[int] = ()) -> Tensor:
+    """Return `value` if it is a finite real floating tensor of an allowed rank and last dimension."""
+    tensor = check_tensor(name, value)
+    if tensor.dtype not in _FLOATS:
+        raise TypeError(f"{name} must have a real floating dtype; got {tensor.dtype}")
+    if dims and tensor.ndim not in dims:
+        raise ValueError(f"{name} must have {' or '.join(map(str, dims))} dimensions; got shape {tuple(tensor.shape)}")
+    if last is not None and (tensor.ndim == 0 or tensor.shape[-1] != last):
+        raise ValueError(f"{name} must have shape (..., {last}); got {tuple(tensor.shape)}")
+    if not torch.isfinite(tensor).all():
+        raise ValueError(f"{name} must be finite; got {int((~torch.isfinite(tensor)).sum())} NaN or infinite values")
+    return tensor
+
+
+def check_integer(name: str, value: object, dims: Sequence[int] = ()) -> Tensor:
+    """Return `value` if it is an integer tensor of an allowed rank."""
+    tensor = check_tensor(name, value)
+    if tensor.dtype not in _INTEGERS:
+        raise TypeError(f"{name} must have an integer dtype; got {tensor.dtype}")
+    if dims and tensor.ndim not in dims:
+        raise ValueError(f"{name} must have {' or '.join(map(str, dims))} dimensions; got shape {tuple(tensor.shape)}")
+    return tensor
+
+
+def check_labels(name: str, value: object) -> Tensor:
+    """Return a label map as int64: integer, (H, W) or (B, H, W), at least one pixel, no negative id."""
+    tensor = check_integer(name, value, dims=(2, 3))
+    if tensor.numel() == 0:
+        raise ValueError(f"{name} must have at least one pixel; got shape {tuple(tensor.shape)}")
+    tensor = tensor.long()
+    if int(tensor.min()) < 0:
+        raise ValueError(f"{name} must hold non-negative ids; got {int(tensor.min())}")
+    return tensor
+
+
+def check_size(name: str, value: object) -> tuple[int, int]:
+    """Return (height, width) if both are whole numbers of at least 1."""
+    if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
+        raise TypeError(f"{name} must be a pair (height, width); got {value!r}")
+    height, width = value
+    if any(isinstance(n, bool) or not isinstance(n, int) for n in value):
+        raise TypeError(f"{name} must hold two integers (height, width); got {value!r}")
+    if height < 1 or width < 1:
+        raise ValueError(f"{name} must be at least 1 x 1; got {value!r}")
+    return height, width
+
+
+def check_image(name: str, value: object) -> Tensor:
+    """Return a finite floating image (C, H, W) or (B, C, H, W) with no empty dimension."""
+    tensor = check_floating(name, value, dims=(3, 4))
+    if tensor.numel() == 0:
+        raise ValueError(f"{name} must not be empty; got shape {tuple(tensor.shape)}")
+    return tensor

@@ -1,0 +1,310 @@
+"""The command `kcgs`: arguments in, calls to the library, one line out."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import sys
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kcgs.functional import RegionMap
+
+app = typer.Typer(
+    help="Contour-aware 2D Gaussian splatting of images.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+class Backend(str, Enum):
+    """Kernels that can be named."""
+
+    auto = "auto"
+    reference = "reference"
+    tiled = "tiled"
+
+
+ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE")]
+SceneFile = Annotated[Path, typer.Argument(help="Scene file (.safetensors).", metavar="SCENE")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
+
+
+@app.command("fit")
+def fit_command(
+    image: ImageFile,
+    regions: Annotated[
+        str,
+        typer.Option(metavar="MASK|auto|none", help="Label-map file, or auto (segment the image), or none."),
+    ] = "auto",
+    num_gaussians: Annotated[int, typer.Option("-n", "--num-gaussians", min=1, help="Number of Gaussians.")] = 1000,
+    recipe: Annotated[str, typer.Option(help="Recipe by name.")] = "paper",
+    iterations: Annotated[int | None, typer.Option(min=1, help="Default: the recipe's.")] = None,
+    max_seconds: Annotated[float | None, typer.Option(help="Stop after this wall time.")] = None,
+    target_psnr: Annotated[float | None, typer.Option(help="Stop at this PSNR in dB.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the random start.")] = 0,
+    backend: Annotated[Backend, typer.Option(help="Kernel.")] = Backend.auto,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Default: IMAGE's name with .safetensors, here.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Fit Gaussians to an image and save the scene."""
+    from kcgs.data import load_image
+    from kcgs.fit import FitConfig, fit
+    from kcgs.io import save
+
+    output = Path(f"{image.stem}.safetensors") if output is None else output
+    _check_output(output, ".safetensors")
+    settings = {"iterations": iterations, "max_seconds": max_seconds, "target_psnr": target_psnr}
+    config = FitConfig.from_recipe(
+        recipe, backend=backend.value, **{k: v for k, v in settings.items() if v is not None}
+    )
+    picture = load_image(image)
+    labels = _read_regions(regions, picture)
+    with _Progress(config.iterations, config.max_seconds) as progress:
+        result = fit(picture, labels, num_gaussians, seed=seed, config=config, on_step=progress.step)
+    written = save(output, result.field, result.regions, metadata={"recipe": recipe})
+    if progress.interrupted:
+        typer.echo(f"interrupted: saved the best so far to {output}", err=True)
+    seconds = result.history[-1].seconds
+    report = _measure(result.field, result.regions, picture, labels, seconds, written)
+    _print_report(report, as_json, f"{output}: {len(result.field)} Gaussians, stopped by {result.stop_reason}")
+
+
+@app.command()
+def render(
+    scene: SceneFile,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Image file to write.")],
+    scale: Annotated[float | None, typer.Option(help="Magnification.")] = None,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Width and height in pixels.")] = None,
+    region: Annotated[int | None, typer.Option(help="Draw only this region; the rest is black.")] = None,
+) -> None:
+    """Draw a scene at any size."""
+    from kcgs.data import save_image
+    from kcgs.io import load
+    from kcgs.nn.renderer import render_image
+
+    loaded = load(scene)
+    field = loaded.field
+    target = _target_size(field.size, scale, size)
+    if region is not None:
+        known = [] if loaded.regions is None else loaded.regions.ids.tolist()
+        if field.region_ids is None or region not in known:
+            raise ValueError(f"--region must be one of the scene's regions {known}; got {region}")
+        field = field.subset(field.region_ids == region)
+    save_image(output, render_image(field, loaded.regions, target))
+
+
+@app.command("eval")
+def eval_command(
+    scene: SceneFile,
+    image: ImageFile,
+    regions: Annotated[
+        str | None,
+        typer.Option(metavar="MASK", help="Label map whose contours EF-PSNR looks at; default: the scene's."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare a scene with an image."""
+    from kcgs.data import load_image, load_labels
+    from kcgs.io import load
+
+    loaded = load(scene)
+    picture = load_image(image)
+    labels = loaded.regions.labels if loaded.regions is not None else None
+    if regions is not None:
+        labels = load_labels(Path(regions))
+    report = _measure(loaded.field, loaded.regions, picture, labels, None, scene.stat().st_size)
+    _print_report(report, as_json, str(scene))
+
+
+@app.command()
+def segment(
+    image: ImageFile,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Label map to write: .png or .npy.")],
+    method: Annotated[str, typer.Option(help="Where the regions come from.")] = "auto",
+    as_json: Json = False,
+) -> None:
+    """Make a label map of an image."""
+    from kcgs.data import load_image, save_labels
+    from kcgs.segment import segment as make_labels
+
+    labels = make_labels(load_image(image), method)
+    save_labels(output, labels)
+    areas = labels.flatten().bincount()
+    report = {
+        "regions": len(areas),
+        "smallest": int(areas.min()),
+        "largest": int(areas.max()),
+        "method": method,
+    }
+    _print_report(report, as_json, str(output))
+
+
+@app.command()
+def info(scene: SceneFile, as_json: Json = False) -> None:
+    """Say what a scene file holds."""
+    from kcgs.io import load
+
+    loaded = load(scene)
+    field, regions = loaded.field, loaded.regions
+    size = scene.stat().st_size
+    report = {
+        "num_gaussians": len(field),
+        "channels": field.colors.shape[-1],
+        "height": field.size[0],
+        "width": field.size[1],
+        "regions": 1 if regions is None else regions.num_regions,
+        "softness": 0.0 if regions is None else regions.softness,
+        "bytes": size,
+        "bits_per_pixel": 8 * size / (field.size[0] * field.size[1]),
+        **{f"metadata.{key}": value for key, value in loaded.metadata.items()},
+    }
+    _print_report(report, as_json, str(scene))
+
+
+@app.command()
+def bench(
+    name: Annotated[str, typer.Argument(help="Experiment by name: demo.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the report.")],
+    data: Annotated[Path | None, typer.Option(help="Folder with images, where the experiment needs them.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A short form of the same.")] = False,
+) -> None:
+    """Run an experiment and write its report."""
+    from kcgs.bench import run
+
+    run(name, output, data=data, quick=quick)
+
+
+def _check_output(path: Path, suffix: str) -> None:
+    # before the work, not after it
+    if path.suffix != suffix:
+        raise ValueError(f"--output must end in {suffix}; got {str(path)!r}")
+    if not path.resolve().parent.is_dir():
+        raise FileNotFoundError(f"--output needs an existing folder; {str(path.resolve().parent)!r} is not there")
+
+
+def _read_regions(regions: str, picture: Tensor) -> Tensor | None:
+    if regions == "none":
+        return None
+    if regions == "auto":
+        from kcgs.segment import segment as make_labels
+
+        return make_labels(picture)
+    from kcgs.data import load_labels
+
+    return load_labels(Path(regions))
+
+
+def _target_size(size: tuple[int, int], scale: float | None, wanted: str | None) -> tuple[int, int]:
+    if scale is not None and wanted is not None:
+        raise typer.BadParameter("give --scale or --size, not both")
+    if wanted is not None:
+        width, _, height = wanted.lower().partition("x")
+        if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
+            raise typer.BadParameter(f"--size must be WxH, such as 640x480; got {wanted!r}")
+        return int(height), int(width)
+    if scale is not None and not 0 < scale < math.inf:
+        raise typer.BadParameter(f"--scale must be positive; got {scale!r}")
+    factor = 1.0 if scale is None else scale
+    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
+
+
+def _measure(
+    field: Any,
+    regions: RegionMap | None,
+    picture: Tensor,
+    labels: Tensor | None,
+    seconds: float | None,
+    written: int,
+) -> dict[str, Any]:
+    import time
+
+    from kcgs.bench.measure import measure
+    from kcgs.nn.renderer import render_image
+
+    start = time.perf_counter()
+    drawn = render_image(field, regions)
+    seconds = time.perf_counter() - start if seconds is None else seconds
+    height, width = field.size
+    return {
+        **measure(drawn, picture, labels),
+        "num_gaussians": len(field),
+        "seconds": seconds,
+        "bytes": written,
+        "bits_per_pixel": 8 * written / (height * width),
+    }
+
+
+def _print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
+    if as_json:
+        clean = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in report.items()}
+        typer.echo(json.dumps(clean))
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("", title, show_header=True)
+    for key, value in report.items():
+        table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
+    Console().print(table)
+
+
+class _Progress:
+    """Bar on standard error, only on a terminal, and Ctrl-C as a wish to stop; a second Ctrl-C ends the program."""
+
+    def __init__(self, iterations: int, max_seconds: float | None) -> None:
+        from rich.console import Console
+        from rich.progress import Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        self.interrupted = False
+        self._max_seconds = max_seconds
+        console = Console(stderr=True)
+        self._bar = Progress(
+            *Progress.get_default_columns()[:2],
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[quality]}"),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("fit", total=iterations, quality="")
+
+    def __enter__(self) -> _Progress:
+        self._before = signal.signal(signal.SIGINT, self._interrupt)
+        self._bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.stop()
+        signal.signal(signal.SIGINT, self._before)
+
+    def _interrupt(self, number: int, frame: object) -> None:
+        self.interrupted = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def step(self, iteration: int, entry: Any) -> bool:
+        self._bar.update(self._task, completed=iteration, quality=f"{entry.psnr:.2f} dB")
+        return self.interrupted
+
+
+def main() -> None:
+    """Run the command: exit 0 done, 1 failed with one line that says why, 2 wrong usage."""
+    try:
+        app()
+    except (ValueError, TypeError, OSError, ImportError) as error:
+        typer.echo(f"kcgs: {' '.join(str(error).split())}", err=True)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

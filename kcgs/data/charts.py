@@ -1,0 +1,117 @@
+"""The two colour charts: pictures whose regions are known exactly."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+_BLOCKS = (
+    ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    ((0.0, 0.5, 0.0), (1.0, 0.5, 0.0), (0.5, 0.0, 0.5)),
+)
+_BLOCK = 100
+
+_SECTORS = (
+    (1.0, 0.0, 0.0),
+    (1.0, 0.5, 0.0),
+    (1.0, 1.0, 0.0),
+    (0.0, 1.0, 0.0),
+    (0.0, 1.0, 1.0),
+    (0.0, 0.0, 1.0),
+    (0.5, 0.0, 0.5),
+    (1.0, 0.0, 1.0),
+)
+_PIE_SIZE = 300
+_PIE_RADIUS = 130.0
+# Half a sector: the first is centred at the top, and no edge runs along a row, a column or a diagonal.
+_PIE_START = torch.pi / 8
+_SUBSAMPLES = 8
+
+
+class ChartSample(NamedTuple):
+    """A chart and its regions."""
+
+    image: Tensor
+    """:math:`(3, H, W)` float32 RGB in [0, 1]."""
+    labels: Tensor
+    """:math:`(H, W)` int64, the region of every pixel's centre."""
+
+
+def chart_2x3(scale: int = 1) -> ChartSample:
+    """Draw two rows of three flat blocks: red, green, blue over dark green, orange, purple.
+
+    Args:
+        scale: how many times the size of 200 rows by 300 columns, at least 1.
+
+    Returns:
+        The chart, (200 scale, 300 scale); labels 0 to 5 in reading order.
+
+    Raises:
+        TypeError: ``scale`` is no integer.
+        ValueError: ``scale`` is below 1.
+
+    Example:
+        >>> image, labels = chart_2x3()
+        >>> tuple(image.shape), labels[150, 250].item(), image[:, 150, 250].tolist()
+        ((3, 200, 300), 5, [0.5, 0.0, 0.5])
+    """
+    _check_scale(scale)
+    blocks = torch.tensor(_BLOCKS)
+    rows, columns = blocks.shape[:2]
+    ids = torch.arange(rows * columns).reshape(rows, columns)
+    side = _BLOCK * scale
+    labels = ids.repeat_interleave(side, 0).repeat_interleave(side, 1)
+    return ChartSample(blocks.flatten(0, 1)[labels].permute(2, 0, 1).contiguous(), labels)
+
+
+def chart_pie(scale: int = 1) -> ChartSample:
+    """Draw a disc of eight flat sectors on white, its edges anti-aliased.
+
+    The disc is centred and has a radius of 130 pixels at ``scale=1``; clockwise from the top the sectors are
+    red, orange, yellow, green, cyan, blue, purple and magenta. A pixel is the mean of 8 x 8 samples.
+
+    Args:
+        scale: how many times the size of 300 by 300, at least 1. The shapes are the same: labels at a higher
+            scale are exact contours, not enlarged ones.
+
+    Returns:
+        The chart, (300 scale, 300 scale); label 0 is the background, 1 to 8 the sectors.
+
+    Raises:
+        TypeError: ``scale`` is no integer.
+        ValueError: ``scale`` is below 1.
+
+    Example:
+        >>> image, labels = chart_pie()
+        >>> tuple(image.shape), labels.unique().tolist()
+        ((3, 300, 300), [0, 1, 2, 3, 4, 5, 6, 7, 8])
+        >>> tuple(chart_pie(scale=2).labels.shape)
+        (600, 600)
+    """
+    _check_scale(scale)
+    labels = _pie_labels(scale, 0.5, 0.5)
+    palette = torch.tensor([(1.0, 1.0, 1.0), *_SECTORS])
+    image = torch.zeros(*labels.shape, 3)
+    offsets = [(k + 0.5) / _SUBSAMPLES for k in range(_SUBSAMPLES)]
+    for dy in offsets:
+        for dx in offsets:
+            image += palette[_pie_labels(scale, dx, dy)]
+    image /= _SUBSAMPLES**2
+    return ChartSample(image.permute(2, 0, 1).contiguous(), labels)
+
+
+def _pie_labels(scale: int, dx: float, dy: float) -> Tensor:
+    """Label every pixel by the point at (dx, dy) inside it."""
+    steps = torch.arange(_PIE_SIZE * scale, dtype=torch.float64)
+    x = ((steps + dx) / scale - _PIE_SIZE / 2)[None, :]
+    y = ((steps + dy) / scale - _PIE_SIZE / 2)[:, None]
+    turn = torch.atan2(x, -y) + _PIE_START  # Clockwise from the top, where the first sector is centred.
+    sector = (turn / (2 * torch.pi / len(_SECTORS))).floor().long() % len(_SECTORS)
+    return torch.where(x**2 + y**2 < _PIE_RADIUS**2, sector + 1, 0)
+
+
+def _check_scale(scale: int) -> None:
+    if isinstance(scale, bool) or not isinstance(scale, int):
+        raise TypeError(f"scale must be an integer; got {scale!r}")
+    if scale < 1:
+        raise ValueError(f"scale must be at least 1; got {scale}")

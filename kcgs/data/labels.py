@@ -1,0 +1,215 @@
+"""Label maps on disk, and as pictures to look at."""
+
+import os
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from kcgs._atomic import atomic_path
+from kcgs._check import check_integer
+from kcgs.data._decode import Array, decode, read_file
+
+MAX_COLORS = 4096
+"""A picture with more distinct colours is taken for a photo, not for a label map."""
+
+_GOLDEN = 0.6180339887498949  # Steps of this share of the hue circle keep any run of hues spread out.
+_SATURATION = (0.85, 0.55, 0.95, 0.40, 0.75)
+_VALUE = (0.95, 0.80, 0.60, 1.00, 0.42)
+
+
+def load_labels(path: str | os.PathLike[str]) -> Tensor:
+    """Read a label map.
+
+    What counts as the label depends on what the file stores:
+
+    - palette pictures such as DAVIS 2017: the palette index, whatever its colour;
+    - grey of 1 to 16 bits, and integer TIFF: the stored value, so a 0/255 mask has the labels 0 and 255;
+    - RGB and RGBA: every distinct colour is a region, numbered from 0 in the order of R, then G, B and A; all
+      fully transparent pixels count as one colour;
+    - .npy: an integer or boolean array of two dimensions.
+
+    Args:
+        path: PNG, TIFF, GIF, BMP, lossless WebP or .npy. Formats that change pixel values are refused.
+
+    Returns:
+        :math:`(H, W)` int64, non-negative; ids need not be consecutive.
+
+    Raises:
+        FileNotFoundError: ``path`` does not exist.
+        ValueError: the file cannot be read, is lossy or a photo (more than 4,096 colours), or holds floats,
+            negative values or another number of dimensions.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_labels(f"{folder}/map.png", torch.tensor([[0, 0, 7], [3, 3, 7]]))
+        ...     load_labels(f"{folder}/map.png").tolist()
+        [[0, 0, 7], [3, 3, 7]]
+    """
+    data = read_file(path)
+    if Path(path).suffix.lower() == ".npy":
+        return _from_npy(data, path)
+    samples = decode(data, path, indices=True)
+    if not samples.lossless:
+        raise ValueError(
+            f"path must be a label map in a lossless format (PNG, TIFF, GIF, BMP, lossless WebP, .npy); "
+            f"got {samples.format} at {path}, whose compression can change labels"
+        )
+    values = samples.values
+    if values.shape[-1] == 2:
+        if (values[..., 1] != values[0, 0, 1]).any():
+            raise ValueError(f"grey label maps must have no varying transparency; got {path}")
+        values = values[..., :1]
+    if values.shape[-1] >= 3:
+        return _from_colors(values, path)
+    return _checked(values[..., 0], path)
+
+
+def save_labels(path: str | os.PathLike[str], labels: Tensor) -> None:
+    """Write a label map losslessly, whole or not at all.
+
+    A .png is an 8-bit palette picture whose index is the label if all ids are below 256, else 16-bit grey.
+
+    Args:
+        path: the file to write, .png or .npy; its folder must exist.
+        labels: :math:`(H, W)` integer, non-negative; at most 65535 for .png.
+
+    Raises:
+        FileNotFoundError: the folder of ``path`` does not exist.
+        TypeError: ``labels`` is no integer tensor.
+        ValueError: ``labels`` has another shape, negative ids or ids too large for the format, or the suffix
+            is another.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_labels(f"{folder}/map.npy", torch.tensor([[0, 100_000]]))
+        ...     load_labels(f"{folder}/map.npy").tolist()
+        [[0, 100000]]
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".png", ".npy"):
+        raise ValueError(f"path must end in .png or .npy; got {str(path)!r}")
+    values = _check_map(labels).cpu().numpy()
+    highest = int(values.max())
+    if suffix == ".npy":
+        with atomic_path(path) as temporary:
+            np.save(temporary, values.astype(np.min_scalar_type(highest)), allow_pickle=False)
+        return
+    if highest > 65535:
+        raise ValueError(
+            f"labels for a .png must be at most 65535; got {highest}: save as .npy or renumber them"
+        )
+    picture = Image.fromarray(values.astype(np.uint8 if highest < 256 else np.uint16))
+    if highest < 256:
+        picture.putpalette((label_colors(256) * 255 + 0.5).floor().to(torch.uint8).flatten().tolist())
+    with atomic_path(path) as temporary:
+        picture.save(temporary, format="PNG")
+
+
+def label_colors(n: int) -> Tensor:
+    """Return ``n`` colours to tell regions apart by; the first of them do not depend on ``n``.
+
+    Args:
+        n: how many, at least 0.
+
+    Returns:
+        :math:`(n, 3)` float32 RGB in [0, 1].
+
+    Raises:
+        TypeError: ``n`` is no integer.
+        ValueError: ``n`` is negative.
+
+    Example:
+        >>> tuple(label_colors(8).shape)
+        (8, 3)
+    """
+    if isinstance(n, bool) or not isinstance(n, int):
+        raise TypeError(f"n must be an integer; got {n!r}")
+    if n < 0:
+        raise ValueError(f"n must be at least 0; got {n}")
+    index = torch.arange(n, dtype=torch.float64)
+    hue = (index * _GOLDEN).frac()
+    cycle = torch.arange(n) % len(_VALUE)
+    saturation = torch.tensor(_SATURATION, dtype=torch.float64)[cycle]
+    value = torch.tensor(_VALUE, dtype=torch.float64)[cycle]
+    # Each channel of HSV is a trapezoid over the hue, a third of the circle apart.
+    phase = (hue[:, None] * 6 + torch.tensor([5.0, 3.0, 1.0], dtype=torch.float64)) % 6
+    dip = torch.minimum(phase, 4 - phase).clamp(0, 1)
+    return (value[:, None] * (1 - saturation[:, None] * dip)).float()
+
+
+def colorize_labels(labels: Tensor) -> Tensor:
+    """Paint a label map: the k-th smallest id gets the k-th colour of `label_colors`.
+
+    Args:
+        labels: :math:`(H, W)` integer, any non-negative ids.
+
+    Returns:
+        :math:`(3, H, W)` float32 RGB in [0, 1], on the device of ``labels``.
+
+    Raises:
+        TypeError: ``labels`` is no integer tensor.
+        ValueError: ``labels`` has another shape, is empty or has negative ids.
+
+    Example:
+        >>> picture = colorize_labels(torch.tensor([[0, 255, 0]]))
+        >>> tuple(picture.shape), bool((picture[:, 0, 0] == picture[:, 0, 2]).all())
+        ((3, 1, 3), True)
+    """
+    ids, rank = torch.unique(_check_map(labels), return_inverse=True)
+    return label_colors(len(ids)).to(labels.device)[rank].permute(2, 0, 1).contiguous()
+
+
+def _check_map(labels: Tensor) -> Tensor:
+    labels = check_integer("labels", labels, dims=(2,))
+    if labels.numel() == 0:
+        raise ValueError(f"labels must have at least one pixel; got shape {tuple(labels.shape)}")
+    labels = labels.long()
+    if int(labels.min()) < 0:
+        raise ValueError(f"labels must be non-negative; got {int(labels.min())}")
+    return labels
+
+
+def _from_npy(data: bytes, path: str | os.PathLike[str]) -> Tensor:
+    try:
+        values = np.load(BytesIO(data), allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise ValueError(f"cannot read {path} as an .npy array: {error}") from error
+    if not isinstance(values, np.ndarray):
+        values.close()
+        raise ValueError(f"{path} must hold one array; got an .npz archive")
+    return _checked(values, path)
+
+
+def _checked(values: Array, path: str | os.PathLike[str]) -> Tensor:
+    if values.dtype.kind not in "uib":
+        raise ValueError(f"label maps hold integers; got {values.dtype} in {path}")
+    if values.ndim != 2 or values.size == 0:
+        raise ValueError(f"label maps have shape (H, W); got {values.shape} in {path}")
+    low, high = int(values.min()), int(values.max())
+    if low < 0 or high > np.iinfo(np.int64).max:
+        raise ValueError(f"labels must lie in 0 ... 2^63 - 1; got {low} ... {high} in {path}")
+    return torch.from_numpy(values.astype(np.int64))
+
+
+def _from_colors(values: Array, path: str | os.PathLike[str]) -> Tensor:
+    if values.dtype.kind != "u":
+        raise ValueError(f"label pictures hold unsigned integers; got {values.dtype} in {path}")
+    bits = np.uint64(values.dtype.itemsize * 8)
+    packed = np.zeros(values.shape[:2], dtype=np.uint64)
+    for channel in range(values.shape[-1]):
+        packed = (packed << bits) | values[..., channel].astype(np.uint64)
+    if values.shape[-1] == 4:
+        packed[values[..., 3] == 0] = 0
+    colors, ids = np.unique(packed, return_inverse=True)
+    if len(colors) > MAX_COLORS:
+        raise ValueError(
+            f"label pictures have at most {MAX_COLORS} distinct colours; got {len(colors)} in {path}, "
+            "which looks like a photo or a mask that went through lossy compression"
+        )
+    return torch.from_numpy(ids.reshape(packed.shape).astype(np.int64))

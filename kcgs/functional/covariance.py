@@ -1,0 +1,180 @@
+r"""Forms of a 2D covariance: Cholesky factor, matrix, conic, scale and rotation, extent.
+
+Convention: :math:`\Sigma = L L^T` with :math:`L = [[l_{11}, 0], [l_{21}, l_{22}]]`, stored as
+``cholesky`` :math:`(..., 3) = (l_{11}, l_{21}, l_{22})` in pixels, :math:`l_{11}, l_{22} > 0`.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcgs._check import check_floating
+from kcgs.kernels.form import support_radius
+
+
+def check_cholesky(name: str, value: object) -> Tensor:
+    """Return `value` if it is a finite (..., 3) tensor with positive l11 and l22."""
+    cholesky = check_floating(name, value, last=3)
+    if not (cholesky[..., ::2] > 0).all():
+        raise ValueError(f"{name} must have l11 > 0 and l22 > 0; got a least of {float(cholesky[..., ::2].min()):g}")
+    return cholesky
+
+
+def cholesky_to_covariance(cholesky: Tensor) -> Tensor:
+    r"""Multiply out :math:`\Sigma = L L^T`.
+
+    Args:
+        cholesky: factors in pixels, :math:`(..., 3)`.
+
+    Returns:
+        Covariances in square pixels, :math:`(..., 2, 2)`.
+
+    Raises:
+        TypeError: not a floating tensor.
+        ValueError: wrong last dimension, not finite, or l11, l22 not positive.
+
+    Example:
+        >>> cholesky_to_covariance(torch.tensor([2.0, 1.0, 3.0]))
+        tensor([[ 4.,  2.],
+                [ 2., 10.]])
+    """
+    l11, l21, l22 = check_cholesky("cholesky", cholesky).unbind(-1)
+    cross = l11 * l21
+    rows = [torch.stack([l11 * l11, cross], -1), torch.stack([cross, l21 * l21 + l22 * l22], -1)]
+    return torch.stack(rows, -2)
+
+
+def covariance_to_cholesky(covariance: Tensor) -> Tensor:
+    r"""Factor :math:`\Sigma = L L^T`.
+
+    Args:
+        covariance: symmetric positive definite matrices in square pixels, :math:`(..., 2, 2)`. The upper right
+            element is not read.
+
+    Returns:
+        Factors in pixels, :math:`(..., 3)`.
+
+    Raises:
+        TypeError: not a floating tensor.
+        ValueError: wrong shape, not finite, or not positive definite.
+
+    Example:
+        >>> covariance_to_cholesky(torch.tensor([[4.0, 2.0], [2.0, 10.0]]))
+        tensor([2., 1., 3.])
+    """
+    covariance = check_floating("covariance", covariance, last=2)
+    if covariance.ndim < 2 or covariance.shape[-2] != 2:
+        raise ValueError(f"covariance must have shape (..., 2, 2); got {tuple(covariance.shape)}")
+    s_xx, s_xy, s_yy = covariance[..., 0, 0], covariance[..., 1, 0], covariance[..., 1, 1]
+    rest = s_yy - s_xy * s_xy / s_xx
+    if not ((s_xx > 0) & (rest > 0)).all():
+        raise ValueError("covariance must be positive definite; got a matrix that is not")
+    l11 = s_xx.sqrt()
+    return torch.stack([l11, s_xy / l11, rest.sqrt()], -1)
+
+
+def cholesky_to_conic(cholesky: Tensor) -> Tensor:
+    r"""Invert the covariance: the conic :math:`\Sigma^{-1} = L^{-T} L^{-1}`, formed from L without subtraction.
+
+    Args:
+        cholesky: factors in pixels, :math:`(..., 3)`.
+
+    Returns:
+        Conics (A, B, C) with :math:`q = A\,dx^2 + 2 B\,dx\,dy + C\,dy^2`, :math:`(..., 3)`.
+
+    Raises:
+        TypeError: not a floating tensor.
+        ValueError: wrong last dimension, not finite, or l11, l22 not positive.
+
+    Example:
+        >>> cholesky_to_conic(torch.tensor([2.0, 0.0, 4.0]))
+        tensor([0.2500, -0.0000, 0.0625])
+    """
+    l11, l21, l22 = check_cholesky("cholesky", cholesky).unbind(-1)
+    slope = l21 / (l11 * l22)
+    return torch.stack([l11**-2 + slope * slope, -slope / l22, l22**-2], -1)
+
+
+def scale_rotation_to_cholesky(scales: Tensor, angle: Tensor) -> Tensor:
+    r"""Factor the covariance :math:`R(\theta)\,\mathrm{diag}(s_1^2, s_2^2)\,R(\theta)^T`.
+
+    Args:
+        scales: standard deviations along the two axes in pixels, positive, :math:`(..., 2)`.
+        angle: of the first axis from x towards y, radians, :math:`(...)`.
+
+    Returns:
+        Factors in pixels, :math:`(..., 3)`.
+
+    Raises:
+        TypeError: not floating tensors.
+        ValueError: wrong shape, not finite, or a scale that is not positive.
+
+    Example:
+        >>> scale_rotation_to_cholesky(torch.tensor([3.0, 1.0]), torch.tensor(0.0))
+        tensor([3., 0., 1.])
+    """
+    scales = check_floating("scales", scales, last=2)
+    angle = check_floating("angle", angle)
+    if not (scales > 0).all():
+        raise ValueError(f"scales must be positive; got a least of {float(scales.min()):g}")
+    if scales.shape[:-1] != angle.shape:
+        raise ValueError(f"angle must have shape {tuple(scales.shape[:-1])}; got {tuple(angle.shape)}")
+    s1, s2 = scales.unbind(-1)
+    cos, sin = torch.cos(angle), torch.sin(angle)
+    l11 = torch.hypot(s1 * cos, s2 * sin)
+    # s1^2 - s2^2 as a product keeps nearly round Gaussians exact, det / l11 keeps needles positive
+    return torch.stack([l11, (s1 - s2) * (s1 + s2) * sin * cos / l11, s1 * s2 / l11], -1)
+
+
+def cholesky_to_scale_rotation(cholesky: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Find the axes of the ellipse.
+
+    Args:
+        cholesky: factors in pixels, :math:`(..., 3)`.
+
+    Returns:
+        Standard deviations (largest first) in pixels :math:`(..., 2)`, and the angle of the first axis from x
+        towards y in radians, in (-pi/2, pi/2], :math:`(...)`.
+
+    Raises:
+        TypeError: not a floating tensor.
+        ValueError: wrong last dimension, not finite, or l11, l22 not positive.
+
+    Example:
+        >>> scales, angle = cholesky_to_scale_rotation(torch.tensor([1.0, 0.0, 3.0]))
+        >>> scales, round(float(angle), 4)
+        (tensor([3., 1.]), 1.5708)
+    """
+    l11, l21, l22 = check_cholesky("cholesky", cholesky).unbind(-1)
+    # singular values of a 2 x 2 triangle: |s1 + s2|, |s1 - s2| without squaring
+    total = torch.hypot(l11 + l22, l21)
+    spread = torch.hypot(l11 - l22, l21)
+    large = 0.5 * (total + spread)
+    angle = 0.5 * torch.atan2(2 * l11 * l21, l11 * l11 - l21 * l21 - l22 * l22)
+    return torch.stack([large, l11 * l22 / large], -1), angle
+
+
+def support_extent(cholesky: Tensor, cutoff: float = 1e-4) -> Tensor:
+    r"""Half the width and height of the box outside which a Gaussian's weight is below `cutoff`.
+
+    Args:
+        cholesky: factors in pixels, :math:`(..., 3)`.
+        cutoff: weight in [0, 1); 0: where the weight is zero in the dtype.
+
+    Returns:
+        Extents along x and y in pixels, :math:`(..., 2)`.
+
+    Raises:
+        TypeError: not a floating tensor.
+        ValueError: wrong last dimension, not finite, l11, l22 not positive, or a cutoff out of range.
+
+    Example:
+        >>> support_extent(torch.tensor([1.0, 3.0, 4.0]), cutoff=0.01).round(decimals=3)
+        tensor([ 3.0350, 15.1740])
+    """
+    l11, l21, l22 = check_cholesky("cholesky", cholesky).unbind(-1)
+    if not 0.0 <= cutoff < 1.0:
+        raise ValueError(f"cutoff must be in [0, 1); got {cutoff!r}")
+    dtype = torch.float64 if cholesky.dtype == torch.float64 else torch.float32
+    return torch.stack([l11, torch.hypot(l21, l22)], -1) * support_radius(cutoff, dtype)

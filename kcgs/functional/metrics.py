@@ -1,0 +1,295 @@
+r"""How far an image is from another: PSNR, SSIM and MS-SSIM over the image, PSNR and SSIM along the contours.
+
+Convention: images are :math:`(C, H, W)` or :math:`(B, C, H, W)` with any number of channels, clipped to [0,
+1] before anything else, data range 1. Every metric gives one number an image: 0-dim for an unbatched pair,
+:math:`(B)` for a batch. Half precision is computed and returned in float32; two dtypes meet in the wider one.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, pad
+
+from kcgs._check import check_image, check_labels
+
+from .regions import edge_band
+
+_WINDOW = 11  # pixels; torchmetrics makes it int(3.5 sigma + 0.5) * 2 + 1 whatever kernel size it is given
+_SIGMA = 1.5
+_MARGIN = _WINDOW // 2
+_SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+_MS_SSIM_SIDE = (_WINDOW - 1) * 2 ** (len(_SCALE_WEIGHTS) - 1) + 1
+
+
+def psnr(image: Tensor, target: Tensor) -> Tensor:
+    r"""Peak signal-to-noise ratio: :math:`-10 \log_{10}` of the mean squared error over pixels and channels.
+
+    Convention: both clipped to [0, 1], data range 1. Differentiable, except between identical images.
+
+    Args:
+        image: floating, :math:`(C, H, W)` or :math:`(B, C, H, W)`.
+        target: same shape and device.
+
+    Returns:
+        dB, 0-dim or :math:`(B)`; infinite for identical images.
+
+    Raises:
+        TypeError: not floating tensors.
+        ValueError: shapes or devices that differ, not 3 or 4 dimensions, no pixels, values that are not
+            finite.
+
+    Example:
+        >>> psnr(torch.full((3, 8, 8), 0.6), torch.full((3, 8, 8), 0.5))
+        tensor(20.0000)
+    """
+    image, target, batched = _check_pair(image, target)
+    return _per_image(_decibels((image - target).square().flatten(1).mean(1)), batched)
+
+
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    r"""Structural similarity: 11 x 11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03.
+
+    Convention: both clipped to [0, 1], data range 1; the mean over channels and over the positions where the
+    window lies inside the image, without padding. Differentiable. On CUDA float32 is computed in float64,
+    since the TF32 that convolutions may use there has too few digits for SSIM (errors up to 0.03 on
+    photographs).
+
+    Args:
+        image: floating, :math:`(C, H, W)` or :math:`(B, C, H, W)`.
+        target: same shape and device.
+
+    Returns:
+        In [-1, 1], 0-dim or :math:`(B)`. NaN, with a RuntimeWarning, where a side is below 11 pixels.
+
+    Raises:
+        TypeError: not floating tensors.
+        ValueError: shapes or devices that differ, not 3 or 4 dimensions, no pixels, values that are not
+            finite.
+
+    Example:
+        >>> stripes = torch.arange(256.0).reshape(1, 16, 16) % 2
+        >>> ssim(stripes, stripes).round(decimals=4), ssim(stripes, 1 - stripes).round(decimals=4)
+        (tensor(1.), tensor(-0.9964))
+
+    Source: Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to structural
+    similarity", 2004.
+    """
+    image, target, batched = _check_pair(image, target)
+    if min(image.shape[-2:]) < _WINDOW:
+        return _too_small("ssim", image, batched, _WINDOW)
+    return _per_image(_valid_mean(_ssim_map(image, target)), batched)
+
+
+def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
+    r"""Multi-scale structural similarity over 5 scales with the published weights.
+
+    Convention: both clipped to [0, 1], data range 1; the window of :func:`ssim`, without padding; channels
+    apart, then averaged. A scale whose mean term is below zero counts as zero, since a fractional power of it
+    does not exist; the gradient is not finite there. Between scales 2 x 2 pixels are averaged, and a last row
+    or column without a partner with itself, as in the authors' program. pytorch-msssim pairs the first and
+    last with black: the same where every halved side is even, else up to 0.004 away (measured at 201 x 333).
+
+    Args:
+        image: floating, :math:`(C, H, W)` or :math:`(B, C, H, W)`.
+        target: same shape and device.
+
+    Returns:
+        In [0, 1], 0-dim or :math:`(B)`. NaN, with a RuntimeWarning, where a side is below 161 pixels.
+
+    Raises:
+        TypeError: not floating tensors.
+        ValueError: shapes or devices that differ, not 3 or 4 dimensions, no pixels, values that are not
+            finite.
+
+    Example:
+        >>> ramp = torch.linspace(0, 1, 161).expand(1, 161, 161)
+        >>> ms_ssim(ramp, ramp).round(decimals=4), ms_ssim(ramp, 1 - ramp)
+        (tensor(1.), tensor(0.))
+
+    Source: Wang, Simoncelli, Bovik, "Multi-scale structural similarity for image quality assessment", 2003.
+    """
+    image, target, batched = _check_pair(image, target)
+    if min(image.shape[-2:]) < _MS_SSIM_SIDE:
+        return _too_small("ms_ssim", image, batched, _MS_SSIM_SIDE)
+    batch, channels = image.shape[:2]
+    # torchmetrics averages channels before the powers are taken: hand it one channel at a time
+    image, target = image.flatten(0, 1)[:, None], target.flatten(0, 1)[:, None]
+    product = image.new_ones(batch * channels)
+    for weight in _SCALE_WEIGHTS[:-1]:
+        product = product * _contrast_structure(image, target).relu() ** weight
+        image, target = _halve(image), _halve(target)
+    product = product * _valid_mean(_ssim_map(image, target)).relu() ** _SCALE_WEIGHTS[-1]
+    return _per_image(product.reshape(batch, channels).mean(1), batched)
+
+
+def ef_psnr(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> Tensor:
+    r"""Edge-focused PSNR: the mean squared error is taken over the band along the contours only.
+
+    Convention: both clipped to [0, 1], data range 1; the band is :func:`edge_band`.
+
+    Args:
+        image: floating, :math:`(C, H, W)` or :math:`(B, C, H, W)`.
+        target: same shape and device.
+        labels: integer label map on the same device, :math:`(H, W)` for every image or :math:`(B, H, W)`.
+        width: of the band on either side in pixels, at least 1.
+
+    Returns:
+        dB, 0-dim or :math:`(B)`; infinite where the band is identical. NaN, with a RuntimeWarning, where the
+        label map has one region and so no band.
+
+    Raises:
+        TypeError: not floating images or not an integer label map.
+        ValueError: shapes or devices that differ, no pixels, values that are not finite, negative ids, width
+            below 1.
+
+    Example:
+        >>> labels = (torch.arange(20) >= 10).long().expand(20, 20)
+        >>> black = torch.zeros(1, 20, 20)
+        >>> image = black.index_fill(2, torch.tensor([0, 19]), 1.0)  # wrong far from the contour
+        >>> psnr(image, black), ef_psnr(image, black, labels)
+        (tensor(10.), tensor(inf))
+
+    Source: the paper's edge-focused evaluation.
+    """
+    image, target, batched = _check_pair(image, target)
+    band = _check_band("ef_psnr", image, labels, width)
+    return _per_image(_decibels(_band_mean((image - target).square(), band)), batched)
+
+
+def ef_ssim(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> Tensor:
+    r"""Edge-focused SSIM: the mean of the SSIM map over the band along the contours only.
+
+    Convention: both clipped to [0, 1], data range 1; the window of :func:`ssim`, and a map as large as the
+    image, which is mirrored at its border for that (border pixel not repeated); the band is
+    :func:`edge_band`.
+
+    Args:
+        image: floating, :math:`(C, H, W)` or :math:`(B, C, H, W)`.
+        target: same shape and device.
+        labels: integer label map on the same device, :math:`(H, W)` for every image or :math:`(B, H, W)`.
+        width: of the band on either side in pixels, at least 1.
+
+    Returns:
+        In [-1, 1], 0-dim or :math:`(B)`. NaN, with a RuntimeWarning, where a side is below 11 pixels or the
+        label map has one region and so no band.
+
+    Raises:
+        TypeError: not floating images or not an integer label map.
+        ValueError: shapes or devices that differ, no pixels, values that are not finite, negative ids, width
+            below 1.
+
+    Example:
+        >>> labels = (torch.arange(40) >= 20).long().expand(20, 40)
+        >>> target = labels[None].float()
+        >>> image = target.index_fill(2, torch.tensor([0, 39]), 0.5)  # wrong far from the contour
+        >>> bool(ssim(image, target) < 0.99), ef_ssim(image, target, labels).round(decimals=4)
+        (True, tensor(1.))
+
+    Source: the paper's edge-focused evaluation.
+    """
+    image, target, batched = _check_pair(image, target)
+    band = _check_band("ef_ssim", image, labels, width)
+    if min(image.shape[-2:]) < _WINDOW:
+        return _too_small("ef_ssim", image, batched, _WINDOW)
+    return _per_image(_band_mean(_ssim_map(image, target), band), batched)
+
+
+def _check_pair(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, bool]:
+    """Validate, clip and batch; tell whether the pair came batched."""
+    check_image("image", image)
+    check_image("target", target)
+    if target.shape != image.shape:
+        raise ValueError(f"target must have the shape of image, {tuple(image.shape)}; got {tuple(target.shape)}")
+    if target.device != image.device:
+        raise ValueError(f"target must be on {image.device} with image; got {target.device}")
+    dtype = torch.promote_types(torch.promote_types(image.dtype, target.dtype), torch.float32)
+    batched = image.ndim == 4
+    image, target = (t.to(dtype).clamp(0.0, 1.0) for t in (image, target))
+    return (image, target, True) if batched else (image[None], target[None], False)
+
+
+def _check_band(name: str, image: Tensor, labels: Tensor, width: float) -> Tensor:
+    """Validate the label map against a batched image and return its band, (B or 1, 1, H, W) bool."""
+    labels = check_labels("labels", labels)
+    if labels.device != image.device:
+        raise ValueError(f"labels must be on {image.device} with image; got {labels.device}")
+    batch, _, height, breadth = image.shape
+    maps = labels.shape[0] if labels.ndim == 3 else 1
+    if labels.shape[-2:] != (height, breadth) or maps not in (1, batch):
+        wanted = f"({height}, {breadth}) or ({batch}, {height}, {breadth})"
+        raise ValueError(f"labels must have shape {wanted} to fit image; got {tuple(labels.shape)}")
+    band = edge_band(labels, width).reshape(maps, 1, height, breadth)
+    empty = int((~band.flatten(1).any(1)).sum())
+    if empty:
+        which = "the label map has" if maps == 1 else f"{empty} of {maps} label maps have"
+        warnings.warn(f"{name} is NaN: {which} one region and so no edge band", RuntimeWarning, stacklevel=3)
+    return band
+
+
+def _too_small(name: str, image: Tensor, batched: bool, side: int) -> Tensor:
+    height, width = image.shape[-2:]
+    warnings.warn(
+        f"{name} is NaN: the image has {height} x {width} pixels, its window needs {side} x {side}",
+        RuntimeWarning,
+        stacklevel=3,
+    )
+    return _per_image(image.new_full((image.shape[0],), math.nan), batched)
+
+
+def _per_image(values: Tensor, batched: bool) -> Tensor:
+    return values if batched else values[0]
+
+
+def _decibels(mse: Tensor) -> Tensor:
+    return -10.0 * torch.log10(mse)
+
+
+def _band_mean(values: Tensor, band: Tensor) -> Tensor:
+    # an empty band gives 0 / 0, the NaN that was announced
+    count = band.sum((1, 2, 3)) * values.shape[1]
+    return (values * band).sum((1, 2, 3)) / count
+
+
+def _valid_mean(similarity: Tensor) -> Tensor:
+    """Average where the window lies inside the image; torchmetrics' own mean takes the padded rim too."""
+    return similarity[..., _MARGIN:-_MARGIN, _MARGIN:-_MARGIN].flatten(1).mean(1)
+
+
+def _halve(image: Tensor) -> Tensor:
+    height, width = image.shape[-2:]
+    return avg_pool2d(pad(image, (0, width % 2, 0, height % 2), mode="replicate"), 2)
+
+
+def _ssim_map(image: Tensor, target: Tensor) -> Tensor:
+    """SSIM at every pixel, (B, C, H, W)."""
+    return _torchmetrics_ssim(image, target, return_full_image=True)
+
+
+def _contrast_structure(image: Tensor, target: Tensor) -> Tensor:
+    """Product of contrast and structure, mean over channels and the valid area, (B)."""
+    return _torchmetrics_ssim(image, target, return_contrast_sensitivity=True)
+
+
+def _torchmetrics_ssim(image: Tensor, target: Tensor, **what: bool) -> Tensor:
+    """Return the second of the two results that torchmetrics gives when asked for `what`."""
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    # variances are differences of near-equal convolutions and need every digit: neither TF32 nor autocast
+    working = torch.float64 if image.is_cuda else image.dtype
+    with torch.autocast(image.device.type, enabled=False):
+        result = structural_similarity_index_measure(
+            image.to(working),
+            target.to(working),
+            sigma=_SIGMA,
+            kernel_size=_WINDOW,
+            reduction="none",
+            data_range=1.0,
+            k1=0.01,
+            k2=0.03,
+            **what,
+        )
+    return result[1].to(image.dtype)

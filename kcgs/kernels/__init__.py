@@ -1,0 +1,7 @@
+"""Ways to evaluate the splat and its gradient; private: call `kcgs.functional.region_splat`."""
+
+from .inputs import SplatInputs
+from .membership import Membership
+from .registry import BACKENDS, resolve
+
+__all__ = ["BACKENDS", "Membership", "SplatInputs", "resolve"]

@@ -1,0 +1,118 @@
+"""How much of each pixel belongs to each region: s_r(x, y).
+
+Hard (softness 0): s_r = [M = r]. Soft: the Gaussian blur of [M = r], of standard deviation `softness` pixels, cut at
+`RADIUS_SIGMAS` standard deviations and normalised to sum to one over the regions, so that outside the image nothing
+weighs. A tile deep inside a region has s_r = 1 everywhere and is stored as nothing but its label.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+RADIUS_SIGMAS = 4.0
+_PATCH_ELEMENTS = 1 << 22
+
+
+class TileMembership(NamedTuple):
+    """Which regions occur in which tile, and their weights where a tile holds several.
+
+    Tiles are numbered in raster order, batch first: (b * tiles_y + ty) * tiles_x + tx.
+    """
+
+    keys: Tensor  # [K] int64, sorted: tile * num_regions + region
+    plane: Tensor  # [K] int64, row of `planes`, -1 where the region is alone in its tile
+    planes: Tensor  # [P, tile * tile] bool (hard) or float64 (soft)
+
+
+class Membership:
+    """Compact label map and contour width, with the tables the kernels need, made once and kept."""
+
+    def __init__(self, index: Tensor, num_regions: int, softness: float = 0.0) -> None:
+        """Take `index` (B, H, W), integers 0 ... num_regions - 1."""
+        self.index = index
+        self.num_regions = num_regions
+        self.softness = softness
+        self._tiles: dict[int, TileMembership] = {}
+
+    @property
+    def radius(self) -> int:
+        """Reach of the soft contour in pixels."""
+        return math.ceil(RADIUS_SIGMAS * self.softness)
+
+    def to(self, device: torch.device) -> Membership:
+        """Return the same membership on `device`, tables not carried along."""
+        return Membership(self.index.to(device), self.num_regions, self.softness)
+
+    def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
+        """Evaluate s_r of one region over one whole map, (H, W): the definition, without tables."""
+        inside = (self.index[batch] == region).to(torch.float64)
+        if self.softness == 0.0:
+            return inside.to(dtype)
+        rows, cols = (self._blur_matrix(n, inside.device) for n in inside.shape)
+        total = rows.sum(1)[:, None] * cols.sum(1)[None, :]
+        return ((rows @ inside @ cols.T) / total).to(dtype)
+
+    def _blur_matrix(self, n: int, device: torch.device) -> Tensor:
+        at = torch.arange(n, device=device, dtype=torch.float64)
+        distance = (at[:, None] - at[None, :]).abs()
+        return torch.where(distance <= self.radius, self._gaussian(distance), 0.0)
+
+    def _gaussian(self, distance: Tensor) -> Tensor:
+        return torch.exp(-0.5 * (distance / self.softness) ** 2)
+
+    def tiles(self, tile: int) -> TileMembership:
+        """Tables for square tiles of `tile` pixels."""
+        if tile not in self._tiles:
+            self._tiles[tile] = self._build_tiles(tile)
+        return self._tiles[tile]
+
+    def _build_tiles(self, tile: int) -> TileMembership:
+        # windows: every tile with the halo that its soft contours can see; -1 is outside the image
+        batch, height, width = self.index.shape
+        radius = self.radius
+        tiles_y, tiles_x = -(-height // tile), -(-width // tile)
+        padded = torch.nn.functional.pad(
+            self.index,
+            (radius, tiles_x * tile - width + radius, radius, tiles_y * tile - height + radius),
+            value=-1,
+        )
+        span = tile + 2 * radius
+        windows = padded.unfold(1, span, tile).unfold(2, span, tile)  # [B, ty, tx, span, span], a view
+        high = windows.amax((-1, -2)).flatten()
+        outside = torch.iinfo(padded.dtype).max
+        low = torch.where(windows < 0, outside, windows).amin((-1, -2)).flatten()
+        single = (low == high).nonzero().flatten()
+        mixed = (low != high).nonzero().flatten()
+        patches = windows.reshape(batch * tiles_y * tiles_x, span, span)[mixed]
+
+        pairs = (mixed[:, None] * self.num_regions + patches.flatten(1)).where(patches.flatten(1) >= 0, -1)
+        mixed_keys = torch.unique(pairs)
+        mixed_keys = mixed_keys[mixed_keys >= 0]
+        slot = torch.searchsorted(mixed, mixed_keys // self.num_regions)
+        planes = self._planes(patches, slot, mixed_keys % self.num_regions, tile)
+
+        keys, order = torch.cat([single * self.num_regions + high[single], mixed_keys]).sort()
+        rows = torch.arange(len(mixed_keys), device=keys.device)
+        plane = torch.cat([torch.full_like(single, -1), rows])[order]
+        return TileMembership(keys, plane, planes)
+
+    def _planes(self, patches: Tensor, slot: Tensor, region: Tensor, tile: int) -> Tensor:
+        if self.softness == 0.0:
+            return (patches[slot] == region[:, None, None]).flatten(1)
+        span, radius = patches.shape[-1], self.radius
+        at = torch.arange(span, device=patches.device, dtype=torch.float64)
+        distance = (at[radius : radius + tile, None] - at[None, :]).abs()
+        blur = torch.where(distance <= radius, self._gaussian(distance), 0.0)  # [tile, span]
+        inside = patches >= 0
+        total = blur @ inside.to(blur.dtype) @ blur.T
+        planes = torch.empty(len(slot), tile * tile, device=patches.device, dtype=torch.float64)
+        step = max(1, _PATCH_ELEMENTS // (span * span))
+        for start in range(0, len(slot), step):
+            part = slice(start, start + step)
+            mask = (patches[slot[part]] == region[part, None, None]).to(blur.dtype)
+            planes[part] = ((blur @ mask @ blur.T) / total[slot[part]].clamp_min(1e-300)).flatten(1)
+        return planes

@@ -1,0 +1,6 @@
+"""Modules: a set of Gaussians, and the renderer that draws it."""
+
+from .field import GaussianField
+from .renderer import RegionSplatRenderer
+
+__all__ = ["GaussianField", "RegionSplatRenderer"]

@@ -1,0 +1,247 @@
+"""GaussianField: parameters and region ids."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from kcgs._check import check_floating, check_integer, check_size
+from kcgs.functional import RegionMap, lookup_regions
+from kcgs.functional.covariance import check_cholesky
+
+_HALF = (torch.float16, torch.bfloat16)
+
+
+class GaussianField(nn.Module):
+    r"""Gaussians of an image, or of a batch of images, with the region that each may paint.
+
+    Convention: a tensor that is already part of a graph (say, the output of a network) stays in that graph and is held
+    as a buffer; any other becomes a parameter. Half precision cannot hold a pixel position, so `.half()` and
+    `.bfloat16()` leave the field in float32 and say so; the renderer takes it as it is.
+
+    Args:
+        means: centres (x, y) in pixels, :math:`(N, 2)` or :math:`(B, N, 2)`.
+        cholesky: factors (l11, l21, l22) in pixels, l11, l22 > 0, :math:`(N, 3)` or :math:`(B, N, 3)`.
+        colors: any range, :math:`(N, C)` or :math:`(B, N, C)`.
+        region_ids: integer, non-negative, :math:`(N)` or :math:`(B, N)`; None: not confined.
+        opacities: the paper's alpha, :math:`(N)` or :math:`(B, N)`, multiplied into the colours when drawn; None:
+            already multiplied.
+        size: (height, width) of the image that the pixel units refer to.
+
+    Raises:
+        TypeError: wrong type or dtype.
+        ValueError: shapes that do not fit, values that are not finite, l11 or l22 not positive, negative ids.
+
+    Example:
+        >>> field = GaussianField.random(10, (32, 48), seed=0)
+        >>> len(field), field.size, field.colors.shape
+        (10, (32, 48), torch.Size([10, 3]))
+
+    Source: the paper's tuple (mu, Sigma, c, alpha, r).
+    """
+
+    means: Tensor
+    cholesky: Tensor
+    colors: Tensor
+    region_ids: Tensor | None
+    opacities: Tensor | None
+
+    def __init__(
+        self,
+        means: Tensor,
+        cholesky: Tensor,
+        colors: Tensor,
+        region_ids: Tensor | None = None,
+        opacities: Tensor | None = None,
+        *,
+        size: tuple[int, int],
+    ) -> None:
+        super().__init__()
+        self.size = check_size("size", size)
+        check_floating("means", means, last=2, dims=(2, 3))
+        lead = means.shape[:-1]
+        check_cholesky("cholesky", cholesky)
+        check_floating("colors", colors, dims=(2, 3))
+        self._hold("means", means, lead)
+        self._hold("cholesky", cholesky, lead)
+        self._hold("colors", colors, lead)
+        if opacities is None:
+            self.register_parameter("opacities", None)
+        else:
+            check_floating("opacities", opacities, dims=(1, 2))
+            if opacities.shape != lead:
+                raise ValueError(f"opacities must have shape {tuple(lead)}; got {tuple(opacities.shape)}")
+            self._hold("opacities", opacities, opacities.shape)
+        self.register_buffer("region_ids", None)
+        if region_ids is not None:
+            self.region_ids = self._checked_ids(region_ids)
+
+    def _hold(self, name: str, value: Tensor, lead: torch.Size) -> None:
+        if value.shape[: len(lead)] != lead:
+            raise ValueError(f"{name} must have shape {(*lead, '...')}; got {tuple(value.shape)}")
+        if value.dtype in _HALF:
+            value = value.float()
+        if value.grad_fn is not None:
+            self.register_buffer(name, value)
+        elif isinstance(value, nn.Parameter):
+            self.register_parameter(name, value)
+        else:
+            self.register_parameter(name, nn.Parameter(value.detach().clone()))
+
+    def _checked_ids(self, region_ids: Tensor) -> Tensor:
+        check_integer("region_ids", region_ids)
+        if region_ids.shape != self.means.shape[:-1]:
+            raise ValueError(
+                f"region_ids must have shape {tuple(self.means.shape[:-1])}; got {tuple(region_ids.shape)}"
+            )
+        if region_ids.numel() and int(region_ids.min()) < 0:
+            raise ValueError(f"region_ids must be non-negative; got {int(region_ids.min())}")
+        return region_ids.to(device=self.means.device, dtype=torch.int64, copy=True)
+
+    def __len__(self) -> int:
+        """Number of Gaussians an image."""
+        return self.means.shape[-2]
+
+    @classmethod
+    def random(
+        cls,
+        num_gaussians: int,
+        size: tuple[int, int],
+        *,
+        channels: int = 3,
+        sigma: float | None = None,
+        regions: RegionMap | Tensor | None = None,
+        seed: int | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> GaussianField:
+        """Draw centres uniformly over the image, round Gaussians, uniform colours that add up to about grey.
+
+        Args:
+            num_gaussians: N, at least 0.
+            size: (height, width) in pixels.
+            channels: C, at least 1.
+            sigma: standard deviation in pixels; None: half the side of the area that each Gaussian serves.
+            regions: assign each Gaussian the region under its centre.
+            seed: of the draw; None: torch's global generator.
+            dtype: float32 or float64.
+
+        Raises:
+            ValueError: a number out of range.
+        """
+        height, width = check_size("size", size)
+        if num_gaussians < 0 or channels < 1:
+            raise ValueError(f"num_gaussians must be >= 0 and channels >= 1; got {num_gaussians!r} and {channels!r}")
+        if sigma is None:
+            sigma = max(0.5, 0.5 * (height * width / max(1, num_gaussians)) ** 0.5)
+        if not 0.0 < sigma < float("inf"):
+            raise ValueError(f"sigma must be positive and finite; got {sigma!r}")
+        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        means = torch.rand(num_gaussians, 2, generator=generator, dtype=dtype) * torch.tensor([width, height])
+        cholesky = torch.tensor([sigma, 0.0, sigma], dtype=dtype).repeat(num_gaussians, 1)
+        # a Gaussian covers 2 pi sigma^2 pixels: with this factor the mean of the image is near the mean colour
+        cover = max(1e-12, 2 * torch.pi * sigma**2 * num_gaussians / (height * width))
+        colors = torch.rand(num_gaussians, channels, generator=generator, dtype=dtype) / max(1.0, cover)
+        field = cls(means.to(dtype), cholesky, colors, size=size)
+        return field if regions is None else field.assign_regions(regions)
+
+    def assign_regions(self, regions: RegionMap | Tensor) -> GaussianField:
+        """Give every Gaussian the region under its centre, in place.
+
+        Args:
+            regions: label map of the field's size, or a RegionMap of one.
+
+        Returns:
+            The field itself.
+
+        Raises:
+            TypeError, ValueError: not a label map of this size.
+        """
+        labels = regions.labels if isinstance(regions, RegionMap) else regions
+        ids = lookup_regions(self.means, labels)
+        if tuple(labels.shape[-2:]) != self.size:
+            raise ValueError(f"regions must have the field's size {self.size}; got {tuple(labels.shape[-2:])}")
+        self.region_ids = ids.to(self.means.device)
+        return self
+
+    def subset(self, mask: Tensor) -> GaussianField:
+        """Copy the Gaussians that `mask` selects.
+
+        Args:
+            mask: boolean (N), or integer indices (K).
+
+        Returns:
+            A new field of unbatched parameters, without the graph.
+
+        Raises:
+            TypeError: neither boolean nor integer.
+            ValueError: the field is batched, or the mask has another length or indices out of range.
+
+        Example:
+            >>> field = GaussianField.random(10, (32, 48), seed=0)
+            >>> len(field.subset(field.means[:, 0] < 24)) < 10
+            True
+        """
+        if self.means.ndim != 2:
+            raise ValueError(f"subset needs an unbatched field; got means of shape {tuple(self.means.shape)}")
+        if mask.dtype == torch.bool:
+            if mask.shape != (len(self),):
+                raise ValueError(f"mask must have shape ({len(self)},); got {tuple(mask.shape)}")
+        else:
+            check_integer("mask", mask, dims=(1,))
+            if mask.numel() and not (0 <= int(mask.min()) and int(mask.max()) < len(self)):
+                raise ValueError(
+                    f"mask must hold indices in [0, {len(self)}); got {int(mask.min())}, {int(mask.max())}"
+                )
+
+        def pick(tensor: Tensor | None) -> Tensor | None:
+            return None if tensor is None else tensor.detach()[mask].clone()
+
+        means, cholesky, colors = (t.detach()[mask].clone() for t in (self.means, self.cholesky, self.colors))
+        ids, opacities = pick(self.region_ids), pick(self.opacities)
+        return GaussianField(means, cholesky, colors, ids, opacities, size=self.size)
+
+    def merged_colors(self) -> Tensor:
+        """Colours with the opacities multiplied in, (N, C) or (B, N, C)."""
+        return self.colors if self.opacities is None else self.colors * self.opacities[..., None]
+
+    def get_extra_state(self) -> dict[str, tuple[int, int]]:
+        """Size, for `state_dict`."""
+        return {"size": self.size}
+
+    def set_extra_state(self, state: dict[str, tuple[int, int]]) -> None:
+        """Size, from `load_state_dict`."""
+        self.size = check_size("size", tuple(state["size"]))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        # torch treats a buffer that is None as absent: take the ids that the state carries
+        ids = state_dict.get(f"{prefix}region_ids")
+        if self.region_ids is None and ids is not None:
+            self.region_ids = self._checked_ids(ids)
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianField:
+        warned = False
+
+        def keep_precision(tensor: Tensor) -> Tensor:
+            nonlocal warned
+            moved = fn(tensor)
+            if moved.dtype not in _HALF:
+                return moved
+            if not warned:
+                warnings.warn(
+                    "GaussianField stays in float32: half precision cannot hold pixel positions", stacklevel=4
+                )
+                warned = True
+            return tensor.to(moved.device, torch.float32)
+
+        super()._apply(keep_precision, recurse)  # type: ignore[no-untyped-call]
+        return self
+
+    def extra_repr(self) -> str:
+        """Show the numbers that matter."""
+        confined = "confined" if self.region_ids is not None else "not confined"
+        return f"{len(self)} Gaussians, {self.colors.shape[-1]} channels, size={self.size}, {confined}"

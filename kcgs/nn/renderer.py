@@ -1,0 +1,107 @@
+"""RegionSplatRenderer: the module twin of region_splat."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from kcgs._check import check_size
+from kcgs.functional import RegionMap, region_splat
+
+from .field import GaussianField
+
+
+class RegionSplatRenderer(nn.Module):
+    r"""Draw a field, at its own size or any other.
+
+    Convention: at another size the Gaussians are scaled and the label map is sampled again, so that contours stay
+    sharp. The module holds no state.
+
+    Args:
+        cutoff: weights below it are skipped, in [0, 1); see :func:`kcgs.functional.region_splat`.
+        clamp: clip the image to [0, 1].
+        backend: auto, reference or tiled.
+
+    Raises:
+        ValueError: cutoff out of range.
+
+    Example:
+        >>> field = GaussianField.random(10, (32, 48), seed=0)
+        >>> RegionSplatRenderer()(field).shape, RegionSplatRenderer()(field, size=(64, 96)).shape
+        (torch.Size([3, 32, 48]), torch.Size([3, 64, 96]))
+    """
+
+    def __init__(self, cutoff: float = 1e-4, clamp: bool = False, backend: str = "auto") -> None:
+        super().__init__()
+        if not 0.0 <= cutoff < 1.0:
+            raise ValueError(f"cutoff must be in [0, 1); got {cutoff!r}")
+        self.cutoff = cutoff
+        self.clamp = clamp
+        self.backend = backend
+
+    def forward(
+        self,
+        field: GaussianField | tuple[GaussianField, RegionMap | Tensor | None],
+        regions: RegionMap | Tensor | None = None,
+        size: tuple[int, int] | None = None,
+    ) -> Tensor:
+        """Render.
+
+        Args:
+            field: the Gaussians; or a pair (field, regions), such as a loaded scene, so that the renderer can be the
+                first link of an `nn.Sequential`.
+            regions: label map of the field's size or of `size`; None: the field's ids are not used.
+            size: (height, width) of the image; None: the field's.
+
+        Returns:
+            Image, :math:`(C, H, W)`, or :math:`(B, C, H, W)` for a batched field.
+
+        Raises:
+            TypeError, ValueError: as :func:`kcgs.functional.region_splat`; regions without region ids.
+        """
+        if isinstance(field, tuple):
+            field, regions, *_ = field
+        if not isinstance(field, GaussianField):
+            raise TypeError(f"field must be a GaussianField; got {type(field).__name__}")
+        target = field.size if size is None else check_size("size", size)
+        means, cholesky = field.means, field.cholesky
+        if target != field.size:
+            down, across = target[0] / field.size[0], target[1] / field.size[1]
+            means = means * means.new_tensor([across, down])
+            cholesky = cholesky * cholesky.new_tensor([across, down, down])
+        if regions is not None:
+            regions = self._fit_regions(field, regions, target)
+        image = region_splat(
+            means,
+            cholesky,
+            field.merged_colors(),
+            None if regions is None else field.region_ids,
+            regions,
+            size=target,
+            cutoff=self.cutoff,
+            backend=self.backend,
+        )
+        return image.clamp(0.0, 1.0) if self.clamp else image
+
+    @staticmethod
+    def _fit_regions(field: GaussianField, regions: RegionMap | Tensor, target: tuple[int, int]) -> RegionMap:
+        if field.region_ids is None:
+            raise ValueError("field must have region_ids where regions are given; call field.assign_regions(regions)")
+        if isinstance(regions, Tensor):
+            regions = RegionMap.from_labels(regions)
+        elif not isinstance(regions, RegionMap):
+            raise TypeError(f"regions must be a RegionMap, a label map Tensor or None; got {type(regions).__name__}")
+        if regions.size not in (target, field.size):
+            raise ValueError(f"regions must have the size {field.size} of the field or {target}; got {regions.size}")
+        return regions.resize(target)
+
+    def extra_repr(self) -> str:
+        """Show the settings."""
+        return f"cutoff={self.cutoff:g}, clamp={self.clamp}, backend={self.backend!r}"
+
+
+def render_image(field: GaussianField, regions: RegionMap | None = None, size: tuple[int, int] | None = None) -> Tensor:
+    """Draw without a graph, clipped to [0, 1]: what a viewer shows, (C, H, W)."""
+    with torch.no_grad():
+        image: Tensor = RegionSplatRenderer(clamp=True)(field, regions, size)
+    return image

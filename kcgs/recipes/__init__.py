@@ -1,0 +1,1 @@
+"""Recipes as TOML: data read by `kcgs.fit`."""

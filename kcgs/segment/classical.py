@@ -1,0 +1,189 @@
+"""Segmentation without learned weights: nothing to download, the same map every time."""
+
+import math
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from kcgs.segment.base import check_segment_image, register
+from kcgs.segment.cleanup import (
+    absorb_specks,
+    check_count,
+    connected_regions,
+    lab_sums,
+    merge_similar,
+    order_by_area,
+    rgb_to_lab,
+)
+from kcgs.segment.contours import snap_contours
+
+# The smallest region as a share of the image: 600 pixels of 481 x 321. Below 250 x 250 pixels, where that is
+# less than a line across the image, it is the length of such a line.
+_MIN_SHARE = 0.004
+_SIGMA = 1.2
+# Tried in turn while a map has few regions and they are not nearly flat (root mean square distance from the
+# mean colour, in Lab, where 2.3 is just noticeable).
+_SCALES = (300.0, 150.0, 75.0)
+_FEWEST = 4
+_FLAT = 3.0
+# Larger images are segmented at this many pixels; only their contours are set at full size.
+_MAX_PIXELS = 500_000
+
+
+@register("auto")
+def auto(image: Tensor, *, max_regions: int = 30) -> Tensor:
+    """Segment a photo into some 4 to 30 clean connected regions.
+
+    The method of Felzenszwalb and Huttenlocher, with its scale halved up to twice while fewer than 4 regions
+    come out that are not nearly flat; contours snap to edges, pieces under 0.4 % of the image are absorbed,
+    and the most similar neighbours merge until ``max_regions`` are left. A picture of fewer flat regions gives
+    fewer, a constant one gives one.
+
+    Args:
+        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1], any size.
+        max_regions: the most regions to return, at least 1.
+
+    Returns:
+        :math:`(H, W)` int64, 4-connected regions with ids 0 to R - 1 by decreasing area.
+
+    Raises:
+        TypeError: ``image`` is no floating tensor or ``max_regions`` no integer.
+        ValueError: ``image`` has another shape, non-finite values or values outside [0, 1], or
+            ``max_regions`` is below 1.
+
+    Example:
+        >>> image = torch.zeros(3, 40, 60)
+        >>> image[0, 10:30, 10:50] = 1.0
+        >>> labels = auto(image)
+        >>> labels.unique().tolist(), labels[20, 30].item()
+        ([0, 1], 1)
+    """
+    pixels = torch.from_numpy(check_segment_image(image)).permute(2, 0, 1)
+    check_count("max_regions", max_regions)
+    best = torch.zeros(pixels.shape[1:], dtype=torch.int64)
+    if (pixels != pixels[:, :1, :1]).any():
+        for scale in _SCALES:
+            labels = _photo_regions(pixels, scale)
+            best = labels if labels.max() > best.max() else best
+            if best.max() + 1 >= _FEWEST or _spread(pixels, best) < _FLAT:
+                break
+    return order_by_area(merge_similar(pixels, best, max_regions)).to(image.device)
+
+
+@register("felzenszwalb")
+def felzenszwalb(
+    image: Tensor, *, scale: float = 300.0, sigma: float = 1.0, min_size: int | None = None
+) -> Tensor:
+    """Segment by the graph-based method of Felzenszwalb and Huttenlocher (IJCV 2004), in CIE Lab.
+
+    Args:
+        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].
+        scale: preference for larger regions, above 0. The same value suits a photo at any size.
+        sigma: smoothing beforehand, in pixels, at least 0.
+        min_size: pixels of the smallest region, at least 1; None: 0.4 % of the image (small images: more).
+
+    Returns:
+        :math:`(H, W)` int64, 4-connected regions with ids 0 to R - 1 by decreasing area.
+
+    Raises:
+        TypeError: ``image`` is no floating tensor or ``min_size`` no integer.
+        ValueError: ``image`` has another shape, non-finite values or values outside [0, 1], or a number is
+            out of its range.
+
+    Example:
+        >>> image = torch.zeros(1, 20, 30)
+        >>> image[..., 12:] = 1.0
+        >>> felzenszwalb(image, sigma=0.0)[0, ::10].tolist()
+        [1, 1, 0]
+    """
+    pixels = check_segment_image(image)
+    if not (math.isfinite(scale) and scale > 0):
+        raise ValueError(f"scale must be a number above 0; got {scale}")
+    if not (math.isfinite(sigma) and sigma >= 0):
+        raise ValueError(f"sigma must be a number of at least 0; got {sigma}")
+    min_size = _min_size(pixels.shape[0] * pixels.shape[1], min_size)
+    from skimage.segmentation import felzenszwalb as graph_based
+
+    # Lab over 100 has about the range of RGB in [0, 1], for which the usual scales are known.
+    raw = graph_based(rgb_to_lab(pixels) / 100, scale=scale, sigma=sigma, min_size=min_size)
+    return _clean(torch.from_numpy(raw), min_size).to(image.device)
+
+
+@register("slic")
+def slic(
+    image: Tensor,
+    *,
+    num_segments: int = 400,
+    compactness: float = 10.0,
+    max_regions: int = 30,
+    min_size: int | None = None,
+) -> Tensor:
+    """Segment into SLIC superpixels (Achanta et al., TPAMI 2012) and merge the most similar neighbours.
+
+    Args:
+        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].
+        num_segments: about how many superpixels, at least 1.
+        compactness: weight of position against colour, above 0.
+        max_regions: the most regions to return, at least 1.
+        min_size: pixels of the smallest region, at least 1; None: 0.4 % of the image (small images: more).
+
+    Returns:
+        :math:`(H, W)` int64, 4-connected regions with ids 0 to R - 1 by decreasing area.
+
+    Raises:
+        TypeError: ``image`` is no floating tensor or a count no integer.
+        ValueError: ``image`` has another shape, non-finite values or values outside [0, 1], or a number is
+            out of its range.
+
+    Example:
+        >>> image = torch.zeros(3, 20, 30)
+        >>> image[:, :, 10:] = 1.0
+        >>> slic(image, num_segments=24, max_regions=2)[0, ::10].tolist()
+        [1, 0, 0]
+    """
+    pixels = check_segment_image(image)
+    check_count("num_segments", num_segments)
+    check_count("max_regions", max_regions)
+    if not (math.isfinite(compactness) and compactness > 0):
+        raise ValueError(f"compactness must be a number above 0; got {compactness}")
+    min_size = _min_size(pixels.shape[0] * pixels.shape[1], min_size)
+    from skimage.segmentation import slic as superpixels
+
+    raw = superpixels(pixels, num_segments, compactness, start_label=0, channel_axis=-1)
+    merged = merge_similar(image, connected_regions(torch.from_numpy(raw)), max_regions)
+    return _clean(merged, min_size).to(image.device)
+
+
+def _photo_regions(image: Tensor, scale: float) -> Tensor:
+    """Return 4-connected regions of (3, H, W), none a speck, contours on edges."""
+    shrink = max(1.0, math.sqrt(image[0].numel() / _MAX_PIXELS))
+    small = image
+    if shrink > 1:
+        size = [max(1, round(side / shrink)) for side in image.shape[1:]]
+        small = F.interpolate(image[None], size, mode="area")[0]
+    labels = felzenszwalb(small, scale=scale, sigma=_SIGMA)
+    if shrink > 1:
+        labels = F.interpolate(labels[None, None].double(), image.shape[1:], mode="nearest")[0, 0].long()
+    labels = snap_contours(image, labels, reach=math.ceil(2 * shrink))
+    return _clean(labels, _min_size(labels.numel(), None))
+
+
+def _spread(image: Tensor, labels: Tensor) -> float:
+    """Return the root mean square distance of colours from their region's mean, in Lab."""
+    lab, regions = rgb_to_lab(check_segment_image(image)), labels.numpy()
+    means = lab_sums(lab, regions) / np.bincount(regions.ravel())[:, None]
+    return float(np.sqrt(((lab - means[regions]) ** 2).sum(axis=-1).mean()))
+
+
+def _clean(labels: Tensor, min_size: int) -> Tensor:
+    # Absorbing keeps ids, and pieces of one region that it joins become one piece: connect after it.
+    return order_by_area(connected_regions(absorb_specks(labels, min_size)))
+
+
+def _min_size(pixels: int, given: int | None) -> int:
+    if given is None:
+        return max(round(_MIN_SHARE * pixels), round(math.sqrt(pixels)))
+    check_count("min_size", given)
+    return given

@@ -1,0 +1,258 @@
+"""Turning raw label maps into few, clean, connected regions."""
+
+import heapq
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcgs._check import check_integer
+from kcgs.segment.base import check_segment_image
+
+Labels = NDArray[np.int64]
+Colors = NDArray[np.float64]
+
+
+def connected_regions(labels: Tensor) -> Tensor:
+    """Split a label map so that every region is one piece, its pixels touching along their sides.
+
+    Args:
+        labels: :math:`(H, W)` integer, any ids.
+
+    Returns:
+        :math:`(H, W)` int64 with ids 0 to R - 1 in raster order of each piece's first pixel.
+
+    Raises:
+        TypeError: ``labels`` is no integer tensor.
+        ValueError: ``labels`` is not two-dimensional or is empty.
+
+    Example:
+        >>> connected_regions(torch.tensor([[5, 2, 5], [5, 2, 2]])).tolist()
+        [[0, 1, 2], [0, 1, 1]]
+    """
+    return torch.from_numpy(components(to_array(labels))).to(labels.device)
+
+
+def order_by_area(labels: Tensor) -> Tensor:
+    """Renumber regions by decreasing area; of equal ones, the one with the earlier first pixel comes first.
+
+    Args:
+        labels: :math:`(H, W)` integer, any ids.
+
+    Returns:
+        :math:`(H, W)` int64 with ids 0 to R - 1.
+
+    Raises:
+        TypeError: ``labels`` is no integer tensor.
+        ValueError: ``labels`` is not two-dimensional or is empty.
+
+    Example:
+        >>> order_by_area(torch.tensor([[9, 4, 4], [9, 4, 7]])).tolist()
+        [[1, 0, 0], [1, 0, 2]]
+    """
+    _, regions = compact(to_array(labels))
+    areas = np.bincount(regions.ravel())
+    first = np.empty_like(areas)
+    first[regions.ravel()[::-1]] = np.arange(regions.size)[::-1]  # Of repeated indices the last one counts.
+    rank = np.empty_like(areas)
+    rank[np.lexsort((first, -areas))] = np.arange(len(areas))
+    return torch.from_numpy(rank[regions]).to(labels.device)
+
+
+def absorb_specks(labels: Tensor, min_size: int) -> Tensor:
+    """Give every 4-connected piece under ``min_size`` pixels to the neighbour it has most border with.
+
+    The smallest piece goes first, and a piece that grew to ``min_size`` by what it took in stays. Of
+    neighbours with equal borders the larger takes it, then the one whose first pixel comes earlier.
+
+    Args:
+        labels: :math:`(H, W)` integer, any ids.
+        min_size: pixels a piece must have to stay, at least 1.
+
+    Returns:
+        :math:`(H, W)` int64; remaining pieces keep their ids.
+
+    Raises:
+        TypeError: ``labels`` is no integer tensor or ``min_size`` no integer.
+        ValueError: ``labels`` is not two-dimensional or is empty, or ``min_size`` is below 1.
+
+    Example:
+        >>> absorb_specks(torch.tensor([[3, 3, 3, 8], [3, 1, 3, 8]]), min_size=2).tolist()
+        [[3, 3, 3, 8], [3, 3, 3, 8]]
+    """
+    values = to_array(labels)
+    check_count("min_size", min_size)
+    pieces = components(values)
+    graph = RegionGraph(pieces)
+    queue = [(int(area), piece) for piece, area in enumerate(graph.areas) if area < min_size]
+    heapq.heapify(queue)
+    while queue:
+        area, piece = heapq.heappop(queue)
+        if graph.is_merged(piece) or area != graph.areas[piece] or not graph.borders[piece]:
+            continue
+        borders = graph.borders[piece]
+        target = max(borders, key=lambda other: (borders[other], graph.areas[other], -other))
+        graph.merge(piece, target)
+        if graph.areas[target] < min_size:
+            heapq.heappush(queue, (int(graph.areas[target]), target))
+    ids = np.empty(len(graph.areas), dtype=np.int64)
+    ids[pieces.ravel()] = values.ravel()
+    return torch.from_numpy(ids[graph.roots()][pieces]).to(labels.device)
+
+
+def merge_similar(image: Tensor, labels: Tensor, max_regions: int) -> Tensor:
+    """Merge the two adjacent regions nearest in mean colour until at most ``max_regions`` are left.
+
+    Colours are compared as CIE Lab (D65); a merged region has the mean of all its pixels.
+
+    Args:
+        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].
+        labels: :math:`(H, W)` integer, any ids.
+        max_regions: how many regions may stay, at least 1.
+
+    Returns:
+        :math:`(H, W)` int64; a merged region has the id of its largest part.
+
+    Raises:
+        TypeError: an argument has another type.
+        ValueError: ``image`` and ``labels`` differ in size, or a number is out of its range.
+
+    Example:
+        >>> image = torch.tensor([[[0.0, 0.1, 0.9]]])
+        >>> merge_similar(image, torch.tensor([[4, 5, 6]]), max_regions=2).tolist()
+        [[4, 4, 6]]
+    """
+    pixels = check_segment_image(image)
+    values = to_array(labels)
+    if pixels.shape[:2] != values.shape:
+        raise ValueError(
+            f"labels must have the image's size; got {values.shape} and an image of {pixels.shape[:2]}"
+        )
+    check_count("max_regions", max_regions)
+    ids, regions = compact(values)
+    graph = RegionGraph(regions)
+    _merge_nearest(graph, lab_sums(rgb_to_lab(pixels), regions), max_regions)
+    return torch.from_numpy(ids[graph.roots()][regions]).to(labels.device)
+
+
+class RegionGraph:
+    """Which regions touch and along how many pixel sides, kept up to date while regions merge.
+
+    Args:
+        labels: (H, W) with every id from 0 to R - 1 in use.
+    """
+
+    def __init__(self, labels: Labels) -> None:
+        """Count areas and shared sides."""
+        self.areas: Labels = np.bincount(labels.ravel())
+        count = len(self.areas)
+        self.borders: list[dict[int, int]] = [{} for _ in range(count)]
+        self._parents = np.arange(count)
+        sides = ((labels[:, :-1], labels[:, 1:]), (labels[:-1], labels[1:]))
+        first, second = (np.concatenate([pair[k].ravel() for pair in sides]) for k in (0, 1))
+        differs = first != second
+        first, second = first[differs], second[differs]
+        keys, lengths = np.unique(
+            np.minimum(first, second) * count + np.maximum(first, second), return_counts=True
+        )
+        for key, length in zip(keys.tolist(), lengths.tolist(), strict=True):
+            a, b = divmod(key, count)
+            self.borders[a][b] = self.borders[b][a] = length
+
+    def is_merged(self, region: int) -> bool:
+        """Say whether ``region`` went into another."""
+        return bool(self._parents[region] != region)
+
+    def merge(self, source: int, target: int) -> None:
+        """Let ``target`` take in its neighbour ``source``."""
+        self._parents[source] = target
+        self.areas[target] += self.areas[source]
+        for other, length in self.borders[source].items():
+            del self.borders[other][source]
+            if other != target:
+                self.borders[target][other] = self.borders[target].get(other, 0) + length
+                self.borders[other][target] = self.borders[target][other]
+        self.borders[source] = {}
+
+    def roots(self) -> Labels:
+        """Return for every region the one it is part of now."""
+        roots = self._parents
+        while (roots != roots[roots]).any():
+            roots = roots[roots]
+        return roots
+
+
+def _merge_nearest(graph: RegionGraph, sums: Colors, max_regions: int) -> None:
+    """Merge the nearest pair while there are too many regions; ``sums`` holds colours times areas."""
+
+    def distance(a: int, b: int) -> float:
+        return float(np.linalg.norm(sums[a] / graph.areas[a] - sums[b] / graph.areas[b]))
+
+    # Distances change with every merge; entries of an earlier state are told by the regions' areas.
+    queue = [
+        (distance(a, b), a, b, graph.areas[a], graph.areas[b])
+        for a, others in enumerate(graph.borders)
+        for b in others
+        if a < b
+    ]
+    heapq.heapify(queue)
+    count = len(graph.areas)
+    while count > max_regions:
+        _, a, b, area_a, area_b = heapq.heappop(queue)
+        if graph.is_merged(a) or graph.is_merged(b) or (area_a, area_b) != (graph.areas[a], graph.areas[b]):
+            continue
+        source, target = (a, b) if area_a < area_b else (b, a)
+        graph.merge(source, target)
+        sums[target] += sums[source]
+        count -= 1
+        for other in graph.borders[target]:
+            low, high = min(target, other), max(target, other)
+            heapq.heappush(queue, (distance(low, high), low, high, graph.areas[low], graph.areas[high]))
+
+
+def rgb_to_lab(pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return (H, W, 3) sRGB as CIE Lab (D65), L in [0, 100]."""
+    from skimage.color import rgb2lab
+
+    return np.asarray(rgb2lab(pixels), dtype=np.float32)
+
+
+def lab_sums(lab: NDArray[np.float32], regions: Labels) -> Colors:
+    """Return (R, 3), the colours of every region's pixels added up."""
+    flat = regions.ravel()
+    return np.stack([np.bincount(flat, weights=lab[..., k].ravel()) for k in range(3)], axis=1)
+
+
+def compact(values: Labels) -> tuple[Labels, Labels]:
+    """Return the ids in use, sorted, and the map with every id replaced by its place among them."""
+    if values.max() >= 4 * values.size:
+        ids, places = np.unique(values, return_inverse=True)
+        return ids, places.reshape(values.shape).astype(np.int64)
+    used = np.bincount(values.ravel()) > 0  # Several times faster than sorting, where ids are not huge.
+    return np.flatnonzero(used), (np.cumsum(used) - 1)[values]
+
+
+def components(values: Labels) -> Labels:
+    """Return the 4-connected pieces, numbered from 0 in raster order."""
+    from skimage.measure import label
+
+    # Shifted to 1 and up: everything is foreground for the labelling, id 0 included.
+    pieces = label(compact(values)[1] + 1, background=0, connectivity=1)
+    return np.asarray(pieces, dtype=np.int64) - 1
+
+
+def to_array(labels: Tensor) -> Labels:
+    """Return a checked label map as (H, W) int64."""
+    labels = check_integer("labels", labels, dims=(2,))
+    if labels.numel() == 0:
+        raise ValueError(f"labels must have at least one pixel; got shape {tuple(labels.shape)}")
+    return labels.long().cpu().numpy()
+
+
+def check_count(name: str, value: int) -> None:
+    """Raise unless ``value`` is a whole number of at least 1."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"{name} must be an integer; got {value!r}")
+    if value < 1:
+        raise ValueError(f"{name} must be at least 1; got {value}")

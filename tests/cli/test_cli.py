@@ -1,0 +1,199 @@
+"""The command line as a user or a script meets it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from kcgs import load
+from kcgs.cli import main
+from kcgs.data import load_image, load_labels, save_image, save_labels
+
+KEYS = {"psnr", "ssim", "ms_ssim", "ef_psnr", "ef_ssim", "num_gaussians", "seconds", "bytes", "bits_per_pixel"}
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    labels = torch.zeros(40, 60, dtype=torch.long)
+    labels[10:30, 20:45] = 1
+    image = torch.where(labels.bool(), torch.tensor([0.9, 0.4, 0.1])[:, None, None], 0.3)
+    save_image("photo.png", image)
+    save_labels("mask.png", labels)
+    return tmp_path
+
+
+def kcgs(*arguments: str, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
+    code = 0
+    try:
+        main_with(arguments)
+    except SystemExit as stop:
+        code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def main_with(arguments: tuple[str, ...]) -> None:
+    before = sys.argv
+    sys.argv = ["kcgs", *arguments]
+    try:
+        main()
+    finally:
+        sys.argv = before
+
+
+FIT = ("fit", "photo.png", "-n", "12", "--iterations", "40", "-o", "scene.safetensors")
+
+
+class TestFit:
+    @pytest.mark.parametrize("regions", ["mask.png", "auto", "none"])
+    def test_fit_render_eval_info(self, files: Path, capsys: pytest.CaptureFixture[str], regions: str) -> None:
+        code, out, err = kcgs(*FIT, "--regions", regions, "--json", capsys=capsys)
+        assert code == 0, err
+        report = json.loads(out)
+        assert set(report) == KEYS
+        assert report["num_gaussians"] == 12
+        assert report["bytes"] == (files / "scene.safetensors").stat().st_size
+        assert (report["ef_psnr"] is None) == (regions == "none")
+        assert report["ms_ssim"] is None  # the image is too small for it
+
+        code, out, _ = kcgs("eval", "scene.safetensors", "photo.png", "--json", capsys=capsys)
+        assert code == 0
+        again = json.loads(out)
+        assert set(again) == KEYS
+        assert again["psnr"] == pytest.approx(report["psnr"], abs=1e-4)
+
+        code, out, _ = kcgs("info", "scene.safetensors", "--json", capsys=capsys)
+        assert code == 0
+        assert json.loads(out)["height"] == 40
+
+        assert kcgs("render", "scene.safetensors", "-o", "large.png", "--scale", "2", capsys=capsys)[0] == 0
+        assert load_image("large.png").shape == (3, 80, 120)
+
+    def test_default_output_is_named_after_the_image(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        code, out, err = kcgs("fit", "photo.png", "-n", "3", "--iterations", "2", capsys=capsys)
+        assert code == 0, err
+        assert (files / "photo.safetensors").is_file()
+        assert "psnr" in out
+
+    def test_no_bar_off_a_terminal(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert kcgs(*FIT, "--json", capsys=capsys)[2] == ""
+
+    def test_recipe_is_recorded(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        kcgs(*FIT, "--recipe", "gaussian-image", capsys=capsys)
+        scene = load("scene.safetensors")
+        assert scene.metadata["recipe"] == "gaussian-image"
+        assert scene.regions is None
+
+    def test_interrupt_saves_the_best_so_far(self, files: Path) -> None:
+        command = [sys.executable, "-m", "kcgs.cli", "fit", "photo.png", "-n", "12", "-o", "scene.safetensors"]
+        process = subprocess.Popen(
+            [*command, "--iterations", "10000000", "--json", "--regions", "mask.png"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "TERM": "dumb"},
+        )
+        time.sleep(12)  # long enough to be in the fit; too short would show as a KeyboardInterrupt below
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+        assert process.returncode == 0, err
+        assert b"interrupted: saved the best so far to scene.safetensors" in err
+        assert json.loads(out)["num_gaussians"] == 12
+        assert len(load(files / "scene.safetensors").field) == 12
+
+
+class TestRender:
+    @pytest.fixture
+    def scene(self, files: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+        assert kcgs(*FIT, "--regions", "mask.png", capsys=capsys)[0] == 0
+        return files / "scene.safetensors"
+
+    def test_size(self, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert kcgs("render", str(scene), "-o", "a.png", "--size", "90x50", capsys=capsys)[0] == 0
+        assert Image.open("a.png").size == (90, 50)
+
+    def test_region(self, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert kcgs("render", str(scene), "-o", "a.png", "--region", "1", capsys=capsys)[0] == 0
+        picture = load_image("a.png")
+        outside = load_labels("mask.png") == 0
+        assert picture[:, outside].max() == 0 and picture.max() > 0
+
+    @pytest.mark.parametrize(
+        ("arguments", "code", "words"),
+        [
+            (("--region", "9"), 1, "--region must be one of the scene's regions [0, 1]; got 9"),
+            (("--size", "90"), 2, "--size must be WxH"),
+            (("--size", "0x5"), 2, "--size must be WxH"),
+            (("--scale", "-1"), 2, "--scale must be positive"),
+            (("--scale", "2", "--size", "4x4"), 2, "not both"),
+        ],
+    )
+    def test_wrong_usage(
+        self, scene: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], code: int, words: str
+    ) -> None:
+        got, _, err = kcgs("render", str(scene), "-o", "a.png", *arguments, capsys=capsys)
+        assert got == code
+        assert words in " ".join(err.replace("│", " ").split())
+        assert not Path("a.png").exists()
+
+
+class TestSegment:
+    def test_writes_a_label_map(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        code, out, _ = kcgs("segment", "photo.png", "-o", "labels.png", "--json", capsys=capsys)
+        assert code == 0
+        labels = load_labels("labels.png")
+        assert labels.shape == (40, 60)
+        assert json.loads(out)["regions"] == len(labels.unique())
+
+
+class TestFailures:
+    @pytest.mark.parametrize(
+        ("arguments", "code", "words"),
+        [
+            ((), 2, "Usage"),
+            (("fit",), 2, "Missing argument"),
+            (("fit", "photo.png", "-n", "0"), 2, "not in the range"),
+            (("fit", "photo.png", "--backend", "gpu"), 2, "'gpu' is not one of"),
+            (("fit", "nothing.png"), 1, "nothing.png"),
+            (("fit", "text.png"), 1, "text.png"),
+            (("fit", "photo.png", "--recipe", "none-such"), 1, "recipe must be one of"),
+            (("fit", "photo.png", "--regions", "nothing.png"), 1, "nothing.png"),
+            (("fit", "photo.png", "--regions", "small.png"), 1, "regions must be one map of the image's size"),
+            (("fit", "photo.png", "-o", "scene.pt"), 1, "must end in .safetensors"),
+            (("fit", "photo.png", "-o", "nowhere/scene.safetensors"), 1, "needs an existing folder"),
+            (("fit", "photo.png", "--max-seconds", "-1"), 1, "max_seconds"),
+            (("info", "text.png"), 1, "text.png"),
+            (("bench", "none-such", "-o", "out"), 1, "name must be one of demo"),
+            (("segment", "photo.png", "-o", "a.png", "--method", "magic"), 1, "method"),
+        ],
+    )
+    def test_one_line_and_an_exit_code(
+        self, files: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], code: int, words: str
+    ) -> None:
+        Path("text.png").write_text("this is no picture")
+        save_labels("small.png", torch.zeros(4, 4, dtype=torch.long))
+        before = sorted(p.name for p in files.iterdir())
+        got, out, err = kcgs(*arguments, capsys=capsys)
+        assert got == code
+        assert words in " ".join((out + err).replace("│", " ").split())
+        if code == 1:
+            assert err.startswith("kcgs: ") and err.count("\n") == 1
+        assert sorted(p.name for p in files.iterdir()) == before
+
+
+def test_bench_demo_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = kcgs("bench", "demo", "-o", str(tmp_path / "demo"), "--quick", capsys=capsys)
+    assert code == 0, err
+    written = {p.name for p in (tmp_path / "demo").iterdir()}
+    pictures = {"original.png", "regions.png", "baseline.png", "contour-aware.png", "error-against-time.png"}
+    assert pictures <= written
+    assert "contour-aware" in out and "EF-PSNR" in out

@@ -1,0 +1,210 @@
+"""Adan against a float64 transcription of the published algorithm, and as a torch optimiser."""
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcgs.fit.adan import Adan
+
+Array = NDArray[np.float64]
+START = np.array([-1.2, 1.0, 0.3, -0.7])
+SETTINGS: list[dict[str, Any]] = [
+    {},
+    {"lr": 0.05},
+    {"lr": 0.02, "betas": (0.9, 0.5, 0.95), "eps": 1e-3, "weight_decay": 0.1},
+    {"lr": 0.01, "betas": (0.0, 0.0, 0.0)},
+]
+
+
+def loss_of(point: Tensor) -> Tensor:
+    """Rosenbrock's function of neighbouring coordinates, with a sine."""
+    return (100 * (point[1:] - point[:-1] ** 2) ** 2 + (1 - point[:-1]) ** 2 + (3 * point[1:]).sin()).sum()
+
+
+def gradient_of(point: Array) -> Array:
+    """Its gradient by hand."""
+    gradient = np.zeros_like(point)
+    inner = point[1:] - point[:-1] ** 2
+    gradient[:-1] += -400 * inner * point[:-1] - 2 * (1 - point[:-1])
+    gradient[1:] += 200 * inner + 3 * np.cos(3 * point[1:])
+    return gradient
+
+
+def published(
+    steps: int,
+    lr: float = 1e-3,
+    betas: tuple[float, float, float] = (0.98, 0.92, 0.99),
+    eps: float = 1e-8,
+    weight_decay: float = 0.0,
+) -> Array:
+    """Algorithm 1 with the paper's beta = 1 - betas and its averages divided by their total weight."""
+    theta = START.copy()
+    beta1, beta2, beta3 = (1 - b for b in betas)
+    m, v, n, before = np.zeros_like(theta), np.zeros_like(theta), np.zeros_like(theta), gradient_of(theta)
+    for k in range(1, steps + 1):
+        g = gradient_of(theta)
+        m = (1 - beta1) * m + beta1 * g
+        v = (1 - beta2) * v + beta2 * (g - before)
+        n = (1 - beta3) * n + beta3 * (g + (1 - beta2) * (g - before)) ** 2
+        m_hat, v_hat, n_hat = (
+            average / (1 - (1 - beta) ** k) for average, beta in ((m, beta1), (v, beta2), (n, beta3))
+        )
+        theta = (theta - lr / (np.sqrt(n_hat) + eps) * (m_hat + (1 - beta2) * v_hat)) / (1 + weight_decay * lr)
+        before = g
+    return theta
+
+
+def advance(optimizer: Adan, point: Tensor, steps: int) -> None:
+    for _ in range(steps):
+        optimizer.zero_grad()
+        loss_of(point).backward()
+        optimizer.step()
+
+
+def parameter(dtype: torch.dtype = torch.float64) -> torch.nn.Parameter:
+    return torch.nn.Parameter(torch.tensor(START, dtype=dtype))
+
+
+class TestAlgorithm:
+    @pytest.mark.parametrize("settings", SETTINGS)
+    @pytest.mark.parametrize("steps", [1, 2, 20])
+    def test_matches_publication(self, settings: dict[str, Any], steps: int) -> None:
+        point = parameter()
+        advance(Adan([point], **settings), point, steps)
+        expected = published(steps, **settings)
+        assert np.abs(expected - START).max() > 0.5 * settings.get("lr", 1e-3)
+        np.testing.assert_allclose(point.detach().numpy(), expected, rtol=0, atol=1e-13)
+
+    def test_float32(self) -> None:
+        point = parameter(torch.float32)
+        advance(Adan([point]), point, 20)
+        np.testing.assert_allclose(point.detach().numpy(), published(20), rtol=0, atol=1e-5)
+
+    def test_first_step_is_lr_against_the_sign(self) -> None:
+        point = parameter()
+        advance(Adan([point], lr=0.25, eps=0.0), point, 1)
+        np.testing.assert_allclose(point.detach().numpy(), START - 0.25 * np.sign(gradient_of(START)), atol=1e-15)
+
+    def test_finds_the_minimum_of_a_bowl(self) -> None:
+        point, goal = parameter(), torch.tensor([0.5, -0.25, 2.0, 0.0], dtype=torch.float64)
+        optimizer = Adan([point], lr=0.05)
+        schedule = torch.optim.lr_scheduler.StepLR(optimizer, 100, 0.5)
+        for _ in range(1000):
+            optimizer.zero_grad()
+            (point - goal).square().sum().backward()
+            optimizer.step()
+            schedule.step()
+        torch.testing.assert_close(point.detach(), goal, atol=1e-3, rtol=0)
+
+
+class TestOptimizer:
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_resumes_bit_for_bit(self, dtype: torch.dtype) -> None:
+        straight = parameter(dtype)
+        advance(Adan([straight], **SETTINGS[2]), straight, 20)
+
+        first = parameter(dtype)
+        optimizer = Adan([first], **SETTINGS[2])
+        advance(optimizer, first, 7)
+        saved = copy.deepcopy(optimizer.state_dict())
+        second = torch.nn.Parameter(first.detach().clone())
+        advance(optimizer, first, 3)  # the saved state must not move along
+
+        restored = Adan([second])
+        restored.load_state_dict(saved)
+        assert restored.param_groups[0]["betas"] == SETTINGS[2]["betas"]
+        advance(restored, second, 13)
+        assert torch.equal(second, straight)
+
+    def test_state_survives_torch_save(self, tmp_path: Path) -> None:
+        point = parameter()
+        optimizer = Adan([point])
+        advance(optimizer, point, 3)
+        torch.save(optimizer.state_dict(), tmp_path / "state.pt")
+        loaded = torch.load(tmp_path / "state.pt", weights_only=True)
+        twin = torch.nn.Parameter(point.detach().clone())
+        restored = Adan([twin])
+        restored.load_state_dict(loaded)
+        advance(optimizer, point, 2)
+        advance(restored, twin, 2)
+        assert torch.equal(point, twin)
+
+    def test_groups_keep_their_own_settings(self) -> None:
+        slow, fast = parameter(), parameter()
+        groups: list[dict[str, Any]] = [{"params": [slow]}, {"params": [fast], "lr": 0.01}]
+        optimizer = Adan(groups, lr=0.001)
+        (loss_of(slow) + loss_of(fast)).backward()
+        optimizer.step()
+        moved = [(p.detach() - torch.from_numpy(START)).abs().max().item() for p in (slow, fast)]
+        np.testing.assert_allclose(moved, [0.001, 0.01], rtol=1e-6)
+
+    def test_leaves_parameters_without_gradient(self) -> None:
+        used, unused = parameter(), parameter()
+        optimizer = Adan([used, unused])
+        loss_of(used).backward()
+        optimizer.step()
+        assert torch.equal(unused.detach(), torch.from_numpy(START))
+        assert unused not in optimizer.state
+        assert not torch.equal(used.detach(), torch.from_numpy(START))
+
+    def test_closure(self) -> None:
+        plain, closed = parameter(), parameter()
+        advance(Adan([plain]), plain, 3)
+        optimizer = Adan([closed])
+
+        def closure() -> float:
+            optimizer.zero_grad()
+            loss = loss_of(closed)
+            loss.backward()
+            return loss.item()
+
+        for _ in range(3):
+            before = loss_of(closed).item()
+            assert optimizer.step(closure) == before
+        assert torch.equal(closed, plain)
+        assert Adan([parameter()]).step() is None
+
+    def test_does_not_touch_the_gradient(self) -> None:
+        point = parameter()
+        optimizer = Adan([point])
+        for _ in range(2):
+            optimizer.zero_grad()
+            loss_of(point).backward()
+            assert point.grad is not None
+            kept = point.grad.clone()
+            optimizer.step()
+            assert torch.equal(point.grad, kept)
+
+
+class TestExceptions:
+    @pytest.mark.parametrize(
+        ("settings", "name"),
+        [
+            ({"lr": -1e-3}, "lr"),
+            ({"lr": float("nan")}, "lr"),
+            ({"lr": float("inf")}, "lr"),
+            ({"eps": -1e-8}, "eps"),
+            ({"weight_decay": -0.1}, "weight_decay"),
+            ({"betas": (0.9, 0.9)}, "betas"),
+            ({"betas": (0.9, 0.9, 1.0)}, "betas"),
+            ({"betas": (-0.1, 0.9, 0.9)}, "betas"),
+            ({"betas": (0.9, float("nan"), 0.9)}, "betas"),
+        ],
+    )
+    def test_settings(self, settings: dict[str, Any], name: str) -> None:
+        with pytest.raises(ValueError, match=f"^{name} must be"):
+            Adan([parameter()], **settings)
+        optimizer = Adan([parameter()])
+        with pytest.raises(ValueError, match=f"^{name} must be"):
+            optimizer.add_param_group({"params": [parameter()], **settings})
+        assert len(optimizer.param_groups) == 1
+
+    def test_no_parameters(self) -> None:
+        with pytest.raises(ValueError, match="empty parameter list"):
+            Adan([])

@@ -1,0 +1,401 @@
+"""Image metrics against float64 transcriptions of their papers, pytorch-msssim, and at their limits."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import pytorch_msssim
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import correlate1d, distance_transform_edt
+from skimage import data
+from torch import Tensor
+from torch.autograd import gradcheck
+
+from kcgs.functional import edge_band, ef_psnr, ef_ssim, ms_ssim, psnr, ssim
+
+Array = NDArray[np.float64]
+Metric = Callable[..., Tensor]
+PHOTOS = ("astronaut", "coffee")
+METRICS = (psnr, ssim, ms_ssim)
+SMALLEST = {psnr: (16, 16), ssim: (16, 16), ms_ssim: (161, 161)}
+FLOATS = (torch.float32, torch.float64)
+
+
+def photo_pair(name: str, rows: int = 176, columns: int = 192) -> tuple[Tensor, Tensor]:
+    """Return a photo and a blurred, noisy copy that leaves [0, 1], (3, rows, columns) float64."""
+    photo = torch.from_numpy(getattr(data, name)()[100 : 100 + rows, 150 : 150 + columns]).double().permute(2, 0, 1)
+    photo = photo / 255.0
+    noise = torch.randn(photo.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    blurred = 0.5 * photo + 0.25 * (photo.roll(2, -1) + photo.roll(2, -2))
+    return (1.2 * (blurred - 0.5) + 0.5 + 0.05 * noise), photo
+
+
+def similarity_maps(first: Array, second: Array) -> tuple[Array, Array]:
+    """SSIM and its contrast-structure factor at every pixel of one channel, as in Wang et al. 2004."""
+    offsets = np.arange(-5, 6)
+    window = np.exp(-(offsets**2) / (2 * 1.5**2))
+    window /= window.sum()
+
+    def mean(values: Array) -> Array:
+        rows: Array = correlate1d(values, window, 0, mode="mirror")
+        return np.asarray(correlate1d(rows, window, 1, mode="mirror"))
+
+    mu1, mu2 = mean(first), mean(second)
+    var1, var2 = mean(first**2) - mu1**2, mean(second**2) - mu2**2
+    structure = (2 * (mean(first * second) - mu1 * mu2) + 0.03**2) / (var1 + var2 + 0.03**2)
+    return structure * (2 * mu1 * mu2 + 0.01**2) / (mu1**2 + mu2**2 + 0.01**2), structure
+
+
+def clipped(image: Tensor) -> Array:
+    """Image as a float64 array in [0, 1]."""
+    return np.asarray(image.double().clamp(0.0, 1.0).numpy())
+
+
+def reference_ssim_map(image: Tensor, target: Tensor) -> Array:
+    """SSIM at every pixel, (C, H, W)."""
+    pairs = zip(clipped(image), clipped(target), strict=True)
+    return np.stack([similarity_maps(first, second)[0] for first, second in pairs])
+
+
+def reference_ssim(image: Tensor, target: Tensor) -> float:
+    return float(reference_ssim_map(image, target)[:, 5:-5, 5:-5].mean())
+
+
+def halved(values: Array) -> Array:
+    """Average each pixel with its right and lower neighbours, mirrored at the end; keep every other one."""
+    grown = np.pad(values, ((0, 1), (0, 1)), mode="symmetric")
+    return (0.25 * (grown[:-1, :-1] + grown[1:, :-1] + grown[:-1, 1:] + grown[1:, 1:]))[::2, ::2]
+
+
+def reference_ms_ssim(image: Tensor, target: Tensor) -> float:
+    """Wang et al. 2003 for each channel, then averaged."""
+    products = []
+    for first, second in zip(clipped(image), clipped(target), strict=True):
+        product = 1.0
+        for scale, weight in enumerate((0.0448, 0.2856, 0.3001, 0.2363, 0.1333)):
+            whole, structure = similarity_maps(first, second)
+            term = (whole if scale == 4 else structure)[5:-5, 5:-5].mean()
+            product *= max(term, 0.0) ** weight
+            first, second = halved(first), halved(second)
+        products.append(product)
+    return float(np.mean(products))
+
+
+def disc_labels(rows: int, columns: int) -> Tensor:
+    """Three regions with ids that are not consecutive."""
+    y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+    disc = (y - rows // 2) ** 2 + (x - columns // 3) ** 2 < (rows // 4) ** 2
+    return torch.where(disc, 7, torch.where(x > columns * 4 // 5, 300, 0))
+
+
+def reference_band(labels: Tensor, width: float) -> NDArray[np.bool_]:
+    """Pixels within `width` of a pixel of another label, by exact distance transforms."""
+    values = labels.numpy()
+    distance = np.zeros(values.shape)
+    for label in np.unique(values):
+        distance += distance_transform_edt(values == label)
+    return np.asarray(distance <= width)
+
+
+class TestPsnr:
+    def test_known_value(self) -> None:
+        image = torch.full((2, 3, 8, 9), 0.5)
+        target = image + torch.tensor([0.1, 0.01]).reshape(2, 1, 1, 1)
+        torch.testing.assert_close(psnr(image, target), torch.tensor([20.0, 40.0]), atol=1e-3, rtol=0)
+
+    def test_pools_error_over_pixels_and_channels(self) -> None:
+        image, target = photo_pair("coffee")
+        expected = -10 * np.log10(np.mean((clipped(image) - clipped(target)) ** 2))
+        assert abs(float(psnr(image, target)) - expected) < 1e-12
+        assert abs(float(psnr(image.float(), target.float())) - expected) < 1e-4
+
+    def test_identical_is_infinite_and_others_are_not(self) -> None:
+        image = torch.rand(2, 1, 5, 5)
+        other = image.clone()
+        other[1, 0, 2, 2] += 0.5 - image[1, 0, 2, 2].round()
+        assert torch.isinf(psnr(image, other)).tolist() == [True, False]
+
+    def test_clips_first(self) -> None:
+        image, target = torch.full((1, 4, 4), 7.0), torch.full((1, 4, 4), 1.0)
+        assert psnr(image, target) == torch.inf
+        assert psnr(-image, target) == 0.0
+
+
+class TestSsim:
+    @pytest.mark.parametrize("name", PHOTOS)
+    def test_matches_paper(self, name: str) -> None:
+        image, target = photo_pair(name)
+        expected = reference_ssim(image, target)
+        assert 0.2 < expected < 0.95
+        assert abs(float(ssim(image, target)) - expected) < 1e-12
+        assert abs(float(ssim(image.float(), target.float())) - expected) < 2e-5
+
+    @pytest.mark.parametrize("name", PHOTOS)
+    def test_matches_pytorch_msssim(self, name: str) -> None:
+        image, target = (t.clamp(0, 1) for t in photo_pair(name))
+        expected = pytorch_msssim.ssim(image[None], target[None], data_range=1.0)
+        # its window is rounded to float32 whatever the images are
+        assert abs(float(ssim(image, target) - expected)) < 2e-5
+
+    def test_smallest_image_has_one_window(self) -> None:
+        image, target = (t[:, 20:31, 30:41] for t in photo_pair("astronaut"))
+        assert abs(float(ssim(image, target)) - reference_ssim_map(image, target)[:, 5, 5].mean()) < 1e-12
+
+    def test_order_of_values(self) -> None:
+        image, target = photo_pair("coffee", 64, 64)
+        better = target + 0.5 * (image - target)
+        assert ssim(target, target) > 0.999999 > ssim(better, target) > ssim(image, target) > ssim(1 - target, target)
+        assert ssim(1 - target, target) < 0
+
+    def test_autocast_changes_nothing(self) -> None:
+        image, target = (t.float() for t in photo_pair("coffee", 64, 64))
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            inside = ssim(image, target)
+        assert inside.dtype == torch.float32
+        assert torch.equal(inside, ssim(image, target))
+
+
+class TestMsSsim:
+    @pytest.mark.parametrize("name", PHOTOS)
+    # even at every scale; odd at several; the smallest, 161 -> 81 -> 41 -> 21 -> 11
+    @pytest.mark.parametrize("size", [(176, 192), (201, 187), (161, 161)])
+    def test_matches_paper(self, name: str, size: tuple[int, int]) -> None:
+        image, target = photo_pair(name, *size)
+        expected = reference_ms_ssim(image, target)
+        assert 0.5 < expected < 0.99
+        assert abs(float(ms_ssim(image, target)) - expected) < 1e-12
+        assert abs(float(ms_ssim(image.float(), target.float())) - expected) < 2e-5
+
+    @pytest.mark.parametrize("name", PHOTOS)
+    def test_matches_pytorch_msssim_where_sides_stay_even(self, name: str) -> None:
+        image, target = (t.clamp(0, 1) for t in photo_pair(name))
+        expected = pytorch_msssim.ms_ssim(image[None], target[None], data_range=1.0)
+        assert abs(float(ms_ssim(image, target) - expected)) < 2e-5
+
+    @pytest.mark.parametrize("name", PHOTOS)
+    def test_known_difference_from_pytorch_msssim_at_odd_sides(self, name: str) -> None:
+        image, target = (t.clamp(0, 1).float() for t in photo_pair(name, 201, 187))
+        theirs = float(pytorch_msssim.ms_ssim(image[None], target[None], data_range=1.0))
+        assert 1e-5 < abs(float(ms_ssim(image, target)) - theirs) < 1e-2
+
+    def test_negative_structure_is_zero_not_nan(self) -> None:
+        target = photo_pair("coffee")[1].float()
+        values = ms_ssim(torch.stack([1 - target, target]), torch.stack([target, target]))
+        assert values[0] == 0.0
+        assert values[1] > 0.9999
+
+    def test_negative_structure_of_one_scale_is_enough(self) -> None:
+        coarse = torch.linspace(0.3, 0.7, 161).expand(1, 161, 161)
+        fine = 0.2 * (-1.0) ** torch.arange(161)[:, None]  # gone at the next scale
+        assert ms_ssim(coarse + fine, coarse - fine) == 0.0
+        assert ms_ssim(coarse + fine, coarse + 0.8 * fine) > 0.9
+
+    def test_channels_are_averaged_after_the_powers(self) -> None:
+        image, target = (t.float() for t in photo_pair("coffee"))
+        image[0] = 1 - target[0]
+        apart = torch.stack([ms_ssim(i[None], t[None]) for i, t in zip(image, target, strict=True)])
+        assert apart[0] == 0.0
+        torch.testing.assert_close(ms_ssim(image, target), apart.mean(), atol=1e-6, rtol=0)
+        assert apart.mean() > 0.4
+
+
+class TestEdgeFocused:
+    @pytest.mark.parametrize("width", [1, 5])
+    def test_psnr_reads_the_band_only(self, width: int) -> None:
+        image, target = photo_pair("astronaut", 64, 80)
+        labels = disc_labels(64, 80)
+        band = reference_band(labels, width)
+        assert 0 < band.mean() < 0.5
+        expected = -10 * np.log10(np.mean((clipped(image) - clipped(target))[:, band] ** 2))
+        assert abs(float(ef_psnr(image, target, labels, width)) - expected) < 1e-12
+
+    @pytest.mark.parametrize("width", [1, 5])
+    def test_ssim_averages_the_band_of_the_map(self, width: int) -> None:
+        image, target = photo_pair("coffee", 64, 80)
+        labels = disc_labels(64, 80)
+        expected = reference_ssim_map(image, target)[:, reference_band(labels, width)].mean()
+        assert abs(float(ef_ssim(image, target, labels, width)) - expected) < 1e-12
+
+    def test_default_width_is_five(self) -> None:
+        image, target = photo_pair("coffee", 64, 80)
+        labels = disc_labels(64, 80)
+        for metric in (ef_psnr, ef_ssim):
+            assert metric(image, target, labels) == metric(image, target, labels, 5)
+            assert metric(image, target, labels) != metric(image, target, labels, 6)
+
+    def test_errors_outside_the_band_do_not_count(self) -> None:
+        _, target = photo_pair("coffee", 64, 80)
+        labels = disc_labels(64, 80)
+        far = ~edge_band(labels, 5 + 8)  # 8: half the diagonal of the SSIM window, rounded up
+        image = torch.where(far, 1 - target, target)
+        assert ef_psnr(image, target, labels) == torch.inf
+        assert ef_ssim(image, target, labels) > 0.999999
+        assert psnr(image, target) < 20 and ssim(image, target) < 0.9
+
+    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    def test_one_map_for_all_or_one_each(self, metric: Metric) -> None:
+        pairs = [photo_pair(name, 64, 80) for name in PHOTOS]
+        images, targets = (torch.stack(part) for part in zip(*pairs, strict=True))
+        maps = torch.stack([disc_labels(64, 80), disc_labels(64, 80).flip(1)])
+        each = torch.stack([metric(i, t, m) for i, t, m in zip(images, targets, maps, strict=True)])
+        shared = torch.stack([metric(i, t, maps[0]) for i, t in zip(images, targets, strict=True)])
+        torch.testing.assert_close(metric(images, targets, maps), each, atol=1e-12, rtol=0)
+        torch.testing.assert_close(metric(images, targets, maps[0]), shared, atol=1e-12, rtol=0)
+        torch.testing.assert_close(metric(images, targets, maps[:1]), shared, atol=1e-12, rtol=0)
+        assert (each - shared).abs().tolist()[1] > 1e-3
+
+    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    def test_one_region_is_nan_and_says_so(self, metric: Metric) -> None:
+        image, target = photo_pair("coffee", 20, 20)
+        flat, split = torch.full((20, 20), 4), disc_labels(20, 20)
+        with pytest.warns(RuntimeWarning, match="NaN: the label map has one region and so no edge band") as caught:
+            assert metric(image, target, flat).isnan()
+        assert caught[0].filename == __file__
+        with pytest.warns(RuntimeWarning, match="1 of 2 label maps have one region"):
+            both = metric(torch.stack([image] * 2), torch.stack([target] * 2), torch.stack([split, flat]))
+        assert both.isnan().tolist() == [False, True]
+
+    @pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32])
+    def test_integer_dtypes_of_labels(self, dtype: torch.dtype) -> None:
+        image, target = photo_pair("coffee", 20, 20)
+        labels = disc_labels(20, 20).clamp_max(9)
+        assert ef_psnr(image, target, labels.to(dtype)) == ef_psnr(image, target, labels)
+
+
+class TestTooSmall:
+    @pytest.mark.parametrize(("rows", "columns"), [(10, 50), (50, 10), (1, 1)])
+    def test_ssim(self, rows: int, columns: int) -> None:
+        image = torch.rand(2, 3, rows, columns)
+        with pytest.warns(RuntimeWarning, match=rf"^ssim is NaN.* {rows} x {columns} .*11 x 11") as caught:
+            values = ssim(image, image)
+        assert caught[0].filename == __file__
+        assert values.shape == (2,) and values.isnan().all()
+
+    @pytest.mark.parametrize(("rows", "columns"), [(160, 400), (400, 160), (11, 11)])
+    def test_ms_ssim(self, rows: int, columns: int) -> None:
+        image = torch.rand(1, rows, columns)
+        with pytest.warns(RuntimeWarning, match=rf"^ms_ssim is NaN.* {rows} x {columns} .*161 x 161"):
+            value = ms_ssim(image, image)
+        assert value.shape == () and value.isnan()
+
+    def test_ef_ssim(self) -> None:
+        labels = torch.zeros(10, 30).long()
+        labels[:, 15:] = 1
+        with pytest.warns(RuntimeWarning, match=r"^ef_ssim is NaN.*11 x 11"):
+            assert ef_ssim(torch.rand(3, 10, 30), torch.rand(3, 10, 30), labels).isnan()
+        assert ef_psnr(torch.rand(3, 10, 30), torch.rand(3, 10, 30), labels) > 0
+
+
+class TestCardinality:
+    @pytest.mark.parametrize("metric", METRICS)
+    @pytest.mark.parametrize("channels", [1, 4])
+    def test_any_channels_batched_or_not(self, metric: Metric, channels: int) -> None:
+        image, target = (t[torch.arange(channels) % 3].float() for t in photo_pair("coffee", *SMALLEST[metric]))
+        single, other = metric(image, target), metric(target.flip(-1), target)
+        assert single.shape == ()
+        batch = metric(torch.stack([image, target.flip(-1)]), torch.stack([target, target]))
+        assert batch.shape == (2,)
+        torch.testing.assert_close(batch, torch.stack([single, other]), atol=1e-5, rtol=0)
+        assert abs(single - other) > 1e-2
+
+    @pytest.mark.parametrize("metric", METRICS)
+    @pytest.mark.parametrize("dtype", FLOATS)
+    def test_keeps_dtype(self, metric: Metric, dtype: torch.dtype) -> None:
+        image, target = (t.to(dtype) for t in photo_pair("coffee", *SMALLEST[metric]))
+        assert metric(image, target).dtype == dtype
+
+    @pytest.mark.parametrize("metric", METRICS)
+    @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+    def test_half_is_float32(self, metric: Metric, dtype: torch.dtype) -> None:
+        image, target = (t.to(dtype) for t in photo_pair("coffee", *SMALLEST[metric]))
+        value = metric(image, target)
+        assert value.dtype == torch.float32
+        assert value == metric(image.float(), target.float())
+
+    def test_two_dtypes_meet_in_the_wider(self) -> None:
+        image, target = photo_pair("coffee", 16, 16)
+        assert psnr(image.half(), target.float()).dtype == torch.float32
+        assert psnr(image.float(), target.double()) == psnr(image.float().double(), target)
+
+
+class TestGradient:
+    @pytest.mark.parametrize("name", ["psnr", "ssim", "ef_psnr", "ef_ssim"])
+    def test_gradcheck(self, name: str) -> None:
+        generator = torch.Generator().manual_seed(1)
+        image, target = (0.1 + 0.8 * torch.rand(2, 1, 11, 12, generator=generator).double() for _ in range(2))
+        image.requires_grad_()
+        labels = disc_labels(11, 12)
+        metrics: dict[str, Metric] = {
+            "psnr": psnr,
+            "ssim": ssim,
+            "ef_psnr": lambda a, b: ef_psnr(a, b, labels, 2),
+            "ef_ssim": lambda a, b: ef_ssim(a, b, labels, 2),
+        }
+        assert gradcheck(metrics[name], (image, target), fast_mode=True)
+        (gradient,) = torch.autograd.grad(metrics[name](image, target).sum(), image)
+        assert gradient.abs().max() > 1e-4
+
+    def test_ascent_on_ms_ssim(self) -> None:
+        image, target = (t.float() for t in photo_pair("coffee", 161, 161))
+        image = image.clamp(0.01, 0.99).requires_grad_()
+        before = ms_ssim(image, target)
+        (gradient,) = torch.autograd.grad(before, image)
+        assert ms_ssim(image.detach() + 0.01 * gradient / gradient.abs().max(), target) > before
+
+
+class TestExceptions:
+    @pytest.mark.parametrize("metric", METRICS)
+    def test_images(self, metric: Metric) -> None:
+        image = torch.rand(3, 16, 16)
+        with pytest.raises(TypeError, match="image must be a Tensor"):
+            metric(image.numpy(), image)
+        with pytest.raises(TypeError, match="target must have a real floating dtype"):
+            metric(image, (image * 255).to(torch.uint8))
+        with pytest.raises(ValueError, match=r"target must have the shape of image, \(3, 16, 16\)"):
+            metric(image, image[:1])
+        with pytest.raises(ValueError, match="image must have 3 or 4 dimensions"):
+            metric(image[0], image[0])
+        with pytest.raises(ValueError, match="image must not be empty"):
+            metric(image[:0], image[:0])
+        with pytest.raises(ValueError, match="target must be finite"):
+            metric(image, image.index_fill(0, torch.tensor(1), torch.nan))
+        with pytest.raises(ValueError, match="target must be on cpu"):
+            metric(image, _on_another_device(image))
+
+    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    def test_labels(self, metric: Metric) -> None:
+        image, labels = torch.rand(2, 3, 16, 20), disc_labels(16, 20)
+        with pytest.raises(TypeError, match="labels must have an integer dtype"):
+            metric(image, image, labels.float())
+        with pytest.raises(TypeError, match="labels must be a Tensor"):
+            metric(image, image, labels.tolist())
+        with pytest.raises(ValueError, match=r"labels must have shape \(16, 20\) or \(2, 16, 20\)"):
+            metric(image, image, labels.T)
+        with pytest.raises(ValueError, match="labels must have shape"):
+            metric(image, image, labels.expand(3, 16, 20))
+        with pytest.raises(ValueError, match="labels must have shape"):
+            metric(image[0], image[0], labels.expand(2, 16, 20))
+        with pytest.raises(ValueError, match="non-negative"):
+            metric(image, image, labels - 1)
+        with pytest.raises(ValueError, match="width"):
+            metric(image, image, labels, 0)
+
+
+def _on_another_device(image: Tensor) -> Tensor:
+    """A finite tensor whose device is not the CPU, which every machine has: a subclass that says so."""
+
+    class Elsewhere(Tensor):
+        @property
+        def device(self) -> torch.device:  # type: ignore[override]
+            return torch.device("meta")
+
+    return image.as_subclass(Elsewhere)
+
+
+def test_importing_kcgs_does_not_import_torchmetrics() -> None:
+    code = "import sys, kcgs, kcgs.functional; print('torchmetrics' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

@@ -1,0 +1,180 @@
+"""Label maps: compaction, memberships, look-up, resampling, the edge band."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+
+import pytest
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from kcgs import RegionMap
+from kcgs.functional import edge_band, lookup_regions
+from kcgs.kernels.binning import TILE
+
+
+def blobs(size: tuple[int, int] = (45, 70), regions: int = 4, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.rand(1, regions, *size, generator=generator)
+    return torch.nn.functional.avg_pool2d(noise, 9, stride=1, padding=4).argmax(1)[0]
+
+
+class TestRegionMap:
+    def test_ids_need_not_be_consecutive(self) -> None:
+        regions = RegionMap.from_labels(torch.tensor([[255, 0], [7, 100_000]]))
+        assert regions.ids.tolist() == [0, 7, 255, 100_000]
+        assert regions.num_regions == 4
+        assert regions.index_of(torch.tensor([7, 8, 100_000, 0])).tolist() == [1, -1, 3, 0]
+
+    @pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.int64])
+    def test_integer_dtypes(self, dtype: torch.dtype) -> None:
+        assert RegionMap.from_labels(torch.tensor([[1, 2]], dtype=dtype)).labels.dtype == torch.int64
+
+    @pytest.mark.parametrize("softness", [0.3, 0.7, 2.0])
+    def test_memberships_sum_to_one(self, softness: float) -> None:
+        regions = RegionMap.from_labels(blobs(), softness)
+        shares = torch.stack([regions._membership.weights(0, r, torch.float64) for r in range(regions.num_regions)])
+        torch.testing.assert_close(shares.sum(0), torch.ones(45, 70, dtype=torch.float64))
+        assert ((shares > 0) & (shares < 1)).any()
+
+    def test_membership_is_the_stated_blur(self) -> None:
+        labels, softness = blobs(), 0.9
+        regions = RegionMap.from_labels(labels, softness)
+        for r in range(regions.num_regions):
+            inside = (labels == r).double().numpy()
+            radius = math.ceil(4 * softness)
+            blurred, ones = (
+                ndimage.gaussian_filter(a, softness, mode="constant", radius=radius) for a in (inside, inside * 0 + 1)
+            )
+            want = torch.from_numpy(blurred / ones)
+            assert (regions._membership.weights(0, r, torch.float64) - want).abs().max() < 1e-12
+
+    @pytest.mark.parametrize("softness", [0.0, 0.7, 5.0])
+    def test_tile_tables_hold_the_same_weights(self, softness: float) -> None:
+        membership = RegionMap.from_labels(blobs(), softness)._membership
+        table = membership.tiles(TILE)
+        cols = -(-70 // TILE)
+        found = torch.zeros(membership.num_regions, 3 * TILE, cols * TILE, dtype=torch.float64)
+        for key, plane in zip(table.keys.tolist(), table.plane.tolist(), strict=True):
+            tile, region = divmod(key, membership.num_regions)
+            y, x = tile // cols * TILE, tile % cols * TILE
+            weights = torch.ones(TILE, TILE).double() if plane < 0 else table.planes[plane].double().view(TILE, TILE)
+            found[region, y : y + TILE, x : x + TILE] = weights
+        for r in range(membership.num_regions):
+            torch.testing.assert_close(found[r, :45, :70], membership.weights(0, r, torch.float64))
+
+    def test_interior_tiles_store_no_weights(self) -> None:
+        labels = torch.zeros(160, 160, dtype=torch.long)
+        labels[:, 80:] = 1
+        for softness, mixed in ((0.0, 0), (0.7, 20)):
+            table = RegionMap.from_labels(labels, softness)._membership.tiles(TILE)
+            assert len(table.planes) == 2 * mixed
+            assert (table.plane < 0).sum() == 100 - mixed
+
+    def test_pickle_and_copy(self) -> None:
+        regions = RegionMap.from_labels(blobs(), 0.7)
+        for other in (pickle.loads(pickle.dumps(regions)), copy.deepcopy(regions)):
+            assert torch.equal(other.labels, regions.labels)
+            assert other.softness == 0.7
+
+    @pytest.mark.parametrize(
+        ("labels", "softness", "error", "words"),
+        [
+            (torch.zeros(3, 3), 0.0, TypeError, "labels must have an integer dtype; got torch.float32"),
+            (torch.zeros(3, dtype=torch.long), 0.0, ValueError, "labels must have 2 or 3 dimensions"),
+            (torch.zeros(0, 4, dtype=torch.long), 0.0, ValueError, "at least one pixel"),
+            (-torch.ones(3, 3, dtype=torch.long), 0.0, ValueError, "non-negative ids; got -1"),
+            (torch.zeros(3, 3, dtype=torch.long), -0.1, ValueError, r"softness must be in \[0, 64\] pixels; got -0.1"),
+            (torch.zeros(3, 3, dtype=torch.long), math.nan, ValueError, "softness must be in"),
+            ([[0]], 0.0, TypeError, "labels must be a Tensor; got list"),
+        ],
+    )
+    def test_bad_input(self, labels: Tensor, softness: float, error: type[Exception], words: str) -> None:
+        with pytest.raises(error, match=words):
+            RegionMap.from_labels(labels, softness)
+
+
+class TestResize:
+    def test_same_size_is_the_same_map(self) -> None:
+        regions = RegionMap.from_labels(blobs())
+        assert regions.resize((45, 70)) is regions
+
+    def test_enlarged_centres_keep_their_labels(self) -> None:
+        labels = blobs()
+        large = RegionMap.from_labels(labels, 0.5).resize((45 * 5, 70 * 5))
+        assert torch.equal(large.labels[2::5, 2::5], labels)
+        assert large.softness == pytest.approx(2.5)
+
+    def test_slanted_contour_has_no_steps(self) -> None:
+        y, x = torch.meshgrid(torch.arange(32), torch.arange(32), indexing="ij")
+        large = RegionMap.from_labels((x > y).long()).resize((256, 256)).labels
+        first = large.argmax(1)[32:200]  # where each row changes label
+        straight = torch.arange(32, 200)
+        # copying pixels makes steps of up to 8 px; smoothed, the contour stays within 2 of a straight line
+        offset = (first - straight).double()
+        assert (offset - offset.mean()).abs().max() <= 2
+
+    def test_reduced(self) -> None:
+        labels = blobs((90, 140))
+        small = RegionMap.from_labels(labels).resize((45, 70)).labels
+        agree = (small == labels[::2, ::2]) | (small == labels[1::2, 1::2])
+        assert agree.float().mean() > 0.97
+
+    def test_batch(self) -> None:
+        maps = torch.stack([blobs(seed=0), blobs(seed=1)])
+        large = RegionMap.from_labels(maps).resize((60, 100)).labels
+        assert torch.equal(large[1], RegionMap.from_labels(maps[1]).resize((60, 100)).labels)
+
+    @pytest.mark.parametrize("size", [(0, 3), (3,), (2.5, 3), "ab", None])
+    def test_bad_size(self, size: object) -> None:
+        with pytest.raises((ValueError, TypeError), match="size must"):
+            RegionMap.from_labels(blobs()).resize(size)  # type: ignore[arg-type]
+
+
+class TestLookup:
+    def test_floor_and_clamp(self) -> None:
+        labels = torch.arange(6).view(2, 3)
+        means = torch.tensor([[0.0, 0.0], [0.999, 0.999], [1.0, 1.0], [2.9, 1.9], [-5.0, 9.0], [1e9, -1e9]])
+        assert lookup_regions(means, labels).tolist() == [0, 0, 4, 5, 3, 2]
+
+    def test_batch_of_maps(self) -> None:
+        labels = torch.stack([torch.zeros(2, 2), torch.ones(2, 2)]).long()
+        assert lookup_regions(torch.zeros(2, 3, 2), labels).tolist() == [[0, 0, 0], [1, 1, 1]]
+
+    def test_bad_batch(self) -> None:
+        with pytest.raises(ValueError, match="labels of shape"):
+            lookup_regions(torch.zeros(3, 2), torch.zeros(2, 4, 4).long())
+
+
+class TestEdgeBand:
+    def test_distance_to_another_label(self) -> None:
+        labels = blobs()
+        distance = torch.full(labels.shape, math.inf, dtype=torch.float64)
+        for r in labels.unique().tolist():
+            inside = labels == r
+            there = torch.from_numpy(ndimage.distance_transform_edt(inside.numpy()))
+            distance[inside] = there[inside]
+        for width in (1, 1.5, 2, 5):
+            assert torch.equal(edge_band(labels, width), distance <= width)
+
+    def test_beside_a_change_is_distance_one(self) -> None:
+        labels = torch.zeros(20, 20, dtype=torch.long)
+        labels[:, 10:] = 3
+        band = edge_band(labels, width=5)
+        assert band.all(0).nonzero().flatten().tolist() == list(range(5, 15))
+        assert torch.equal(band.any(0), band.all(0))
+
+    def test_one_region_has_no_band(self) -> None:
+        assert not edge_band(torch.ones(9, 9).long()).any()
+
+    def test_image_smaller_than_the_band(self) -> None:
+        assert edge_band(torch.tensor([[0, 1]])).all()
+        assert edge_band(torch.tensor([[0], [1], [1]])).all()
+
+    @pytest.mark.parametrize("width", [0, 0.5, -1, math.inf, math.nan])
+    def test_bad_width(self, width: float) -> None:
+        with pytest.raises(ValueError, match="width must be"):
+            edge_band(blobs(), width)

@@ -1,0 +1,354 @@
+"""region_splat: the hand-worked table, every backend against float64, gradients, exactness, extremes."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import NamedTuple
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs import RegionMap
+from kcgs.functional import region_splat
+
+
+class Scene(NamedTuple):
+    means: Tensor
+    cholesky: Tensor
+    colors: Tensor
+    region_ids: Tensor
+    labels: Tensor
+
+
+def random_scene(n: int, size: tuple[int, int], regions: int, *, channels: int = 3, seed: int = 0) -> Scene:
+    """Draw a float64 scene whose label map has blocks and a disc."""
+    generator = torch.Generator().manual_seed(seed)
+    height, width = size
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    means = uniform(n, 2) * torch.tensor([width, height]) * 1.2 - 0.1 * torch.tensor([width, height])
+    sigma = 0.6 * math.sqrt(height * width / max(n, 1)) + 0.3
+    cholesky = torch.stack([sigma * (0.3 + uniform(n)), sigma * (uniform(n) - 0.5), sigma * (0.3 + uniform(n))], -1)
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    labels = (x * 3 // max(width, 1) + 3 * (y * 2 // max(height, 1))) % max(1, regions - 1)
+    if regions > 1:
+        disc = (x - width / 2) ** 2 + (y - height / 2) ** 2 < (min(height, width) / 3) ** 2
+        labels = torch.where(disc, regions - 1, labels)
+    ids = torch.randint(0, regions, (n,), generator=generator)
+    return Scene(means, cholesky, uniform(n, channels) - 0.3, 10 * ids, 10 * labels)
+
+
+def as_float32(scene: Scene) -> Scene:
+    return Scene(*(t.float() for t in scene[:3]), *scene[3:])
+
+
+def gradients(scene: Scene, regions: RegionMap | None, **options: object) -> tuple[Tensor, list[Tensor]]:
+    inputs = [t.detach().clone().requires_grad_() for t in scene[:3]]
+    size = None if regions is not None else tuple(scene.labels.shape)
+    image = region_splat(*inputs, scene.region_ids, regions, size=size, **options)
+    probe = torch.linspace(-1, 2, image.numel(), dtype=image.dtype).view_as(image)
+    return image.detach(), list(torch.autograd.grad((image * probe).sum(), inputs))
+
+
+def assert_gradients_close(actual: list[Tensor], expected: list[Tensor], tolerance: float) -> None:
+    """Compare as values and, as an error in scale or direction would hide in large values, as vectors."""
+    for got, want in zip(actual, expected, strict=True):
+        scale = want.abs().max().clamp_min(1e-30)
+        assert ((got.double() - want.double()).abs().max() / scale) <= tolerance
+        cosine = torch.nn.functional.cosine_similarity(got.double().flatten(), want.double().flatten(), dim=0)
+        assert cosine >= 1 - tolerance
+
+
+class TestTable:
+    """Three Gaussians, two regions, written out."""
+
+    def test_hand_worked(self, backend: str) -> None:
+        means = [(1.0, 1.0), (3.5, 0.5), (2.0, 1.5)]
+        factors = [(1.0, 0.0, 1.0), (2.0, 1.0, 0.5), (0.7, -0.4, 1.5)]
+        colors = [(1.0, 0.0), (0.25, -0.5), (0.0, 2.0)]
+        ids = [5, 9, 5]
+        labels = [[5, 5, 9, 9], [5, 9, 9, 5]]
+        expected = torch.zeros(2, 2, 4, dtype=torch.float64)
+        for i, j, k in itertools.product(range(2), range(4), range(3)):
+            (mx, my), (l11, l21, l22) = means[k], factors[k]
+            s_xx, s_xy, s_yy = l11 * l11, l11 * l21, l21 * l21 + l22 * l22
+            dx, dy = j + 0.5 - mx, i + 0.5 - my
+            q = (s_yy * dx * dx - 2 * s_xy * dx * dy + s_xx * dy * dy) / (s_xx * s_yy - s_xy * s_xy)
+            for c in range(2):
+                expected[c, i, j] += (ids[k] == labels[i][j]) * math.exp(-0.5 * q) * colors[k][c]
+        double = [torch.tensor(v, dtype=torch.float64) for v in (means, factors, colors)]
+        image = region_splat(*double, torch.tensor(ids), torch.tensor(labels), cutoff=0, backend=backend)
+        torch.testing.assert_close(image, expected, rtol=1e-12, atol=1e-14)
+        assert image.abs().max() > 0.5
+
+    def test_soft_membership_by_hand(self, backend: str) -> None:
+        labels = torch.tensor([[0, 0, 0, 1, 1, 1]])
+        one = torch.ones(1, 1, dtype=torch.float64)
+        flat = torch.tensor([[1e6, 0.0, 1e6]], dtype=torch.float64)
+        regions = RegionMap.from_labels(labels, softness=0.5)
+        image = region_splat(
+            torch.zeros(1, 2, dtype=torch.float64), flat, one, torch.tensor([0]), regions, cutoff=0, backend=backend
+        )
+        kernel = [math.exp(-0.5 * (d / 0.5) ** 2) for d in range(3)]  # the blur is cut at 4 sigma = 2 px
+        share = [
+            sum(kernel[abs(i - j)] for j in range(3) if abs(i - j) <= 2)
+            / sum(kernel[abs(i - j)] for j in range(6) if abs(i - j) <= 2)
+            for i in range(6)
+        ]
+        torch.testing.assert_close(image[0, 0], torch.tensor(share, dtype=torch.float64), rtol=0, atol=1e-9)
+        assert share[0] == 1.0 and share[5] == 0.0 and 0.5 < share[2] < 1.0
+
+
+SIZES = [(1, 1), (1, 37), (33, 16), (47, 61)]
+
+
+class TestAgainstReference:
+    @pytest.mark.parametrize("softness", [0.0, 0.7, 3.0])
+    @pytest.mark.parametrize("regions", [1, 2, 5])
+    @pytest.mark.parametrize("size", SIZES)
+    def test_cutoff_zero(self, backend: str, size: tuple[int, int], regions: int, softness: float) -> None:
+        scene = random_scene(60, size, regions)
+        region_map = RegionMap.from_labels(scene.labels, softness)
+        want, want_gradients = gradients(scene, region_map, cutoff=0, backend="reference")
+        got, got_gradients = gradients(as_float32(scene), region_map, cutoff=0, backend=backend)
+        assert got.dtype == torch.float32
+        assert (got - want).abs().max() < 1e-5
+        assert want.abs().max() > 1e-3
+        assert_gradients_close(got_gradients, want_gradients, 1e-4)
+
+    @pytest.mark.parametrize("cutoff", [1e-2, 1e-4])
+    def test_cutoff_error_is_bounded(self, backend: str, cutoff: float) -> None:
+        scene = random_scene(300, (64, 80), 3)
+        exact = region_splat(*scene, cutoff=0, backend="reference")
+        got = region_splat(*as_float32(scene), cutoff=cutoff, backend=backend)
+        # every skipped weight is below the cutoff: the error is at most cutoff x the colours that overlap
+        overlap = scene.colors.abs().sum()
+        assert (got - exact).abs().max() <= 2 * cutoff * overlap
+        assert (got - exact).abs().max() > 0
+
+    def test_many_gaussians(self, backend: str) -> None:
+        scene = random_scene(10_000, (70, 90), 4)
+        got = region_splat(*as_float32(scene), backend=backend)
+        want = region_splat(*scene, backend="reference")
+        assert (got - want).abs().max() < 2e-3
+
+    def test_list_longer_than_a_segment(self, backend: str) -> None:
+        scene = random_scene(3000, (16, 16), 2)
+        want, want_gradients = gradients(scene, RegionMap.from_labels(scene.labels), cutoff=0, backend="reference")
+        got, got_gradients = gradients(scene, RegionMap.from_labels(scene.labels), cutoff=0, backend=backend)
+        torch.testing.assert_close(got, want, rtol=1e-10, atol=1e-10)
+        assert_gradients_close(got_gradients, want_gradients, 1e-9)
+
+    @pytest.mark.parametrize("channels", [1, 2, 4, 9])
+    def test_channels(self, backend: str, channels: int) -> None:
+        scene = random_scene(40, (20, 30), 3, channels=channels)
+        got = region_splat(*scene, cutoff=0, backend=backend)
+        assert got.shape == (channels, 20, 30)
+        torch.testing.assert_close(got, region_splat(*scene, cutoff=0, backend="reference"), rtol=1e-10, atol=1e-12)
+
+
+class TestGradcheck:
+    @pytest.mark.parametrize("softness", [0.0, 0.8])
+    @pytest.mark.parametrize("regions", [1, 3])
+    def test_gradcheck(self, backend: str, regions: int, softness: float) -> None:
+        scene = random_scene(5, (9, 19), regions, channels=2)
+        region_map = RegionMap.from_labels(scene.labels, softness)
+
+        def draw(means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
+            return region_splat(means, cholesky, colors, scene.region_ids, region_map, cutoff=0, backend=backend)
+
+        inputs = tuple(t.requires_grad_() for t in scene[:3])
+        assert torch.autograd.gradcheck(draw, inputs)
+
+    def test_only_what_is_asked(self, backend: str) -> None:
+        scene = random_scene(20, (20, 30), 2)
+        full = gradients(scene, RegionMap.from_labels(scene.labels), backend=backend)[1]
+        for chosen in range(3):
+            inputs = [t.detach().requires_grad_(i == chosen) for i, t in enumerate(scene[:3])]
+            image = region_splat(*inputs, *scene[3:], backend=backend)
+            probe = torch.linspace(-1, 2, image.numel(), dtype=image.dtype).view_as(image)
+            (image * probe).sum().backward()
+            torch.testing.assert_close(inputs[chosen].grad, full[chosen], rtol=1e-10, atol=1e-12)
+            assert all(t.grad is None for i, t in enumerate(inputs) if i != chosen)
+
+
+class TestConstraint:
+    def test_other_regions_do_not_change_a_bit(self, backend: str) -> None:
+        scene = as_float32(random_scene(200, (60, 75), 4))
+        before = region_splat(*scene, backend=backend)
+        chosen = scene.region_ids == 20
+        assert chosen.any()
+        generator = torch.Generator().manual_seed(1)
+        changed = [torch.where(chosen[:, None], 3 * torch.rand(t.shape, generator=generator) + 1, t) for t in scene[:3]]
+        after = region_splat(*changed, *scene[3:], backend=backend)
+        outside = scene.labels != 20
+        assert torch.equal(before[:, outside], after[:, outside])
+        assert not torch.equal(before[:, ~outside], after[:, ~outside])
+
+    def test_an_unknown_region_draws_nothing(self, backend: str) -> None:
+        scene = random_scene(10, (12, 12), 2)
+        image = region_splat(*scene[:3], torch.full_like(scene.region_ids, 77), scene.labels, backend=backend)
+        assert torch.equal(image, torch.zeros_like(image))
+        single = torch.zeros(12, 12, dtype=torch.long)
+        image = region_splat(*scene[:3], torch.full_like(scene.region_ids, 77), single, backend=backend)
+        assert torch.equal(image, torch.zeros_like(image))
+
+    def test_one_region_equals_no_regions(self, backend: str) -> None:
+        scene = random_scene(30, (20, 33), 1)
+        plain = region_splat(*scene[:3], size=(20, 33), backend=backend)
+        assert torch.equal(region_splat(*scene, backend=backend), plain)
+
+
+class TestConventions:
+    def test_pixel_centres(self, backend: str) -> None:
+        image = region_splat(
+            torch.tensor([[3.5, 1.5]]), torch.tensor([[0.2, 0.0, 0.2]]), torch.ones(1, 1), size=(4, 6), backend=backend
+        )
+        assert image[0, 1, 3] == 1.0
+        assert image.sum() < 1.001
+
+    def test_batch_equals_singles(self, backend: str) -> None:
+        scenes = [random_scene(25, (24, 40), 3, seed=s) for s in range(3)]
+        stacked = [torch.stack(parts) for parts in zip(*scenes, strict=True)]
+        maps = torch.stack([s.labels.roll(i, 1) for i, s in enumerate(scenes)])
+        together = region_splat(*stacked[:4], maps, backend=backend)
+        for i, scene in enumerate(scenes):
+            alone = region_splat(*scene[:4], maps[i], backend=backend)
+            torch.testing.assert_close(together[i], alone, rtol=1e-12, atol=1e-12)
+
+    def test_shared_map(self, backend: str) -> None:
+        scenes = [random_scene(25, (24, 40), 3, seed=s) for s in range(2)]
+        stacked = [torch.stack(parts) for parts in zip(*scenes, strict=True)]
+        together = region_splat(*stacked[:4], scenes[0].labels, backend=backend)
+        torch.testing.assert_close(together[1], region_splat(*scenes[1], backend=backend), rtol=1e-12, atol=1e-12)
+
+    def test_empty(self, backend: str) -> None:
+        empty = torch.zeros(0, 2), torch.zeros(0, 3), torch.zeros(0, 3)
+        assert torch.equal(region_splat(*empty, size=(4, 5), backend=backend), torch.zeros(3, 4, 5))
+
+    @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+    def test_half_is_computed_in_float32(self, backend: str, dtype: torch.dtype) -> None:
+        scene = random_scene(20, (20, 30), 2)
+        half = [t.to(dtype) for t in scene[:3]]
+        image = region_splat(*half, *scene[3:], backend=backend)
+        want = region_splat(*(t.float() for t in half), *scene[3:], backend=backend)
+        assert image.dtype == dtype
+        assert torch.equal(image, want.to(dtype))
+
+    def test_non_contiguous(self, backend: str) -> None:
+        scene = random_scene(20, (20, 30), 2)
+        strided = [t.T.contiguous().T for t in scene[:3]]
+        assert not strided[0].is_contiguous()
+        labels = scene.labels.T.contiguous().T
+        image = region_splat(*strided, scene.region_ids, labels, backend=backend)
+        assert torch.equal(image, region_splat(*scene, backend=backend))
+
+    def test_same_bits_every_time(self, backend: str) -> None:
+        scene = as_float32(random_scene(500, (60, 75), 4))
+        region_map = RegionMap.from_labels(scene.labels, 0.7)
+        first, second = (gradients(scene, region_map, backend=backend) for _ in range(2))
+        assert torch.equal(first[0], second[0])
+        assert all(torch.equal(a, b) for a, b in zip(first[1], second[1], strict=True))
+
+
+class TestExtremes:
+    """Image error against float64, relative to the largest colour; gradients finite."""
+
+    @pytest.mark.parametrize("anisotropy", [1.0, 1e2, 1e4])
+    @pytest.mark.parametrize("sigma", [0.05, 1.0, 1e4])
+    def test_stiff(self, backend: str, sigma: float, anisotropy: float) -> None:
+        angles = torch.linspace(0, math.pi, 25, dtype=torch.float64)
+        cos, sin = angles.cos(), angles.sin()
+        long, short = sigma * anisotropy, sigma
+        l11 = torch.hypot(long * cos, short * sin)
+        cholesky = torch.stack([l11, (long**2 - short**2) * sin * cos / l11, long * short / l11], -1).clamp_max(1e8)
+        means = torch.rand(25, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 40
+        scene = as_float32(Scene(means, cholesky, torch.ones(25, 1).double(), torch.zeros(25), torch.zeros(40, 50)))
+        scene = scene._replace(region_ids=scene.region_ids.long(), labels=scene.labels.long())
+        exact = Scene(*(t.double() for t in scene[:3]), *scene[3:])  # of the float32 numbers, which are given
+        want, want_gradients = gradients(exact, None, cutoff=0, backend="reference")
+        got, got_gradients = gradients(scene, None, cutoff=0, backend=backend)
+        assert torch.isfinite(got).all()
+        # the reference in float32 subtracts at full coordinates; the others in float64
+        tolerance = 1e-5 if backend != "reference" else 2e-4 * max(1.0, 0.05 / sigma)
+        assert (got - want).abs().max() <= tolerance * 25
+        for g, w in zip(got_gradients, want_gradients, strict=True):
+            assert torch.isfinite(g).all()
+            assert ((g - w).abs() <= 2e-3 * w.abs().amax(0)).all()
+
+    def test_far_outside(self, backend: str) -> None:
+        means = torch.tensor([[1e5, 3.0], [-1e7, 1e7], [4.0, 4.0], [1e8, -1e8]])
+        cholesky = torch.tensor([[1.0, 0.0, 1.0], [2e-6, 1e8, 2e-6], [2.0, 0.0, 2.0], [1e8, 1e8, 1e8]])
+        scene = Scene(means, cholesky, torch.full((4, 1), 1e6), torch.zeros(4).long(), torch.zeros(9, 9).long())
+        image, grads = gradients(scene, None, cutoff=0, backend=backend)
+        assert torch.isfinite(image).all() and all(torch.isfinite(g).all() for g in grads)
+        assert image.abs().max() > 1e5
+
+    def test_all_on_one_pixel(self, backend: str) -> None:
+        n = 10_000
+        cholesky = torch.tensor([[0.5, 0.0, 0.5]]).repeat(n, 1)
+        means, colors = torch.full((n, 2), 2.5), torch.full((n, 1), 1e-4)
+        image = region_splat(means, cholesky, colors, size=(5, 5), backend=backend)
+        assert abs(float(image[0, 2, 2]) - 1.0) < 1e-4
+
+    def test_checkerboard_and_one_pixel_regions(self, backend: str) -> None:
+        size = (20, 24)
+        labels = torch.arange(20 * 24).view(size)
+        scene = as_float32(random_scene(100, size, 1))
+        ids = torch.arange(100) * 4
+        for softness in (0.0, 0.7):
+            regions = RegionMap.from_labels(labels, softness)
+            image = region_splat(*scene[:3], ids, regions, cutoff=0, backend=backend)
+            want = region_splat(*(t.double() for t in scene[:3]), ids, regions, cutoff=0, backend="reference")
+            assert (image - want).abs().max() < 1e-5
+
+
+class TestErrors:
+    def good(self) -> dict[str, object]:
+        return {
+            "means": torch.zeros(2, 2), "cholesky": torch.tensor([[1.0, 0.0, 1.0]] * 2), "colors": torch.zeros(2, 3),
+            "region_ids": torch.tensor([0, 1]), "regions": torch.tensor([[0, 1]]),
+        }  # fmt: skip
+
+    def test_good_is_good(self) -> None:
+        assert region_splat(**self.good()).shape == (3, 1, 2)
+
+    @pytest.mark.parametrize(
+        ("change", "error", "words"),
+        [
+            ({"means": [[0.0, 0.0]]}, TypeError, "means must be a Tensor; got list"),
+            ({"means": torch.zeros(2, 2).long()}, TypeError, "means must have a real floating dtype; got torch.int64"),
+            ({"means": torch.zeros(2, 3)}, ValueError, r"means must have shape \(..., 2\); got \(2, 3\)"),
+            ({"means": torch.full((2, 2), math.nan)}, ValueError, "means must be finite; got 4 NaN"),
+            ({"means": torch.full((2, 2), 1e9)}, ValueError, "means must be within"),
+            ({"cholesky": torch.zeros(2, 3)}, ValueError, "l11 > 0 and l22 > 0"),
+            ({"cholesky": torch.tensor([[1.0, 0.0, -1.0]] * 2)}, ValueError, "got a least of -1"),
+            ({"cholesky": torch.tensor([[1e-7, 0.0, 1.0]] * 2)}, ValueError, "least diagonal of 1e-07"),
+            ({"cholesky": torch.ones(3, 3)}, ValueError, "cholesky must have shape"),
+            ({"colors": torch.zeros(2, 0)}, ValueError, "at least one channel"),
+            ({"colors": torch.full((2, 3), math.inf)}, ValueError, "colors must be finite"),
+            ({"region_ids": None}, TypeError, "region_ids must be a Tensor"),
+            ({"region_ids": torch.tensor([0.0, 1.0])}, TypeError, "region_ids must have an integer dtype"),
+            ({"region_ids": torch.tensor([0, -1])}, ValueError, "region_ids must be non-negative; got -1"),
+            ({"region_ids": torch.tensor([0])}, ValueError, r"region_ids must have shape \(2,\); got \(1,\)"),
+            ({"regions": torch.tensor([[0.0, 1.0]])}, TypeError, "labels must have an integer dtype"),
+            ({"regions": torch.tensor([[0, -1]])}, ValueError, "labels must hold non-negative ids; got -1"),
+            ({"regions": torch.zeros(0, 3).long()}, ValueError, "labels must have at least one pixel"),
+            ({"regions": torch.zeros(2, 3, 3).long()}, ValueError, "regions must hold 1 map"),
+            ({"regions": "map.png"}, TypeError, "regions must be a RegionMap, a label map Tensor or None"),
+            ({"regions": None}, ValueError, "size must be given"),
+            ({"regions": None, "size": (0, 4)}, ValueError, "size must be at least 1 x 1"),
+            ({"regions": None, "size": (2.0, 4)}, TypeError, "size must hold two integers"),
+            ({"size": (2, 2)}, ValueError, r"size must equal the size of regions, \(1, 2\); got \(2, 2\)"),
+            ({"cutoff": 1.0}, ValueError, r"cutoff must be in \[0, 1\); got 1.0"),
+            ({"cutoff": math.nan}, ValueError, "cutoff must be in"),
+            ({"backend": "gpu"}, ValueError, "backend must be one of auto, reference, tiled"),
+        ],
+    )  # fmt: skip
+    def test_bad_input(self, change: dict[str, object], error: type[Exception], words: str) -> None:
+        with pytest.raises(error, match=words):
+            region_splat(**{**self.good(), **change})

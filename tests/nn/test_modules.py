@@ -1,0 +1,218 @@
+"""GaussianField and RegionSplatRenderer as torch modules among others."""
+
+from __future__ import annotations
+
+import copy
+import io
+import math
+import pickle
+
+import kornia
+import pytest
+import torch
+from torch import Tensor, nn
+
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer
+
+SIZE = (24, 36)
+
+
+@pytest.fixture
+def labels() -> Tensor:
+    labels = torch.zeros(SIZE, dtype=torch.long)
+    labels[6:18, 10:30] = 4
+    return labels
+
+
+@pytest.fixture
+def field(labels: Tensor) -> GaussianField:
+    return GaussianField.random(60, SIZE, regions=labels, seed=0)
+
+
+class TestField:
+    def test_parameters_and_buffer(self, field: GaussianField) -> None:
+        assert {n for n, _ in field.named_parameters()} == {"means", "cholesky", "colors"}
+        assert dict(field.named_buffers())["region_ids"].dtype == torch.int64
+        assert len(field) == 60
+
+    def test_random_is_seeded(self) -> None:
+        a, b = (GaussianField.random(10, SIZE, seed=3) for _ in range(2))
+        assert torch.equal(a.means, b.means) and torch.equal(a.colors, b.colors)
+        assert not torch.equal(a.means, GaussianField.random(10, SIZE, seed=4).means)
+
+    def test_random_paints_about_grey(self) -> None:
+        image = RegionSplatRenderer()(GaussianField.random(2000, (64, 64), seed=0))
+        assert 0.3 < float(image.detach().mean()) < 0.7
+
+    def test_inputs_are_copied(self) -> None:
+        means = torch.zeros(1, 2)
+        field = GaussianField(means, torch.ones(1, 3), torch.ones(1, 3), size=SIZE)
+        with torch.no_grad():
+            field.means += 1
+        assert torch.equal(means, torch.zeros(1, 2))
+
+    def test_state_dict_round_trip(self, field: GaussianField) -> None:
+        buffer = io.BytesIO()
+        torch.save(field.state_dict(), buffer)
+        buffer.seek(0)
+        other = GaussianField.random(60, (5, 5), seed=1)
+        other.load_state_dict(torch.load(buffer, weights_only=True))
+        assert other.size == SIZE
+        for a, b in zip(field.state_dict().values(), other.state_dict().values(), strict=True):
+            assert a == b if isinstance(a, dict) else torch.equal(a, b)
+
+    def test_pickle_and_deepcopy_draw_the_same(self, field: GaussianField, labels: Tensor) -> None:
+        image = RegionSplatRenderer()(field, labels)
+        for other in (pickle.loads(pickle.dumps(field)), copy.deepcopy(field)):
+            assert torch.equal(RegionSplatRenderer()(other, labels), image)
+
+    @pytest.mark.parametrize("move", [lambda f: f.half(), lambda f: f.bfloat16(), lambda f: f.to(torch.float16)])
+    def test_half_is_refused_aloud(self, field: GaussianField, move: object) -> None:
+        before = field.means.detach().clone()
+        with pytest.warns(UserWarning, match="stays in float32"):
+            move(field)  # type: ignore[operator]
+        assert field.means.dtype == field.colors.dtype == torch.float32
+        assert torch.equal(field.means, before)
+
+    def test_double(self, field: GaussianField, labels: Tensor) -> None:
+        field.double()
+        assert field.region_ids is not None and field.region_ids.dtype == torch.int64
+        assert RegionSplatRenderer()(field, labels).dtype == torch.float64
+
+    def test_subset(self, field: GaussianField, labels: Tensor) -> None:
+        assert field.region_ids is not None
+        inside = field.region_ids == 4
+        part, rest = field.subset(inside), field.subset((~inside).nonzero().flatten())
+        assert len(part) + len(rest) == 60 and 0 < len(part) < 60
+        total = RegionSplatRenderer()(part, labels) + RegionSplatRenderer()(rest, labels)
+        torch.testing.assert_close(total, RegionSplatRenderer()(field, labels))
+
+    def test_opacities_are_merged(self, field: GaussianField, labels: Tensor) -> None:
+        alpha = torch.rand(60)
+        with_alpha = GaussianField(field.means, field.cholesky, field.colors, field.region_ids, alpha, size=SIZE)
+        merged = GaussianField(
+            field.means, field.cholesky, field.colors.detach() * alpha[:, None], field.region_ids, size=SIZE
+        )
+        image = RegionSplatRenderer()(with_alpha, labels)
+        torch.testing.assert_close(image, RegionSplatRenderer()(merged, labels))
+        image.sum().backward()
+        assert with_alpha.opacities is not None and with_alpha.opacities.grad is not None
+        assert with_alpha.opacities.grad.abs().max() > 0
+
+    @pytest.mark.parametrize(
+        ("change", "error", "words"),
+        [
+            ({"means": torch.zeros(3, 2)}, ValueError, "cholesky must have shape"),
+            ({"cholesky": torch.zeros(2, 3)}, ValueError, "l11 > 0"),
+            ({"colors": torch.zeros(2)}, ValueError, "colors must have 2 or 3 dimensions"),
+            ({"region_ids": torch.tensor([0, -3])}, ValueError, "non-negative; got -3"),
+            ({"region_ids": torch.tensor([0.5, 1.0])}, TypeError, "integer dtype"),
+            ({"opacities": torch.ones(3)}, ValueError, r"opacities must have shape \(2,\); got \(3,\)"),
+            ({"size": (4, 0)}, ValueError, "size must be at least 1 x 1"),
+            ({"means": torch.full((2, 2), math.inf)}, ValueError, "means must be finite"),
+        ],
+    )
+    def test_bad_input(self, change: dict[str, object], error: type[Exception], words: str) -> None:
+        good = {"means": torch.zeros(2, 2), "cholesky": torch.ones(2, 3), "colors": torch.zeros(2, 3), "size": SIZE}
+        with pytest.raises(error, match=words):
+            GaussianField(**{**good, **change})
+
+    @pytest.mark.parametrize("mask", [torch.ones(5, dtype=torch.bool), torch.tensor([60]), torch.tensor([-1])])
+    def test_bad_subset(self, field: GaussianField, mask: Tensor) -> None:
+        with pytest.raises(ValueError, match="mask must"):
+            field.subset(mask)
+
+
+class TestRenderer:
+    def test_functional_twin(self, field: GaussianField, labels: Tensor) -> None:
+        from kcgs.functional import region_splat
+
+        image = RegionSplatRenderer(cutoff=1e-3)(field, labels)
+        twin = region_splat(field.means, field.cholesky, field.colors, field.region_ids, labels, cutoff=1e-3)
+        assert torch.equal(image, twin)
+
+    def test_clamp(self, field: GaussianField) -> None:
+        with torch.no_grad():
+            field.colors.mul_(20).sub_(3)
+        free, clamped = RegionSplatRenderer()(field), RegionSplatRenderer(clamp=True)(field)
+        assert free.min() < 0 and free.max() > 1
+        assert torch.equal(clamped, free.clamp(0, 1))
+
+    def test_another_size(self, field: GaussianField, labels: Tensor) -> None:
+        large = RegionSplatRenderer(cutoff=0)(field, labels, (72, 108))
+        small = RegionSplatRenderer(cutoff=0)(field, labels)
+        # the middle pixel of every 3 x 3 block has its centre where the small pixel has it
+        torch.testing.assert_close(large[:, 1::3, 1::3], small, rtol=1e-4, atol=1e-5)
+
+    def test_another_aspect(self, field: GaussianField) -> None:
+        wide = RegionSplatRenderer(cutoff=0)(field, None, (24, 108))
+        torch.testing.assert_close(wide[:, :, 1::3], RegionSplatRenderer(cutoff=0)(field), rtol=1e-4, atol=1e-5)
+
+    def test_regions_of_the_target_size(self, field: GaussianField, labels: Tensor) -> None:
+        fine = labels.repeat_interleave(2, 0).repeat_interleave(2, 1)
+        assert RegionSplatRenderer()(field, fine, (48, 72)).shape == (3, 48, 72)
+
+    def test_errors(self, field: GaussianField, labels: Tensor) -> None:
+        render = RegionSplatRenderer()
+        with pytest.raises(ValueError, match=r"regions must have the size \(24, 36\)"):
+            render(field, labels[:5])
+        with pytest.raises(ValueError, match="field must have region_ids"):
+            render(GaussianField.random(3, SIZE), labels)
+        with pytest.raises(TypeError, match="field must be a GaussianField; got Tensor"):
+            render(labels)
+        with pytest.raises(ValueError, match="cutoff must be in"):
+            RegionSplatRenderer(cutoff=2.0)
+
+
+class TestComposition:
+    def test_sequential_with_kornia(self, field: GaussianField, labels: Tensor) -> None:
+        chain = nn.Sequential(
+            RegionSplatRenderer(), nn.Unflatten(0, (1, 3)), kornia.filters.GaussianBlur2d((3, 3), (1.0, 1.0))
+        )
+        image = chain((field, RegionMap.from_labels(labels)))
+        loss = kornia.losses.ssim_loss(image, torch.full_like(image, 0.5), window_size=5)
+        loss.backward()
+        assert image.shape == (1, 3, *SIZE)
+        for parameter in field.parameters():
+            assert parameter.grad is not None and parameter.grad.abs().max() > 0
+
+    def test_batch_predicted_by_a_network(self, labels: Tensor) -> None:
+        network = nn.Linear(4, 10 * 8)
+        raw = network(torch.randn(2, 4, generator=torch.Generator().manual_seed(0))).view(2, 10, 8)
+        extent = torch.tensor([36.0, 24.0])
+        cholesky = nn.functional.softplus(raw[..., 2:5]) + 0.5
+        field = GaussianField(raw[..., :2].sigmoid() * extent, cholesky, raw[..., 5:], size=SIZE)
+        field.assign_regions(labels)
+        image = RegionSplatRenderer()(field, labels)
+        assert image.shape == (2, 3, *SIZE)
+        image.square().mean().backward()
+        assert network.weight.grad is not None and network.weight.grad.abs().max() > 0
+        assert not list(field.parameters())
+
+    def test_no_grad_and_inference_mode(self, field: GaussianField, labels: Tensor) -> None:
+        render = RegionSplatRenderer()
+        want = render(field, labels)
+        assert want.requires_grad
+        with torch.no_grad():
+            got = render(field, labels)
+            assert torch.equal(got, want) and not got.requires_grad
+        with torch.inference_mode():
+            assert torch.equal(render(field, labels), want)
+        # tables made in inference mode serve a later backward
+        regions = RegionMap.from_labels(labels, 0.7)
+        with torch.inference_mode():
+            render(field, regions)
+        render(field, regions).sum().backward()
+        assert field.means.grad is not None
+
+    def test_gradient_descent_lowers_the_loss(self, field: GaussianField, labels: Tensor) -> None:
+        target = (labels > 0).float().expand(3, -1, -1)
+        optimizer = torch.optim.Adam(field.parameters(), lr=0.05)
+        losses = []
+        for _ in range(30):
+            loss = (RegionSplatRenderer()(field, labels) - target).square().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            losses.append(float(loss))
+        assert losses[-1] < 0.3 * losses[0]

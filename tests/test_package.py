@@ -1,0 +1,73 @@
+"""What the package promises from outside: names, a light import, layers, the wheel."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import kcgs
+
+ROOT = Path(kcgs.__file__).resolve().parent.parent
+
+# lower imports nothing higher; a folder may import itself and anything to its right
+LAYERS = [
+    {"cli", "bench"},
+    {"fit", "io", "segment", "data"},
+    {"nn"},
+    {"functional"},
+    {"kernels"},
+    {"_check", "_atomic"},
+]
+
+
+def test_public_names() -> None:
+    for name in ("GaussianField", "RegionSplatRenderer", "RegionMap", "FitConfig", "fit", "load", "save"):
+        assert name in kcgs.__all__
+        assert hasattr(kcgs, name)
+    for name in ("region_splat", "edge_band", "psnr", "ssim", "ms_ssim", "ef_psnr", "ef_ssim"):
+        assert name in kcgs.functional.__all__
+
+
+def test_import_is_light() -> None:
+    heavy = ("skimage", "matplotlib", "torchmetrics", "onnx", "onnxruntime", "typer", "rich", "kornia", "scipy")
+    code = f"import sys, kcgs; print([m for m in {heavy!r} if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+
+
+def test_imports_go_one_way() -> None:
+    level = {name: i for i, names in enumerate(LAYERS) for name in names}
+    for path in (ROOT / "kcgs").rglob("*.py"):
+        here = path.relative_to(ROOT / "kcgs").parts[0].removesuffix(".py")
+        if here == "__init__":
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.level == 0 and (node.module or "").startswith("kcgs."):
+                there = (node.module or "").split(".")[1]
+                assert level[there] >= level[here], f"{path.name} of {here} imports {there}"
+                assert level[there] > level[here] or there == here or here in {"cli", "bench", "fit"}, path
+
+
+def test_files_stay_short() -> None:
+    for path in (ROOT / "kcgs").rglob("*.py"):
+        assert len(path.read_text().splitlines()) <= 420, path
+
+
+@pytest.mark.parametrize("kind", ["wheel"])
+def test_wheel_holds_kcgs_only(tmp_path: Path, kind: str) -> None:
+    if not (ROOT / "pyproject.toml").is_file():
+        pytest.skip("not a source checkout")
+    command = [sys.executable, "-m", "build", f"--{kind}", "--no-isolation", "-o", str(tmp_path), str(ROOT)]
+    subprocess.run(command, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+    tops = {n.split("/")[0] for n in names}
+    assert tops == {"kcgs", f"kcgs-{kcgs.__version__}.dist-info"}
+    assert "kcgs/recipes/paper.toml" in names
+    assert "kcgs/py.typed" in names
+    assert any(n.endswith("licenses/LICENSE") for n in names)
