@@ -38,9 +38,7 @@ class TestAtomicPath:
         assert target.read_text() == "new"
 
     @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
-    def test_any_exception_removes_it_and_keeps_the_old(
-        self, tmp_path: Path, error: type[BaseException]
-    ) -> None:
+    def test_any_exception_removes_it_and_keeps_the_old(self, tmp_path: Path, error: type[BaseException]) -> None:
         target = tmp_path / "a.txt"
         target.write_text("old")
         with pytest.raises(error), atomic_path(target) as temporary:

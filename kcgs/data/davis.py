@@ -124,9 +124,7 @@ class Davis:
                 )
         first, second = ({entry.name for entry in tree.iterdir() if entry.is_dir()} for tree in trees)
         if not first & second:
-            raise FileNotFoundError(
-                f"no sequence has a folder both in {self._images} and in {self._annotations}"
-            )
+            raise FileNotFoundError(f"no sequence has a folder both in {self._images} and in {self._annotations}")
         return sorted(first & second)
 
     @staticmethod

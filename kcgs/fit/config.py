@@ -36,7 +36,7 @@ class FitConfig(BaseModel):
 
     # The start
     init_sigma: float | None = Field(
-        None, gt=0.0, description="pixels; None: a quarter of the spacing sqrt(H W / N), at least 1 pixel"
+        None, gt=0.0, description="pixels; None: half the spacing sqrt(H W / N), at least 1 pixel"
     )
 
     # Region ids

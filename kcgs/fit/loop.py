@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_image
-from kcgs.functional import RegionMap, edge_band, lookup_regions, region_splat
+from kcgs.functional import RegionMap, edge_band, region_splat
 from kcgs.nn import GaussianField
 
 from .adan import Adan
+from .assign import refresh_ids
 from .config import FitConfig
 from .initialize import random_field
 from .parameters import RawParameters
@@ -93,7 +94,7 @@ def fit(
     drawn = _regions_to_draw(regions, config)
     monitor = _Monitor(image, regions, start)
 
-    sigma = config.init_sigma or max(1.0, 0.25 * math.sqrt(image.shape[1] * image.shape[2] / num_gaussians))
+    sigma = config.init_sigma or max(1.0, 0.5 * math.sqrt(image.shape[1] * image.shape[2] / num_gaussians))
     field = random_field(image, num_gaussians, sigma, drawn, seed)
     raw = RawParameters(field)
     optimizer = _make_optimizer(config, raw, sigma)
@@ -114,7 +115,7 @@ def fit(
             break
         means, cholesky, colors = raw.tensors()
         if drawn is not None and config.warmup and 0 < iteration <= config.refresh_until * config.iterations:
-            ids = lookup_regions(means, drawn.labels) if iteration % refresh_every == 0 else ids
+            ids = refresh_ids(means, ids, drawn) if iteration % refresh_every == 0 else ids
         picture = _draw(means, cholesky, colors, ids, drawn, image, config)
         loss = _loss(picture, image, config)
         if iteration % log_every == 0:

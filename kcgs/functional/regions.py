@@ -207,11 +207,10 @@ def edge_band(labels: Tensor, width: float = 5) -> Tensor:
         raise ValueError(f"width must be a finite number of at least 1 pixel; got {width!r}")
     height, breadth = labels.shape[-2:]
     band = torch.zeros_like(labels, dtype=torch.bool)
+    width = min(width, math.hypot(height, breadth))
     for dy in range(min(int(width), height - 1) + 1):
-        reach = int(math.sqrt(width * width - dy * dy))
+        reach = min(int(math.sqrt(width * width - dy * dy)), breadth - 1)
         for dx in range(-reach if dy else 1, reach + 1):
-            if abs(dx) >= breadth:
-                continue
             here = (..., slice(0, height - dy), slice(max(0, -dx), breadth - max(0, dx)))
             there = (..., slice(dy, height), slice(max(0, dx), breadth - max(0, -dx)))
             differs = labels[here] != labels[there]

@@ -126,9 +126,7 @@ def merge_similar(image: Tensor, labels: Tensor, max_regions: int) -> Tensor:
     pixels = check_segment_image(image)
     values = to_array(labels)
     if pixels.shape[:2] != values.shape:
-        raise ValueError(
-            f"labels must have the image's size; got {values.shape} and an image of {pixels.shape[:2]}"
-        )
+        raise ValueError(f"labels must have the image's size; got {values.shape} and an image of {pixels.shape[:2]}")
     check_count("max_regions", max_regions)
     ids, regions = compact(values)
     graph = RegionGraph(regions)
@@ -153,9 +151,7 @@ class RegionGraph:
         first, second = (np.concatenate([pair[k].ravel() for pair in sides]) for k in (0, 1))
         differs = first != second
         first, second = first[differs], second[differs]
-        keys, lengths = np.unique(
-            np.minimum(first, second) * count + np.maximum(first, second), return_counts=True
-        )
+        keys, lengths = np.unique(np.minimum(first, second) * count + np.maximum(first, second), return_counts=True)
         for key, length in zip(keys.tolist(), lengths.tolist(), strict=True):
             a, b = divmod(key, count)
             self.borders[a][b] = self.borders[b][a] = length

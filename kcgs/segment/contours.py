@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.segment.base import check_segment_image
-from kcgs.segment.cleanup import Labels, RegionGraph, compact, lab_sums, rgb_to_lab, to_array
+from kcgs.segment.cleanup import Labels, compact, rgb_to_lab, to_array
 
 # A region with a smaller share of its pixels further than `reach` inside is a ribbon.
 _CORE_SHARE = 0.1
@@ -56,44 +56,40 @@ def snap_contours(image: Tensor, labels: Tensor, *, reach: int = 2) -> Tensor:
     if reach < 1:
         raise ValueError(f"reach must be at least 1; got {reach}")
     ids, regions = compact(values)
-    fixed = _fixed(lab, regions, reach)
+    gradient = _gradient(lab)
+    fixed = _fixed(gradient, regions, reach)
     # The watershed runs in the band that is open and on its rim: the inside of regions has no say in it.
     seeds = np.where(fixed, regions + 1, 0)
     band = binary_dilation(~fixed, np.ones((3, 3)))
-    flooded = watershed(_gradient(lab), seeds, mask=band)
+    flooded = watershed(gradient, seeds, mask=band)
     return torch.from_numpy(ids[np.where(fixed, regions, flooded - 1)]).to(labels.device)
 
 
-def _fixed(lab: NDArray[np.float32], regions: Labels, reach: int) -> NDArray[np.bool_]:
+def _fixed(gradient: NDArray[np.float32], regions: Labels, reach: int) -> NDArray[np.bool_]:
     """Return (H, W), true where the label stays."""
+    areas = np.bincount(regions.ravel())
+    core = _inside(regions, reach)
+    thin = np.bincount(regions[core], minlength=len(areas)) < _CORE_SHARE * areas
+    if thin.all():  # Dissolving them would leave nothing to grow from.
+        return np.ones_like(core)
+    # A line has its steepest pixels on its rim, the blur of an edge has them in its middle.
+    middle = _inside(regions, 1)
+    slopes = [
+        np.bincount(regions[part], weights=gradient[part], minlength=len(areas))
+        / np.maximum(np.bincount(regions[part], minlength=len(areas)), 1)
+        for part in (middle, ~middle)
+    ]
+    has_middle = np.bincount(regions[middle], minlength=len(areas)) > 0
+    lines = thin & has_middle & (slopes[0] < slopes[1])
+    return core | lines[regions]
+
+
+def _inside(regions: Labels, depth: int) -> NDArray[np.bool_]:
+    """Return (H, W), true where all pixels up to ``depth`` away are of the same region."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    size = 2 * reach + 1
-    core = minimum_filter(regions, size, mode="nearest") == maximum_filter(regions, size, mode="nearest")
-    graph = RegionGraph(regions)
-    thin = np.bincount(regions[core], minlength=len(graph.areas)) < _CORE_SHARE * graph.areas
-    means = lab_sums(lab, regions) / graph.areas[:, None]
-    stays = np.zeros_like(thin)
-    for region in np.flatnonzero(thin):
-        # Where all regions are thin, dissolving them would leave nothing to grow from.
-        stays[region] = thin.all() or not _is_blur(graph, means, int(region))
-    return core | stays[regions]
-
-
-def _is_blur(graph: RegionGraph, means: NDArray[np.float64], region: int) -> bool:
-    """Say whether a thin region's colour is a mixture of those on its two sides, blur themselves or not."""
-    borders = graph.borders[region]
-    sides = sorted(borders, key=lambda other: (-borders[other], other))[:2]
-    if len(sides) < 2 or borders[sides[0]] + borders[sides[1]] < 0.6 * sum(borders.values()):
-        return False
-    start, line = means[sides[0]], means[sides[1]] - means[sides[0]]
-    length = float(np.linalg.norm(line))
-    offset = means[region] - start
-    if min(np.linalg.norm(offset), np.linalg.norm(offset - line)) < _JUST_NOTICEABLE:
-        return True
-    along = float(offset @ line) / length**2
-    beside = float(np.linalg.norm(offset - along * line))
-    return 0 <= along <= 1 and beside <= _MIXTURE_TOLERANCE * length
+    size = 2 * depth + 1
+    return np.asarray(minimum_filter(regions, size, mode="nearest") == maximum_filter(regions, size, mode="nearest"))
 
 
 def _gradient(lab: NDArray[np.float32]) -> NDArray[np.float32]:
