@@ -300,7 +300,7 @@ class _Progress:
 def main() -> None:
     """Run the command: exit 0 done, 1 failed with one line that says why, 2 wrong usage."""
     try:
-        app()
+        app(prog_name="kcgs")
     except (ValueError, TypeError, OSError, ImportError) as error:
         typer.echo(f"kcgs: {' '.join(str(error).split())}", err=True)
         sys.exit(1)

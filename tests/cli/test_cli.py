@@ -119,7 +119,8 @@ class TestRender:
 
     def test_size(self, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert kcgs("render", str(scene), "-o", "a.png", "--size", "90x50", capsys=capsys)[0] == 0
-        assert Image.open("a.png").size == (90, 50)
+        with Image.open("a.png") as picture:
+            assert picture.size == (90, 50)
 
     def test_region(self, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert kcgs("render", str(scene), "-o", "a.png", "--region", "1", capsys=capsys)[0] == 0
@@ -161,7 +162,7 @@ class TestFailures:
         [
             ((), 2, "Usage"),
             (("fit",), 2, "Missing argument"),
-            (("fit", "photo.png", "-n", "0"), 2, "not in the range"),
+            (("fit", "photo.png", "-n", "0"), 2, "greater than or equal to 1"),
             (("fit", "photo.png", "--backend", "gpu"), 2, "'gpu' is not one of"),
             (("fit", "nothing.png"), 1, "nothing.png"),
             (("fit", "text.png"), 1, "text.png"),

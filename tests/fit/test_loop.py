@@ -169,7 +169,7 @@ class TestCharts:
         image, labels = chart()  # type: ignore[operator]
         best = {}
         for recipe in ("paper", "gaussian-image", "gaussian-image-clamp"):
-            history = fit(image, labels, 20, config=FitConfig.from_recipe(recipe, iterations=800)).history
+            history = fit(image, labels, 20, config=FitConfig.from_recipe(recipe, iterations=500)).history
             best[recipe] = max(history, key=lambda h: h.psnr)
         for baseline in ("gaussian-image", "gaussian-image-clamp"):
             assert best["paper"].psnr > best[baseline].psnr + lead
