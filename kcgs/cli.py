@@ -31,6 +31,7 @@ class Backend(str, Enum):
     auto = "auto"
     reference = "reference"
     tiled = "tiled"
+    cpu = "cpu"
 
 
 ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE")]

@@ -1,5 +1,6 @@
 """Image files as arrays of the samples they store, at full precision; the readers give them a meaning."""
 
+import logging
 import os
 import re
 import struct
@@ -13,6 +14,9 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 Array = NDArray[Any]
+
+# tifffile logs what ails a file besides raising; the error says it once.
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _TIFF = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
@@ -62,13 +66,14 @@ def decode(data: bytes, path: str | os.PathLike[str], *, indices: bool = False) 
         ValueError: the bytes are no whole image, or hold samples with no meaning as a picture.
     """
     try:
-        if data.startswith(_TIFF):
-            deep = _tiff(data)
-            if deep is not None:
-                return deep
-        with Image.open(BytesIO(data)) as image:
-            image.load()
-            return _pillow(data, image, indices)
+        samples = _tiff(data) if data.startswith(_TIFF) else None
+        if samples is None:
+            with Image.open(BytesIO(data)) as image:
+                image.load()
+                samples = _pillow(data, image, indices)
+        if samples.values.ndim != 3 or samples.values.size == 0:
+            raise ValueError(f"it holds samples of shape {samples.values.shape}, expected a picture")
+        return samples
     except MemoryError:
         raise
     except UnidentifiedImageError:

@@ -8,10 +8,13 @@ weighs. A tile deep inside a region has s_r = 1 everywhere and is stored as noth
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
+
+T = TypeVar("T")
 
 RADIUS_SIGMAS = 4.0
 _PATCH_ELEMENTS = 1 << 22
@@ -36,7 +39,7 @@ class Membership:
         self.index = index
         self.num_regions = num_regions
         self.softness = softness
-        self._tiles: dict[int, TileMembership] = {}
+        self._derived: dict[object, Any] = {}
 
     @property
     def radius(self) -> int:
@@ -66,9 +69,14 @@ class Membership:
 
     def tiles(self, tile: int) -> TileMembership:
         """Tables for square tiles of `tile` pixels."""
-        if tile not in self._tiles:
-            self._tiles[tile] = self._build_tiles(tile)
-        return self._tiles[tile]
+        return self.derived(("tiles", tile), lambda _: self._build_tiles(tile))
+
+    def derived(self, key: object, build: Callable[[Membership], T]) -> T:
+        """Return what `build` makes of this membership, made once and kept."""
+        if key not in self._derived:
+            self._derived[key] = build(self)
+        value: T = self._derived[key]
+        return value
 
     def _build_tiles(self, tile: int) -> TileMembership:
         # windows: every tile with the halo that its soft contours can see; -1 is outside the image

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .inputs import SplatInputs
 
-BACKENDS = ("auto", "reference", "tiled")
+BACKENDS = ("auto", "reference", "tiled", "cpu")
 
 Kernel = Callable[[SplatInputs], Tensor]
 
@@ -23,6 +23,8 @@ def resolve(backend: str, device: torch.device, dtype: torch.dtype) -> Kernel:
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
-    name = "tiled" if backend == "auto" else backend
+    name = backend
+    if backend == "auto":
+        name = "cpu" if device.type == "cpu" and dtype == torch.float32 else "tiled"
     kernel: Kernel = import_module(f"{__package__}.{name}").splat
     return kernel

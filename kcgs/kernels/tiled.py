@@ -7,14 +7,14 @@ coordinates whose constants are made in float64; the image and the colour gradie
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from .binning import TILE, Pairs, bin_gaussians, grid_of
 from .form import Z_LIMIT, lowest_exponent, moments_to_gradients
+from .function import Gradients, Steps, apply_kernel
 from .inputs import SplatInputs
 
 _CHUNK_ELEMENTS = 1 << 18
@@ -40,35 +40,7 @@ class _Plan(NamedTuple):
 
 def splat(inputs: SplatInputs) -> Tensor:
     """Render (B, C, H, W)."""
-    image: Tensor = _TiledSplat.apply(inputs.means, inputs.cholesky, inputs.colors, inputs)  # type: ignore[no-untyped-call]
-    return image
-
-
-class _TiledSplat(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, means: Tensor, cholesky: Tensor, colors: Tensor, inputs: SplatInputs) -> Tensor:
-        plan = _make_plan(inputs)
-        image = _render(plan, inputs)
-        if any(ctx.needs_input_grad):
-            ctx.save_for_backward(means, cholesky, colors)
-            ctx.plan, ctx.settings = (
-                plan,
-                (inputs.region_index, inputs.membership, inputs.size, inputs.cutoff),
-            )
-        return image
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        means, cholesky, colors = ctx.saved_tensors
-        inputs = SplatInputs(means, cholesky, colors, *ctx.settings)
-        geometry = ctx.needs_input_grad[0] or ctx.needs_input_grad[1]
-        first, second, color = _differentiate(ctx.plan, inputs, grad, geometry)
-        if not geometry:
-            return None, None, color, None
-        g_means, g_cholesky = moments_to_gradients(first, second, cholesky)
-        wanted = zip((g_means, g_cholesky, color, None), ctx.needs_input_grad, strict=True)
-        return tuple(g if need else None for g, need in wanted)
+    return apply_kernel(Steps(_make_plan, _render, _differentiate), inputs)
 
 
 def _make_plan(inputs: SplatInputs) -> _Plan:
@@ -166,8 +138,7 @@ def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
     return image.reshape(grid.batch, channels, grid.rows * TILE, grid.cols * TILE)[..., :height, :width].contiguous()
 
 
-def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Return moments (B, N, 2), (B, N, 3) of z and the colour gradient (B, N, C)."""
+def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
     grid = grid_of(inputs)
     height, width = inputs.size
     grad = torch.nn.functional.pad(grad, (0, grid.cols * TILE - width, 0, grid.rows * TILE - height))
@@ -186,7 +157,11 @@ def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: boo
         sums[batch.entries] = torch.cat(parts, -1)
     counts = torch.bincount(plan.pairs.gaussian, minlength=inputs.means.shape[0] * inputs.means.shape[1])
     total = _sum_runs(sums[:-1], counts).unflatten(0, inputs.means.shape[:2])
-    return total[..., channels : channels + 2], total[..., channels + 2 :], total[..., :channels]
+    colors = total[..., :channels]
+    if not geometry:
+        return None, None, colors
+    first, second = total[..., channels : channels + 2], total[..., channels + 2 :]
+    return *moments_to_gradients(first, second, inputs.cholesky), colors
 
 
 def _moments(z1: Tensor, z2: Tensor, value: Tensor) -> Tensor:

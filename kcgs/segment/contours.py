@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.segment.base import check_segment_image
-from kcgs.segment.cleanup import Labels, compact, rgb_to_lab, to_array
+from kcgs.segment.cleanup import Labels, RegionGraph, compact, lab_sums, rgb_to_lab, to_array
 
 # A region with a smaller share of its pixels further than `reach` inside is a ribbon.
 _CORE_SHARE = 0.1
@@ -22,8 +22,8 @@ def snap_contours(image: Tensor, labels: Tensor, *, reach: int = 2) -> Tensor:
     Segmenters that smooth the image leave contours a pixel or two beside its edges, put whiskers along them
     and make ribbons of blurred edges. Here every region keeps what lies further than ``reach`` inside it, and
     the rest goes by watershed on the gradient in CIE Lab. Ribbons whose colour is a mixture of the regions on
-    their two sides, or hardly another than one of them, are dissolved; other regions too thin to have an inside
-    stay as they are.
+    their two sides, or hardly another than one of them, are dissolved; other regions too thin to have an
+    inside stay as they are.
 
     Args:
         image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].
@@ -56,40 +56,42 @@ def snap_contours(image: Tensor, labels: Tensor, *, reach: int = 2) -> Tensor:
     if reach < 1:
         raise ValueError(f"reach must be at least 1; got {reach}")
     ids, regions = compact(values)
-    gradient = _gradient(lab)
-    fixed = _fixed(gradient, regions, reach)
+    fixed = _fixed(lab, regions, reach)
     # The watershed runs in the band that is open and on its rim: the inside of regions has no say in it.
     seeds = np.where(fixed, regions + 1, 0)
     band = binary_dilation(~fixed, np.ones((3, 3)))
-    flooded = watershed(gradient, seeds, mask=band)
+    flooded = watershed(_gradient(lab), seeds, mask=band)
     return torch.from_numpy(ids[np.where(fixed, regions, flooded - 1)]).to(labels.device)
 
 
-def _fixed(gradient: NDArray[np.float32], regions: Labels, reach: int) -> NDArray[np.bool_]:
+def _fixed(lab: NDArray[np.float32], regions: Labels, reach: int) -> NDArray[np.bool_]:
     """Return (H, W), true where the label stays."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    size = 2 * reach + 1
+    core = minimum_filter(regions, size, mode="nearest") == maximum_filter(regions, size, mode="nearest")
     areas = np.bincount(regions.ravel())
-    core = _inside(regions, reach)
     thin = np.bincount(regions[core], minlength=len(areas)) < _CORE_SHARE * areas
     if thin.all():  # Dissolving them would leave nothing to grow from.
         return np.ones_like(core)
-    # A line has its steepest pixels on its rim, the blur of an edge has them in its middle.
-    middle = _inside(regions, 1)
-    slopes = [
-        np.bincount(regions[part], weights=gradient[part], minlength=len(areas))
-        / np.maximum(np.bincount(regions[part], minlength=len(areas)), 1)
-        for part in (middle, ~middle)
-    ]
-    has_middle = np.bincount(regions[middle], minlength=len(areas)) > 0
-    lines = thin & has_middle & (slopes[0] < slopes[1])
-    return core | lines[regions]
+    graph = RegionGraph(regions)
+    means = lab_sums(lab, regions) / areas[:, None]
+    stays = np.zeros_like(thin)
+    for region in np.flatnonzero(thin):
+        stays[region] = not _is_mixture(means[region], means[list(graph.borders[region])])
+    return core | stays[regions]
 
 
-def _inside(regions: Labels, depth: int) -> NDArray[np.bool_]:
-    """Return (H, W), true where all pixels up to ``depth`` away are of the same region."""
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    size = 2 * depth + 1
-    return np.asarray(minimum_filter(regions, size, mode="nearest") == maximum_filter(regions, size, mode="nearest"))
+def _is_mixture(color: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
+    """Say whether ``color`` (3,) is hardly another than one of ``others`` (N, 3) or lies between two."""
+    offsets = color - others
+    if np.linalg.norm(offsets, axis=1).min() < _JUST_NOTICEABLE:
+        return True
+    lines = others[None] - others[:, None]
+    squared = np.maximum((lines**2).sum(axis=-1), 1e-12)
+    along = (offsets[:, None] * lines).sum(axis=-1) / squared
+    beside = np.linalg.norm(offsets[:, None] - along[..., None] * lines, axis=-1)
+    return bool(((along > 0) & (along < 1) & (beside < _MIXTURE_TOLERANCE * np.sqrt(squared))).any())
 
 
 def _gradient(lab: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -46,6 +46,16 @@ def as_float32(scene: Scene) -> Scene:
     return Scene(*(t.float() for t in scene[:3]), *scene[3:])
 
 
+def suited(scene: Scene, backend: str) -> Scene:
+    """Give a float64 scene in the widest dtype that the backend computes in."""
+    return as_float32(scene) if backend == "cpu" else scene
+
+
+def rounding(backend: str) -> float:
+    """Allow for the arithmetic of :func:`suited` scenes."""
+    return 2e-6 if backend == "cpu" else 1e-11
+
+
 def gradients(scene: Scene, regions: RegionMap | None, **options: object) -> tuple[Tensor, list[Tensor]]:
     inputs = [t.detach().clone().requires_grad_() for t in scene[:3]]
     size = None if regions is not None else tuple(scene.labels.shape)
@@ -80,18 +90,18 @@ class TestTable:
             q = (s_yy * dx * dx - 2 * s_xy * dx * dy + s_xx * dy * dy) / (s_xx * s_yy - s_xy * s_xy)
             for c in range(2):
                 expected[c, i, j] += (ids[k] == labels[i][j]) * math.exp(-0.5 * q) * colors[k][c]
-        double = [torch.tensor(v, dtype=torch.float64) for v in (means, factors, colors)]
-        image = region_splat(*double, torch.tensor(ids), torch.tensor(labels), cutoff=0, backend=backend)
-        torch.testing.assert_close(image, expected, rtol=1e-12, atol=1e-14)
+        dtype = torch.float32 if backend == "cpu" else torch.float64
+        arrays = [torch.tensor(v, dtype=dtype) for v in (means, factors, colors)]
+        image = region_splat(*arrays, torch.tensor(ids), torch.tensor(labels), cutoff=0, backend=backend)
+        torch.testing.assert_close(image.double(), expected, rtol=rounding(backend), atol=rounding(backend))
         assert image.abs().max() > 0.5
 
     def test_soft_membership_by_hand(self, backend: str) -> None:
         labels = torch.tensor([[0, 0, 0, 1, 1, 1]])
-        one = torch.ones(1, 1, dtype=torch.float64)
-        flat = torch.tensor([[1e6, 0.0, 1e6]], dtype=torch.float64)
+        flat = torch.tensor([[1e6, 0.0, 1e6]])
         regions = RegionMap.from_labels(labels, softness=0.5)
         image = region_splat(
-            torch.zeros(1, 2, dtype=torch.float64), flat, one, torch.tensor([0]), regions, cutoff=0, backend=backend
+            torch.zeros(1, 2), flat, torch.ones(1, 1), torch.tensor([0]), regions, cutoff=0, backend=backend
         )
         kernel = [math.exp(-0.5 * (d / 0.5) ** 2) for d in range(3)]  # the blur is cut at 4 sigma = 2 px
         share = [
@@ -99,7 +109,7 @@ class TestTable:
             / sum(kernel[abs(i - j)] for j in range(6) if abs(i - j) <= 2)
             for i in range(6)
         ]
-        torch.testing.assert_close(image[0, 0], torch.tensor(share, dtype=torch.float64), rtol=0, atol=1e-9)
+        torch.testing.assert_close(image[0, 0], torch.tensor(share), rtol=0, atol=1e-6)
         assert share[0] == 1.0 and share[5] == 0.0 and 0.5 < share[2] < 1.0
 
 
@@ -139,21 +149,28 @@ class TestAgainstReference:
     def test_list_longer_than_a_segment(self, backend: str) -> None:
         scene = random_scene(3000, (16, 16), 2)
         want, want_gradients = gradients(scene, RegionMap.from_labels(scene.labels), cutoff=0, backend="reference")
-        got, got_gradients = gradients(scene, RegionMap.from_labels(scene.labels), cutoff=0, backend=backend)
-        torch.testing.assert_close(got, want, rtol=1e-10, atol=1e-10)
-        assert_gradients_close(got_gradients, want_gradients, 1e-9)
+        regions = RegionMap.from_labels(scene.labels)
+        got, got_gradients = gradients(suited(scene, backend), regions, cutoff=0, backend=backend)
+        tolerance = 100 * rounding(backend)
+        torch.testing.assert_close(got.double(), want, rtol=tolerance, atol=tolerance)
+        assert_gradients_close(got_gradients, want_gradients, tolerance)
 
-    @pytest.mark.parametrize("channels", [1, 2, 4, 9])
+    @pytest.mark.parametrize("channels", [1, 2, 4, 9, 32])
     def test_channels(self, backend: str, channels: int) -> None:
         scene = random_scene(40, (20, 30), 3, channels=channels)
-        got = region_splat(*scene, cutoff=0, backend=backend)
+        regions = RegionMap.from_labels(scene.labels)
+        want, want_gradients = gradients(scene, regions, cutoff=0, backend="reference")
+        got, got_gradients = gradients(suited(scene, backend), regions, cutoff=0, backend=backend)
         assert got.shape == (channels, 20, 30)
-        torch.testing.assert_close(got, region_splat(*scene, cutoff=0, backend="reference"), rtol=1e-10, atol=1e-12)
+        tolerance = 10 * rounding(backend)
+        torch.testing.assert_close(got.double(), want, rtol=tolerance, atol=tolerance)
+        assert_gradients_close(got_gradients, want_gradients, tolerance)
 
 
 class TestGradcheck:
     @pytest.mark.parametrize("softness", [0.0, 0.8])
     @pytest.mark.parametrize("regions", [1, 3])
+    @pytest.mark.parametrize("backend", ["reference", "tiled"])
     def test_gradcheck(self, backend: str, regions: int, softness: float) -> None:
         scene = random_scene(5, (9, 19), regions, channels=2)
         region_map = RegionMap.from_labels(scene.labels, softness)
@@ -165,14 +182,14 @@ class TestGradcheck:
         assert torch.autograd.gradcheck(draw, inputs)
 
     def test_only_what_is_asked(self, backend: str) -> None:
-        scene = random_scene(20, (20, 30), 2)
+        scene = suited(random_scene(20, (20, 30), 2), backend)
         full = gradients(scene, RegionMap.from_labels(scene.labels), backend=backend)[1]
         for chosen in range(3):
             inputs = [t.detach().requires_grad_(i == chosen) for i, t in enumerate(scene[:3])]
             image = region_splat(*inputs, *scene[3:], backend=backend)
             probe = torch.linspace(-1, 2, image.numel(), dtype=image.dtype).view_as(image)
             (image * probe).sum().backward()
-            torch.testing.assert_close(inputs[chosen].grad, full[chosen], rtol=1e-10, atol=1e-12)
+            torch.testing.assert_close(inputs[chosen].grad, full[chosen], rtol=1e-5, atol=1e-5)
             assert all(t.grad is None for i, t in enumerate(inputs) if i != chosen)
 
 
@@ -190,7 +207,7 @@ class TestConstraint:
         assert not torch.equal(before[:, ~outside], after[:, ~outside])
 
     def test_an_unknown_region_draws_nothing(self, backend: str) -> None:
-        scene = random_scene(10, (12, 12), 2)
+        scene = as_float32(random_scene(10, (12, 12), 2))
         image = region_splat(*scene[:3], torch.full_like(scene.region_ids, 77), scene.labels, backend=backend)
         assert torch.equal(image, torch.zeros_like(image))
         single = torch.zeros(12, 12, dtype=torch.long)
@@ -198,7 +215,7 @@ class TestConstraint:
         assert torch.equal(image, torch.zeros_like(image))
 
     def test_one_region_equals_no_regions(self, backend: str) -> None:
-        scene = random_scene(30, (20, 33), 1)
+        scene = as_float32(random_scene(30, (20, 33), 1))
         plain = region_splat(*scene[:3], size=(20, 33), backend=backend)
         assert torch.equal(region_splat(*scene, backend=backend), plain)
 
@@ -212,19 +229,19 @@ class TestConventions:
         assert image.sum() < 1.001
 
     def test_batch_equals_singles(self, backend: str) -> None:
-        scenes = [random_scene(25, (24, 40), 3, seed=s) for s in range(3)]
+        scenes = [as_float32(random_scene(25, (24, 40), 3, seed=s)) for s in range(3)]
         stacked = [torch.stack(parts) for parts in zip(*scenes, strict=True)]
         maps = torch.stack([s.labels.roll(i, 1) for i, s in enumerate(scenes)])
         together = region_splat(*stacked[:4], maps, backend=backend)
         for i, scene in enumerate(scenes):
             alone = region_splat(*scene[:4], maps[i], backend=backend)
-            torch.testing.assert_close(together[i], alone, rtol=1e-12, atol=1e-12)
+            torch.testing.assert_close(together[i], alone, rtol=1e-5, atol=1e-6)
 
     def test_shared_map(self, backend: str) -> None:
-        scenes = [random_scene(25, (24, 40), 3, seed=s) for s in range(2)]
+        scenes = [as_float32(random_scene(25, (24, 40), 3, seed=s)) for s in range(2)]
         stacked = [torch.stack(parts) for parts in zip(*scenes, strict=True)]
         together = region_splat(*stacked[:4], scenes[0].labels, backend=backend)
-        torch.testing.assert_close(together[1], region_splat(*scenes[1], backend=backend), rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(together[1], region_splat(*scenes[1], backend=backend), rtol=1e-5, atol=1e-6)
 
     def test_empty(self, backend: str) -> None:
         empty = torch.zeros(0, 2), torch.zeros(0, 3), torch.zeros(0, 3)
@@ -240,7 +257,7 @@ class TestConventions:
         assert torch.equal(image, want.to(dtype))
 
     def test_non_contiguous(self, backend: str) -> None:
-        scene = random_scene(20, (20, 30), 2)
+        scene = as_float32(random_scene(20, (20, 30), 2))
         strided = [t.T.contiguous().T for t in scene[:3]]
         assert not strided[0].is_contiguous()
         labels = scene.labels.T.contiguous().T
@@ -346,7 +363,7 @@ class TestErrors:
             ({"size": (2, 2)}, ValueError, r"size must equal the size of regions, \(1, 2\); got \(2, 2\)"),
             ({"cutoff": 1.0}, ValueError, r"cutoff must be in \[0, 1\); got 1.0"),
             ({"cutoff": math.nan}, ValueError, "cutoff must be in"),
-            ({"backend": "gpu"}, ValueError, "backend must be one of auto, reference, tiled"),
+            ({"backend": "gpu"}, ValueError, "backend must be one of auto, reference, tiled, cpu"),
         ],
     )  # fmt: skip
     def test_bad_input(self, change: dict[str, object], error: type[Exception], words: str) -> None:

@@ -1,0 +1,170 @@
+"""The splat on the CPU: numba, explicit 16-wide vectors, bands of rows shared among threads.
+
+float32 only. The first call compiles (seconds, once a machine and number of channels) or loads the compiled code.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+import math
+import os
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .form import lowest_exponent, support_radius
+from .function import Gradients, Steps, apply_kernel
+from .inputs import SplatInputs
+from .membership import Membership
+from .strips import SIDE, Loops, Scene, compile_loops
+
+# fewer pixels x Gaussians than this are drawn by the calling thread: waking another costs as much
+_SERIAL_ENTRIES = 200
+_SOURCES = ("form.py", "simd.py", "lanes.py", "strips.py")
+
+log = logging.getLogger("kcgs")
+
+
+class _Plan(NamedTuple):
+    scene: Scene
+    order: Any  # [N] int64, sorted to given
+
+
+def splat(inputs: SplatInputs) -> Tensor:
+    """Render (B, C, H, W)."""
+    if inputs.means.dtype != torch.float32:
+        raise ValueError(f"backend 'cpu' computes in float32; got {inputs.means.dtype}: use 'tiled' or 'reference'")
+    if inputs.means.device.type != "cpu":
+        raise ValueError(f"backend 'cpu' needs tensors on the CPU; got {inputs.means.device}")
+    return apply_kernel(Steps(_plan, _render, _differentiate), inputs)
+
+
+@functools.cache
+def _loops() -> Loops:
+    digest = hashlib.sha256()
+    for name in _SOURCES:
+        digest.update((Path(__file__).parent / name).read_bytes())
+    return compile_loops(digest.hexdigest())
+
+
+@functools.cache
+def _announced(channels: int) -> threading.Lock:
+    return threading.Lock()
+
+
+_ready: set[tuple[str, int]] = set()
+
+
+def _first_time(name: str, channels: int, call: Callable[[], None]) -> None:
+    """Run `call`; the first time, say how long the code took to compile or to load."""
+    if (name, channels) in _ready:
+        call()
+        return
+    start = time.perf_counter()
+    loops: Any = getattr(_loops(), name)
+    call()
+    _ready.add((name, channels))
+    how = "compiled" if sum(loops.stats.cache_misses.values()) else "loaded from disk"
+    log.info("kcgs: CPU kernel (%s, %d channels) %s in %.1f s", name, channels, how, time.perf_counter() - start)
+
+
+def _tag(channels: int) -> tuple[float, ...]:
+    return (0.0 if os.environ.get("KCGS_SIMD") == "0" else 0,) * channels
+
+
+def _plan(inputs: SplatInputs) -> _Plan:
+    batch, count, channels = inputs.colors.shape
+    height, width = inputs.size
+    means = inputs.means.detach().reshape(-1, 2).numpy()
+    factors = inputs.cholesky.detach().reshape(-1, 3).numpy()
+    images = np.repeat(np.arange(batch), count)
+    rows = -(-height // SIDE)
+    # neighbours in the picture become neighbours in memory
+    order = np.lexsort((means[:, 0], np.floor(means[:, 1] / SIDE), images))
+    gaussians = np.empty((batch * count, 6))
+    gaussians[:, :2] = means[order]
+    gaussians[:, 2:5] = factors[order]
+    np.hypot(gaussians[:, 3], gaussians[:, 4], out=gaussians[:, 5])
+    images = images[order]
+    table = _NO_TABLE
+    regions = np.zeros(batch * count, np.int64)
+    if inputs.membership is not None and inputs.region_index is not None:
+        table = inputs.membership.derived("cpu", _table)
+        regions = inputs.region_index.flatten().numpy()[order]
+    radius = support_radius(inputs.cutoff, torch.float32)
+    exponent = lowest_exponent(torch.float32)
+    lowest = np.float32(max(math.log(inputs.cutoff) if inputs.cutoff > 0 else exponent, exponent) / math.log(2))
+    start, entries = _loops().list_bands(gaussians, regions, images, rows, batch, height, width, radius)
+    colors = inputs.colors.detach().reshape(-1, channels).numpy()[order].ravel()
+    return _Plan(Scene(gaussians, colors, regions, images, start, entries, *table, radius, lowest), order)
+
+
+_NOTHING = np.zeros(1, np.int64)
+_NO_TABLE = (0, 1, _NOTHING, _NOTHING, _NOTHING, np.zeros(1, np.float32))
+
+
+def _table(membership: Membership) -> tuple[Any, ...]:
+    tiles = membership.tiles(SIDE)
+    maps, height, width = membership.index.shape
+    keys = tiles.keys.numpy()
+    count = maps * -(-height // SIDE) * -(-width // SIDE)
+    start = np.searchsorted(keys, np.arange(count + 1) * membership.num_regions)
+    planes = tiles.planes.to(torch.float32).flatten().numpy()
+    return membership.num_regions, maps, keys, start, tiles.plane.numpy(), planes
+
+
+def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
+    batch, _, channels = inputs.colors.shape
+    image = torch.empty(batch, channels, *inputs.size)
+    tag = _tag(channels)
+    loop = _loops().draw
+
+    def draw(offset: int, step: int) -> None:
+        loop(plan.scene, offset, step, image.numpy(), tag)
+
+    _first_time("draw", channels, lambda: _share(draw, plan.scene))
+    return image
+
+
+def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
+    channels = inputs.colors.shape[-1]
+    terms = np.empty((len(plan.scene.entries), channels + (5 if geometry else 0)), np.float32)
+    tag = _tag(channels)
+    values = grad.contiguous().numpy()
+    loop = _loops().gather
+
+    def gather(offset: int, step: int) -> None:
+        loop(plan.scene, offset, step, values, terms, geometry, tag)
+
+    _first_time("gather", channels, lambda: _share(gather, plan.scene))
+    means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs[:3])
+    flat = [t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors)]
+    _loops().finish(plan.scene, plan.order, terms, *flat)
+    return (means, cholesky, colors) if geometry else (None, None, colors)
+
+
+@functools.cache
+def _pool(process: int, threads: int) -> ThreadPoolExecutor:
+    # by process, since threads do not survive a fork
+    return ThreadPoolExecutor(threads, thread_name_prefix="kcgs")
+
+
+def _share(work: Callable[[int, int], None], scene: Scene) -> None:
+    """Run work(offset, step) over all bands with torch's number of threads, the caller's among them."""
+    threads = min(torch.get_num_threads(), len(scene.start) - 1)
+    if threads < 2 or len(scene.entries) < _SERIAL_ENTRIES:
+        work(0, 1)
+        return
+    others = [_pool(os.getpid(), torch.get_num_threads() - 1).submit(work, t, threads) for t in range(1, threads)]
+    work(0, threads)
+    for other in others:
+        other.result()

@@ -1,0 +1,139 @@
+"""The CPU kernel beyond what every backend is tested for: threads, scalar twins, laziness, refusals."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs import RegionMap
+from kcgs.functional import region_splat
+from kcgs.kernels.simd import EXP2
+
+RANDOM = torch.Generator()
+
+
+@pytest.fixture
+def scene() -> tuple[Tensor, ...]:
+    RANDOM.manual_seed(0)
+    means = torch.rand(600, 2, generator=RANDOM) * torch.tensor([150.0, 110.0])
+    cholesky = torch.rand(600, 3, generator=RANDOM) * torch.tensor([6.0, 4.0, 6.0]) + torch.tensor([0.3, -2.0, 0.3])
+    colors = torch.rand(600, 3, generator=RANDOM) - 0.2
+    labels = torch.zeros(110, 150, dtype=torch.long)
+    labels[20:70, 33:101] = 1
+    labels[60:, 80:] = 2
+    return means, cholesky, colors, torch.randint(0, 3, (600,), generator=RANDOM), labels
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def draw(scene: tuple[Tensor, ...], softness: float = 0.7) -> list[Tensor]:
+    inputs = [t.clone().requires_grad_() for t in scene[:3]]
+    regions = RegionMap.from_labels(scene[4], softness)
+    image = region_splat(*inputs, scene[3], regions, backend="cpu")
+    image.square().sum().backward()
+    return [image.detach(), *(t.grad for t in inputs if t.grad is not None)]
+
+
+@pytest.mark.usefixtures("threads")
+def test_same_bits_for_any_number_of_threads(scene: tuple[Tensor, ...]) -> None:
+    results = []
+    for count in (1, 2, 3, 7):
+        torch.set_num_threads(count)
+        results.append(draw(scene))
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@pytest.mark.parametrize("softness", [0.0, 0.7])
+def test_scalar_twins_agree(scene: tuple[Tensor, ...], softness: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    vector = draw(scene, softness)
+    monkeypatch.setenv("KCGS_SIMD", "0")
+    scalar = draw(scene, softness)
+    assert not all(torch.equal(a, b) for a, b in zip(vector, scalar, strict=True))
+    for a, b in zip(vector, scalar, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * float(b.abs().max()))
+
+
+def test_only_colours(scene: tuple[Tensor, ...]) -> None:
+    full = draw(scene)[3]
+    colors = scene[2].clone().requires_grad_()
+    image = region_splat(*scene[:2], colors, scene[3], RegionMap.from_labels(scene[4], 0.7), backend="cpu")
+    image.square().sum().backward()
+    assert torch.equal(colors.grad, full)
+
+
+def test_exp2_polynomial() -> None:
+    at = np.linspace(-0.5, 0.5, 20_001)
+    assert np.abs(np.polyval(EXP2[::-1], at) / np.exp2(at) - 1).max() < 4e-7
+    assert EXP2[0] == 1.0
+
+
+def test_slanted_needles_are_found_in_every_strip() -> None:
+    angles = torch.linspace(0.01, math.pi, 40, dtype=torch.float64)
+    cos, sin = angles.cos(), angles.sin()
+    l11 = torch.hypot(300 * cos, 0.4 * sin)
+    cholesky = torch.stack([l11, (300**2 - 0.4**2) * sin * cos / l11, 300 * 0.4 / l11], -1)
+    means = torch.tensor([[200.0, 150.0]], dtype=torch.float64).repeat(40, 1)
+    colors = torch.ones(40, 1, dtype=torch.float64)
+    want = region_splat(means, cholesky, colors, size=(300, 400), cutoff=0, backend="reference")
+    got = region_splat(means.float(), cholesky.float(), colors.float(), size=(300, 400), cutoff=0, backend="cpu")
+    assert (got - want).abs().max() < 2e-3  # the needle's float32 parameters themselves move it
+
+
+def test_gradient_that_is_not_contiguous(scene: tuple[Tensor, ...]) -> None:
+    grads = []
+    for view in (lambda t: t, lambda t: t.permute(1, 2, 0)):
+        means = scene[0].clone().requires_grad_()
+        image = region_splat(means, *scene[1:], backend="cpu")
+        probe = torch.linspace(0, 1, image.numel()).view_as(image)
+        (view(image) * view(probe)).sum().backward()
+        grads.append(means.grad)
+    assert torch.equal(*grads)
+
+
+def test_works_after_a_fork(scene: tuple[Tensor, ...]) -> None:
+    want = draw(scene)[0]
+    if not hasattr(os, "fork"):
+        pytest.skip("no fork on this system")
+    code = (
+        "import os, torch, sys\n"
+        "from kcgs.functional import region_splat\n"
+        "torch.set_num_threads(2)\n"
+        "args = torch.rand(800, 2) * 200, torch.ones(800, 3) * 3, torch.ones(800, 3)\n"
+        "region_splat(*args, size=(200, 200), backend='cpu')\n"
+        "pid = os.fork()\n"
+        "region_splat(*args, size=(200, 200), backend='cpu')\n"
+        "sys.exit(0 if pid == 0 else os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))\n"
+    )
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, timeout=120)
+    assert torch.equal(draw(scene)[0], want)
+
+
+def test_import_compiles_nothing() -> None:
+    code = "import sys, kcgs; print('numba' in sys.modules, 'triton' in sys.modules)"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.split() == ["False", "False"]
+
+
+def test_float64_is_refused_by_name(scene: tuple[Tensor, ...]) -> None:
+    with pytest.raises(ValueError, match="backend 'cpu' computes in float32; got torch.float64"):
+        region_splat(*(t.double() for t in scene[:3]), *scene[3:], backend="cpu")
+
+
+def test_auto_is_this_kernel(scene: tuple[Tensor, ...]) -> None:
+    assert torch.equal(region_splat(*scene), region_splat(*scene, backend="cpu"))
+    double = [t.double() for t in scene[:3]]
+    assert torch.equal(region_splat(*double, *scene[3:]), region_splat(*double, *scene[3:], backend="tiled"))
