@@ -20,8 +20,10 @@ def check_tensor(name: str, value: object) -> Tensor:
     return value
 
 
-def check_floating(name: str, value: object, last: int | None = None, dims: Sequence[int] = ()) -> Tensor:
-    """Return `value` if it is a finite real floating tensor of an allowed rank and last dimension."""
+def check_floating(
+    name: str, value: object, last: int | None = None, dims: Sequence[int] = (), finite: bool = True
+) -> Tensor:
+    """Return `value` if it is a real floating tensor of an allowed rank and last dimension, and finite if asked."""
     tensor = check_tensor(name, value)
     if tensor.dtype not in _FLOATS:
         raise TypeError(f"{name} must have a real floating dtype; got {tensor.dtype}")
@@ -29,7 +31,7 @@ def check_floating(name: str, value: object, last: int | None = None, dims: Sequ
         raise ValueError(f"{name} must have {' or '.join(map(str, dims))} dimensions; got shape {tuple(tensor.shape)}")
     if last is not None and (tensor.ndim == 0 or tensor.shape[-1] != last):
         raise ValueError(f"{name} must have shape (..., {last}); got {tuple(tensor.shape)}")
-    if not torch.isfinite(tensor).all():
+    if finite and not torch.isfinite(tensor).all():
         raise ValueError(f"{name} must be finite; got {int((~torch.isfinite(tensor)).sum())} NaN or infinite values")
     return tensor
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 NUM_GAUSSIANS = 400
-ITERATIONS = 800
+ITERATIONS = 2000
 RECIPES = {"baseline": "gaussian-image", "contour-aware": "paper"}
 
 
@@ -36,7 +36,7 @@ def run(output: Path, *, data: Path | None = None, quick: bool = False) -> None:
     save_image(output / "original.png", image)
     save_image(output / "regions.png", colorize_labels(labels))
     save_labels(output / "labels.png", labels)
-    iterations = ITERATIONS // 40 if quick else ITERATIONS
+    iterations = ITERATIONS // 100 if quick else ITERATIONS
     console = Console(stderr=True)
     results: dict[str, FitResult] = {}
     with Progress(console=console, disable=not console.is_terminal) as progress:

@@ -161,6 +161,7 @@ def _tiff(data: bytes) -> Samples | None:
         unsigned = page.sampleformat == 1
         if not (gray or rgb) or (unsigned and page.bitspersample in (1, 8)):
             return None
+        _check_pixels(page.imagewidth * page.imagelength * max(1, page.samplesperpixel // 4))
         values = page.asarray()
         lossless = int(page.compression) in _LOSSLESS_TIFF
         orientation = page.tags[_ORIENTATION].value if _ORIENTATION in page.tags else 1
@@ -177,6 +178,13 @@ def _tiff(data: bytes) -> Samples | None:
     if extra == 1:
         values = _straight(values)
     return Samples(_upright(values, orientation), white, "TIFF", lossless)
+
+
+def _check_pixels(count: int) -> None:
+    """Refuse what a damaged or hostile header claims, by the limit that Pillow has for its own formats."""
+    limit = Image.MAX_IMAGE_PIXELS
+    if limit is not None and count > 2 * limit:
+        raise ValueError(f"its header claims {count} pixels, more than twice the limit of {limit}")
 
 
 def _tiff_white(values: Array, page: Any) -> float | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -71,13 +73,13 @@ def region_splat(
     index, membership, size = _resolve_regions(means, region_ids, regions, size)
     kernel = resolve(backend, means.device, dtype)
     image = kernel(SplatInputs(arrays[0], arrays[1], arrays[2], index, membership, size, float(cutoff)))
-    return (image if batched else image[0]).to(colors.dtype)
+    return (image if batched else image.squeeze(0)).to(colors.dtype)
 
 
 def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
-    check_floating("means", means, last=2, dims=(2, 3))
-    check_cholesky("cholesky", cholesky)
-    check_floating("colors", colors, dims=(2, 3))
+    check_floating("means", means, last=2, dims=(2, 3), finite=False)
+    check_floating("cholesky", cholesky, last=3, finite=False)
+    check_floating("colors", colors, dims=(2, 3), finite=False)
     for name, tensor in (("cholesky", cholesky), ("colors", colors)):
         if tensor.shape[:-1] != means.shape[:-1]:
             raise ValueError(f"{name} must have shape {(*means.shape[:-1], '...')}; got {tuple(tensor.shape)}")
@@ -87,16 +89,27 @@ def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
         raise ValueError(f"colors must have at least one channel; got shape {tuple(colors.shape)}")
     if means.shape[0] == 0 and means.ndim == 3:
         raise ValueError(f"means must hold at least one image; got shape {tuple(means.shape)}")
-    if means.numel() == 0:
-        return
-    if float(means.detach().abs().max()) > MEAN_LIMIT:
-        raise ValueError(f"means must be within {MEAN_LIMIT:g} pixels; got {float(means.abs().max()):g}")
-    low, high = float(cholesky.detach()[..., ::2].min()), float(cholesky.detach().abs().max())
-    if low < SCALE_LIMITS[0] or high > SCALE_LIMITS[1]:
+    if means.numel():
+        _check_values(means.detach(), cholesky.detach(), colors.detach())
+
+
+def _check_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
+    # extremes carry NaN along, so that one pass checks finiteness and range; written so that NaN fails
+    low, high = (float(t) for t in torch.aminmax(means))
+    if not (low >= -MEAN_LIMIT and high <= MEAN_LIMIT):
+        check_floating("means", means)
+        raise ValueError(f"means must be within {MEAN_LIMIT:g} pixels; got {max(-low, high):g}")
+    least, most = (float(t) for t in torch.aminmax(cholesky[..., ::2]))
+    low, high = (float(t) for t in torch.aminmax(cholesky[..., 1]))
+    if not (least >= SCALE_LIMITS[0] and max(most, -low, high) <= SCALE_LIMITS[1]):
+        check_cholesky("cholesky", cholesky)
         raise ValueError(
             f"cholesky must have l11, l22 in [{SCALE_LIMITS[0]:g}, {SCALE_LIMITS[1]:g}] pixels and |l21| at most "
-            f"{SCALE_LIMITS[1]:g}; got a least diagonal of {low:g} and a largest value of {high:g}"
+            f"{SCALE_LIMITS[1]:g}; got a least diagonal of {least:g} and a largest value of {max(most, -low, high):g}"
         )
+    low, high = (float(t) for t in torch.aminmax(colors))
+    if not (low > -math.inf and high < math.inf):
+        check_floating("colors", colors)
 
 
 def _resolve_regions(

@@ -87,13 +87,8 @@ def _plan(inputs: SplatInputs) -> _Plan:
     means = inputs.means.detach().reshape(-1, 2).numpy()
     factors = inputs.cholesky.detach().reshape(-1, 3).numpy()
     images = np.repeat(np.arange(batch), count)
-    rows = -(-height // SIDE)
     # neighbours in the picture become neighbours in memory
     order = np.lexsort((means[:, 0], np.floor(means[:, 1] / SIDE), images))
-    gaussians = np.empty((batch * count, 6))
-    gaussians[:, :2] = means[order]
-    gaussians[:, 2:5] = factors[order]
-    np.hypot(gaussians[:, 3], gaussians[:, 4], out=gaussians[:, 5])
     images = images[order]
     table = _NO_TABLE
     regions = np.zeros(batch * count, np.int64)
@@ -103,7 +98,9 @@ def _plan(inputs: SplatInputs) -> _Plan:
     radius = support_radius(inputs.cutoff, torch.float32)
     exponent = lowest_exponent(torch.float32)
     lowest = np.float32(max(math.log(inputs.cutoff) if inputs.cutoff > 0 else exponent, exponent) / math.log(2))
-    start, entries = _loops().list_bands(gaussians, regions, images, rows, batch, height, width, radius)
+    gaussians, start, entries = _loops().list_bands(
+        means, factors, order, regions, images, batch, height, width, radius
+    )
     colors = inputs.colors.detach().reshape(-1, channels).numpy()[order].ravel()
     return _Plan(Scene(gaussians, colors, regions, images, start, entries, *table, radius, lowest), order)
 

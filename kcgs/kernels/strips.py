@@ -23,14 +23,16 @@ SCALE = math.sqrt(0.5 / math.log(2.0))
 # pixels by which geometry in float64 is kept on the safe side of the weights in float32
 MARGIN = 1e-3
 
-# columns of the table of Gaussians
-MX, MY, L11, L21, L22, HEIGHT = range(6)
+# columns of the table of Gaussians: mean, factor, standard deviation along y, 1 / l11, where the ellipse is highest
+# (in standard deviations along x), and the slopes of z1 along x and of z2 along x and y, times SCALE
+MX, MY, L11, L21, L22, HEIGHT, INVERSE, PEAK, RISE1, RISE2, RISE3 = range(11)
+COLUMNS = 11
 
 
 class Scene(NamedTuple):
     """Everything the loops read, as arrays."""
 
-    gaussians: Any  # [N, 6] float64: mean, factor, standard deviation along y; sorted
+    gaussians: Any  # [N, COLUMNS] float64, sorted
     colors: Any  # [N * C] float32
     regions: Any  # [N] int64
     images: Any  # [N] int64, which image of the batch
@@ -46,10 +48,30 @@ class Scene(NamedTuple):
     lowest: Any  # float32, least exponent of 2
 
 
+@njit
+def _bounded(value):  # type: ignore[no-untyped-def]
+    return min(max(value, -Z_LIMIT), Z_LIMIT)
+
+
+@njit
+def _tabulate(means, factors, order, radius):  # type: ignore[no-untyped-def]
+    table = np.empty((len(order), COLUMNS))
+    for i in range(len(order)):
+        g, given = table[i], order[i]
+        g[MX], g[MY] = means[given, 0], means[given, 1]
+        g[L11], g[L21], g[L22] = factors[given, 0], factors[given, 1], factors[given, 2]
+        g[HEIGHT] = math.hypot(g[L21], g[L22])
+        g[INVERSE] = 1.0 / g[L11]
+        g[PEAK] = radius * g[L21] / g[HEIGHT]
+        g[RISE1] = _bounded(SCALE / g[L11])
+        g[RISE2] = _bounded(-SCALE * (g[L21] / g[L11]) / g[L22])
+        g[RISE3] = _bounded(SCALE / g[L22])
+    return table
+
+
 @njit(inline="always")
-def _highest(along, across, low, high, radius):  # type: ignore[no-untyped-def]
-    """Return the largest along * u + across * sqrt(radius^2 - u^2) over u in [low, high]: an ellipse's edge."""
-    peak = radius * along / math.hypot(along, across)
+def _highest(along, across, peak, low, high, radius):  # type: ignore[no-untyped-def]
+    """Return the largest along * u + across * sqrt(radius^2 - u^2), which peaks at u = peak, over [low, high]."""
     u = min(max(peak, low), high)
     return along * u + across * math.sqrt(max(radius * radius - u * u, 0.0))
 
@@ -71,8 +93,8 @@ def _strip_range(g, band, height, width, radius):  # type: ignore[no-untyped-def
     top = max((band * SIDE + 0.5 - MARGIN - g[MY]) / h, -radius)
     bottom = min((min(band * SIDE + SIDE, height) - 0.5 + MARGIN - g[MY]) / h, radius)
     along, across = g[L11] * g[L21] / h, g[L11] * g[L22] / h
-    right = g[MX] + _highest(along, across, top, bottom, radius) + MARGIN
-    left = g[MX] - _highest(along, across, -bottom, -top, radius) - MARGIN
+    right = g[MX] + _highest(along, across, g[PEAK], top, bottom, radius) + MARGIN
+    left = g[MX] - _highest(along, across, g[PEAK], -bottom, -top, radius) - MARGIN
     first = math.ceil(max(left - 0.5, 0.0))
     last = math.floor(min(right - 0.5, width - 1.0))
     return (first // SIDE, last // SIDE + 1) if first <= last else (0, 0)
@@ -120,29 +142,23 @@ def _find_plane(scene, tile, region):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _bounded(value):  # type: ignore[no-untyped-def]
-    return min(max(value, -Z_LIMIT), Z_LIMIT)
-
-
-@njit
 def _enter_strip(g, strip, band, height, width, radius, coefficients):  # type: ignore[no-untyped-def]
     """Set the coefficients of z * SCALE about the strip's middle; return the rows, first and last + 1, to visit."""
-    left = max((strip * SIDE + 0.5 - MARGIN - g[MX]) / g[L11], -radius)
-    right = min((min(strip * SIDE + SIDE, width) - 0.5 + MARGIN - g[MX]) / g[L11], radius)
+    left = max((strip * SIDE + 0.5 - MARGIN - g[MX]) * g[INVERSE], -radius)
+    right = min((min(strip * SIDE + SIDE, width) - 0.5 + MARGIN - g[MX]) * g[INVERSE], radius)
     if left > right:
         return 0, 0
     base = band * SIDE
-    bottom = g[MY] + _highest(g[L21], g[L22], left, right, radius) + MARGIN
-    top = g[MY] - _highest(g[L21], g[L22], -right, -left, radius) - MARGIN
+    bottom = g[MY] + _highest(g[L21], g[L22], g[PEAK], left, right, radius) + MARGIN
+    top = g[MY] - _highest(g[L21], g[L22], g[PEAK], -right, -left, radius) - MARGIN
     first = math.ceil(max(top - 0.5, float(base)))
     last = math.floor(min(bottom - 0.5, min(base + SIDE, height) - 1.0))
-    slope = g[L21] / g[L11]
     x, y = strip * SIDE + SIDE / 2 - g[MX], base + SIDE / 2 - g[MY]
-    coefficients[0] = _bounded(SCALE * x / g[L11])
-    coefficients[1] = _bounded(SCALE / g[L11])
-    coefficients[2] = _bounded(SCALE * (y - slope * x) / g[L22])
-    coefficients[3] = _bounded(-SCALE * slope / g[L22])
-    coefficients[4] = _bounded(SCALE / g[L22])
+    coefficients[0] = _bounded(g[RISE1] * x)
+    coefficients[1] = g[RISE1]
+    coefficients[2] = _bounded(g[RISE3] * y + g[RISE2] * x)
+    coefficients[3] = g[RISE2]
+    coefficients[4] = g[RISE3]
     return first - base, last + 1 - base
 
 
@@ -262,9 +278,12 @@ def compile_loops(fingerprint: str) -> Loops:
     """
 
     @njit(cache=True, nogil=True)
-    def list_bands(gaussians, regions, images, rows, batch, height, width, radius):  # type: ignore[no-untyped-def]
+    def list_bands(means, factors, order, regions, images, batch, height, width, radius):  # type: ignore[no-untyped-def]
+        """Make the table of Gaussians, the start of each band in the list, and the list."""
         fingerprint  # noqa: B018
-        return _list_bands(gaussians, regions, images, rows, batch, height, width, radius)
+        table = _tabulate(means, factors, order, radius)
+        start, entries = _list_bands(table, regions, images, -(-height // SIDE), batch, height, width, radius)
+        return table, start, entries
 
     @njit(cache=True, nogil=True)
     def draw(scene, offset, step, image, tag):  # type: ignore[no-untyped-def]

@@ -1,6 +1,7 @@
-"""Modules: a set of Gaussians, and the renderer that draws it."""
+"""Modules: a set of Gaussians, the renderer that draws it, and pruning."""
 
 from .field import GaussianField
+from .prune import PruneResult, prune
 from .renderer import RegionSplatRenderer
 
-__all__ = ["GaussianField", "RegionSplatRenderer"]
+__all__ = ["GaussianField", "PruneResult", "RegionSplatRenderer", "prune"]

@@ -341,7 +341,7 @@ class TestBadFiles:
             load_image(path)
 
     @pytest.mark.parametrize("suffix", ["png", "jpg", "webp", "tif", "gif", "16.png", "16.tif"])
-    @settings(max_examples=1500, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(data=st.data())
     def test_damaged_bytes_give_an_image_or_value_error(self, tmp_path: Path, suffix: str, data: st.DataObject) -> None:
         damaged = bytearray(encoded(suffix))

@@ -1,0 +1,276 @@
+"""The splat in Triton: an image tile of 16 x 16 pixels a program, and on the way back a piece of a tile's list.
+
+Forward, a thread owns pixels and walks the tile's Gaussians; backward, it owns a Gaussian and walks the tile's pixels,
+so that every sum is a thread's own: no atomics, and the same bits every time. float32 only.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .binning import TILE, Pairs, bin_gaussians, grid_of
+from .form import moments_to_gradients
+from .function import Gradients, Steps, apply_kernel
+from .inputs import SplatInputs
+from .membership import Membership
+from .tiled import _coefficients, _sum_runs
+
+try:
+    import triton
+    import triton.language as tl
+except ImportError:  # told by splat
+    triton = None
+
+_PIXELS = TILE * TILE
+_MOMENTS = 5
+# Gaussians of a program of the backward, one a thread of its one warp
+_PIECE = 32
+_DRAW_WARPS = 4
+
+
+class _Plan(NamedTuple):
+    """Pairs in the order of their tiles, and where the list of each tile starts."""
+
+    start: Tensor  # [tiles + 1] int64
+    coefficients: Tensor  # [P, 5]: z1 = k0 + k1 x, z2 = k2 + k3 x + k4 y in tile-centred pixels
+    gaussian: Tensor  # [P] int64, b * N + i
+    plane: Tensor | None  # [P] int64 row of planes, -1: weight 1
+    planes: Tensor | None  # [K, 256] float32
+    order: Tensor  # [P] int64, the pair's place in the order of the Gaussians
+    counts: Tensor  # [B * N] int64, pairs of each Gaussian
+
+
+def splat(inputs: SplatInputs) -> Tensor:
+    """Render (B, C, H, W)."""
+    dtype, device = inputs.means.dtype, inputs.means.device
+    if dtype != torch.float32:
+        raise ValueError(f"backend 'cuda' computes in float32; got {dtype}: use 'tiled' or 'reference'")
+    if device.type != "cuda" and not _interpreted():
+        raise ValueError(f"backend 'cuda' needs tensors on a CUDA device; got {device}")
+    if triton is None:
+        raise ImportError("backend 'cuda' needs Triton: pip install triton")
+    return apply_kernel(Steps(_make_plan, _render, _differentiate), inputs)
+
+
+def _interpreted() -> bool:
+    """Whether TRITON_INTERPRET=1 was set when triton was imported: the kernels run in numpy, on CPU tensors."""
+    return triton is not None and not isinstance(_draw_tile, triton.JITFunction)
+
+
+def _make_plan(inputs: SplatInputs) -> _Plan:
+    pairs = bin_gaussians(inputs)
+    order = torch.argsort(pairs.tile, stable=True)
+    counts = _starts(pairs.gaussian, inputs.means.shape[0] * inputs.means.shape[1]).diff()
+    pairs = Pairs(*(None if t is None else t[order] for t in pairs))
+    planes = None
+    if pairs.plane is not None and inputs.membership is not None:
+        planes = inputs.membership.derived("cuda", _planes)
+    start = _starts(pairs.tile, grid_of(inputs).total)
+    return _Plan(start, _coefficients(pairs, inputs), pairs.gaussian, pairs.plane, planes, order, counts)
+
+
+def _planes(membership: Membership) -> Tensor:
+    return membership.tiles(TILE).planes.to(torch.float32)
+
+
+def _starts(values: Tensor, total: int) -> Tensor:
+    """Where each of 0 ... total - 1, and the end, starts in sorted `values`."""
+    return torch.searchsorted(values, torch.arange(total + 1, device=values.device))
+
+
+def _tables(plan: _Plan, inputs: SplatInputs) -> tuple[Any, ...]:
+    colors = inputs.colors.detach().flatten(0, 1).contiguous()
+    # where there are no maps, any address will do: it is not read
+    plane = plan.gaussian if plan.plane is None else plan.plane
+    planes = plan.coefficients if plan.planes is None else plan.planes
+    return plan.start, plan.coefficients, plan.gaussian, plane, planes, colors, inputs.cutoff
+
+
+def _constants(plan: _Plan, inputs: SplatInputs) -> dict[str, Any]:
+    channels = inputs.colors.shape[-1]
+    padded = 1 << (channels - 1).bit_length()
+    return {"SIDE": TILE, "CHANNELS": channels, "PADDED": padded, "MAPPED": plan.plane is not None}
+
+
+def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
+    grid = grid_of(inputs)
+    image = inputs.colors.new_empty(grid.batch, inputs.colors.shape[-1], *inputs.size)
+    if grid.total:
+        with torch.cuda.device_of(image):
+            _draw_tile[(grid.total,)](
+                image,
+                grid.rows,
+                grid.cols,
+                *inputs.size,
+                *_tables(plan, inputs),
+                **_constants(plan, inputs),
+                num_warps=_DRAW_WARPS,
+            )
+    return image
+
+
+def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
+    channels = inputs.colors.shape[-1]
+    terms = inputs.colors.new_empty(len(plan.order), channels + (_MOMENTS if geometry else 0))
+    tile, first = _pieces(plan)
+    if len(tile):
+        with torch.cuda.device_of(terms):
+            _gather_piece[(len(tile),)](
+                terms,
+                plan.order,
+                tile,
+                first,
+                _by_tile(grad, inputs),
+                *_tables(plan, inputs),
+                **_constants(plan, inputs),
+                GEOMETRY=geometry,
+                PIECE=_PIECE,
+                num_warps=1,
+            )
+    total = _sum_runs(terms, plan.counts).unflatten(0, inputs.means.shape[:2])
+    colors = total[..., :channels]
+    if not geometry:
+        return None, None, colors
+    first_moments, second_moments = total[..., channels : channels + 2], total[..., channels + 2 :]
+    return *moments_to_gradients(first_moments, second_moments, inputs.cholesky), colors
+
+
+def _pieces(plan: _Plan) -> tuple[Tensor, Tensor]:
+    """Cut every tile's list into pieces: their tiles and first pairs."""
+    pieces = (plan.start.diff() + _PIECE - 1) // _PIECE
+    tile = torch.repeat_interleave(pieces)
+    rank = torch.arange(len(tile), device=tile.device) - (pieces.cumsum(0) - pieces)[tile]
+    return tile, plan.start[tile] + rank * _PIECE
+
+
+def _by_tile(grad: Tensor, inputs: SplatInputs) -> Tensor:
+    """Lay an image out as [tiles, 256, C], zero outside."""
+    grid = grid_of(inputs)
+    height, width = inputs.size
+    grad = torch.nn.functional.pad(grad, (0, grid.cols * TILE - width, 0, grid.rows * TILE - height))
+    grad = grad.unflatten(3, (grid.cols, TILE)).unflatten(2, (grid.rows, TILE)).permute(0, 2, 4, 3, 5, 1)
+    return grad.reshape(grid.total, _PIXELS, -1).contiguous()
+
+
+def _jit(function: Any) -> Any:
+    return function if triton is None else triton.jit(function)
+
+
+@_jit
+def _weigh(k0, k1, k2, k3, k4, x, y, cutoff):  # type: ignore[no-untyped-def]
+    z1 = k0 + k1 * x
+    z2 = k2 + k4 * y + k3 * x
+    weight = tl.exp(-0.5 * (z1 * z1 + z2 * z2))
+    return z1, z2, tl.where(weight >= cutoff, weight, 0.0)
+
+
+@_jit
+def _draw_tile(  # type: ignore[no-untyped-def]
+    image,
+    rows,
+    cols,
+    height,
+    width,
+    start,
+    coefficients,
+    gaussian,
+    plane,
+    planes,
+    colors,
+    cutoff,
+    SIDE: tl.constexpr,
+    CHANNELS: tl.constexpr,
+    PADDED: tl.constexpr,
+    MAPPED: tl.constexpr,
+):
+    tile = tl.program_id(0).to(tl.int64)
+    pixel = tl.arange(0, SIDE * SIDE)
+    column, row = pixel % SIDE, pixel // SIDE
+    x, y = column - (SIDE - 1) / 2, row - (SIDE - 1) / 2
+    channel = tl.arange(0, PADDED)[:, None]
+    value = tl.zeros([PADDED, SIDE * SIDE], tl.float32)
+    for i in range(tl.load(start + tile), tl.load(start + tile + 1)):
+        k = coefficients + 5 * i
+        _, _, weight = _weigh(tl.load(k), tl.load(k + 1), tl.load(k + 2), tl.load(k + 3), tl.load(k + 4), x, y, cutoff)
+        if MAPPED:
+            which = tl.load(plane + i)
+            weight *= tl.load(planes + which * (SIDE * SIDE) + pixel, mask=which >= 0, other=1.0)
+        color = tl.load(colors + tl.load(gaussian + i) * CHANNELS + channel, mask=channel < CHANNELS, other=0.0)
+        value += color * weight[None, :]
+
+    batch, local = tile // (rows * cols), tile % (rows * cols)
+    row += local // cols * SIDE
+    column += local % cols * SIDE
+    at = ((batch * CHANNELS + channel) * height + row[None, :]) * width + column[None, :]
+    inside = (row < height) & (column < width)
+    tl.store(image + at, value, mask=(channel < CHANNELS) & inside[None, :])
+
+
+@_jit
+def _gather_piece(  # type: ignore[no-untyped-def]
+    terms,
+    order,
+    tiles,
+    firsts,
+    grad,
+    start,
+    coefficients,
+    gaussian,
+    plane,
+    planes,
+    colors,
+    cutoff,
+    SIDE: tl.constexpr,
+    CHANNELS: tl.constexpr,
+    PADDED: tl.constexpr,
+    MAPPED: tl.constexpr,
+    GEOMETRY: tl.constexpr,
+    PIECE: tl.constexpr,
+):
+    tile = tl.load(tiles + tl.program_id(0))
+    entry = tl.load(firsts + tl.program_id(0)) + tl.arange(0, PIECE)
+    valid = entry < tl.load(start + tile + 1)
+    k = coefficients + 5 * entry
+    k0, k1 = tl.load(k, mask=valid, other=0.0), tl.load(k + 1, mask=valid, other=0.0)
+    k2, k3 = tl.load(k + 2, mask=valid, other=0.0), tl.load(k + 3, mask=valid, other=0.0)
+    k4 = tl.load(k + 4, mask=valid, other=0.0)
+    channel = tl.arange(0, PADDED)[:, None]
+    known = channel < CHANNELS
+    which = tl.load(gaussian + entry, mask=valid, other=0)
+    color = tl.load(colors + which[None, :] * CHANNELS + channel, mask=known & valid[None, :], other=0.0)
+    if MAPPED:
+        which = tl.load(plane + entry, mask=valid, other=-1)
+
+    sums = tl.zeros([PADDED, PIECE], tl.float32)
+    zero = tl.zeros([PIECE], tl.float32)
+    s1, s2, s11, s12, s22 = zero, zero, zero, zero, zero
+    for row in range(SIDE):
+        for column in range(SIDE):
+            z1, z2, weight = _weigh(k0, k1, k2, k3, k4, column - (SIDE - 1) / 2, row - (SIDE - 1) / 2, cutoff)
+            pixel = row * SIDE + column
+            if MAPPED:
+                weight *= tl.load(planes + which * (SIDE * SIDE) + pixel, mask=which >= 0, other=1.0)
+            local = tl.load(grad + (tile * (SIDE * SIDE) + pixel) * CHANNELS + channel, mask=known, other=0.0)
+            sums += local * weight[None, :]
+            if GEOMETRY:
+                first = tl.sum(local * color, axis=0) * weight
+                second = first * z2
+                first *= z1
+                s1 += first
+                s2 += second
+                s11 += first * z1
+                s12 += first * z2
+                s22 += second * z2
+
+    width: tl.constexpr = CHANNELS + (5 if GEOMETRY else 0)
+    at = terms + tl.load(order + entry, mask=valid, other=0) * width
+    tl.store(at[None, :] + channel, sums, mask=known & valid[None, :])
+    if GEOMETRY:
+        tl.store(at + CHANNELS, s1, mask=valid)
+        tl.store(at + CHANNELS + 1, s2, mask=valid)
+        tl.store(at + CHANNELS + 2, s11, mask=valid)
+        tl.store(at + CHANNELS + 3, s12, mask=valid)
+        tl.store(at + CHANNELS + 4, s22, mask=valid)

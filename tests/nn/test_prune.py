@@ -1,0 +1,60 @@
+"""Pruning keeps its bound and removes what it can."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from kcgs import GaussianField, RegionSplatRenderer
+from kcgs.nn import prune
+
+
+@pytest.fixture
+def field() -> GaussianField:
+    field = GaussianField.random(300, (40, 60), seed=0)
+    with torch.no_grad():
+        field.colors[:100] *= torch.logspace(-6, 0, 100)[:, None]
+    return field
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1e-4, 1e-2, 0.1])
+def test_change_is_within_the_tolerance(field: GaussianField, tolerance: float) -> None:
+    result = prune(field, tolerance=tolerance)
+    with torch.no_grad():
+        change = (RegionSplatRenderer()(field) - RegionSplatRenderer()(result.field)).abs().max()
+    assert float(change) == result.change <= tolerance + 1e-6
+    assert len(result.field) == 300 - result.removed
+
+
+def test_a_larger_tolerance_removes_more(field: GaussianField) -> None:
+    removed = [prune(field, tolerance=t).removed for t in (0.0, 1e-3, 1e-1, 1e3)]
+    assert removed == sorted(removed)
+    assert removed[0] == 0 < removed[1] < removed[2] < removed[3] == 300
+
+
+def test_what_paints_nothing_goes(field: GaussianField) -> None:
+    labels = torch.zeros(40, 60, dtype=torch.long)
+    ids = torch.zeros(300, dtype=torch.long)
+    ids[50:80] = 9
+    confined = GaussianField(field.means, field.cholesky, field.colors, ids, size=(40, 60))
+    result = prune(confined, labels, tolerance=0.0)
+    assert (result.removed, result.change) == (30, 0.0)
+
+
+def test_opacities_count(field: GaussianField) -> None:
+    opacities = torch.ones(300)
+    opacities[:40] = 0
+    faint = GaussianField(field.means, field.cholesky, field.colors, opacities=opacities, size=(40, 60))
+    assert prune(faint, tolerance=0.0).removed == 40
+
+
+def test_nothing_to_prune() -> None:
+    assert prune(GaussianField.random(0, (4, 4))).removed == 0
+
+
+@pytest.mark.parametrize("tolerance", [-1e-3, math.nan, math.inf])
+def test_bad_tolerance(field: GaussianField, tolerance: float) -> None:
+    with pytest.raises(ValueError, match="tolerance must be"):
+        prune(field, tolerance=tolerance)
