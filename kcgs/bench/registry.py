@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from pathlib import Path
 
-_EXPERIMENTS = ("demo",)
+_EXPERIMENTS = ("demo", "render")
 
 
 def available_experiments() -> tuple[str, ...]:

@@ -124,7 +124,7 @@ class Davis:
                 )
         first, second = ({entry.name for entry in tree.iterdir() if entry.is_dir()} for tree in trees)
         if not first & second:
-            raise FileNotFoundError(f"no sequence has a folder both in {self._images} and in {self._annotations}")
+            raise FileNotFoundError(f"no sequence has a folder in both {trees[0]} and {trees[1]}")
         return sorted(first & second)
 
     @staticmethod

@@ -123,7 +123,7 @@ def save_image(path: str | os.PathLike[str], image: Tensor) -> None:
 
 
 def _check_background(background: Sequence[float]) -> NDArray[np.float32]:
-    if not isinstance(background, Sequence) or not all(isinstance(value, int | float) for value in background):
+    if not isinstance(background, Sequence) or not all(isinstance(v, int | float) for v in background):
         raise TypeError(f"background must be three numbers (R, G, B); got {background!r}")
     if len(background) != 3 or not all(0 <= value <= 1 for value in background):
         raise ValueError(f"background must be three numbers (R, G, B) in [0, 1]; got {background!r}")

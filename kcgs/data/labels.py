@@ -101,7 +101,7 @@ def save_labels(path: str | os.PathLike[str], labels: Tensor) -> None:
             np.save(temporary, values.astype(np.min_scalar_type(highest)), allow_pickle=False)
         return
     if highest > 65535:
-        raise ValueError(f"labels for a .png must be at most 65535; got {highest}: save as .npy or renumber them")
+        raise ValueError(f"labels for a .png must be at most 65535; got {highest}: renumber or save as .npy")
     picture = Image.fromarray(values.astype(np.uint8 if highest < 256 else np.uint16))
     if highest < 256:
         picture.putpalette((label_colors(256) * 255 + 0.5).floor().to(torch.uint8).flatten().tolist())

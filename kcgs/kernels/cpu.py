@@ -45,7 +45,7 @@ def splat(inputs: SplatInputs) -> Tensor:
         raise ValueError(f"backend 'cpu' computes in float32; got {inputs.means.dtype}: use 'tiled' or 'reference'")
     if inputs.means.device.type != "cpu":
         raise ValueError(f"backend 'cpu' needs tensors on the CPU; got {inputs.means.device}")
-    return apply_kernel(Steps(_plan, _render, _differentiate), inputs)
+    return apply_kernel(Steps(plan, _render, _differentiate), inputs)
 
 
 @functools.cache
@@ -81,7 +81,8 @@ def _tag(channels: int) -> tuple[float, ...]:
     return (0.0 if os.environ.get("KCGS_SIMD") == "0" else 0,) * channels
 
 
-def _plan(inputs: SplatInputs) -> _Plan:
+def plan(inputs: SplatInputs) -> _Plan:
+    """List which Gaussians touch which band, for the loops."""
     batch, count, channels = inputs.colors.shape
     height, width = inputs.size
     means = inputs.means.detach().reshape(-1, 2).numpy()
@@ -119,33 +120,33 @@ def _table(membership: Membership) -> tuple[Any, ...]:
     return membership.num_regions, maps, keys, start, tiles.plane.numpy(), planes
 
 
-def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
+def _render(planned: _Plan, inputs: SplatInputs) -> Tensor:
     batch, _, channels = inputs.colors.shape
     image = torch.empty(batch, channels, *inputs.size)
     tag = _tag(channels)
     loop = _loops().draw
 
     def draw(offset: int, step: int) -> None:
-        loop(plan.scene, offset, step, image.numpy(), tag)
+        loop(planned.scene, offset, step, image.numpy(), tag)
 
-    _first_time("draw", channels, lambda: _share(draw, plan.scene))
+    _first_time("draw", channels, lambda: _share(draw, planned.scene))
     return image
 
 
-def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
+def _differentiate(planned: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
     channels = inputs.colors.shape[-1]
-    terms = np.empty((len(plan.scene.entries), channels + (5 if geometry else 0)), np.float32)
+    terms = np.empty((len(planned.scene.entries), channels + (5 if geometry else 0)), np.float32)
     tag = _tag(channels)
     values = grad.contiguous().numpy()
     loop = _loops().gather
 
     def gather(offset: int, step: int) -> None:
-        loop(plan.scene, offset, step, values, terms, geometry, tag)
+        loop(planned.scene, offset, step, values, terms, geometry, tag)
 
-    _first_time("gather", channels, lambda: _share(gather, plan.scene))
+    _first_time("gather", channels, lambda: _share(gather, planned.scene))
     means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs[:3])
     flat = [t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors)]
-    _loops().finish(plan.scene, plan.order, terms, *flat)
+    _loops().finish(planned.scene, planned.order, terms, *flat)
     return (means, cholesky, colors) if geometry else (None, None, colors)
 
 

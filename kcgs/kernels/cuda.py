@@ -26,6 +26,8 @@ except ImportError:  # told by splat
 
 _PIXELS = TILE * TILE
 _MOMENTS = 5
+# channels that a thread holds at once
+_MOST_CHANNELS = 8
 # Gaussians of a program of the backward, one a thread of its one warp
 _PIECE = 32
 _DRAW_WARPS = 4
@@ -81,34 +83,29 @@ def _starts(values: Tensor, total: int) -> Tensor:
     return torch.searchsorted(values, torch.arange(total + 1, device=values.device))
 
 
-def _tables(plan: _Plan, inputs: SplatInputs) -> tuple[Any, ...]:
-    colors = inputs.colors.detach().flatten(0, 1).contiguous()
+def _lists(plan: _Plan, inputs: SplatInputs) -> tuple[Any, ...]:
     # where there are no maps, any address will do: it is not read
     plane = plan.gaussian if plan.plane is None else plan.plane
     planes = plan.coefficients if plan.planes is None else plan.planes
-    return plan.start, plan.coefficients, plan.gaussian, plane, planes, colors, inputs.cutoff
+    return plan.start, plan.coefficients, plan.gaussian, plane, planes, inputs.cutoff
 
 
 def _constants(plan: _Plan, inputs: SplatInputs) -> dict[str, Any]:
     channels = inputs.colors.shape[-1]
-    padded = 1 << (channels - 1).bit_length()
-    return {"SIDE": TILE, "CHANNELS": channels, "PADDED": padded, "MAPPED": plan.plane is not None}
+    block = min(_MOST_CHANNELS, 1 << (channels - 1).bit_length())
+    return {"SIDE": TILE, "CHANNELS": channels, "BLOCK": block, "MAPPED": plan.plane is not None}
 
 
 def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
-    grid = grid_of(inputs)
-    image = inputs.colors.new_empty(grid.batch, inputs.colors.shape[-1], *inputs.size)
-    if grid.total:
-        with torch.cuda.device_of(image):
-            _draw_tile[(grid.total,)](
-                image,
-                grid.rows,
-                grid.cols,
-                *inputs.size,
-                *_tables(plan, inputs),
-                **_constants(plan, inputs),
-                num_warps=_DRAW_WARPS,
-            )
+    grid, channels = grid_of(inputs), inputs.colors.shape[-1]
+    image = inputs.colors.new_empty(grid.batch, channels, *inputs.size)
+    colors = inputs.colors.detach().flatten(0, 1).contiguous()
+    constants = _constants(plan, inputs)
+    programs = grid.total, -(-channels // constants["BLOCK"])
+    with torch.cuda.device_of(image):
+        _draw_tile[programs](
+            image, colors, grid.rows, grid.cols, *inputs.size, *_lists(plan, inputs), **constants, num_warps=_DRAW_WARPS
+        )
     return image
 
 
@@ -117,24 +114,16 @@ def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: boo
     terms = inputs.colors.new_empty(len(plan.order), channels + (_MOMENTS if geometry else 0))
     tile, first = _pieces(plan)
     if len(tile):
+        # channels first, so that the compiler gives whole Gaussians to threads
+        colors = inputs.colors.detach().flatten(0, 1).T.contiguous()
+        arguments = terms, plan.order, tile, first, _by_tile(grad, inputs), colors, colors.shape[1]
+        constants = {**_constants(plan, inputs), "GEOMETRY": geometry, "PIECE": _PIECE}
         with torch.cuda.device_of(terms):
-            _gather_piece[(len(tile),)](
-                terms,
-                plan.order,
-                tile,
-                first,
-                _by_tile(grad, inputs),
-                *_tables(plan, inputs),
-                **_constants(plan, inputs),
-                GEOMETRY=geometry,
-                PIECE=_PIECE,
-                num_warps=1,
-            )
+            _gather_piece[(len(tile),)](*arguments, *_lists(plan, inputs), **constants, num_warps=1)
     total = _sum_runs(terms, plan.counts).unflatten(0, inputs.means.shape[:2])
-    colors = total[..., :channels]
     if not geometry:
-        return None, None, colors
-    first_moments, second_moments = total[..., channels : channels + 2], total[..., channels + 2 :]
+        return None, None, total
+    colors, first_moments, second_moments = total.split([channels, 2, 3], -1)
     return *moments_to_gradients(first_moments, second_moments, inputs.cholesky), colors
 
 
@@ -170,6 +159,7 @@ def _weigh(k0, k1, k2, k3, k4, x, y, cutoff):  # type: ignore[no-untyped-def]
 @_jit
 def _draw_tile(  # type: ignore[no-untyped-def]
     image,
+    colors,
     rows,
     cols,
     height,
@@ -179,25 +169,25 @@ def _draw_tile(  # type: ignore[no-untyped-def]
     gaussian,
     plane,
     planes,
-    colors,
     cutoff,
     SIDE: tl.constexpr,
     CHANNELS: tl.constexpr,
-    PADDED: tl.constexpr,
+    BLOCK: tl.constexpr,
     MAPPED: tl.constexpr,
 ):
     tile = tl.program_id(0).to(tl.int64)
     pixel = tl.arange(0, SIDE * SIDE)
     column, row = pixel % SIDE, pixel // SIDE
     x, y = column - (SIDE - 1) / 2, row - (SIDE - 1) / 2
-    channel = tl.arange(0, PADDED)[:, None]
-    value = tl.zeros([PADDED, SIDE * SIDE], tl.float32)
+    channel = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)[:, None]
+    value = tl.zeros([BLOCK, SIDE * SIDE], tl.float32)
     for i in range(tl.load(start + tile), tl.load(start + tile + 1)):
         k = coefficients + 5 * i
         _, _, weight = _weigh(tl.load(k), tl.load(k + 1), tl.load(k + 2), tl.load(k + 3), tl.load(k + 4), x, y, cutoff)
         if MAPPED:
             which = tl.load(plane + i)
-            weight *= tl.load(planes + which * (SIDE * SIDE) + pixel, mask=which >= 0, other=1.0)
+            if which >= 0:
+                weight *= tl.load(planes + which * (SIDE * SIDE) + pixel)
         color = tl.load(colors + tl.load(gaussian + i) * CHANNELS + channel, mask=channel < CHANNELS, other=0.0)
         value += color * weight[None, :]
 
@@ -216,16 +206,17 @@ def _gather_piece(  # type: ignore[no-untyped-def]
     tiles,
     firsts,
     grad,
+    colors,
+    count,
     start,
     coefficients,
     gaussian,
     plane,
     planes,
-    colors,
     cutoff,
     SIDE: tl.constexpr,
     CHANNELS: tl.constexpr,
-    PADDED: tl.constexpr,
+    BLOCK: tl.constexpr,
     MAPPED: tl.constexpr,
     GEOMETRY: tl.constexpr,
     PIECE: tl.constexpr,
@@ -237,37 +228,37 @@ def _gather_piece(  # type: ignore[no-untyped-def]
     k0, k1 = tl.load(k, mask=valid, other=0.0), tl.load(k + 1, mask=valid, other=0.0)
     k2, k3 = tl.load(k + 2, mask=valid, other=0.0), tl.load(k + 3, mask=valid, other=0.0)
     k4 = tl.load(k + 4, mask=valid, other=0.0)
-    channel = tl.arange(0, PADDED)[:, None]
-    known = channel < CHANNELS
     which = tl.load(gaussian + entry, mask=valid, other=0)
-    color = tl.load(colors + which[None, :] * CHANNELS + channel, mask=known & valid[None, :], other=0.0)
     if MAPPED:
-        which = tl.load(plane + entry, mask=valid, other=-1)
-
-    sums = tl.zeros([PADDED, PIECE], tl.float32)
-    zero = tl.zeros([PIECE], tl.float32)
-    s1, s2, s11, s12, s22 = zero, zero, zero, zero, zero
-    for row in range(SIDE):
-        for column in range(SIDE):
-            z1, z2, weight = _weigh(k0, k1, k2, k3, k4, column - (SIDE - 1) / 2, row - (SIDE - 1) / 2, cutoff)
-            pixel = row * SIDE + column
-            if MAPPED:
-                weight *= tl.load(planes + which * (SIDE * SIDE) + pixel, mask=which >= 0, other=1.0)
-            local = tl.load(grad + (tile * (SIDE * SIDE) + pixel) * CHANNELS + channel, mask=known, other=0.0)
-            sums += local * weight[None, :]
-            if GEOMETRY:
-                first = tl.sum(local * color, axis=0) * weight
-                second = first * z2
-                first *= z1
-                s1 += first
-                s2 += second
-                s11 += first * z1
-                s12 += first * z2
-                s22 += second * z2
+        row_of = tl.load(plane + entry, mask=valid, other=-1)
 
     width: tl.constexpr = CHANNELS + (5 if GEOMETRY else 0)
     at = terms + tl.load(order + entry, mask=valid, other=0) * width
-    tl.store(at[None, :] + channel, sums, mask=known & valid[None, :])
+    zero = tl.zeros([PIECE], tl.float32)
+    s1, s2, s11, s12, s22 = zero, zero, zero, zero, zero
+    for base in range(0, CHANNELS, BLOCK):
+        channel = base + tl.arange(0, BLOCK)[:, None]
+        known = channel < CHANNELS
+        color = tl.load(colors + channel.to(tl.int64) * count + which[None, :], mask=known & valid[None, :], other=0.0)
+        sums = tl.zeros([BLOCK, PIECE], tl.float32)
+        for row in range(SIDE):
+            for column in range(SIDE):
+                z1, z2, weight = _weigh(k0, k1, k2, k3, k4, column - (SIDE - 1) / 2, row - (SIDE - 1) / 2, cutoff)
+                pixel = row * SIDE + column
+                if MAPPED:
+                    weight *= tl.load(planes + row_of * (SIDE * SIDE) + pixel, mask=row_of >= 0, other=1.0)
+                local = tl.load(grad + (tile * (SIDE * SIDE) + pixel) * CHANNELS + channel, mask=known, other=0.0)
+                sums += local * weight[None, :]
+                if GEOMETRY:
+                    first = tl.sum(local * color, axis=0) * weight
+                    second = first * z2
+                    first *= z1
+                    s1 += first
+                    s2 += second
+                    s11 += first * z1
+                    s12 += first * z2
+                    s22 += second * z2
+        tl.store(at[None, :] + channel, sums, mask=known & valid[None, :])
     if GEOMETRY:
         tl.store(at + CHANNELS, s1, mask=valid)
         tl.store(at + CHANNELS + 1, s2, mask=valid)

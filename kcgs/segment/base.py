@@ -105,11 +105,11 @@ def check_segment_image(image: object) -> NDArray[np.float32]:
 
     Values may pass the range by 0.001, which resizing and colour conversion leave, and are clipped.
     """
-    tensor = check_floating("image", image, dims=(3,))
+    tensor = check_floating("image", image, dims=(3,)).detach()
     if tensor.shape[0] not in (1, 3) or tensor.numel() == 0:
         raise ValueError(f"image must have shape (3, H, W) or (1, H, W); got {tuple(tensor.shape)}")
     low, high = float(tensor.min()), float(tensor.max())
     if low < -_TOLERANCE or high > 1 + _TOLERANCE:
         raise ValueError(f"image must lie in [0, 1]; got [{low:g}, {high:g}]")
-    pixels = tensor.detach().float().clamp(0, 1).expand(3, -1, -1).permute(1, 2, 0)
+    pixels = tensor.float().clamp(0, 1).expand(3, -1, -1).permute(1, 2, 0)
     return np.ascontiguousarray(pixels.cpu().numpy())

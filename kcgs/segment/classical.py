@@ -75,7 +75,13 @@ def auto(image: Tensor, *, max_regions: int = 30) -> Tensor:
 
 
 @register("felzenszwalb")
-def felzenszwalb(image: Tensor, *, scale: float = 300.0, sigma: float = 1.0, min_size: int | None = None) -> Tensor:
+def felzenszwalb(
+    image: Tensor,
+    *,
+    scale: float = 300.0,
+    sigma: float = 1.0,
+    min_size: int | None = None,
+) -> Tensor:
     """Segment by the graph-based method of Felzenszwalb and Huttenlocher (IJCV 2004), in CIE Lab.
 
     Args:

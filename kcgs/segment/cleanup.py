@@ -18,14 +18,14 @@ def connected_regions(labels: Tensor) -> Tensor:
     """Split a label map so that every region is one piece, its pixels touching along their sides.
 
     Args:
-        labels: :math:`(H, W)` integer, any ids.
+        labels: :math:`(H, W)` integer, any non-negative ids.
 
     Returns:
         :math:`(H, W)` int64 with ids 0 to R - 1 in raster order of each piece's first pixel.
 
     Raises:
         TypeError: ``labels`` is no integer tensor.
-        ValueError: ``labels`` is not two-dimensional or is empty.
+        ValueError: ``labels`` is not two-dimensional, is empty or has negative ids.
 
     Example:
         >>> connected_regions(torch.tensor([[5, 2, 5], [5, 2, 2]])).tolist()
@@ -38,14 +38,14 @@ def order_by_area(labels: Tensor) -> Tensor:
     """Renumber regions by decreasing area; of equal ones, the one with the earlier first pixel comes first.
 
     Args:
-        labels: :math:`(H, W)` integer, any ids.
+        labels: :math:`(H, W)` integer, any non-negative ids.
 
     Returns:
         :math:`(H, W)` int64 with ids 0 to R - 1.
 
     Raises:
         TypeError: ``labels`` is no integer tensor.
-        ValueError: ``labels`` is not two-dimensional or is empty.
+        ValueError: ``labels`` is not two-dimensional, is empty or has negative ids.
 
     Example:
         >>> order_by_area(torch.tensor([[9, 4, 4], [9, 4, 7]])).tolist()
@@ -67,7 +67,7 @@ def absorb_specks(labels: Tensor, min_size: int) -> Tensor:
     neighbours with equal borders the larger takes it, then the one whose first pixel comes earlier.
 
     Args:
-        labels: :math:`(H, W)` integer, any ids.
+        labels: :math:`(H, W)` integer, any non-negative ids.
         min_size: pixels a piece must have to stay, at least 1.
 
     Returns:
@@ -75,7 +75,8 @@ def absorb_specks(labels: Tensor, min_size: int) -> Tensor:
 
     Raises:
         TypeError: ``labels`` is no integer tensor or ``min_size`` no integer.
-        ValueError: ``labels`` is not two-dimensional or is empty, or ``min_size`` is below 1.
+        ValueError: ``labels`` is not two-dimensional, is empty or has negative ids, or ``min_size`` is below
+            1.
 
     Example:
         >>> absorb_specks(torch.tensor([[3, 3, 3, 8], [3, 1, 3, 8]]), min_size=2).tolist()
@@ -108,7 +109,7 @@ def merge_similar(image: Tensor, labels: Tensor, max_regions: int) -> Tensor:
 
     Args:
         image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].
-        labels: :math:`(H, W)` integer, any ids.
+        labels: :math:`(H, W)` integer, any non-negative ids.
         max_regions: how many regions may stay, at least 1.
 
     Returns:
@@ -126,7 +127,7 @@ def merge_similar(image: Tensor, labels: Tensor, max_regions: int) -> Tensor:
     pixels = check_segment_image(image)
     values = to_array(labels)
     if pixels.shape[:2] != values.shape:
-        raise ValueError(f"labels must have the image's size; got {values.shape} and an image of {pixels.shape[:2]}")
+        raise ValueError(f"labels must have the image's size; got {values.shape} and {pixels.shape[:2]}")
     check_count("max_regions", max_regions)
     ids, regions = compact(values)
     graph = RegionGraph(regions)
@@ -151,7 +152,8 @@ class RegionGraph:
         first, second = (np.concatenate([pair[k].ravel() for pair in sides]) for k in (0, 1))
         differs = first != second
         first, second = first[differs], second[differs]
-        keys, lengths = np.unique(np.minimum(first, second) * count + np.maximum(first, second), return_counts=True)
+        pairs = np.minimum(first, second) * count + np.maximum(first, second)
+        keys, lengths = np.unique(pairs, return_counts=True)
         for key, length in zip(keys.tolist(), lengths.tolist(), strict=True):
             a, b = divmod(key, count)
             self.borders[a][b] = self.borders[b][a] = length
@@ -243,7 +245,10 @@ def to_array(labels: Tensor) -> Labels:
     labels = check_integer("labels", labels, dims=(2,))
     if labels.numel() == 0:
         raise ValueError(f"labels must have at least one pixel; got shape {tuple(labels.shape)}")
-    return labels.long().cpu().numpy()
+    labels = labels.long()
+    if int(labels.min()) < 0:
+        raise ValueError(f"labels must hold non-negative ids; got {int(labels.min())}")
+    return labels.cpu().numpy()
 
 
 def check_count(name: str, value: int) -> None:

@@ -27,7 +27,7 @@ def snap_contours(image: Tensor, labels: Tensor, *, reach: int = 2) -> Tensor:
 
     Args:
         image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].
-        labels: :math:`(H, W)` integer, any ids.
+        labels: :math:`(H, W)` integer, any non-negative ids.
         reach: pixels, at least 1.
 
     Returns:
@@ -79,7 +79,7 @@ def _fixed(lab: NDArray[np.float32], regions: Labels, reach: int) -> NDArray[np.
     stays = np.zeros_like(thin)
     for region in np.flatnonzero(thin):
         stays[region] = not _is_mixture(means[region], means[list(graph.borders[region])])
-    return core | stays[regions]
+    return np.asarray(core | stays[regions])
 
 
 def _is_mixture(color: NDArray[np.float64], others: NDArray[np.float64]) -> bool:

@@ -173,7 +173,7 @@ class TestFailures:
             (("fit", "photo.png", "-o", "nowhere/scene.safetensors"), 1, "needs an existing folder"),
             (("fit", "photo.png", "--max-seconds", "-1"), 1, "max_seconds"),
             (("info", "text.png"), 1, "text.png"),
-            (("bench", "none-such", "-o", "out"), 1, "name must be one of demo"),
+            (("bench", "none-such", "-o", "out"), 1, "name must be one of demo, render"),
             (("segment", "photo.png", "-o", "a.png", "--method", "magic"), 1, "method"),
         ],
     )

@@ -88,11 +88,11 @@ class TestPie:
         assert ((areas[1:] - disc / 8).abs() < 0.01 * disc / 8).all()
 
     def test_edges_are_area_averages(self) -> None:
-        # The share of every region in every pixel, from a much finer label map.
+        # Labels at eight times the size are the 8 x 8 samples of every pixel.
         image, labels = chart_pie()
-        fine = chart_pie(scale=16).labels
+        fine = chart_pie(scale=8).labels
         colors = torch.stack([image[:, labels == k].median(dim=1).values for k in range(9)])
-        expected = colors[fine].reshape(300, 16, 300, 16, 3).mean(dim=(1, 3))
-        torch.testing.assert_close(image.permute(1, 2, 0), expected, atol=0.05, rtol=0)
+        expected = colors[fine].reshape(300, 8, 300, 8, 3).mean(dim=(1, 3))
+        torch.testing.assert_close(image.permute(1, 2, 0), expected, atol=1e-5, rtol=0)
         pure = (expected[:, :, None] == colors).all(dim=-1).any(dim=-1)
         assert (~pure).sum() > 1000  # the check above saw a rim and eight edges of mixed pixels

@@ -113,7 +113,7 @@ class TestDavis:
     def test_no_common_sequence(self, tmp_path: Path) -> None:
         (tmp_path / "JPEGImages" / "480p" / "dog").mkdir(parents=True)
         (tmp_path / "Annotations" / "480p" / "cat").mkdir(parents=True)
-        with pytest.raises(FileNotFoundError, match="no sequence has a folder both in"):
+        with pytest.raises(FileNotFoundError, match="no sequence has a folder in both"):
             Davis(tmp_path)
 
     def test_unknown_sequence_lists_a_few(self, root: Path) -> None:

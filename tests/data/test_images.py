@@ -152,12 +152,12 @@ class TestModes:
         picture.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
         picture.save(tmp_path / "a.png", transparency=bytes([0, 51, 255]))
         image = load_image(tmp_path / "a.png", background=(0, 0, 0))
-        np.testing.assert_allclose(pixels(image)[0], [[0, 0, 0], [0, 0.2, 0], [0, 0, 1]], atol=1e-6)
+        np.testing.assert_allclose(pixels(image)[0], [[0.0, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 1.0]], atol=1e-6)
 
     @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
     def test_color_key_of_gray(self, tmp_path: Path, dtype: type) -> None:
         top = np.iinfo(dtype).max
-        samples = np.array([[[top], [top - 1], [0]]], dtype)
+        samples: np.ndarray = np.array([top, top - 1, 0]).astype(dtype).reshape(1, 3, 1)
         key = (b"tRNS", struct.pack(">H", top - 1))
         path = write(tmp_path / "a.png", encode_png(samples, GRAY, [key]))
         image = load_image(path, channels="RGBA")
@@ -173,6 +173,12 @@ class TestModes:
         alpha = load_image(path, channels="RGBA")[3]
         assert (alpha == 0).nonzero().tolist() == [[0, 0], [2, 3]]
         assert (load_image(path, background=(0, 0, 1))[:, 2, 3] == torch.tensor([0.0, 0.0, 1.0])).all()
+
+    def test_portable_graymap_of_sixteen_bits(self, tmp_path: Path) -> None:
+        samples = random_samples(1, np.uint16)
+        header = f"P5 {WIDTH} {HEIGHT} 65535\n".encode()
+        image = load_image(write(tmp_path / "a.pgm", header + samples.astype(">u2").tobytes()), channels="L")
+        np.testing.assert_array_equal(np.rint(pixels(image) * 65535), samples)
 
     def test_cmyk(self, tmp_path: Path) -> None:
         samples = np.broadcast_to(np.array([0, 255, 255, 0], np.uint8), (8, 8, 4)).copy()

@@ -1,0 +1,182 @@
+"""The measurements, in order, and what becomes of them."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcgs._atomic import atomic_path
+
+from . import report
+from .limit import evaluated_pairs, pixels_per_second
+from .peers import MOST_PAIRS, PEERS, pairs
+from .stiffness import sweep
+from .timing import drawer, medians, once, peak_memory, probe_of, threads
+from .workloads import STANDARD, Workload, standard, workload
+
+CUTOFFS = (1 / 255, 1e-3, 1e-4, 1e-6, 0.0)
+DEFAULT_CUTOFF = 1e-4
+# the dense reference is timed where it takes seconds
+DENSE = ("W3",)
+
+
+class Row(NamedTuple):
+    """One measured number."""
+
+    section: str
+    case: str
+    backend: str
+    threads: int
+    quantity: str
+    value: float
+    unit: str
+
+
+def run(output: Path, *, data: Path | None = None, quick: bool = False) -> None:
+    """Measure speed, memory, error against run time, growth and stiffness; write results.csv, report.md, figures."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    repeats = 1 if quick else 5
+    standards = ("W3",) if quick else tuple(STANDARD)
+    steps: list[tuple[str, Callable[[], list[Row]]]] = [
+        ("limit", lambda: _limit(standards, quick)),
+        *((f"speed {name}", partial(_speed, name, repeats)) for name in standards),
+        ("memory", lambda: _memory(standards[:1] if quick else ("W1", "W2", "W4"))),
+        ("error against run time", lambda: _error_and_time("W3" if quick else "W1", repeats)),
+        ("growth", lambda: _growth(repeats, quick)),
+        ("stiffness", _stiffness),
+    ]
+    rows: list[Row] = []
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("", total=len(steps))
+        for name, step in steps:
+            progress.update(task, description=name)
+            rows += step()
+            progress.advance(task)
+    _write_csv(output / "results.csv", rows)
+    report.write(output, rows, quick)
+    Console().print(f"{output}/report.md")
+
+
+def backends() -> list[str]:
+    """Backends that run here."""
+    return ["cpu", "tiled", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+def _limit(names: tuple[str, ...], quick: bool) -> list[Row]:
+    rows = []
+    rates = {}
+    for kind in ("forward", "backward"):
+        rates[kind] = pixels_per_second(backward=kind == "backward", rows=200_000 if quick else 4_000_000)
+        rows.append(Row("limit", "registers", "limit", 1, f"{kind} rate", rates[kind] / 1e9, "Gpairs/s"))
+    for name in names:
+        for cutoff in (1 / 255, DEFAULT_CUTOFF):
+            count = evaluated_pairs(standard(name), cutoff)
+            case = f"{name} cutoff {cutoff:.2g}"
+            rows.append(Row("limit", case, "limit", 1, "pairs", count / 1e6, "M"))
+            for kind, rate in rates.items():
+                rows.append(Row("limit", case, "limit", 1, kind, 1e3 * count / rate, "ms"))
+    return rows
+
+
+def _speed(name: str, repeats: int) -> list[Row]:
+    scene = standard(name)
+    rows = []
+    for cutoff in (1 / 255, DEFAULT_CUTOFF):
+        case = f"{name} cutoff {cutoff:.2g}"
+        names = [*backends(), *(["reference"] if name in DENSE else [])]
+        names += [peer for peer in PEERS if pairs(peer, scene, cutoff) <= MOST_PAIRS]
+        for backend in names:
+            for count in (1, 2):
+                with threads(count):
+                    timing = medians(backend, scene, cutoff, repeats)
+                rows.append(Row("speed", case, backend, count, "forward", 1e3 * timing.forward, "ms"))
+                rows.append(Row("speed", case, backend, count, "backward", 1e3 * timing.backward, "ms"))
+                rows.append(Row("speed", case, backend, count, "sum", 1e3 * timing.sum, "ms"))
+    return rows
+
+
+def _memory(names: tuple[str, ...]) -> list[Row]:
+    rows = []
+    for name in names:
+        scene = standard(name)
+        for backend in ("cpu", "tiled", *PEERS):
+            if backend in PEERS and pairs(backend, scene, DEFAULT_CUTOFF) > MOST_PAIRS:
+                continue
+            peak = peak_memory(backend, name, DEFAULT_CUTOFF)
+            rows.append(Row("memory", name, backend, 1, "peak", peak, "MiB"))
+    return rows
+
+
+def _error_and_time(name: str, repeats: int) -> list[Row]:
+    scene = standard(name)
+    exact = scene.double()
+    _, want, want_gradients = once(drawer("reference"), exact, 0.0, probe_of(exact))
+    rows = []
+    for backend in backends():
+        for cutoff in CUTOFFS:
+            with threads(1):
+                timing = medians(backend, scene, cutoff, repeats)
+                _, image, gradients = once(drawer(backend), scene, cutoff, probe_of(scene))
+            case = f"{name} cutoff {cutoff:.2g}"
+            error = (image - want).abs()
+            rows.append(Row("error", case, backend, 1, "sum", 1e3 * timing.sum, "ms"))
+            rows.append(Row("error", case, backend, 1, "image max", float(error.max()), "1"))
+            rows.append(Row("error", case, backend, 1, "image rms", float(error.square().mean().sqrt()), "1"))
+            largest, mean = _gradient_error(gradients, want_gradients)
+            rows.append(Row("error", case, backend, 1, "gradient max", largest, "relative to the largest"))
+            rows.append(Row("error", case, backend, 1, "gradient rms", mean, "relative to the rms"))
+    return rows
+
+
+def _gradient_error(got: list[Tensor], want: list[Tensor]) -> tuple[float, float]:
+    largest = [float((g - w).abs().max() / w.abs().max()) for g, w in zip(got, want, strict=True)]
+    rms = [float((g - w).square().mean().sqrt() / w.square().mean().sqrt()) for g, w in zip(got, want, strict=True)]
+    return max(largest), max(rms)
+
+
+def _growth(repeats: int, quick: bool) -> list[Row]:
+    counts = (100, 400) if quick else (100, 400, 1_600, 6_400, 25_600)
+    heights = (60, 120) if quick else (120, 240, 480, 960, 1_920)
+    by_count: list[Workload] = [workload(f"N = {n}", 480, 854, n, spread=8.0) for n in counts]
+    by_pixels = [workload(f"{h} x {h * 16 // 9}", h, h * 16 // 9, max(1, h * h // 300)) for h in heights]
+    rows = []
+    for axis, scenes in (("Gaussians", by_count), ("pixels", by_pixels)):
+        for backend in backends():
+            evaluated, seconds = [], []
+            for scene in scenes:
+                with threads(1):
+                    timing = medians(backend, scene, DEFAULT_CUTOFF, repeats)
+                evaluated.append(evaluated_pairs(scene, DEFAULT_CUTOFF))
+                seconds.append(timing.sum)
+                case = f"{axis}: {scene.name}"
+                rows.append(Row("growth", case, backend, 1, "pairs", evaluated[-1] / 1e6, "M"))
+                rows.append(Row("growth", case, backend, 1, "sum", 1e3 * seconds[-1], "ms"))
+            slope = float(np.polyfit(np.log(evaluated), np.log(seconds), 1)[0])
+            rows.append(Row("growth", axis, backend, 1, "exponent of time in pairs", slope, "1"))
+    return rows
+
+
+def _stiffness() -> list[Row]:
+    rows = []
+    for r in sweep([*backends(), "reference"]):
+        case = f"sigma {r.sigma:g} anisotropy {r.anisotropy:g}"
+        rows.append(Row("stiffness", case, r.backend, 1, "image", r.image, "1"))
+        rows.append(Row("stiffness", case, r.backend, 1, "gradient", r.gradient, "relative to the largest"))
+    return rows
+
+
+def _write_csv(path: Path, rows: list[Row]) -> None:
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(Row._fields)
+        writer.writerows((*r[:5], f"{r.value:.6g}", r.unit) for r in rows)

@@ -1,0 +1,163 @@
+"""Stiff and extreme scenes: finite, and within a stated bound of float64; or a clear ValueError."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs import RegionMap
+from kcgs.functional import region_splat, scale_rotation_to_cholesky
+
+FAST = ["tiled", "cpu"]
+SIZE = (40, 50)
+
+
+def compare(
+    backend: str, scene: list[Tensor], ids: Tensor | None = None, regions: RegionMap | None = None
+) -> tuple[float, float, float]:
+    """Return the image error, the gradient error relative to each component's largest, and 1 - cosine."""
+    size = SIZE if regions is None else None
+    results = []
+    for name, dtype in ((backend, torch.float32), ("reference", torch.float64)):
+        inputs = [t.detach().to(dtype).requires_grad_() for t in scene]
+        image = region_splat(*inputs, ids, regions, size=size, cutoff=0, backend=name)
+        probe = torch.cos(torch.linspace(0, 60, image.numel(), dtype=torch.float64)).view_as(image)
+        (image.double() * probe).sum().backward()
+        assert torch.isfinite(image).all()
+        results.append([image.detach().double(), *(t.grad.double() for t in inputs if t.grad is not None)])
+    got, want = results
+    assert all(torch.isfinite(g).all() for g in got)
+    gradient, angle = 0.0, 0.0
+    for g, w in zip(got[1:], want[1:], strict=True):
+        gradient = max(gradient, float(((g - w).abs() / w.abs().amax(0).clamp_min(1e-12)).max()))
+        if w.norm() > 1e-9:
+            angle = max(angle, 1 - float(torch.nn.functional.cosine_similarity(g.flatten(), w.flatten(), dim=0)))
+    return float((got[0] - want[0]).abs().max()), gradient, angle
+
+
+def centres(count: int) -> Tensor:
+    return torch.rand(count, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([50.0, 40.0])
+
+
+@pytest.mark.parametrize("backend", FAST)
+@pytest.mark.parametrize("anisotropy", [1.0, 1e2, 1e4, 1e6])
+@pytest.mark.parametrize("sigma", [0.05, 1.0, 1e2, 1e4])
+def test_sigma_and_anisotropy_at_every_angle(backend: str, sigma: float, anisotropy: float) -> None:
+    """Image within 1e-5 a Gaussian, gradients within 1e-3; whitened coordinates keep both, however thin."""
+    long = min(sigma * anisotropy, 5e7)
+    angle = torch.cat([torch.linspace(0, math.pi, 17), torch.tensor([1e-7, math.pi / 2 - 1e-7])]).double()
+    scales = torch.tensor([long, sigma], dtype=torch.float64).expand(19, 2)
+    cholesky = scale_rotation_to_cholesky(scales, angle).float()
+    image, gradient, angle_error = compare(backend, [centres(19), cholesky, torch.ones(19, 2)])
+    assert image < 1e-5 * 19
+    assert gradient < 1e-3
+    assert angle_error < 1e-6
+
+
+@pytest.mark.parametrize("backend", FAST)
+@pytest.mark.parametrize("size", [1e-8, 1.0, 1e6])
+def test_colours_of_any_size(backend: str, size: float) -> None:
+    cholesky = torch.tensor([[3.0, 1.0, 2.0]]).repeat(30, 1)
+    image, gradient, _ = compare(backend, [centres(30), cholesky, size * torch.rand(30, 3)])
+    assert image < 1e-5 * size
+    assert gradient < 1e-5
+
+
+@pytest.mark.parametrize("backend", FAST)
+@pytest.mark.parametrize("distance", [1e3, 1e5, 1e7])
+def test_centres_far_away(backend: str, distance: float) -> None:
+    angle = torch.linspace(0, 2 * math.pi, 13)
+    means = distance * torch.stack([angle.cos(), angle.sin()], -1)
+    cholesky = torch.tensor([[distance, 0.3 * distance, distance / 2]]).repeat(13, 1)
+    image, gradient, _ = compare(backend, [means, cholesky, torch.ones(13, 1)])
+    assert image < 1e-5
+    assert gradient < 1e-4
+
+
+@pytest.mark.parametrize("backend", FAST)
+@pytest.mark.parametrize("size", [(1, 1), (1, 5000), (5000, 1), (3, 17)])
+@pytest.mark.parametrize("count", [0, 1, 40])
+def test_shapes(backend: str, size: tuple[int, int], count: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(count, 2, generator=generator) * torch.tensor([float(size[1]), float(size[0])])
+    cholesky = torch.rand(count, 3, generator=generator) * 5 + 0.2
+    labels = torch.arange(size[0] * size[1]).view(size) % 3
+    ids = torch.arange(count) % 3
+    scene = [means, cholesky, torch.ones(count, 2)]
+    for softness in (0.0, 0.7):
+        image, gradient, _ = compare_any(backend, scene, ids, RegionMap.from_labels(labels, softness))
+        assert image < 1e-5 * max(count, 1)
+        assert gradient < 1e-3  # of a component that may be a small difference of large terms
+
+
+def compare_any(backend: str, scene: list[Tensor], ids: Tensor, regions: RegionMap) -> tuple[float, float, float]:
+    if len(scene[0]):
+        return compare(backend, scene, ids, regions)
+    image = region_splat(*scene, ids, regions, backend=backend)
+    return float(image.abs().max()), 0.0, 0.0
+
+
+@pytest.mark.parametrize("backend", FAST)
+@pytest.mark.parametrize("softness", [0.0, 0.7])
+def test_checkerboard(backend: str, softness: float) -> None:
+    y, x = torch.meshgrid(torch.arange(SIZE[0]), torch.arange(SIZE[1]), indexing="ij")
+    cholesky = torch.tensor([[6.0, 1.0, 4.0]]).repeat(40, 1)
+    regions = RegionMap.from_labels((x + y) % 2, softness)
+    image, gradient, _ = compare(backend, [centres(40), cholesky, torch.rand(40, 3)], torch.arange(40) % 2, regions)
+    assert image < 1e-5
+    assert gradient < 1e-5
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_65535_regions_of_a_few_pixels(backend: str) -> None:
+    labels = torch.arange(256 * 512).view(256, 512) // 2 % 65_535
+    ids = torch.arange(0, 65_535, 7)
+    generator = torch.Generator().manual_seed(0)
+    means = torch.stack([2.0 * (ids % 256) + 1, ids // 256 + 0.5], -1)
+    colors = torch.rand(len(ids), 1, generator=generator)
+    image = region_splat(
+        means, torch.tensor([[4.0, 0.0, 4.0]]).repeat(len(ids), 1), colors, ids, labels, backend=backend
+    )
+    painted = torch.zeros(65_535).index_put((ids,), colors[:, 0])
+    at = labels[0, ::2]
+    want = painted[at] * math.exp(-0.5 * (0.5 / 4) ** 2)
+    torch.testing.assert_close(image[0, 0, ::2], want, rtol=1e-4, atol=1e-6)
+    assert (image[0] > 0).float().mean() == pytest.approx(1 / 7, abs=0.01)
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_8k_image(backend: str) -> None:
+    height, width = 4320, 7680
+    means = torch.tensor([[7000.3, 4000.7], [100.0, 4319.5], [3840.0, 2160.0]])
+    cholesky = torch.tensor([[30.0, 10.0, 20.0], [50.0, 0.0, 3.0], [400.0, -300.0, 200.0]])
+    image = region_splat(means, cholesky, torch.ones(3, 1), size=(height, width), backend=backend)
+    assert torch.isfinite(image).all()
+    for (mx, my), factor in zip(means.double(), cholesky.double(), strict=True):
+        x, y = int(mx), min(int(my), height - 1)
+        window = image[0, y, x]
+        z1 = (x + 0.5 - mx) / factor[0]
+        z2 = (y + 0.5 - my - factor[1] * z1) / factor[2]
+        assert float(window) == pytest.approx(float(torch.exp(-0.5 * (z1**2 + z2**2))), abs=1e-4)
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_error_at_the_default_cutoff(backend: str) -> None:
+    """Under 1e-3 in the image and 2e-3, relative, in the gradients."""
+    generator = torch.Generator().manual_seed(0)
+    n = 150
+    means = torch.rand(n, 2, generator=generator) * torch.tensor([120.0, 90.0])
+    cholesky = (torch.rand(n, 3, generator=generator) + 0.4) * 6
+    scene = [means, cholesky, torch.rand(n, 3, generator=generator)]
+    images, grads = [], []
+    for name, cutoff, dtype in ((backend, 1e-4, torch.float32), ("reference", 0.0, torch.float64)):
+        inputs = [t.detach().clone().to(dtype).requires_grad_() for t in scene]
+        image = region_splat(*inputs, size=(90, 120), cutoff=cutoff, backend=name)
+        (image * torch.cos(torch.linspace(0, 60, image.numel(), dtype=dtype)).view_as(image)).sum().backward()
+        images.append(image.detach().double())
+        grads.append([t.grad.double() for t in inputs if t.grad is not None])
+    assert 1e-6 < (images[0] - images[1]).abs().max() < 1e-3
+    for g, w in zip(*grads, strict=True):
+        assert (g - w).abs().max() < 2e-3 * w.abs().max()

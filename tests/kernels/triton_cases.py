@@ -1,0 +1,173 @@
+"""Cases that test_cuda.py runs in a process of their own: on a GPU, or with TRITON_INTERPRET=1 in numpy."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs.kernels import Membership, SplatInputs, cuda, reference
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def make_inputs(
+    n: int = 20,
+    size: tuple[int, int] = (16, 20),
+    *,
+    regions: int = 1,
+    softness: float = 0.0,
+    channels: int = 3,
+    batch: int = 1,
+    maps: int = 1,
+    cutoff: float = 0.0,
+) -> SplatInputs:
+    generator = torch.Generator().manual_seed(0)
+    height, width = size
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    means = uniform(batch, n, 2) * torch.tensor([width, height]) * 1.2 - 0.1 * torch.tensor([width, height])
+    sigma = 0.6 * math.sqrt(height * width / max(n, 1)) + 0.3
+    cholesky = sigma * (uniform(batch, n, 3) + torch.tensor([0.3, -0.5, 0.3]))
+    index, membership = None, None
+    if regions > 1:
+        y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        labels = ((x > width // 2) + 2 * (y > height // 2)) % regions
+        labels = torch.stack([labels.roll(3 * i, 1) for i in range(maps)]).to(DEVICE)
+        membership = Membership(labels, regions, softness)
+        index = torch.randint(-1, regions, (batch, n), generator=generator).to(DEVICE)
+    arrays = (t.to(DEVICE) for t in (means, cholesky, uniform(batch, n, channels) - 0.3))
+    return SplatInputs(*arrays, index, membership, size, cutoff)
+
+
+def draw(kernel: object, inputs: SplatInputs, wanted: tuple[bool, ...] = (True, True, True)) -> list[Tensor]:
+    """Return the image and the wanted gradients."""
+    arrays = [t.detach().clone().requires_grad_(w) for t, w in zip(inputs[:3], wanted, strict=True)]
+    image = kernel(SplatInputs(*arrays, *inputs[3:]))
+    probe = torch.linspace(-1, 2, image.numel(), dtype=image.dtype, device=DEVICE).view_as(image)
+    return [image.detach(), *torch.autograd.grad((image * probe).sum(), [t for t in arrays if t.requires_grad])]
+
+
+def assert_matches_reference(inputs: SplatInputs, tolerance: float = 5e-6) -> None:
+    got = draw(cuda.splat, inputs)
+    want = draw(reference.splat, SplatInputs(*(t.double() for t in inputs[:3]), *inputs[3:]))
+    for a, b in zip(got, want, strict=True):
+        assert a.dtype == torch.float32 and a.shape == b.shape
+        assert b.abs().max() > 1e-3
+        assert (a.double() - b).abs().max() <= tolerance * b.abs().max()
+        cosine = torch.nn.functional.cosine_similarity(a.double().flatten(), b.flatten(), dim=0)
+        assert cosine >= 1 - tolerance
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 33)])
+@pytest.mark.parametrize("softness", [0.0, 0.7])
+def test_sizes(size: tuple[int, int], softness: float) -> None:
+    assert_matches_reference(make_inputs(size=size, regions=1 if size == (1, 1) else 3, softness=softness))
+
+
+@pytest.mark.parametrize("cutoff", [0.0, 1e-3])
+@pytest.mark.parametrize("regions", [1, 2])
+def test_cutoffs(regions: int, cutoff: float) -> None:
+    assert_matches_reference(make_inputs(40, regions=regions, cutoff=cutoff))
+
+
+@pytest.mark.parametrize("channels", [1, 5, 32])
+def test_channels(channels: int) -> None:
+    assert_matches_reference(make_inputs(size=(16, 16), channels=channels))
+
+
+@pytest.mark.parametrize("maps", [1, 2])
+def test_batch(maps: int) -> None:
+    assert_matches_reference(make_inputs(batch=2, maps=maps, regions=3, softness=0.7))
+
+
+def test_tile_inside_one_region_beside_mixed_tiles() -> None:
+    inputs = make_inputs(size=(16, 48), regions=2)
+    assert inputs.membership is not None
+    assert len(inputs.membership.tiles(16).keys) > (inputs.membership.tiles(16).plane < 0).sum() > 0
+    assert_matches_reference(inputs)
+
+
+def test_list_longer_than_a_piece() -> None:
+    inputs = make_inputs(300, size=(9, 16), regions=2, softness=0.5)
+    assert inputs.means.shape[1] > 4 * cuda._PIECE
+    assert_matches_reference(inputs, 2e-5)
+
+
+def test_slanted_needles() -> None:
+    angles = torch.linspace(0.1, math.pi, 20, dtype=torch.float64)
+    cos, sin = angles.cos(), angles.sin()
+    l11 = torch.hypot(1e4 * cos, sin)
+    cholesky = torch.stack([l11, (1e8 - 1) * sin * cos / l11, 1e4 / l11], -1).float()[None].to(DEVICE)
+    inputs = make_inputs()._replace(cholesky=cholesky)
+    want = reference.splat(SplatInputs(*(t.double() for t in inputs[:3]), *inputs[3:]))
+    got = draw(cuda.splat, inputs)
+    assert (got[0] - want).abs().max() < 1e-5 * 20
+    assert all(torch.isfinite(t).all() for t in got)
+
+
+def test_only_what_is_asked() -> None:
+    inputs = make_inputs(regions=2)
+    _, means, cholesky, colors = draw(cuda.splat, inputs)
+    assert torch.equal(draw(cuda.splat, inputs, (False, False, True))[1], colors)
+    assert torch.equal(draw(cuda.splat, inputs, (True, False, False))[1], means)
+    assert torch.equal(draw(cuda.splat, inputs, (False, True, False))[1], cholesky)
+
+
+def test_gradient_that_is_not_contiguous() -> None:
+    inputs = make_inputs()
+    means = inputs.means.clone().requires_grad_()
+    image = cuda.splat(inputs._replace(means=means))
+    (ones,) = torch.autograd.grad(image.sum(), means, retain_graph=True)  # an expanded scalar
+    (same,) = torch.autograd.grad((image.permute(0, 2, 3, 1) * torch.ones(1, device=DEVICE)).sum(), means)
+    assert torch.equal(ones, same) and ones.abs().max() > 0
+
+
+def test_nothing_to_draw() -> None:
+    for inputs in (make_inputs(0), make_inputs(3)._replace(means=torch.full((1, 3, 2), 1e6, device=DEVICE))):
+        image, *gradients = draw(cuda.splat, inputs)
+        assert torch.equal(image, torch.zeros(1, 3, 16, 20, device=DEVICE))
+        for gradient, array in zip(gradients, inputs[:3], strict=True):
+            assert torch.equal(gradient, torch.zeros_like(array))
+
+
+def test_same_bits_every_time() -> None:
+    inputs = make_inputs(60, regions=3, softness=0.7)
+    first, second = draw(cuda.splat, inputs), draw(cuda.splat, inputs)
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+TYPES = {
+    **dict.fromkeys(("start", "gaussian", "plane", "order", "tiles", "firsts"), "*i64"),
+    **dict.fromkeys(("image", "colors", "coefficients", "planes", "terms", "grad"), "*fp32"),
+    **dict.fromkeys(("rows", "cols", "height", "width", "count"), "i32"),
+    "cutoff": "fp32",
+}
+
+
+@pytest.mark.skipif(cuda._interpreted(), reason="the interpreter does not compile")
+@pytest.mark.parametrize("capability", [80, 90])
+@pytest.mark.parametrize("channels", [3, 32])
+@pytest.mark.parametrize("mapped", [False, True])
+def test_compiles(capability: int, channels: int, mapped: bool) -> None:
+    import triton
+    from triton.backends.compiler import GPUTarget
+
+    block = min(cuda._MOST_CHANNELS, 1 << (channels - 1).bit_length())
+    common = {"SIDE": 16, "CHANNELS": channels, "BLOCK": block, "MAPPED": mapped}
+    gather = {**common, "GEOMETRY": True, "PIECE": cuda._PIECE}
+    for kernel, constants, warps in (
+        (cuda._draw_tile, common, cuda._DRAW_WARPS),
+        (cuda._gather_piece, gather, 1),
+    ):
+        signature = {name: TYPES.get(name, "constexpr") for name in kernel.arg_names}
+        source = triton.compiler.ASTSource(kernel, signature, constants)
+        target = GPUTarget("cuda", capability, 32)
+        ptx = triton.compile(source, target=target, options={"num_warps": warps}).asm["ptx"]
+        # a thread owns its sums: lanes exchange nothing
+        assert "ex2.approx" in ptx
+        assert "shfl" not in ptx
