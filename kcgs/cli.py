@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import signal
 import sys
@@ -300,6 +301,8 @@ class _Progress:
 
 def main() -> None:
     """Run the command: exit 0 done, 1 failed with one line that says why, 2 wrong usage."""
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("kcgs").setLevel(logging.INFO)
     try:
         app(prog_name="kcgs")
     except (ValueError, TypeError, OSError, ImportError) as error:

@@ -10,12 +10,11 @@ import hashlib
 import logging
 import math
 import os
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -45,6 +44,7 @@ def splat(inputs: SplatInputs) -> Tensor:
         raise ValueError(f"backend 'cpu' computes in float32; got {inputs.means.dtype}: use 'tiled' or 'reference'")
     if inputs.means.device.type != "cpu":
         raise ValueError(f"backend 'cpu' needs tensors on the CPU; got {inputs.means.device}")
+    _prepare(_tag(inputs.colors.shape[-1]))
     return apply_kernel(Steps(plan, _render, _differentiate), inputs)
 
 
@@ -57,24 +57,24 @@ def _loops() -> Loops:
 
 
 @functools.cache
-def _announced(channels: int) -> threading.Lock:
-    return threading.Lock()
-
-
-_ready: set[tuple[str, int]] = set()
-
-
-def _first_time(name: str, channels: int, call: Callable[[], None]) -> None:
-    """Run `call`; the first time, say how long the code took to compile or to load."""
-    if (name, channels) in _ready:
-        call()
-        return
+def _prepare(tag: tuple[float, ...]) -> None:
+    """Compile the loops for this number of channels, or load them from disk, and say how long it took."""
     start = time.perf_counter()
-    loops: Any = getattr(_loops(), name)
-    call()
-    _ready.add((name, channels))
-    how = "compiled" if sum(loops.stats.cache_misses.values()) else "loaded from disk"
-    log.info("kcgs: CPU kernel (%s, %d channels) %s in %.1f s", name, channels, how, time.perf_counter() - start)
+    channels = len(tag)
+    inputs = SplatInputs(
+        torch.full((1, 1, 2), 8.0), torch.ones(1, 1, 3), torch.ones(1, 1, channels), None, None, (16, 16), 1e-4
+    )
+    planned = plan(inputs)
+    _differentiate(planned, inputs, _render(planned, inputs), geometry=True)
+    compiled = any(loop.stats.cache_misses for loop in cast(Any, _loops()))
+    log.log(
+        logging.WARNING if compiled else logging.INFO,
+        "kcgs: %s the CPU kernel for %d channels in %.1f s%s",
+        "compiled" if compiled else "loaded",
+        channels,
+        time.perf_counter() - start,
+        ", kept on disk for next time" if compiled else "",
+    )
 
 
 def _tag(channels: int) -> tuple[float, ...]:
@@ -129,7 +129,7 @@ def _render(planned: _Plan, inputs: SplatInputs) -> Tensor:
     def draw(offset: int, step: int) -> None:
         loop(planned.scene, offset, step, image.numpy(), tag)
 
-    _first_time("draw", channels, lambda: _share(draw, planned.scene))
+    _share(draw, planned.scene)
     return image
 
 
@@ -143,7 +143,7 @@ def _differentiate(planned: _Plan, inputs: SplatInputs, grad: Tensor, geometry: 
     def gather(offset: int, step: int) -> None:
         loop(planned.scene, offset, step, values, terms, geometry, tag)
 
-    _first_time("gather", channels, lambda: _share(gather, planned.scene))
+    _share(gather, planned.scene)
     means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs[:3])
     flat = [t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors)]
     _loops().finish(planned.scene, planned.order, terms, *flat)

@@ -31,6 +31,8 @@ _MOST_CHANNELS = 8
 # Gaussians of a program of the backward, one a thread of its one warp
 _PIECE = 32
 _DRAW_WARPS = 4
+# multiply and add in one: Triton 3.9 warns where it is not said, and 3.10 will leave it out
+_OPTIONS = {"enable_fp_fusion": True}
 
 
 class _Plan(NamedTuple):
@@ -66,10 +68,10 @@ def _make_plan(inputs: SplatInputs) -> _Plan:
     pairs = bin_gaussians(inputs)
     order = torch.argsort(pairs.tile, stable=True)
     counts = _starts(pairs.gaussian, inputs.means.shape[0] * inputs.means.shape[1]).diff()
-    pairs = Pairs(*(None if t is None else t[order] for t in pairs))
-    planes = None
+    plane, planes = None, None
     if pairs.plane is not None and inputs.membership is not None:
-        planes = inputs.membership.derived("cuda", _planes)
+        plane, planes = pairs.plane[order], inputs.membership.derived("cuda", _planes)
+    pairs = Pairs(pairs.gaussian[order], pairs.tile[order], plane, pairs.origin[order])
     start = _starts(pairs.tile, grid_of(inputs).total)
     return _Plan(start, _coefficients(pairs, inputs), pairs.gaussian, pairs.plane, planes, order, counts)
 
@@ -104,22 +106,32 @@ def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
     programs = grid.total, -(-channels // constants["BLOCK"])
     with torch.cuda.device_of(image):
         _draw_tile[programs](
-            image, colors, grid.rows, grid.cols, *inputs.size, *_lists(plan, inputs), **constants, num_warps=_DRAW_WARPS
+            image,
+            colors,
+            grid.rows,
+            grid.cols,
+            *inputs.size,
+            *_lists(plan, inputs),
+            **constants,
+            num_warps=_DRAW_WARPS,
+            **_OPTIONS,
         )
     return image
 
 
 def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
+    if not len(plan.order):
+        means, cholesky, colors = (torch.zeros_like(t) for t in inputs[:3])
+        return (means, cholesky, colors) if geometry else (None, None, colors)
     channels = inputs.colors.shape[-1]
     terms = inputs.colors.new_empty(len(plan.order), channels + (_MOMENTS if geometry else 0))
     tile, first = _pieces(plan)
-    if len(tile):
-        # channels first, so that the compiler gives whole Gaussians to threads
-        colors = inputs.colors.detach().flatten(0, 1).T.contiguous()
-        arguments = terms, plan.order, tile, first, _by_tile(grad, inputs), colors, colors.shape[1]
-        constants = {**_constants(plan, inputs), "GEOMETRY": geometry, "PIECE": _PIECE}
-        with torch.cuda.device_of(terms):
-            _gather_piece[(len(tile),)](*arguments, *_lists(plan, inputs), **constants, num_warps=1)
+    # channels first, so that the compiler gives whole Gaussians to threads
+    colors = inputs.colors.detach().flatten(0, 1).T.contiguous()
+    arguments = terms, plan.order, tile, first, _by_tile(grad, inputs), colors, colors.shape[1]
+    constants = {**_constants(plan, inputs), "GEOMETRY": geometry, "PIECE": _PIECE}
+    with torch.cuda.device_of(terms):
+        _gather_piece[(len(tile),)](*arguments, *_lists(plan, inputs), **constants, num_warps=1, **_OPTIONS)
     total = _sum_runs(terms, plan.counts).unflatten(0, inputs.means.shape[:2])
     if not geometry:
         return None, None, total

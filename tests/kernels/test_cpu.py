@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -137,3 +138,21 @@ def test_auto_is_this_kernel(scene: tuple[Tensor, ...]) -> None:
     assert torch.equal(region_splat(*scene), region_splat(*scene, backend="cpu"))
     double = [t.double() for t in scene[:3]]
     assert torch.equal(region_splat(*double, *scene[3:]), region_splat(*double, *scene[3:], backend="tiled"))
+
+
+def test_first_call_says_what_it_took(tmp_path: Path) -> None:
+    code = (
+        "import logging, torch; logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
+        "from kcgs.functional import region_splat\n"
+        "for _ in range(2): region_splat(torch.ones(1, 2), torch.ones(1, 3), torch.ones(1, 1), size=(4, 4))\n"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", code]
+    words, seconds = [], []
+    for _ in range(2):
+        err = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stderr
+        (line,) = [line for line in err.splitlines() if line.startswith("kcgs: ")]
+        words.append(line.split()[1])
+        seconds.append(float(line.split(" in ")[1].split()[0]))
+    assert words == ["compiled", "loaded"]
+    assert seconds[1] < seconds[0]
