@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import signal
 import sys
 from enum import Enum
@@ -33,6 +34,7 @@ class Backend(str, Enum):
     reference = "reference"
     tiled = "tiled"
     cpu = "cpu"
+    cuda = "cuda"
 
 
 ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE")]
@@ -301,6 +303,8 @@ class _Progress:
 
 def main() -> None:
     """Run the command: exit 0 done, 1 failed with one line that says why, 2 wrong usage."""
+    # before torch is imported: threads that wait spinning would keep the kernel's threads from their cores
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     logging.basicConfig(format="%(message)s")
     logging.getLogger("kcgs").setLevel(logging.INFO)
     try:

@@ -32,6 +32,7 @@ class RegionMap:
     ids: Tensor  # (R,) int64, sorted
     softness: float = 0.0
     _membership: Membership = field(repr=False, kw_only=True)
+    _table: Tensor | None = field(repr=False, kw_only=True)
 
     @classmethod
     def from_labels(cls, labels: Tensor, softness: float = 0.0) -> RegionMap:
@@ -49,9 +50,9 @@ class RegionMap:
         softness = float(softness)
         if not 0.0 <= softness <= MAX_SOFTNESS:
             raise ValueError(f"softness must be in [0, {MAX_SOFTNESS:g}] pixels; got {softness!r}")
-        ids, index = _compact(labels)
+        ids, index, table = _compact(labels)
         batched = index if index.ndim == 3 else index[None]
-        return cls(labels, ids, softness, _membership=Membership(batched, len(ids), softness))
+        return cls(labels, ids, softness, _membership=Membership(batched, len(ids), softness), _table=table)
 
     @property
     def num_regions(self) -> int:
@@ -65,6 +66,8 @@ class RegionMap:
 
     def index_of(self, region_ids: Tensor) -> Tensor:
         """Return the position of each id among `ids`, -1 where the map does not hold it."""
+        if self._table is not None:
+            return self._table[region_ids.clamp(-1, len(self._table) - 1)]
         at = torch.searchsorted(self.ids, region_ids).clamp_max(self.num_regions - 1)
         return torch.where(self.ids[at] == region_ids, at, -1)
 
@@ -73,8 +76,13 @@ class RegionMap:
         device = torch.device(device)
         if device == self.labels.device:
             return self
-        moved = self._membership.to(device)
-        return RegionMap(self.labels.to(device), self.ids.to(device), self.softness, _membership=moved)
+        return RegionMap(
+            self.labels.to(device),
+            self.ids.to(device),
+            self.softness,
+            _membership=self._membership.to(device),
+            _table=None if self._table is None else self._table.to(device),
+        )
 
     def resize(self, size: tuple[int, int]) -> RegionMap:
         """Sample the map at another resolution; contours are smoothed, not stepped, and the softness scales along.
@@ -101,16 +109,20 @@ class RegionMap:
         return RegionMap.from_labels(_sample_labels(self.labels, height, width), softness)
 
 
-def _compact(labels: Tensor) -> tuple[Tensor, Tensor]:
+def _compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return the sorted ids, each pixel's position among them, and for small ids a table from id to position.
+
+    The table ends with -1, for ids beyond it and for -1.
+    """
     highest = int(labels.max())
     if highest < 1 << 16:  # a table is ten times faster than sorting every pixel
         present = torch.zeros(highest + 1, dtype=torch.bool, device=labels.device)
         present[labels.flatten()] = True
         ids = present.nonzero().flatten()
-        table = present.to(torch.int32).cumsum(0, dtype=torch.int32) - 1
-        return ids, table[labels]
+        table = torch.where(present, present.cumsum(0) - 1, -1)
+        return ids, table.to(torch.int32)[labels], torch.nn.functional.pad(table, (0, 1), value=-1)
     ids, index = torch.unique(labels, return_inverse=True)
-    return ids, index.to(torch.int32)
+    return ids, index.to(torch.int32), None
 
 
 def _sample_labels(labels: Tensor, height: int, width: int) -> Tensor:

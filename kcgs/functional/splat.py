@@ -47,7 +47,7 @@ def region_splat(
         size: (height, width); needed without `regions`, else it must equal theirs.
         cutoff: weights below it are skipped, in [0, 1); 0 evaluates all. The image is off by at most cutoff times the
             sum of the absolute colours that overlap there.
-        backend: auto, reference, tiled or cpu.
+        backend: auto, reference, tiled, cpu or cuda.
 
     Returns:
         Image, :math:`(B, C, H, W)`, or :math:`(C, H, W)` for unbatched input, in the dtype of `colors`.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .form import support_radius
+from .form import Z_LIMIT, support_radius
 from .inputs import SplatInputs
 
 TILE = 16
@@ -100,3 +100,19 @@ def _find_planes(inputs: SplatInputs, tile: Tensor, region: Tensor) -> tuple[Ten
     key = torch.where(region >= 0, tile * inputs.membership.num_regions + region, -1)
     at = torch.searchsorted(table.keys, key).clamp_max(len(table.keys) - 1)
     return table.plane[at], table.keys[at] == key
+
+
+def coefficients(pairs: Pairs, inputs: SplatInputs) -> Tensor:
+    """Coefficients of z in tile-centred pixels, [P, 5]: z1 = k0 + k1 x, z2 = k2 + k3 x + k4 y; made in float64."""
+    l11, l21, l22 = inputs.cholesky.detach().double().flatten(0, 1)[pairs.gaussian].unbind(-1)
+    x, y = pairs.origin.unbind(-1)
+    slope = l21 / l11
+    rows = torch.stack([x / l11, 1 / l11, (y - slope * x) / l22, -slope / l22, 1 / l22], -1)
+    return rows.clamp(-Z_LIMIT, Z_LIMIT).to(inputs.means.dtype)
+
+
+def sum_runs(values: Tensor, counts: Tensor) -> Tensor:
+    """Sum consecutive runs of rows: the same order of addition every time, on any device."""
+    if len(counts) == 0:
+        return values.new_zeros(0, values.shape[-1])
+    return torch.segment_reduce(values, "sum", lengths=counts, axis=0, initial=0.0)

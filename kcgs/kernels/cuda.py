@@ -11,12 +11,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .binning import TILE, Pairs, bin_gaussians, grid_of
+from .binning import TILE, Pairs, bin_gaussians, coefficients, grid_of, sum_runs
 from .form import moments_to_gradients
 from .function import Gradients, Steps, apply_kernel
 from .inputs import SplatInputs
 from .membership import Membership
-from .tiled import _coefficients, _sum_runs
 
 try:
     import triton
@@ -73,7 +72,7 @@ def _make_plan(inputs: SplatInputs) -> _Plan:
         plane, planes = pairs.plane[order], inputs.membership.derived("cuda", _planes)
     pairs = Pairs(pairs.gaussian[order], pairs.tile[order], plane, pairs.origin[order])
     start = _starts(pairs.tile, grid_of(inputs).total)
-    return _Plan(start, _coefficients(pairs, inputs), pairs.gaussian, pairs.plane, planes, order, counts)
+    return _Plan(start, coefficients(pairs, inputs), pairs.gaussian, pairs.plane, planes, order, counts)
 
 
 def _planes(membership: Membership) -> Tensor:
@@ -132,7 +131,7 @@ def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: boo
     constants = {**_constants(plan, inputs), "GEOMETRY": geometry, "PIECE": _PIECE}
     with torch.cuda.device_of(terms):
         _gather_piece[(len(tile),)](*arguments, *_lists(plan, inputs), **constants, num_warps=1, **_OPTIONS)
-    total = _sum_runs(terms, plan.counts).unflatten(0, inputs.means.shape[:2])
+    total = sum_runs(terms, plan.counts).unflatten(0, inputs.means.shape[:2])
     if not geometry:
         return None, None, total
     colors, first_moments, second_moments = total.split([channels, 2, 3], -1)

@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
+import functools
+import warnings
 from collections.abc import Callable
-from importlib import import_module
+from importlib import import_module, util
 
 import torch
 from torch import Tensor
 
 from .inputs import SplatInputs
 
-BACKENDS = ("auto", "reference", "tiled", "cpu")
+BACKENDS = ("auto", "reference", "tiled", "cpu", "cuda")
 
 Kernel = Callable[[SplatInputs], Tensor]
+
+
+def _runs(device: str) -> bool:
+    return device == "cpu" or (device == "cuda" and _has_triton())
+
+
+@functools.cache
+def _has_triton() -> bool:
+    if util.find_spec("triton") is not None:
+        return True
+    warnings.warn(
+        "Triton is not installed: drawing on CUDA takes the slower 'tiled' (pip install triton)", stacklevel=2
+    )
+    return False
 
 
 def resolve(backend: str, device: torch.device, dtype: torch.dtype) -> Kernel:
@@ -25,6 +41,6 @@ def resolve(backend: str, device: torch.device, dtype: torch.dtype) -> Kernel:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
     name = backend
     if backend == "auto":
-        name = "cpu" if device.type == "cpu" and dtype == torch.float32 else "tiled"
+        name = device.type if dtype == torch.float32 and _runs(device.type) else "tiled"
     kernel: Kernel = import_module(f"{__package__}.{name}").splat
     return kernel

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .binning import TILE, Pairs, bin_gaussians, grid_of
-from .form import Z_LIMIT, lowest_exponent, moments_to_gradients
+from .binning import TILE, Pairs, bin_gaussians, coefficients, grid_of, sum_runs
+from .form import lowest_exponent, moments_to_gradients
 from .function import Gradients, Steps, apply_kernel
 from .inputs import SplatInputs
 
@@ -66,7 +66,7 @@ def _make_plan(inputs: SplatInputs) -> _Plan:
         for kind in (False, True)
         for batch in _batches((mixed == kind).nonzero().flatten(), start, length, order, kind)
     ]
-    return _Plan(pairs, batches, tiles[owner], _coefficients(pairs, inputs), planes)
+    return _Plan(pairs, batches, tiles[owner], _padded(coefficients(pairs, inputs)), planes)
 
 
 def _batches(chosen: Tensor, start: Tensor, length: Tensor, order: Tensor, mixed: bool) -> Iterator[_Batch]:
@@ -84,13 +84,8 @@ def _batches(chosen: Tensor, start: Tensor, length: Tensor, order: Tensor, mixed
         at = stop
 
 
-def _coefficients(pairs: Pairs, inputs: SplatInputs) -> Tensor:
-    l11, l21, l22 = inputs.cholesky.detach().double().flatten(0, 1)[pairs.gaussian].unbind(-1)
-    x, y = pairs.origin.unbind(-1)
-    slope = l21 / l11
-    rows = torch.stack([x / l11, 1 / l11, (y - slope * x) / l22, -slope / l22, 1 / l22], -1)
-    rows = rows.clamp(-Z_LIMIT, Z_LIMIT).to(inputs.means.dtype)
-    return torch.cat([rows, rows.new_zeros(1, 5)])
+def _padded(rows: Tensor) -> Tensor:
+    return torch.cat([rows, rows.new_zeros(1, rows.shape[-1])])
 
 
 def _bases(like: Tensor) -> tuple[Tensor, Tensor]:
@@ -116,8 +111,7 @@ def _weights(plan: _Plan, batch: _Batch, bases: tuple[Tensor, Tensor], cutoff: f
 
 
 def _padded_colors(plan: _Plan, inputs: SplatInputs) -> Tensor:
-    colors = inputs.colors.detach().flatten(0, 1)[plan.pairs.gaussian]
-    return torch.cat([colors, colors.new_zeros(1, colors.shape[-1])])  # [P + 1, C]
+    return _padded(inputs.colors.detach().flatten(0, 1)[plan.pairs.gaussian])  # [P + 1, C]
 
 
 def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
@@ -129,7 +123,7 @@ def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
         values[batch.segments] = colors[batch.entries].transpose(1, 2) @ weight
     tiles, counts = torch.unique_consecutive(plan.segment_tile, return_counts=True)
     if len(tiles) < len(values):
-        values = _sum_runs(values.flatten(1), counts).unflatten(1, (channels, _PIXELS))
+        values = sum_runs(values.flatten(1), counts).unflatten(1, (channels, _PIXELS))
     grid = grid_of(inputs)
     image = colors.new_zeros(grid.total, channels, _PIXELS)
     image[tiles] = values
@@ -156,7 +150,7 @@ def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: boo
             parts.append(_moments(z1, z2, weight.mul_(colors[batch.entries] @ local)))
         sums[batch.entries] = torch.cat(parts, -1)
     counts = torch.bincount(plan.pairs.gaussian, minlength=inputs.means.shape[0] * inputs.means.shape[1])
-    total = _sum_runs(sums[:-1], counts).unflatten(0, inputs.means.shape[:2])
+    total = sum_runs(sums[:-1], counts).unflatten(0, inputs.means.shape[:2])
     colors = total[..., :channels]
     if not geometry:
         return None, None, colors
@@ -171,8 +165,3 @@ def _moments(z1: Tensor, z2: Tensor, value: Tensor) -> Tensor:
     mean = torch.stack([first.sum(-1), second.sum(-1)], -1)
     cross = (second * z1).sum(-1)
     return torch.cat([mean, torch.stack([first.mul_(z1).sum(-1), cross, second.mul_(z2).sum(-1)], -1)], -1)
-
-
-def _sum_runs(values: Tensor, counts: Tensor) -> Tensor:
-    """Sum consecutive runs of rows: the same order of addition every time, on any device."""
-    return torch.segment_reduce(values, "sum", lengths=counts, axis=0, initial=0.0)

@@ -20,7 +20,7 @@ class RegionSplatRenderer(nn.Module):
     Args:
         cutoff: weights below it are skipped, in [0, 1); see :func:`kcgs.functional.region_splat`.
         clamp: clip the image to [0, 1].
-        backend: auto, reference, tiled or cpu.
+        backend: auto, reference, tiled, cpu or cuda.
 
     Raises:
         ValueError: cutoff out of range.

@@ -245,7 +245,10 @@ class TestConventions:
 
     def test_empty(self, backend: str) -> None:
         empty = torch.zeros(0, 2), torch.zeros(0, 3), torch.zeros(0, 3)
-        assert torch.equal(region_splat(*empty, size=(4, 5), backend=backend), torch.zeros(3, 4, 5))
+        image = region_splat(*(t.requires_grad_() for t in empty), size=(4, 5), backend=backend)
+        assert torch.equal(image, torch.zeros(3, 4, 5))
+        image.sum().backward()
+        assert empty[0].grad is None or empty[0].grad.shape == (0, 2)
 
     @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
     def test_half_is_computed_in_float32(self, backend: str, dtype: torch.dtype) -> None:
@@ -363,7 +366,7 @@ class TestErrors:
             ({"size": (2, 2)}, ValueError, r"size must equal the size of regions, \(1, 2\); got \(2, 2\)"),
             ({"cutoff": 1.0}, ValueError, r"cutoff must be in \[0, 1\); got 1.0"),
             ({"cutoff": math.nan}, ValueError, "cutoff must be in"),
-            ({"backend": "gpu"}, ValueError, "backend must be one of auto, reference, tiled, cpu"),
+            ({"backend": "gpu"}, ValueError, "backend must be one of auto, reference, tiled, cpu, cuda"),
         ],
     )  # fmt: skip
     def test_bad_input(self, change: dict[str, object], error: type[Exception], words: str) -> None:
