@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 
 import torch
@@ -46,6 +47,28 @@ def check_integer(name: str, value: object, dims: Sequence[int] = ()) -> Tensor:
     return tensor
 
 
+def check_ids(name: str, value: object, like: Tensor) -> Tensor:
+    """Return region ids as int64: integer, one for each centre of `like` (..., 2), on its device, none negative."""
+    tensor = check_integer(name, value)
+    if tensor.shape != like.shape[:-1]:
+        raise ValueError(f"{name} must have shape {tuple(like.shape[:-1])}; got {tuple(tensor.shape)}")
+    if tensor.device != like.device:
+        raise ValueError(f"{name} must be on {like.device} with means; got {tensor.device}")
+    tensor = tensor.long()
+    if tensor.numel() and int(tensor.min()) < 0:
+        raise ValueError(f"{name} must be non-negative; got {int(tensor.min())}")
+    return tensor
+
+
+def check_cutoff(value: object) -> float:
+    """Return the cutoff if it is a number in [0, 1)."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"cutoff must be a number in [0, 1); got {value!r}")
+    if not 0.0 <= value < 1.0:
+        raise ValueError(f"cutoff must be in [0, 1); got {value!r}")
+    return float(value)
+
+
 def check_labels(name: str, value: object) -> Tensor:
     """Return a label map as int64: integer, (H, W) or (B, H, W), at least one pixel, no negative id."""
     tensor = check_integer(name, value, dims=(2, 3))
@@ -62,8 +85,9 @@ def check_size(name: str, value: object) -> tuple[int, int]:
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
         raise TypeError(f"{name} must be a pair (height, width); got {value!r}")
     height, width = value
-    if any(isinstance(n, bool) or not isinstance(n, int) for n in value):
+    if any(isinstance(n, bool) or not hasattr(n, "__index__") for n in value):
         raise TypeError(f"{name} must hold two integers (height, width); got {value!r}")
+    height, width = operator.index(height), operator.index(width)
     if height < 1 or width < 1:
         raise ValueError(f"{name} must be at least 1 x 1; got {value!r}")
     return height, width

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
 import signal
 import sys
 from enum import Enum
@@ -36,6 +35,8 @@ class Backend(str, Enum):
     cpu = "cpu"
     cuda = "cuda"
 
+
+_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
 ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE")]
 SceneFile = Annotated[Path, typer.Argument(help="Scene file (.safetensors).", metavar="SCENE")]
@@ -97,6 +98,7 @@ def render(
     from kcgs.io import load
     from kcgs.nn.renderer import render_image
 
+    _check_output(output, *_IMAGES)
     loaded = load(scene)
     field = loaded.field
     target = _target_size(field.size, scale, size)
@@ -124,6 +126,8 @@ def eval_command(
 
     loaded = load(scene)
     picture = load_image(image)
+    if picture.shape[1:] != loaded.field.size:
+        raise ValueError(f"IMAGE must have the size {loaded.field.size} of SCENE; got {tuple(picture.shape[1:])}")
     labels = loaded.regions.labels if loaded.regions is not None else None
     if regions is not None:
         labels = load_labels(Path(regions))
@@ -142,6 +146,7 @@ def segment(
     from kcgs.data import load_image, save_labels
     from kcgs.segment import segment as make_labels
 
+    _check_output(output, ".png", ".npy")
     labels = make_labels(load_image(image), method)
     save_labels(output, labels)
     areas = labels.flatten().bincount()
@@ -189,10 +194,10 @@ def bench(
     run(name, output, data=data, quick=quick)
 
 
-def _check_output(path: Path, suffix: str) -> None:
+def _check_output(path: Path, *suffixes: str) -> None:
     # before the work, not after it
-    if path.suffix != suffix:
-        raise ValueError(f"--output must end in {suffix}; got {str(path)!r}")
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"--output must end in {' or '.join(suffixes)}; got {str(path)!r}")
     if not path.resolve().parent.is_dir():
         raise FileNotFoundError(f"--output needs an existing folder; {str(path.resolve().parent)!r} is not there")
 
@@ -303,14 +308,12 @@ class _Progress:
 
 def main() -> None:
     """Run the command: exit 0 done, 1 failed with one line that says why, 2 wrong usage."""
-    # before torch is imported: threads that wait spinning would keep the kernel's threads from their cores
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     logging.basicConfig(format="%(message)s")
     logging.getLogger("kcgs").setLevel(logging.INFO)
     try:
         app(prog_name="kcgs")
-    except (ValueError, TypeError, OSError, ImportError) as error:
-        typer.echo(f"kcgs: {' '.join(str(error).split())}", err=True)
+    except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
+        typer.echo(f"kcgs: {' '.join(str(error).split()) or type(error).__name__}", err=True)
         sys.exit(1)
 
 

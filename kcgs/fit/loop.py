@@ -48,6 +48,8 @@ class FitResult(NamedTuple):
     config: FitConfig
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def fit(
     image: Tensor,
     regions: RegionMap | Tensor | None = None,
@@ -91,6 +93,8 @@ def fit(
     config = FitConfig.from_recipe(recipe) if config is None else config
     start = time.perf_counter()
     image, regions = _check_problem(image, regions, num_gaussians)
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
+        raise ValueError(f"seed must be an integer in [0, 2**63); got {seed!r}")
     drawn = _regions_to_draw(regions, config)
     monitor = _Monitor(image, regions, start)
 
@@ -168,7 +172,8 @@ def _check_problem(
             )
         regions = regions.to(image.device)
     dtype = torch.float64 if image.dtype == torch.float64 else torch.float32
-    return image.detach().to(dtype), regions
+    # a copy: an inference tensor cannot take part in a graph
+    return image.detach().to(dtype, copy=True), regions
 
 
 def _regions_to_draw(regions: RegionMap | None, config: FitConfig) -> RegionMap | None:
@@ -243,4 +248,4 @@ class _Monitor:
 
 
 def _decibel(mean_square: float) -> float:
-    return -10.0 * math.log10(mean_square) if mean_square > 0 else math.inf
+    return math.inf if mean_square == 0 else -10.0 * math.log10(mean_square)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcgs._check import check_floating
+from kcgs._check import check_cutoff, check_floating
 from kcgs.kernels.form import support_radius
 
 
@@ -174,7 +174,6 @@ def support_extent(cholesky: Tensor, cutoff: float = 1e-4) -> Tensor:
         tensor([ 3.0350, 15.1740])
     """
     l11, l21, l22 = check_cholesky("cholesky", cholesky).unbind(-1)
-    if not 0.0 <= cutoff < 1.0:
-        raise ValueError(f"cutoff must be in [0, 1); got {cutoff!r}")
+    cutoff = check_cutoff(cutoff)
     dtype = torch.float64 if cholesky.dtype == torch.float64 else torch.float32
     return torch.stack([l11, torch.hypot(l21, l22)], -1) * support_radius(cutoff, dtype)

@@ -47,6 +47,8 @@ class RegionMap:
             ValueError: wrong shape, no pixels, negative ids, softness out of range.
         """
         labels = check_labels("labels", labels)
+        if isinstance(softness, bool) or not isinstance(softness, int | float):
+            raise TypeError(f"softness must be a number of pixels; got {softness!r}")
         softness = float(softness)
         if not 0.0 <= softness <= MAX_SOFTNESS:
             raise ValueError(f"softness must be in [0, {MAX_SOFTNESS:g}] pixels; got {softness!r}")
@@ -68,7 +70,7 @@ class RegionMap:
         """Return the position of each id among `ids`, -1 where the map does not hold it."""
         if self._table is not None:
             return self._table[region_ids.clamp(-1, len(self._table) - 1)]
-        at = torch.searchsorted(self.ids, region_ids).clamp_max(self.num_regions - 1)
+        at = torch.searchsorted(self.ids, region_ids.contiguous()).clamp_max(self.num_regions - 1)
         return torch.where(self.ids[at] == region_ids, at, -1)
 
     def to(self, device: torch.device | str) -> RegionMap:

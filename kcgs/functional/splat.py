@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcgs._check import check_floating, check_integer, check_size, check_tensor
+from kcgs._check import check_cutoff, check_floating, check_ids, check_size, check_tensor
 from kcgs.kernels import Membership, SplatInputs, resolve
 
 from .covariance import check_cholesky
@@ -35,7 +35,8 @@ def region_splat(
 
     Convention: points are (x, y) in pixels and pixel (j, i) is sampled at (j + 0.5, i + 0.5); a Gaussian whose id the
     map does not hold draws nothing; N = 0 gives a black image. Half precision is computed in float32. The result is
-    not clamped. Once differentiable in means, cholesky and colors.
+    not clamped. Once differentiable in means, cholesky and colors, by
+    `backward` and `torch.autograd.grad` (transforms of `torch.func` only through backend "reference").
 
     Args:
         means: centres in pixels, within 1e8, :math:`(B, N, 2)`, or all without B.
@@ -68,11 +69,10 @@ def region_splat(
     batched = means.ndim == 3
     dtype = torch.float64 if torch.float64 in (means.dtype, cholesky.dtype, colors.dtype) else torch.float32
     arrays = [t.to(dtype) if batched else t.to(dtype)[None] for t in (means, cholesky, colors)]
-    if not isinstance(cutoff, int | float) or not 0.0 <= cutoff < 1.0:
-        raise ValueError(f"cutoff must be in [0, 1); got {cutoff!r}")
+    cutoff = check_cutoff(cutoff)
     index, membership, size = _resolve_regions(means, region_ids, regions, size)
     kernel = resolve(backend, means.device, dtype)
-    image = kernel(SplatInputs(arrays[0], arrays[1], arrays[2], index, membership, size, float(cutoff)))
+    image = kernel(SplatInputs(arrays[0], arrays[1], arrays[2], index, membership, size, cutoff))
     return (image if batched else image.squeeze(0)).to(colors.dtype)
 
 
@@ -101,7 +101,7 @@ def _check_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
         raise ValueError(f"means must be within {MEAN_LIMIT:g} pixels; got {max(-low, high):g}")
     least, most = (float(t) for t in torch.aminmax(cholesky[..., ::2]))
     low, high = (float(t) for t in torch.aminmax(cholesky[..., 1]))
-    if not (least >= SCALE_LIMITS[0] and max(most, -low, high) <= SCALE_LIMITS[1]):
+    if not (least >= SCALE_LIMITS[0] * (1 - 1e-6) and max(most, -low, high) <= SCALE_LIMITS[1]):
         check_cholesky("cholesky", cholesky)
         raise ValueError(
             f"cholesky must have l11, l22 in [{SCALE_LIMITS[0]:g}, {SCALE_LIMITS[1]:g}] pixels and |l21| at most "
@@ -118,13 +118,7 @@ def _resolve_regions(
     if size is not None:
         size = check_size("size", size)
     if region_ids is not None:
-        check_integer("region_ids", region_ids)
-        if region_ids.shape != means.shape[:-1]:
-            raise ValueError(f"region_ids must have shape {tuple(means.shape[:-1])}; got {tuple(region_ids.shape)}")
-        if region_ids.device != means.device:
-            raise ValueError(f"region_ids must be on {means.device} with means; got {region_ids.device}")
-        if region_ids.numel() and int(region_ids.min()) < 0:
-            raise ValueError(f"region_ids must be non-negative; got {int(region_ids.min())}")
+        region_ids = check_ids("region_ids", region_ids, means)
     if regions is None:
         if size is None:
             raise ValueError("size must be given as (height, width) where regions is None; got None")
@@ -136,7 +130,7 @@ def _resolve_regions(
     check_tensor("region_ids", region_ids)
     assert region_ids is not None
     _check_fit(means, regions, size)
-    index = regions.index_of(region_ids.long())
+    index = regions.index_of(region_ids)
     if index.ndim == 1:
         index = index[None]
     if regions.num_regions == 1:

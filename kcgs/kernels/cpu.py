@@ -26,7 +26,7 @@ from .inputs import SplatInputs
 from .membership import Membership
 from .strips import SIDE, Loops, Scene, compile_loops
 
-# fewer pixels x Gaussians than this are drawn by the calling thread: waking another costs as much
+# fewer (Gaussian, band) entries than this are drawn by the calling thread: waking another costs as much
 _SERIAL_ENTRIES = 200
 _SOURCES = ("form.py", "simd.py", "lanes.py", "strips.py")
 
@@ -45,7 +45,7 @@ def splat(inputs: SplatInputs) -> Tensor:
     if inputs.means.device.type != "cpu":
         raise ValueError(f"backend 'cpu' needs tensors on the CPU; got {inputs.means.device}")
     _prepare(_tag(inputs.colors.shape[-1]))
-    return apply_kernel(Steps(plan, _render, _differentiate), inputs)
+    return apply_kernel(Steps(plan, render, differentiate), inputs)
 
 
 @functools.cache
@@ -53,20 +53,28 @@ def _loops() -> Loops:
     digest = hashlib.sha256()
     for name in _SOURCES:
         digest.update((Path(__file__).parent / name).read_bytes())
-    return compile_loops(digest.hexdigest())
+    try:
+        return compile_loops(digest.hexdigest(), cache=True)
+    except RuntimeError:  # numba finds no folder that it may write to
+        log.warning("kcgs: no folder to keep the compiled CPU kernel in; set NUMBA_CACHE_DIR to one")
+        return compile_loops(digest.hexdigest(), cache=False)
+
+
+def _cache_misses() -> int:
+    return sum(sum(loop.stats.cache_misses.values()) for loop in cast(Any, _loops()))
 
 
 @functools.cache
 def _prepare(tag: tuple[float, ...]) -> None:
     """Compile the loops for this number of channels, or load them from disk, and say how long it took."""
-    start = time.perf_counter()
+    start, misses = time.perf_counter(), _cache_misses()
     channels = len(tag)
     inputs = SplatInputs(
         torch.full((1, 1, 2), 8.0), torch.ones(1, 1, 3), torch.ones(1, 1, channels), None, None, (16, 16), 1e-4
     )
     planned = plan(inputs)
-    _differentiate(planned, inputs, _render(planned, inputs), geometry=True)
-    compiled = any(loop.stats.cache_misses for loop in cast(Any, _loops()))
+    differentiate(planned, inputs, render(planned, inputs), geometry=True)
+    compiled = _cache_misses() > misses
     log.log(
         logging.WARNING if compiled else logging.INFO,
         "kcgs: %s the CPU kernel for %d channels in %.1f s%s",
@@ -83,10 +91,9 @@ def _tag(channels: int) -> tuple[float, ...]:
 
 def plan(inputs: SplatInputs) -> _Plan:
     """List which Gaussians touch which band, for the loops."""
-    batch, count, channels = inputs.colors.shape
+    batch, count, _ = inputs.colors.shape
     height, width = inputs.size
-    means = inputs.means.detach().reshape(-1, 2).numpy()
-    factors = inputs.cholesky.detach().reshape(-1, 3).numpy()
+    means, factors, colors = (_array(t) for t in inputs[:3])
     images = np.repeat(np.arange(batch), count)
     # neighbours in the picture become neighbours in memory
     order = np.lexsort((means[:, 0], np.floor(means[:, 1] / SIDE), images))
@@ -102,8 +109,12 @@ def plan(inputs: SplatInputs) -> _Plan:
     gaussians, start, entries = _loops().list_bands(
         means, factors, order, regions, images, batch, height, width, radius
     )
-    colors = inputs.colors.detach().reshape(-1, channels).numpy()[order].ravel()
-    return _Plan(Scene(gaussians, colors, regions, images, start, entries, *table, radius, lowest), order)
+    return _Plan(Scene(gaussians, colors[order].ravel(), regions, start, entries, *table, radius, lowest), order)
+
+
+def _array(tensor: Tensor) -> Any:
+    # contiguous, since every other layout would be compiled for
+    return tensor.detach().resolve_neg().reshape(-1, tensor.shape[-1]).contiguous().numpy()
 
 
 _NOTHING = np.zeros(1, np.int64)
@@ -120,7 +131,8 @@ def _table(membership: Membership) -> tuple[Any, ...]:
     return membership.num_regions, maps, keys, start, tiles.plane.numpy(), planes
 
 
-def _render(planned: _Plan, inputs: SplatInputs) -> Tensor:
+def render(planned: _Plan, inputs: SplatInputs) -> Tensor:
+    """Draw (B, C, H, W)."""
     batch, _, channels = inputs.colors.shape
     # numpy asks for huge pages where an array is large: first use costs a quarter of what torch.empty's does
     image = torch.from_numpy(np.empty((batch, channels, *inputs.size), np.float32))
@@ -134,11 +146,12 @@ def _render(planned: _Plan, inputs: SplatInputs) -> Tensor:
     return image
 
 
-def _differentiate(planned: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
+def differentiate(planned: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
+    """Give the gradients of means, cholesky (unless only colours are asked for) and colors."""
     channels = inputs.colors.shape[-1]
     terms = np.empty((len(planned.scene.entries), channels + (5 if geometry else 0)), np.float32)
     tag = _tag(channels)
-    values = grad.contiguous().numpy()
+    values = grad.resolve_neg().contiguous().numpy()
     loop = _loops().gather
 
     def gather(offset: int, step: int) -> None:

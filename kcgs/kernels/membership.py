@@ -80,45 +80,50 @@ class Membership:
 
     def _build_tiles(self, tile: int) -> TileMembership:
         # windows: every tile with the halo that its soft contours can see; -1 is outside the image
-        batch, height, width = self.index.shape
+        height, width = self.index.shape[1:]
         radius = self.radius
         tiles_y, tiles_x = -(-height // tile), -(-width // tile)
-        padded = torch.nn.functional.pad(
-            self.index,
-            (radius, tiles_x * tile - width + radius, radius, tiles_y * tile - height + radius),
-            value=-1,
-        )
+        border = (radius, tiles_x * tile - width + radius, radius, tiles_y * tile - height + radius)
         span = tile + 2 * radius
-        windows = padded.unfold(1, span, tile).unfold(2, span, tile)  # [B, ty, tx, span, span], a view
-        high = windows.amax((-1, -2)).flatten()
-        outside = torch.iinfo(padded.dtype).max
-        low = torch.where(windows < 0, outside, windows).amin((-1, -2)).flatten()
+
+        def windows(outside: int) -> Tensor:  # [B, ty, tx, span, span], a view
+            padded = torch.nn.functional.pad(self.index, border, value=outside)
+            return padded.unfold(1, span, tile).unfold(2, span, tile)
+
+        high = windows(-1).amax((-1, -2)).flatten()
+        low = windows(self.num_regions).amin((-1, -2)).flatten()
         single = (low == high).nonzero().flatten()
         mixed = (low != high).nonzero().flatten()
-        patches = windows.reshape(batch * tiles_y * tiles_x, span, span)[mixed]
+        keys, planes = [single * self.num_regions + high[single]], []
+        step = max(1, _PATCH_ELEMENTS // (span * span))
+        for some in mixed.split(step):
+            image, place = some // (tiles_y * tiles_x), some % (tiles_y * tiles_x)
+            patches = windows(-1)[image, place // tiles_x, place % tiles_x]
+            held = torch.unique((some[:, None] * self.num_regions + patches.flatten(1))[patches.flatten(1) >= 0])
+            keys.append(held)
+            slot = torch.searchsorted(some, held // self.num_regions)
+            planes.append(self._planes(patches, slot, held % self.num_regions, tile))
 
-        pairs = (mixed[:, None] * self.num_regions + patches.flatten(1)).where(patches.flatten(1) >= 0, -1)
-        mixed_keys = torch.unique(pairs)
-        mixed_keys = mixed_keys[mixed_keys >= 0]
-        slot = torch.searchsorted(mixed, mixed_keys // self.num_regions)
-        planes = self._planes(patches, slot, mixed_keys % self.num_regions, tile)
-
-        keys, order = torch.cat([single * self.num_regions + high[single], mixed_keys]).sort()
-        rows = torch.arange(len(mixed_keys), device=keys.device)
+        rows = torch.arange(sum(map(len, planes)), device=self.index.device)
+        all_keys, order = torch.cat(keys).sort()
         plane = torch.cat([torch.full_like(single, -1), rows])[order]
-        return TileMembership(keys, plane, planes)
+        empty = self._planes(windows(-1)[:1, 0, 0], rows[:0], rows[:0], tile)
+        return TileMembership(all_keys, plane, torch.cat(planes) if planes else empty)
 
     def _planes(self, patches: Tensor, slot: Tensor, region: Tensor, tile: int) -> Tensor:
-        if self.softness == 0.0:
-            return (patches[slot] == region[:, None, None]).flatten(1)
         span, radius = patches.shape[-1], self.radius
+        dtype = torch.bool if self.softness == 0.0 else torch.float64
+        planes = torch.empty(len(slot), tile * tile, device=patches.device, dtype=dtype)
+        step = max(1, _PATCH_ELEMENTS // (span * span))
+        if self.softness == 0.0:
+            for start in range(0, len(slot), step):
+                part = slice(start, start + step)
+                planes[part] = (patches[slot[part]] == region[part, None, None]).flatten(1)
+            return planes
         at = torch.arange(span, device=patches.device, dtype=torch.float64)
         distance = (at[radius : radius + tile, None] - at[None, :]).abs()
         blur = torch.where(distance <= radius, self._gaussian(distance), 0.0)  # [tile, span]
-        inside = patches >= 0
-        total = blur @ inside.to(blur.dtype) @ blur.T
-        planes = torch.empty(len(slot), tile * tile, device=patches.device, dtype=torch.float64)
-        step = max(1, _PATCH_ELEMENTS // (span * span))
+        total = blur @ (patches >= 0).to(blur.dtype) @ blur.T
         for start in range(0, len(slot), step):
             part = slice(start, start + step)
             mask = (patches[slot[part]] == region[part, None, None]).to(blur.dtype)

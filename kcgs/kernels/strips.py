@@ -35,7 +35,6 @@ class Scene(NamedTuple):
     gaussians: Any  # [N, COLUMNS] float64, sorted
     colors: Any  # [N * C] float32
     regions: Any  # [N] int64
-    images: Any  # [N] int64, which image of the batch
     start: Any  # [bands + 1] int64
     entries: Any  # [E, 3] int32: Gaussian, first strip, last strip + 1
     num_regions: int  # 0: no map
@@ -270,14 +269,14 @@ class Loops(NamedTuple):
     finish: Callable[..., None]
 
 
-def compile_loops(fingerprint: str) -> Loops:
-    """Make the entry points; they compile when called and are kept on disk under `fingerprint` of the sources.
+def compile_loops(fingerprint: str, cache: bool) -> Loops:
+    """Make the entry points; they compile when called and are kept on disk (`cache`) by `fingerprint` of the sources.
 
     numba looks at one file only to tell whether its disk cache is stale, and these loops span three; what a function
     closes over is part of the key.
     """
 
-    @njit(cache=True, nogil=True)
+    @njit(cache=cache, nogil=True)
     def list_bands(means, factors, order, regions, images, batch, height, width, radius):  # type: ignore[no-untyped-def]
         """Make the table of Gaussians, the start of each band in the list, and the list."""
         fingerprint  # noqa: B018
@@ -285,7 +284,7 @@ def compile_loops(fingerprint: str) -> Loops:
         start, entries = _list_bands(table, regions, images, -(-height // SIDE), batch, height, width, radius)
         return table, start, entries
 
-    @njit(cache=True, nogil=True)
+    @njit(cache=cache, nogil=True)
     def draw(scene, offset, step, image, tag):  # type: ignore[no-untyped-def]
         """Draw every `step`-th band from `offset`: image[b, c, y, x]."""
         fingerprint  # noqa: B018
@@ -295,7 +294,7 @@ def compile_loops(fingerprint: str) -> Loops:
         for band in range(offset, batch * -(-height // SIDE), step):
             _draw_band(scene, band, image, strip, coefficients, tag)
 
-    @njit(cache=True, nogil=True)
+    @njit(cache=cache, nogil=True)
     def gather(scene, offset, step, grad, out, moments, tag):  # type: ignore[no-untyped-def]
         """Fill out[e] for the entries of every `step`-th band: C colour gradients, then five moments of z * SCALE."""
         fingerprint  # noqa: B018
@@ -307,7 +306,7 @@ def compile_loops(fingerprint: str) -> Loops:
             if scene.start[band] < scene.start[band + 1]:
                 _gather_band(scene, band, grad, strip, coefficients, sums, out, moments, tag)
 
-    @njit(cache=True, nogil=True)
+    @njit(cache=cache, nogil=True)
     def finish(scene, order, out, means, cholesky, colors):  # type: ignore[no-untyped-def]
         """Add up each Gaussian's entries in float64 and turn moments into gradients, in the caller's order."""
         fingerprint  # noqa: B018

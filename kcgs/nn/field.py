@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from kcgs._check import check_floating, check_integer, check_size
+from kcgs._check import check_floating, check_ids, check_integer, check_size, check_tensor
 from kcgs.functional import RegionMap, lookup_regions
 from kcgs.functional.covariance import check_cholesky
 
@@ -93,14 +93,7 @@ class GaussianField(nn.Module):
             self.register_parameter(name, nn.Parameter(value.detach().clone()))
 
     def _checked_ids(self, region_ids: Tensor) -> Tensor:
-        check_integer("region_ids", region_ids)
-        if region_ids.shape != self.means.shape[:-1]:
-            raise ValueError(
-                f"region_ids must have shape {tuple(self.means.shape[:-1])}; got {tuple(region_ids.shape)}"
-            )
-        if region_ids.numel() and int(region_ids.min()) < 0:
-            raise ValueError(f"region_ids must be non-negative; got {int(region_ids.min())}")
-        return region_ids.to(device=self.means.device, dtype=torch.int64, copy=True)
+        return check_ids("region_ids", region_ids.to(self.means.device), self.means).clone()
 
     def __len__(self) -> int:
         """Number of Gaussians an image."""
@@ -187,7 +180,7 @@ class GaussianField(nn.Module):
         """
         if self.means.ndim != 2:
             raise ValueError(f"subset needs an unbatched field; got means of shape {tuple(self.means.shape)}")
-        if mask.dtype == torch.bool:
+        if check_tensor("mask", mask).dtype == torch.bool:
             if mask.shape != (len(self),):
                 raise ValueError(f"mask must have shape ({len(self)},); got {tuple(mask.shape)}")
         else:

@@ -57,7 +57,8 @@ def prune(
     if len(field) == 0:
         return PruneResult(field.subset(torch.zeros(0, dtype=torch.bool)), 0, 0.0)
 
-    order = _painted(field, regions, render).argsort(stable=True)
+    with torch.inference_mode(False), torch.enable_grad():
+        order = _painted(field, regions, render).argsort(stable=True)
     magnitudes = GaussianField(
         field.means.detach(), field.cholesky.detach(), field.merged_colors().detach().abs(), field.region_ids,
         size=field.size,
@@ -75,10 +76,9 @@ def prune(
 
 def _painted(field: GaussianField, regions: RegionMap | Tensor | None, render: RegionSplatRenderer) -> Tensor:
     """Bound each Gaussian's largest effect on a value: no more than its colour, nor than all it paints together."""
-    colors = field.merged_colors().detach()
-    probe = GaussianField(
-        field.means.detach(), field.cholesky.detach(), torch.ones_like(colors[:, :1]), field.region_ids, size=field.size
-    )
+    means, cholesky, colors = (t.detach().clone() for t in (field.means, field.cholesky, field.merged_colors()))
+    ids = None if field.region_ids is None else field.region_ids.clone()
+    probe = GaussianField(means, cholesky, torch.ones_like(colors), ids, size=field.size)
     probe.means.requires_grad_(False)
     probe.cholesky.requires_grad_(False)
     render(probe, regions).sum().backward()

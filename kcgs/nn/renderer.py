@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from kcgs._check import check_size
+from kcgs._check import check_cutoff, check_size
 from kcgs.functional import RegionMap, region_splat
 
 from .field import GaussianField
@@ -33,9 +33,7 @@ class RegionSplatRenderer(nn.Module):
 
     def __init__(self, cutoff: float = 1e-4, clamp: bool = False, backend: str = "auto") -> None:
         super().__init__()
-        if not 0.0 <= cutoff < 1.0:
-            raise ValueError(f"cutoff must be in [0, 1); got {cutoff!r}")
-        self.cutoff = cutoff
+        self.cutoff = check_cutoff(cutoff)
         self.clamp = clamp
         self.backend = backend
 

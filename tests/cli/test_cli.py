@@ -103,7 +103,10 @@ class TestFit:
             stderr=subprocess.PIPE,
             env={**os.environ, "OMP_NUM_THREADS": "1", "TERM": "dumb"},
         )
-        time.sleep(12)  # long enough to be in the fit; too short would show as a KeyboardInterrupt below
+        assert process.stderr is not None
+        while not process.stderr.readline().startswith(b"kcgs: "):  # the kernel is ready: the fit has begun
+            assert process.poll() is None
+        time.sleep(1)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
         assert process.returncode == 0, err

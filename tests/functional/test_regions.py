@@ -89,6 +89,7 @@ class TestRegionMap:
             (-torch.ones(3, 3, dtype=torch.long), 0.0, ValueError, "non-negative ids; got -1"),
             (torch.zeros(3, 3, dtype=torch.long), -0.1, ValueError, r"softness must be in \[0, 64\] pixels; got -0.1"),
             (torch.zeros(3, 3, dtype=torch.long), math.nan, ValueError, "softness must be in"),
+            (torch.zeros(3, 3, dtype=torch.long), "a", TypeError, "softness must be a number of pixels; got 'a'"),
             ([[0]], 0.0, TypeError, "labels must be a Tensor; got list"),
         ],
     )

@@ -210,6 +210,10 @@ class TestConstraint:
         scene = as_float32(random_scene(10, (12, 12), 2))
         image = region_splat(*scene[:3], torch.full_like(scene.region_ids, 77), scene.labels, backend=backend)
         assert torch.equal(image, torch.zeros_like(image))
+        means = scene.means.clone().requires_grad_()
+        strangers = torch.full_like(scene.region_ids, 77)
+        region_splat(means, *scene[1:3], strangers, scene.labels, backend=backend).sum().backward()
+        assert torch.equal(means.grad, torch.zeros_like(means))
         single = torch.zeros(12, 12, dtype=torch.long)
         image = region_splat(*scene[:3], torch.full_like(scene.region_ids, 77), single, backend=backend)
         assert torch.equal(image, torch.zeros_like(image))
@@ -258,6 +262,17 @@ class TestConventions:
         want = region_splat(*(t.float() for t in half), *scene[3:], backend=backend)
         assert image.dtype == dtype
         assert torch.equal(image, want.to(dtype))
+
+    @pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.uint16, torch.uint32])
+    def test_integer_dtypes_of_ids(self, backend: str, dtype: torch.dtype) -> None:
+        scene = as_float32(random_scene(20, (20, 30), 2))
+        image = region_splat(*scene[:3], scene.region_ids.to(dtype), scene.labels.to(dtype), backend=backend)
+        assert torch.equal(image, region_splat(*scene, backend=backend))
+
+    def test_lazy_negation(self, backend: str) -> None:
+        scene = as_float32(random_scene(20, (20, 30), 2))
+        image = region_splat(*scene[:2], torch._neg_view(scene.colors), *scene[3:], backend=backend)
+        torch.testing.assert_close(image, -region_splat(*scene, backend=backend))
 
     def test_non_contiguous(self, backend: str) -> None:
         scene = as_float32(random_scene(20, (20, 30), 2))

@@ -50,6 +50,14 @@ def test_opacities_count(field: GaussianField) -> None:
     assert prune(faint, tolerance=0.0).removed == 40
 
 
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_without_a_graph(field: GaussianField, mode: type) -> None:
+    want = prune(field, tolerance=1e-2)
+    with mode():
+        got = prune(field, tolerance=1e-2)
+    assert got[1:] == want[1:]
+
+
 def test_nothing_to_prune() -> None:
     assert prune(GaussianField.random(0, (4, 4))).removed == 0
 

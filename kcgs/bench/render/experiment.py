@@ -18,7 +18,7 @@ from . import report
 from .limit import evaluated_pairs, pixels_per_second
 from .peers import MOST_PAIRS, PEERS, pairs
 from .stiffness import sweep
-from .timing import drawer, medians, once, peak_memory, probe_of, threads
+from .timing import drawer, medians, once, overhead, peak_memory, probe_of, threads
 from .workloads import STANDARD, Workload, standard, workload
 
 CUTOFFS = (1 / 255, 1e-3, 1e-4, 1e-6, 0.0)
@@ -49,6 +49,7 @@ def run(output: Path, *, data: Path | None = None, quick: bool = False) -> None:
     steps: list[tuple[str, Callable[[], list[Row]]]] = [
         ("limit", lambda: _limit(standards, quick)),
         *((f"speed {name}", partial(_speed, name, repeats)) for name in standards),
+        ("overhead", partial(_overhead, standards[: 1 if quick else 2], repeats)),
         ("memory", lambda: _memory(standards[:1] if quick else ("W1", "W2", "W4"))),
         ("error against run time", lambda: _error_and_time("W3" if quick else "W1", repeats)),
         ("growth", lambda: _growth(repeats, quick)),
@@ -102,6 +103,16 @@ def _speed(name: str, repeats: int) -> list[Row]:
                 rows.append(Row("speed", case, backend, count, "forward", 1e3 * timing.forward, "ms"))
                 rows.append(Row("speed", case, backend, count, "backward", 1e3 * timing.backward, "ms"))
                 rows.append(Row("speed", case, backend, count, "sum", 1e3 * timing.sum, "ms"))
+    return rows
+
+
+def _overhead(names: tuple[str, ...], repeats: int) -> list[Row]:
+    rows = []
+    for name in names:
+        with threads(1):
+            alone, whole = overhead(standard(name), DEFAULT_CUTOFF, 4 * repeats)
+        for quantity, value in (("kernel alone", alone), ("module and autograd", whole)):
+            rows.append(Row("overhead", name, "cpu", 1, quantity, 1e3 * value, "ms"))
     return rows
 
 

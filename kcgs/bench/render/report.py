@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from kcgs._atomic import atomic_path
 from kcgs.bench.machine import describe
-from kcgs.bench.plots import figure, save_figure
+from kcgs.bench.plots import COLORS, figure, save_figure
 
 if TYPE_CHECKING:
     from .experiment import Row
@@ -18,6 +18,8 @@ Gaussians a pixel (3 sigma), 6 regions. W3 is 200x300 with 20 Gaussians, W1 480x
 W4 2160x3840 with 50,000. `limit` is the same arithmetic for the same pairs in registers, one core, in the same run."""
 _ERROR_TEXT = """One thread. Image error against the float64 reference at cutoff 0, colours in [0, 1]; gradient error
 relative to the largest gradient (max) or the rms gradient (rms), the worst of means, cholesky and colors."""
+_GROWTH_TEXT = """Forward and backward against evaluated pairs, one thread. An exponent of 1 is a flat cost a pair; it
+is below 1 where the fixed costs of a picture (filling and reading its pixels) weigh less as pairs grow."""
 _STIFF_TEXT = """37 needles of one shape, turned from 0 to 180 degrees, drawn in float32 at cutoff 0 against float64.
 Image error relative to a colour of 1; gradient error relative to the largest of its component. The parameters are the
 same float32 numbers on both sides: what is measured is the arithmetic."""
@@ -51,9 +53,10 @@ def write(output: Path, rows: list[Row], quick: bool) -> None:
     parts += ["\n".join(f"- {line}" for line in describe())]
     parts += ["## Speed", _SPEED_TEXT, _speed(table)]
     parts += ["## Against the limit of the processor", _against_limit(table)]
+    parts += ["## Overhead of the module", _overhead(table)]
     parts += ["## Peak memory", "MiB added by one drawing and its gradients, in a process of its own.", _memory(table)]
     parts += ["## Error against run time", _ERROR_TEXT, "![](error-against-time.png)", _errors(table)]
-    parts += ["## Growth", "Forward and backward against evaluated pairs.", "![](growth.png)", _exponents(table)]
+    parts += ["## Growth", _GROWTH_TEXT, "![](growth.png)", _exponents(table)]
     parts += ["## Stiffness", _STIFF_TEXT, "![](stiffness.png)", _stiffness(table)]
     with atomic_path(output / "report.md") as temporary:
         temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
@@ -101,6 +104,15 @@ def _against_limit(table: Table) -> str:
         lines.append([case, count, *rates, f"{100 * fraction:.0f} %"])
     header = ["workload", "evaluated pairs (M)", "forward Gpairs/s", "backward Gpairs/s", "share of the limit"]
     return _markdown(header, lines)
+
+
+def _overhead(table: Table) -> str:
+    lines: list[list[Any]] = []
+    for case in table.names("overhead", "case"):
+        alone, whole = (table.value("overhead", case, "cpu", q) for q in ("kernel alone", "module and autograd"))
+        if alone and whole:
+            lines.append([case, alone, whole, f"{100 * (whole / alone - 1):.0f} %"])
+    return _markdown(["workload", "kernel alone (ms)", "through RegionSplatRenderer and autograd (ms)", "more"], lines)
 
 
 def _memory(table: Table) -> str:
@@ -180,7 +192,7 @@ def _plot_stiffness(table: Table, path: Path) -> None:
                 x = [float(c.split()[3]) for c in cases]
                 y = [max(table.value("stiffness", c, backend, quantity) or 0.0, 1e-9) for c in cases]
                 label = backend if sigma == "5" else None
-                axis.plot(x, y, style, color=f"C{index}", marker=".", label=label)
+                axis.plot(x, y, style, color=COLORS[index], marker=".", label=label)
         axis.set(xlabel="anisotropy", ylabel=f"{quantity} error, max", xscale="log", yscale="log")
         axis.legend()
     axes[0].set_title("thin sigma: 5 px solid, 0.5 px dashed, 0.05 px dotted")

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
-import resource
 import statistics
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcgs.functional import region_splat
+from kcgs.kernels import SplatInputs, cpu
+from kcgs.nn import GaussianField, RegionSplatRenderer
 
 from .peers import PEERS
-from .workloads import STANDARD, Workload, standard
+from .workloads import Workload, standard
 
 Draw = Callable[[Workload, Tensor, Tensor, Tensor, float], Tensor]
 
@@ -81,8 +84,34 @@ def medians(name: str, scene: Workload, cutoff: float, repeats: int) -> Timing:
     return Timing(statistics.median(r.forward for r in runs), statistics.median(r.backward for r in runs))
 
 
+def overhead(scene: Workload, cutoff: float, repeats: int) -> tuple[float, float]:
+    """Time the CPU kernel alone, and through the module and autograd: median seconds, forward and backward."""
+    membership, size = scene.regions._membership, scene.regions.size
+    index = scene.regions.index_of(scene.region_ids)[None]
+    inputs = SplatInputs(scene.means[None], scene.cholesky[None], scene.colors[None], index, membership, size, cutoff)
+    field = GaussianField(scene.means, scene.cholesky, scene.colors, scene.region_ids, size=size)
+    render, probe = RegionSplatRenderer(cutoff=cutoff, backend="cpu"), probe_of(scene)
+    alone, whole = [], []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        planned = cpu.plan(inputs)
+        cpu.render(planned, inputs)
+        cpu.differentiate(planned, inputs, probe[None], geometry=True)
+        middle = time.perf_counter()
+        field.zero_grad(set_to_none=True)
+        render(field, scene.regions).backward(probe)
+        alone.append(middle - start)
+        whole.append(time.perf_counter() - middle)
+    return statistics.median(alone[1:]), statistics.median(whole[1:])
+
+
 def peak_memory(backend: str, workload: str, cutoff: float) -> float:
-    """Measure, in a process of its own, how many MiB drawing and differentiating adds at its peak."""
+    """Measure, in a process of its own, how many MiB drawing and differentiating adds at its peak.
+
+    Returns NaN where the system does not tell (it is asked through /proc).
+    """
+    if not Path("/proc/self/clear_refs").exists():
+        return math.nan
     context = multiprocessing.get_context("spawn")
     with context.Pool(1) as pool:
         return pool.apply(_peak, (backend, workload, cutoff))
@@ -94,9 +123,16 @@ def _peak(backend: str, workload: str, cutoff: float) -> float:
     once(drawer(backend), small, cutoff, probe_of(small))
     scene = standard(workload)
     probe = probe_of(scene)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = _resident("VmRSS")
+    # the peak is inherited from the parent, and the warm-up has one of its own: start again from here
+    Path("/proc/self/clear_refs").write_text("5")
     once(drawer(backend), scene, cutoff, probe)
-    return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    return (_resident("VmHWM") - before) / 1024
 
 
-__all__ = ["STANDARD", "Timing", "drawer", "medians", "once", "peak_memory", "probe_of", "threads"]
+def _resident(field: str) -> int:
+    status = Path("/proc/self/status").read_text(encoding="utf-8")
+    return int(next(line for line in status.splitlines() if line.startswith(field)).split()[1])
+
+
+__all__ = ["Timing", "drawer", "medians", "once", "peak_memory", "probe_of", "threads"]
