@@ -69,7 +69,9 @@ class RegionMap:
     def index_of(self, region_ids: Tensor) -> Tensor:
         """Return the position of each id among `ids`, -1 where the map does not hold it."""
         if self._table is not None:
-            return self._table[region_ids.clamp(-1, len(self._table) - 1)]
+            # not self._table[...]: that wakes torch's threads, which then spin beside the kernel's
+            at = region_ids.clamp(-1, len(self._table) - 1).flatten() % len(self._table)
+            return self._table.index_select(0, at).view(region_ids.shape)
         at = torch.searchsorted(self.ids, region_ids.contiguous()).clamp_max(self.num_regions - 1)
         return torch.where(self.ids[at] == region_ids, at, -1)
 

@@ -6,7 +6,6 @@ import csv
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,9 +13,9 @@ from torch import Tensor
 
 from kcgs._atomic import atomic_path
 
-from . import report
 from .limit import evaluated_pairs, pixels_per_second
 from .peers import MOST_PAIRS, PEERS, pairs
+from .report import Row, write
 from .stiffness import sweep
 from .timing import drawer, medians, once, overhead, peak_memory, probe_of, threads
 from .workloads import STANDARD, Workload, standard, workload
@@ -27,18 +26,6 @@ DEFAULT_CUTOFF = 1e-4
 DENSE = ("W3",)
 
 
-class Row(NamedTuple):
-    """One measured number."""
-
-    section: str
-    case: str
-    backend: str
-    threads: int
-    quantity: str
-    value: float
-    unit: str
-
-
 def run(output: Path, *, data: Path | None = None, quick: bool = False) -> None:
     """Measure speed, memory, error against run time, growth and stiffness; write results.csv, report.md, figures."""
     from rich.console import Console
@@ -47,7 +34,6 @@ def run(output: Path, *, data: Path | None = None, quick: bool = False) -> None:
     repeats = 1 if quick else 5
     standards = ("W3",) if quick else tuple(STANDARD)
     steps: list[tuple[str, Callable[[], list[Row]]]] = [
-        ("limit", lambda: _limit(standards, quick)),
         *((f"speed {name}", partial(_speed, name, repeats)) for name in standards),
         ("overhead", partial(_overhead, standards[: 1 if quick else 2], repeats)),
         ("memory", lambda: _memory(standards[:1] if quick else ("W1", "W2", "W4"))),
@@ -64,29 +50,13 @@ def run(output: Path, *, data: Path | None = None, quick: bool = False) -> None:
             rows += step()
             progress.advance(task)
     _write_csv(output / "results.csv", rows)
-    report.write(output, rows, quick)
+    write(output, rows, quick)
     Console().print(f"{output}/report.md")
 
 
 def backends() -> list[str]:
     """Backends that run here."""
     return ["cpu", "tiled", *(["cuda"] if torch.cuda.is_available() else [])]
-
-
-def _limit(names: tuple[str, ...], quick: bool) -> list[Row]:
-    rows = []
-    rates = {}
-    for kind in ("forward", "backward"):
-        rates[kind] = pixels_per_second(backward=kind == "backward", rows=200_000 if quick else 4_000_000)
-        rows.append(Row("limit", "registers", "limit", 1, f"{kind} rate", rates[kind] / 1e9, "Gpairs/s"))
-    for name in names:
-        for cutoff in (1 / 255, DEFAULT_CUTOFF):
-            count = evaluated_pairs(standard(name), cutoff)
-            case = f"{name} cutoff {cutoff:.2g}"
-            rows.append(Row("limit", case, "limit", 1, "pairs", count / 1e6, "M"))
-            for kind, rate in rates.items():
-                rows.append(Row("limit", case, "limit", 1, kind, 1e3 * count / rate, "ms"))
-    return rows
 
 
 def _speed(name: str, repeats: int) -> list[Row]:
@@ -97,12 +67,24 @@ def _speed(name: str, repeats: int) -> list[Row]:
         names = [*backends(), *(["reference"] if name in DENSE else [])]
         names += [peer for peer in PEERS if pairs(peer, scene, cutoff) <= MOST_PAIRS]
         for backend in names:
-            for count in (1, 2):
+            if backend == "cpu":  # side by side, since a shared machine's speed drifts
+                rows += _limit(scene, case, cutoff)
+            for count in (1,) if backend in PEERS else (1, 2):
                 with threads(count):
-                    timing = medians(backend, scene, cutoff, repeats)
+                    timing = medians(backend, scene, cutoff, 3 * repeats if backend == "cpu" else repeats)
                 rows.append(Row("speed", case, backend, count, "forward", 1e3 * timing.forward, "ms"))
                 rows.append(Row("speed", case, backend, count, "backward", 1e3 * timing.backward, "ms"))
                 rows.append(Row("speed", case, backend, count, "sum", 1e3 * timing.sum, "ms"))
+    return rows
+
+
+def _limit(scene: Workload, case: str, cutoff: float) -> list[Row]:
+    count = evaluated_pairs(scene, cutoff)
+    rows = [Row("limit", case, "limit", 1, "pairs", count / 1e6, "M")]
+    for kind in ("forward", "backward"):
+        rate = pixels_per_second(backward=kind == "backward")
+        rows.append(Row("limit", case, "limit", 1, f"{kind} rate", rate / 1e9, "Gpairs/s"))
+        rows.append(Row("limit", case, "limit", 1, kind, 1e3 * count / rate, "ms"))
     return rows
 
 

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 from kcgs._atomic import atomic_path
 from kcgs.bench.machine import describe
 from kcgs.bench.plots import COLORS, figure, save_figure
 
-if TYPE_CHECKING:
-    from .experiment import Row
-
 _SPEED_TEXT = """Milliseconds, medians; through `region_splat` and autograd, validation included. Coverage 12
 Gaussians a pixel (3 sigma), 6 regions. W3 is 200x300 with 20 Gaussians, W1 480x854 with 1,250, W2 480x854 with 7,500,
-W4 2160x3840 with 50,000. `limit` is the same arithmetic for the same pairs in registers, one core, in the same run."""
+W4 2160x3840 with 50,000. `limit` is the same arithmetic for the same pairs in registers, one core, measured beside the
+kernel. The plain-torch peers run on one thread; where they are missing they need too much memory."""
 _ERROR_TEXT = """One thread. Image error against the float64 reference at cutoff 0, colours in [0, 1]; gradient error
 relative to the largest gradient (max) or the rms gradient (rms), the worst of means, cholesky and colors."""
 _GROWTH_TEXT = """Forward and backward against evaluated pairs, one thread. An exponent of 1 is a flat cost a pair; it
@@ -23,6 +21,18 @@ is below 1 where the fixed costs of a picture (filling and reading its pixels) w
 _STIFF_TEXT = """37 needles of one shape, turned from 0 to 180 degrees, drawn in float32 at cutoff 0 against float64.
 Image error relative to a colour of 1; gradient error relative to the largest of its component. The parameters are the
 same float32 numbers on both sides: what is measured is the arithmetic."""
+
+
+class Row(NamedTuple):
+    """One measured number."""
+
+    section: str
+    case: str
+    backend: str
+    threads: int
+    quantity: str
+    value: float
+    unit: str
 
 
 class Table:
