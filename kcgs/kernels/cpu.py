@@ -60,28 +60,29 @@ def _loops() -> Loops:
         return compile_loops(digest.hexdigest(), cache=False)
 
 
-def _cache_misses() -> int:
-    return sum(sum(loop.stats.cache_misses.values()) for loop in cast(Any, _loops()))
+def _compiled() -> int:
+    return sum(len(loop.overloads) - sum(loop.stats.cache_hits.values()) for loop in cast(Any, _loops()))
 
 
 @functools.cache
 def _prepare(tag: tuple[float, ...]) -> None:
     """Compile the loops for this number of channels, or load them from disk, and say how long it took."""
-    start, misses = time.perf_counter(), _cache_misses()
+    start, before = time.perf_counter(), _compiled()
     channels = len(tag)
     inputs = SplatInputs(
         torch.full((1, 1, 2), 8.0), torch.ones(1, 1, 3), torch.ones(1, 1, channels), None, None, (16, 16), 1e-4
     )
     planned = plan(inputs)
     differentiate(planned, inputs, render(planned, inputs), geometry=True)
-    compiled = _cache_misses() > misses
+    compiled = _compiled() > before
+    kept = all(loop.stats.cache_path for loop in cast(Any, _loops()))
     log.log(
         logging.WARNING if compiled else logging.INFO,
         "kcgs: %s the CPU kernel for %d channels in %.1f s%s",
         "compiled" if compiled else "loaded",
         channels,
         time.perf_counter() - start,
-        ", kept on disk for next time" if compiled else "",
+        ", kept on disk for next time" if compiled and kept else "",
     )
 
 
@@ -95,8 +96,7 @@ def plan(inputs: SplatInputs) -> _Plan:
     height, width = inputs.size
     means, factors, colors = (_array(t) for t in inputs[:3])
     images = np.repeat(np.arange(batch), count)
-    # neighbours in the picture become neighbours in memory
-    order = np.lexsort((means[:, 0], np.floor(means[:, 1] / SIDE), images))
+    order = _neighbours(means, images, height, width)
     images = images[order]
     table = _NO_TABLE
     regions = np.zeros(batch * count, np.int64)
@@ -110,6 +110,14 @@ def plan(inputs: SplatInputs) -> _Plan:
         means, factors, order, regions, images, batch, height, width, radius
     )
     return _Plan(Scene(gaussians, colors[order].ravel(), regions, start, entries, *table, radius, lowest), order)
+
+
+def _neighbours(means: Any, images: Any, height: int, width: int) -> Any:
+    """Order by image, band and x: what is near in the picture becomes near in memory."""
+    rows = -(-height // SIDE)
+    band = images * (rows + 2) + np.clip(np.floor(means[:, 1] / SIDE), -1, rows)
+    # stable: what other Gaussians do must not change the order of these
+    return np.argsort(band * (width + 2.0) + np.clip(means[:, 0], -1, width), kind="stable")
 
 
 def _array(tensor: Tensor) -> Any:

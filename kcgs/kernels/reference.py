@@ -5,11 +5,11 @@ One region at a time, in chunks of pixels that are recomputed in the backward, s
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from .form import Z_LIMIT
 from .inputs import SplatInputs
@@ -26,8 +26,13 @@ def splat(inputs: SplatInputs) -> Tensor:
     image = image + sum((0.0 * t).sum() for t in inputs[:3])
     for b in range(batch):
         for chosen, weights in _regions(inputs, b):
-            pixels = weights.nonzero().flatten() if weights is not None else None
-            _add_region(image[b], inputs, b, chosen, pixels, weights)
+            if weights is None:
+                pixels = torch.arange(height * width, device=inputs.means.device)
+            else:
+                pixels = weights.nonzero().flatten()
+                weights = weights[pixels]
+            gaussians = [t[b, chosen] for t in inputs[:3]]
+            image[b].index_add_(0, pixels, _region_sum(inputs, *gaussians, pixels, weights))
     return image.transpose(1, 2).reshape(batch, channels, height, width)
 
 
@@ -44,28 +49,44 @@ def _regions(inputs: SplatInputs, b: int) -> Iterator[tuple[Tensor, Tensor | Non
             yield chosen, membership.weights(map_of, region, inputs.means.dtype).flatten()
 
 
-def _add_region(
-    image: Tensor, inputs: SplatInputs, b: int, chosen: Tensor, pixels: Tensor | None, weights: Tensor | None
-) -> None:
-    if pixels is None:
-        pixels = torch.arange(image.shape[0], device=image.device)
-    means, cholesky, colors = (t[b, chosen] for t in (inputs.means, inputs.cholesky, inputs.colors))
-    step = max(1, _CHUNK_ELEMENTS // max(1, len(chosen)))
-    for part in pixels.split(step):
-        share = None if weights is None else weights[part]
-        x = (part % inputs.size[1]).to(means.dtype) + 0.5
-        y = (part // inputs.size[1]).to(means.dtype) + 0.5
-        arguments = (x, y, means, cholesky, colors, share, inputs.cutoff)
-        if torch.is_grad_enabled():
-            value = checkpoint(_dense_sum, *arguments, use_reentrant=False, preserve_rng_state=False)
-        else:
-            value = _dense_sum(*arguments)
-        image.index_add_(0, part, value)
-
-
-def _dense_sum(
-    x: Tensor, y: Tensor, means: Tensor, cholesky: Tensor, colors: Tensor, share: Tensor | None, cutoff: float
+def _region_sum(
+    inputs: SplatInputs, means: Tensor, cholesky: Tensor, colors: Tensor, pixels: Tensor, weights: Tensor | None
 ) -> Tensor:
+    """Draw Gaussians (N, ...) at flat pixel indices (P,), which gives (P, C)."""
+    x, y = ((v.to(means.dtype) + 0.5) for v in (pixels % inputs.size[1], pixels // inputs.size[1]))
+    step = max(1, _CHUNK_ELEMENTS // max(1, len(means)))
+    if len(pixels) <= step:
+        return _dense_sum(x, y, weights, (means, cholesky, colors), inputs.cutoff)
+    parts = [slice(k, k + step) for k in range(0, len(pixels), step)]
+    points = [(x[p], y[p], None if weights is None else weights[p]) for p in parts]
+    total: Tensor = _Chunks.apply(points, inputs.cutoff, means, cholesky, colors)  # type: ignore[no-untyped-call]
+    return total
+
+
+class _Chunks(torch.autograd.Function):
+    """`_dense_sum` chunk by chunk, each drawn again when it is differentiated."""
+
+    @staticmethod
+    def forward(ctx: Any, points: list[Any], cutoff: float, *gaussians: Tensor) -> Tensor:
+        ctx.points, ctx.cutoff = points, cutoff
+        ctx.save_for_backward(*gaussians)
+        return torch.cat([_dense_sum(x, y, share, gaussians, cutoff) for x, y, share in points])
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        again = torch.is_grad_enabled()
+        gaussians = ctx.saved_tensors if again else [t.detach().requires_grad_() for t in ctx.saved_tensors]
+        total = [torch.zeros_like(t) for t in gaussians]
+        for (x, y, share), part in zip(ctx.points, grad.split([len(p[0]) for p in ctx.points]), strict=True):
+            with torch.enable_grad():
+                value = _dense_sum(x, y, share, gaussians, ctx.cutoff)
+            terms = torch.autograd.grad(value, gaussians, part, create_graph=again)
+            total = [t + term for t, term in zip(total, terms, strict=True)]
+        return (None, None, *total)
+
+
+def _dense_sum(x: Tensor, y: Tensor, share: Tensor | None, gaussians: Sequence[Tensor], cutoff: float) -> Tensor:
+    means, cholesky, colors = gaussians
     l11, l21, l22 = cholesky.unbind(-1)
     # far beyond any weight that is not zero, and squares stay finite: no inf * 0 in the backward
     z1 = ((x[:, None] - means[:, 0]) / l11).clamp(-Z_LIMIT, Z_LIMIT)  # [P, N]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numba import njit
@@ -29,6 +29,10 @@ MX, MY, L11, L21, L22, HEIGHT, INVERSE, PEAK, RISE1, RISE2, RISE3 = range(11)
 COLUMNS = 11
 
 
+# called from compiled code alone: without entry points for Python to call they compile in less time
+_inner = cast(Any, njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+
+
 class Scene(NamedTuple):
     """Everything the loops read, as arrays."""
 
@@ -47,12 +51,12 @@ class Scene(NamedTuple):
     lowest: Any  # float32, least exponent of 2
 
 
-@njit
+@_inner
 def _bounded(value):  # type: ignore[no-untyped-def]
     return min(max(value, -Z_LIMIT), Z_LIMIT)
 
 
-@njit
+@_inner
 def _tabulate(means, factors, order, radius):  # type: ignore[no-untyped-def]
     table = np.empty((len(order), COLUMNS))
     for i in range(len(order)):
@@ -68,14 +72,14 @@ def _tabulate(means, factors, order, radius):  # type: ignore[no-untyped-def]
     return table
 
 
-@njit(inline="always")
+@_inner
 def _highest(along, across, peak, low, high, radius):  # type: ignore[no-untyped-def]
     """Return the largest along * u + across * sqrt(radius^2 - u^2), which peaks at u = peak, over [low, high]."""
     u = min(max(peak, low), high)
     return along * u + across * math.sqrt(max(radius * radius - u * u, 0.0))
 
 
-@njit
+@_inner
 def _row_range(g, height, width, radius):  # type: ignore[no-untyped-def]
     reach, spread = g[HEIGHT] * radius + MARGIN, g[L11] * radius + MARGIN
     first = math.ceil(max(g[MY] - reach - 0.5, 0.0))
@@ -85,7 +89,7 @@ def _row_range(g, height, width, radius):  # type: ignore[no-untyped-def]
     return first // SIDE, last // SIDE + 1
 
 
-@njit
+@_inner
 def _strip_range(g, band, height, width, radius):  # type: ignore[no-untyped-def]
     # the ellipse's columns within the band, by the factor of (y, x)
     h = g[HEIGHT]
@@ -99,7 +103,7 @@ def _strip_range(g, band, height, width, radius):  # type: ignore[no-untyped-def
     return (first // SIDE, last // SIDE + 1) if first <= last else (0, 0)
 
 
-@njit
+@_inner
 def _list_bands(gaussians, regions, images, rows, batch, height, width, radius):  # type: ignore[no-untyped-def]
     """Start of each band in the list, and the list: Gaussian, first strip, last strip + 1."""
     count = gaussians.shape[0]
@@ -107,7 +111,7 @@ def _list_bands(gaussians, regions, images, rows, batch, height, width, radius):
     span = np.zeros((count, 2), np.int64)
     for i in range(count):
         if regions[i] >= 0:
-            span[i] = _row_range(gaussians[i], height, width, radius)
+            span[i, 0], span[i, 1] = _row_range(gaussians[i], height, width, radius)
         for band in range(span[i, 0], span[i, 1]):
             start[images[i] * rows + band + 1] += 1
     for b in range(batch * rows):
@@ -123,7 +127,7 @@ def _list_bands(gaussians, regions, images, rows, batch, height, width, radius):
     return start, entries
 
 
-@njit
+@_inner
 def _find_plane(scene, tile, region):  # type: ignore[no-untyped-def]
     """Offset of the membership weights: negative where the region is alone in the tile; and whether it is there."""
     key = tile * scene.num_regions + region
@@ -140,7 +144,7 @@ def _find_plane(scene, tile, region):  # type: ignore[no-untyped-def]
     return scene.plane[low] * SIDE * SIDE, True
 
 
-@njit
+@_inner
 def _enter_strip(g, strip, band, height, width, radius, coefficients):  # type: ignore[no-untyped-def]
     """Set the coefficients of z * SCALE about the strip's middle; return the rows, first and last + 1, to visit."""
     left = max((strip * SIDE + 0.5 - MARGIN - g[MX]) * g[INVERSE], -radius)
@@ -161,7 +165,7 @@ def _enter_strip(g, strip, band, height, width, radius, coefficients):  # type: 
     return first - base, last + 1 - base
 
 
-@njit
+@_inner
 def _write_band(strip, image, b, band, cols):  # type: ignore[no-untyped-def]
     channels, height, width = image.shape[1:]
     for r in range(min(SIDE, height - band * SIDE)):
@@ -176,7 +180,7 @@ def _write_band(strip, image, b, band, cols):  # type: ignore[no-untyped-def]
                 line[width // SIDE * SIDE + k] = strip[at + k]
 
 
-@njit
+@_inner
 def _read_band(strip, image, b, band, cols):  # type: ignore[no-untyped-def]
     channels, height, width = image.shape[1:]
     for r in range(min(SIDE, height - band * SIDE)):
@@ -191,12 +195,13 @@ def _read_band(strip, image, b, band, cols):  # type: ignore[no-untyped-def]
                 strip[at + k] = line[width // SIDE * SIDE + k]
 
 
-@njit
+@_inner
 def _draw_band(scene, band, image, strip, coefficients, tag):  # type: ignore[no-untyped-def]
     channels, height, width = image.shape[1:]
     rows, cols = -(-height // SIDE), -(-width // SIDE)
     per_strip = SIDE * SIDE * channels
-    strip[:] = 0.0
+    for k in range(len(strip)):
+        strip[k] = 0.0
     plane_at, there = -1, True
     for e in range(scene.start[band], scene.start[band + 1]):
         i = scene.entries[e, 0]
@@ -214,7 +219,7 @@ def _draw_band(scene, band, image, strip, coefficients, tag):  # type: ignore[no
     _write_band(strip, image, band // rows, band % rows, cols)
 
 
-@njit
+@_inner
 def _gather_band(scene, band, grad, strip, coefficients, sums, out, moments, tag):  # type: ignore[no-untyped-def]
     channels, height, width = grad.shape[1:]
     rows, cols = -(-height // SIDE), -(-width // SIDE)
@@ -223,7 +228,8 @@ def _gather_band(scene, band, grad, strip, coefficients, sums, out, moments, tag
     plane_at, there = -1, True
     for e in range(scene.start[band], scene.start[band + 1]):
         i = scene.entries[e, 0]
-        sums[:] = 0.0
+        for k in range(len(sums)):
+            sums[k] = 0.0
         for s in range(scene.entries[e, 1], scene.entries[e, 2]):
             if scene.num_regions > 0:
                 plane_at, there = _find_plane(scene, band % (scene.maps * rows) * cols + s, scene.regions[i])
@@ -239,7 +245,7 @@ def _gather_band(scene, band, grad, strip, coefficients, sums, out, moments, tag
             out[e, k] = lane_sum(sums, k)  # type: ignore[call-arg]
 
 
-@njit
+@_inner
 def _finish(scene, order, out, means, cholesky, colors):  # type: ignore[no-untyped-def]
     count, channels = colors.shape
     total = np.zeros((count, out.shape[1]))
@@ -275,8 +281,9 @@ def compile_loops(fingerprint: str, cache: bool) -> Loops:
     numba looks at one file only to tell whether its disk cache is stale, and these loops span three; what a function
     closes over is part of the key.
     """
+    entry = cast(Any, njit)(cache=cache, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
 
-    @njit(cache=cache, nogil=True)
+    @entry
     def list_bands(means, factors, order, regions, images, batch, height, width, radius):  # type: ignore[no-untyped-def]
         """Make the table of Gaussians, the start of each band in the list, and the list."""
         fingerprint  # noqa: B018
@@ -284,7 +291,7 @@ def compile_loops(fingerprint: str, cache: bool) -> Loops:
         start, entries = _list_bands(table, regions, images, -(-height // SIDE), batch, height, width, radius)
         return table, start, entries
 
-    @njit(cache=cache, nogil=True)
+    @entry
     def draw(scene, offset, step, image, tag):  # type: ignore[no-untyped-def]
         """Draw every `step`-th band from `offset`: image[b, c, y, x]."""
         fingerprint  # noqa: B018
@@ -294,7 +301,7 @@ def compile_loops(fingerprint: str, cache: bool) -> Loops:
         for band in range(offset, batch * -(-height // SIDE), step):
             _draw_band(scene, band, image, strip, coefficients, tag)
 
-    @njit(cache=cache, nogil=True)
+    @entry
     def gather(scene, offset, step, grad, out, moments, tag):  # type: ignore[no-untyped-def]
         """Fill out[e] for the entries of every `step`-th band: C colour gradients, then five moments of z * SCALE."""
         fingerprint  # noqa: B018
@@ -306,7 +313,7 @@ def compile_loops(fingerprint: str, cache: bool) -> Loops:
             if scene.start[band] < scene.start[band + 1]:
                 _gather_band(scene, band, grad, strip, coefficients, sums, out, moments, tag)
 
-    @njit(cache=cache, nogil=True)
+    @entry
     def finish(scene, order, out, means, cholesky, colors):  # type: ignore[no-untyped-def]
         """Add up each Gaussian's entries in float64 and turn moments into gradients, in the caller's order."""
         fingerprint  # noqa: B018

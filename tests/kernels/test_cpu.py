@@ -140,19 +140,34 @@ def test_auto_is_this_kernel(scene: tuple[Tensor, ...]) -> None:
     assert torch.equal(region_splat(*double, *scene[3:]), region_splat(*double, *scene[3:], backend="tiled"))
 
 
-def test_first_call_says_what_it_took(tmp_path: Path) -> None:
+def first_calls(environment: dict[str, str]) -> list[str]:
+    """Draw twice in a new process; return what it said."""
     code = (
         "import logging, torch; logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
         "from kcgs.functional import region_splat\n"
         "for _ in range(2): region_splat(torch.ones(1, 2), torch.ones(1, 3), torch.ones(1, 1), size=(4, 4))\n"
     )
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c", code]
-    words, seconds = [], []
-    for _ in range(2):
-        err = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stderr
-        (line,) = [line for line in err.splitlines() if line.startswith("kcgs: ")]
-        words.append(line.split()[1])
-        seconds.append(float(line.split(" in ")[1].split()[0]))
-    assert words == ["compiled", "loaded"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, **environment})
+    return [line for line in done.stderr.splitlines() if line.startswith("kcgs: ")]
+
+
+def test_first_call_says_what_it_took(tmp_path: Path) -> None:
+    ((first,), (second,)) = (first_calls({"NUMBA_CACHE_DIR": str(tmp_path)}) for _ in range(2))
+    assert first.startswith("kcgs: compiled the CPU kernel for 1 channels in ")
+    assert first.endswith(", kept on disk for next time")
+    assert second.startswith("kcgs: loaded the CPU kernel for 1 channels in ")
+    seconds = [float(line.split(" in ")[1].split()[0]) for line in (first, second)]
     assert seconds[1] < seconds[0]
+
+
+def test_no_folder_to_keep_it_in_is_said_once(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    nowhere = {
+        "NUMBA_CACHE_DIR": str(tmp_path / "file" / "below"),
+        "NUMBA_CACHE_LOCATOR_CLASSES": "_UserProvidedCacheLocator",
+    }
+    advice, first = first_calls(nowhere)
+    assert advice == "kcgs: no folder to keep the compiled CPU kernel in; set NUMBA_CACHE_DIR to one"
+    assert first.startswith("kcgs: compiled the CPU kernel for 1 channels in ")
+    assert first.endswith(" s")

@@ -1,4 +1,4 @@
-"""The oracle's memory stays flat, whatever the scene."""
+"""The oracle's chunks: they change no value, and memory stays flat."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ import subprocess
 import sys
 
 import pytest
+import torch
+from torch import Tensor
+
+from kcgs.functional import region_splat
+from kcgs.kernels import reference
 
 
 @pytest.mark.slow
@@ -21,3 +26,19 @@ def test_480x854_with_7500_gaussians_in_2_gib() -> None:
     peak, least = (float(v) for v in out.stdout.split())
     assert peak < 2.0
     assert least > 0
+
+
+@pytest.mark.parametrize("chunk", [4, 1 << 22])
+def test_chunks_change_nothing(monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+    monkeypatch.setattr(reference, "_CHUNK_ELEMENTS", chunk)
+    labels = torch.tensor([[0, 0, 1], [0, 1, 1]])
+    generator = torch.Generator().manual_seed(0)
+    means, colors = (3 * torch.rand(2, k, generator=generator, dtype=torch.float64) for k in (2, 1))
+    factors = torch.tensor([[1.0, 0.2, 0.8], [0.7, -0.1, 1.2]], dtype=torch.float64)
+
+    def draw(*gaussians: Tensor) -> Tensor:
+        return region_splat(*gaussians, torch.tensor([0, 1]), labels, cutoff=0.0, backend="reference")
+
+    inputs = [t.requires_grad_() for t in (means, factors, colors)]
+    assert torch.autograd.gradcheck(draw, inputs)
+    assert torch.autograd.gradgradcheck(draw, inputs)

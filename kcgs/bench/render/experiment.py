@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import statistics
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -13,15 +14,26 @@ from torch import Tensor
 
 from kcgs._atomic import atomic_path
 
-from .limit import evaluated_pairs, pixels_per_second
+from .limit import evaluated_pairs, seconds_for
 from .peers import MOST_PAIRS, PEERS, pairs
 from .report import Row, write
 from .stiffness import sweep
-from .timing import drawer, medians, once, overhead, peak_memory, probe_of, threads
+from .timing import (
+    Timing,
+    drawer,
+    images_per_second,
+    medians,
+    once,
+    overhead,
+    peak_memory,
+    probe_of,
+    threads,
+)
 from .workloads import STANDARD, Workload, standard, workload
 
 CUTOFFS = (1 / 255, 1e-3, 1e-4, 1e-6, 0.0)
 DEFAULT_CUTOFF = 1e-4
+SPEED_CUTOFFS = (1 / 255, DEFAULT_CUTOFF)
 # the dense reference is timed where it takes seconds
 DENSE = ("W3",)
 
@@ -34,6 +46,8 @@ def run(output: Path, *, data: Path | None = None, quick: bool = False) -> None:
     repeats = 1 if quick else 5
     standards = ("W3",) if quick else tuple(STANDARD)
     steps: list[tuple[str, Callable[[], list[Row]]]] = [
+        # first, since peers leave a gigabyte of memory in pieces behind them
+        *((f"kernel and limit {name}", partial(_beside_limit, name, 3 * repeats)) for name in standards),
         *((f"speed {name}", partial(_speed, name, repeats)) for name in standards),
         ("overhead", partial(_overhead, standards[: 1 if quick else 2], repeats)),
         ("memory", lambda: _memory(standards[:1] if quick else ("W1", "W2", "W4"))),
@@ -62,30 +76,65 @@ def backends() -> list[str]:
 def _speed(name: str, repeats: int) -> list[Row]:
     scene = standard(name)
     rows = []
-    for cutoff in (1 / 255, DEFAULT_CUTOFF):
-        case = f"{name} cutoff {cutoff:.2g}"
-        names = [*backends(), *(["reference"] if name in DENSE else [])]
+    for cutoff in SPEED_CUTOFFS:
+        names = [*(b for b in backends() if b != "cpu"), *(["reference"] if name in DENSE else [])]
         names += [peer for peer in PEERS if pairs(peer, scene, cutoff) <= MOST_PAIRS]
         for backend in names:
-            if backend == "cpu":  # side by side, since a shared machine's speed drifts
-                rows += _limit(scene, case, cutoff)
             for count in (1,) if backend in PEERS else (1, 2):
                 with threads(count):
-                    timing = medians(backend, scene, cutoff, 3 * repeats if backend == "cpu" else repeats)
-                rows.append(Row("speed", case, backend, count, "forward", 1e3 * timing.forward, "ms"))
-                rows.append(Row("speed", case, backend, count, "backward", 1e3 * timing.backward, "ms"))
-                rows.append(Row("speed", case, backend, count, "sum", 1e3 * timing.sum, "ms"))
+                    timing = medians(backend, scene, cutoff, repeats)
+                rows += _timing_rows(_case(name, cutoff), backend, count, [timing])
     return rows
 
 
-def _limit(scene: Workload, case: str, cutoff: float) -> list[Row]:
+def _beside_limit(name: str, repeats: int) -> list[Row]:
+    scene = standard(name)
+    return [row for cutoff in SPEED_CUTOFFS for row in _in_turns(scene, _case(name, cutoff), cutoff, repeats)]
+
+
+def _in_turns(scene: Workload, case: str, cutoff: float, repeats: int) -> list[Row]:
+    """Time the CPU kernel and the limit in turns, on one thread and on two: a shared machine's speed drifts."""
     count = evaluated_pairs(scene, cutoff)
+    draw, probe = drawer("cpu"), probe_of(scene)
+    found: dict[tuple[str, int], list[Timing]] = {(name, n): [] for name in ("limit", "cpu") for n in (1, 2)}
+    for _ in range(repeats + 1):
+        for n in (1, 2):
+            limits = (seconds_for(count, backward=kind, threads=n) for kind in (False, True))
+            found["limit", n].append(Timing(*limits))
+            with threads(n):
+                found["cpu", n].append(once(draw, scene, cutoff, probe)[0])
+    found = {key: timings[1:] for key, timings in found.items()}
     rows = [Row("limit", case, "limit", 1, "pairs", count / 1e6, "M")]
-    for kind in ("forward", "backward"):
-        rate = pixels_per_second(backward=kind == "backward")
-        rows.append(Row("limit", case, "limit", 1, f"{kind} rate", rate / 1e9, "Gpairs/s"))
-        rows.append(Row("limit", case, "limit", 1, kind, 1e3 * count / rate, "ms"))
+    for (name, n), timings in found.items():
+        rows += _timing_rows(case, name, n, timings)
+    in_turns = zip(found["limit", 1], found["cpu", 1], strict=True)
+    rows.append(Row("limit", case, "cpu", 1, "share", statistics.median(a.sum / b.sum for a, b in in_turns), "1"))
+    for name in ("limit", "cpu"):
+        in_turns = zip(found[name, 1], found[name, 2], strict=True)
+        gain = statistics.median(one.sum / two.sum for one, two in in_turns)
+        rows.append(Row("limit", case, name, 2, "gain", gain, "1"))
+    with threads(2):
+        rows.append(Row("limit", case, "cpu", 2, "images", images_per_second(scene, cutoff, repeats), "1/s"))
     return rows
+
+
+def _case(name: str, cutoff: float) -> str:
+    return f"{name} cutoff {cutoff:.2g}"
+
+
+def _timing_rows(case: str, backend: str, count: int, timings: list[Timing]) -> list[Row]:
+    return [
+        Row(
+            "speed",
+            case,
+            backend,
+            count,
+            quantity,
+            1e3 * statistics.median(getattr(t, quantity) for t in timings),
+            "ms",
+        )
+        for quantity in ("forward", "backward", "sum")
+    ]
 
 
 def _overhead(names: tuple[str, ...], repeats: int) -> list[Row]:

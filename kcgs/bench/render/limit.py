@@ -6,6 +6,7 @@ The loops are those of the kernel (`kcgs.kernels.simd`), with the pixels' loads 
 from __future__ import annotations
 
 import time
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -69,15 +70,22 @@ def _spin(rows, coefficients, lowest, backward):  # type: ignore[no-untyped-def]
     return _backward(rows, coefficients, lowest) if backward else _forward(rows, coefficients, lowest)  # type: ignore[call-arg]
 
 
-def pixels_per_second(*, backward: bool, rows: int = 1_000_000) -> float:
-    """Measure how many (pixel, Gaussian) pairs one core evaluates in registers; the best of five."""
+def seconds_for(pairs: float, *, backward: bool, threads: int = 1) -> float:
+    """Measure how long this many (pixel, Gaussian) pairs take in registers; on two threads, half each."""
     coefficients = np.array([0.1, 0.01, 0.1, 0.01, 0.02], np.float32)
-    times = []
-    for _ in range(6):
-        start = time.perf_counter()
+    rows = round(pairs / SIDE / threads)
+
+    def spin() -> None:
         _spin(rows, coefficients, np.float32(-20.0), backward)
-        times.append(time.perf_counter() - start)
-    return rows * SIDE / min(times[1:])
+
+    others = [Thread(target=spin) for _ in range(threads - 1)]
+    start = time.perf_counter()
+    for other in others:
+        other.start()
+    spin()
+    for other in others:
+        other.join()
+    return time.perf_counter() - start
 
 
 @njit

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,8 +13,11 @@ from kcgs.bench.plots import COLORS, figure, save_figure
 
 _SPEED_TEXT = """Milliseconds, medians; through `region_splat` and autograd, validation included. Coverage 12
 Gaussians a pixel (3 sigma), 6 regions. W3 is 200x300 with 20 Gaussians, W1 480x854 with 1,250, W2 480x854 with 7,500,
-W4 2160x3840 with 50,000. `limit` is the same arithmetic for the same pairs in registers, one core, measured beside the
-kernel. The plain-torch peers run on one thread; where they are missing they need too much memory."""
+W4 2160x3840 with 50,000. `limit` is the same arithmetic for the same pairs with nothing read and nothing written. The
+plain-torch peers run on one thread; where they are missing they need too much memory."""
+_LIMIT_TEXT = """Kernel and limit are timed in turns; shares and gains are medians of the ratios of neighbouring runs.
+The limit's own gain tells what a second thread is worth on this machine. Images a second are through
+`RegionSplatRenderer`, without gradients."""
 _ERROR_TEXT = """One thread. Image error against the float64 reference at cutoff 0, colours in [0, 1]; gradient error
 relative to the largest gradient (max) or the rms gradient (rms), the worst of means, cholesky and colors."""
 _GROWTH_TEXT = """Forward and backward against evaluated pairs, one thread. An exponent of 1 is a flat cost a pair; it
@@ -62,7 +66,7 @@ def write(output: Path, rows: list[Row], quick: bool) -> None:
     parts = ["# Rendering: speed, error, stability", f"Made by `kcgs bench render{' --quick' if quick else ''}`."]
     parts += ["\n".join(f"- {line}" for line in describe())]
     parts += ["## Speed", _SPEED_TEXT, _speed(table)]
-    parts += ["## Against the limit of the processor", _against_limit(table)]
+    parts += ["## Against the limit of the processor", _LIMIT_TEXT, _against_limit(table)]
     parts += ["## Overhead of the module", _overhead(table)]
     parts += ["## Peak memory", "MiB added by one drawing and its gradients, in a process of its own.", _memory(table)]
     parts += ["## Error against run time", _ERROR_TEXT, "![](error-against-time.png)", _errors(table)]
@@ -89,30 +93,25 @@ def _speed(table: Table) -> str:
     lines: list[list[Any]] = []
     for case in table.names("speed", "case"):
         best = table.value("speed", case, "cpu", "sum")
-        for backend in ["limit", *table.names("speed", "backend")]:
-            section = "limit" if backend == "limit" else "speed"
-            forward, backward = (table.value(section, case, backend, q) for q in ("forward", "backward"))
-            if forward is None or backward is None:
-                continue
-            total, two = forward + backward, table.value(section, case, backend, "sum", 2)
-            total = table.value(section, case, backend, "sum") or total
-            lines.append([case, backend, forward, backward, total, two, total / best if best else None])
+        for backend in table.names("speed", "backend"):
+            one = [table.value("speed", case, backend, quantity) for quantity in ("forward", "backward", "sum")]
+            if one[2] is not None and best:
+                lines.append([case, backend, *one, table.value("speed", case, backend, "sum", 2), one[2] / best])
     return _markdown(header, lines)
 
 
 def _against_limit(table: Table) -> str:
     lines: list[list[Any]] = []
-    for case in table.names("speed", "case"):
-        count = table.value("limit", case, "limit", "pairs")
-        limits = [table.value("limit", case, "limit", q) for q in ("forward", "backward")]
-        times = [table.value("speed", case, "cpu", q) for q in ("forward", "backward")]
-        total = table.value("speed", case, "cpu", "sum")
-        if count is None or total is None or None in limits or None in times:
-            continue
-        rates = [count / t for t in times if t]
-        fraction = sum(v for v in limits if v) / total
-        lines.append([case, count, *rates, f"{100 * fraction:.0f} %"])
+    for case in table.names("limit", "case"):
+        count = table.value("limit", case, "limit", "pairs") or 0.0
+        rates = [count / (table.value("speed", case, "cpu", q) or math.nan) for q in ("forward", "backward")]
+        share = table.value("limit", case, "cpu", "share") or math.nan
+        gains = [table.value("limit", case, name, "gain", 2) for name in ("cpu", "limit")]
+        lines.append(
+            [case, count, *rates, f"{100 * share:.0f} %", *gains, table.value("limit", case, "cpu", "images", 2)]
+        )
     header = ["workload", "evaluated pairs (M)", "forward Gpairs/s", "backward Gpairs/s", "share of the limit"]
+    header += ["gain of 2 threads", "the limit's gain", "images/s, forward only, 2 threads"]
     return _markdown(header, lines)
 
 

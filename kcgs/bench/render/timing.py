@@ -84,6 +84,19 @@ def medians(name: str, scene: Workload, cutoff: float, repeats: int) -> Timing:
     return Timing(statistics.median(r.forward for r in runs), statistics.median(r.backward for r in runs))
 
 
+def images_per_second(scene: Workload, cutoff: float, repeats: int) -> float:
+    """Draw without gradients, on as many threads as torch has: the median rate."""
+    field = GaussianField(scene.means, scene.cholesky, scene.colors, scene.region_ids, size=scene.regions.size)
+    render = RegionSplatRenderer(cutoff=cutoff, backend="cpu")
+    seconds = []
+    with torch.inference_mode():
+        for _ in range(repeats + 1):
+            start = time.perf_counter()
+            render(field, scene.regions)
+            seconds.append(time.perf_counter() - start)
+    return 1 / statistics.median(seconds[1:])
+
+
 def overhead(scene: Workload, cutoff: float, repeats: int) -> tuple[float, float]:
     """Time the CPU kernel alone, and through the module and autograd: median seconds, forward and backward."""
     membership, size = scene.regions._membership, scene.regions.size
