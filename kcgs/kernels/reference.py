@@ -31,8 +31,8 @@ def splat(inputs: SplatInputs) -> Tensor:
             else:
                 pixels = weights.nonzero().flatten()
                 weights = weights[pixels]
-            gaussians = [t[b, chosen] for t in inputs[:3]]
-            image[b].index_add_(0, pixels, _region_sum(inputs, *gaussians, pixels, weights))
+            means, cholesky, colors = (t[b, chosen] for t in inputs[:3])
+            image[b].index_add_(0, pixels, _region_sum(inputs, means, cholesky, colors, pixels, weights))
     return image.transpose(1, 2).reshape(batch, channels, height, width)
 
 
