@@ -4,6 +4,10 @@ The file holds the tensors ``means``, ``cholesky``, ``colors`` and, where the sc
 (float32 or float64), ``region_ids`` and ``labels`` (the smallest of uint8, uint16, int32, int64 that holds
 them). Its metadata are ``format``, ``format_version``, ``kcgs_version``, ``height``, ``width``, ``softness``
 (where there are labels) and what the caller adds, each key behind ``user.``.
+
+Format version 2 is written only for what version 1 cannot say: where pairs of regions have widths of their own,
+``softness`` is a JSON list of [id, id, width]; where the label map is finer than the picture, ``supersample`` says how
+many labels there are along a side of a pixel, and ``labels`` is the fine map.
 """
 
 from __future__ import annotations
@@ -21,10 +25,11 @@ from torch import Tensor
 
 from kcgs._atomic import atomic_path
 from kcgs.functional import RegionMap
+from kcgs.functional.regions import PairWidths
 from kcgs.nn import GaussianField
 
 FORMAT = "kcgs.scene"
-FORMAT_VERSION = "1"
+FORMAT_VERSIONS = ("1", "2")
 MAX_SIDE = 1 << 20  # pixels; past it float32 centres cannot tell tenths of a pixel apart
 _SUFFIX = ".safetensors"
 _USER = "user."
@@ -156,7 +161,8 @@ def _serialize(field: GaussianField, regions: RegionMap | Tensor | None, metadat
         raise TypeError(f"regions must be a RegionMap, a label map or None; got {type(regions).__name__}")
     notes = _describe(field, regions, metadata)
     tensors = {name: getattr(field, name) for name in (*_REQUIRED, "opacities", "region_ids")}
-    tensors["labels"] = None if regions is None else regions.labels
+    if regions is not None:
+        tensors["labels"] = regions.labels if regions.fine_labels is None else regions.fine_labels
     packed = {}
     for name, tensor in tensors.items():
         if tensor is not None:
@@ -171,16 +177,28 @@ def _describe(field: GaussianField, regions: RegionMap | None, metadata: Mapping
     from kcgs import __version__
 
     height, width = field.size
-    notes = {"format": FORMAT, "format_version": FORMAT_VERSION, "kcgs_version": __version__}
+    notes = {"format": FORMAT, "format_version": FORMAT_VERSIONS[0], "kcgs_version": __version__}
     notes |= {"height": str(height), "width": str(width)}
     if regions is not None:
-        notes["softness"] = repr(float(regions.softness))
+        notes |= _describe_regions(regions)
     if metadata is not None and not isinstance(metadata, Mapping):
         raise TypeError(f"metadata must map str to str; got {type(metadata).__name__}")
     for key, value in (metadata or {}).items():
         if not isinstance(key, str) or not isinstance(value, str):
             raise TypeError(f"metadata must map str to str; got {key!r}: {value!r}")
         notes[_USER + key] = value
+    return notes
+
+
+def _describe_regions(regions: RegionMap) -> dict[str, str]:
+    notes = {}
+    if isinstance(regions.softness, PairWidths):
+        widths = [[*pair, width] for pair, width in regions.softness.items()]
+        notes = {"softness": json.dumps(widths, separators=(",", ":")), "format_version": FORMAT_VERSIONS[1]}
+    else:
+        notes["softness"] = repr(regions.softness)
+    if regions.supersample > 1:
+        notes |= {"supersample": str(regions.supersample), "format_version": FORMAT_VERSIONS[1]}
     return notes
 
 
@@ -202,9 +220,9 @@ def _sort_header(content: bytes) -> bytes:
 def _check_format(notes: Mapping[str, str]) -> None:
     if notes.get("format") != FORMAT:
         raise ValueError(f"its format must be {FORMAT!r}; got {notes.get('format')!r}")
-    if notes.get("format_version") != FORMAT_VERSION:
-        version = notes.get("format_version")
-        raise ValueError(f"its format version must be {FORMAT_VERSION!r}; got {version!r}")
+    version = notes.get("format_version")
+    if version not in FORMAT_VERSIONS:
+        raise ValueError(f"its format version must be one of {FORMAT_VERSIONS}; got {version!r}")
 
 
 def _assemble(tensors: dict[str, Tensor], notes: Mapping[str, str]) -> Scene:
@@ -239,17 +257,30 @@ def _assemble(tensors: dict[str, Tensor], notes: Mapping[str, str]) -> Scene:
 
 
 def _assemble_regions(field: GaussianField, labels: Tensor, notes: Mapping[str, str]) -> RegionMap:
-    try:
-        softness = float(notes["softness"])
-    except (KeyError, ValueError):
-        raise ValueError(f"softness must be a number; got {notes.get('softness')!r}") from None
-    regions = RegionMap.from_labels(labels, softness)
-    if max(regions.size) > MAX_SIDE:
-        raise ValueError(f"labels must be at most {MAX_SIDE} pixels a side; got {regions.size}")
+    supersample = 1
+    if notes["format_version"] != FORMAT_VERSIONS[0] and "supersample" in notes:
+        supersample = _read_side("supersample", notes)
+    regions = RegionMap.from_labels(labels, _read_softness(notes), supersample=supersample)
+    if max(labels.shape[-2:]) > MAX_SIDE:
+        raise ValueError(f"labels must be at most {MAX_SIDE} pixels a side; got {tuple(labels.shape[-2:])}")
     images = field.means.shape[0] if field.means.ndim == 3 else 1
     if labels.ndim == 3 and labels.shape[0] not in (1, images):
         raise ValueError(f"labels must hold 1 map or one for each of {images} images; got {labels.shape[0]}")
     return regions
+
+
+def _read_softness(notes: Mapping[str, str]) -> float | dict[tuple[int, int], float]:
+    text = notes.get("softness", "")
+    if notes["format_version"] != FORMAT_VERSIONS[0] and text.startswith("["):
+        try:
+            widths = {(low, high): float(width) for low, high, width in json.loads(text)}
+        except (TypeError, ValueError, OverflowError, RecursionError):
+            raise ValueError(f"softness must be a list of [id, id, width]; got {text[:80]!r}") from None
+        return widths
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"softness must be a number; got {notes.get('softness')!r}") from None
 
 
 def _read_side(name: str, notes: Mapping[str, str]) -> int:

@@ -21,6 +21,7 @@ from kcgs.io import FORMAT, MAX_SIDE, Scene, load, save, scene_bytes
 from kcgs.nn import RegionSplatRenderer
 
 SIZE = (9, 11)
+Softness = float | dict[tuple[int, int], float]
 TENSORS = ("means", "cholesky", "colors", "region_ids", "opacities")
 
 
@@ -66,6 +67,9 @@ def assert_same_scene(scene: Scene, field: GaussianField, regions: RegionMap | N
         assert scene.regions is not None
         assert same_bits(scene.regions.labels, regions.labels)
         assert scene.regions.softness == regions.softness
+        assert type(scene.regions.softness) is type(regions.softness)
+        assert same_bits(scene.regions.fine_labels, regions.fine_labels)
+        assert scene.regions.supersample == regions.supersample
 
 
 def read_header(path: Path) -> tuple[dict[str, Any], bytes]:
@@ -103,6 +107,18 @@ class TestRoundTrip:
         scene = load(path)
         assert_same_scene(scene, field, regions)
         assert scene.metadata == {}
+
+    @pytest.mark.parametrize("batched", [False, True])
+    @pytest.mark.parametrize("softness", [0.0, 0.7, {(0, 1): 1 / 3, (2, 1): 1.25, (3, 7): 0.0}])
+    def test_widths_of_pairs_and_fine_labels(self, path: Path, softness: Softness, batched: bool) -> None:
+        fine = labels_with(7, (27, 33)) % 20
+        fine[:, 20:] = 3
+        regions = RegionMap.from_labels(fine[None] if batched else fine, softness, supersample=3)
+        save(path, make_field(), regions)
+        scene = load(path)
+        assert_same_scene(scene, make_field(), regions)
+        first, second = (RegionSplatRenderer()(make_field(), r) for r in (regions, scene.regions))
+        assert torch.equal(first, second)
 
     @pytest.mark.parametrize("channels", [1, 4])
     def test_without_regions(self, path: Path, channels: int) -> None:
@@ -203,6 +219,23 @@ class TestFormat:
                 "softness": "0.75",
                 "user.title": "a",
             }
+
+    def test_version_2_only_where_version_1_cannot_say_it(self, path: Path) -> None:
+        labels = labels_with(7)
+        every_pair = {(a, b): 0.75 for b in (0, 1, 2, 3, 7) for a in range(min(b, 4))}
+        save(path, make_field(), RegionMap.from_labels(labels, 0.75))
+        plain = path.read_bytes()
+        save(path, make_field(), RegionMap.from_labels(labels, every_pair, supersample=1))
+        assert path.read_bytes() == plain
+        save(path, make_field(), RegionMap.from_labels(labels, {(7, 3): 0.5, (0, 1): 0.25}))
+        notes = read_header(path)[0]["__metadata__"]
+        assert (notes["format_version"], notes["softness"]) == ("2", "[[0,1,0.25],[3,7,0.5]]")
+        assert "supersample" not in notes
+        save(path, make_field(), RegionMap.from_labels(labels_with(7, (18, 22)), 0.5, supersample=2))
+        header = read_header(path)[0]
+        notes = header["__metadata__"]
+        assert (notes["format_version"], notes["softness"], notes["supersample"]) == ("2", "0.5", "2")
+        assert header["labels"]["shape"] == [18, 22]
 
     def test_absent_things_take_no_room(self, path: Path) -> None:
         save(path, make_field(opacities=False))
@@ -335,8 +368,9 @@ class TestLoadRefuses:
         ("edit", "message"),
         [
             (_note("format", "pt"), r"its format must be 'kcgs\.scene'; got 'pt'"),
-            (_note("format_version", "2"), "its format version must be '1'; got '2'"),
-            (_drop("format_version"), "its format version must be '1'; got None"),
+            (_note("format_version", "3"), r"its format version must be one of \('1', '2'\); got '3'"),
+            (_drop("format_version"), r"its format version must be one of \('1', '2'\); got None"),
+            (_note("softness", "[[0,1,0.7]]"), r"softness must be a number; got '\[\[0,1,0.7\]\]'"),
             (_drop("height"), "height must be a whole number"),
             (_note("height", "0"), "height must be a whole number of 1 to 1048576 pixels; got '0'"),
             (_note("width", "-11"), "width must be a whole number"),
@@ -381,6 +415,36 @@ class TestLoadRefuses:
         with pytest.raises(ValueError, match=rf"^cannot load {saved}: .*{message}") as caught:
             load(saved)
         assert "\n" not in str(caught.value)
+
+    @pytest.mark.parametrize(
+        ("name", "value", "message"),
+        [
+            ("softness", "[[0,1]]", r"softness must be a list of \[id, id, width\]; got '\[\[0,1\]\]'"),
+            ("softness", "[[0,1,0.5]", "softness must be a list of"),
+            ("softness", "[" * 100_000, "softness must be a list of"),
+            ("softness", "[1]", "softness must be a list of"),
+            ("softness", '[[0,1,"a"]]', "softness must be a list of"),
+            ("softness", "[[0,1,null]]", "softness must be a list of"),
+            ("softness", "[[[0],1,0.5]]", "softness must"),
+            ("softness", "[[0,1.5,0.5]]", "softness must map pairs of ids"),
+            ("softness", "[[0,99,0.5]]", r"softness must map pairs of two different ids in the map; got \(0, 99\)"),
+            ("softness", "[[0,1,NaN]]", r"softness of \(0, 1\) must be in"),
+            ("softness", "[[0,1,1e400]]", r"softness of \(0, 1\) must be in"),
+            ("softness", "wide", "softness must be a number; got 'wide'"),
+            ("supersample", "0", "supersample must be a whole number"),
+            ("supersample", "-2", "supersample must be a whole number"),
+            ("supersample", "4", "labels must have sides that supersample, 4, divides"),
+        ],
+    )
+    def test_header_of_version_2(self, path: Path, name: str, value: str, message: str) -> None:
+        widths = {(0, 1): 0.5, (1, 2): 0.75}
+        save(path, make_field(), RegionMap.from_labels(labels_with(7, (18, 22)) % 20, widths, supersample=2))
+        header, body = read_header(path)
+        load(path)
+        header["__metadata__"][name] = value
+        write_header(path, header, body)
+        with pytest.raises(ValueError, match=rf"^cannot load {path}: .*{message}"):
+            load(path)
 
     @pytest.mark.parametrize(
         ("name", "value", "message"),

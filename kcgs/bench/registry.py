@@ -5,7 +5,9 @@ from __future__ import annotations
 from importlib import import_module
 from pathlib import Path
 
-_EXPERIMENTS = ("demo", "render")
+_EXPERIMENTS = ("demo", "fit", "render")
+# those that have groups to choose from
+_GROUPED = ("fit",)
 
 
 def available_experiments() -> tuple[str, ...]:
@@ -13,7 +15,7 @@ def available_experiments() -> tuple[str, ...]:
     return _EXPERIMENTS
 
 
-def run(name: str, output: Path, *, data: Path | None = None, quick: bool = False) -> None:
+def run(name: str, output: Path, *, data: Path | None = None, quick: bool = False, only: str | None = None) -> None:
     """Run an experiment and write its report into the folder `output`, which is made if it is not there.
 
     Args:
@@ -21,12 +23,16 @@ def run(name: str, output: Path, *, data: Path | None = None, quick: bool = Fals
         output: folder.
         data: folder with images, for the experiments that need it.
         quick: a short form of the same experiment.
+        only: names of groups with commas between them, for the experiments that have groups; None: all.
 
     Raises:
-        ValueError: unknown name.
+        ValueError: unknown name or group; `only` for an experiment without groups.
         OSError: the folder cannot be made.
     """
     if name not in _EXPERIMENTS:
         raise ValueError(f"name must be one of {', '.join(_EXPERIMENTS)}; got {name!r}")
+    if only is not None and name not in _GROUPED:
+        raise ValueError(f"only is for experiments with groups ({', '.join(_GROUPED)}); got {only!r} for {name!r}")
     output.mkdir(parents=True, exist_ok=True)
-    import_module(f"{__package__}.{name}").run(output, data=data, quick=quick)
+    choice = {} if only is None else {"only": only}
+    import_module(f"{__package__}.{name}").run(output, data=data, quick=quick, **choice)

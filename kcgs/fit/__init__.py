@@ -1,6 +1,7 @@
 """An image in, a field out."""
 
 from .config import FitConfig, available_recipes
-from .loop import FitResult, HistoryEntry, fit
+from .loop import fit
+from .monitor import FitResult, HistoryEntry
 
 __all__ = ["FitConfig", "FitResult", "HistoryEntry", "available_recipes", "fit"]

@@ -63,3 +63,13 @@ class RawParameters:
             -1,
         )
         return means, cholesky, self.colors
+
+    def state(self) -> dict[str, Tensor]:
+        """Return the numbers that the optimiser moves."""
+        return {name: getattr(self, name).detach() for name in ("centres", "factors", "colors")}
+
+    @torch.no_grad()
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Take up numbers, in place, since the optimiser holds these tensors."""
+        for name, value in state.items():
+            getattr(self, name).copy_(value)

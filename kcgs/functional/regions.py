@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import operator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -14,13 +16,46 @@ from kcgs.kernels import Membership
 MAX_SOFTNESS = 64.0
 
 
+class PairWidths(Mapping[tuple[int, int], float]):
+    """Contour width in pixels of pairs of regions: an immutable mapping with ids a < b, read in either order.
+
+    Example:
+        >>> widths = PairWidths({(1, 2): 0.7, (1, 5): 0.0})
+        >>> widths[2, 1], widths
+        (0.7, PairWidths({(1, 2): 0.7, (1, 5): 0.0}))
+    """
+
+    __slots__ = ("_widths",)
+
+    def __init__(self, widths: Mapping[tuple[int, int], float]) -> None:
+        self._widths = dict(sorted(((min(pair), max(pair)), width) for pair, width in widths.items()))
+
+    def __getitem__(self, pair: tuple[int, int]) -> float:
+        return self._widths[min(pair), max(pair)]
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        return iter(self._widths)
+
+    def __len__(self) -> int:
+        return len(self._widths)
+
+    def __hash__(self) -> int:
+        return hash(tuple(self._widths.items()))
+
+    def __repr__(self) -> str:
+        return f"PairWidths({self._widths})"
+
+
 @dataclass(frozen=True, eq=False)
 class RegionMap:
     r"""A label map made ready for rendering: which region each pixel belongs to, and how sharply.
 
     Convention: ids are any non-negative integers. With ``softness`` 0 a pixel belongs to its label alone (the paper's
     rule). Above 0 the membership of region r is the blur of [M = r] by a Gaussian of that standard deviation, cut at
-    4 standard deviations, normalised to sum to one: pixels farther than that from a contour are unchanged.
+    4 standard deviations, normalised to sum to one: pixels farther than that from a contour are unchanged. With a
+    width for each pair of regions a pixel is blurred by the width of its nearest contour. With ``supersample`` k the
+    map has k x k labels a pixel, and a pixel's membership is the mean over them; ``labels`` is then the label with
+    the largest share (the smallest on a tie), and regions too small to have any such pixel are regions still.
 
     Example:
         >>> regions = RegionMap.from_labels(torch.tensor([[3, 3, 7], [3, 7, 7]]))
@@ -30,31 +65,53 @@ class RegionMap:
 
     labels: Tensor  # (H, W) or (B, H, W) int64
     ids: Tensor  # (R,) int64, sorted
-    softness: float = 0.0
+    softness: float | PairWidths = 0.0
+    fine_labels: Tensor | None = None  # (k * H, k * W) or (B, k * H, k * W) int64; None where k is 1
+    supersample: int = 1  # k
     _membership: Membership = field(repr=False, kw_only=True)
     _table: Tensor | None = field(repr=False, kw_only=True)
 
     @classmethod
-    def from_labels(cls, labels: Tensor, softness: float = 0.0) -> RegionMap:
+    def from_labels(
+        cls, labels: Tensor, softness: float | Mapping[tuple[int, int], float] = 0.0, *, supersample: int = 1
+    ) -> RegionMap:
         r"""Build from a label map.
 
         Args:
-            labels: integer, :math:`(H, W)` or :math:`(B, H, W)`, non-negative; ids need not be consecutive.
-            softness: contour width (standard deviation) in pixels, 0 to 64.
+            labels: integer, :math:`(H, W)` or :math:`(B, H, W)`, non-negative; ids need not be consecutive. With
+                ``supersample`` k it has k times the image's height and width.
+            softness: contour width (standard deviation) in pixels, 0 to 64; or one for each pair of ids in any
+                order, 0 for pairs that are not mentioned.
+            supersample: labels along a side of a pixel, k.
 
         Raises:
-            TypeError: labels are not an integer tensor.
-            ValueError: wrong shape, no pixels, negative ids, softness out of range.
+            TypeError: labels are not an integer tensor; softness or supersample of another type.
+            ValueError: wrong shape, no pixels, negative ids, softness out of range or of ids that are not in the map,
+                a size that supersample does not divide.
+
+        Example:
+            >>> edge = torch.tensor([[1, 1, 1, 2], [1, 1, 1, 2]])
+            >>> RegionMap.from_labels(edge, {(2, 1): 0.7}).softness
+            0.7
+            >>> half = RegionMap.from_labels(edge, supersample=2)
+            >>> half.labels, half.num_regions
+            (tensor([[1, 1]]), 2)
         """
         labels = check_labels("labels", labels)
-        if isinstance(softness, bool) or not isinstance(softness, int | float):
-            raise TypeError(f"softness must be a number of pixels; got {softness!r}")
-        softness = float(softness)
-        if not 0.0 <= softness <= MAX_SOFTNESS:
-            raise ValueError(f"softness must be in [0, {MAX_SOFTNESS:g}] pixels; got {softness!r}")
+        _check_supersample(supersample, labels)
         ids, index, table = _compact(labels)
-        batched = index if index.ndim == 3 else index[None]
-        return cls(labels, ids, softness, _membership=Membership(batched, len(ids), softness), _table=table)
+        width = _check_softness(softness, ids)
+        by_index: float | Mapping[tuple[int, int], float] = width
+        if isinstance(width, PairWidths):
+            position = {region: at for at, region in enumerate(ids.tolist())}
+            by_index = {(position[a], position[b]): value for (a, b), value in width.items()}
+        index = index if index.ndim == 3 else index[None]
+        if supersample == 1:
+            return cls(labels, ids, width, _membership=Membership(index, len(ids), by_index), _table=table)
+        coarse = _largest_share(index, supersample)
+        membership = Membership(coarse, len(ids), by_index, fine=index)
+        shown = ids[coarse if labels.ndim == 3 else coarse[0]]
+        return cls(shown, ids, width, labels, supersample, _membership=membership, _table=table)
 
     @property
     def num_regions(self) -> int:
@@ -84,6 +141,8 @@ class RegionMap:
             self.labels.to(device),
             self.ids.to(device),
             self.softness,
+            None if self.fine_labels is None else self.fine_labels.to(device),
+            self.supersample,
             _membership=self._membership.to(device),
             _table=None if self._table is None else self._table.to(device),
         )
@@ -93,7 +152,8 @@ class RegionMap:
 
         Between pixel centres a point has the label with the largest share among its four neighbours (bilinear
         weights; the nearest neighbour's label on a tie). At the centres that is the map itself, so that the same size
-        gives the same map.
+        gives the same map. With ``supersample`` k it is the fine map that is sampled, at k times the new size: the
+        result has k x k labels a pixel as before. Widths of regions that the new map has lost are dropped.
 
         Args:
             size: (height, width).
@@ -109,8 +169,67 @@ class RegionMap:
         if (height, width) == self.size:
             return self
         scale = math.sqrt(height * width / (self.size[0] * self.size[1]))
-        softness = min(self.softness * scale, MAX_SOFTNESS)
-        return RegionMap.from_labels(_sample_labels(self.labels, height, width), softness)
+        k = self.supersample
+        labels = _sample_labels(self.labels if self.fine_labels is None else self.fine_labels, k * height, k * width)
+        if not isinstance(self.softness, PairWidths):
+            return RegionMap.from_labels(labels, min(self.softness * scale, MAX_SOFTNESS), supersample=k)
+        left = set(labels.unique().tolist())
+        widths = {pair: min(w * scale, MAX_SOFTNESS) for pair, w in self.softness.items() if left.issuperset(pair)}
+        return RegionMap.from_labels(labels, widths, supersample=k)
+
+
+def _check_width(name: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{name} must be a number of pixels; got {value!r}")
+    if not 0.0 <= value <= MAX_SOFTNESS:
+        raise ValueError(f"{name} must be in [0, {MAX_SOFTNESS:g}] pixels; got {float(value)!r}")
+    return float(value)
+
+
+def _check_softness(softness: object, ids: Tensor) -> float | PairWidths:
+    """Return the width if all pairs have the same, else the widths of pairs."""
+    if not isinstance(softness, Mapping):
+        return _check_width("softness", softness)
+    known: set[int] = set(ids.tolist())
+    widths: dict[tuple[int, int], float] = {}
+    for pair, value in softness.items():
+        if not isinstance(pair, tuple) or len(pair) != 2 or not all(hasattr(i, "__index__") for i in pair):
+            raise TypeError(f"softness must map pairs of ids to widths; got the key {pair!r}")
+        low, high = sorted(map(operator.index, pair))
+        if low == high or not known.issuperset((low, high)):
+            raise ValueError(f"softness must map pairs of two different ids in the map; got {pair!r}")
+        if (low, high) in widths:
+            raise ValueError(f"softness must name a pair once; got {(low, high)} and {(high, low)}")
+        widths[low, high] = _check_width(f"softness of {pair}", value)
+    every_pair = len(widths) == len(known) * (len(known) - 1) // 2
+    distinct = {*widths.values()} | (set() if every_pair else {0.0})
+    return PairWidths(widths) if len(distinct) > 1 else distinct.pop() if distinct else 0.0
+
+
+def _check_supersample(supersample: object, labels: Tensor) -> None:
+    if isinstance(supersample, bool) or not isinstance(supersample, int):
+        raise TypeError(f"supersample must be an integer; got {supersample!r}")
+    if supersample < 1:
+        raise ValueError(f"supersample must be at least 1; got {supersample}")
+    if labels.shape[-2] % supersample or labels.shape[-1] % supersample:
+        raise ValueError(f"labels must have sides that supersample, {supersample}, divides; got {tuple(labels.shape)}")
+
+
+def _largest_share(index: Tensor, factor: int) -> Tensor:
+    """Give each block of factor x factor its most frequent label, the smallest on a tie."""
+    maps, height, width = index.shape
+    split = index.reshape(maps, height // factor, factor, width // factor, factor)
+    blocks = split.transpose(2, 3).flatten(-2)  # [B, H, W, factor**2]
+    best = blocks.amin(-1)
+    mixed = best != blocks.amax(-1)
+    ordered = blocks[mixed].sort(-1).values  # [P, factor**2], equal labels in runs
+    at = torch.arange(factor * factor, device=index.device)
+    starts = ordered != torch.nn.functional.pad(ordered[:, :-1], (1, 0), value=-1)
+    run = at - torch.where(starts, at, 0).cummax(-1).values  # place within its run
+    # the longest run, then the first
+    last = (run * (factor * factor) - at).argmax(-1, keepdim=True)
+    best[mixed] = ordered.gather(-1, last)[:, 0]
+    return best
 
 
 def _compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:

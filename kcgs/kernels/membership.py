@@ -2,15 +2,18 @@
 
 Hard (softness 0): s_r = [M = r]. Soft: the Gaussian blur of [M = r], of standard deviation `softness` pixels, cut at
 `RADIUS_SIGMAS` standard deviations and normalised to sum to one over the regions, so that outside the image nothing
-weighs. A tile deep inside a region has s_r = 1 everywhere and is stored as nothing but its label.
+weighs. Where every pair of regions has a width of its own, a pixel takes the width of its nearest contour. Where the
+map is finer than the image, all this holds on the fine map, and a pixel has the mean over its sub-pixels.
+A tile deep inside a region has s_r = 1 everywhere and is stored as nothing but its label.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,44 +31,91 @@ class TileMembership(NamedTuple):
 
     keys: Tensor  # [K] int64, sorted: tile * num_regions + region
     plane: Tensor  # [K] int64, row of `planes`, -1 where the region is alone in its tile
-    planes: Tensor  # [P, tile * tile] bool (hard) or float64 (soft)
+    planes: Tensor  # [P, tile * tile] bool (hard, one label a pixel) or float64
+
+
+class Levels(NamedTuple):
+    """The widths that occur, and which of them each sub-pixel has."""
+
+    widths: tuple[float, ...]  # pixels, ascending
+    of: Tensor | None  # [B, k * H, k * W] int32, position in `widths`; None: one width everywhere
 
 
 class Membership:
-    """Compact label map and contour width, with the tables the kernels need, made once and kept."""
+    """Compact label map and contour widths, with the tables the kernels need, made once and kept."""
 
-    def __init__(self, index: Tensor, num_regions: int, softness: float = 0.0) -> None:
-        """Take `index` (B, H, W), integers 0 ... num_regions - 1."""
+    def __init__(
+        self,
+        index: Tensor,
+        num_regions: int,
+        softness: float | Mapping[tuple[int, int], float] = 0.0,
+        *,
+        fine: Tensor | None = None,
+    ) -> None:
+        """Take the labels of pixels as integers 0 ... num_regions - 1.
+
+        Args:
+            index: (B, H, W).
+            num_regions: number of labels.
+            softness: contour width in pixels, or that of each pair (a, b) of labels with a < b, 0 where absent.
+            fine: (B, k * H, k * W), the labels of the k * k sub-pixels of each pixel; None: k is 1.
+        """
         self.index = index
         self.num_regions = num_regions
         self.softness = softness
+        self.fine = fine
         self._derived: dict[object, Any] = {}
 
     @property
+    def grid(self) -> Tensor:
+        """The map at its own resolution, (B, k * H, k * W)."""
+        return self.index if self.fine is None else self.fine
+
+    @property
+    def supersample(self) -> int:
+        """Sub-pixels along a side of a pixel, k."""
+        return self.grid.shape[-1] // self.index.shape[-1]
+
+    @property
+    def levels(self) -> Levels:
+        """Contour widths of the sub-pixels."""
+        return self.derived("levels", _find_levels)
+
+    @property
     def radius(self) -> int:
-        """Reach of the soft contour in pixels."""
-        return math.ceil(RADIUS_SIGMAS * self.softness)
+        """Reach of the softest contour in pixels."""
+        return math.ceil(RADIUS_SIGMAS * self.levels.widths[-1])
 
     def to(self, device: torch.device) -> Membership:
         """Return the same membership on `device`, tables not carried along."""
-        return Membership(self.index.to(device), self.num_regions, self.softness)
+        fine = None if self.fine is None else self.fine.to(device)
+        return Membership(self.index.to(device), self.num_regions, self.softness, fine=fine)
 
     def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
         """Evaluate s_r of one region over one whole map, (H, W): the definition, without tables."""
-        inside = (self.index[batch] == region).to(torch.float64)
-        if self.softness == 0.0:
-            return inside.to(dtype)
-        rows, cols = (self._blur_matrix(n, inside.device) for n in inside.shape)
+        inside = (self.grid[batch] == region).to(torch.float64)
+        widths, level = self.levels
+        share = torch.zeros_like(inside)
+        for position, width in enumerate(widths):
+            blurred = self._blur(inside, width)
+            share = blurred if level is None else torch.where(level[batch] == position, blurred, share)
+        return _pool(share, self.supersample).to(dtype)
+
+    def _blur(self, inside: Tensor, width: float) -> Tensor:
+        if width == 0.0:
+            return inside
+        axes = [torch.arange(n, device=inside.device) for n in inside.shape]
+        rows, cols = (self._weights_at(at[:, None] - at[None, :], width) for at in axes)
         total = rows.sum(1)[:, None] * cols.sum(1)[None, :]
-        return ((rows @ inside @ cols.T) / total).to(dtype)
+        return (rows @ inside @ cols.T) / total
 
-    def _blur_matrix(self, n: int, device: torch.device) -> Tensor:
-        at = torch.arange(n, device=device, dtype=torch.float64)
-        distance = (at[:, None] - at[None, :]).abs()
-        return torch.where(distance <= self.radius, self._gaussian(distance), 0.0)
+    def _reach(self, width: float) -> int:
+        return math.ceil(RADIUS_SIGMAS * width * self.supersample)  # sub-pixels
 
-    def _gaussian(self, distance: Tensor) -> Tensor:
-        return torch.exp(-0.5 * (distance / self.softness) ** 2)
+    def _weights_at(self, offset: Tensor, width: float) -> Tensor:
+        distance = offset.abs().to(torch.float64)
+        gaussian = torch.exp(-0.5 * (distance / (width * self.supersample)) ** 2)
+        return torch.where(distance <= self._reach(width), gaussian, 0.0)
 
     def tiles(self, tile: int) -> TileMembership:
         """Tables for square tiles of `tile` pixels."""
@@ -79,53 +129,168 @@ class Membership:
         return value
 
     def _build_tiles(self, tile: int) -> TileMembership:
-        # windows: every tile with the halo that its soft contours can see; -1 is outside the image
-        height, width = self.index.shape[1:]
-        radius = self.radius
-        tiles_y, tiles_x = -(-height // tile), -(-width // tile)
-        border = (radius, tiles_x * tile - width + radius, radius, tiles_y * tile - height + radius)
-        span = tile + 2 * radius
+        side = tile * self.supersample
+        widths, level = self.levels
+        holds = _levels_held(self.grid, level, len(widths), side)  # [T, levels]
+        # a tile is mixed if a contour is within the reach of one of its own pixels
+        mixed = torch.zeros_like(holds[:, 0])
+        label = torch.zeros(len(holds), dtype=torch.int64, device=holds.device)
+        for position, width in enumerate(widths):
+            low, high = _extremes(self.grid, side, self._reach(width), self.num_regions)
+            mixed |= holds[:, position] & (low != high)
+            label = torch.where(holds[:, position], high, label)
+        single = (~mixed).nonzero().flatten()
+        parts = [
+            part
+            for position, width in enumerate(widths)
+            for part in self._keys((mixed & holds[:, position]).nonzero().flatten(), side, self._reach(width))
+        ]
+        several = torch.cat([single[:0], *parts])
+        several = several if level is None else several.unique()
+        planes = self._planes(several, holds, tile)
+        all_keys, order = torch.cat([single * self.num_regions + label[single], several]).sort()
+        rows = torch.arange(len(several), device=several.device)
+        return TileMembership(all_keys, torch.cat([torch.full_like(single, -1), rows])[order], planes)
 
-        def windows(outside: int) -> Tensor:  # [B, ty, tx, span, span], a view
-            padded = torch.nn.functional.pad(self.index, border, value=outside)
-            return padded.unfold(1, span, tile).unfold(2, span, tile)
+    def _keys(self, tiles: Tensor, side: int, reach: int) -> list[Tensor]:
+        """List tile * num_regions + region of all that the pixels of some tiles can see, in sorted pieces."""
+        view = _windows(self.grid, side, reach, -1)
+        keys = []
+        for some in tiles.split(max(1, _PATCH_ELEMENTS // (side + 2 * reach) ** 2)):
+            seen = view[_place(some, view)].flatten(1)
+            keys.append(torch.unique((some[:, None] * self.num_regions + seen)[seen >= 0]))
+        return keys
 
-        high = windows(-1).amax((-1, -2)).flatten()
-        low = windows(self.num_regions).amin((-1, -2)).flatten()
-        single = (low == high).nonzero().flatten()
-        mixed = (low != high).nonzero().flatten()
-        keys, planes = [single * self.num_regions + high[single]], []
-        step = max(1, _PATCH_ELEMENTS // (span * span))
-        for some in mixed.split(step):
-            image, place = some // (tiles_y * tiles_x), some % (tiles_y * tiles_x)
-            patches = windows(-1)[image, place // tiles_x, place % tiles_x]
-            held = torch.unique((some[:, None] * self.num_regions + patches.flatten(1))[patches.flatten(1) >= 0])
-            keys.append(held)
-            slot = torch.searchsorted(some, held // self.num_regions)
-            planes.append(self._planes(patches, slot, held % self.num_regions, tile))
-
-        rows = torch.arange(sum(map(len, planes)), device=self.index.device)
-        all_keys, order = torch.cat(keys).sort()
-        plane = torch.cat([torch.full_like(single, -1), rows])[order]
-        empty = self._planes(windows(-1)[:1, 0, 0], rows[:0], rows[:0], tile)
-        return TileMembership(all_keys, plane, torch.cat(planes) if planes else empty)
-
-    def _planes(self, patches: Tensor, slot: Tensor, region: Tensor, tile: int) -> Tensor:
-        span, radius = patches.shape[-1], self.radius
-        dtype = torch.bool if self.softness == 0.0 else torch.float64
-        planes = torch.empty(len(slot), tile * tile, device=patches.device, dtype=dtype)
-        step = max(1, _PATCH_ELEMENTS // (span * span))
-        if self.softness == 0.0:
-            for start in range(0, len(slot), step):
-                part = slice(start, start + step)
-                planes[part] = (patches[slot[part]] == region[part, None, None]).flatten(1)
-            return planes
-        at = torch.arange(span, device=patches.device, dtype=torch.float64)
-        distance = (at[radius : radius + tile, None] - at[None, :]).abs()
-        blur = torch.where(distance <= radius, self._gaussian(distance), 0.0)  # [tile, span]
-        total = blur @ (patches >= 0).to(blur.dtype) @ blur.T
-        for start in range(0, len(slot), step):
-            part = slice(start, start + step)
-            mask = (patches[slot[part]] == region[part, None, None]).to(blur.dtype)
-            planes[part] = ((blur @ mask @ blur.T) / total[slot[part]].clamp_min(1e-300)).flatten(1)
+    def _planes(self, keys: Tensor, holds: Tensor, tile: int) -> Tensor:
+        """Weights of each key's region over its tile."""
+        side = tile * self.supersample
+        widths, level = self.levels
+        tiles, region = keys // self.num_regions, (keys % self.num_regions)[:, None, None]
+        hard = self.supersample == 1 and widths == (0.0,)
+        planes = torch.zeros(len(keys), tile * tile, device=keys.device, dtype=torch.bool if hard else torch.float64)
+        for position, width in enumerate(widths):
+            reach = self._reach(width)
+            view = _windows(self.grid, side, reach, -1)
+            share = self._sharer(width, side)
+            rows = holds[tiles, position].nonzero().flatten()
+            for some in rows.split(max(1, _PATCH_ELEMENTS // (side + 2 * reach) ** 2)):
+                place = _place(tiles[some], view)
+                inside = view[place] == region[some]
+                if hard:
+                    planes[some] = inside.flatten(1)
+                    continue
+                shares = share(inside.to(torch.float64), place)
+                if level is not None:
+                    own = _windows(level, side, 0, -1)[place] == position
+                    shares = torch.where(own, shares, 0.0)
+                planes[some] += _pool(shares, self.supersample).flatten(1)
         return planes
+
+    def _sharer(self, width: float, side: int) -> Callable[[Tensor, tuple[Tensor, ...]], Tensor]:
+        """Return the map from windows of [M = r] (P, span, span) and their places to s_r (P, side, side)."""
+        if width == 0.0:
+            return lambda inside, _: inside
+        reach, device = self._reach(width), self.grid.device
+        span = torch.arange(side + 2 * reach, device=device)
+        blur = self._weights_at(span[reach : reach + side, None] - span[None, :], width)  # [side, span]
+        sums = []
+        for n in self.grid.shape[1:]:
+            there = torch.nn.functional.pad(blur.new_ones(n), (reach, -n % side + reach))
+            sums.append(there.unfold(0, len(span), side) @ blur.T)  # [tiles, side]
+
+        def share(inside: Tensor, place: tuple[Tensor, ...]) -> Tensor:
+            total = sums[0][place[1]][:, :, None] * sums[1][place[2]][:, None, :]
+            return (blur @ inside @ blur.T) / total.clamp_min(1e-300)
+
+        return share
+
+
+def _find_levels(membership: Membership) -> Levels:
+    """Give each sub-pixel the width of the contour it is nearest to.
+
+    The nearest sub-pixel that touches a contour has the same label, since on the way to another label one would touch
+    the contour earlier; so the pair is this one's, with the first of its neighbours that differs.
+    """
+    if not isinstance(membership.softness, Mapping):
+        return Levels((membership.softness,), None)
+    from scipy.ndimage import distance_transform_edt
+
+    maps = membership.grid.cpu().numpy()
+    other = np.stack([_across(labels) for labels in maps])
+    touches = other >= 0
+    low, high = np.sort([maps[touches], other[touches]], axis=0).astype(np.int64)
+    pairs, place = np.unique(low * membership.num_regions + high, return_inverse=True)
+    of_pair = [membership.softness.get(divmod(pair, membership.num_regions), 0.0) for pair in pairs.tolist()]
+    if len(set(of_pair)) < 2:
+        return Levels((of_pair[0] if of_pair else 0.0,), None)
+    widths, of_pair_level = np.unique(of_pair, return_inverse=True)
+    level = np.zeros(maps.shape, np.int32)
+    level[touches] = of_pair_level[place]
+    for one, touch in zip(level, touches, strict=True):
+        if touch.any():
+            rows, cols = distance_transform_edt(~touch, return_distances=False, return_indices=True)
+            one[:] = one[rows, cols]
+    return Levels(tuple(widths.tolist()), torch.from_numpy(level).to(membership.grid.device))
+
+
+def _across(labels: Any) -> Any:
+    """Label on the other side of the contour that a pixel touches (above, left, right, below: the first); else -1."""
+    other = np.full_like(labels, -1)
+    most, least = slice(1, None), slice(None, -1)
+    whole = slice(None)
+    for here, there in (
+        ((most, whole), (least, whole)),
+        ((whole, most), (whole, least)),
+        ((whole, least), (whole, most)),
+        ((least, whole), (most, whole)),
+    ):
+        found = (labels[here] != labels[there]) & (other[here] < 0)
+        other[here][found] = labels[there][found]
+    return other
+
+
+def _pool(shares: Tensor, factor: int) -> Tensor:
+    """Mean over the sub-pixels of each pixel: (..., k * H, k * W) to (..., H, W)."""
+    if factor == 1:
+        return shares
+    height, width = shares.shape[-2:]
+    return shares.reshape(*shares.shape[:-2], height // factor, factor, width // factor, factor).mean((-3, -1))
+
+
+def _pad(grid: Tensor, side: int, reach: int, outside: int) -> Tensor:
+    height, width = grid.shape[1:]
+    return torch.nn.functional.pad(grid, (reach, -width % side + reach, reach, -height % side + reach), value=outside)
+
+
+def _windows(grid: Tensor, side: int, reach: int, outside: int) -> Tensor:
+    """Every tile with a halo that wide, (B, tiles_y, tiles_x, span, span), a view."""
+    span = side + 2 * reach
+    return _pad(grid, side, reach, outside).unfold(1, span, side).unfold(2, span, side)
+
+
+def _place(tiles: Tensor, windows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Image, row and column of tiles by number."""
+    rows, cols = windows.shape[1:3]
+    return tiles // (rows * cols), tiles // cols % rows, tiles % cols
+
+
+def _extremes(grid: Tensor, side: int, reach: int, num_regions: int) -> tuple[Tensor, Tensor]:
+    """Lowest and highest label of every window, [T] each."""
+    span = side + 2 * reach
+    low, high = _pad(grid, side, reach, num_regions), _pad(grid, side, reach, -1)
+    for axis in (1, 2):
+        low, high = low.unfold(axis, span, side).amin(-1), high.unfold(axis, span, side).amax(-1)
+    return low.flatten(), high.flatten()
+
+
+def _levels_held(grid: Tensor, level: Tensor | None, count: int, side: int) -> Tensor:
+    """Say which levels the pixels of each tile have, [T, count] bool."""
+    maps, height, width = grid.shape
+    rows, cols = -(-height // side), -(-width // side)
+    if level is None:
+        return torch.ones(maps * rows * cols, 1, dtype=torch.bool, device=grid.device)
+    at = [torch.arange(n, device=grid.device) for n in grid.shape]
+    tile = (at[0][:, None, None] * rows + at[1][:, None] // side) * cols + at[2] // side
+    holds = torch.zeros(maps * rows * cols * count, dtype=torch.bool, device=grid.device)
+    holds[(tile * count + level).flatten()] = True
+    return holds.view(-1, count)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from kcgs import RegionMap
 from kcgs.functional import edge_band, lookup_regions
+from kcgs.functional.regions import PairWidths
 from kcgs.kernels.binning import TILE
 
 
@@ -98,6 +99,104 @@ class TestRegionMap:
             RegionMap.from_labels(labels, softness)
 
 
+class TestPairWidths:
+    def test_one_width_for_every_pair_is_a_number(self) -> None:
+        labels = torch.tensor([[3, 5, 9]])
+        assert RegionMap.from_labels(labels, {(3, 5): 0.7, (9, 3): 0.7, (5, 9): 0.7}).softness == 0.7
+        assert RegionMap.from_labels(labels, {(3, 5): 0.0}).softness == 0.0
+        assert RegionMap.from_labels(labels, {}).softness == 0.0
+        assert RegionMap.from_labels(torch.ones(2, 2).long(), {}).softness == 0.0
+
+    def test_read_in_either_order_and_never_written(self) -> None:
+        given = {(9, 3): 0.7, (3, 5): 1}
+        softness = RegionMap.from_labels(torch.tensor([[3, 5, 9]]), given).softness
+        assert isinstance(softness, PairWidths)
+        assert list(softness.items()) == [((3, 5), 1.0), ((3, 9), 0.7)]
+        assert softness[9, 3] == softness[3, 9] == 0.7 and (5, 9) not in softness
+        given[9, 3] = 2.0
+        assert softness == {(3, 5): 1.0, (3, 9): 0.7}
+        assert hash(softness) == hash(PairWidths(dict(sorted(softness.items(), reverse=True))))
+        with pytest.raises(TypeError):
+            softness[3, 9] = 1.0  # type: ignore[index]
+
+    def test_pickle_copy_and_move(self) -> None:
+        regions = RegionMap.from_labels(blobs((44, 70)), {(0, 1): 0.7, (2, 3): 1.0}, supersample=2)
+        regions._membership.tiles(TILE)
+        others = (pickle.loads(pickle.dumps(regions)), copy.deepcopy(regions), regions.to("meta"))
+        for other in others:
+            assert other.softness == regions.softness
+            assert (other.supersample, other.size) == (2, (22, 35))
+            assert other.fine_labels is not None and other.fine_labels.shape == (44, 70)
+            assert other._membership.grid.shape == (1, 44, 70)
+        assert others[2].fine_labels is not None and others[2].fine_labels.device.type == "meta"
+        assert torch.equal(others[0]._membership.tiles(TILE).planes, regions._membership.tiles(TILE).planes)
+
+    @pytest.mark.parametrize(
+        ("softness", "error", "words"),
+        [
+            ({(0, 4): 0.7}, ValueError, r"softness must map pairs of two different ids in the map; got \(0, 4\)"),
+            ({(1, 1): 0.7}, ValueError, "softness must map pairs of two different ids"),
+            ({(0, 1): 0.7, (1, 0): 0.7}, ValueError, r"name a pair once; got \(0, 1\) and \(1, 0\)"),
+            ({(0, 1): 64.5}, ValueError, r"softness of \(0, 1\) must be in \[0, 64\] pixels; got 64.5"),
+            ({(0, 1): -0.5}, ValueError, "softness of"),
+            ({(0, 1): math.nan}, ValueError, "softness of"),
+            ({(0, 1): "a"}, TypeError, r"softness of \(0, 1\) must be a number of pixels; got 'a'"),
+            ({0: 0.7}, TypeError, "softness must map pairs of ids to widths; got the key 0"),
+            ({(0, 1, 2): 0.7}, TypeError, "softness must map pairs"),
+            ({(0.0, 1.0): 0.7}, TypeError, "softness must map pairs"),
+        ],
+    )
+    def test_bad_widths(self, softness: object, error: type[Exception], words: str) -> None:
+        with pytest.raises(error, match=words):
+            RegionMap.from_labels(blobs(), softness)  # type: ignore[arg-type]
+
+
+class TestSupersample:
+    def test_one_is_the_plain_map(self) -> None:
+        regions = RegionMap.from_labels(blobs(), supersample=1)
+        assert regions.fine_labels is None and regions.supersample == 1
+        assert regions._membership.fine is None
+
+    @pytest.mark.parametrize("factor", [2, 3, 4])
+    def test_labels_have_the_largest_share(self, factor: int) -> None:
+        fine = torch.randint(0, 3, (2, 6 * factor, 9 * factor), generator=torch.Generator().manual_seed(0)) * 7
+        regions = RegionMap.from_labels(fine, supersample=factor)
+        for b, y, x in [(b, y, x) for b in range(2) for y in range(6) for x in range(9)]:
+            block = fine[b, factor * y : factor * (y + 1), factor * x : factor * (x + 1)].flatten().tolist()
+            assert regions.labels[b, y, x] == max(sorted(set(block)), key=block.count)
+        assert regions.size == (6, 9)
+        assert torch.equal(regions.fine_labels, fine)
+        assert RegionMap.from_labels(fine[0], supersample=factor).labels.shape == (6, 9)
+
+    def test_a_region_without_a_pixel_is_a_region(self) -> None:
+        fine = torch.ones(4, 4).long()
+        fine[1, 2] = 5
+        regions = RegionMap.from_labels(fine, supersample=2)
+        assert regions.labels.unique().tolist() == [1]
+        assert regions.ids.tolist() == [1, 5]
+        assert regions._membership.weights(0, 1, torch.float64).tolist() == [[0.0, 0.25], [0.0, 0.0]]
+
+    def test_edges_at_sub_pixels_keep_their_place(self) -> None:
+        fine = (torch.arange(80) >= 41).long().expand(8, 80)
+        for softness in (0.0, 0.7):
+            share = RegionMap.from_labels(fine, softness, supersample=4)._membership.weights(0, 0, torch.float64)
+            assert share.sum(1).tolist() == pytest.approx([41 / 4] * 2, abs=1e-12)
+
+    @pytest.mark.parametrize(
+        ("supersample", "error", "words"),
+        [
+            (0, ValueError, "supersample must be at least 1; got 0"),
+            (True, TypeError, "supersample must be an integer; got True"),
+            (2.0, TypeError, "supersample must be an integer; got 2.0"),
+            (2, ValueError, r"labels must have sides that supersample, 2, divides; got \(45, 70\)"),
+            (100, ValueError, "labels must have sides"),
+        ],
+    )
+    def test_bad_input(self, supersample: object, error: type[Exception], words: str) -> None:
+        with pytest.raises(error, match=words):
+            RegionMap.from_labels(blobs(), supersample=supersample)  # type: ignore[arg-type]
+
+
 class TestResize:
     def test_same_size_is_the_same_map(self) -> None:
         regions = RegionMap.from_labels(blobs())
@@ -123,6 +222,30 @@ class TestResize:
         small = RegionMap.from_labels(labels).resize((45, 70)).labels
         agree = (small == labels[::2, ::2]) | (small == labels[1::2, 1::2])
         assert agree.float().mean() > 0.97
+
+    def test_widths_scale_along_and_those_of_lost_regions_go(self) -> None:
+        labels = torch.zeros(40, 40).long()
+        labels[:, 20:], labels[7, 7] = 1, 2
+        widths = {(0, 1): 0.5, (0, 2): 40.0, (1, 2): 0.0}
+        regions = RegionMap.from_labels(labels, widths)
+        assert regions.resize((80, 80)).softness == {(0, 1): 1.0, (0, 2): 64.0, (1, 2): 0.0}
+        small = regions.resize((10, 10))
+        assert small.num_regions == 2 and small.softness == 0.125
+
+    @pytest.mark.parametrize("factor", [2, 4])
+    def test_fine_map_is_sampled(self, factor: int) -> None:
+        y, x = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
+        fine = ((x - 30.3) ** 2 + (y - 33.1) ** 2 < 400).long()
+        regions = RegionMap.from_labels(fine, 0.5, supersample=factor)
+        side = 64 // factor
+        large = regions.resize((2 * side, 2 * side))
+        assert (large.supersample, large.size, large.softness) == (factor, (2 * side, 2 * side), 1.0)
+        assert torch.equal(large.fine_labels, RegionMap.from_labels(fine).resize((128, 128)).labels)
+        assert regions.resize((side, side)) is regions
+        small = RegionMap.from_labels(fine, supersample=factor).resize((side // 2, side // 2))
+        shares = small._membership.weights(0, 1, torch.float64)
+        exact = torch.nn.functional.avg_pool2d(fine[None].double(), 2 * factor)[0]
+        assert (shares - exact).abs().max() <= 0.25 and (shares.mean() - exact.mean()).abs() < 5e-3
 
     def test_batch(self) -> None:
         maps = torch.stack([blobs(seed=0), blobs(seed=1)])

@@ -1,0 +1,113 @@
+"""The fits, one after the other, and what becomes of them."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from kcgs._atomic import atomic_path
+
+from .cases import GROUPS, Case, cases, missing
+from .report import write
+from .runs import Run, Store, equal_bytes, perform
+
+
+def run(output: Path, *, data: Path | None = None, quick: bool = False, only: str | None = None) -> None:
+    """Race the recipes; write results.csv, report.md and figures.
+
+    Every finished fit is kept in `output`/runs, so that the same call goes on where an earlier one was interrupted;
+    the report is of all runs there that have the present settings. Remove the folder to measure changed code anew.
+
+    Args:
+        output: folder.
+        data: folder with DAVIS, bsds and kodak in it; None: the charts and one photo are all there is.
+        quick: one small picture for each group and few iterations.
+        only: names of groups with commas between them; None: all that can be run.
+
+    Raises:
+        ValueError: `only` names no group, or one whose pictures are missing.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    chosen = _choose(only, data)
+    store = Store(output / "runs")
+    waiting = [case for group in chosen for case in cases(group, data, quick)]
+    console = Console(stderr=True)
+    try:
+        with Progress(console=console, disable=not console.is_terminal) as progress:
+            task = progress.add_task("", total=len(waiting))
+
+            def obtain(case: Case) -> Run:
+                progress.update(task, description=f"{case.group}: {case.image}, N = {case.n:,}, {case.name}")
+                return store.read(case) or _perform(store, case, data)
+
+            for case in waiting:
+                for _ in _with_equal_bytes(case, obtain):
+                    pass
+                progress.advance(task)
+    finally:
+        _report(output, store, data, quick, chosen)
+    Console().print(f"{output}/report.md")
+
+
+def _choose(only: str | None, data: Path | None) -> list[str]:
+    if only is None:
+        return [group for group in GROUPS if missing(group, data) is None]
+    names = [name.strip() for name in only.split(",")]
+    for name in names:
+        if name not in GROUPS:
+            raise ValueError(f"only must name groups of {', '.join(GROUPS)}, with commas; got {only!r}")
+        why = missing(name, data)
+        if why is not None:
+            raise ValueError(f"only asks for {name!r}, but {why}")
+    return [group for group in GROUPS if group in names]
+
+
+def _perform(store: Store, case: Case, data: Path | None) -> Run:
+    made = perform(case, data)
+    store.write(case, made)
+    return made
+
+
+def _with_equal_bytes(case: Case, obtain: Callable[[Case], Run | None]) -> Iterator[tuple[Case, Run]]:
+    """Yield the run of a case and the baseline's at equal bytes, as far as they can be had."""
+    made = obtain(case)
+    if made is None:
+        return
+    yield case, made
+    other = equal_bytes(case, made)
+    rival = None if other is None else obtain(other)
+    if other is not None and rival is not None:
+        yield other, rival
+
+
+def _report(output: Path, store: Store, data: Path | None, quick: bool, chosen: list[str]) -> None:
+    runs: dict[str, Run] = {}  # by key: the baseline at equal bytes may be that of two recipes
+    notes = []
+    for group in GROUPS:
+        why = missing(group, data)
+        if why is not None:
+            notes.append(f"{group}: {why}.")
+            continue
+        wanted = cases(group, data, quick)
+        made = [list(_with_equal_bytes(case, store.read)) for case in wanted]
+        runs |= {case.key(): run for found in made for case, run in found}
+        count = sum(bool(found) for found in made)
+        if count < len(wanted):
+            why = "stopped before its end" if group in chosen else "not chosen"
+            notes.append(f"{group}: {why}, {count} of {len(wanted)} fits are there.")
+    _write_csv(output / "results.csv", list(runs.values()))
+    write(output, list(runs.values()), notes, quick)
+
+
+def _write_csv(path: Path, runs: list[Run]) -> None:
+    names = [field.name for field in dataclasses.fields(Run) if field.name != "history"]
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([*names, "bytes"])
+        for run in runs:
+            values = [getattr(run, name) for name in names]
+            writer.writerow([*(f"{v:.6g}" if isinstance(v, float) else v for v in values), run.bytes])

@@ -1,0 +1,157 @@
+"""One fit, measured, and kept on disk as soon as it is done."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from functools import lru_cache
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from kcgs._atomic import atomic_path
+from kcgs.bench.measure import measure
+from kcgs.fit import FitConfig, HistoryEntry, fit
+from kcgs.functional import RegionMap
+from kcgs.nn.renderer import render_image
+
+from .cases import BASELINE, COMPARED, RIVALS, Case, load
+
+GAUSSIAN_BYTES = 7
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run:
+    """A finished fit: what was asked, what came out."""
+
+    group: str
+    image: str
+    n: int
+    name: str
+    seed: int = 0
+    psnr: float
+    ef_psnr: float
+    ssim: float
+    ms_ssim: float
+    ef_ssim: float
+    seconds: float  # of the whole call
+    num_gaussians: int  # what is left of n
+    given_bytes: int  # of the label map that came in, 0: none
+    map_bytes: int  # of the label map that must be stored, 0: none
+    iterations: int
+    stop_reason: str
+    history: tuple[HistoryEntry, ...] = ()
+
+    @property
+    def bytes(self) -> int:
+        """Size of the scene: 7 bytes a Gaussian, and the label map."""
+        return GAUSSIAN_BYTES * self.num_gaussians + self.map_bytes
+
+
+class Store:
+    """Runs in a folder, a JSON file each, named by a hash of the case and its settings."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder = folder
+
+    def read(self, case: Case) -> Run | None:
+        """Return the run of a case, None where there is none."""
+        path = self._path(case)
+        if not path.is_file():
+            return None
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        return Run(**{**kept["run"], "history": tuple(HistoryEntry(*entry) for entry in kept["run"]["history"])})
+
+    def write(self, case: Case, run: Run) -> None:
+        """Keep a run."""
+        # the case and its settings are there for who reads the file
+        kept = {
+            "recipe": case.recipe,
+            "overrides": case.overrides,
+            "settings": case.config().model_dump(mode="json"),
+            "run": dataclasses.asdict(run),
+        }
+        with atomic_path(self._path(case)) as temporary:
+            temporary.write_text(json.dumps(kept), encoding="utf-8")
+
+    def _path(self, case: Case) -> Path:
+        # what is recorded is part of the name: files of another form are not read
+        return self.folder / f"{case.group}-{case.key(*(f.name for f in dataclasses.fields(Run)))}.json"
+
+
+def equal_bytes(case: Case, run: Run) -> Case | None:
+    """Return the baseline's fit with the Gaussians that the bytes of `run` buy; None where none is asked for."""
+    if case.group not in COMPARED or case.name not in RIVALS:
+        return None
+    # what cuts the quick form short cuts this short too
+    overrides = {key: value for key, value in case.overrides.items() if key == "iterations"}
+    return Case(case.group, case.image, affordable(run), BASELINE, BASELINE, overrides, case.seed)
+
+
+def affordable(run: Run) -> int:
+    """Gaussians without a map in the bytes of `run`."""
+    return run.bytes // GAUSSIAN_BYTES
+
+
+def perform(case: Case, data: Path | None) -> Run:
+    """Fit and measure; edge-focused figures are taken along the contours of the map that was given."""
+    problem, config = load(case, data), case.config()
+    _warm_up(config)
+    start = time.perf_counter()
+    result = fit(problem.image, problem.regions, case.n, config=config, seed=case.seed)
+    seconds = time.perf_counter() - start
+    figures = measure(render_image(result.field, result.regions), problem.image, problem.labels)
+    return Run(
+        group=case.group,
+        image=case.image,
+        n=case.n,
+        name=case.name,
+        seed=case.seed,
+        seconds=seconds,
+        num_gaussians=len(result.field),
+        given_bytes=_stored_bytes(problem.regions),
+        map_bytes=_stored_bytes(result.regions),
+        iterations=result.history[-1].iteration,
+        stop_reason=result.stop_reason,
+        history=tuple(result.history),
+        **figures,
+    )
+
+
+def map_bytes(labels: Tensor) -> int:
+    """Size of a label map as lossless WebP."""
+    index = torch.unique(labels, return_inverse=True)[1].cpu().numpy().astype(np.int32)
+    return _webp_bytes(index.tobytes(), index.shape[0])
+
+
+# a second's work, and most fits store the map that they were given
+@lru_cache(maxsize=8)
+def _webp_bytes(index: bytes, height: int) -> int:
+    values = np.frombuffer(index, np.int32).reshape(height, -1)
+    levels = np.stack([values >> 16, values >> 8, values], -1).astype(np.uint8)
+    picture = Image.fromarray(levels if values.max() > 255 else levels[..., 2].copy())
+    file = BytesIO()
+    picture.save(file, "WEBP", lossless=True, quality=100, method=6)
+    return file.getbuffer().nbytes
+
+
+def _stored_bytes(regions: RegionMap | None) -> int:
+    if regions is None:
+        return 0
+    return map_bytes(regions.labels if regions.fine_labels is None else regions.fine_labels)
+
+
+@lru_cache(maxsize=64)
+def _warm_up(config: FitConfig) -> None:
+    """Compile what this recipe needs: no fit's clock shall count it."""
+    ramp = torch.linspace(0.0, 1.0, 96)
+    image = torch.stack([ramp.expand(64, 96), 1 - ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96)])
+    labels = (ramp > 0.6).long().expand(64, 96).contiguous()
+    short = config.model_copy(update={"iterations": min(config.iterations, 20), "max_seconds": None})
+    fit(image, labels, 24, config=short)

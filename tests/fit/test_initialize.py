@@ -1,0 +1,163 @@
+"""Starts: counts, ids, determinism, where the centres go, odd regions."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs import RegionMap
+from kcgs.fit.initialize import INITIALIZERS, kmeans_field, random_field, sampled_field
+from kcgs.functional import lookup_regions, psnr, region_splat
+from kcgs.nn import GaussianField
+
+NAMES = sorted(INITIALIZERS)
+
+
+def scene(size: tuple[int, int] = (48, 64), channels: int = 3) -> tuple[Tensor, Tensor]:
+    """Detail on the left, little on the right; a disc and a bar on a ground."""
+    y, x = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")
+    labels = torch.zeros(size, dtype=torch.long)
+    labels[(x - 20) ** 2 + (y - 16) ** 2 < 100] = 3
+    labels[30:40, 40:60] = 11
+    phases = torch.arange(channels)[:, None, None]
+    image = 0.5 + 0.2 * torch.sin(x * 0.9 + phases) * (x < size[1] // 2) + 0.02 * labels
+    return image.clamp(0, 1), labels
+
+
+def draw(field: GaussianField, regions: RegionMap | None) -> Tensor:
+    return region_splat(field.means, field.cholesky, field.colors, field.region_ids, regions, size=field.size).detach()
+
+
+@pytest.mark.parametrize("name", NAMES)
+class TestEvery:
+    @pytest.mark.parametrize("channels", [1, 3, 8])
+    @pytest.mark.parametrize("count", [1, 40, 500])
+    def test_counts_shapes_and_ids(self, name: str, count: int, channels: int) -> None:
+        image, labels = scene(channels=channels)
+        regions = RegionMap.from_labels(labels)
+        field = INITIALIZERS[name](image, count, regions, 0)
+        assert len(field) == count and field.size == (48, 64) and field.colors.shape == (count, channels)
+        assert field.region_ids is not None and bool((regions.index_of(field.region_ids) >= 0).all())
+        assert all(torch.isfinite(t).all() for t in (field.means, field.cholesky, field.colors))
+
+    def test_without_regions(self, name: str) -> None:
+        field = INITIALIZERS[name](scene()[0], 30, None, 0)
+        assert len(field) == 30 and field.region_ids is None
+
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_keeps_the_dtype(self, name: str, dtype: torch.dtype) -> None:
+        image, labels = scene()
+        assert INITIALIZERS[name](image.to(dtype), 30, RegionMap.from_labels(labels), 0).colors.dtype == dtype
+
+    def test_same_seed_same_bits(self, name: str) -> None:
+        image, labels = scene()
+        a, b, c = (INITIALIZERS[name](image, 60, RegionMap.from_labels(labels), seed) for seed in (2, 2, 3))
+        for part in ("means", "cholesky", "colors", "region_ids"):
+            assert torch.equal(getattr(a, part), getattr(b, part))
+        assert not torch.equal(a.means, c.means)
+
+    def test_more_gaussians_than_pixels(self, name: str) -> None:
+        labels = torch.tensor([[0, 0, 5], [0, 9, 9]])
+        field = INITIALIZERS[name](torch.rand(2, 2, 3), 50, RegionMap.from_labels(labels), 0)
+        assert len(field) == 50 and len(field.means.unique(dim=0)) == 50
+
+    def test_parameters_without_graph_under_any_mode(self, name: str) -> None:
+        image, labels = scene()
+        with torch.no_grad():
+            field = INITIALIZERS[name](image, 10, RegionMap.from_labels(labels), 0)
+        assert all(p.requires_grad and p.is_leaf for p in field.parameters())
+
+
+class TestRandom:
+    def test_is_random_field_with_a_sigma_of_half_the_spacing(self) -> None:
+        image, labels = scene()
+        regions = RegionMap.from_labels(labels)
+        named = INITIALIZERS["random"](image, 12, regions, 7)
+        plain = random_field(image, 12, 0.5 * math.sqrt(48 * 64 / 12), regions, 7)
+        assert torch.equal(named.means, plain.means) and torch.equal(named.cholesky, plain.cholesky)
+
+
+class TestGradient:
+    def test_centres_follow_the_detail(self) -> None:
+        field = sampled_field(scene()[0], 200, None, 0)
+        share = float((field.means[:, 0] < 32).float().mean())
+        assert share > 0.7
+
+    def test_flat_image_is_covered_evenly_at_its_level(self) -> None:
+        image = torch.full((1, 60, 60), 0.4)
+        field = sampled_field(image, 200, None, 0)
+        assert float((field.means[:, 0] < 30).float().mean()) == pytest.approx(0.5, abs=0.1)
+        assert float(draw(field, None)[:, 10:-10, 10:-10].mean()) == pytest.approx(0.4, rel=0.15)
+
+    def test_no_pixel_twice(self) -> None:
+        assert len(sampled_field(scene()[0], 1000, None, 0).means.floor().unique(dim=0)) == 1000
+
+
+class TestKmeans:
+    def test_beats_the_others(self) -> None:
+        image, labels = scene()
+        regions = RegionMap.from_labels(labels)
+        quality = {n: float(psnr(draw(f(image, 150, regions, 0), regions), image)) for n, f in INITIALIZERS.items()}
+        assert quality["kmeans"] > 5 + max(quality["random"], quality["gradient"])
+
+    def test_every_region_has_one(self) -> None:
+        image, labels = scene()
+        labels[0, 0] = 99
+        field = kmeans_field(image, 4, RegionMap.from_labels(labels), 0)
+        assert field.region_ids is not None and sorted(field.region_ids.tolist()) == [0, 3, 11, 99]
+
+    def test_fewer_gaussians_than_regions_go_to_the_largest(self) -> None:
+        image = torch.full((1, 20, 20), 0.5)
+        labels = torch.zeros(20, 20, dtype=torch.long)
+        labels[:8], labels[0, 0] = 5, 7
+        field = kmeans_field(image, 2, RegionMap.from_labels(labels), 0)
+        assert field.region_ids is not None and sorted(field.region_ids.tolist()) == [0, 5]
+
+    def test_centres_lie_in_a_convex_region(self) -> None:
+        image, labels = scene()
+        labels[labels == 0] = 1
+        field = kmeans_field(image, 200, RegionMap.from_labels(labels), 0)
+        assert field.region_ids is not None
+        disc = field.region_ids == 3
+        assert int(disc.sum()) > 5
+        assert torch.equal(lookup_regions(field.means[disc], labels), field.region_ids[disc])
+
+    def test_the_contour_attracts_nothing(self) -> None:
+        labels = torch.zeros(40, 40, dtype=torch.long)
+        labels[:, 20:] = 1
+        field = kmeans_field(labels[None].float(), 80, RegionMap.from_labels(labels), 0)
+        near = float(((field.means[:, 0] - 20).abs() < 5).float().mean())
+        assert near == pytest.approx(0.25, abs=0.12)
+
+    def test_gaussians_take_the_shape_of_their_cells(self) -> None:
+        labels = torch.zeros(40, 60, dtype=torch.long)
+        labels[10:14, 5:55] = 1
+        image = torch.full((1, 40, 60), 0.5)
+        field = kmeans_field(image, 2, RegionMap.from_labels(labels), 0)
+        assert field.region_ids is not None
+        l11, _, l22 = field.cholesky[field.region_ids == 1][0].tolist()
+        assert l11 > 4 * l22
+
+    @pytest.mark.parametrize("count", [1, 2, 40])
+    def test_checkerboard(self, count: int) -> None:
+        labels = (torch.arange(20)[:, None] + torch.arange(24)) % 2
+        regions = RegionMap.from_labels(labels)
+        field = kmeans_field(0.2 + 0.6 * labels[None].float(), count, regions, 0)
+        assert len(field) == count
+        if count == 40:
+            assert float(psnr(draw(field, regions), 0.2 + 0.6 * labels[None].float())) > 20
+
+    def test_one_pixel_regions(self) -> None:
+        labels = torch.arange(12).view(3, 4)
+        regions = RegionMap.from_labels(labels)
+        image = torch.linspace(0.1, 0.9, 12).view(1, 3, 4)
+        field = kmeans_field(image, 12, regions, 0)
+        torch.testing.assert_close(draw(field, regions), image, atol=1e-3, rtol=0)
+
+    def test_soft_map(self) -> None:
+        image, labels = scene()
+        regions = RegionMap.from_labels(labels, softness=0.8)
+        assert float(psnr(draw(kmeans_field(image, 150, regions, 0), regions), image)) > 15

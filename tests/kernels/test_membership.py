@@ -1,0 +1,249 @@
+"""Widths of their own for pairs of regions, and maps finer than the image: the definition, its tables, the kernels."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from kcgs import RegionMap
+from kcgs.functional import region_splat
+from kcgs.kernels.binning import TILE
+from kcgs.kernels.membership import Membership
+
+Widths = float | dict[tuple[int, int], float]
+PAIRS: dict[tuple[int, int], float] = {(0, 1): 0.7, (1, 2): 2.0, (0, 3): 1.1, (2, 3): 0.7}
+SIZE = (36, 60)
+
+
+def blobs(size: tuple[int, int] = SIZE, regions: int = 4, seed: int = 0, grain: int = 9) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.rand(1, regions, *size, generator=generator)
+    return torch.nn.functional.avg_pool2d(noise, grain, stride=1, padding=grain // 2).argmax(1)[0]
+
+
+def junction(size: tuple[int, int] = SIZE) -> Tensor:
+    """Three regions that meet in the middle."""
+    y, x = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")
+    return torch.where(y < size[0] // 2, (x > size[1] // 2).long(), 2)
+
+
+def shares_of(membership: Membership) -> Tensor:
+    """Dense weights of all regions of the first map, (R, H, W)."""
+    return torch.stack([membership.weights(0, r, torch.float64) for r in range(membership.num_regions)])
+
+
+def from_tiles(membership: Membership, tile: int, batch: int = 0) -> Tensor:
+    """Weights of all regions of one map, put together from the tables."""
+    table = membership.tiles(tile)
+    height, width = membership.index.shape[1:]
+    rows, cols = -(-height // tile), -(-width // tile)
+    found = torch.zeros(membership.num_regions, rows * tile, cols * tile, dtype=torch.float64)
+    for key, plane in zip(table.keys.tolist(), table.plane.tolist(), strict=True):
+        place, region = divmod(key, membership.num_regions)
+        image, place = divmod(place, rows * cols)
+        if image != batch:
+            continue
+        y, x = place // cols * tile, place % cols * tile
+        weights = torch.ones(tile, tile).double() if plane < 0 else table.planes[plane].double().view(tile, tile)
+        found[region, y : y + tile, x : x + tile] = weights
+    return found[:, :height, :width]
+
+
+def width_of_pixels(labels: Any, widths: dict[tuple[int, int], float]) -> Any:
+    """Width of each pixel by the letter: nearest pixel that touches a contour, what lies on its other side."""
+    height, width = labels.shape
+    across = {}
+    for y, x in np.ndindex(labels.shape):
+        for v, u in ((y - 1, x), (y, x - 1), (y, x + 1), (y + 1, x)):
+            if 0 <= v < height and 0 <= u < width and labels[v, u] != labels[y, x]:
+                across.setdefault((y, x), labels[v, u])
+    touches = np.zeros(labels.shape, bool)
+    touches[tuple(zip(*across, strict=True))] = True
+    rows, cols = ndimage.distance_transform_edt(~touches, return_distances=False, return_indices=True)
+    sigma = np.zeros(labels.shape)
+    for y, x in np.ndindex(labels.shape):
+        nearest = rows[y, x], cols[y, x]
+        other = labels[nearest] if labels[nearest] != labels[y, x] else across[nearest]
+        sigma[y, x] = widths.get(tuple(sorted((int(labels[y, x]), int(other)))), 0.0)
+    return sigma
+
+
+def stated(labels: Tensor, sigma: Any, region: int, factor: int = 1) -> Tensor:
+    """Blur of [M = region] with the width of each pixel, averaged over sub-pixels."""
+    inside = (labels == region).double().numpy()
+    share = inside.copy()
+    for width in set(np.unique(sigma)) - {0.0}:
+        radius = math.ceil(4 * width * factor)
+        blurred, ones = (
+            ndimage.gaussian_filter(a, width * factor, mode="constant", radius=radius) for a in (inside, 0 * inside + 1)
+        )
+        share = np.where(sigma == width, blurred / ones, share)
+    return torch.nn.functional.avg_pool2d(torch.from_numpy(share)[None], factor)[0]
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3])
+@pytest.mark.parametrize("seed", [0, 1])
+class TestDefinition:
+    def test_pairs(self, seed: int, factor: int) -> None:
+        labels = blobs(seed=seed)
+        membership = RegionMap.from_labels(labels, PAIRS, supersample=factor)._membership
+        sigma = width_of_pixels(labels.numpy(), PAIRS)
+        assert set(np.unique(sigma)) == {0.0, 0.7, 1.1, 2.0}
+        for region in range(4):
+            want = stated(labels, sigma, region, factor)
+            assert (membership.weights(0, region, torch.float64) - want).abs().max() < 1e-12
+
+    def test_one_width(self, seed: int, factor: int) -> None:
+        labels = blobs(seed=seed)
+        membership = RegionMap.from_labels(labels, 0.9, supersample=factor)._membership
+        for region in range(4):
+            want = stated(labels, np.full(labels.shape, 0.9), region, factor)
+            assert (membership.weights(0, region, torch.float64) - want).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("factor", [1, 2, 4])
+@pytest.mark.parametrize("softness", [0.0, 0.7, 5.0, PAIRS, {(0, 1): 0.3}])
+class TestTables:
+    def test_hold_the_dense_weights(self, softness: Widths, factor: int) -> None:
+        maps = torch.stack([blobs((factor * 37, factor * 53), seed=s, grain=8 * factor + 1) for s in (0, 1)])
+        maps[0, : factor * 20, : factor * 18] = 3  # tiles with a region of their own
+        membership = RegionMap.from_labels(maps, softness, supersample=factor)._membership
+        for tile in (TILE, 5):
+            for batch in (0, 1):
+                dense = [membership.weights(batch, r, torch.float64) for r in range(4)]
+                assert (from_tiles(membership, tile, batch) - torch.stack(dense)).abs().max() < 1e-12
+
+    def test_sum_to_one(self, softness: Widths, factor: int) -> None:
+        membership = RegionMap.from_labels(blobs(), softness, supersample=factor)._membership
+        shares = shares_of(membership)
+        assert (shares.sum(0) - 1).abs().max() < 1e-12
+        assert shares.min() >= 0
+        assert ((shares > 0) & (shares < 1)).any() == (softness != 0.0 or factor > 1)
+
+
+class TestPairWidths:
+    def test_junction(self) -> None:
+        widths = {(0, 1): 0.0, (0, 2): 0.7, (1, 2): 2.0}
+        shares = shares_of(RegionMap.from_labels(junction(), widths)._membership)
+        apart = {pair: shares_of(RegionMap.from_labels(junction(), w)._membership) for pair, w in widths.items()}
+        # far from the junction each contour is as if it were alone
+        assert torch.equal(shares[:, :10, 20:40], apart[0, 1][:, :10, 20:40])
+        assert (shares[:, :, :20] - apart[0, 2][:, :, :20]).abs().max() < 1e-12
+        assert (shares[:, 12:, 45:] - apart[1, 2][:, 12:, 45:]).abs().max() < 1e-12
+        assert (shares.sum(0) - 1).abs().max() < 1e-12
+
+    def test_hard_pair_beside_a_soft_pair(self) -> None:
+        labels = (torch.arange(60) // 20).expand(20, 60)
+        shares = shares_of(RegionMap.from_labels(labels, {(1, 2): 1.5})._membership)
+        assert torch.equal(shares[:, :, :30], torch.stack([labels == r for r in range(3)])[:, :, :30].double())
+        soft = shares_of(RegionMap.from_labels(labels, 1.5)._membership)
+        assert torch.equal(shares[:, :, 31:], soft[:, :, 31:])
+        assert (shares[2, :, 39] > 0.3).all()
+
+    def test_equal_widths_of_the_contours_are_one_width(self) -> None:
+        labels = (torch.arange(60) // 20).expand(20, 60)  # 0 and 2 do not touch
+        regions = RegionMap.from_labels(labels, {(0, 1): 0.7, (1, 2): 0.7, (0, 2): 3.0})
+        assert regions._membership.levels.widths == (0.7,)
+        table, plain = (r._membership.tiles(TILE) for r in (regions, RegionMap.from_labels(labels, 0.7)))
+        assert all(torch.equal(a, b) for a, b in zip(table, plain, strict=True))
+
+    def test_contours_without_a_width_are_hard(self) -> None:
+        labels = (torch.arange(60) // 20).expand(20, 60)
+        regions = RegionMap.from_labels(labels, {(0, 2): 3.0})
+        assert regions._membership.tiles(TILE).planes.dtype == torch.bool
+        assert regions._membership.radius == 0
+
+    def test_batch_with_a_map_of_one_region(self) -> None:
+        maps = torch.stack([junction(), torch.ones(SIZE).long()])
+        membership = RegionMap.from_labels(maps, {(0, 1): 0.7, (1, 2): 1.0})._membership
+        assert torch.equal(membership.weights(1, 1, torch.float64), torch.ones(SIZE).double())
+        assert torch.equal(from_tiles(membership, TILE, 1)[1], torch.ones(SIZE).double())
+
+    def test_only_tiles_that_see_a_contour_have_planes(self) -> None:
+        labels = torch.zeros(160, 160, dtype=torch.long)
+        labels[:, 80:], labels[:, 144:] = 1, 2
+        table = RegionMap.from_labels(labels, {(0, 1): 0.7})._membership.tiles(TILE)
+        assert len(table.planes) == 2 * 20
+        # between 1 and 2 no pixel is soft, and their contour is a border of tiles
+        assert (table.plane < 0).sum() == 80
+
+
+class TestCoverage:
+    @pytest.mark.parametrize("factor", [2, 4])
+    def test_is_the_average_of_the_mask(self, factor: int) -> None:
+        fine = blobs((factor * 37, factor * 53))
+        membership = RegionMap.from_labels(fine, supersample=factor)._membership
+        one_hot = torch.stack([fine == r for r in range(4)]).double()
+        want = torch.nn.functional.avg_pool2d(one_hot, factor)
+        assert torch.equal(shares_of(membership), want)
+        assert torch.equal(from_tiles(membership, TILE), want)
+
+    def test_interior_tiles_store_no_weights(self) -> None:
+        fine = torch.zeros(320, 320, dtype=torch.long)
+        fine[:, 161:] = 1
+        for softness, mixed in ((0.0, 10), (0.7, 20)):
+            table = RegionMap.from_labels(fine, softness, supersample=2)._membership.tiles(TILE)
+            assert len(table.planes) == 2 * mixed
+            assert (table.plane < 0).sum() == 100 - mixed
+
+    def test_copies_of_pixels_change_nothing(self) -> None:
+        labels = blobs()
+        fine = labels.repeat_interleave(2, 0).repeat_interleave(2, 1)
+        regions = RegionMap.from_labels(fine, supersample=2)
+        assert torch.equal(regions.labels, labels)
+        plain = RegionMap.from_labels(labels)
+        assert torch.equal(shares_of(regions._membership), shares_of(plain._membership))
+
+
+def test_to_keeps_everything(device: torch.device) -> None:
+    membership = RegionMap.from_labels(blobs(), PAIRS, supersample=2)._membership
+    moved = membership.to(device)
+    assert moved.grid.device.type == device.type
+    assert (from_tiles(moved, TILE) - from_tiles(membership, TILE)).abs().max() < 1e-12
+
+
+MAPS = [(1, PAIRS), (2, 0.0), (2, 0.7), (4, 0.0), (2, PAIRS)]
+
+
+@pytest.mark.parametrize(("factor", "softness"), MAPS)
+class TestKernels:
+    def gaussians(self, count: int, size: tuple[int, int], dtype: torch.dtype) -> tuple[Tensor, ...]:
+        generator = torch.Generator().manual_seed(3)
+        unit = torch.rand(count, 9, generator=generator, dtype=torch.float64)
+        means = unit[:, :2] * torch.tensor([size[1], size[0]])
+        factors = torch.stack([1 + 3 * unit[:, 2], unit[:, 3] - 0.5, 1 + 3 * unit[:, 4]], -1)
+        ids = torch.arange(count) % 4
+        return means.to(dtype), factors.to(dtype), unit[:, 5:8].to(dtype), ids
+
+    def test_agree(self, factor: int, softness: Widths) -> None:
+        regions = RegionMap.from_labels(
+            blobs((factor * 40, factor * 70), grain=4 * factor + 1), softness, supersample=factor
+        )
+        results = []
+        for backend in ("reference", "tiled", "cpu"):
+            *leaves, ids = self.gaussians(60, (40, 70), torch.float32)
+            leaves = [leaf.requires_grad_() for leaf in leaves]
+            image = region_splat(*leaves, ids, regions, cutoff=0.0, backend=backend)
+            probe = torch.sin(torch.arange(image.numel(), dtype=torch.float32)).view_as(image)
+            (image * probe).sum().backward()
+            results.append([image.detach(), *(leaf.grad for leaf in leaves)])
+        assert results[0][0].std() > 0.1
+        for result in results[1:]:
+            for value, want in zip(result, results[0], strict=True):
+                assert (value - want).abs().max() < 1e-5 * max(1.0, float(want.abs().max()))
+
+    @pytest.mark.parametrize("backend", ["reference", "tiled"])
+    def test_gradcheck(self, backend: str, factor: int, softness: Widths) -> None:
+        regions = RegionMap.from_labels(blobs((factor * 6, factor * 7), grain=3), softness, supersample=factor)
+        *leaves, ids = self.gaussians(5, (6, 7), torch.float64)
+
+        def draw(*gaussians: Tensor) -> Tensor:
+            return region_splat(*gaussians, ids, regions, cutoff=0.0, backend=backend)
+
+        assert torch.autograd.gradcheck(draw, [leaf.requires_grad_() for leaf in leaves])
