@@ -51,15 +51,21 @@ def fit_command(
         typer.Option(metavar="MASK|auto|none", help="Label-map file, or auto (segment the image), or none."),
     ] = "auto",
     num_gaussians: Annotated[int, typer.Option("-n", "--num-gaussians", min=1, help="Number of Gaussians.")] = 1000,
-    recipe: Annotated[str, typer.Option(help="Recipe by name.")] = "paper",
+    recipe: Annotated[str, typer.Option(help="Recipe by name.")] = "best",
     iterations: Annotated[int | None, typer.Option(min=1, help="Default: the recipe's.")] = None,
-    max_seconds: Annotated[float | None, typer.Option(help="Stop after this wall time.")] = None,
-    target_psnr: Annotated[float | None, typer.Option(help="Stop at this PSNR in dB.")] = None,
+    max_seconds: Annotated[float | None, typer.Option(help="The best picture in this wall time.")] = None,
+    target_psnr: Annotated[
+        float | None, typer.Option(help="As few Gaussians as reach this PSNR in dB, at most --num-gaussians.")
+    ] = None,
+    keep_contours: Annotated[bool, typer.Option("--keep-contours", help="Take the label map as exact.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of the random start.")] = 0,
     backend: Annotated[Backend, typer.Option(help="Kernel.")] = Backend.auto,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Default: IMAGE's name with .safetensors, here.")
     ] = None,
+    plot: Annotated[Path | None, typer.Option(help="Draw error against run time into this PNG.")] = None,
+    checkpoint: Annotated[Path | None, typer.Option(help="Keep the fit's state in this file as it goes.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from --checkpoint, where it exists.")] = False,
     as_json: Json = False,
 ) -> None:
     """Fit Gaussians to an image and save the scene."""
@@ -69,20 +75,39 @@ def fit_command(
 
     output = Path(f"{image.stem}.safetensors") if output is None else output
     _check_output(output, ".safetensors")
-    settings = {"iterations": iterations, "max_seconds": max_seconds, "target_psnr": target_psnr}
+    if plot is not None:
+        _check_output(plot, ".png", option="--plot")
+    if resume and checkpoint is None:
+        raise typer.BadParameter("--resume needs --checkpoint")
+    settings: dict[str, Any] = {"iterations": iterations, "max_seconds": max_seconds, "target_psnr": target_psnr}
+    if keep_contours:
+        settings["refine"] = False
+    elif regions == "auto":
+        # nobody gave these contours, so none are to be kept near
+        settings["max_move"] = "any"
     config = FitConfig.from_recipe(
         recipe, backend=backend.value, **{k: v for k, v in settings.items() if v is not None}
     )
     picture = load_image(image)
     labels = _read_regions(regions, picture)
     with _Progress(config.iterations, config.max_seconds) as progress:
-        result = fit(picture, labels, num_gaussians, seed=seed, config=config, on_step=progress.step)
+        result = fit(
+            picture, labels, num_gaussians,
+            seed=seed, config=config, on_step=progress.step, checkpoint=checkpoint, resume=resume,
+        )  # fmt: skip
+    if plot is not None:
+        from kcgs.bench.plots import plot_history
+
+        plot_history(plot, {recipe: result.history})
     written = save(output, result.field, result.regions, metadata={"recipe": recipe})
     if progress.interrupted:
         typer.echo(f"interrupted: saved the best so far to {output}", err=True)
     seconds = result.history[-1].seconds
     report = _measure(result.field, result.regions, picture, labels, seconds, written)
-    _print_report(report, as_json, f"{output}: {len(result.field)} Gaussians, stopped by {result.stop_reason}")
+    title = f"{output}: {len(result.field)} Gaussians, stopped by {result.stop_reason}"
+    if result.removed:
+        title += f"; {result.removed} useless ones removed, which changed no value by more than {result.change:.1g}"
+    _print_report(report, as_json, title)
 
 
 @app.command()
@@ -173,7 +198,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
         "height": field.size[0],
         "width": field.size[1],
         "regions": 1 if regions is None else regions.num_regions,
-        "softness": 0.0 if regions is None else regions.softness,
+        "softness": 0.0 if regions is None else _mean_softness(regions),
         "bytes": size,
         "bits_per_pixel": 8 * size / (field.size[0] * field.size[1]),
         **{f"metadata.{key}": value for key, value in loaded.metadata.items()},
@@ -183,23 +208,24 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
 
 @app.command()
 def bench(
-    name: Annotated[str, typer.Argument(help="Experiment by name: demo, render.")],
+    name: Annotated[str, typer.Argument(help="Experiment by name: demo, fit, render.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the report.")],
     data: Annotated[Path | None, typer.Option(help="Folder with images, where the experiment needs them.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A short form of the same.")] = False,
+    only: Annotated[str | None, typer.Option(help="Parts to run, with commas between, where it has parts.")] = None,
 ) -> None:
     """Run an experiment and write its report."""
     from kcgs.bench import run
 
-    run(name, output, data=data, quick=quick)
+    run(name, output, data=data, quick=quick, only=only)
 
 
-def _check_output(path: Path, *suffixes: str) -> None:
+def _check_output(path: Path, *suffixes: str, option: str = "--output") -> None:
     # before the work, not after it
     if path.suffix.lower() not in suffixes:
-        raise ValueError(f"--output must end in {' or '.join(suffixes)}; got {str(path)!r}")
+        raise ValueError(f"{option} must end in {' or '.join(suffixes)}; got {str(path)!r}")
     if not path.resolve().parent.is_dir():
-        raise FileNotFoundError(f"--output needs an existing folder; {str(path.resolve().parent)!r} is not there")
+        raise FileNotFoundError(f"{option} needs an existing folder; {str(path.resolve().parent)!r} is not there")
 
 
 def _read_regions(regions: str, picture: Tensor) -> Tensor | None:
@@ -212,6 +238,11 @@ def _read_regions(regions: str, picture: Tensor) -> Tensor | None:
     from kcgs.data import load_labels
 
     return load_labels(Path(regions))
+
+
+def _mean_softness(regions: RegionMap) -> float:
+    softness = regions.softness
+    return softness if isinstance(softness, float) else sum(softness.values()) / max(1, len(softness))
 
 
 def _target_size(size: tuple[int, int], scale: float | None, wanted: str | None) -> tuple[int, int]:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kcgs._atomic import atomic_path
+
+if TYPE_CHECKING:
+    from kcgs.fit import HistoryEntry
 
 # Okabe and Ito's colours, which people with any colour vision tell apart
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
@@ -29,3 +33,25 @@ def save_figure(plot: Any, path: Path) -> None:
     """Write the figure."""
     with atomic_path(path) as temporary:
         plot.savefig(temporary, dpi=130)
+
+
+def plot_history(path: Path, histories: Mapping[str, Sequence[HistoryEntry]]) -> None:
+    """Draw PSNR and EF-PSNR of fits against seconds and against iterations.
+
+    Args:
+        path: PNG to write.
+        histories: of fits, by name.
+    """
+    plot, axes = figure(1, 2, width=9.5, height=3.8)
+    for axis, field, unit in ((axes[0], "seconds", "seconds"), (axes[1], "iteration", "iterations")):
+        for index, (name, history) in enumerate(histories.items()):
+            x = [getattr(entry, field) for entry in history]
+            axis.plot(x, [entry.psnr for entry in history], color=COLORS[index], label=f"{name}, PSNR")
+            edge = [entry.ef_psnr for entry in history]
+            if any(value == value for value in edge):
+                axis.plot(x, edge, "--", color=COLORS[index], label=f"{name}, EF-PSNR (contours)")
+        axis.set(xlabel=unit, ylabel="dB")
+        axis.legend(loc="lower right")
+    axes[0].set_title("error against run time")
+    axes[1].set_title("error against iterations")
+    save_figure(plot, path)

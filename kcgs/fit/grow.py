@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,13 +20,13 @@ _REACH = 3.0
 # standard deviation of the search's Gaussians in blocks, at least
 _SIGMA_PER_BLOCK = 0.9
 # candidates for each wanted Gaussian, and at least
-_CANDIDATES = (16, 512)
+_CANDIDATES = (16, 4096)
 # two Gaussians whose normalised inner product is above this explain the same error: 2.5 sigma apart, at one scale
 _OVERLAP = 0.2
 # steps towards the joint solution for the colours: more follow the approximation, not the error
 _CG_STEPS = 3
 
-Array = NDArray[np.floating]
+Array = NDArray[Any]
 
 
 class Proposal(NamedTuple):
@@ -41,27 +41,18 @@ class Proposal(NamedTuple):
 class _Candidates(NamedTuple):
     """Places worth trying, M of them."""
 
-    region: NDArray[np.int64]  # [M], position in the map's ids
+    region: Array  # [M], position in the map's ids
     x: Array  # [M], pixels
     y: Array  # [M]
     sigma: Array  # [M]
-    block: NDArray[np.int64]  # [M], side in pixels of the block that x, y is the middle of
+    block: Array  # [M], side in pixels of the block that x, y is the middle of
     inner: Array  # [M, C], <g, residual>
     norm: Array  # [M], <g, g>
     gain: Array  # [M], fall of the squared error
 
     def take(self, at: NDArray[np.int64]) -> _Candidates:
         """Return those at these positions."""
-        return _Candidates(
-            self.region[at],
-            self.x[at],
-            self.y[at],
-            self.sigma[at],
-            self.block[at],
-            self.inner[at],
-            self.norm[at],
-            self.gain[at],
-        )
+        return _Candidates(*(column[at] for column in self))
 
 
 def propose(residual: Tensor, regions: RegionMap | None, count: int, *, sigmas: Sequence[float]) -> Proposal:
@@ -102,8 +93,7 @@ def propose(residual: Tensor, regions: RegionMap | None, count: int, *, sigmas: 
     # below this the gain is rounding error: one pixel's, at the precision of the largest
     floor = (128 * torch.finfo(left.dtype).eps * float(left.abs().max())) ** 2
     parts: list[Proposal] = []
-    wanted = count
-    while wanted > 0:
+    while (wanted := count - sum(len(part.means) for part in parts)) > 0:
         chosen = _pursue(_search(left, labels, sigmas, wanted), wanted, floor)
         if not len(chosen.x):
             break
@@ -112,7 +102,6 @@ def propose(residual: Tensor, regions: RegionMap | None, count: int, *, sigmas: 
             break
         parts.append(part)
         left = left - picture
-        wanted -= len(chosen.x)
     return _join(parts, residual, regions)
 
 
@@ -233,9 +222,9 @@ def _strongest(gain: Array, limit: int) -> NDArray[np.int64]:
 def _pursue(candidates: _Candidates, count: int, floor: float) -> _Candidates:
     """Take the largest gain, take its share of the error off its neighbours', and again; the strongest first.
 
-    Inner products of two Gaussians are those of the plane, with the norms inside the region for the squared widths: in
-    a region of one pixel all scales are one. Those that overlap too much with one that was taken are out, for that is
-    as far as the approximation carries.
+    Inner products of two Gaussians are those of the plane, or with the norms inside the region for the squared widths
+    where that is more: in a region of one pixel all scales are the same. Those that overlap too much with one that was
+    taken are out, for that is as far as the approximation carries.
     """
     share = (candidates.inner / np.sqrt(candidates.norm)[:, None]).T.copy()  # [C, M], of normalised Gaussians
     gain = candidates.gain.copy()
@@ -255,8 +244,9 @@ def _pursue(candidates: _Candidates, count: int, floor: float) -> _Candidates:
         near = low + (abs(x[low:high] - x[best]) <= reach).nonzero()[0]
         both = square[near] + square[best]
         distance = (x[near] - x[best]) ** 2 + (y[near] - y[best]) ** 2
-        width = 2 * np.sqrt(norm[near] * norm[best]) / (norm[near] + norm[best])
-        overlap = width * np.exp(-0.5 * distance / both)
+        width = np.sqrt(square[near] * square[best]) / both
+        cropped = np.sqrt(norm[near] * norm[best]) / (norm[near] + norm[best])
+        overlap = 2 * np.maximum(width, cropped) * np.exp(-0.5 * distance / both)
         rest = share[:, near] - overlap * share[:, best, None]
         share[:, near] = rest
         gain[near] = np.where((overlap > _OVERLAP) | (gain[near] < 0), -1.0, (rest * rest).sum(0))
@@ -285,9 +275,21 @@ def _solve(
     colors = torch.from_numpy(_joint_colors(chosen, centres, inner.cpu().double().numpy())).to(residual)
     with torch.no_grad():
         picture = draw(colors)
-        # the products above are approximate: this step makes the fall of the error certain
-        length = (picture * residual).sum() / picture.square().sum().clamp_min(torch.finfo(picture.dtype).tiny)
-        return Proposal(means, cholesky, colors * length, ids), picture * length
+        # the products above are approximate: steps of the best length make the fall of the error certain
+        hard = regions is None or regions.softness == 0
+        # under a soft contour regions mix: one length for all
+        index = torch.from_numpy(labels if hard else np.zeros_like(labels)).to(residual.device, torch.int64)
+        length = _best_lengths(picture, residual, index)
+        part = torch.from_numpy(chosen.region if hard else np.zeros_like(chosen.region)).to(index)
+        return Proposal(means, cholesky, colors * length[part, None], ids), picture * length[index]
+
+
+def _best_lengths(picture: Tensor, residual: Tensor, index: Tensor) -> Tensor:
+    """Factor of the picture that leaves the least squared error, for each part of the image, (R,)."""
+    ahead, square = (
+        torch.bincount(index.flatten(), (picture * other).sum(0).flatten()) for other in (residual, picture)
+    )
+    return (ahead / square.clamp_min(torch.finfo(picture.dtype).tiny)).to(picture.dtype)
 
 
 def _pixel_of_region(chosen: _Candidates, labels: NDArray[np.int32]) -> NDArray[np.float64]:
@@ -307,14 +309,13 @@ def _pixel_of_region(chosen: _Candidates, labels: NDArray[np.int32]) -> NDArray[
 
 
 def _joint_colors(chosen: _Candidates, centres: NDArray[np.float64], inner: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Solve (overlaps) c = <g, residual> by conjugate gradients, (K, C); overlaps as in `_pursue`."""
+    """Solve (overlaps) c = <g, residual> by conjugate gradients, (K, C); overlaps are those of the plane."""
     root = np.sqrt(chosen.norm.astype(np.float64))[:, None]
     # single precision: the step that follows makes up for it, at a third of the time
     x, y, square = (values.astype(np.float32) for values in (centres[:, 0], centres[:, 1], chosen.sigma**2))
     both = square[:, None] + square
     distance = np.square(x[:, None] - x) + np.square(y[:, None] - y)
-    norm = chosen.norm.astype(np.float32)
-    overlap = 2 * np.sqrt(norm[:, None] * norm) / (norm[:, None] + norm) * np.exp(distance / both * -0.5)
+    overlap = 2 * np.sqrt(square[:, None] * square) / both * np.exp(distance / both * -0.5)
     overlap *= chosen.region[:, None] == chosen.region
     left = (inner / root).astype(np.float32)
     solved, way = np.zeros_like(left), left.copy()

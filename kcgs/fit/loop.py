@@ -27,7 +27,7 @@ def fit(
     regions: RegionMap | Tensor | None = None,
     num_gaussians: int = 1000,
     *,
-    recipe: str = "paper",
+    recipe: str = "best",
     seed: int = 0,
     config: FitConfig | None = None,
     on_step: Callable[[int, HistoryEntry], bool | None] | None = None,

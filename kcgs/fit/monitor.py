@@ -30,7 +30,8 @@ class HistoryEntry(NamedTuple):
 class FitResult(NamedTuple):
     """What a fit gives back.
 
-    `regions` is what the field must be drawn with: None where the recipe confines nothing.
+    `regions` is what the field must be drawn with: None where nothing is confined. `removed` Gaussians were left out
+    at the end, which changed no value of the image by more than `change`.
     """
 
     field: GaussianField
@@ -38,6 +39,8 @@ class FitResult(NamedTuple):
     history: list[HistoryEntry]
     stop_reason: StopReason
     config: FitConfig
+    removed: int = 0
+    change: float = 0.0
 
 
 class Gaussians(NamedTuple):

@@ -7,8 +7,7 @@ of Gaussians for each region.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -16,8 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_image, check_labels
-from kcgs.functional import RegionMap, edge_band, region_splat
+from kcgs.functional import RegionMap, edge_band
 from kcgs.nn import GaussianField
+
+from .contours import Contours, Costs, bounding_boxes, index_map, unequal
 
 Ints = NDArray[np.int64]
 Labels = NDArray[np.int32]
@@ -98,16 +99,16 @@ def refine_contours(
         raise ValueError(f"given must have the shape {tuple(regions.labels.shape)}; got {tuple(given.shape)}")
     if regions.num_regions == 1:
         return regions
-    index = _index(regions, regions.labels)
+    index = index_map(regions, regions.labels)
     distance = min(1 if max_distance is None else max_distance, math.hypot(*index.shape))
     pad = max(reach, int(distance))
     rim = edge_band(torch.from_numpy(index), 1).numpy()
-    boxes = _boxes(np.where(rim, index, -1), regions.num_regions, reach * sweeps + smallest)
-    costs = _Costs(field, image, regions, boxes, pad, blur, cutoff=cutoff, backend=backend)
-    contours = _Contours(index, costs, length_weight, pad, smallest)
+    boxes = bounding_boxes(np.where(rim, index, -1), regions.num_regions, reach * sweeps + smallest)
+    costs = Costs(field, image, regions, boxes, pad, blur, cutoff=cutoff, backend=backend)
+    contours = Contours(index, costs, length_weight, pad, smallest)
     contours.hold(rim, reach * sweeps)
     if max_distance is not None:
-        contours.bound(_index(regions, given), distance)
+        contours.bound(index_map(regions, given), distance)
     for _ in range(sweeps):
         if not contours.sweep(reach):
             break
@@ -163,11 +164,11 @@ def contour_energy(
     """
     _check_problem(field, image, regions)
     _check_numbers({"length_weight": length_weight, "blur": blur})
-    index = _index(regions, regions.labels)
-    boxes = _boxes(index, regions.num_regions, 0)
-    costs = _Costs(field, image, regions, boxes, 0, blur, cutoff=cutoff, backend=backend)
+    index = index_map(regions, regions.labels)
+    boxes = bounding_boxes(index, regions.num_regions, 0)
+    costs = Costs(field, image, regions, boxes, 0, blur, cutoff=cutoff, backend=backend)
     data = costs.at(np.arange(index.size), index.ravel()).sum()
-    return float(data) + length_weight / 4 * _unequal(np.pad(index, 1, constant_values=-1))
+    return float(data) + length_weight / 4 * unequal(np.pad(index, 1, constant_values=-1))
 
 
 def _check_problem(field: GaussianField, image: Tensor, regions: RegionMap) -> None:
@@ -202,243 +203,6 @@ def _check_numbers(values: dict[str, float]) -> None:
         low, high = ranges[name]
         if not low <= value <= high:
             raise ValueError(f"{name} must be in [{low:g}, {high:g}]; got {value!r}")
-
-
-def _index(regions: RegionMap, labels: Tensor) -> Labels:
-    """Return each label's place among the map's ids, -1 where it has none, (H, W)."""
-    return np.asarray(regions.index_of(labels).cpu().numpy(), dtype=np.int32)
-
-
-def _boxes(index: Labels, count: int, margin: int) -> Ints:
-    """Return (R, 4) top, bottom, left, right of each region's pixels, grown by the margin; empty where it has none."""
-    from scipy.ndimage import find_objects
-
-    height, width = index.shape
-    boxes = np.zeros((count, 4), np.int64)
-    for region, found in enumerate(find_objects(index + 1, max_label=count)):
-        if found is not None:
-            rows, columns = found
-            boxes[region, ::2] = max(0, rows.start - margin), max(0, columns.start - margin)
-            boxes[region, 1::2] = min(height, rows.stop + margin), min(width, columns.stop + margin)
-    return boxes
-
-
-def _unequal(padded: Labels) -> int:
-    """Count the unordered pairs of 8-neighbours with different labels; the rim holds -1."""
-    width = padded.shape[1]
-    flat = padded.ravel()
-    pairs = ((flat[:-step], flat[step:]) for step in (1, width - 1, width, width + 1))
-    return sum(int(np.count_nonzero((a != b) & (np.minimum(a, b) >= 0))) for a, b in pairs)
-
-
-class _Costs:
-    """Blurred squared error of each region's own picture, kept inside the region's box.
-
-    Pixels are flat indices into the image with a rim of `pad`.
-    """
-
-    def __init__(
-        self,
-        field: GaussianField,
-        image: Tensor,
-        regions: RegionMap,
-        boxes: Ints,
-        pad: int,
-        blur: float,
-        **drawing: Any,
-    ) -> None:
-        assert field.region_ids is not None
-        owners = regions.to(field.means.device).index_of(field.region_ids)
-        colors = field.merged_colors()
-        image = image.to(colors.device, colors.dtype)
-        margin = math.ceil(4 * blur)
-        parts = []
-        for region, (top, bottom, left, right) in enumerate(boxes.tolist()):
-            y, x = max(0, top - margin), max(0, left - margin)
-            target = image[:, y : bottom + margin, x : right + margin]
-            if top < bottom:
-                mine = (owners == region).nonzero().flatten()
-                means = field.means[mine] - field.means.new_tensor([x, y])
-                picture = region_splat(
-                    means, field.cholesky[mine], colors[mine], size=(target.shape[1], target.shape[2]), **drawing
-                )
-                error = _blur(_blur((picture - target).square_().mean(0), blur).T, blur).T
-                parts.append(error[top - y : bottom - y, left - x : right - x].cpu().numpy().ravel())
-        self._values = np.concatenate(parts)
-        self._stride = image.shape[2] + 2 * pad
-        self._top, self._bottom, self._left, self._right = np.ascontiguousarray(boxes.T + pad)
-        self._width = self._right - self._left
-        sizes = (self._bottom - self._top) * self._width
-        self._start = np.cumsum(sizes) - sizes
-
-    def at(self, pixels: Ints, region: Labels) -> Floats:
-        """Return the costs of pixels in regions, infinite outside a region's box."""
-        y, x = np.divmod(pixels, self._stride)
-        top, left = self._top[region], self._left[region]
-        inside = (y >= top) & (y < self._bottom[region]) & (x >= left) & (x < self._right[region])
-        place = self._start[region] + (y - top) * self._width[region] + (x - left)
-        return np.where(inside, self._values[np.where(inside, place, 0)].astype(np.float64), np.inf)
-
-
-def _blur(rows: Tensor, sigma: float) -> Tensor:
-    """Blur (h, w) along h, normalised at the borders."""
-    radius, count = math.ceil(4 * sigma), rows.shape[0]
-    if radius == 0:
-        return rows
-    taps = [math.exp(-0.5 * (k / sigma) ** 2) for k in range(-radius, radius + 1)]
-    padded = torch.nn.functional.pad(rows, (0, 0, radius, radius))
-    total = torch.zeros_like(rows, memory_format=torch.contiguous_format)
-    for k, tap in enumerate(taps):
-        total.add_(padded[k : k + count], alpha=tap)
-    within = np.convolve(np.ones(count), taps)[radius : radius + count]
-    return total.div_(torch.from_numpy(within).to(total)[:, None])
-
-
-class _Contours:
-    """A label map on the move, flat and with a rim of -1, so that a pixel's neighbours are sums of indices."""
-
-    def __init__(self, index: Labels, costs: _Costs, length_weight: float, pad: int, smallest: int) -> None:
-        padded = np.pad(index, pad, constant_values=-1)
-        self.map = padded[pad:-pad, pad:-pad]
-        self._labels, self._before = padded.reshape(-1), padded.flatten()
-        self._costs, self._smallest, self._pad, self._stride = costs, smallest, pad, padded.shape[1]
-        self._pair = length_weight / 4  # two neighbours that differ count an eighth each
-        self._sides = _disc(1, self._stride)[1:]
-        self._eight = _disc(1.5, self._stride)[1:]
-        self._floor = np.minimum(np.bincount(index.ravel()), smallest)
-        self._free = np.ones(index.shape, np.bool_)
-        specks = np.zeros(padded.shape, np.bool_)
-        specks[pad:-pad, pad:-pad].flat[_small_pieces(index, smallest)[0]] = True
-        self._specks = specks.reshape(-1)  # pixels of pieces that were small in the map as it came
-        self._given = np.zeros(0, np.int32)
-        self._allowing = _disc(0, 0)[1:]
-
-    def hold(self, rim: Mask, distance: int) -> None:
-        """Hold the pixels that each region keeps, unless it has that many beyond the distance that contours move."""
-        from scipy.ndimage import distance_transform_cdt
-
-        depth = distance_transform_cdt(~rim, "chessboard")
-        deep = np.bincount(self.map[depth > distance], minlength=len(self._floor))
-        y, x = np.nonzero((deep < self._floor)[self.map])
-        region = self.map[y, x]
-        order = np.lexsort((-depth[y, x], region))
-        rank = np.arange(len(order)) - np.searchsorted(region[order], region[order])
-        held = order[rank < self._floor[region[order]]]
-        self._free[y[held], x[held]] = False
-
-    def bound(self, given: Labels, distance: float) -> None:
-        """Allow a pixel only the labels that `given` has within the distance."""
-        # repeated beyond the border: what is there is nearer still
-        self._given = np.pad(given, self._pad, mode="edge").reshape(-1)
-        self._allowing = _disc(distance, self._stride)
-        self._free &= edge_band(torch.from_numpy(given + 1), distance).numpy()
-
-    def sweep(self, reach: int) -> bool:
-        """Give every free pixel near a contour its best label, and say whether one changed."""
-        y, x = np.nonzero(edge_band(torch.from_numpy(self.map.copy()), reach).numpy() & self._free)
-        pixels, colour = (y + self._pad) * self._stride + x + self._pad, 2 * (y % 2) + x % 2
-        near, present = _disc(reach, self._stride), self._labels.copy()
-        for c in range(4):
-            some = pixels[colour == c]
-            self._improve(some, present[some[:, None] + near])
-        return not np.array_equal(present, self._labels)
-
-    def _improve(self, pixels: Ints, candidates: Labels) -> None:
-        around, own = self._labels[pixels[:, None] + self._eight], self._labels[pixels]
-        best, least = own.copy(), self._cost(pixels, own, around)
-        for rows, labels in _others(candidates, own):
-            cost = self._cost(pixels[rows], labels, around[rows])
-            better = np.flatnonzero(cost < least[rows])
-            better = better[self._allowed(pixels[rows[better]], labels[better])]
-            best[rows[better]], least[rows[better]] = labels[better], cost[better]
-        self._labels[pixels] = best
-
-    def _cost(self, pixels: Ints, labels: Labels, around: Labels) -> Floats:
-        """Return what of the energy depends on each pixel's label, up to a constant."""
-        equal = np.count_nonzero(around == labels[:, None], axis=1)
-        return np.asarray(self._costs.at(pixels, labels) - self._pair * equal)
-
-    def _allowed(self, pixels: Ints, labels: Labels) -> Mask:
-        found = np.full(len(pixels), not len(self._allowing))
-        for start in range(0, len(self._allowing), 32):  # the nearest first, since most are found there
-            left = np.flatnonzero(~found)
-            seen = self._given[pixels[left, None] + self._allowing[start : start + 32]]
-            found[left] = (seen == labels[left, None]).any(axis=1)
-        return found
-
-    def absorb(self) -> bool:
-        """Give away the small pieces that came up, the smallest first, and say whether any went.
-
-        Each time there is one piece fewer, so that this comes to an end.
-        """
-        small, pieces = _small_pieces(self.map, self._smallest)
-        y, x = np.divmod(small, self.map.shape[1])
-        pixels = (y + self._pad) * self._stride + x + self._pad
-        areas = np.bincount(self.map.ravel(), minlength=len(self._floor))
-        changed = np.zeros(len(self._labels), np.bool_)
-        for piece in sorted(np.split(pixels, np.flatnonzero(np.diff(pieces)) + 1), key=len):
-            # beside one that has just gone it may be a piece no more: next time
-            if not len(piece) or changed[piece[:, None] + self._sides].any():
-                continue
-            source, target = self._labels[piece[0]], self._taker(piece, areas)
-            self._labels[piece], changed[piece] = target, source != target
-            areas[source] -= len(piece)
-            areas[target] += len(piece)
-        return bool(changed.any())
-
-    def _taker(self, piece: Ints, areas: Ints) -> int:
-        """Return the adjacent label under which the piece costs least; its own where it is to stay."""
-        own = int(self._labels[piece[0]])
-        was_small = bool((self._specks[piece] & (self._before[piece] == own)).any())
-        if was_small or areas[own] - len(piece) < self._floor[own]:
-            return own
-        best, least = own, math.inf
-        around = self._labels[piece[:, None] + self._eight]
-        for target in np.unique(self._labels[piece[:, None] + self._sides]).tolist():
-            labels = np.full(len(piece), target, np.int32)
-            if target in (own, -1) or not self._allowed(piece, labels).all():
-                continue
-            cost = float(self._cost(piece, labels, around).sum())
-            if cost < least:
-                best, least = target, cost
-        return best
-
-    def change(self) -> float:
-        """Return the energy that the map has more than it came with."""
-        moved = np.flatnonzero(self._labels != self._before)
-        data = self._costs.at(moved, self._labels[moved]) - self._costs.at(moved, self._before[moved])
-        pairs = [_unequal(flat.reshape(-1, self._stride)) for flat in (self._labels, self._before)]
-        return float(data.sum()) + self._pair * (pairs[0] - pairs[1])
-
-
-def _disc(radius: float, stride: int) -> Ints:
-    """Return the offsets within the radius as flat indices, the nearest first."""
-    y, x = np.mgrid[-int(radius) : int(radius) + 1, -int(radius) : int(radius) + 1]
-    square = y * y + x * x
-    inside = square <= radius * radius
-    return np.asarray((y * stride + x)[inside][np.argsort(square[inside], kind="stable")], dtype=np.int64)
-
-
-def _small_pieces(labels: Labels, smallest: int) -> tuple[Ints, Ints]:
-    """Return the pixels of 4-connected pieces under `smallest` pixels as flat indices, and their pieces, sorted."""
-    from skimage.measure import label
-
-    pieces = label(labels + 1, background=0, connectivity=1).ravel()
-    small = np.flatnonzero((np.bincount(pieces) < smallest)[pieces])
-    small = small[np.argsort(pieces[small], kind="stable")]
-    return small, pieces[small]
-
-
-def _others(around: Labels, own: Labels) -> Iterator[tuple[Ints, Labels]]:
-    """Yield (rows, labels) until every label in a row of `around` (P, K) but the pixel's own and -1 came up once."""
-    rows = np.arange(len(own))
-    left = (around != own[:, None]) & (around >= 0)
-    while len(rows):
-        some = left.any(axis=1)
-        rows, around, left = rows[some], around[some], left[some]
-        labels = around[np.arange(len(rows)), left.argmax(axis=1)]
-        yield rows, labels
-        left &= around != labels[:, None]
 
 
 def _softness(regions: RegionMap, labels: Tensor) -> float | Mapping[tuple[int, int], float]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap, region_splat
-from kcgs.nn import GaussianField
+from kcgs.nn import GaussianField, PruneResult, prune
 
 from .assign import refresh_ids
 from .config import FitConfig
@@ -17,11 +17,15 @@ from .descent import make_descent
 from .grow import propose
 from .initialize import INITIALIZERS, random_field
 from .monitor import FitResult, Gaussians, Monitor, StopReason
+from .polish import is_flat, polish
 from .refine import refine_contours
 from .release import helpless_pairs, merge_pairs
-from .schedule import Schedule
+from .schedule import make_schedule
 from .widths import choose_widths
 
+# a fit to a target starts with a Gaussian for each square of so many pixels
+_TARGET_SPACING = 64
+_KEPT = ("iteration", "wanted", "released", "ids", "drawn")
 # scales that growth looks for, in pixels
 _GROWTH_SIGMAS = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
 
@@ -39,9 +43,9 @@ class Session:
         field, sigma = _initialize(image, num_gaussians, self.drawn, config, seed)
         self.ids = field.region_ids
         self.descent = make_descent(config, field, sigma)
-        self.schedule = Schedule(config, num_gaussians, len(field))
+        self.schedule = make_schedule(config, num_gaussians, len(field))
         self.iteration = 0
-        self.grown = 0
+        self.wanted = len(field)
         self.released = False
         self.log_every = max(1, config.iterations // config.history_points)
 
@@ -53,9 +57,9 @@ class Session:
         """Return what is drawn now."""
         return Gaussians(*self.descent.tensors(), self.ids, self.drawn)
 
-    def draw(self) -> Tensor:
-        """Draw (C, H, W)."""
-        means, cholesky, colors, ids, regions = self.gaussians()
+    def draw(self, gaussians: Gaussians | None = None) -> Tensor:
+        """Draw (C, H, W): these Gaussians, or those of the moment."""
+        means, cholesky, colors, ids, regions = gaussians or self.gaussians()
         cutoff, backend = self.config.cutoff, self.config.backend
         picture = region_splat(means, cholesky, colors, ids, regions, size=self.size, cutoff=cutoff, backend=backend)
         return picture.clamp(0.0, 1.0) if self.config.clamp else picture
@@ -68,11 +72,12 @@ class Session:
         self.descent.step(self.schedule.rate(progress))
         self.iteration += 1
 
-    def log(self, picture: Tensor) -> None:
-        """Measure the picture and write it down."""
+    def log(self, picture: Tensor, gaussians: Gaussians | None = None) -> None:
+        """Measure the picture of these Gaussians, or of those of the moment, and write it down."""
         difference = picture.detach() - self.image
         loss = difference.abs().mean() if self.config.loss == "l1" else difference.square().mean()
-        self.monitor.log(self.iteration, float(loss), picture, self.gaussians())
+        self.monitor.log(self.iteration, float(loss), picture, gaussians or self.gaussians())
+        self.schedule.observe(self.progress(), self.monitor.history[-1].psnr)
 
     def refresh_ids(self) -> None:
         """Read the ids again under the centres, where the recipe does so and it is time."""
@@ -86,14 +91,14 @@ class Session:
     @torch.no_grad()
     def grow(self, progress: float) -> None:
         """Add Gaussians where the error is, after moving the contours, if that is due."""
-        due = self.schedule.growth_step(progress)
-        if due <= self.grown:
+        wanted = self.schedule.wanted(progress)
+        if wanted <= self.wanted:
             return
-        self.grown = due
+        self.wanted = wanted
         if self.config.refine:
             self.refine()
         residual = self.image - self.draw()
-        count = self.schedule.alive(due) - len(self.descent.tensors()[0])
+        count = wanted - len(self.descent.tensors()[0])
         found = propose(residual, self.drawn, count, sigmas=_GROWTH_SIGMAS)
         self.descent.append(found.means, found.cholesky, found.colors)
         if self.ids is not None and found.region_ids is not None:
@@ -102,7 +107,7 @@ class Session:
     @torch.no_grad()
     def refine(self) -> None:
         """Move the contours."""
-        if self.drawn is None or self.given is None:
+        if self.drawn is None or self.given is None or self.drawn.supersample > 1:
             return
         self.drawn = refine_contours(
             self.gaussians().field(self.size),
@@ -119,7 +124,7 @@ class Session:
         if not self.config.release or self.released or progress < self.config.grow_between[1]:
             return
         self.released = True
-        if self.drawn is not None and self.ids is not None:
+        if self.drawn is not None and self.ids is not None and self.drawn.supersample == 1:
             pairs = helpless_pairs(self)
             self.drawn, self.ids = merge_pairs(self.drawn, self.ids, pairs)
 
@@ -130,19 +135,35 @@ class Session:
                 self.log(self.draw())
         best = self.monitor.best
         assert best is not None
-        return FitResult(best.field(self.size), best.regions, self.monitor.history, reason, self.config)
+        field, regions, config = best.field(self.size), best.regions, self.config
+        if config.polish and reason == "iterations" and is_flat(self.image, regions, len(field)):
+            field = self._polished(field, regions)
+        left = PruneResult(field, 0, 0.0)
+        if config.prune > 0:
+            left = prune(field, regions, config.prune, cutoff=config.cutoff)
+        return FitResult(left.field, regions, self.monitor.history, reason, config, left.removed, left.change)
+
+    def _polished(self, field: GaussianField, regions: RegionMap | None) -> GaussianField:
+        """Take a flat scene to its last digits, and write them down."""
+        polished = polish(field, self.image, regions, cutoff=self.config.cutoff)
+        means, cholesky, colors = (t.detach() for t in (polished.means, polished.cholesky, polished.colors))
+        gaussians = Gaussians(means, cholesky, colors, polished.region_ids, regions)
+        with torch.no_grad():
+            self.log(self.draw(gaussians), gaussians)
+        return polished
 
     def state(self) -> dict[str, Any]:
         """Return everything a resumed fit needs."""
-        kept = {name: getattr(self, name) for name in ("iteration", "grown", "released", "ids", "drawn")}
-        return {**kept, "descent": self.descent.state(), "monitor": self.monitor.state()}
+        kept = {name: getattr(self, name) for name in _KEPT}
+        parts = {name: getattr(self, name).state() for name in ("descent", "monitor", "schedule")}
+        return {**kept, **parts}
 
     def load(self, state: dict[str, Any]) -> None:
         """Take up a state."""
-        for name in ("iteration", "grown", "released", "ids", "drawn"):
+        for name in _KEPT:
             setattr(self, name, state[name])
-        self.descent.load(state["descent"])
-        self.monitor.load(state["monitor"])
+        for name in ("descent", "monitor", "schedule"):
+            getattr(self, name).load(state[name])
 
 
 def _regions_to_draw(image: Tensor, regions: RegionMap | None, config: FitConfig) -> RegionMap | None:
@@ -159,7 +180,11 @@ def _initialize(
     image: Tensor, num_gaussians: int, drawn: RegionMap | None, config: FitConfig, seed: int
 ) -> tuple[GaussianField, float]:
     least = 1 if drawn is None else drawn.num_regions
-    count = min(num_gaussians, max(least, math.ceil(config.grow_from * num_gaussians)))
+    first = math.ceil(config.grow_from * num_gaussians)
+    if config.target_psnr is not None and config.grow_from < 1.0:
+        # num_gaussians is the most there may be, and says nothing of how many are needed
+        first = min(first, math.ceil(image.shape[1] * image.shape[2] / _TARGET_SPACING**2))
+    count = min(num_gaussians, max(least, first))
     sigma = config.init_sigma or max(1.0, 0.5 * math.sqrt(image.shape[1] * image.shape[2] / count))
     if config.initializer == "random":
         return random_field(image, count, sigma, drawn, seed), sigma

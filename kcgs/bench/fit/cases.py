@@ -38,7 +38,8 @@ PAPER_SEQUENCES = ("blackswan", "train")
 TIME_SEQUENCES = ("blackswan", "dog", "train")
 PAPER_ITERATIONS = 20_000
 SHORT_ITERATIONS = 1_000
-QUICK_ITERATIONS = 30
+QUICK_ITERATIONS = 20
+QUICK_STRIDE = 2
 SECONDS = 3.0
 # a pixel of the pie is the mean of 8 x 8 samples: at this many labels a pixel its contours are exact
 COVERAGE_LABELS = 8
@@ -75,10 +76,11 @@ class Case(NamedTuple):
     recipe: str
     overrides: dict[str, Any]
     seed: int = 0
+    stride: int = 1  # every how many pixels are taken
 
     def config(self) -> FitConfig:
         """All settings."""
-        return FitConfig.from_recipe(self.recipe, **self.overrides)
+        return _resolve(self.recipe, tuple(sorted(self.overrides.items())))
 
     def key(self, *more: Any) -> str:
         """Hash everything that the result depends on, and `more`."""
@@ -97,8 +99,9 @@ class Problem(NamedTuple):
 def make_case(group: str, image: str, n: int, name: str, *, quick: bool = False) -> Case:
     """Make a case of a recipe by the name it has in tables; a quick one has few iterations."""
     recipe, overrides = _RECIPES.get(name, (name, {}))
-    short = {"iterations": QUICK_ITERATIONS} if quick else {}
-    return Case(group, image, n, name, recipe, {**overrides, **short})
+    if not quick:
+        return Case(group, image, n, name, recipe, overrides)
+    return Case(group, image, n, name, recipe, {**overrides, "iterations": QUICK_ITERATIONS}, stride=QUICK_STRIDE)
 
 
 def cases(group: str, data: Path | None, quick: bool) -> list[Case]:
@@ -125,6 +128,9 @@ def missing(group: str, data: Path | None) -> str | None:
 def load(case: Case, data: Path | None) -> Problem:
     """Read the picture of a case."""
     image, labels = _read(GROUPS[case.group], case.image, data)
+    if case.stride > 1:
+        image = image[:, :: case.stride, :: case.stride].contiguous()
+        labels = None if labels is None else labels[:: case.stride, :: case.stride].contiguous()
     if case.name == COVERAGE:
         fine = chart_pie(COVERAGE_LABELS).labels
         return Problem(image, labels, RegionMap.from_labels(fine, supersample=COVERAGE_LABELS))
@@ -132,6 +138,7 @@ def load(case: Case, data: Path | None) -> Problem:
 
 
 def _plan(group: str, data: Path | None, quick: bool) -> tuple[list[str], tuple[int, ...], tuple[str, ...]]:
+    """Return a group's pictures, its N and its recipes."""
     folder = GROUPS[group]
     if folder is None:
         if group == "charts":
@@ -159,6 +166,11 @@ def _choose(present: list[str], wanted: tuple[str, ...] | list[str], least: int 
     chosen = [name for name in wanted if name in present]
     least = len(wanted) if least is None else least
     return chosen + [name for name in present if name not in chosen][: max(0, least - len(chosen))]
+
+
+@lru_cache
+def _resolve(recipe: str, overrides: tuple[tuple[str, Any], ...]) -> FitConfig:
+    return FitConfig.from_recipe(recipe, **dict(overrides))
 
 
 @lru_cache(maxsize=2)

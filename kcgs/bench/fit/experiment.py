@@ -23,7 +23,7 @@ def run(output: Path, *, data: Path | None = None, quick: bool = False, only: st
     Args:
         output: folder.
         data: folder with DAVIS, bsds and kodak in it; None: the charts and one photo are all there is.
-        quick: one small picture for each group and few iterations.
+        quick: one picture for each group, half as large, and few iterations.
         only: names of groups with commas between them; None: all that can be run.
 
     Raises:
@@ -35,6 +35,8 @@ def run(output: Path, *, data: Path | None = None, quick: bool = False, only: st
     chosen = _choose(only, data)
     store = Store(output / "runs")
     waiting = [case for group in chosen for case in cases(group, data, quick)]
+    for case in waiting:
+        case.config()  # read before hours of work: a recipe may be wrong, or edited meanwhile
     console = Console(stderr=True)
     try:
         with Progress(console=console, disable=not console.is_terminal) as progress:

@@ -25,16 +25,14 @@ def plot_time(runs: Runs, path: Path) -> str | None:
     plot, axes = figure(2, len(panels), width=max(5.0, 3.2 * len(panels)), height=6.0)
     for column, (image, n) in enumerate(panels):
         for row, (quantity, label) in enumerate((("psnr", "PSNR (dB)"), ("ef_psnr", "EF-PSNR (dB)"))):
-            # one panel a row comes as a list
-            axis = axes[row, column] if len(panels) > 1 else axes.flat[row]
+            axis = axes[row, column]
             for name in runs.names(group):
                 run = runs.find(group, image, n, name)
                 if run is not None:
                     _draw_history(axis, run, quantity)
             axis.set(xlabel="seconds", ylabel=label, xscale="log")
             axis.legend(loc="lower right", fontsize=7)
-        top = axes[0, column] if len(panels) > 1 else axes.flat[0]
-        top.set_title(f"{image}, N = {n:,}")
+        axes[0, column].set_title(f"{image}, N = {n:,}")
     save_figure(plot, path)
     return group
 

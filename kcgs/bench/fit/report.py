@@ -53,7 +53,7 @@ def write(output: Path, made: Iterable[Run], notes: list[str], quick: bool) -> N
     parts = ["# Fitting: quality, bytes, time", f"Made by `kcgs bench fit{' --quick' if quick else ''}`."]
     parts.append("\n".join(f"- {line}" for line in [*describe(), f"Threads: {torch.get_num_threads()}"]))
     if quick:
-        parts.append("This is the short form: fits of a few iterations, whose numbers only show that all of it runs.")
+        parts.append("The short form, small pictures and few iterations: the numbers only show that all of it runs.")
     parts.append(_INTRODUCTION)
     if notes:
         parts += ["## Left out", "\n".join(f"- {note}" for note in notes)]

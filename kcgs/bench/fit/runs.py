@@ -91,7 +91,7 @@ def equal_bytes(case: Case, run: Run) -> Case | None:
         return None
     # what cuts the quick form short cuts this short too
     overrides = {key: value for key, value in case.overrides.items() if key == "iterations"}
-    return Case(case.group, case.image, affordable(run), BASELINE, BASELINE, overrides, case.seed)
+    return case._replace(n=affordable(run), name=BASELINE, recipe=BASELINE, overrides=overrides)
 
 
 def affordable(run: Run) -> int:

@@ -206,7 +206,7 @@ def _db(value: float) -> str:
 
 
 def _signed(value: float) -> str:
-    return "" if math.isnan(value) else f"{value:+.2f}"
+    return "" if math.isnan(value) else f"{round(value, 2) + 0.0:+.2f}"  # no -0.00
 
 
 def _seconds(value: float) -> str:
