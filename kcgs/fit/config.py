@@ -35,6 +35,9 @@ class FitConfig(BaseModel):
         0.0, description="contour width in pixels, 0 to 64; 0: that of the map; auto: chosen for each pair of regions"
     )
     cutoff: float = Field(1e-4, ge=0.0, lt=1.0, description="weights below it are skipped")
+    draft_cutoff: float | None = Field(
+        None, ge=0.0, lt=1.0, description="of the first 85 % of a fit that has no target; None: cutoff"
+    )
     backend: str = Field("auto", description="kernel, as in region_splat")
 
     # The start

@@ -85,11 +85,12 @@ def fit(
             reason = "diverged"
             break
         progress = session.progress()
+        session.sharpen(progress)
         session.refresh_ids()
         session.grow(progress)
         session.release(progress)
         picture = session.draw()
-        if session.iteration % session.log_every == 0:
+        if session.log_is_due(progress):
             session.log(picture)
             if session.monitor.best_psnr >= (config.target_psnr or math.inf):
                 reason = "target_psnr"

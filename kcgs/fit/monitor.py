@@ -89,6 +89,10 @@ class Monitor:
             self.best_psnr = psnr
             self.best = drawn.detached()
 
+    def forget_best(self) -> None:
+        """Let the next state be the best; the history stays."""
+        self.best_psnr = -math.inf
+
     def state(self) -> dict[str, Any]:
         """Return everything a resumed fit needs."""
         return {"seconds": self.seconds(), "history": self.history, "best_psnr": self.best_psnr, "best": self.best}

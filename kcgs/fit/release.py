@@ -15,23 +15,23 @@ from kcgs.functional import RegionMap
 if TYPE_CHECKING:
     from .session import Session
 
-# steps of each trial
-TRIAL_STEPS = 40
+# steps of each trial, as a share of the fit so far
+_TRIAL = 0.05
 # pixels about a contour in which its help is measured
 _REACH = 12.0
 
 
-def helpless_pairs(session: Session, steps: int = TRIAL_STEPS) -> list[tuple[int, int]]:
+def helpless_pairs(session: Session) -> list[tuple[int, int]]:
     """Find the pairs of touching regions that are drawn better without the contour between them.
 
-    The fit goes on for `steps` steps twice from the same state, with all contours and with none; the squared errors of
+    The fit goes on for some steps twice from the same state, with all contours and with none; the squared errors of
     the two pictures are summed over the pixels nearest to each pair's contour. The session is left as it was.
 
     Returns:
         Pairs (a, b) of region ids, a < b.
     """
     kept = session.ids, session.drawn, session.iteration, copy.deepcopy(session.descent.state())
-    drawn = session.drawn
+    drawn, steps = session.drawn, max(5, round(_TRIAL * session.iteration))
     assert drawn is not None
     with_contours = _trial(session, steps)
     _restore(session, kept)

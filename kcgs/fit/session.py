@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcgs.functional import RegionMap, region_splat
+from kcgs.functional import RegionMap, region_splat, smooth_contours
 from kcgs.nn import GaussianField, PruneResult, prune
 
 from .assign import refresh_ids
@@ -23,9 +23,16 @@ from .release import helpless_pairs, merge_pairs
 from .schedule import make_schedule
 from .widths import choose_widths
 
+# of smoothed contours
+_SUPERSAMPLE = 4
 # a fit to a target starts with a Gaussian for each square of so many pixels
 _TARGET_SPACING = 64
-_KEPT = ("iteration", "wanted", "released", "ids", "drawn")
+_DRAFTS_END = 0.85
+_KEPT = ("iteration", "cutoff", "wanted", "additions", "released", "ids", "drawn")
+# contours move before every second addition
+_ADDITIONS_A_REFINEMENT = 2
+# where the clock ends the fit, descent gets this many times the seconds of the growth before it
+_GROWTH_PATIENCE = 2.0
 # scales that growth looks for, in pixels
 _GROWTH_SIGMAS = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
 
@@ -39,15 +46,18 @@ class Session:
         self.image, self.given, self.config = image, regions, config
         self.size = (image.shape[1], image.shape[2])
         self.monitor = Monitor(image, regions, start)
-        self.drawn = _regions_to_draw(image, regions, config)
+        self.drawn = _regions_to_draw(image, regions, num_gaussians, config)
         field, sigma = _initialize(image, num_gaussians, self.drawn, config, seed)
         self.ids = field.region_ids
         self.descent = make_descent(config, field, sigma)
         self.schedule = make_schedule(config, num_gaussians, len(field))
         self.iteration = 0
         self.wanted = len(field)
+        drafts = config.draft_cutoff is not None and config.target_psnr is None
+        self.cutoff: float = config.draft_cutoff if drafts else config.cutoff  # type: ignore[assignment]
         self.released = False
-        self.log_every = max(1, config.iterations // config.history_points)
+        self.additions = 0
+        self.grow_after = 0.0
 
     def progress(self) -> float:
         """Share of the fit that is done."""
@@ -57,10 +67,17 @@ class Session:
         """Return what is drawn now."""
         return Gaussians(*self.descent.tensors(), self.ids, self.drawn)
 
+    def sharpen(self, progress: float) -> None:
+        """Draw with the cutoff of the result from here on, once drafts have served their time."""
+        if self.cutoff != self.config.cutoff and progress >= _DRAFTS_END:
+            self.cutoff = self.config.cutoff
+            # what was measured on drafts does not compare
+            self.monitor.forget_best()
+
     def draw(self, gaussians: Gaussians | None = None) -> Tensor:
         """Draw (C, H, W): these Gaussians, or those of the moment."""
         means, cholesky, colors, ids, regions = gaussians or self.gaussians()
-        cutoff, backend = self.config.cutoff, self.config.backend
+        cutoff, backend = self.cutoff, self.config.backend
         picture = region_splat(means, cholesky, colors, ids, regions, size=self.size, cutoff=cutoff, backend=backend)
         return picture.clamp(0.0, 1.0) if self.config.clamp else picture
 
@@ -71,6 +88,12 @@ class Session:
         picture.backward(difference.sign_() if self.config.loss == "l1" else difference)
         self.descent.step(self.schedule.rate(progress))
         self.iteration += 1
+
+    def log_is_due(self, progress: float) -> bool:
+        """Say whether the history wants an entry: `history_points` over the fit, by iterations or by the clock."""
+        if self.config.max_seconds is None:
+            return self.iteration % max(1, self.config.iterations // self.config.history_points) == 0
+        return progress * self.config.history_points >= len(self.monitor.history)
 
     def log(self, picture: Tensor, gaussians: Gaussians | None = None) -> None:
         """Measure the picture of these Gaussians, or of those of the moment, and write it down."""
@@ -91,11 +114,15 @@ class Session:
     @torch.no_grad()
     def grow(self, progress: float) -> None:
         """Add Gaussians where the error is, after moving the contours, if that is due."""
+        end = self.config.grow_between[1]
         wanted = self.schedule.wanted(progress)
-        if wanted <= self.wanted:
+        start = self.monitor.seconds()
+        # against the clock, growth must leave time for the descent
+        if wanted <= self.wanted or (self.config.max_seconds and start < self.grow_after and progress < 0.9 * end):
             return
         self.wanted = wanted
-        if self.config.refine:
+        self.additions += 1
+        if self.config.refine and self.additions % _ADDITIONS_A_REFINEMENT == 0:
             self.refine()
         residual = self.image - self.draw()
         count = wanted - len(self.descent.tensors()[0])
@@ -103,6 +130,7 @@ class Session:
         self.descent.append(found.means, found.cholesky, found.colors)
         if self.ids is not None and found.region_ids is not None:
             self.ids = torch.cat([self.ids, found.region_ids])
+        self.grow_after = self.monitor.seconds() + _GROWTH_PATIENCE * (self.monitor.seconds() - start)
 
     @torch.no_grad()
     def refine(self) -> None:
@@ -130,7 +158,8 @@ class Session:
 
     def finish(self, reason: StopReason) -> FitResult:
         """Measure the last state and return the best."""
-        if reason in ("iterations", "callback", "seconds") and self.descent.is_finite():
+        self.sharpen(1.0)
+        if reason != "diverged" and self.descent.is_finite():
             with torch.no_grad():
                 self.log(self.draw())
         best = self.monitor.best
@@ -166,14 +195,22 @@ class Session:
             getattr(self, name).load(state[name])
 
 
-def _regions_to_draw(image: Tensor, regions: RegionMap | None, config: FitConfig) -> RegionMap | None:
+def _regions_to_draw(
+    image: Tensor, regions: RegionMap | None, num_gaussians: int, config: FitConfig
+) -> RegionMap | None:
     if regions is None or not config.guidance or regions.num_regions == 1:
         return None
     # a map that comes with widths, or with sub-pixel coverage, says how sharp it is
     if regions.softness != 0.0 or regions.supersample > 1 or config.softness == 0.0:
         return regions
-    softness = choose_widths(image, regions.labels) if config.softness == "auto" else config.softness
-    return RegionMap.from_labels(regions.labels, softness)
+    if config.softness != "auto":
+        return RegionMap.from_labels(regions.labels, config.softness)
+    widths = choose_widths(image, regions.labels)
+    if config.polish and any(widths.values()) and is_flat(image, regions, num_gaussians):
+        # a chart's edges are smooth curves: their coverage says more than a blur
+        fine = smooth_contours(regions.labels, _SUPERSAMPLE)
+        return RegionMap.from_labels(fine, supersample=_SUPERSAMPLE)
+    return RegionMap.from_labels(regions.labels, widths)
 
 
 def _initialize(

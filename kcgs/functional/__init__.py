@@ -1,5 +1,6 @@
 """Stateless public operations: splatting, covariances, label maps, metrics."""
 
+from .contours import smooth_contours
 from .covariance import (
     cholesky_to_conic,
     cholesky_to_covariance,
@@ -26,6 +27,7 @@ __all__ = [
     "psnr",
     "region_splat",
     "scale_rotation_to_cholesky",
+    "smooth_contours",
     "ssim",
     "support_extent",
 ]
