@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any
 
 import torch
@@ -217,6 +218,12 @@ def _initialize(
     image: Tensor, num_gaussians: int, drawn: RegionMap | None, config: FitConfig, seed: int
 ) -> tuple[GaussianField, float]:
     least = 1 if drawn is None else drawn.num_regions
+    if least > num_gaussians:
+        warnings.warn(
+            f"{least - num_gaussians} of {least} regions get no Gaussian and stay black: num_gaussians is "
+            f"{num_gaussians}; merge regions or take more",
+            stacklevel=4,
+        )
     first = math.ceil(config.grow_from * num_gaussians)
     if config.target_psnr is not None and config.grow_from < 1.0:
         # num_gaussians is the most there may be, and says nothing of how many are needed

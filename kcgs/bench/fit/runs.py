@@ -20,7 +20,7 @@ from kcgs.fit import FitConfig, HistoryEntry, fit
 from kcgs.functional import RegionMap
 from kcgs.nn.renderer import render_image
 
-from .cases import BASELINE, COMPARED, RIVALS, Case, load
+from .cases import BASELINE, COMPARED, Case, load
 
 GAUSSIAN_BYTES = 7
 
@@ -87,7 +87,7 @@ class Store:
 
 def equal_bytes(case: Case, run: Run) -> Case | None:
     """Return the baseline's fit with the Gaussians that the bytes of `run` buy; None where none is asked for."""
-    if case.group not in COMPARED or case.name not in RIVALS:
+    if COMPARED.get(case.group) != case.name:
         return None
     # what cuts the quick form short cuts this short too
     overrides = {key: value for key, value in case.overrides.items() if key == "iterations"}
