@@ -48,8 +48,8 @@ class Checkpoint:
     def write(self, state: dict[str, Any]) -> None:
         """Put the state in the file's place."""
         start = time.perf_counter()
-        with atomic_path(self.path) as temporary:
-            torch.save({"version": _VERSION, "problem": self.problem, **_plain(state)}, temporary)
+        with atomic_path(self.path) as temporary, temporary.open("wb") as file:
+            torch.save({"version": _VERSION, "problem": self.problem, **_plain(state)}, file)
         end = time.perf_counter()
         self._next = end + _PATIENCE * (end - start)
 

@@ -37,6 +37,9 @@ class Descent(Protocol):
     def append(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
         """Add Gaussians."""
 
+    def recolor(self, colors: Tensor) -> None:
+        """Replace the colours."""
+
     def is_finite(self) -> bool:
         """Say whether every number is finite, and colours far from overflow."""
 
@@ -75,6 +78,11 @@ class RawDescent:
     def append(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
         """Refuse: these parameters do not grow."""
         raise NotImplementedError("only optimizer 'frame' grows")
+
+    def recolor(self, colors: Tensor) -> None:
+        """Replace the colours."""
+        with torch.no_grad():
+            self.raw.colors.copy_(colors)
 
     def is_finite(self) -> bool:
         """Say whether every number is finite."""
@@ -166,6 +174,10 @@ class FrameDescent:
         self.momentum, self.square, self.age = (
             torch.nn.functional.pad(t, more) for t in (self.momentum, self.square, self.age)
         )
+
+    def recolor(self, colors: Tensor) -> None:
+        """Replace the colours."""
+        self._hold(self.means, self.cholesky, colors)
 
     def is_finite(self) -> bool:
         """Say whether every number is finite, and colours far from overflow."""

@@ -92,7 +92,7 @@ def fit(
         picture = session.draw()
         if session.log_is_due(progress):
             session.log(picture)
-            if session.monitor.best_psnr >= (config.target_psnr or math.inf):
+            if config.target_psnr is not None and session.monitor.best_psnr >= config.target_psnr:
                 reason = "target_psnr"
                 break
         session.step(picture, progress)

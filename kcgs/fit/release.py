@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from scipy import ndimage
@@ -12,45 +11,82 @@ from torch import Tensor
 
 from kcgs.functional import RegionMap
 
+from .colors import solve_colors
+
 if TYPE_CHECKING:
     from .session import Session
 
 # steps of each trial, as a share of the fit so far
 _TRIAL = 0.05
+_SOLVE_STEPS = 8
+# steps of the fits that are compared at the start
+_REHEARSAL = 20
 # pixels about a contour in which its help is measured
 _REACH = 12.0
 
 
-def helpless_pairs(session: Session) -> list[tuple[int, int]]:
-    """Find the pairs of touching regions that are drawn better without the contour between them.
+def release(session: Session) -> None:
+    """Unite the touching regions that are drawn better without the contour between them.
 
-    The fit goes on for some steps twice from the same state, with all contours and with none; the squared errors of
-    the two pictures are summed over the pixels nearest to each pair's contour. The session is left as it was.
-
-    Returns:
-        Pairs (a, b) of region ids, a < b.
+    The fit goes on for some steps twice from the same state, with all contours and with none, both after a solution of
+    the colours, since Gaussians that were confined overlap once they are not. The squared errors of the two pictures
+    are summed over the pixels nearest to each pair's contour; where none is better the pair is united.
     """
-    kept = session.ids, session.drawn, session.iteration, copy.deepcopy(session.descent.state())
-    drawn, steps = session.drawn, max(5, round(_TRIAL * session.iteration))
-    assert drawn is not None
+    drawn, ids, kept = session.drawn, session.ids, session.state()
+    assert drawn is not None and ids is not None
+    kept = copy.deepcopy({name: kept[name] for name in ("descent", "iteration")})
+    steps = max(5, round(_TRIAL * session.iteration))
     with_contours = _trial(session, steps)
-    _restore(session, kept)
+    _restore(session, kept, ids, drawn)
     session.ids = session.drawn = None
     without = _trial(session, steps)
-    _restore(session, kept)
-    return _pairs_below(drawn.labels, without - with_contours)
+    _restore(session, kept, ids, drawn)
+    pairs = _pairs_below(drawn.labels, without - with_contours)
+    if pairs:
+        session.drawn, session.ids = merge_pairs(drawn, ids, pairs)
+        session.anchor = _united(drawn, pairs)[drawn.index_of(session.anchor)]
+        _solve(session)
+
+
+def choose_contours(session: Session) -> RegionMap | None:
+    """Leave out, before the fit, the contours that are no help from the start.
+
+    Two short fits, one with all contours and one with none, start anew with the few Gaussians that growth starts from;
+    they are compared as in :func:`release`, which cannot see this: what confined Gaussians have learnt by then is
+    little use to unconfined ones. The session is left at the start of the fit, with the map that is returned.
+    """
+    drawn = session.drawn
+    assert drawn is not None
+    errors = []
+    for regions in (drawn, None):
+        session.begin(regions)
+        for _ in range(_REHEARSAL):
+            session.step(session.draw(), 0.0)
+        with torch.no_grad():
+            errors.append((session.draw() - session.image).square().mean(0))
+    chosen, _ = merge_pairs(drawn, drawn.ids, _pairs_below(drawn.labels, errors[1] - errors[0]))
+    session.begin(chosen)
+    return chosen
 
 
 def _trial(session: Session, steps: int) -> Tensor:
+    _solve(session)
     for _ in range(steps):
         session.step(session.draw(), session.progress())
     with torch.no_grad():
         return (session.draw() - session.image).square().mean(0)
 
 
-def _restore(session: Session, kept: tuple[object, ...]) -> None:
-    session.ids, session.drawn, session.iteration = kept[:3]  # type: ignore[assignment]
-    session.descent.load(copy.deepcopy(kept[3]))  # type: ignore[arg-type]
+def _solve(session: Session) -> None:
+    field = session.gaussians().field(session.size)
+    settings = {"cutoff": session.cutoff, "backend": session.config.backend}
+    solved = solve_colors(field, session.image, session.drawn, steps=_SOLVE_STEPS, **settings)  # type: ignore[arg-type]
+    session.descent.recolor(solved.colors.detach())
+
+
+def _restore(session: Session, kept: dict[str, Any], ids: Tensor, drawn: RegionMap) -> None:
+    session.ids, session.drawn, session.iteration = ids, drawn, kept["iteration"]
+    session.descent.load(copy.deepcopy(kept["descent"]))
 
 
 def _pairs_below(labels: Tensor, difference: Tensor) -> list[tuple[int, int]]:
@@ -92,6 +128,17 @@ def merge_pairs(
         ids: of the Gaussians, (N,).
         pairs: ids to unite.
     """
+    if not pairs:
+        return regions, ids
+    new = _united(regions, pairs)
+    if len(torch.unique(new)) == 1:
+        return None, None
+    labels = new[regions.index_of(regions.labels)]
+    return RegionMap.from_labels(labels, _united_widths(regions, new)), new[regions.index_of(ids)]
+
+
+def _united(regions: RegionMap, pairs: list[tuple[int, int]]) -> Tensor:
+    """New id of each region: the least of those it is united with."""
     root = {int(i): int(i) for i in regions.ids}
 
     def find(i: int) -> int:
@@ -102,22 +149,17 @@ def merge_pairs(
     for a, b in pairs:
         low, high = sorted((find(a), find(b)))
         root[high] = low
-    new = torch.tensor([find(int(i)) for i in regions.ids], device=ids.device)
-    if len(torch.unique(new)) == 1:
-        return None, None
-    if not pairs:
-        return regions, ids
-    labels = new[regions.index_of(regions.labels)]
-    return RegionMap.from_labels(labels, _united_widths(regions, find)), new[regions.index_of(ids)]
+    return torch.tensor([find(int(i)) for i in regions.ids], device=regions.ids.device)
 
 
-def _united_widths(regions: RegionMap, find: Callable[[int], int]) -> float | dict[tuple[int, int], float]:
-    softness = regions.softness
-    if isinstance(softness, float):
-        return softness
+def _united_widths(regions: RegionMap, new: Tensor) -> float | dict[tuple[int, int], float]:
+    """Width of each pair of united regions: the mean of what was united."""
+    if isinstance(regions.softness, float):
+        return regions.softness
+    root = dict(zip(regions.ids.tolist(), new.tolist(), strict=True))
     widths: dict[tuple[int, int], list[float]] = {}
-    for (a, b), width in softness.items():
-        low, high = sorted((find(a), find(b)))
+    for (a, b), width in regions.softness.items():
+        low, high = sorted((root[a], root[b]))
         if low != high:
             widths.setdefault((low, high), []).append(width)
     return {pair: sum(found) / len(found) for pair, found in widths.items()}

@@ -20,7 +20,7 @@ from .initialize import INITIALIZERS, random_field
 from .monitor import FitResult, Gaussians, Monitor, StopReason
 from .polish import is_flat, polish
 from .refine import refine_contours
-from .release import helpless_pairs, merge_pairs
+from .release import choose_contours, release
 from .schedule import make_schedule
 from .widths import choose_widths
 
@@ -29,7 +29,7 @@ _SUPERSAMPLE = 4
 # a fit to a target starts with a Gaussian for each square of so many pixels
 _TARGET_SPACING = 64
 _DRAFTS_END = 0.85
-_KEPT = ("iteration", "cutoff", "wanted", "additions", "released", "ids", "drawn")
+_KEPT = ("iteration", "cutoff", "wanted", "additions", "released", "ids", "drawn", "anchor")
 # contours move before every second addition
 _ADDITIONS_A_REFINEMENT = 2
 # where the clock ends the fit, descent gets this many times the seconds of the growth before it
@@ -44,20 +44,30 @@ class Session:
     def __init__(
         self, image: Tensor, regions: RegionMap | None, num_gaussians: int, config: FitConfig, seed: int, start: float
     ) -> None:
-        self.image, self.given, self.config = image, regions, config
+        self.image, self.config = image, config
         self.size = (image.shape[1], image.shape[2])
         self.monitor = Monitor(image, regions, start)
-        self.drawn = _regions_to_draw(image, regions, num_gaussians, config)
-        field, sigma = _initialize(image, num_gaussians, self.drawn, config, seed)
-        self.ids = field.region_ids
-        self.descent = make_descent(config, field, sigma)
-        self.schedule = make_schedule(config, num_gaussians, len(field))
-        self.iteration = 0
-        self.wanted = len(field)
+        self.seed, self.num_gaussians = seed, num_gaussians
         drafts = config.draft_cutoff is not None and config.target_psnr is None
         self.cutoff: float = config.draft_cutoff if drafts else config.cutoff  # type: ignore[assignment]
+        self.begin(_regions_to_draw(image, regions, num_gaussians, config))
+        if config.release and self.drawn is not None and self.drawn.supersample == 1:
+            choose_contours(self)
+        if self.drawn is not None and self.drawn.num_regions > num_gaussians:
+            _warn_of_empty_regions(self.drawn.num_regions, num_gaussians)
+
+    def begin(self, drawn: RegionMap | None) -> None:
+        """Start with these regions."""
+        self.drawn = drawn
+        # where contours may not move far from
+        self.anchor = drawn.labels if drawn is not None else torch.zeros(0, dtype=torch.long)
+        field, sigma = _initialize(self.image, self.num_gaussians, drawn, self.config, self.seed)
+        self.ids = field.region_ids
+        self.descent = make_descent(self.config, field, sigma)
+        self.schedule = make_schedule(self.config, self.num_gaussians, len(field))
+        self.wanted = len(field)
+        self.iteration = self.additions = 0
         self.released = False
-        self.additions = 0
         self.grow_after = 0.0
 
     def progress(self) -> float:
@@ -136,13 +146,13 @@ class Session:
     @torch.no_grad()
     def refine(self) -> None:
         """Move the contours."""
-        if self.drawn is None or self.given is None or self.drawn.supersample > 1:
+        if self.drawn is None or self.drawn.supersample > 1:
             return
         self.drawn = refine_contours(
             self.gaussians().field(self.size),
             self.image,
             self.drawn,
-            given=self.given.labels,
+            given=self.anchor,
             max_distance=None if self.config.max_move == "any" else self.config.max_move,
             length_weight=self.config.contour_price,
             backend=self.config.backend,
@@ -154,8 +164,7 @@ class Session:
             return
         self.released = True
         if self.drawn is not None and self.ids is not None and self.drawn.supersample == 1:
-            pairs = helpless_pairs(self)
-            self.drawn, self.ids = merge_pairs(self.drawn, self.ids, pairs)
+            release(self)
 
     def finish(self, reason: StopReason) -> FitResult:
         """Measure the last state and return the best."""
@@ -218,12 +227,6 @@ def _initialize(
     image: Tensor, num_gaussians: int, drawn: RegionMap | None, config: FitConfig, seed: int
 ) -> tuple[GaussianField, float]:
     least = 1 if drawn is None else drawn.num_regions
-    if least > num_gaussians:
-        warnings.warn(
-            f"{least - num_gaussians} of {least} regions get no Gaussian and stay black: num_gaussians is "
-            f"{num_gaussians}; merge regions or take more",
-            stacklevel=4,
-        )
     first = math.ceil(config.grow_from * num_gaussians)
     if config.target_psnr is not None and config.grow_from < 1.0:
         # num_gaussians is the most there may be, and says nothing of how many are needed
@@ -233,3 +236,11 @@ def _initialize(
     if config.initializer == "random":
         return random_field(image, count, sigma, drawn, seed), sigma
     return INITIALIZERS[config.initializer](image, count, drawn, seed), sigma
+
+
+def _warn_of_empty_regions(regions: int, num_gaussians: int) -> None:
+    warnings.warn(
+        f"{regions - num_gaussians} of {regions} regions get no Gaussian and stay black: num_gaussians is "
+        f"{num_gaussians}; merge regions or take more",
+        stacklevel=4,
+    )

@@ -112,11 +112,15 @@ class TestContours:
         assert (moved.labels != labels).sum() < 0.3 * (given != labels).sum()
         assert not bool(((moved.labels != given) & ~edge_band(given, 3)).any())
 
-    def test_a_contour_without_an_edge_is_let_go(self) -> None:
+    def test_contours_without_edges_are_let_go(self) -> None:
         image, labels = scene()
-        y, x = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+        y, x = torch.meshgrid(torch.arange(48), torch.arange(64), indexing="ij")
         smooth = torch.stack([0.5 + 0.3 * torch.sin(0.11 * x + 0.07 * k * y) for k in range(3)])
-        assert fit(smooth, labels, 24, config=quick(refine=False)).regions is None
+        board = (x // 6 + y // 6) % 2
+        result = fit(smooth, board, 24, config=quick(refine=False))
+        assert result.regions is None
+        assert result.field.region_ids is None
+        assert fit(smooth, board, 24, config=quick(refine=False, release=False)).regions is not None
         assert fit(image, labels, 24, config=quick()).regions is not None
 
     def test_of_three_regions_two_become_one(self) -> None:
@@ -209,9 +213,8 @@ class TestCheckpoint:
             fit(image, labels, 30, config=config, checkpoint=file, on_step=kill)
         resumed = fit(image, labels, 30, config=config, checkpoint=file, resume=True)
         assert same(whole, resumed)
-        assert [h._replace(seconds=0) for h in whole.history] == pytest.approx(
-            [h._replace(seconds=0) for h in resumed.history], nan_ok=True
-        )
+        timeless = [[h._replace(seconds=0.0) for h in result.history] for result in (whole, resumed)]
+        assert timeless[0] == timeless[1]
 
     def test_finished_gives_the_same_again(self, tmp_path: Path) -> None:
         image, labels = scene()
@@ -273,9 +276,12 @@ class TestHardCases:
         reached = float(psnr(picture, image))
         assert reached >= max(h.psnr for h in exact) - 0.1 or reached > 60
         assert reached > 5
-        limit = 2 * math.hypot(*image.shape[1:])
-        assert float(result.field.cholesky.abs().max()) <= limit
-        assert float(result.field.means.abs().max()) <= 3 * limit
+        if not len(result.field):
+            return
+        # a polished Gaussian may be as wide as 100 diagonals, any other as one
+        limit = (1.01 if reached < 60 and name != "saturated" else 101) * math.hypot(*image.shape[1:])
+        assert float(result.field.cholesky.detach().abs().max()) <= limit
+        assert float(result.field.means.detach().abs().max()) <= 4 * limit
 
     @pytest.mark.parametrize("rate", [1e-6, 10.0, 1e6])
     def test_extreme_learning_rates(self, rate: float) -> None:
