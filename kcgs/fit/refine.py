@@ -120,6 +120,37 @@ def refine_contours(
     return RegionMap.from_labels(labels, _softness(regions, labels))
 
 
+def accept_moves(before: RegionMap, after: RegionMap, gain: Tensor) -> RegionMap:
+    """Keep, of the moves between two maps, those whose own surroundings are drawn better.
+
+    Moves are judged by the region's Gaussians alone; the picture blends them over soft contours. Pixels that changed
+    hands are grouped with all within two pixels, and a group stays changed where the squared error fell in its sum.
+
+    Args:
+        before: the map that moved.
+        after: what it became, with the same regions.
+        gain: squared error of the picture drawn with `before` minus that with `after`, (H, W).
+
+    Returns:
+        A map; `before` where nothing is kept, or a region would be lost.
+
+    Example:
+        >>> maps = [RegionMap.from_labels((torch.arange(9) > k).long().expand(6, 9)) for k in (3, 4)]
+        >>> accept_moves(*maps, -torch.ones(6, 9)) is maps[0]
+        True
+    """
+    from scipy import ndimage
+
+    changed = (before.labels != after.labels).cpu().numpy()
+    groups, count = ndimage.label(ndimage.binary_dilation(changed, iterations=2), np.ones((3, 3)))
+    sums = ndimage.sum_labels(gain.double().cpu().numpy(), groups, np.arange(1, count + 1))
+    kept = torch.from_numpy(np.concatenate([[False], sums > 0])[groups]).to(before.labels.device)
+    labels = torch.where(kept, after.labels, before.labels)
+    if not bool(kept.any()) or len(torch.unique(labels)) < before.num_regions:
+        return before
+    return RegionMap.from_labels(labels, _softness(after, labels))
+
+
 @torch.no_grad()
 def contour_energy(
     field: GaussianField,

@@ -63,7 +63,7 @@ def choose_contours(session: Session) -> RegionMap | None:
         for _ in range(_REHEARSAL):
             session.step(session.draw(), 0.0)
         with torch.no_grad():
-            errors.append((session.draw() - session.image).square().mean(0))
+            errors.append(session.error())
     chosen, _ = merge_pairs(drawn, drawn.ids, _pairs_below(drawn.labels, errors[1] - errors[0]))
     session.begin(chosen)
     return chosen
@@ -74,7 +74,7 @@ def _trial(session: Session, steps: int) -> Tensor:
     for _ in range(steps):
         session.step(session.draw(), session.progress())
     with torch.no_grad():
-        return (session.draw() - session.image).square().mean(0)
+        return session.error()
 
 
 def _solve(session: Session) -> None:

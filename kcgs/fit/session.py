@@ -19,7 +19,7 @@ from .grow import propose
 from .initialize import INITIALIZERS, random_field
 from .monitor import FitResult, Gaussians, Monitor, StopReason
 from .polish import is_flat, polish
-from .refine import refine_contours
+from .refine import accept_moves, refine_contours
 from .release import choose_contours, release
 from .schedule import make_schedule
 from .widths import choose_widths
@@ -148,15 +148,23 @@ class Session:
         """Move the contours."""
         if self.drawn is None or self.drawn.supersample > 1:
             return
-        self.drawn = refine_contours(
+        before, distance = self.drawn, self.config.max_move
+        moved = refine_contours(
             self.gaussians().field(self.size),
             self.image,
-            self.drawn,
+            before,
             given=self.anchor,
-            max_distance=None if self.config.max_move == "any" else self.config.max_move,
+            max_distance=None if distance == "any" else distance,
             length_weight=self.config.contour_price,
             backend=self.config.backend,
         )
+        if moved is not before:
+            gain = self.error() - self.error(self.gaussians()._replace(regions=moved))
+            self.drawn = accept_moves(before, moved, gain)
+
+    def error(self, gaussians: Gaussians | None = None) -> Tensor:
+        """Squared error of each pixel, (H, W), channels averaged."""
+        return (self.draw(gaussians).detach() - self.image).square().mean(0)
 
     def release(self, progress: float) -> None:
         """Let go, once, the contours that a trial finds no help."""
