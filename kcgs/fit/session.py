@@ -26,6 +26,8 @@ from .widths import choose_widths
 
 # of smoothed contours
 _SUPERSAMPLE = 4
+# by which moved contours may raise the squared error for the moment, since Gaussians adapt to them
+_LARGEST_RISE = 1.15
 # a fit to a target starts with a Gaussian for each square of so many pixels
 _TARGET_SPACING = 64
 _DRAFTS_END = 0.85
@@ -159,8 +161,9 @@ class Session:
             backend=self.config.backend,
         )
         if moved is not before:
-            gain = self.error() - self.error(self.gaussians()._replace(regions=moved))
-            self.drawn = accept_moves(before, moved, gain)
+            old, new = self.error(), self.error(self.gaussians()._replace(regions=moved))
+            adapts = float(new.mean()) <= _LARGEST_RISE * float(old.mean())
+            self.drawn = moved if adapts else accept_moves(before, moved, old - new)
 
     def error(self, gaussians: Gaussians | None = None) -> Tensor:
         """Squared error of each pixel, (H, W), channels averaged."""

@@ -55,13 +55,40 @@ FIT = ("fit", "photo.png", "-n", "12", "--iterations", "40", "-o", "scene.safete
 
 
 class TestFit:
+    def test_plot_and_kept_contours(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        code, _, err = kcgs(*FIT, "--regions", "mask.png", "--keep-contours", "--plot", "plot.png", capsys=capsys)
+        assert code == 0, err
+        assert Image.open("plot.png").width > 500
+        regions = load("scene.safetensors").regions
+        assert regions is not None
+        assert torch.equal(regions.labels, load_labels(Path("mask.png")))
+
+    def test_checkpoint_and_resume(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        scenes = []
+        for _ in range(2):
+            code, _, err = kcgs(*FIT, "--checkpoint", "state", "--resume", "--regions", "none", capsys=capsys)
+            assert code == 0, err
+            scenes.append((files / "scene.safetensors").read_bytes())
+        assert scenes[0] == scenes[1]
+        code, _, err = kcgs(*FIT, "--checkpoint", "state", "--resume", "--seed", "1", capsys=capsys)
+        assert code == 1
+        assert "belongs to another fit" in err
+
+    def test_target_psnr(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        arguments = ("--iterations", "300", "--target-psnr", "25", "-n", "500", "--regions", "mask.png", "--json")
+        code, out, err = kcgs(*FIT, *arguments, capsys=capsys)
+        assert code == 0, err
+        report = json.loads(out)
+        assert report["psnr"] >= 24.99
+        assert report["num_gaussians"] < 100
+
     @pytest.mark.parametrize("regions", ["mask.png", "auto", "none"])
     def test_fit_render_eval_info(self, files: Path, capsys: pytest.CaptureFixture[str], regions: str) -> None:
         code, out, err = kcgs(*FIT, "--regions", regions, "--json", capsys=capsys)
         assert code == 0, err
         report = json.loads(out)
         assert set(report) == KEYS
-        assert report["num_gaussians"] == 12
+        assert 1 <= report["num_gaussians"] <= 12
         assert report["bytes"] == (files / "scene.safetensors").stat().st_size
         assert (report["ef_psnr"] is None) == (regions == "none")
         assert report["ms_ssim"] is None  # the image is too small for it
@@ -111,7 +138,7 @@ class TestFit:
         out, err = process.communicate(timeout=60)
         assert process.returncode == 0, err
         assert b"interrupted: saved the best so far to scene.safetensors" in err
-        assert json.loads(out)["num_gaussians"] == 12
+        assert 1 <= json.loads(out)["num_gaussians"] <= 12
         assert len(load(files / "scene.safetensors").field) == 12
 
 
@@ -171,6 +198,9 @@ class TestFailures:
             (("fit", "nothing.png"), 1, "nothing.png"),
             (("fit", "text.png"), 1, "text.png"),
             (("fit", "photo.png", "--recipe", "none-such"), 1, "recipe must be one of"),
+            (("fit", "photo.png", "--resume"), 2, "--resume needs --checkpoint"),
+            (("fit", "photo.png", "--plot", "plot.txt"), 1, "--plot must end in .png"),
+            (("bench", "render", "-o", "out", "--only", "speed"), 1, "only"),
             (("fit", "photo.png", "--regions", "nothing.png"), 1, "nothing.png"),
             (("fit", "photo.png", "--regions", "small.png"), 1, "regions must be one map of the image's size"),
             (("fit", "photo.png", "-o", "scene.pt"), 1, "must end in .safetensors"),

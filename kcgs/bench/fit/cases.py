@@ -158,7 +158,7 @@ def _plan(group: str, data: Path | None, quick: bool) -> tuple[list[str], tuple[
     if group == "time":
         return _choose(present, TIME_SEQUENCES), (1_250, 7_500), (BEST, LIMITED)
     wanted = [s for s in SEQUENCES if s != STAND_IN or "motocross-jump" not in present]
-    return _choose(present, wanted, LEAST_SEQUENCES), (1_250, 7_500), (BASELINE, BEST, KEPT)
+    return _choose(present, wanted, LEAST_SEQUENCES), (1_250, 7_500), (BASELINE, BEST)
 
 
 def _choose(present: list[str], wanted: tuple[str, ...] | list[str], least: int | None = None) -> list[str]:
