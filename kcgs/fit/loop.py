@@ -37,12 +37,14 @@ def fit(
     r"""Fit a field of Gaussians to an image.
 
     Convention: the same arguments, device and number of threads give the same field, bit for bit (unless it is stopped
-    by the clock). The best state that was logged is returned, not the last.
+    by the clock). The best state that was logged is returned, not the last; with a draft cutoff, the best of those that
+    were drawn without. The field holds fewer than N Gaussians where the recipe prunes, or reaches its target sooner.
 
     Args:
         image: :math:`(C, H, W)` or :math:`(1, C, H, W)`, floating, values in [0, 1].
         regions: label map of the image's size, or a RegionMap; also says where EF-PSNR is measured. None: one region.
-        num_gaussians: N, at least 1.
+        num_gaussians: N, at least 1; with `target_psnr` and growth, the most there may be. Where it is below the number
+            of regions, the smaller ones stay empty and black, and a UserWarning says how many.
         recipe: a name from :func:`available_recipes`; not read where `config` is given.
         seed: of the random start.
         config: all settings.
@@ -52,7 +54,8 @@ def fit(
         resume: go on from `checkpoint` where it exists; the result is that of an uninterrupted fit.
 
     Returns:
-        Field, regions to draw it with, history, why it stopped, and the settings.
+        Field, regions to draw it with (moved, or united, where the recipe does so), history, why it stopped, settings,
+        and how many Gaussians were left out as useless.
 
     Raises:
         TypeError: wrong types.

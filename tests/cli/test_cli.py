@@ -58,7 +58,8 @@ class TestFit:
     def test_plot_and_kept_contours(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
         code, _, err = kcgs(*FIT, "--regions", "mask.png", "--keep-contours", "--plot", "plot.png", capsys=capsys)
         assert code == 0, err
-        assert Image.open("plot.png").width > 500
+        with Image.open("plot.png") as plot:
+            assert plot.width > 500
         regions = load("scene.safetensors").regions
         assert regions is not None
         assert torch.equal(regions.labels, load_labels(Path("mask.png")))
@@ -139,7 +140,7 @@ class TestFit:
         assert process.returncode == 0, err
         assert b"interrupted: saved the best so far to scene.safetensors" in err
         assert 1 <= json.loads(out)["num_gaussians"] <= 12
-        assert len(load(files / "scene.safetensors").field) == 12
+        assert 1 <= len(load(files / "scene.safetensors").field) <= 12
 
 
 class TestRender:
