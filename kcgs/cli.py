@@ -81,7 +81,7 @@ def fit_command(
         raise typer.BadParameter("--resume needs --checkpoint")
     settings: dict[str, Any] = {"iterations": iterations, "max_seconds": max_seconds, "target_psnr": target_psnr}
     if keep_contours:
-        settings["refine"] = False
+        settings |= {"refine": False, "release": False}
     elif regions == "auto":
         # nobody gave these contours, so none are to be kept near
         settings["max_move"] = "any"

@@ -32,7 +32,8 @@ class FitConfig(BaseModel):
     guidance: bool = Field(True, description="confine Gaussians to regions, where regions are given")
     clamp: bool = Field(False, description="clip the image to [0, 1] in training")
     softness: float | Literal["auto"] = Field(
-        0.0, description="contour width in pixels, 0 to 64; 0: that of the map; auto: chosen for each pair of regions"
+        0.0,
+        description="contour width in pixels, 0 to 64, of maps that have none; auto: chosen for each pair of regions",
     )
     cutoff: float = Field(1e-4, ge=0.0, lt=1.0, description="weights below it are skipped")
     draft_cutoff: float | None = Field(
@@ -67,7 +68,11 @@ class FitConfig(BaseModel):
     # The descent
     loss: Literal["l1", "l2"] = "l1"
     optimizer: Literal["adam", "adan", "frame"] = Field("adam", description="frame: Adam in each Gaussian's own frame")
-    learning_rate: float = Field(1e-3, gt=0.0, description="at `full_iterations`; see `effective_learning_rate`")
+    learning_rate: float = Field(
+        1e-3,
+        gt=0.0,
+        description="of frame as it is; of adam and adan at `full_iterations`, see `effective_learning_rate`",
+    )
     color_rate: float = Field(0.03, gt=0.0, description="of the colours, for optimizer 'frame'")
     betas: tuple[float, float] = Field((0.9, 0.99), description="decay of the two averages, for optimizer 'frame'")
     full_iterations: int = Field(50_000, ge=1, description="the length that learning_rate is meant for")

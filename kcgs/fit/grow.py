@@ -55,7 +55,9 @@ class _Candidates(NamedTuple):
         return _Candidates(*(column[at] for column in self))
 
 
-def propose(residual: Tensor, regions: RegionMap | None, count: int, *, sigmas: Sequence[float]) -> Proposal:
+def propose(
+    residual: Tensor, regions: RegionMap | None, count: int, *, sigmas: Sequence[float], backend: str = "auto"
+) -> Proposal:
     r"""Find round Gaussians that lower the squared error most when they are added to the picture.
 
     A Gaussian g of region r and colour :math:`\langle g, e \rangle_r / \langle g, g \rangle_r` lowers the squared
@@ -72,6 +74,7 @@ def propose(residual: Tensor, regions: RegionMap | None, count: int, *, sigmas: 
         regions: one map of that size; None: one region.
         count: most Gaussians to propose, at least 0; fewer come only where none lowers the error.
         sigmas: standard deviations to try, in pixels, positive.
+        backend: kernel that the colours are solved with, as in :func:`kcgs.functional.region_splat`.
 
     Returns:
         Means :math:`(K, 2)`, factors :math:`(K, 3)`, colours :math:`(K, C)`, region ids :math:`(K,)` or None.
@@ -97,7 +100,7 @@ def propose(residual: Tensor, regions: RegionMap | None, count: int, *, sigmas: 
         chosen = _pursue(_search(left, labels, sigmas, wanted), wanted, floor)
         if not len(chosen.x):
             break
-        part, picture = _solve(chosen, left, labels, regions)
+        part, picture = _solve(chosen, left, labels, regions, backend)
         if not bool(part.colors.any()):
             break
         parts.append(part)
@@ -125,6 +128,8 @@ def _search(residual: Tensor, labels: NDArray[np.int32], sigmas: Sequence[float]
     align = 2 * max(scales)
     found: list[_Candidates] = []
     for region, box in enumerate(find_objects(labels + 1)):
+        if box is None:
+            continue
         # blocks of all regions start at multiples of their side
         top, left = (side.start // align * align for side in box)
         crop = residual[:, top : box[0].stop, left : box[1].stop]
@@ -254,7 +259,7 @@ def _pursue(candidates: _Candidates, count: int, floor: float) -> _Candidates:
 
 
 def _solve(
-    chosen: _Candidates, residual: Tensor, labels: NDArray[np.int32], regions: RegionMap | None
+    chosen: _Candidates, residual: Tensor, labels: NDArray[np.int32], regions: RegionMap | None, backend: str
 ) -> tuple[Proposal, Tensor]:
     """Snap the centres to pixels of their region, solve for the colours, and draw."""
     centres = _pixel_of_region(chosen, labels)
@@ -267,7 +272,7 @@ def _solve(
     size = (residual.shape[1], residual.shape[2])
 
     def draw(colors: Tensor) -> Tensor:
-        return region_splat(means, cholesky, colors, ids, regions, size=size)
+        return region_splat(means, cholesky, colors, ids, regions, size=size, backend=backend)
 
     with torch.enable_grad():
         start.requires_grad_()

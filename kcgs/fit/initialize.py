@@ -61,7 +61,8 @@ def _fill_empty_regions(field: GaussianField, regions: RegionMap, seed: int) -> 
     index = regions.index_of(field.region_ids)
     counts = index.bincount(minlength=regions.num_regions)
     areas = regions.index_of(regions.labels.flatten()).bincount(minlength=regions.num_regions)
-    empty = [r for r in areas.argsort(descending=True, stable=True).tolist() if counts[r] == 0]
+    # a region may have no pixel of its own, with a map finer than the image
+    empty = [r for r in areas.argsort(descending=True, stable=True).tolist() if counts[r] == 0 and areas[r] > 0]
     for region in empty:
         donor = int(counts.argmax())
         if counts[donor] < 2:
@@ -75,7 +76,9 @@ def _fill_empty_regions(field: GaussianField, regions: RegionMap, seed: int) -> 
         counts[region] += 1
 
 
-def sampled_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:
+def sampled_field(
+    image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int, backend: str = "auto"
+) -> GaussianField:
     """Draw centres where the image changes: with probability 0.7 x gradient magnitude + 0.3 x uniform.
 
     Round Gaussians of half the expected spacing, coloured like the pixel under them, so scaled that their sum is
@@ -86,6 +89,7 @@ def sampled_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, 
         num_gaussians: N, at least 1.
         regions: the map whose ids they get; None: none.
         seed: of the draw.
+        backend: kernel that colours are solved with.
 
     Example:
         >>> image = torch.zeros(1, 20, 40)
@@ -111,7 +115,9 @@ def sampled_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, 
     return field if regions is None else field.assign_regions(regions)
 
 
-def kmeans_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:
+def kmeans_field(
+    image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int, backend: str = "auto"
+) -> GaussianField:
     """Cut every region into cells of equal density mass by k-means; one Gaussian a cell, of its shape and colour.
 
     The density of a pixel is 0.7 x (gradient inside its region / mean gradient)^1.3 + 0.3: detail attracts cells, the
@@ -123,6 +129,7 @@ def kmeans_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, s
         num_gaussians: N, at least 1.
         regions: the map; None: one region, and no ids.
         seed: of the draw of the first centres and of the pixels that the cells are computed from.
+        backend: kernel that colours are solved with.
 
     Example:
         >>> labels = torch.zeros(16, 24, dtype=torch.long)
@@ -139,10 +146,14 @@ def kmeans_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, s
     density = np.full(size, 1.0 - _GRADIENT_SHARE)
     if slope.any():
         density += _GRADIENT_SHARE * (slope / slope.mean()) ** _GRADIENT_POWER
-    budget = _budget(np.bincount(index.ravel(), density.ravel()).astype(np.float64), num_gaussians)
+    count = 1 if regions is None else regions.num_regions
+    mass = np.bincount(index.ravel(), density.ravel(), minlength=count).astype(np.float64)
+    budget = np.zeros(count, np.int64)
+    # a region may have no pixel of its own, with a map finer than the image
+    budget[mass > 0] = _budget(mass[mass > 0], num_gaussians)
     # pixels sorted by region, raster order within
     order = np.argsort(index, axis=None, kind="stable")
-    ends = np.bincount(index.ravel()).cumsum()
+    ends = np.bincount(index.ravel(), minlength=count).cumsum()
     values = planes.reshape(len(planes), -1).T
     parts = []
     for region in np.flatnonzero(budget):
@@ -152,7 +163,7 @@ def kmeans_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, s
     field = _field(image, centres, cholesky, colors)
     if regions is not None:
         field.region_ids = regions.ids[torch.from_numpy(np.repeat(np.arange(len(budget)), budget)).to(image.device)]
-    return _solve_colors(field, image, regions)
+    return _solve_colors(field, image, regions, backend)
 
 
 def _slope(planes: Array, index: Indices) -> Array:
@@ -265,7 +276,7 @@ def _field(image: Tensor, centres: Array, cholesky: Array, colors: Array) -> Gau
     return GaussianField(means, factors, shades, size=(image.shape[1], image.shape[2]))
 
 
-def _solve_colors(field: GaussianField, image: Tensor, regions: RegionMap | None) -> GaussianField:
+def _solve_colors(field: GaussianField, image: Tensor, regions: RegionMap | None, backend: str) -> GaussianField:
     """Take a few steps of conjugate gradients from the scaled mean colours towards the least squared error, in place.
 
     They are worth 6 to 8 dB at the start of a fit and still 0.3 to 0.7 after 100 iterations; twice as many add little.
@@ -273,7 +284,7 @@ def _solve_colors(field: GaussianField, image: Tensor, regions: RegionMap | None
     means, cholesky = field.means.detach(), field.cholesky.detach()
     with torch.enable_grad():
         colors = (0.4 * field.colors.detach()).requires_grad_()
-        picture = region_splat(means, cholesky, colors, field.region_ids, regions, size=field.size)
+        picture = region_splat(means, cholesky, colors, field.region_ids, regions, size=field.size, backend=backend)
 
     def project(error: Tensor) -> Tensor:
         return torch.autograd.grad(picture, colors, error, retain_graph=True)[0]
@@ -283,7 +294,7 @@ def _solve_colors(field: GaussianField, image: Tensor, regions: RegionMap | None
         slope = project(error)
         way, size = slope, slope.square().sum()
         for _ in range(_COLOR_STEPS):
-            ahead = region_splat(means, cholesky, way, field.region_ids, regions, size=field.size)
+            ahead = region_splat(means, cholesky, way, field.region_ids, regions, size=field.size, backend=backend)
             step = size / ahead.square().sum().clamp_min(torch.finfo(ahead.dtype).tiny)
             solved += step * way
             error = error - step * ahead
@@ -295,13 +306,15 @@ def _solve_colors(field: GaussianField, image: Tensor, regions: RegionMap | None
     return field
 
 
-def _random(image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:
+def _random(
+    image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int, backend: str = "auto"
+) -> GaussianField:
     sigma = max(1.0, 0.5 * math.sqrt(image.shape[1] * image.shape[2] / num_gaussians))
     return random_field(image, num_gaussians, sigma, regions, seed)
 
 
 # image, number of Gaussians, map, seed
-INITIALIZERS: dict[str, Callable[[Tensor, int, RegionMap | None, int], GaussianField]] = {
+INITIALIZERS: dict[str, Callable[..., GaussianField]] = {
     "random": _random,
     "gradient": sampled_field,
     "kmeans": kmeans_field,

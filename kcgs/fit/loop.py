@@ -75,6 +75,8 @@ def fit(
     image, regions = _check_problem(image, regions, num_gaussians)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
         raise ValueError(f"seed must be an integer in [0, 2**63); got {seed!r}")
+    if resume and checkpoint is None:
+        raise ValueError("resume needs checkpoint, a file to go on from; got None")
     keeper = None if checkpoint is None else Checkpoint(checkpoint, image, regions, config, num_gaussians, seed)
     state = keeper.read() if keeper is not None and resume else None
     session = Session(image, regions, num_gaussians, config, seed, start)
@@ -84,7 +86,7 @@ def fit(
     reason: StopReason | None = None
     while reason is None and session.iteration < config.iterations:
         if not session.descent.is_finite():
-            warnings.warn(f"the fit diverged at iteration {session.iteration}: the best so far is kept", stacklevel=2)
+            warnings.warn(f"the fit diverged at iteration {session.iteration}: the best so far is kept", stacklevel=4)
             reason = "diverged"
             break
         progress = session.progress()

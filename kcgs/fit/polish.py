@@ -46,6 +46,7 @@ def polish(
     max_seconds: float = 10.0,
     cutoff: float = 0.0,
     sigma_range: tuple[float, float] | None = None,
+    backend: str = "auto",
 ) -> GaussianField:
     r"""Fit all parameters of a small scene to the last digit, by Levenberg-Marquardt in float64.
 
@@ -63,6 +64,7 @@ def polish(
         cutoff: weights below it are skipped; draw with the same.
         sigma_range: bounds of l11 and l22 in pixels, the upper also of abs(l21); None: 0.05 to 100 image diagonals,
             where flat regions end. Centres stay within 3 diagonals of the image.
+        backend: kernel that the result is compared with the start with.
 
     Returns:
         A new field; `field` itself where the squared error, drawn in its dtype, did not fall, or rose once clipped.
@@ -87,7 +89,7 @@ def polish(
     bounds = _Bounds.of(field, sigma_range)
     cutoff = check_cutoff(cutoff)
     whole = [t.detach().clone() for t in (field.means, field.cholesky, field.merged_colors())]
-    before = Drawing(field, regions, cutoff, "auto").draw(whole[2])
+    before = Drawing(field, regions, cutoff, backend).draw(whole[2])
     kept = bounds.clamp(whole[0].double(), whole[1].double())
     flat = _sheets(*kept, field, regions, bounds.sigma[1])
     groups = _groups(_cells(field, image, regions), len(field))
@@ -104,7 +106,7 @@ def polish(
         for tensor, value in zip(whole, state[:3], strict=True):
             tensor[members] = value.to(image.dtype)
     polished = GaussianField(whole[0], whole[1], whole[2], field.region_ids, size=field.size)
-    after = Drawing(polished, regions, cutoff, "auto").draw(polished.colors)
+    after = Drawing(polished, regions, cutoff, backend).draw(polished.colors)
     return polished if is_better(after, before, image) else field
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -43,7 +44,7 @@ def release(session: Session) -> None:
     session.ids = session.drawn = None
     without = _trial(session, steps)
     _restore(session, kept, ids, drawn)
-    pairs = _pairs_below(drawn.labels, without - (1 - _MARGIN) * with_contours)
+    pairs = _harmful_pairs(drawn.labels, with_contours, without)
     if pairs:
         session.drawn, session.ids = merge_pairs(drawn, ids, pairs)
         session.anchor = _united(drawn, pairs)[drawn.index_of(session.anchor)]
@@ -62,19 +63,24 @@ def choose_contours(session: Session) -> RegionMap | None:
     errors = []
     for regions in (drawn, None):
         session.begin(regions)
-        for _ in range(_REHEARSAL):
-            session.step(session.draw(), 0.0)
-        with torch.no_grad():
-            errors.append(session.error())
-    chosen, _ = merge_pairs(drawn, drawn.ids, _pairs_below(drawn.labels, errors[1] - (1 - _MARGIN) * errors[0]))
+        errors.append(_error_after(session, _REHEARSAL))
+    chosen, _ = merge_pairs(drawn, drawn.ids, _harmful_pairs(drawn.labels, *errors))
     session.begin(chosen)
     return chosen
 
 
 def _trial(session: Session, steps: int) -> Tensor:
     _solve(session)
+    return _error_after(session, steps)
+
+
+def _error_after(session: Session, steps: int) -> Tensor:
+    """Squared error of each pixel after some steps; infinite where they diverge."""
+    progress = session.progress()
     for _ in range(steps):
-        session.step(session.draw(), session.progress())
+        session.step(session.draw(), progress)
+        if not session.descent.is_finite():
+            return torch.full(session.size, math.inf, device=session.image.device)
     with torch.no_grad():
         return session.error()
 
@@ -91,8 +97,11 @@ def _restore(session: Session, kept: dict[str, Any], ids: Tensor, drawn: RegionM
     session.descent.load(copy.deepcopy(kept["descent"]))
 
 
-def _pairs_below(labels: Tensor, difference: Tensor) -> list[tuple[int, int]]:
-    """Pairs whose pixels sum to less than zero; two regions share all pixels of the image."""
+def _harmful_pairs(labels: Tensor, with_contours: Tensor, without: Tensor) -> list[tuple[int, int]]:
+    """Pairs without whose contour the error is plainly less; two regions share all pixels of the image."""
+    if not bool(torch.isfinite(with_contours + without).all()):
+        return []  # a trial that diverged tells nothing
+    difference = without - (1 - _MARGIN) * with_contours
     ids = torch.unique(labels)
     if len(ids) == 2:
         return [(int(ids[0]), int(ids[1]))] if float(difference.sum()) < 0 else []

@@ -24,10 +24,14 @@ from .release import choose_contours, release
 from .schedule import make_schedule
 from .widths import choose_widths
 
+# share of its pixels that a region must keep when contours are smoothed
+_LEAST_AREA = 0.7
 # of smoothed contours
 _SUPERSAMPLE = 4
 # by which moved contours may raise the squared error for the moment, since Gaussians adapt to them
 _LARGEST_RISE = 1.15
+# share of the seconds that a fit may have used and still try out its contours at the start
+_TRIALS_SHARE = 0.1
 # a fit to a target starts with a Gaussian for each square of so many pixels
 _TARGET_SPACING = 64
 _DRAFTS_END = 0.85
@@ -53,7 +57,8 @@ class Session:
         drafts = config.draft_cutoff is not None and config.target_psnr is None
         self.cutoff: float = config.draft_cutoff if drafts else config.cutoff  # type: ignore[assignment]
         self.begin(_regions_to_draw(image, regions, num_gaussians, config))
-        if config.release and self.drawn is not None and self.drawn.supersample == 1:
+        in_time = self.monitor.seconds() < _TRIALS_SHARE * (config.max_seconds or math.inf)
+        if config.release and self.drawn is not None and self.drawn.supersample == 1 and in_time:
             choose_contours(self)
         if self.drawn is not None and self.drawn.num_regions > num_gaussians:
             _warn_of_empty_regions(self.drawn.num_regions, num_gaussians)
@@ -104,6 +109,8 @@ class Session:
 
     def log_is_due(self, progress: float) -> bool:
         """Say whether the history wants an entry: `history_points` over the fit, by iterations or by the clock."""
+        if self.config.target_psnr is not None and self.iteration % max(1, self.config.iterations // 100) == 0:
+            return True  # the search for a target goes by what is measured
         if self.config.max_seconds is None:
             return self.iteration % max(1, self.config.iterations // self.config.history_points) == 0
         return progress * self.config.history_points >= len(self.monitor.history)
@@ -139,7 +146,7 @@ class Session:
             self.refine()
         residual = self.image - self.draw()
         count = wanted - len(self.descent.tensors()[0])
-        found = propose(residual, self.drawn, count, sigmas=_GROWTH_SIGMAS)
+        found = propose(residual, self.drawn, count, sigmas=_GROWTH_SIGMAS, backend=self.config.backend)
         self.descent.append(found.means, found.cholesky, found.colors)
         if self.ids is not None and found.region_ids is not None:
             self.ids = torch.cat([self.ids, found.region_ids])
@@ -179,9 +186,12 @@ class Session:
 
     def finish(self, reason: StopReason) -> FitResult:
         """Measure the last state and return the best."""
+        drafted = self.monitor.best if self.cutoff != self.config.cutoff else None
         self.sharpen(1.0)
-        if reason != "diverged" and self.descent.is_finite():
-            with torch.no_grad():
+        with torch.no_grad():
+            if drafted is not None:
+                self.log(self.draw(drafted), drafted)
+            if reason != "diverged" and self.descent.is_finite():
                 self.log(self.draw())
         best = self.monitor.best
         assert best is not None
@@ -190,12 +200,14 @@ class Session:
             field = self._polished(field, regions)
         left = PruneResult(field, 0, 0.0)
         if config.prune > 0:
-            left = prune(field, regions, config.prune, cutoff=config.cutoff)
+            left = prune(field, regions, config.prune, cutoff=config.cutoff, backend=config.backend)
         return FitResult(left.field, regions, self.monitor.history, reason, config, left.removed, left.change)
 
     def _polished(self, field: GaussianField, regions: RegionMap | None) -> GaussianField:
         """Take a flat scene to its last digits, and write them down."""
-        polished = polish(field, self.image, regions, cutoff=self.config.cutoff)
+        config = self.config
+        left = math.inf if config.max_seconds is None else max(0.01, config.max_seconds - self.monitor.seconds())
+        polished = polish(field, self.image, regions, max_seconds=left, cutoff=config.cutoff, backend=config.backend)
         means, cholesky, colors = (t.detach() for t in (polished.means, polished.cholesky, polished.colors))
         gaussians = Gaussians(means, cholesky, colors, polished.region_ids, regions)
         with torch.no_grad():
@@ -227,10 +239,11 @@ def _regions_to_draw(
     if config.softness != "auto":
         return RegionMap.from_labels(regions.labels, config.softness)
     widths = choose_widths(image, regions.labels)
-    if config.polish and any(widths.values()) and is_flat(image, regions, num_gaussians):
+    if config.polish and config.refine and any(widths.values()) and is_flat(image, regions, num_gaussians):
         # a chart's edges are smooth curves: their coverage says more than a blur
-        fine = smooth_contours(regions.labels, _SUPERSAMPLE)
-        return RegionMap.from_labels(fine, supersample=_SUPERSAMPLE)
+        smooth = RegionMap.from_labels(smooth_contours(regions.labels, _SUPERSAMPLE), supersample=_SUPERSAMPLE)
+        if _keeps_areas(regions, smooth):
+            return smooth
     return RegionMap.from_labels(regions.labels, widths)
 
 
@@ -246,12 +259,20 @@ def _initialize(
     sigma = config.init_sigma or max(1.0, 0.5 * math.sqrt(image.shape[1] * image.shape[2] / count))
     if config.initializer == "random":
         return random_field(image, count, sigma, drawn, seed), sigma
-    return INITIALIZERS[config.initializer](image, count, drawn, seed), sigma
+    return INITIALIZERS[config.initializer](image, count, drawn, seed, config.backend), sigma
 
 
 def _warn_of_empty_regions(regions: int, num_gaussians: int) -> None:
     warnings.warn(
         f"{regions - num_gaussians} of {regions} regions get no Gaussian and stay black: num_gaussians is "
         f"{num_gaussians}; merge regions or take more",
-        stacklevel=4,
+        stacklevel=6,  # past the session and the decorators of `fit`
     )
+
+
+def _keeps_areas(regions: RegionMap, smooth: RegionMap) -> bool:
+    """Say whether smooth contours leave every region, thin ones too, most of its pixels."""
+    count = regions.num_regions
+    before = regions.index_of(regions.labels).flatten().bincount(minlength=count)
+    own = regions.index_of(smooth.labels).flatten()
+    return bool((own.bincount(minlength=count) >= _LEAST_AREA * before).all())

@@ -16,7 +16,8 @@ def smooth_contours(labels: Tensor, supersample: int = 4, sigma: float = 1.5) ->
     r"""Draw a label map's contours as the smooth curves that its staircases stand for, on a finer grid.
 
     Each indicator is blurred by a Gaussian, and every fine pixel takes the label with the largest blur: straight
-    edges come back within a few hundredths of a pixel, corners sharper than `sigma` are rounded. The result is what
+    edges come back within a few hundredths of a pixel, corners sharper than `sigma` are rounded, and regions
+    thinner than about twice `sigma` vanish. The result is what
     :meth:`RegionMap.from_labels` takes with the same `supersample`.
 
     Args:

@@ -22,7 +22,12 @@ class PruneResult(NamedTuple):
 
 
 def prune(
-    field: GaussianField, regions: RegionMap | Tensor | None = None, tolerance: float = 1e-3, *, cutoff: float = 1e-4
+    field: GaussianField,
+    regions: RegionMap | Tensor | None = None,
+    tolerance: float = 1e-3,
+    *,
+    cutoff: float = 1e-4,
+    backend: str = "auto",
 ) -> PruneResult:
     """Remove as many Gaussians as go without changing any value of the image by more than `tolerance`.
 
@@ -34,6 +39,7 @@ def prune(
         regions: what the field is drawn with.
         tolerance: largest change of a value of the image, at least 0; 0 removes what paints nothing.
         cutoff: of the renderer.
+        backend: of the renderer.
 
     Returns:
         The remaining field (no graph), the number removed, and the measured largest change.
@@ -53,7 +59,7 @@ def prune(
         raise ValueError(f"field must not be batched; got means of shape {tuple(field.means.shape)}")
     if not 0.0 <= tolerance < float("inf"):
         raise ValueError(f"tolerance must be at least 0 and finite; got {tolerance!r}")
-    render = RegionSplatRenderer(cutoff=cutoff)
+    render = RegionSplatRenderer(cutoff=cutoff, backend=backend)
     if len(field) == 0:
         return PruneResult(field.subset(torch.zeros(0, dtype=torch.bool)), 0, 0.0)
 

@@ -295,3 +295,69 @@ class TestHardCases:
         with pytest.warns(UserWarning, match="11 of 16 regions get no Gaussian and stay black"):
             result = fit(image, labels, 5, config=quick(iterations=10, release=False, refine=False))
         assert len(result.field) <= 5
+
+
+class TestReviewed:
+    """Cases that once went wrong."""
+
+    def test_a_chart_keeps_its_small_regions(self) -> None:
+        labels = torch.zeros(48, 48, dtype=torch.long)
+        for k in range(8):
+            labels[5 + 10 * (k // 4) : 8 + 10 * (k // 4), 5 + 10 * (k % 4) : 8 + 10 * (k % 4)] = k + 1
+        shades = torch.linspace(0.1, 0.9, 9)[torch.randperm(9, generator=torch.Generator().manual_seed(0))]
+        image = torch.nn.functional.avg_pool2d(shades[labels].repeat(1, 1, 1), 3, 1, 1).expand(3, -1, -1)
+        result = fit(image, labels, 12, config=quick(iterations=60))
+        assert result.regions is not None
+        assert result.regions.num_regions >= 8
+
+    @pytest.mark.parametrize("recipe", ["best", "best-baseline", "paper"])
+    def test_a_region_that_wins_no_pixel(self, recipe: str) -> None:
+        image, labels = scene((24, 32))
+        fine = labels.repeat_interleave(3, 0).repeat_interleave(3, 1).clone()
+        fine[31, 31] = 7
+        regions = RegionMap.from_labels(fine, supersample=3)
+        assert regions.num_regions == 3
+        assert fit(image, regions, 12, config=quick(recipe, iterations=30)).history[-1].psnr > 10
+
+    def test_kept_contours_are_exact_on_charts_too(self) -> None:
+        image, labels = chart_pie()
+        config = quick(iterations=5, refine=False, release=False)
+        regions = fit(image, labels, 20, config=config).regions
+        assert regions is not None
+        assert torch.equal(regions.labels, labels)
+        assert regions.supersample == 1
+
+    def test_target_does_not_depend_on_the_history(self) -> None:
+        image, labels = scene()
+        sizes = {
+            len(fit(image, labels, 400, config=quick(iterations=300, target_psnr=28.0, history_points=h)).field)
+            for h in (100, 5)
+        }
+        assert len(sizes) == 1
+
+    def test_stopped_among_drafts_returns_the_best(self) -> None:
+        image, labels = scene()
+        result = fit(image, labels, 30, config=quick(), on_step=lambda i, _: i == 51)
+        reached = float(psnr(render_image(result.field, result.regions), image))
+        assert reached >= max(h.psnr for h in result.history) - 0.15
+
+    def test_divergence_while_contours_are_tried(self) -> None:
+        image, labels = scene()
+        with pytest.warns(UserWarning, match="diverged"):
+            result = fit(image, labels, 30, config=quick(learning_rate=1e30, color_rate=1e30))
+        assert bool(torch.isfinite(render_image(result.field, result.regions)).all())
+
+    def test_the_named_backend_is_the_one_that_draws(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        import kcgs.kernels.cpu
+
+        def refuse(*_: object) -> None:
+            raise AssertionError("another kernel was asked for")
+
+        monkeypatch.setattr(kcgs.kernels.cpu, "plan", refuse)
+        image, labels = scene((16, 20))
+        fit(image, labels, 6, config=quick(iterations=12, backend="tiled"))
+
+    def test_resume_needs_a_checkpoint(self) -> None:
+        image, labels = scene()
+        with pytest.raises(ValueError, match="resume needs checkpoint"):
+            fit(image, labels, 5, config=quick(iterations=2), resume=True)

@@ -58,7 +58,7 @@ GROUPS: dict[str, str | None] = {
 COMPARED = {"davis": BEST, "bsds": REFINED, "astronaut": BEST}
 
 _RECIPES: dict[str, tuple[str, dict[str, Any]]] = {
-    KEPT: ("best", {"refine": False}),
+    KEPT: ("best", {"refine": False, "release": False}),
     PAPER: ("paper", {"iterations": PAPER_ITERATIONS}),
     COVERAGE: ("best", {"refine": False, "softness": 0.0}),
     LIMITED: ("best", {"max_seconds": SECONDS}),
