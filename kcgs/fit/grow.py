@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import find_objects
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
@@ -123,6 +122,8 @@ def _check(residual: Tensor, regions: RegionMap | None, count: int, sigmas: Sequ
 
 def _search(residual: Tensor, labels: NDArray[np.int32], sigmas: Sequence[float], count: int) -> _Candidates:
     """Evaluate every place and scale of every region; keep the best of each cell, and of those the strongest."""
+    from scipy.ndimage import find_objects
+
     limit = max(_CANDIDATES[0] * count, _CANDIDATES[1])
     scales = {block: [s for s in sigmas if _block(s) == block] for block in sorted(map(_block, sigmas))}
     align = 2 * max(scales)

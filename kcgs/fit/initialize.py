@@ -8,7 +8,6 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from kcgs.functional import RegionMap, region_splat
@@ -232,6 +231,8 @@ def _cells(
         count: K.
         rng: of the draws.
     """
+    from scipy.spatial import cKDTree
+
     places = np.stack([pixels % width, pixels // width], -1) + 0.5
     first = _draw(density, count, rng)
     centres = _spread_repeats(places[first], first, rng)

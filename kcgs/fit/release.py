@@ -7,7 +7,6 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from kcgs.functional import RegionMap
@@ -115,6 +114,8 @@ def _harmful_pairs(labels: Tensor, with_contours: Tensor, without: Tensor) -> li
 
 def nearest_contour(labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """For every pixel: its label, the label on the other side of the nearest contour, and the distance in pixels."""
+    from scipy import ndimage
+
     labels = labels.cpu()
     other = labels.clone()
     for dim in (0, 1):

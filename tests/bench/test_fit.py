@@ -149,10 +149,10 @@ class TestBytes:
         assert affordable(row(BEST, 100, num_gaussians=90, map_bytes=0)) == 90
 
     def test_case_at_equal_bytes(self) -> None:
-        case = make_case("davis", "dog", 100, KEPT, quick=True)
-        other = equal_bytes(case, row(KEPT, 100, map_bytes=70))
+        case = make_case("davis", "dog", 100, BEST, quick=True)
+        other = equal_bytes(case, row(BEST, 100, map_bytes=70))
         assert other == make_case("davis", "dog", 110, BASELINE, quick=True)
-        for name, group in ((BASELINE, "davis"), (PAPER, "astronaut"), (BEST, "paper")):
+        for name, group in ((BASELINE, "davis"), (KEPT, "bsds"), (BEST, "paper")):
             assert equal_bytes(make_case(group, "dog", 100, name), row(name)) is None
 
     def test_map(self) -> None:
