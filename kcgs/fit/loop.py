@@ -93,6 +93,7 @@ def fit(
         session.sharpen(progress)
         session.refresh_ids()
         session.grow(progress)
+        session.settle(progress)
         session.release(progress)
         picture = session.draw()
         if session.log_is_due(progress):

@@ -124,12 +124,12 @@ def accept_moves(before: RegionMap, after: RegionMap, gain: Tensor) -> RegionMap
     """Keep, of the moves between two maps, those whose own surroundings are drawn better.
 
     Moves are judged by the region's Gaussians alone; the picture blends them over soft contours. Pixels that changed
-    hands are grouped with all within two pixels, and a group stays changed where the squared error fell in its sum.
+    hands are grouped with all within two pixels, and a group stays changed where the gain is positive in its sum.
 
     Args:
         before: the map that moved.
         after: what it became, with the same regions.
-        gain: squared error of the picture drawn with `before` minus that with `after`, (H, W).
+        gain: squared error of the picture drawn with `before`, or what else it may be, minus that with `after`, (H, W).
 
     Returns:
         A map; `before` where nothing is kept, or a region would be lost.

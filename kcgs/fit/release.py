@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _TRIAL = 0.05
 _SOLVE_STEPS = 8
 # share of the error that must be saved: contours stay unless they plainly harm, for they are sharp where it shows
-_MARGIN = 0.1
+_MARGIN = 0.25
 # steps of the fits that are compared at the start
 _REHEARSAL = 20
 # pixels about a contour in which its help is measured
@@ -32,7 +32,7 @@ def release(session: Session) -> None:
 
     The fit goes on for some steps twice from the same state, with all contours and with none, both after a solution of
     the colours, since Gaussians that were confined overlap once they are not. The squared errors of the two pictures
-    are summed over the pixels nearest to each pair's contour; where none is better by a tenth the pair is united.
+    are summed over the pixels nearest to each pair's contour; where none is better by a quarter the pair is united.
     """
     drawn, ids, kept = session.drawn, session.ids, session.state()
     assert drawn is not None and ids is not None

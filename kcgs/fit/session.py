@@ -28,16 +28,21 @@ from .widths import choose_widths
 _LEAST_AREA = 0.7
 # of smoothed contours
 _SUPERSAMPLE = 4
-# by which moved contours may raise the squared error for the moment, since Gaussians adapt to them
-_LARGEST_RISE = 1.15
+# by which moved contours may raise the squared error about them while Gaussians are added, since those adapt to them
+_LARGEST_RISE = 1.5
+# how often contours move after growth, and then only where that helps at once
+_SETTLINGS = 4
+# share of the seconds that a fit may spend on moving contours
+_REFINEMENT_SHARE = 0.1
 # share of the seconds that a fit may have used and still try out its contours at the start
 _TRIALS_SHARE = 0.1
 # a fit to a target starts with a Gaussian for each square of so many pixels
 _TARGET_SPACING = 64
 _DRAFTS_END = 0.85
-_KEPT = ("iteration", "cutoff", "wanted", "additions", "released", "ids", "drawn", "anchor")
-# contours move before every second addition
+_KEPT = ("iteration", "cutoff", "wanted", "additions", "settlings", "released", "ids", "drawn", "anchor")
+# contours move before every second addition, and every fourth time their widths are chosen anew
 _ADDITIONS_A_REFINEMENT = 2
+_ADDITIONS_A_CHOICE = 4
 # where the clock ends the fit, descent gets this many times the seconds of the growth before it
 _GROWTH_PATIENCE = 2.0
 # scales that growth looks for, in pixels
@@ -57,6 +62,8 @@ class Session:
         drafts = config.draft_cutoff is not None and config.target_psnr is None
         self.cutoff: float = config.draft_cutoff if drafts else config.cutoff  # type: ignore[assignment]
         self.begin(_regions_to_draw(image, regions, num_gaussians, config))
+        # a map that came with widths keeps them
+        self.chooses_widths = config.softness == "auto" and regions is not None and regions.softness == 0.0
         in_time = self.monitor.seconds() < _TRIALS_SHARE * (config.max_seconds or math.inf)
         if config.release and self.drawn is not None and self.drawn.supersample == 1 and in_time:
             choose_contours(self)
@@ -73,9 +80,9 @@ class Session:
         self.descent = make_descent(self.config, field, sigma)
         self.schedule = make_schedule(self.config, self.num_gaussians, len(field))
         self.wanted = len(field)
-        self.iteration = self.additions = 0
+        self.iteration = self.additions = self.settlings = 0
         self.released = False
-        self.grow_after = 0.0
+        self.grow_after = self.refining = 0.0
 
     def progress(self) -> float:
         """Share of the fit that is done."""
@@ -142,8 +149,8 @@ class Session:
             return
         self.wanted = wanted
         self.additions += 1
-        if self.config.refine and self.additions % _ADDITIONS_A_REFINEMENT == 0:
-            self.refine()
+        if self.additions % _ADDITIONS_A_REFINEMENT == 0:
+            self.refine(_LARGEST_RISE, choose=self.additions % _ADDITIONS_A_CHOICE == _ADDITIONS_A_REFINEMENT)
         residual = self.image - self.draw()
         count = wanted - len(self.descent.tensors()[0])
         found = propose(residual, self.drawn, count, sigmas=_GROWTH_SIGMAS, backend=self.config.backend)
@@ -152,25 +159,37 @@ class Session:
             self.ids = torch.cat([self.ids, found.region_ids])
         self.grow_after = self.monitor.seconds() + _GROWTH_PATIENCE * (self.monitor.seconds() - start)
 
+    def settle(self, progress: float) -> None:
+        """Move the contours after growth, if that is due."""
+        end = self.config.grow_between[1]
+        if progress >= end + (1 - end) * (self.settlings + 1) / (_SETTLINGS + 1) and self.settlings < _SETTLINGS:
+            self.settlings += 1
+            self.refine(1.0)
+
     @torch.no_grad()
-    def refine(self) -> None:
-        """Move the contours."""
-        if self.drawn is None or self.drawn.supersample > 1:
+    def refine(self, largest_rise: float, choose: bool = False) -> None:
+        """Move the contours where that raises the squared error about them by no more than this factor."""
+        config, before, start = self.config, self.drawn, self.monitor.seconds()
+        if not config.refine or before is None or before.supersample > 1:
             return
-        before, distance = self.drawn, self.config.max_move
+        if self.refining > _REFINEMENT_SHARE * (config.max_seconds or math.inf):
+            return
         moved = refine_contours(
             self.gaussians().field(self.size),
             self.image,
             before,
             given=self.anchor,
-            max_distance=None if distance == "any" else distance,
-            length_weight=self.config.contour_price,
-            backend=self.config.backend,
+            max_distance=None if config.max_move == "any" else config.max_move,
+            length_weight=config.contour_price,
+            backend=config.backend,
         )
         if moved is not before:
-            old, new = self.error(), self.error(self.gaussians()._replace(regions=moved))
-            adapts = float(new.mean()) <= _LARGEST_RISE * float(old.mean())
-            self.drawn = moved if adapts else accept_moves(before, moved, old - new)
+            gain = largest_rise * self.error() - self.error(self.gaussians()._replace(regions=moved))
+            moved = accept_moves(before, moved, gain)
+        if choose and self.chooses_widths:
+            moved = RegionMap.from_labels(moved.labels, choose_widths(self.image, moved.labels))
+        self.drawn = moved
+        self.refining += self.monitor.seconds() - start
 
     def error(self, gaussians: Gaussians | None = None) -> Tensor:
         """Squared error of each pixel, (H, W), channels averaged."""
