@@ -11,9 +11,11 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_floating, check_labels, check_size
-from kcgs.kernels import Membership
+from kcgs.kernels import Membership, Resampled
 
 MAX_SOFTNESS = 64.0
+# places between two pixel centres that hard contours are sampled at
+_OFFSETS = 1024
 
 
 class PairWidths(Mapping[tuple[int, int], float]):
@@ -70,6 +72,7 @@ class RegionMap:
     supersample: int = 1  # k
     _membership: Membership = field(repr=False, kw_only=True)
     _table: Tensor | None = field(repr=False, kw_only=True)
+    _origin: RegionMap | None = field(default=None, repr=False, kw_only=True)  # what this was resized from
 
     @classmethod
     def from_labels(
@@ -145,15 +148,21 @@ class RegionMap:
             self.supersample,
             _membership=self._membership.to(device),
             _table=None if self._table is None else self._table.to(device),
+            _origin=None if self._origin is None else self._origin.to(device),
         )
 
     def resize(self, size: tuple[int, int]) -> RegionMap:
-        """Sample the map at another resolution; contours are smoothed, not stepped, and the softness scales along.
+        """Sample the map at another resolution; contours are smoothed, not stepped.
 
-        Between pixel centres a point has the label with the largest share among its four neighbours (bilinear
-        weights; the nearest neighbour's label on a tie). At the centres that is the map itself, so that the same size
-        gives the same map. With ``supersample`` k it is the fine map that is sampled, at k times the new size: the
-        result has k x k labels a pixel as before. Widths of regions that the new map has lost are dropped.
+        Hard contours stay hard: between pixel centres a point has the label with the largest share among its four
+        neighbours (bilinear weights, of offsets rounded to odd multiples of 1/2048 pixel, so that no two labels tie).
+        With ``supersample`` k it is the fine map that is sampled, at k times the new size: the result has k x k labels
+        a pixel as before, and only labels that still have any are regions.
+
+        Soft contours widen along with the map: between pixel centres a point has the bilinear mean of its four
+        neighbours' memberships. ``softness`` says the new widths; all regions stay.
+
+        The same size gives the same map, also from one that was resized before.
 
         Args:
             size: (height, width).
@@ -166,16 +175,30 @@ class RegionMap:
             tensor([1, 1, 0, 0, 0, 0])
         """
         height, width = check_size("size", size)
+        if self._origin is not None:
+            return self._origin.resize((height, width))
         if (height, width) == self.size:
             return self
-        scale = math.sqrt(height * width / (self.size[0] * self.size[1]))
         k = self.supersample
-        labels = _sample_labels(self.labels if self.fine_labels is None else self.fine_labels, k * height, k * width)
-        if not isinstance(self.softness, PairWidths):
-            return RegionMap.from_labels(labels, min(self.softness * scale, MAX_SOFTNESS), supersample=k)
-        left = set(labels.unique().tolist())
-        widths = {pair: min(w * scale, MAX_SOFTNESS) for pair, w in self.softness.items() if left.issuperset(pair)}
-        return RegionMap.from_labels(labels, widths, supersample=k)
+        if self.softness == 0.0:
+            fine = self.labels if self.fine_labels is None else self.fine_labels
+            return RegionMap.from_labels(_sample_labels(fine, k * height, k * width), supersample=k)
+        labels = _sample_labels(self.labels, height, width)
+        index = self.index_of(labels).to(torch.int32)
+        return RegionMap(
+            labels,
+            self.ids,
+            _scaled(self.softness, math.sqrt(height * width / (self.size[0] * self.size[1]))),
+            _membership=Resampled(index if index.ndim == 3 else index[None], self._membership),
+            _table=self._table,
+            _origin=self,
+        )
+
+
+def _scaled(softness: float | PairWidths, scale: float) -> float | PairWidths:
+    if not isinstance(softness, PairWidths):
+        return min(softness * scale, MAX_SOFTNESS)
+    return PairWidths({pair: min(width * scale, MAX_SOFTNESS) for pair, width in softness.items()})
 
 
 def _check_width(name: str, value: object) -> float:
@@ -249,34 +272,19 @@ def _compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
 
 
 def _sample_labels(labels: Tensor, height: int, width: int) -> Tensor:
-    old_h, old_w = labels.shape[-2:]
-
-    def neighbours(new: int, old: int) -> tuple[Tensor, Tensor, Tensor]:
+    def neighbours(new: int, old: int) -> tuple[Tensor, Tensor]:
         at = (torch.arange(new, device=labels.device, dtype=torch.float64) + 0.5) * (old / new) - 0.5
         low = at.floor()
-        return low.long().clamp(0, old - 1), (low.long() + 1).clamp(0, old - 1), at - low
+        offset = (((at - low) * _OFFSETS).floor() + 0.5) / _OFFSETS
+        ends = torch.stack([low, low + 1]).long().clamp(0, old - 1)
+        return ends, torch.stack([1 - offset, offset])
 
-    top, bottom, down = neighbours(height, old_h)
-    left, right, across = neighbours(width, old_w)
-    corners, weights = [], []
-    # nearest first, so that the first of equal scores is the nearest neighbour's
-    for near_y in (True, False):
-        for near_x in (True, False):
-            take_bottom = (down >= 0.5) == near_y
-            take_right = (across >= 0.5) == near_x
-            rows, cols = torch.where(take_bottom, bottom, top), torch.where(take_right, right, left)
-            weight_y, weight_x = (
-                torch.where(take_bottom, down, 1 - down),
-                torch.where(take_right, across, 1 - across),
-            )
-            corners.append(labels[..., rows[:, None], cols[None, :]])
-            weights.append(weight_y[:, None] * weight_x[None, :])
-    best, best_score = corners[0], torch.full_like(corners[0], -1.0, dtype=torch.float64)
-    for candidate in corners:
-        score = torch.stack([w * (c == candidate) for c, w in zip(corners, weights, strict=True)]).sum(0)
-        better = score > best_score + 1e-12
-        best, best_score = torch.where(better, candidate, best), torch.where(better, score, best_score)
-    return best
+    (rows, down), (cols, across) = neighbours(height, labels.shape[-2]), neighbours(width, labels.shape[-1])
+    corners = torch.stack([labels[..., r[:, None], c[None, :]] for r in rows for c in cols])
+    weights = torch.stack([d[:, None] * a[None, :] for d in down for a in across])
+    weights = weights.view(4, *[1] * (labels.ndim - 2), height, width)
+    scores = torch.stack([torch.where(corners == corner, weights, 0.0).sum(0) for corner in corners])
+    return corners.gather(0, scores.argmax(0, keepdim=True))[0]
 
 
 def lookup_regions(means: Tensor, labels: Tensor) -> Tensor:

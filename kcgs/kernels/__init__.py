@@ -3,5 +3,6 @@
 from .inputs import SplatInputs
 from .membership import Membership
 from .registry import BACKENDS, resolve
+from .resampled import Resampled
 
-__all__ = ["BACKENDS", "Membership", "SplatInputs", "resolve"]
+__all__ = ["BACKENDS", "Membership", "Resampled", "SplatInputs", "resolve"]

@@ -3,7 +3,8 @@
 Hard (softness 0): s_r = [M = r]. Soft: the Gaussian blur of [M = r], of standard deviation `softness` pixels, cut at
 `RADIUS_SIGMAS` standard deviations and normalised to sum to one over the regions, so that outside the image nothing
 weighs. Where every pair of regions has a width of its own, a pixel takes the width of its nearest contour. Where the
-map is finer than the image, all this holds on the fine map, and a pixel has the mean over its sub-pixels.
+map is finer than the image, all this holds on the fine map, and a pixel has the mean over its sub-pixels. At another
+size a soft membership is that of the map's own pixels, interpolated (`resampled.py`).
 A tile deep inside a region has s_r = 1 everywhere and is stored as nothing but its label.
 """
 
@@ -147,7 +148,7 @@ class Membership:
         ]
         several = torch.cat([single[:0], *parts])
         several = several if level is None else several.unique()
-        planes = self._planes(several, holds, tile)
+        planes = self._planes(several, tile)
         all_keys, order = torch.cat([single * self.num_regions + label[single], several]).sort()
         rows = torch.arange(len(several), device=several.device)
         return TileMembership(all_keys, torch.cat([torch.full_like(single, -1), rows])[order], planes)
@@ -161,48 +162,73 @@ class Membership:
             keys.append(torch.unique((some[:, None] * self.num_regions + seen)[seen >= 0]))
         return keys
 
-    def _planes(self, keys: Tensor, holds: Tensor, tile: int) -> Tensor:
+    def _planes(self, keys: Tensor, tile: int) -> Tensor:
         """Weights of each key's region over its tile."""
-        side = tile * self.supersample
-        widths, level = self.levels
-        tiles, region = keys // self.num_regions, (keys % self.num_regions)[:, None, None]
-        hard = self.supersample == 1 and widths == (0.0,)
-        planes = torch.zeros(len(keys), tile * tile, device=keys.device, dtype=torch.bool if hard else torch.float64)
-        for position, width in enumerate(widths):
-            reach = self._reach(width)
-            view = _windows(self.grid, side, reach, -1)
-            share = self._sharer(width, side)
-            rows = holds[tiles, position].nonzero().flatten()
-            for some in rows.split(max(1, _PATCH_ELEMENTS // (side + 2 * reach) ** 2)):
-                place = _place(tiles[some], view)
-                inside = view[place] == region[some]
-                if hard:
-                    planes[some] = inside.flatten(1)
-                    continue
-                shares = share(inside.to(torch.float64), place)
-                if level is not None:
-                    own = _windows(level, side, 0, -1)[place] == position
-                    shares = torch.where(own, shares, 0.0)
-                planes[some] += _pool(shares, self.supersample).flatten(1)
-        return planes
+        cols = -(-self.index.shape[2] // tile)
+        per_map = cols * -(-self.index.shape[1] // tile)
+        tiles, region = keys // self.num_regions, keys % self.num_regions
+        batch, row, col = tiles // per_map, tiles // cols % (per_map // cols) * tile, tiles % cols * tile
+        planes = self.window_shares(batch, region, row, col, (tile, tile)).flatten(1)
+        hard = self.supersample == 1 and self.levels.widths == (0.0,)
+        return planes.bool() if hard else planes
 
-    def _sharer(self, width: float, side: int) -> Callable[[Tensor, tuple[Tensor, ...]], Tensor]:
-        """Return the map from windows of [M = r] (P, span, span) and their places to s_r (P, side, side)."""
+    def window_shares(self, batch: Tensor, region: Tensor, rows: Tensor, cols: Tensor, span: tuple[int, int]) -> Tensor:
+        """Evaluate s_r over windows of pixels.
+
+        Args:
+            batch: (P,), image of each window.
+            region: (P,), whose weights.
+            rows: (P,), first row; windows may reach beyond the image, where the weights mean nothing.
+            cols: (P,), first column.
+            span: height and width of the windows.
+
+        Returns:
+            float64, (P, *span).
+        """
+        k, (widths, level) = self.supersample, self.levels
+        sides = (k * span[0], k * span[1])
+        shares = torch.zeros(len(region), *span, dtype=torch.float64, device=region.device)
+        reach = max(self._reach(width) for width in widths)
+        windows = torch.arange(len(region), device=region.device)
+        for some in windows.split(max(1, _PATCH_ELEMENTS // ((sides[0] + 2 * reach) * (sides[1] + 2 * reach)))):
+            place, ids = (batch[some], k * rows[some], k * cols[some]), region[some]
+            if level is None:
+                shares[some] = _pool(self._blurred(place, ids, sides, widths[0]), k)
+                continue
+            levels = self._read(level, place, sides, 0)[0]
+            for position, width in enumerate(widths):
+                own = levels == position
+                held = own.flatten(1).any(1).nonzero().flatten()
+                if len(held):
+                    blurred = self._blurred(tuple(part[held] for part in place), ids[held], sides, width)
+                    shares[some[held]] += _pool(torch.where(own[held], blurred, 0.0), k)
+        return shares
+
+    def _read(
+        self, grid: Tensor, place: tuple[Tensor, ...], sides: tuple[int, int], reach: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return windows of a grid with a halo, held at its border, and which of their rows and columns are inside."""
+        at, there = [], []
+        for first, side, length in zip(place[1:], sides, grid.shape[1:], strict=True):
+            line = first[:, None] + torch.arange(-reach, side + reach, device=grid.device)
+            at.append(line.clamp(0, length - 1))
+            there.append((line == at[-1]).double())
+        return grid[place[0][:, None, None], at[0][:, :, None], at[1][:, None, :]], there[0], there[1]
+
+    def _blurred(self, place: tuple[Tensor, ...], region: Tensor, sides: tuple[int, int], width: float) -> Tensor:
+        """Blur [M = r] over windows of the grid, of one width."""
+        reach = self._reach(width)
+        seen, down, across = self._read(self.grid, place, sides, reach)
+        inside = (seen == region[:, None, None]).double()
         if width == 0.0:
-            return lambda inside, _: inside
-        reach, device = self._reach(width), self.grid.device
-        span = torch.arange(side + 2 * reach, device=device)
-        blur = self._weights_at(span[reach : reach + side, None] - span[None, :], width)  # [side, span]
-        sums = []
-        for n in self.grid.shape[1:]:
-            there = torch.nn.functional.pad(blur.new_ones(n), (reach, -n % side + reach))
-            sums.append(there.unfold(0, len(span), side) @ blur.T)  # [tiles, side]
-
-        def share(inside: Tensor, place: tuple[Tensor, ...]) -> Tensor:
-            total = sums[0][place[1]][:, :, None] * sums[1][place[2]][:, None, :]
-            return (blur @ inside @ blur.T) / total.clamp_min(1e-300)
-
-        return share
+            return inside
+        blurs = []
+        for side in sides:
+            line = torch.arange(side + 2 * reach, device=region.device)
+            blurs.append(self._weights_at(line[reach : reach + side, None] - line, width))
+        total = (down @ blurs[0].T)[:, :, None] * (across @ blurs[1].T)[:, None, :]
+        inside *= down[:, :, None] * across[:, None, :]
+        return (blurs[0] @ inside @ blurs[1].T) / total.clamp_min(1e-300)
 
 
 def _find_levels(membership: Membership) -> Levels:

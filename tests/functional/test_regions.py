@@ -223,23 +223,70 @@ class TestResize:
         agree = (small == labels[::2, ::2]) | (small == labels[1::2, 1::2])
         assert agree.float().mean() > 0.97
 
-    def test_widths_scale_along_and_those_of_lost_regions_go(self) -> None:
+    def test_widths_scale_along(self) -> None:
         labels = torch.zeros(40, 40).long()
         labels[:, 20:], labels[7, 7] = 1, 2
         widths = {(0, 1): 0.5, (0, 2): 40.0, (1, 2): 0.0}
         regions = RegionMap.from_labels(labels, widths)
         assert regions.resize((80, 80)).softness == {(0, 1): 1.0, (0, 2): 64.0, (1, 2): 0.0}
         small = regions.resize((10, 10))
-        assert small.num_regions == 2 and small.softness == 0.125
+        assert small.num_regions == 3 and small.softness[0, 1] == 0.125
+
+    @pytest.mark.parametrize("size", [(45, 71), (23, 31), (91, 140), (300, 70), (7, 500), (1, 1)])
+    @pytest.mark.parametrize("softness", [0.8, {(0, 1): 0.0, (0, 2): 1.1, (1, 2): 2.3}])
+    @pytest.mark.parametrize("factor", [1, 2])
+    def test_soft_memberships_are_interpolated(self, size: tuple[int, int], softness: object, factor: int) -> None:
+        fine = blobs((45 * factor, 70 * factor)) % 3
+        regions = RegionMap.from_labels(fine, softness, supersample=factor)  # type: ignore[arg-type]
+        resized = regions.resize(size)
+        assert resized.resize((45, 70)) is regions
+        table = resized._membership.tiles(16)
+        tiles_x = -(-size[1] // 16)
+        for region in range(3):
+            own = regions._membership.weights(0, region, torch.float64)
+            # torch's own bilinear resampling holds the border and puts pixels at their centres, as we do
+            want = torch.nn.functional.interpolate(own[None, None], size, mode="bilinear", align_corners=False)[0, 0]
+            got = resized._membership.weights(0, region, torch.float64)
+            assert (got - want).abs().max() < 1e-9
+            for key, plane in zip(table.keys.tolist(), table.plane.tolist(), strict=True):
+                if key % 3 != region:
+                    continue
+                y, x = key // 3 // tiles_x * 16, key // 3 % tiles_x * 16
+                part = want[y : y + 16, x : x + 16]
+                shares = torch.ones(16, 16).double() if plane < 0 else table.planes[plane].view(16, 16)
+                assert (shares[: part.shape[0], : part.shape[1]] - part).abs().max() < 1e-9
+                want[y : y + 16, x : x + 16] = 0.0
+            assert want.abs().max() < 1e-9, "tiles without the key have none of the region"
+
+    @pytest.mark.parametrize("size", [(9, 9), (12, 18), (60, 66), (5, 7)])
+    def test_largest_share_in_exact_arithmetic(self, size: tuple[int, int]) -> None:
+        for labels in (torch.arange(36).view(6, 6), torch.arange(36).view(6, 6) % 7 % 2):
+            got = RegionMap.from_labels(labels).resize(size).labels
+            for i in range(size[0]):
+                for j in range(size[1]):
+                    shares: dict[int, int] = {}
+                    (top, down), (left, across) = (
+                        divmod((2 * at + 1) * 6 * 1024 - new * 1024, 2 * new * 1024)
+                        for at, new in zip((i, j), size, strict=True)
+                    )
+                    # offsets in odd 2048ths of a pixel
+                    down, across = (2 * (part // (2 * new)) + 1 for part, new in zip((down, across), size, strict=True))
+                    for y, weight_y in ((top, 2048 - down), (top + 1, down)):
+                        for x, weight_x in ((left, 2048 - across), (left + 1, across)):
+                            label = int(labels[min(max(y, 0), 5), min(max(x, 0), 5)])
+                            shares[label] = shares.get(label, 0) + weight_y * weight_x
+                    best, *others = sorted(shares.values(), reverse=True)
+                    assert not others or best > others[0], "no two labels tie"
+                    assert shares[int(got[i, j])] == best
 
     @pytest.mark.parametrize("factor", [2, 4])
     def test_fine_map_is_sampled(self, factor: int) -> None:
         y, x = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
         fine = ((x - 30.3) ** 2 + (y - 33.1) ** 2 < 400).long()
-        regions = RegionMap.from_labels(fine, 0.5, supersample=factor)
+        regions = RegionMap.from_labels(fine, supersample=factor)
         side = 64 // factor
         large = regions.resize((2 * side, 2 * side))
-        assert (large.supersample, large.size, large.softness) == (factor, (2 * side, 2 * side), 1.0)
+        assert (large.supersample, large.size, large.softness) == (factor, (2 * side, 2 * side), 0.0)
         assert torch.equal(large.fine_labels, RegionMap.from_labels(fine).resize((128, 128)).labels)
         assert regions.resize((side, side)) is regions
         small = RegionMap.from_labels(fine, supersample=factor).resize((side // 2, side // 2))

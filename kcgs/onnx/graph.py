@@ -1,0 +1,133 @@
+"""Graphs put together operator by operator, checked and written whole."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnx_ir as ir
+from numpy.typing import NDArray
+from onnx_ir.tape import Tape
+
+from kcgs._atomic import atomic_path
+
+OPSET = 20
+_IR_VERSION = 10
+_SUFFIX = ".onnx"
+
+Value = ir.Value
+Array = NDArray[np.generic]
+Operand = Value | Array | int | float
+
+
+class Graph:
+    """A graph in the making: call it with an operator's name and operands, and get the result.
+
+    Numbers become constants: of the type of the first operand that is a value where that is floating, int64 else.
+    Equal constants are stored once.
+
+    Example:
+        >>> graph = Graph()
+        >>> size = graph.input("size", np.int64, [2])
+        >>> model = graph.finish({"area": graph("ReduceProd", size, keepdims=0)}, np.int64, [[]], {})
+        >>> [node.op_type for node in model.graph.node]
+        ['ReduceProd']
+    """
+
+    def __init__(self, outer: Graph | None = None) -> None:
+        self._tape = Tape()
+        self._inputs: list[Value] = []
+        self._constants: dict[tuple[str, tuple[int, ...], bytes], Value] = {}
+        self._outer = outer
+        self._names: list[int] = [0] if outer is None else outer._names
+
+    def input(self, name: str, dtype: type[np.generic], shape: Sequence[int | str]) -> Value:
+        """Declare an input; names stand for sizes that vary."""
+        value = ir.val(name, dtype=ir.DataType.from_numpy(np.dtype(dtype)), shape=ir.Shape(list(shape)))
+        self._inputs.append(value)
+        return value
+
+    def constant(self, array: Array | Sequence[int] | Sequence[float] | int | float, dtype: object = None) -> Value:
+        """Store an array."""
+        data = np.ascontiguousarray(np.asarray(array, dtype=dtype))  # type: ignore[call-overload]
+        data = data.reshape(np.shape(array))
+        key = (data.dtype.str, data.shape, data.tobytes())
+        if key not in self._constants:
+            name = self._fresh("c")
+            self._constants[key] = self._tape.initializer(ir.tensor(data, name=name), name=name)
+        return self._constants[key]
+
+    def __call__(self, op: str, *operands: Operand, **attributes: object) -> Value:
+        """Apply an operator that has one result."""
+        return self.apply(op, operands, 1, **attributes)[0]
+
+    def apply(self, op: str, operands: Sequence[Operand | None], results: int, **attributes: object) -> Sequence[Value]:
+        """Apply an operator that has several results, or leaves operands out."""
+        values = [None if x is None else x if isinstance(x, Value) else self.constant(x) for x in operands]
+        made = self._tape.op_multi_out(op, values, attributes, num_outputs=results)  # type: ignore[arg-type]
+        for value in made:
+            value.name = self._fresh("v")
+        return made
+
+    def body(self, build: Callable[[Graph], Sequence[Value]], name: str) -> ir.Graph:
+        """Make the graph inside a Loop or an If; it may use values from outside."""
+        inner = Graph(self)
+        outputs = build(inner)
+        return inner._close(outputs, name)
+
+    def finish(
+        self,
+        outputs: Mapping[str, Value],
+        dtype: type[np.generic],
+        shapes: Sequence[Sequence[int | str]],
+        metadata: Mapping[str, str],
+    ) -> onnx.ModelProto:
+        """Close the graph and check it."""
+        for (name, value), shape in zip(outputs.items(), shapes, strict=True):
+            value.name, value.dtype = name, ir.DataType.from_numpy(np.dtype(dtype))
+            value.shape = ir.Shape(list(shape))
+        model = ir.Model(self._close(list(outputs.values()), "decoder"), ir_version=_IR_VERSION, producer_name="kcgs")
+        model.metadata_props.update(metadata)
+        proto = ir.to_proto(model)
+        onnx.checker.check_model(proto, full_check=True)
+        return proto
+
+    def _close(self, outputs: Sequence[Value], name: str) -> ir.Graph:
+        return ir.Graph(
+            self._inputs,
+            outputs,
+            nodes=self._tape.nodes,
+            initializers=self._tape.initializers,
+            opset_imports={"": OPSET} if self._outer is None else {},
+            name=name,
+        )
+
+    def _fresh(self, prefix: str) -> str:
+        self._names[0] += 1
+        return f"{prefix}{self._names[0]}"
+
+
+def write_model(model: onnx.ModelProto, path: str | os.PathLike[str]) -> int:
+    """Write a model; the file appears whole or not at all.
+
+    Args:
+        model: checked.
+        path: ends in .onnx.
+
+    Returns:
+        Size of the file in bytes.
+
+    Raises:
+        ValueError: another suffix.
+        FileNotFoundError: the folder does not exist.
+    """
+    path = Path(path)
+    if path.suffix != _SUFFIX:
+        raise ValueError(f"path must end in {_SUFFIX}; got {str(path)!r}")
+    content = model.SerializeToString(deterministic=True)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+    return len(content)
