@@ -126,6 +126,11 @@ class RegionMap:
         """(height, width) in pixels."""
         return self.labels.shape[-2], self.labels.shape[-1]
 
+    @property
+    def resized(self) -> bool:
+        """Whether these are memberships of another map's pixels, interpolated."""
+        return self._origin is not None
+
     def index_of(self, region_ids: Tensor) -> Tensor:
         """Return the position of each id among `ids`, -1 where the map does not hold it."""
         if self._table is not None:
@@ -156,8 +161,8 @@ class RegionMap:
 
         Hard contours stay hard: between pixel centres a point has the label with the largest share among its four
         neighbours (bilinear weights, of offsets rounded to odd multiples of 1/2048 pixel, so that no two labels tie).
-        With ``supersample`` k it is the fine map that is sampled, at k times the new size: the result has k x k labels
-        a pixel as before, and only labels that still have any are regions.
+        With ``supersample`` k it is the fine map that is sampled: the result has k x k labels a pixel as before, spread
+        over the new pixel, or over one old pixel where that is smaller. Labels that are left with none are no regions.
 
         Soft contours widen along with the map: between pixel centres a point has the bilinear mean of its four
         neighbours' memberships. ``softness`` says the new widths; all regions stay.
@@ -182,8 +187,8 @@ class RegionMap:
         k = self.supersample
         if self.softness == 0.0:
             fine = self.labels if self.fine_labels is None else self.fine_labels
-            return RegionMap.from_labels(_sample_labels(fine, k * height, k * width), supersample=k)
-        labels = _sample_labels(self.labels, height, width)
+            return RegionMap.from_labels(_sample_labels(fine, height, width, k), supersample=k)
+        labels = _sample_labels(self.labels, height, width, 1)
         index = self.index_of(labels).to(torch.int32)
         return RegionMap(
             labels,
@@ -271,9 +276,13 @@ def _compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     return ids, index.to(torch.int32), None
 
 
-def _sample_labels(labels: Tensor, height: int, width: int) -> Tensor:
+def _sample_labels(labels: Tensor, height: int, width: int, factor: int) -> Tensor:
+    spread = (torch.arange(factor, device=labels.device, dtype=torch.float64) + 0.5) / factor - 0.5
+
     def neighbours(new: int, old: int) -> tuple[Tensor, Tensor]:
-        at = (torch.arange(new, device=labels.device, dtype=torch.float64) + 0.5) * (old / new) - 0.5
+        step = old / factor / new
+        centre = (torch.arange(new, device=labels.device, dtype=torch.float64) + 0.5) * step
+        at = (centre[:, None] + spread * min(step, 1.0)).flatten() * factor - 0.5
         low = at.floor()
         offset = (((at - low) * _OFFSETS).floor() + 0.5) / _OFFSETS
         ends = torch.stack([low, low + 1]).long().clamp(0, old - 1)
@@ -282,7 +291,7 @@ def _sample_labels(labels: Tensor, height: int, width: int) -> Tensor:
     (rows, down), (cols, across) = neighbours(height, labels.shape[-2]), neighbours(width, labels.shape[-1])
     corners = torch.stack([labels[..., r[:, None], c[None, :]] for r in rows for c in cols])
     weights = torch.stack([d[:, None] * a[None, :] for d in down for a in across])
-    weights = weights.view(4, *[1] * (labels.ndim - 2), height, width)
+    weights = weights.view(4, *[1] * (labels.ndim - 2), *weights.shape[1:])
     scores = torch.stack([torch.where(corners == corner, weights, 0.0).sum(0) for corner in corners])
     return corners.gather(0, scores.argmax(0, keepdim=True))[0]
 

@@ -20,14 +20,13 @@ _SUFFIX = ".onnx"
 
 Value = ir.Value
 Array = NDArray[np.generic]
-Operand = Value | Array | int | float
+Operand = Value | Array | np.generic | int
 
 
 class Graph:
     """A graph in the making: call it with an operator's name and operands, and get the result.
 
-    Numbers become constants: of the type of the first operand that is a value where that is floating, int64 else.
-    Equal constants are stored once.
+    Arrays become constants, stored once if equal; integers are int64, other numbers need a numpy type.
 
     Example:
         >>> graph = Graph()
@@ -50,10 +49,9 @@ class Graph:
         self._inputs.append(value)
         return value
 
-    def constant(self, array: Array | Sequence[int] | Sequence[float] | int | float, dtype: object = None) -> Value:
+    def constant(self, array: Array | np.generic | int | Sequence[int]) -> Value:
         """Store an array."""
-        data = np.ascontiguousarray(np.asarray(array, dtype=dtype))  # type: ignore[call-overload]
-        data = data.reshape(np.shape(array))
+        data = np.asarray(array).copy(order="C")
         key = (data.dtype.str, data.shape, data.tobytes())
         if key not in self._constants:
             name = self._fresh("c")
@@ -70,6 +68,9 @@ class Graph:
         made = self._tape.op_multi_out(op, values, attributes, num_outputs=results)  # type: ignore[arg-type]
         for value in made:
             value.name = self._fresh("v")
+        node = made[0].producer()
+        assert node is not None
+        node.name = ""  # names of nodes are optional, and weigh as much as the nodes
         return made
 
     def body(self, build: Callable[[Graph], Sequence[Value]], name: str) -> ir.Graph:
@@ -108,6 +109,11 @@ class Graph:
     def _fresh(self, prefix: str) -> str:
         self._names[0] += 1
         return f"{prefix}{self._names[0]}"
+
+
+def smallest(numbers: NDArray[np.int64]) -> Array:
+    """Store numbers from 0 on in the narrowest type that holds them."""
+    return numbers.astype(np.min_scalar_type(int(numbers.max(initial=0))))
 
 
 def write_model(model: onnx.ModelProto, path: str | os.PathLike[str]) -> int:

@@ -1,29 +1,20 @@
-"""The command `kcgs`: arguments in, calls to the library, one line out."""
+"""Commands that fit, draw and measure: arguments in, calls to the library, one line out."""
 
 from __future__ import annotations
 
-import json
-import logging
 import math
-import signal
-import sys
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from .common import Json, Progress, SceneFile, app, check_output, print_report
+
 if TYPE_CHECKING:
     from torch import Tensor
 
     from kcgs.functional import RegionMap
-
-app = typer.Typer(
-    help="Contour-aware 2D Gaussian splatting of images.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
 
 
 class Backend(str, Enum):
@@ -39,8 +30,6 @@ class Backend(str, Enum):
 _IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
 ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE")]
-SceneFile = Annotated[Path, typer.Argument(help="Scene file (.safetensors).", metavar="SCENE")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
 
 @app.command("fit")
@@ -74,9 +63,9 @@ def fit_command(
     from kcgs.io import save
 
     output = Path(f"{image.stem}.safetensors") if output is None else output
-    _check_output(output, ".safetensors")
+    check_output(output, ".safetensors")
     if plot is not None:
-        _check_output(plot, ".png", option="--plot")
+        check_output(plot, ".png", option="--plot")
     if resume and checkpoint is None:
         raise typer.BadParameter("--resume needs --checkpoint")
     settings: dict[str, Any] = {"iterations": iterations, "max_seconds": max_seconds, "target_psnr": target_psnr}
@@ -90,7 +79,7 @@ def fit_command(
     )
     picture = load_image(image)
     labels = _read_regions(regions, picture)
-    with _Progress(config.iterations, config.max_seconds) as progress:
+    with Progress(config.iterations, config.max_seconds) as progress:
         result = fit(
             picture, labels, num_gaussians,
             seed=seed, config=config, on_step=progress.step, checkpoint=checkpoint, resume=resume,
@@ -107,7 +96,7 @@ def fit_command(
     title = f"{output}: {len(result.field)} Gaussians, stopped by {result.stop_reason}"
     if result.removed:
         title += f"; {result.removed} useless ones removed, which changed no value by more than {result.change:.1g}"
-    _print_report(report, as_json, title)
+    print_report(report, as_json, title)
 
 
 @app.command()
@@ -123,7 +112,7 @@ def render(
     from kcgs.io import load
     from kcgs.nn.renderer import render_image
 
-    _check_output(output, *_IMAGES)
+    check_output(output, *_IMAGES)
     loaded = load(scene)
     field = loaded.field
     target = _target_size(field.size, scale, size)
@@ -157,7 +146,7 @@ def eval_command(
     if regions is not None:
         labels = load_labels(Path(regions))
     report = _measure(loaded.field, loaded.regions, picture, labels, None, scene.stat().st_size)
-    _print_report(report, as_json, str(scene))
+    print_report(report, as_json, str(scene))
 
 
 @app.command()
@@ -171,7 +160,7 @@ def segment(
     from kcgs.data import load_image, save_labels
     from kcgs.segment import segment as make_labels
 
-    _check_output(output, ".png", ".npy")
+    check_output(output, ".png", ".npy")
     labels = make_labels(load_image(image), method)
     save_labels(output, labels)
     areas = labels.flatten().bincount()
@@ -181,7 +170,7 @@ def segment(
         "largest": int(areas.max()),
         "method": method,
     }
-    _print_report(report, as_json, str(output))
+    print_report(report, as_json, str(output))
 
 
 @app.command()
@@ -203,7 +192,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
         "bits_per_pixel": 8 * size / (field.size[0] * field.size[1]),
         **{f"metadata.{key}": value for key, value in loaded.metadata.items()},
     }
-    _print_report(report, as_json, str(scene))
+    print_report(report, as_json, str(scene))
 
 
 @app.command()
@@ -218,14 +207,6 @@ def bench(
     from kcgs.bench import run
 
     run(name, output, data=data, quick=quick, only=only)
-
-
-def _check_output(path: Path, *suffixes: str, option: str = "--output") -> None:
-    # before the work, not after it
-    if path.suffix.lower() not in suffixes:
-        raise ValueError(f"{option} must end in {' or '.join(suffixes)}; got {str(path)!r}")
-    if not path.resolve().parent.is_dir():
-        raise FileNotFoundError(f"{option} needs an existing folder; {str(path.resolve().parent)!r} is not there")
 
 
 def _read_regions(regions: str, picture: Tensor) -> Tensor | None:
@@ -283,70 +264,3 @@ def _measure(
         "bytes": written,
         "bits_per_pixel": 8 * written / (height * width),
     }
-
-
-def _print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
-    if as_json:
-        clean = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in report.items()}
-        typer.echo(json.dumps(clean))
-        return
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table("", title, show_header=True)
-    for key, value in report.items():
-        table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
-    Console().print(table)
-
-
-class _Progress:
-    """Bar on standard error, only on a terminal, and Ctrl-C as a wish to stop; a second Ctrl-C ends the program."""
-
-    def __init__(self, iterations: int, max_seconds: float | None) -> None:
-        from rich.console import Console
-        from rich.progress import Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-        self.interrupted = False
-        self._max_seconds = max_seconds
-        console = Console(stderr=True)
-        self._bar = Progress(
-            *Progress.get_default_columns()[:2],
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[quality]}"),
-            console=console,
-            disable=not console.is_terminal,
-        )
-        self._task = self._bar.add_task("fit", total=iterations, quality="")
-
-    def __enter__(self) -> _Progress:
-        self._before = signal.signal(signal.SIGINT, self._interrupt)
-        self._bar.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._bar.stop()
-        signal.signal(signal.SIGINT, self._before)
-
-    def _interrupt(self, number: int, frame: object) -> None:
-        self.interrupted = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    def step(self, iteration: int, entry: Any) -> bool:
-        self._bar.update(self._task, completed=iteration, quality=f"{entry.psnr:.2f} dB")
-        return self.interrupted
-
-
-def main() -> None:
-    """Run the command: exit 0 done, 1 failed with one line that says why, 2 wrong usage."""
-    logging.basicConfig(format="%(message)s")
-    logging.getLogger("kcgs").setLevel(logging.INFO)
-    try:
-        app(prog_name="kcgs")
-    except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
-        typer.echo(f"kcgs: {' '.join(str(error).split()) or type(error).__name__}", err=True)
-        sys.exit(1)
-
-
-if __name__ == "__main__":
-    main()

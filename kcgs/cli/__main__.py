@@ -1,0 +1,5 @@
+"""`python -m kcgs.cli`."""
+
+from . import main
+
+main()

@@ -1,0 +1,93 @@
+"""What the commands share: arguments, tables, progress."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+app = typer.Typer(
+    help="Contour-aware 2D Gaussian splatting of images.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def _scene_path(text: str) -> Path:
+    from kcgs.zoo import PREFIX, find
+
+    return find(text) if text.startswith(PREFIX) else Path(text)
+
+
+SceneFile = Annotated[
+    Path, typer.Argument(help="Scene file (.safetensors), or zoo:NAME.", metavar="SCENE", parser=_scene_path)
+]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
+
+
+def check_output(path: Path, *suffixes: str, option: str = "--output") -> None:
+    """Refuse an output that cannot be written, before the work, not after it."""
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{option} must end in {' or '.join(suffixes)}; got {str(path)!r}")
+    if not path.resolve().parent.is_dir():
+        raise FileNotFoundError(f"{option} needs an existing folder; {str(path.resolve().parent)!r} is not there")
+
+
+def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
+    """Print a table, or one JSON object."""
+    if as_json:
+        clean = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in report.items()}
+        typer.echo(json.dumps(clean))
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("", title, show_header=True)
+    for key, value in report.items():
+        table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
+    Console().print(table)
+
+
+class Progress:
+    """Bar on standard error, only on a terminal, and Ctrl-C as a wish to stop; a second Ctrl-C ends the program."""
+
+    def __init__(self, iterations: int, max_seconds: float | None) -> None:
+        from rich.console import Console
+        from rich.progress import Progress as Bar
+        from rich.progress import TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        self.interrupted = False
+        self._max_seconds = max_seconds
+        console = Console(stderr=True)
+        self._bar = Bar(
+            *Bar.get_default_columns()[:2],
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[quality]}"),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("fit", total=iterations, quality="")
+
+    def __enter__(self) -> Progress:
+        self._before = signal.signal(signal.SIGINT, self._interrupt)
+        self._bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.stop()
+        signal.signal(signal.SIGINT, self._before)
+
+    def _interrupt(self, number: int, frame: object) -> None:
+        self.interrupted = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def step(self, iteration: int, entry: Any) -> bool:
+        """Show the iteration; say whether to stop."""
+        self._bar.update(self._task, completed=iteration, quality=f"{entry.psnr:.2f} dB")
+        return self.interrupted

@@ -1,0 +1,7 @@
+"""Scenes as ONNX: decoders that run wherever ONNX does."""
+
+from .decoder import PRECISIONS, describe_decoder, scene_decoder
+from .generic import generic_decoder
+from .graph import write_model
+
+__all__ = ["PRECISIONS", "describe_decoder", "generic_decoder", "scene_decoder", "write_model"]

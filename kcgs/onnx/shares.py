@@ -1,0 +1,77 @@
+"""Memberships of the blocks of a graph."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .axis import FLOAT, Axis
+from .graph import Graph, Value
+from .lists import TILE, Tiles, margin
+
+_STEPS = 65535
+
+
+class Windows:
+    """Samples memberships from the windows of tiles with several regions."""
+
+    def __init__(self, graph: Graph, tiles: Tiles, down: Axis, across: Axis, factor: int, soft: bool) -> None:
+        """Take the windows.
+
+        Args:
+            graph: the graph.
+            tiles: with their windows.
+            down: rows.
+            across: columns.
+            factor: labels along a side of a pixel; 1 where contours are soft.
+            soft: whether contours are.
+        """
+        self.g, self.tiles, self.factor, self.soft = graph, tiles, factor, soft
+        self.side = factor * TILE + 2 * margin(factor)
+        self.across = across.weights(factor, margin(factor), soft)
+        self.down = graph("Transpose", down.weights(factor, margin(factor), soft), perm=[0, 2, 1])
+        self.sides = across.side, down.side
+
+    def shares(self, chosen: NDArray[np.int64], regions: int, slots: Value, row: Value, col: Value) -> Value:
+        """Sample the memberships of blocks, (B, K, 1, P), column by column.
+
+        Args:
+            chosen: tiles of the group, (T,).
+            regions: K, at least those of every tile.
+            slots: the tile of each block, by place among the chosen, (B,).
+            row: row of each block, (B,).
+            col: its column, (B,).
+        """
+        g = self.g
+        windows = self._soft(chosen, regions) if self.soft else self._hard(chosen, regions)  # [T, K, S, S]
+        one = g.constant([1])
+        across, down = (g("Unsqueeze", g("Gather", w, at), one) for w, at in ((self.across, col), (self.down, row)))
+        shares = g("MatMul", g("MatMul", across, g("Gather", windows, slots)), down)
+        if not self.soft:
+            best = g("ReduceMax", shares, one, keepdims=1)
+            shares = g("Cast", g("Equal", shares, best), to=FLOAT)
+        if self.factor > 1:
+            k = g.constant([self.factor])
+            split = g("Concat", g.constant([0, regions]), self.sides[0], k, self.sides[1], k, axis=0)
+            shares = g("ReduceMean", g("Reshape", shares, split), g.constant([3, 5]), keepdims=0)
+        return g("Reshape", shares, g.constant([0, 0, 1, -1]))
+
+    def _soft(self, chosen: NDArray[np.int64], regions: int) -> Value:
+        """All but the last region's are stored, in 65,535 steps; they sum to one."""
+        g = self.g
+        stored = np.zeros((len(chosen), regions - 1, self.side, self.side), np.uint16)
+        last = np.zeros((len(chosen), regions, 1, 1), bool)
+        for at, tile in enumerate(chosen.tolist()):
+            window = self.tiles.windows[tile].numpy()
+            stored[at, : len(window) - 1] = np.round(window[:-1] * _STEPS)
+            last[at, len(window) - 1] = True
+        shares = g("Mul", g("Cast", g.constant(stored.swapaxes(2, 3)), to=FLOAT), np.float32(1 / _STEPS))
+        rest = g("Sub", np.float32(1), g("ReduceSum", shares, g.constant([1]), keepdims=1))
+        shares = g("Pad", shares, np.array([0, 0, 0, 0, 0, 1, 0, 0]))
+        return g("Add", shares, g("Mul", rest, g("Cast", g.constant(last), to=FLOAT)))
+
+    def _hard(self, chosen: NDArray[np.int64], regions: int) -> Value:
+        g = self.g
+        stored = np.stack([self.tiles.windows[tile].numpy() for tile in chosen.tolist()]).astype(np.uint8)
+        numbers = np.arange(regions, dtype=np.uint8)[:, None, None]
+        return g("Cast", g("Equal", g.constant(stored[:, None].swapaxes(2, 3)), numbers), to=FLOAT)

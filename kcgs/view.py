@@ -1,0 +1,97 @@
+"""A scene in the browser: its decoder and the viewer's page, served on this machine alone."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import webbrowser
+from collections.abc import Callable
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from urllib.parse import quote, urlencode
+
+from kcgs.functional import RegionMap
+from kcgs.nn import GaussianField
+from kcgs.onnx import scene_decoder, write_model
+
+_PAGE = Path(__file__).resolve().parent.parent / "export" / "web" / "dist"
+
+
+class _Handler(SimpleHTTPRequestHandler):
+    """Serves the page's files, and what was put beside them."""
+
+    extensions_map = {**SimpleHTTPRequestHandler.extensions_map, ".mjs": "text/javascript", ".wasm": "application/wasm"}
+
+    def __init__(self, *args: object, extra: Path, **kwargs: object) -> None:
+        self.extra = extra
+        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+
+    def translate_path(self, path: str) -> str:
+        if path.startswith("/scene/"):
+            return str(self.extra / Path(path.partition("?")[0]).name)
+        return super().translate_path(path)
+
+    def end_headers(self) -> None:
+        # with these the page may use threads
+        self.send_header("Cross-Origin-Opener-Policy", "same-origin")
+        self.send_header("Cross-Origin-Embedder-Policy", "require-corp")
+        self.send_header("Cache-Control", "no-cache")
+        super().end_headers()
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing of requests."""
+
+
+def serve(
+    field: GaussianField,
+    regions: RegionMap | None,
+    *,
+    name: str = "scene",
+    original: Path | None = None,
+    port: int = 0,
+    browser: bool = True,
+    say: Callable[[str], object] = print,
+    page: Path | None = None,
+) -> None:
+    """Export a scene to a temporary folder and serve the viewer on loopback until Ctrl-C.
+
+    Args:
+        field: unbatched.
+        regions: what the field is drawn with.
+        name: the page's title for it.
+        original: an image file to compare with.
+        port: 0 for any that is free.
+        browser: whether to open a window.
+        say: takes the line that says where the page is.
+        page: folder of the built page; None: that of the checkout this package runs from.
+
+    Raises:
+        FileNotFoundError: the page is not built, or there is no such image.
+        OSError: the port is taken.
+    """
+    page = _PAGE if page is None else page
+    if not (page / "index.html").is_file():
+        raise FileNotFoundError(
+            f"the viewer's page is not built: {page / 'index.html'} is not there; in a checkout, run "
+            "npm --prefix export/web ci && npm --prefix export/web run build"
+        )
+    if original is not None and not original.is_file():
+        raise FileNotFoundError(f"--original must be an image file; {original} is not there")
+    with tempfile.TemporaryDirectory() as folder:
+        model = scene_decoder(field, regions, interactive=True)
+        write_model(model, Path(folder) / "decoder.onnx")
+        query = {"decoder": "scene/decoder.onnx", "name": name}
+        if original is not None:
+            shutil.copyfile(original, Path(folder) / f"original{original.suffix.lower()}")
+            query["original"] = f"scene/original{original.suffix.lower()}"
+        handler = partial(_Handler, directory=str(page), extra=Path(folder))
+        with ThreadingHTTPServer(("127.0.0.1", port), handler) as server:
+            url = f"http://127.0.0.1:{server.server_address[1]}/?{urlencode(query, quote_via=quote, safe='/')}"
+            say(f"{url} (Ctrl-C ends)")
+            if browser:
+                webbrowser.open(url)
+            try:
+                server.serve_forever()
+            except KeyboardInterrupt:
+                return

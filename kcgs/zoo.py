@@ -1,0 +1,72 @@
+"""The fitted scenes that come with a checkout, by name."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+_FOLDER = Path(__file__).resolve().parent.parent / "models"
+PREFIX = "zoo:"
+
+
+class Entry(NamedTuple):
+    """A scene of the zoo, as `models/manifest.json` has it."""
+
+    name: str
+    title: str
+    scene: str  # file, relative to the folder
+    sha256: str
+    bytes: int
+    recipe: str
+    num_gaussians: int
+    num_regions: int
+    psnr: float
+    ef_psnr: float | None
+    licence: str
+    command: str
+    decoder: str | None = None
+    decoder_sha256: str | None = None
+
+
+def entries(folder: Path | None = None) -> list[Entry]:
+    """Read the manifest.
+
+    Args:
+        folder: the zoo's; None: that of the checkout this package runs from.
+
+    Raises:
+        FileNotFoundError: there is none; an installed package has no zoo.
+        ValueError: the manifest is damaged.
+    """
+    path = (folder or _FOLDER) / "manifest.json"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"there is no zoo at {path.parent}: fitted scenes come with a checkout, not with a wheel"
+        )
+    try:
+        return [Entry(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))["entries"]]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} must be a zoo's manifest; {error}") from None
+
+
+def find(name: str, folder: Path | None = None) -> Path:
+    """Return the scene file of an entry, its hash checked.
+
+    Args:
+        name: of the entry, with or without "zoo:".
+        folder: as in :func:`entries`.
+
+    Raises:
+        FileNotFoundError: there is no zoo.
+        ValueError: no such entry, or a file that is not what the manifest says.
+    """
+    wanted = name.removeprefix(PREFIX)
+    known = {entry.name: entry for entry in entries(folder)}
+    if wanted not in known:
+        raise ValueError(f"zoo entry must be one of {', '.join(known)}; got {wanted!r}")
+    path = (folder or _FOLDER) / known[wanted].scene
+    if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != known[wanted].sha256:
+        raise ValueError(f"{path} must be the file that the manifest names; it is missing or was changed")
+    return path

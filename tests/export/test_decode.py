@@ -1,0 +1,636 @@
+"""export/decode.py: alone in an environment without torch and kcgs, its pictures, its refusals."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import random
+import re
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+import kcgs
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, save
+from kcgs.data import save_image
+from kcgs.nn.renderer import render_image
+from kcgs.onnx import generic_decoder, scene_decoder, write_model
+from kcgs.onnx.graph import Graph
+
+ROOT = Path(kcgs.__file__).resolve().parent.parent
+SCRIPT = ROOT / "export" / "decode.py"
+if not SCRIPT.is_file():
+    pytest.skip("not a source checkout: there is no export/decode.py", allow_module_level=True)
+
+SIZE = (37, 53)
+IDS = [5, 300, 70_000]
+
+
+def load_script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("kcgs_export_decode", SCRIPT)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+SCRIPT_MODULE = load_script()
+
+
+def make_labels(size: tuple[int, int] = SIZE) -> Tensor:
+    y, x = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")
+    index = torch.where((x - 20) ** 2 + (y - 15) ** 2 < 80, 2, (x + 2 * y > 70).long())
+    return torch.tensor(IDS)[index]
+
+
+def make_field(channels: int = 3, opacities: bool = True, dtype: torch.dtype = torch.float32) -> GaussianField:
+    field = GaussianField.random(60, SIZE, channels=channels, regions=make_labels(), seed=1, dtype=dtype)
+    generator = torch.Generator().manual_seed(2)
+    if opacities:
+        alpha = torch.rand(60, generator=generator).to(dtype)
+        field = GaussianField(field.means, field.cholesky, field.colors, field.region_ids, alpha, size=SIZE)
+    with torch.no_grad():
+        field.cholesky[:, 1] = torch.randn(60, generator=generator)
+        field.colors *= 1.5
+    return field
+
+
+def ramp_decoder(interactive: bool, height: str = "10") -> onnx.ModelProto:
+    """Stand-in for a scene decoder: red is x, green is y, blue the sum of `visible`, over 16."""
+    graph = Graph()
+    size = graph.input("size", np.int64, [2])
+    view = graph.constant(np.array([0, 0, 12, 10], np.float32))
+    visible = graph.constant(np.array([1, 2], np.float32))
+    if interactive:
+        view, visible = graph.input("view", np.float32, [4]), graph.input("visible", np.float32, [2])
+
+    def along(axis: int) -> Any:
+        side, low, high = graph("Gather", size, axis), graph("Gather", view, 1 - axis), graph("Gather", view, 3 - axis)
+        place = graph("Cast", graph("Range", 0, side, 1), to=onnx.TensorProto.FLOAT)
+        place = graph("Add", place, np.array(0.5, np.float32))
+        step = graph("Div", graph("Sub", high, low), graph("Cast", side, to=onnx.TensorProto.FLOAT))
+        return graph("Add", graph("Mul", place, step), low)
+
+    x, y = along(1), graph("Unsqueeze", along(0), graph.constant([1]))
+    planes = [graph("Expand", v, size) for v in (x, y, graph("ReduceSum", visible, keepdims=0))]
+    stacked = graph("Concat", *(graph("Unsqueeze", v, graph.constant([0, 1])) for v in planes), axis=1)
+    image = graph("Div", stacked, np.array(16, np.float32))
+    notes = {"format": "kcgs.decoder", "format_version": "1", "kind": "scene", "region_ids": "[7, 9]"}
+    return graph.finish({"image": image}, np.float32, [[1, 3, "H", "W"]], notes | {"height": height, "width": "12"})
+
+
+def ramp(size: tuple[int, int], view: tuple[float, ...] = (0, 0, 12, 10), blue: float = 3) -> np.ndarray:
+    x = view[0] + (np.arange(size[1]) + 0.5) * (view[2] - view[0]) / size[1]
+    y = view[1] + (np.arange(size[0]) + 0.5) * (view[3] - view[1]) / size[0]
+    return np.stack([np.broadcast_to(x, size), np.broadcast_to(y[:, None], size), np.full(size, blue)]) / 16
+
+
+class Files(NamedTuple):
+    generic: Path
+    plain: Path
+    interactive: Path
+    scene: Path
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
+    folder = tmp_path_factory.mktemp("decoders")
+    made = Files(*(folder / n for n in ("generic.onnx", "plain.onnx", "interactive.onnx", "scene.safetensors")))
+    write_model(generic_decoder(), made.generic)
+    write_model(ramp_decoder(interactive=False), made.plain)
+    write_model(ramp_decoder(interactive=True), made.interactive)
+    save(made.scene, make_field(), make_labels())
+    return made
+
+
+class Result(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def decode(capsys: pytest.CaptureFixture[str]) -> Callable[..., Result]:
+    """Run the command within this process."""
+
+    def run(*arguments: object) -> Result:
+        try:
+            code = SCRIPT_MODULE.main([str(argument) for argument in arguments])
+        except SystemExit as stop:
+            code = stop.code
+        return Result(code, *capsys.readouterr())
+
+    return run
+
+
+def read(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image).astype(int)
+
+
+def library_levels(folder: Path, field: GaussianField, regions: RegionMap | None, size: tuple[int, int]) -> np.ndarray:
+    path = folder / "library.png"
+    save_image(path, render_image(field, regions, size))
+    return read(path)
+
+
+def read_header(path: Path) -> tuple[dict[str, Any], bytes]:
+    content = path.read_bytes()
+    (length,) = struct.unpack("<Q", content[:8])
+    return json.loads(content[8 : 8 + length]), content[8 + length :]
+
+
+def write_header(path: Path, header: object, body: bytes) -> None:
+    text = json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(text)) + text + body)
+
+
+class TestGenericPictures:
+    @pytest.mark.parametrize("channels", [1, 3, 4])
+    @pytest.mark.parametrize(
+        ("options", "size"),
+        [
+            ([], SIZE),
+            (["--scale", 2], (74, 106)),
+            (["--scale", 0.4], (15, 21)),
+            (["--size", "101x64"], (64, 101)),
+            (["--size", "1x1"], (1, 1)),
+        ],
+    )
+    def test_same_as_the_library(
+        self, files: Files, decode: Any, tmp_path: Path, channels: int, options: list[object], size: tuple[int, int]
+    ) -> None:
+        field, scene, output = make_field(channels), tmp_path / "scene.safetensors", tmp_path / "out.png"
+        save(scene, field, make_labels())
+        assert decode(files.generic, scene, "-o", output, *options) == Result(0, "", "")
+        want = library_levels(tmp_path, field, RegionMap.from_labels(make_labels()), size)
+        assert read(output).shape == want.shape
+        assert np.abs(read(output) - want).max() <= 1
+        assert (read(output) != want).mean() < 0.01
+        assert len(np.unique(want)) > min(20, want.size // 2)
+
+    @pytest.mark.parametrize("case", ["no labels", "no labels but ids", "labels of the target size", "float64"])
+    def test_kinds_of_scenes(self, files: Files, decode: Any, tmp_path: Path, case: str) -> None:
+        field = make_field(opacities=False, dtype=torch.float64 if case == "float64" else torch.float32)
+        labels: Tensor | None = make_labels((74, 106) if case == "labels of the target size" else SIZE)
+        if case.startswith("no labels"):
+            labels = None
+        if case == "no labels":
+            field.region_ids = None
+        scene, output = tmp_path / "scene.safetensors", tmp_path / "out.npy"
+        save(scene, field, labels)
+        assert decode(files.generic, scene, "-o", output, "--scale", 2).code == 0
+        with torch.no_grad():
+            regions = None if labels is None else RegionMap.from_labels(labels)
+            want = RegionSplatRenderer()(field, regions, (74, 106)).numpy()
+        assert np.load(output).dtype == np.float32
+        assert np.abs(np.load(output) - want).max() < 1e-4
+
+    @pytest.mark.parametrize("highest", [3, 300, 70_000, 1 << 40])
+    def test_label_types(self, files: Files, decode: Any, tmp_path: Path, highest: int) -> None:
+        labels = torch.where(make_labels() == IDS[0], 1, highest)
+        field = make_field().assign_regions(labels)
+        scene, output = tmp_path / "scene.safetensors", tmp_path / "out.png"
+        save(scene, field, labels)
+        assert decode(files.generic, scene, "-o", output).code == 0
+        want = library_levels(tmp_path, field, RegionMap.from_labels(labels), SIZE)
+        assert np.abs(read(output) - want).max() <= 1
+
+    def test_other_channels_as_npy(self, files: Files, decode: Any, tmp_path: Path) -> None:
+        field, scene = make_field(channels=5), tmp_path / "scene.safetensors"
+        save(scene, field, make_labels())
+        assert decode(files.generic, scene, "-o", tmp_path / "out.npy").code == 0
+        image = np.load(tmp_path / "out.npy")
+        assert image.shape == (5, *SIZE)
+        refused = decode(files.generic, scene, "-o", tmp_path / "out.png")
+        assert refused.code == 1
+        assert "a PNG has 1, 3 or 4 channels; got 5: write a .npy file" in refused.err
+        assert not (tmp_path / "out.png").exists()
+
+    def test_regions(self, files: Files, decode: Any, tmp_path: Path) -> None:
+        images = {}
+        for chosen in ([], [5], [300], [70_000], [5, 70_000]):
+            options = ["--region", *chosen] if chosen else []
+            assert decode(files.generic, files.scene, "-o", tmp_path / "out.npy", *options).code == 0
+            images[tuple(chosen)] = np.load(tmp_path / "out.npy")
+        assert (images[5,] > 0).any()
+        assert not images[5,][:, make_labels().numpy() != 5].any()
+        np.testing.assert_allclose(images[5, 70_000], images[5,] + images[70_000,])
+        np.testing.assert_allclose(images[()], images[5, 70_000] + images[300,])
+
+    def test_views_are_cuts_of_the_whole(self, files: Files, decode: Any, tmp_path: Path) -> None:
+        output = tmp_path / "out.npy"
+        assert decode(files.generic, files.scene, "-o", output, "--scale", 4).code == 0
+        whole = np.load(output)
+        assert decode(files.generic, files.scene, "-o", output, "--scale", 4, "--view", "5,3,40,30").code == 0
+        np.testing.assert_allclose(np.load(output), whole[:, 12:120, 20:160], atol=2e-4)
+        assert decode(files.generic, files.scene, "-o", output, "--size", "212x148", "--view=0,0,53,37").code == 0
+        np.testing.assert_allclose(np.load(output), whole, atol=1e-6)
+
+    @pytest.mark.parametrize("size", [(37, 53), (1, 1), (74, 106), (18, 26), (50, 200), (111, 7)])
+    def test_labels_are_sampled_as_in_the_library(self, size: tuple[int, int]) -> None:
+        labels = torch.randint(0, 4, SIZE, generator=torch.Generator().manual_seed(0)) * 1000
+        want = RegionMap.from_labels(labels).resize(size).labels.numpy()
+        sampled = SCRIPT_MODULE.sample_labels(labels.numpy(), size)
+        assert np.array_equal(sampled, want)
+
+
+class TestSceneDecoders:
+    @pytest.mark.parametrize("name", ["plain", "interactive"])
+    @pytest.mark.parametrize(
+        ("options", "size"), [([], (10, 12)), (["--scale", 2.5], (25, 30)), (["--size", "7x1"], (1, 7))]
+    )
+    def test_sizes(
+        self, files: Files, decode: Any, tmp_path: Path, name: str, options: list[object], size: tuple[int, int]
+    ) -> None:
+        output = tmp_path / "out.npy"
+        assert decode(getattr(files, name), "-o", output, *options) == Result(0, "", "")
+        np.testing.assert_allclose(np.load(output), ramp(size, blue=3 if name == "plain" else 2), rtol=1e-6)
+
+    def test_view_and_regions(self, files: Files, decode: Any, tmp_path: Path) -> None:
+        output = tmp_path / "out.npy"
+        options = ["--view=-2,1.5,4,9", "--scale", 2, "--region", 9]
+        assert decode(files.interactive, "-o", output, *options).code == 0
+        np.testing.assert_allclose(np.load(output), ramp((15, 12), (-2, 1.5, 4, 9), blue=1), rtol=1e-5)
+
+    def test_png(self, files: Files, decode: Any, tmp_path: Path) -> None:
+        assert decode(files.plain, "-o", tmp_path / "out.png", "--size", "300x200").code == 0
+        want = np.floor(ramp((200, 300)) * 255 + 0.5).transpose(1, 2, 0)
+        assert np.abs(read(tmp_path / "out.png") - want).max() <= 1
+
+    @pytest.mark.parametrize("softness", [0.0, 0.7])
+    def test_a_scene_of_the_library(self, decode: Any, tmp_path: Path, softness: float) -> None:
+        field, regions = make_field(), RegionMap.from_labels(make_labels(), softness)
+        decoder, output = tmp_path / "decoder.onnx", tmp_path / "out.png"
+        write_model(scene_decoder(field, regions, interactive=True), decoder)
+        assert decode(decoder, "-o", output, "--scale", 2) == Result(0, "", "")
+        want = library_levels(tmp_path, field, regions, (74, 106))
+        assert np.abs(read(output) - want).max() <= 1
+        assert decode(decoder, "-o", output, "--scale", 2, "--view", "5,3,40,30").code == 0
+        assert np.abs(read(output) - want[6:60, 10:80]).max() <= 1
+        assert decode(decoder, "-o", output, "--region", *IDS).code == 0
+        assert np.abs(read(output) - library_levels(tmp_path, field, regions, SIZE)).max() <= 1
+
+    def test_times(self, files: Files, decode: Any, tmp_path: Path) -> None:
+        output = tmp_path / "out.png"
+        result = decode(files.plain, "-o", output, "--repeat", 3, "--threads", 1)
+        assert re.fullmatch(r"loaded in [\d.]+ ms, decoded in [\d.]+ ms \(median of 3\)\n", result.out)
+        result = decode(files.plain, "-o", output, "--repeat", 3, "--json", "--providers", "CPUExecutionProvider")
+        report = json.loads(result.out)
+        assert report["load_ms"] > 0 and report["decode_ms"] > 0
+        del report["load_ms"], report["decode_ms"]
+        assert report == {
+            "output": str(output), "kind": "scene", "width": 12, "height": 10, "channels": 3, "repeat": 3,
+            "providers": ["CPUExecutionProvider"], "bytes": files.plain.stat().st_size,
+        }  # fmt: skip
+
+    def test_replaces_what_was_there(self, files: Files, decode: Any, tmp_path: Path) -> None:
+        output = tmp_path / "out.png"
+        output.write_bytes(b"old")
+        assert decode(files.plain, "-o", output).code == 0
+        assert output.read_bytes().startswith(b"\x89PNG")
+        assert list(tmp_path.iterdir()) == [output]
+
+
+def _edit(**notes: str | None) -> Callable[[Any], None]:
+    """Change the metadata of a model."""
+
+    def change(model: onnx.ModelProto) -> None:
+        kept = {entry.key: entry.value for entry in model.metadata_props} | notes
+        onnx.helper.set_model_props(model, {key: value for key, value in kept.items() if value is not None})
+
+    return change
+
+
+def _rename_input(model: onnx.ModelProto) -> None:
+    model.graph.input[0].name = "shape"
+    for node in model.graph.node:
+        node.input[:] = ["shape" if name == "size" else name for name in node.input]
+
+
+def _wrong_depth(model: onnx.ModelProto) -> None:
+    axes = onnx.numpy_helper.from_array(np.array([0]), "axes")
+    model.graph.initializer.append(axes)
+    model.graph.node[-1].output[0] = "flat"
+    model.graph.node.append(onnx.helper.make_node("Squeeze", ["flat", "axes"], ["image"]))
+    del model.graph.output[0].type.tensor_type.shape.dim[0]
+
+
+class TestRefusals:
+    @pytest.fixture
+    def refuses(self, decode: Any, tmp_path: Path) -> Callable[..., None]:
+        """The command fails in one line that matches, and writes nothing."""
+
+        def check(pattern: str, *arguments: object, code: int = 1, output: Path | None = None) -> None:
+            folder = tmp_path / "output"
+            folder.mkdir(exist_ok=True)
+            result = decode(*arguments, "-o", output or folder / "out.png")
+            assert result.code == code
+            assert result.out == ""
+            assert re.search(pattern, result.err), result.err
+            assert result.err.startswith("decode.py: ") and result.err.count("\n") == 1
+            assert list(folder.iterdir()) == []
+
+        return check
+
+    @pytest.mark.parametrize(
+        ("arguments", "pattern"),
+        [
+            (["--scale", "0"], "argument --scale: must be a positive number; got '0'"),
+            (["--scale", "nan"], "--scale: must be a positive number; got 'nan'"),
+            (["--scale", "two"], "--scale: must be a positive number; got 'two'"),
+            (["--size", "640"], "--size: must be WxH, such as 640x480; got '640'"),
+            (["--size", "-1x5"], "--size"),
+            (["--size", "5x5", "--scale", "2"], "not allowed with"),
+            (["--view", "0,0,5"], "--view: must be LEFT,TOP,RIGHT,BOTTOM in pixels of the scene; got '0,0,5'"),
+            (["--view", "0,0,5,nan"], "--view: must be LEFT,TOP,RIGHT,BOTTOM"),
+            (["--view", "5,0,5,5"], "--view: must have LEFT < RIGHT and TOP < BOTTOM"),
+            (["--view", "0,0,5,1e9"], "--view: must have LEFT < RIGHT and TOP < BOTTOM, up to 1048576"),
+            (["--region", "x"], "--region: invalid int value: 'x'"),
+            (["--threads", "0"], "--threads: must be a whole number from 1 to 999999; got '0'"),
+            (["--repeat", "1.5"], "--repeat: must be a whole number from 1 to 999999; got '1.5'"),
+            (["--what"], "unrecognized arguments: --what"),
+        ],
+    )
+    def test_usage(self, files: Files, refuses: Any, arguments: list[str], pattern: str) -> None:
+        refuses(pattern, files.plain, *arguments, code=2)
+
+    def test_usage_without_output(self, files: Files, decode: Any) -> None:
+        result = decode(files.plain)
+        assert result.code == 2
+        assert "the following arguments are required: -o/--output" in result.err
+
+    @pytest.mark.parametrize("options", [["--size", "2000000x3"], ["--size", "0x3"], ["--scale", "1e300"]])
+    def test_absurd_sizes(self, files: Files, refuses: Any, options: list[str]) -> None:
+        for inputs in ((files.plain,), (files.generic, files.scene)):
+            refuses(r"the picture must have 1 to 1048576 pixels a side; got \d+x\d+$", *inputs, *options)
+
+    @pytest.mark.parametrize("error", [MemoryError(), MemoryError("Unable to allocate 8 TiB"), KeyboardInterrupt()])
+    def test_stopped(self, files: Files, refuses: Any, monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+        def stop(*_: object) -> None:
+            raise error
+
+        monkeypatch.setattr(SCRIPT_MODULE, "encode_png", stop)
+        interrupted = isinstance(error, KeyboardInterrupt)
+        refuses("nothing written" if interrupted else "memory|allocate", files.plain, code=130 if interrupted else 1)
+
+    def test_outputs(self, files: Files, refuses: Any, tmp_path: Path) -> None:
+        refuses(r"-o must end in .png or .npy; got .*out.jpg", files.plain, output=tmp_path / "out.jpg")
+        nowhere = tmp_path / "nowhere" / "out.png"
+        refuses(f"cannot write {nowhere}: the folder .*nowhere does not exist", files.plain, output=nowhere)
+        folder = tmp_path / "folder.png"
+        folder.mkdir()
+        refuses(f"cannot write {folder}: it is a folder", files.plain, output=folder)
+
+    def test_providers(self, files: Files, refuses: Any) -> None:
+        pattern = "--providers: NoProvider not available here; there are .*CPUExecutionProvider"
+        refuses(pattern, files.plain, "--providers", "NoProvider,CPUExecutionProvider")
+
+    def test_a_provider_that_does_not_start(self, files: Files, refuses: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+        runtime = SCRIPT_MODULE.onnxruntime
+        begin = runtime.InferenceSession
+        monkeypatch.setattr(runtime, "get_available_providers", lambda: ["SleepyProvider"])
+        refuses("onnxruntime cannot load .*SleepyProvider", files.plain, "--providers", "SleepyProvider")
+        # as onnxruntime does with some providers: it goes on without
+        monkeypatch.setattr(
+            runtime, "InferenceSession", lambda content, *_, **__: begin(content, providers=["CPUExecutionProvider"])
+        )
+        pattern = r"--providers: SleepyProvider did not start here; what did: \['CPUExecutionProvider'\]"
+        refuses(pattern, files.plain, "--providers", "SleepyProvider")
+
+    def test_what_a_decoder_does_not_take(self, files: Files, refuses: Any) -> None:
+        refuses("holds its own scene; leave out .*scene.safetensors", files.plain, files.scene)
+        refuses(r"is a generic decoder: give a scene \(.safetensors\) after it", files.generic)
+        refuses("--view needs an interactive decoder, with the input view", files.plain, "--view", "0,0,5,5")
+        refuses("--region needs an interactive decoder, with the input visible", files.plain, "--region", 7)
+        refuses(r"--region must be among the scene's regions \[7, 9\]; got 8", files.interactive, "--region", 8)
+        pattern = r"--region must be among the scene's regions \[5, 300, 70000\]; got 10{30}"
+        refuses(pattern, files.generic, files.scene, "--region", 10**30)
+
+    def test_missing_files_and_folders(self, files: Files, refuses: Any, tmp_path: Path) -> None:
+        refuses(r"cannot read .*absent.onnx: No such file or directory", tmp_path / "absent.onnx")
+        refuses(r"cannot read .*: Is a directory", tmp_path)
+        refuses(r"cannot read .*absent: No such file", files.generic, tmp_path / "absent")
+
+    @pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n" + bytes(100), b"\x80\x04}q\0.", b"\xff" * 64])
+    def test_foreign_files(self, files: Files, refuses: Any, tmp_path: Path, content: bytes) -> None:
+        path = tmp_path / "foreign"
+        path.write_bytes(content)
+        refuses(f"onnxruntime cannot load {path}: ", path)
+        refuses(f"{path} is not a .safetensors file, or is truncated: ", files.generic, path)
+
+    def test_truncated_decoders(self, files: Files, refuses: Any, tmp_path: Path) -> None:
+        content = files.generic.read_bytes()
+        rng = random.Random(0)
+        path = tmp_path / "cut.onnx"
+        for _ in range(40):
+            path.write_bytes(content[: rng.randrange(len(content))])
+            refuses(f"(onnxruntime cannot load {path}: |{path} is not a decoder: )", path, files.scene)
+
+    @pytest.mark.parametrize(
+        ("edit", "pattern"),
+        [
+            (_edit(format=None), "is not a decoder: format must be kcgs.decoder; got None"),
+            (_edit(format_version="2"), "is not a decoder: format_version must be 1; got '2'"),
+            (_edit(kind="movie"), "is not a decoder: kind must be scene or generic; got 'movie'"),
+            (_edit(kind="generic"), "is not a generic decoder: its inputs must be"),
+            (_edit(height=None), "its height must be a whole number of 1 to 1048576 pixels; got ''"),
+            (_edit(width="1e3"), "its width must be a whole number of 1 to 1048576 pixels; got '1e3'"),
+            (_edit(region_ids="[1"), "is damaged: its region_ids must be a JSON list of integers"),
+            (_edit(region_ids='{"a": 1}'), "is damaged: its region_ids must be a JSON list of integers"),
+            (_edit(region_ids="[7, 9, 11]"), "failed at 12x10: .*visible"),
+            (_rename_input, "is not a scene decoder: its inputs must be .*; got"),
+            (_wrong_depth, r"must give an image of shape \(1, C, 10, 12\); got \(3, 10, 12\)"),
+        ],
+    )
+    def test_wrong_decoders(
+        self, files: Files, refuses: Any, tmp_path: Path, edit: Callable[[Any], None], pattern: str
+    ) -> None:
+        model = onnx.load(files.interactive)
+        edit(model)
+        path = tmp_path / "wrong.onnx"
+        path.write_bytes(model.SerializeToString())
+        refuses(pattern, path)
+
+    def test_soft_and_fine_contours(self, files: Files, refuses: Any, tmp_path: Path) -> None:
+        path, labels = tmp_path / "scene.safetensors", make_labels()
+        fine = labels.repeat_interleave(2, 0).repeat_interleave(2, 1)
+        for regions, what in (
+            (RegionMap.from_labels(labels, 0.7), "softness 0.7"),
+            (RegionMap.from_labels(labels, {(5, 300): 0.5}), r"softness \[\[5,300,0.5\]\]"),
+            (RegionMap.from_labels(fine, supersample=2), "supersample 2"),
+        ):
+            save(path, make_field(), regions)
+            refuses(rf"{path} has soft or finer contours \({what}\); a generic decoder draws hard", files.generic, path)
+
+    @pytest.mark.parametrize(
+        ("edit", "pattern"),
+        [
+            (lambda h: h["__metadata__"].update(format="pt"), "is not a scene: its format must be kcgs.scene"),
+            (lambda h: h["__metadata__"].update(format_version="3"), "is not a scene: its format must be kcgs.scene"),
+            (lambda h: h["__metadata__"].update(height="0"), "its height must be a whole number of 1 to 1048576"),
+            (lambda h: h["__metadata__"].update(width="9" * 5000), "its width must be a whole number .*got '999"),
+            (lambda h: h["__metadata__"].update(height="36"), r"labels must have the size \(36, 53\) of the scene"),
+            (lambda h: h["__metadata__"].update(extra=1), "metadata must be strings"),
+            (lambda h: h.pop("means"), "is not a scene: means missing"),
+            (lambda h: h.pop("region_ids"), "it must hold region_ids where it holds labels"),
+            (lambda h: h.update(blobs=h["means"]), "a scene holds means, .*; got 'blobs'"),
+            (lambda h: h["means"].update(dtype="F16"), "means must have a dtype among F32, F64; got F16"),
+            (lambda h: h["labels"].update(dtype=["I8"]), "unhashable|must have a dtype"),
+            (lambda h: h["means"].update(shape=[120]), r"means must have shape \(N, 2\)"),
+            (lambda h: h["means"].update(shape=[1, 60, 2]), r"means must have shape \(N, 2\), of one scene"),
+            (lambda h: h["means"].update(shape=[40, 3]), r"means must have shape \(N, 2\), of one scene"),
+            (lambda h: h["colors"].update(shape=[30, 6]), r"colors must have shape \(N, 6\)"),
+            (lambda h: h["labels"].update(shape=[1, 37, 53]), r"labels must have shape \(H, W\)"),
+            (lambda h: h["means"].update(shape=[60, 3]), "means lies at"),
+            (lambda h: h["means"].update(shape=[-60, -2]), "means must have a shape and offsets of whole numbers"),
+            (lambda h: h["means"].update(data_offsets=[0, 10**12]), "means lies at"),
+            (lambda h: h["means"].update(data_offsets=[0]), "not enough values"),
+            (lambda h: h["means"].pop("dtype"), "'dtype'"),
+        ],
+    )
+    def test_scene_headers(
+        self, files: Files, refuses: Any, tmp_path: Path, edit: Callable[[Any], None], pattern: str
+    ) -> None:
+        path = tmp_path / "scene.safetensors"
+        header, body = read_header(files.scene)
+        edit(header)
+        write_header(path, header, body)
+        refuses(f"{path}.*({pattern})", files.generic, path)
+
+    @pytest.mark.parametrize(
+        ("name", "value", "pattern"),
+        [
+            ("means", float("nan"), "means must be finite; got NaN or infinite values"),
+            ("opacities", float("inf"), "opacities must be finite"),
+            ("means", 1e30, r"Gaussians must lie within 1e\+08 pixels, 1e-06 to 1e\+08 wide"),
+            ("cholesky", 0.0, "cholesky must have l11 > 0 and l22 > 0"),
+            ("cholesky", 1e-9, "Gaussians must lie within"),
+        ],
+    )
+    def test_values(self, files: Files, refuses: Any, tmp_path: Path, name: str, value: float, pattern: str) -> None:
+        path = tmp_path / "scene.safetensors"
+        header, body = read_header(files.scene)
+        at = header[name]["data_offsets"][0]
+        write_header(path, header, body[:at] + struct.pack("<f", value) + body[at + 4 :])
+        refuses(f"{path}: {pattern}", files.generic, path)
+
+    def test_colors_beyond_floats(self, files: Files, refuses: Any, tmp_path: Path) -> None:
+        path = tmp_path / "scene.safetensors"
+        field = make_field(dtype=torch.float64)
+        with torch.no_grad():
+            field.colors[:] = 1e300
+        save(path, field, make_labels())
+        refuses("the decoder gave NaN or infinite values", files.generic, path)
+
+    def test_negative_ids(self, files: Files, refuses: Any, tmp_path: Path) -> None:
+        path = tmp_path / "scene.safetensors"
+        header, body = read_header(files.scene)
+        assert header["labels"]["dtype"] == "I32"
+        at = header["labels"]["data_offsets"][0]
+        write_header(path, header, body[:at] + struct.pack("<i", -1) + body[at + 4 :])
+        refuses(f"{path}: labels must be non-negative; got -1", files.generic, path)
+
+    def test_damage_is_drawn_or_refused(self, files: Files, decode: Any, tmp_path: Path) -> None:
+        content = files.scene.read_bytes()
+        rng = random.Random(0)
+        path, output = tmp_path / "damaged", tmp_path / "out.png"
+        refused = 0
+        for turn in range(60):
+            damaged = bytearray(content)
+            if turn % 3 == 0:
+                del damaged[rng.randrange(len(content)) :]
+            for _ in range(turn % 3):
+                damaged[rng.randrange(800 if turn % 2 else len(content))] ^= rng.randrange(1, 256)
+            path.write_bytes(damaged)
+            output.unlink(missing_ok=True)
+            result = decode(files.generic, path, "-o", output)
+            assert (result.code, output.exists()) in {(0, True), (1, False)}
+            assert result.err.count("\n") == result.code
+            refused += result.code
+        assert 20 <= refused < 60
+        assert {p.name for p in tmp_path.iterdir()} <= {"damaged", "out.png"}
+
+
+# the script runs as a program in a process where anything but the standard library, numpy and onnxruntime is absent
+_BLOCKED = """
+import sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {"torch", "kcgs", "onnx", "safetensors", "PIL", "scipy", "kornia"}:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Absent())
+import runpy
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+@pytest.fixture(scope="module")
+def bare_python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Interpreter of a new environment that holds numpy and onnxruntime, as CI pins them, and nothing of ours."""
+    folder = tmp_path_factory.mktemp("bare")
+    subprocess.run([sys.executable, "-m", "venv", folder], check=True, capture_output=True)
+    python = folder / ("Scripts" if os.name == "nt" else "bin") / "python"
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = [line for line in lines if line.startswith(("numpy==", "onnxruntime=="))]
+    assert len(pins) == 2
+    command = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *pins]
+    installed = subprocess.run(command, capture_output=True, text=True)
+    if installed.returncode:
+        pytest.skip(f"pip cannot install {pins}: {installed.stderr.strip().splitlines()[-1]}")
+    for name in ("torch", "kcgs"):
+        assert subprocess.run([python, "-I", "-c", f"import {name}"], capture_output=True).returncode == 1
+    return python
+
+
+class TestAlone:
+    def check(self, command: list[object], files: Files, folder: Path) -> None:
+        def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+            return subprocess.run([str(a) for a in (*command, *arguments)], capture_output=True, text=True)
+
+        output = folder / "out.png"
+        done = run(SCRIPT, files.generic, files.scene, "-o", output, "--scale", 2)
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+        want = library_levels(folder, make_field(), RegionMap.from_labels(make_labels()), (74, 106))
+        assert np.abs(read(output) - want).max() <= 1
+        done = run(SCRIPT, files.interactive, "-o", output, "--repeat", 2, "--json")
+        assert (done.returncode, done.stderr) == (0, "")
+        assert json.loads(done.stdout)["kind"] == "scene"
+        output.unlink()
+        done = run(SCRIPT, files.scene, "-o", output)
+        assert done.returncode == 1
+        assert "onnxruntime cannot load" in done.stderr and done.stderr.count("\n") == 1
+        assert not output.exists()
+
+    def test_without_torch_and_kcgs(self, files: Files, tmp_path: Path) -> None:
+        self.check([sys.executable, "-I", "-W", "error", "-c", _BLOCKED], files, tmp_path)
+
+    def test_in_a_new_environment(self, bare_python: Path, files: Files, tmp_path: Path) -> None:
+        self.check([bare_python, "-I", "-W", "error"], files, tmp_path)
+
+    def test_says_what_to_install(self) -> None:
+        blocked = _BLOCKED.replace('"torch"', '"onnxruntime"')
+        done = subprocess.run([sys.executable, "-I", "-c", blocked, SCRIPT], capture_output=True, text=True)
+        assert done.returncode == 1
+        assert done.stderr.strip().endswith("install what it needs: pip install numpy onnxruntime")
+        assert "Traceback" not in done.stderr
+
+    def test_states_its_dependencies(self) -> None:
+        block = re.search(r"(?m)^# /// script\n((?:# .*\n)+)# ///$", SCRIPT.read_text())
+        assert block is not None
+        assert 'dependencies = ["numpy>=' in block[1] and '"onnxruntime>=' in block[1]
+        assert 'requires-python = ">=3.11"' in block[1]

@@ -1,0 +1,320 @@
+"""The generic decoder against the renderer, its graph, its memory."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from torch import Tensor
+
+import kcgs
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer
+from kcgs.kernels.form import support_radius
+from kcgs.onnx.generic import MAX_WEIGHTS, generic_decoder
+
+ERROR = {0.0: 1e-4, 1e-6: 1e-4, 1e-4: 1e-3}  # allowed, by cutoff
+
+
+@cache
+def session(cutoff: float = 1e-4, clamp: bool = False, channels: int | None = None) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    model = generic_decoder(cutoff=cutoff, clamp=clamp, channels=channels)
+    return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+
+
+def feeds_of(field: GaussianField, labels: Tensor) -> dict[str, np.ndarray]:
+    assert field.region_ids is not None
+    tensors = {"means": field.means, "cholesky": field.cholesky, "colors": field.merged_colors()}
+    return {
+        **{name: tensor.detach().float().numpy() for name, tensor in tensors.items()},
+        "region_ids": field.region_ids.numpy(),
+        "labels": labels.numpy(),
+    }
+
+
+def decode(field: GaussianField, labels: Tensor, cutoff: float = 1e-4) -> Tensor:
+    (image,) = session(cutoff).run(None, feeds_of(field, labels))
+    assert image.dtype == np.float32
+    assert image.shape == (1, field.colors.shape[-1], *labels.shape)
+    return torch.from_numpy(image[0])
+
+
+def render(field: GaussianField, labels: Tensor, cutoff: float = 1e-4) -> Tensor:
+    with torch.no_grad():
+        image: Tensor = RegionSplatRenderer(cutoff)(field, RegionMap.from_labels(labels))
+    return image
+
+
+def blobs(size: tuple[int, int], regions: int, seed: int = 0) -> Tensor:
+    """Label map of at most `regions` connected-looking regions whose ids are far apart."""
+    generator = torch.Generator().manual_seed(seed)
+    coarse = torch.rand(1, regions, size[0] // 16 + 2, size[1] // 16 + 2, generator=generator)
+    index = torch.nn.functional.interpolate(coarse, size=size, mode="bilinear").argmax(1)[0]
+    return index * 1_000_003 + 5
+
+
+def make_field(
+    count: int, size: tuple[int, int], labels: Tensor, channels: int = 3, seed: int = 0, sigma: float | None = None
+) -> GaussianField:
+    """Slanted Gaussians of many widths, colours of both signs."""
+    generator = torch.Generator().manual_seed(seed)
+    field = GaussianField.random(count, size, channels=channels, regions=labels, seed=seed, sigma=sigma)
+    with torch.no_grad():
+        field.cholesky *= (0.5 * torch.randn(count, 3, generator=generator)).exp()
+        field.cholesky.clamp_(min=0.3)
+        field.cholesky[:, 1] = field.cholesky[:, 0] * torch.randn(count, generator=generator)
+        field.colors -= 0.2 * field.colors.amax()
+    return field
+
+
+def one(mean: tuple[float, float], cholesky: tuple[float, float, float], size: tuple[int, int]) -> GaussianField:
+    tensors = [torch.tensor([row]) for row in (mean, cholesky, (1.0,))]
+    return GaussianField(*tensors, torch.zeros(1, dtype=torch.int64), size=size)
+
+
+def needle(mean: tuple[float, float], angle: float, long: float, short: float, size: tuple[int, int]) -> GaussianField:
+    c, s = math.cos(angle), math.sin(angle)
+    l11 = math.hypot(c * long, s * short)
+    return one(mean, (l11, c * s * (long**2 - short**2) / l11, long * short / l11), size)
+
+
+class TestAgainstRenderer:
+    @pytest.mark.parametrize("cutoff", [0.0, 1e-6, 1e-4])
+    @pytest.mark.parametrize(
+        ("count", "regions", "channels", "size"),
+        [
+            (1, 1, 3, (1, 1)),
+            (5, 2, 1, (1, 50)),
+            (1, 3, 4, (50, 1)),
+            (7, 1, 3, (32, 32)),
+            (65, 1, 3, (33, 31)),
+            (64, 5, 1, (37, 53)),
+            (300, 50, 3, (64, 96)),
+            (1000, 6, 4, (37, 53)),
+            (1000, 12, 3, (130, 97)),
+        ],
+    )
+    def test_sizes_numbers_and_regions(
+        self, count: int, regions: int, channels: int, size: tuple[int, int], cutoff: float
+    ) -> None:
+        labels = blobs(size, regions, seed=count)
+        field = make_field(count, size, labels, channels)
+        want = render(field, labels, cutoff)
+        assert want.abs().max() > 1e-3
+        assert (decode(field, labels, cutoff) - want).abs().max() < ERROR[cutoff]
+
+    @pytest.mark.parametrize(("cutoff", "regions"), [(1e-4, 50), (1e-6, 1)])
+    def test_a_photo_of_ten_thousand(self, cutoff: float, regions: int) -> None:
+        size = (480, 854)
+        labels = blobs(size, regions)
+        assert len(labels.unique()) == regions
+        field = make_field(10_000, size, labels)
+        want = render(field, labels, cutoff)
+        assert (decode(field, labels, cutoff) - want).abs().max() < ERROR[cutoff]
+
+    @pytest.mark.parametrize("cutoff", [1e-6, 1e-4])
+    @pytest.mark.parametrize("angle", [0.0, 0.3, math.pi / 4, math.pi / 2, 2.0])
+    @pytest.mark.parametrize("along", [0.0, 2.5])
+    def test_needles(self, angle: float, along: float, cutoff: float) -> None:
+        """Anisotropy 1,000, also where the picture shows one end alone."""
+        size = (300, 300)
+        mean = (150.3 + along * 300 * math.cos(angle), 149.8 + along * 300 * math.sin(angle))
+        field, labels = needle(mean, angle, 300.0, 0.3, size), torch.zeros(size, dtype=torch.int64)
+        want = render(field, labels, cutoff)
+        assert want.max() > (0.3 if along == 0.0 else 0.01)
+        assert (decode(field, labels, cutoff) - want).abs().max() < ERROR[cutoff]
+
+    @pytest.mark.parametrize("cutoff", [0.0, 1e-6, 1e-4])
+    @pytest.mark.parametrize(
+        ("mean", "cholesky"),
+        [
+            ((20.5, 20.5), (0.3, 0.0, 0.3)),
+            ((20.5, 20.5), (0.05, 0.0, 0.05)),  # one pixel
+            ((20.0, 20.0), (0.05, 0.0, 0.05)),  # between pixels
+            ((20.0, 20.0), (1e5, 0.0, 1e5)),
+            ((1e8, -1e8), (1e8, 0.0, 1e8)),
+            ((-60.0, 20.0), (20.0, 0.0, 20.0)),
+            ((-1e6, 20.0), (1.0, 0.0, 1.0)),
+            ((20.0, 20.0), (1e-6, 1e8, 1e-6)),
+            ((20.0, 20.0), (1e8, -1e8, 1e8)),
+        ],
+    )
+    def test_extremes(self, mean: tuple[float, float], cholesky: tuple[float, float, float], cutoff: float) -> None:
+        size = (40, 70)
+        field, labels = one(mean, cholesky, size), torch.zeros(size, dtype=torch.int64)
+        image = decode(field, labels, cutoff)
+        assert (image - render(field, labels, cutoff)).abs().max() < ERROR[cutoff]
+
+    def test_every_pixel_another_region(self) -> None:
+        size = (37, 53)
+        generator = torch.Generator().manual_seed(0)
+        labels = torch.randint(0, 1 << 40, size, generator=generator)
+        field = make_field(500, size, labels)
+        want = render(field, labels)
+        assert want.abs().max() > 0.01
+        assert (decode(field, labels) - want).abs().max() < 1e-5
+
+    def test_ids_that_the_map_does_not_hold_draw_nothing(self) -> None:
+        labels = torch.tensor([[3, 9], [9, 9]]).repeat_interleave(20, 0).repeat_interleave(20, 1)
+        field = make_field(100, (40, 40), labels)
+        field.region_ids = torch.full((100,), 5)
+        assert decode(field, labels).abs().max() == 0.0
+        assert decode(field, torch.zeros_like(labels)).abs().max() == 0.0
+
+    def test_ids_differ_by_one_beyond_what_floats_hold(self) -> None:
+        far = 2**62
+        labels = torch.full((8, 8), far)
+        labels[:, 4:] = far + 1
+        field = one((4.0, 4.0), (50.0, 0.0, 50.0), (8, 8))
+        field.region_ids = torch.tensor([far + 1])
+        drawn = decode(field, labels)[0] > 0
+        assert torch.equal(drawn, labels == far + 1)
+
+    @pytest.mark.parametrize("cutoff", [1e-6, 1e-4, 0.3])
+    def test_weights_below_the_cutoff_are_exactly_zero(self, cutoff: float) -> None:
+        size = (40, 40)
+        field, labels = one((18.3, 21.9), (3.0, 1.0, 2.0), size), torch.zeros(size, dtype=torch.int64)
+        image, exact = decode(field, labels, cutoff), render(field, labels, 0.0)
+        assert torch.equal(image[exact < cutoff * 0.999], torch.zeros(int((exact < cutoff * 0.999).sum())))
+        kept = exact > cutoff * 1.001
+        assert torch.allclose(image[kept], exact[kept], rtol=1e-4)
+        assert support_radius(cutoff, torch.float32) < 10  # so that both sets are there
+
+    def test_no_gaussian_gives_black(self) -> None:
+        labels = torch.zeros(3, 4, dtype=torch.int64)
+        field = make_field(4, (3, 4), labels).subset(torch.zeros(4, dtype=torch.bool))
+        assert decode(field, labels).abs().max() == 0.0
+
+    def test_clamp(self) -> None:
+        labels = blobs((37, 53), 3)
+        field = make_field(50, (37, 53), labels, sigma=9.0)
+        with torch.no_grad():
+            field.colors *= 30.0
+        plain = decode(field, labels)
+        assert plain.max() > 1.0 and plain.min() < 0.0
+        (clamped,) = session(clamp=True).run(None, feeds_of(field, labels))
+        assert torch.equal(torch.from_numpy(clamped[0]), plain.clamp(0, 1))
+
+    def test_fixed_channels(self) -> None:
+        labels = blobs((37, 53), 3)
+        field = make_field(50, (37, 53), labels, channels=4)
+        (image,) = session(channels=4).run(None, feeds_of(field, labels))
+        assert torch.equal(torch.from_numpy(image[0]), decode(field, labels))
+
+
+def all_nodes(graph: onnx.GraphProto) -> Iterator[onnx.NodeProto]:
+    for node in graph.node:
+        yield node
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                yield from all_nodes(attribute.g)
+
+
+class TestGraph:
+    def test_checked_scatter_free_and_small(self) -> None:
+        model = generic_decoder()
+        onnx.checker.check_model(model, full_check=True)
+        operators = {node.op_type for node in all_nodes(model.graph)}
+        assert {"Loop", "Exp", "MatMul"} <= operators
+        assert not any(name.startswith("Scatter") or name == "NonZero" for name in operators)
+        assert {entry.domain for entry in model.opset_import} == {""}
+        assert model.opset_import[0].version >= 18
+        assert len(model.SerializeToString()) < 20_000
+
+    @pytest.mark.parametrize(("channels", "depth"), [(None, "C"), (4, 4)])
+    def test_signature(self, channels: int | None, depth: int | str) -> None:
+        run = session(channels=channels)
+        assert [(value.name, value.type, value.shape) for value in (*run.get_inputs(), *run.get_outputs())] == [
+            ("means", "tensor(float)", ["N", 2]),
+            ("cholesky", "tensor(float)", ["N", 3]),
+            ("colors", "tensor(float)", ["N", depth]),
+            ("region_ids", "tensor(int64)", ["N"]),
+            ("labels", "tensor(int64)", ["H", "W"]),
+            ("image", "tensor(float)", [1, depth, "H", "W"]),
+        ]
+
+    def test_metadata(self) -> None:
+        notes = {entry.key: entry.value for entry in generic_decoder(cutoff=1e-6).metadata_props}
+        left_out = json.loads(notes.pop("left_out"))
+        assert left_out[0] == "the clip to [0, 1]"
+        assert notes == {
+            "format": "kcgs.decoder",
+            "format_version": "1",
+            "kind": "generic",
+            "kcgs_version": kcgs.__version__,
+            "cutoff": "1e-06",
+            "precision": "fp32",
+            "clamp": "false",
+        }
+        notes = {entry.key: entry.value for entry in generic_decoder(clamp=True).metadata_props}
+        assert notes["clamp"] == "true"
+        assert json.loads(notes["left_out"]) == left_out[1:]
+
+    def test_the_same_bytes_every_time(self) -> None:
+        contents = {generic_decoder().SerializeToString(deterministic=True) for _ in range(3)}
+        assert len(contents) == 1
+
+    @pytest.mark.parametrize(
+        ("arguments", "error", "message"),
+        [
+            ({"cutoff": 1.0}, ValueError, r"cutoff must be in \[0, 1\); got 1.0"),
+            ({"cutoff": "1e-4"}, TypeError, r"cutoff must be a number in \[0, 1\); got '1e-4'"),
+            ({"clamp": 1}, TypeError, "clamp must be True or False; got 1"),
+            ({"channels": 0}, ValueError, "channels must be at least 1; got 0"),
+            ({"channels": 3.0}, TypeError, "channels must be an integer or None; got 3.0"),
+            ({"channels": True}, TypeError, "channels must be an integer or None; got True"),
+        ],
+    )
+    def test_refuses(self, arguments: dict[str, object], error: type[Exception], message: str) -> None:
+        with pytest.raises(error, match=message):
+            generic_decoder(**arguments)  # type: ignore[arg-type]
+
+
+_MEASURE = """
+import sys
+import numpy as np
+import onnxruntime
+
+def memory(key):
+    with open("/proc/self/status") as status:
+        return int(next(line for line in status if line.startswith(key)).split()[1]) * 1024
+
+options = onnxruntime.SessionOptions()
+options.intra_op_num_threads = 1
+session = onnxruntime.InferenceSession(sys.argv[1], options, providers=["CPUExecutionProvider"])
+with np.load(sys.argv[2]) as file:
+    feeds = {name: file[name] for name in file.files}
+before = memory("VmRSS")
+session.run(None, feeds)
+print(memory("VmHWM") - before)
+"""
+
+
+class TestMemory:
+    @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="the peak is read from /proc")
+    @pytest.mark.parametrize(("count", "spread"), [(10_000, None), (10_000, 60.0)])
+    def test_bounded(self, tmp_path: Path, count: int, spread: float | None) -> None:
+        """Few Gaussians on a tile, or nearly all of them: dense weights would take 16 GB."""
+        size = (480, 854)
+        labels = blobs(size, 6)
+        model, data = tmp_path / "generic.onnx", tmp_path / "scene.npz"
+        model.write_bytes(generic_decoder().SerializeToString())
+        small = (480, 854) if spread is None else (64, 96)
+        labels = labels[: small[0], : small[1]]
+        np.savez(data, **feeds_of(make_field(count, small, labels, sigma=spread), labels))
+        command = [sys.executable, "-c", _MEASURE, str(model), str(data)]
+        grown = int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        picture = 3 * 4 * small[0] * small[1]
+        assert grown < 6 * picture + 64 * count * 4 + 24 * MAX_WEIGHTS * 4 + 8e6
+        assert grown < 60e6

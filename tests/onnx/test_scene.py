@@ -1,0 +1,283 @@
+"""Scene decoders against the renderer: any size, any contours, and what they leave out."""
+
+from __future__ import annotations
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer
+from kcgs.onnx import describe_decoder, scene_decoder, write_model
+
+SIZES = [(37, 53), (74, 106), (111, 160), (20, 31), (1, 1), (5, 300)]
+
+
+def blobs(size: tuple[int, int], count: int, seed: int = 0) -> Tensor:
+    """Cells about random points: `count` regions, ids not consecutive."""
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(count, 2, generator=generator) * torch.tensor(size)
+    y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in size), indexing="ij")
+    nearest = ((y[..., None] - points[:, 0]) ** 2 + (x[..., None] - points[:, 1]) ** 2).argmin(-1)
+    return 3 * nearest + 2
+
+
+def scattered(
+    count: int, size: tuple[int, int], regions: RegionMap | None = None, channels: int = 3, seed: int = 0
+) -> GaussianField:
+    generator = torch.Generator().manual_seed(seed)
+    means = torch.rand(count, 2, generator=generator) * torch.tensor([size[1], size[0]]) * 1.2 - 2
+    sigma = 0.5 + 0.1 * min(size) * torch.rand(count, 1, generator=generator)
+    factors = torch.rand(count, 3, generator=generator) + torch.tensor([0.4, -0.5, 0.4])
+    colors = torch.rand(count, channels, generator=generator) - 0.2
+    field = GaussianField(means, sigma * factors, colors, size=size)
+    if regions is not None:
+        field.assign_regions(regions)
+    return field
+
+
+def session_of(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return onnxruntime.InferenceSession(model.SerializeToString(), options)
+
+
+def decode(session: onnxruntime.InferenceSession, size: tuple[int, int], **feeds: object) -> Tensor:
+    (picture,) = session.run(None, {"size": np.array(size), **feeds})
+    return torch.from_numpy(picture)[0]
+
+
+def assert_same(
+    field: GaussianField, regions: RegionMap | None, sizes: list[tuple[int, int]], cutoff: float = 1e-4, **options: bool
+) -> None:
+    session = session_of(scene_decoder(field, regions, cutoff=cutoff, **options))  # type: ignore[arg-type]
+    bound = 1e-3 if cutoff >= 1e-4 else 1e-4
+    for size in sizes:
+        with torch.no_grad():
+            want = RegionSplatRenderer(cutoff=cutoff, **options)(field, regions, size)
+        got = decode(session, size)
+        assert got.shape == want.shape
+        assert (got - want).abs().max() < bound, size
+
+
+class TestPicture:
+    @pytest.mark.parametrize("cutoff", [1e-4, 1e-6, 0.0])
+    @pytest.mark.parametrize("kind", ["none", "hard", "soft", "pairs", "fine"])
+    def test_any_size(self, kind: str, cutoff: float) -> None:
+        size = (37, 53)
+        labels = blobs(size, 7)
+        regions = {
+            "none": None,
+            "hard": RegionMap.from_labels(labels),
+            "soft": RegionMap.from_labels(labels, 0.8),
+            "pairs": RegionMap.from_labels(labels, {(2, 5): 0.0, (5, 8): 1.7, (2, 11): 0.6}),
+            "fine": RegionMap.from_labels(blobs((37 * 3, 53 * 3), 7), supersample=3),
+        }[kind]
+        assert_same(scattered(80, size, regions), regions, [size, *SIZES], cutoff)
+
+    @pytest.mark.parametrize("softness", [0.0, 0.7])
+    @pytest.mark.parametrize("count", [1, 2, 50])
+    def test_any_number_of_regions(self, count: int, softness: float) -> None:
+        size = (90, 120)
+        regions = RegionMap.from_labels(blobs(size, count), softness)
+        assert_same(scattered(300, size, regions), regions, [size, (131, 200)])
+
+    @pytest.mark.parametrize("count", [1, 17, 10_000])
+    def test_any_number_of_gaussians(self, count: int) -> None:
+        size = (64, 96)
+        regions = RegionMap.from_labels(blobs(size, 4), 0.7)
+        field = scattered(count, size, regions)
+        field.colors.data /= max(1, count // 300)  # a picture, not a sum of thousands
+        assert_same(field, regions, [size, (100, 100)])
+
+    @pytest.mark.parametrize("channels", [1, 4])
+    def test_channels(self, channels: int) -> None:
+        size = (40, 56)
+        regions = RegionMap.from_labels(blobs(size, 3))
+        assert_same(scattered(60, size, regions, channels), regions, [size, (41, 57)])
+
+    def test_one_pixel_regions_and_narrow_gaussians(self) -> None:
+        size = (33, 34)
+        y, x = torch.meshgrid(*(torch.arange(n) for n in size), indexing="ij")
+        regions = RegionMap.from_labels((y + x) % 2)
+        field = scattered(100, size, regions)
+        field.cholesky.data[::2] *= 0.02
+        assert_same(field, regions, [size, (66, 68)])
+        assert_same(field, regions, [size, (66, 68)], 1e-6)
+
+    def test_needles_giants_and_absent(self) -> None:
+        field = GaussianField(
+            torch.tensor([[20.0, 20.0], [1e5, 0.0], [30.0, 10.0], [-400.0, 20.0], [10.0, 30.0]]),
+            torch.tensor([[1e3, 1e3, 0.3], [1.0, 0.0, 1.0], [1e4, 0.0, 1e4], [100.0, 0.0, 5.0], [2e-6, 0.0, 2e-6]]),
+            torch.full((5, 3), 0.3),
+            size=(48, 64),
+        )
+        assert_same(field, None, [(48, 64), (96, 128), (47, 65)])
+        assert "1 Gaussians that touch no pixel" in describe_decoder(scene_decoder(field))["left_out"]  # type: ignore[operator]
+
+    def test_nothing_to_draw(self) -> None:
+        field = GaussianField(
+            torch.tensor([[-1e4, 0.0]]), torch.tensor([[1.0, 0.0, 1.0]]), torch.ones(1, 3), size=(20, 30)
+        )
+        assert decode(session_of(scene_decoder(field)), (40, 50)).abs().max() == 0
+
+    def test_opacities_and_clamp(self) -> None:
+        field = GaussianField(
+            torch.rand(20, 2) * 30, torch.tensor([[4.0, 0.0, 4.0]]).repeat(20, 1), 2 * torch.rand(20, 3) - 0.5,
+            opacities=torch.rand(20), size=(30, 30),
+        )  # fmt: skip
+        assert_same(field, None, [(30, 30), (60, 40)], clamp=True)
+
+
+class TestInteractive:
+    def test_view_and_visible(self) -> None:
+        size = (48, 80)
+        regions = RegionMap.from_labels(blobs(size, 5), 0.6)
+        field = scattered(150, size, regions)
+        session = session_of(scene_decoder(field, regions, interactive=True))
+        whole = np.array([0, 0, 80, 48], np.float32)
+        every = np.ones(5, np.float32)
+        with torch.no_grad():
+            large = RegionSplatRenderer()(field, regions, (48 * 8, 80 * 8))
+        assert (decode(session, (48 * 8, 80 * 8), view=whole, visible=every) - large).abs().max() < 1e-3
+        # a part at the same scale, across tiles
+        part = decode(session, (100, 200), view=np.array([10, 7, 35, 19.5], np.float32), visible=every)
+        assert (part - large[:, 56:156, 80:280]).abs().max() < 1e-3
+        # beyond the border there is what the formula says, and nothing breaks
+        assert torch.isfinite(
+            decode(session, (50, 50), view=np.array([-30, -30, 5, 5], np.float32), visible=every)
+        ).all()
+        for hidden in range(5):
+            factor = every.copy()
+            factor[hidden] = 0
+            left = field.subset(field.region_ids != regions.ids[hidden])
+            with torch.no_grad():
+                want = RegionSplatRenderer()(left, regions)
+            assert (decode(session, size, view=whole, visible=factor) - want).abs().max() < 1e-3
+
+    def test_far_in(self) -> None:
+        size = (48, 80)
+        regions = RegionMap.from_labels(blobs(size, 5))
+        session = session_of(scene_decoder(scattered(150, size, regions), regions, interactive=True))
+        view = np.array([40, 24, 40.5, 24.4], np.float32)
+        assert torch.isfinite(decode(session, (400, 500), view=view, visible=np.ones(5, np.float32))).all()
+
+
+class TestFile:
+    def test_metadata_and_what_was_left_out(self) -> None:
+        size = (64, 96)
+        labels = torch.zeros(size, dtype=torch.long)
+        labels[:, 40:] = 7
+        hard = RegionMap.from_labels(labels)
+        field = scattered(30, size, hard)
+        field.means.data[0] = -1e4
+        facts = describe_decoder(scene_decoder(field, hard, recipe="best"))
+        assert facts["region_ids"] == [0, 7] and facts["recipe"] == "best" and facts["contours"] == "hard"
+        assert facts["format"] == "kcgs.decoder" and facts["height"] == "64" and facts["precision"] == "fp32"
+        said = " ".join(facts["left_out"])  # type: ignore[arg-type]
+        assert (
+            "memberships in 20 of 24 tiles" in said
+            and "soft weights" in said
+            and "Gaussians that touch no pixel" in said
+        )
+        plain = describe_decoder(scene_decoder(scattered(30, size)))
+        assert plain["contours"] == "none" and "regions: the scene has one" in plain["left_out"]  # type: ignore[operator]
+
+    def test_leaves_out_operators(self) -> None:
+        size = (64, 96)
+        labels = torch.zeros(size, dtype=torch.long)
+        labels[:, 40:] = 1
+
+        def operators(field: GaussianField, regions: RegionMap | None, **options: bool) -> set[str]:
+            return {node.op_type for node in scene_decoder(field, regions, **options).graph.node}  # type: ignore[arg-type]
+
+        soft, hard = (RegionMap.from_labels(labels, s) for s in (0.7, 0.0))
+        field = scattered(30, size, hard)
+        none, some = operators(field, None), operators(field, hard)
+        assert "ReduceMax" in some and not any(name.startswith("Scatter") for name in some | operators(field, soft))
+        assert "Clip" in operators(field, None, clamp=True)
+        counts = [len(scene_decoder(field, m).graph.node) for m in (None, hard)]
+        assert counts[0] < counts[1]
+        assert not {"Loop", "If", "NonZero"} & (none | some)
+
+    def test_same_scene_same_bytes(self) -> None:
+        field = scattered(30, (40, 60))
+        assert len({scene_decoder(field).SerializeToString(deterministic=True) for _ in range(2)}) == 1
+
+    def test_bytes_of_a_scene_with_regions(self, tmp_path: object) -> None:
+        from kcgs.io import scene_bytes
+
+        size = (480, 854)
+        regions = RegionMap.from_labels(blobs(size, 6), 0.7)
+        field = scattered(1250, size, regions)
+        field.cholesky.data *= 0.2
+        assert write_model(scene_decoder(field, regions), f"{tmp_path}/d.onnx") < 2.5 * scene_bytes(field, regions)
+
+    def test_half_precision(self) -> None:
+        field = scattered(40, (40, 60))
+        exact, half = (scene_decoder(field, precision=p) for p in ("fp32", "fp16"))
+        assert describe_decoder(half)["precision"] == "fp16"
+        assert half.ByteSize() < exact.ByteSize()
+        change = (decode(session_of(exact), (80, 120)) - decode(session_of(half), (80, 120))).abs().max()
+        assert 0 < change < 1 / 255
+
+    def test_half_precision_refused_where_it_shows(self) -> None:
+        field = scattered(4, (40, 60))
+        field.colors.data = torch.tensor([[90.03], [-90.03], [70.02], [-70.02]]).repeat(1, 3)
+        field.means.data, field.cholesky.data = torch.full((4, 2), 20.3), torch.tensor([[9.01, 0.3, 8.7]]).repeat(4, 1)
+        field.cholesky.data += 0.003 * torch.arange(4)[:, None]
+        with pytest.raises(ValueError, match=r"precision must be fp32 .* changes a value of the picture by 0\.\d+"):
+            scene_decoder(field, precision="fp16")
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            ({"field": 3}, "field must be a GaussianField"),
+            ({"regions": "x"}, "regions must be a RegionMap"),
+            ({"regions": torch.zeros(3, 4).long()}, "regions must be one map of the field's size"),
+            ({"regions": torch.zeros(2, 20, 30).long()}, "regions must be one map"),
+            ({"regions": torch.zeros(20, 30).long()}, "field must have region_ids"),
+            ({"precision": "fp8"}, "precision must be one of"),
+            ({"cutoff": 2.0}, "cutoff must"),
+        ],
+    )  # fmt: skip
+    def test_says_what_is_wrong(self, change: dict[str, object], words: str) -> None:
+        with pytest.raises((ValueError, TypeError), match=words):
+            scene_decoder(**{"field": scattered(5, (20, 30)), **change})  # type: ignore[arg-type]
+
+    def test_resized_map(self) -> None:
+        regions = RegionMap.from_labels(blobs((20, 30), 3), 0.7)
+        field = scattered(5, (40, 60), regions.resize((40, 60)))
+        with pytest.raises(ValueError, match="resized"):
+            scene_decoder(field, regions.resize((40, 60)))
+
+    def test_batch(self) -> None:
+        with pytest.raises(ValueError, match="unbatched"):
+            scene_decoder(GaussianField(torch.rand(2, 3, 2), torch.ones(2, 3, 3), torch.rand(2, 3, 3), size=(8, 8)))
+
+
+def test_chains_with_kornia() -> None:
+    """A decoder before a graph of another maker, through Kornia's own way of chaining."""
+    from kornia.onnx import ONNXSequential
+
+    field = scattered(20, (32, 48))
+    decoder = scene_decoder(field)
+    picture = onnx.helper.make_tensor_value_info("image_in", onnx.TensorProto.FLOAT, [1, 3, "height", "width"])
+    gray = onnx.helper.make_tensor_value_info("gray", onnx.TensorProto.FLOAT, [1, 1, "height", "width"])
+    weights = onnx.numpy_helper.from_array(np.array([0.299, 0.587, 0.114], np.float32).reshape(1, 3, 1, 1), "weights")
+    nodes = [
+        onnx.helper.make_node("Mul", ["image_in", "weights"], ["weighted"]),
+        onnx.helper.make_node("ReduceSum", ["weighted", "axis"], ["gray"], keepdims=1),
+    ]
+    axis = onnx.numpy_helper.from_array(np.array([1]), "axis")
+    graph = onnx.helper.make_graph(nodes, "to_gray", [picture], [gray], [weights, axis])
+    to_gray = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 20)], ir_version=10)
+    chain = ONNXSequential(decoder, to_gray, io_maps=[[("image", "image_in")]])
+    (got,) = chain(np.array([40, 50]))
+    with torch.no_grad():
+        want = RegionSplatRenderer()(field, size=(40, 50))
+    assert np.abs(got[0, 0] - (want * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0).numpy()).max() < 1e-3
