@@ -9,6 +9,7 @@ from collections.abc import Callable
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import ClassVar
 from urllib.parse import quote, urlencode
 
 from kcgs.functional import RegionMap
@@ -21,7 +22,11 @@ _PAGE = Path(__file__).resolve().parent.parent / "export" / "web" / "dist"
 class _Handler(SimpleHTTPRequestHandler):
     """Serves the page's files, and what was put beside them."""
 
-    extensions_map = {**SimpleHTTPRequestHandler.extensions_map, ".mjs": "text/javascript", ".wasm": "application/wasm"}
+    extensions_map: ClassVar[dict[str, str]] = {  # type: ignore[misc]
+        **SimpleHTTPRequestHandler.extensions_map,
+        ".mjs": "text/javascript",
+        ".wasm": "application/wasm",
+    }
 
     def __init__(self, *args: object, extra: Path, **kwargs: object) -> None:
         self.extra = extra

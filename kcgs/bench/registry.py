@@ -5,9 +5,9 @@ from __future__ import annotations
 from importlib import import_module
 from pathlib import Path
 
-_EXPERIMENTS = ("demo", "render", "fit")
+_EXPERIMENTS = ("demo", "render", "fit", "zoo")
 # those that have groups to choose from
-_GROUPED = ("fit",)
+_GROUPED = ("fit", "zoo")
 
 
 def available_experiments() -> tuple[str, ...]:

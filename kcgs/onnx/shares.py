@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .axis import FLOAT, Axis
-from .graph import Graph, Value
+from .axis import FLOAT, INT32, Axis
+from .graph import Graph, Value, smallest
 from .lists import TILE, Tiles, margin
 
 _STEPS = 65535
@@ -71,7 +71,17 @@ class Windows:
         return g("Add", shares, g("Mul", rest, g("Cast", g.constant(last), to=FLOAT)))
 
     def _hard(self, chosen: NDArray[np.int64], regions: int) -> Value:
+        """Labels are stored in as few bits as tell a tile's regions apart."""
         g = self.g
-        stored = np.stack([self.tiles.windows[tile].numpy() for tile in chosen.tolist()]).astype(np.uint8)
-        numbers = np.arange(regions, dtype=np.uint8)[:, None, None]
-        return g("Cast", g("Equal", g.constant(stored[:, None].swapaxes(2, 3)), numbers), to=FLOAT)
+        labels = np.stack([self.tiles.windows[tile].numpy() for tile in chosen.tolist()]).swapaxes(1, 2)
+        bits = next(b for b in (1, 2, 4, 8, 16) if regions <= 1 << b)
+        count = max(1, 8 // bits)
+        places = (1 << bits) ** np.arange(count)
+        width = -(-self.side // count) * count
+        padded = np.pad(labels, ((0, 0), (0, 0), (0, width - self.side))).reshape(*labels.shape[:2], -1, count)
+        packed = g("Cast", g.constant(smallest((padded * places).sum(-1))), to=INT32)
+        unpacked = g("Div", g("Unsqueeze", packed, g.constant([3])), places.astype(np.int32))
+        unpacked = g("Mod", unpacked, np.int32(1 << bits))
+        unpacked = g("Reshape", unpacked, g.constant([len(chosen), 1, self.side, width]))
+        unpacked = g("Slice", unpacked, g.constant([0]), g.constant([self.side]), g.constant([3]))
+        return g("Cast", g("Equal", unpacked, np.arange(regions, dtype=np.int32)[:, None, None]), to=FLOAT)
