@@ -73,7 +73,7 @@ def fit_command(
         settings |= {"refine": False, "release": False}
     elif regions == "auto":
         # nobody gave these contours, so none are to be kept near
-        settings["max_move"] = "any"
+        settings |= {"max_move": "any", "contour_rise": 2.5}
     config = FitConfig.from_recipe(
         recipe, backend=backend.value, **{k: v for k, v in settings.items() if v is not None}
     )

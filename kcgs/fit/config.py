@@ -63,6 +63,12 @@ class FitConfig(BaseModel):
         3.0, description="how far a contour may move from the given map, in pixels, at least 1; any: as far as it likes"
     )
     contour_price: float = Field(0.003, ge=0.0, description="squared error that a pixel of contour must save")
+    contour_rise: float = Field(
+        1.5,
+        ge=1.0,
+        description="factor by which a moved contour may raise the squared error about it, for Gaussians adapt to it; "
+        "while they are added: later moves must lower it",
+    )
     release: bool = Field(False, description="let regions go where a trial says that they do not help")
 
     # The descent

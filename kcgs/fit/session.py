@@ -28,8 +28,6 @@ from .widths import choose_widths
 _LEAST_AREA = 0.7
 # of smoothed contours
 _SUPERSAMPLE = 4
-# by which moved contours may raise the squared error about them while Gaussians are added, since those adapt to them
-_LARGEST_RISE = 1.5
 # how often contours move after growth, and then only where that helps at once
 _SETTLINGS = 4
 # share of the seconds that a fit may spend on moving contours
@@ -150,7 +148,7 @@ class Session:
         self.wanted = wanted
         self.additions += 1
         if self.additions % _ADDITIONS_A_REFINEMENT == 0:
-            self.refine(_LARGEST_RISE, choose=self.additions % _ADDITIONS_A_CHOICE == _ADDITIONS_A_REFINEMENT)
+            self.refine(self.config.contour_rise, choose=self.additions % _ADDITIONS_A_CHOICE == _ADDITIONS_A_REFINEMENT)
         residual = self.image - self.draw()
         count = wanted - len(self.descent.tensors()[0])
         found = propose(residual, self.drawn, count, sigmas=_GROWTH_SIGMAS, backend=self.config.backend)
