@@ -148,7 +148,9 @@ class Session:
         self.wanted = wanted
         self.additions += 1
         if self.additions % _ADDITIONS_A_REFINEMENT == 0:
-            self.refine(self.config.contour_rise, choose=self.additions % _ADDITIONS_A_CHOICE == _ADDITIONS_A_REFINEMENT)
+            self.refine(
+                self.config.contour_rise, choose=self.additions % _ADDITIONS_A_CHOICE == _ADDITIONS_A_REFINEMENT
+            )
         residual = self.image - self.draw()
         count = wanted - len(self.descent.tensors()[0])
         found = propose(residual, self.drawn, count, sigmas=_GROWTH_SIGMAS, backend=self.config.backend)
