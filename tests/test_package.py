@@ -34,7 +34,18 @@ def test_public_names() -> None:
 
 
 def test_import_is_light() -> None:
-    heavy = ("skimage", "matplotlib", "torchmetrics", "onnx", "onnx_ir", "onnxruntime", "typer", "rich", "kornia", "scipy")
+    heavy = (
+        "skimage",
+        "matplotlib",
+        "torchmetrics",
+        "onnx",
+        "onnx_ir",
+        "onnxruntime",
+        "typer",
+        "rich",
+        "kornia",
+        "scipy",
+    )
     code = f"import sys, kcgs; print([m for m in {heavy!r} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"

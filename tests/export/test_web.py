@@ -537,5 +537,5 @@ class TestSources:
 
     def test_only_needed_files_are_shipped(self, site: tuple[Path, str]) -> None:
         assets = sorted(os.listdir(site[0] / "assets"))
-        assert [Path(name).suffix for name in assets].count(".wasm") == 1
+        assert [Path(name).suffix for name in assets].count(".wasm") == 2
         assert not any(name.endswith((".mjs", ".map")) for name in assets)

@@ -1,0 +1,136 @@
+"""export, view and models from the shell."""
+
+from __future__ import annotations
+
+import json
+import threading
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+
+from kcgs import GaussianField, RegionMap, load, save
+from kcgs.cli import main
+from kcgs.nn.renderer import render_image
+from kcgs.view import serve
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr("sys.argv", ["kcgs", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    labels = torch.zeros(32, 48, dtype=torch.long)
+    labels[:, 20:] = 4
+    regions = RegionMap.from_labels(labels, 0.7)
+    field = GaussianField.random(30, (32, 48), seed=0)
+    field.assign_regions(regions)
+    save(tmp_path / "scene.safetensors", field, regions, metadata={"recipe": "best"})
+    return tmp_path / "scene.safetensors"
+
+
+class TestExport:
+    def test_scene(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: Path) -> None:
+        out = scene.with_name("decoder.onnx")
+        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--interactive", "--json") == 0
+        facts = json.loads(capsys.readouterr().out)
+        assert facts["recipe"] == "best" and facts["bytes"] == out.stat().st_size and facts["left_out"]
+        names = [i.name for i in onnxruntime.InferenceSession(str(out)).get_inputs()]
+        assert names == ["size", "view", "visible"]
+
+    def test_generic_and_half(self, monkeypatch: pytest.MonkeyPatch, scene: Path) -> None:
+        out = scene.with_name("generic.onnx")
+        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic") == 0
+        assert len(onnxruntime.InferenceSession(str(out)).get_inputs()) == 5
+        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic", "--interactive") == 2
+        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--precision", "fp16", "--clamp") == 0
+        (drawn,) = onnxruntime.InferenceSession(str(out)).run(None, {"size": np.array([32, 48])})
+        loaded = load(scene)
+        want = render_image(loaded.field, loaded.regions).numpy()
+        assert np.abs(drawn[0] - want).max() < 1 / 255
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            (["-o", "decoder.txt"], "--output must end in .onnx"),
+            (["-o", "decoder.onnx", "--cutoff", "3"], "cutoff must"),
+        ],
+    )
+    def test_errors(
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+        scene: Path,
+        arguments: list[str],
+        words: str,
+    ) -> None:
+        monkeypatch.chdir(scene.parent)
+        assert run(monkeypatch, "export", str(scene), *arguments) == 1
+        assert words in capsys.readouterr().err
+        assert not list(scene.parent.glob("decoder*"))
+
+    def test_truncated_scene(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: Path
+    ) -> None:
+        scene.write_bytes(scene.read_bytes()[:300])
+        assert run(monkeypatch, "export", str(scene), "-o", str(scene.with_name("d.onnx"))) == 1
+        assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+class TestZoo:
+    def test_models_and_render(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    ) -> None:
+        assert run(monkeypatch, "models", "--json") == 0
+        listed = json.loads(capsys.readouterr().out)
+        assert "chart-2x3" in listed
+        assert run(monkeypatch, "render", "zoo:chart-2x3", "-o", str(tmp_path / "chart.png")) == 0
+        assert (tmp_path / "chart.png").stat().st_size > 0
+        assert run(monkeypatch, "render", "zoo:nothing", "-o", str(tmp_path / "chart.png")) == 2
+        assert "zoo entry must be one of" in " ".join(capsys.readouterr().err.split())
+
+
+class TestView:
+    def test_serves_the_page_and_the_decoder_on_loopback(self, tmp_path: Path) -> None:
+        (tmp_path / "page").mkdir()
+        (tmp_path / "page" / "index.html").write_text("<p>page</p>")
+        (tmp_path / "photo.PNG").write_bytes(b"png")
+        said: list[str] = []
+        field = GaussianField.random(5, (8, 9), seed=0)
+        serving = threading.Thread(
+            target=serve,
+            args=(field, None),
+            kwargs={
+                "browser": False,
+                "say": said.append,
+                "page": tmp_path / "page",
+                "original": tmp_path / "photo.PNG",
+            },
+            daemon=True,
+        )
+        serving.start()
+        for _ in range(1000):
+            if said:
+                break
+            serving.join(0.02)
+        url = said[0].split(" ")[0]
+        assert url.startswith("http://127.0.0.1:") and "original=scene/original.png" in url
+        root = url.partition("?")[0]
+        assert urllib.request.urlopen(root).read() == b"<p>page</p>"
+        answer = urllib.request.urlopen(root + "scene/decoder.onnx")
+        assert answer.headers["Cross-Origin-Embedder-Policy"] == "require-corp"
+        onnxruntime.InferenceSession(answer.read())
+        with pytest.raises(urllib.error.HTTPError):
+            urllib.request.urlopen(root + "scene/../../secret")
+
+    def test_page_that_is_not_built(self, tmp_path: Path) -> None:
+        with pytest.raises(FileNotFoundError, match="npm --prefix export/web"):
+            serve(GaussianField.random(5, (8, 9)), None, page=tmp_path)

@@ -1,0 +1,92 @@
+"""Every scene of the zoo is what its manifest says, and draws what it was fitted to."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+
+import kcgs
+from kcgs.bench.zoo import PLANS, picture, run
+from kcgs.fit import FitConfig
+from kcgs.functional import psnr
+from kcgs.io import load
+from kcgs.nn.renderer import render_image
+from kcgs.zoo import Entry, entries, find
+
+MODELS = Path(kcgs.__file__).resolve().parent.parent / "models"
+if not MODELS.is_dir():
+    pytest.skip("the zoo comes with a checkout", allow_module_level=True)
+ENTRIES = entries()
+
+
+def test_zoo_is_whole_and_small() -> None:
+    assert [entry.name for entry in ENTRIES] == list(PLANS)
+    files = [path for path in MODELS.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 5_000_000
+    assert not list(MODELS.rglob("*.py")), "models are data, never imported"
+
+
+@pytest.mark.parametrize("entry", ENTRIES, ids=[entry.name for entry in ENTRIES])
+def test_entry(entry: Entry) -> None:
+    path = find(f"zoo:{entry.name}")
+    assert path.stat().st_size == entry.bytes
+    scene = load(path)
+    assert len(scene.field) == entry.num_gaussians
+    image, _ = picture(PLANS[entry.name].picture)
+    assert float(psnr(render_image(scene.field, scene.regions), image)) == pytest.approx(entry.psnr, abs=0.02)
+    folder = path.parent
+    FitConfig(**json.loads((folder / "recipe.json").read_text()))
+    assert entry.licence in (folder / "card.md").read_text() and (folder / "preview.png").is_file()
+    if entry.decoder is None:
+        return
+    decoder = (MODELS / entry.decoder).read_bytes()
+    assert hashlib.sha256(decoder).hexdigest() == entry.decoder_sha256
+    session = onnxruntime.InferenceSession(decoder)
+    for factor in (1, 2):
+        size = (factor * image.shape[1], factor * image.shape[2])
+        feeds = {
+            "size": np.array(size),
+            "view": np.array([0, 0, image.shape[2], image.shape[1]], np.float32),
+            "visible": np.ones(entry.num_regions, np.float32),
+        }
+        (drawn,) = session.run(None, feeds)
+        want = render_image(scene.field, scene.regions, size)
+        assert (torch.from_numpy(drawn)[0].clamp(0, 1) - want).abs().max() < 1e-3
+
+
+class TestErrors:
+    def test_no_zoo(self, tmp_path: Path) -> None:
+        with pytest.raises(FileNotFoundError, match="with a checkout"):
+            entries(tmp_path)
+
+    def test_unknown_name(self) -> None:
+        with pytest.raises(ValueError, match="zoo entry must be one of chart-2x3"):
+            find("zoo:nothing")
+
+    @pytest.mark.parametrize("text", ["{", '{"entries": [{}]}', '{"entries": [3]}', "[]"])
+    def test_damaged_manifest(self, tmp_path: Path, text: str) -> None:
+        (tmp_path / "manifest.json").write_text(text)
+        with pytest.raises(ValueError, match="must be a zoo's manifest"):
+            entries(tmp_path)
+
+    def test_changed_file(self, tmp_path: Path) -> None:
+        entry = ENTRIES[0]
+        (tmp_path / "manifest.json").write_text(json.dumps({"entries": [entry._asdict()]}))
+        (tmp_path / entry.name).mkdir()
+        (tmp_path / entry.scene).write_bytes(b"other")
+        with pytest.raises(ValueError, match="missing or was changed"):
+            find(entry.name, tmp_path)
+
+
+def test_zoo_can_be_made(tmp_path: Path) -> None:
+    run(tmp_path, quick=True, only="chart-2x3")
+    (made,) = entries(tmp_path)
+    assert made.name == "chart-2x3" and find("chart-2x3", tmp_path).is_file()
+    with pytest.raises(ValueError, match="only must name scenes"):
+        run(tmp_path, only="chart-3x2")
