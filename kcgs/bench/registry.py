@@ -5,9 +5,9 @@ from __future__ import annotations
 from importlib import import_module
 from pathlib import Path
 
-_EXPERIMENTS = ("demo", "render", "fit", "zoo")
+_EXPERIMENTS = ("demo", "render", "fit", "decode", "zoo")
 # those that have groups to choose from
-_GROUPED = ("fit", "zoo")
+_GROUPED = ("fit", "decode", "zoo")
 
 
 def available_experiments() -> tuple[str, ...]:

@@ -14,11 +14,13 @@ from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 
 from .axis import DOUBLE, INT64, Axis
+from .drawing import Drawing
 from .graph import Graph, Value, smallest
+from .groups import Baked, Group, bake, group_tiles
 from .lists import Tiles, find_tiles, list_gaussians
 from .metadata import describe
-from .scene import Baked, Drawing, Group, bake, group_tiles
 from .shares import Windows
+from .stored import Stored
 
 PRECISIONS = ("fp32", "fp16")
 # change of a value of the picture that float16 may make
@@ -104,7 +106,8 @@ class _Plan:
         """Build the graph."""
         g = Graph()
         down, across, visible = self._inputs(g)
-        drawing = Drawing(g, self.baked, down, across, self.cutoff, visible, half=precision == "fp16")
+        stored = Stored(g, self.baked, self.groups, self.tiles, visible, half=precision == "fp16")
+        drawing = Drawing(g, stored, down, across, self.cutoff)
         picture = _assemble(g, self._blocks(g, drawing), down, across, drawing.channels)
         if self.clamp:
             picture = g("Clip", picture, np.float32(0), np.float32(1))
@@ -143,7 +146,7 @@ class _Plan:
             start, stop = (g("Gather", at, g.constant([number])) for at in (starts, stops))
             chosen = g("Slice", order, start, stop, g.constant([0]))
             place = g("Min", g("Gather", slots, chosen), len(group.tiles) - 1)
-            drawn.append(drawing.group(group, tiles, chosen, place, windows))
+            drawn.append(drawing.group(number, chosen, place, windows))
         # one black block for all that nothing touches
         black = g("Concat", g.constant([1, drawing.channels]), drawing.pixels, axis=0)
         drawn.append(g("Expand", np.float32(0), black))

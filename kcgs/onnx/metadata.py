@@ -9,8 +9,8 @@ from importlib.metadata import version
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 
+from .groups import Group
 from .lists import Entries, Tiles
-from .scene import Group
 
 FORMAT = "kcgs.decoder"
 FORMAT_VERSION = "1"

@@ -59,16 +59,18 @@ class Windows:
     def _soft(self, chosen: NDArray[np.int64], regions: int) -> Value:
         """All but the last region's are stored, in 65,535 steps; they sum to one."""
         g = self.g
-        stored = np.zeros((len(chosen), regions - 1, self.side, self.side), np.uint16)
-        last = np.zeros((len(chosen), regions, 1, 1), bool)
-        for at, tile in enumerate(chosen.tolist()):
-            window = self.tiles.windows[tile].numpy()
-            stored[at, : len(window) - 1] = np.round(window[:-1] * _STEPS)
-            last[at, len(window) - 1] = True
-        shares = g("Mul", g("Cast", g.constant(stored.swapaxes(2, 3)), to=FLOAT), np.float32(1 / _STEPS))
+        windows = [self.tiles.windows[tile].numpy() for tile in chosen.tolist()]
+        stored = np.concatenate([window[:-1] for window in windows]).swapaxes(1, 2)
+        counts = np.array([len(window) for window in windows])[:, None]
+        place = np.arange(regions)
+        # which of the stored a region has; the one beyond them is zero
+        which = np.where(place < counts - 1, np.cumsum(counts - 1)[:, None] - counts + 1 + place, len(stored))
+        planes = g("Cast", g.constant(np.round(stored * _STEPS).astype(np.uint16)), to=FLOAT)
+        planes = g("Pad", g("Mul", planes, np.float32(1 / _STEPS)), np.array([0, 0, 0, 1, 0, 0]))
+        shares = g("Gather", planes, g("Cast", g.constant(smallest(which)), to=INT32))
         rest = g("Sub", np.float32(1), g("ReduceSum", shares, g.constant([1]), keepdims=1))
-        shares = g("Pad", shares, np.array([0, 0, 0, 0, 0, 1, 0, 0]))
-        return g("Add", shares, g("Mul", rest, g("Cast", g.constant(last), to=FLOAT)))
+        last = g("Cast", g.constant((place == counts - 1)[:, :, None, None]), to=FLOAT)
+        return g("Add", shares, g("Mul", rest, last))
 
     def _hard(self, chosen: NDArray[np.int64], regions: int) -> Value:
         """Labels are stored in as few bits as tell a tile's regions apart."""
