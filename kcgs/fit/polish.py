@@ -73,6 +73,7 @@ def polish(
         TypeError, ValueError: wrong types; a batched field; sizes, channels, devices that differ; numbers out of range.
 
     Example:
+        >>> from kcgs.functional import region_splat
         >>> regions = RegionMap.from_labels(torch.arange(30).expand(20, 30) // 15)
         >>> field = GaussianField.random(6, (20, 30), regions=regions, seed=1)
         >>> field = polish(field, regions.labels.expand(3, 20, 30) * 0.5 + 0.2, regions)
