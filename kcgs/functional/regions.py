@@ -277,16 +277,20 @@ def _compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
 
 
 def _sample_labels(labels: Tensor, height: int, width: int, factor: int) -> Tensor:
-    spread = (torch.arange(factor, device=labels.device, dtype=torch.float64) + 0.5) / factor - 0.5
-
+    # in integers, so that any program that draws the map puts a pixel on the same side
     def neighbours(new: int, old: int) -> tuple[Tensor, Tensor]:
-        step = old / factor / new
-        centre = (torch.arange(new, device=labels.device, dtype=torch.float64) + 0.5) * step
-        at = (centre[:, None] + spread * min(step, 1.0)).flatten() * factor - 0.5
-        low = at.floor()
-        offset = (((at - low) * _OFFSETS).floor() + 0.5) / _OFFSETS
-        ends = torch.stack([low, low + 1]).long().clamp(0, old - 1)
-        return ends, torch.stack([1 - offset, offset])
+        pixels = old // factor
+        i = torch.arange(new, device=labels.device)[:, None]
+        j = torch.arange(factor, device=labels.device)
+        if pixels <= new:  # sub-pixels spread over a new pixel
+            at = pixels * (2 * (i * factor + j) + 1) - new
+        else:  # over an old one
+            at = factor * (2 * i + 1) * pixels + (2 * j - factor) * new
+        at = at.flatten()
+        low = torch.div(at, 2 * new, rounding_mode="floor")
+        offset = (torch.div((at - 2 * new * low) * _OFFSETS, 2 * new, rounding_mode="floor") + 0.5) / _OFFSETS
+        ends = torch.stack([low, low + 1]).clamp(0, old - 1)
+        return ends, torch.stack([1 - offset, offset]).double()
 
     (rows, down), (cols, across) = neighbours(height, labels.shape[-2]), neighbours(width, labels.shape[-1])
     corners = torch.stack([labels[..., r[:, None], c[None, :]] for r in rows for c in cols])

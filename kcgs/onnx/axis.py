@@ -4,45 +4,47 @@ from __future__ import annotations
 
 import numpy as np
 
-from .graph import Graph, Value
+from .graph import FLOAT, INT64, Graph, Value
 from .lists import TILE
 
-INT32, INT64, FLOAT, DOUBLE = 6, 7, 1, 11  # ONNX's numbers of its types
+# places between two pixel centres that hard contours are sampled at, as in `RegionMap.resize`
 _OFFSETS = 1024
+# parts of a pixel that the ends of a view are given in
+_PARTS = 1 << 20
 
 
 class Axis:
     """Rows, or columns, of the output.
 
     Pixels whose centres lie in the same tile of the scene make a run; runs are cut into blocks of one length, at most
-    `TILE` pixels, with some pixels to spare at the ends of runs. Places are computed in float64 by the same operations
-    as in `RegionMap.resize`, since a contour's pixel falls on one side or the other.
+    `TILE` pixels, with some pixels to spare at the ends of runs. Places are integers over a common denominator: pixel i
+    is at (2 n start + (2 i + 1) (end - start)) / 2 n, so that a contour's pixels fall on the same side everywhere, and
+    not all runtimes have float64.
     """
 
-    def __init__(
-        self, graph: Graph, size: Value, length: int, start: Value | None = None, end: Value | None = None
-    ) -> None:
+    def __init__(self, graph: Graph, size: Value, length: int, ends: tuple[Value, Value] | None = None) -> None:
         """Take the sizes.
 
         Args:
             graph: the graph.
             size: int64 (1,), pixels of the output.
             length: pixels of the scene.
-            start: float64 (1,), where the output begins in the scene; None: 0.
-            end: float64 (1,), where it ends; None: length.
+            ends: float32 (1,) each, the part of the scene that fills the output; None: all of it.
         """
         g = self.g = graph
         self.size, self.tiles = size, -(-length // TILE)
-        extent = g.constant(np.array([length], np.float64))
-        if start is not None and end is not None:
+        start, extent = g.constant([0]), g.constant([length * _PARTS])
+        if ends is not None:
+            start, end = (g("Cast", g("Mul", at, np.float32(_PARTS)), to=INT64) for at in ends)
             extent = g("Sub", end, start)
-        self.step = g("Div", extent, g("Cast", size, to=DOUBLE))  # scene pixels between pixels
+        self.extent, self.parts = extent, g("Mul", size, 2 * _PARTS)  # of the scene; of a pixel of it
+        self.step = g("Div", g("Cast", extent, to=FLOAT), g("Cast", g("Mul", size, _PARTS), to=FLOAT))
         places = g("Range", np.int64(0), g("Squeeze", size), np.int64(1))
-        centre = g("Mul", g("Add", g("Cast", places, to=DOUBLE), np.float64(0.5)), self.step)
-        self.centre = centre if start is None else g("Add", start, centre)
-        tile = g("Floor", g("Div", self.centre, np.float64(TILE)))
-        tile = g("Cast", g("Clip", tile, np.float64(0), np.float64(self.tiles - 1)), to=INT64)
-        self._cut(tile, places)
+        odd = g("Add", g("Mul", places, 2), 1)
+        self.centre = g("Add", g("Mul", odd, extent), g("Mul", g("Mul", size, 2), start))  # in parts
+        # bounded once it is small: onnxruntime 1.31 takes the wrong one of two int64 beyond 32 bits
+        tile = g("Div", self.centre, g("Mul", self.parts, TILE))
+        self._cut(g("Min", g("Max", tile, 0), self.tiles - 1), places)
 
     def _cut(self, tile: Value, places: Value) -> None:
         g = self.g
@@ -62,14 +64,17 @@ class Axis:
         # pixels of each block; those to spare at the end of the last one repeat the last pixel
         within = g("Range", np.int64(0), g("Squeeze", self.side), np.int64(1))
         inside = g("Add", g("Unsqueeze", first, g.constant([1])), within)
-        self.pixels = g("Min", inside, g("Sub", self.size, 1))  # (blocks, side)
+        pixels = g("Min", inside, g("Sub", self.size, 1))  # (blocks, side)
+        # in the coordinates of the block's tile, in parts
+        corner = g("Mul", g("Mul", self.tile, TILE), self.parts)
+        self.local = g("Sub", g("Gather", self.centre, pixels), g("Unsqueeze", corner, g.constant([1])))
         # from the middle of a block, where polynomials are rounded least
-        middle = g("Mul", g("Cast", g("Sub", self.side, 1), to=DOUBLE), np.float64(0.5))
-        centred = g("Sub", g("Cast", within, to=DOUBLE), middle)
-        self.steps = g("Cast", g("Mul", centred, self.step), to=FLOAT)  # (side,)
-        origin = g("Add", g("Gather", self.centre, first), g("Mul", middle, self.step))
-        tile_centre = g("Mul", g("Add", g("Cast", self.tile, to=DOUBLE), np.float64(0.5)), np.float64(TILE))
-        self.origins = g("Cast", g("Sub", origin, tile_centre), to=FLOAT)  # (blocks,), in the tile's coordinates
+        middle = g("Mul", g("Cast", g("Sub", self.side, 1), to=FLOAT), np.float32(0.5))
+        self.steps = g("Mul", g("Sub", g("Cast", within, to=FLOAT), middle), self.step)  # (side,)
+        begin = g("Cast", g("Sub", g("Gather", self.centre, first), corner), to=FLOAT)
+        begin = g("Div", begin, g("Cast", self.parts, to=FLOAT))
+        # (blocks,), from the tile's centre
+        self.origins = g("Add", g("Sub", begin, np.float32(TILE / 2)), g("Mul", middle, self.step))
 
     def weights(self, factor: int, halo: int, soft: bool) -> Value:
         """Weights of a window's labels or pixels at the pixels of each block, (blocks, side * factor, window).
@@ -80,17 +85,19 @@ class Axis:
             soft: whether to interpolate; else offsets are such that no two labels weigh the same.
         """
         g = self.g
-        centre = g("Gather", self.centre, self.pixels)
-        spread = (np.arange(factor) + 0.5) / factor - 0.5
-        narrowed = g("Mul", g.constant(spread), g("Min", self.step, np.array([1.0])))
-        at = g("Add", g("Unsqueeze", centre, g.constant([2])), narrowed)  # (blocks, side, factor)
-        at = g("Sub", g("Mul", at, np.float64(factor)), np.float64(0.5))
-        if not soft:
-            low = g("Floor", at)
-            odd = g("Add", g("Floor", g("Mul", g("Sub", at, low), np.float64(_OFFSETS))), np.float64(0.5))
-            at = g("Add", low, g("Div", odd, np.float64(_OFFSETS)))
-        base = g("Sub", g("Mul", self.tile, factor * TILE), halo)
-        base = g("Reshape", g("Cast", base, to=DOUBLE), g.constant([-1, 1, 1]))
-        at = g("Reshape", g("Cast", g("Sub", at, base), to=FLOAT), g.constant(np.array([0, -1, 1])))
+        if soft:
+            at = g("Div", g("Cast", self.local, to=FLOAT), g("Cast", self.parts, to=FLOAT))
+            at = g("Unsqueeze", g("Add", at, np.float32(halo - 0.5)), g.constant([2]))
+        else:
+            # sub-pixels spread over a pixel of the output, or one of the scene where that is smaller
+            whole = g("Mul", self.extent, 2)
+            spread = g("Where", g("Less", whole, self.parts), whole, self.parts)
+            j = g.constant(2 * np.arange(factor) + 1 - factor)
+            # all in halves of a part of a label; from the first label's centre
+            at = g("Mul", g("Unsqueeze", self.local, g.constant([2])), 2 * factor)
+            at = g("Add", g("Add", at, g("Mul", j, spread)), g("Mul", self.parts, 2 * halo - 1))
+            offsets = g("Max", g("Div", g("Mul", at, _OFFSETS // 2), self.parts), 0)
+            at = g("Div", g("Cast", g("Add", g("Mul", offsets, 2), 1), to=FLOAT), np.float32(2 * _OFFSETS))
+            at = g("Reshape", at, g.constant([0, -1, 1]))
         window = np.arange(factor * TILE + 2 * halo, dtype=np.float32)
         return g("Relu", g("Sub", np.float32(1), g("Abs", g("Sub", at, window))))

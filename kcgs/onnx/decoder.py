@@ -13,9 +13,9 @@ from kcgs._check import check_cutoff
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 
-from .axis import DOUBLE, INT64, Axis
+from .axis import Axis
 from .drawing import Drawing
-from .graph import Graph, Value, smallest
+from .graph import INT64, Graph, Value
 from .groups import Baked, Group, bake, group_tiles
 from .lists import Tiles, find_tiles, list_gaussians
 from .metadata import describe
@@ -119,10 +119,10 @@ class _Plan:
         rows, cols = g.apply("Split", [size], 2, axis=0, num_outputs=2)
         if not self.interactive:
             return Axis(g, rows, self.size[0]), Axis(g, cols, self.size[1]), None
-        view = g("Cast", g.input("view", np.float32, [4]), to=DOUBLE)
+        view = g.input("view", np.float32, [4])
         left, top, right, bottom = g.apply("Split", [view], 4, axis=0, num_outputs=4)
         visible = g.input("visible", np.float32, [1 if self.regions is None else self.regions.num_regions])
-        return Axis(g, rows, self.size[0], top, bottom), Axis(g, cols, self.size[1], left, right), visible
+        return Axis(g, rows, self.size[0], (top, bottom)), Axis(g, cols, self.size[1], (left, right)), visible
 
     def _blocks(self, g: Graph, drawing: Drawing) -> Value:
         """Draw all blocks in raster order, (NB, C, P)."""
@@ -138,8 +138,8 @@ class _Plan:
         one = g.constant([1])
         tile = g("Add", g("Unsqueeze", g("Mul", down.tile, tiles.cols), one), across.tile)
         tile = g("Reshape", tile, g.constant([-1]))
-        own = g("Cast", g("Gather", g.constant(smallest(group_of)), tile), to=INT64)
-        slots = g("Cast", g("Gather", g.constant(smallest(slot_of)), tile), to=INT64)
+        own = g("Cast", g("Gather", g.whole(group_of), tile), to=INT64)
+        slots = g("Cast", g("Gather", g.whole(slot_of), tile), to=INT64)
         order, starts, stops, index = self._sort(g, own)
         drawn = []
         for number, group in enumerate(self.groups):

@@ -15,6 +15,7 @@ from onnx_ir.tape import Tape
 from kcgs._atomic import atomic_path
 
 OPSET = 20
+INT32, INT64, FLOAT = 6, 7, 1  # ONNX's numbers of its types
 _IR_VERSION = 10
 _SUFFIX = ".onnx"
 
@@ -57,6 +58,20 @@ class Graph:
             name = self._fresh("c")
             self._constants[key] = self._tape.initializer(ir.tensor(data, name=name), name=name)
         return self._constants[key]
+
+    def whole(self, numbers: NDArray[np.int64]) -> Value:
+        """Store whole numbers from 0 on in one, two or four bytes each, and make them int32.
+
+        Two bytes are stored as such, low and high: not all runtimes have 16-bit types.
+        """
+        most = int(numbers.max(initial=0))
+        if most >= 1 << 16:
+            return self.constant(numbers.astype(np.int32))
+        low = self("Cast", self.constant((numbers % 256).astype(np.uint8)), to=INT32)
+        if most < 256:
+            return low
+        high = self("Cast", self.constant((numbers // 256).astype(np.uint8)), to=INT32)
+        return self("Add", low, self("Mul", high, np.int32(256)))
 
     def __call__(self, op: str, *operands: Operand, **attributes: object) -> Value:
         """Apply an operator that has one result."""
@@ -109,11 +124,6 @@ class Graph:
     def _fresh(self, prefix: str) -> str:
         self._names[0] += 1
         return f"{prefix}{self._names[0]}"
-
-
-def smallest(numbers: NDArray[np.int64]) -> Array:
-    """Store numbers from 0 on in the narrowest type that holds them."""
-    return numbers.astype(np.min_scalar_type(int(numbers.max(initial=0))))
 
 
 def write_model(model: onnx.ModelProto, path: str | os.PathLike[str]) -> int:

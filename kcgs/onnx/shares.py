@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .axis import FLOAT, INT32, Axis
-from .graph import Graph, Value, smallest
+from .axis import Axis
+from .graph import FLOAT, Graph, Value
 from .lists import TILE, Tiles, margin
 
 _STEPS = 65535
@@ -65,9 +65,9 @@ class Windows:
         place = np.arange(regions)
         # which of the stored a region has; the one beyond them is zero
         which = np.where(place < counts - 1, np.cumsum(counts - 1)[:, None] - counts + 1 + place, len(stored))
-        planes = g("Cast", g.constant(np.round(stored * _STEPS).astype(np.uint16)), to=FLOAT)
+        planes = g("Cast", g.whole(np.round(stored * _STEPS).astype(np.int64)), to=FLOAT)
         planes = g("Pad", g("Mul", planes, np.float32(1 / _STEPS)), np.array([0, 0, 0, 1, 0, 0]))
-        shares = g("Gather", planes, g("Cast", g.constant(smallest(which)), to=INT32))
+        shares = g("Gather", planes, g.whole(which))
         rest = g("Sub", np.float32(1), g("ReduceSum", shares, g.constant([1]), keepdims=1))
         last = g("Cast", g.constant((place == counts - 1)[:, :, None, None]), to=FLOAT)
         return g("Add", shares, g("Mul", rest, last))
@@ -81,7 +81,7 @@ class Windows:
         places = (1 << bits) ** np.arange(count)
         width = -(-self.side // count) * count
         padded = np.pad(labels, ((0, 0), (0, 0), (0, width - self.side))).reshape(*labels.shape[:2], -1, count)
-        packed = g("Cast", g.constant(smallest((padded * places).sum(-1))), to=INT32)
+        packed = g.whole((padded * places).sum(-1))
         unpacked = g("Div", g("Unsqueeze", packed, g.constant([3])), places.astype(np.int32))
         unpacked = g("Mod", unpacked, np.int32(1 << bits))
         unpacked = g("Reshape", unpacked, g.constant([len(chosen), 1, self.side, width]))

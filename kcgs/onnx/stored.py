@@ -9,8 +9,7 @@ import numpy as np
 
 from kcgs.kernels.form import Z_LIMIT
 
-from .axis import FLOAT, INT32
-from .graph import Graph, Value, smallest
+from .graph import FLOAT, Graph, Value
 from .groups import Baked, Group
 from .lists import TILE, Tiles
 
@@ -60,7 +59,7 @@ class Stored:
         else:
             cholesky, colors = g.constant(baked.cholesky), g.constant(baked.colors)
         if visible is not None:
-            shown = g("Gather", visible, g("Cast", g.constant(smallest(baked.region)), to=INT32))
+            shown = g("Gather", visible, g.whole(baked.region))
             colors = g("Mul", colors, g("Unsqueeze", shown, g.constant([1])))
         self._forms = self._whiten(entries, tile, cholesky)
         self._colors = g("Mul", g("Gather", colors, entries), self._real(tile))
@@ -107,7 +106,7 @@ class Stored:
         steps = [np.diff(group.entries, axis=1, prepend=group.entries[:, :1]) for group in self.groups]
         flat = np.concatenate([part.ravel() for part in steps])
         base = np.concatenate([group.entries[:, 0] for group in self.groups]) - np.cumsum(flat)[self._begins]
-        total = g("CumSum", g("Cast", g.constant(smallest(flat)), to=INT32), np.int64(0))
+        total = g("CumSum", g.whole(flat), np.int64(0))
         return g("Add", total, g("Gather", g.constant(base.astype(np.int32)), tile))
 
     def _real(self, tile: Value) -> Value:
@@ -121,7 +120,7 @@ class Stored:
     def _whiten(self, entries: Value, tile: Value, cholesky: Value) -> Value:
         g, cols = self.g, self.tiles.cols
         numbers = np.concatenate([group.tiles for group in self.groups])
-        place = g("Cast", g.constant(smallest(np.stack([numbers % cols, numbers // cols], -1))), to=FLOAT)
+        place = g("Cast", g.whole(np.stack([numbers % cols, numbers // cols], -1)), to=FLOAT)
         centre = g("Mul", g("Add", place, F32(0.5)), F32(TILE))
         offset = g("Sub", g("Gather", centre, tile), g("Gather", g.constant(self.baked.means), entries))
         x, y = g.apply("Split", [offset], 2, axis=1, num_outputs=2)

@@ -326,6 +326,18 @@ class TestPicture:
         page.do("click", on="[data-show=all]")
         assert page.canvas()[1].max() > 0.9
 
+    def test_wasm_where_webgpu_fails(self, page: Browser, decoder: Path) -> None:
+        """The browser of the tests has no GPU: choosing it anyway is a session that fails, said once."""
+        page.evaluate(
+            "(async () => { const select = document.querySelector('#provider'); select.options[0].disabled = false;"
+            "select.value = 'webgpu'; select.dispatchEvent(new Event('change')); await kcgs.settled(); })()"
+        )
+        assert page.do("text", on="[role=status]").startswith("WebGPU could not run this decoder, so WASM draws it")
+        part, got = page.canvas()
+        want = decode(decoder, (part["height"], part["width"]), view=part["rect"], visible=[1, 1, 1])
+        np.testing.assert_allclose(got, np.clip(want, 0, 1), atol=LEVEL)
+        page.evaluate("document.querySelector('#provider').value = 'wasm'")
+
     def test_threads_where_the_page_is_isolated(self, page: Browser, site: tuple[Path, str], decoder: Path) -> None:
         page.do("goto", url=f"{site[1]}isolated/?decoder=waves.onnx")
         assert page.evaluate("crossOriginIsolated") is True

@@ -292,7 +292,8 @@ class TestResize:
         small = RegionMap.from_labels(fine, supersample=factor).resize((side // 2, side // 2))
         shares = small._membership.weights(0, 1, torch.float64)
         exact = torch.nn.functional.avg_pool2d(fine[None].double(), 2 * factor)[0]
-        assert (shares - exact).abs().max() <= 0.25 and (shares.mean() - exact.mean()).abs() < 5e-3
+        # sampled over one pixel of the old map, not averaged over two: as the Gaussians are
+        assert (shares - exact).abs().max() <= 0.5 and (shares.mean() - exact.mean()).abs() < 1e-2
 
     def test_batch(self) -> None:
         maps = torch.stack([blobs(seed=0), blobs(seed=1)])

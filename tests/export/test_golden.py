@@ -1,0 +1,263 @@
+"""export/golden: torch's kernels, stored and fresh decoders all draw what the cases expect."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+
+import kcgs
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer
+from kcgs.onnx import generic_decoder, scene_decoder
+
+ROOT = Path(kcgs.__file__).resolve().parent.parent
+FOLDER = ROOT / "export" / "golden"
+if not FOLDER.is_dir():
+    pytest.skip("not a source checkout: there is no export/golden", allow_module_level=True)
+
+NAMES = ("plain", "hard", "soft", "pairs", "fine", "needle")
+HARD = ("plain", "hard", "needle")
+MOST = 1e-3
+Arrays = dict[str, np.ndarray]
+
+
+def load_maker() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("kcgs_export_golden", FOLDER / "make.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def read(name: str) -> Arrays:
+    with np.load(FOLDER / f"{name}.npz") as file:
+        return dict(file)
+
+
+def size_of(case: Arrays) -> tuple[int, int]:
+    return int(case["height"]), int(case["width"])
+
+
+def scene_of(case: Arrays) -> tuple[GaussianField, RegionMap | None]:
+    """Build the scene from the arrays alone."""
+    numbers = [torch.from_numpy(case[name]) for name in ("means", "cholesky", "colors")]
+    opacities = torch.from_numpy(case["opacities"]) if "opacities" in case else None
+    if "labels" not in case:
+        return GaussianField(*numbers, opacities=opacities, size=size_of(case)), None
+    labels, ids = (torch.from_numpy(case[name].astype(np.int64)) for name in ("labels", "region_ids"))
+    pairs: Any = case["softness"]
+    softness = {(int(a), int(b)): float(w) for a, b, w in pairs} if pairs.ndim else float(pairs)
+    regions = RegionMap.from_labels(labels, softness, supersample=int(case["supersample"]))
+    return GaussianField(*numbers, ids, opacities, size=size_of(case)), regions
+
+
+def wholes(case: Arrays) -> dict[tuple[int, int], np.ndarray]:
+    names = [name for name in case if name.startswith("image_") and name[6].isdigit()]
+    return {tuple(map(int, name[6:].split("x"))): case[name] for name in names}
+
+
+def assert_same(got: Any, want: np.ndarray) -> None:
+    got = np.asarray(got)
+    assert got.shape == want.shape
+    assert np.abs(got - want).max() < MOST
+
+
+def assert_decodes(session: onnxruntime.InferenceSession, case: Arrays) -> None:
+    """Draw every picture of a case."""
+    height, width = size_of(case)
+    every = np.ones_like(case["visible"]) if "visible" in case else np.ones(1, np.float32)
+    whole = np.array([0, 0, width, height], np.float32)
+
+    def decode(size: tuple[int, ...], view: np.ndarray = whole, visible: np.ndarray = every) -> np.ndarray:
+        return session.run(["image"], {"size": np.array(size), "view": view, "visible": visible})[0][0]
+
+    for size, want in wholes(case).items():
+        assert_same(decode(size), want)
+    assert_same(decode(case["image_view"].shape[1:], view=case["view"]), case["image_view"])
+    if "visible" in case:
+        assert_same(decode((height, width), visible=case["visible"]), case["image_visible"])
+
+
+@pytest.fixture(params=NAMES)
+def name(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def case(name: str) -> Arrays:
+    return read(name)
+
+
+class TestCases:
+    def test_all_are_here_and_small(self) -> None:
+        assert {path.stem for path in FOLDER.glob("*.npz")} == set(NAMES) == {p.stem for p in FOLDER.glob("*.onnx")}
+        for name in NAMES:
+            assert sum((FOLDER / f"{name}{suffix}").stat().st_size for suffix in (".npz", ".onnx")) < 64_000
+
+    def test_cover_what_they_are_for(self, name: str, case: Arrays) -> None:
+        own, enlarged, reduced = wholes(case)
+        assert own == size_of(case) and enlarged > own > reduced
+        images = [array for key, array in case.items() if key.startswith("image_")]
+        assert len(images) == (4 if name == "plain" else 5)
+        for image in images:
+            assert image.dtype == np.float32 and image.std() > 0.03
+        if name != "plain":
+            assert set(case["visible"]) == {0, 1}
+            assert np.abs(case["image_visible"] - case[f"image_{own[0]}x{own[1]}"]).max() > 0.1
+        if name == "pairs":
+            assert 0 in case["softness"][:, 2] and len(set(case["softness"][:, 2])) > 3
+        if name == "needle":
+            assert case["colors"].shape[1] == 4
+            assert (case["cholesky"][:, 0] > 50 * case["cholesky"][:, 2]).any()
+
+    def test_made_again_they_are_the_same(self, tmp_path: Path) -> None:
+        maker = load_maker()
+        folders = [tmp_path / "first", tmp_path / "second"]
+        for folder in folders:
+            folder.mkdir()
+            maker.make(folder)
+        for path in sorted(folders[0].iterdir()):
+            assert path.read_bytes() == (folders[1] / path.name).read_bytes(), path.name
+        for name in NAMES:
+            stored = read(name)
+            with np.load(folders[0] / f"{name}.npz") as made:
+                assert list(made) == list(stored)
+                for key, array in made.items():
+                    assert array.dtype == stored[key].dtype
+                    # another processor may add up float64 in another order
+                    most = 1e-6 if key.startswith("image_") else 0
+                    np.testing.assert_allclose(array, stored[key], rtol=0, atol=most)
+
+
+class TestTorch:
+    @pytest.mark.parametrize("kernel", ["cpu", "tiled"])
+    def test_draws_them(self, case: Arrays, kernel: str) -> None:
+        field, regions = scene_of(case)
+        render = RegionSplatRenderer(cutoff=float(case["cutoff"]), backend=kernel)
+        with torch.no_grad():
+            for size, want in wholes(case).items():
+                assert_same(render(field, regions, size), want)
+            if regions is not None:
+                at = regions.index_of(field.region_ids)
+                shown = field.subset(torch.from_numpy(case["visible"])[at] > 0)
+                assert_same(render(shown, regions), case["image_visible"])
+
+    def test_a_view_is_a_cut(self, case: Arrays) -> None:
+        field, regions = scene_of(case)
+        left, top, right, _ = case["view"].tolist()
+        _, height, width = case["image_view"].shape
+        zoom = width / (right - left)
+        x, y = round(left * zoom), round(top * zoom)
+        whole = tuple(round(zoom * side) for side in size_of(case))
+        with torch.no_grad():
+            large = RegionSplatRenderer(cutoff=float(case["cutoff"]))(field, regions, whole)
+        assert_same(large[:, y : y + height, x : x + width], case["image_view"])
+
+
+class Described:
+    """A decoder written from README.md alone, in numpy."""
+
+    def __init__(self, case: Arrays) -> None:
+        self.case, self.size = case, size_of(case)
+        self.colors = case["colors"] * case.get("opacities", np.ones(len(case["means"])))[:, None].astype(float)
+        self.ids = np.unique(case["labels"]) if "labels" in case else np.zeros(1)
+        self.of = np.searchsorted(self.ids, case["region_ids"]) if "labels" in case else np.zeros(len(self.colors), int)
+
+    def picture(self, size: tuple[int, ...], view: Any = None, factors: Any = None) -> np.ndarray:
+        left, top, right, bottom = (0, 0, self.size[1], self.size[0]) if view is None else view.tolist()
+        across, down = (right - left) / size[1], (bottom - top) / size[0]
+        x, y = left + (np.arange(size[1]) + 0.5) * across, top + (np.arange(size[0]) + 0.5) * down
+        l11, l21, l22 = self.case["cholesky"].astype(float).T[:, :, None, None]
+        mx, my = self.case["means"].astype(float).T[:, :, None, None]
+        z1 = (x - mx) / l11
+        z2 = (y[:, None] - my - l21 * z1) / l22
+        weight = np.exp(-(z1**2 + z2**2) / 2)
+        weight[weight < self.case["cutoff"]] = 0
+        if "labels" in self.case:
+            soft = self.case["softness"].ndim or self.case["softness"] > 0
+            weight *= (self.soft(x, y) if soft else self.hard(x, y, across, down))[self.of]
+        colors = self.colors if factors is None else self.colors * factors[self.of][:, None]
+        return np.einsum("nhw,nc->chw", weight, colors)
+
+    def hard(self, x: np.ndarray, y: np.ndarray, across: float, down: float) -> np.ndarray:
+        k = int(self.case["supersample"])
+        spread = (np.arange(k) + 0.5) / k - 0.5
+        corners = []
+        for at, step, length in ((y, down, self.size[0]), (x, across, self.size[1])):
+            fine = (at[:, None] + spread * min(step, 1)).ravel() * k - 0.5
+            low = np.floor(fine)
+            offset = np.floor((fine - low) * 1024) / 1024 + 1 / 2048
+            places = [(low + i).astype(int).clip(0, k * length - 1) for i in (0, 1)]
+            corners.append(list(zip(places, (1 - offset, offset), strict=True)))
+        scores = sum(
+            u[:, None] * v * (self.case["labels"][r[:, None], c] == self.ids[:, None, None])
+            for r, u in corners[0]
+            for c, v in corners[1]
+        )
+        best = scores.argmax(0) == np.arange(len(self.ids))[:, None, None]
+        return best.reshape(-1, len(y), k, len(x), k).mean((2, 4))
+
+    def soft(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        widths = self.case.get("contour_width")
+        widths = np.full(self.size, self.case["softness"]) if widths is None else widths
+        inside = (self.case["labels"] == self.ids[:, None, None]).astype(float)
+        shares = np.empty_like(inside)
+        for i, j in np.ndindex(*self.size):
+            width = float(widths[i, j])
+            dy, dx = np.arange(self.size[0])[:, None] - i, np.arange(self.size[1]) - j
+            near = (np.maximum(np.abs(dy), np.abs(dx)) <= np.ceil(np.round(4 * width, 4))).astype(float)
+            near *= np.exp(-(dy**2 + dx**2) / (2 * width**2)) if width else 1.0
+            shares[:, i, j] = (inside * near).sum((1, 2)) / near.sum()
+        for axis, at in ((1, y), (2, x)):
+            low = np.floor(at - 0.5).astype(int)
+            last = shares.shape[axis] - 1
+            offset = (at - 0.5 - low)[:, None] if axis == 1 else at - 0.5 - low
+            before, after = (shares.take((low + i).clip(0, last), axis) for i in (0, 1))
+            shares = before * (1 - offset) + after * offset
+        return shares
+
+
+class TestDescription:
+    def test_is_enough_to_draw_them(self, case: Arrays) -> None:
+        decoder = Described(case)
+        for size, want in wholes(case).items():
+            assert_same(decoder.picture(size), want)
+        assert_same(decoder.picture(case["image_view"].shape[1:], view=case["view"]), case["image_view"])
+        if "visible" in case:
+            assert_same(decoder.picture(size_of(case), factors=case["visible"]), case["image_visible"])
+
+
+class TestOnnx:
+    def test_stored_decoder(self, name: str, case: Arrays) -> None:
+        path = FOLDER / f"{name}.onnx"
+        model = onnx.load(path)
+        onnx.checker.check_model(model, full_check=True)
+        notes = {entry.key: entry.value for entry in model.metadata_props}
+        assert (int(notes["height"]), int(notes["width"])) == size_of(case)
+        assert json.loads(notes["region_ids"]) == (np.unique(case["labels"]).tolist() if "labels" in case else [0])
+        assert_decodes(onnxruntime.InferenceSession(path), case)
+
+    def test_fresh_decoder(self, case: Arrays) -> None:
+        field, regions = scene_of(case)
+        model = scene_decoder(field, regions, cutoff=float(case["cutoff"]), interactive=True)
+        assert_decodes(onnxruntime.InferenceSession(model.SerializeToString()), case)
+
+    @pytest.mark.parametrize("name", HARD)
+    def test_generic_decoder(self, name: str) -> None:
+        case = read(name)
+        session = onnxruntime.InferenceSession(generic_decoder(cutoff=float(case["cutoff"])).SerializeToString())
+        size = size_of(case)
+        feeds = {name: case[name] for name in ("means", "cholesky", "colors")}
+        if "opacities" in case:
+            feeds["colors"] = feeds["colors"] * case["opacities"][:, None]
+        feeds["region_ids"] = case.get("region_ids", np.zeros(len(case["means"]))).astype(np.int64)
+        feeds["labels"] = case.get("labels", np.zeros(size)).astype(np.int64)
+        assert_same(session.run(["image"], feeds)[0][0], case[f"image_{size[0]}x{size[1]}"])
