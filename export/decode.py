@@ -37,6 +37,7 @@ except ImportError as missing:
 
 MAX_SIDE = 1 << 20
 _FORMAT, _VERSION = "kcgs.decoder", "1"
+_PARTS = 1 << 20
 _SCENE_FORMAT, _SCENE_VERSIONS = "kcgs.scene", ("1", "2")
 _FLOAT, _INTEGER = "tensor(float)", "tensor(int64)"
 _OPTIONAL = {"view": _FLOAT, "visible": _FLOAT}
@@ -222,11 +223,13 @@ def sample_labels(labels: Array, size: tuple[int, int], view: View | None = None
 
 
 def _neighbours(count: int, start: float, extent: float, length: int) -> tuple[Array, Array, Array, Array]:
-    at = start + (np.arange(count) + 0.5) * (extent / count) - 0.5
-    low = np.floor(at)
+    # whole parts of a pixel: a label falls on the same side in every program
+    begin, long = (round(value * _PARTS) for value in (start, extent))
+    whole = 2 * count * _PARTS
+    at = (2 * np.arange(count) + 1) * long + 2 * count * begin - count * _PARTS
+    index = at // whole
     # odd multiples of 1 / 2048: no two labels can have the same share
-    second = 2 * np.floor((at - low) * 1024).astype(np.int64) + 1
-    index = low.astype(np.int64)
+    second = 2 * ((at - index * whole) * 1024 // whole) + 1
     return index.clip(0, length - 1), (index + 1).clip(0, length - 1), 2048 - second, second
 
 

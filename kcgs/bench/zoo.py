@@ -104,6 +104,9 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
         path.write_text(config.model_dump_json(indent=1) + "\n", encoding="utf-8")
     decoder = _write_decoder(folder / "decoder.onnx", name, recipe, result.field, regions)
     drawn = render_image(field, regions)
+    if decoder is not None:
+        # to compare with in the viewer
+        save_image(folder / ("original.webp" if recipe == "best" else "original.jpg"), image)
     shrink = _PREVIEW / max(field.size)
     save_image(folder / "preview.png", render_image(field, regions, _scaled(field.size, shrink)))
     figures = measure(drawn, image, labels)

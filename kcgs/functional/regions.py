@@ -180,10 +180,10 @@ class RegionMap:
             tensor([1, 1, 0, 0, 0, 0])
         """
         height, width = check_size("size", size)
-        if self._origin is not None:
-            return self._origin.resize((height, width))
         if (height, width) == self.size:
             return self
+        if self._origin is not None:
+            return self._origin.resize((height, width))
         k = self.supersample
         if self.softness == 0.0:
             fine = self.labels if self.fine_labels is None else self.fine_labels

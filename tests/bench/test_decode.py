@@ -23,7 +23,8 @@ from kcgs.bench.decode.decoders import (
     truth,
     write_files,
 )
-from kcgs.bench.decode.findings import Row, cutoff_name
+from kcgs.bench.decode.findings import Findings, Row, cutoff_name
+from kcgs.bench.decode.report import write
 from kcgs.bench.decode.scenes import Scene, fitted_scenes, standard_scenes, why_not_fitted
 from kcgs.bench.decode.timing import Entrant, opening, peak_memory, race, ratio
 
@@ -148,6 +149,13 @@ def test_quick_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     report = (tmp_path / "report.md").read_text()
     for words in ("onnxruntime, generic", "small soft", "soft weights: contours are hard", "kcgs bench decode"):
         assert words in report
+    # the long form's tables, from the same numbers
+    kinds = {"threads": int, "cutoff": float, "value": float}
+    numbers = [Row(**{key: kinds.get(key, str)(value) for key, value in row.items()}) for row in rows]
+    (tmp_path / "long").mkdir()
+    write(tmp_path / "long", Findings(numbers, standard_scenes(quick=True), {}, "no data", False))
+    report = (tmp_path / "long" / "report.md").read_text()
+    assert "goals" in report and "(met)" in report and "Without fitted scenes: no data." in report
 
 
 def _pretend(name: str, files: Files, size: tuple[int, int], small: Files) -> float:

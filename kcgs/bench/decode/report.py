@@ -34,7 +34,8 @@ and needs the scene beside it. `export` is the time to make and write both decod
 the files on disk to being ready to draw, onnxruntime's optimisation of the graph, scaling and sampling the label map
 included; the first picture is loading and one drawing. One thread, medians."""
 _MEMORY_TEXT = """MB added at the peak by loading and drawing one picture, on one thread, each in a process of its own
-that has drawn a small scene before."""
+that has drawn a small scene before. At another size that includes sampling the label map, for all but the scene
+decoder."""
 _SWEEP_TEXT = """One thread, the scene's own size, cutoffs of 1e-2, 1/255, 1e-3, 1e-4 and 1e-6; all timed in turns.
 Left and below is better."""
 _LEFT_OUT_TEXT = "What each decoder says that it does without."
