@@ -32,8 +32,10 @@ _SUPERSAMPLE = 4
 _SETTLINGS = 4
 # share of the seconds that a fit may spend on moving contours
 _REFINEMENT_SHARE = 0.1
-# share of the seconds that a fit may have used and still try out its contours at the start
-_TRIALS_SHARE = 0.1
+# share of the seconds that a fit may have used and still try out its contours at the start: that starts it twice more
+_START_SHARE = 0.03
+# what the later trial costs, in iterations, and the share of the seconds that it may take
+_TRIAL_ITERATIONS, _TRIAL_SHARE = 60, 0.1
 # a fit to a target starts with a Gaussian for each square of so many pixels
 _TARGET_SPACING = 64
 _DRAFTS_END = 0.85
@@ -62,7 +64,7 @@ class Session:
         self.begin(_regions_to_draw(image, regions, num_gaussians, config))
         # a map that came with widths keeps them
         self.chooses_widths = config.softness == "auto" and regions is not None and regions.softness == 0.0
-        in_time = self.monitor.seconds() < _TRIALS_SHARE * (config.max_seconds or math.inf)
+        in_time = self.monitor.seconds() < _START_SHARE * (config.max_seconds or math.inf)
         if config.release and self.drawn is not None and self.drawn.supersample == 1 and in_time:
             choose_contours(self)
         if self.drawn is not None and self.drawn.num_regions > num_gaussians:
@@ -200,7 +202,9 @@ class Session:
         if not self.config.release or self.released or progress < self.config.grow_between[1]:
             return
         self.released = True
-        if self.drawn is not None and self.ids is not None and self.drawn.supersample == 1:
+        cost = _TRIAL_ITERATIONS * self.monitor.seconds() / max(1, self.iteration)
+        in_time = cost < _TRIAL_SHARE * (self.config.max_seconds or math.inf)
+        if self.drawn is not None and self.ids is not None and self.drawn.supersample == 1 and in_time:
             release(self)
 
     def finish(self, reason: StopReason) -> FitResult:
