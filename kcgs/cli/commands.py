@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .common import Json, Progress, SceneFile, app, check_output, print_report
+from .segmentation import warn_if_misaligned
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -150,30 +151,6 @@ def eval_command(
 
 
 @app.command()
-def segment(
-    image: ImageFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Label map to write: .png or .npy.")],
-    method: Annotated[str, typer.Option(help="Where the regions come from.")] = "auto",
-    as_json: Json = False,
-) -> None:
-    """Make a label map of an image."""
-    from kcgs.data import load_image, save_labels
-    from kcgs.segment import segment as make_labels
-
-    check_output(output, ".png", ".npy")
-    labels = make_labels(load_image(image), method)
-    save_labels(output, labels)
-    areas = labels.flatten().bincount()
-    report = {
-        "regions": len(areas),
-        "smallest": int(areas.min()),
-        "largest": int(areas.max()),
-        "method": method,
-    }
-    print_report(report, as_json, str(output))
-
-
-@app.command()
 def info(scene: SceneFile, as_json: Json = False) -> None:
     """Say what a scene file holds."""
     from kcgs.io import load
@@ -218,7 +195,9 @@ def _read_regions(regions: str, picture: Tensor) -> Tensor | None:
         return make_labels(picture)
     from kcgs.data import load_labels
 
-    return load_labels(Path(regions))
+    labels = load_labels(Path(regions))
+    warn_if_misaligned(picture, labels, regions)
+    return labels
 
 
 def _mean_softness(regions: RegionMap) -> float:

@@ -3,7 +3,7 @@
 from kcgs.data.charts import ChartSample, chart_2x3, chart_pie
 from kcgs.data.davis import Davis, DavisFrame
 from kcgs.data.images import load_image, save_image
-from kcgs.data.labels import colorize_labels, label_colors, load_labels, save_labels
+from kcgs.data.labels import colorize_labels, label_colors, load_labels, overlay_labels, save_labels
 
 __all__ = [
     "ChartSample",
@@ -15,6 +15,7 @@ __all__ = [
     "label_colors",
     "load_image",
     "load_labels",
+    "overlay_labels",
     "save_image",
     "save_labels",
 ]

@@ -10,7 +10,7 @@ from PIL import Image
 from torch import Tensor
 
 from kcgs._atomic import atomic_path
-from kcgs._check import check_integer
+from kcgs._check import check_floating, check_integer
 from kcgs.data._decode import Array, decode, read_file
 
 MAX_COLORS = 4096
@@ -19,6 +19,18 @@ MAX_COLORS = 4096
 _GOLDEN = 0.6180339887498949  # Steps of this share of the hue circle keep any run of hues spread out.
 _SATURATION = (0.85, 0.55, 0.95, 0.40, 0.75)
 _VALUE = (0.95, 0.80, 0.60, 1.00, 0.42)
+
+# Okabe and Ito's palette, which people with any colour vision tell apart, without its black.
+_SAFE_COLORS = (
+    (0.902, 0.624, 0.0),
+    (0.337, 0.706, 0.914),
+    (0.0, 0.620, 0.451),
+    (0.941, 0.894, 0.259),
+    (0.0, 0.447, 0.698),
+    (0.835, 0.369, 0.0),
+    (0.800, 0.475, 0.655),
+)
+_TINT = 0.45
 
 
 def load_labels(path: str | os.PathLike[str]) -> Tensor:
@@ -161,6 +173,63 @@ def colorize_labels(labels: Tensor) -> Tensor:
     """
     ids, rank = torch.unique(_check_map(labels), return_inverse=True)
     return label_colors(len(ids)).to(labels.device)[rank].permute(2, 0, 1).contiguous()
+
+
+def overlay_labels(image: Tensor, labels: Tensor) -> Tensor:
+    """Draw a label map over its image: the image in grey, every region tinted, contours white between black.
+
+    The seven colours of Okabe and Ito are told apart with any colour vision. Regions that touch have different
+    ones, unless seven neighbours leave none.
+
+    Args:
+        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].
+        labels: :math:`(H, W)` integer, any non-negative ids.
+
+    Returns:
+        :math:`(3, H, W)` float32 RGB in [0, 1], on the CPU.
+
+    Raises:
+        TypeError: ``image`` is no floating or ``labels`` no integer tensor.
+        ValueError: other shapes, sizes that differ, negative ids.
+
+    Example:
+        >>> halves = (torch.arange(8) >= 4).long().expand(6, 8)
+        >>> overlay_labels(torch.full((3, 6, 8), 0.5), halves)[:, 0, ::7]
+        tensor([[0.6809, 0.4267],
+                [0.5558, 0.5927],
+                [0.2750, 0.6863]])
+    """
+    from skimage.color import label2rgb
+    from skimage.segmentation import mark_boundaries
+
+    image = check_floating("image", image, dims=(3,)).detach()
+    regions = _check_map(labels).unique(return_inverse=True)[1].cpu()
+    if image.shape[0] not in (1, 3) or image.shape[1:] != regions.shape:
+        raise ValueError(
+            f"image must have shape (3, H, W) or (1, H, W) with the size of labels, {tuple(regions.shape)}; got "
+            f"{tuple(image.shape)}"
+        )
+    pixels = image.float().clamp(0, 1).expand(3, -1, -1).permute(1, 2, 0).cpu().numpy()
+    colors = _neighbour_colors(regions)[regions].numpy()
+    tinted = label2rgb(colors, pixels, colors=_SAFE_COLORS, alpha=_TINT, bg_label=-1)
+    drawn = mark_boundaries(tinted, regions.numpy(), color=(1, 1, 1), outline_color=(0, 0, 0), mode="inner")
+    return torch.from_numpy(drawn).permute(2, 0, 1).float().clamp(0, 1)
+
+
+def _neighbour_colors(regions: Tensor) -> Tensor:
+    """Return each region's colour by number: in turn, the first that none of its neighbours has."""
+    sides = ((regions[:, :-1], regions[:, 1:]), (regions[:-1], regions[1:]))
+    pairs = torch.cat([torch.stack([a.flatten(), b.flatten()], 1)[(a != b).flatten()] for a, b in sides])
+    neighbours: dict[int, set[int]] = {}
+    for a, b in pairs.unique(dim=0).tolist():
+        neighbours.setdefault(a, set()).add(b)
+        neighbours.setdefault(b, set()).add(a)
+    colors: list[int] = []
+    for region in range(int(regions.max()) + 1):
+        taken = {colors[other] for other in neighbours.get(region, ()) if other < region}
+        free = [color for color in range(len(_SAFE_COLORS)) if color not in taken]
+        colors.append(free[0] if free else region % len(_SAFE_COLORS))
+    return torch.tensor(colors)
 
 
 def _check_map(labels: Tensor) -> Tensor:

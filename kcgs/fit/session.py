@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcgs.functional import RegionMap, region_splat, smooth_contours
+from kcgs.functional import RegionMap, choose_widths, region_splat, smooth_contours
 from kcgs.nn import GaussianField, PruneResult, prune
 
 from .assign import refresh_ids
@@ -22,7 +22,6 @@ from .polish import is_flat, polish
 from .refine import accept_moves, refine_contours
 from .release import choose_contours, release
 from .schedule import make_schedule
-from .widths import choose_widths
 
 # share of its pixels that a region must keep when contours are smoothed
 _LEAST_AREA = 0.7

@@ -1,6 +1,13 @@
 """Stateless public operations: splatting, covariances, label maps, metrics."""
 
-from .contours import smooth_contours
+from .contours import (
+    BoundaryScore,
+    boundary_f_score,
+    coverage,
+    edge_alignment,
+    edge_alignment_map,
+    smooth_contours,
+)
 from .covariance import (
     cholesky_to_conic,
     cholesky_to_covariance,
@@ -10,20 +17,32 @@ from .covariance import (
     support_extent,
 )
 from .metrics import ef_psnr, ef_ssim, ms_ssim, psnr, ssim
+from .polygons import polygon_coverage, polygon_labels
 from .regions import RegionMap, edge_band, lookup_regions
 from .splat import region_splat
+from .widths import BandGain, band_gain, choose_widths
 
 __all__ = [
+    "BandGain",
+    "BoundaryScore",
     "RegionMap",
+    "band_gain",
+    "boundary_f_score",
     "cholesky_to_conic",
     "cholesky_to_covariance",
     "cholesky_to_scale_rotation",
+    "choose_widths",
     "covariance_to_cholesky",
+    "coverage",
+    "edge_alignment",
+    "edge_alignment_map",
     "edge_band",
     "ef_psnr",
     "ef_ssim",
     "lookup_regions",
     "ms_ssim",
+    "polygon_coverage",
+    "polygon_labels",
     "psnr",
     "region_splat",
     "scale_rotation_to_cholesky",

@@ -1,0 +1,242 @@
+"""Networks in ONNX: every kind of output by hand-made graphs, real objects by U-2-Net."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from torch import Tensor
+
+from kcgs.data import Davis
+from kcgs.segment import segment, segment_with_scores
+
+PLAIN: dict[str, Any] = {"mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
+SEQUENCES = ("blackswan", "car-shadow", "cows", "dance-jump", "dog", "horsejump-low", "lucia", "surf", "tennis")
+
+
+def two_colors() -> Tensor:
+    """Red on the left, blue on the right."""
+    image = torch.zeros(3, 24, 40)
+    image[0, :, :25] = 1.0
+    image[2, :, 25:] = 1.0
+    return image
+
+
+def mixing(path: Path, weights: list[list[float]], *, tail: str = "", size: Any = ("h", "w"), **kinds: int) -> Path:
+    """Write a network that is a 1 x 1 convolution of the three channels and perhaps one operator more."""
+    weight = numpy_helper.from_array(np.array(weights, dtype=np.float32)[:, :, None, None], "weight")
+    source = kinds.get("source", TensorProto.FLOAT)
+    nodes = [helper.make_node("Cast", ["image"], ["values"], to=TensorProto.FLOAT)]
+    nodes.append(helper.make_node("Conv", ["values", "weight"], ["mixed" if tail else "out"]))
+    if tail == "ArgMax":
+        nodes.append(helper.make_node("ArgMax", ["mixed"], ["out"], axis=1, keepdims=0))
+    elif tail:
+        nodes.append(helper.make_node(tail, ["mixed"], ["out"], **({"axis": 1} if tail == "Softmax" else {})))
+    result = TensorProto.INT64 if tail == "ArgMax" else TensorProto.FLOAT
+    graph = helper.make_graph(
+        nodes,
+        "mixing",
+        [helper.make_tensor_value_info("image", source, [1, 3, *size])],
+        [helper.make_tensor_value_info("out", result, [None] * (3 if tail == "ArgMax" else 4))],
+        [weight],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    onnx.checker.check_model(model)
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+EYE = [[4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 4.0]]
+LEFT = (torch.arange(40) >= 25).long().expand(24, 40)  # The larger left side is region 0.
+
+
+class TestKinds:
+    @pytest.mark.parametrize(
+        ("tail", "kind", "score"),
+        [
+            ("", "logits", np.exp(4) / (np.exp(4) + 2)),
+            ("", "auto", np.exp(4) / (np.exp(4) + 2)),
+            ("Softmax", "probability", np.exp(4) / (np.exp(4) + 2)),
+            ("Softmax", "auto", np.exp(4) / (np.exp(4) + 2)),
+            ("ArgMax", "label", None),
+            ("ArgMax", "auto", None),
+        ],
+    )
+    def test_several_classes(self, tmp_path: Path, tail: str, kind: str, score: float | None) -> None:
+        path = mixing(tmp_path / "net.onnx", EYE, tail=tail)
+        labels, scores = segment_with_scores(two_colors(), "onnx", model=path, kind=kind, **PLAIN)
+        assert torch.equal(labels, LEFT)
+        if score is None:
+            assert scores is None
+        else:
+            assert scores is not None
+            assert scores.tolist() == pytest.approx([score, score], rel=1e-5)
+
+    @pytest.mark.parametrize(
+        ("weights", "tail", "kind", "scores"),
+        [
+            ([[0.8, 0.0, 0.1]], "", "auto", [1.0, 1.0]),
+            ([[0.8, 0.0, 0.1]], "", "saliency", [1.0, 1.0]),
+            ([[0.8, 0.0, 0.1]], "", "probability", [0.8, 0.9]),
+            ([[2.0, 0.0, -2.0]], "", "auto", [0.8808, 0.8808]),
+            ([[2.0, 0.0, -2.0]], "", "logits", [0.8808, 0.8808]),
+            ([[2.0, 0.0, -2.0]], "Sigmoid", "probability", [0.8808, 0.8808]),
+        ],
+    )
+    def test_one_channel(
+        self, tmp_path: Path, weights: list[list[float]], tail: str, kind: str, scores: list[float]
+    ) -> None:
+        path = mixing(tmp_path / "net.onnx", weights, tail=tail)
+        labels, found = segment_with_scores(two_colors(), "onnx", model=path, kind=kind, **PLAIN)
+        assert torch.equal(labels, LEFT)
+        assert found is not None
+        assert found.tolist() == pytest.approx(scores, abs=1e-4)
+
+    def test_constant_saliency_is_one_region(self, tmp_path: Path) -> None:
+        path = mixing(tmp_path / "net.onnx", [[0.3, 0.3, 0.3]])
+        assert int(segment(two_colors(), "onnx", model=path, kind="saliency", **PLAIN).max()) == 0
+
+    def test_pieces_and_budget(self, tmp_path: Path) -> None:
+        image = two_colors()
+        image[:, :, :8] = image[:, :, 30:31]
+        path = mixing(tmp_path / "net.onnx", EYE)
+        counts = [
+            int(segment(image, "onnx", model=path, **PLAIN, **options).max()) + 1
+            for options in ({"min_size": 1}, {"connected": False}, {"max_regions": 1})
+        ]
+        assert counts == [3, 2, 1]
+
+
+class TestPreprocessing:
+    def test_mean_std_scale(self, tmp_path: Path) -> None:
+        # Of 255 times red less 100, over 50, less 2: above 0 where red is above 200 / 255.
+        path = mixing(tmp_path / "net.onnx", [[1.0, 0.0, 0.0]])
+        image = torch.full((3, 20, 20), 195 / 255)
+        image[0, :, 12:] = 205 / 255
+        options: dict[str, Any] = {"mean": (200.0, 0.0, 0.0), "std": (5.0, 1.0, 1.0), "scale": 255.0}
+        labels, scores = segment_with_scores(image, "onnx", model=path, kind="logits", **options)
+        assert torch.equal(labels, (torch.arange(20) >= 12).long().expand(20, 20))
+        assert scores is not None
+        assert scores.tolist() == pytest.approx([0.7311, 0.7311], abs=1e-3)
+
+    def test_fixed_size_is_taken_and_the_result_enlarged(self, tmp_path: Path) -> None:
+        path = mixing(tmp_path / "net.onnx", EYE, size=(12, 20))
+        assert torch.equal(segment(two_colors(), "onnx", model=path, **PLAIN), LEFT)
+        with pytest.raises(ValueError, match=r"size must be the 12 x 20 that .*net.onnx is made for; got \(8, 8\)"):
+            segment(two_colors(), "onnx", model=path, size=(8, 8))
+
+    def test_chosen_size_and_bytes(self, tmp_path: Path) -> None:
+        path = mixing(tmp_path / "net.onnx", EYE, source=TensorProto.UINT8)
+        labels = segment(two_colors(), "onnx", model=path, size=(48, 80), scale=255.0, kind="logits", **PLAIN)
+        assert torch.equal(labels, LEFT)
+
+    def test_gray_image_and_session(self, tmp_path: Path) -> None:
+        path = mixing(tmp_path / "net.onnx", [[1.0, 0.0, 0.0]])
+        session = onnxruntime.InferenceSession(str(path))
+        image = two_colors()[:1]
+        assert torch.equal(segment(image, "onnx", model=session, output="out", **PLAIN), LEFT)
+
+
+class TestErrors:
+    def test_files(self, tmp_path: Path) -> None:
+        with pytest.raises(FileNotFoundError, match="no ONNX network at .*gone.onnx"):
+            segment(two_colors(), "onnx", model=tmp_path / "gone.onnx")
+        path = mixing(tmp_path / "net.onnx", EYE)
+        path.write_bytes(path.read_bytes()[:60])
+        with pytest.raises(ValueError, match="cannot read .*net.onnx as an ONNX network"):
+            segment(two_colors(), "onnx", model=path)
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"kind": "mask"}, "kind must be one of"),
+            ({"threshold": 2.0}, "threshold must be in"),
+            ({"output": 3}, r"output must be a position or one of the outputs \['out'\]"),
+            ({"output": "in"}, "output must be"),
+            ({"mean": (0.0,)}, "mean must be three numbers"),
+            ({"std": (0.0, 1.0, 1.0)}, "std must be above 0"),
+            ({"scale": 0.0}, "scale must be"),
+            ({"kind": "saliency"}, "saliency output must have one channel"),
+            ({"kind": "label"}, "labels must be whole numbers"),
+            ({"min_size": 0}, "min_size must be"),
+        ],
+    )
+    def test_options(self, tmp_path: Path, options: dict[str, Any], message: str) -> None:
+        path = mixing(tmp_path / "net.onnx", EYE)
+        with pytest.raises(ValueError, match=message):
+            segment(two_colors(), "onnx", model=path, **options)
+
+    def test_input_of_another_shape(self, tmp_path: Path) -> None:
+        graph = helper.make_graph(
+            [helper.make_node("Relu", ["x"], ["y"])],
+            "flat",
+            [helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 224, 224, 3])],
+            [helper.make_tensor_value_info("y", TensorProto.FLOAT, [1, 224, 224, 3])],
+        )
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+        (tmp_path / "net.onnx").write_bytes(model.SerializeToString())
+        with pytest.raises(ValueError, match=r"must be \(1, 3, h, w\); got \[1, 224, 224, 3\]"):
+            segment(two_colors(), "onnx", model=tmp_path / "net.onnx")
+
+
+class TestLseg:
+    def test_nearest_text(self, tmp_path: Path) -> None:
+        path = mixing(tmp_path / "encoder.onnx", EYE)
+        texts = np.array([[0.0, 0.1, 9.0], [0.5, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=np.float32)
+        np.save(tmp_path / "texts.npy", texts)
+        labels, scores = segment_with_scores(
+            two_colors(), "lseg", model=path, embeddings=tmp_path / "texts.npy", **PLAIN
+        )
+        assert torch.equal(labels, LEFT)
+        assert scores is not None
+        assert (scores > 0.99).all()
+        assert torch.equal(labels, segment(two_colors(), "lseg", model=path, embeddings=texts, **PLAIN))
+
+    def test_errors(self, tmp_path: Path) -> None:
+        path = mixing(tmp_path / "encoder.onnx", EYE)
+        with pytest.raises(ValueError, match=r"features must have shape \(1, 5, h, w\)"):
+            segment(two_colors(), "lseg", model=path, embeddings=np.ones((2, 5), dtype=np.float32))
+        with pytest.raises(ValueError, match="floating array"):
+            segment(two_colors(), "lseg", model=path, embeddings=np.ones((2, 3), dtype=int))
+        with pytest.raises(FileNotFoundError, match="no text embeddings at"):
+            segment(two_colors(), "lseg", model=path, embeddings=tmp_path / "gone.npy")
+        (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY")
+        with pytest.raises(ValueError, match=r"cannot read .*bad.npy"):
+            segment(two_colors(), "lseg", model=path, embeddings=tmp_path / "bad.npy")
+
+
+@pytest.fixture(scope="module")
+def u2net(data_root: Path) -> Path:
+    path = data_root / "weights" / "u2netp.onnx"
+    if not path.is_file() or not (data_root / "DAVIS").is_dir():
+        pytest.skip(f"no weights/u2netp.onnx and DAVIS in {data_root}")
+    return path
+
+
+class TestRealNetwork:
+    def test_objects_are_found(self, data_root: Path, u2net: Path) -> None:
+        scores = {}
+        for frame in Davis(data_root / "DAVIS", sequences=SEQUENCES):
+            labels = segment(frame.image, "onnx", model=u2net, connected=False)
+            assert labels.unique().tolist() == [0, 1]
+            found, truth = labels == 1, frame.labels > 0
+            scores[frame.sequence] = float((found & truth).sum() / (found | truth).sum())
+        assert min(scores.values()) >= 0.8, scores
+        assert sum(scores.values()) / len(scores) >= 0.88, scores
+
+    def test_same_every_time_and_pieces_are_regions(self, data_root: Path, u2net: Path) -> None:
+        image = Davis(data_root / "DAVIS")["blackswan"].image
+        first = segment_with_scores(image, "onnx", model=u2net, snap=2)
+        again = segment_with_scores(image, "onnx", model=u2net, snap=2)
+        assert torch.equal(first.labels, again.labels)
+        assert first.scores is not None
+        assert again.scores is not None
+        assert torch.equal(first.scores, again.scores)
+        assert (first.scores > 0.8).all()
+        areas = first.labels.flatten().bincount()
+        assert (areas[:-1] >= areas[1:]).all()
+        assert int(areas.min()) >= 0.0039 * first.labels.numel()

@@ -1,0 +1,203 @@
+"""What the sources share, and maps that exist already: masks on disk, DAVIS."""
+
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs.data import Davis, save_image, save_labels
+from kcgs.segment import (
+    Cleanup,
+    Segmentation,
+    available_methods,
+    register_scored,
+    sam,
+    segment,
+    segment_with_scores,
+)
+from kcgs.segment.base import _methods
+from kcgs.segment.sources import _scored, require
+
+
+def two_colors(height: int = 20, width: int = 30, split: int = 10) -> Tensor:
+    image = torch.zeros(3, height, width)
+    image[..., split:] = 1.0
+    return image
+
+
+class TestRegistry:
+    def test_methods(self) -> None:
+        assert {"sam", "dino", "text", "lseg", "onnx", "file", "davis"} <= set(available_methods())
+
+    def test_a_method_without_scores(self) -> None:
+        labels, scores = segment_with_scores(two_colors(), "felzenszwalb", sigma=0.0)
+        assert scores is None
+        assert torch.equal(labels, segment(two_colors(), "felzenszwalb", sigma=0.0))
+
+    def test_unknown_method(self) -> None:
+        with pytest.raises(ValueError, match="method must be one of"):
+            segment_with_scores(two_colors(), "magic")
+
+    def test_scored_and_plain_agree(self) -> None:
+        @register_scored("test-scored")
+        def halves(image: Tensor) -> Segmentation:
+            labels = (torch.arange(image.shape[-1]) >= 10).long().expand(image.shape[-2:])
+            return Cleanup(min_size=1).apply(image, labels, labels * 0.5 + 0.25)
+
+        try:
+            labels, scores = segment_with_scores(two_colors(), "test-scored")
+            assert torch.equal(labels, segment(two_colors(), "test-scored"))
+            assert torch.equal(labels, halves(two_colors()))
+            assert scores is not None
+            assert scores.tolist() == [0.75, 0.25]  # The larger right side comes first.
+            with pytest.raises(ValueError, match="already"):
+                register_scored("test-scored")(halves)  # type: ignore[arg-type]
+        finally:
+            del _methods["test-scored"], _scored["test-scored"]
+
+    def test_signature_says_what_is_returned(self) -> None:
+        signature = inspect.signature(sam)
+        assert signature.return_annotation is Tensor
+        assert "checkpoint" in signature.parameters
+
+    def test_import_loads_no_library(self) -> None:
+        heavy = ("transformers", "onnxruntime", "kornia", "PIL", "skimage", "scipy")
+        code = f"import sys, kcgs.segment; print([name for name in {heavy!r} if name in sys.modules])"
+        out = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
+        assert out.stdout.strip() == "[]"
+
+    def test_missing_library(self) -> None:
+        with pytest.raises(ImportError, match=r"method 'x' needs kcgs_nowhere: pip install 'kcgs\[segment\]'"):
+            require("kcgs_nowhere.models", "'kcgs[segment]'", "x")
+
+    @pytest.mark.parametrize(
+        ("method", "library", "options", "line"),
+        [
+            ("dino", "transformers", {"model": "some/model"}, r"pip install 'kcgs\[segment\]'"),
+            ("text", "transformers", {"model": "some/model", "prompts": ["a", "b"]}, r"pip install 'kcgs\[segment\]'"),
+            ("sam", "transformers", {"model": "some/model"}, r"pip install 'kcgs\[segment\]'"),
+            ("sam", "kornia.models.sam", {}, "pip install kornia"),
+            ("onnx", "onnxruntime", {"model": "net.onnx"}, "pip install onnxruntime"),
+        ],
+    )
+    def test_method_says_what_to_install(
+        self, monkeypatch: pytest.MonkeyPatch, method: str, library: str, options: dict[str, Any], line: str
+    ) -> None:
+        monkeypatch.setitem(sys.modules, library, None)
+        with pytest.raises(ImportError, match=f"segmentation method '{method}' needs .*{line}"):
+            segment(two_colors(), method, **options)
+
+
+class TestCleanup:
+    def labels(self) -> Tensor:
+        labels = (torch.arange(30) >= 12).long().repeat(20, 1)
+        labels[5, 20] = 7
+        labels[:, 28:] = 0
+        return labels
+
+    def test_defaults(self) -> None:
+        result, scores = Cleanup().apply(two_colors(), self.labels())
+        assert scores is None
+        assert result.flatten().bincount().tolist() == [320, 240, 40]  # The speck is gone, the strip a region.
+
+    def test_nothing(self) -> None:
+        result, _ = Cleanup(min_size=1, connected=False).apply(two_colors(), self.labels())
+        assert result.flatten().bincount().tolist() == [319, 280, 1]
+
+    def test_contours_snap(self) -> None:
+        result, _ = Cleanup(snap=3).apply(two_colors(), (torch.arange(30) >= 12).long().repeat(20, 1))
+        assert torch.equal(result, (torch.arange(30) < 10).long().repeat(20, 1))
+
+    def test_budget(self) -> None:
+        result, _ = Cleanup(max_regions=2).apply(two_colors(), self.labels())
+        assert int(result.max()) + 1 == 2
+
+    def test_scores_are_means_of_what_is_known(self) -> None:
+        painted = torch.full((20, 30), float("nan"))
+        painted[:10, :12] = 0.5
+        painted[10:, :6] = 0.9
+        _, scores = Cleanup().apply(two_colors(), self.labels(), painted)
+        assert scores is not None
+        assert scores.isnan().tolist() == [True, False, True]
+        assert float(scores[1]) == pytest.approx((120 * 0.5 + 60 * 0.9) / 180)
+
+    @pytest.mark.parametrize(
+        ("options", "error"),
+        [
+            ({"min_size": 0}, ValueError),
+            ({"min_size": 1.5}, TypeError),
+            ({"snap": -1}, ValueError),
+            ({"snap": True}, TypeError),
+            ({"max_regions": 0}, ValueError),
+            ({"connected": 1}, TypeError),
+        ],
+    )
+    def test_bad_option(self, options: dict[str, Any], error: type[Exception]) -> None:
+        with pytest.raises(error, match=rf"{next(iter(options))} must be .*got"):
+            Cleanup(**options)
+
+
+class TestFile:
+    def test_map_stays_as_it_is(self, tmp_path: Path) -> None:
+        mask = (torch.arange(30) >= 12).long().repeat(20, 1) * 255
+        mask[3, 2] = 255
+        save_labels(tmp_path / "mask.png", mask)
+        assert torch.equal(segment(two_colors(), "file", path=tmp_path / "mask.png"), (mask == 0).long())
+
+    def test_cleaned_if_asked(self, tmp_path: Path) -> None:
+        mask = (torch.arange(30) >= 12).long().repeat(20, 1)
+        mask[3, 2] = 1
+        save_labels(tmp_path / "mask.npy", mask)
+        labels = segment(two_colors(), "file", path=tmp_path / "mask.npy", min_size=2, snap=2)
+        assert torch.equal(labels, (torch.arange(30) < 10).long().repeat(20, 1))
+
+    def test_other_size(self, tmp_path: Path) -> None:
+        save_labels(tmp_path / "mask.png", torch.zeros(4, 5, dtype=torch.int64))
+        with pytest.raises(ValueError, match=r"size \(20, 30\); got \(4, 5\) in .*mask.png"):
+            segment(two_colors(), "file", path=tmp_path / "mask.png")
+
+    def test_missing_and_unreadable(self, tmp_path: Path) -> None:
+        with pytest.raises(FileNotFoundError, match=r"gone.png"):
+            segment(two_colors(), "file", path=tmp_path / "gone.png")
+        (tmp_path / "bad.png").write_bytes(b"no picture")
+        with pytest.raises(ValueError, match=r"bad.png"):
+            segment(two_colors(), "file", path=tmp_path / "bad.png")
+
+    def test_unknown_option(self, tmp_path: Path) -> None:
+        save_labels(tmp_path / "mask.png", torch.zeros(20, 30, dtype=torch.int64))
+        with pytest.raises(TypeError, match="colour"):
+            segment(two_colors(), "file", path=tmp_path / "mask.png", colour=1)
+
+
+class TestDavis:
+    def make(self, root: Path) -> None:
+        for tree in ("JPEGImages", "Annotations"):
+            (root / tree / "480p" / "cows").mkdir(parents=True)
+        save_image(root / "JPEGImages/480p/cows/00000.jpg", two_colors())
+        save_labels(root / "Annotations/480p/cows/00000.png", (torch.arange(30) < 9).long().repeat(20, 1))
+
+    def test_annotation(self, tmp_path: Path) -> None:
+        self.make(tmp_path)
+        labels = segment(two_colors(), "davis", root=tmp_path, sequence="cows")
+        assert torch.equal(labels, (torch.arange(30) < 9).long().repeat(20, 1))
+
+    def test_errors(self, tmp_path: Path) -> None:
+        self.make(tmp_path)
+        with pytest.raises(ValueError, match="no sequence 'dogs'"):
+            segment(two_colors(), "davis", root=tmp_path, sequence="dogs")
+        with pytest.raises(ValueError, match="in sequence 'cows'"):
+            segment(two_colors(21), "davis", root=tmp_path, sequence="cows")
+        with pytest.raises(FileNotFoundError):
+            segment(two_colors(), "davis", root=tmp_path / "gone", sequence="cows")
+
+    def test_real_frame(self, data_root: Path) -> None:
+        if not (data_root / "DAVIS").is_dir():
+            pytest.skip(f"no DAVIS in {data_root}")
+        frame = Davis(data_root / "DAVIS")["cows"]
+        labels = segment(frame.image, "davis", root=data_root / "DAVIS", sequence="cows")
+        assert torch.equal(labels, (frame.labels > 0).long())

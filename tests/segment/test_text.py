@@ -1,0 +1,134 @@
+"""CLIPSeg: a small random model and tokenizer, saved and loaded as released ones are."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs.segment import segment, segment_with_scores
+
+transformers = pytest.importorskip("transformers", reason="needs the extra: pip install 'kcgs[segment]'")
+
+PROMPTS = ["a dog", "the grass", "god"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    letters = list("abcdefghijklmnopqrstuvwxyz")
+    words = [*letters, *(letter + "</w>" for letter in letters), "<|startoftext|>", "<|endoftext|>"]
+    tokenizer = transformers.CLIPTokenizer(vocab={word: k for k, word in enumerate(words)}, merges=[])
+    sizes = {"hidden_size": 16, "intermediate_size": 24, "num_hidden_layers": 2, "num_attention_heads": 2}
+    config = transformers.CLIPSegConfig(
+        text_config={
+            **sizes,
+            "vocab_size": len(words),
+            "max_position_embeddings": 12,
+            "bos_token_id": len(words) - 2,
+            "eos_token_id": len(words) - 1,
+        },
+        vision_config={**sizes, "image_size": 32, "patch_size": 8},
+        projection_dim=16,
+        reduce_dim=8,
+        extract_layers=[0, 1],
+        decoder_num_attention_heads=2,
+        decoder_intermediate_size=16,
+    )
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = transformers.CLIPSegForImageSegmentation(config)
+        for parameter in model.parameters():  # Maps that depend on words and pixels, though nothing was learned.
+            if parameter.ndim > 1:
+                torch.nn.init.normal_(parameter, std=0.3)
+    path = tmp_path_factory.mktemp("clipseg")
+    model.save_pretrained(path)
+    tokenizer.save_pretrained(path)
+    return path
+
+
+def picture() -> Tensor:
+    image = torch.zeros(3, 60, 90)
+    image[0, :, 30:] = 1.0
+    image[1, 25:, 50:] = 0.8
+    return image
+
+
+def assert_map(labels: Tensor, scores: Tensor | None) -> None:
+    assert labels.shape == (60, 90)
+    assert labels.dtype == torch.int64
+    areas = labels.flatten().bincount()
+    assert (areas[:-1] >= areas[1:]).all()
+    assert scores is not None
+    assert scores.shape == areas.shape
+    assert ((scores > 0) & (scores <= 1)).all()
+
+
+class TestText:
+    def test_prompts(self, folder: Path) -> None:
+        labels, scores = segment_with_scores(picture(), "text", prompts=PROMPTS, model=folder, size=64)
+        assert_map(labels, scores)
+        assert torch.equal(labels, segment(picture(), "text", prompts=PROMPTS, model=str(folder), size=64))
+
+    def test_equals_the_model_itself(self, folder: Path) -> None:
+        model = transformers.CLIPSegForImageSegmentation.from_pretrained(folder)
+        tokenizer = transformers.AutoTokenizer.from_pretrained(folder)
+        tokens = tokenizer(PROMPTS, padding=True, return_tensors="pt")
+        image = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(0))
+        mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+        shown = ((image - mean[:, None, None]) / std[:, None, None]).expand(3, -1, -1, -1)
+        with torch.no_grad():
+            truth = model(pixel_values=shown, input_ids=tokens["input_ids"]).logits.argmax(dim=0)
+        options: dict[str, Any] = {"prompts": PROMPTS, "size": 64, "min_size": 1, "connected": False}
+        labels = segment(image, "text", model=model, tokenizer=tokenizer, **options)
+        pairs = (truth * 3 + labels).unique()  # Each class is one region: the numbers alone differ.
+        assert len(pairs) == len(truth.unique()) == len(labels.unique())
+
+    @pytest.mark.parametrize("background", [0.0, 0.5, 1.0])
+    def test_background(self, folder: Path, background: float) -> None:
+        options: dict[str, Any] = {"prompts": ["a dog"], "background": background, "model": folder, "size": 64}
+        labels, scores = segment_with_scores(picture(), "text", connected=False, **options)
+        assert_map(labels, scores)
+        if background in (0.0, 1.0):
+            assert int(labels.max()) == 0
+
+    def test_long_prompts_are_cut(self, folder: Path) -> None:
+        assert segment(picture(), "text", prompts=["dog " * 40, "cat"], model=folder, size=64).shape == (60, 90)
+
+
+class TestErrors:
+    @pytest.mark.parametrize(
+        ("options", "error", "message"),
+        [
+            ({"prompts": "dog"}, TypeError, "prompts must be a list of strings"),
+            ({"prompts": ["dog", 3]}, TypeError, "prompts must be a list of strings"),
+            ({"prompts": ["dog"]}, ValueError, "prompts must be at least 2 non-empty"),
+            ({"prompts": [], "background": 0.5}, ValueError, "prompts must be at least 1 non-empty"),
+            ({"prompts": ["dog", " "]}, ValueError, "prompts must be"),
+            ({"prompts": ["dog", "cat"], "background": 2.0}, ValueError, "background must be in"),
+            ({"prompts": ["dog", "cat"], "size": 0}, ValueError, "size must be at least 1"),
+        ],
+    )
+    def test_options(self, folder: Path, options: dict[str, Any], error: type[Exception], message: str) -> None:
+        with pytest.raises(error, match=message):
+            segment(picture(), "text", model=folder, **options)
+
+    @pytest.mark.parametrize("damage", ["no weights", "truncated", "no tokenizer"])
+    def test_folder(self, tmp_path: Path, folder: Path, damage: str) -> None:
+        path = tmp_path / "model"
+        shutil.copytree(folder, path)
+        if damage == "no tokenizer":
+            for file in path.glob("*token*"):
+                file.unlink()
+        elif damage == "truncated":
+            (path / "model.safetensors").write_bytes((folder / "model.safetensors").read_bytes()[:200])
+        else:
+            (path / "model.safetensors").unlink()
+        with pytest.raises(ValueError, match=f"(cannot load|the tokenizer of) .*{path}"):
+            segment(picture(), "text", prompts=PROMPTS, model=path)
+
+    def test_loaded_model_needs_its_tokenizer(self, folder: Path) -> None:
+        model = transformers.CLIPSegForImageSegmentation.from_pretrained(folder)
+        with pytest.raises(ValueError, match="tokenizer must be given"):
+            segment(picture(), "text", prompts=PROMPTS, model=model)
