@@ -108,7 +108,7 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
         # to compare with in the viewer
         save_image(folder / ("original.webp" if recipe == "best" else "original.jpg"), image)
     shrink = _PREVIEW / max(field.size)
-    save_image(folder / "preview.png", render_image(field, regions, _scaled(field.size, shrink)))
+    save_image(folder / "preview.jpg", render_image(field, regions, _scaled(field.size, shrink)))
     figures = measure(drawn, image, labels)
     edge = figures["ef_psnr"]
     entry = Entry(
@@ -166,4 +166,4 @@ def _card(entry: Entry, size: tuple[int, int], figures: dict[str, float]) -> str
         "decoder": "`decoder.onnx`, with `view` and `visible`" if entry.decoder else "left out: large",
     }
     table = "\n".join(f"| {key} | {value} |" for key, value in rows.items())
-    return f"# {entry.name}\n\n![{entry.title}](preview.png)\n\n| | |\n|---|---|\n{table}\n"
+    return f"# {entry.name}\n\n![{entry.title}](preview.jpg)\n\n| | |\n|---|---|\n{table}\n"

@@ -11,6 +11,7 @@ import http.server
 import json
 import os
 import queue
+import re
 import shutil
 import subprocess
 import threading
@@ -532,6 +533,53 @@ class TestExamples:
                 assert page.evaluate("kcgs.metadata") is None and page.alert() == ""
         finally:
             shutil.rmtree(folder)
+
+
+GOLDEN = WEB.parent / "golden"
+MODELS = WEB.parents[1] / "models"
+
+
+class TestRealDecoders:
+    """What kcgs exports, in the browser."""
+
+    @pytest.mark.parametrize("name", sorted(path.stem for path in GOLDEN.glob("*.npz")))
+    def test_golden(self, page: Browser, site: tuple[Path, str], name: str) -> None:
+        shutil.copy(GOLDEN / f"{name}.onnx", site[0])
+        page.evaluate(f"kcgs.open('{name}.onnx')")
+        page.settle()
+        assert page.alert() == ""
+        with np.load(GOLDEN / f"{name}.npz") as case:
+            height, width = int(case["height"]), int(case["width"])
+            whole, every = [0, 0, width, height], [1.0] * len(page.evaluate("kcgs.metadata.regionIds"))
+            pictures = [key for key in case.files if re.fullmatch(r"image_\d+x\d+", key)]
+            assert len(pictures) == 3
+            for key in pictures:
+                got = page.render(case[key].shape[-2:], view=whole, visible=every)
+                np.testing.assert_allclose(got[0], case[key], atol=1e-3)
+            got = page.render(case["image_view"].shape[-2:], view=case["view"].tolist(), visible=every)
+            np.testing.assert_allclose(got[0], case["image_view"], atol=1e-3)
+            if "visible" in case.files:
+                shape = case["image_visible"].shape[-2:]
+                got = page.render(shape, view=whole, visible=case["visible"].tolist())
+                np.testing.assert_allclose(got[0], case["image_visible"], atol=1e-3)
+
+    @pytest.mark.parametrize("name", ["chelsea-500", "chart-pie"])
+    def test_bundled_example(self, page: Browser, site: tuple[Path, str], name: str) -> None:
+        path = site[0] / f"{name}.onnx"
+        shutil.copy(MODELS / name / "decoder.onnx", path)
+        page.evaluate(f"kcgs.open('{name}.onnx')")
+        part, got = page.canvas()
+        every = [1.0] * len(page.evaluate("kcgs.metadata.regionIds"))
+        want = decode(path, (part["height"], part["width"]), view=part["rect"], visible=every)
+        np.testing.assert_allclose(got, np.clip(want, 0, 1), atol=LEVEL)
+
+    def test_examples_are_copied_from_the_zoo(self, node_modules: Path) -> None:
+        assert npm("run", "examples").returncode == 0
+        listed = json.loads((WEB / "public" / "examples" / "index.json").read_text())
+        assert [example["name"] for example in listed] == ["chelsea-500", "chart-pie"]
+        for example in listed:
+            for file in (example["decoder"], example["original"]):
+                assert (WEB / "public" / "examples" / file).stat().st_size > 0
 
 
 class TestSources:

@@ -42,7 +42,7 @@ def test_entry(entry: Entry) -> None:
     assert float(psnr(render_image(scene.field, scene.regions), image)) == pytest.approx(entry.psnr, abs=0.02)
     folder = path.parent
     FitConfig(**json.loads((folder / "recipe.json").read_text()))
-    assert entry.licence in (folder / "card.md").read_text() and (folder / "preview.png").is_file()
+    assert entry.licence in (folder / "card.md").read_text() and (folder / "preview.jpg").is_file()
     if entry.decoder is None:
         return
     decoder = (MODELS / entry.decoder).read_bytes()
