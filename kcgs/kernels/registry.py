@@ -42,5 +42,17 @@ def resolve(backend: str, device: torch.device, dtype: torch.dtype) -> Kernel:
     name = backend
     if backend == "auto":
         name = device.type if dtype == torch.float32 and _runs(device.type) else "tiled"
+    if torch.compiler.is_compiling():
+        return functools.partial(_untraced, name)
+    return _kernel(name)
+
+
+def _kernel(name: str) -> Kernel:
     kernel: Kernel = import_module(f"{__package__}.{name}").splat
     return kernel
+
+
+@torch._disable_dynamo
+def _untraced(name: str, inputs: SplatInputs) -> Tensor:
+    """Draw outside of the compiled graph: the compiler would trace into numba and Triton."""
+    return _kernel(name)(inputs)

@@ -9,8 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from kcgs.data import chart_2x3, chart_pie, load_image, load_labels
-from kcgs.fit import widths
-from kcgs.functional import RegionMap
+from kcgs.functional import RegionMap, widths
 from kcgs.functional.widths import band_gain, choose_widths
 
 COLORS = torch.tensor([[0.2, 0.3, 0.6], [0.8, 0.6, 0.3]])
