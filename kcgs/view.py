@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 from urllib.parse import quote, urlencode
 
 from kcgs.functional import RegionMap
@@ -29,13 +29,25 @@ class _Handler(SimpleHTTPRequestHandler):
     }
 
     def __init__(self, *args: object, extra: Path, **kwargs: object) -> None:
-        self.extra = extra
+        self.extra, self.shown = extra, {file.name for file in extra.iterdir()}
         super().__init__(*args, **kwargs)  # type: ignore[arg-type]
 
     def translate_path(self, path: str) -> str:
         if path.startswith("/scene/"):
-            return str(self.extra / Path(path.partition("?")[0]).name)
+            name = Path(path.partition("?")[0]).name
+            return str(self.extra / name if name in self.shown else self.extra / "nothing")
         return super().translate_path(path)
+
+    def send_head(self) -> Any:
+        # other names for this machine are other people's
+        if self.headers.get("Host", "").partition(":")[0] not in ("127.0.0.1", "localhost"):
+            self.send_error(403, "only this machine's own address")
+            return None
+        return super().send_head()
+
+    def list_directory(self, path: object) -> None:
+        """List nothing."""
+        self.send_error(404)
 
     def end_headers(self) -> None:
         # with these the page may use threads

@@ -33,7 +33,10 @@ def export(
         Kind, typer.Option(help="scene: this scene's decoder; generic: one that takes any scene's numbers.")
     ] = Kind.scene,
     precision: Annotated[
-        Precision, typer.Option(help="fp16 stores half the bytes, where no value of the picture changes by 1/255.")
+        Precision,
+        typer.Option(
+            help="fp16 stores factors and colours in 16 bits, where no value of the picture changes by 1/255."
+        ),
     ] = Precision.fp32,
     cutoff: Annotated[float, typer.Option(help="Weights below it are skipped.")] = 1e-4,
     clamp: Annotated[bool, typer.Option("--clamp", help="Clip the picture to [0, 1].")] = False,
@@ -51,6 +54,9 @@ def export(
     if kind is Kind.generic:
         if interactive or precision is Precision.fp16:
             raise typer.BadParameter("--interactive and --precision are for --kind scene")
+        regions = loaded.regions
+        if regions is not None and regions.num_regions > 1 and (regions.softness != 0.0 or regions.supersample > 1):
+            raise ValueError("--kind generic draws hard contours of whole pixels; this scene's are soft or finer")
         model = generic_decoder(cutoff=cutoff, clamp=clamp)
     else:
         model = scene_decoder(

@@ -85,9 +85,12 @@ class Axis:
             soft: whether to interpolate; else offsets are such that no two labels weigh the same.
         """
         g = self.g
+        # a view may go beyond the scene, where the border's are held
+        last = factor * TILE + 2 * halo - 1
         if soft:
             at = g("Div", g("Cast", self.local, to=FLOAT), g("Cast", self.parts, to=FLOAT))
-            at = g("Unsqueeze", g("Add", at, np.float32(halo - 0.5)), g.constant([2]))
+            at = g("Clip", g("Add", at, np.float32(halo - 0.5)), np.float32(0), np.float32(last))
+            at = g("Unsqueeze", at, g.constant([2]))
         else:
             # sub-pixels spread over a pixel of the output, or one of the scene where that is smaller
             whole = g("Mul", self.extent, 2)
@@ -97,6 +100,7 @@ class Axis:
             at = g("Mul", g("Unsqueeze", self.local, g.constant([2])), 2 * factor)
             at = g("Add", g("Add", at, g("Mul", j, spread)), g("Mul", self.parts, 2 * halo - 1))
             offsets = g("Max", g("Div", g("Mul", at, _OFFSETS // 2), self.parts), 0)
+            offsets = g("Min", offsets, last * _OFFSETS - 1)
             at = g("Div", g("Cast", g("Add", g("Mul", offsets, 2), 1), to=FLOAT), np.float32(2 * _OFFSETS))
             at = g("Reshape", at, g.constant([0, -1, 1]))
         window = np.arange(factor * TILE + 2 * halo, dtype=np.float32)

@@ -23,6 +23,7 @@ from .shares import Windows
 from .stored import Stored
 
 PRECISIONS = ("fp32", "fp16")
+_LISTS = ("region_ids", "left_out")
 # change of a value of the picture that float16 may make
 _LARGEST_CHANGE = 1 / 255
 
@@ -249,4 +250,4 @@ def describe_decoder(model: onnx.ModelProto) -> dict[str, object]:
         '10'
     """
     entries = {entry.key: entry.value for entry in model.metadata_props}
-    return {key: json.loads(value) if value.startswith("[") else value for key, value in entries.items()}
+    return {key: json.loads(value) if key in _LISTS else value for key, value in entries.items()}

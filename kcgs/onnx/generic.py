@@ -23,6 +23,7 @@ from .metadata import FORMAT, FORMAT_VERSION
 
 _SIDE = 32  # of a tile, in pixels
 _CHUNK = 64  # Gaussians drawn at once
+_OPSET = 20  # reductions of flags
 MAX_WEIGHTS = _CHUNK * _SIDE * _SIDE
 """Most (Gaussian, pixel) weights that exist at a time."""
 
@@ -107,7 +108,7 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = False, channels: int 
             raise TypeError(f"channels must be an integer or None; got {channels!r}")
         if channels < 1:
             raise ValueError(f"channels must be at least 1; got {channels}")
-    graph = Graph()
+    graph = Graph(opset=_OPSET)
     depth = "C" if channels is None else channels
     scene = _declare(graph, depth, cutoff)
     image = _draw(graph, scene)

@@ -14,7 +14,7 @@ from onnx_ir.tape import Tape
 
 from kcgs._atomic import atomic_path
 
-OPSET = 20
+OPSET = 18  # what torch exports by default, so that graphs of both chain
 INT32, INT64, FLOAT = 6, 7, 1  # ONNX's numbers of its types
 _IR_VERSION = 10
 _SUFFIX = ".onnx"
@@ -37,7 +37,8 @@ class Graph:
         ['ReduceProd']
     """
 
-    def __init__(self, outer: Graph | None = None) -> None:
+    def __init__(self, outer: Graph | None = None, opset: int = OPSET) -> None:
+        self.opset = opset
         self._tape = Tape()
         self._inputs: list[Value] = []
         self._constants: dict[tuple[str, tuple[int, ...], bytes], Value] = {}
@@ -117,7 +118,7 @@ class Graph:
             outputs,
             nodes=self._tape.nodes,
             initializers=self._tape.initializers,
-            opset_imports={"": OPSET} if self._outer is None else {},
+            opset_imports={"": self.opset} if self._outer is None else {},
             name=name,
         )
 
@@ -141,7 +142,7 @@ def write_model(model: onnx.ModelProto, path: str | os.PathLike[str]) -> int:
         FileNotFoundError: the folder does not exist.
     """
     path = Path(path)
-    if path.suffix != _SUFFIX:
+    if path.suffix.lower() != _SUFFIX:
         raise ValueError(f"path must end in {_SUFFIX}; got {str(path)!r}")
     content = model.SerializeToString(deterministic=True)
     with atomic_path(path) as temporary:

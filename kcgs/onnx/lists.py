@@ -133,7 +133,7 @@ def list_gaussians(field: GaussianField, regions: RegionMap | None, tiles: Tiles
     x, y = first[gaussian, 0] + rank % across[gaussian], first[gaussian, 1] + rank // across[gaussian]
     tile = y * tiles.cols + x
     keep = torch.ones_like(tile, dtype=torch.bool)
-    if regions is not None and regions.num_regions > 1:
+    if regions is not None:
         assert field.region_ids is not None
         own = regions.index_of(field.region_ids).cpu()[gaussian]
         held = torch.tensor(sorted(t * regions.num_regions + r for t, ids in enumerate(tiles.regions) for r in ids))

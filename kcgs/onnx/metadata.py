@@ -55,7 +55,6 @@ def _left_out(
 ) -> list[str]:
     total = tiles.rows * tiles.cols
     drawn = sum(len(group.tiles) for group in groups)
-    filled = sum(group.entries.size for group in groups)
     unseen = len(field) - len(entries.gaussian.unique())
     said = []
     if kind == "none":
@@ -75,6 +74,4 @@ def _left_out(
     said.append(
         f"all but {100 * len(entries.tile) / max(1, total * len(field)):.2g} % of the pairs of Gaussian and tile"
     )
-    if filled:
-        said.append(f"filling: lists are {100 * (filled / len(entries.tile) - 1):.2g} % longer than needed")
     return said

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import threading
 import urllib.error
+import urllib.parse
 import urllib.request
 from pathlib import Path
 
@@ -48,6 +50,8 @@ class TestExport:
 
     def test_generic_and_half(self, monkeypatch: pytest.MonkeyPatch, scene: Path) -> None:
         out = scene.with_name("generic.onnx")
+        soft = load(scene)
+        save(scene, soft.field, RegionMap.from_labels(soft.regions.labels))
         assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic") == 0
         assert len(onnxruntime.InferenceSession(str(out)).get_inputs()) == 5
         assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic", "--interactive") == 2
@@ -76,6 +80,12 @@ class TestExport:
         assert run(monkeypatch, "export", str(scene), *arguments) == 1
         assert words in capsys.readouterr().err
         assert not list(scene.parent.glob("decoder*"))
+
+    def test_generic_for_a_soft_scene(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: Path
+    ) -> None:
+        assert run(monkeypatch, "export", str(scene), "-o", str(scene.with_name("g.onnx")), "--kind", "generic") == 1
+        assert "soft or finer" in capsys.readouterr().err
 
     def test_truncated_scene(
         self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: Path
@@ -128,8 +138,13 @@ class TestView:
         answer = urllib.request.urlopen(root + "scene/decoder.onnx")
         assert answer.headers["Cross-Origin-Embedder-Policy"] == "require-corp"
         onnxruntime.InferenceSession(answer.read())
-        with pytest.raises(urllib.error.HTTPError):
-            urllib.request.urlopen(root + "scene/../../secret")
+        for hidden in ("scene/..", "scene/../", "scene/", "scene/page", "page"):
+            connection = http.client.HTTPConnection("127.0.0.1", urllib.parse.urlsplit(root).port)
+            connection.request("GET", f"/{hidden}")
+            assert connection.getresponse().status == 404, hidden
+            connection.close()
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(urllib.request.Request(root, headers={"Host": "elsewhere.example"}))
 
     def test_page_that_is_not_built(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError, match="npm --prefix export/web"):

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer
+from kcgs.functional import region_splat
 from kcgs.onnx import describe_decoder, scene_decoder, write_model
 
 SIZES = [(37, 53), (74, 106), (111, 160), (20, 31), (1, 1), (5, 300)]
@@ -130,6 +131,20 @@ class TestPicture:
         )  # fmt: skip
         assert_same(field, None, [(30, 30), (60, 40)], clamp=True)
 
+    @pytest.mark.parametrize("count", [1, 2])
+    def test_ids_that_the_map_has_not(self, count: int) -> None:
+        size = (40, 50)
+        regions = RegionMap.from_labels(blobs(size, count))
+        field = scattered(30, size, regions)
+        field.region_ids[::2] = 999
+        assert_same(field, regions, [size, (33, 71)])
+        session = session_of(scene_decoder(field, regions, interactive=True))
+        view, every = np.array([0, 0, 50, 40], np.float32), np.ones(count, np.float32)
+        with torch.no_grad():
+            assert (
+                decode(session, size, view=view, visible=every) - RegionSplatRenderer()(field, regions)
+            ).abs().max() < 1e-3
+
 
 class TestInteractive:
     def test_view_and_visible(self) -> None:
@@ -156,6 +171,29 @@ class TestInteractive:
             with torch.no_grad():
                 want = RegionSplatRenderer()(left, regions)
             assert (decode(session, size, view=whole, visible=factor) - want).abs().max() < 1e-3
+
+    @pytest.mark.parametrize("softness", [0.0, 0.8])
+    def test_beyond_the_border_its_labels_are_held(self, softness: float) -> None:
+        size, pad = (48, 64), 64
+        labels = blobs(size, 5)
+        regions = RegionMap.from_labels(labels, softness)
+        field = scattered(60, size, regions)
+        session = session_of(scene_decoder(field, regions, interactive=True))
+        held = torch.nn.functional.pad(labels[None, None].double(), (pad,) * 4, mode="replicate")[0, 0].long()
+        shares = [regions._membership.weights(0, r, torch.float64) for r in range(5)]
+        shares = [torch.nn.functional.pad(s[None, None], (pad,) * 4, mode="replicate")[0, 0] for s in shares]
+        moved = (field.means.detach() + pad, field.cholesky.detach(), field.colors.detach())
+        want = torch.zeros(3, *held.shape)
+        for r, share in enumerate(shares):
+            own = field.region_ids == regions.ids[r]
+            want += share * region_splat(*(t[own] for t in moved), size=tuple(held.shape))
+        view = np.array([-pad, -pad, size[1] + pad, size[0] + pad], np.float32)
+        got = decode(session, tuple(held.shape), view=view, visible=np.ones(5, np.float32))
+        inside = (slice(None), slice(pad, pad + size[0]), slice(pad, pad + size[1]))
+        assert (got[inside] - want[inside]).abs().max() < 1e-3
+        # lists are of the tiles of the scene: near its border they hold what reaches
+        rim = (slice(None), slice(pad - 4, pad + size[0] + 4), slice(pad - 4, pad + size[1] + 4))
+        assert (got[rim] - want[rim]).abs().max() < 0.15
 
     def test_far_in(self) -> None:
         size = (48, 80)
@@ -201,6 +239,9 @@ class TestFile:
         counts = [len(scene_decoder(field, m).graph.node) for m in (None, hard)]
         assert counts[0] < counts[1]
         assert not {"Loop", "If", "NonZero"} & (none | some)
+
+    def test_recipe_of_any_name(self) -> None:
+        assert describe_decoder(scene_decoder(scattered(3, (20, 30)), recipe="[mine] v2"))["recipe"] == "[mine] v2"
 
     def test_same_scene_same_bytes(self) -> None:
         field = scattered(30, (40, 60))
@@ -260,24 +301,22 @@ class TestBadInput:
             scene_decoder(GaussianField(torch.rand(2, 3, 2), torch.ones(2, 3, 3), torch.rand(2, 3, 3), size=(8, 8)))
 
 
-def test_chains_with_kornia() -> None:
-    """A decoder before a graph of another maker, through Kornia's own way of chaining."""
+@pytest.mark.filterwarnings("ignore:.*:DeprecationWarning", "ignore:.*:FutureWarning", "ignore:.*:UserWarning")
+def test_chains_with_kornia(tmp_path: object) -> None:
+    """A decoder before a Kornia module as torch exports it, through Kornia's own way of chaining."""
+    from kornia.color import RgbToGrayscale
     from kornia.onnx import ONNXSequential
 
+    path = f"{tmp_path}/gray.onnx"
+    shape = {2: torch.export.Dim("height"), 3: torch.export.Dim("width")}
+    example = torch.rand(1, 3, 24, 32)
+    torch.onnx.export(
+        RgbToGrayscale(), (example,), path, input_names=["color"], output_names=["gray"],
+        dynamo=True, opset_version=18, dynamic_shapes=({**shape},), external_data=False, verbose=False,
+    )  # fmt: skip
     field = scattered(20, (32, 48))
-    decoder = scene_decoder(field)
-    picture = onnx.helper.make_tensor_value_info("image_in", onnx.TensorProto.FLOAT, [1, 3, "height", "width"])
-    gray = onnx.helper.make_tensor_value_info("gray", onnx.TensorProto.FLOAT, [1, 1, "height", "width"])
-    weights = onnx.numpy_helper.from_array(np.array([0.299, 0.587, 0.114], np.float32).reshape(1, 3, 1, 1), "weights")
-    nodes = [
-        onnx.helper.make_node("Mul", ["image_in", "weights"], ["weighted"]),
-        onnx.helper.make_node("ReduceSum", ["weighted", "axis"], ["gray"], keepdims=1),
-    ]
-    axis = onnx.numpy_helper.from_array(np.array([1]), "axis")
-    graph = onnx.helper.make_graph(nodes, "to_gray", [picture], [gray], [weights, axis])
-    to_gray = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 20)], ir_version=10)
-    chain = ONNXSequential(decoder, to_gray, io_maps=[[("image", "image_in")]])
+    chain = ONNXSequential(scene_decoder(field), onnx.load(path), io_maps=[[("image", "color")]])
     (got,) = chain(np.array([40, 50]))
     with torch.no_grad():
-        want = RegionSplatRenderer()(field, size=(40, 50))
-    assert np.abs(got[0, 0] - (want * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0).numpy()).max() < 1e-3
+        want = RgbToGrayscale()(RegionSplatRenderer()(field, size=(40, 50))[None])
+    assert np.abs(got - want.numpy()).max() < 1e-3

@@ -8,6 +8,7 @@ const KEPT_TIMES = 10;
 export class FrameQueue {
   private wanted = false;
   private readonly tasks: (() => Promise<void>)[] = [];
+  private urgent = 0;
   private running = false;
   private readonly waiting: (() => void)[] = [];
 
@@ -23,7 +24,8 @@ export class FrameQueue {
   task<T>(work: () => Promise<T>, urgent = false): Promise<T> {
     return new Promise((resolve, reject) => {
       const task = (): Promise<void> => work().then(resolve, reject);
-      if (urgent) this.tasks.unshift(task);
+      // Urgent tasks among themselves keep their order: of two files opened at once the last one stays.
+      if (urgent) this.tasks.splice(this.urgent++, 0, task);
       else this.tasks.push(task);
       void this.pump();
     });
@@ -44,6 +46,7 @@ export class FrameQueue {
       } else {
         const task = this.tasks.shift();
         if (task === undefined) break;
+        this.urgent = Math.max(0, this.urgent - 1);
         await task();
       }
     }
