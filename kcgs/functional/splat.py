@@ -35,8 +35,8 @@ def region_splat(
 
     Convention: points are (x, y) in pixels and pixel (j, i) is sampled at (j + 0.5, i + 0.5); a Gaussian whose id the
     map does not hold draws nothing; N = 0 gives a black image. Half precision is computed in float32. The result is
-    not clamped. Once differentiable in means, cholesky and colors, by
-    `backward` and `torch.autograd.grad` (`torch.func.grad`, `vjp` and `jvp` only through backend "reference"; `vmap` is refused: give the batch as B).
+    not clamped. Once differentiable in means, cholesky and colors, by `backward` and `torch.autograd.grad`;
+    `torch.func.grad`, `vjp` and `jvp` work with backend "reference" only, and `vmap` is refused: give the batch as B.
 
     Args:
         means: centres in pixels, within 1e8, :math:`(B, N, 2)`, or all without B.
