@@ -52,7 +52,7 @@ def _kernel(name: str) -> Kernel:
     return kernel
 
 
-@torch._disable_dynamo
+@torch._disable_dynamo  # type: ignore[attr-defined]  # the public name imports the compiler
 def _untraced(name: str, inputs: SplatInputs) -> Tensor:
     """Draw outside of the compiled graph: the compiler would trace into numba and Triton."""
     return _kernel(name)(inputs)
