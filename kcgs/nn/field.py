@@ -93,7 +93,9 @@ class GaussianField(nn.Module):
             self.register_parameter(name, nn.Parameter(value.detach().clone()))
 
     def _checked_ids(self, region_ids: Tensor) -> Tensor:
-        return check_ids("region_ids", region_ids.to(self.means.device), self.means).clone()
+        if isinstance(region_ids, Tensor):
+            region_ids = region_ids.to(self.means.device)
+        return check_ids("region_ids", region_ids, self.means).clone()
 
     def __len__(self) -> int:
         """Number of Gaussians an image."""
