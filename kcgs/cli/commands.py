@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .common import Json, Progress, SceneFile, app, check_output, print_report
+from .common import IMAGES, Json, Progress, SceneFile, app, check_output, print_report
 from .segmentation import warn_if_misaligned
 
 if TYPE_CHECKING:
@@ -27,8 +27,6 @@ class Backend(str, Enum):
     cpu = "cpu"
     cuda = "cuda"
 
-
-_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
 ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE")]
 
@@ -74,7 +72,8 @@ def fit_command(
         settings |= {"refine": False, "release": False}
     elif regions == "auto":
         # nobody gave these contours, so none are to be kept near
-        settings |= {"max_move": "any", "contour_rise": 2.5}
+        free = FitConfig.from_recipe("best-refined")
+        settings |= {"max_move": free.max_move, "contour_rise": free.contour_rise}
     config = FitConfig.from_recipe(
         recipe, backend=backend.value, **{k: v for k, v in settings.items() if v is not None}
     )
@@ -113,7 +112,7 @@ def render(
     from kcgs.io import load
     from kcgs.nn.renderer import render_image
 
-    check_output(output, *_IMAGES)
+    check_output(output, *IMAGES)
     loaded = load(scene)
     field = loaded.field
     target = _target_size(field.size, scale, size)

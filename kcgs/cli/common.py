@@ -18,6 +18,9 @@ app = typer.Typer(
 )
 
 
+IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+
+
 def _scene_path(text: str) -> Path:
     from kcgs.zoo import PREFIX, find
 

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .common import Json, app, check_output, print_report
+from .common import IMAGES, Json, app, check_output, print_report
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 # Contours drawn by people reach 0.63 and more on their own image, at most 0.54 on its mirror image.
 _ALIGNED = 0.58
-_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
 
 @app.command()
@@ -40,7 +39,7 @@ def segment(
 
     check_output(output, ".png", ".npy")
     if overlay is not None:
-        check_output(overlay, *_IMAGES, option="--overlay")
+        check_output(overlay, *IMAGES, option="--overlay")
     options = _parse_options(option or [])
     if max_regions is not None:
         options["max_regions"] = max_regions

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -23,7 +22,6 @@ from .shares import Windows
 from .stored import Stored
 
 PRECISIONS = ("fp32", "fp16")
-_LISTS = ("region_ids", "left_out")
 # change of a value of the picture that float16 may make
 _LARGEST_CHANGE = 1 / 255
 
@@ -233,21 +231,3 @@ def _check_change(
                 f"precision must be fp32 for this scene: fp16 changes a value of the picture by {change:.2g}, which is "
                 f"not below 1/255 = {_LARGEST_CHANGE:.2g}"
             )
-
-
-def describe_decoder(model: onnx.ModelProto) -> dict[str, object]:
-    """Read what a decoder says of itself.
-
-    Args:
-        model: made by :func:`scene_decoder` or :func:`generic_decoder`.
-
-    Returns:
-        The metadata; lists as lists.
-
-    Example:
-        >>> model = scene_decoder(GaussianField.random(10, (32, 48), seed=0))
-        >>> describe_decoder(model)["num_gaussians"]
-        '10'
-    """
-    entries = {entry.key: entry.value for entry in model.metadata_props}
-    return {key: json.loads(value) if key in _LISTS else value for key, value in entries.items()}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-from importlib.metadata import version
 from typing import NamedTuple
 
 import numpy as np
@@ -18,8 +17,8 @@ import torch
 from kcgs._check import check_cutoff
 from kcgs.kernels.form import lowest_exponent, support_radius
 
-from .graph import Array, Graph, Value
-from .metadata import FORMAT, FORMAT_VERSION
+from .graph import FLOAT, Array, Graph, Value
+from .metadata import header
 
 _SIDE = 32  # of a tile, in pixels
 _CHUNK = 64  # Gaussians drawn at once
@@ -120,13 +119,8 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = False, channels: int 
 def _metadata(cutoff: float, clamp: bool) -> dict[str, str]:
     left_out = ["soft weights: contours are hard", "opacities: the caller multiplies them into the colours"]
     return {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        "kind": "generic",
-        "kcgs_version": version("kcgs"),
-        "cutoff": f"{cutoff:g}",
+        **header("generic", cutoff, clamp),
         "precision": "fp32",
-        "clamp": json.dumps(clamp),
         "left_out": json.dumps(left_out if clamp else ["the clip to [0, 1]", *left_out]),
     }
 
@@ -187,7 +181,7 @@ def _span(graph: Graph, at: Value, length: Value) -> tuple[Value, Value]:
     """Return the pixels of band or tile `at`, the last one repeated past the edge, and the middle."""
     start = graph("Mul", at, _SIDE)
     pixels = graph("Add", graph.constant(np.arange(_SIDE)), start)
-    middle = graph("Add", graph("Cast", start, to=onnx.TensorProto.FLOAT), _floats(_SIDE / 2))
+    middle = graph("Add", graph("Cast", start, to=FLOAT), _floats(_SIDE / 2))
     return graph("Min", pixels, graph("Sub", length, 1)), middle
 
 

@@ -1,10 +1,12 @@
-"""What a scene decoder says of itself."""
+"""What a decoder says of itself."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
 from importlib.metadata import version
+
+import onnx
 
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
@@ -14,6 +16,19 @@ from .lists import Entries, Tiles
 
 FORMAT = "kcgs.decoder"
 FORMAT_VERSION = "1"
+_LISTS = ("region_ids", "left_out")
+
+
+def header(kind: str, cutoff: float, clamp: bool) -> dict[str, str]:
+    """Facts of every decoder."""
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "kind": kind,
+        "kcgs_version": version("kcgs"),
+        "cutoff": f"{cutoff:g}",
+        "clamp": json.dumps(clamp),
+    }
 
 
 def describe(
@@ -32,10 +47,7 @@ def describe(
     ids = [0] if regions is None else regions.ids.tolist()
     kind = "none" if count == 1 else "hard" if regions is None or regions.softness == 0.0 else "soft"
     return {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        "kind": "scene",
-        "kcgs_version": version("kcgs"),
+        **header("scene", cutoff, clamp),
         "recipe": recipe,
         "height": str(field.size[0]),
         "width": str(field.size[1]),
@@ -44,8 +56,6 @@ def describe(
         "num_regions": str(count),
         "region_ids": json.dumps(ids),
         "contours": kind,
-        "cutoff": f"{cutoff:g}",
-        "clamp": json.dumps(clamp),
         "left_out": json.dumps(_left_out(field, kind, tiles, groups, entries, clamp)),
     }
 
@@ -75,3 +85,22 @@ def _left_out(
         f"all but {100 * len(entries.tile) / max(1, total * len(field)):.2g} % of the pairs of Gaussian and tile"
     )
     return said
+
+
+def describe_decoder(model: onnx.ModelProto) -> dict[str, object]:
+    """Read what a decoder says of itself.
+
+    Args:
+        model: made by :func:`kcgs.onnx.scene_decoder` or :func:`kcgs.onnx.generic_decoder`.
+
+    Returns:
+        The metadata; lists as lists.
+
+    Example:
+        >>> from kcgs.onnx import scene_decoder
+        >>> model = scene_decoder(GaussianField.random(10, (32, 48), seed=0))
+        >>> describe_decoder(model)["num_gaussians"]
+        '10'
+    """
+    entries = {entry.key: entry.value for entry in model.metadata_props}
+    return {key: json.loads(value) if key in _LISTS else value for key, value in entries.items()}

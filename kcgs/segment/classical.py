@@ -11,6 +11,7 @@ from kcgs.segment.base import check_segment_image, register
 from kcgs.segment.cleanup import (
     absorb_specks,
     check_count,
+    check_number,
     connected_regions,
     lab_sums,
     merge_similar,
@@ -110,10 +111,8 @@ def felzenszwalb(
         [1, 1, 0]
     """
     pixels = check_segment_image(image)
-    if not (math.isfinite(scale) and scale > 0):
-        raise ValueError(f"scale must be a number above 0; got {scale}")
-    if not (math.isfinite(sigma) and sigma >= 0):
-        raise ValueError(f"sigma must be a number of at least 0; got {sigma}")
+    check_number("scale", scale, positive=True)
+    check_number("sigma", sigma)
     if max_regions is not None:
         check_count("max_regions", max_regions)
     min_size = smallest_size(pixels.shape[0] * pixels.shape[1], min_size)
@@ -164,15 +163,12 @@ def slic(
     pixels = check_segment_image(image)
     check_count("num_segments", num_segments)
     check_count("max_regions", max_regions)
-    if not (math.isfinite(compactness) and compactness > 0):
-        raise ValueError(f"compactness must be a number above 0; got {compactness}")
+    check_number("compactness", compactness, positive=True)
     min_size = smallest_size(pixels.shape[0] * pixels.shape[1], min_size)
     from skimage.segmentation import slic as superpixels
 
     raw = superpixels(pixels, num_segments, compactness, start_label=0, channel_axis=-1)
-    merged = merge_similar(image, connected_regions(torch.from_numpy(raw)), max_regions)
-    cleaned = clean(snap_contours(image, merged), min_size)
-    return order_by_area(merge_similar(image, cleaned, max_regions)).to(image.device)
+    return reduce_regions(image, connected_regions(torch.from_numpy(raw)), max_regions, min_size)
 
 
 def _photo_regions(image: Tensor, scale: float) -> Tensor:
@@ -206,6 +202,13 @@ def _spread(image: Tensor, labels: Tensor) -> float:
     lab, regions = rgb_to_lab(check_segment_image(image)), labels.numpy()
     means = lab_sums(lab, regions) / np.bincount(regions.ravel())[:, None]
     return float(np.sqrt(((lab - means[regions]) ** 2).sum(axis=-1).mean()))
+
+
+def reduce_regions(image: Tensor, pieces: Tensor, max_regions: int, min_size: int, snap: bool = True) -> Tensor:
+    """Merge pieces by colour, set contours on edges, and clean: at most ``max_regions``, by decreasing area."""
+    merged = merge_similar(image, pieces, max_regions)
+    cleaned = clean(snap_contours(image, merged) if snap else merged, min_size)
+    return order_by_area(merge_similar(image, cleaned, max_regions)).to(image.device)
 
 
 def clean(labels: Tensor, min_size: int) -> Tensor:

@@ -1,6 +1,7 @@
 """Turning raw label maps into few, clean, connected regions."""
 
 import heapq
+import math
 
 import numpy as np
 import torch
@@ -257,3 +258,9 @@ def check_count(name: str, value: int) -> None:
         raise TypeError(f"{name} must be an integer; got {value!r}")
     if value < 1:
         raise ValueError(f"{name} must be at least 1; got {value}")
+
+
+def check_number(name: str, value: float, *, positive: bool = False) -> None:
+    """Refuse what is not finite, or below 0, or 0 where it must be positive."""
+    if not (math.isfinite(value) and (value > 0 if positive else value >= 0)):
+        raise ValueError(f"{name} must be a number {'above' if positive else 'of at least'} 0; got {value}")

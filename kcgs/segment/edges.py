@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.segment.base import check_segment_image, register
-from kcgs.segment.classical import clean, smallest_size
-from kcgs.segment.cleanup import Labels, check_count, merge_similar, order_by_area, rgb_to_lab
-from kcgs.segment.contours import snap_contours
+from kcgs.segment.classical import clean, reduce_regions, smallest_size
+from kcgs.segment.cleanup import Labels, check_count, check_number, rgb_to_lab
 
 # Basins below this share of the smallest region go to their longest border first: hundreds of specks would use up the
 # merges by colour.
@@ -60,9 +59,8 @@ def watershed(
         [1, 0, 0]
     """
     pixels = check_segment_image(image)
-    for name, value in (("sigma", sigma), ("depth", depth)):
-        if not (math.isfinite(value) and value >= 0):
-            raise ValueError(f"{name} must be a number of at least 0; got {value}")
+    check_number("sigma", sigma)
+    check_number("depth", depth)
     if markers is not None:
         check_count("markers", markers)
     check_count("max_regions", max_regions)
@@ -73,14 +71,8 @@ def watershed(
     seeds = _minima(edges, depth) if markers is None else _deepest_minima(edges, markers)
     if not seeds.any():  # a level picture has no minimum
         return torch.zeros(pixels.shape[:2], dtype=torch.int64, device=image.device)
-    return _reduce(image, torch.from_numpy(flood(edges, seeds).astype(np.int64)), max_regions, min_size, snap)
-
-
-def _reduce(image: Tensor, basins: Tensor, max_regions: int, min_size: int, snap: bool) -> Tensor:
-    basins = clean(basins, max(1, round(_SPECK * min_size)))
-    labels = merge_similar(image, basins, max_regions)
-    labels = clean(snap_contours(image, labels) if snap else labels, min_size)
-    return order_by_area(merge_similar(image, labels, max_regions)).to(image.device)
+    basins = torch.from_numpy(flood(edges, seeds).astype(np.int64))
+    return reduce_regions(image, clean(basins, max(1, round(_SPECK * min_size))), max_regions, min_size, snap)
 
 
 def _edge_strength(pixels: NDArray[np.float32], sigma: float) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcgs.segment.base import check_segment_image, register
 from kcgs.segment.classical import clean, smallest_size
-from kcgs.segment.cleanup import check_count, connected_regions, merge_similar, order_by_area, rgb_to_lab
+from kcgs.segment.cleanup import check_count, check_number, connected_regions, merge_similar, order_by_area, rgb_to_lab
 from kcgs.segment.contours import snap_contours
 
 # Where k is not given: as few colours as leave this share of the variance, or are nearly flat (root mean square
@@ -62,8 +62,7 @@ def kmeans(
     pixels = check_segment_image(image)
     if num_colors is not None:
         check_count("num_colors", num_colors)
-    if not (math.isfinite(sigma) and sigma >= 0):
-        raise ValueError(f"sigma must be a number of at least 0; got {sigma}")
+    check_number("sigma", sigma)
     check_count("max_regions", max_regions)
     min_size = smallest_size(pixels.shape[0] * pixels.shape[1], min_size)
     from scipy.cluster.vq import vq

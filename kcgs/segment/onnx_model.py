@@ -14,6 +14,7 @@ from torch import Tensor
 
 from kcgs._check import check_size
 from kcgs.segment.base import check_segment_image
+from kcgs.segment.cleanup import check_number
 from kcgs.segment.sources import (
     IMAGENET_MEAN,
     IMAGENET_STD,
@@ -179,8 +180,7 @@ def check_preprocessing(
             raise ValueError(f"{name} must be three numbers; got {values!r}")
     if min(std) <= 0:
         raise ValueError(f"std must be above 0; got {std!r}")
-    if not (math.isfinite(scale) and scale > 0):
-        raise ValueError(f"scale must be a number above 0; got {scale}")
+    check_number("scale", scale, positive=True)
     return Preprocessing(None if size is None else check_size("size", size), tuple(mean), tuple(std), float(scale))
 
 
