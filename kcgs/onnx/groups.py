@@ -14,7 +14,7 @@ from kcgs.nn import GaussianField
 from .lists import TILE, Entries, Tiles
 
 # what a group of lists costs beside its entries, in entries
-_GROUP_COST = 150
+_GROUP_COST = 450
 # rounding of a polynomial shows in log w where a Gaussian is narrow: pixels, where weights down to a hundred-thousandth
 # are wanted, and below that
 _NARROW, _NARROW_OF_FAINT = 0.15, 0.4

@@ -530,7 +530,7 @@ class TestExamples:
             for content in ("[]", "{", "null"):
                 (folder / "index.json").write_text(content)
                 page.do("goto", url=site[1])
-                assert page.evaluate("kcgs.metadata") is None and page.alert() == ""
+                assert page.evaluate("kcgs.ready.then(() => kcgs.metadata)") is None and page.alert() == ""
         finally:
             shutil.rmtree(folder)
 

@@ -23,10 +23,10 @@ export function sameOrigin(address: string, base: string = document.baseURI): UR
   return url;
 }
 
-export async function fetchBlob(url: URL): Promise<Blob> {
+export async function fetchBlob(url: URL, cache: RequestCache = "default"): Promise<Blob> {
   let response: Response;
   try {
-    response = await fetch(url);
+    response = await fetch(url, { cache });
   } catch {
     throw new Error("the server does not answer.");
   }
@@ -34,11 +34,14 @@ export async function fetchBlob(url: URL): Promise<Blob> {
   return response.blob();
 }
 
-/** The bundled examples, none where the list is missing or no list. Its addresses are relative to itself. */
+/**
+ * The bundled examples, none where the list is missing or no list. Its addresses are relative to itself. Servers date
+ * files to the second, so a list that was just changed would come from the cache: it is read without.
+ */
 export async function readExamples(): Promise<Example[]> {
   const base = new URL(EXAMPLES, document.baseURI).href;
   try {
-    const list: unknown = JSON.parse(await (await fetchBlob(new URL(base))).text());
+    const list: unknown = JSON.parse(await (await fetchBlob(new URL(base), "no-store")).text());
     return Array.isArray(list) ? list.flatMap((item) => readExample(item, base)) : [];
   } catch {
     return [];
