@@ -33,8 +33,9 @@ class Axis:
         """
         g = self.g = graph
         self.size, self.tiles = size, -(-length // TILE)
-        start, extent = g.constant([0]), g.constant([length * _PARTS])
-        if ends is not None:
+        if ends is None:
+            start, extent = g.constant([0]), g.constant([length * _PARTS])
+        else:
             start, end = (g("Cast", g("Mul", at, np.float32(_PARTS)), to=INT64) for at in ends)
             extent = g("Sub", end, start)
         self.extent, self.parts = extent, g("Mul", size, 2 * _PARTS)  # of the scene; of a pixel of it
