@@ -63,6 +63,20 @@ def assert_same(
         assert (got - want).abs().max() < bound, size
 
 
+@pytest.mark.parametrize("interactive", [False, True])
+def test_every_constant_is_read(interactive: bool) -> None:
+    """The runtime says so of others, at every load."""
+    regions = RegionMap.from_labels(blobs((37, 53), 4), 0.8)
+    graphs = [scene_decoder(scattered(40, (37, 53), regions), regions, interactive=interactive).graph]
+    read: set[str] = set()
+    stored: set[str] = set()
+    for graph in graphs:  # grows by the graphs inside
+        stored |= {value.name for value in graph.initializer}
+        read |= {name for node in graph.node for name in node.input} | {value.name for value in graph.output}
+        graphs += [attribute.g for node in graph.node for attribute in node.attribute if attribute.HasField("g")]
+    assert stored and stored <= read
+
+
 class TestPicture:
     @pytest.mark.parametrize("cutoff", [1e-4, 1e-6, 0.0])
     @pytest.mark.parametrize("kind", ["none", "hard", "soft", "pairs", "fine"])
