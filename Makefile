@@ -3,7 +3,7 @@ VENV ?= .venv
 EXTRAS ?= dev
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all lint clean
+.PHONY: demo test test-all notebooks lint clean
 
 # The stamp is newer than what it was made from, or the environment is made again.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -20,6 +20,9 @@ test: $(VENV)/.installed
 
 test-all: $(VENV)/.installed
 	$(BIN)/python -m pytest
+
+notebooks: $(VENV)/.installed
+	$(BIN)/python notebooks/execute.py
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
