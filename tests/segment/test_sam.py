@@ -112,20 +112,20 @@ class TestPrompts:
 
     def test_boxes(self, options: dict[str, Any]) -> None:
         boxes = torch.tensor([[10.0, 10.0, 40.0, 30.0], [30.0, 25.0, 60.0, 45.0]])
-        labels, scores = segment_with_scores(picture(), "sam", boxes=boxes, **options)
+        labels, scores, _ = segment_with_scores(picture(), "sam", boxes=boxes, **options)
         assert_map(labels, scores)
         assert torch.equal(labels, segment(picture(), "sam", boxes=boxes, **options))
 
     def test_points(self, options: dict[str, Any]) -> None:
         points = torch.tensor([[[20.0, 20.0], [50.0, 40.0]]])
-        labels, scores = segment_with_scores(
+        labels, scores, _ = segment_with_scores(
             picture(), "sam", points=points, point_labels=torch.tensor([[1, 0]]), **options
         )
         assert_map(labels, scores)
-        assert_map(*segment_with_scores(picture(), "sam", points=points[0], **options))
+        assert_map(*segment_with_scores(picture(), "sam", points=points[0], **options)[:2])
 
     def test_grid(self, options: dict[str, Any]) -> None:
-        labels, scores = segment_with_scores(picture(), "sam", max_regions=5, min_size=4, **LOOSE, **options)
+        labels, scores, _ = segment_with_scores(picture(), "sam", max_regions=5, min_size=4, **LOOSE, **options)
         assert_map(labels, scores)
         assert 1 < len(labels.unique()) <= 5
 
@@ -139,7 +139,7 @@ class TestPrompts:
         assert torch.equal(labels, expected.repeat_interleave(2, 0).repeat_interleave(2, 1))
 
     def test_no_mask_is_good_enough(self, options: dict[str, Any]) -> None:
-        labels, scores = segment_with_scores(picture(), "sam", grid=1, min_stability=1.0, **options)
+        labels, scores, _ = segment_with_scores(picture(), "sam", grid=1, min_stability=1.0, **options)
         assert int(labels.max()) == 0
         assert scores is not None
         assert scores.isnan().all()
@@ -194,9 +194,10 @@ class TestKorniaCheckpoint:
             torch.manual_seed(0)
             torch.save(Sam.from_config(SamConfig("mobile_sam")).state_dict(), tmp_path / "mobile.pth")
         boxes = torch.tensor([[10.0, 10.0, 40.0, 30.0]])
-        assert_map(
-            *segment_with_scores(picture(), "sam", model="mobile_sam", checkpoint=tmp_path / "mobile.pth", boxes=boxes)
+        found = segment_with_scores(
+            picture(), "sam", model="mobile_sam", checkpoint=tmp_path / "mobile.pth", boxes=boxes
         )
+        assert_map(found.labels, found.scores)
 
 
 class TestSam2Checkpoint:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable
 from itertools import product
 
 from kcgs.bench.cells import count, db, markdown, seconds, signed

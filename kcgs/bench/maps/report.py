@@ -24,8 +24,9 @@ EF-PSNR within 5 pixels of the contours of the final map, the one that the scene
 that same band. Gained is what the fit with the map has over the baseline, in dB. An image whose final map has no
 contour has no band. Intervals are the bootstrap's, 95 %, of the mean over images drawn in pairs. Bytes are those of the
 final map as lossless WebP."""
-_BYTES_TEXT = """The gains are at equal numbers of Gaussians: a map's bytes come on top. At {size} bytes a Gaussian, those
-of `{auto}` would buy {bought} more Gaussians in the mean at N = {n:,}. `kcgs bench fit` compares at equal bytes."""
+_BYTES_TEXT = """The gains are at equal numbers of Gaussians: a map's bytes come on top. At {size} bytes a Gaussian,
+those of `{auto}` would buy {bought} more Gaussians in the mean at N = {n:,}. `kcgs bench fit` compares at equal
+bytes."""
 _BOUNDS_TEXT = "What automatic maps (`auto`) are held to, over all images."
 _QUICK_TEXT = "The short form, small pictures and few iterations: the numbers only show that all of it runs."
 
