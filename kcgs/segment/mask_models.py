@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, NamedTuple, Protocol, Unpack
 
 import torch
@@ -221,7 +222,9 @@ class _KorniaSam:
             self._prompter = visual.VisualPrompter(models.SamConfig(**fields), device=pixels.device)
         except Exception as error:  # Whatever a damaged file, other weights or a missing network raises.
             name = source or f"the released weights of {config.model_type!r}"
-            raise ValueError(f"cannot load {name} as Segment Anything {model!r}: {first_line(error)}") from error
+            # torch's own words advise to run whatever code is in the file
+            why = "it is no file of weights" if isinstance(error, UnpicklingError) else first_line(error)
+            raise ValueError(f"cannot load {name} as Segment Anything {model!r}: {why}") from error
         self._prompter.model.eval()
         self._prompter.set_image(pixels)
 

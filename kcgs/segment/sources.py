@@ -4,7 +4,7 @@ import functools
 import importlib
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, ParamSpec, TypedDict, Unpack
@@ -178,6 +178,10 @@ def segment_with_scores(image: Tensor, method: str = "auto", **options: object) 
 def cleanup_of(options: CleanupOptions, **defaults: Unpack[CleanupOptions]) -> Cleanup:
     """Return the clean-up of a call, its own options over a method's defaults."""
     merged: dict[str, Any] = {**defaults, **options}
+    known = [field.name for field in fields(Cleanup)]
+    unknown = [name for name in merged if name not in known]
+    if unknown:
+        raise TypeError(f"the method has no option {unknown[0]!r}; clean-up takes {', '.join(known)}")
     return Cleanup(**merged)
 
 

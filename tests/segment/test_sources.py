@@ -240,3 +240,34 @@ class TestDavis:
         frame = Davis(data_root / "DAVIS")["cows"]
         labels = segment(frame.image, "davis", root=data_root / "DAVIS", sequence="cows")
         assert torch.equal(labels, (frame.labels > 0).long())
+
+
+class TestOneCleanup:
+    """Sources without a model take the options of `Cleanup` too."""
+
+    @pytest.fixture
+    def photo(self) -> Tensor:
+        import skimage.data
+
+        return torch.from_numpy(skimage.data.coffee()).permute(2, 0, 1).float()[:, ::4, ::4] / 255
+
+    @pytest.mark.parametrize("method", ["auto", "felzenszwalb", "slic", "watershed", "kmeans"])
+    def test_least_area_and_budget(self, photo: Tensor, method: str) -> None:
+        areas = segment(photo, method, min_size=500, max_regions=3).flatten().bincount()
+        assert len(areas) <= 3 and areas.min() >= 500
+        assert len(segment(photo, method, min_size=60).unique()) > len(areas)
+
+    @pytest.mark.parametrize("method", ["felzenszwalb", "slic", "watershed", "kmeans"])
+    def test_snapping_is_optional(self, photo: Tensor, method: str) -> None:
+        maps = {snap: segment(photo, method, snap=snap) for snap in (False, True, 4)}
+        assert torch.equal(maps[False], segment(photo, method, snap=0))
+        assert torch.equal(maps[True], segment(photo, method, snap=2))
+        assert len({tuple(labels.flatten().tolist()) for labels in maps.values()}) == 3
+        with pytest.raises(ValueError, match="snap must be at least 0; got -1"):
+            segment(photo, method, snap=-1)
+        with pytest.raises(TypeError, match=r"snap must be a number of pixels, .*got 1.5"):
+            segment(photo, method, snap=1.5)
+
+    def test_unknown_option(self, tmp_path: Path) -> None:
+        with pytest.raises(TypeError, match="no option 'nams'; clean-up takes min_size, snap, max_regions, connected"):
+            segment(two_colors(), "onnx", model=tmp_path / "net.onnx", nams=["sky"])
