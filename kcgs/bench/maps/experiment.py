@@ -9,7 +9,9 @@ from pathlib import Path
 from kcgs._atomic import atomic_path
 
 from .report import write
-from .trials import Result, Scenes, plan, with_baselines
+from .trials import Result, Scenes, Trial, plan
+
+_GAINS = ("gain", "ef_gain", "equal_gain", "equal_ef_gain")
 
 
 def run(output: Path, *, data: Path | None = None, quick: bool = False) -> None:
@@ -30,16 +32,23 @@ def run(output: Path, *, data: Path | None = None, quick: bool = False) -> None:
     from rich.progress import Progress
 
     trials = plan(data, quick)
-    waiting = list(with_baselines(trials))
     scenes = Scenes(output / "runs", data)
     console = Console(stderr=True)
     try:
         with Progress(console=console, disable=not console.is_terminal) as progress:
-            task = progress.add_task("", total=len(waiting))
-            for trial in waiting:
+            task = progress.add_task("", total=len(trials))
+
+            def obtain(trial: Trial) -> None:
                 progress.update(task, description=f"{trial.image}, N = {trial.n:,}, map: {trial.source}")
                 if not scenes.has(trial):
                     scenes.make(trial)
+
+            for trial in trials:
+                obtain(trial.baseline())
+                obtain(trial)
+                rival = scenes.equal_bytes(trial)
+                if rival is not None:
+                    obtain(rival)
                 progress.advance(task)
     finally:
         results = [result for trial in trials if (result := scenes.result(trial)) is not None]
@@ -51,7 +60,7 @@ def run(output: Path, *, data: Path | None = None, quick: bool = False) -> None:
 def _write_csv(path: Path, results: Sequence[Result]) -> None:
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow([*Result._fields, "gain", "ef_gain"])
+        writer.writerow([*Result._fields, *_GAINS])
         for result in results:
-            values = [*result, result.gain, result.ef_gain]
+            values = [*result, *(getattr(result, name) for name in _GAINS)]
             writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])

@@ -57,7 +57,7 @@ def interval(values: Sequence[float]) -> tuple[float, float]:
 
 
 def gain_of(results: Iterable[Result], quantity: str) -> Gain | None:
-    """Sum up `gain` or `ef_gain`; images without a contour have no band and are left out. None: there are none."""
+    """Sum up one of the gains of a result, by name; images where it is not defined are left out. None: it nowhere is."""
     values = {r.image: float(getattr(r, quantity)) for r in results}
     values = {image: value for image, value in values.items() if not math.isnan(value)}
     if not values:

@@ -24,9 +24,14 @@ EF-PSNR within 5 pixels of the contours of the final map, the one that the scene
 that same band. Gained is what the fit with the map has over the baseline, in dB. An image whose final map has no
 contour has no band. Intervals are the bootstrap's, 95 %, of the mean over images drawn in pairs. Bytes are those of the
 final map as lossless WebP."""
-_BYTES_TEXT = """The gains are at equal numbers of Gaussians: a map's bytes come on top. At {size} bytes a Gaussian,
-those of `{auto}` would buy {bought} more Gaussians in the mean at N = {n:,}. `kcgs bench fit` compares at equal
-bytes."""
+_BYTES_TEXT = f"""Gains above are at equal numbers of Gaussians, and a map's bytes come on top. Here the baseline has the
+Gaussians that the bytes of the whole scene buy, the map's included, at {GAUSSIAN_BYTES} bytes a Gaussian."""
+_QUANTITIES = {
+    "gain": "PSNR",
+    "ef_gain": "EF-PSNR",
+    "equal_gain": "PSNR at equal bytes",
+    "equal_ef_gain": "EF-PSNR at equal bytes",
+}
 _BOUNDS_TEXT = "What automatic maps (`auto`) are held to, over all images."
 _QUICK_TEXT = "The short form, small pictures and few iterations: the numbers only show that all of it runs."
 
@@ -59,9 +64,9 @@ def _sections(results: Sequence[Result], output: Path, quick: bool) -> list[str]
     parts = ["## Where a map does not help", failures(results)]
     if not quick:
         parts += ["## Bounds", _BOUNDS_TEXT, bounds_table(automatic)]
-    parts += ["## Automatic maps", summary(automatic), _bytes_note(automatic)]
     plot_gains(results, output / "gains.png")
-    parts.append("![](gains.png)")
+    parts += ["## Automatic maps", summary(automatic), "![](gains.png)"]
+    parts += ["### At equal bytes", _BYTES_TEXT, at_equal_bytes(automatic)]
     others = [r for r in results if r.source in OTHERS]
     if others:
         images = list(dict.fromkeys(r.image for r in others))
@@ -80,7 +85,7 @@ def failures(results: Sequence[Result]) -> str:
     lines = []
     for n, source in dict.fromkeys((r.n, r.source) for r in results):
         found = [r for r in results if (r.n, r.source) == (n, source)]
-        for quantity, shown in (("gain", "PSNR"), ("ef_gain", "EF-PSNR")):
+        for quantity, shown in _QUANTITIES.items():
             below = sorted((getattr(r, quantity), r.image) for r in found if getattr(r, quantity) < -TIE)
             if below:
                 which = ", ".join(f"{image} {signed(value)}" for value, image in below)
@@ -113,23 +118,34 @@ def summary(results: Sequence[Result]) -> str:
     return markdown(header, lines)
 
 
+def at_equal_bytes(automatic: Sequence[Result]) -> str:
+    """Gains over the baseline of as many bytes."""
+    header = ["N", "source", "images", "baseline's N, mean", "PSNR gained", "95 %", "won-lost", "worst"]
+    header += ["EF-PSNR gained", "95 %", "won-lost", "worst"]
+    lines = []
+    for n in sorted({r.n for r in automatic}):
+        found = [r for r in automatic if r.n == n and r.equal_n]
+        if found:
+            line = [count(n), AUTO, str(len(found)), count(statistics.fmean(r.equal_n for r in found))]
+            lines.append([*line, *(c for q in ("equal_gain", "equal_ef_gain") for c in _gain_cells(gain_of(found, q)))])
+    return markdown(header, lines)
+
+
 def each_image(results: Sequence[Result]) -> str:
     """One line a fit; where a map loses comes first."""
     header = ["image", "source", "regions found", "regions kept", "map bytes", "PSNR", "baseline", "gained", "EF-PSNR"]
     header += ["baseline", "gained", "s, map", "s, fit", "s, baseline"]
+    has_rivals = any(r.equal_n for r in results)
+    header += ["baseline's N at equal bytes", "PSNR gained", "EF-PSNR gained"] if has_rivals else []
     lines = []
     for r in sorted(results, key=lambda r: (r.gain >= -TIE, r.gain if r.gain < -TIE else 0.0)):
         line = [r.image, r.source, count(r.given_regions), count(r.regions), count(r.map_bytes)]
         line += [db(r.psnr), db(r.baseline_psnr), signed(r.gain)]
         line += [db(r.ef_psnr), db(r.baseline_ef_psnr), signed(r.ef_gain)]
-        lines.append([*line, *map(seconds, (r.segment_seconds, r.seconds, r.baseline_seconds))])
+        line += map(seconds, (r.segment_seconds, r.seconds, r.baseline_seconds))
+        line += [count(r.equal_n), signed(r.equal_gain), signed(r.equal_ef_gain)] if has_rivals else []
+        lines.append(line)
     return markdown(header, lines)
-
-
-def _bytes_note(automatic: Sequence[Result]) -> str:
-    n = min(r.n for r in automatic)
-    bought = statistics.fmean(r.map_bytes for r in automatic if r.n == n) / GAUSSIAN_BYTES
-    return _BYTES_TEXT.format(size=GAUSSIAN_BYTES, auto=AUTO, bought=count(bought), n=n)
 
 
 def _gain_cells(gain: Gain | None) -> list[str]:

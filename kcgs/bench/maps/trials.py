@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 import warnings
-from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -13,12 +13,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.bench.fit.cases import BASELINE, QUICK_STRIDE, REFINED, Case, make_case
+from kcgs.bench.fit.cases import BASELINE, REFINED, Case, make_case
 from kcgs.bench.fit.runs import warm_up
-from kcgs.bench.sizes import stored_bytes
+from kcgs.bench.sizes import GAUSSIAN_BYTES, stored_bytes
 from kcgs.data import load_image
 from kcgs.fit import fit
-from kcgs.functional import ef_psnr, psnr
+from kcgs.functional import RegionMap, ef_psnr, psnr
 from kcgs.io import Scene, load, save
 from kcgs.nn.renderer import render_image
 from kcgs.segment import segment
@@ -31,6 +31,7 @@ COUNTS = (400, 1_000)
 # the other sources are compared at the first of the counts, on every so many of the pictures
 OTHERS_STRIDE = 4
 QUICK_COUNT = 60
+QUICK_STRIDE = 4
 QUICK_IMAGES = 2
 
 
@@ -44,7 +45,9 @@ class Trial(NamedTuple):
 
     def case(self) -> Case:
         """Recipe and settings; those of a map are what `kcgs fit --regions auto` takes."""
-        return make_case("maps", self.image, self.n, BASELINE if self.source == NO_MAP else REFINED, quick=self.quick)
+        name = BASELINE if self.source == NO_MAP else REFINED
+        case = make_case("maps", self.image, self.n, name, quick=self.quick)
+        return case._replace(stride=QUICK_STRIDE if self.quick else 1)
 
     def baseline(self) -> Trial:
         """Return the fit of the same picture without a map."""
@@ -67,6 +70,9 @@ class Result(NamedTuple):
     segment_seconds: float
     seconds: float  # of the fit
     baseline_seconds: float
+    equal_n: int = 0  # of the baseline that the bytes of all of the scene buy; 0: it was not asked for
+    equal_psnr: float = math.nan
+    equal_ef_psnr: float = math.nan
 
     @property
     def gain(self) -> float:
@@ -77,6 +83,16 @@ class Result(NamedTuple):
     def ef_gain(self) -> float:
         """Difference in EF-PSNR."""
         return self.ef_psnr - self.baseline_ef_psnr
+
+    @property
+    def equal_gain(self) -> float:
+        """Difference in PSNR to the baseline of as many bytes."""
+        return self.psnr - self.equal_psnr
+
+    @property
+    def equal_ef_gain(self) -> float:
+        """Difference in EF-PSNR to the baseline of as many bytes."""
+        return self.ef_psnr - self.equal_ef_psnr
 
 
 def images_of(data: Path | None) -> list[str]:
@@ -105,11 +121,6 @@ def plan(data: Path | None, quick: bool) -> list[Trial]:
     shown = images[:QUICK_IMAGES] if quick else images
     trials = [Trial(image, n, AUTO, quick) for n in counts for image in shown]
     return trials + [Trial(i, counts[0], source, quick) for i in subset(images, quick) for source in OTHERS]
-
-
-def with_baselines(trials: list[Trial]) -> Iterator[Trial]:
-    """Yield every fit that is needed, each once."""
-    yield from dict.fromkeys(t for trial in trials for t in (trial.baseline(), trial))
 
 
 class Scenes:
@@ -143,13 +154,24 @@ class Scenes:
         }
         save(self._path(trial), result.field, result.regions, metadata={k: str(v) for k, v in notes.items()})
 
+    def equal_bytes(self, trial: Trial) -> Trial | None:
+        """Return the baseline with the Gaussians that the bytes of a finished fit buy; None: it is not asked for."""
+        if trial.source != AUTO:
+            return None
+        scene = load(self._path(trial))
+        bought = stored_bytes(_contours(scene)) // GAUSSIAN_BYTES
+        return trial.baseline()._replace(n=len(scene.field) + bought)
+
     def result(self, trial: Trial) -> Result | None:
-        """Measure a fit and its baseline; None: one of them is not there."""
+        """Measure a fit beside its baselines; None: the fit, or the one of as many Gaussians, is not there."""
         if not (self.has(trial) and self.has(trial.baseline())):
             return None
-        image, ours, other = self._image(trial), load(self._path(trial)), load(self._path(trial.baseline()))
-        regions = ours.regions if ours.regions is not None and ours.regions.num_regions > 1 else None
-        figures = [_quality(scene, image, None if regions is None else regions.labels) for scene in (ours, other)]
+        ours, other = load(self._path(trial)), load(self._path(trial.baseline()))
+        rival = self.equal_bytes(trial)
+        rivals = [] if rival is None or not self.has(rival) else [load(self._path(rival))]
+        image, regions = self._image(trial), _contours(ours)
+        labels = None if regions is None else regions.labels
+        figures = [_quality(scene, image, labels) for scene in (ours, other, *rivals)]
         return Result(
             trial.image,
             trial.n,
@@ -162,6 +184,7 @@ class Scenes:
             float(ours.metadata["segment_seconds"]),
             float(ours.metadata["seconds"]),
             float(other.metadata["seconds"]),
+            *(() if rival is None or not rivals else (rival.n, *figures[2])),
         )
 
     def _path(self, trial: Trial) -> Path:
@@ -170,13 +193,18 @@ class Scenes:
 
     def _image(self, trial: Trial) -> Tensor:
         image = _read(self._data, trial.image)
-        stride = QUICK_STRIDE if trial.quick else 1
+        stride = trial.case().stride
         return image[:, ::stride, ::stride].contiguous()
+
+
+def _contours(scene: Scene) -> RegionMap | None:
+    """Return the map of a scene, None where it has no contour."""
+    return scene.regions if scene.regions is not None and scene.regions.num_regions > 1 else None
 
 
 def _quality(scene: Scene, image: Tensor, labels: Tensor | None) -> tuple[float, float]:
     picture = render_image(scene.field, scene.regions)
-    edges = float("nan") if labels is None else float(ef_psnr(picture, image, labels))
+    edges = math.nan if labels is None else float(ef_psnr(picture, image, labels))
     return float(psnr(picture, image)), edges
 
 
