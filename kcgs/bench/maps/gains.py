@@ -57,7 +57,7 @@ def interval(values: Sequence[float]) -> tuple[float, float]:
 
 
 def gain_of(results: Iterable[Result], quantity: str) -> Gain | None:
-    """Sum up one of the gains of a result, by name; images where it is not defined are left out. None: it nowhere is."""
+    """Sum up a gain of results, by name; images where it is not defined are left out. None: it is nowhere."""
     values = {r.image: float(getattr(r, quantity)) for r in results}
     values = {image: value for image, value in values.items() if not math.isnan(value)}
     if not values:

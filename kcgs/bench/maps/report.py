@@ -24,8 +24,8 @@ EF-PSNR within 5 pixels of the contours of the final map, the one that the scene
 that same band. Gained is what the fit with the map has over the baseline, in dB. An image whose final map has no
 contour has no band. Intervals are the bootstrap's, 95 %, of the mean over images drawn in pairs. Bytes are those of the
 final map as lossless WebP."""
-_BYTES_TEXT = f"""Gains above are at equal numbers of Gaussians, and a map's bytes come on top. Here the baseline has the
-Gaussians that the bytes of the whole scene buy, the map's included, at {GAUSSIAN_BYTES} bytes a Gaussian."""
+_BYTES_TEXT = f"""Gains above are at equal numbers of Gaussians, and a map's bytes come on top. Here the baseline has
+the Gaussians that the bytes of the whole scene buy, the map's included, at {GAUSSIAN_BYTES} bytes a Gaussian."""
 _QUANTITIES = {
     "gain": "PSNR",
     "ef_gain": "EF-PSNR",
