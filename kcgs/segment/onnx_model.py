@@ -166,8 +166,7 @@ def lseg(
     """
     pixels = torch.from_numpy(check_segment_image(image)).permute(2, 0, 1)
     rules = cleanup_of(cleanup)
-    if not (math.isfinite(temperature) and temperature > 0):
-        raise ValueError(f"temperature must be a number above 0; got {temperature}")
+    check_number("temperature", temperature, positive=True)
     texts, words = _embeddings(embeddings), read_names(names)
     if words is not None:
         check_names(words, len(texts))
@@ -187,6 +186,8 @@ def check_preprocessing(
 ) -> Preprocessing:
     """Return checked options."""
     for name, values in (("mean", mean), ("std", std)):
+        if not isinstance(values, Sequence) or not all(isinstance(value, int | float) for value in values):
+            raise TypeError(f"{name} must be three numbers; got {values!r}")
         if len(values) != 3 or not all(math.isfinite(value) for value in values):
             raise ValueError(f"{name} must be three numbers; got {values!r}")
     if min(std) <= 0:

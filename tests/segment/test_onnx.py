@@ -201,6 +201,11 @@ class TestErrors:
         with pytest.raises(ValueError, match=message):
             segment(two_colors(), "onnx", model=path, **options)
 
+    @pytest.mark.parametrize("options", [{"mean": "half"}, {"std": (1.0, "one", 1.0)}, {"scale": "255"}])
+    def test_numbers(self, tmp_path: Path, options: dict[str, Any]) -> None:
+        with pytest.raises(TypeError, match=f"{next(iter(options))} must be .*number.*; got"):
+            segment(two_colors(), "onnx", model=mixing(tmp_path / "net.onnx", EYE), **options)
+
     def test_input_of_another_shape(self, tmp_path: Path) -> None:
         graph = helper.make_graph(
             [helper.make_node("Relu", ["x"], ["y"])],

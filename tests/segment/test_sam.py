@@ -115,6 +115,7 @@ class TestPrompts:
         labels, scores, _ = segment_with_scores(picture(), "sam", boxes=boxes, **options)
         assert_map(labels, scores)
         assert torch.equal(labels, segment(picture(), "sam", boxes=boxes, **options))
+        assert torch.equal(labels, segment(picture(), "sam", boxes=boxes.int().tolist(), **options))
 
     def test_points(self, options: dict[str, Any]) -> None:
         points = torch.tensor([[[20.0, 20.0], [50.0, 40.0]]])
@@ -123,6 +124,16 @@ class TestPrompts:
         )
         assert_map(labels, scores)
         assert_map(*segment_with_scores(picture(), "sam", points=points[0], **options)[:2])
+
+    def test_lists(self, options: dict[str, Any]) -> None:
+        labels = segment(picture(), "sam", points=[[20, 20], [50, 40.5]], point_labels=[1, 0], **options)
+        points = torch.tensor([[20.0, 20.0], [50.0, 40.5]])
+        assert torch.equal(
+            labels, segment(picture(), "sam", points=points, point_labels=torch.tensor([1, 0]), **options)
+        )
+        for wrong in ({"boxes": [[1, 2], [3]]}, {"points": "here"}, {"points": [[1, 2]], "point_labels": [0.5]}):
+            with pytest.raises(TypeError, match=f"{list(wrong)[-1]} must"):
+                segment(picture(), "sam", **wrong, **options)
 
     def test_grid(self, options: dict[str, Any]) -> None:
         labels, scores, _ = segment_with_scores(picture(), "sam", max_regions=5, min_size=4, **LOOSE, **options)
