@@ -46,7 +46,8 @@ def auto(image: Tensor, *, max_regions: int = 30, min_size: int | None = None) -
     regions unite whose contour saves less error than it costs (`merge_worthless`), and then the most similar
     neighbours until ``max_regions`` are left. A scene that needs no contour gives one region. On 21 photos of
     BSDS500 some three fifths of the contours lie within 3 pixels of human ones, and of the human ones are
-    found; borders of texture alone are not seen.
+    found; borders of texture alone are not seen. With 400 Gaussians a fit gains 0.76 dB by these maps, and
+    loses 0.65 dB to Gaussians of as many bytes where a map is stored as lossless WebP (`kcgs bench maps`).
 
     Args:
         image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1], any size.

@@ -23,7 +23,8 @@ freely, which is `{ours}`. The baseline is `{baseline}` with as many Gaussians. 
 EF-PSNR within 5 pixels of the contours of the final map, the one that the scene stores: both pictures are measured in
 that same band. Gained is what the fit with the map has over the baseline, in dB. An image whose final map has no
 contour has no band. Intervals are the bootstrap's, 95 %, of the mean over images drawn in pairs. Bytes are those of the
-final map as lossless WebP."""
+final map as lossless WebP. Seconds are wall time, compilation excluded, in summaries medians; what else the machine did
+meanwhile slows them."""
 _BYTES_TEXT = f"""Gains above are at equal numbers of Gaussians, and a map's bytes come on top. Here the baseline has
 the Gaussians that the bytes of the whole scene buy, the map's included, at {GAUSSIAN_BYTES} bytes a Gaussian."""
 _QUANTITIES = {
