@@ -39,7 +39,7 @@ _MAX_PIXELS = 500_000
 
 @register("auto")
 def auto(image: Tensor, *, max_regions: int = 30, min_size: int | None = None) -> Tensor:
-    """Segment a photo into up to 30 clean connected regions, as many as are worth their bits.
+    """Segment a photo into up to 30 clean connected regions, fewer where contours would save too little.
 
     The method of Felzenszwalb and Huttenlocher, with its scale halved up to twice while fewer than 4 regions
     come out that are not nearly flat; contours snap to edges, pieces under ``min_size`` are absorbed;
