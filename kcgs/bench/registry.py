@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from pathlib import Path
 
-_EXPERIMENTS = ("demo", "render", "fit", "decode", "zoo")
+_EXPERIMENTS = ("demo", "render", "fit", "maps", "decode", "zoo")
 # those that have groups to choose from
 _GROUPED = ("fit", "decode", "zoo")
 

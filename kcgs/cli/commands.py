@@ -173,7 +173,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
 
 @app.command()
 def bench(
-    name: Annotated[str, typer.Argument(help="Experiment by name: decode, demo, fit, render, zoo.")],
+    name: Annotated[str, typer.Argument(help="Experiment by name: decode, demo, fit, maps, render, zoo.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the report.")],
     data: Annotated[Path | None, typer.Option(help="Folder with images, where the experiment needs them.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A short form of the same.")] = False,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,8 +15,21 @@ from .common import IMAGES, Json, app, check_output, print_report
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from kcgs.segment import Segmentation
+
 # Contours drawn by people reach 0.63 and more on their own image, at most 0.54 on its mirror image.
 _ALIGNED = 0.58
+# of the table of regions: title and text of each column
+_COLUMNS: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "id": ("id", str),
+    "name": ("name", str),
+    "area": ("area", str),
+    "share": ("share", "{:.1%}".format),
+    "edge_alignment": ("edge alignment", "{:.2f}".format),
+    "gaussian_share": ("share of Gaussians", "{:.1%}".format),
+    "score": ("score", "{:.2f}".format),
+}
+_KNOWN = ("id", "area", "share", "edge_alignment", "gaussian_share")
 
 
 @app.command()
@@ -33,9 +47,13 @@ def segment(
     overlay: Annotated[Path | None, typer.Option(help="Draw the regions over the image into this file.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Make a label map of an image, and say of each region its size and how well its contour lies on edges."""
+    """Make a label map of an image, and list its regions.
+
+    The list says of each its area, how well its contour lies on edges (0.5 is chance), the share of the Gaussians that
+    a fit starts with there, and, where the method knows them, its name and score.
+    """
     from kcgs.data import load_image, overlay_labels, save_image, save_labels
-    from kcgs.segment import segment as make_labels
+    from kcgs.segment import segment_with_scores
 
     check_output(output, ".png", ".npy")
     if overlay is not None:
@@ -44,11 +62,11 @@ def segment(
     if max_regions is not None:
         options["max_regions"] = max_regions
     picture = load_image(image)
-    labels = make_labels(picture, method, **options)
-    save_labels(output, labels)
+    found = segment_with_scores(picture, method, **options)
+    save_labels(output, found.labels)
     if overlay is not None:
-        save_image(overlay, overlay_labels(picture, labels))
-    rows, alignment = _table(picture, labels)
+        save_image(overlay, overlay_labels(picture, found.labels))
+    rows, alignment = _table(picture, found)
     report = {
         "regions": len(rows),
         "smallest": rows[-1]["area"],
@@ -93,31 +111,41 @@ def _parse_options(pairs: list[str]) -> dict[str, Any]:
     return options
 
 
-def _table(picture: Tensor, labels: Tensor) -> tuple[list[dict[str, Any]], float]:
-    """Return a row for each region, and the alignment of the whole map; None where a region has no contour."""
-    from kcgs.functional import edge_alignment_map
+def _table(picture: Tensor, found: Segmentation) -> tuple[list[dict[str, Any]], float]:
+    """Return a row for each region, and the alignment of the whole map; None is what is not known."""
+    from kcgs.fit.initialize import gaussian_shares
+    from kcgs.functional import RegionMap, edge_alignment_map
 
-    aligned = edge_alignment_map(picture, labels).flatten()
+    aligned = edge_alignment_map(picture, found.labels).flatten()
     known = aligned.isfinite()
-    flat = labels.flatten()
+    flat = found.labels.flatten()
     areas = flat.bincount()
     sums = flat[known].bincount(aligned[known], minlength=len(areas))
-    means = (sums / flat[known].bincount(minlength=len(areas))).tolist()
-    rows = [
-        {"id": region, "area": area, "share": area / len(flat), "edge_alignment": None if math.isnan(mean) else mean}
-        for region, (area, mean) in enumerate(zip(areas.tolist(), means, strict=True))
-    ]
+    columns = {
+        "area": areas.tolist(),
+        "share": (areas / len(flat)).tolist(),
+        "edge_alignment": (sums / flat[known].bincount(minlength=len(areas))).tolist(),
+        "gaussian_share": gaussian_shares(picture, RegionMap.from_labels(found.labels)).tolist(),
+        "score": [None] * len(areas) if found.scores is None else found.scores.tolist(),
+    }
+    rows = []
+    for region in range(len(areas)):
+        row = {name: values[region] for name, values in columns.items()}
+        row = {name: None if isinstance(v, float) and math.isnan(v) else v for name, v in row.items()}
+        rows.append({"id": region, "name": None if found.names is None else found.names[region], **row})
     return rows, float(aligned.nanmean())
 
 
 def _print_table(rows: list[dict[str, Any]]) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
-    table = Table("id", "area", "share", "edge alignment")
-    for column in table.columns:
-        column.justify = "right"
+    # a method without names or scores gets no empty columns for them
+    shown = {key: _COLUMNS[key] for key in _COLUMNS if key in _KNOWN or any(row[key] is not None for row in rows)}
+    table = Table()
+    for title, _ in shown.values():
+        table.add_column(title, justify="left" if title == "name" else "right")
     for row in rows:
-        mean = row["edge_alignment"]
-        table.add_row(str(row["id"]), str(row["area"]), f"{row['share']:.1%}", "" if mean is None else f"{mean:.2f}")
+        table.add_row(*("" if row[key] is None else escape(text(row[key])) for key, (_, text) in shown.items()))
     Console().print(table)

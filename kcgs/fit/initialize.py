@@ -140,12 +140,8 @@ def kmeans_field(
     rng = np.random.default_rng(seed)
     planes = image.detach().cpu().double().numpy()
     size = planes.shape[1:]
-    index = np.zeros(size, np.int64) if regions is None else regions._membership.index[0].cpu().numpy().astype(np.int64)
-    slope = _slope(planes, index)
-    density = np.full(size, 1.0 - _GRADIENT_SHARE)
-    if slope.any():
-        density += _GRADIENT_SHARE * (slope / slope.mean()) ** _GRADIENT_POWER
-    count = 1 if regions is None else regions.num_regions
+    index, count = _region_index(size, regions)
+    density = _density(planes, index)
     mass = np.bincount(index.ravel(), density.ravel(), minlength=count).astype(np.float64)
     budget = np.zeros(count, np.int64)
     # a region may have no pixel of its own, with a map finer than the image
@@ -163,6 +159,44 @@ def kmeans_field(
     if regions is not None:
         field.region_ids = regions.ids[torch.from_numpy(np.repeat(np.arange(len(budget)), budget)).to(image.device)]
     return _solve_colors(field, image, regions, backend)
+
+
+def gaussian_shares(image: Tensor, regions: RegionMap) -> Tensor:
+    """Share of the Gaussians that `kmeans_field` gives every region, the rounding to whole ones left aside.
+
+    Args:
+        image: (C, H, W) floating.
+        regions: the map, R regions.
+
+    Returns:
+        (R,) float64 on the CPU in the order of the map's ids; they sum to 1.
+
+    Example:
+        >>> labels = torch.zeros(16, 24, dtype=torch.long)
+        >>> labels[:, 18:] = 7
+        >>> gaussian_shares(torch.zeros(3, 16, 24), RegionMap.from_labels(labels))
+        tensor([0.7500, 0.2500], dtype=torch.float64)
+    """
+    planes = image.detach().cpu().double().numpy()
+    index, count = _region_index(planes.shape[1:], regions)
+    mass = np.bincount(index.ravel(), _density(planes, index).ravel(), minlength=count)
+    return torch.from_numpy(mass / mass.sum())
+
+
+def _region_index(size: tuple[int, ...], regions: RegionMap | None) -> tuple[Indices, int]:
+    """Place of every pixel's region in the map's ids, (H, W), and the number of regions."""
+    if regions is None:
+        return np.zeros(size, np.int64), 1
+    return regions._membership.index[0].cpu().numpy().astype(np.int64), regions.num_regions
+
+
+def _density(planes: Array, index: Indices) -> Array:
+    """Density of the cells' centres, (H, W)."""
+    slope = _slope(planes, index)
+    density = np.full(index.shape, 1.0 - _GRADIENT_SHARE)
+    if slope.any():
+        density += _GRADIENT_SHARE * (slope / slope.mean()) ** _GRADIENT_POWER
+    return density
 
 
 def _slope(planes: Array, index: Indices) -> Array:

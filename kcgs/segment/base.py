@@ -1,6 +1,7 @@
 """What a segmenter is, and the segmenters by name."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -10,6 +11,8 @@ from torch import Tensor
 from kcgs._check import check_floating
 
 _TOLERANCE = 1e-3
+# packages that are called otherwise than what is imported
+_PACKAGES = {"skimage": "scikit-image", "PIL": "pillow"}
 
 
 class Segmenter(Protocol):
@@ -87,6 +90,7 @@ def segment(image: Tensor, method: str = "auto", **options: object) -> Tensor:
         TypeError: ``image`` is no floating tensor, or the method has no such option.
         ValueError: ``method`` is unknown, or ``image`` has another shape, non-finite values or values outside
             [0, 1].
+        ImportError: the method's library is not installed; the message has the line that installs it.
 
     Example:
         >>> import torch
@@ -97,7 +101,21 @@ def segment(image: Tensor, method: str = "auto", **options: object) -> Tensor:
     """
     if method not in _methods:
         raise ValueError(f"method must be one of {', '.join(available_methods())}; got {method!r}")
-    return _methods[method](image, **options)
+    with names_missing_library(method):
+        return _methods[method](image, **options)
+
+
+@contextmanager
+def names_missing_library(used_by: str) -> Iterator[None]:
+    """Let a library that is not installed raise an ImportError with the line that installs it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        module = (error.name or "").partition(".")[0]
+        if module in ("", "kcgs"):
+            raise
+        package = _PACKAGES.get(module, module)
+        raise ImportError(f"segmentation method {used_by!r} needs {module}: pip install {package} ({error})") from error
 
 
 def check_segment_image(image: object) -> NDArray[np.float32]:

@@ -261,6 +261,8 @@ def check_count(name: str, value: int) -> None:
 
 
 def check_number(name: str, value: float, *, positive: bool = False) -> None:
-    """Refuse what is not finite, or below 0, or 0 where it must be positive."""
+    """Refuse what is no number, not finite, below 0, or 0 where it must be positive."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{name} must be a number; got {value!r}")
     if not (math.isfinite(value) and (value > 0 if positive else value >= 0)):
         raise ValueError(f"{name} must be a number {'above' if positive else 'of at least'} 0; got {value}")

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.segment.base import check_segment_image, register
-from kcgs.segment.classical import clean, reduce_regions, smallest_size
+from kcgs.segment.classical import check_reach, clean, reduce_regions, smallest_size
 from kcgs.segment.cleanup import Labels, check_count, check_number, rgb_to_lab
 
 # Basins below this share of the smallest region go to their longest border first: hundreds of specks would use up the
@@ -27,7 +27,7 @@ def watershed(
     markers: int | None = None,
     max_regions: int = 20,
     min_size: int | None = None,
-    snap: bool = True,
+    snap: bool | int = True,
 ) -> Tensor:
     """Segment into the basins of the edge strength by watershed, and merge the most similar neighbours.
 
@@ -42,7 +42,7 @@ def watershed(
         markers: about how many basins to flood, at least 1, the deepest; None: as many as ``depth`` gives.
         max_regions: the most regions to return, at least 1.
         min_size: pixels of the smallest region, at least 1; None: 0.4 % of the image (small images: more).
-        snap: move contours onto the strongest edge within 2 pixels.
+        snap: move contours by up to so many pixels onto the image's edges; True: 2, False: 0.
 
     Returns:
         :math:`(H, W)` int64, 4-connected regions with ids 0 to R - 1 by decreasing area.
@@ -64,6 +64,7 @@ def watershed(
     if markers is not None:
         check_count("markers", markers)
     check_count("max_regions", max_regions)
+    reach = check_reach(snap)
     min_size = smallest_size(pixels.shape[0] * pixels.shape[1], min_size)
     from skimage.segmentation import watershed as flood
 
@@ -72,7 +73,7 @@ def watershed(
     if not seeds.any():  # a level picture has no minimum
         return torch.zeros(pixels.shape[:2], dtype=torch.int64, device=image.device)
     basins = torch.from_numpy(flood(edges, seeds).astype(np.int64))
-    return reduce_regions(image, clean(basins, max(1, round(_SPECK * min_size))), max_regions, min_size, snap)
+    return reduce_regions(image, clean(basins, max(1, round(_SPECK * min_size))), max_regions, min_size, reach)
 
 
 def _edge_strength(pixels: NDArray[np.float32], sigma: float) -> NDArray[np.float64]:

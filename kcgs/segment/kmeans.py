@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.segment.base import check_segment_image, register
-from kcgs.segment.classical import clean, smallest_size
+from kcgs.segment.classical import check_reach, clean, smallest_size
 from kcgs.segment.cleanup import check_count, check_number, connected_regions, merge_similar, order_by_area, rgb_to_lab
 from kcgs.segment.contours import snap_contours
 
@@ -30,7 +30,7 @@ def kmeans(
     sigma: float = 1.0,
     max_regions: int = 20,
     min_size: int | None = None,
-    snap: bool = True,
+    snap: bool | int = True,
 ) -> Tensor:
     """Cluster the colours by k-means in CIE Lab, take the connected pieces, and merge the most similar neighbours.
 
@@ -43,7 +43,7 @@ def kmeans(
         sigma: smoothing beforehand, in pixels, at least 0; the contours then snap to the image's own edges.
         max_regions: the most regions to return, at least 1.
         min_size: pixels of the smallest region, at least 1; None: 0.4 % of the image (small images: more).
-        snap: move contours onto the strongest edge within 2 pixels.
+        snap: move contours by up to so many pixels onto the image's edges; True: 2, False: 0.
 
     Returns:
         :math:`(H, W)` int64, 4-connected regions with ids 0 to R - 1 by decreasing area.
@@ -64,6 +64,7 @@ def kmeans(
         check_count("num_colors", num_colors)
     check_number("sigma", sigma)
     check_count("max_regions", max_regions)
+    reach = check_reach(snap)
     min_size = smallest_size(pixels.shape[0] * pixels.shape[1], min_size)
     from scipy.cluster.vq import vq
     from scipy.ndimage import gaussian_filter
@@ -74,8 +75,8 @@ def kmeans(
     clusters = torch.from_numpy(nearest.astype(np.int64)).view(pixels.shape[:2])
     # Not kornia.contrib's: there corners join pieces, and the one by pooling cuts what is longer than its steps.
     pieces = clean(connected_regions(clusters), min_size)
-    if snap:
-        pieces = clean(snap_contours(image, pieces), min_size)
+    if reach:
+        pieces = clean(snap_contours(image, pieces, reach=reach), min_size)
     return order_by_area(merge_similar(image, pieces, max_regions)).to(image.device)
 
 

@@ -1,7 +1,9 @@
 """Segment Anything: kornia's, and SAM 2 through transformers, prompted by points, boxes or a grid."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, NamedTuple, Protocol, Unpack
 
 import torch
@@ -57,9 +59,9 @@ def sam(
     *,
     model: str | os.PathLike[str] | Any = "vit_b",
     checkpoint: str | os.PathLike[str] | None = None,
-    boxes: Tensor | None = None,
-    points: Tensor | None = None,
-    point_labels: Tensor | None = None,
+    boxes: Tensor | Sequence[Any] | None = None,
+    points: Tensor | Sequence[Any] | None = None,
+    point_labels: Tensor | Sequence[Any] | None = None,
     grid: int = 16,
     min_score: float = 0.88,
     min_stability: float = 0.95,
@@ -81,7 +83,7 @@ def sam(
             ``kornia.models.sam.SamConfig``; else SAM 2 by transformers: a hub id such as
             "facebook/sam2.1-hiera-tiny", a local folder, or a loaded ``Sam2Model``.
         checkpoint: the weights of a kornia model, a file or URL; None: the released ones, downloaded once.
-        boxes: :math:`(K, 4)` left, top, right, bottom in pixels.
+        boxes: :math:`(K, 4)` left, top, right, bottom in pixels; these three may be lists too.
         points: :math:`(K, 2)`, or :math:`(K, P, 2)` for K objects of P points each, (x, y) in pixels.
         point_labels: integers of the shape of ``points`` less its last dimension, 1 in the object and 0
             outside; None: all 1.
@@ -106,7 +108,8 @@ def sam(
     """
     pixels = torch.from_numpy(check_segment_image(image)).permute(2, 0, 1).to(image.device)
     rules = cleanup_of(cleanup)
-    prompts = _check_prompts(pixels, boxes, points, point_labels, grid)
+    given = {"boxes": boxes, "points": points, "point_labels": point_labels}
+    prompts = _check_prompts(pixels, **{name: _as_tensor(name, values) for name, values in given.items()}, grid=grid)
     for name, value in (("min_score", min_score), ("min_stability", min_stability), ("max_overlap", max_overlap)):
         check_share(name, value)
     pixels, prompts = _shrunk(pixels, prompts)
@@ -221,7 +224,9 @@ class _KorniaSam:
             self._prompter = visual.VisualPrompter(models.SamConfig(**fields), device=pixels.device)
         except Exception as error:  # Whatever a damaged file, other weights or a missing network raises.
             name = source or f"the released weights of {config.model_type!r}"
-            raise ValueError(f"cannot load {name} as Segment Anything {model!r}: {first_line(error)}") from error
+            # torch's own words advise to run whatever code is in the file
+            why = "it is no file of weights" if isinstance(error, UnpicklingError) else first_line(error)
+            raise ValueError(f"cannot load {name} as Segment Anything {model!r}: {why}") from error
         self._prompter.model.eval()
         self._prompter.set_image(pixels)
 
@@ -271,8 +276,19 @@ def _predictor(pixels: Tensor, model: Any, checkpoint: str | os.PathLike[str] | 
     return _Sam2(pixels, model)
 
 
+def _as_tensor(name: str, values: Tensor | Sequence[Any] | None) -> Tensor | None:
+    """Return what may be a list, as from the command line, as a tensor; its shape is checked later."""
+    if values is None or isinstance(values, Tensor):
+        return values
+    try:
+        tensor = torch.tensor(values)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"{name} must be a tensor, or lists of numbers of one length; got {values!r}") from error
+    return tensor if name == "point_labels" else tensor.float()
+
+
 def _check_prompts(
-    pixels: Tensor, boxes: Tensor | None, points: Tensor | None, point_labels: Tensor | None, grid: int
+    pixels: Tensor, *, boxes: Tensor | None, points: Tensor | None, point_labels: Tensor | None, grid: int
 ) -> Prompts:
     check_count("grid", grid)
     height, width = pixels.shape[1:]

@@ -15,6 +15,7 @@ from torch import Tensor
 from kcgs._check import check_size
 from kcgs.segment.base import check_segment_image
 from kcgs.segment.cleanup import check_number
+from kcgs.segment.names import check_names, read_names
 from kcgs.segment.sources import (
     IMAGENET_MEAN,
     IMAGENET_STD,
@@ -61,6 +62,7 @@ def onnx(
     mean: Sequence[float] = IMAGENET_MEAN,
     std: Sequence[float] = IMAGENET_STD,
     scale: float = 1.0,
+    names: Sequence[str] | str | os.PathLike[str] | None = None,
     **cleanup: Unpack[CleanupOptions],
 ) -> Segmentation:
     """Segment by a network in ONNX, run by onnxruntime on the CPU.
@@ -86,11 +88,14 @@ def onnx(
         mean: three numbers, in units of the scaled image.
         std: three numbers above 0, in units of the scaled image.
         scale: 255 for a network that takes [0, 255].
+        names: of the classes, class 0 first, or a text file with one a line; of one-channel outputs two, the
+            background's first.
         cleanup: ``min_size``, ``snap``, ``max_regions`` and ``connected`` of `Cleanup`.
 
     Returns:
         :math:`(H, W)` int64 with ids 0 to R - 1 by decreasing area; `segment_with_scores` adds :math:`(R,)`
-        scores, the foreground's and one less it for the background.
+        scores, the foreground's and one less it for the background, and each region's name where there are
+        ``names``.
 
     Raises:
         FileNotFoundError: ``model`` does not exist.
@@ -107,10 +112,12 @@ def onnx(
     rules = cleanup_of(cleanup)
     if kind not in _KINDS:
         raise ValueError(f"kind must be one of {', '.join(_KINDS)}; got {kind!r}")
-    threshold = check_share("threshold", threshold)
+    threshold, words = check_share("threshold", threshold), read_names(names)
     raw = run_network(pixels, model, output, check_preprocessing(size, mean, std, scale), "onnx")
     labels, scores = decode_output(raw, kind, threshold, (pixels.shape[1], pixels.shape[2]))
-    return rules.apply(image.detach(), labels, scores)
+    if words is not None:
+        _check_names(words, raw, labels, scored=scores is not None)
+    return rules.apply(image.detach(), labels, scores, words)
 
 
 @register_scored("lseg")
@@ -125,6 +132,7 @@ def lseg(
     std: Sequence[float] = (0.5, 0.5, 0.5),
     scale: float = 1.0,
     temperature: float = 0.07,
+    names: Sequence[str] | str | os.PathLike[str] | None = None,
     **cleanup: Unpack[CleanupOptions],
 ) -> Segmentation:
     """Segment by language as LSeg does (Li et al., ICLR 2022): pixel features against text embeddings.
@@ -139,11 +147,12 @@ def lseg(
         std: three numbers above 0, in units of the scaled image.
         scale: 255 for a network that takes [0, 255].
         temperature: above 0; the score is the softmax of cosine similarities over it.
+        names: of the classes, one an embedding, or a text file with one a line.
         cleanup: ``min_size``, ``snap``, ``max_regions`` and ``connected`` of `Cleanup`.
 
     Returns:
         :math:`(H, W)` int64, the class of largest cosine similarity, cleaned; ids 0 to R - 1 by decreasing
-        area. `segment_with_scores` adds :math:`(R,)` scores.
+        area. `segment_with_scores` adds :math:`(R,)` scores, and each region's name where there are ``names``.
 
     Raises:
         FileNotFoundError: a file does not exist.
@@ -157,9 +166,10 @@ def lseg(
     """
     pixels = torch.from_numpy(check_segment_image(image)).permute(2, 0, 1)
     rules = cleanup_of(cleanup)
-    if not (math.isfinite(temperature) and temperature > 0):
-        raise ValueError(f"temperature must be a number above 0; got {temperature}")
-    texts = _embeddings(embeddings)
+    check_number("temperature", temperature, positive=True)
+    texts, words = _embeddings(embeddings), read_names(names)
+    if words is not None:
+        check_names(words, len(texts))
     features = run_network(pixels, model, output, check_preprocessing(size, mean, std, scale), "lseg")
     if features.ndim != 4 or features.shape[1] != texts.shape[1]:
         raise ValueError(
@@ -168,7 +178,7 @@ def lseg(
         )
     similarity = torch.einsum("bdhw,kd->bkhw", F.normalize(features.float(), dim=1), F.normalize(texts, dim=1))
     classes, _, scores = largest_map(similarity / temperature, (pixels.shape[1], pixels.shape[2]))
-    return rules.apply(image.detach(), classes, scores)
+    return rules.apply(image.detach(), classes, scores, words)
 
 
 def check_preprocessing(
@@ -176,6 +186,8 @@ def check_preprocessing(
 ) -> Preprocessing:
     """Return checked options."""
     for name, values in (("mean", mean), ("std", std)):
+        if not isinstance(values, Sequence) or not all(isinstance(value, int | float) for value in values):
+            raise TypeError(f"{name} must be three numbers; got {values!r}")
         if len(values) != 3 or not all(math.isfinite(value) for value in values):
             raise ValueError(f"{name} must be three numbers; got {values!r}")
     if min(std) <= 0:
@@ -232,6 +244,15 @@ def decode_output(raw: Tensor, kind: Kind, threshold: float, size: tuple[int, in
         inside = values > threshold
         return inside.long(), torch.where(inside, values, 1 - values)
     return classes, shares if kind == "logits" else values
+
+
+def _check_names(names: list[str], raw: Tensor, labels: Tensor, *, scored: bool) -> None:
+    """Refuse names that do not go with the classes of a network's output."""
+    if scored:
+        channels = raw.shape[1] if raw.ndim == 4 else 1
+        check_names(names, max(2, channels))
+    elif int(labels.max()) >= len(names):
+        raise ValueError(f"names must be at least {int(labels.max()) + 1}, one a class; got {len(names)}")
 
 
 def _told_kind(raw: Tensor) -> Kind:

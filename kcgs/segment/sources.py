@@ -3,8 +3,8 @@
 import functools
 import importlib
 import inspect
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, ParamSpec, TypedDict, Unpack
@@ -13,22 +13,26 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from kcgs.segment.base import available_methods, register, segment
+from kcgs.segment.base import available_methods, names_missing_library, register, segment
 from kcgs.segment.classical import smallest_size
 from kcgs.segment.cleanup import absorb_specks, check_count, connected_regions, merge_similar, order_by_area
 from kcgs.segment.contours import snap_contours
+from kcgs.segment.names import region_names
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+_LONGEST = 240  # Of an error's line: libraries list every weight.
 
 
 class Segmentation(NamedTuple):
-    """A label map and how sure its source is of every region."""
+    """A label map, how sure its source is of every region, and what each is called."""
 
     labels: Tensor
     """:math:`(H, W)` int64, ids 0 to R - 1 by decreasing area."""
     scores: Tensor | None
     """:math:`(R,)` float32 in [0, 1], NaN for a region that the source says nothing about; None: no scores."""
+    names: dict[int, str] | None = None
+    """By id; several regions may have one name. None: the source knows no names."""
 
 
 class CleanupOptions(TypedDict, total=False):
@@ -74,9 +78,16 @@ class Cleanup:
         if not isinstance(self.connected, bool):
             raise TypeError(f"connected must be True or False; got {self.connected!r}")
 
-    def apply(self, image: Tensor, labels: Tensor, scores: Tensor | None = None) -> Segmentation:
-        """Clean the labels (H, W) of an image; a region scores the mean of its pixels' scores (H, W)."""
+    def apply(
+        self, image: Tensor, labels: Tensor, scores: Tensor | None = None, names: Sequence[str] | None = None
+    ) -> Segmentation:
+        """Clean the labels (H, W) of an image.
+
+        A region scores the mean of its pixels' scores (H, W). With ``names``, one a label from 0 on, it is called as
+        most of its pixels were labelled.
+        """
         labels = labels.to(image.device)
+        classes = labels
         if self.snap:
             labels = snap_contours(image, labels, reach=self.snap)
         labels = absorb_specks(labels, smallest_size(labels.numel(), self.min_size))
@@ -85,7 +96,11 @@ class Cleanup:
         if self.max_regions is not None:
             labels = merge_similar(image, labels, self.max_regions)
         labels = order_by_area(labels)
-        return Segmentation(labels, None if scores is None else _region_means(labels, scores))
+        return Segmentation(
+            labels,
+            None if scores is None else _region_means(labels, scores),
+            None if names is None else region_names(labels, classes, names),
+        )
 
 
 _P = ParamSpec("_P")
@@ -130,7 +145,7 @@ def register_scored(name: str) -> Callable[[Callable[_P, Segmentation]], Callabl
 
 
 def segment_with_scores(image: Tensor, method: str = "auto", **options: object) -> Segmentation:
-    """Divide an image into regions by the named method and say how sure it is of each.
+    """Divide an image into regions by the named method; say how sure it is of each and what it is called.
 
     Args:
         image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].
@@ -138,8 +153,8 @@ def segment_with_scores(image: Tensor, method: str = "auto", **options: object) 
         options: keyword arguments of that method.
 
     Returns:
-        The label map that `segment` returns, and a score in [0, 1] for every region: the mean over its pixels
-        of what the method states as its score. None where a method has no scores.
+        The label map that `segment` returns; a score in [0, 1] for every region, the mean over its pixels of what the
+        method states as its score; and a name for every region, a prompt or a class. None where a method has none.
 
     Raises:
         TypeError: ``image`` is no floating tensor, or the method has no such option.
@@ -150,18 +165,23 @@ def segment_with_scores(image: Tensor, method: str = "auto", **options: object) 
     Example:
         >>> image = torch.zeros(3, 40, 60)
         >>> image[:, :, 20:] = 1.0
-        >>> labels, scores = segment_with_scores(image)
-        >>> labels[0, ::20].tolist(), scores
-        ([1, 0, 0], None)
+        >>> labels, scores, names = segment_with_scores(image)
+        >>> labels[0, ::20].tolist(), scores, names
+        ([1, 0, 0], None, None)
     """
     if method in _scored and method in available_methods():
-        return _scored[method](image, **options)
+        with names_missing_library(method):
+            return _scored[method](image, **options)
     return Segmentation(segment(image, method, **options), None)
 
 
 def cleanup_of(options: CleanupOptions, **defaults: Unpack[CleanupOptions]) -> Cleanup:
     """Return the clean-up of a call, its own options over a method's defaults."""
     merged: dict[str, Any] = {**defaults, **options}
+    known = [field.name for field in fields(Cleanup)]
+    unknown = [name for name in merged if name not in known]
+    if unknown:
+        raise TypeError(f"the method has no option {unknown[0]!r}; clean-up takes {', '.join(known)}")
     return Cleanup(**merged)
 
 
@@ -216,9 +236,12 @@ def load_pretrained(class_name: str, model: Any, used_by: str, device: torch.dev
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an error's message, or its kind."""
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+    """Return the first line of an error's message, with what it announces, not too long; or the error's kind."""
+    lines = [line.strip() for line in str(error).strip().splitlines()]
+    if not lines:
+        return type(error).__name__
+    text = " ".join(lines[:2]) if lines[0].endswith(":") else lines[0]
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
 
 
 def check_share(name: str, value: float) -> float:

@@ -25,6 +25,8 @@ from kcgs.segment.sources import (
     require,
 )
 
+BACKGROUND = "background"  # What is no prompt's is called so.
+
 
 @register_scored("text")
 def text(
@@ -55,7 +57,7 @@ def text(
 
     Returns:
         :math:`(H, W)` int64 with ids 0 to R - 1 by decreasing area; `segment_with_scores` adds :math:`(R,)`
-        scores.
+        scores, and names: each region's prompt, or "background".
 
     Raises:
         FileNotFoundError: ``model`` is the path of a folder that is not there.
@@ -79,10 +81,11 @@ def text(
     logits = logits.reshape(1, len(words), *logits.shape[-2:])
     best, values, shares = largest_map(logits, (pixels.shape[1], pixels.shape[2]))
     if background is None:
-        return rules.apply(image.detach(), best, shares)
+        return rules.apply(image.detach(), best, shares, words)
     sure = values.sigmoid()
     inside = sure >= background
-    return rules.apply(image.detach(), torch.where(inside, best + 1, 0), torch.where(inside, sure, 1 - sure))
+    scores = torch.where(inside, sure, 1 - sure)
+    return rules.apply(image.detach(), torch.where(inside, best + 1, 0), scores, [BACKGROUND, *words])
 
 
 def _check_prompts(prompts: Sequence[str], background: float | None) -> list[str]:

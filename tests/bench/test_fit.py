@@ -18,7 +18,8 @@ from kcgs.bench.fit.cases import BASELINE, BEST, COVERAGE, KEPT, LIMITED, PAPER,
 from kcgs.bench.fit.compare import Runs, seconds_to_pass, spread, winner
 from kcgs.bench.fit.experiment import run
 from kcgs.bench.fit.report import write
-from kcgs.bench.fit.runs import Run, Store, affordable, equal_bytes, map_bytes
+from kcgs.bench.fit.runs import Run, Store, affordable, equal_bytes
+from kcgs.bench.sizes import map_bytes
 from kcgs.data import save_image, save_labels
 from kcgs.fit import FitConfig, FitResult, HistoryEntry
 from kcgs.functional import RegionMap, ef_psnr, psnr
@@ -60,7 +61,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> Stub:
     played = Stub()
     monkeypatch.setattr(runs_module, "fit", played)
     monkeypatch.setattr(runs_module, "measure", _measure)
-    runs_module._warm_up.cache_clear()
+    runs_module.warm_up.cache_clear()
     return played
 
 

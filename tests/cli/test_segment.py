@@ -8,9 +8,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
 from kcgs.cli import main
 from kcgs.data import load_image, load_labels, overlay_labels, save_image, save_labels
+from kcgs.fit.initialize import kmeans_field
+from kcgs.functional import RegionMap
+from kcgs.segment import Cleanup, Segmentation, register_scored
+from kcgs.segment.base import _methods
+from kcgs.segment.sources import _scored
 
 
 @pytest.fixture
@@ -48,7 +54,10 @@ class TestSegment:
         assert report["regions"] == len(labels.unique()) == 2
         assert report["method"] == method
         rows = report["table"]
-        assert [set(row) for row in rows] == [{"id", "area", "share", "edge_alignment"}] * 2
+        keys = {"id", "name", "area", "share", "edge_alignment", "gaussian_share", "score"}
+        assert [set(row) for row in rows] == [keys] * 2
+        assert {(row["name"], row["score"]) for row in rows} == {(None, None)}
+        assert sum(row["gaussian_share"] for row in rows) == pytest.approx(1)
         assert [row["area"] for row in rows] == labels.flatten().bincount().tolist()
         assert sum(row["share"] for row in rows) == pytest.approx(1)
         assert report["edge_alignment"] > 0.9 and all(row["edge_alignment"] > 0.9 for row in rows)
@@ -65,6 +74,43 @@ class TestSegment:
         arguments = ("segment", "photo.png", "-o", "out.npy", "--method", "file", "--option", "path=mask.png")
         code, _, err = kcgs(*arguments, capsys=capsys, monkeypatch=monkeypatch)
         assert code == 0, err
+
+    def test_share_of_gaussians_is_what_a_fit_starts_with(
+        self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        picture = load_image("photo.png")
+        picture[:, 12:36, 8:28] += 0.1 * torch.rand(24, 20, generator=torch.Generator().manual_seed(0)) - 0.1
+        save_image("photo.png", picture)
+        arguments = ("segment", "photo.png", "-o", "out.png", "--method", "file", "--option", "path=mask.png")
+        _, out, _ = kcgs(*arguments, "--json", capsys=capsys, monkeypatch=monkeypatch)
+        shares = [row["gaussian_share"] for row in json.loads(out)["table"]]
+        regions = RegionMap.from_labels(load_labels("out.png"))
+        field = kmeans_field(load_image("photo.png"), 1000, regions, seed=0)
+        assert field.region_ids is not None
+        assert field.region_ids.bincount().tolist() == pytest.approx([1000 * share for share in shares], abs=1)
+        assert shares[1] > 0.5  # all detail is in the smaller region
+        _, out, _ = kcgs(*arguments, capsys=capsys, monkeypatch=monkeypatch)
+        assert "share of Gaussians" in out and f"{shares[1]:.1%}" in out
+        assert "score" not in out and "name" not in out
+
+    def test_names_and_scores(
+        self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def named(image: Tensor, *, classes: list[str]) -> Segmentation:
+            labels = load_labels("mask.png")
+            scores = torch.where(labels > 0, 0.75, float("nan"))
+            return Cleanup().apply(image, labels, scores, classes)
+
+        monkeypatch.setattr("kcgs.segment.base._methods", dict(_methods))
+        monkeypatch.setattr("kcgs.segment.sources._scored", dict(_scored))
+        register_scored("named")(named)
+        arguments = ("segment", "photo.png", "-o", "out.png", "--method", "named")
+        arguments += ("--option", 'classes=["the wall", "a [red] door"]')
+        _, out, _ = kcgs(*arguments, "--json", capsys=capsys, monkeypatch=monkeypatch)
+        rows = json.loads(out)["table"]
+        assert [(row["name"], row["score"]) for row in rows] == [("the wall", None), ("a [red] door", 0.75)]
+        _, out, _ = kcgs(*arguments, capsys=capsys, monkeypatch=monkeypatch)
+        assert "the wall" in out and "a [red] door" in out and "0.75" in out and "nan" not in out
 
     def test_one_region_has_no_alignment(
         self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

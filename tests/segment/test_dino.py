@@ -49,7 +49,7 @@ def picture(width: int = 120) -> Tensor:
 
 class TestDino:
     def test_label_map(self, folder: Path) -> None:
-        labels, scores = segment_with_scores(picture(), "dino", model=folder, clusters=3, size=112)
+        labels, scores, _ = segment_with_scores(picture(), "dino", model=folder, clusters=3, size=112)
         areas = labels.flatten().bincount()
         assert labels.shape == (80, 120)
         assert labels.dtype == torch.int64

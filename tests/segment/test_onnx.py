@@ -68,7 +68,7 @@ class TestKinds:
     )
     def test_several_classes(self, tmp_path: Path, tail: str, kind: str, score: float | None) -> None:
         path = mixing(tmp_path / "net.onnx", EYE, tail=tail)
-        labels, scores = segment_with_scores(two_colors(), "onnx", model=path, kind=kind, **PLAIN)
+        labels, scores, _ = segment_with_scores(two_colors(), "onnx", model=path, kind=kind, **PLAIN)
         assert torch.equal(labels, LEFT)
         if score is None:
             assert scores is None
@@ -91,7 +91,7 @@ class TestKinds:
         self, tmp_path: Path, weights: list[list[float]], tail: str, kind: str, scores: list[float]
     ) -> None:
         path = mixing(tmp_path / "net.onnx", weights, tail=tail)
-        labels, found = segment_with_scores(two_colors(), "onnx", model=path, kind=kind, **PLAIN)
+        labels, found, _ = segment_with_scores(two_colors(), "onnx", model=path, kind=kind, **PLAIN)
         assert torch.equal(labels, LEFT)
         assert found is not None
         assert found.tolist() == pytest.approx(scores, abs=1e-4)
@@ -111,6 +111,37 @@ class TestKinds:
         assert counts == [3, 2, 1]
 
 
+class TestNames:
+    NAMES = ("red", "green", "blue")
+
+    @pytest.mark.parametrize("tail", ["", "Softmax", "ArgMax"])
+    def test_classes(self, tmp_path: Path, tail: str) -> None:
+        path = mixing(tmp_path / "net.onnx", EYE, tail=tail)
+        found = segment_with_scores(two_colors(), "onnx", model=path, names=self.NAMES, **PLAIN)
+        assert found.names == {0: "red", 1: "blue"}
+        (tmp_path / "names.txt").write_text("\n".join(self.NAMES))
+        again = segment_with_scores(two_colors(), "onnx", model=path, names=tmp_path / "names.txt", **PLAIN)
+        assert again.names == found.names
+        assert segment_with_scores(two_colors(), "onnx", model=path, **PLAIN).names is None
+
+    def test_foreground(self, tmp_path: Path) -> None:
+        path = mixing(tmp_path / "net.onnx", [[0.8, 0.0, 0.1]])
+        found = segment_with_scores(two_colors(), "onnx", model=path, names=["rest", "thing"], **PLAIN)
+        assert found.names == {0: "thing", 1: "rest"}
+
+    @pytest.mark.parametrize(
+        ("tail", "names", "message"),
+        [
+            ("", ["red", "green"], "names must be 3, one a class, class 0 first; got 2"),
+            ("ArgMax", ["red", "green"], "names must be at least 3, one a class; got 2"),
+        ],
+    )
+    def test_of_another_number(self, tmp_path: Path, tail: str, names: list[str], message: str) -> None:
+        path = mixing(tmp_path / "net.onnx", EYE, tail=tail)
+        with pytest.raises(ValueError, match=message):
+            segment(two_colors(), "onnx", model=path, names=names, **PLAIN)
+
+
 class TestPreprocessing:
     def test_mean_std_scale(self, tmp_path: Path) -> None:
         # Of 255 times red less 100, over 50, less 2: above 0 where red is above 200 / 255.
@@ -118,7 +149,7 @@ class TestPreprocessing:
         image = torch.full((3, 20, 20), 195 / 255)
         image[0, :, 12:] = 205 / 255
         options: dict[str, Any] = {"mean": (200.0, 0.0, 0.0), "std": (5.0, 1.0, 1.0), "scale": 255.0}
-        labels, scores = segment_with_scores(image, "onnx", model=path, kind="logits", **options)
+        labels, scores, _ = segment_with_scores(image, "onnx", model=path, kind="logits", **options)
         assert torch.equal(labels, (torch.arange(20) >= 12).long().expand(20, 20))
         assert scores is not None
         assert scores.tolist() == pytest.approx([0.7311, 0.7311], abs=1e-3)
@@ -170,6 +201,11 @@ class TestErrors:
         with pytest.raises(ValueError, match=message):
             segment(two_colors(), "onnx", model=path, **options)
 
+    @pytest.mark.parametrize("options", [{"mean": "half"}, {"std": (1.0, "one", 1.0)}, {"scale": "255"}])
+    def test_numbers(self, tmp_path: Path, options: dict[str, Any]) -> None:
+        with pytest.raises(TypeError, match=f"{next(iter(options))} must be .*number.*; got"):
+            segment(two_colors(), "onnx", model=mixing(tmp_path / "net.onnx", EYE), **options)
+
     def test_input_of_another_shape(self, tmp_path: Path) -> None:
         graph = helper.make_graph(
             [helper.make_node("Relu", ["x"], ["y"])],
@@ -188,9 +224,10 @@ class TestLseg:
         path = mixing(tmp_path / "encoder.onnx", EYE)
         texts = np.array([[0.0, 0.1, 9.0], [0.5, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=np.float32)
         np.save(tmp_path / "texts.npy", texts)
-        labels, scores = segment_with_scores(
-            two_colors(), "lseg", model=path, embeddings=tmp_path / "texts.npy", **PLAIN
+        labels, scores, names = segment_with_scores(
+            two_colors(), "lseg", model=path, embeddings=tmp_path / "texts.npy", names=["sea", "rose", "grass"], **PLAIN
         )
+        assert names == {0: "rose", 1: "sea"}
         assert torch.equal(labels, LEFT)
         assert scores is not None
         assert (scores > 0.99).all()
@@ -200,6 +237,8 @@ class TestLseg:
         path = mixing(tmp_path / "encoder.onnx", EYE)
         with pytest.raises(ValueError, match=r"features must have shape \(1, 5, h, w\)"):
             segment(two_colors(), "lseg", model=path, embeddings=np.ones((2, 5), dtype=np.float32))
+        with pytest.raises(ValueError, match="names must be 2, one a class"):
+            segment(two_colors(), "lseg", model=path, embeddings=np.ones((2, 3), dtype=np.float32), names=["sea"])
         with pytest.raises(ValueError, match="floating array"):
             segment(two_colors(), "lseg", model=path, embeddings=np.ones((2, 3), dtype=int))
         with pytest.raises(FileNotFoundError, match="no text embeddings at"):

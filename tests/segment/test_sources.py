@@ -21,6 +21,7 @@ from kcgs.segment import (
     segment_with_scores,
 )
 from kcgs.segment.base import _methods
+from kcgs.segment.names import read_names
 from kcgs.segment.sources import _scored, require
 
 
@@ -35,7 +36,7 @@ class TestRegistry:
         assert {"sam", "dino", "text", "lseg", "onnx", "file", "davis"} <= set(available_methods())
 
     def test_a_method_without_scores(self) -> None:
-        labels, scores = segment_with_scores(two_colors(), "felzenszwalb", sigma=0.0)
+        labels, scores, _ = segment_with_scores(two_colors(), "felzenszwalb", sigma=0.0)
         assert scores is None
         assert torch.equal(labels, segment(two_colors(), "felzenszwalb", sigma=0.0))
 
@@ -50,7 +51,7 @@ class TestRegistry:
             return Cleanup(min_size=1).apply(image, labels, labels * 0.5 + 0.25)
 
         try:
-            labels, scores = segment_with_scores(two_colors(), "test-scored")
+            labels, scores, _ = segment_with_scores(two_colors(), "test-scored")
             assert torch.equal(labels, segment(two_colors(), "test-scored"))
             assert torch.equal(labels, halves(two_colors()))
             assert scores is not None
@@ -83,6 +84,10 @@ class TestRegistry:
             ("sam", "transformers", {"model": "some/model"}, r"pip install 'kcgs\[segment\]'"),
             ("sam", "kornia.models.sam", {}, "pip install kornia"),
             ("onnx", "onnxruntime", {"model": "net.onnx"}, "pip install onnxruntime"),
+            ("auto", "skimage.segmentation", {}, "pip install scikit-image"),
+            ("slic", "skimage.segmentation", {}, "pip install scikit-image"),
+            ("watershed", "skimage.color", {}, "pip install scikit-image"),
+            ("kmeans", "scipy.cluster.vq", {}, "pip install scipy"),
         ],
     )
     def test_method_says_what_to_install(
@@ -91,6 +96,40 @@ class TestRegistry:
         monkeypatch.setitem(sys.modules, library, None)
         with pytest.raises(ImportError, match=f"segmentation method '{method}' needs .*{line}"):
             segment(two_colors(), method, **options)
+        with pytest.raises(ImportError, match=line):
+            segment_with_scores(two_colors(), method, **options)
+
+
+class TestNames:
+    def test_a_region_is_called_as_most_of_it(self) -> None:
+        classes = (torch.arange(30) >= 12).long().repeat(20, 1) * 2
+        classes[:, 28:] = 0
+        classes[5, 20] = 1
+        found = Cleanup().apply(two_colors(), classes, names=["sky", "bird", "dog"])
+        assert found.names == {0: "dog", 1: "sky", 2: "sky"}  # The bird was a speck; sky is in two pieces.
+        merged = Cleanup(max_regions=1).apply(two_colors(), classes, names=["sky", "bird", "dog"])
+        assert merged.names == {0: "dog"}
+        assert Cleanup().apply(two_colors(), classes).names is None
+
+    def test_file(self, tmp_path: Path) -> None:
+        path = tmp_path / "names.txt"
+        path.write_text("sky\n\nzweite Möwe \n\n", encoding="utf-8")
+        assert read_names(path) == read_names(str(path)) == ["sky", "", "zweite Möwe"]
+        assert read_names(None) is None
+
+    def test_errors(self, tmp_path: Path) -> None:
+        with pytest.raises(FileNotFoundError, match=r"no names of classes at .*gone.txt"):
+            read_names(tmp_path / "gone.txt")
+        (tmp_path / "bad.txt").write_bytes(b"\xff\xfe\x00")
+        with pytest.raises(ValueError, match=r"cannot read .*bad.txt as UTF-8"):
+            read_names(tmp_path / "bad.txt")
+        (tmp_path / "empty.txt").write_text("")
+        for empty in ([], tmp_path / "empty.txt"):
+            with pytest.raises(ValueError, match="at least one name"):
+                read_names(empty)
+        for wrong in (["sky", 3], 5):
+            with pytest.raises(TypeError, match="names must be a list of strings"):
+                read_names(wrong)  # type: ignore[arg-type]
 
 
 class TestCleanup:
@@ -101,27 +140,27 @@ class TestCleanup:
         return labels
 
     def test_defaults(self) -> None:
-        result, scores = Cleanup().apply(two_colors(), self.labels())
+        result, scores, _ = Cleanup().apply(two_colors(), self.labels())
         assert scores is None
         assert result.flatten().bincount().tolist() == [320, 240, 40]  # The speck is gone, the strip a region.
 
     def test_nothing(self) -> None:
-        result, _ = Cleanup(min_size=1, connected=False).apply(two_colors(), self.labels())
+        result = Cleanup(min_size=1, connected=False).apply(two_colors(), self.labels()).labels
         assert result.flatten().bincount().tolist() == [319, 280, 1]
 
     def test_contours_snap(self) -> None:
-        result, _ = Cleanup(snap=3).apply(two_colors(), (torch.arange(30) >= 12).long().repeat(20, 1))
+        result = Cleanup(snap=3).apply(two_colors(), (torch.arange(30) >= 12).long().repeat(20, 1)).labels
         assert torch.equal(result, (torch.arange(30) < 10).long().repeat(20, 1))
 
     def test_budget(self) -> None:
-        result, _ = Cleanup(max_regions=2).apply(two_colors(), self.labels())
+        result = Cleanup(max_regions=2).apply(two_colors(), self.labels()).labels
         assert int(result.max()) + 1 == 2
 
     def test_scores_are_means_of_what_is_known(self) -> None:
         painted = torch.full((20, 30), float("nan"))
         painted[:10, :12] = 0.5
         painted[10:, :6] = 0.9
-        _, scores = Cleanup().apply(two_colors(), self.labels(), painted)
+        _, scores, _ = Cleanup().apply(two_colors(), self.labels(), painted)
         assert scores is not None
         assert scores.isnan().tolist() == [True, False, True]
         assert float(scores[1]) == pytest.approx((120 * 0.5 + 60 * 0.9) / 180)
@@ -201,3 +240,34 @@ class TestDavis:
         frame = Davis(data_root / "DAVIS")["cows"]
         labels = segment(frame.image, "davis", root=data_root / "DAVIS", sequence="cows")
         assert torch.equal(labels, (frame.labels > 0).long())
+
+
+class TestOneCleanup:
+    """Sources without a model take the options of `Cleanup` too."""
+
+    @pytest.fixture
+    def photo(self) -> Tensor:
+        import skimage.data
+
+        return torch.from_numpy(skimage.data.coffee()).permute(2, 0, 1).float()[:, ::4, ::4] / 255
+
+    @pytest.mark.parametrize("method", ["auto", "felzenszwalb", "slic", "watershed", "kmeans"])
+    def test_least_area_and_budget(self, photo: Tensor, method: str) -> None:
+        areas = segment(photo, method, min_size=500, max_regions=3).flatten().bincount()
+        assert len(areas) <= 3 and areas.min() >= 500
+        assert len(segment(photo, method, min_size=60).unique()) > len(areas)
+
+    @pytest.mark.parametrize("method", ["felzenszwalb", "slic", "watershed", "kmeans"])
+    def test_snapping_is_optional(self, photo: Tensor, method: str) -> None:
+        maps = {snap: segment(photo, method, snap=snap) for snap in (False, True, 4)}
+        assert torch.equal(maps[False], segment(photo, method, snap=0))
+        assert torch.equal(maps[True], segment(photo, method, snap=2))
+        assert len({tuple(labels.flatten().tolist()) for labels in maps.values()}) == 3
+        with pytest.raises(ValueError, match="snap must be at least 0; got -1"):
+            segment(photo, method, snap=-1)
+        with pytest.raises(TypeError, match=r"snap must be a number of pixels, .*got 1.5"):
+            segment(photo, method, snap=1.5)
+
+    def test_unknown_option(self, tmp_path: Path) -> None:
+        with pytest.raises(TypeError, match="no option 'nams'; clean-up takes min_size, snap, max_regions, connected"):
+            segment(two_colors(), "onnx", model=tmp_path / "net.onnx", nams=["sky"])

@@ -67,8 +67,11 @@ def assert_map(labels: Tensor, scores: Tensor | None) -> None:
 
 class TestText:
     def test_prompts(self, folder: Path) -> None:
-        labels, scores = segment_with_scores(picture(), "text", prompts=PROMPTS, model=folder, size=64)
+        labels, scores, names = segment_with_scores(picture(), "text", prompts=PROMPTS, model=folder, size=64)
         assert_map(labels, scores)
+        assert names is not None
+        assert list(names) == labels.unique().tolist()
+        assert set(names.values()) <= set(PROMPTS)
         assert torch.equal(labels, segment(picture(), "text", prompts=PROMPTS, model=str(folder), size=64))
 
     def test_equals_the_model_itself(self, folder: Path) -> None:
@@ -82,16 +85,20 @@ class TestText:
             truth = model(pixel_values=shown, input_ids=tokens["input_ids"]).logits.argmax(dim=0)
         options: dict[str, Any] = {"prompts": PROMPTS, "size": 64, "min_size": 1, "connected": False}
         labels = segment(image, "text", model=model, tokenizer=tokenizer, **options)
+        found = segment_with_scores(image, "text", model=model, tokenizer=tokenizer, **options)
+        assert torch.equal(found.labels, labels)
+        assert found.names == {int(labels[truth == k][0]): PROMPTS[k] for k in truth.unique().tolist()}
         pairs = (truth * 3 + labels).unique()  # Each class is one region: the numbers alone differ.
         assert len(pairs) == len(truth.unique()) == len(labels.unique())
 
     @pytest.mark.parametrize("background", [0.0, 0.5, 1.0])
     def test_background(self, folder: Path, background: float) -> None:
         options: dict[str, Any] = {"prompts": ["a dog"], "background": background, "model": folder, "size": 64}
-        labels, scores = segment_with_scores(picture(), "text", connected=False, **options)
+        labels, scores, names = segment_with_scores(picture(), "text", connected=False, **options)
         assert_map(labels, scores)
         if background in (0.0, 1.0):
             assert int(labels.max()) == 0
+            assert names == {0: "background" if background else "a dog"}
 
     def test_long_prompts_are_cut(self, folder: Path) -> None:
         assert segment(picture(), "text", prompts=["dog " * 40, "cat"], model=folder, size=64).shape == (60, 90)

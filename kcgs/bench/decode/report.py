@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from kcgs._atomic import atomic_path
-from kcgs.bench.fit.tables import markdown
+from kcgs.bench.cells import markdown
 from kcgs.bench.machine import describe
 
 from .decoders import DECODERS, GENERIC, SCENE, TRUTH_CUTOFF, YARDSTICK, Files

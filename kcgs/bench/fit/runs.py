@@ -6,23 +6,17 @@ import dataclasses
 import json
 import time
 from functools import lru_cache
-from io import BytesIO
 from pathlib import Path
 
-import numpy as np
 import torch
-from PIL import Image
-from torch import Tensor
 
 from kcgs._atomic import atomic_path
 from kcgs.bench.measure import measure
+from kcgs.bench.sizes import GAUSSIAN_BYTES, stored_bytes
 from kcgs.fit import FitConfig, HistoryEntry, fit
-from kcgs.functional import RegionMap
 from kcgs.nn.renderer import render_image
 
 from .cases import BASELINE, COMPARED, Case, load
-
-GAUSSIAN_BYTES = 7
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -102,7 +96,7 @@ def affordable(run: Run) -> int:
 def perform(case: Case, data: Path | None) -> Run:
     """Fit and measure; edge-focused figures are taken along the contours of the map that was given."""
     problem, config = load(case, data), case.config()
-    _warm_up(config)
+    warm_up(config)
     start = time.perf_counter()
     result = fit(problem.image, problem.regions, case.n, config=config, seed=case.seed)
     seconds = time.perf_counter() - start
@@ -115,8 +109,8 @@ def perform(case: Case, data: Path | None) -> Run:
         seed=case.seed,
         seconds=seconds,
         num_gaussians=len(result.field),
-        given_bytes=_stored_bytes(problem.regions),
-        map_bytes=_stored_bytes(result.regions),
+        given_bytes=stored_bytes(problem.regions),
+        map_bytes=stored_bytes(result.regions),
         iterations=result.history[-1].iteration,
         stop_reason=result.stop_reason,
         history=tuple(result.history),
@@ -124,31 +118,8 @@ def perform(case: Case, data: Path | None) -> Run:
     )
 
 
-def map_bytes(labels: Tensor) -> int:
-    """Size of a label map as lossless WebP."""
-    index = torch.unique(labels, return_inverse=True)[1].cpu().numpy().astype(np.int32)
-    return _webp_bytes(index.tobytes(), index.shape[0])
-
-
-# a second's work, and most fits store the map that they were given
-@lru_cache(maxsize=8)
-def _webp_bytes(index: bytes, height: int) -> int:
-    values = np.frombuffer(index, np.int32).reshape(height, -1)
-    levels = np.stack([values >> 16, values >> 8, values], -1).astype(np.uint8)
-    picture = Image.fromarray(levels if values.max() > 255 else levels[..., 2].copy())
-    file = BytesIO()
-    picture.save(file, "WEBP", lossless=True, quality=100, method=6)
-    return file.getbuffer().nbytes
-
-
-def _stored_bytes(regions: RegionMap | None) -> int:
-    if regions is None:
-        return 0
-    return map_bytes(regions.labels if regions.fine_labels is None else regions.fine_labels)
-
-
 @lru_cache(maxsize=64)
-def _warm_up(config: FitConfig) -> None:
+def warm_up(config: FitConfig) -> None:
     """Compile what this recipe needs: no fit's clock shall count it."""
     ramp = torch.linspace(0.0, 1.0, 96)
     image = torch.stack([ramp.expand(64, 96), 1 - ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96)])

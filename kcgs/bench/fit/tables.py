@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable
 from itertools import product
+
+from kcgs.bench.cells import count, db, markdown, seconds, signed
 
 from .cases import BASELINE, BEST, LIMITED, PAPER, SHORT
 from .compare import TIE, Pair, Runs, Spread, mean, seconds_to_pass, spread, winner
@@ -26,11 +27,6 @@ PROTOTYPE = {
 THEIRS = (32.05, 0.9797, 29.9)
 
 
-def markdown(header: list[str], lines: Iterable[list[str]]) -> str:
-    """Lay out a table."""
-    return "\n".join("| " + " | ".join(row) + " |" for row in [header, ["---"] * len(header), *lines])
-
-
 def summary(runs: Runs, group: str) -> str:
     """Means of every recipe, and differences to the baseline of as many Gaussians."""
     header = ["N", "recipe", "images", "PSNR", "EF-PSNR", "s, median", "map bytes", "PSNR, difference", "won-lost"]
@@ -41,9 +37,9 @@ def summary(runs: Runs, group: str) -> str:
             found = runs.of(group, name, n)
             if not found:
                 continue
-            line = [_count(n), name, str(len(found)), _db(mean(r.psnr for r in found))]
-            line += [_db(mean(r.ef_psnr for r in found)), _seconds(statistics.median(r.seconds for r in found))]
-            line.append(_count(mean(r.map_bytes for r in found)))
+            line = [count(n), name, str(len(found)), db(mean(r.psnr for r in found))]
+            line += [db(mean(r.ef_psnr for r in found)), seconds(statistics.median(r.seconds for r in found))]
+            line.append(count(mean(r.map_bytes for r in found)))
             pairs = [] if name == BASELINE else runs.pairs(group, n, name)
             for quantity in ("psnr", "ef_psnr"):
                 line += _spread_cells(spread(pairs, quantity))
@@ -61,8 +57,8 @@ def at_equal_bytes(runs: Runs, group: str) -> str:
             pairs = runs.pairs(group, n, name, equal_bytes=True)
             if not pairs:
                 continue
-            line = [_count(n), name, str(len(pairs)), _count(mean(p.ours.bytes for p in pairs))]
-            line.append(_count(mean(p.baseline.n for p in pairs)))
+            line = [count(n), name, str(len(pairs)), count(mean(p.ours.bytes for p in pairs))]
+            line.append(count(mean(p.baseline.n for p in pairs)))
             spreads = [spread(pairs, quantity) for quantity in ("psnr", "ef_psnr")]
             line += [cell for found in spreads for cell in _spread_cells(found)]
             line += ["" if found is None else winner(found.mean, name) for found in spreads]
@@ -80,8 +76,8 @@ def each_image(runs: Runs, group: str, n: int) -> str:
             found = runs.find(group, image, n, name)
             if found is None:
                 continue
-            line = [image, name, _db(found.psnr), _db(found.ef_psnr), _seconds(found.seconds)]
-            line += [_count(found.given_bytes), _count(found.map_bytes)]
+            line = [image, name, db(found.psnr), db(found.ef_psnr), seconds(found.seconds)]
+            line += [count(found.given_bytes), count(found.map_bytes)]
             line += _difference_cells(_pair_of(runs, found, equal_bytes=False))
             line += _equal_bytes_cells(_pair_of(runs, found, equal_bytes=True))
             lines.append(line)
@@ -97,7 +93,7 @@ def losses(runs: Runs, group: str) -> str:
             below = sorted((getattr(p, quantity), p.ours.image) for p in pairs if getattr(p, quantity) < -TIE)
             if below:
                 at = "equal bytes" if equal_bytes else "equal N"
-                which = ", ".join(f"{image} {_signed(value)}" for value, image in below)
+                which = ", ".join(f"{image} {signed(value)}" for value, image in below)
                 lines.append(f"- {at}, N = {n:,}, {name}, {shown}: {len(below)} of {len(pairs)}: {which}")
     return "\n".join(lines) or "Nowhere."
 
@@ -107,13 +103,13 @@ def against_paper(runs: Runs) -> str:
     header = ["image", "N", "recipe", "iterations", "PSNR", "EF-PSNR", "s", "s to pass paper", "share of paper's time"]
     lines = []
     for paper in runs.of("paper", PAPER):
-        lines.append([paper.image, _count(paper.n), PAPER, *_fit_cells(paper), "", ""])
+        lines.append([paper.image, count(paper.n), PAPER, *_fit_cells(paper), "", ""])
         for name in (BASELINE, BEST):
             found = runs.find("paper", paper.image, paper.n, name)
             if found is not None:
                 passed = seconds_to_pass(found, paper.psnr)
                 share = "never" if math.isnan(passed) else f"{100 * passed / paper.seconds:.2g} %"
-                lines.append([paper.image, _count(paper.n), name, *_fit_cells(found), _seconds(passed), share])
+                lines.append([paper.image, count(paper.n), name, *_fit_cells(found), seconds(passed), share])
     return markdown(header, lines)
 
 
@@ -126,11 +122,11 @@ def under_a_limit(runs: Runs) -> str:
         full = runs.find("time", limited.image, limited.n, BEST)
         if full is not None:
             pairs.append(Pair(limited, full))
-            line = [limited.image, _count(limited.n), _seconds(full.seconds), _db(full.psnr), _db(full.ef_psnr)]
-            line += [f"{limited.seconds:.2f}", _count(limited.iterations), *_difference_cells(pairs[-1])]
+            line = [limited.image, count(limited.n), seconds(full.seconds), db(full.psnr), db(full.ef_psnr)]
+            line += [f"{limited.seconds:.2f}", count(limited.iterations), *_difference_cells(pairs[-1])]
             lines.append(line)
     means = [mean(getattr(p, quantity) for p in pairs) for quantity in ("psnr", "ef_psnr")]
-    lines.append(["mean", *[""] * 6, *map(_signed, means)])
+    lines.append(["mean", *[""] * 6, *map(signed, means)])
     return markdown(header, lines)
 
 
@@ -138,7 +134,7 @@ def every_fit(runs: Runs, group: str) -> str:
     """All fits of a small group."""
     header = ["image", "N", "recipe", "iterations", "PSNR", "EF-PSNR", "s", "stored map, bytes"]
     order = sorted(runs.of(group), key=lambda r: r.image)
-    return markdown(header, ([r.image, _count(r.n), r.name, *_fit_cells(r), _count(r.map_bytes)] for r in order))
+    return markdown(header, ([r.image, count(r.n), r.name, *_fit_cells(r), count(r.map_bytes)] for r in order))
 
 
 def kodak(runs: Runs) -> str:
@@ -155,12 +151,12 @@ def kodak(runs: Runs) -> str:
         line = [image, *(cell for run in found for cell in _quality_cells([] if run is None else [run]))]
         then = PROTOTYPE.get(image, math.nan)
         now = math.nan if found[0] is None else found[0].psnr
-        lines.append([*line, _db(then), _signed(now - then)])
+        lines.append([*line, db(then), signed(now - then)])
     known = [r for r in runs.of("kodak", SHORT) if r.image in PROTOTYPE]
     line = ["mean", *(cell for name in names for cell in _quality_cells(runs.of("kodak", name)))]
     changes = mean(r.psnr - PROTOTYPE[r.image] for r in known)
-    lines.append([*line, _db(mean(PROTOTYPE[r.image] for r in known)), _signed(changes)])
-    theirs = [_db(THEIRS[0]), f"{THEIRS[1]:.4f}", _seconds(THEIRS[2])]
+    lines.append([*line, db(mean(PROTOTYPE[r.image] for r in known)), signed(changes)])
+    theirs = [db(THEIRS[0]), f"{THEIRS[1]:.4f}", seconds(THEIRS[2])]
     lines.append(["GaussianImage, theirs: 24 images", "", "", "", *theirs, "", ""])
     return markdown(header, lines)
 
@@ -173,45 +169,29 @@ def _pair_of(runs: Runs, run: Run, *, equal_bytes: bool) -> Pair | None:
 
 
 def _fit_cells(run: Run) -> list[str]:
-    return [_count(run.iterations), _db(run.psnr), _db(run.ef_psnr), _seconds(run.seconds)]
+    return [count(run.iterations), db(run.psnr), db(run.ef_psnr), seconds(run.seconds)]
 
 
 def _quality_cells(found: list[Run]) -> list[str]:
     ms_ssim = mean(r.ms_ssim for r in found)
     shown = "" if math.isnan(ms_ssim) else f"{ms_ssim:.4f}"
-    return [_db(mean(r.psnr for r in found)), shown, _seconds(mean(r.seconds for r in found))]
+    return [db(mean(r.psnr for r in found)), shown, seconds(mean(r.seconds for r in found))]
 
 
 def _difference_cells(pair: Pair | None) -> list[str]:
-    return ["", ""] if pair is None else [_signed(pair.psnr), _signed(pair.ef_psnr)]
+    return ["", ""] if pair is None else [signed(pair.psnr), signed(pair.ef_psnr)]
 
 
 def _equal_bytes_cells(pair: Pair | None) -> list[str]:
     if pair is None:
         return [""] * 4
     ahead = f"{winner(pair.psnr, pair.ours.name)} / {winner(pair.ef_psnr, pair.ours.name) or 'no band'}"
-    return [_count(pair.baseline.n), *_difference_cells(pair), ahead]
+    return [count(pair.baseline.n), *_difference_cells(pair), ahead]
 
 
 def _spread_cells(found: Spread | None) -> list[str]:
     if found is None:
         return [""] * 3
     deviation = "" if math.isnan(found.deviation) else f" ± {found.deviation:.2f}"
-    worst = f"{found.worst} {_signed(found.lowest)}"
-    return [f"{_signed(found.mean)}{deviation}", f"{found.wins}-{found.losses}", worst]
-
-
-def _db(value: float) -> str:
-    return "" if math.isnan(value) else f"{value:.2f}"
-
-
-def _signed(value: float) -> str:
-    return "" if math.isnan(value) else f"{round(value, 2) + 0.0:+.2f}"  # no -0.00
-
-
-def _seconds(value: float) -> str:
-    return "" if math.isnan(value) else f"{value:.2g}" if value < 10 else f"{value:.0f}"
-
-
-def _count(value: float) -> str:
-    return "" if math.isnan(value) else f"{value:,.0f}"
+    worst = f"{found.worst} {signed(found.lowest)}"
+    return [f"{signed(found.mean)}{deviation}", f"{found.wins}-{found.losses}", worst]
