@@ -32,6 +32,7 @@ FORMAT = "kcgs.scene"
 FORMAT_VERSIONS = ("1", "2")
 MAX_SIDE = 1 << 20  # pixels; past it float32 centres cannot tell tenths of a pixel apart
 _SUFFIX = ".safetensors"
+_COMPRESSED = ".kcgs"
 _USER = "user."
 _REQUIRED = ("means", "cholesky", "colors")
 _INTEGER = ("region_ids", "labels")
@@ -117,10 +118,10 @@ def scene_bytes(
 
 
 def load(path: str | os.PathLike[str]) -> Scene:
-    """Read a scene that :func:`save` wrote.
+    """Read a scene that :func:`save` wrote, or a compressed file.
 
     Args:
-        path: the file.
+        path: the file; what ends in .kcgs is decoded (:func:`kcgs.codec.decode`) and must be whole.
 
     Returns:
         Field, regions and metadata, on the CPU, bit for bit as saved; region ids and labels are int64.
@@ -141,6 +142,8 @@ def load(path: str | os.PathLike[str]) -> Scene:
     path = Path(path)
     with path.open("rb"):  # safetensors' own errors for a file that cannot be opened do not name it
         pass
+    if path.suffix == _COMPRESSED:
+        return _load_compressed(path)
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             notes = file.metadata() or {}
@@ -150,6 +153,21 @@ def load(path: str | os.PathLike[str]) -> Scene:
         return _assemble(tensors, notes)
     except (safetensors.SafetensorError, TypeError, ValueError) as error:
         raise ValueError(f"cannot load {path}: {error}") from error
+
+
+def _load_compressed(path: Path) -> Scene:
+    from kcgs.codec import CodecError, decode
+
+    try:
+        decoded = decode(path.read_bytes())
+    except CodecError as error:
+        raise ValueError(f"cannot load {path}: {error}") from error
+    if decoded.layers < decoded.num_layers:
+        raise ValueError(
+            f"cannot load {path}: it ends early, with {decoded.layers} of {decoded.num_layers} layers; "
+            "kcgs.codec.decode draws what is there"
+        )
+    return Scene(decoded.field, decoded.regions, {})
 
 
 def _serialize(field: GaussianField, regions: RegionMap | Tensor | None, metadata: Mapping[str, str] | None) -> bytes:

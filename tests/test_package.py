@@ -19,6 +19,7 @@ LAYERS = [
     {"cli", "bench", "view"},
     {"segment"},
     {"fit", "io", "onnx", "data", "zoo"},
+    {"codec"},
     {"nn"},
     {"functional"},
     {"kernels"},
@@ -46,6 +47,7 @@ def test_import_is_light() -> None:
         "rich",
         "kornia",
         "scipy",
+        "constriction",
     )
     code = f"import sys, kcgs; print([m for m in {heavy!r} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .common import IMAGES, Json, Progress, SceneFile, app, check_output, print_report
+from .fitting import fit_into
 from .segmentation import warn_if_misaligned
 
 if TYPE_CHECKING:
@@ -38,18 +39,24 @@ def fit_command(
         str,
         typer.Option(metavar="MASK|auto|none", help="Label-map file, or auto (segment the image), or none."),
     ] = "auto",
-    num_gaussians: Annotated[int, typer.Option("-n", "--num-gaussians", min=1, help="Number of Gaussians.")] = 1000,
+    num_gaussians: Annotated[
+        int | None, typer.Option("-n", "--num-gaussians", min=1, help="Number of Gaussians; default: 1000.")
+    ] = None,
     recipe: Annotated[str, typer.Option(help="Recipe by name.")] = "best",
     iterations: Annotated[int | None, typer.Option(min=1, help="Default: the recipe's.")] = None,
     max_seconds: Annotated[float | None, typer.Option(help="The best picture in this wall time.")] = None,
     target_psnr: Annotated[
         float | None, typer.Option(help="As few Gaussians as reach this PSNR in dB, at most --num-gaussians.")
     ] = None,
+    target_bytes: Annotated[
+        int | None, typer.Option(min=1, help="The best .kcgs file that is not larger; chooses the number of Gaussians.")
+    ] = None,
     keep_contours: Annotated[bool, typer.Option("--keep-contours", help="Take the label map as exact.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of the random start.")] = 0,
     backend: Annotated[Backend, typer.Option(help="Kernel.")] = Backend.auto,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Default: IMAGE's name with .safetensors, here.")
+        Path | None,
+        typer.Option("-o", "--output", help="Scene (.safetensors) or file (.kcgs); default: IMAGE's name, here."),
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="Draw error against run time into this PNG.")] = None,
     checkpoint: Annotated[Path | None, typer.Option(help="Keep the fit's state in this file as it goes.")] = None,
@@ -58,11 +65,15 @@ def fit_command(
 ) -> None:
     """Fit Gaussians to an image and save the scene."""
     from kcgs.data import load_image
-    from kcgs.fit import FitConfig, fit
-    from kcgs.io import save
+    from kcgs.fit import FitConfig
 
-    output = Path(f"{image.stem}.safetensors") if output is None else output
-    check_output(output, ".safetensors")
+    suffixes = (".safetensors", ".kcgs") if target_bytes is None else (".kcgs",)
+    output = Path(f"{image.stem}{suffixes[0]}") if output is None else output
+    check_output(output, *suffixes)
+    if target_bytes is not None:
+        for name, given in (("-n", num_gaussians), ("--target-psnr", target_psnr), ("--checkpoint", checkpoint)):
+            if given is not None:
+                raise typer.BadParameter(f"--target-bytes chooses the Gaussians itself and excludes {name}")
     if plot is not None:
         check_output(plot, ".png", option="--plot")
     if resume and checkpoint is None:
@@ -79,21 +90,22 @@ def fit_command(
     )
     picture = load_image(image)
     labels = _read_regions(regions, picture)
+    count = 1000 if num_gaussians is None else num_gaussians
     with Progress(config.iterations, config.max_seconds) as progress:
-        result = fit(
-            picture, labels, num_gaussians,
-            seed=seed, config=config, on_step=progress.step, checkpoint=checkpoint, resume=resume,
+        fitted = fit_into(
+            output, picture, labels, count, target_bytes,
+            recipe=recipe, seed=seed, config=config, on_step=progress.step, checkpoint=checkpoint, resume=resume,
         )  # fmt: skip
+    result = fitted.result
     if plot is not None:
         from kcgs.bench.plots import plot_history
 
         plot_history(plot, {recipe: result.history})
-    written = save(output, result.field, result.regions, metadata={"recipe": recipe})
     if progress.interrupted:
         typer.echo(f"interrupted: saved the best so far to {output}", err=True)
     seconds = result.history[-1].seconds
-    report = _measure(result.field, result.regions, picture, labels, seconds, written)
-    title = f"{output}: {len(result.field)} Gaussians, stopped by {result.stop_reason}"
+    report = _measure(fitted.field, fitted.regions, picture, labels, seconds, fitted.written)
+    title = f"{output}: {len(fitted.field)} Gaussians, stopped by {result.stop_reason}"
     if result.removed:
         title += f"; {result.removed} useless ones removed, which changed no value by more than {result.change:.1g}"
     print_report(report, as_json, title)
@@ -115,7 +127,7 @@ def render(
     check_output(output, *IMAGES)
     loaded = load(scene)
     field = loaded.field
-    target = _target_size(field.size, scale, size)
+    target = target_size(field.size, scale, size)
     if region is not None:
         known = [] if loaded.regions is None else loaded.regions.ids.tolist()
         if field.region_ids is None or region not in known:
@@ -173,7 +185,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
 
 @app.command()
 def bench(
-    name: Annotated[str, typer.Argument(help="Experiment by name: decode, demo, fit, maps, render, zoo.")],
+    name: Annotated[str, typer.Argument(help="Experiment by name: decode, demo, fit, maps, rate, render, zoo.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the report.")],
     data: Annotated[Path | None, typer.Option(help="Folder with images, where the experiment needs them.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A short form of the same.")] = False,
@@ -204,7 +216,8 @@ def _mean_softness(regions: RegionMap) -> float:
     return softness if isinstance(softness, float) else sum(softness.values()) / max(1, len(softness))
 
 
-def _target_size(size: tuple[int, int], scale: float | None, wanted: str | None) -> tuple[int, int]:
+def target_size(size: tuple[int, int], scale: float | None, wanted: str | None) -> tuple[int, int]:
+    """Return the (height, width) that the options --scale and --size ask for."""
     if scale is not None and wanted is not None:
         raise typer.BadParameter("give --scale or --size, not both")
     if wanted is not None:

@@ -28,7 +28,7 @@ def _scene_path(text: str) -> Path:
 
 
 SceneFile = Annotated[
-    Path, typer.Argument(help="Scene file (.safetensors), or zoo:NAME.", metavar="SCENE", parser=_scene_path)
+    Path, typer.Argument(help="Scene file (.safetensors or .kcgs), or zoo:NAME.", metavar="SCENE", parser=_scene_path)
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 

@@ -1,0 +1,218 @@
+"""The numbers of Gaussians, coded: a layer for each class of energy, the strongest first, so that a part is a picture.
+
+A layer tells, for each class of size, how many Gaussians there are, and then what each is. The order of a sum is free:
+within a class Gaussians go by the cell that they lie in, row by row, and only how many lie in each cell is told.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import CodecError
+from .models import Choices, Magnitudes
+from .quantize import MARGIN_CELLS, SIZES, Classes, Codes, Quantizer, side_for
+from .ranges import Coder
+
+Integers = NDArray[np.int64]
+# positions among the map's ids under centres (N, 2), float32
+Lookup = Callable[[NDArray[np.float32]], Integers]
+
+# more in a cell are told by repeating this
+_FULL = 7
+_MOST_BITS = 21
+# half the log2 of the ratio of scales is measured in this
+_RATIO_SCALE = 2.0
+# a colour's part is faint, middling or strong against the whole
+_FAINT, _STRONG = 0.35, 0.8
+_GREY = np.array([8, 7, 7, 6, 6, 6, 7, 7, 6, 5, 4, 3, 2, 1, 1, 0.5, *[0.2] * 8])
+_HUE = np.array([20, 12, 8, 6, 4, 3, 2, 2, 1, 1, 0.7, 0.5, 0.3, 0.3, 0.2, 0.2, *[0.1] * 8])
+_RATIO = np.array([6, 8, 10, 9, 8, 6, 4, 3, 2, 1, 1, 0.5, *[0.2] * 12])
+
+
+class Layers:
+    """Codes layers one after another; what was learned in one helps the next.
+
+    Args:
+        quantizer: of the file.
+        channels: of the colours.
+        regions: how many regions there are.
+        lookup: the region under a centre; read only where there are more than one.
+    """
+
+    def __init__(self, quantizer: Quantizer, channels: int, regions: int, lookup: Lookup | None) -> None:
+        self.quantizer, self.channels, self.regions, self.lookup = quantizer, channels, regions, lookup
+        self._colors = [Magnitudes(_GREY), *(Magnitudes(_HUE, 3) for _ in range(min(channels, 3) - 1))]
+        self._ratio = Magnitudes(_RATIO)
+        self._stays = Choices(np.array([20.0, 0.5]))
+        self._lengths = Choices(np.array([2.0, *[1.0] * 9, *[0.3] * (_MOST_BITS - 9)]))
+        self._margins = Choices(np.array([3.0, *[1.0] * 4, *[0.3] * 4]))
+        self._outside = 0.5, 20.0
+
+    def code(
+        self, coder: Coder, energy: int, codes: Codes | None, ids: Integers | None, most: int
+    ) -> tuple[Codes, Integers]:
+        """Code the layer of one energy.
+
+        Args:
+            coder: writes or reads.
+            energy: of the layer.
+            codes: the layer's Gaussians, sorted by `layer_order`; None: to read.
+            ids: their regions, as positions among the map's ids.
+            most: more Gaussians than this are refused.
+
+        Raises:
+            CodecError: a stream that names more.
+        """
+        counts = None if codes is None else np.bincount(codes.classes.size - SIZES[0], minlength=64)
+        counts = self._code_counts(coder, counts)
+        if counts.sum() > most:
+            raise CodecError(f"a layer must hold at most {most} Gaussians; got {counts.sum()}")
+        if not counts.any():
+            raise CodecError("a layer must hold Gaussians; got none")
+        cells, start = [], 0
+        for count in counts[counts > 0][::-1].tolist():
+            own = None if codes is None else codes.cell[start : start + count]
+            cells.append(self._code_cells(coder, count, own))
+            start += count
+        size = np.repeat(np.arange(64)[::-1], counts[::-1]) + SIZES[0]
+        classes = Classes(np.full(start, energy), size)
+        found = self._code_numbers(coder, classes, np.concatenate(cells), codes)
+        return found, self._code_regions(coder, found, ids)
+
+    def _code_counts(self, coder: Coder, counts: Integers | None) -> Integers:
+        one = np.ones(1, np.int64)
+        held = None if counts is None else np.flatnonzero(counts)
+        first = int(coder.uniform(64 * one, None if held is None else held[:1])[0])
+        span = int(coder.uniform((64 - first) * one, None if held is None else held[-1:] - first)[0]) + 1
+        found = np.zeros(64, np.int64)
+        for size in range(first, first + span):
+            value = None if counts is None else counts[size : size + 1]
+            length = None if value is None else np.array([int(value[0]).bit_length()])
+            length = self._lengths.code(coder, 0 * one, length)
+            low = one << max(int(length[0]) - 1, 0) if length[0] else 0 * one
+            found[size] = (low + coder.uniform(np.maximum(low, 1), None if value is None else value - low))[0]
+        return found
+
+    def _code_numbers(self, coder: Coder, classes: Classes, cell: Integers, codes: Codes | None) -> Codes:
+        quantizer = self.quantizer
+        steps, side = quantizer.steps(classes), quantizer.cell_side(classes)
+        zero = np.zeros(len(cell), np.int64)
+        scale = coder.uniform(steps.scales, None if codes is None else codes.scale)
+        ratio = self._ratio.code(coder, _RATIO_SCALE / steps.ratio[0], zero, None if codes is None else codes.ratio)
+        angle = coder.uniform(quantizer.angles(ratio, steps), None if codes is None else codes.angle)
+        # how many steps the amplitude of a Gaussian of this energy has
+        loud = math.sqrt(math.pi / (12.0 * quantizer.noise)) * 2.0 ** float(classes.energy[0])
+        colors = self._code_colors(coder, len(cell), loud, None if codes is None else codes.colors)
+        parts = quantizer.parts(quantizer.restore_shape(classes, scale, ratio, angle), classes, side)
+        place = [coder.uniform(parts[:, axis], None if codes is None else codes.place[:, axis]) for axis in range(2)]
+        return Codes(classes, scale, ratio, angle, colors, cell, np.stack(place, -1))
+
+    def _code_cells(self, coder: Coder, count: int, cell: Integers | None) -> Integers:
+        """Code how many Gaussians lie in each cell, row by row, with a margin of cells where some lie outside."""
+        height, width = self.quantizer.size
+        side = side_for(count, self.quantizer.size)
+        rows, columns = -(-height // side), -(-width // side)
+        margin = None
+        if cell is not None:
+            beyond = [-cell.min(), (cell[:, 0] - columns + 1).max(), (cell[:, 1] - rows + 1).max(), 0]
+            margin = int(max(beyond))
+        margin = self._code_margin(coder, margin)
+        tall, wide = rows + 2 * margin, columns + 2 * margin
+        inside = np.zeros((tall, wide), bool)
+        inside[margin : margin + rows, margin : margin + columns] = True
+        held = None
+        if cell is not None:
+            held = np.bincount((cell[:, 1] + margin) * wide + cell[:, 0] + margin, minlength=tall * wide)
+        # shares of those seen so far tell how many lie outside
+        out, all_seen = self._outside
+        share = out / all_seen if margin else 0.0
+        found = np.zeros(tall * wide, np.int64)
+        for where, part in ((inside.ravel(), 1.0 - share), (~inside.ravel(), share)):
+            cells = int(where.sum())
+            if cells:
+                rate = max(count * part, 0.01) / cells
+                found[where] = self._code_fill(coder, rate, cells, None if held is None else held[where])
+        if found.sum() != count:
+            raise CodecError(f"cells must hold {count} Gaussians; got {found.sum()}")
+        if margin:
+            self._outside = out + float(found[~inside.ravel()].sum()), all_seen + count
+        at = np.repeat(np.arange(tall * wide), found)
+        return np.stack([at % wide - margin, at // wide - margin], -1)
+
+    def _code_margin(self, coder: Coder, margin: int | None) -> int:
+        one = np.zeros(1, np.int64)
+        length = self._margins.code(coder, one, None if margin is None else np.array([margin.bit_length()]))
+        low = int(1 << (int(length[0]) - 1)) if length[0] else 0
+        rest = None if margin is None else np.array([margin - low])
+        found = low + int(coder.uniform(np.array([max(low, 1)]), rest)[0])
+        if found > MARGIN_CELLS:
+            raise CodecError(f"a margin must be at most {MARGIN_CELLS} cells; got {found}")
+        return found
+
+    @staticmethod
+    def _code_fill(coder: Coder, rate: float, cells: int, held: Integers | None) -> Integers:
+        # one more with the probability rate / (1 + rate) each: nearly Poisson where cells are many
+        more = rate / (1.0 + rate)
+        weights = np.array([(1.0 - more) * more**0, *[0.0] * _FULL])
+        for i in range(1, _FULL + 1):
+            weights[i] = weights[i - 1] * more
+        weights[_FULL] /= 1.0 - more
+        total = np.zeros(cells, np.int64)
+        open_ones = np.arange(cells)
+        for _ in range(64):
+            value = None if held is None else np.minimum(held[open_ones] - total[open_ones], _FULL)
+            found = coder.repeat(weights, len(open_ones), value)
+            total[open_ones] += found
+            open_ones = open_ones[found == _FULL]
+            if not len(open_ones):
+                return total
+        raise CodecError("a cell holds too many Gaussians")
+
+    def _code_colors(self, coder: Coder, count: int, loud: float, colors: Integers | None) -> Integers:
+        channels: list[Integers] = []
+        for channel in range(self.channels):
+            context = np.zeros(count, np.int64)
+            if channel:
+                last = np.abs(channels[-1])
+                context = (last > _FAINT * loud).astype(np.int64) + (last > _STRONG * loud)
+            value = None if colors is None else colors[:, channel]
+            model = self._colors[min(channel, 2)]
+            size = model.code(coder, loud, context, None if value is None else np.abs(value))
+            sign = coder.uniform(1 + (size > 0), None if value is None else (value < 0).astype(np.int64))
+            channels.append(np.where(sign == 1, -size, size))
+        return np.stack(channels, -1)
+
+    def _code_regions(self, coder: Coder, codes: Codes, ids: Integers | None) -> Integers:
+        if self.lookup is None or self.regions == 1:
+            return np.zeros(len(codes.scale), np.int64)
+        under = self.lookup(self.quantizer.restore(codes)[0])
+        strays = None if ids is None else (ids != under).astype(np.int64)
+        strays = self._stays.code(coder, np.zeros(len(under), np.int64), strays)
+        away = np.flatnonzero(strays)
+        # any but the one under it
+        others = None if ids is None else (ids[away] - under[away] - 1) % self.regions
+        step = coder.uniform(np.full(len(away), self.regions - 1), others)
+        found = under.copy()
+        found[away] = (under[away] + 1 + step) % self.regions
+        return found
+
+
+def layer_order(codes: Codes) -> Integers:
+    """Return the order that Gaussians are told in: by energy, then size, falling; then by cell, row by row."""
+    column, row = codes.cell.T
+    return np.lexsort((column, row, -codes.classes.size, -codes.classes.energy))
+
+
+def pick(codes: Codes, index: Integers | slice | NDArray[np.bool_]) -> Codes:
+    """Return some of the Gaussians."""
+    return Codes(Classes(*(t[index] for t in codes.classes)), *(t[index] for t in codes[1:]))
+
+
+def join(parts: list[Codes]) -> Codes:
+    """Return the Gaussians of all parts."""
+    classes = Classes(*(np.concatenate(t) for t in zip(*(p.classes for p in parts), strict=True)))
+    return Codes(classes, *(np.concatenate(t) for t in zip(*(p[1:] for p in parts), strict=True)))

@@ -1,0 +1,108 @@
+"""A region map in a file: labels, and how wide the contours are.
+
+======================  ==================================================================================
+bytes                   meaning
+======================  ==================================================================================
+varint                  labels along a side of a pixel, k
+varint, labels          length in bytes; the map of (k height, k width) as `labels` says
+varint                  W, how many different widths there are
+varint                  for each: the width in fortieths of a pixel
+widths                  if W > 1, to the end: for each two regions with labels side by side, a < b by positions
+                        among the sorted ids, in order: its place in that list, range coded by counts that start
+                        at 1 and are updated every 32 pairs
+======================  ==================================================================================
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kcgs.functional import RegionMap
+from kcgs.functional.regions import MAX_SOFTNESS, PairWidths
+
+from .errors import CodecError
+from .labels import decode_labels, encode_labels
+from .models import Choices
+from .ranges import Coder, Reader, Writer
+from .stream import MOST_LABELS, ByteReader, varint
+
+Integers = NDArray[np.int64]
+_FORTIETHS = 40
+_MOST_WIDTH = int(MAX_SOFTNESS) * _FORTIETHS
+_MOST_SUPERSAMPLE = 64
+_AT_ONCE = 32
+
+
+def encode_map(regions: RegionMap) -> bytes:
+    """Write a map with two regions or more; contour widths are rounded to fortieths of a pixel."""
+    if regions.labels.ndim != 2 or regions.resized:
+        raise ValueError("regions must be one map of its own pixels, not a batch and not resized")
+    fine = regions.labels if regions.fine_labels is None else regions.fine_labels
+    labels = encode_labels(fine.cpu().numpy())
+    pairs = _touching(regions)
+    softness, ids = regions.softness, regions.ids.tolist()
+    if isinstance(softness, PairWidths):
+        widths = [_round(softness.get((ids[a], ids[b]), 0.0)) for a, b in pairs.tolist()]
+    else:
+        widths = [_round(softness)]
+    distinct = sorted(set(widths))
+    head = varint(regions.supersample) + varint(len(labels)) + labels
+    head += b"".join(map(varint, [len(distinct), *distinct]))
+    if len(distinct) == 1:
+        return head
+    writer = Writer()
+    _code_places(writer, len(pairs), len(distinct), np.array([distinct.index(width) for width in widths]))
+    return head + writer.finish()
+
+
+def decode_map(data: bytes, size: tuple[int, int], num_regions: int) -> RegionMap:
+    """Read a map of `num_regions` regions for a picture of `size`."""
+    stream = ByteReader(data)
+    k = stream.varint("labels along a side of a pixel", 1, _MOST_SUPERSAMPLE)
+    if size[0] * size[1] * k * k > MOST_LABELS:
+        raise CodecError(f"a map must have at most {MOST_LABELS} labels; got {size} times {k} squared")
+    labels = stream.take(stream.varint("length of the labels", 1, len(data)))
+    found = decode_labels(labels, k * size[0], k * size[1], max_regions=num_regions)
+    regions = RegionMap.from_labels(torch.from_numpy(found), supersample=k)
+    if regions.num_regions != num_regions:
+        raise CodecError(f"the map must have {num_regions} regions; got {regions.num_regions}")
+    count = stream.varint("contour widths", 1, min(_MOST_WIDTH + 1, len(data)))
+    distinct = [stream.varint("a contour width", 0, _MOST_WIDTH) / _FORTIETHS for _ in range(count)]
+    if count == 1:
+        widths: float | dict[tuple[int, int], float] = distinct[0]
+    else:
+        pairs, ids = _touching(regions), regions.ids.tolist()
+        places = _code_places(Reader(stream.take(len(data) - stream.at)), len(pairs), count, None)
+        named = zip(pairs.tolist(), places.tolist(), strict=True)
+        widths = {(ids[a], ids[b]): distinct[place] for (a, b), place in named}
+    return RegionMap.from_labels(torch.from_numpy(found), widths, supersample=k)
+
+
+def _round(width: float) -> int:
+    return math.floor(width * _FORTIETHS + 0.5)
+
+
+def _code_places(coder: Coder, pairs: int, count: int, places: Integers | None) -> Integers:
+    model, found = Choices(np.ones(count)), np.zeros(pairs, np.int64)
+    for start in range(0, pairs, _AT_ONCE):
+        part = slice(start, min(start + _AT_ONCE, pairs))
+        context = np.zeros(part.stop - start, np.int64)
+        found[part] = model.code(coder, context, None if places is None else places[part])
+    return found
+
+
+def _touching(regions: RegionMap) -> Integers:
+    """Return the pairs of positions a < b [P, 2] of regions that have labels side by side."""
+    fine = regions.labels if regions.fine_labels is None else regions.fine_labels
+    index = regions.index_of(fine).cpu().numpy().astype(np.int64)
+    keys = []
+    for here, there in ((index[:, :-1], index[:, 1:]), (index[:-1], index[1:])):
+        differ = here != there
+        low, high = np.minimum(here[differ], there[differ]), np.maximum(here[differ], there[differ])
+        keys.append(np.unique(low * regions.num_regions + high))
+    key = np.unique(np.concatenate(keys))
+    return np.stack([key // regions.num_regions, key % regions.num_regions], -1)

@@ -1,0 +1,228 @@
+r"""Gaussians as whole numbers, each number as fine as the picture needs it.
+
+A change of one parameter changes the picture by a squared error that is known without drawing: with the amplitude
+:math:`|c|` and the standard deviations :math:`\sigma_1 \ge \sigma_2`, :math:`w = \pi |c|^2 \sigma_1 \sigma_2` is the
+Gaussian's energy, and
+
+===========================================  ==========================  ========================
+parameter                                    changed by                  squared error
+===========================================  ==========================  ========================
+centre, in standard deviations               :math:`\delta`              :math:`w \delta^2 / 2`
+log of :math:`\sqrt{\sigma_1 \sigma_2}`      :math:`\delta`              :math:`2 w \delta^2`
+half the log of :math:`\sigma_1 / \sigma_2`  :math:`\delta`              :math:`w \delta^2`
+angle, times :math:`\sinh` of that log       :math:`\delta`              :math:`w \delta^2`
+colour, one channel                          :math:`\delta`              :math:`(w / |c|^2) \delta^2`
+===========================================  ==========================  ========================
+
+At a given size the total is least where every parameter of every Gaussian adds the same error, the noise D. So faint
+and small Gaussians get coarse shapes, and wide ones fine colours. The steps are read from two classes: energy (octaves
+of :math:`|c| \sqrt{\sigma_1 \sigma_2}`) and size (three quarters of an octave of :math:`\sqrt{\sigma_1 \sigma_2}`).
+
+What is restored is computed from sums, products and square roots of float64 alone: the same bits on every machine.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .exact import Floats, exp2, turn
+
+Integers = NDArray[np.int64]
+
+ENERGIES = (-24, 40)
+SIZES = (-8, 28)
+# octaves that a class of size spans
+OCTAVES = 0.75
+# the noise that a file may ask for: D = 2^(-code / 32)
+NOISE_CODES = (-512, 1023)
+# half the log2 of the ratio of standard deviations
+_MOST_RATIO = 12.0
+_MOST_LEVELS = 1 << 20
+_LN2 = 0.6931471805599453
+# cells are numbered from the image's corner; centres farther out are brought to the border of that
+MARGIN_CELLS = 255
+# an opposition of colours: grey, red against blue, green against both; orthonormal
+_OPPONENT = (
+    (0.5773502691896258, 0.5773502691896258, 0.5773502691896258),
+    (0.7071067811865476, 0.0, -0.7071067811865476),
+    (-0.408248290463863, 0.816496580927726, -0.408248290463863),
+)
+
+
+class Classes(NamedTuple):
+    """What the steps are read from, for each Gaussian."""
+
+    energy: Integers  # [N]
+    size: Integers  # [N]
+
+
+class Codes(NamedTuple):
+    """N Gaussians as whole numbers."""
+
+    classes: Classes
+    scale: Integers  # [N] place within the class of size
+    ratio: Integers  # [N] of the standard deviations
+    angle: Integers  # [N] of the longer one
+    colors: Integers  # [N, C] grey first
+    cell: Integers  # [N, 2] column, row
+    place: Integers  # [N, 2] within the cell
+
+
+class Steps(NamedTuple):
+    """How fine each number is."""
+
+    place: Floats  # [N] in standard deviations
+    scales: Integers  # [N] places in a class of size
+    ratio: Floats  # [N] in log2
+    angle: Floats  # [N] radians, times sinh of the log ratio
+    color: Floats  # [N]
+
+
+class Quantizer:
+    """Whole numbers from Gaussians, and back, at one noise.
+
+    Args:
+        noise_code: the noise is D = 2^(-noise_code / 32), squared error that a parameter adds to the picture.
+        size: (height, width) of the picture.
+    """
+
+    def __init__(self, noise_code: int, size: tuple[int, int]) -> None:
+        self.noise_code, self.size = noise_code, size
+        self.noise = float(exp2(np.array([-noise_code / 32.0]))[0])
+
+    def classify(self, cholesky: Floats, colors: Floats) -> Classes:
+        """Return the classes of Gaussians with `cholesky` [N, 3] and `colors` [N, C]."""
+        scale = 0.5 * np.log2(cholesky[:, 0] * cholesky[:, 2])
+        energy = np.log2(np.maximum(np.sqrt((colors * colors).sum(1)), 1e-12)) + scale
+        return Classes(
+            np.clip(np.floor(energy), ENERGIES[0], ENERGIES[1]).astype(np.int64),
+            np.clip(np.floor(scale / OCTAVES), SIZES[0], SIZES[1]).astype(np.int64),
+        )
+
+    def steps(self, classes: Classes) -> Steps:
+        """Return the steps of each Gaussian: those at which every parameter adds the noise."""
+        relative = np.sqrt(12.0 * self.noise / (math.pi * np.ldexp(1.0, 2 * classes.energy.astype(np.int32) + 1)))
+        area = math.pi * exp2(2.0 * OCTAVES * (classes.size + 0.5))
+        scale = relative * (math.sqrt(0.5) / _LN2)
+        return Steps(
+            place=relative * math.sqrt(2.0),
+            scales=np.clip(np.floor(OCTAVES / scale + 0.5), 1, _MOST_LEVELS).astype(np.int64),
+            ratio=relative * (1.0 / _LN2),
+            angle=relative,
+            color=np.sqrt(12.0 * self.noise / area),
+        )
+
+    def cell_side(self, classes: Classes) -> Integers:
+        """Return the side in pixels, a power of two, of the cells that each Gaussian's place is told in."""
+        group = (classes.energy - ENERGIES[0]) * 64 + classes.size - SIZES[0]
+        _, index, counts = np.unique(group, return_inverse=True, return_counts=True)
+        sides = np.array([side_for(int(count), self.size) for count in counts], np.int64)
+        return sides[index]
+
+    def is_seen(self, colors: Floats, classes: Classes) -> NDArray[np.bool_]:
+        """Say which Gaussians do not round to black [N]."""
+        rounded = np.floor(opponent(colors) / self.steps(classes).color[:, None] + 0.5)
+        seen: NDArray[np.bool_] = (rounded != 0).any(1)
+        return seen
+
+    def quantize(self, means: Floats, cholesky: Floats, colors: Floats, classes: Classes) -> Codes:
+        """Round Gaussians; what leaves its class of size is brought back to its border."""
+        steps = self.steps(classes)
+        scale, ratio, angle = _decompose(cholesky)
+        within = np.floor((scale / OCTAVES - classes.size) * steps.scales).astype(np.int64)
+        within = np.clip(within, 0, steps.scales - 1)
+        ratios = np.floor(np.clip(ratio, 0, _MOST_RATIO) / steps.ratio + 0.5).astype(np.int64)
+        turns = self.angles(ratios, steps)
+        angles = np.floor(angle / math.pi * turns + 0.5).astype(np.int64) % turns
+        opposed = opponent(colors) / steps.color[:, None]
+        codes = np.clip(np.floor(opposed + 0.5), -_MOST_LEVELS, _MOST_LEVELS).astype(np.int64)
+        shape = self.restore_shape(classes, within, ratios, angles)
+        cell, place = self._locate(means, shape, steps, self.cell_side(classes))
+        return Codes(classes, within, ratios, angles, codes, cell, place)
+
+    def angles(self, ratios: Integers, steps: Steps) -> Integers:
+        """Return how many angles there are at each ratio: one for circles."""
+        log = 2.0 * ratios * steps.ratio
+        stretch = 0.5 * (exp2(log) - exp2(-log))
+        turns = np.clip(np.floor(math.pi * stretch / steps.angle + 0.5), 2, _MOST_LEVELS)
+        return np.where(ratios == 0, 1, turns).astype(np.int64)
+
+    def restore_shape(self, classes: Classes, scale: Integers, ratio: Integers, angle: Integers) -> Floats:
+        """Return `cholesky` [N, 3]."""
+        steps = self.steps(classes)
+        middle = OCTAVES * (classes.size + (scale + 0.5) / steps.scales)
+        stretch = ratio * steps.ratio
+        major, minor = exp2(middle + stretch), exp2(middle - stretch)
+        cos, sin = turn(angle / self.angles(ratio, steps))
+        along, across = major * cos, minor * sin
+        l11 = np.sqrt(along * along + across * across)
+        return np.stack([l11, (major * major - minor * minor) * cos * sin / l11, major * minor / l11], -1)
+
+    def parts(self, shape: Floats, classes: Classes, side: Integers) -> Integers:
+        """Return how many places there are in a cell, across and down [N, 2]."""
+        step = self.steps(classes).place[:, None] * shape[:, ::2]
+        return np.clip(np.ceil(side[:, None] / step), 1, _MOST_LEVELS).astype(np.int64)
+
+    def restore_means(self, cell: Integers, place: Integers, parts: Integers, side: Integers) -> Floats:
+        """Return centres [N, 2]."""
+        return side[:, None] * (cell + (place + 0.5) / parts)
+
+    def restore(self, codes: Codes) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Return means (N, 2), cholesky (N, 3), colors (N, C)."""
+        classes, side = codes.classes, self.cell_side(codes.classes)
+        shape = self.restore_shape(classes, codes.scale, codes.ratio, codes.angle)
+        means = self.restore_means(codes.cell, codes.place, self.parts(shape, classes, side), side)
+        colors = opponent(codes.colors * self.steps(classes).color[:, None], back=True)
+        return means.astype(np.float32), shape.astype(np.float32), colors.astype(np.float32)
+
+    def restore_layers(self, parts: list[Codes]) -> list[NDArray[np.float32]]:
+        """Return means (N, 2), cholesky (N, 3), colors (N, C) of one part after another."""
+        return [np.concatenate(arrays) for arrays in zip(*map(self.restore, parts), strict=True)]
+
+    def _locate(self, means: Floats, shape: Floats, steps: Steps, side: Integers) -> tuple[Integers, Integers]:
+        """Round x, then y to where it counts: the error of x along the Gaussian's slant is made up for."""
+        parts = np.ceil(side[:, None] / (steps.place[:, None] * shape[:, ::2]))
+        parts = np.clip(parts, 1, _MOST_LEVELS).astype(np.int64)
+        cells, places = [], []
+        wanted = means[:, 0]
+        for axis, pixels in enumerate((self.size[1], self.size[0])):
+            highest = -(-pixels // side) + MARGIN_CELLS - 1
+            at = np.clip(wanted / side, -MARGIN_CELLS, np.nextafter(highest + 1.0, 0))
+            cell = np.floor(at).astype(np.int64)
+            place = np.minimum(np.floor((at - cell) * parts[:, axis]).astype(np.int64), parts[:, axis] - 1)
+            cells.append(cell)
+            places.append(place)
+            if axis == 0:
+                rounded = side * (cell + (place + 0.5) / parts[:, 0])
+                wanted = means[:, 1] + shape[:, 1] / shape[:, 0] * (rounded - means[:, 0])
+        return np.stack(cells, -1), np.stack(places, -1)
+
+
+def side_for(count: int, size: tuple[int, int]) -> int:
+    """Return the side of the cells of a group of Gaussians: 16 to 64 cells a Gaussian, a pixel at least."""
+    cells = size[0] * size[1] // (16 * max(count, 1))
+    return 1 << max(0, (cells.bit_length() - 1) // 2)
+
+
+def opponent(colors: Floats, *, back: bool = False) -> Floats:
+    """Rotate RGB [N, 3] into grey and two oppositions, or back; other numbers of channels stay."""
+    if colors.shape[1] != 3:
+        return colors
+    rows = tuple(zip(*_OPPONENT, strict=True)) if back else _OPPONENT
+    # not a matrix product: its order of summation is the machine's
+    return np.stack([colors[:, 0] * a + colors[:, 1] * b + colors[:, 2] * c for a, b, c in rows], -1)
+
+
+def _decompose(cholesky: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return log2 of the mean scale, half the log2 of the ratio of scales, and the angle of the longer in [0, pi)."""
+    l11, l21, l22 = cholesky.T
+    product = l11 * l22
+    xx, xy, yy = l11 * l11, l11 * l21, l21 * l21 + l22 * l22
+    half = 0.5 * (xx - yy)
+    major = 0.5 * (xx + yy) + np.hypot(half, xy)
+    ratio = 0.5 * np.log2(np.maximum(major / product, 1.0))
+    return 0.5 * np.log2(product), ratio, 0.5 * np.arctan2(xy, half) % math.pi

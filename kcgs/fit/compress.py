@@ -1,0 +1,225 @@
+"""From a picture to a file of so many bytes: how many Gaussians, how finely rounded, and whether contours pay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcgs._check import check_image
+from kcgs.codec.maps import encode_map
+from kcgs.codec.quantize import Quantizer
+from kcgs.codec.scene import (
+    DEFAULT_QUALITY,
+    check_scene,
+    decode,
+    encode_codes,
+    finest,
+    noise_code_for,
+    numbers,
+)
+from kcgs.functional import RegionMap
+from kcgs.nn import GaussianField
+
+from .config import FitConfig
+from .fine_tune import FineTuning
+from .loop import fit
+from .monitor import FitResult, HistoryEntry
+
+# a Gaussian whose whole energy is below this many times the noise costs more bits than it saves: at the best rate a
+# bit saves 2 ln 2 D for each number, and a Gaussian has about 30
+_WORTH = 20.0
+# bits of a Gaussian where rounding costs half a dB, at `_COUNT` of them, and for each doubling
+_BITS, _COUNT, _BITS_AN_OCTAVE = 31.0, 2100, 1.9
+_HEADER_BYTES = 60
+# squared error falls with the power of the bytes
+_POWER = 0.93
+# bits of a pixel of contour
+_CONTOUR_BITS = 1.2
+# contours show: a picture with them may have this much more squared error, 0.1 dB
+_FAVOUR = 1.023
+_TRIAL_ITERATIONS, _TRIAL_TO_END = 80, 0.65
+# coded lengths vary by so much as Gaussians are tuned
+_SLACK = 0.997
+
+
+class Compressed(NamedTuple):
+    """A file and what it was made from."""
+
+    data: bytes
+    field: GaussianField
+    """As decoded."""
+    regions: RegionMap | None
+    result: FitResult
+    """The fit, before rounding."""
+
+
+def compress(
+    field: GaussianField,
+    image: Tensor,
+    regions: RegionMap | Tensor | None = None,
+    *,
+    quality: float | None = None,
+    target_bytes: int | None = None,
+    iterations: int = 100,
+    seed: int = 0,
+) -> bytes:
+    """Write a scene as a `.kcgs` file, rounded with an eye on the image that it shows.
+
+    Gaussians are rounded a few at a time, and those that are still free make up for it: about a third less error than
+    :func:`kcgs.codec.encode` at the same bytes. Those too faint to pay for their bits are left out.
+
+    Args:
+        field: N Gaussians of one image; opacities are merged into the colours.
+        image: :math:`(C, H, W)` or :math:`(1, C, H, W)` in [0, 1], of the field's size and channels.
+        regions: the map to draw with; None: one region.
+        quality: as in :func:`kcgs.codec.encode`, before the others make up for it.
+        target_bytes: the finest file that is not larger, in place of `quality`.
+        iterations: drawings that the descent may take, at least 1.
+        seed: of the order in which Gaussians are rounded.
+
+    Returns:
+        The file.
+
+    Raises:
+        TypeError, ValueError: as :func:`kcgs.codec.encode`; an image that does not fit the field; `iterations` below 1.
+
+    Example:
+        >>> from kcgs.codec import decode
+        >>> image = torch.linspace(0, 1, 48).expand(3, 32, 48)
+        >>> field = fit(image, num_gaussians=20, config=FitConfig.from_recipe("best", iterations=50)).field
+        >>> len(compress(field, image, target_bytes=150)) <= 150
+        True
+    """
+    regions, ids = check_scene(field, regions)
+    image = _check_image(image, field)
+    if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
+        raise ValueError(f"iterations must be an integer of at least 1; got {iterations!r}")
+    if quality is not None and target_bytes is not None:
+        raise ValueError(f"quality and target_bytes exclude each other; got {quality!r} and {target_bytes!r}")
+    region_map = None if regions is None else encode_map(regions)
+
+    def begin(code: int) -> tuple[FineTuning, torch.Tensor]:
+        quantizer = Quantizer(code, field.size)
+        kept = _worth(field, quantizer)
+        return FineTuning(field.subset(kept), image, regions, quantizer, seed), kept
+
+    def write(tuning: FineTuning, kept: Tensor, steps: int) -> bytes:
+        return encode_codes(tuning.quantizer, tuning.run(steps), ids[kept.numpy()], regions, region_map)
+
+    if target_bytes is None:
+        code = noise_code_for(DEFAULT_QUALITY if quality is None else quality, field)
+        return write(*begin(code), iterations)
+    code, data = finest(lambda code: write(*begin(code), 0), round(_SLACK * target_bytes), field)
+    while len(data := write(*begin(code), iterations)) > target_bytes:
+        code -= 1
+    return data
+
+
+def fit_bytes(
+    image: Tensor,
+    regions: RegionMap | Tensor | None = None,
+    target_bytes: int = 8000,
+    *,
+    recipe: str = "best",
+    seed: int = 0,
+    config: FitConfig | None = None,
+    on_step: Callable[[int, HistoryEntry], bool | None] | None = None,
+) -> Compressed:
+    """Fit an image to a budget of bytes, everything included.
+
+    One trade decides: what the last bit saves. The number of Gaussians is that at which another one, or more digits
+    for all, would save as much; a pixel of contour must save what its bits would save as Gaussians; and the map as a
+    whole stays only where two short fits, with it and with Gaussians for its bytes, say so, within 0.1 dB.
+
+    Args:
+        image: as in :func:`kcgs.fit.fit`.
+        regions: as there.
+        target_bytes: the file is not larger.
+        recipe: as there.
+        seed: as there.
+        config: as there; its price of contours is replaced by the coder's.
+        on_step: as there, for the fit itself, not the trials.
+
+    Returns:
+        The file, what it decodes to, and the fit.
+
+    Raises:
+        TypeError, ValueError: as :func:`kcgs.fit.fit`; a target too small for a Gaussian and the map.
+
+    Example:
+        >>> image = torch.linspace(0, 1, 48).expand(3, 32, 48)
+        >>> done = fit_bytes(image, None, 200, config=FitConfig.from_recipe("best", iterations=50))
+        >>> len(done.data) <= 200, done.regions
+        (True, None)
+    """
+    config = FitConfig.from_recipe(recipe) if config is None else config
+    image = check_image("image", image)
+    image = image[0] if image.ndim == 4 and image.shape[0] == 1 else image
+    if isinstance(regions, Tensor):
+        regions = RegionMap.from_labels(regions)
+    if isinstance(target_bytes, bool) or not isinstance(target_bytes, int):
+        raise TypeError(f"target_bytes must be an integer; got {target_bytes!r}")
+    regions, price = _choose(image, regions, target_bytes, config, seed)
+    count = count_for(target_bytes - _map_bytes(regions))
+    config = config.model_copy(update={"contour_price": price})
+    result = fit(image, regions, count, seed=seed, config=config, on_step=on_step)
+    data = compress(result.field, image, result.regions, target_bytes=target_bytes, seed=seed)
+    decoded = decode(data)
+    return Compressed(data, decoded.field, decoded.regions, result)
+
+
+def count_for(num_bytes: float) -> int:
+    """Return how many Gaussians make the best of so many bytes."""
+    bits = 8 * max(num_bytes - _HEADER_BYTES, 1)
+    count = bits / _BITS
+    for _ in range(4):
+        count = bits / max(_BITS + _BITS_AN_OCTAVE * math.log2(max(count, 1.0) / _COUNT), 8.0)
+    return max(1, round(count))
+
+
+def _choose(
+    image: Tensor, regions: RegionMap | None, target_bytes: int, config: FitConfig, seed: int
+) -> tuple[RegionMap | None, float]:
+    """Return the map, or None where its bytes do more as Gaussians, and what a pixel of contour must save."""
+    if regions is None or regions.num_regions == 1:
+        return None, config.contour_price
+    spent = _map_bytes(regions)
+    trial = config.model_copy(
+        update={"iterations": min(_TRIAL_ITERATIONS, config.iterations), "release": False, "polish": False}
+    )
+
+    def error(drawn: RegionMap | None, left: int) -> float:
+        result = fit(image, drawn, count_for(left), seed=seed, config=trial)
+        return float(10 ** (-max(entry.psnr for entry in result.history) / 10))
+
+    without = error(None, target_bytes)
+    bits = 8 * target_bytes
+    price = _CONTOUR_BITS * _POWER * _TRIAL_TO_END * without * image.shape[-2] * image.shape[-1] / bits
+    if count_for(target_bytes - spent) < regions.num_regions:
+        return None, price
+    return (regions if error(regions, target_bytes - spent) < _FAVOUR * without else None), price
+
+
+def _map_bytes(regions: RegionMap | None) -> int:
+    return 0 if regions is None or regions.num_regions == 1 else len(encode_map(regions))
+
+
+def _worth(field: GaussianField, quantizer: Quantizer) -> Tensor:
+    """Say which Gaussians pay for their bits; one at least."""
+    _, cholesky, colors = (torch.from_numpy(t) for t in numbers(field))
+    energy = math.pi * colors.square().sum(-1) * cholesky[:, 0] * cholesky[:, 2]
+    kept = energy >= _WORTH * quantizer.noise
+    kept[energy.argmax()] = True
+    return kept
+
+
+def _check_image(image: Tensor, field: GaussianField) -> Tensor:
+    image = check_image("image", image)
+    image = image[0] if image.ndim == 4 and image.shape[0] == 1 else image
+    if tuple(image.shape) != (field.colors.shape[-1], *field.size):
+        raise ValueError(f"image must have shape {(field.colors.shape[-1], *field.size)}; got {tuple(image.shape)}")
+    return image.detach().float().cpu()
