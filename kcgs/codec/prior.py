@@ -1,0 +1,59 @@
+"""What the coder knows about label maps before it has seen one: a small network, trained once, in integers."""
+
+from __future__ import annotations
+
+import functools
+from importlib import resources
+from typing import Any, NamedTuple
+
+import numpy as np
+
+# columns of each row above the pixel that the network sees, nearest row first
+_REACH = ((-8, -1), (-8, 2), (-7, 5), (-6, 6), (-5, 5), (-3, 4), (-2, 3))
+_OFFSETS = [(dx, -dy) for dy, (low, high) in enumerate(_REACH) for dx in range(low, high + 1)]
+TEMPLATE = sorted(_OFFSETS, key=lambda at: (at[0] ** 2 + at[1] ** 2, -at[1], at[0]))
+HIDDEN, LATENT = 48, 16
+
+
+class Prior(NamedTuple):
+    """Weights in 1/64, first estimates of the mixer in 1/65536."""
+
+    layer1: Any  # [T, 2, HIDDEN] int32
+    bias1: Any  # [HIDDEN] int32
+    layer2: Any  # [HIDDEN, LATENT] int32
+    bias2: Any  # [LATENT] int32, 1/4096
+    layer3: Any  # [LATENT, 2] int32
+    bias3: Any  # [2] int32, 1/4096
+    mixer: Any  # [4] int32
+
+
+@functools.cache
+def load_prior() -> Prior:
+    """Read the table that comes with the package."""
+    data = resources.files(__package__).joinpath("prior.bin").read_bytes()
+    return unpack(data)
+
+
+def shapes() -> list[tuple[type, tuple[int, ...]]]:
+    """Return type and shape of each array of the file, in order."""
+    t = len(TEMPLATE)
+    return [
+        (np.int8, (t, 2, HIDDEN)),
+        (np.int16, (HIDDEN,)),
+        (np.int8, (HIDDEN, LATENT)),
+        (np.int32, (LATENT,)),
+        (np.int8, (LATENT, 2)),
+        (np.int32, (2,)),
+        (np.int32, (4,)),
+    ]
+
+
+def unpack(data: bytes) -> Prior:
+    """Take the file apart."""
+    arrays, at = [], 0
+    for kind, shape in shapes():
+        count = int(np.prod(shape))
+        dtype = np.dtype(kind).newbyteorder("<")
+        arrays.append(np.frombuffer(data, dtype, count, at).reshape(shape).astype(np.int32))
+        at += count * dtype.itemsize
+    return Prior(*arrays)

@@ -1,0 +1,118 @@
+"""constriction's range coder behind two classes, so that one procedure describes both writing and reading."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import constriction
+import numpy as np
+
+ONE = 1 << 16  # chances are whole multiples of 1 / ONE
+_WINDOW = 64  # bits of the coder's state
+_MOST = 1 << 16  # largest alphabet of equally likely numbers
+
+# constriction rounds chances to 1/2**24: those given here are exact
+_BERNOULLI = constriction.stream.model.Bernoulli(perfect=True)
+
+
+class CodecError(ValueError):
+    """Bytes that no encoder wrote."""
+
+
+class Coder(Protocol):
+    """Either side of a stream: what is written is returned, so is what is read."""
+
+    reads: bool
+
+    def bits(self, chances: Any, values: Any) -> Any:
+        """Code bits that are 1 with these chances: (n,) float64 and int32; `values` are ignored by a reader."""
+
+    def number(self, value: int, size: int) -> int:
+        """Code one of 0 to size - 1, all equally likely; size is at most 2**16."""
+
+
+class Writer:
+    """Turns symbols into bytes."""
+
+    reads = False
+
+    def __init__(self) -> None:
+        self._encoder = constriction.stream.queue.RangeEncoder()
+
+    def bits(self, chances: Any, values: Any) -> Any:
+        """Write bits."""
+        self._encoder.encode(values, _BERNOULLI, chances)
+        return values
+
+    def number(self, value: int, size: int) -> int:
+        """Write a number."""
+        if size > 1:
+            self._encoder.encode(value, constriction.stream.model.Uniform(size))
+        return value
+
+    def finish(self) -> bytes:
+        """Return the fewest bytes that, with zeros behind them, read as what was written."""
+        position, (lower, width) = self._encoder.pos()
+        length = 4 * position + _WINDOW // 8
+        words: bytes = self._encoder.get_compressed().astype(">u4").tobytes()
+        value = int.from_bytes(words[:length].ljust(length, b"\0"), "big")
+        # all values from `low` for `width` read the same; this one was constriction's choice
+        low = value - ((value - lower) % (1 << _WINDOW))
+        for zeros in range(length, -1, -1):
+            step = 1 << (8 * zeros)
+            value = -(-low // step) * step
+            if value < low + width:
+                break
+        return value.to_bytes(length, "big").rstrip(b"\0")
+
+
+class Reader:
+    """Turns bytes into symbols; zeros follow the last byte."""
+
+    reads = True
+
+    def __init__(self, data: bytes) -> None:
+        padded = data + bytes(-len(data) % 4)
+        self._decoder = constriction.stream.queue.RangeDecoder(np.frombuffer(padded, ">u4").astype(np.uint32))
+
+    def bits(self, chances: Any, values: Any) -> Any:
+        """Read bits."""
+        return self._decode(_BERNOULLI, chances)
+
+    def number(self, value: int, size: int) -> int:
+        """Read a number."""
+        return int(self._decode(constriction.stream.model.Uniform(size))) if size > 1 else 0
+
+    def _decode(self, *model: Any) -> Any:
+        try:
+            return self._decoder.decode(*model)
+        except AssertionError:
+            raise CodecError("data must be a stream of labels; got bytes that no encoder wrote") from None
+
+
+def flag(coder: Coder, value: int, chance: int) -> int:
+    """Code one bit that is 1 with chance / ONE."""
+    return int(coder.bits(np.array([chance / ONE]), np.array([value], np.int32))[0])
+
+
+def plain(coder: Coder, value: int, count: int) -> int:
+    """Code the low `count` bits of a number, 16 at a time, lowest first."""
+    result = 0
+    for shift in range(0, count, 16):
+        size = 1 << min(16, count - shift)
+        result |= coder.number(value >> shift & (size - 1), size) << shift
+    return result
+
+
+def uniform(coder: Coder, value: int, size: int) -> int:
+    """Code one of 0 to size - 1, all about equally likely: the high digits, then 16 bits."""
+    if size <= _MOST:
+        return coder.number(value, size)
+    high = uniform(coder, value >> 16, -(-size >> 16))
+    return high << 16 | coder.number(value & (_MOST - 1), _MOST)
+
+
+def magnitude(coder: Coder, value: int) -> int:
+    """Code a number below 2**63 whose size is unknown: its count of bits, then those below the highest."""
+    length = coder.number(value.bit_length(), 64)
+    return 1 << (length - 1) | plain(coder, value, length - 1) if length else 0
