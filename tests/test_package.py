@@ -18,7 +18,7 @@ ROOT = Path(kcgs.__file__).resolve().parent.parent
 LAYERS = [
     {"cli", "bench", "view"},
     {"segment"},
-    {"fit", "io", "onnx", "data", "zoo"},
+    {"fit", "io", "onnx", "data", "zoo", "codec"},
     {"nn"},
     {"functional"},
     {"kernels"},

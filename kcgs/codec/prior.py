@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 # columns of each row above the pixel that the network sees, nearest row first
-_REACH = ((-8, -1), (-8, 2), (-7, 5), (-6, 6), (-5, 5), (-3, 4), (-2, 3))
+_REACH = ((-8, -1), (-8, 7), (-7, 8), (-6, 7), (-5, 6), (-3, 4), (-2, 3))
 _OFFSETS = [(dx, -dy) for dy, (low, high) in enumerate(_REACH) for dx in range(low, high + 1)]
 TEMPLATE = sorted(_OFFSETS, key=lambda at: (at[0] ** 2 + at[1] ** 2, -at[1], at[0]))
 HIDDEN, LATENT = 48, 16

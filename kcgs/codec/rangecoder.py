@@ -10,6 +10,7 @@ import numpy as np
 ONE = 1 << 16  # chances are whole multiples of 1 / ONE
 _WINDOW = 64  # bits of the coder's state
 _MOST = 1 << 16  # largest alphabet of equally likely numbers
+_LEAST = 64  # chance of a Counter's bit
 
 # constriction rounds chances to 1/2**24: those given here are exact
 _BERNOULLI = constriction.stream.model.Bernoulli(perfect=True)
@@ -90,9 +91,24 @@ class Reader:
             raise CodecError("data must be a stream of labels; got bytes that no encoder wrote") from None
 
 
-def flag(coder: Coder, value: int, chance: int) -> int:
-    """Code one bit that is 1 with chance / ONE."""
-    return int(coder.bits(np.array([chance / ONE]), np.array([value], np.int32))[0])
+class Counter:
+    """A bit whose chance is learnt while it is coded: it starts at `ones` of 4."""
+
+    def __init__(self, ones: int) -> None:
+        self._ones, self._all = ones, 4
+
+    def code(self, coder: Coder, value: bool) -> bool:
+        """Code the bit."""
+        chance = min(max(self._ones * ONE // self._all, _LEAST), ONE - _LEAST)
+        bit = bool(coder.bits(np.array([chance / ONE]), np.array([value], np.int32))[0])
+        self._ones += 2 * bit
+        self._all += 2
+        return bit
+
+
+def fair(coder: Coder, value: bool) -> bool:
+    """Code a bit that is as likely 0 as 1."""
+    return bool(coder.number(int(value), 2))
 
 
 def plain(coder: Coder, value: int, count: int) -> int:
@@ -105,7 +121,7 @@ def plain(coder: Coder, value: int, count: int) -> int:
 
 
 def uniform(coder: Coder, value: int, size: int) -> int:
-    """Code one of 0 to size - 1, all about equally likely: the high digits, then 16 bits."""
+    """Code one of 0 to size - 1, all about equally likely: what exceeds 16 bits, then 16 bits."""
     if size <= _MOST:
         return coder.number(value, size)
     high = uniform(coder, value >> 16, -(-size >> 16))
