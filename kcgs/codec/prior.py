@@ -1,8 +1,12 @@
-"""What the coder knows about label maps before it has seen one: a small network, trained once, in integers."""
+"""What the coder knows about label maps before it has seen one: a small network, trained once, in integers.
+
+`prior.bin` holds the arrays of `Prior` one after the other, lowest bytes first, in the types of `_LAYOUT`. The network was
+trained on segmentations of Kodak photos and of scikit-image's, and on drawn shapes: none of DAVIS or BSDS.
+"""
 
 from __future__ import annotations
 
-import functools
+import math
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -13,6 +17,15 @@ _REACH = ((-8, -1), (-8, 7), (-7, 8), (-6, 7), (-5, 6), (-3, 4), (-2, 3))
 _OFFSETS = [(dx, -dy) for dy, (low, high) in enumerate(_REACH) for dx in range(low, high + 1)]
 TEMPLATE = sorted(_OFFSETS, key=lambda at: (at[0] ** 2 + at[1] ** 2, -at[1], at[0]))
 HIDDEN, LATENT = 48, 16
+_LAYOUT = (
+    ("<i1", (len(TEMPLATE), 2, HIDDEN)),
+    ("<i2", (HIDDEN,)),
+    ("<i1", (HIDDEN, LATENT)),
+    ("<i4", (LATENT,)),
+    ("<i1", (LATENT, 2)),
+    ("<i4", (2,)),
+    ("<i4", (4,)),
+)
 
 
 class Prior(NamedTuple):
@@ -27,33 +40,17 @@ class Prior(NamedTuple):
     mixer: Any  # [4] int32
 
 
-@functools.cache
 def load_prior() -> Prior:
     """Read the table that comes with the package."""
     data = resources.files(__package__).joinpath("prior.bin").read_bytes()
     return unpack(data)
 
 
-def shapes() -> list[tuple[type, tuple[int, ...]]]:
-    """Return type and shape of each array of the file, in order."""
-    t = len(TEMPLATE)
-    return [
-        (np.int8, (t, 2, HIDDEN)),
-        (np.int16, (HIDDEN,)),
-        (np.int8, (HIDDEN, LATENT)),
-        (np.int32, (LATENT,)),
-        (np.int8, (LATENT, 2)),
-        (np.int32, (2,)),
-        (np.int32, (4,)),
-    ]
-
-
 def unpack(data: bytes) -> Prior:
     """Take the file apart."""
     arrays, at = [], 0
-    for kind, shape in shapes():
-        count = int(np.prod(shape))
-        dtype = np.dtype(kind).newbyteorder("<")
-        arrays.append(np.frombuffer(data, dtype, count, at).reshape(shape).astype(np.int32))
-        at += count * dtype.itemsize
+    for kind, shape in _LAYOUT:
+        count = math.prod(shape)
+        arrays.append(np.frombuffer(data, kind, count, at).reshape(shape).astype(np.int32))
+        at += count * np.dtype(kind).itemsize
     return Prior(*arrays)

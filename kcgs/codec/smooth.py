@@ -12,16 +12,13 @@ from numpy.typing import NDArray
 
 from .contexts import CLIP, HEADS, LEFT, RIGHT, TOP, compiled, describe, inner, network, quiet
 from .labels import Labels, compact
-from .prior import TEMPLATE, load_prior
+from .prior import TEMPLATE
 
 _START, _ESCAPE = 11.0, 4.0  # bits of a start's place, of a label that is no candidate
 _SWEEPS = 4
 
 
 class _Model(NamedTuple):
-    dx: Any  # [T] int32
-    dy: Any
-    prior: Any
     cost: Any  # [2 * CLIP + 1] float64, bits of a 1 at this logit
     scratch: Any  # [T] int8
     row: Any  # int32
@@ -44,8 +41,8 @@ def _bits(labels, top, bottom, left, right, several, model):  # type: ignore[no-
                 if label != labels[y, x - 1]:
                     total += _START
                 continue
-            describe(labels, y, x, model.dx, model.dy, model.row, model.scratch)
-            network(model.scratch, model.prior, model.logits)
+            describe(labels, y, x, model.row, model.scratch)
+            network(model.scratch, model.logits)
             neither = label != model.row[2] and label != model.row[3]
             if several:
                 logit = model.logits[1, 0]
@@ -125,10 +122,9 @@ def _loops() -> _Loops:
 
 @functools.cache
 def _model() -> _Model:
-    dx, dy = (np.array(axis, np.int32) for axis in zip(*TEMPLATE, strict=True))
     cost = np.log2(1 + np.exp(-np.arange(-CLIP, CLIP + 1) / 256))
     scratch, row = np.zeros(len(TEMPLATE), np.int8), np.zeros(6, np.int32)
-    return _Model(dx, dy, load_prior(), cost, scratch, row, np.zeros((HEADS, 1), np.int32))
+    return _Model(cost, scratch, row, np.zeros((HEADS, 1), np.int32))
 
 
 def _frame(index: Any) -> Any:

@@ -12,6 +12,7 @@ from numba import njit
 from .contexts import (
     CODED,
     COLUMNS,
+    DECISION,
     FIRST,
     HEADS,
     INPUTS,
@@ -48,9 +49,8 @@ class Work(NamedTuple):
     bits: Any  # [2 * H] int32
     features: Any  # [H, T] int8: 0 the first candidate, 1 the second, 2 another
     inputs: Any  # [H, HEADS, INPUTS] int32
-    slots: Any  # [H, HEADS, 3] int32
-    mixed: Any  # [H, HEADS] int32
-    chosen: Any  # [H, HEADS] int32
+    slots: Any  # [H, HEADS, DECISION] int32
+    changes: Any  # [TOP + H] int32, the last pixel of each row that differs from the one before
 
 
 def new_work(height: int) -> Work:
@@ -61,10 +61,27 @@ def new_work(height: int) -> Work:
         np.zeros(2 * height, np.int32),
         np.zeros((height, len(TEMPLATE)), np.int8),
         np.zeros((height, HEADS, INPUTS), np.int32),
-        np.zeros((height, HEADS, 3), np.int32),
-        np.zeros((height, HEADS), np.int32),
-        np.zeros((height, HEADS), np.int32),
+        np.zeros((height, HEADS, DECISION), np.int32),
+        np.zeros(height + TOP, np.int32),
     )
+
+
+@inner
+def _still(labels, y, x, changes):  # type: ignore[no-untyped-def]
+    """Tell the same as `quiet`, by the last change in each row, which in the row above is not beyond what it reads."""
+    if y < TOP + 2:
+        return quiet(labels, y, x)
+    label = labels[y, x - 1]
+    if changes[y] > x - 2 or changes[y - 1] > x - 2 or labels[y - 1, x] != label or labels[y - 2, x] != label:
+        return False
+    return changes[y - 2] < x or quiet(labels, y, x)
+
+
+@inner
+def _set(labels, y, x, label, width, changes):  # type: ignore[no-untyped-def]
+    if label != labels[y, x - 1]:
+        changes[y] = x
+    _put(labels, y, x, label, width)
 
 
 @inner
@@ -97,11 +114,11 @@ def _settle(state, labels, width, tables, work):  # type: ignore[no-untyped-def]
                 learn(tables, work, n, 0, bit)
                 row[LABEL] = row[SECOND] if bit else row[FIRST]
             at += 1
-        _put(labels, row[Y], row[X], row[LABEL], width)
+        _set(labels, row[Y], row[X], row[LABEL], width, work.changes)
 
 
 @inner
-def _look(state, labels, events, tables, work):  # type: ignore[no-untyped-def]
+def _look(state, labels, events, work):  # type: ignore[no-untyped-def]
     """List the pixels of a wave that are to be decided; the others get their label."""
     height, width = events.shape
     wave = state[WAVE]
@@ -109,17 +126,16 @@ def _look(state, labels, events, tables, work):  # type: ignore[no-untyped-def]
         x, y = wave - SLANT * j + LEFT, j + TOP
         n = state[ROWS]
         row = work.rows[n]
-        if not quiet(labels, y, x):
-            describe(labels, y, x, tables.dx, tables.dy, row, work.features[n])
+        if not _still(labels, y, x, work.changes):
+            describe(labels, y, x, row, work.features[n])
             row[X], row[Y], row[CODED] = x, y, 1
             state[ROWS] += 1
             state[DECIDED] += 1
         elif events[j, x - LEFT] == 0:
             _put(labels, y, x, labels[y, x - 1], width)
-        elif state[REGIONS] == 2:
-            _put(labels, y, x, 1 - labels[y, x - 1], width)
         else:
             row[X], row[Y], row[CODED], row[FIRST], row[SECOND] = x, y, 0, labels[y, x - 1], -1
+            row[LABEL] = 1 - row[FIRST]  # unless there are more than two regions
             state[ROWS] += 1
 
 
@@ -130,8 +146,8 @@ def _weigh(state, tables, work):  # type: ignore[no-untyped-def]
     at = 0
     for n in range(state[ROWS]):
         if work.rows[n, CODED]:
-            network(work.features[n], tables.prior, work.inputs[n])
-            contexts(work.features[n], tables.bases, work.slots[n])
+            network(work.features[n], work.inputs[n])
+            contexts(work.features[n], work.slots[n])
             if escapes > 0:
                 work.chances[at] = mix(tables, work, n, 1)
             work.chances[escapes + at] = mix(tables, work, n, 0)
@@ -227,7 +243,7 @@ def _compile(fingerprint: str, cache: bool) -> Loops:
         state[DECIDED] = 0
         while state[ROWS] == 0 and state[WAVE] < width - 1 + SLANT * (height - 1):
             state[WAVE] += 1
-            _look(state, labels, events, tables, work)
+            _look(state, labels, events, work)
         _weigh(state, tables, work)
         return state[ROWS]
 
