@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .errors import CodecError
 from .models import Choices, Magnitudes
 from .quantize import MARGIN_CELLS, SIZES, Classes, Codes, Quantizer, side_for
-from .ranges import Coder
+from .rangecoder import Coder
 
 Integers = NDArray[np.int64]
 # positions among the map's ids under centres (N, 2), float32

@@ -25,9 +25,8 @@ from kcgs.functional import RegionMap
 from kcgs.functional.regions import MAX_SOFTNESS, PairWidths
 
 from .errors import CodecError
-from .labels import decode_labels, encode_labels
 from .models import Choices
-from .ranges import Coder, Reader, Writer
+from .rangecoder import Coder, Reader, Writer
 from .stream import MOST_LABELS, ByteReader, varint
 
 Integers = NDArray[np.int64]
@@ -39,6 +38,8 @@ _AT_ONCE = 32
 
 def encode_map(regions: RegionMap) -> bytes:
     """Write a map with two regions or more; contour widths are rounded to fortieths of a pixel."""
+    from .labels import encode_labels  # compiles loops
+
     if regions.labels.ndim != 2 or regions.resized:
         raise ValueError("regions must be one map of its own pixels, not a batch and not resized")
     fine = regions.labels if regions.fine_labels is None else regions.fine_labels
@@ -61,6 +62,8 @@ def encode_map(regions: RegionMap) -> bytes:
 
 def decode_map(data: bytes, size: tuple[int, int], num_regions: int) -> RegionMap:
     """Read a map of `num_regions` regions for a picture of `size`."""
+    from .labels import decode_labels
+
     stream = ByteReader(data)
     k = stream.varint("labels along a side of a pixel", 1, _MOST_SUPERSAMPLE)
     if size[0] * size[1] * k * k > MOST_LABELS:

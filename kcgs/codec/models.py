@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .exact import Floats
-from .ranges import Coder
+from .rangecoder import Coder
 
 Integers = NDArray[np.int64]
 
@@ -27,6 +27,7 @@ def _bounds() -> tuple[Integers, Integers]:
 
 
 _LOW, _HIGH = _bounds()
+_EDGES = np.append(_LOW, _HIGH[-1]).astype(np.float64)
 
 
 class Magnitudes:
@@ -67,8 +68,9 @@ class Magnitudes:
         for i in range(_BINS):  # not cumsum: its order of summation is its own
             total[i + 1] = total[i] + shape[i]
         edges = np.arange(_BINS + 1) * (scale * _WIDTH)
-        cumulative = _interpolate(np.maximum(np.append(_LOW, _HIGH[-1]) - 0.5, 0.0), edges, total)
-        return (cumulative[1:] - cumulative[:-1]) + 1e-3 * total[-1] / _BUCKETS
+        cumulative = _interpolate(np.maximum(_EDGES - 0.5, 0.0), edges, total)
+        table: Floats = (cumulative[1:] - cumulative[:-1]) + 1e-3 * total[-1] / _BUCKETS
+        return table
 
 
 class Choices:

@@ -106,7 +106,7 @@ class Quantizer:
     def steps(self, classes: Classes) -> Steps:
         """Return the steps of each Gaussian: those at which every parameter adds the noise."""
         relative = np.sqrt(12.0 * self.noise / (math.pi * np.ldexp(1.0, 2 * classes.energy.astype(np.int32) + 1)))
-        area = math.pi * exp2(2.0 * OCTAVES * (classes.size + 0.5))
+        area = math.pi * exp2(np.asarray(2.0 * OCTAVES * (classes.size + 0.5), np.float64))
         scale = relative * (math.sqrt(0.5) / _LN2)
         return Steps(
             place=relative * math.sqrt(2.0),

@@ -18,7 +18,7 @@ from .errors import CodecError
 from .gaussians import Layers, Lookup, layer_order, pick
 from .maps import decode_map, encode_map
 from .quantize import NOISE_CODES, Classes, Codes, Quantizer
-from .ranges import Reader, Writer
+from .rangecoder import Reader, Writer
 from .stream import Header, pack, unpack
 
 Integers = NDArray[np.int64]

@@ -1,0 +1,200 @@
+"""The model of label maps: what a pixel may be, given the pixels before it. Loops in integers, compiled by numba.
+
+A decoder must reproduce these loops; the stream itself is specified in `labels`. For each pixel and each decision (0:
+whether it is the second candidate rather than the first, 1: whether it is neither):
+
+1. Each pixel of the template is 0, 1 or 2: the first candidate, the second, another label (`describe`).
+2. A network with fixed weights (`prior`) turns them into a logit in 1/256 for each decision (`network`).
+3. Three counters by smaller contexts, 16-bit chances that move to the bits seen by 2 / (2 n + 3) of the distance, give
+   a logit each; one that was not seen yet gives the network's, and starts there with n = 2 (`contexts`, `learn`).
+4. The chance is that of the weighted sum of the four logits; weights, one set for each of four ages of the third counter,
+   start from `prior` and move along their gradient after each bit (`mix`, `learn`).
+
+Counters and weights change between waves only: within a wave in its order, decision 1 before decision 0.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numba import njit
+
+from .prior import HIDDEN, LATENT, TEMPLATE, load_prior
+
+log = logging.getLogger("kcgs")
+
+LEFT, RIGHT, TOP = 8, 9, 6  # margins around the map
+CLIP = 3071  # largest logit, in 1/256
+HEADS, INPUTS = 2, 4  # decisions: which of two candidates, or neither; estimates that are mixed
+# columns of a pixel's row: its place, the candidates, whether it is decided by bits, its label
+X, Y, FIRST, SECOND, CODED, LABEL, COLUMNS = 0, 1, 2, 3, 4, 5, 6
+
+# columns of a decision: its three counters, the mixer's weights, the chance
+CHOSEN, MIXED, DECISION = 3, 4, 5
+
+# where the counters of each context begin
+_BASES = np.array([[0, 1 << 6, (1 << 6) + (1 << 11)], [67648, 67649, 67649 + 3**4]], np.int32)
+_SLOTS = 67649 + 3**4 + 3**8
+_RATE, _SHIFT = 6, 18  # the mixer's step
+_HEAVIEST = 1 << 22
+_MEMORY = 40  # decisions that a counter remembers
+_SURE = 16  # least chance, in 1/65536
+
+
+# constants of the loops: the template, the network, 65536 / (1 + e**(-x / 256)) for logits from -CLIP, its inverse.
+# No value of the third but 32768 is within 1e-6 of a half before it is rounded: any machine's exp gives the same table.
+_DX, _DY = (np.array(axis, np.int32) for axis in zip(*TEMPLATE, strict=True))
+_LAYER1, _BIAS1, _LAYER2, _BIAS2, _LAYER3, _BIAS3, _MIXER = load_prior()
+SQUASH = np.rint(65536 / (1 + np.exp(np.arange(CLIP, -CLIP - 1, -1) / 256))).astype(np.int32)
+_STRETCH = (np.searchsorted(SQUASH, np.arange(4096) * 16 + 8) - CLIP).astype(np.int32)
+
+
+class Tables(NamedTuple):
+    """What adapts."""
+
+    chance: Any  # [slots] uint16, 1/65536
+    seen: Any  # [slots] uint8
+    weights: Any  # [HEADS, 4, INPUTS] int32, 1/65536
+
+
+def new_tables() -> Tables:
+    """Return what every stream starts with."""
+    weights = np.empty((HEADS, 4, INPUTS), np.int32)
+    weights[:] = _MIXER
+    return Tables(np.zeros(_SLOTS, np.uint16), np.zeros(_SLOTS, np.uint8), weights)
+
+
+inner = cast(Any, njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+
+
+@inner
+def quiet(labels, y, x):  # type: ignore[no-untyped-def]
+    """Tell whether the pixels around (x, y) that come before it have one label."""
+    label = labels[y, x - 1]
+    for i in range(x - 2, x + 8):
+        if labels[y - 1, i] != label:
+            return False
+    for i in range(x - 1, x + 4):
+        if labels[y - 2, i] != label:
+            return False
+    return labels[y, x - 2] == label
+
+
+@inner
+def describe(labels, y, x, row, feature):  # type: ignore[no-untyped-def]
+    """Find the two candidates, and which of them each pixel of the template is."""
+    first = labels[y, x - 1]
+    second = -1
+    for t in range(len(_DX)):
+        label = labels[y + _DY[t], x + _DX[t]]
+        if label == first:
+            feature[t] = 0
+        elif second < 0 or label == second:
+            second = label
+            feature[t] = 1
+        else:
+            feature[t] = 2
+    row[FIRST] = first
+    row[SECOND] = second
+
+
+@inner
+def network(feature, out):  # type: ignore[no-untyped-def]
+    """Two layers of rectified sums of small integers; out: logits in 1/256."""
+    hidden = _BIAS1.copy()
+    for t in range(len(feature)):
+        if feature[t] > 0:
+            row = _LAYER1[t, feature[t] - 1]
+            for j in range(HIDDEN):
+                hidden[j] += row[j]
+    latent = _BIAS2.copy()
+    for j in range(HIDDEN):
+        value = min(hidden[j], 4095)
+        if value > 0:
+            row = _LAYER2[j]
+            for k in range(LATENT):
+                latent[k] += value * row[k]
+    for h in range(HEADS):
+        total = _BIAS3[h]
+        for k in range(LATENT):
+            total += min(max(latent[k] >> 6, 0), 4095) * _LAYER3[k, h]
+        out[h, 0] = min(max(total >> 4, -CLIP), CLIP)
+
+
+@inner
+def contexts(feature, slots):  # type: ignore[no-untyped-def]
+    """Find the counters of a pixel: by its nearest 6, 11 and 16; and for the other decision all, by 4 and by 8."""
+    bits = 0
+    for t in range(1, 17):
+        bits = bits << 1 | (feature[t] > 0)
+        if t == 6:
+            slots[0, 0] = _BASES[0, 0] + bits
+        elif t == 11:
+            slots[0, 1] = _BASES[0, 1] + bits
+        elif t == 16:
+            slots[0, 2] = _BASES[0, 2] + bits
+    digits = 0
+    for t in range(1, 9):
+        digits = digits * 3 + feature[t]
+        if t == 4:
+            slots[1, 1] = _BASES[1, 1] + digits
+        elif t == 8:
+            slots[1, 2] = _BASES[1, 2] + digits
+    slots[1, 0] = _BASES[1, 0]
+
+
+@inner
+def mix(tables, work, i, h):  # type: ignore[no-untyped-def]
+    """Weigh the network and the counters into one chance."""
+    inputs = work.inputs[i, h]
+    seen = 0
+    for c in range(3):
+        slot = work.slots[i, h, c]
+        seen = tables.seen[slot]
+        inputs[c + 1] = _STRETCH[tables.chance[slot] >> 4] if seen > 0 else inputs[0]
+    chosen = 0 if seen == 0 else 1 if seen < 5 else 2 if seen < 12 else 3
+    total: Any = np.int64(0)
+    for k in range(INPUTS):
+        total += np.int64(tables.weights[h, chosen, k]) * inputs[k]
+    logit: Any = min(max(total >> 16, -CLIP), CLIP)
+    work.slots[i, h, CHOSEN] = chosen
+    work.slots[i, h, MIXED] = min(max(SQUASH[logit + CLIP], _SURE), 65536 - _SURE)
+    return work.slots[i, h, MIXED] / 65536
+
+
+@inner
+def learn(tables, work, i, h, bit):  # type: ignore[no-untyped-def]
+    """Move the weights along the error, and the counters to the bit."""
+    error = (bit << 16) - work.slots[i, h, MIXED]
+    weights = tables.weights[h, work.slots[i, h, CHOSEN]]
+    for k in range(INPUTS):
+        step = np.int64(work.inputs[i, h, k]) * error * _RATE
+        weight = weights[k] + ((step + (1 << (_SHIFT - 1))) >> _SHIFT)
+        weights[k] = min(max(weight, -_HEAVIEST), _HEAVIEST)
+    for c in range(3):
+        slot = work.slots[i, h, c]
+        seen: Any = np.int64(tables.seen[slot])
+        chance: Any = np.int64(tables.chance[slot])
+        if seen == 0:
+            chance = np.int64(SQUASH[work.inputs[i, h, 0] + CLIP])
+            seen = 2
+        chance += ((bit << 16) - chance) * 2 // (2 * seen + 3)
+        tables.chance[slot] = min(max(chance, 32), 65504)
+        tables.seen[slot] = min(seen + 1, _MEMORY)
+
+
+def compiled(compiler: Callable[[str, bool], Any], *sources: str) -> Any:
+    """Compile loops that call those of this file, kept on disk by what is in the sources."""
+    digest = hashlib.sha256()
+    for name in ("contexts.py", "prior.py", "prior.bin", *sources):
+        digest.update((Path(__file__).parent / name).read_bytes())
+    try:
+        return compiler(digest.hexdigest(), True)
+    except RuntimeError:  # numba finds no folder that it may write to
+        log.warning("kcgs: no folder to keep the compiled codec in; set NUMBA_CACHE_DIR to one")
+        return compiler(digest.hexdigest(), False)

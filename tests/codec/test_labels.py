@@ -1,0 +1,208 @@
+"""Label maps as bytes: nothing lost, nothing wasted, nothing trusted."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from PIL import Image
+
+from kcgs.codec.contexts import CLIP, SQUASH
+from kcgs.codec.labels import decode_labels, encode_labels
+from kcgs.codec.rangecoder import CodecError, Reader, Writer
+from kcgs.codec.smooth import bits_without, contour_bits, smooth_labels
+from kcgs.data import load_labels
+
+Labels = NDArray[np.int64]
+
+
+def roundtrip(labels: Labels) -> int:
+    data = encode_labels(labels)
+    height, width = labels.shape
+    assert np.array_equal(decode_labels(data, height, width, max_regions=labels.size), labels)
+    return len(data)
+
+
+def shapes(seed: int, size: tuple[int, int] = (120, 160), count: int = 6) -> Labels:
+    """Draw overlapping discs, from integers alone."""
+    rng = np.random.RandomState(seed)
+    y, x = np.mgrid[: size[0], : size[1]]
+    labels = np.zeros(size, np.int64)
+    for region in range(1, count):
+        cy, cx, radius = rng.randint(size[0]), rng.randint(size[1]), rng.randint(5, 40)
+        labels[(y - cy) ** 2 + (x - cx) ** 2 < radius**2] = region
+    return labels
+
+
+def webp_bytes(labels: Labels) -> int:
+    file = BytesIO()
+    picture = Image.fromarray(labels.astype(np.uint8))
+    picture.save(file, "WEBP", lossless=True, quality=100, method=6, exact=True)
+    return len(file.getvalue())
+
+
+class TestLossless:
+    @settings(max_examples=60, deadline=None)
+    @given(st.data())
+    def test_any_map_comes_back(self, data: st.DataObject) -> None:
+        height, width = data.draw(st.integers(1, 24)), data.draw(st.integers(1, 24))
+        rng = np.random.default_rng(data.draw(st.integers(0, 1000)))
+        ids = data.draw(st.lists(st.integers(0, 1 << 31), min_size=1, max_size=12, unique=True))
+        scale = data.draw(st.integers(1, 8))
+        coarse = rng.choice(np.array(ids), (-(-height // scale), -(-width // scale)))
+        roundtrip(np.kron(coarse, np.ones((scale, scale), np.int64))[:height, :width])
+
+    @pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1), (2, 2), (3, 500), (500, 3), (9, 8)])
+    @pytest.mark.parametrize("regions", [2, 3, 40])
+    def test_narrow_maps(self, size: tuple[int, int], regions: int) -> None:
+        rng = np.random.default_rng(0)
+        roundtrip(rng.integers(0, regions, size))
+        roundtrip(np.sort(rng.integers(0, regions, size), axis=None).reshape(size))
+
+    @pytest.mark.parametrize("regions", [2, 3, 16, 256])
+    def test_noise_costs_little_more_than_its_bits(self, regions: int) -> None:
+        labels = np.random.default_rng(1).integers(0, regions, (96, 96))
+        assert roundtrip(labels) < 1.06 * labels.size * np.ceil(np.log2(regions)) / 8 + 200
+
+    def test_thousands_of_regions(self) -> None:
+        labels = np.arange(5000).reshape(50, 100)
+        roundtrip(labels)
+        roundtrip(np.random.default_rng(0).permutation(5000).reshape(50, 100) * 400_000)
+
+    @pytest.mark.parametrize("seed", range(4))
+    def test_regions_of_one_pixel(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        labels = np.zeros((80, 90), np.int64)
+        labels[rng.integers(0, 80, 30), rng.integers(0, 90, 30)] = np.arange(1, 31)
+        roundtrip(labels)
+
+    def test_ids_up_to_the_largest(self) -> None:
+        labels = shapes(3)
+        roundtrip(labels + (1 << 31))
+        roundtrip(labels * (1 << 60))
+
+    @pytest.mark.parametrize(("region", "most"), [(0, 0), (5, 2), (255, 2)])
+    def test_one_region(self, region: int, most: int) -> None:
+        assert roundtrip(np.full((480, 854), region, np.int64)) <= most
+
+
+class TestStream:
+    def test_same_map_same_bytes(self) -> None:
+        assert encode_labels(shapes(0)) == encode_labels(shapes(0).copy())
+
+    def test_golden(self) -> None:
+        data = encode_labels(shapes(7, (96, 128), 9) * 3)
+        assert (len(data), hashlib.sha256(data).hexdigest()[:16]) == (97, "84365dbbba2486aa")
+
+    def test_too_many_regions(self) -> None:
+        data = encode_labels(shapes(0))
+        with pytest.raises(CodecError, match="at most 3 regions; got 6"):
+            decode_labels(data, 120, 160, max_regions=3)
+
+    def test_broken_streams(self) -> None:
+        rng = np.random.default_rng(0)
+        whole = [encode_labels(shapes(seed, (48, 64), 5) * 7) for seed in range(3)]
+        start = time.perf_counter()
+        for trial in range(300):
+            data = bytearray(whole[trial % 3])
+            if trial % 2:
+                data = data[: rng.integers(0, len(data))]
+            else:
+                for at in rng.integers(0, len(data), rng.integers(1, 4)):
+                    data[at] = rng.integers(0, 256)
+            try:
+                labels = decode_labels(bytes(data), 48, 64, max_regions=100)
+            except CodecError:
+                continue
+            assert labels.shape == (48, 64) and labels.min() >= 0
+        assert time.perf_counter() - start < 120
+
+    @pytest.mark.parametrize("data", [b"\xff" * 50, bytes(range(200)), b"\xaa" * 31])
+    def test_garbage(self, data: bytes) -> None:
+        try:
+            decode_labels(data, 64, 64, max_regions=1000)
+        except CodecError as error:
+            assert "data must" in str(error)
+
+    @settings(max_examples=100, deadline=None)
+    @given(st.lists(st.tuples(st.integers(1, 65535), st.booleans()), max_size=200))
+    def test_end_of_stream(self, symbols: list[tuple[int, bool]]) -> None:
+        chances = np.array([chance / 65536 for chance, _ in symbols])
+        values = np.array([value for _, value in symbols], np.int32)
+        writer = Writer()
+        writer.bits(chances, values)
+        data = writer.finish()
+        cost = -np.log2(np.where(values == 1, chances, 1 - chances)).sum()
+        assert len(data) <= cost / 8 + 1.1
+        assert np.array_equal(Reader(data).bits(chances, values), values)
+
+    def test_table_does_not_hang_on_the_last_digit_of_exp(self) -> None:
+        exact = 65536 / (1 + np.exp(-np.arange(-CLIP, CLIP + 1) / 256))
+        assert np.array_equal(SQUASH, np.rint(exact))
+        assert np.abs(np.abs(exact - np.floor(exact)) - 0.5).min() > 1e-6
+
+
+class TestSize:
+    """Against lossless WebP; the network was trained on other maps, of other pictures."""
+
+    def ratio(self, paths: list[Path]) -> float:
+        assert paths
+        maps = [load_labels(path).numpy() for path in paths]
+        return float(np.mean([len(encode_labels(labels)) / webp_bytes(labels) for labels in maps]))
+
+    def test_davis(self, data_root: Path) -> None:
+        assert self.ratio(sorted(data_root.glob("DAVIS/Annotations/480p/*/00000.png"))[::3]) < 0.35
+
+    def test_bsds(self, data_root: Path) -> None:
+        assert self.ratio(sorted(data_root.glob("bsds/*/mask.png"))[::3]) < 0.38
+
+
+class TestEstimates:
+    def test_estimate_is_near_the_stream(self) -> None:
+        labels = shapes(2, (240, 320), 8)
+        assert contour_bits(labels) == pytest.approx(8 * len(encode_labels(labels)), rel=0.3)
+
+    def test_merging_saves_what_the_estimate_says(self) -> None:
+        labels = shapes(2, (240, 320), 8)
+        merged = np.where(labels == 4, 0, labels)
+        saved = bits_without(labels, 4, 0)
+        assert saved == pytest.approx(contour_bits(labels) - contour_bits(merged), abs=1.0)
+        assert saved > 50
+
+    def test_smoothing_shrinks_the_stream(self) -> None:
+        labels = shapes(1)
+        noise = np.random.default_rng(0).random(labels.shape) < 0.01
+        ragged = np.where(noise, np.roll(labels, 1, axis=1), labels)
+        smooth = smooth_labels(ragged, rate=0.3)
+        assert len(encode_labels(smooth)) < 0.8 * len(encode_labels(ragged))
+        assert (smooth != ragged).mean() < 0.03
+        assert np.array_equal(smooth, smooth_labels(ragged, rate=0.3))
+
+    def test_regions_stay(self) -> None:
+        labels = np.zeros((20, 20), np.int64)
+        labels[5, 5], labels[12, 12:14] = 7, 9
+        assert set(np.unique(smooth_labels(labels, rate=100.0))) == {0, 7, 9}
+        assert set(np.unique(smooth_labels(labels, rate=100.0, keep=False))) == {0}
+
+    def test_costs_decide(self) -> None:
+        labels = np.zeros((16, 16), np.int64)
+        labels[8:] = 1
+        labels[7, 5] = 1
+        costs = np.zeros((2, 16, 16), np.float32)
+        costs[0, 7, 5] = 1e6
+        assert smooth_labels(labels, costs, 1.0)[7, 5] == 1
+        with pytest.raises(ValueError, match="costs must have shape"):
+            smooth_labels(labels, costs[:1])
+
+    @pytest.mark.parametrize("labels", [np.zeros((4, 5), np.int64), np.full((1, 1), 9)])
+    def test_one_region_is_free(self, labels: Any) -> None:
+        assert contour_bits(labels) == 0
+        assert np.array_equal(smooth_labels(labels), labels)
