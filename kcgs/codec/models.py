@@ -67,7 +67,7 @@ class Magnitudes:
         total = np.zeros(_BINS + 1)
         for i in range(_BINS):  # not cumsum: its order of summation is its own
             total[i + 1] = total[i] + shape[i]
-        edges = np.arange(_BINS + 1) * (scale * _WIDTH)
+        edges = np.arange(_BINS + 1).astype(np.float64) * (scale * _WIDTH)
         cumulative = _interpolate(np.maximum(_EDGES - 0.5, 0.0), edges, total)
         table: Floats = (cumulative[1:] - cumulative[:-1]) + 1e-3 * total[-1] / _BUCKETS
         return table

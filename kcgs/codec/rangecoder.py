@@ -93,7 +93,8 @@ class Writer:
         value = int.from_bytes(words[:length].ljust(length, b"\0"), "big")
         # all values from `low` for `width` read the same; this one was constriction's choice
         low = value - ((value - lower) % (1 << _WINDOW))
-        for zeros in range(length, -1, -1):
+        # the width is below 2**64: more zeros than that come by themselves
+        for zeros in range(min(length, _WINDOW // 8), -1, -1):
             step = 1 << (8 * zeros)
             value = -(-low // step) * step
             if value < low + width:
