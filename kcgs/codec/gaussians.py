@@ -189,7 +189,7 @@ class Layers:
     def _code_regions(self, coder: Coder, codes: Codes, ids: Integers | None) -> Integers:
         if self.lookup is None or self.regions == 1:
             return np.zeros(len(codes.scale), np.int64)
-        under = self.lookup(self.quantizer.restore(codes)[0])
+        under = self.lookup(self.quantizer.restore_centres(codes))
         strays = None if ids is None else (ids != under).astype(np.int64)
         strays = self._stays.code(coder, np.zeros(len(under), np.int64), strays)
         away = np.flatnonzero(strays)

@@ -93,6 +93,10 @@ class Quantizer:
     def __init__(self, noise_code: int, size: tuple[int, int]) -> None:
         self.noise_code, self.size = noise_code, size
         self.noise = float(exp2(np.array([-noise_code / 32.0]))[0])
+        energies, sizes = (np.arange(low, high + 1, dtype=np.float64) for low, high in (ENERGIES, SIZES))
+        share = 12.0 * self.noise / math.pi
+        self._relative = np.sqrt(share * exp2(-2.0 * energies - 1.0))  # by energy
+        self._color = np.sqrt(share * exp2(-2.0 * OCTAVES * (sizes + 0.5)))  # by size
 
     def classify(self, cholesky: Floats, colors: Floats) -> Classes:
         """Return the classes of Gaussians with `cholesky` [N, 3] and `colors` [N, C]."""
@@ -105,23 +109,24 @@ class Quantizer:
 
     def steps(self, classes: Classes) -> Steps:
         """Return the steps of each Gaussian: those at which every parameter adds the noise."""
-        relative = np.sqrt(12.0 * self.noise / (math.pi * np.ldexp(1.0, 2 * classes.energy.astype(np.int32) + 1)))
-        area = math.pi * exp2(np.asarray(2.0 * OCTAVES * (classes.size + 0.5), np.float64))
+        relative: Floats = self._relative[classes.energy - ENERGIES[0]]
         scale = relative * (math.sqrt(0.5) / _LN2)
         return Steps(
             place=relative * math.sqrt(2.0),
             scales=np.clip(np.floor(OCTAVES / scale + 0.5), 1, _MOST_LEVELS).astype(np.int64),
             ratio=relative * (1.0 / _LN2),
             angle=relative,
-            color=np.sqrt(12.0 * self.noise / area),
+            color=self._color[classes.size - SIZES[0]],
         )
 
     def cell_side(self, classes: Classes) -> Integers:
         """Return the side in pixels, a power of two, of the cells that each Gaussian's place is told in."""
         group = (classes.energy - ENERGIES[0]) * 64 + classes.size - SIZES[0]
-        _, index, counts = np.unique(group, return_inverse=True, return_counts=True)
-        sides = np.array([side_for(int(count), self.size) for count in counts], np.int64)
-        return sides[index]
+        counts = np.bincount(group)
+        sides = np.zeros(len(counts), np.int64)
+        for held in np.flatnonzero(counts).tolist():
+            sides[held] = side_for(int(counts[held]), self.size)
+        return sides[group]
 
     def is_seen(self, colors: Floats, classes: Classes) -> NDArray[np.bool_]:
         """Say which Gaussians do not round to black [N]."""
@@ -167,17 +172,19 @@ class Quantizer:
         step = self.steps(classes).place[:, None] * shape[:, ::2]
         return np.clip(np.ceil(side[:, None] / step), 1, _MOST_LEVELS).astype(np.int64)
 
-    def restore_means(self, cell: Integers, place: Integers, parts: Integers, side: Integers) -> Floats:
-        """Return centres [N, 2]."""
-        return side[:, None] * (cell + (place + 0.5) / parts)
-
     def restore(self, codes: Codes) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Return means (N, 2), cholesky (N, 3), colors (N, C)."""
+        shape = self.restore_shape(codes.classes, codes.scale, codes.ratio, codes.angle)
+        colors = opponent(codes.colors * self.steps(codes.classes).color[:, None], back=True)
+        return self.restore_centres(codes, shape), shape.astype(np.float32), colors.astype(np.float32)
+
+    def restore_centres(self, codes: Codes, shape: Floats | None = None) -> NDArray[np.float32]:
+        """Return means (N, 2)."""
         classes, side = codes.classes, self.cell_side(codes.classes)
-        shape = self.restore_shape(classes, codes.scale, codes.ratio, codes.angle)
-        means = self.restore_means(codes.cell, codes.place, self.parts(shape, classes, side), side)
-        colors = opponent(codes.colors * self.steps(classes).color[:, None], back=True)
-        return means.astype(np.float32), shape.astype(np.float32), colors.astype(np.float32)
+        if shape is None:
+            shape = self.restore_shape(classes, codes.scale, codes.ratio, codes.angle)
+        parts = self.parts(shape, classes, side)
+        return (side[:, None] * (codes.cell + (codes.place + 0.5) / parts)).astype(np.float32)
 
     def restore_layers(self, parts: list[Codes]) -> list[NDArray[np.float32]]:
         """Return means (N, 2), cholesky (N, 3), colors (N, C) of one part after another."""
