@@ -31,6 +31,9 @@ class Coder(Protocol):
     def number(self, value: int, size: int) -> int:
         """Code one of 0 to size - 1, all equally likely; size is at most 2**16."""
 
+    def numbers(self, values: Any, size: int, count: int) -> Any:
+        """Code that many, (count,) int32; size is 2 to 2**24."""
+
 
 class Writer:
     """Turns symbols into bytes."""
@@ -51,6 +54,11 @@ class Writer:
             self._encoder.encode(value, constriction.stream.model.Uniform(size))
         return value
 
+    def numbers(self, values: Any, size: int, count: int) -> Any:
+        """Write numbers."""
+        self._encoder.encode(values, constriction.stream.model.Uniform(size))
+        return values
+
     def finish(self) -> bytes:
         """Return the fewest bytes that, with zeros behind them, read as what was written."""
         position, (lower, width) = self._encoder.pos()
@@ -59,7 +67,7 @@ class Writer:
         value = int.from_bytes(words[:length].ljust(length, b"\0"), "big")
         # all values from `low` for `width` read the same; this one was constriction's choice
         low = value - ((value - lower) % (1 << _WINDOW))
-        for zeros in range(length, -1, -1):
+        for zeros in range(_WINDOW // 8, -1, -1):
             step = 1 << (8 * zeros)
             value = -(-low // step) * step
             if value < low + width:
@@ -83,6 +91,10 @@ class Reader:
     def number(self, value: int, size: int) -> int:
         """Read a number."""
         return int(self._decode(constriction.stream.model.Uniform(size))) if size > 1 else 0
+
+    def numbers(self, values: Any, size: int, count: int) -> Any:
+        """Read numbers."""
+        return self._decode(constriction.stream.model.Uniform(size), count)
 
     def _decode(self, *model: Any) -> Any:
         try:
