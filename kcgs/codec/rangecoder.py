@@ -41,6 +41,9 @@ class Coder(Protocol):
     def repeat(self, table: Floats, count: int, values: Integers | None) -> Integers:
         """Code `count` values by one table of weights, (A,)."""
 
+    def numbers(self, values: Any, size: int, count: int) -> Any:
+        """Code that many, (count,) int32; size is 2 to 2**24."""
+
 
 class Writer:
     """Turns symbols into bytes."""
@@ -83,6 +86,11 @@ class Writer:
         assert values is not None
         if count:
             self._encoder.encode(values.astype(np.int32), self._models.Categorical(table, perfect=False))
+        return values
+
+    def numbers(self, values: Any, size: int, count: int) -> Any:
+        """Write numbers."""
+        self._encoder.encode(values, self._models.Uniform(size))
         return values
 
     def finish(self) -> bytes:
@@ -140,6 +148,10 @@ class Reader:
         if not count:
             return np.zeros(0, np.int64)
         return np.asarray(self._decode(self._models.Categorical(table, perfect=False), count), np.int64)
+
+    def numbers(self, values: Any, size: int, count: int) -> Any:
+        """Read numbers."""
+        return self._decode(self._models.Uniform(size), count)
 
     def _decode(self, *model: Any) -> Any:
         try:
