@@ -114,7 +114,7 @@ class Quantizer:
         return Steps(
             place=relative * math.sqrt(2.0),
             scales=np.clip(np.floor(OCTAVES / scale + 0.5), 1, _MOST_LEVELS).astype(np.int64),
-            ratio=relative * (1.0 / _LN2),
+            ratio=np.maximum(relative * (1.0 / _LN2), _MOST_RATIO / _MOST_LEVELS),
             angle=relative,
             color=self._color[classes.size - SIZES[0]],
         )
@@ -126,7 +126,8 @@ class Quantizer:
         sides = np.zeros(len(counts), np.int64)
         for held in np.flatnonzero(counts).tolist():
             sides[held] = side_for(int(counts[held]), self.size)
-        return sides[group]
+        found: Integers = sides[group]
+        return found
 
     def is_seen(self, colors: Floats, classes: Classes) -> NDArray[np.bool_]:
         """Say which Gaussians do not round to black [N]."""

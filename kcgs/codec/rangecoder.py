@@ -157,7 +157,7 @@ class Reader:
         try:
             return self._decoder.decode(*model)
         except AssertionError:
-            raise CodecError("the stream must be an encoder's; got bytes that no encoder wrote") from None
+            raise CodecError("data must be an encoder's stream; got bytes that no encoder wrote") from None
 
 
 def _queue() -> Any:

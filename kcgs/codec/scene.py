@@ -248,6 +248,7 @@ def _lookup(regions: RegionMap | None) -> Lookup | None:
     def under(means: NDArray[np.float32]) -> Integers:
         column, row = np.floor(means).T
         at = np.clip(row, 0, height - 1).astype(np.int64), np.clip(column, 0, width - 1).astype(np.int64)
-        return index[at].astype(np.int64)
+        found: Integers = index[at].astype(np.int64)
+        return found
 
     return under

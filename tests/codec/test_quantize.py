@@ -78,7 +78,9 @@ class TestNoise:
         size, generator = (320, 320), np.random.default_rng(0)
         grid = np.stack(np.meshgrid(np.arange(8), np.arange(8)), -1).reshape(-1, 2)
         means = 40.0 * grid + 20 + generator.uniform(-2, 2, (64, 2))
-        cholesky = np.stack([generator.uniform(2, 5, 64), generator.uniform(-2, 2, 64), generator.uniform(2, 5, 64)], -1)
+        cholesky = np.stack(
+            [generator.uniform(2, 5, 64), generator.uniform(-2, 2, 64), generator.uniform(2, 5, 64)], -1
+        )
         colors = generator.uniform(0.3, 1.0, (64, 3))
         quantizer = Quantizer(200, size)
         total = 0.0
