@@ -15,7 +15,8 @@ colour, one channel                          :math:`\delta`              :math:`
 ===========================================  ==========================  ========================
 
 At a given size the total is least where every parameter of every Gaussian adds the same error, the noise D. So faint
-and small Gaussians get coarse shapes, and wide ones fine colours. The steps are read from two classes: energy (octaves
+and small Gaussians get coarse shapes, and wide ones fine colours. Nothing counts beyond the picture: a Gaussian wider
+than that has the picture's area in place of its own. The steps are read from two classes: energy (octaves
 of :math:`|c| \sqrt{\sigma_1 \sigma_2}`) and size (three quarters of an octave of :math:`\sqrt{\sigma_1 \sigma_2}`).
 
 What is restored is computed from sums, products and square roots of float64 alone: the same bits on every machine.
@@ -42,6 +43,8 @@ NOISE_CODES = (-512, 1023)
 # half the log2 of the ratio of standard deviations
 _MOST_RATIO = 12.0
 _MOST_LEVELS = 1 << 20
+# steps that a colour may have
+MOST_COLOR = 1 << 24
 _LN2 = 0.6931471805599453
 # cells are numbered from the image's corner; centres farther out are brought to the border of that
 MARGIN_CELLS = 255
@@ -94,14 +97,15 @@ class Quantizer:
         self.noise_code, self.size = noise_code, size
         self.noise = float(exp2(np.array([-noise_code / 32.0]))[0])
         energies, sizes = (np.arange(low, high + 1, dtype=np.float64) for low, high in (ENERGIES, SIZES))
-        share = 12.0 * self.noise / math.pi
-        self._relative = np.sqrt(share * exp2(-2.0 * energies - 1.0))  # by energy
-        self._color = np.sqrt(share * exp2(-2.0 * OCTAVES * (sizes + 0.5)))  # by size
+        self._relative = np.sqrt(12.0 * self.noise / math.pi * exp2(-2.0 * energies - 1.0))  # by energy
+        area = np.minimum(math.pi * exp2(2.0 * OCTAVES * (sizes + 0.5)), float(size[0] * size[1]))
+        self._color = np.sqrt(12.0 * self.noise / area)  # by size
 
     def classify(self, cholesky: Floats, colors: Floats) -> Classes:
         """Return the classes of Gaussians with `cholesky` [N, 3] and `colors` [N, C]."""
         scale = 0.5 * np.log2(cholesky[:, 0] * cholesky[:, 2])
-        energy = np.log2(np.maximum(np.sqrt((colors * colors).sum(1)), 1e-12)) + scale
+        within = np.minimum(scale, 0.5 * math.log2(self.size[0] * self.size[1] / math.pi))
+        energy = np.log2(np.maximum(np.sqrt((colors * colors).sum(1)), 1e-12)) + within
         return Classes(
             np.clip(np.floor(energy), ENERGIES[0], ENERGIES[1]).astype(np.int64),
             np.clip(np.floor(scale / OCTAVES), SIZES[0], SIZES[1]).astype(np.int64),
@@ -144,8 +148,13 @@ class Quantizer:
         ratios = np.floor(np.clip(ratio, 0, _MOST_RATIO) / steps.ratio + 0.5).astype(np.int64)
         turns = self.angles(ratios, steps)
         angles = np.floor(angle / math.pi * turns + 0.5).astype(np.int64) % turns
-        opposed = opponent(colors) / steps.color[:, None]
-        codes = np.clip(np.floor(opposed + 0.5), -_MOST_LEVELS, _MOST_LEVELS).astype(np.int64)
+        opposed = np.floor(opponent(colors) / steps.color[:, None] + 0.5)
+        if not (np.abs(opposed) < MOST_COLOR).all():
+            raise ValueError(
+                f"colors must be below {MOST_COLOR:g} steps of {steps.color.min():.3g} at this quality; got colors up to "
+                f"{np.abs(colors).max():.3g}"
+            )
+        codes = opposed.astype(np.int64)
         shape = self.restore_shape(classes, within, ratios, angles)
         cell, place = self._locate(means, shape, steps, self.cell_side(classes))
         return Codes(classes, within, ratios, angles, codes, cell, place)

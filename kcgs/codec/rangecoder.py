@@ -33,7 +33,7 @@ class Coder(Protocol):
         """Code one of 0 to size - 1, all equally likely; size is at most 2**16."""
 
     def uniform(self, sizes: Integers, values: Integers | None) -> Integers:
-        """Code values of 0 to size - 1 (n,), all equally likely; sizes are at most 2**20."""
+        """Code values of 0 to size - 1 (n,), all equally likely; sizes are below 2**24."""
 
     def choose(self, tables: Floats, values: Integers | None) -> Integers:
         """Code values (n,) by a table of weights each, (n, A)."""

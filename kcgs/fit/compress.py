@@ -211,7 +211,8 @@ def _map_bytes(regions: RegionMap | None) -> int:
 def _worth(field: GaussianField, quantizer: Quantizer) -> Tensor:
     """Say which Gaussians pay for their bits; one at least."""
     _, cholesky, colors = (torch.from_numpy(t) for t in numbers(field))
-    energy = math.pi * colors.square().sum(-1) * cholesky[:, 0] * cholesky[:, 2]
+    area = (math.pi * cholesky[:, 0] * cholesky[:, 2]).clamp_max(field.size[0] * field.size[1])
+    energy = colors.square().sum(-1) * area
     kept = energy >= _WORTH * quantizer.noise
     kept[energy.argmax()] = True
     return kept
