@@ -151,8 +151,8 @@ class Quantizer:
         opposed = np.floor(opponent(colors) / steps.color[:, None] + 0.5)
         if not (np.abs(opposed) < MOST_COLOR).all():
             raise ValueError(
-                f"colors must be below {MOST_COLOR:g} steps of {steps.color.min():.3g} at this quality; got colors up to "
-                f"{np.abs(colors).max():.3g}"
+                f"colors must be below {MOST_COLOR:g} steps of {steps.color.min():.3g} at this quality; got colors "
+                f"up to {np.abs(colors).max():.3g}"
             )
         codes = opposed.astype(np.int64)
         shape = self.restore_shape(classes, within, ratios, angles)
