@@ -57,4 +57,5 @@ def merge_worthless(image: Tensor, labels: Tensor, price: float = PRICE) -> Tens
                 into[b] = a
                 taken |= {a, b}
         labels = into[labels]
-    return ids[labels].long()
+    united: Tensor = ids[labels].long()
+    return united
