@@ -196,7 +196,7 @@ class TestEnd:
     def test_pie_with_sub_pixel_coverage(self) -> None:
         image = chart_pie().image
         fine = RegionMap.from_labels(chart_pie(8).labels, supersample=8)
-        result = fit(image, fine, 20, config=quick(iterations=300))
+        result = fit(image, fine, 20, config=quick(iterations=100))
         assert float(psnr(render_image(result.field, result.regions), image)) > 60
 
 
