@@ -11,6 +11,12 @@ from torch import Tensor
 
 from kcgs.kernels import BACKENDS
 
+# Pictures of tests are small: a second thread costs more in waking and spinning than it saves, and workers that share
+# the processors would wait for one another. Threads have tests of their own, which say how many.
+if "OMP_NUM_THREADS" not in os.environ:
+    os.environ["OMP_NUM_THREADS"] = "1"  # of processes that tests start
+    torch.set_num_threads(1)
+
 ROOT = Path(__file__).resolve().parent.parent
 
 

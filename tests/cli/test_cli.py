@@ -126,15 +126,14 @@ class TestFit:
     def test_interrupt_saves_the_best_so_far(self, files: Path) -> None:
         command = [sys.executable, "-m", "kcgs.cli", "fit", "photo.png", "-n", "12", "-o", "scene.safetensors"]
         process = subprocess.Popen(
-            [*command, "--iterations", "10000000", "--json", "--regions", "mask.png"],
+            [*command, "--iterations", "10000000", "--json", "--regions", "mask.png", "--checkpoint", "state"],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             env={**os.environ, "OMP_NUM_THREADS": "1", "TERM": "dumb"},
         )
-        assert process.stderr is not None
-        while not process.stderr.readline().startswith(b"kcgs: "):  # the kernel is ready: the fit has begun
-            assert process.poll() is None
-        time.sleep(1)
+        while not (files / "state").exists():  # it is written after the first iteration: the fit has begun
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.05)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
         assert process.returncode == 0, err

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
 
 import pytest
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from kcgs import FitConfig, RegionMap, fit
 from kcgs.data import chart_2x3, chart_pie
+from kcgs.fit import FitResult
 from kcgs.functional import edge_band, psnr
 from kcgs.nn.renderer import render_image
 
@@ -40,10 +41,17 @@ def same(a: object, b: object) -> bool:
     )
 
 
+@pytest.fixture(scope="module")
+def fitted() -> FitResult:
+    """The scene by 40 Gaussians: what it is, several tests ask."""
+    image, labels = scene()
+    return fit(image, labels, 40, config=quick())
+
+
 class TestBest:
-    def test_is_the_default_and_better_than_paper(self) -> None:
+    def test_is_the_default_and_better_than_paper(self, fitted: FitResult) -> None:
         image, labels = scene()
-        ours, theirs = fit(image, labels, 40, config=quick()), fit(image, labels, 40, config=quick("paper"))
+        ours, theirs = fitted, fit(image, labels, 40, config=quick("paper"))
         assert ours.history[-1].psnr > theirs.history[-1].psnr + 1
         assert inspect.signature(fit).parameters["recipe"].default == "best"
 
@@ -53,12 +61,9 @@ class TestBest:
         assert with_.psnr > without.psnr + 0.5
         assert with_.ef_psnr > without.ef_psnr + 0.5
 
-    def test_psnr_is_that_of_the_scene_as_drawn_by_default(self) -> None:
-        image, labels = scene()
-        result = fit(image, labels, 40, config=quick())
-        assert result.history[-1].psnr == pytest.approx(
-            float(psnr(render_image(result.field, result.regions), image)), abs=0.01
-        )
+    def test_psnr_is_that_of_the_scene_as_drawn_by_default(self, fitted: FitResult) -> None:
+        drawn = render_image(fitted.field, fitted.regions)
+        assert fitted.history[-1].psnr == pytest.approx(float(psnr(drawn, scene()[0])), abs=0.01)
 
     def test_grows_to_n(self) -> None:
         image, labels = scene()
@@ -76,14 +81,14 @@ class TestBest:
         image, labels = scene()
         assert fit(image, labels, 40, config=quick(initializer=initializer)).history[-1].psnr > 25
 
-    def test_same_seed_same_bits(self) -> None:
+    def test_same_seed_same_bits(self, fitted: FitResult) -> None:
         image, labels = scene()
-        a, b = (fit(image, labels, 40, config=quick(), seed=3) for _ in range(2))
+        a, b = fitted, fit(image, labels, 40, config=quick(), seed=0)
         assert same(a, b)
         assert a.regions is not None and b.regions is not None
         assert torch.equal(a.regions.labels, b.regions.labels)
 
-    @pytest.mark.parametrize("channels", [1, 4, 8])
+    @pytest.mark.parametrize("channels", [1, 4, 9])
     def test_any_number_of_channels(self, channels: int) -> None:
         image, labels = scene()
         picture = torch.cat([image, image, image])[:channels]
@@ -163,7 +168,9 @@ class TestTarget:
 
 
 class TestClock:
-    def test_the_schedule_ends_with_the_time(self) -> None:
+    def test_the_schedule_ends_with_the_time(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        # a clock that only being read moves on: a busy machine would have done too little when the time is up
+        monkeypatch.setattr("time.perf_counter", map(lambda tick: 0.005 * tick, count()).__next__)
         image, labels = scene()
         result = fit(image, labels, 40, config=quick(iterations=10**6, max_seconds=1.5))
         assert result.stop_reason == "seconds"
@@ -189,7 +196,7 @@ class TestEnd:
     def test_pie_with_sub_pixel_coverage(self) -> None:
         image = chart_pie().image
         fine = RegionMap.from_labels(chart_pie(8).labels, supersample=8)
-        result = fit(image, fine, 20, config=quick(iterations=300))
+        result = fit(image, fine, 20, config=quick(iterations=100))
         assert float(psnr(render_image(result.field, result.regions), image)) > 60
 
 
@@ -197,13 +204,23 @@ class _Killed(BaseException):
     pass
 
 
+RECIPES = ["best", "best-baseline", "paper"]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted() -> dict[str, FitResult]:
+    image, labels = scene()
+    return {recipe: fit(image, labels, 30, config=quick(recipe)) for recipe in RECIPES}
+
+
 class TestCheckpoint:
-    @pytest.mark.parametrize("recipe", ["best", "best-baseline", "paper"])
+    @pytest.mark.parametrize("recipe", RECIPES)
     @pytest.mark.parametrize("killed_at", [1, 47, 75, 119])
-    def test_resumed_is_uninterrupted(self, tmp_path: Path, recipe: str, killed_at: int) -> None:
+    def test_resumed_is_uninterrupted(
+        self, tmp_path: Path, uninterrupted: dict[str, FitResult], recipe: str, killed_at: int
+    ) -> None:
         image, labels = scene()
-        config, file = quick(recipe), tmp_path / "state"
-        whole = fit(image, labels, 30, config=config)
+        config, file, whole = quick(recipe), tmp_path / "state", uninterrupted[recipe]
 
         def kill(iteration: int, _: object) -> None:
             if iteration == killed_at:
@@ -257,7 +274,7 @@ def hard_cases() -> dict[str, tuple[Tensor, Tensor, int]]:
         "black": (torch.zeros_like(image), labels, 30),
         "saturated": (image.round(), labels, 30),
         "checkerboard": (image, (x + y) % 2, 30),
-        "blocks": (image, (x // 4 + 16 * (y // 4)), 400),
+        "blocks": (image, (x // 6 + 16 * (y // 6)), 200),
         "one-pixel regions": (image, specks, 30),
         "more gaussians than pixels of a region": (image, specks, 800),
         "one row": (image[:, :1], labels[:1] + (x[:1] > 20).long(), 12),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -14,7 +15,6 @@ from typing import Any, NamedTuple
 import pytest
 
 import kcgs
-from kcgs import GaussianField, RegionSplatRenderer
 
 FOLDER = Path(kcgs.__file__).resolve().parent.parent / "notebooks"
 SCRIPT = FOLDER / "execute.py"
@@ -32,6 +32,10 @@ PRINTED = {
     "06_differentiable_layer": r"after: loss 0\.\d+, PSNR +[12]\d\.\d\d dB",
 }
 SECONDS = 180
+_COMPILE = (
+    "from kcgs import GaussianField, RegionSplatRenderer\n"
+    "RegionSplatRenderer()(GaussianField.random(1, (16, 16), seed=0)).sum().backward()\n"
+)
 BYTES = 2_000_000
 
 
@@ -56,11 +60,12 @@ def run_quick(name: str, folder: Path) -> Run:
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Future[Run]]]:
-    """Run all, two at a time: a kernel takes one thread, and seconds to import what it needs."""
-    # compiled and kept here, so that no kernel has to, and says so
-    RegionSplatRenderer()(GaussianField.random(1, (16, 16), seed=0)).sum().backward()
+    """Run all, two at a time unless tests do: a kernel takes one thread, and seconds to import what it needs."""
+    # Compiled and kept here, so that no kernel has to, and says so. In a new process, as they are: this one may have
+    # the code in memory when it is on disk no more, since two that keep theirs at once may drop the other's.
+    subprocess.run([sys.executable, "-c", _COMPILE], check=True, timeout=SECONDS)
     folder = tmp_path_factory.mktemp("quick")
-    with ThreadPoolExecutor(2) as pool:
+    with ThreadPoolExecutor(1 if "PYTEST_XDIST_WORKER" in os.environ else 2) as pool:
         yield {name: pool.submit(run_quick, name, folder) for name in PRINTED}
         pool.shutdown(cancel_futures=True)
 
