@@ -32,56 +32,44 @@ def by_index(found: list[Done[Any]]) -> list[Done[Any]]:
 
 @pytest.mark.parametrize("workers", [None, 1, 2])
 class TestBoth:
-    def test_results(self, tmp_path: Path, workers: int | None) -> None:
+    def test_results_and_a_job_that_raises(self, tmp_path: Path, workers: int | None) -> None:
         seen: list[Done[int]] = []
-        found = list(run_jobs(function("double"), tasks(5, tmp_path), workers=workers, on_done=seen.append))
-        assert [done.result for done in by_index(found)] == [0, 2, 4, 6, 8]
-        assert seen == found and all(done.error is None and 0 <= done.seconds < 5 for done in found)
-
-    def test_a_job_that_raises(self, tmp_path: Path, workers: int | None) -> None:
-        found = by_index(list(run_jobs(function("fail_at_one"), tasks(4, tmp_path), workers=workers)))
+        found = list(run_jobs(function("fail_at_one"), tasks(4, tmp_path), workers=workers, on_done=seen.append))
+        assert seen == found and all(0 <= done.seconds < 5 for done in found)
+        found = by_index(found)
         assert [done.result for done in found] == [0, None, 4, 6]
+        assert [done.error is None for done in found] == [True, False, True, True]
         error = found[1].error
         assert error is not None and (error.type, error.message) == ("ValueError", "no 1\nplease")
         assert "fail_at_one" in error.traceback and str(error) == "ValueError: no 1 please"
 
     def test_threads(self, tmp_path: Path, workers: int | None) -> None:
         before = torch.get_num_threads()
-        for threads, wanted in ((None, 1), (3, 3)):
-            found = list(
-                run_jobs(function("process_and_threads"), tasks(4, tmp_path), workers=workers, threads=threads)
-            )
-            assert {done.result[1] for done in found if done.result} == {wanted}
-            processes = {done.result[0] for done in found if done.result}
-            assert len(processes) == (workers or 1) and (os.getpid() in processes) == (workers != 2)
-        assert torch.get_num_threads() == before
+        jobs = tasks(4, tmp_path)
+        found = list(run_jobs(function("process_and_threads"), jobs, workers=workers, threads=3))
+        assert {done.result[1] for done in found if done.result} == {3} and torch.get_num_threads() == before
+        processes = {done.result[0] for done in found if done.result}
+        assert len(processes) == (workers or 1) and (os.getpid() in processes) == (workers != 2)
 
     def test_no_jobs(self, workers: int | None) -> None:
-        assert list(run_jobs(function("double"), [], workers=workers)) == []
+        assert list(run_jobs(function("process_and_threads"), [], workers=workers)) == []
+
+
+def test_one_thread_by_default(tmp_path: Path) -> None:
+    (done,) = run_jobs(function("process_and_threads"), tasks(1, tmp_path))
+    assert done.result == (os.getpid(), 1)
 
 
 class TestProcesses:
-    @pytest.mark.parametrize("name", ["die_at_one", "exit_at_one"])
-    def test_killed_twice(self, tmp_path: Path, name: str) -> None:
-        found = by_index(list(run_jobs(function(name), tasks(5, tmp_path), workers=2)))
-        assert [done.result for done in found] == [0, None, 4, 6, 8]
+    def test_killed(self, tmp_path: Path) -> None:
+        """One job kills every worker, another its first one, a third has a result that cannot be sent."""
+        found = by_index(list(run_jobs(function("misbehave"), tasks(5, tmp_path), workers=2)))
+        assert [done.result for done in found] == [0, None, 4, None, 8]
         error = found[1].error
         assert error is not None and error.type == "WorkerDied"
-        assert error.message == (
-            "the worker process was ended by SIGKILL, memory may have run out, twice"
-            if name == "die_at_one"
-            else "the worker process was ended with exit code 3, twice"
-        )
-        if name == "die_at_one":
-            assert [(tmp_path / str(i)).read_text() for i in range(5)] == ["x", "xx", "x", "x", "x"]
-
-    def test_killed_once(self, tmp_path: Path) -> None:
-        found = by_index(list(run_jobs(function("die_once"), tasks(3, tmp_path), workers=2)))
-        assert [done.result for done in found] == [0, 2, 4]
-
-    def test_a_result_that_cannot_be_sent(self, tmp_path: Path) -> None:
-        found = by_index(list(run_jobs(function("unspeakable"), tasks(3, tmp_path), workers=2)))
-        assert [done.result for done in found] == [0, None, 2] and "lambda" in str(found[1].error)
+        assert error.message == "the worker process was ended by SIGKILL, memory may have run out, twice"
+        assert "lambda" in str(found[3].error)
+        assert [(tmp_path / str(i)).read_text() for i in range(5)] == ["x", "xx", "xx", "x", "x"]
 
     def test_left_early(self, tmp_path: Path) -> None:
         start = time.monotonic()
@@ -113,15 +101,6 @@ class TestProcesses:
         while any(_is_alive(process) for process in workers):
             assert time.monotonic() < until
             time.sleep(0.05)
-
-    def test_same_bytes(self, tmp_path: Path) -> None:
-        for threads in (1, 2):
-            found = [
-                by_index(list(run_jobs(function("fitted_bytes"), tasks(2, tmp_path), workers=w, threads=threads)))
-                for w in (1, 2)
-            ]
-            assert [d.result for d in found[0]] == [d.result for d in found[1]]
-            assert all(d.error is None for d in found[0])
 
 
 class TestArguments:
