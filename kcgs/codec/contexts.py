@@ -7,8 +7,8 @@ whether it is the second candidate rather than the first, 1: whether it is neith
 2. A network with fixed weights (`prior`) turns them into a logit in 1/256 for each decision (`network`).
 3. Three counters by smaller contexts, 16-bit chances that move to the bits seen by 2 / (2 n + 3) of the distance, give
    a logit each; one that was not seen yet gives the network's, and starts there with n = 2 (`contexts`, `learn`).
-4. The chance is that of the weighted sum of the four logits; weights, one set for each of four ages of the third counter,
-   start from `prior` and move along their gradient after each bit (`mix`, `learn`).
+4. The chance is that of the weighted sum of the four logits. Weights, one set for each of four ages of the third
+   counter, start from `prior` and move along their gradient after each bit (`mix`, `learn`).
 
 Counters and weights change between waves only: within a wave in its order, decision 1 before decision 0.
 """

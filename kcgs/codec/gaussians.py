@@ -28,9 +28,13 @@ _MOST_BITS = 21
 _RATIO_SCALE = 2.0
 # a colour's part is faint, middling or strong against the whole
 _FAINT, _STRONG = 0.35, 0.8
-_GREY = np.array([8, 7, 7, 6, 6, 6, 7, 7, 6, 5, 4, 3, 2, 1, 1, 0.5, *[0.2] * 8])
-_HUE = np.array([20, 12, 8, 6, 4, 3, 2, 2, 1, 1, 0.7, 0.5, 0.3, 0.3, 0.2, 0.2, *[0.1] * 8])
-_RATIO = np.array([6, 8, 10, 9, 8, 6, 4, 3, 2, 1, 1, 0.5, *[0.2] * 12])
+# where learning starts: shapes found on photos that no report measures, in parts of a thousand
+_GREY = np.array([1, 1, 2, 3, 12, 22, 49, 80, 102, 110, 110, 103, 88, 74, 62, 46, 34, 27, 22, 17, 12, 6, 6, 12])
+_HUE = np.array([382, 247, 144, 96, 51, 30, 21, 12, 7, 3, 2, 2, 1, 1, *[0.5] * 10])
+_HUE2 = np.array([547, 224, 98, 63, 27, 13, 12, 9, 5, 1, 1, *[0.5] * 13])
+_RATIO = np.array([102, 159, 168, 150, 125, 98, 69, 46, 30, 21, 14, 8, 5, 3, 2, 1, *[0.5] * 8])
+# what a start weighs against what is seen, in Gaussians
+_WEIGHT = 0.05
 
 
 class Layers:
@@ -45,8 +49,8 @@ class Layers:
 
     def __init__(self, quantizer: Quantizer, channels: int, regions: int, lookup: Lookup | None) -> None:
         self.quantizer, self.channels, self.regions, self.lookup = quantizer, channels, regions, lookup
-        self._colors = [Magnitudes(_GREY), *(Magnitudes(_HUE, 3) for _ in range(min(channels, 3) - 1))]
-        self._ratio = Magnitudes(_RATIO)
+        self._colors = [Magnitudes(_WEIGHT * _GREY), Magnitudes(_WEIGHT * _HUE, 3), Magnitudes(_WEIGHT * _HUE2, 3)]
+        self._ratio = Magnitudes(_WEIGHT * _RATIO)
         self._stays = Choices(np.array([20.0, 0.5]))
         self._lengths = Choices(np.array([2.0, *[1.0] * 9, *[0.3] * (_MOST_BITS - 9)]))
         self._margins = Choices(np.array([3.0, *[1.0] * 4, *[0.3] * 4]))
@@ -189,7 +193,7 @@ class Layers:
     def _code_regions(self, coder: Coder, codes: Codes, ids: Integers | None) -> Integers:
         if self.lookup is None or self.regions == 1:
             return np.zeros(len(codes.scale), np.int64)
-        under = self.lookup(self.quantizer.restore(codes)[0])
+        under = self.lookup(self.quantizer.restore_centres(codes))
         strays = None if ids is None else (ids != under).astype(np.int64)
         strays = self._stays.code(coder, np.zeros(len(under), np.int64), strays)
         away = np.flatnonzero(strays)

@@ -19,6 +19,9 @@ bit: 0 if the ids of regions, in the order in which regions are numbered (below)
 each as the magnitude of its distance from the one before, less 1 (the first: from -1); then for each region, in
 order, which of the sorted ids that are left it has, a number of as many. With R = 1 the stream ends here.
 
+**Noise.** A bit of chance 64 / 65536. If it is 1, the regions' numbers follow row by row, numbers of R each (here R may
+exceed 65536, up to 2**24), and that is all. Encoders choose this for maps that would take more bytes otherwise.
+
 **Order.** Pixels go in *waves*: x + 8 y is the same in a wave, waves go by that sum, a wave goes by y. Regions are
 numbered from 0 as they are met. Chances of a wave's bits depend on the waves before it only. Pixels outside the map
 have labels too: to the left of row y, that of pixel (0, y - 1), and 0 for y = 0; to the right of row y, that of its
@@ -50,7 +53,8 @@ starts and of pixels that are neither follow, in the order of the wave:
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +68,7 @@ from .waves import DECIDED, RANKS, REGIONS, STATE, Loops, loops, new_work
 Labels = NDArray[np.int64]
 _TABLE = 1 << 20  # ids below it are looked up, not sorted
 _MOST = 24  # bits of the number of regions
+_NOISY = np.array([2.0**-10])  # chance of a map that the model makes larger
 
 
 def encode_labels(labels: Labels) -> bytes:
@@ -80,20 +85,24 @@ def encode_labels(labels: Labels) -> bytes:
         >>> len(encode_labels(halves)) < 12
         True
     """
-    writer = Writer()
-    code_labels(writer, labels)
-    return writer.finish()
-
-
-def code_labels(coder: Coder, labels: Labels) -> None:
-    """Write a label map to any coder that does not read."""
     ids, index = compact(labels)
+    writer = Writer()
     if len(ids) == 1:
-        _code_ids(coder, ids.tolist(), 1)
-        return
+        _code_ids(writer, ids.tolist(), 1)
+        return writer.finish()
     truth, starts, order = loops().survey(index, len(ids))
-    _code_ids(coder, ids[order].tolist(), len(ids))
-    _code_pixels(coder, truth, starts, len(ids))
+    numbered = ids[order].tolist()
+    _code_ids(writer, numbered, len(ids))
+    if not writer.bits(_NOISY, np.zeros(1, np.int32))[0]:
+        _code_pixels(writer, truth, starts, len(ids))
+    data = writer.finish()
+    if 8 * len(data) <= labels.size * math.log2(len(ids)) + 64:
+        return data
+    writer = Writer()
+    _code_ids(writer, numbered, len(ids))
+    writer.bits(_NOISY, np.ones(1, np.int32))
+    writer.numbers(truth.reshape(-1), len(ids), labels.size)
+    return writer.finish()
 
 
 def decode_labels(data: bytes, height: int, width: int, *, max_regions: int) -> Labels:
@@ -120,10 +129,12 @@ def decode_labels(data: bytes, height: int, width: int, *, max_regions: int) -> 
     ids = _code_ids(reader, [], min(max_regions, height * width))
     if len(ids) == 1:
         return np.full((height, width), ids[0], np.int64)
+    if reader.bits(_NOISY, np.zeros(1, np.int32))[0]:
+        index = reader.numbers(None, len(ids), height * width).reshape(height, width)
+        return cast(Labels, np.array(ids, np.int64)[index])
     starts = np.zeros((height, width), np.uint8)
     index = _code_pixels(reader, np.zeros((0, 0), np.int32), starts, len(ids))
-    labels: Labels = np.array(ids, np.int64)[index]
-    return labels
+    return cast(Labels, np.array(ids, np.int64)[index])
 
 
 def compact(labels: Labels) -> tuple[Any, Any]:
@@ -142,7 +153,7 @@ def _code_ids(coder: Coder, ids: list[int], limit: int) -> list[int]:
     extra = 0
     while fair(coder, len(ids) >= 2 << extra):
         extra += 1
-        if extra > _MOST:
+        if extra == _MOST:
             raise CodecError(f"data must hold at most {limit} regions; got {1 << extra} or more")
     count = 1 << extra | plain(coder, len(ids), extra)
     if count > limit:

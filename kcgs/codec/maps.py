@@ -38,13 +38,13 @@ _AT_ONCE = 32
 
 def encode_map(regions: RegionMap) -> bytes:
     """Write a map with two regions or more; contour widths are rounded to fortieths of a pixel."""
-    from .labels import encode_labels  # compiles loops
+    from .labels import compact, encode_labels  # compiles loops
 
     if regions.labels.ndim != 2 or regions.resized:
         raise ValueError("regions must be one map of its own pixels, not a batch and not resized")
     fine = regions.labels if regions.fine_labels is None else regions.fine_labels
     labels = encode_labels(fine.cpu().numpy())
-    pairs = _touching(regions)
+    pairs = _touching(compact(fine.cpu().numpy())[1], regions.num_regions)
     softness, ids = regions.softness, regions.ids.tolist()
     if isinstance(softness, PairWidths):
         widths = [_round(softness.get((ids[a], ids[b]), 0.0)) for a, b in pairs.tolist()]
@@ -62,7 +62,7 @@ def encode_map(regions: RegionMap) -> bytes:
 
 def decode_map(data: bytes, size: tuple[int, int], num_regions: int) -> RegionMap:
     """Read a map of `num_regions` regions for a picture of `size`."""
-    from .labels import decode_labels
+    from .labels import compact, decode_labels
 
     stream = ByteReader(data)
     k = stream.varint("labels along a side of a pixel", 1, _MOST_SUPERSAMPLE)
@@ -70,18 +70,18 @@ def decode_map(data: bytes, size: tuple[int, int], num_regions: int) -> RegionMa
         raise CodecError(f"a map must have at most {MOST_LABELS} labels; got {size} times {k} squared")
     labels = stream.take(stream.varint("length of the labels", 1, len(data)))
     found = decode_labels(labels, k * size[0], k * size[1], max_regions=num_regions)
-    regions = RegionMap.from_labels(torch.from_numpy(found), supersample=k)
-    if regions.num_regions != num_regions:
-        raise CodecError(f"the map must have {num_regions} regions; got {regions.num_regions}")
+    ids, index = compact(found)
+    if len(ids) != num_regions:
+        raise CodecError(f"the map must have {num_regions} regions; got {len(ids)}")
     count = stream.varint("contour widths", 1, min(_MOST_WIDTH + 1, len(data)))
     distinct = [stream.varint("a contour width", 0, _MOST_WIDTH) / _FORTIETHS for _ in range(count)]
     if count == 1:
         widths: float | dict[tuple[int, int], float] = distinct[0]
     else:
-        pairs, ids = _touching(regions), regions.ids.tolist()
+        pairs = _touching(index, num_regions)
         places = _code_places(Reader(stream.take(len(data) - stream.at)), len(pairs), count, None)
         named = zip(pairs.tolist(), places.tolist(), strict=True)
-        widths = {(ids[a], ids[b]): distinct[place] for (a, b), place in named}
+        widths = {(int(ids[a]), int(ids[b])): distinct[place] for (a, b), place in named}
     return RegionMap.from_labels(torch.from_numpy(found), widths, supersample=k)
 
 
@@ -98,14 +98,12 @@ def _code_places(coder: Coder, pairs: int, count: int, places: Integers | None) 
     return found
 
 
-def _touching(regions: RegionMap) -> Integers:
+def _touching(index: Integers, num_regions: int) -> Integers:
     """Return the pairs of positions a < b [P, 2] of regions that have labels side by side."""
-    fine = regions.labels if regions.fine_labels is None else regions.fine_labels
-    index = regions.index_of(fine).cpu().numpy().astype(np.int64)
     keys = []
     for here, there in ((index[:, :-1], index[:, 1:]), (index[:-1], index[1:])):
         differ = here != there
         low, high = np.minimum(here[differ], there[differ]), np.maximum(here[differ], there[differ])
-        keys.append(np.unique(low * regions.num_regions + high))
+        keys.append(np.unique(low.astype(np.int64) * num_regions + high))
     key = np.unique(np.concatenate(keys))
-    return np.stack([key // regions.num_regions, key % regions.num_regions], -1)
+    return np.stack([key // num_regions, key % num_regions], -1)

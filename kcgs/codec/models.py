@@ -12,7 +12,8 @@ Integers = NDArray[np.int64]
 
 # sizes below 16 have a bucket each; above, an octave has eight
 _PLAIN, _AN_OCTAVE = 16, 8
-_BUCKETS = _PLAIN + 17 * _AN_OCTAVE
+_OCTAVES = (4, 24)
+_BUCKETS = _PLAIN + (_OCTAVES[1] - _OCTAVES[0]) * _AN_OCTAVE
 # bins of the shape that all scales share, in units of the scale
 _BINS, _WIDTH = 24, 0.125
 _PARTS = 256
@@ -20,10 +21,10 @@ _PARTS = 256
 
 def _bounds() -> tuple[Integers, Integers]:
     starts = list(range(_PLAIN))
-    for octave in range(4, 21):
+    for octave in range(*_OCTAVES):
         starts += [(1 << octave) + ((1 << octave) // _AN_OCTAVE) * i for i in range(_AN_OCTAVE)]
     low = np.array(starts, np.int64)
-    return low, np.append(low[1:], 1 << 21)
+    return low, np.append(low[1:], 1 << _OCTAVES[1])
 
 
 _LOW, _HIGH = _bounds()
@@ -67,7 +68,7 @@ class Magnitudes:
         total = np.zeros(_BINS + 1)
         for i in range(_BINS):  # not cumsum: its order of summation is its own
             total[i + 1] = total[i] + shape[i]
-        edges = np.arange(_BINS + 1) * (scale * _WIDTH)
+        edges = np.arange(_BINS + 1).astype(np.float64) * (scale * _WIDTH)
         cumulative = _interpolate(np.maximum(_EDGES - 0.5, 0.0), edges, total)
         table: Floats = (cumulative[1:] - cumulative[:-1]) + 1e-3 * total[-1] / _BUCKETS
         return table

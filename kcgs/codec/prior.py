@@ -1,7 +1,7 @@
 """What the coder knows about label maps before it has seen one: a small network, trained once, in integers.
 
-`prior.bin` holds the arrays of `Prior` one after the other, lowest bytes first, in the types of `_LAYOUT`. The network was
-trained on segmentations of Kodak photos and of scikit-image's, and on drawn shapes: none of DAVIS or BSDS.
+`prior.bin` holds the arrays of `Prior` one after the other, lowest bytes first, in the types of `_LAYOUT`. The network
+was trained on segmentations of Kodak photos and of scikit-image's, and on drawn shapes: none of DAVIS or BSDS.
 """
 
 from __future__ import annotations

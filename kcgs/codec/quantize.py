@@ -15,7 +15,8 @@ colour, one channel                          :math:`\delta`              :math:`
 ===========================================  ==========================  ========================
 
 At a given size the total is least where every parameter of every Gaussian adds the same error, the noise D. So faint
-and small Gaussians get coarse shapes, and wide ones fine colours. The steps are read from two classes: energy (octaves
+and small Gaussians get coarse shapes, and wide ones fine colours. Nothing counts beyond the picture: a Gaussian wider
+than that has the picture's area in place of its own. The steps are read from two classes: energy (octaves
 of :math:`|c| \sqrt{\sigma_1 \sigma_2}`) and size (three quarters of an octave of :math:`\sqrt{\sigma_1 \sigma_2}`).
 
 What is restored is computed from sums, products and square roots of float64 alone: the same bits on every machine.
@@ -42,6 +43,8 @@ NOISE_CODES = (-512, 1023)
 # half the log2 of the ratio of standard deviations
 _MOST_RATIO = 12.0
 _MOST_LEVELS = 1 << 20
+# steps that a colour may have
+MOST_COLOR = 1 << 24
 _LN2 = 0.6931471805599453
 # cells are numbered from the image's corner; centres farther out are brought to the border of that
 MARGIN_CELLS = 255
@@ -93,11 +96,16 @@ class Quantizer:
     def __init__(self, noise_code: int, size: tuple[int, int]) -> None:
         self.noise_code, self.size = noise_code, size
         self.noise = float(exp2(np.array([-noise_code / 32.0]))[0])
+        energies, sizes = (np.arange(low, high + 1, dtype=np.float64) for low, high in (ENERGIES, SIZES))
+        self._relative = np.sqrt(12.0 * self.noise / math.pi * exp2(-2.0 * energies - 1.0))  # by energy
+        area = np.minimum(math.pi * exp2(2.0 * OCTAVES * (sizes + 0.5)), float(size[0] * size[1]))
+        self._color = np.sqrt(12.0 * self.noise / area)  # by size
 
     def classify(self, cholesky: Floats, colors: Floats) -> Classes:
         """Return the classes of Gaussians with `cholesky` [N, 3] and `colors` [N, C]."""
         scale = 0.5 * np.log2(cholesky[:, 0] * cholesky[:, 2])
-        energy = np.log2(np.maximum(np.sqrt((colors * colors).sum(1)), 1e-12)) + scale
+        within = np.minimum(scale, 0.5 * math.log2(self.size[0] * self.size[1] / math.pi))
+        energy = np.log2(np.maximum(np.sqrt((colors * colors).sum(1)), 1e-12)) + within
         return Classes(
             np.clip(np.floor(energy), ENERGIES[0], ENERGIES[1]).astype(np.int64),
             np.clip(np.floor(scale / OCTAVES), SIZES[0], SIZES[1]).astype(np.int64),
@@ -105,23 +113,25 @@ class Quantizer:
 
     def steps(self, classes: Classes) -> Steps:
         """Return the steps of each Gaussian: those at which every parameter adds the noise."""
-        relative = np.sqrt(12.0 * self.noise / (math.pi * np.ldexp(1.0, 2 * classes.energy.astype(np.int32) + 1)))
-        area = math.pi * exp2(np.asarray(2.0 * OCTAVES * (classes.size + 0.5), np.float64))
+        relative: Floats = self._relative[classes.energy - ENERGIES[0]]
         scale = relative * (math.sqrt(0.5) / _LN2)
         return Steps(
             place=relative * math.sqrt(2.0),
             scales=np.clip(np.floor(OCTAVES / scale + 0.5), 1, _MOST_LEVELS).astype(np.int64),
-            ratio=relative * (1.0 / _LN2),
+            ratio=np.maximum(relative * (1.0 / _LN2), _MOST_RATIO / _MOST_LEVELS),
             angle=relative,
-            color=np.sqrt(12.0 * self.noise / area),
+            color=self._color[classes.size - SIZES[0]],
         )
 
     def cell_side(self, classes: Classes) -> Integers:
         """Return the side in pixels, a power of two, of the cells that each Gaussian's place is told in."""
         group = (classes.energy - ENERGIES[0]) * 64 + classes.size - SIZES[0]
-        _, index, counts = np.unique(group, return_inverse=True, return_counts=True)
-        sides = np.array([side_for(int(count), self.size) for count in counts], np.int64)
-        return sides[index]
+        counts = np.bincount(group)
+        sides = np.zeros(len(counts), np.int64)
+        for held in np.flatnonzero(counts).tolist():
+            sides[held] = side_for(int(counts[held]), self.size)
+        found: Integers = sides[group]
+        return found
 
     def is_seen(self, colors: Floats, classes: Classes) -> NDArray[np.bool_]:
         """Say which Gaussians do not round to black [N]."""
@@ -138,8 +148,13 @@ class Quantizer:
         ratios = np.floor(np.clip(ratio, 0, _MOST_RATIO) / steps.ratio + 0.5).astype(np.int64)
         turns = self.angles(ratios, steps)
         angles = np.floor(angle / math.pi * turns + 0.5).astype(np.int64) % turns
-        opposed = opponent(colors) / steps.color[:, None]
-        codes = np.clip(np.floor(opposed + 0.5), -_MOST_LEVELS, _MOST_LEVELS).astype(np.int64)
+        opposed = np.floor(opponent(colors) / steps.color[:, None] + 0.5)
+        if not (np.abs(opposed) < MOST_COLOR).all():
+            raise ValueError(
+                f"colors must be below {MOST_COLOR:g} steps of {steps.color.min():.3g} at this quality; got colors "
+                f"up to {np.abs(colors).max():.3g}"
+            )
+        codes = opposed.astype(np.int64)
         shape = self.restore_shape(classes, within, ratios, angles)
         cell, place = self._locate(means, shape, steps, self.cell_side(classes))
         return Codes(classes, within, ratios, angles, codes, cell, place)
@@ -167,17 +182,19 @@ class Quantizer:
         step = self.steps(classes).place[:, None] * shape[:, ::2]
         return np.clip(np.ceil(side[:, None] / step), 1, _MOST_LEVELS).astype(np.int64)
 
-    def restore_means(self, cell: Integers, place: Integers, parts: Integers, side: Integers) -> Floats:
-        """Return centres [N, 2]."""
-        return side[:, None] * (cell + (place + 0.5) / parts)
-
     def restore(self, codes: Codes) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Return means (N, 2), cholesky (N, 3), colors (N, C)."""
+        shape = self.restore_shape(codes.classes, codes.scale, codes.ratio, codes.angle)
+        colors = opponent(codes.colors * self.steps(codes.classes).color[:, None], back=True)
+        return self.restore_centres(codes, shape), shape.astype(np.float32), colors.astype(np.float32)
+
+    def restore_centres(self, codes: Codes, shape: Floats | None = None) -> NDArray[np.float32]:
+        """Return means (N, 2)."""
         classes, side = codes.classes, self.cell_side(codes.classes)
-        shape = self.restore_shape(classes, codes.scale, codes.ratio, codes.angle)
-        means = self.restore_means(codes.cell, codes.place, self.parts(shape, classes, side), side)
-        colors = opponent(codes.colors * self.steps(classes).color[:, None], back=True)
-        return means.astype(np.float32), shape.astype(np.float32), colors.astype(np.float32)
+        if shape is None:
+            shape = self.restore_shape(classes, codes.scale, codes.ratio, codes.angle)
+        parts = self.parts(shape, classes, side)
+        return (side[:, None] * (codes.cell + (codes.place + 0.5) / parts)).astype(np.float32)
 
     def restore_layers(self, parts: list[Codes]) -> list[NDArray[np.float32]]:
         """Return means (N, 2), cholesky (N, 3), colors (N, C) of one part after another."""

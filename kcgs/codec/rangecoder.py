@@ -33,13 +33,16 @@ class Coder(Protocol):
         """Code one of 0 to size - 1, all equally likely; size is at most 2**16."""
 
     def uniform(self, sizes: Integers, values: Integers | None) -> Integers:
-        """Code values of 0 to size - 1 (n,), all equally likely; sizes are at most 2**20."""
+        """Code values of 0 to size - 1 (n,), all equally likely; sizes are below 2**24."""
 
     def choose(self, tables: Floats, values: Integers | None) -> Integers:
         """Code values (n,) by a table of weights each, (n, A)."""
 
     def repeat(self, table: Floats, count: int, values: Integers | None) -> Integers:
         """Code `count` values by one table of weights, (A,)."""
+
+    def numbers(self, values: Any, size: int, count: int) -> Any:
+        """Code that many, (count,) int32; size is 2 to 2**24."""
 
 
 class Writer:
@@ -85,6 +88,11 @@ class Writer:
             self._encoder.encode(values.astype(np.int32), self._models.Categorical(table, perfect=False))
         return values
 
+    def numbers(self, values: Any, size: int, count: int) -> Any:
+        """Write numbers."""
+        self._encoder.encode(values, self._models.Uniform(size))
+        return values
+
     def finish(self) -> bytes:
         """Return the fewest bytes that, with zeros behind them, read as what was written."""
         position, (lower, width) = self._encoder.pos()
@@ -93,7 +101,8 @@ class Writer:
         value = int.from_bytes(words[:length].ljust(length, b"\0"), "big")
         # all values from `low` for `width` read the same; this one was constriction's choice
         low = value - ((value - lower) % (1 << _WINDOW))
-        for zeros in range(length, -1, -1):
+        # the width is below 2**64: more zeros than that come by themselves
+        for zeros in range(min(length, _WINDOW // 8), -1, -1):
             step = 1 << (8 * zeros)
             value = -(-low // step) * step
             if value < low + width:
@@ -140,11 +149,15 @@ class Reader:
             return np.zeros(0, np.int64)
         return np.asarray(self._decode(self._models.Categorical(table, perfect=False), count), np.int64)
 
+    def numbers(self, values: Any, size: int, count: int) -> Any:
+        """Read numbers."""
+        return self._decode(self._models.Uniform(size), count)
+
     def _decode(self, *model: Any) -> Any:
         try:
             return self._decoder.decode(*model)
         except AssertionError:
-            raise CodecError("the stream must be an encoder's; got bytes that no encoder wrote") from None
+            raise CodecError("data must be an encoder's stream; got bytes that no encoder wrote") from None
 
 
 def _queue() -> Any:

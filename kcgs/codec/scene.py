@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs.functional import RegionMap, lookup_regions
+from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 
 from .errors import CodecError
@@ -242,8 +242,13 @@ def _lookup(regions: RegionMap | None) -> Lookup | None:
     if regions is None:
         return None
 
+    index = regions.index_of(regions.labels).numpy()
+    height, width = regions.size
+
     def under(means: NDArray[np.float32]) -> Integers:
-        found: Integers = regions.index_of(lookup_regions(torch.from_numpy(means), regions.labels)).numpy()
+        column, row = np.floor(means).T
+        at = np.clip(row, 0, height - 1).astype(np.int64), np.clip(column, 0, width - 1).astype(np.int64)
+        found: Integers = index[at].astype(np.int64)
         return found
 
     return under

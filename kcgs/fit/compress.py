@@ -21,7 +21,7 @@ from kcgs.codec.scene import (
     noise_code_for,
     numbers,
 )
-from kcgs.functional import RegionMap
+from kcgs.functional import RegionMap, merge_worthless
 from kcgs.nn import GaussianField
 
 from .config import FitConfig
@@ -37,8 +37,6 @@ _BITS, _COUNT, _BITS_AN_OCTAVE = 31.0, 2100, 1.9
 _HEADER_BYTES = 60
 # squared error falls with the power of the bytes
 _POWER = 0.93
-# bits of a pixel of contour
-_CONTOUR_BITS = 1.2
 # contours show: a picture with them may have this much more squared error, 0.1 dB
 _FAVOUR = 1.023
 _TRIAL_ITERATIONS, _TRIAL_TO_END = 80, 0.65
@@ -132,8 +130,9 @@ def fit_bytes(
     """Fit an image to a budget of bytes, everything included.
 
     One trade decides: what the last bit saves. The number of Gaussians is that at which another one, or more digits
-    for all, would save as much; a pixel of contour must save what its bits would save as Gaussians; and the map as a
-    whole stays only where two short fits, with it and with Gaussians for its bytes, say so, within 0.1 dB.
+    for all, would save as much; a pixel of contour must save what the bits that the coder needs for it would save as
+    Gaussians, else it moves or its regions unite; and the map as a whole stays only where two short fits, with it and
+    with Gaussians for its bytes, say so, within 0.1 dB.
 
     Args:
         image: as in :func:`kcgs.fit.fit`.
@@ -187,7 +186,6 @@ def _choose(
     """Return the map, or None where its bytes do more as Gaussians, and what a pixel of contour must save."""
     if regions is None or regions.num_regions == 1:
         return None, config.contour_price
-    spent = _map_bytes(regions)
     trial = config.model_copy(
         update={"iterations": min(_TRIAL_ITERATIONS, config.iterations), "release": False, "polish": False}
     )
@@ -197,11 +195,22 @@ def _choose(
         return float(10 ** (-max(entry.psnr for entry in result.history) / 10))
 
     without = error(None, target_bytes)
-    bits = 8 * target_bytes
-    price = _CONTOUR_BITS * _POWER * _TRIAL_TO_END * without * image.shape[-2] * image.shape[-1] / bits
-    if count_for(target_bytes - spent) < regions.num_regions:
+    # what a bit saves, where it is spent on Gaussians
+    saved = _POWER * _TRIAL_TO_END * without * image.shape[-2] * image.shape[-1] / (8 * target_bytes)
+    price = saved * _contour_bits(regions)
+    if config.release and regions.softness == 0.0 and regions.supersample == 1:
+        regions = RegionMap.from_labels(merge_worthless(image, regions.labels, price))
+    left = target_bytes - _map_bytes(regions)
+    if regions.num_regions == 1 or count_for(left) < regions.num_regions:
         return None, price
-    return (regions if error(regions, target_bytes - spent) < _FAVOUR * without else None), price
+    return (regions if error(regions, left) < _FAVOUR * without else None), price
+
+
+def _contour_bits(regions: RegionMap) -> float:
+    """Bits that the coder takes for a pixel of this map's contours."""
+    labels = regions.labels if regions.fine_labels is None else regions.fine_labels
+    edges = int((labels[1:] != labels[:-1]).sum() + (labels[:, 1:] != labels[:, :-1]).sum())
+    return 8 * _map_bytes(regions) / max(edges, 1)
 
 
 def _map_bytes(regions: RegionMap | None) -> int:
@@ -211,7 +220,8 @@ def _map_bytes(regions: RegionMap | None) -> int:
 def _worth(field: GaussianField, quantizer: Quantizer) -> Tensor:
     """Say which Gaussians pay for their bits; one at least."""
     _, cholesky, colors = (torch.from_numpy(t) for t in numbers(field))
-    energy = math.pi * colors.square().sum(-1) * cholesky[:, 0] * cholesky[:, 2]
+    area = (math.pi * cholesky[:, 0] * cholesky[:, 2]).clamp_max(field.size[0] * field.size[1])
+    energy = colors.square().sum(-1) * area
     kept = energy >= _WORTH * quantizer.noise
     kept[energy.argmax()] = True
     return kept

@@ -92,7 +92,8 @@ class FineTuning:
         picture.backward(picture.detach() - self.image)
         (gx, gy), (g11, g21, g22) = self._gradient(x).unbind(-1), self._gradient(factors).unbind(-1)
         l11, l21, l22 = cholesky.unbind(-1)
-        area = math.pi * l11 * l22
+        height, width = self.field.size
+        area = (math.pi * l11 * l22).clamp_max(height * width)
         energy = (colors.square().sum(-1) * area).clamp_min(_FAINT)
         # half the second derivatives of the squared error, as the gradient is half the first
         frame = [

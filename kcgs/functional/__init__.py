@@ -21,6 +21,7 @@ from .polygons import polygon_coverage, polygon_labels
 from .regions import RegionMap, edge_band, lookup_regions
 from .splat import region_splat
 from .widths import BandGain, band_gain, choose_widths
+from .worth import merge_worthless
 
 __all__ = [
     "BandGain",
@@ -40,6 +41,7 @@ __all__ = [
     "ef_psnr",
     "ef_ssim",
     "lookup_regions",
+    "merge_worthless",
     "ms_ssim",
     "polygon_coverage",
     "polygon_labels",

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from kcgs.functional import merge_worthless
 from kcgs.segment.base import check_segment_image, register
 from kcgs.segment.cleanup import (
     absorb_specks,
@@ -19,7 +20,6 @@ from kcgs.segment.cleanup import (
     rgb_to_lab,
 )
 from kcgs.segment.contours import snap_contours
-from kcgs.segment.worth import merge_worthless
 
 # The smallest region as a share of the image: 600 pixels of 481 x 321. Below 250 x 250 pixels, where that is
 # less than a line across the image, it is the length of such a line.
@@ -77,7 +77,7 @@ def auto(image: Tensor, *, max_regions: int = 30, min_size: int | None = None) -
             best = _cut_out(best, _photo_regions(pixels, scale, min_size), min_size)
             if best.max() + 1 >= _FEWEST or _spread(pixels, best) < _FLAT:
                 break
-    worthy = merge_worthless(pixels, best) if best.max() > 0 else best
+    worthy = order_by_area(merge_worthless(pixels, best)) if best.max() > 0 else best
     return order_by_area(merge_similar(pixels, worthy, max_regions)).to(image.device)
 
 

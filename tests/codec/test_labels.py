@@ -70,7 +70,7 @@ class TestLossless:
     @pytest.mark.parametrize("regions", [2, 3, 16, 256])
     def test_noise_costs_little_more_than_its_bits(self, regions: int) -> None:
         labels = np.random.default_rng(1).integers(0, regions, (96, 96))
-        assert roundtrip(labels) < 1.06 * labels.size * np.ceil(np.log2(regions)) / 8 + 200
+        assert roundtrip(labels) < 1.001 * labels.size * np.log2(regions) / 8 + 3 * regions
 
     def test_thousands_of_regions(self) -> None:
         labels = np.arange(5000).reshape(50, 100)
@@ -100,11 +100,11 @@ class TestStream:
 
     def test_golden(self) -> None:
         data = encode_labels(shapes(7, (96, 128), 9) * 3)
-        assert (len(data), hashlib.sha256(data).hexdigest()[:16]) == (97, "84365dbbba2486aa")
+        assert (len(data), hashlib.sha256(data).hexdigest()[:16]) == (97, "9de774e00b30b698")
 
     def test_too_many_regions(self) -> None:
         data = encode_labels(shapes(0))
-        with pytest.raises(CodecError, match="at most 3 regions; got 6"):
+        with pytest.raises(CodecError, match="at most 3 regions; got 5"):
             decode_labels(data, 120, 160, max_regions=3)
 
     def test_broken_streams(self) -> None:
@@ -179,11 +179,11 @@ class TestEstimates:
 
     def test_smoothing_shrinks_the_stream(self) -> None:
         labels = shapes(1)
-        noise = np.random.default_rng(0).random(labels.shape) < 0.01
+        noise = np.random.default_rng(0).random(labels.shape) < 0.3
         ragged = np.where(noise, np.roll(labels, 1, axis=1), labels)
         smooth = smooth_labels(ragged, rate=0.3)
-        assert len(encode_labels(smooth)) < 0.8 * len(encode_labels(ragged))
-        assert (smooth != ragged).mean() < 0.03
+        assert len(encode_labels(smooth)) < 0.85 * len(encode_labels(ragged))
+        assert (smooth != ragged).mean() < 0.05
         assert np.array_equal(smooth, smooth_labels(ragged, rate=0.3))
 
     def test_regions_stay(self) -> None:

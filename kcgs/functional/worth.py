@@ -5,9 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcgs.functional import band_gain
-
-from .cleanup import order_by_area
+from .widths import band_gain
 
 # squared error, channels averaged, that a pixel of contour must save: what its bits save where Gaussians spend them
 PRICE = 0.003
@@ -30,7 +28,7 @@ def merge_worthless(image: Tensor, labels: Tensor, price: float = PRICE) -> Tens
         price: squared error that a pixel of contour must save, at least 0.
 
     Returns:
-        :math:`(H, W)` int64, ids 0 to R - 1 by decreasing area; one region where no contour is worth it.
+        :math:`(H, W)` int64; united regions have the id of one of them; one region where no contour is worth it.
 
     Raises:
         TypeError, ValueError: as :func:`kcgs.functional.band_gain`; a negative price.
@@ -40,10 +38,11 @@ def merge_worthless(image: Tensor, labels: Tensor, price: float = PRICE) -> Tens
         >>> image[:, :, 16:] = 1.0
         >>> labels = (torch.arange(48) // 16).expand(32, 48)
         >>> merge_worthless(image, labels)[0, ::16].tolist()
-        [1, 0, 0]
+        [0, 1, 1]
     """
     if not price >= 0.0:
         raise ValueError(f"price must be at least 0; got {price!r}")
+    ids, labels = torch.unique(labels, return_inverse=True)
     for _ in range(_ROUNDS):
         gains = band_gain(image, labels)
         worth = {pair: _BAND * (gain.smooth - gain.soft) for pair, gain in gains.items()}
@@ -58,4 +57,4 @@ def merge_worthless(image: Tensor, labels: Tensor, price: float = PRICE) -> Tens
                 into[b] = a
                 taken |= {a, b}
         labels = into[labels]
-    return order_by_area(labels)
+    return ids[labels].long()

@@ -1,0 +1,114 @@
+"""Compressed files from the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from kcgs import save
+from kcgs.cli import app
+from kcgs.codec import decode
+from kcgs.data import load_image, save_image
+from tests.codec.conftest import make_scene
+
+runner = CliRunner()
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    field, regions = make_scene(120, (48, 64))
+    save(tmp_path / "scene.safetensors", field, regions)
+    return tmp_path / "scene.safetensors"
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    across = torch.linspace(0, 1, 64).expand(3, 48, 64).clone()
+    across[:, 10:30, 20:40] = 0.9
+    save_image(tmp_path / "photo.png", across)
+    return tmp_path / "photo.png"
+
+
+def run(*arguments: object, code: int = 0) -> str:
+    result = runner.invoke(app, [str(a) for a in arguments])
+    assert result.exit_code == code, result.output
+    return result.stdout
+
+
+class TestEncode:
+    def test_goals(self, scene: Path, tmp_path: Path) -> None:
+        out = tmp_path / "a.kcgs"
+        report = json.loads(run("encode", scene, "-o", out, "--target-bytes", 800, "--json"))
+        assert report["bytes"] == out.stat().st_size <= 800 and report["regions"] == 3
+        finer = json.loads(run("encode", scene, "-o", out, "--quality", 60, "--json"))
+        assert finer["bytes"] > report["bytes"]
+        assert report["bits_per_pixel"] == pytest.approx(8 * report["bytes"] / (48 * 64))
+
+    def test_with_the_image(self, scene: Path, photo: Path, tmp_path: Path) -> None:
+        run("encode", scene, "-o", tmp_path / "a.kcgs", "--target-bytes", 700, "--image", photo)
+        assert (tmp_path / "a.kcgs").stat().st_size <= 700
+
+    def test_nothing_is_written_on_failure(self, scene: Path, tmp_path: Path) -> None:
+        result = runner.invoke(app, ["encode", str(scene), "-o", str(tmp_path / "a.kcgs"), "--target-bytes", "9"])
+        assert result.exit_code == 1 and "target_bytes must be at least" in str(result.exception)
+        assert not (tmp_path / "a.kcgs").exists()
+
+
+class TestDecode:
+    def test_picture_and_its_beginning(self, scene: Path, tmp_path: Path) -> None:
+        file, whole, part = tmp_path / "a.kcgs", tmp_path / "a.png", tmp_path / "b.png"
+        run("encode", scene, "-o", file)
+        run("decode", file, "-o", whole)
+        half = len(file.read_bytes()) // 2
+        result = runner.invoke(app, ["decode", str(file), "-o", str(part), "--bytes", str(half)])
+        assert result.exit_code == 0 and "a coarser picture" in result.stderr
+        assert load_image(whole).shape == load_image(part).shape == (3, 48, 64)
+        assert not torch.equal(load_image(whole), load_image(part))
+
+    def test_enlarged(self, scene: Path, tmp_path: Path) -> None:
+        run("encode", scene, "-o", tmp_path / "a.kcgs")
+        run("decode", tmp_path / "a.kcgs", "-o", tmp_path / "a.png", "--scale", 2)
+        assert load_image(tmp_path / "a.png").shape == (3, 96, 128)
+
+    def test_damage(self, tmp_path: Path) -> None:
+        (tmp_path / "a.kcgs").write_bytes(b"kcgs\1 and so on")
+        result = runner.invoke(app, ["decode", str(tmp_path / "a.kcgs"), "-o", str(tmp_path / "a.png")])
+        assert result.exit_code == 1 and "cannot decode" in str(result.exception)
+        assert not (tmp_path / "a.png").exists()
+
+
+class TestOtherCommands:
+    def test_take_a_file(self, scene: Path, photo: Path, tmp_path: Path) -> None:
+        file = tmp_path / "a.kcgs"
+        run("encode", scene, "-o", file)
+        held = json.loads(run("info", file, "--json"))
+        assert held["num_gaussians"] == len(decode(file.read_bytes()).field) and held["regions"] == 3
+        assert held["bytes"] == file.stat().st_size
+        run("render", file, "-o", tmp_path / "a.png")
+        assert "psnr" in json.loads(run("eval", file, photo, "--json"))
+        run("export", file, "-o", tmp_path / "a.onnx")
+        assert (tmp_path / "a.onnx").stat().st_size > 1000
+
+
+class TestFit:
+    def test_to_a_budget(self, photo: Path, tmp_path: Path) -> None:
+        file = tmp_path / "a.kcgs"
+        report = json.loads(
+            run("fit", photo, "--regions", "none", "--iterations", 60, "--target-bytes", 400, "-o", file, "--json")
+        )
+        assert report["bytes"] == file.stat().st_size <= 400
+        assert report["num_gaussians"] == len(decode(file.read_bytes()).field)
+
+    def test_to_a_file(self, photo: Path, tmp_path: Path) -> None:
+        file = tmp_path / "a.kcgs"
+        run("fit", photo, "--regions", "none", "--iterations", 60, "-n", 50, "-o", file)
+        assert 1 <= len(decode(file.read_bytes()).field) <= 50
+
+    def test_refusals(self, photo: Path, tmp_path: Path) -> None:
+        run("fit", photo, "-n", 50, "--target-bytes", 400, "-o", tmp_path / "a.kcgs", code=2)
+        result = runner.invoke(app, ["fit", str(photo), "--target-bytes", "400", "-o", str(tmp_path / "a.safetensors")])
+        assert result.exit_code == 1 and "--output must end in .kcgs" in str(result.exception)
