@@ -23,7 +23,7 @@ LAYERS = [
     {"nn"},
     {"functional"},
     {"kernels"},
-    {"_check", "_atomic"},
+    {"_check", "_atomic", "engine"},
 ]
 
 
@@ -48,6 +48,7 @@ def test_imports_are_light() -> None:
         "rich",
         "scipy",
         "constriction",
+        "ray",
         "skimage",
         "torchmetrics",
         "transformers",

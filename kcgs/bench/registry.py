@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
+from typing import Any
+
+from .fits import Place
 
 _EXPERIMENTS = ("demo", "render", "fit", "maps", "decode", "zoo")
 # those that have groups to choose from
 _GROUPED = ("fit", "decode", "zoo")
+# those whose fits may run side by side
+_PARALLEL = ("fit", "maps")
 
 
 def available_experiments() -> tuple[str, ...]:
@@ -15,7 +20,16 @@ def available_experiments() -> tuple[str, ...]:
     return _EXPERIMENTS
 
 
-def run(name: str, output: Path, *, data: Path | None = None, quick: bool = False, only: str | None = None) -> None:
+def run(
+    name: str,
+    output: Path,
+    *,
+    data: Path | None = None,
+    quick: bool = False,
+    only: str | None = None,
+    engine: str = "local",
+    workers: int | None = None,
+) -> None:
     """Run an experiment and write its report into the folder `output`, which is made if it is not there.
 
     Args:
@@ -24,15 +38,23 @@ def run(name: str, output: Path, *, data: Path | None = None, quick: bool = Fals
         data: folder with images, for the experiments that need it.
         quick: a short form of the same experiment.
         only: names of groups with commas between them, for the experiments that have groups; None: all.
+        engine: local or ray, for the experiments whose fits may run side by side.
+        workers: fits at a time; None: one locally, and on Ray what its processors allow.
 
     Raises:
-        ValueError: unknown name or group; `only` for an experiment without groups.
+        ValueError: unknown name or group; `only` for an experiment without groups, an engine or workers for one whose
+            fits run one after another.
         OSError: the folder cannot be made.
     """
     if name not in _EXPERIMENTS:
         raise ValueError(f"name must be one of {', '.join(_EXPERIMENTS)}; got {name!r}")
     if only is not None and name not in _GROUPED:
         raise ValueError(f"only is for experiments with groups ({', '.join(_GROUPED)}); got {only!r} for {name!r}")
+    place = Place(engine, workers)
+    if not place.is_here and name not in _PARALLEL:
+        raise ValueError(f"engine and workers are for {', '.join(_PARALLEL)}; {name!r} runs one after another")
     output.mkdir(parents=True, exist_ok=True)
-    choice = {} if only is None else {"only": only}
+    choice: dict[str, Any] = {} if only is None else {"only": only}
+    if name in _PARALLEL:
+        choice["place"] = place
     import_module(f"{__package__}.{name}").run(output, data=data, quick=quick, **choice)

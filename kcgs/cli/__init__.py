@@ -5,10 +5,10 @@ import sys
 
 import typer
 
-from . import commands, decoders, files, segmentation  # each puts its commands into `app`
+from . import batch, commands, decoders, files, segmentation  # each puts its commands into `app`
 from .common import app
 
-__all__ = ["app", "commands", "decoders", "files", "main", "segmentation"]
+__all__ = ["app", "batch", "commands", "decoders", "files", "main", "segmentation"]
 
 
 def main() -> None:

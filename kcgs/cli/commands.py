@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import math
-from enum import Enum
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from .common import IMAGES, Json, Progress, SceneFile, app, check_output, print_report
-from .fitting import fit_into
-from .segmentation import warn_if_misaligned
+from .fitting import fit_into, measure_scene, read_regions
+from .options import (
+    DEFAULT_GAUSSIANS,
+    Backend,
+    Engine,
+    EngineName,
+    Gaussians,
+    Iterations,
+    KeepContours,
+    KernelName,
+    MaxSeconds,
+    Recipe,
+    Seed,
+    TargetPsnr,
+    make_config,
+)
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from kcgs.functional import RegionMap
-
-
-class Backend(str, Enum):
-    """Kernels that can be named."""
-
-    auto = "auto"
-    reference = "reference"
-    tiled = "tiled"
-    cpu = "cpu"
-    cuda = "cuda"
 
 
 ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE")]
@@ -39,21 +41,17 @@ def fit_command(
         str,
         typer.Option(metavar="MASK|auto|none", help="Label-map file, or auto (segment the image), or none."),
     ] = "auto",
-    num_gaussians: Annotated[
-        int | None, typer.Option("-n", "--num-gaussians", min=1, help="Number of Gaussians; default: 1000.")
-    ] = None,
-    recipe: Annotated[str, typer.Option(help="Recipe by name.")] = "best",
-    iterations: Annotated[int | None, typer.Option(min=1, help="Default: the recipe's.")] = None,
-    max_seconds: Annotated[float | None, typer.Option(help="The best picture in this wall time.")] = None,
-    target_psnr: Annotated[
-        float | None, typer.Option(help="As few Gaussians as reach this PSNR in dB, at most --num-gaussians.")
-    ] = None,
+    num_gaussians: Gaussians = None,
+    recipe: Recipe = "best",
+    iterations: Iterations = None,
+    max_seconds: MaxSeconds = None,
+    target_psnr: TargetPsnr = None,
     target_bytes: Annotated[
         int | None, typer.Option(min=1, help="The best .kcgs file that is not larger; chooses the number of Gaussians.")
     ] = None,
-    keep_contours: Annotated[bool, typer.Option("--keep-contours", help="Take the label map as exact.")] = False,
-    seed: Annotated[int, typer.Option(help="Seed of the random start.")] = 0,
-    backend: Annotated[Backend, typer.Option(help="Kernel.")] = Backend.auto,
+    keep_contours: KeepContours = False,
+    seed: Seed = 0,
+    backend: KernelName = Backend.auto,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", help="Scene (.safetensors) or file (.kcgs); default: IMAGE's name, here."),
@@ -65,7 +63,6 @@ def fit_command(
 ) -> None:
     """Fit Gaussians to an image and save the scene."""
     from kcgs.data import load_image
-    from kcgs.fit import FitConfig
 
     suffixes = (".safetensors", ".kcgs") if target_bytes is None else (".kcgs",)
     output = Path(f"{image.stem}{suffixes[0]}") if output is None else output
@@ -78,19 +75,13 @@ def fit_command(
         check_output(plot, ".png", option="--plot")
     if resume and checkpoint is None:
         raise typer.BadParameter("--resume needs --checkpoint")
-    settings: dict[str, Any] = {"iterations": iterations, "max_seconds": max_seconds, "target_psnr": target_psnr}
-    if keep_contours:
-        settings |= {"refine": False, "release": False}
-    elif regions == "auto":
-        # nobody gave these contours, so none are to be kept near
-        free = FitConfig.from_recipe("best-refined")
-        settings |= {"max_move": free.max_move, "contour_rise": free.contour_rise}
-    config = FitConfig.from_recipe(
-        recipe, backend=backend.value, **{k: v for k, v in settings.items() if v is not None}
-    )
+    config = make_config(
+        recipe, regions, iterations=iterations, max_seconds=max_seconds, target_psnr=target_psnr,
+        keep_contours=keep_contours, backend=backend,
+    )  # fmt: skip
     picture = load_image(image)
-    labels = _read_regions(regions, picture)
-    count = 1000 if num_gaussians is None else num_gaussians
+    labels = read_regions(regions, picture, partial(typer.echo, err=True))
+    count = DEFAULT_GAUSSIANS if num_gaussians is None else num_gaussians
     with Progress(config.iterations, config.max_seconds) as progress:
         fitted = fit_into(
             output, picture, labels, count, target_bytes,
@@ -104,7 +95,7 @@ def fit_command(
     if progress.interrupted:
         typer.echo(f"interrupted: saved the best so far to {output}", err=True)
     seconds = result.history[-1].seconds
-    report = _measure(fitted.field, fitted.regions, picture, labels, seconds, fitted.written)
+    report = measure_scene(fitted.field, fitted.regions, picture, labels, seconds, fitted.written)
     title = f"{output}: {len(fitted.field)} Gaussians, stopped by {result.stop_reason}"
     if result.removed:
         title += f"; {result.removed} useless ones removed, which changed no value by more than {result.change:.1g}"
@@ -157,7 +148,7 @@ def eval_command(
     labels = loaded.regions.labels if loaded.regions is not None else None
     if regions is not None:
         labels = load_labels(Path(regions))
-    report = _measure(loaded.field, loaded.regions, picture, labels, None, scene.stat().st_size)
+    report = measure_scene(loaded.field, loaded.regions, picture, labels, None, scene.stat().st_size)
     print_report(report, as_json, str(scene))
 
 
@@ -190,25 +181,15 @@ def bench(
     data: Annotated[Path | None, typer.Option(help="Folder with images, where the experiment needs them.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A short form of the same.")] = False,
     only: Annotated[str | None, typer.Option(help="Parts to run, with commas between, where it has parts.")] = None,
+    engine: EngineName = Engine.local,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Fits at a time, in fit and maps; those that are timed run alone.")
+    ] = None,
 ) -> None:
     """Run an experiment and write its report."""
     from kcgs.bench import run
 
-    run(name, output, data=data, quick=quick, only=only)
-
-
-def _read_regions(regions: str, picture: Tensor) -> Tensor | None:
-    if regions == "none":
-        return None
-    if regions == "auto":
-        from kcgs.segment import segment as make_labels
-
-        return make_labels(picture)
-    from kcgs.data import load_labels
-
-    labels = load_labels(Path(regions))
-    warn_if_misaligned(picture, labels, regions)
-    return labels
+    run(name, output, data=data, quick=quick, only=only, engine=engine.value, workers=workers)
 
 
 def _mean_softness(regions: RegionMap) -> float:
@@ -229,29 +210,3 @@ def target_size(size: tuple[int, int], scale: float | None, wanted: str | None) 
         raise typer.BadParameter(f"--scale must be positive; got {scale!r}")
     factor = 1.0 if scale is None else scale
     return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
-
-
-def _measure(
-    field: Any,
-    regions: RegionMap | None,
-    picture: Tensor,
-    labels: Tensor | None,
-    seconds: float | None,
-    written: int,
-) -> dict[str, Any]:
-    import time
-
-    from kcgs.bench.measure import measure
-    from kcgs.nn.renderer import render_image
-
-    start = time.perf_counter()
-    drawn = render_image(field, regions)
-    seconds = time.perf_counter() - start if seconds is None else seconds
-    height, width = field.size
-    return {
-        **measure(drawn, picture, labels),
-        "num_gaussians": len(field),
-        "seconds": seconds,
-        "bytes": written,
-        "bits_per_pixel": 8 * written / (height * width),
-    }

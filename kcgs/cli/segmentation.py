@@ -81,19 +81,19 @@ def segment(
     _print_table(rows)
 
 
-def warn_if_misaligned(picture: Tensor, labels: Tensor, name: str) -> None:
-    """Say on standard error that a map's contours lie beside the image's edges, with the figure, where they do."""
+def misalignment(picture: Tensor, labels: Tensor, name: str) -> str | None:
+    """Say that a map's contours lie beside the image's edges, with the figure, where they do; None: they do not."""
     from kcgs.functional import edge_alignment
 
     if labels.shape != picture.shape[1:]:
-        return  # the fit says so
+        return None  # the fit says so
     figure = float(edge_alignment(picture, labels))
-    if figure < _ALIGNED:
-        typer.echo(
-            f"warning: the contours of {name} hardly follow the image's edges: alignment {figure:.2f}, where chance "
-            "gives 0.50 and good masks 0.63 or more; does the mask belong to this image?",
-            err=True,
-        )
+    if figure >= _ALIGNED:
+        return None
+    return (
+        f"warning: the contours of {name} hardly follow the image's edges: alignment {figure:.2f}, where chance "
+        "gives 0.50 and good masks 0.63 or more; does the mask belong to this image?"
+    )
 
 
 def _parse_options(pairs: list[str]) -> dict[str, Any]:

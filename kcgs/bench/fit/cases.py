@@ -54,6 +54,8 @@ GROUPS: dict[str, str | None] = {
     "kodak": "kodak",
     "astronaut": None,
 }
+# groups whose seconds are held against each other: nothing else may run meanwhile
+TIMED = ("paper", "time")
 # the recipe of a group that a baseline at equal bytes is made for
 COMPARED = {"davis": BEST, "bsds": REFINED, "astronaut": BEST}
 

@@ -1,20 +1,24 @@
-"""The fits, one after the other, and what becomes of them."""
+"""The fits, and what becomes of them."""
 
 from __future__ import annotations
 
 import csv
 import dataclasses
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 from kcgs._atomic import atomic_path
+from kcgs.bench.fits import HERE, Place, check_made, make_all
 
-from .cases import GROUPS, Case, cases, missing
+from .cases import GROUPS, TIMED, Case, cases, missing
 from .report import write
 from .runs import Run, Store, equal_bytes, perform
 
 
-def run(output: Path, *, data: Path | None = None, quick: bool = False, only: str | None = None) -> None:
+def run(
+    output: Path, *, data: Path | None = None, quick: bool = False, only: str | None = None, place: Place = HERE
+) -> None:
     """Race the recipes; write results.csv, report.md and figures.
 
     Every finished fit is kept in `output`/runs, so that the same call goes on where an earlier one was interrupted;
@@ -25,34 +29,42 @@ def run(output: Path, *, data: Path | None = None, quick: bool = False, only: st
         data: folder with DAVIS, bsds and kodak in it; None: the charts and one photo are all there is.
         quick: one picture for each group, half as large, and few iterations.
         only: names of groups with commas between them; None: all that can be run.
+        place: where the fits are made; those of the groups `TIMED` are made one after another in this process.
 
     Raises:
         ValueError: `only` names no group, or one whose pictures are missing.
+        RuntimeError: fits failed; the others are kept, and in the report.
     """
     from rich.console import Console
-    from rich.progress import Progress
 
     chosen = _choose(only, data)
-    store = Store(output / "runs")
+    store = Store(output.absolute() / "runs")
+    data = None if data is None else data.absolute()
     waiting = [case for group in chosen for case in cases(group, data, quick)]
     for case in waiting:
         case.config()  # read before hours of work: a recipe may be wrong, or edited meanwhile
-    console = Console(stderr=True)
+    failed: list[str] = []
     try:
-        with Progress(console=console, disable=not console.is_terminal) as progress:
-            task = progress.add_task("", total=len(waiting))
-
-            def obtain(case: Case) -> Run:
-                progress.update(task, description=f"{case.group}: {case.image}, N = {case.n:,}, {case.name}")
-                return store.read(case) or _perform(store, case, data)
-
-            for case in waiting:
-                for _ in _with_equal_bytes(case, obtain):
-                    pass
-                progress.advance(task)
+        for timed in (False, True):
+            here = HERE if timed else place
+            part = [case for case in waiting if (case.group in TIMED) == timed]
+            failed += _obtain(store, part, data, here)
+            rivals = [equal_bytes(case, made) for case in part if (made := store.read(case)) is not None]
+            failed += _obtain(store, [rival for rival in rivals if rival is not None], data, here)
     finally:
-        _report(output, store, data, quick, chosen)
+        _report(output, store, data, quick, chosen, place)
+    check_made(failed)
     Console().print(f"{output}/report.md")
+
+
+def _obtain(store: Store, wanted: list[Case], data: Path | None, place: Place) -> list[str]:
+    # by key, for a case holds a dict: the baseline at equal bytes may be that of two recipes
+    missing = {case.key(): case for case in wanted if store.read(case) is None}
+
+    def name(case: Case) -> str:
+        return f"{case.group}: {case.image}, N = {case.n:,}, {case.name}"
+
+    return make_all(partial(_perform, store, data), list(missing.values()), place, name=name)
 
 
 def _choose(only: str | None, data: Path | None) -> list[str]:
@@ -68,10 +80,8 @@ def _choose(only: str | None, data: Path | None) -> list[str]:
     return [group for group in GROUPS if group in names]
 
 
-def _perform(store: Store, case: Case, data: Path | None) -> Run:
-    made = perform(case, data)
-    store.write(case, made)
-    return made
+def _perform(store: Store, data: Path | None, case: Case) -> None:
+    store.write(case, perform(case, data))
 
 
 def _with_equal_bytes(case: Case, obtain: Callable[[Case], Run | None]) -> Iterator[tuple[Case, Run]]:
@@ -86,7 +96,7 @@ def _with_equal_bytes(case: Case, obtain: Callable[[Case], Run | None]) -> Itera
         yield other, rival
 
 
-def _report(output: Path, store: Store, data: Path | None, quick: bool, chosen: list[str]) -> None:
+def _report(output: Path, store: Store, data: Path | None, quick: bool, chosen: list[str], place: Place) -> None:
     runs: dict[str, Run] = {}  # by key: the baseline at equal bytes may be that of two recipes
     notes = []
     for group in GROUPS:
@@ -102,7 +112,7 @@ def _report(output: Path, store: Store, data: Path | None, quick: bool, chosen: 
             why = "stopped before its end" if group in chosen else "not chosen"
             notes.append(f"{group}: {why}, {count} of {len(wanted)} fits are there.")
     _write_csv(output / "results.csv", list(runs.values()))
-    write(output, list(runs.values()), notes, quick)
+    write(output, list(runs.values()), notes, quick, place)
 
 
 def _write_csv(path: Path, runs: list[Run]) -> None:

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-import torch
-
 from kcgs._atomic import atomic_path
+from kcgs.bench.fits import HERE, Place
 from kcgs.bench.machine import describe
 
 from . import tables
+from .cases import TIMED
 from .compare import Runs
 from .figures import plot_differences, plot_time
 from .runs import Run
 
-_INTRODUCTION = """Every recipe runs on the same kernel, in the same process, from the same pictures, with seed 0. PSNR
+_INTRODUCTION = """Every recipe runs on the same kernel, from the same pictures, with seed 0. PSNR
 and EF-PSNR are in dB; EF-PSNR is taken within 5 pixels of the contours of the map that was given, whichever map the
 scene stores in the end. Seconds are wall time of the whole fit, compilation excluded. `best-baseline` is `best` with
 the regions off; `best --keep-contours` draws with the map as given; in `best` contours may move a little, in
@@ -40,7 +40,7 @@ prototype is the script that the recipe was found with; the mean of its column a
 it has."""
 
 
-def write(output: Path, made: Iterable[Run], notes: list[str], quick: bool) -> None:
+def write(output: Path, made: Iterable[Run], notes: list[str], quick: bool, place: Place = HERE) -> None:
     """Write report.md and its figures into the folder.
 
     Args:
@@ -48,10 +48,11 @@ def write(output: Path, made: Iterable[Run], notes: list[str], quick: bool) -> N
         made: all that is there.
         notes: what was left out, a sentence each.
         quick: whether it is the short form.
+        place: where fits that were missing were made.
     """
     runs = Runs(made)
     parts = ["# Fitting: quality, bytes, time", f"Made by `kcgs bench fit{' --quick' if quick else ''}`."]
-    parts.append("\n".join(f"- {line}" for line in [*describe(), f"Threads: {torch.get_num_threads()}"]))
+    parts.append("\n".join(f"- {line}" for line in [*describe(), _where(place)]))
     if quick:
         parts.append("The short form, small pictures and few iterations: the numbers only show that all of it runs.")
     parts.append(_INTRODUCTION)
@@ -72,6 +73,12 @@ def write(output: Path, made: Iterable[Run], notes: list[str], quick: bool) -> N
             parts += [f"## {title}", text, table(runs)]
     with atomic_path(output / "report.md") as temporary:
         temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+
+
+def _where(place: Place) -> str:
+    if place.is_here:
+        return f"Fits: {place}"
+    return f"Fits: {place}, except that those of {' and '.join(TIMED)} run one after another: {HERE}"
 
 
 def _time_figure(runs: Runs, output: Path) -> list[str]:

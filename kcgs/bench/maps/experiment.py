@@ -1,4 +1,4 @@
-"""The fits, one after the other, and what becomes of them."""
+"""The fits, and what becomes of them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from kcgs._atomic import atomic_path
+from kcgs.bench.fits import HERE, Place, check_made, make_all
 
 from .report import write
 from .trials import Result, Scenes, Trial, plan
@@ -14,47 +15,43 @@ from .trials import Result, Scenes, Trial, plan
 _GAINS = ("gain", "ef_gain", "equal_gain", "equal_ef_gain")
 
 
-def run(output: Path, *, data: Path | None = None, quick: bool = False) -> None:
+def run(output: Path, *, data: Path | None = None, quick: bool = False, place: Place = HERE) -> None:
     """Fit with automatic maps and without; write results.csv, report.md and gains.png.
 
     Every finished fit is kept in `output`/runs as a scene, so that the same call goes on where an earlier one was
-    interrupted. Remove the folder to measure changed code anew.
+    interrupted. Remove the folder to measure changed code anew. No fit's seconds are held against another's, so that
+    they may run side by side; the report says where they ran.
 
     Args:
         output: folder.
         data: folder with bsds in it; None: one photo is all there is.
         quick: two pictures, half as large, and few iterations.
+        place: where the fits are made.
 
     Raises:
         ValueError: there are no pictures in the data.
+        RuntimeError: fits failed; the others are kept, and in the report.
     """
-    from rich.console import Console
-    from rich.progress import Progress
-
     trials = plan(data, quick)
-    scenes = Scenes(output / "runs", data)
-    console = Console(stderr=True)
+    scenes = Scenes(output.absolute() / "runs", None if data is None else data.absolute())
     try:
-        with Progress(console=console, disable=not console.is_terminal) as progress:
-            task = progress.add_task("", total=len(trials))
-
-            def obtain(trial: Trial) -> None:
-                progress.update(task, description=f"{trial.image}, N = {trial.n:,}, map: {trial.source}")
-                if not scenes.has(trial):
-                    scenes.make(trial)
-
-            for trial in trials:
-                obtain(trial.baseline())
-                obtain(trial)
-                rival = scenes.equal_bytes(trial)
-                if rival is not None:
-                    obtain(rival)
-                progress.advance(task)
+        # a picture's baseline before its maps, so that what is there when somebody interrupts can be compared
+        failed = _obtain(scenes, [t for trial in trials for t in (trial.baseline(), trial)], place)
+        rivals = [scenes.equal_bytes(trial) for trial in trials if scenes.has(trial)]
+        failed += _obtain(scenes, [rival for rival in rivals if rival is not None], place)
     finally:
         results = [result for trial in trials if (result := scenes.result(trial)) is not None]
         _write_csv(output / "results.csv", results)
-        write(output, results, planned=len(trials), quick=quick)
+        write(output, results, planned=len(trials), quick=quick, place=place)
+    check_made(failed)
+    from rich.console import Console
+
     Console().print(f"{output}/report.md")
+
+
+def _obtain(scenes: Scenes, trials: list[Trial], place: Place) -> list[str]:
+    missing = [trial for trial in dict.fromkeys(trials) if not scenes.has(trial)]
+    return make_all(scenes.make, missing, place, name=lambda t: f"{t.image}, N = {t.n:,}, map: {t.source}")
 
 
 def _write_csv(path: Path, results: Sequence[Result]) -> None:

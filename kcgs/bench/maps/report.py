@@ -6,10 +6,9 @@ import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-
 from kcgs._atomic import atomic_path
 from kcgs.bench.cells import count, db, markdown, seconds, signed
+from kcgs.bench.fits import HERE, Place
 from kcgs.bench.machine import describe
 from kcgs.bench.sizes import GAUSSIAN_BYTES
 
@@ -37,7 +36,7 @@ _BOUNDS_TEXT = "What automatic maps (`auto`) are held to, over all images."
 _QUICK_TEXT = "The short form, small pictures and few iterations: the numbers only show that all of it runs."
 
 
-def write(output: Path, results: Sequence[Result], *, planned: int, quick: bool) -> None:
+def write(output: Path, results: Sequence[Result], *, planned: int, quick: bool, place: Place = HERE) -> None:
     """Write report.md and its figure into the folder.
 
     Args:
@@ -45,9 +44,10 @@ def write(output: Path, results: Sequence[Result], *, planned: int, quick: bool)
         results: all that is there.
         planned: how many there should be.
         quick: whether it is the short form.
+        place: where fits that were missing were made.
     """
     parts = ["# Label maps found in the picture", f"Made by `kcgs bench maps{' --quick' if quick else ''}`."]
-    parts.append("\n".join(f"- {line}" for line in [*describe(), f"Threads: {torch.get_num_threads()}"]))
+    parts.append("\n".join(f"- {line}" for line in [*describe(), f"Fits: {place}"]))
     if quick:
         parts.append(_QUICK_TEXT)
     if len(results) < planned:

@@ -1,0 +1,133 @@
+"""What `kcgs fit-many` does with one image, in whichever process that happens."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+import warnings
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from .fitting import fit_into, measure_scene, read_regions
+
+if TYPE_CHECKING:
+    from kcgs.fit import FitConfig
+
+# of the note in a scene that says what it was made from
+_NOTE = "fit"
+
+
+class Order(NamedTuple):
+    """An image to be fitted, and how."""
+
+    image: Path
+    output: Path
+    regions: str
+    """auto, none, or where the masks are."""
+    masks: tuple[Path, ...]
+    """The files there that have the image's stem, one where all is well."""
+    num_gaussians: int
+    recipe: str
+    config: FitConfig
+    seed: int
+    known: str
+    """Which fit the table has figures of."""
+
+
+class Outcome(NamedTuple):
+    """What the table gets."""
+
+    fit: str
+    """Hash of the image, the mask and all settings."""
+    figures: dict[str, float] | None
+    """None: the scene was there, and its figures are in the table."""
+    core_seconds: float
+    """Processor time of all that was done for the image, in all threads; NaN: nothing was fitted."""
+    warnings: tuple[str, ...]
+
+
+def fit_one(order: Order) -> Outcome:
+    """Fit an image and write its scene, unless it is there from the same image and settings."""
+    _warm_up(order.config, order.regions == "auto")
+    # not wall time, which also counts what the machine does for others
+    start = time.process_time()
+    fit = _fingerprint(order)
+    is_there = _made_from(order.output) == fit
+    if is_there and order.known == fit:
+        return Outcome(fit, None, math.nan, ())
+    # a warning of one image among many must say which image: the caller does
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        figures = _figures(order) if is_there else _fit(order, fit)
+    core_seconds = math.nan if is_there else time.process_time() - start
+    said = tuple(str(warning.message) for warning in caught if issubclass(warning.category, UserWarning))
+    return Outcome(fit, figures, core_seconds, said)
+
+
+def _fit(order: Order, fit: str) -> dict[str, float]:
+    from kcgs.data import load_image
+
+    picture = load_image(order.image)
+    labels = read_regions(_source(order), picture, warnings.warn)
+    fitted = fit_into(
+        order.output, picture, labels, order.num_gaussians, None,
+        recipe=order.recipe, seed=order.seed, config=order.config,
+        on_step=None, checkpoint=None, resume=False, notes={_NOTE: fit},
+    )  # fmt: skip
+    seconds = fitted.result.history[-1].seconds
+    return measure_scene(fitted.field, fitted.regions, picture, labels, seconds, fitted.written)
+
+
+def _figures(order: Order) -> dict[str, float]:
+    """Measure a scene whose figures were lost with the process that should have written them."""
+    from kcgs.data import load_image
+    from kcgs.io import load
+
+    picture, scene = load_image(order.image), load(order.output)
+    labels = read_regions(_source(order), picture, warnings.warn)
+    return measure_scene(scene.field, scene.regions, picture, labels, math.nan, order.output.stat().st_size)
+
+
+def _source(order: Order) -> str:
+    if order.regions in ("auto", "none"):
+        return order.regions
+    if len(order.masks) != 1:
+        found = ", ".join(path.name for path in order.masks) or "none"
+        raise ValueError(f"{order.regions} must hold one mask {order.image.stem}.*; found {found}")
+    return str(order.masks[0])
+
+
+def _fingerprint(order: Order) -> str:
+    settings = f"{order.config.model_dump_json()} {order.num_gaussians} {order.seed}"
+    source = _source(order)
+    digest = hashlib.sha256(settings.encode())
+    digest.update(order.image.read_bytes())
+    digest.update(Path(source).read_bytes() if order.masks else source.encode())
+    return digest.hexdigest()[:20]
+
+
+def _made_from(scene: Path) -> str | None:
+    from kcgs.io import load
+
+    try:
+        return load(scene).metadata.get(_NOTE)
+    except (FileNotFoundError, ValueError):
+        return None
+
+
+@lru_cache(maxsize=4)
+def _warm_up(config: FitConfig, segments: bool) -> None:
+    """Load and compile what a worker needs once: no image's cost shall count it."""
+    import torch
+
+    from kcgs.bench.fit.runs import warm_up
+    from kcgs.nn import GaussianField
+
+    warm_up(config)
+    # as large as MS-SSIM needs
+    ramp = torch.linspace(0.0, 1.0, 192).expand(3, 192, 192)
+    picture = torch.where(ramp > 0.4, 0.2 * ramp, 0.5 + 0.5 * ramp)
+    labels = read_regions("auto" if segments else "none", picture, warnings.warn)
+    measure_scene(GaussianField.random(8, (192, 192), seed=0), None, picture, labels, None, 0)

@@ -1,0 +1,83 @@
+"""The one function that callers use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from functools import partial
+from typing import TypeVar
+
+from .jobs import Done, perform
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+ENGINES = ("local", "ray")
+
+
+def run_jobs(
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    *,
+    engine: str = "local",
+    workers: int | None = None,
+    threads: int | None = None,
+    on_done: Callable[[Done[Result]], None] | None = None,
+) -> Iterator[Done[Result]]:
+    """Do independent jobs, and hand over each as it ends.
+
+    Convention: a job that raises, or whose worker process is killed, takes no other with it. A killed worker is
+    replaced and its job tried once more. Every job runs on `threads` threads, so that it has the same result on either
+    engine. With more than one worker, and on Ray, functions, jobs and results are pickled, and a script must guard its
+    main part by ``if __name__ == "__main__":``. Leaving the iterator early stops the jobs that run.
+
+    Args:
+        function: called with one job; importable by name where there are worker processes.
+        jobs: what it is called with.
+        engine: ``local``, or ``ray``: on the cluster at RAY_ADDRESS, or one on this machine that is shut down again.
+        workers: jobs at a time. None: 1 locally, on Ray what its processors allow. With 1, ``local`` is this process.
+        threads: of each job; None: 1.
+        on_done: called with each job that has ended, before it is handed over.
+
+    Returns:
+        An iterator over all jobs in the order in which they end; nothing runs before the first is asked for.
+
+    Raises:
+        ValueError: unknown engine, workers or threads below 1.
+        ImportError: engine ``ray`` without the package ray.
+
+    Example:
+        >>> [done.result for done in run_jobs(str.upper, ["a", "b"])]
+        ['A', 'B']
+        >>> [str(done.error) for done in run_jobs(int, ["7", "seven"])]
+        ['None', "ValueError: invalid literal for int() with base 10: 'seven'"]
+    """
+    if engine not in ENGINES:
+        raise ValueError(f"engine must be one of {', '.join(ENGINES)}; got {engine!r}")
+    for name, value in (("workers", workers), ("threads", threads)):
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be at least 1; got {value}")
+    threads = 1 if threads is None else threads
+    if engine == "ray":
+        from . import cluster
+
+        cluster.load()  # at once, not after the caller's preparations
+        return _hand_over(cluster.run(function, jobs, workers, threads), on_done)
+    if workers is None or workers == 1:
+        return _hand_over(_one_after_another(function, jobs, threads), on_done)
+    from . import pool
+
+    return _hand_over(pool.run(function, jobs, workers, threads), on_done)
+
+
+def _one_after_another(function: Callable[[Job], Result], jobs: Sequence[Job], threads: int) -> Iterator[Done[Result]]:
+    for index, job in enumerate(jobs):
+        yield perform(index, partial(function, job), threads)
+
+
+def _hand_over(found: Iterator[Done[Result]], on_done: Callable[[Done[Result]], None] | None) -> Iterator[Done[Result]]:
+    with closing(found):  # type: ignore[type-var]  # all three are generators
+        for done in found:
+            if on_done is not None:
+                on_done(done)
+            yield done

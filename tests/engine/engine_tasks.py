@@ -1,0 +1,57 @@
+"""Jobs that the tests of the engines run; a module of its own, which worker processes can import by name."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+
+class Task(NamedTuple):
+    number: int
+    folder: Path
+
+
+def fail_at_one(task: Task) -> int:
+    if task.number == 1:
+        raise ValueError(f"no {task.number}\nplease")
+    return 2 * task.number
+
+
+def misbehave(task: Task) -> object:
+    """Write down each attempt; kill the worker, or stump it, as the number says."""
+    mark = task.folder / str(task.number)
+    first = not mark.exists()
+    with mark.open("a") as file:
+        file.write("x")
+    if task.number == 1 or (task.number == 2 and first):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return (lambda: 1) if task.number == 3 else 2 * task.number
+
+
+def process_and_threads(task: Task) -> tuple[int, int]:
+    time.sleep(0.05)
+    return os.getpid(), torch.get_num_threads()
+
+
+def slow_then_mark(task: Task) -> None:
+    if task.number:
+        time.sleep(60)
+        (task.folder / "finished").touch()
+
+
+def fitted_bytes(task: Task) -> bytes:
+    """Fit a small picture; a kernel that runs on several threads, and recipes that draw at random, must agree."""
+    from kcgs import FitConfig, fit, save
+
+    ramp = torch.linspace(0.0, 1.0, 96)
+    image = torch.stack([ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96), ramp.flip(0).expand(64, 96)])
+    labels = (ramp > 0.3 + 0.1 * task.number).long().expand(64, 96).contiguous()
+    result = fit(image, labels, 40, config=FitConfig.from_recipe("best", iterations=10), seed=task.number)
+    path = task.folder / f"{os.getpid()}-{task.number}.safetensors"
+    save(path, result.field, result.regions)
+    return path.read_bytes()

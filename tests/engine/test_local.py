@@ -1,0 +1,125 @@
+"""Jobs in this process, and in worker processes of this machine."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from kcgs.engine import Done, run_jobs
+
+
+def function(name: str) -> Callable[[Any], Any]:
+    return getattr(import_module("engine_tasks"), name)
+
+
+def tasks(count: int, folder: Path) -> list[Any]:
+    return [import_module("engine_tasks").Task(number, folder) for number in range(count)]
+
+
+def by_index(found: list[Done[Any]]) -> list[Done[Any]]:
+    assert sorted(done.index for done in found) == list(range(len(found)))  # each job once
+    return sorted(found, key=lambda done: done.index)
+
+
+@pytest.mark.parametrize("workers", [None, 1, 2])
+class TestBoth:
+    def test_results_and_a_job_that_raises(self, tmp_path: Path, workers: int | None) -> None:
+        seen: list[Done[int]] = []
+        found = list(run_jobs(function("fail_at_one"), tasks(4, tmp_path), workers=workers, on_done=seen.append))
+        assert seen == found and all(0 <= done.seconds < 5 for done in found)
+        found = by_index(found)
+        assert [done.result for done in found] == [0, None, 4, 6]
+        assert [done.error is None for done in found] == [True, False, True, True]
+        error = found[1].error
+        assert error is not None and (error.type, error.message) == ("ValueError", "no 1\nplease")
+        assert "fail_at_one" in error.traceback and str(error) == "ValueError: no 1 please"
+
+    def test_threads(self, tmp_path: Path, workers: int | None) -> None:
+        before = torch.get_num_threads()
+        jobs = tasks(4, tmp_path)
+        found = list(run_jobs(function("process_and_threads"), jobs, workers=workers, threads=3))
+        assert {done.result[1] for done in found if done.result} == {3} and torch.get_num_threads() == before
+        processes = {done.result[0] for done in found if done.result}
+        assert len(processes) == (workers or 1) and (os.getpid() in processes) == (workers != 2)
+
+    def test_no_jobs(self, workers: int | None) -> None:
+        assert list(run_jobs(function("process_and_threads"), [], workers=workers)) == []
+
+
+def test_one_thread_by_default(tmp_path: Path) -> None:
+    (done,) = run_jobs(function("process_and_threads"), tasks(1, tmp_path))
+    assert done.result == (os.getpid(), 1)
+
+
+class TestProcesses:
+    def test_killed(self, tmp_path: Path) -> None:
+        """One job kills every worker, another its first one, a third has a result that cannot be sent."""
+        found = by_index(list(run_jobs(function("misbehave"), tasks(5, tmp_path), workers=2)))
+        assert [done.result for done in found] == [0, None, 4, None, 8]
+        error = found[1].error
+        assert error is not None and error.type == "WorkerDied"
+        assert error.message == "the worker process was ended by SIGKILL, memory may have run out, twice"
+        assert "lambda" in str(found[3].error)
+        assert [(tmp_path / str(i)).read_text() for i in range(5)] == ["x", "xx", "xx", "x", "x"]
+
+    def test_left_early(self, tmp_path: Path) -> None:
+        start = time.monotonic()
+        iterator = run_jobs(function("slow_then_mark"), tasks(3, tmp_path), workers=2)
+        assert next(iterator).index == 0
+        iterator.close()  # type: ignore[attr-defined]
+        assert time.monotonic() - start < 30 and not (tmp_path / "finished").exists()
+
+    def test_caller_killed(self, tmp_path: Path) -> None:
+        code = (
+            "import os, sys; sys.path.insert(0, sys.argv[1])\n"
+            "from pathlib import Path\n"
+            "from engine_tasks import Task, process_and_threads\n"
+            "from kcgs.engine import run_jobs\n"
+            "if __name__ == '__main__':\n"
+            "    tasks = [Task(i, Path()) for i in range(10_000)]\n"
+            "    for done in run_jobs(process_and_threads, tasks, workers=2):\n"
+            "        print(done.result[0], flush=True)\n"
+            "        if done.index > 5: os.kill(os.getpid(), 9)\n"
+        )
+        script = tmp_path / "script.py"
+        script.write_text(code)
+        command = [sys.executable, str(script), str(Path(__file__).parent)]
+        ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+        assert ended.returncode == -9
+        workers = {int(line) for line in ended.stdout.split()}
+        assert len(workers) == 2
+        until = time.monotonic() + 20
+        while any(_is_alive(process) for process in workers):
+            assert time.monotonic() < until
+            time.sleep(0.05)
+
+
+class TestArguments:
+    def test_refused(self) -> None:
+        with pytest.raises(ValueError, match="engine must be one of local, ray; got 'slurm'"):
+            run_jobs(str, [], engine="slurm")
+        with pytest.raises(ValueError, match="workers must be at least 1; got 0"):
+            run_jobs(str, [], workers=0)
+        with pytest.raises(ValueError, match="threads must be at least 1; got -1"):
+            run_jobs(str, [], threads=-1)
+
+    def test_without_ray(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(sys.modules, "ray", None)
+        with pytest.raises(ImportError, match=r"pip install 'kcgs\[ray\]'"):
+            run_jobs(str, [], engine="ray")
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
