@@ -47,9 +47,9 @@ class Place(NamedTuple):
 
     def __str__(self) -> str:
         if self.is_here:
-            return f"one fit at a time, {self.threads} threads"
-        count = "as many fits as there are processors for" if self.workers is None else f"{self.workers} fits"
-        return f"{count} at a time, one thread each, engine {self.engine}"
+            return f"one at a time on {self.threads} thread{'s' * (self.threads > 1)}"
+        count = "as many as there are processors for" if self.workers is None else f"{self.workers}"
+        return f"{count} at a time on one thread each, engine {self.engine}"
 
 
 HERE = Place()

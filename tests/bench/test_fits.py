@@ -59,8 +59,8 @@ class TestEnsure:
 
 class TestPlace:
     def test_words(self) -> None:
-        assert str(HERE) == f"one fit at a time, {torch.get_num_threads()} threads"
-        assert str(Place(workers=3)) == "3 fits at a time, one thread each, engine local"
+        assert str(HERE).startswith(f"one at a time on {torch.get_num_threads()} thread")
+        assert str(Place(workers=3)) == "3 at a time on one thread each, engine local"
         assert Place("ray").threads == Place(workers=2).threads == 1
         assert "processors" in str(Place("ray"))
 

@@ -78,7 +78,7 @@ def write(output: Path, made: Iterable[Run], notes: list[str], quick: bool, plac
 def _where(place: Place) -> str:
     if place.is_here:
         return f"Fits: {place}"
-    return f"Fits: {place}, except that those of {' and '.join(TIMED)} run one after another: {HERE}"
+    return f"Fits: {place}, but those of {' and '.join(TIMED)} {HERE}"
 
 
 def _time_figure(runs: Runs, output: Path) -> list[str]:
