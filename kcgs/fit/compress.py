@@ -140,7 +140,8 @@ def fit_bytes(
         target_bytes: the file is not larger.
         recipe: as there.
         seed: as there.
-        config: as there; its price of contours is replaced by the coder's.
+        config: as there; its price of contours is replaced by the coder's, and `max_seconds` is for the fit alone,
+            without the trials and the rounding.
         on_step: as there, for the fit itself, not the trials.
 
     Returns:
@@ -186,9 +187,10 @@ def _choose(
     """Return the map, or None where its bytes do more as Gaussians, and what a pixel of contour must save."""
     if regions is None or regions.num_regions == 1:
         return None, config.contour_price
-    trial = config.model_copy(
-        update={"iterations": min(_TRIAL_ITERATIONS, config.iterations), "release": False, "polish": False}
-    )
+    iterations = min(_TRIAL_ITERATIONS, config.iterations)
+    # by iterations, so that the same arguments give the same file
+    shorter = {"iterations": iterations, "max_seconds": None, "release": False, "polish": False}
+    trial = config.model_copy(update=shorter)
 
     def error(drawn: RegionMap | None, left: int) -> float:
         result = fit(image, drawn, count_for(left), seed=seed, config=trial)
