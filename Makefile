@@ -2,6 +2,9 @@ PYTHON ?= python3
 VENV ?= .venv
 EXTRAS ?= dev
 BIN := $(VENV)/bin
+# Tests take one thread each. Those of a file stay together: they share a browser, an environment, networks, fits.
+WORKERS ?= 2
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 .PHONY: demo test test-all notebooks lint clean
 
@@ -16,10 +19,10 @@ demo: $(VENV)/.installed
 	$(BIN)/kcgs bench demo -o demo
 
 test: $(VENV)/.installed
-	$(BIN)/python -m pytest -m "not slow"
+	$(PYTEST) -m "not slow"
 
 test-all: $(VENV)/.installed
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 notebooks: $(VENV)/.installed
 	$(BIN)/python notebooks/execute.py

@@ -193,7 +193,8 @@ class TestKorniaCheckpoint:
             torch.save({"weight": torch.zeros(3)}, path)
         with pytest.raises(ValueError, match=r"cannot load .*bad.pth as Segment Anything") as error:
             segment(picture(), "sam", model=TINY, checkpoint=path)
-        assert len(str(error.value)) < 500 and "weights_only" not in str(error.value)
+        said = str(error.value).replace(str(path), "")  # which is as long as the machine has it
+        assert len(said) < 450 and "weights_only" not in said
         if damage == "other":
             assert "Missing key(s)" in str(error.value)
 
