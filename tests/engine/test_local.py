@@ -85,10 +85,11 @@ class TestProcesses:
             "from engine_tasks import Task, process_and_threads\n"
             "from kcgs.engine import run_jobs\n"
             "if __name__ == '__main__':\n"
-            "    tasks = [Task(i, Path()) for i in range(10_000)]\n"
+            "    tasks, seen = [Task(i, Path()) for i in range(200_000)], set()\n"
             "    for done in run_jobs(process_and_threads, tasks, workers=2):\n"
-            "        print(done.result[0], flush=True)\n"
-            "        if done.index > 5: os.kill(os.getpid(), 9)\n"
+            "        if done.result[0] not in seen: print(done.result[0], flush=True)\n"
+            "        seen.add(done.result[0])\n"
+            "        if len(seen) == 2: os.kill(os.getpid(), 9)  # either may start seconds after the other\n"
         )
         script = tmp_path / "script.py"
         script.write_text(code)
