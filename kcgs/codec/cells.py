@@ -6,7 +6,7 @@ The grid
 For n Gaussians in a picture of H x W pixels the *side* of a cell is 2**floor(log2(q) / 2) pixels with
 q = H W // (16 n), and 1 for q = 0; cell (column, row) begins at pixel (side x column, side x row). ceil(H / side) rows
 and ceil(W / side) columns are *inside*; m more on each side are *outside*. m is at most 255, and at most such that all
-cells together are no more than 2**16 plus 16 times those inside.
+cells together are no more than 2**17 plus 16 times those inside.
 
 The stream
 ----------
@@ -38,7 +38,7 @@ Integers = NDArray[np.int64]
 
 # cells beyond the picture on each side; centres farther out are brought to the border of that
 _MOST_MARGIN = 255
-_CELLS_OUTSIDE = 1 << 16
+_CELLS_OUTSIDE = 1 << 17
 # more in a cell are told by repeating this
 _FULL = 7
 # cells that are looked at together
