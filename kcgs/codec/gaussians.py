@@ -12,17 +12,16 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from .cells import Cells
 from .errors import CodecError
 from .models import Choices, Magnitudes
-from .quantize import MARGIN_CELLS, SIZES, Classes, Codes, Quantizer, side_for
+from .quantize import SIZES, Classes, Codes, Quantizer
 from .rangecoder import Coder
 
 Integers = NDArray[np.int64]
 # positions among the map's ids under centres (N, 2), float32
 Lookup = Callable[[NDArray[np.float32]], Integers]
 
-# more in a cell are told by repeating this
-_FULL = 7
 _MOST_BITS = 21
 # half the log2 of the ratio of scales is measured in this
 _RATIO_SCALE = 2.0
@@ -53,8 +52,7 @@ class Layers:
         self._ratio = Magnitudes(_WEIGHT * _RATIO)
         self._stays = Choices(np.array([20.0, 0.5]))
         self._lengths = Choices(np.array([2.0, *[1.0] * 9, *[0.3] * (_MOST_BITS - 9)]))
-        self._margins = Choices(np.array([3.0, *[1.0] * 4, *[0.3] * 4]))
-        self._outside = 0.5, 20.0
+        self._cells = Cells(quantizer.size)
 
     def code(
         self, coder: Coder, energy: int, codes: Codes | None, ids: Integers | None, most: int
@@ -75,12 +73,14 @@ class Layers:
         counts = self._code_counts(coder, counts)
         if counts.sum() > most:
             raise CodecError(f"a layer must hold at most {most} Gaussians; got {counts.sum()}")
+        if counts[SIZES[1] - SIZES[0] + 1 :].any():
+            raise CodecError(f"a class of size must be at most {SIZES[1]}; got {np.flatnonzero(counts)[-1] + SIZES[0]}")
         if not counts.any():
             raise CodecError("a layer must hold Gaussians; got none")
         cells, start = [], 0
         for count in counts[counts > 0][::-1].tolist():
             own = None if codes is None else codes.cell[start : start + count]
-            cells.append(self._code_cells(coder, count, own))
+            cells.append(self._cells.code(coder, count, own))
             start += count
         size = np.repeat(np.arange(64)[::-1], counts[::-1]) + SIZES[0]
         classes = Classes(np.full(start, energy), size)
@@ -107,74 +107,15 @@ class Layers:
         zero = np.zeros(len(cell), np.int64)
         scale = coder.uniform(steps.scales, None if codes is None else codes.scale)
         ratio = self._ratio.code(coder, _RATIO_SCALE / steps.ratio[0], zero, None if codes is None else codes.ratio)
+        if (ratio > quantizer.most_ratio(steps)).any():
+            raise CodecError(f"a ratio must be at most {quantizer.most_ratio(steps)[0]} steps; got {ratio.max()}")
         angle = coder.uniform(quantizer.angles(ratio, steps), None if codes is None else codes.angle)
         # how many steps the amplitude of a Gaussian of this energy has
-        loud = math.sqrt(math.pi / (12.0 * quantizer.noise)) * 2.0 ** float(classes.energy[0])
+        loud = math.ldexp(math.sqrt(math.pi / (12.0 * quantizer.noise)), int(classes.energy[0]))
         colors = self._code_colors(coder, len(cell), loud, None if codes is None else codes.colors)
         parts = quantizer.parts(quantizer.restore_shape(classes, scale, ratio, angle), classes, side)
         place = [coder.uniform(parts[:, axis], None if codes is None else codes.place[:, axis]) for axis in range(2)]
         return Codes(classes, scale, ratio, angle, colors, cell, np.stack(place, -1))
-
-    def _code_cells(self, coder: Coder, count: int, cell: Integers | None) -> Integers:
-        """Code how many Gaussians lie in each cell, row by row, with a margin of cells where some lie outside."""
-        height, width = self.quantizer.size
-        side = side_for(count, self.quantizer.size)
-        rows, columns = -(-height // side), -(-width // side)
-        margin = None
-        if cell is not None:
-            beyond = [-cell.min(), (cell[:, 0] - columns + 1).max(), (cell[:, 1] - rows + 1).max(), 0]
-            margin = int(max(beyond))
-        margin = self._code_margin(coder, margin)
-        tall, wide = rows + 2 * margin, columns + 2 * margin
-        inside = np.zeros((tall, wide), bool)
-        inside[margin : margin + rows, margin : margin + columns] = True
-        held = None
-        if cell is not None:
-            held = np.bincount((cell[:, 1] + margin) * wide + cell[:, 0] + margin, minlength=tall * wide)
-        # shares of those seen so far tell how many lie outside
-        out, all_seen = self._outside
-        share = out / all_seen if margin else 0.0
-        found = np.zeros(tall * wide, np.int64)
-        for where, part in ((inside.ravel(), 1.0 - share), (~inside.ravel(), share)):
-            cells = int(where.sum())
-            if cells:
-                rate = max(count * part, 0.01) / cells
-                found[where] = self._code_fill(coder, rate, cells, None if held is None else held[where])
-        if found.sum() != count:
-            raise CodecError(f"cells must hold {count} Gaussians; got {found.sum()}")
-        if margin:
-            self._outside = out + float(found[~inside.ravel()].sum()), all_seen + count
-        at = np.repeat(np.arange(tall * wide), found)
-        return np.stack([at % wide - margin, at // wide - margin], -1)
-
-    def _code_margin(self, coder: Coder, margin: int | None) -> int:
-        one = np.zeros(1, np.int64)
-        length = self._margins.code(coder, one, None if margin is None else np.array([margin.bit_length()]))
-        low = int(1 << (int(length[0]) - 1)) if length[0] else 0
-        rest = None if margin is None else np.array([margin - low])
-        found = low + int(coder.uniform(np.array([max(low, 1)]), rest)[0])
-        if found > MARGIN_CELLS:
-            raise CodecError(f"a margin must be at most {MARGIN_CELLS} cells; got {found}")
-        return found
-
-    @staticmethod
-    def _code_fill(coder: Coder, rate: float, cells: int, held: Integers | None) -> Integers:
-        # one more with the probability rate / (1 + rate) each: nearly Poisson where cells are many
-        more = rate / (1.0 + rate)
-        weights = np.array([(1.0 - more) * more**0, *[0.0] * _FULL])
-        for i in range(1, _FULL + 1):
-            weights[i] = weights[i - 1] * more
-        weights[_FULL] /= 1.0 - more
-        total = np.zeros(cells, np.int64)
-        open_ones = np.arange(cells)
-        for _ in range(64):
-            value = None if held is None else np.minimum(held[open_ones] - total[open_ones], _FULL)
-            found = coder.repeat(weights, len(open_ones), value)
-            total[open_ones] += found
-            open_ones = open_ones[found == _FULL]
-            if not len(open_ones):
-                return total
-        raise CodecError("a cell holds too many Gaussians")
 
     def _code_colors(self, coder: Coder, count: int, loud: float, colors: Integers | None) -> Integers:
         channels: list[Integers] = []

@@ -160,13 +160,47 @@ def _code_ids(coder: Coder, ids: list[int], limit: int) -> list[int]:
         raise CodecError(f"data must hold at most {limit} regions; got {count}")
     if not fair(coder, ids != list(range(len(ids)))):
         return list(range(count))
-    ordered, rest, last = sorted(ids), [], -1
+    given, ordered, found, last = sorted(ids), [], [], -1
     for i in range(count):
-        last += 1 + magnitude(coder, 0 if coder.reads else ordered[i] - last - 1)
-        rest.append(last)
+        last += 1 + magnitude(coder, 0 if coder.reads else given[i] - last - 1)
+        ordered.append(last)
     if last >= 1 << 63:
         raise CodecError(f"data must hold ids below 2**63; got {last}")
-    return [rest.pop(uniform(coder, 0 if coder.reads else rest.index(ids[i]), count - i)) for i in range(count)]
+    left, places = _Left(count), {region: i for i, region in enumerate(given)}
+    for i in range(count):
+        rank = uniform(coder, 0 if coder.reads else left.rank(places[ids[i]]), count - i)
+        if rank >= count - i:
+            raise CodecError(f"data must name one of {count - i} ids that are left; got number {rank}")
+        found.append(ordered[left.take(rank)])
+    return found
+
+
+class _Left:
+    """Which of so many things in order are left: a tree of counts, so that millions take seconds."""
+
+    def __init__(self, count: int) -> None:
+        self._tree = [i & -i for i in range(count + 1)]
+
+    def rank(self, place: int) -> int:
+        """Return how many are left before the one at `place`."""
+        total = 0
+        while place:
+            total += self._tree[place]
+            place &= place - 1
+        return total
+
+    def take(self, rank: int) -> int:
+        """Remove the one that so many are left before; return its place."""
+        place, step = 0, 1 << len(self._tree).bit_length()
+        while step := step >> 1:
+            if place + step >= len(self._tree):
+                continue
+            if self._tree[place + step] <= rank:
+                place += step
+                rank -= self._tree[place]
+            else:
+                self._tree[place + step] -= 1
+        return place
 
 
 def _code_pixels(coder: Coder, truth: Any, starts: Any, regions: int) -> Any:

@@ -3,7 +3,7 @@
 ======================  ==================================================================================
 bytes                   meaning
 ======================  ==================================================================================
-varint                  labels along a side of a pixel, k
+varint                  labels along a side of a pixel, k, at most 64
 varint, labels          length in bytes; the map of (k height, k width) as `labels` says
 varint                  W, how many different widths there are
 varint                  for each: the width in fortieths of a pixel
@@ -32,7 +32,7 @@ from .stream import MOST_LABELS, ByteReader, varint
 Integers = NDArray[np.int64]
 _FORTIETHS = 40
 _MOST_WIDTH = int(MAX_SOFTNESS) * _FORTIETHS
-_MOST_SUPERSAMPLE = 64
+MOST_SUPERSAMPLE = 64
 _AT_ONCE = 32
 
 
@@ -74,7 +74,7 @@ def decode_map(data: bytes, size: tuple[int, int], num_regions: int) -> RegionMa
     from .labels import compact, decode_labels
 
     stream = ByteReader(data)
-    k = stream.varint("labels along a side of a pixel", 1, _MOST_SUPERSAMPLE)
+    k = stream.varint("labels along a side of a pixel", 1, MOST_SUPERSAMPLE)
     if size[0] * size[1] * k * k > MOST_LABELS:
         raise CodecError(f"a map must have at most {MOST_LABELS} labels; got {size} times {k} squared")
     labels = stream.take(stream.varint("length of the labels", 1, len(data)))

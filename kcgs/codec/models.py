@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .exact import Floats
-from .rangecoder import Coder
+from .rangecoder import Coder, batches
 
 Integers = NDArray[np.int64]
 
@@ -46,7 +46,7 @@ class Magnitudes:
         """Code one size for each context [n]; `scale` is what size is measured in, above 0."""
         tables = np.stack([self._table(shape, scale) for shape in self._shape])
         bucket = None if sizes is None else np.searchsorted(_LOW, sizes, side="right") - 1
-        bucket = coder.choose(tables[context], bucket)
+        bucket = coder.choose(tables, context, bucket)
         width = _HIGH[bucket] - _LOW[bucket]
         found = _LOW[bucket] + coder.uniform(width, None if sizes is None else sizes - _LOW[bucket])
         self._learn(scale, context, found)
@@ -54,13 +54,14 @@ class Magnitudes:
 
     def _learn(self, scale: float, context: Integers, sizes: Integers) -> None:
         # a size stands for what rounds to it; in whole parts, whose sums no order changes
-        low, high = np.maximum(sizes - 0.5, 0.0)[:, None], (sizes + 0.5)[:, None]
         edges = np.arange(_BINS + 1) * (scale * _WIDTH)
         edges[-1] = np.inf
-        overlap = np.clip(np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1]), 0.0, None) / (high - low)
-        parts = np.floor(overlap * _PARTS + 0.5).astype(np.int64)
-        for each in range(len(self._shape)):
-            self._shape[each] += parts[context == each].sum(0) / _PARTS
+        learned = np.zeros(self._shape.shape, np.int64)
+        for part in batches(len(sizes)):
+            low, high = np.maximum(sizes[part] - 0.5, 0.0)[:, None], (sizes[part] + 0.5)[:, None]
+            overlap = np.clip(np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1]), 0.0, None) / (high - low)
+            np.add.at(learned, context[part], np.floor(overlap * _PARTS + 0.5).astype(np.int64))
+        self._shape += learned / _PARTS
 
     @staticmethod
     def _table(shape: Floats, scale: float) -> Floats:
@@ -82,7 +83,7 @@ class Choices:
 
     def code(self, coder: Coder, context: Integers, values: Integers | None) -> Integers:
         """Code one symbol for each context [n]."""
-        found = coder.choose(self._weights[context], values)
+        found = coder.choose(self._weights, context, values)
         np.add.at(self._weights, (context, found), 1.0)
         return found
 

@@ -30,6 +30,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .cells import Grid
 from .exact import Floats, exp2, turn
 
 Integers = NDArray[np.int64]
@@ -46,8 +47,6 @@ _MOST_LEVELS = 1 << 20
 # steps that a colour may have
 MOST_COLOR = 1 << 24
 _LN2 = 0.6931471805599453
-# cells are numbered from the image's corner; centres farther out are brought to the border of that
-MARGIN_CELLS = 255
 # an opposition of colours: grey, red against blue, green against both; orthonormal
 _OPPONENT = (
     (0.5773502691896258, 0.5773502691896258, 0.5773502691896258),
@@ -129,7 +128,7 @@ class Quantizer:
         counts = np.bincount(group)
         sides = np.zeros(len(counts), np.int64)
         for held in np.flatnonzero(counts).tolist():
-            sides[held] = side_for(int(counts[held]), self.size)
+            sides[held] = Grid.over(self.size, int(counts[held])).side
         found: Integers = sides[group]
         return found
 
@@ -158,6 +157,10 @@ class Quantizer:
         shape = self.restore_shape(classes, within, ratios, angles)
         cell, place = self._locate(means, shape, steps, self.cell_side(classes))
         return Codes(classes, within, ratios, angles, codes, cell, place)
+
+    def most_ratio(self, steps: Steps) -> Integers:
+        """Return the largest code of a ratio [N]."""
+        return np.floor(_MOST_RATIO / steps.ratio + 0.5).astype(np.int64)
 
     def angles(self, ratios: Integers, steps: Steps) -> Integers:
         """Return how many angles there are at each ratio: one for circles."""
@@ -204,11 +207,13 @@ class Quantizer:
         """Round x, then y to where it counts: the error of x along the Gaussian's slant is made up for."""
         parts = np.ceil(side[:, None] / (steps.place[:, None] * shape[:, ::2]))
         parts = np.clip(parts, 1, _MOST_LEVELS).astype(np.int64)
+        sides, which = np.unique(side, return_inverse=True)
+        margin = np.array([Grid.of_side(self.size, one).most_margin for one in sides.tolist()], np.int64)[which]
         cells, places = [], []
         wanted = means[:, 0]
         for axis, pixels in enumerate((self.size[1], self.size[0])):
-            highest = -(-pixels // side) + MARGIN_CELLS - 1
-            at = np.clip(wanted / side, -MARGIN_CELLS, np.nextafter(highest + 1.0, 0))
+            highest = -(-pixels // side) + margin - 1
+            at = np.clip(wanted / side, -margin, np.nextafter(highest + 1.0, 0))
             cell = np.floor(at).astype(np.int64)
             place = np.minimum(np.floor((at - cell) * parts[:, axis]).astype(np.int64), parts[:, axis] - 1)
             cells.append(cell)
@@ -217,12 +222,6 @@ class Quantizer:
                 rounded = side * (cell + (place + 0.5) / parts[:, 0])
                 wanted = means[:, 1] + shape[:, 1] / shape[:, 0] * (rounded - means[:, 0])
         return np.stack(cells, -1), np.stack(places, -1)
-
-
-def side_for(count: int, size: tuple[int, int]) -> int:
-    """Return the side of the cells of a group of Gaussians: 16 to 64 cells a Gaussian, a pixel at least."""
-    cells = size[0] * size[1] // (16 * max(count, 1))
-    return 1 << max(0, (cells.bit_length() - 1) // 2)
 
 
 def opponent(colors: Floats, *, back: bool = False) -> Floats:

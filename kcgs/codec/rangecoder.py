@@ -19,6 +19,7 @@ ONE = 1 << 16  # chances are whole multiples of 1 / ONE
 _WINDOW = 64  # bits of the coder's state
 _MOST = 1 << 16  # largest alphabet of equally likely numbers
 _LEAST = 64  # chance of a Counter's bit
+_AT_ONCE = 1 << 12
 
 
 class Coder(Protocol):
@@ -35,8 +36,8 @@ class Coder(Protocol):
     def uniform(self, sizes: Integers, values: Integers | None) -> Integers:
         """Code values of 0 to size - 1 (n,), all equally likely; sizes are below 2**24."""
 
-    def choose(self, tables: Floats, values: Integers | None) -> Integers:
-        """Code values (n,) by a table of weights each, (n, A)."""
+    def choose(self, tables: Floats, rows: Integers, values: Integers | None) -> Integers:
+        """Code values (n,) by tables of weights, (T, A); each by the one that its entry of `rows` (n,) names."""
 
     def repeat(self, table: Floats, count: int, values: Integers | None) -> Integers:
         """Code `count` values by one table of weights, (A,)."""
@@ -74,11 +75,12 @@ class Writer:
             self._encoder.encode(values[told].astype(np.int32), self._models.Uniform(), sizes[told].astype(np.int32))
         return values
 
-    def choose(self, tables: Floats, values: Integers | None) -> Integers:
+    def choose(self, tables: Floats, rows: Integers, values: Integers | None) -> Integers:
         """Write values by a table each."""
         assert values is not None
-        if len(values):
-            self._encoder.encode(values.astype(np.int32), self._models.Categorical(perfect=False), tables)
+        model = self._models.Categorical(perfect=False)
+        for part in batches(len(rows)):
+            self._encoder.encode(values[part].astype(np.int32), model, tables[rows[part]])
         return values
 
     def repeat(self, table: Floats, count: int, values: Integers | None) -> Integers:
@@ -137,11 +139,12 @@ class Reader:
             found[told] = self._decode(self._models.Uniform(), sizes[told].astype(np.int32))
         return found
 
-    def choose(self, tables: Floats, values: Integers | None) -> Integers:
+    def choose(self, tables: Floats, rows: Integers, values: Integers | None) -> Integers:
         """Read values by a table each."""
-        if not len(tables):
-            return np.zeros(0, np.int64)
-        return np.asarray(self._decode(self._models.Categorical(perfect=False), tables), np.int64)
+        model, found = self._models.Categorical(perfect=False), np.zeros(len(rows), np.int64)
+        for part in batches(len(rows)):
+            found[part] = self._decode(model, tables[rows[part]])
+        return found
 
     def repeat(self, table: Floats, count: int, values: Integers | None) -> Integers:
         """Read values by one table."""
@@ -158,6 +161,11 @@ class Reader:
             return self._decoder.decode(*model)
         except AssertionError:
             raise CodecError("data must be an encoder's stream; got bytes that no encoder wrote") from None
+
+
+def batches(count: int) -> list[slice]:
+    """Cut so many rows into parts whose tables fit into memory."""
+    return [slice(start, start + _AT_ONCE) for start in range(0, count, _AT_ONCE)]
 
 
 def _queue() -> Any:

@@ -11,20 +11,32 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kcgs._check import check_floating
 from kcgs.functional import RegionMap
+from kcgs.functional.covariance import check_cholesky
 from kcgs.nn import GaussianField
 
 from .errors import CodecError
 from .gaussians import Layers, Lookup, layer_order, pick
-from .maps import decode_map, encode_map, smooth_map
+from .maps import MOST_SUPERSAMPLE, decode_map, encode_map, smooth_map
 from .quantize import NOISE_CODES, Classes, Codes, Quantizer
 from .rangecoder import Reader, Writer
-from .stream import Header, pack, unpack
+from .stream import (
+    MOST_CHANNELS,
+    MOST_COLORS,
+    MOST_GAUSSIANS,
+    MOST_LABELS,
+    MOST_REGIONS,
+    MOST_SIDE,
+    SPARE,
+    Header,
+    most_gaussians,
+    pack,
+    unpack,
+)
 
 Integers = NDArray[np.int64]
 
-# a Gaussian takes more than a bit, so that a layer cannot promise more than it holds
-_BITS_A_BYTE = 8
 # of the picture that is decoded against the scene's own, in dB
 QUALITIES = (10.0, 90.0)
 DEFAULT_QUALITY = 46.0
@@ -122,11 +134,13 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
     regions = None if header.regions == 1 else decode_map(region_map, header.size, header.regions)
     quantizer = Quantizer(header.noise_code, header.size)
     model = Layers(quantizer, header.channels, header.regions, _lookup(regions))
-    parts, ids = [], []
+    parts, ids, count = [], [], 0
     for (energy, _), layer in zip(header.layers, layers, strict=False):
-        codes, own = model.code(Reader(layer), energy, None, None, _BITS_A_BYTE * len(layer) + 64)
+        most = most_gaussians(len(layer), header.channels, count)
+        codes, own = model.code(Reader(layer), energy, None, None, most)
         parts.append(codes)
         ids.append(own)
+        count += len(own)
     means, cholesky, colors = (torch.from_numpy(t) for t in quantizer.restore_layers(parts))
     region_ids = None if regions is None else regions.ids[torch.from_numpy(np.concatenate(ids))]
     try:
@@ -149,7 +163,8 @@ def encode_codes(
     for energy, start, end in zip((-energies).tolist(), starts.tolist(), ends, strict=True):
         writer = Writer()
         model.code(writer, energy, pick(codes, slice(start, end)), ids[start:end], count)
-        layers.append(writer.finish())
+        # each Gaussian takes more than a bit, but zeros at the end are left out
+        layers.append(writer.finish().ljust(-(-(end - start - SPARE) // 8), b"\0"))
     header = Header(
         quantizer.size,
         channels,
@@ -168,6 +183,7 @@ def check_scene(field: GaussianField, regions: RegionMap | Tensor | None) -> tup
         raise TypeError(f"field must be a GaussianField; got {type(field).__name__}")
     if field.means.ndim != 2 or len(field) == 0:
         raise ValueError(f"field must hold the Gaussians of one image; got means of shape {tuple(field.means.shape)}")
+    _check_field(field)
     if isinstance(regions, Tensor):
         regions = RegionMap.from_labels(regions)
     if regions is not None and not isinstance(regions, RegionMap):
@@ -176,6 +192,7 @@ def check_scene(field: GaussianField, regions: RegionMap | Tensor | None) -> tup
         return None, np.zeros(len(field), np.int64)
     if regions.labels.ndim != 2 or regions.size != field.size:
         raise ValueError(f"regions must be one map of size {field.size}; got {tuple(regions.labels.shape)}")
+    _check_map(regions)
     if field.region_ids is None:
         raise ValueError("field must have region_ids where regions are given; call field.assign_regions(regions)")
     index = regions.index_of(field.region_ids.to(regions.ids.device))
@@ -183,6 +200,31 @@ def check_scene(field: GaussianField, regions: RegionMap | Tensor | None) -> tup
         unknown = int(field.region_ids[index.to(field.region_ids.device) < 0][0])
         raise ValueError(f"region_ids must be ids of the map; got {unknown}")
     return regions.to("cpu"), index.cpu().numpy()
+
+
+def _check_field(field: GaussianField) -> None:
+    """Refuse what no file can hold; a parameter may have been changed since the field was made."""
+    check_floating("means", field.means.detach().float())
+    check_cholesky("cholesky", field.cholesky.detach().float())
+    check_floating("colors", field.merged_colors().detach().float())
+    channels = field.colors.shape[-1]
+    if max(field.size) > MOST_SIDE:
+        raise ValueError(f"size must be at most {MOST_SIDE} pixels a side; got {field.size}")
+    if channels > MOST_CHANNELS:
+        raise ValueError(f"colors must have at most {MOST_CHANNELS} channels; got {channels}")
+    most = min(MOST_GAUSSIANS, MOST_COLORS // channels)
+    if len(field) > most:
+        raise ValueError(f"field must hold at most {most} Gaussians of {channels} channels; got {len(field)}")
+
+
+def _check_map(regions: RegionMap) -> None:
+    labels = regions.labels if regions.fine_labels is None else regions.fine_labels
+    if labels.numel() > MOST_LABELS:
+        raise ValueError(f"regions must have at most {MOST_LABELS} labels; got {tuple(labels.shape)}")
+    if regions.supersample > MOST_SUPERSAMPLE:
+        raise ValueError(f"supersample must be at most {MOST_SUPERSAMPLE}; got {regions.supersample}")
+    if regions.num_regions > MOST_REGIONS:
+        raise ValueError(f"regions must be at most {MOST_REGIONS}; got {regions.num_regions}")
 
 
 def noise_code_for(quality: float, field: GaussianField) -> int:
@@ -202,25 +244,28 @@ def code_for_noise(noise: float) -> int:
     return min(max(math.floor(-32 * math.log2(max(noise, 1e-12)) + 0.5), NOISE_CODES[0]), NOISE_CODES[1])
 
 
-def finest(encode_at: Callable[[int], bytes], target_bytes: int, field: GaussianField) -> tuple[int, bytes]:
-    """Return the noise code with the largest file of at most `target_bytes`, and that file.
+def finest(
+    encode_at: Callable[[int], bytes], target_bytes: int, field: GaussianField, *, share: float = 1.0
+) -> tuple[int, bytes]:
+    """Return the noise code with the largest file of at most this share of `target_bytes`, and that file.
 
     A step of the code is 1/32 of a bit for each number of a Gaussian, so that a few files tell which.
     """
     if isinstance(target_bytes, bool) or not isinstance(target_bytes, int):
         raise TypeError(f"target_bytes must be an integer; got {target_bytes!r}")
+    most = round(share * target_bytes)
     low, high = NOISE_CODES[0], noise_code_for(QUALITIES[1], field)
     code, best = min(max(noise_code_for(DEFAULT_QUALITY, field), low), high), None
     slope = len(field) * (5 + field.colors.shape[-1]) / (8 * 32)
     while low <= high:
         data = encode_at(code)
-        if len(data) <= target_bytes:
+        if len(data) <= most:
             best, low = (code, data), code + 1
         else:
             least, high = len(data), code - 1
-        code = min(max(code + math.floor((target_bytes - len(data)) / slope), low), high)
+        code = min(max(code + math.floor((most - len(data)) / slope), low), high)
     if best is None:
-        raise ValueError(f"target_bytes must be at least {least} for this scene; got {target_bytes}")
+        raise ValueError(f"target_bytes must be at least {math.ceil(least / share)} for this scene; got {target_bytes}")
     return best
 
 

@@ -21,6 +21,10 @@ layer                   for each: its bytes (`gaussians`), then 2 bytes, CRC-16 
 ======================  ==================================================================================
 
 A file that ends early is a coarser picture, as long as its header and a layer are whole.
+
+What a decoder may refuse, and an encoder must not write: a side above 2**20 pixels, more than 1,024 channels, 2**24
+regions or more, a map of more than 2**26 labels; more than 2**21 - 1 Gaussians, or 2**27 numbers of colours, in all;
+in a layer, more Gaussians than 64 plus its bits (bytes of zero at its end make it longer, and mean nothing).
 """
 
 from __future__ import annotations
@@ -34,8 +38,12 @@ from .errors import CodecError
 from .quantize import ENERGIES, NOISE_CODES
 
 MAGIC, VERSION = b"kcgs", 1
-# pixels of a map: its memory
+# a decoder's memory: pixels of a map; Gaussians in all, and numbers of their colours
 MOST_LABELS = 1 << 26
+MOST_GAUSSIANS, MOST_COLORS = (1 << 21) - 1, 1 << 27
+MOST_SIDE, MOST_CHANNELS, MOST_REGIONS = 1 << 20, 1 << 10, (1 << 24) - 1
+# Gaussians that a layer of no bytes may hold
+SPARE = 64
 _CRC_OF_HEAD, _CRC_OF_LAYER = 4, 2
 
 
@@ -76,6 +84,11 @@ class ByteReader:
         if not low <= value <= high:
             raise CodecError(f"{name} must be in [{low}, {high}]; got {value}")
         return value
+
+
+def most_gaussians(layer_bytes: int, channels: int, so_far: int) -> int:
+    """Return how many Gaussians a layer may hold: each takes more than a bit, and all must fit into memory."""
+    return min(8 * layer_bytes + SPARE, min(MOST_GAUSSIANS, MOST_COLORS // channels) - so_far)
 
 
 def pack(header: Header, region_map: bytes, layers: list[bytes]) -> bytes:
@@ -126,11 +139,10 @@ def _read_header(stream: ByteReader) -> tuple[Header, int]:
         raise CodecError(f"it must start with {MAGIC!r}; got {stream.data[:4]!r}")
     if (version := stream.take(1)[0]) != VERSION:
         raise CodecError(f"its version must be {VERSION}; got {version}")
-    side = 1 << 20
-    size = stream.varint("height", 1, side), stream.varint("width", 1, side)
-    channels = stream.varint("channels", 1, 1 << 10)
+    size = stream.varint("height", 1, MOST_SIDE), stream.varint("width", 1, MOST_SIDE)
+    channels = stream.varint("channels", 1, MOST_CHANNELS)
     noise_code = stream.varint("noise code", 0, NOISE_CODES[1] - NOISE_CODES[0]) + NOISE_CODES[0]
-    regions = stream.varint("regions", 1, MOST_LABELS)
+    regions = stream.varint("regions", 1, MOST_REGIONS)
     length = 0
     if regions > 1:
         if size[0] * size[1] > MOST_LABELS:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcgs._check import check_image
 from kcgs.codec.maps import encode_map
-from kcgs.codec.quantize import Quantizer
+from kcgs.codec.quantize import NOISE_CODES, Quantizer
 from kcgs.codec.scene import (
     DEFAULT_QUALITY,
     check_scene,
@@ -55,6 +55,8 @@ class Compressed(NamedTuple):
     """The fit, before rounding."""
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def compress(
     field: GaussianField,
     image: Tensor,
@@ -111,10 +113,12 @@ def compress(
     if target_bytes is None:
         code = noise_code_for(DEFAULT_QUALITY if quality is None else quality, field)
         return write(*begin(code), iterations)
-    code, data = finest(lambda code: write(*begin(code), 0), round(_SLACK * target_bytes), field)
-    while len(data := write(*begin(code), iterations)) > target_bytes:
-        code -= 1
-    return data
+    highest, plain = finest(lambda code: write(*begin(code), 0), target_bytes, field, share=_SLACK)
+    for code in range(highest, NOISE_CODES[0] - 1, -1):
+        data = write(*begin(code), iterations)
+        if len(data) <= target_bytes:
+            return data
+    return plain
 
 
 def fit_bytes(
@@ -163,6 +167,8 @@ def fit_bytes(
         regions = RegionMap.from_labels(regions)
     if isinstance(target_bytes, bool) or not isinstance(target_bytes, int):
         raise TypeError(f"target_bytes must be an integer; got {target_bytes!r}")
+    if target_bytes < 1:
+        raise ValueError(f"target_bytes must be at least 1; got {target_bytes}")
     regions, price = _choose(image, regions, target_bytes, config, seed)
     count = count_for(target_bytes - _map_bytes(regions))
     config = config.model_copy(update={"contour_price": price})

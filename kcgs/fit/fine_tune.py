@@ -42,7 +42,8 @@ class FineTuning:
     def __init__(
         self, field: GaussianField, image: Tensor, regions: RegionMap | None, quantizer: Quantizer, seed: int = 0
     ) -> None:
-        self.field, self.image, self.regions, self.quantizer = field, image, regions, quantizer
+        self.image, self.regions, self.quantizer, self.size = image, regions, quantizer, field.size
+        self.ids = None if field.region_ids is None else field.region_ids.to(image.device)
         means, cholesky, colors = numbers(field)
         self.classes = quantizer.classify(cholesky, colors)
         self.free = [torch.from_numpy(t).to(image) for t in (means, cholesky, colors)]
@@ -86,13 +87,12 @@ class FineTuning:
     def _downhill(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> tuple[Tensor, Tensor]:
         """Return Newton's steps of each number alone: of centre and factor in the Gaussian's frame, of colours."""
         leaves = [t.detach().requires_grad_() for t in (means, cholesky, colors)]
-        ids, size = self.field.region_ids, self.field.size
         x, factors, c = leaves
-        picture = region_splat(x, factors, c, ids, self.regions, size=size, cutoff=_DRAFT_CUTOFF)
+        picture = region_splat(x, factors, c, self.ids, self.regions, size=self.size, cutoff=_DRAFT_CUTOFF)
         picture.backward(picture.detach() - self.image)
         (gx, gy), (g11, g21, g22) = self._gradient(x).unbind(-1), self._gradient(factors).unbind(-1)
         l11, l21, l22 = cholesky.unbind(-1)
-        height, width = self.field.size
+        height, width = self.size
         area = (math.pi * l11 * l22).clamp_max(height * width)
         energy = (colors.square().sum(-1) * area).clamp_min(_FAINT)
         # half the second derivatives of the squared error, as the gradient is half the first

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from kcgs.codec.quantize import MARGIN_CELLS, Quantizer, opponent, side_for
+from kcgs.codec.cells import Grid
+from kcgs.codec.quantize import Quantizer, opponent
 from kcgs.functional import region_splat
 
 from .conftest import make_scene
@@ -68,7 +69,8 @@ class TestRoundTrip:
         cholesky, colors = np.array([[2.0, 0.0, 2.0]] * 2), np.ones((2, 3))
         codes = quantizer.quantize(means, cholesky, colors, quantizer.classify(cholesky, colors))
         found = quantizer.restore(codes)[0]
-        reach = MARGIN_CELLS * side_for(2, (96, 144))
+        grid = Grid.over((96, 144), 2)
+        reach = grid.most_margin * grid.side
         assert (found >= -reach).all() and (found[1] <= np.array([144, 96]) + reach + 64).all()
 
 
@@ -106,5 +108,5 @@ class TestNoise:
 
 def test_sides_of_cells() -> None:
     for count in (1, 7, 100, 5000, 10**6):
-        side = side_for(count, (480, 854))
+        side = Grid.over((480, 854), count).side
         assert side == 1 or 16 <= 480 * 854 / (side * side * count) < 128

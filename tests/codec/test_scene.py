@@ -117,6 +117,16 @@ class TestRoundTrip:
         found = decode(encode(GaussianField(means, cholesky, colors, size=(20, 20)), quality=60)).field
         assert torch.isfinite(found.means).all() and (found.cholesky[:, ::2] > 0).all()
 
+    def test_many_of_one_kind_in_one_place(self) -> None:
+        # all bits that tell them apart are zeros, which files leave out at their end
+        many = GaussianField(
+            torch.full((3000, 2), 0.5),
+            torch.tensor([[1.0, 0.0, 1.0]]).repeat(3000, 1),
+            torch.ones(3000, 1),
+            size=(1, 1),
+        )
+        assert len(decode(encode(many, quality=10)).field) == 3000
+
 
 class TestGoals:
     @pytest.mark.parametrize("quality", [30.0, 45.0, 60.0])
@@ -176,6 +186,35 @@ class TestRefusals:
         ):
             with pytest.raises((TypeError, ValueError), match=match):
                 call()
+
+    @pytest.mark.parametrize(
+        ("name", "value", "match"),
+        [
+            ("means", math.nan, "means must be finite"),
+            ("cholesky", math.inf, "cholesky must be finite"),
+            ("cholesky", -1.0, "cholesky must have l11 > 0"),
+            ("colors", math.inf, "colors must be finite"),
+        ],
+    )
+    def test_values_that_were_changed(self, scene: Scene, name: str, value: float, match: str) -> None:
+        field, regions = scene
+        with torch.no_grad():
+            getattr(field, name)[3, 0] = value
+        with pytest.raises(ValueError, match=match):
+            encode(field, regions)
+
+    def test_what_no_decoder_takes(self) -> None:
+        wide = GaussianField.random(5, (1, (1 << 20) + 1), seed=0)
+        with pytest.raises(ValueError, match="size must be at most 1048576 pixels a side"):
+            encode(wide)
+        field, _ = make_scene(regions=1)
+        deep = GaussianField(field.means, field.cholesky, torch.ones(60, 1025), size=field.size)
+        with pytest.raises(ValueError, match="colors must have at most 1024 channels; got 1025"):
+            encode(deep)
+        ids = torch.zeros(60, dtype=torch.long)
+        fine = RegionMap.from_labels((torch.arange(65 * 24) >= 99).long()[:, None].expand(-1, 65 * 36), supersample=65)
+        with pytest.raises(ValueError, match="supersample must be at most 64; got 65"):
+            encode(GaussianField(field.means, field.cholesky, field.colors, ids, size=field.size), fine)
 
     def test_load_reads_it(self, scene: Scene, tmp_path: object) -> None:
         path = f"{tmp_path}/scene.kcgs"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -71,13 +73,22 @@ class TestCompress:
         decoded = decode(compress(with_faint, image, regions, quality=36, iterations=2))
         assert len(decoded.field) <= 200
 
+    @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+    def test_where_gradients_are_off(self, fitted: Fitted, mode: Callable[[], Any]) -> None:
+        image, field, regions = fitted
+        expected = compress(field, image, regions, quality=30, iterations=3)
+        with mode():
+            same = GaussianField(field.means, field.cholesky, field.colors, field.region_ids, size=field.size)
+            assert compress(same, image.clone(), RegionMap.from_labels(regions.labels), quality=30, iterations=3)
+            assert compress(field, image, regions, quality=30, iterations=3) == expected
+
     def test_refusals(self, fitted: Fitted) -> None:
         image, field, regions = fitted
         for changed, match in (
             ({"image": image[:, :50]}, "image must have shape"),
             ({"iterations": 0}, "iterations must be an integer"),
             ({"quality": 40, "target_bytes": 900}, "exclude each other"),
-            ({"target_bytes": 30}, "target_bytes must be at least"),
+            ({"target_bytes": 40}, "target_bytes must be at least [0-9]+ for this scene; got 40"),
         ):
             arguments = {"field": field, "image": image, "regions": regions, **changed}
             with pytest.raises(ValueError, match=match):
@@ -125,5 +136,7 @@ class TestBudget:
         image = torch.zeros(3, 16, 16)
         with pytest.raises(TypeError, match="target_bytes must be an integer"):
             fit_bytes(image, None, 1.5)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="target_bytes must be at least 1; got 0"):
+            fit_bytes(image, torch.arange(16).expand(16, 16), 0)
         with pytest.raises(ValueError, match="target_bytes must be at least"):
             fit_bytes(torch.rand(3, 16, 16), None, 12, config=SHORT)
