@@ -5,9 +5,9 @@ from __future__ import annotations
 from importlib import import_module
 from pathlib import Path
 
-_EXPERIMENTS = ("demo", "render", "fit", "maps", "decode", "zoo")
+_EXPERIMENTS = ("demo", "render", "fit", "maps", "decode", "rate", "zoo")
 # those that have groups to choose from
-_GROUPED = ("fit", "decode", "zoo")
+_GROUPED = ("fit", "decode", "rate", "zoo")
 
 
 def available_experiments() -> tuple[str, ...]:
