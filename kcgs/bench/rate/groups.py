@@ -37,6 +37,8 @@ from .workshop import FIRST_QUALITY, Workshop, draw, timed
 # some files of one picture; those that are not there, and may not be made, are left out
 Step = Callable[[], list[Point]]
 SPEED_THREADS = 2
+# share of another file's bytes that is nearly as many
+_NEAR = 0.98
 
 
 def steps(group: str, workshop: Workshop) -> Iterator[tuple[str, Step]]:
@@ -65,8 +67,8 @@ def steps(group: str, workshop: Workshop) -> Iterator[tuple[str, Step]]:
 def _matched(workshop: Workshop, image: str) -> list[Point]:
     """Make other codecs' files, then kcgs' of no more bytes than each.
 
-    A fit is made for the larger of AVIF's files. It is written again for the others; where JPEG or WebP have no fewer
-    bytes than one of these, that one is what they meet.
+    A fit is made for the larger of AVIF's files. It is written again for the others, unless there is a file of nearly
+    as many bytes already, or they could not go as low.
     """
     most = QUICK_BYTES if workshop.quick else MOST_BYTES
     others = _there([workshop.other(MATCHED, image, codec, most) for codec in present()])
@@ -76,7 +78,8 @@ def _matched(workshop: Workshop, image: str) -> list[Point]:
         return others
     ours = [first, *(workshop.rewritten(first, smaller) for smaller in avif[1:])]
     for point in others:
-        if not any(one is not None and one.bytes <= point.bytes for one in ours):
+        least = _NEAR * point.bytes if point.bytes <= most else 0.0
+        if not any(one is not None and least <= one.bytes <= point.bytes for one in ours):
             ours.append(workshop.rewritten(first, point.bytes))
     return [*others, *_there(ours)]
 
@@ -90,7 +93,8 @@ def _matched_without(workshop: Workshop, image: str) -> list[Point]:
 
 def _on_curve(workshop: Workshop, group: str, image: str, most: int) -> list[Point]:
     points = [workshop.other(group, image, codec, most, exact=False) for codec in present()]
-    return _there([*points, *(workshop.fitted(group, image, most, regions=regions) for regions in (True, False))])
+    which = (True,) if workshop.quick else (True, False)
+    return _there([*points, *(workshop.fitted(group, image, most, regions=regions) for regions in which)])
 
 
 def _precision(workshop: Workshop, image: str, n: int) -> list[Point]:

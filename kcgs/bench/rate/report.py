@@ -43,10 +43,10 @@ mean over images drawn in pairs. Seconds to encode are those of the final settin
 those of the whole fit and of finding the map, to decode until the picture is there; medians, compilation excluded. What
 else the machine did meanwhile slows them."""
 _MATCHED_TEXT = f"""Every codec made its largest file of at most {MOST_BYTES:,} bytes, or its smallest if it cannot go
-as low. Kcgs was fitted to the bytes of the larger AVIF file; the fit was written again with the bytes of the other and,
-where all of its files were larger than one of JPEG or WebP, with those of that. Each file of another codec meets the
-largest of kcgs' that has no more bytes. Without regions kcgs was asked for the bytes that it was fitted to with
-them."""
+as low. Kcgs was fitted to the bytes of the larger AVIF file; the fit was written again with the bytes of each other
+file, unless nearly as many were there already. Each file of another codec meets the largest of kcgs' that has no more
+bytes; of the codecs that cannot go as low, one of far fewer. Without regions kcgs was asked for the bytes that it was
+fitted to with them."""
 _CURVE_TEXT = """Files of about 2,000, 4,000, 8,000, 16,000 and 32,000 bytes; a codec that cannot go as low has its
 smallest file there. BD-rate is how many more bits kcgs takes for the same quality, in %, below zero where it saves
 bits; BD-PSNR how much better it is at the same bits. Both are means over where two curves overlap, log-rate over
