@@ -8,9 +8,9 @@ from typing import Any
 
 from .fits import Place
 
-_EXPERIMENTS = ("demo", "render", "fit", "maps", "decode", "zoo")
+_EXPERIMENTS = ("demo", "render", "fit", "maps", "decode", "rate", "zoo")
 # those that have groups to choose from
-_GROUPED = ("fit", "decode", "zoo")
+_GROUPED = ("fit", "decode", "rate", "zoo")
 # those whose fits may run side by side
 _PARALLEL = ("fit", "maps")
 
