@@ -32,8 +32,8 @@ CONTESTS = (
     Contest(BASELINE.name, UNCLAMPED.name),
 )
 _WORST = 3
-_EXTRA_TEXT = """For `best-baseline` a file is made at about the bytes of `best`, with as many Gaussians as they buy, so
-that the curve has a point there; the other curves have their points at the N above only, a coarse interpolation."""
+_EXTRA_TEXT = """For `best-baseline` a file is made at about the bytes of `best`, with as many Gaussians as they buy,
+so that the curve has a point there; the other curves have their points at the N above only, a coarse interpolation."""
 
 
 def run(output: Path, options: Options) -> None:

@@ -15,12 +15,12 @@ from .options import Options
 from .trials import Row, Trial
 
 _QUICK_TEXT = "The short form, small pictures and few iterations: the numbers only show that all of it runs."
-METRICS_TEXT = """PSNR and MS-SSIM are over the whole picture, EF-PSNR and edge SSIM within 5 pixels of the contours of the
-given map, for every method alike; decibels, of values clipped to [0, 1]. `paper` is the paper's method, `gaussian-image`
-its baseline without clamp and `gaussian-image-clamp` with it, `best` ours, and `best-baseline` ours with the regions
-off, the baseline improved as much. All run on the same kernel. Differences are paired by picture, above zero where the
-first is better; intervals are 95 %, by bootstrap over pictures. Seconds are wall time of a fit, which other work on the
-machine slows; core s is the processor time of fit and measurement."""
+METRICS_TEXT = """PSNR and MS-SSIM are over the whole picture, EF-PSNR and edge SSIM within 5 pixels of the contours of
+the given map, for every method alike; decibels, of values clipped to [0, 1]. `paper` is the paper's method,
+`gaussian-image` its baseline without clamp and `gaussian-image-clamp` with it, `best` ours, and `best-baseline` ours
+with the regions off, the baseline improved as much. All run on the same kernel. Differences are paired by picture,
+above zero where the first is better; intervals are 95 %, by bootstrap over pictures. Seconds are wall time of a fit,
+which other work on the machine slows; core s is the processor time of fit and measurement."""
 
 
 def head(title: str, name: str, options: Options) -> list[str]:

@@ -14,11 +14,11 @@ from .compare import QUANTITIES, Difference, by_picture, complete, counts, equal
 from .trials import Row
 
 _WAYS: dict[str, Callable[..., Difference | None]] = {"equal N": equal_n, "equal bits": equal_bits}
-BITS_TEXT = """Bytes are the size of the scene's `.kcgs` file: Gaussians, region ids, label map, contour widths, all that
-a decoder needs, written by `kcgs.codec.encode(field, regions, quality=psnr + 14.5)`, without a look at the image.
+BITS_TEXT = """Bytes are the size of the scene's `.kcgs` file: Gaussians, region ids, label map, contour widths, all
+that a decoder needs, written by `kcgs.codec.encode(field, regions, quality=psnr + 14.5)`, without a look at the image.
 *Decoded* figures are those of the picture that this file decodes to."""
-EQUAL_BITS_TEXT = """At equal bits the decoded picture is compared with the other method's at the same number of bytes of
-the same picture: its curve is interpolated linearly over the logarithm of the bytes, between its own files."""
+EQUAL_BITS_TEXT = """At equal bits the decoded picture is compared with the other method's at the same number of bytes
+of the same picture: its curve is interpolated linearly over the logarithm of the bytes, between its own files."""
 
 
 class Contest(NamedTuple):

@@ -131,8 +131,7 @@ class Store:
 
     def _expected(self, trial: Trial) -> float:
         """Return the seconds that the slowest fit took with these settings and N."""
-        kept = _known(self.folder).get(_settings(trial), 0.0)
-        return kept
+        return _known(self.folder).get(_settings(trial), 0.0)
 
     def _path(self, trial: Trial) -> Path:
         fields = [field.name for field in dataclasses.fields(Row)]
@@ -186,12 +185,15 @@ def _perform(trial: Trial, data: Path | None, folder: Path) -> Row:
     regions = pictures.coverage_map() if trial.method == COVERAGE and trial.stride == 1 else labels
     spec = Spec(image, regions, trial.n, config, trial.seed, labels, str(trial))
     is_new = not spec.path(folder).is_file()
-    warm_up(config)
+    if config.iterations > QUICK_ITERATIONS:  # the quick form's seconds mean nothing
+        warm_up(config)
     began, start = time.monotonic(), time.process_time()
     fitted = ensure_one(spec, folder)
     core_seconds = time.process_time() - start if is_new else math.nan
     scene = fitted.scene()
-    data_bytes = encode(scene.field, scene.regions, quality=min(max(fitted.psnr + MARGIN, _QUALITIES[0]), _QUALITIES[1]))
+    data_bytes = encode(
+        scene.field, scene.regions, quality=min(max(fitted.psnr + MARGIN, _QUALITIES[0]), _QUALITIES[1])
+    )
     held = decode(data_bytes)
     figures = measure(render_image(held.field, held.regions), image, labels)
     has_map = scene.regions is not None and scene.regions.num_regions > 1
