@@ -3,7 +3,7 @@ VENV ?= .venv
 EXTRAS ?= dev
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all notebooks lint clean
+.PHONY: demo report test test-all notebooks lint clean
 
 # The stamp is newer than what it was made from, or the environment is made again.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -14,6 +14,12 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 demo: $(VENV)/.installed
 	$(BIN)/kcgs bench demo -o demo
+
+# The charts, a few minutes, and README's tables from all committed results.csv. Sequences of DAVIS take hours: see
+# `kcgs bench davis`, which goes on where it was stopped.
+report: $(VENV)/.installed
+	$(BIN)/kcgs bench charts -o notebooks/reports/charts
+	$(BIN)/python -m kcgs.bench.paper.readme
 
 test: $(VENV)/.installed
 	$(BIN)/python -m pytest -m "not slow"

@@ -28,9 +28,9 @@ NAMES = tuple(m.name for m in METHODS)
 # the share of the budget, or the seconds, that the network gets
 _NETWORK_SHARE, _NETWORK_SECONDS, _QUICK_NETWORK_SECONDS = 0.2, 60.0, 0.5
 _QUALITIES = (20.0, 22.0, 24.0, 25.0, 26.0, 27.0, 28.0)
-_SPEED_TEXT = """All fits ran one after another in this process on the same kernel; seconds include the start of a fit,
-not compilation. They are wall time, so that whatever else the machine did is in them: ratios of processor time are
-given too. *Never*: the fit ends below."""
+_SPEED_TEXT = """All fits ran one after another on the same kernel; seconds include the start of a
+fit, not compilation. They are wall time, so that whatever else the machine did is in them; the processor time of whole
+fits is given too. *Never*: the fit ends below."""
 _PEER_TEXT = """JPEG, WebP and AVIF (Pillow) at the largest quality whose file is not above the bytes of the `.kcgs`
 file of `best`; SIREN: three hidden layers with sines, weights at half precision and nothing else counted, the widest
 that these bytes hold, Adam on random pixels for the seconds shown. The two Gaussian rows are the decoded files. The
@@ -139,7 +139,7 @@ def against_paper(rows: Sequence[Row]) -> str:
             cells = []
             for quantity in ("psnr", "ef_psnr"):
                 passed = seconds_to(row, quantity, getattr(paper, quantity))
-                cells += ["never", ""] if math.isnan(passed) else [seconds(passed), f"{paper.seconds / passed:.0f}"]
+                cells += ["never", ""] if math.isnan(passed) else [seconds(passed), f"{paper.seconds / passed:.2g}"]
             cells += [seconds(row.core_seconds), signed(row.psnr - paper.psnr), signed(row.ef_psnr - paper.ef_psnr)]
             lines.append([row.method, *cells])
     text = (
@@ -178,9 +178,9 @@ def beaten(rows: Sequence[Row], others: Sequence[Peer]) -> str:
     for peer in others:
         gaps = (peer.psnr - ours[0].decoded_psnr, peer.ef_psnr - ours[0].decoded_ef_psnr)
         if max(gaps) > 0:
-            more = f", with {peer.bytes / ours[0].bytes:.2f} of our bytes"
             lines.append(
-                f"- {peer.name} is ahead of `best`: PSNR {signed(gaps[0])} dB, EF-PSNR {signed(gaps[1])} dB{more}"
+                f"- {peer.name} is ahead of `best`, or behind where negative: PSNR {signed(gaps[0])} dB, "
+                f"EF-PSNR {signed(gaps[1])} dB, with {peer.bytes / ours[0].bytes:.2f} of its bytes"
             )
     return "\n".join(lines)
 

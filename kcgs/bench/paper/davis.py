@@ -79,7 +79,9 @@ def rivals(store: Store, trials: Sequence[Trial]) -> list[Trial]:
 
 def _stages(names: list[str], options: Options) -> list[list[Trial]]:
     first, rest = (QUICK_COUNTS, ()) if options.quick else (FIRST_COUNTS, OTHER_COUNTS)
-    parts = [(first, [name]) for name in names] if options.budget_seconds else [(first, names)]
+    parts: list[tuple[tuple[int, ...], list[str]]] = [(first, names)]
+    if options.budget_seconds is not None:
+        parts = [(first, [name]) for name in names]
     parts += [((n,), names) for n in rest]
     stride = QUICK_STRIDE if options.quick else 1
     iterations = options.iterations or PUBLISHED_ITERATIONS

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import time
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -62,7 +62,7 @@ def codec(name: str, image: Tensor, labels: Tensor, size: int) -> Peer:
     with Image.open(BytesIO(best)) as file:
         pixels = np.asarray(file.convert("RGB"))
     picture = torch.from_numpy(pixels.copy()).permute(2, 0, 1).float() / 255
-    return Peer(name=name, bytes=len(best), seconds=seconds, note=note, **measure(picture, image, labels))
+    return _measured(picture, image, labels, name=name, bytes=len(best), seconds=seconds, note=note)
 
 
 def network(image: Tensor, labels: Tensor, size: int, seconds: float) -> Peer:
@@ -72,13 +72,15 @@ def network(image: Tensor, labels: Tensor, size: int, seconds: float) -> Peer:
     for spent, picture in trained.history:
         figures = measure(picture, image, labels)
         curve.append((spent, figures["psnr"], figures["ef_psnr"]))
-    return Peer(
+    return _measured(
+        trained.picture,
+        image,
+        labels,
         name="SIREN",
         bytes=trained.bytes,
         seconds=trained.seconds,
         note=f"{trained.width} wide, {trained.iterations:,} iterations",
         history=tuple(curve),
-        **measure(trained.picture, image, labels),
     )
 
 
@@ -89,12 +91,17 @@ def ensure_network(path: Path, image: Tensor, labels: Tensor, size: int, seconds
         with atomic_path(path) as temporary:
             temporary.write_text(json.dumps(dataclasses.asdict(peer)), encoding="utf-8")
     kept = json.loads(path.read_text(encoding="utf-8"))
-    return Peer(**{**kept, "history": tuple((s, p, math.nan if e is None else e) for s, p, e in kept["history"])})
+    return Peer(**{**kept, "history": tuple((s, p, e) for s, p, e in kept["history"])})
+
+
+def _measured(picture: Tensor, image: Tensor, labels: Tensor, **told: Any) -> Peer:
+    figures = measure(picture, image, labels)
+    return Peer(**{key: figures[key] for key in ("psnr", "ms_ssim", "ef_psnr", "ef_ssim")}, **told)
 
 
 def _encode(name: str, image: Tensor, quality: int) -> bytes:
     levels = (image.clamp(0, 1) * 255 + 0.5).floor().to(torch.uint8).permute(1, 2, 0).numpy()
     file, (codec_name, key) = BytesIO(), CODECS[name]
-    options = {"jpg": {"optimize": True}, "webp": {"method": 6}, "avif": {"speed": 4}}[key]
-    Image.fromarray(np.ascontiguousarray(levels)).save(file, codec_name, quality=quality, **options)
+    effort: dict[str, dict[str, Any]] = {"jpg": {"optimize": True}, "webp": {"method": 6}, "avif": {"speed": 4}}
+    Image.fromarray(np.ascontiguousarray(levels)).save(file, codec_name, quality=quality, **effort[key])
     return file.getvalue()

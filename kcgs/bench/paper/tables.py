@@ -117,8 +117,9 @@ def unpaid(rows: Sequence[Row], ours: str, baseline: str) -> str:
             shares = [row.map_bytes / row.bytes for row in select(rows, ours, n)]
             word = "does not pay for itself" if found.mean < 0 else "pays for itself"
             lines.append(
-                f"- N = {n:,}: the map is {100 * mean(shares):.1f} % of the bytes and {word} in {QUANTITIES[quantity]}: "
-                f"{signed(found.mean)} dB at equal bits, {found.wins} won and {found.losses} lost of {len(found.values)}"
+                f"- N = {n:,}: the map is {100 * mean(shares):.1f} % of the bytes and {word} in "
+                f"{QUANTITIES[quantity]}: {signed(found.mean)} dB at equal bits, {found.wins} won and "
+                f"{found.losses} lost of {len(found.values)}"
             )
     return "\n".join(lines) or "Nothing to compare."
 
