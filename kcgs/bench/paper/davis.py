@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from pathlib import Path
 
 from kcgs.bench.fits import check_made
@@ -15,7 +13,7 @@ from .methods import BASELINE, BEST, CLAMPED, PAPER, UNCLAMPED
 from .options import PUBLISHED_ITERATIONS, Options
 from .report import METRICS_TEXT, head, what_was_run, write
 from .tables import Contest
-from .trials import Row, Store, Trial, plan
+from .trials import Row, Store, Trial, plan, rivals
 
 METHODS = (BEST, BASELINE, PAPER, UNCLAMPED, CLAMPED)
 NAMES = tuple(m.name for m in METHODS)
@@ -27,6 +25,7 @@ QUICK_STRIDE = 3
 CONTESTS = (
     Contest(BEST.name, BASELINE.name),
     Contest(BEST.name, PAPER.name),
+    Contest(BEST.name, UNCLAMPED.name),
     Contest(PAPER.name, UNCLAMPED.name),
     Contest(PAPER.name, CLAMPED.name),
     Contest(BASELINE.name, UNCLAMPED.name),
@@ -57,24 +56,11 @@ def run(output: Path, options: Options) -> None:
     try:
         for stage in stages:
             failed += store.obtain(stage, options.place, deadline)
-            failed += store.obtain(rivals(store, stage), options.place, deadline)
+            failed += store.obtain(rivals(store, stage, BEST, BASELINE), options.place, deadline)
     finally:
         wanted = [trial for stage in stages for trial in stage]
         _report(output, store, wanted, options)
     check_made(failed)
-
-
-def rivals(store: Store, trials: Sequence[Trial]) -> list[Trial]:
-    """Return the improved baseline's fits with about the Gaussians that the bytes of ours buy."""
-    found = []
-    for trial in trials:
-        if trial.method == BEST:
-            ours, other = store.read(trial), store.read(trial._replace(method=BASELINE))
-            if ours is not None and other is not None and ours.bytes > other.bytes:
-                # a little more than they buy, so that the curve reaches as far
-                bought = 1 + math.ceil(1.03 * other.n * ours.bytes / other.bytes)
-                found.append(trial._replace(method=BASELINE, n=bought))
-    return found
 
 
 def _stages(names: list[str], options: Options) -> list[list[Trial]]:
@@ -93,7 +79,7 @@ def _stages(names: list[str], options: Options) -> list[list[Trial]]:
 
 def _report(output: Path, store: Store, wanted: list[Trial], options: Options) -> None:
     rows = store.rows(wanted)
-    extra = store.rows(rivals(store, wanted))
+    extra = store.rows(rivals(store, wanted, BEST, BASELINE))
     both = [*rows, *extra]
     parts = head("DAVIS first frames: quality against the number of Gaussians", "davis", options)
     parts += ["## What was run", what_was_run(rows, wanted, options), METRICS_TEXT]

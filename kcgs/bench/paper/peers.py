@@ -96,7 +96,8 @@ def ensure_network(path: Path, image: Tensor, labels: Tensor, size: int, seconds
 
 def _measured(picture: Tensor, image: Tensor, labels: Tensor, **told: Any) -> Peer:
     figures = measure(picture, image, labels)
-    return Peer(**{key: figures[key] for key in ("psnr", "ms_ssim", "ef_psnr", "ef_ssim")}, **told)
+    shown: dict[str, Any] = {key: figures[key] for key in ("psnr", "ms_ssim", "ef_psnr", "ef_ssim")}
+    return Peer(**shown, **told)
 
 
 def _encode(name: str, image: Tensor, quality: int) -> bytes:

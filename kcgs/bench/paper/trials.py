@@ -112,7 +112,7 @@ class Store:
             temporary.write_text(json.dumps(dataclasses.asdict(row)), encoding="utf-8")
 
     def obtain(self, trials: Sequence[Trial], place: Place, deadline: float | None = None) -> list[str]:
-        """Make what is missing, as far as it is expected to be done by `deadline` of the monotonic clock.
+        """Make what is missing, leaving out what would not be done by `deadline` of the monotonic clock.
 
         Returns:
             What is to be said of those that failed.
@@ -124,9 +124,8 @@ class Store:
         failed: list[str] = []
         for first in range(0, len(missing), at_once):
             part = missing[first : first + at_once]
-            if time.monotonic() + max(map(self._expected, part)) > deadline:
-                break
-            failed += make_all(self.make, part, place, name=str)
+            if time.monotonic() + max(map(self._expected, part)) <= deadline:
+                failed += make_all(self.make, part, place, name=str)
         return failed
 
     def _expected(self, trial: Trial) -> float:
@@ -159,6 +158,24 @@ def plan(
         for seed in range(seeds)
         for m in methods
     ]
+
+
+def rivals(store: Store, trials: Iterable[Trial], ours: Method, other: Method) -> list[Trial]:
+    """Return fits of the other method with about the Gaussians that the bytes of ours buy, where that is more."""
+    trials = list(dict.fromkeys(trials))
+    found = []
+    for trial in trials:
+        beside = next((t for t in trials if t.method == other and _is_beside(t, trial)), None)
+        if trial.method == ours and beside is not None:
+            mine, theirs = store.read(trial), store.read(beside)
+            if mine is not None and theirs is not None and mine.bytes > theirs.bytes:
+                # a little more than they buy, so that the curve reaches as far
+                found.append(beside._replace(n=1 + math.ceil(1.03 * theirs.n * mine.bytes / theirs.bytes)))
+    return found
+
+
+def _is_beside(one: Trial, other: Trial) -> bool:
+    return (one.picture, one.n, one.seed) == (other.picture, other.n, other.seed)
 
 
 def _settings(trial: Trial) -> str:
