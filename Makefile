@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-.PHONY: demo test test-all notebooks lint clean
+.PHONY: demo report test test-all notebooks lint clean
 
 # The stamp is newer than what it was made from, or the environment is made again.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -17,6 +17,12 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 demo: $(VENV)/.installed
 	$(BIN)/kcgs bench demo -o demo
+
+# The charts, a few minutes, and README's tables from all committed results.csv. Sequences of DAVIS take hours: see
+# `kcgs bench davis`, which goes on where it was stopped.
+report: $(VENV)/.installed
+	$(BIN)/kcgs bench charts -o notebooks/reports/charts
+	$(BIN)/python -m kcgs.bench.paper.readme
 
 test: $(VENV)/.installed
 	$(PYTEST) -m "not slow"

@@ -129,6 +129,10 @@ class Spec(NamedTuple):
         _add(digest.update, self.band)
         return digest.hexdigest()[:20]
 
+    def path(self, folder: Path) -> Path:
+        """Return the file that the result is kept in."""
+        return folder.absolute() / f"{self.key()}.safetensors"
+
 
 class Fitted(NamedTuple):
     """A finished fit: its figures; the scene is read when it is asked for."""
@@ -185,11 +189,19 @@ def ensure(specs: Iterable[Spec], folder: Path, *, engine: str = "local", worker
     """
     folder = folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
-    wanted = [(folder / f"{spec.key()}.safetensors", spec) for spec in specs]
+    wanted = [(spec.path(folder), spec) for spec in specs]
     missing = {path: spec for path, spec in wanted if not path.is_file()}
     place = Place(engine, workers)
     check_made(make_all(_make, list(missing.items()), place, name=lambda job: job[1].name or job[0].stem))
     return [_read(path) for path, _ in wanted]
+
+
+def ensure_one(spec: Spec, folder: Path) -> Fitted:
+    """Return one result, after making it here where it is not in the folder yet: `ensure` within a job of one's own."""
+    path = spec.path(folder)
+    if not path.is_file():
+        _make((path, spec))
+    return _read(path)
 
 
 def _make(job: tuple[Path, Spec]) -> None:

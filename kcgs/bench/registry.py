@@ -8,11 +8,13 @@ from typing import Any
 
 from .fits import Place
 
-_EXPERIMENTS = ("demo", "render", "fit", "maps", "decode", "rate", "zoo")
+# the paper's, which share their options
+_PAPER = ("charts", "davis", "ablation", "convergence")
+_EXPERIMENTS = ("demo", "render", "fit", "maps", "decode", "rate", "zoo", *_PAPER)
 # those that have groups to choose from
 _GROUPED = ("fit", "decode", "rate", "zoo")
 # those whose fits may run side by side
-_PARALLEL = ("fit", "maps")
+_PARALLEL = ("fit", "maps", *_PAPER)
 
 
 def available_experiments() -> tuple[str, ...]:
@@ -29,6 +31,7 @@ def run(
     only: str | None = None,
     engine: str = "local",
     workers: int | None = None,
+    **settings: Any,
 ) -> None:
     """Run an experiment and write its report into the folder `output`, which is made if it is not there.
 
@@ -40,10 +43,12 @@ def run(
         only: names of groups with commas between them, for the experiments that have groups; None: all.
         engine: local or ray, for the experiments whose fits may run side by side.
         workers: fits at a time; None: one locally, and on Ray what its processors allow.
+        settings: sequences, budget_seconds, seeds, iterations, runs, for the paper's experiments, as in
+            :class:`kcgs.bench.paper.options.Options`; None: not given.
 
     Raises:
         ValueError: unknown name or group; `only` for an experiment without groups, an engine or workers for one whose
-            fits run one after another.
+            fits run one after another, settings for one that has none.
         OSError: the folder cannot be made.
     """
     if name not in _EXPERIMENTS:
@@ -53,7 +58,16 @@ def run(
     place = Place(engine, workers)
     if not place.is_here and name not in _PARALLEL:
         raise ValueError(f"engine and workers are for {', '.join(_PARALLEL)}; {name!r} runs one after another")
+    given = {key: value for key, value in settings.items() if value is not None}
+    if given and name not in _PAPER:
+        raise ValueError(f"{', '.join(given)} are for {', '.join(_PAPER)}; got {given} for {name!r}")
     output.mkdir(parents=True, exist_ok=True)
+    if name in _PAPER:
+        from .paper.options import Options
+
+        options = Options(data=data, quick=quick, place=place, **given)
+        import_module(f"{__package__}.paper.{name}").run(output, options)
+        return
     choice: dict[str, Any] = {} if only is None else {"only": only}
     if name in _PARALLEL:
         choice["place"] = place

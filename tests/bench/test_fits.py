@@ -70,6 +70,9 @@ class TestPlace:
         check_made([])
 
     def test_only_where_fits_may_run_side_by_side(self, tmp_path: Path) -> None:
-        with pytest.raises(ValueError, match="engine and workers are for fit, maps; 'render' runs one after another"):
+        with pytest.raises(
+            ValueError,
+            match="engine and workers are for fit, maps, charts, .*; 'render' runs one after another",
+        ):
             kcgs.bench.run("render", tmp_path / "out", workers=2)
         assert not (tmp_path / "out").exists()

@@ -1,0 +1,1 @@
+"""The paper's experiments: `kcgs bench charts`, `davis`, `ablation`, `convergence`."""

@@ -1,0 +1,108 @@
+"""Other ways to store a picture, in the bytes of our file: JPEG, WebP, AVIF, a small network."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image, features
+from torch import Tensor
+
+from kcgs._atomic import atomic_path
+from kcgs.bench.measure import measure
+
+from . import siren
+
+CODECS = {"JPEG": ("JPEG", "jpg"), "WebP": ("WEBP", "webp"), "AVIF": ("AVIF", "avif")}
+GAUSSIAN_TOOLS_TEXT = """No other tool that fits 2D Gaussians to pictures was run. The registry's list has `gsplat`,
+which draws on CUDA only; GaussianImage and Image-GS are not on it, and their code needs CUDA. `splatthis`, which
+writes such splats as SVG, is on the list and was not tried."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Peer:
+    """A picture in about the bytes asked for, and how good it is."""
+
+    name: str
+    bytes: int
+    psnr: float
+    ms_ssim: float
+    ef_psnr: float
+    ef_ssim: float
+    seconds: float
+    note: str = ""
+    history: tuple[tuple[float, float, float], ...] = ()  # seconds, PSNR, EF-PSNR
+
+
+def codecs(image: Tensor, labels: Tensor, size: int) -> list[Peer]:
+    """Encode with every codec that Pillow has, at the largest quality whose file is not above `size` bytes."""
+    return [codec(name, image, labels, size) for name, (_, key) in CODECS.items() if features.check(key)]
+
+
+def codec(name: str, image: Tensor, labels: Tensor, size: int) -> Peer:
+    """Encode with one codec; where even its smallest file is larger, that one, and a note says so."""
+    start = time.perf_counter()
+    low, high, best = 1, 100, b""
+    while low <= high:  # sizes rise with quality
+        quality = (low + high) // 2
+        data = _encode(name, image, quality)
+        if len(data) <= size:
+            best, low = data, quality + 1
+        else:
+            high = quality - 1
+    note = "" if best else "its smallest file is larger"
+    best = best or _encode(name, image, 0)
+    seconds = time.perf_counter() - start
+    with Image.open(BytesIO(best)) as file:
+        pixels = np.asarray(file.convert("RGB"))
+    picture = torch.from_numpy(pixels.copy()).permute(2, 0, 1).float() / 255
+    return _measured(picture, image, labels, name=name, bytes=len(best), seconds=seconds, note=note)
+
+
+def network(image: Tensor, labels: Tensor, size: int, seconds: float) -> Peer:
+    """Train a SIREN whose half-precision weights fit into `size` bytes."""
+    trained = siren.train(image, size, seconds=seconds)
+    curve = []
+    for spent, picture in trained.history:
+        figures = measure(picture, image, labels)
+        curve.append((spent, figures["psnr"], figures["ef_psnr"]))
+    return _measured(
+        trained.picture,
+        image,
+        labels,
+        name="SIREN",
+        bytes=trained.bytes,
+        seconds=trained.seconds,
+        note=f"{trained.width} wide, {trained.iterations:,} iterations",
+        history=tuple(curve),
+    )
+
+
+def ensure_network(path: Path, image: Tensor, labels: Tensor, size: int, seconds: float) -> Peer:
+    """Read a trained network's figures, after training it where they are not there."""
+    if not path.is_file():
+        peer = network(image, labels, size, seconds)
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(dataclasses.asdict(peer)), encoding="utf-8")
+    kept = json.loads(path.read_text(encoding="utf-8"))
+    return Peer(**{**kept, "history": tuple((s, p, e) for s, p, e in kept["history"])})
+
+
+def _measured(picture: Tensor, image: Tensor, labels: Tensor, **told: Any) -> Peer:
+    figures = measure(picture, image, labels)
+    shown: dict[str, Any] = {key: figures[key] for key in ("psnr", "ms_ssim", "ef_psnr", "ef_ssim")}
+    return Peer(**shown, **told)
+
+
+def _encode(name: str, image: Tensor, quality: int) -> bytes:
+    levels = (image.clamp(0, 1) * 255 + 0.5).floor().to(torch.uint8).permute(1, 2, 0).numpy()
+    file, (codec_name, key) = BytesIO(), CODECS[name]
+    effort: dict[str, dict[str, Any]] = {"jpg": {"optimize": True}, "webp": {"method": 6}, "avif": {"speed": 4}}
+    Image.fromarray(np.ascontiguousarray(levels)).save(file, codec_name, quality=quality, **effort[key])
+    return file.getvalue()

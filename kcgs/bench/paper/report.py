@@ -1,0 +1,75 @@
+"""What the four reports have in common."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+from kcgs._atomic import atomic_path
+from kcgs.bench.machine import describe
+
+from .methods import FULL_ITERATIONS
+from .options import Options
+from .trials import Row, Trial
+
+_QUICK_TEXT = "The short form, small pictures and few iterations: the numbers only show that all of it runs."
+METRICS_TEXT = """PSNR and MS-SSIM are over the whole picture, EF-PSNR and edge SSIM within 5 pixels of the contours of
+the given map, for every method alike; decibels, of values clipped to [0, 1]. `paper` is the paper's method,
+`gaussian-image` its baseline without clamp and `gaussian-image-clamp` with it, `best` ours, and `best-baseline` ours
+with the regions off, the baseline improved as much. All run on the same kernel. Differences are paired by picture,
+above zero where the first is better; intervals are 95 %, by bootstrap over pictures. Seconds are wall time of a fit,
+which other work on the machine slows; core s is the processor time of fit and measurement."""
+
+
+def head(title: str, name: str, options: Options) -> list[str]:
+    """Begin a report: title, command, machine."""
+    parts = [f"# {title}", f"Made by `{options.command(name)}`."]
+    parts.append("\n".join(f"- {line}" for line in [*describe(), f"Fits: {options.place}"]))
+    return [*parts, _QUICK_TEXT] if options.quick else parts
+
+
+def what_was_run(rows: Sequence[Row], wanted: Sequence[Trial], options: Options) -> str:
+    """State pictures, iterations, seconds, and what is missing."""
+    there = {(row.picture, row.n, row.method, row.seed) for row in rows}
+    lacking = [t for t in wanted if (t.picture, t.n, t.method.name, t.seed) not in there]
+    lines = [f"- Pictures: {', '.join(dict.fromkeys(row.picture for row in rows)) or 'none'}."]
+    published = sorted({t.config().iterations for t in wanted if t.method.is_published})
+    own = sorted({t.config().iterations for t in wanted if not t.method.is_published})
+    if published:
+        lines.append(
+            f"- Published recipes: {' and '.join(f'{i:,}' for i in published)} iterations, not {FULL_ITERATIONS:,}, "
+            "with their schedule shortened and larger steps, by the recipes' own rule: not the published figures."
+        )
+    if own:
+        lines.append(f"- Ours: {' and '.join(f'{i:,}' for i in own)} iterations.")
+    lines.append(f"- {len(rows)} fits are there, of {sum(row.seconds for row in rows):,.0f} s in all.")
+    if lacking:
+        budget = "" if options.budget_seconds is None else f", for the budget of {options.budget_seconds:,.0f} s"
+        lines.append(f"- Missing{budget}: {len(lacking)} of {len(wanted)} fits: {_missing(lacking)}.")
+    return "\n".join(lines)
+
+
+def write(output: Path, rows: Sequence[Row], parts: Sequence[str]) -> None:
+    """Write report.md and results.csv."""
+    with atomic_path(output / "report.md") as temporary:
+        temporary.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
+    names = [field.name for field in dataclasses.fields(Row) if field.name not in ("history", "scene")]
+    with atomic_path(output / "results.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([*names, "bits_per_pixel"])
+        for row in rows:
+            values = [getattr(row, name) for name in names] + [row.bits_per_pixel]
+            writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])
+
+
+def _missing(lacking: Sequence[Trial]) -> str:
+    """Group what is missing by N."""
+    parts = []
+    for n in sorted({t.n for t in lacking}):
+        here = [t for t in lacking if t.n == n]
+        pictures = list(dict.fromkeys(t.picture for t in here))
+        shown = ", ".join(pictures[:4]) + (f" and {len(pictures) - 4} more pictures" if len(pictures) > 4 else "")
+        parts.append(f"N = {n:,}: {len(here)} of {shown}")
+    return "; ".join(parts)
