@@ -2,6 +2,33 @@
 
 A layer tells, for each class of size, how many Gaussians there are, and then what each is. The order of a sum is free:
 within a class Gaussians go by the cell that they lie in, row by row, and only how many lie in each cell is told.
+
+The stream of a layer
+---------------------
+
+Bytes are as in `labels`; Uniforms, Choices and Magnitudes are those of `models`, `quantize` says what numbers mean.
+Models begin with the file and go on from layer to layer. Each line below is coded for all Gaussians of the layer before
+the next one begins, in their order: by class of size, the largest first, then by cell, row by row.
+
+1. Counts. The least class of size that is held, from -8: Uniform of 64, f; the last one, from that: Uniform of 64 - f.
+   No class is above 28. For each of them, rising: the count's number of bits by the Choices ``lengths``, alone, then
+   the count less its highest bit, a Uniform of that bit. A layer holds a Gaussian at least.
+2. Cells, class by class, falling, of those that hold any: `cells`.
+3. ``scale``: Uniform of S.
+4. ``ratio``: the Magnitudes ``ratio`` with t = 2 / (the step of the ratio); at most floor(12 / step + 1/2).
+5. ``angle``: Uniform of T.
+6. Colours, channel by channel: the size by the Magnitudes ``grey``, ``hue`` and ``hue2`` of the first, the second,
+   and all later channels, with t = loud = sqrt(pi / (12 D)) * 2**energy; then the sign, 1 if negative: Uniform of 2, of
+   1 where the size is 0. The context is 0 in the first channel; else, a being the size of the channel before, 2 if
+   a > 0.8 loud, 1 if a > 0.35 loud, else 0.
+7. Place in the cell, across: Uniform of X; then down: Uniform of Y.
+8. If the file has R > 1 regions: whether the Gaussian's region is another than that under its centre (that of the label
+   at floor(x), floor(y) as float32, clamped to the picture), by the Choices ``stays``; then for those of which it is,
+   Uniform of R - 1: the region's position among the sorted ids, less that under the centre, less 1, modulo R.
+
+Weights at the start are those in the code: ``grey`` (one context), ``hue`` and ``hue2`` (three each, all alike) and
+``ratio`` are 0.05 times the tables below; ``stays`` 20, 0.5; ``lengths`` 2, nine times 1, twelve times 0.3; ``margins``
+3, four times 1, four times 0.3.
 """
 
 from __future__ import annotations

@@ -5,14 +5,17 @@ The stream, for a map of H x W pixels whose size the reader knows
 
 **Bytes.** They are what constriction's range coder (``stream.queue.RangeEncoder``: 32-bit words, 64-bit state) makes of
 the symbols below, each word's highest byte first. Bytes of zero at the end are left out, and the last bytes are those
-that leave out most; a reader puts zeros behind the stream. Probabilities have 24 bits in constriction. A *bit of chance
-p* is its Bernoulli model with p in whole 1/65536, exact there. A *number of n* is its Uniform model, n at most 65536;
-for n = 1 nothing is coded. A larger n is coded as a number of ceil(n / 65536) (the value's part above 16 bits, itself
-so if it must be), then one of 65536. A *fair bit* is a number of 2. *k plain bits* are numbers of 65536, lowest bits
-first, the last one of the 2**(k mod 16) that are left. A *magnitude* is the value's count of bits, a number of 64, then
-the plain bits below its highest one. A *learnt bit* has the chance ``ones / all``, rounded down to 1/65536 and kept
-within 64 of 0 and of 65536; ``all`` starts at 4 and ``ones`` at 2 unless said otherwise; each bit adds 2 to ``all``,
-and 2 to ``ones`` if it is 1.
+that leave out most; a reader puts zeros behind the stream. It has three numbers of 64 bits: ``low`` is 0, ``range`` is
+2**64 - 1, ``point`` the first two words. The code of a symbol is ``(point - low) // step`` with ``step = range >> 24``;
+those from a to b mean it; then ``low += a * step``, ``range = (b - a) * step``, modulo 2**64; and if ``range`` is below
+2**32, all three move up by 32 bits, and ``point`` takes the next word in. Probabilities have 24 bits in constriction. A
+*bit of chance p* is its Bernoulli model with p in whole 1/65536, exact there. A *number of n* is its Uniform model, n
+at most 65536; for n = 1 nothing is coded. A larger n is coded as a number of ceil(n / 65536) (the value's part above 16
+bits, itself so if it must be), then one of 65536. A *fair bit* is a number of 2. *k plain bits* are numbers of 65536,
+lowest bits first, the last one of the 2**(k mod 16) that are left. A *magnitude* is the value's count of bits, a number
+of 64, then the plain bits below its highest one. A *learnt bit* has the chance ``ones / all``, rounded down to 1/65536
+and kept within 64 of 0 and of 65536; ``all`` starts at 4 and ``ones`` at 2 unless said otherwise; each bit adds 2 to
+``all``, and 2 to ``ones`` if it is 1.
 
 **Regions.** Their number R: fair bits of 1 for floor(log2 R), a fair bit of 0, and so many plain bits of R. Then a fair
 bit: 0 if the ids of regions, in the order in which regions are numbered (below), are 0 to R - 1. Else the ids: sorted,

@@ -1,4 +1,29 @@
-"""What is likely: adaptive tables of weights for the numbers of a Gaussian."""
+"""What is likely: adaptive tables of weights for the numbers of a Gaussian.
+
+All numbers are float64; every sum goes from left to right, every operation is rounded once.
+
+**A categorical symbol** of A values with weights w_0 to w_(A-1), above 0, is coded in 24 bits: with
+``scale = (2**24 - A) / (w_0 + ... + w_(A-1))`` the codes of value s begin at
+``floor((w_0 + ... + w_(s-1)) * scale) + s``, and end where those of s + 1 begin, or at 2**24. (That is constriction's
+Categorical with ``perfect=False``.) In a *Uniform* of n, 2 to 2**24, those of s begin at ``s * (2**24 // n)``, and the
+last ones end at 2**24; for n = 1 nothing is coded.
+
+**Choices** code a symbol by weights that they keep, for each of their contexts; after a group of symbols that are coded
+together, 1 is added to the weight of each that was seen.
+
+**Magnitudes** code sizes 0, 1, 2 ... below 2**24 in units of a given scale t. They keep, for each of their contexts, a
+*shape* of 24 bins: bin i is about sizes from i t / 8 to (i + 1) t / 8. A size is its *bucket* (0 to 15 have their own;
+each octave from 2**4 to 2**23 has eight of equal width: 176 in all), as a categorical symbol, then a Uniform of the
+bucket's width. Of a group all buckets come first, then all Uniforms. The weight of the bucket [a, b) is
+
+    F(b - 1/2) - F(max(a - 1/2, 0)) + 0.001 * total / 176,
+
+where F rises from 0 to ``total``, the sum of the shape's bins, piecewise linear with knots at the bins' borders e_i =
+i * (t * 0.125) and constant beyond: ``F(x) = F_i + clip((x - e_i) / (e_(i+1) - e_i), 0, 1) * (F_(i+1) - F_i)``, i
+being the last border at or below x, at most 23. After a group each size s is spread over [max(s - 1/2, 0), s + 1/2]:
+each bin of its context (the last one without end) gets the share that it covers, rounded to whole 1/256 (halves up);
+the group's sum is added to the shape at once.
+"""
 
 from __future__ import annotations
 

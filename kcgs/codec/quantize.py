@@ -19,7 +19,20 @@ and small Gaussians get coarse shapes, and wide ones fine colours. Nothing count
 than that has the picture's area in place of its own. The steps are read from two classes: energy (octaves
 of :math:`|c| \sqrt{\sigma_1 \sigma_2}`) and size (three quarters of an octave of :math:`\sqrt{\sigma_1 \sigma_2}`).
 
-What is restored is computed from sums, products and square roots of float64 alone: the same bits on every machine.
+What is restored is computed from sums, products, quotients and square roots of float64 alone (`exact`): the same bits
+on every machine that does them in the order of the code, :class:`Quantizer`. In short, with D = 2^(-code / 32), classes
+e of energy and s of size, and A = min(pi 2^(1.5 (s + 1/2)), H W), u = sqrt(12 D / pi * 2^(-2 e - 1)):
+
+- there are S = floor(0.75 / (sqrt(1/2) / ln 2 * u) + 1/2) scales in a class (1 to 2^20): log2 of
+  sqrt(sigma_1 sigma_2) is m = 0.75 (s + (scale + 1/2) / S);
+- half the log2 of sigma_1 / sigma_2 is h = ratio * max(u / ln 2, 12 / 2^20);
+- there are T = floor(pi sinh(2 h ln 2) / u + 1/2) angles (2 to 2^20; 1 for ratio 0): that of the longer axis, from x
+  to y, is pi * angle / T; sigma_1 = 2^(m + h) along it, sigma_2 = 2^(m - h) across give ``cholesky``;
+- colours are counted in steps of sqrt(12 D / A); three channels are the rotated ones (`opponent`);
+- a cell of side a has X = ceil(a / (sqrt(2) u l11)) places across and Y = ceil(a / (sqrt(2) u l22)) down (1 to 2^20):
+  x = a (column + (place + 1/2) / X), and so y.
+
+Centres, factors and colours are then rounded to float32.
 """
 
 from __future__ import annotations

@@ -81,8 +81,9 @@ def encode(
 
     Raises:
         TypeError: an argument of the wrong type.
-        ValueError: a batch, no Gaussians, region ids that the map does not hold, both `quality` and `target_bytes`,
-            numbers out of range, a target that the coarsest file misses.
+        ValueError: a batch, no Gaussians, values that are not finite, region ids that the map does not hold, both
+            `quality` and `target_bytes`, numbers out of range, more than a file may hold (:mod:`kcgs.codec.stream`),
+            a target that the coarsest file misses.
 
     Example:
         >>> field = GaussianField.random(100, (32, 48), seed=0)

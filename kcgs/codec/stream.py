@@ -17,7 +17,7 @@ varint                  layers
 varint, varint          for each layer: its energy, as steps down from the last one's (the first: from 40), length
 4                       CRC-32 of everything above, then of the map
 map                     if R > 1 (`maps`)
-layer                   for each: its bytes (`gaussians`), then 2 bytes, CRC-16 (CCITT, from 0) of them
+layer                   for each: its bytes (`gaussians`), then 2 bytes, CRC-16 (polynomial 0x1021, from 0)
 ======================  ==================================================================================
 
 A file that ends early is a coarser picture, as long as its header and a layer are whole.
