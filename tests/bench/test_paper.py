@@ -71,6 +71,7 @@ class TestCompare:
         lines = tables.losses(rows, [CONTEST]).splitlines()
         assert lines[0] == "- best - best-baseline, equal N, N = 100, PSNR: 1 of 2: b -0.50"
         assert tables.losses([row(), row(method="best-baseline", psnr=20.0)], [CONTEST]) == "Nowhere."
+        assert "0.30 dB here (b, N = 100, best)" in tables.rounding([rows[0], row("b", decoded_psnr=29.7)])
         assert "| 100 | best - best-baseline | equal N | 2 | +0.00 |" in tables.differences(rows, [CONTEST])
 
 
@@ -117,7 +118,7 @@ class TestStore:
         store.make(trials[0])
         assert [r.method for r in store.rows(trials)] == ["gaussian-image"]
         made = store.read(trials[0])
-        assert made is not None and made.bytes > 0 and made.decoded_psnr > made.psnr - 0.16
+        assert made is not None and made.bytes > 0 and made.decoded_psnr > made.psnr - 1
         # as long as the last one would take is more than is left
         assert store.obtain(trials, HERE, time.monotonic() + 60) == [] and len(store.rows(trials)) == 2
         assert store.read(trials[0]) == made

@@ -105,7 +105,7 @@ def _report(output: Path, store: Store, wanted: list[Trial], options: Options) -
         parts += ["## The paper's rows", _PAPER_TEXT, paper_table(rows)]
         parts += ["## Ours", _OUR_TEXT, our_table(rows)]
         parts += ["## Differences", tables.EQUAL_BITS_TEXT, tables.differences(rows, contests)]
-        parts += ["## All figures", tables.BITS_TEXT, tables.quality(rows, tuple(SHOWN), SHOWN)]
+        parts += ["## All figures", tables.BITS_TEXT, tables.rounding(rows), tables.quality(rows, tuple(SHOWN), SHOWN)]
         parts += ["## Each picture", tables.each(rows, tuple(SHOWN))]
     write(output, rows, parts)
 

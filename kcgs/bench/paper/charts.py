@@ -102,7 +102,7 @@ def _report(output: Path, store: Store, wanted: list[Trial], options: Options) -
     parts += [_TEXT, "## What was run", what_was_run(rows, wanted, options), METRICS_TEXT]
     if rows:
         parts += ["## Where a method loses", tables.losses(both, CONTESTS, [NUM_GAUSSIANS])]
-        parts += ["## Results", tables.BITS_TEXT]
+        parts += ["## Results", tables.BITS_TEXT, tables.rounding(rows)]
     for name in dict.fromkeys(row.picture for row in rows):
         here = [row for row in rows if row.picture == name]
         present = tuple(n for n in SHOWN if select(here, n))
