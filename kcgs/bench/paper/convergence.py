@@ -44,7 +44,7 @@ def run(output: Path, options: Options) -> None:
 
     Args:
         output: folder.
-        options: what is asked; of sequences the first is taken, and without data scikit-image's photo or, quick, a disc.
+        options: what is asked; of sequences the first is taken, without data a photo of scikit-image, or quick a disc.
 
     Raises:
         ValueError: a sequence that is not there, numbers out of range.

@@ -105,6 +105,10 @@ def unpaid(rows: Sequence[Row], ours: str, baseline: str) -> str:
         if found is not None:
             shares = [row.map_bytes / row.bytes for row in select(rows, ours, n)]
             word = "does not pay for itself" if found.mean < 0 else "pays for itself"
+            if math.isnan(found.low):
+                word += " on this one picture"
+            elif found.low < 0 < found.high:
+                word = "is not shown to pay for itself or not to"
             lines.append(
                 f"- N = {n:,}: the map is {100 * mean(shares):.1f} % of the bytes and {word} in "
                 f"{QUANTITIES[quantity]}: {signed(found.mean)} dB at equal bits, {found.wins} won and "
