@@ -45,9 +45,15 @@ def what_was_run(rows: Sequence[Row], wanted: Sequence[Trial], options: Options)
     if own:
         lines.append(f"- Ours: {' and '.join(f'{i:,}' for i in own)} iterations.")
     lines.append(f"- {len(rows)} fits are there, of {sum(row.seconds for row in rows):,.0f} s in all.")
+    if options.runs is not None:
+        lines.append("- Fits are shared with the other benches, which may have made them.")
     if lacking:
-        budget = "" if options.budget_seconds is None else f", for the budget of {options.budget_seconds:,.0f} s"
-        lines.append(f"- Missing{budget}: {len(lacking)} of {len(wanted)} fits: {_missing(lacking)}.")
+        budget = (
+            "" if options.budget_seconds is None else f" the budget of {options.budget_seconds:,.0f} s was over, or"
+        )
+        lines.append(
+            f"- Missing, because{budget} the run was stopped: {len(lacking)} of {len(wanted)} fits: {_missing(lacking)}."
+        )
     return "\n".join(lines)
 
 
