@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -44,7 +45,8 @@ def what_was_run(rows: Sequence[Row], wanted: Sequence[Trial], options: Options)
         )
     if own:
         lines.append(f"- Ours: {' and '.join(f'{i:,}' for i in own)} iterations.")
-    lines.append(f"- {len(rows)} fits are there, of {sum(row.seconds for row in rows):,.0f} s in all.")
+    known = sum(row.seconds for row in rows if not math.isnan(row.seconds))
+    lines.append(f"- {len(rows)} fits are there, of {known:,.0f} s in all.")
     if options.runs is not None:
         lines.append("- Fits are shared with the other benches, which may have made them.")
     if lacking:

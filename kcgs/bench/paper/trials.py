@@ -62,7 +62,7 @@ class Row:
     ms_ssim: float
     ef_psnr: float
     ef_ssim: float
-    seconds: float  # wall time of the whole call, compilation excluded
+    seconds: float  # wall time of the whole call, compilation excluded; NaN: it was stopped meanwhile
     core_seconds: float  # processor time of fit and measurement; NaN: the fit was there already
     num_gaussians: int  # what is left of n
     pixels: int
