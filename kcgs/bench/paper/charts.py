@@ -113,6 +113,7 @@ def _report(output: Path, store: Store, wanted: list[Trial], options: Options) -
         parts += ["## Differences", tables.EQUAL_BITS_TEXT, _BITS_TEXT]
         parts.append(tables.differences(both, CONTESTS, [NUM_GAUSSIANS]))
         extra = [row for row in both if row.n != NUM_GAUSSIANS]
+        parts.append("" if extra else "No fits of the baselines at our bytes are there.")
         parts += ["### The baselines with the Gaussians that our bytes buy", tables.each(extra, NAMES)] if extra else []
     write(output, both, parts)
 

@@ -17,11 +17,11 @@ from .trials import Row, Trial
 
 _QUICK_TEXT = "The short form, small pictures and few iterations: the numbers only show that all of it runs."
 METRICS_TEXT = """PSNR and MS-SSIM are over the whole picture, EF-PSNR and edge SSIM within 5 pixels of the contours of
-the given map, for every method alike; decibels, of values clipped to [0, 1]. `paper` is the paper's method,
-`gaussian-image` its baseline without clamp and `gaussian-image-clamp` with it, `best` ours, and `best-baseline` ours
-with the regions off, the baseline improved as much. All run on the same kernel. Differences are paired by picture,
-above zero where the first is better; intervals are 95 %, by bootstrap over pictures. Seconds are wall time of a fit,
-which other work on the machine slows; core s is the processor time of fit and measurement."""
+the given map, for every method alike; decibels, of values clipped to [0, 1]. `paper` is the paper's method, `gaussian-
+image` its baseline without clamp and `gaussian-image-clamp` with it, `best` ours, and `best-baseline` ours with the
+regions off, the baseline improved as much. All run on the same kernel. Differences are paired by picture, above zero
+where the first is better; intervals are 95 %, by bootstrap over pictures, where there are five or more. Seconds are
+wall time of a fit, which other work on the machine slows; core s is the processor time of fit and measurement."""
 
 
 def head(title: str, name: str, options: Options) -> list[str]:
@@ -54,7 +54,7 @@ def what_was_run(rows: Sequence[Row], wanted: Sequence[Trial], options: Options)
             "" if options.budget_seconds is None else f" the budget of {options.budget_seconds:,.0f} s was over, or"
         )
         lines.append(
-            f"- Missing, because{budget} the run was stopped: {len(lacking)} of {len(wanted)} fits: {_missing(lacking)}."
+            f"- Missing, for{budget} the run was stopped: {len(lacking)} of {len(wanted)} fits: {_missing(lacking)}."
         )
     return "\n".join(lines)
 

@@ -106,7 +106,7 @@ def unpaid(rows: Sequence[Row], ours: str, baseline: str) -> str:
             shares = [row.map_bytes / row.bytes for row in select(rows, ours, n)]
             word = "does not pay for itself" if found.mean < 0 else "pays for itself"
             if math.isnan(found.low):
-                word += " on this one picture"
+                word += " on so few pictures as here"
             elif found.low < 0 < found.high:
                 word = "is not shown to pay for itself or not to"
             lines.append(
