@@ -41,13 +41,16 @@ class TestCompare:
         rows += [row("a", method="best-baseline"), row("b", method="best-baseline", psnr=31.5)]
         found = equal_n(rows, *CONTEST, 100, "psnr")
         assert found is not None and found.values == {"a": 0.5, "b": -0.5} and found.worst == ["b", "a"]
-        assert (found.mean, found.wins, found.losses) == (0.0, 1, 1) and found.low < 0 < found.high
+        assert (found.mean, found.wins, found.losses) == (0.0, 1, 1) and math.isnan(found.low)
         assert complete(rows, CONTEST, 100) == ["a", "b"]
         assert equal_n(rows, *CONTEST, 200, "psnr") is None
 
-    def test_one_picture_has_no_interval(self) -> None:
-        found = equal_n([row(psnr=31.0), row(method="best-baseline")], *CONTEST, 100, "psnr")
-        assert found is not None and found.mean == 1.0 and math.isnan(found.low)
+    def test_five_pictures_have_an_interval(self) -> None:
+        rows = [row(p, psnr=30.0 + i) for i, p in enumerate("abcde")] + [
+            row(p, method="best-baseline") for p in "abcde"
+        ]
+        found = equal_n(rows, *CONTEST, 100, "psnr")
+        assert found is not None and found.mean == 2.0 and 0.0 < found.low < 2.0 < found.high
 
     def test_seeds_are_averaged_before_pairs_are_made(self) -> None:
         rows = [row(psnr=30.0), row(psnr=32.0, seed=1), row(method="best-baseline", psnr=30.5)]
@@ -71,6 +74,7 @@ class TestCompare:
         lines = tables.losses(rows, [CONTEST]).splitlines()
         assert lines[0] == "- best - best-baseline, equal N, N = 100, PSNR: 1 of 2: b -0.50"
         assert tables.losses([row(), row(method="best-baseline", psnr=20.0)], [CONTEST]) == "Nowhere."
+        assert "0.30 dB here (b, N = 100, best)" in tables.rounding([rows[0], row("b", decoded_psnr=29.7)])
         assert "| 100 | best - best-baseline | equal N | 2 | +0.00 |" in tables.differences(rows, [CONTEST])
 
 
@@ -117,7 +121,7 @@ class TestStore:
         store.make(trials[0])
         assert [r.method for r in store.rows(trials)] == ["gaussian-image"]
         made = store.read(trials[0])
-        assert made is not None and made.bytes > 0 and made.decoded_psnr > made.psnr - 0.16
+        assert made is not None and made.bytes > 0 and made.decoded_psnr > made.psnr - 1
         # as long as the last one would take is more than is left
         assert store.obtain(trials, HERE, time.monotonic() + 60) == [] and len(store.rows(trials)) == 2
         assert store.read(trials[0]) == made

@@ -7,7 +7,7 @@ from pathlib import Path
 from kcgs.bench.cells import count, db, markdown, signed
 from kcgs.bench.fits import check_made
 
-from . import pictures, tables
+from . import figures, pictures, tables
 from .compare import by_picture, complete, counts, equal_bits, equal_n, mean, select
 from .methods import BASELINE, BEST, CLAMPED, PAPER, UNCLAMPED, method
 from .options import PUBLISHED_ITERATIONS, Options
@@ -102,10 +102,11 @@ def _report(output: Path, store: Store, wanted: list[Trial], options: Options) -
         contests = [Contest(m.name, CLAMPED.name) for m in PAPER_ROWS[2:]]
         contests += [Contest(BEST.name, m.name) for m in OUR_ROWS[1:]]
         parts += ["## Where a part does harm", tables.losses(rows, contests)]
+        parts += _figure(output / "changes.png", rows)
         parts += ["## The paper's rows", _PAPER_TEXT, paper_table(rows)]
         parts += ["## Ours", _OUR_TEXT, our_table(rows)]
         parts += ["## Differences", tables.EQUAL_BITS_TEXT, tables.differences(rows, contests)]
-        parts += ["## All figures", tables.BITS_TEXT, tables.quality(rows, tuple(SHOWN), SHOWN)]
+        parts += ["## All figures", tables.BITS_TEXT, tables.rounding(rows), tables.quality(rows, tuple(SHOWN), SHOWN)]
         parts += ["## Each picture", tables.each(rows, tuple(SHOWN))]
     write(output, rows, parts)
 
@@ -145,6 +146,29 @@ def our_table(rows: list[Row]) -> str:
             line.append(db(_mean(rows, name, n, "decoded_psnr", shared)))
             lines.append(line + ([""] * 6 if name == BEST.name else _changes(rows, name, n, shared)))
     return markdown(header, lines)
+
+
+def _figure(path: Path, rows: list[Row]) -> list[str]:
+    """Draw the paper's rows against its first, and ours against best."""
+    panels = {}
+    for n in sorted({row.n for row in rows}):
+        for first, group, where in ((CLAMPED, PAPER_ROWS, "clamped baseline"), (BEST, OUR_ROWS, "best")):
+            present = [m.name for m in group if n in counts(rows, m.name)]
+            shared = complete(rows, present, n)
+            changes = {}
+            for name in present if first.name in present and shared else []:
+                if name != first.name:
+                    psnr, ef_psnr = (
+                        _mean(rows, name, n, q, shared) - _mean(rows, first.name, n, q, shared)
+                        for q in ("psnr", "ef_psnr")
+                    )
+                    changes[SHOWN[name]] = psnr, ef_psnr
+            if changes:
+                panels[f"against {where}, N = {n:,}, pictures: {len(shared)}"] = changes
+    if not panels:
+        return []
+    figures.plot_changes(path, panels)
+    return ["## Changes", "Means over the pictures that all rows of a panel have.", "![](changes.png)"]
 
 
 def _changes(rows: list[Row], name: str, n: int, shared: list[str]) -> list[str]:

@@ -102,7 +102,7 @@ def _report(output: Path, store: Store, wanted: list[Trial], options: Options) -
     parts += [_TEXT, "## What was run", what_was_run(rows, wanted, options), METRICS_TEXT]
     if rows:
         parts += ["## Where a method loses", tables.losses(both, CONTESTS, [NUM_GAUSSIANS])]
-        parts += ["## Results", tables.BITS_TEXT]
+        parts += ["## Results", tables.BITS_TEXT, tables.rounding(rows)]
     for name in dict.fromkeys(row.picture for row in rows):
         here = [row for row in rows if row.picture == name]
         present = tuple(n for n in SHOWN if select(here, n))
@@ -113,6 +113,7 @@ def _report(output: Path, store: Store, wanted: list[Trial], options: Options) -
         parts += ["## Differences", tables.EQUAL_BITS_TEXT, _BITS_TEXT]
         parts.append(tables.differences(both, CONTESTS, [NUM_GAUSSIANS]))
         extra = [row for row in both if row.n != NUM_GAUSSIANS]
+        parts.append("" if extra else "No fits of the baselines at our bytes are there.")
         parts += ["### The baselines with the Gaussians that our bytes buy", tables.each(extra, NAMES)] if extra else []
     write(output, both, parts)
 

@@ -13,6 +13,8 @@ from kcgs.bench.maps.gains import interval
 from .trials import Row
 
 QUANTITIES = {"psnr": "PSNR", "ms_ssim": "MS-SSIM", "ef_psnr": "EF-PSNR", "ef_ssim": "edge SSIM"}
+# drawing among fewer pictures says nothing of others
+LEAST = 5
 _TIES = {"psnr": 0.005, "ef_psnr": 0.005, "ms_ssim": 0.0001, "ef_ssim": 0.0005}
 
 
@@ -20,7 +22,7 @@ class Difference(NamedTuple):
     """Mean of differences over pictures, its bootstrap 95 % interval, and how many are won."""
 
     mean: float
-    low: float  # NaN for one picture
+    low: float  # NaN for fewer than LEAST pictures
     high: float
     wins: int
     losses: int
@@ -106,7 +108,7 @@ def summarize(values: dict[str, float], quantity: str) -> Difference | None:
     if not values:
         return None
     tie = _TIES[quantity.removeprefix("decoded_")]
-    low, high = interval(list(values.values())) if len(values) > 1 else (math.nan, math.nan)
+    low, high = interval(list(values.values())) if len(values) >= LEAST else (math.nan, math.nan)
     return Difference(
         statistics.fmean(values.values()),
         low,

@@ -44,7 +44,7 @@ def run(output: Path, options: Options) -> None:
 
     Args:
         output: folder.
-        options: what is asked; of sequences the first is taken, and without data scikit-image's photo.
+        options: what is asked; of sequences the first is taken, without data a photo of scikit-image, or quick a disc.
 
     Raises:
         ValueError: a sequence that is not there, numbers out of range.
@@ -52,7 +52,10 @@ def run(output: Path, options: Options) -> None:
     """
     options = options._replace(place=HERE)
     options.check()
-    name = "astronaut" if options.data is None else pictures.sequences(options.data, options.sequences, quick=False)[0]
+    if options.data is None:
+        name = "disc" if options.quick else "astronaut"
+    else:
+        name = pictures.sequences(options.data, options.sequences, quick=False)[0]
     store, wanted, deadline = options.store(output), trials(name, options), options.deadline()
     failed: list[str] = []
     try:
@@ -91,7 +94,7 @@ def _report(output: Path, store: Store, wanted: list[Trial], options: Options) -
         parts += ["### Seconds to a PSNR", reached(rows, "psnr")]
         parts += ["### Seconds to an EF-PSNR", reached(rows, "ef_psnr")]
         parts += ["## At the same bytes", _PEER_TEXT, peer_table(rows, others), peers.GAUSSIAN_TOOLS_TEXT]
-        parts += ["## All figures", tables.BITS_TEXT, tables.quality(rows, NAMES)]
+        parts += ["## All figures", tables.BITS_TEXT, tables.rounding(rows), tables.quality(rows, NAMES)]
     write(output, [*rows, *map(_as_row(rows), others)] if rows else rows, parts)
 
 

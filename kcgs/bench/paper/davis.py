@@ -88,7 +88,7 @@ def _report(output: Path, store: Store, wanted: list[Trial], options: Options) -
         parts += ["## Where a method loses", tables.losses(both, CONTESTS, at)]
         parts += ["## Do contours pay for their bits?", tables.unpaid(both, BEST.name, BASELINE.name)]
         parts += ["## Differences", tables.EQUAL_BITS_TEXT, _EXTRA_TEXT, tables.differences(both, CONTESTS, at)]
-        parts += ["## Means", tables.BITS_TEXT, tables.quality(rows, NAMES)]
+        parts += ["## Means", tables.BITS_TEXT, tables.rounding(rows), tables.quality(rows, NAMES)]
         parts += _figures(output, rows)
         parts += _worst(output, store, rows, options)
         parts += ["## Each sequence", tables.each(rows, NAMES)]

@@ -75,6 +75,29 @@ def plot_strip(path: Path, lines: Sequence[Mapping[str, Tensor]], *, side_names:
     save_figure(plot, path)
 
 
+def plot_changes(path: Path, changes: Mapping[str, Mapping[str, tuple[float, float]]]) -> None:
+    """Draw changes in PSNR and EF-PSNR, a line a row, a panel each title.
+
+    Args:
+        path: PNG to write.
+        changes: by title and row.
+    """
+    tallest = max(map(len, changes.values()))
+    plot, axes = figure(1, len(changes), width=5.4 * len(changes), height=1.6 + 0.28 * tallest)
+    for axis, (title, rows) in zip(axes if len(changes) > 1 else [axes], changes.items(), strict=True):
+        at = range(len(rows))[::-1]
+        axis.axvline(0.0, color="black", linewidth=0.8)
+        axis.plot([psnr for psnr, _ in rows.values()], at, "o", color=COLORS[0], label="PSNR")
+        axis.plot([ef for _, ef in rows.values()], at, "s", color=COLORS[1], markersize=4, label="EF-PSNR")
+        axis.set_yticks(at, list(rows))
+        axis.set_ylim(-0.6, len(rows) - 0.4)
+        axis.set(xlabel="change (dB)")
+        axis.set_title(title, fontsize=8)
+    handles, names = (axes[0] if len(changes) > 1 else axes).get_legend_handles_labels()
+    plot.legend(handles, names, loc="outside lower center", ncols=2)
+    save_figure(plot, path)
+
+
 def error(picture: Tensor, image: Tensor) -> Tensor:
     """Return the root of the mean squared error of every pixel, (H, W)."""
     return (picture - image).square().mean(0).sqrt()

@@ -14,7 +14,6 @@ BEGIN, END = "<!-- results: made by `make report` -->", "<!-- end of results -->
 _TITLES = {
     "davis": "DAVIS first frames",
     "charts": "Colour charts",
-    "ablation": "Ablation",
 }
 Line = dict[str, str]
 
@@ -30,10 +29,10 @@ def results(reports: Path) -> str:
         path = reports / name / "results.csv"
         lines = _read(path) if path.is_file() else []
         if lines:
-            parts.append(
-                f"**{title}** (`kcgs bench {name}`, `notebooks/reports/{name}/report.md`): {_pictures(lines)}."
-            )
-            parts.append(_table(lines))
+            parts.append(f"**{title}** (`kcgs bench {name}`, `notebooks/reports/{name}/report.md`):")
+            # two charts are no sample of pictures: no means
+            groups = _by_picture(lines) if name == "charts" else [lines]
+            parts += [f"{_pictures(group).capitalize()}.\n\n{_table(group)}" for group in groups]
     return "\n\n".join(parts)
 
 
@@ -61,6 +60,11 @@ def main() -> None:
 def _read(path: Path) -> list[Line]:
     with path.open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
+
+
+def _by_picture(lines: Sequence[Line]) -> list[list[Line]]:
+    names = dict.fromkeys(line["picture"] for line in lines)
+    return [[line for line in lines if line["picture"] == name] for name in names]
 
 
 def _pictures(lines: Sequence[Line]) -> str:

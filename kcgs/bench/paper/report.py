@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,11 +17,11 @@ from .trials import Row, Trial
 
 _QUICK_TEXT = "The short form, small pictures and few iterations: the numbers only show that all of it runs."
 METRICS_TEXT = """PSNR and MS-SSIM are over the whole picture, EF-PSNR and edge SSIM within 5 pixels of the contours of
-the given map, for every method alike; decibels, of values clipped to [0, 1]. `paper` is the paper's method,
-`gaussian-image` its baseline without clamp and `gaussian-image-clamp` with it, `best` ours, and `best-baseline` ours
-with the regions off, the baseline improved as much. All run on the same kernel. Differences are paired by picture,
-above zero where the first is better; intervals are 95 %, by bootstrap over pictures. Seconds are wall time of a fit,
-which other work on the machine slows; core s is the processor time of fit and measurement."""
+the given map, for every method alike; decibels, of values clipped to [0, 1]. `paper` is the paper's method, `gaussian-
+image` its baseline without clamp and `gaussian-image-clamp` with it, `best` ours, and `best-baseline` ours with the
+regions off, the baseline improved as much. All run on the same kernel. Differences are paired by picture, above zero
+where the first is better; intervals are 95 %, by bootstrap over pictures, where there are five or more. Seconds are
+wall time of a fit, which other work on the machine slows; core s is the processor time of fit and measurement."""
 
 
 def head(title: str, name: str, options: Options) -> list[str]:
@@ -44,10 +45,17 @@ def what_was_run(rows: Sequence[Row], wanted: Sequence[Trial], options: Options)
         )
     if own:
         lines.append(f"- Ours: {' and '.join(f'{i:,}' for i in own)} iterations.")
-    lines.append(f"- {len(rows)} fits are there, of {sum(row.seconds for row in rows):,.0f} s in all.")
+    known = sum(row.seconds for row in rows if not math.isnan(row.seconds))
+    lines.append(f"- {len(rows)} fits are there, of {known:,.0f} s in all.")
+    if options.runs is not None:
+        lines.append("- Fits are shared with the other benches, which may have made them.")
     if lacking:
-        budget = "" if options.budget_seconds is None else f", for the budget of {options.budget_seconds:,.0f} s"
-        lines.append(f"- Missing{budget}: {len(lacking)} of {len(wanted)} fits: {_missing(lacking)}.")
+        budget = (
+            "" if options.budget_seconds is None else f" the budget of {options.budget_seconds:,.0f} s was over, or"
+        )
+        lines.append(
+            f"- Missing, for{budget} the run was stopped: {len(lacking)} of {len(wanted)} fits: {_missing(lacking)}."
+        )
     return "\n".join(lines)
 
 

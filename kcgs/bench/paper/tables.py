@@ -83,17 +83,6 @@ def losses(rows: Sequence[Row], contests: Sequence[Contest], at: Sequence[int] |
     return "\n".join(lines) or "Nowhere."
 
 
-def verdicts(rows: Sequence[Row], contests: Sequence[Contest], at: Sequence[int]) -> str:
-    """Say of every contest whether the interval leaves zero out."""
-    lines = []
-    for contest, n in product(contests, at):
-        for (way, compare), quantity in product(_WAYS.items(), ("psnr", "ef_psnr")):
-            found = compare(rows, *contest, n, quantity)
-            if found is not None:
-                lines.append(f"- {contest}, N = {n:,}, {way}, {QUANTITIES[quantity]}: {_verdict(found)}")
-    return "\n".join(lines) or "Nothing to compare."
-
-
 def each(rows: Sequence[Row], methods: Sequence[str]) -> str:
     """One line a picture, N and method."""
     header = ["picture", "N", "method", "PSNR", "MS-SSIM", "EF-PSNR", "edge SSIM", "bytes", "of these map"]
@@ -116,6 +105,10 @@ def unpaid(rows: Sequence[Row], ours: str, baseline: str) -> str:
         if found is not None:
             shares = [row.map_bytes / row.bytes for row in select(rows, ours, n)]
             word = "does not pay for itself" if found.mean < 0 else "pays for itself"
+            if math.isnan(found.low):
+                word += " on so few pictures as here"
+            elif found.low < 0 < found.high:
+                word = "is not shown to pay for itself or not to"
             lines.append(
                 f"- N = {n:,}: the map is {100 * mean(shares):.1f} % of the bytes and {word} in "
                 f"{QUANTITIES[quantity]}: {signed(found.mean)} dB at equal bits, {found.wins} won and "
@@ -124,12 +117,11 @@ def unpaid(rows: Sequence[Row], ours: str, baseline: str) -> str:
     return "\n".join(lines) or "Nothing to compare."
 
 
-def _verdict(found: Difference) -> str:
-    text = f"{signed(found.mean)} dB"
-    if math.isnan(found.low):
-        return f"{text} on one picture, which says nothing of others"
-    text += f" ({signed(found.low)} to {signed(found.high)}), {found.wins} won, {found.losses} lost"
-    return text + ("" if found.low > 0 or found.high < 0 else ": no difference shown")
+def rounding(rows: Sequence[Row]) -> str:
+    """Say what the files cost at most."""
+    worst = max(rows, key=lambda row: row.psnr - row.decoded_psnr)
+    where = f"{worst.picture}, N = {worst.n:,}, {worst.method}"
+    return f"Rounding costs a PSNR of at most {worst.psnr - worst.decoded_psnr:.2f} dB here ({where})."
 
 
 def _means(found: list[Row], *, spread: bool = True) -> list[str]:

@@ -25,7 +25,8 @@ from kcgs.nn.renderer import render_image
 from . import pictures
 from .methods import COVERAGE, QUICK_ITERATIONS, Method
 
-# dB of a file's picture against the scene's own above the scene's PSNR: the error grows by at most a 28th, 0.15 dB
+# dB of a file's picture against the scene's own above the scene's PSNR: the error grows by about a 28th, 0.15 dB,
+# and by more where so few Gaussians are rounded that errors do not average out
 MARGIN = 14.5
 _QUALITIES = (10.0, 90.0)
 
@@ -61,7 +62,7 @@ class Row:
     ms_ssim: float
     ef_psnr: float
     ef_ssim: float
-    seconds: float  # wall time of the whole call, compilation excluded
+    seconds: float  # wall time of the whole call, compilation excluded; NaN: it was stopped meanwhile
     core_seconds: float  # processor time of fit and measurement; NaN: the fit was there already
     num_gaussians: int  # what is left of n
     pixels: int
