@@ -371,12 +371,12 @@ class TestFiles:
 
     def test_interrupted(self, tmp_path: Path, data: Path, stub: Stub, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(workshop, "largest", lambda *a, exact, quick: largest(*a, exact=exact, quick=True))
-        stub.stop_at = 2
+        stub.stop_at = 1
         with pytest.raises(KeyboardInterrupt):
             run(tmp_path / "out", data=data, only="davis8k,maps")
         text = (tmp_path / "out/report.md").read_text()
-        assert "- davis8k: stopped before its end, 1 of 2 steps are there." in text
-        assert "- precision: not chosen, 0 of 2 steps are there." in text
+        assert "- davis8k: stopped before its end, 0 of 2 steps are finished." in text
+        assert "- precision: not chosen, 0 of 2 steps are finished." in text
         assert "- speed: the data folder has none of its pictures." in text
         stub.stop_at = None
         run(tmp_path / "out", data=data, only="davis8k,maps")

@@ -74,13 +74,16 @@ def _report(output: Path, kept: Workshop, chosen: list[str]) -> None:
         if why is not None:
             notes.append(f"{group}: {why}.")
             continue
-        made = [step() for _, step in steps(group, kept)]
-        # a step that was reached may be unfinished; its points are shown all the same
-        points += [point for found in made for point in found]
-        count = sum(bool(found) for found in made)
-        if count < len(made):
+        todo, whole = list(steps(group, kept)), 0
+        for _, step in todo:
+            before = kept.missed
+            found = step()
+            # what there is of an unfinished step is shown all the same
+            points += found
+            whole += bool(found) and kept.missed == before
+        if whole < len(todo):
             why = "stopped before its end" if group in chosen else "not chosen"
-            notes.append(f"{group}: {why}, {count} of {len(made)} steps are there.")
+            notes.append(f"{group}: {why}, {whole} of {len(todo)} steps are finished.")
     _write_csv(output / "results.csv", points)
     absent = [name for name in ("JPEG", "WebP", "AVIF") if name not in present()]
     notes += [f"This Pillow has no {name}." for name in absent]

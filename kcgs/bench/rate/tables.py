@@ -15,6 +15,7 @@ from .gains import (
     QUALITIES,
     RIVALS,
     TIE,
+    Mean,
     Pair,
     bits_a_gaussian,
     bounds,
@@ -102,8 +103,7 @@ def _pair_cells(found: Sequence[Pair]) -> list[str]:
             continue
         won = sum(v > TIE[unit] for v in mean.values.values())
         lost = sum(v < -TIE[unit] for v in mean.values.values())
-        spread = f"{_signed(mean.low, unit)} to {_signed(mean.high, unit)}"
-        cells += [_signed(mean.mean, unit), spread, f"{won}-{lost}"]
+        cells += [_signed(mean.mean, unit), _spread(mean, unit), f"{won}-{lost}"]
     return cells + _times([p.other for p in found])
 
 
@@ -152,7 +152,12 @@ def _mean_cells(values: dict[str, float], unit: str) -> list[str]:
     if mean is None:
         return ["", ""]
     of = "" if len(mean.values) == len(values) else f" (of {len(mean.values)})"
-    return [_signed(mean.mean, unit) + of, f"{_signed(mean.low, unit)} to {_signed(mean.high, unit)}"]
+    return [_signed(mean.mean, unit) + of, _spread(mean, unit)]
+
+
+def _spread(mean: Mean, unit: str) -> str:
+    """Write an interval; one image has none."""
+    return f"{_signed(mean.low, unit)} to {_signed(mean.high, unit)}" if len(mean.values) > 1 else ""
 
 
 def bd_each(points: Sequence[Point], group: str) -> str:

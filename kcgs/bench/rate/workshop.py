@@ -49,6 +49,7 @@ class Workshop:
 
     def __init__(self, store: Store, data: Path | None, quick: bool, makes: bool = True) -> None:
         self.store, self.data, self.quick, self.makes = store, data, quick, makes
+        self.missed = 0  # how often something was not there that may not be made
         overrides = {"iterations": QUICK_ITERATIONS} if quick else {}
         self.config = FitConfig.from_recipe(RECIPE, **overrides)
         self.tuning = QUICK_TUNING if quick else ITERATIONS
@@ -76,7 +77,8 @@ class Workshop:
 
         def make() -> Point:
             picture = read(group, image, self.data)
-            _warm_up(self.config)
+            if not self.quick:
+                _warm_up(self.config)
             labels = picture.labels if regions else None
             start = time.perf_counter()
             made = fit_bytes(picture.image, labels, most, config=self.config)
@@ -110,7 +112,8 @@ class Workshop:
 
         def make() -> Point:
             picture = read(group, image, self.data)
-            warm_up(self.config)
+            if not self.quick:
+                warm_up(self.config)
             start = time.perf_counter()
             result = fit(picture.image, picture.labels, n, config=self.config)
             seconds = time.perf_counter() - start
@@ -165,7 +168,11 @@ class Workshop:
         return [how, codec_digest(), self.config.model_dump(mode="json")]
 
     def _kept(self, ask: Ask, settings: Any, make: Callable[[], Point]) -> Point | None:
-        return self.store.read(ask, settings) or (make() if self.makes else None)
+        found = self.store.read(ask, settings)
+        if found is None and self.makes:
+            return make()
+        self.missed += found is None
+        return found
 
     def _of_file(self, ask: Ask, picture: Picture, data: bytes) -> Point:
         """Measure kcgs' own."""
