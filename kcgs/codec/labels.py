@@ -52,6 +52,9 @@ starts and of pixels that are neither follow, in the order of the wave:
 - else for each of up to three labels in turn a learnt bit whether it is this one (three bits for starts, three for
   others); these are the nearest labels that are no candidates, see `waves`;
 - if it is none of them, the label, a number of as many as were met.
+
+A stream that codes more than 2**23 pixels, or more than 2**18 labels of starts and of pixels that are neither, is
+refused, since it would take minutes to read; maps like that are written plainly.
 """
 
 from __future__ import annotations
@@ -68,6 +71,8 @@ from .rangecoder import Coder, Counter, Reader, Writer, fair, magnitude, plain, 
 from .starts import code_starts
 from .waves import DECIDED, RANKS, REGIONS, STATE, Loops, loops, new_work
 
+# what a reader may be asked to work through: seconds
+_MOST_ASKED, _MOST_ESCAPES = 1 << 23, 1 << 18
 Labels = NDArray[np.int64]
 _TABLE = 1 << 20  # ids below it are looked up, not sorted
 _MOST = 24  # bits of the number of regions
@@ -96,11 +101,14 @@ def encode_labels(labels: Labels) -> bytes:
     truth, starts, order = loops().survey(index, len(ids))
     numbered = ids[order].tolist()
     _code_ids(writer, numbered, len(ids))
-    if not writer.bits(_NOISY, np.zeros(1, np.int32))[0]:
+    writer.bits(_NOISY, np.zeros(1, np.int32))
+    try:
         _code_pixels(writer, truth, starts, len(ids))
-    data = writer.finish()
-    if 8 * len(data) <= labels.size * math.log2(len(ids)) + 64:
-        return data
+        data = writer.finish()
+        if 8 * len(data) <= labels.size * math.log2(len(ids)) + 64:
+            return data
+    except _Laborious:
+        pass  # noise, or nearly
     writer = Writer()
     _code_ids(writer, numbered, len(ids))
     writer.bits(_NOISY, np.ones(1, np.int32))
@@ -216,9 +224,13 @@ def _code_pixels(coder: Coder, truth: Any, starts: Any, regions: int) -> Any:
     state = np.zeros(STATE, np.int64)
     state[REGIONS] = regions
     escapes = _Escapes(coder, run, labels, regions)
+    asked = 0
     while rows := run.advance(state, labels, starts, tables, work):
         decided = int(state[DECIDED])
         used = decided if regions == 2 else 2 * decided
+        asked += decided
+        if asked > _MOST_ASKED:
+            raise _Laborious(f"data must ask for at most {_MOST_ASKED} pixels near contours; got more")
         if not coder.reads:
             run.answer(state, truth, work)
         if used:
@@ -228,12 +240,16 @@ def _code_pixels(coder: Coder, truth: Any, starts: Any, regions: int) -> Any:
     return labels[TOP : TOP + height, LEFT : LEFT + width]
 
 
+class _Laborious(CodecError):
+    """A map that would take minutes to read."""
+
+
 class _Escapes:
     """Labels of pixels that are neither candidate."""
 
     def __init__(self, coder: Coder, run: Loops, labels: Any, regions: int) -> None:
         self._coder, self._run, self._labels, self._regions = coder, run, labels, regions
-        self._met = 1
+        self._met, self._count = 1, 0
         self._new = [Counter(2), Counter(2)]
         self._rank = [[Counter(2) for _ in range(RANKS)] for _ in range(2)]
         self._found = np.zeros(RANKS, np.int32)
@@ -242,6 +258,9 @@ class _Escapes:
         """Code the labels of a wave."""
         asked = rows[:, CODED] == 0
         asked[~asked] = neither
+        self._count += int(asked.sum())
+        if self._count > _MOST_ESCAPES:
+            raise _Laborious(f"data must hold at most {_MOST_ESCAPES} labels that no neighbour has; got more")
         for at in np.flatnonzero(asked):
             rows[at, LABEL] = self._code(rows[at])
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
 
+from kcgs.codec import labels as labels_module
 from kcgs.codec.contexts import CLIP, SQUASH
 from kcgs.codec.labels import decode_labels, encode_labels
 from kcgs.codec.rangecoder import CodecError, Reader, Writer
@@ -206,3 +207,19 @@ class TestEstimates:
     def test_one_region_is_free(self, labels: Any) -> None:
         assert contour_bits(labels) == 0
         assert np.array_equal(smooth_labels(labels), labels)
+
+
+class TestWork:
+    """What takes minutes is written plainly, and refused where it is not."""
+
+    @pytest.mark.parametrize("limit", ["_MOST_ASKED", "_MOST_ESCAPES"])
+    def test_bounded(self, limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        specks = np.random.default_rng(0).random((80, 120))
+        labels = np.where(specks < 0.02, (specks * 300).astype(np.int64), np.arange(120) // 18)
+        modelled = encode_labels(labels)
+        monkeypatch.setattr(labels_module, limit, 50)
+        with pytest.raises(CodecError, match="data must"):
+            decode_labels(modelled, 80, 120, max_regions=7)
+        plain = encode_labels(labels)
+        assert len(plain) > len(modelled)
+        assert (decode_labels(plain, 80, 120, max_regions=7) == labels).all()
