@@ -1,14 +1,26 @@
-"""Tables in Markdown, and numbers as reports write them; what is not a number is an empty cell."""
+"""Tables, and numbers as reports write them; in Markdown, what is not a number is an empty cell."""
 
 from __future__ import annotations
 
+import csv
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from kcgs._atomic import atomic_path
 
 
 def markdown(header: list[str], lines: Iterable[list[str]]) -> str:
     """Lay out a table."""
     return "\n".join("| " + " | ".join(row) + " |" for row in [header, ["---"] * len(header), *lines])
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
+    """Write a table, floats with six digits; the file appears whole or not at all."""
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in rows)
 
 
 def db(value: float) -> str:

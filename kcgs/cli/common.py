@@ -35,10 +35,20 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on sta
 
 def check_output(path: Path, *suffixes: str, option: str = "--output") -> None:
     """Refuse an output that cannot be written, before the work, not after it."""
-    if path.suffix.lower() not in suffixes:
+    # scenes are written by their exact suffix, images in any case
+    suffix = path.suffix.lower() if path.suffix.lower() in IMAGES else path.suffix
+    if suffix not in suffixes:
         raise ValueError(f"{option} must end in {' or '.join(suffixes)}; got {str(path)!r}")
     if not path.resolve().parent.is_dir():
         raise FileNotFoundError(f"{option} needs an existing folder; {str(path.resolve().parent)!r} is not there")
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all."""
+    from kcgs._atomic import atomic_path
+
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
 
 
 def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from .common import IMAGES, Json, SceneFile, app, check_output, print_report
+from .common import IMAGES, Json, SceneFile, app, check_output, print_report, write_file
 
 KcgsFile = Annotated[Path, typer.Argument(help="Compressed file (.kcgs).", metavar="FILE")]
 
@@ -32,7 +32,6 @@ def encode_command(
     as_json: Json = False,
 ) -> None:
     """Compress a scene."""
-    from kcgs._atomic import atomic_path
     from kcgs.codec import decode, encode
     from kcgs.io import load
 
@@ -48,8 +47,7 @@ def encode_command(
         from kcgs.fit import compress
 
         data = compress(loaded.field, load_image(image), loaded.regions, **goal)
-    with atomic_path(output) as temporary:
-        temporary.write_bytes(data)
+    write_file(output, data)
     decoded = decode(data)
     height, width = decoded.field.size
     report = {

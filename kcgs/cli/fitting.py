@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from .common import write_file
 from .segmentation import misalignment
 
 if TYPE_CHECKING:
@@ -46,27 +47,25 @@ def fit_into(
     notes: Mapping[str, str] | None = None,
 ) -> Fitted:
     """Fit, and write the scene, with notes in it, or the compressed file, as the suffix says."""
-    from kcgs._atomic import atomic_path
     from kcgs.codec import QUALITIES, decode
     from kcgs.fit import compress, fit, fit_bytes
     from kcgs.io import save
 
     if target_bytes is not None:
         done = fit_bytes(picture, labels, target_bytes, seed=seed, config=config, on_step=on_step)
-        data, result = done.data, done.result
-    else:
-        result = fit(
-            picture, labels, num_gaussians,
-            seed=seed, config=config, on_step=on_step, checkpoint=checkpoint, resume=resume,
-        )  # fmt: skip
-        if output.suffix != ".kcgs":
-            written = save(output, result.field, result.regions, metadata={"recipe": recipe, **(notes or {})})
-            return Fitted(result, result.field, result.regions, written)
-        psnr = max(entry.psnr for entry in result.history)
-        quality = min(max(psnr + _BELOW_THE_FIT, QUALITIES[0]), QUALITIES[1])
-        data = compress(result.field, picture, result.regions, quality=quality, seed=seed)
-    with atomic_path(output) as temporary:
-        temporary.write_bytes(data)
+        write_file(output, done.data)
+        return Fitted(done.result, done.field, done.regions, len(done.data))
+    result = fit(
+        picture, labels, num_gaussians,
+        seed=seed, config=config, on_step=on_step, checkpoint=checkpoint, resume=resume,
+    )  # fmt: skip
+    if output.suffix != ".kcgs":
+        written = save(output, result.field, result.regions, metadata={"recipe": recipe, **(notes or {})})
+        return Fitted(result, result.field, result.regions, written)
+    psnr = max(entry.psnr for entry in result.history)
+    quality = min(max(psnr + _BELOW_THE_FIT, QUALITIES[0]), QUALITIES[1])
+    data = compress(result.field, picture, result.regions, quality=quality, seed=seed)
+    write_file(output, data)
     decoded = decode(data)
     return Fitted(result, decoded.field, decoded.regions, len(data))
 

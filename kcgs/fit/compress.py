@@ -9,7 +9,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs._check import check_image
 from kcgs.codec.maps import encode_map
 from kcgs.codec.quantize import NOISE_CODES, Quantizer
 from kcgs.codec.scene import (
@@ -26,7 +25,7 @@ from kcgs.nn import GaussianField
 
 from .config import FitConfig
 from .fine_tune import FineTuning
-from .loop import fit
+from .loop import check_problem, fit
 from .monitor import FitResult, HistoryEntry
 
 # a Gaussian whose whole energy is below this many times the noise costs more bits than it saves: at the best rate a
@@ -161,10 +160,7 @@ def fit_bytes(
         (True, None)
     """
     config = FitConfig.from_recipe(recipe) if config is None else config
-    image = check_image("image", image)
-    image = image[0] if image.ndim == 4 and image.shape[0] == 1 else image
-    if isinstance(regions, Tensor):
-        regions = RegionMap.from_labels(regions)
+    image, regions = check_problem(image, regions)
     if isinstance(target_bytes, bool) or not isinstance(target_bytes, int):
         raise TypeError(f"target_bytes must be an integer; got {target_bytes!r}")
     if target_bytes < 1:
@@ -236,8 +232,7 @@ def _worth(field: GaussianField, quantizer: Quantizer) -> Tensor:
 
 
 def _check_image(image: Tensor, field: GaussianField) -> Tensor:
-    image = check_image("image", image)
-    image = image[0] if image.ndim == 4 and image.shape[0] == 1 else image
+    image, _ = check_problem(image, None)
     if tuple(image.shape) != (field.colors.shape[-1], *field.size):
         raise ValueError(f"image must have shape {(field.colors.shape[-1], *field.size)}; got {tuple(image.shape)}")
-    return image.detach().float().cpu()
+    return image.float().cpu()

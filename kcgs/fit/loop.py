@@ -72,7 +72,7 @@ def fit(
     """
     config = FitConfig.from_recipe(recipe) if config is None else config
     start = time.perf_counter()
-    image, regions = _check_problem(image, regions, num_gaussians)
+    image, regions = check_problem(image, regions, num_gaussians)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
         raise ValueError(f"seed must be an integer in [0, 2**63); got {seed!r}")
     if resume and checkpoint is None:
@@ -112,9 +112,10 @@ def fit(
     return session.finish(reason or "iterations")
 
 
-def _check_problem(
-    image: Tensor, regions: RegionMap | Tensor | None, num_gaussians: int
+def check_problem(
+    image: Tensor, regions: RegionMap | Tensor | None, num_gaussians: int = 1
 ) -> tuple[Tensor, RegionMap | None]:
+    """Return the image, (C, H, W), and its regions, as copies that a fit may use; refuse what cannot be fitted."""
     image = check_image("image", image)
     if image.ndim == 4:
         if image.shape[0] != 1:

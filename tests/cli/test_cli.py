@@ -204,6 +204,7 @@ class TestFailures:
             (("fit", "photo.png", "--regions", "nothing.png"), 1, "nothing.png"),
             (("fit", "photo.png", "--regions", "small.png"), 1, "regions must be one map of the image's size"),
             (("fit", "photo.png", "-o", "scene.pt"), 1, "must end in .safetensors"),
+            (("fit", "photo.png", "-o", "scene.KCGS"), 1, "must end in .safetensors"),
             (("fit", "photo.png", "-o", "nowhere/scene.safetensors"), 1, "needs an existing folder"),
             (("fit", "photo.png", "--max-seconds", "-1"), 1, "max_seconds"),
             (("info", "text.png"), 1, "text.png"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -13,7 +12,7 @@ from tempfile import TemporaryDirectory
 import torch
 from torch import Tensor
 
-from kcgs._atomic import atomic_path
+from kcgs.bench.cells import write_csv
 from kcgs.bench.render.timing import threads
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
@@ -70,7 +69,7 @@ def run(output: Path, *, data: Path | None = None, quick: bool = False) -> None:
             rows += step()
             progress.advance(task)
         findings = Findings(rows, scenes, describe_files(bench.files), why_not_fitted(data, quick), quick)
-    _write_csv(output / "results.csv", rows)
+    write_csv(output / "results.csv", Row._fields, rows)
     write(output, findings)
     Console().print(f"{output}/report.md")
 
@@ -200,10 +199,3 @@ def _small() -> Scene:
     labels = (torch.arange(64) > 30).long().expand(48, 64)
     field = GaussianField.random(40, (48, 64), regions=labels, seed=0)
     return Scene("warm-up", "made by rule", field, RegionMap.from_labels(labels))
-
-
-def _write_csv(path: Path, rows: list[Row]) -> None:
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(Row._fields)
-        writer.writerows((*r[:5], f"{r.cutoff:.3g}", r.quantity, f"{r.value:.6g}", r.unit) for r in rows)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-from kcgs._atomic import atomic_path
+from kcgs.bench.cells import write_csv
 from kcgs.bench.fits import HERE, Place, check_made, make_all
 
 from .cases import GROUPS, TIMED, Case, cases, missing
@@ -117,9 +116,5 @@ def _report(output: Path, store: Store, data: Path | None, quick: bool, chosen: 
 
 def _write_csv(path: Path, runs: list[Run]) -> None:
     names = [field.name for field in dataclasses.fields(Run) if field.name != "history"]
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([*names, "bytes"])
-        for run in runs:
-            values = [getattr(run, name) for name in names]
-            writer.writerow([*(f"{v:.6g}" if isinstance(v, float) else v for v in values), run.bytes])
+    names.append("bytes")
+    write_csv(path, names, ([getattr(run, name) for name in names] for run in runs))

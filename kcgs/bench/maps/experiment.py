@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Sequence
 from pathlib import Path
 
-from kcgs._atomic import atomic_path
+from kcgs.bench.cells import write_csv
 from kcgs.bench.fits import HERE, Place, check_made, make_all
 
 from .report import write
@@ -41,7 +39,8 @@ def run(output: Path, *, data: Path | None = None, quick: bool = False, place: P
         failed += _obtain(scenes, [rival for rival in rivals if rival is not None], place)
     finally:
         results = [result for trial in trials if (result := scenes.result(trial)) is not None]
-        _write_csv(output / "results.csv", results)
+        values = ([*result, *(getattr(result, name) for name in _GAINS)] for result in results)
+        write_csv(output / "results.csv", [*Result._fields, *_GAINS], values)
         write(output, results, planned=len(trials), quick=quick, place=place)
     check_made(failed)
     from rich.console import Console
@@ -52,12 +51,3 @@ def run(output: Path, *, data: Path | None = None, quick: bool = False, place: P
 def _obtain(scenes: Scenes, trials: list[Trial], place: Place) -> list[str]:
     missing = [trial for trial in dict.fromkeys(trials) if not scenes.has(trial)]
     return make_all(scenes.make, missing, place, name=lambda t: f"{t.image}, N = {t.n:,}, map: {t.source}")
-
-
-def _write_csv(path: Path, results: Sequence[Result]) -> None:
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([*Result._fields, *_GAINS])
-        for result in results:
-            values = [*result, *(getattr(result, name) for name in _GAINS)]
-            writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])

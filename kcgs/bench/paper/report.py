@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from kcgs._atomic import atomic_path
+from kcgs.bench.cells import write_csv
 from kcgs.bench.machine import describe
 
 from .methods import FULL_ITERATIONS
@@ -64,12 +64,8 @@ def write(output: Path, rows: Sequence[Row], parts: Sequence[str]) -> None:
     with atomic_path(output / "report.md") as temporary:
         temporary.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
     names = [field.name for field in dataclasses.fields(Row) if field.name not in ("history", "scene")]
-    with atomic_path(output / "results.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([*names, "bits_per_pixel"])
-        for row in rows:
-            values = [getattr(row, name) for name in names] + [row.bits_per_pixel]
-            writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])
+    names.append("bits_per_pixel")
+    write_csv(output / "results.csv", names, ([getattr(row, name) for name in names] for row in rows))
 
 
 def _missing(lacking: Sequence[Trial]) -> str:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
-from kcgs._atomic import atomic_path
+from kcgs.bench.cells import write_csv
 
 from .codecs import present
 from .groups import steps
@@ -84,15 +83,7 @@ def _report(output: Path, kept: Workshop, chosen: list[str]) -> None:
         if whole < len(todo):
             why = "stopped before its end" if group in chosen else "not chosen"
             notes.append(f"{group}: {why}, {whole} of {len(todo)} steps are finished.")
-    _write_csv(output / "results.csv", points)
+    write_csv(output / "results.csv", Point._fields, points)
     absent = [name for name in ("JPEG", "WebP", "AVIF") if name not in present()]
     notes += [f"This Pillow has no {name}." for name in absent]
     write(output, points, notes, kept.quick)
-
-
-def _write_csv(path: Path, points: list[Point]) -> None:
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(Point._fields)
-        for point in points:
-            writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in point])

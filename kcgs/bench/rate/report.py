@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
 from kcgs._atomic import atomic_path
+from kcgs.bench.cells import write_csv
 from kcgs.bench.machine import describe
 
 from .codecs import AVIF_PSNR, versions
@@ -85,7 +85,7 @@ def write(output: Path, points: Sequence[Point], notes: Sequence[str], quick: bo
         parts += _sections(points, output)
     with atomic_path(output / "report.md") as temporary:
         temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
-    _write_summary(output / "summary.csv", lines(points))
+    write_csv(output / "summary.csv", Line._fields, lines(points))
 
 
 def _sections(points: Sequence[Point], output: Path) -> list[str]:
@@ -116,11 +116,3 @@ def _sections(points: Sequence[Point], output: Path) -> list[str]:
     for rival in rivals:
         parts += [f"## Each frame at {MOST_BYTES:,} bytes: against {rival}", each_frame(points, rival)]
     return parts
-
-
-def _write_summary(path: Path, found: Sequence[Line]) -> None:
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(Line._fields)
-        for line in found:
-            writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in line])

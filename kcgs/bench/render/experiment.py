@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import statistics
 from collections.abc import Callable
 from functools import partial
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs._atomic import atomic_path
+from kcgs.bench.cells import write_csv
 
 from .limit import evaluated_pairs, seconds_for
 from .peers import MOST_PAIRS, PEERS, pairs
@@ -63,7 +62,7 @@ def run(output: Path, *, data: Path | None = None, quick: bool = False) -> None:
             progress.update(task, description=name)
             rows += step()
             progress.advance(task)
-    _write_csv(output / "results.csv", rows)
+    write_csv(output / "results.csv", Row._fields, rows)
     write(output, rows, quick)
     Console().print(f"{output}/report.md")
 
@@ -215,10 +214,3 @@ def _stiffness() -> list[Row]:
         rows.append(Row("stiffness", case, r.backend, 1, "image", r.image, "1"))
         rows.append(Row("stiffness", case, r.backend, 1, "gradient", r.gradient, "relative to the largest"))
     return rows
-
-
-def _write_csv(path: Path, rows: list[Row]) -> None:
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(Row._fields)
-        writer.writerows((*r[:5], f"{r.value:.6g}", r.unit) for r in rows)
