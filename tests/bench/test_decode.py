@@ -144,7 +144,7 @@ def test_quick_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             assert 0 < float(row["value"]) < 1e-3
     worst = {(r["scene"], r["decoder"], r["cutoff"]): float(r["value"]) for r in rows if r["quantity"] == "max error"}
     for name in (SCENE, CPU, TILED):
-        errors = [worst["small hard", name, cutoff] for cutoff in ("0.01", "0.00392", "0.001", "0.0001", "1e-06")]
+        errors = [worst["small hard", name, cutoff] for cutoff in ("0.01", "0.00392157", "0.001", "0.0001", "1e-06")]
         assert errors == sorted(errors, reverse=True) and errors[-1] < 1e-4
     report = (tmp_path / "report.md").read_text()
     for words in ("onnxruntime, generic", "small soft", "soft weights: contours are hard", "kcgs bench decode"):
