@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from kcgs.functional import RegionMap
     from kcgs.nn import GaussianField
 
-# dB that rounding lies below the error of the fit, so that it costs a tenth of a dB
-_BELOW_THE_FIT = 14.5
-
 
 class Fitted(NamedTuple):
     """A fit, and what was written of it."""
@@ -47,7 +44,8 @@ def fit_into(
     notes: Mapping[str, str] | None = None,
 ) -> Fitted:
     """Fit, and write the scene, with notes in it, or the compressed file, as the suffix says."""
-    from kcgs.codec import QUALITIES, decode
+    from kcgs.bench.sizes import quality_for
+    from kcgs.codec import decode
     from kcgs.fit import compress, fit, fit_bytes
     from kcgs.io import save
 
@@ -63,8 +61,7 @@ def fit_into(
         written = save(output, result.field, result.regions, metadata={"recipe": recipe, **(notes or {})})
         return Fitted(result, result.field, result.regions, written)
     psnr = max(entry.psnr for entry in result.history)
-    quality = min(max(psnr + _BELOW_THE_FIT, QUALITIES[0]), QUALITIES[1])
-    data = compress(result.field, picture, result.regions, quality=quality, seed=seed)
+    data = compress(result.field, picture, result.regions, quality=quality_for(psnr), seed=seed)
     write_file(output, data)
     decoded = decode(data)
     return Fitted(result, decoded.field, decoded.regions, len(data))

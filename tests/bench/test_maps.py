@@ -18,12 +18,12 @@ from kcgs.bench.maps import report, trials
 from kcgs.bench.maps.experiment import run
 from kcgs.bench.maps.gains import bounds, gain_of, interval
 from kcgs.bench.maps.trials import AUTO, COUNTS, NO_MAP, OTHERS, Result, Scenes, Trial, images_of, plan, subset
-from kcgs.bench.sizes import map_bytes
 from kcgs.cli import main
+from kcgs.codec import decode, encode
 from kcgs.data import load_image, save_image
 from kcgs.fit import FitConfig, FitResult, HistoryEntry
 from kcgs.functional import RegionMap, ef_psnr, psnr
-from kcgs.io import load
+from kcgs.io import Scene, load
 from kcgs.nn import GaussianField
 from kcgs.nn.renderer import render_image
 
@@ -69,8 +69,13 @@ def data(tmp_path: Path) -> Path:
 
 
 def row(image: str = "7", n: int = 400, gain: float = 0.5, ef_gain: float = 1.0, **values: Any) -> Result:
-    fixed = Result(image, n, AUTO, 4, 3, 700, 30.0, 25.0, 30.0 - gain, 25.0 - ef_gain, 0.5, 8.0, 4.0, 500, 30.25, 24.5)
+    ours = 30.0, 25.0, 30.0 - gain, 25.0 - ef_gain, 0.5, 8.0, 4.0
+    fixed = Result(image, n, AUTO, 4, 3, 2400, 200, *ours, 29.75, 24.75, 500, 2410, 30.0, 24.25)
     return fixed._replace(**values)
+
+
+def encode_like_reports(scene: Scene, quality: float) -> bytes:
+    return encode(scene.field, scene.regions, quality=quality + 14.5)
 
 
 def section(text: str, title: str) -> str:
@@ -128,17 +133,22 @@ class TestResult:
         assert ours.regions is not None and other.regions is None
         final = ours.regions.labels
         assert final[0, 59] != final[0, 60]  # where the stub puts it, not where it was found
-        assert found.map_bytes == map_bytes(final) > 0 and found.regions == 2
+        assert 0 < found.map_bytes < found.bytes and found.regions == 2
         pictures = [render_image(ours.field, ours.regions), render_image(other.field)]
         assert [found.psnr, found.baseline_psnr] == [float(psnr(p, image)) for p in pictures]
         assert [found.ef_psnr, found.baseline_ef_psnr] == [float(ef_psnr(p, image, final)) for p in pictures]
 
+        held, alone = encode_like_reports(ours, found.psnr), encode_like_reports(other, found.baseline_psnr)
+        assert len(held) == found.bytes
         rival = scenes.equal_bytes(trial)
-        assert rival == Trial("7", (30 * 7 + found.map_bytes) // 7, NO_MAP)
-        assert rival is not None and scenes.equal_bytes(trial._replace(source="slic")) is None
+        assert rival == Trial("7", round(30 * len(held) / len(alone)), NO_MAP) and rival.n > 30
+        assert scenes.equal_bytes(trial._replace(source="slic")) is None
         scenes.make(rival)
         found = scenes.result(trial)
         assert found is not None and found.equal_n == rival.n and math.isfinite(found.equal_ef_gain)
+        decoded, third = decode(held), load(scenes._path(rival))
+        assert found.decoded_psnr == float(psnr(render_image(decoded.field, decoded.regions), image))
+        assert found.equal_bytes == len(encode_like_reports(third, float(psnr(render_image(third.field), image))))
 
     def test_without_a_contour(self, tmp_path: Path, data: Path, stub: Stub) -> None:
         stub.keeps_contours = False
@@ -181,7 +191,7 @@ class TestReport:
         ]
         assert "| N = 400: mean PSNR gained, at least | +0.40 | +0.15 | NO |" in section(text, "Bounds")
         each = section(text, "Each image: auto, N = 400").splitlines()
-        assert each[2].startswith("| b | auto | 4 | 3 | 700 | 30.00 | 30.20 | -0.20 |")
+        assert each[2].startswith("| b | auto | 4 | 3 | 2,400 | 200 | 30.00 | 30.20 | -0.20 |")
         assert each[2].endswith("| 500 | -0.25 | +0.50 |") and each[3].startswith("| a |")
 
     def test_nothing_lost(self) -> None:

@@ -20,7 +20,7 @@ def plot_gains(results: Sequence[Result], path: Path) -> None:
     plot, axes = figure(1, len(counts), width=1.0 + 4.6 * len(counts), height=4.4)
     for axis, n in zip(axes if len(counts) > 1 else [axes], counts, strict=True):
         _draw(axis, [r for r in results if r.n == n])
-        axis.set(xlabel="bytes of the final map, lossless WebP", ylabel="PSNR gained (dB)", title=f"N = {n:,}")
+        axis.set(xlabel="bytes of the final map", ylabel="PSNR gained (dB)", title=f"N = {n:,}")
         axis.set_xlim(left=0)
         axis.legend(fontsize=7)
     save_figure(plot, path)

@@ -15,7 +15,9 @@ from torch import Tensor
 
 from kcgs.bench.fit.cases import BASELINE, REFINED, Case, make_case
 from kcgs.bench.fit.runs import warm_up
-from kcgs.bench.sizes import GAUSSIAN_BYTES, stored_bytes
+from kcgs.bench.sizes import write_scene
+from kcgs.codec import Decoded, decode
+from kcgs.codec.maps import encode_map
 from kcgs.data import load_image
 from kcgs.fit import fit
 from kcgs.functional import RegionMap, ef_psnr, psnr
@@ -62,7 +64,8 @@ class Result(NamedTuple):
     source: str
     given_regions: int
     regions: int  # in the end
-    map_bytes: int  # of the final map; 0: it has no contour
+    bytes: int  # of the scene's file
+    map_bytes: int  # of these the final map's; 0: it has no contour
     psnr: float
     ef_psnr: float  # NaN: there is no contour
     baseline_psnr: float
@@ -70,8 +73,11 @@ class Result(NamedTuple):
     segment_seconds: float
     seconds: float  # of the fit
     baseline_seconds: float
-    equal_n: int = 0  # of the baseline that the bytes of all of the scene buy; 0: it was not asked for
-    equal_psnr: float = math.nan
+    decoded_psnr: float = math.nan  # of the file
+    decoded_ef_psnr: float = math.nan
+    equal_n: int = 0  # of the baseline that the bytes of the file buy; 0: it was not asked for
+    equal_bytes: int = 0  # of that baseline's file
+    equal_psnr: float = math.nan  # decoded
     equal_ef_psnr: float = math.nan
 
     @property
@@ -86,13 +92,13 @@ class Result(NamedTuple):
 
     @property
     def equal_gain(self) -> float:
-        """Difference in PSNR to the baseline of as many bytes."""
-        return self.psnr - self.equal_psnr
+        """Difference in PSNR to the baseline of as many bytes, both decoded."""
+        return self.decoded_psnr - self.equal_psnr
 
     @property
     def equal_ef_gain(self) -> float:
-        """Difference in EF-PSNR to the baseline of as many bytes."""
-        return self.ef_psnr - self.equal_ef_psnr
+        """Difference in EF-PSNR to the baseline of as many bytes, both decoded."""
+        return self.decoded_ef_psnr - self.equal_ef_psnr
 
 
 def images_of(data: Path | None) -> list[str]:
@@ -156,36 +162,43 @@ class Scenes:
 
     def equal_bytes(self, trial: Trial) -> Trial | None:
         """Return the baseline with the Gaussians that the bytes of a finished fit buy; None: it is not asked for."""
-        if trial.source != AUTO:
+        if trial.source != AUTO or not self.has(trial.baseline()):
             return None
-        scene = load(self._path(trial))
-        bought = stored_bytes(_contours(scene)) // GAUSSIAN_BYTES
-        return trial.baseline()._replace(n=len(scene.field) + bought)
+        ours, other = (len(self._file(t)) for t in (trial, trial.baseline()))
+        return trial.baseline()._replace(n=max(1, round(trial.n * ours / other)))
 
     def result(self, trial: Trial) -> Result | None:
         """Measure a fit beside its baselines; None: the fit, or the one of as many Gaussians, is not there."""
         if not (self.has(trial) and self.has(trial.baseline())):
             return None
         ours, other = load(self._path(trial)), load(self._path(trial.baseline()))
-        rival = self.equal_bytes(trial)
-        rivals = [] if rival is None or not self.has(rival) else [load(self._path(rival))]
-        image, regions = self._image(trial), _contours(ours)
+        image, regions, file = self._image(trial), _contours(ours), self._file(trial)
         labels = None if regions is None else regions.labels
-        figures = [_quality(scene, image, labels) for scene in (ours, other, *rivals)]
-        return Result(
+        result = Result(
             trial.image,
             trial.n,
             trial.source,
             int(ours.metadata["given_regions"]),
             1 if regions is None else regions.num_regions,
-            stored_bytes(regions),
-            *figures[0],
-            *figures[1],
+            len(file),
+            0 if regions is None else len(encode_map(regions)),
+            *_quality(ours, image, labels),
+            *_quality(other, image, labels),
             float(ours.metadata["segment_seconds"]),
             float(ours.metadata["seconds"]),
             float(other.metadata["seconds"]),
-            *(() if rival is None or not rivals else (rival.n, *figures[2])),
+            *_quality(decode(file), image, labels),
         )
+        rival = self.equal_bytes(trial)
+        if rival is None or not self.has(rival):
+            return result
+        file = self._file(rival)
+        psnr, ef_psnr = _quality(decode(file), image, labels)
+        return result._replace(equal_n=rival.n, equal_bytes=len(file), equal_psnr=psnr, equal_ef_psnr=ef_psnr)
+
+    def _file(self, trial: Trial) -> bytes:
+        scene = load(self._path(trial))
+        return write_scene(scene.field, scene.regions, _quality(scene, self._image(trial), None)[0])
 
     def _path(self, trial: Trial) -> Path:
         key = trial.case().key(trial.source)
@@ -202,7 +215,7 @@ def _contours(scene: Scene) -> RegionMap | None:
     return scene.regions if scene.regions is not None and scene.regions.num_regions > 1 else None
 
 
-def _quality(scene: Scene, image: Tensor, labels: Tensor | None) -> tuple[float, float]:
+def _quality(scene: Scene | Decoded, image: Tensor, labels: Tensor | None) -> tuple[float, float]:
     picture = render_image(scene.field, scene.regions)
     edges = math.nan if labels is None else float(ef_psnr(picture, image, labels))
     return float(psnr(picture, image)), edges

@@ -16,7 +16,8 @@ from kcgs._atomic import atomic_path
 from kcgs.bench.fit.runs import warm_up
 from kcgs.bench.fits import Place, Spec, ensure_one, make_all
 from kcgs.bench.measure import measure
-from kcgs.codec import decode, encode
+from kcgs.bench.sizes import write_scene
+from kcgs.codec import decode
 from kcgs.codec.maps import encode_map
 from kcgs.fit import FitConfig, HistoryEntry
 from kcgs.io import Scene, load
@@ -24,11 +25,6 @@ from kcgs.nn.renderer import render_image
 
 from . import pictures
 from .methods import COVERAGE, QUICK_ITERATIONS, Method
-
-# dB of a file's picture against the scene's own above the scene's PSNR: the error grows by about a 28th, 0.15 dB,
-# and by more where so few Gaussians are rounded that errors do not average out
-MARGIN = 14.5
-_QUALITIES = (10.0, 90.0)
 
 
 class Trial(NamedTuple):
@@ -209,9 +205,7 @@ def _perform(trial: Trial, data: Path | None, folder: Path) -> Row:
     fitted = ensure_one(spec, folder)
     core_seconds = time.process_time() - start if is_new else math.nan
     scene = fitted.scene()
-    data_bytes = encode(
-        scene.field, scene.regions, quality=min(max(fitted.psnr + MARGIN, _QUALITIES[0]), _QUALITIES[1])
-    )
+    data_bytes = write_scene(scene.field, scene.regions, fitted.psnr)
     held = decode(data_bytes)
     figures = measure(render_image(held.field, held.regions), image, labels)
     has_map = scene.regions is not None and scene.regions.num_regions > 1
