@@ -30,7 +30,9 @@ class FitConfig(BaseModel):
 
     # The model
     guidance: bool = Field(True, description="confine Gaussians to regions, where regions are given")
-    clamp: bool = Field(False, description="clip the image to [0, 1] in training")
+    clamp: bool | Literal["auto"] = Field(
+        False, description="clip the image to [0, 1] in training; auto: if a quarter of its values are 0 or 1"
+    )
     softness: float | Literal["auto"] = Field(
         0.0,
         description="contour width in pixels, 0 to 64, of maps that have none; auto: chosen for each pair of regions",

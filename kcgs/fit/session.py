@@ -48,6 +48,10 @@ _GROWTH_PATIENCE = 2.0
 _GROWTH_SIGMAS = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
 
 
+# share of a picture's values that are 0 or 1, from which on Gaussians that overshoot them are of use
+_SATURATED = 0.25
+
+
 class Session:
     """State of a fit and the moves it can make; `fit` says when."""
 
@@ -56,6 +60,7 @@ class Session:
     ) -> None:
         self.image, self.config = image, config
         self.size = (image.shape[1], image.shape[2])
+        self.clamps = _is_saturated(image) if config.clamp == "auto" else config.clamp
         self.monitor = Monitor(image, regions, start)
         self.seed, self.num_gaussians = seed, num_gaussians
         drafts = config.draft_cutoff is not None and config.target_psnr is None
@@ -103,7 +108,7 @@ class Session:
         means, cholesky, colors, ids, regions = gaussians or self.gaussians()
         cutoff, backend = self.cutoff, self.config.backend
         picture = region_splat(means, cholesky, colors, ids, regions, size=self.size, cutoff=cutoff, backend=backend)
-        return picture.clamp(0.0, 1.0) if self.config.clamp else picture
+        return picture.clamp(0.0, 1.0) if self.clamps else picture
 
     def step(self, picture: Tensor, progress: float) -> None:
         """Move the Gaussians downhill."""
@@ -248,6 +253,10 @@ class Session:
             setattr(self, name, state[name])
         for name in ("descent", "monitor", "schedule"):
             getattr(self, name).load(state[name])
+
+
+def _is_saturated(image: Tensor) -> bool:
+    return bool(((image == 0.0) | (image == 1.0)).float().mean() >= _SATURATED)
 
 
 def _regions_to_draw(

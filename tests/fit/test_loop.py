@@ -113,6 +113,14 @@ class TestSwitches:
         free, clamped = (fit(image, labels, 8, config=quick(clamp=c)).field.colors for c in (False, True))
         assert not torch.equal(free, clamped)
 
+    def test_clamp_of_saturated_pictures(self) -> None:
+        image, labels = disc()
+        for picture in (image.clamp(0.1, 0.9), (image > 0.5).float()):
+            by_share, by_hand = (
+                fit(picture, labels, 8, config=quick(clamp=c)).field.colors for c in ("auto", bool(picture.max() == 1))
+            )
+            assert torch.equal(by_share, by_hand)
+
     @pytest.mark.parametrize("loss", ["l1", "l2"])
     @pytest.mark.parametrize("optimizer", ["adam", "adan"])
     def test_losses_and_optimizers(self, loss: str, optimizer: str) -> None:
