@@ -7,6 +7,7 @@ import math
 import os
 import statistics
 from collections.abc import Iterable
+from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,12 +29,21 @@ from .options import (
     MaxSeconds,
     Recipe,
     Seed,
+    TargetBytes,
     TargetPsnr,
+    check_budget,
     make_config,
 )
 from .table import Table
 
-_SUFFIX = ".safetensors"
+
+class Suffix(str, Enum):
+    """What is written of an image."""
+
+    scene = ".safetensors"
+    file = ".kcgs"
+
+
 _MILLION = 1_000_000
 
 
@@ -42,7 +52,7 @@ def fit_many_command(
     patterns: Annotated[
         list[str], typer.Argument(metavar="PATTERN...", help="Images, folders of images, or quoted patterns.")
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the scenes and results.csv.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the scenes or files, and results.csv.")],
     regions: Annotated[
         str,
         typer.Option(metavar="DIR|auto|none", help="Folder of masks with the images' stems, or auto, or none."),
@@ -52,6 +62,10 @@ def fit_many_command(
     iterations: Iterations = None,
     max_seconds: MaxSeconds = None,
     target_psnr: TargetPsnr = None,
+    target_bytes: TargetBytes = None,
+    suffix: Annotated[
+        Suffix | None, typer.Option(help="What is written; default: .safetensors, with --target-bytes .kcgs.")
+    ] = None,
     keep_contours: KeepContours = False,
     seed: Seed = 0,
     backend: KernelName = Backend.auto,
@@ -63,11 +77,14 @@ def fit_many_command(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Fit many images, each into a scene of its own.
+    """Fit many images, each into a scene or a compressed file of its own.
 
-    The same command again goes on where an earlier one was stopped: a scene that is there from the same image, mask
+    The same command again goes on where an earlier one was stopped: what is there from the same image, mask
     and settings is kept. One image's failure stops no other; with any, the exit status is 1.
     """
+    check_budget(target_bytes, num_gaussians=num_gaussians, target_psnr=target_psnr)
+    if target_bytes is not None and suffix is Suffix.scene:
+        raise typer.BadParameter("--target-bytes is the size of a .kcgs file and excludes --suffix .safetensors")
     images = _expand(patterns)
     config = make_config(
         recipe, regions, iterations=iterations, max_seconds=max_seconds, target_psnr=target_psnr,
@@ -78,11 +95,12 @@ def fit_many_command(
     output.mkdir(parents=True, exist_ok=True)
     folder, table = output.absolute(), Table(output / "results.csv")
     count = DEFAULT_GAUSSIANS if num_gaussians is None else num_gaussians
+    ending = suffix or (Suffix.scene if target_bytes is None else Suffix.file)
 
     def order(image: Path) -> Order:
         known = table.get(image).get("fit", "")
-        target = folder / f"{image.stem}{_SUFFIX}"
-        return Order(image, target, regions, masks.get(image.stem, ()), count, recipe, config, seed, known)
+        target, own = folder / f"{image.stem}{ending.value}", masks.get(image.stem, ())
+        return Order(image, target, regions, own, count, target_bytes, recipe, config, seed, known)
 
     orders = [order(image) for image in images]
     if workers is None and engine is Engine.local:

@@ -23,7 +23,9 @@ from .options import (
     MaxSeconds,
     Recipe,
     Seed,
+    TargetBytes,
     TargetPsnr,
+    check_budget,
     make_config,
 )
 
@@ -46,9 +48,7 @@ def fit_command(
     iterations: Iterations = None,
     max_seconds: MaxSeconds = None,
     target_psnr: TargetPsnr = None,
-    target_bytes: Annotated[
-        int | None, typer.Option(min=1, help="The best .kcgs file that is not larger; chooses the number of Gaussians.")
-    ] = None,
+    target_bytes: TargetBytes = None,
     keep_contours: KeepContours = False,
     seed: Seed = 0,
     backend: KernelName = Backend.auto,
@@ -67,10 +67,7 @@ def fit_command(
     suffixes = (".safetensors", ".kcgs") if target_bytes is None else (".kcgs",)
     output = Path(f"{image.stem}{suffixes[0]}") if output is None else output
     check_output(output, *suffixes)
-    if target_bytes is not None:
-        for name, given in (("-n", num_gaussians), ("--target-psnr", target_psnr), ("--checkpoint", checkpoint)):
-            if given is not None:
-                raise typer.BadParameter(f"--target-bytes chooses the Gaussians itself and excludes {name}")
+    check_budget(target_bytes, num_gaussians=num_gaussians, target_psnr=target_psnr, checkpoint=checkpoint)
     if plot is not None:
         check_output(plot, ".png", option="--plot")
     if resume and checkpoint is None:

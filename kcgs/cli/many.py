@@ -29,6 +29,8 @@ class Order(NamedTuple):
     masks: tuple[Path, ...]
     """The files there that have the image's stem, one where all is well."""
     num_gaussians: int
+    target_bytes: int | None
+    """Of a `.kcgs` file; None: as many Gaussians as said."""
     recipe: str
     config: FitConfig
     seed: int
@@ -42,19 +44,19 @@ class Outcome(NamedTuple):
     fit: str
     """Hash of the image, the mask and all settings."""
     figures: dict[str, float] | None
-    """None: the scene was there, and its figures are in the table."""
+    """None: the file was there, and its figures are in the table."""
     core_seconds: float
     """Processor time of all that was done for the image, in all threads; NaN: nothing was fitted."""
     warnings: tuple[str, ...]
 
 
 def fit_one(order: Order) -> Outcome:
-    """Fit an image and write its scene, unless it is there from the same image and settings."""
+    """Fit an image and write its scene or file, unless it is there from the same image and settings."""
     _warm_up(order.config, order.regions == "auto")
     # not wall time, which also counts what the machine does for others
     start = time.process_time()
     fit = _fingerprint(order)
-    is_there = _made_from(order.output) == fit
+    is_there = _made_from(order) == fit
     if is_there and order.known == fit:
         return Outcome(fit, None, math.nan, ())
     # a warning of one image among many must say which image: the caller does
@@ -72,7 +74,7 @@ def _fit(order: Order, fit: str) -> dict[str, float]:
     picture = load_image(order.image)
     labels = read_regions(_source(order), picture, warnings.warn)
     fitted = fit_into(
-        order.output, picture, labels, order.num_gaussians, None,
+        order.output, picture, labels, order.num_gaussians, order.target_bytes,
         recipe=order.recipe, seed=order.seed, config=order.config,
         on_step=None, checkpoint=None, resume=False, notes={_NOTE: fit},
     )  # fmt: skip
@@ -100,19 +102,21 @@ def _source(order: Order) -> str:
 
 
 def _fingerprint(order: Order) -> str:
-    settings = f"{order.config.model_dump_json()} {order.num_gaussians} {order.seed}"
+    settings = order.config.model_dump_json(), order.num_gaussians, order.target_bytes, order.output.suffix, order.seed
     source = _source(order)
-    digest = hashlib.sha256(settings.encode())
+    digest = hashlib.sha256(repr(settings).encode())
     digest.update(order.image.read_bytes())
     digest.update(Path(source).read_bytes() if order.masks else source.encode())
     return digest.hexdigest()[:20]
 
 
-def _made_from(scene: Path) -> str | None:
+def _made_from(order: Order) -> str | None:
     from kcgs.io import load
 
     try:
-        return load(scene).metadata.get(_NOTE)
+        notes = load(order.output).metadata
+        # a compressed file has no notes: the table must know it
+        return order.known if order.output.suffix == ".kcgs" else notes.get(_NOTE)
     except (FileNotFoundError, ValueError):
         return None
 

@@ -40,12 +40,24 @@ MaxSeconds = Annotated[float | None, typer.Option(help="The best picture in this
 TargetPsnr = Annotated[
     float | None, typer.Option(help="As few Gaussians as reach this PSNR in dB, at most --num-gaussians.")
 ]
+TargetBytes = Annotated[
+    int | None, typer.Option(min=1, help="The best .kcgs file that is not larger; chooses the number of Gaussians.")
+]
 KeepContours = Annotated[bool, typer.Option("--keep-contours", help="Take the label map as exact.")]
 Seed = Annotated[int, typer.Option(help="Seed of the random start.")]
 KernelName = Annotated[Backend, typer.Option(help="Kernel.")]
 EngineName = Annotated[
     Engine, typer.Option(help="local: processes of this machine; ray: the cluster at RAY_ADDRESS, or one started here.")
 ]
+
+
+def check_budget(target_bytes: int | None, **excluded: object) -> None:
+    """Refuse what a size in bytes leaves no room for: options by their names, None where they were not given."""
+    for name, given in excluded.items():
+        if target_bytes is not None and given is not None:
+            raise typer.BadParameter(
+                f"--target-bytes chooses the Gaussians itself and excludes --{name.replace('_', '-')}"
+            )
 
 
 def make_config(

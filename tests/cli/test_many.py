@@ -75,6 +75,30 @@ class TestTable:
         assert report["core_hours_per_million"] == pytest.approx(mean * 1e6 / 3600)
         assert report["dollars_per_million"] == pytest.approx(mean * 1e6 / 3600 * 0.5)
 
+    @pytest.mark.parametrize(
+        "wanted", [("--suffix", ".kcgs", "-n", "12"), ("--target-bytes", "200")], ids=["suffix", "bytes"]
+    )
+    def test_compressed_files(self, files: Path, kcgs: Any, wanted: tuple[str, ...]) -> None:
+        settings = (*wanted, "--iterations", "5", "--regions", "none", "-o", "out", "--workers", "1", "--json")
+        code, out, err = kcgs("photos/*.png", *settings)
+        assert code == 0 and json.loads(out)["fitted"] == 3, err
+        for stem, row in rows().items():
+            file = files / f"out/{stem}.kcgs"
+            assert int(row["bytes"]) == file.stat().st_size <= 200 and len(load(file).field) == int(
+                row["num_gaussians"]
+            )
+        (files / "out/b.kcgs").write_bytes(b"not a file")
+        (files / "out/c.kcgs").unlink()
+        code, out, err = kcgs("photos/*.png", *settings)
+        assert code == 0 and [json.loads(out)[key] for key in ("fitted", "kept")] == [2, 1], err
+        code, out, err = kcgs("photos/*.png", *settings, "--seed", "1")
+        assert code == 0 and json.loads(out)["fitted"] == 3, err
+
+    @pytest.mark.parametrize("given", [("-n", "5"), ("--target-psnr", "20"), ("--suffix", ".safetensors")])
+    def test_bytes_exclude(self, files: Path, kcgs: Any, given: tuple[str, ...]) -> None:
+        code, _, err = kcgs("photos/*.png", "-o", "out", "--target-bytes", "200", *given)
+        assert code == 2 and "--target-bytes" in err and not (files / "out").exists()
+
     def test_no_price_is_invented(self, files: Path, kcgs: Any) -> None:
         code, out, _ = kcgs("photos/a.png", *SETTINGS)
         assert code == 0 and "core_hours_per_million" in out and "dollars" not in out
