@@ -55,9 +55,8 @@ def check_budget(target_bytes: int | None, **excluded: object) -> None:
     """Refuse what a size in bytes leaves no room for: options by their names, None where they were not given."""
     for name, given in excluded.items():
         if target_bytes is not None and given is not None:
-            raise typer.BadParameter(
-                f"--target-bytes chooses the Gaussians itself and excludes --{name.replace('_', '-')}"
-            )
+            option = "--" + name.replace("_", "-")
+            raise typer.BadParameter(f"--target-bytes chooses the Gaussians itself and excludes {option}")
 
 
 def make_config(
