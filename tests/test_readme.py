@@ -3,14 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import kcgs
 from kcgs.bench.paper.readme import BEGIN, END, put, results
+from kcgs.bench.paper.report import read_rows, write
+from kcgs.bench.paper.trials import Row
 
 ROOT = Path(kcgs.__file__).resolve().parent.parent
 REPORTS = ROOT / "notebooks/reports"
+
+
+def row(method: str, psnr: float, picture: str = "pie") -> Row:
+    figures = {"psnr": psnr, "ms_ssim": 0.9, "ef_psnr": 31.2, "ef_ssim": 0.8}
+    decoded: dict[str, Any] = {f"decoded_{name}": value for name, value in figures.items()}
+    return Row(
+        picture=picture, n=20, method=method, seed=0, iterations=700, seconds=3.0, core_seconds=2.0, num_gaussians=20,
+        pixels=16_000, bytes=100, map_bytes=10, scene="", **figures, **decoded,
+    )  # fmt: skip
 
 
 def test_results_are_those_of_the_reports() -> None:
@@ -21,13 +33,24 @@ def test_results_are_those_of_the_reports() -> None:
 
 
 def test_a_changed_figure_shows(tmp_path: Path) -> None:
+    rows = [row("best", 38.6), row("paper", 30.0)]
     (tmp_path / "charts").mkdir()
-    head = "picture,n,method,iterations,psnr,ef_psnr,bits_per_pixel,decoded_psnr\n"
-    (tmp_path / "charts/results.csv").write_text(
-        head + "pie,20,best,700,38.6,31.2,0.05,38.5\npie,20,paper,5000,30.0,25.0,0.04,29.9\n"
-    )
+    write(tmp_path / "charts", rows, [])
+    assert read_rows(tmp_path / "charts/results.csv") == rows
     text = results(tmp_path)
-    assert "| 20 | `best` | 700 | 1 | 38.60 | 31.20 | 0.050 | 38.50 |" in text
+    assert "| 20 | `best` | 700 | 1 | 38.60 | 31.20 | 0.050 | 38.60 | 2 |" in text
     assert put(f"a\n{BEGIN}\nold\n{END}\nb", text) == f"a\n{BEGIN}\n{text}\n{END}\nb"
     with pytest.raises(ValueError, match="README must have"):
         put("nothing", text)
+
+
+def test_differences_are_paired(tmp_path: Path) -> None:
+    (tmp_path / "davis").mkdir()
+    gains = {"a": 0.1, "b": 0.2, "c": 0.3, "d": 0.2, "e": 0.2}
+    write(
+        tmp_path / "davis",
+        [row(m, 30.0 + g * (m == "best"), p) for p, g in gains.items() for m in ("best", "paper")],
+        [],
+    )
+    text = results(tmp_path)
+    assert "| 20 | best - paper | equal N | 5 | +0.20 | +0.14 to +0.26 | 5-0 | +0.00 |" in text

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-import csv
-import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
 from kcgs._atomic import atomic_path
-from kcgs.bench.cells import count, markdown
+from kcgs.bench.cells import count, db, markdown, seconds
+
+from . import tables
+from .compare import complete, mean, select
+from .methods import BASELINE, BEST, CLAMPED, PAPER, UNCLAMPED
+from .report import read_rows
+from .tables import Contest
+from .trials import Row
 
 BEGIN, END = "<!-- results: made by `make report` -->", "<!-- end of results -->"
 _TITLES = {
     "davis": "DAVIS first frames",
     "charts": "Colour charts",
+    "ablation": "What each part is worth",
+    "convergence": "Against run time, and other codecs at the same bytes",
 }
-Line = dict[str, str]
+_CONTESTS = tuple(Contest(BEST.name, other.name) for other in (BASELINE, PAPER, UNCLAMPED, CLAMPED))
 
 
 def results(reports: Path) -> str:
@@ -27,12 +34,15 @@ def results(reports: Path) -> str:
     parts = []
     for name, title in _TITLES.items():
         path = reports / name / "results.csv"
-        lines = _read(path) if path.is_file() else []
-        if lines:
+        rows = read_rows(path) if path.is_file() else []
+        if rows:
             parts.append(f"**{title}** (`kcgs bench {name}`, `notebooks/reports/{name}/report.md`):")
             # two charts are no sample of pictures: no means
-            groups = _by_picture(lines) if name == "charts" else [lines]
+            groups = _by_picture(rows) if name == "charts" else [rows]
             parts += [f"{_pictures(group).capitalize()}.\n\n{_table(group)}" for group in groups]
+            if name == "davis":
+                parts.append("Differences, paired by picture, with bootstrap intervals where there are enough:")
+                parts.append(tables.differences(rows, _CONTESTS, _compared(rows), ("psnr", "ef_psnr")))
     return "\n\n".join(parts)
 
 
@@ -57,36 +67,41 @@ def main() -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def _read(path: Path) -> list[Line]:
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+def _by_picture(rows: Sequence[Row]) -> list[list[Row]]:
+    names = dict.fromkeys(row.picture for row in rows)
+    return [[row for row in rows if row.picture == name] for name in names]
 
 
-def _by_picture(lines: Sequence[Line]) -> list[list[Line]]:
-    names = dict.fromkeys(line["picture"] for line in lines)
-    return [[line for line in lines if line["picture"] == name] for name in names]
-
-
-def _pictures(lines: Sequence[Line]) -> str:
-    names = list(dict.fromkeys(line["picture"] for line in lines))
+def _pictures(rows: Sequence[Row]) -> str:
+    names = list(dict.fromkeys(row.picture for row in rows))
     return f"{len(names)} pictures, {', '.join(names)}" if len(names) > 1 else f"one picture, {names[0]}"
 
 
-def _table(lines: Sequence[Line]) -> str:
-    """Means over the pictures that every method of an N has; N that only one method has are points of its curve."""
-    header = ["N", "method", "iterations", "pictures", "PSNR", "EF-PSNR", "bits per pixel", "PSNR decoded"]
-    rows = []
-    for n in sorted({int(line["n"]) for line in lines}):
-        here = [line for line in lines if int(line["n"]) == n]
-        methods = list(dict.fromkeys(line["method"] for line in here))
-        shared = set.intersection(*({line["picture"] for line in here if line["method"] == m} for m in methods))
-        for method in methods if len(methods) > 1 else ():
-            found = [line for line in here if line["method"] == method and line["picture"] in shared]
-            if found:
-                row = [count(n), f"`{method}`", count(int(found[0]["iterations"])), str(len(shared))]
-                keys = (("psnr", 2), ("ef_psnr", 2), ("bits_per_pixel", 3), ("decoded_psnr", 2))
-                rows.append(row + [f"{statistics.fmean(float(line[k]) for line in found):.{d}f}" for k, d in keys])
-    return markdown(header, rows)
+def _methods(rows: Sequence[Row], n: int) -> list[str]:
+    return list(dict.fromkeys(row.method for row in rows if row.n == n))
+
+
+def _compared(rows: Sequence[Row]) -> list[int]:
+    """Return the N of more than one method; those that only one has are points of its curve."""
+    return [n for n in sorted({row.n for row in rows}) if len(_methods(rows, n)) > 1]
+
+
+def _table(rows: Sequence[Row]) -> str:
+    """Means over the pictures that every method of an N has."""
+    header = ["N", "method", "iterations", "pictures", "PSNR", "EF-PSNR", "bits per pixel", "PSNR decoded", "core s"]
+    lines = []
+    for n in _compared(rows):
+        methods = _methods(rows, n)
+        shared = complete(rows, methods, n)
+        for method in methods if shared else ():
+            found = [row for row in select(rows, method, n) if row.picture in shared]
+            # other codecs have neither Gaussians nor iterations
+            line = [count(n) if n else "", f"`{method}`", count(found[0].iterations) if n else "", str(len(shared))]
+            line += [db(mean(row.psnr for row in found)), db(mean(row.ef_psnr for row in found))]
+            line.append(f"{mean(row.bits_per_pixel for row in found):.3f}")
+            line += [db(mean(row.decoded_psnr for row in found)), seconds(mean(row.core_seconds for row in found))]
+            lines.append(line)
+    return markdown(header, lines)
 
 
 if __name__ == "__main__":

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from kcgs._atomic import atomic_path
 from kcgs.bench.cells import write_csv
@@ -15,6 +17,7 @@ from .methods import FULL_ITERATIONS
 from .options import Options
 from .trials import Row, Trial
 
+_NOT_WRITTEN = ("scene", "history")
 _QUICK_TEXT = "The short form, small pictures and few iterations: the numbers only show that all of it runs."
 METRICS_TEXT = """PSNR and MS-SSIM are over the whole picture, EF-PSNR and edge SSIM within 5 pixels of the contours of
 the given map, for every method alike; decibels, of values clipped to [0, 1]. `paper` is the paper's method, `gaussian-
@@ -63,9 +66,18 @@ def write(output: Path, rows: Sequence[Row], parts: Sequence[str]) -> None:
     """Write report.md and results.csv."""
     with atomic_path(output / "report.md") as temporary:
         temporary.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
-    names = [field.name for field in dataclasses.fields(Row) if field.name not in ("history", "scene")]
+    names = [field.name for field in dataclasses.fields(Row) if field.name not in _NOT_WRITTEN]
     names.append("bits_per_pixel")
     write_csv(output / "results.csv", names, ([getattr(row, name) for name in names] for row in rows))
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Read what `write` wrote: all but scenes and histories."""
+    with path.open(newline="", encoding="utf-8") as file:
+        lines = list(csv.DictReader(file))
+    read: dict[Any, Callable[[str], Any]] = {"str": str, "int": int, "float": float}
+    kinds = {field.name: read[field.type] for field in dataclasses.fields(Row) if field.name not in _NOT_WRITTEN}
+    return [Row(scene="", **{name: kind(line[name]) for name, kind in kinds.items()}) for line in lines]
 
 
 def _missing(lacking: Sequence[Trial]) -> str:

@@ -53,15 +53,20 @@ def quality(rows: Sequence[Row], methods: Sequence[str], names: dict[str, str] |
     return markdown(header, lines)
 
 
-def differences(rows: Sequence[Row], contests: Sequence[Contest], at: Sequence[int] | None = None) -> str:
+def differences(
+    rows: Sequence[Row],
+    contests: Sequence[Contest],
+    at: Sequence[int] | None = None,
+    quantities: Sequence[str] = tuple(QUANTITIES),
+) -> str:
     """Paired differences, a line each contest, N and way."""
     header = ["N", "difference", "at", "pictures"]
-    for title in QUANTITIES.values():
-        header += [title, "95 %", "won-lost"]
+    for quantity in quantities:
+        header += [QUANTITIES[quantity], "95 %", "won-lost"]
     lines = []
     for contest, (way, compare) in product(contests, _WAYS.items()):
         for n in counts(rows, contest.ours) if at is None else at:
-            found = {q: compare(rows, *contest, n, q) for q in QUANTITIES}
+            found = {q: compare(rows, *contest, n, q) for q in quantities}
             most = max((len(d.values) for d in found.values() if d is not None), default=0)
             if most:
                 line = [count(n), str(contest), way, str(most)]
