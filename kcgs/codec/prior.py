@@ -1,7 +1,9 @@
 """What the coder knows about label maps before it has seen one: a small network, trained once, in integers.
 
-`prior.bin` holds the arrays of `Prior` one after the other, lowest bytes first, in the types of `_LAYOUT`. The network
-was trained on segmentations of Kodak photos and of scikit-image's, and on drawn shapes: none of DAVIS or BSDS.
+`prior.bin` holds these arrays one after the other, the last index running fastest, lowest bytes first: ``layer1``, int8
+[T, 2, 48], T being the length of the template; ``bias1``, int16 [48]; ``layer2``, int8 [48, 16]; ``bias2``, int32 [16];
+``layer3``, int8 [16, 2]; ``bias3``, int32 [2]; ``mixer``, int32 [4]. `contexts` says what they are for. The network was
+trained on segmentations of Kodak photos and of scikit-image's, and on drawn shapes: none of DAVIS or BSDS.
 """
 
 from __future__ import annotations
