@@ -78,9 +78,11 @@ class Writer:
     def choose(self, tables: Floats, rows: Integers, values: Integers | None) -> Integers:
         """Write values by a table each."""
         assert values is not None
-        model = self._models.Categorical(perfect=False)
-        for part in batches(len(rows)):
-            self._encoder.encode(values[part].astype(np.int32), model, tables[rows[part]])
+        if len(tables) == 1:
+            return self.repeat(tables[0], len(rows), values)
+        models = [self._models.Categorical(table, perfect=False) for table in tables]
+        for value, row in zip(values.tolist(), rows.tolist(), strict=True):
+            self._encoder.encode(value, models[row])
         return values
 
     def repeat(self, table: Floats, count: int, values: Integers | None) -> Integers:
@@ -134,17 +136,18 @@ class Reader:
     def uniform(self, sizes: Integers, values: Integers | None) -> Integers:
         """Read values that are equally likely."""
         found = np.zeros(len(sizes), np.int64)
-        told = sizes > 1
-        if told.any():
+        told = np.flatnonzero(sizes > 1)
+        if len(told):
             found[told] = self._decode(self._models.Uniform(), sizes[told].astype(np.int32))
         return found
 
     def choose(self, tables: Floats, rows: Integers, values: Integers | None) -> Integers:
         """Read values by a table each."""
-        model, found = self._models.Categorical(perfect=False), np.zeros(len(rows), np.int64)
-        for part in batches(len(rows)):
-            found[part] = self._decode(model, tables[rows[part]])
-        return found
+        if len(tables) == 1:
+            return self.repeat(tables[0], len(rows), values)
+        # one by one: the library would make a model of each symbol's table, many times
+        models, decode = [self._models.Categorical(table, perfect=False) for table in tables], self._decode
+        return np.array([decode(models[row]) for row in rows.tolist()], np.int64)
 
     def repeat(self, table: Floats, count: int, values: Integers | None) -> Integers:
         """Read values by one table."""
