@@ -32,12 +32,14 @@ LEFT, RIGHT, TOP = 8, 9, 6  # margins around the map
 CLIP = 3071  # largest logit, in 1/256
 HEADS, INPUTS = 2, 4  # decisions: which of two candidates, or neither; estimates that are mixed
 # columns of a pixel's row: its place, the candidates, whether it is decided by bits, its label; then for each decision
-# the estimates, and the three counters, the mixer's weights, the chance; then the template
+# the estimates, and the three counters, the mixer's weights, the chance; then the template, and the network's units
 X, Y, FIRST, SECOND, CODED, LABEL, INPUT = 0, 1, 2, 3, 4, 5, 6
 SLOT = INPUT + HEADS * INPUTS
 CHOSEN, MIXED, DECISION = 3, 4, 5
 FEATURE = SLOT + HEADS * DECISION
-COLUMNS = FEATURE + len(TEMPLATE)
+_LATENT = FEATURE + len(TEMPLATE)
+_HIDDEN = _LATENT + LATENT
+COLUMNS = _HIDDEN + HIDDEN
 
 # where the counters of each context begin
 _BASES = np.array([[0, 1 << 6, (1 << 6) + (1 << 11)], [67648, 67649, 67649 + 3**4]], np.int32)
@@ -107,18 +109,24 @@ def describe(labels, y, x, row):  # type: ignore[no-untyped-def]
 @inner
 def network(row):  # type: ignore[no-untyped-def]
     """Two layers of rectified sums of small integers; the first estimate of each decision, a logit in 1/256."""
-    hidden = _BIAS1.copy()
+    # lengths that a compiler cannot know: it would write known loops out, and not use vectors, at three times the time
+    latent, hidden = row[_LATENT : len(row) - HIDDEN], row[_HIDDEN:]
+    for j in range(len(hidden)):
+        hidden[j] = _BIAS1[j]
     for t in range(len(_DX)):
         kind = row[FEATURE + t]
         if kind > 0:
-            for j in range(HIDDEN):
-                hidden[j] += _LAYER1[t, kind - 1, j]
-    latent = _BIAS2.copy()
+            weights = _LAYER1[t, kind - 1]
+            for j in range(len(hidden)):
+                hidden[j] += weights[j]
+    for k in range(len(latent)):
+        latent[k] = _BIAS2[k]
     for j in range(HIDDEN):
         value = min(hidden[j], 4095)
         if value > 0:
-            for k in range(LATENT):
-                latent[k] += value * _LAYER2[j, k]
+            weights = _LAYER2[j]
+            for k in range(len(latent)):
+                latent[k] += value * weights[k]
     for h in range(HEADS):
         total = _BIAS3[h]
         for k in range(LATENT):

@@ -20,6 +20,8 @@ _WINDOW = 64  # bits of the coder's state
 _MOST = 1 << 16  # largest alphabet of equally likely numbers
 _LEAST = 64  # chance of a Counter's bit
 _AT_ONCE = 1 << 12
+_FEW = 16  # symbols among which the library finds one faster by trying all than by a table
+_FOREIGN = "data must be an encoder's stream; got bytes that no encoder wrote"
 
 
 class Coder(Protocol):
@@ -145,15 +147,19 @@ class Reader:
         """Read values by a table each."""
         if len(tables) == 1:
             return self.repeat(tables[0], len(rows), values)
-        # one by one: the library would make a model of each symbol's table, many times
-        models, decode = [self._models.Categorical(table, perfect=False) for table in tables], self._decode
-        return np.array([decode(models[row]) for row in rows.tolist()], np.int64)
+        # one by one, since the library makes a model anew for each row of many tables
+        models, decode = [self._models.Categorical(table, perfect=False) for table in tables], self._decoder.decode
+        try:
+            return np.array([decode(models[row]) for row in rows.tolist()], np.int64)
+        except AssertionError:
+            raise CodecError(_FOREIGN) from None
 
     def repeat(self, table: Floats, count: int, values: Integers | None) -> Integers:
         """Read values by one table."""
         if not count:
             return np.zeros(0, np.int64)
-        return np.asarray(self._decode(self._models.Categorical(table, perfect=False), count), np.int64)
+        model = self._models.Categorical(table, lazy=len(table) < _FEW, perfect=False)
+        return np.asarray(self._decode(model, count), np.int64)
 
     def numbers(self, values: Any, size: int, count: int) -> Any:
         """Read numbers."""
@@ -163,7 +169,7 @@ class Reader:
         try:
             return self._decoder.decode(*model)
         except AssertionError:
-            raise CodecError("data must be an encoder's stream; got bytes that no encoder wrote") from None
+            raise CodecError(_FOREIGN) from None
 
 
 def batches(count: int) -> list[slice]:
