@@ -17,9 +17,10 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numba import njit
@@ -27,6 +28,7 @@ from numba import njit
 from .prior import HIDDEN, LATENT, TEMPLATE, load_prior
 
 log = logging.getLogger("kcgs")
+T = TypeVar("T")
 
 LEFT, RIGHT, TOP = 8, 9, 6  # margins around the map
 CLIP = 3071  # largest logit, in 1/256
@@ -197,13 +199,32 @@ def learn(tables, row, h, bit):  # type: ignore[no-untyped-def]
         counter[1] = min(seen + 1, _MEMORY)
 
 
-def compiled(compiler: Callable[[str, bool], Any], *sources: str) -> Any:
-    """Compile loops that call those of this file, kept on disk by what is in the sources."""
-    digest = hashlib.sha256()
-    for name in ("contexts.py", "prior.py", "prior.bin", *sources):
-        digest.update((Path(__file__).parent / name).read_bytes())
+def compiled(name: str, compiler: Callable[[str, bool], T], rehearse: Callable[[T], None], *sources: str) -> T:
+    """Compile loops that call those of this file, kept on disk by what is in the sources; say how long it took.
+
+    Args:
+        name: of what they do.
+        compiler: makes them of a fingerprint, and of whether to keep them on disk.
+        rehearse: calls each of them once, for it is then that they compile.
+        sources: files that they are in, besides this one.
+    """
+    start, digest = time.perf_counter(), hashlib.sha256()
+    for source in ("contexts.py", "prior.py", "prior.bin", *sources):
+        digest.update((Path(__file__).parent / source).read_bytes())
     try:
-        return compiler(digest.hexdigest(), True)
+        loops = compiler(digest.hexdigest(), True)
     except RuntimeError:  # numba finds no folder that it may write to
         log.warning("kcgs: no folder to keep the compiled codec in; set NUMBA_CACHE_DIR to one")
-        return compiler(digest.hexdigest(), False)
+        loops = compiler(digest.hexdigest(), False)
+    rehearse(loops)
+    made = any(len(loop.overloads) > sum(loop.stats.cache_hits.values()) for loop in cast(Any, loops))
+    kept = all(loop.stats.cache_path for loop in cast(Any, loops))
+    log.log(
+        logging.WARNING if made else logging.INFO,
+        "kcgs: %s %s in %.1f s%s",
+        "compiled" if made else "loaded",
+        name,
+        time.perf_counter() - start,
+        ", kept on disk for next time" if made and kept else "",
+    )
+    return loops

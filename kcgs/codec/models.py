@@ -80,7 +80,7 @@ class Magnitudes:
         return found
 
     def _learn(self, scale: float, context: Integers, sizes: Integers) -> None:
-        # a size stands for what rounds to it; in whole parts, whose sums no order changes
+        # a size stands for what rounds to it; in whole parts, whose sums no order changes: equal ones at once
         edges = np.arange(_BINS + 1) * (scale * _WIDTH)
         edges[-1] = np.inf
         contexts = len(self._shape)
@@ -96,10 +96,10 @@ class Magnitudes:
         self._shape += learned / _PARTS
 
     def _tables(self, scale: float) -> Floats:
-        # the share of each bucket: the integral of the shape between its bounds, by linear interpolation
-        # not cumsum: its order of summation is its own
+        # the share of each bucket: the integral of the shape between its bounds, by linear interpolation; its sums by
+        # hand, since numpy's have an order of their own
         total = np.array([list(itertools.accumulate(shape, initial=0.0)) for shape in self._shape.tolist()])
-        edges = np.arange(_BINS + 1) * (scale * _WIDTH)
+        edges: Floats = np.arange(_BINS + 1.0) * (scale * _WIDTH)
         cumulative = _interpolate(_MIDDLES, edges, total)
         return (cumulative[:, 1:] - cumulative[:, :-1]) + 1e-3 * total[:, -1:] / _BUCKETS
 

@@ -30,6 +30,7 @@ from .labels import Labels, compact
 
 _START, _ESCAPE = 11.0, 4.0  # bits of a start's place, of a label that is no candidate
 _SWEEPS = 4
+_NO_COSTS = np.zeros((0, 1, 1), np.float32)
 
 
 class _Model(NamedTuple):
@@ -129,7 +130,13 @@ def _compile(fingerprint: str, cache: bool) -> _Loops:
 
 @functools.cache
 def _loops() -> _Loops:
-    return cast(_Loops, compiled(_compile, "smooth.py"))
+    return compiled("the estimates of contours", _compile, _rehearse, "smooth.py")
+
+
+def _rehearse(run: _Loops) -> None:
+    index = np.eye(2, dtype=np.int32)
+    run.measure(_frame(index), TOP, TOP + 1, LEFT, LEFT + 1, False, _model())
+    run.sweep(_frame(index), index, _NO_COSTS, np.full(2, 2), 0.0, True, False, _model())
 
 
 @functools.cache
@@ -214,7 +221,7 @@ def smooth_labels(
     ids, index = compact(labels)
     if costs is not None and costs.shape != (len(ids), *labels.shape):
         raise ValueError(f"costs must have shape {(len(ids), *labels.shape)}; got {costs.shape}")
-    table = np.zeros((0, 1, 1), np.float32) if costs is None else np.asarray(costs, np.float32)
+    table = _NO_COSTS if costs is None else np.asarray(costs, np.float32)
     height, width = labels.shape
     sizes = np.bincount(index.reshape(-1), minlength=len(ids))
     frame = _frame(index)

@@ -28,6 +28,7 @@ from .contexts import (
     learn,
     mix,
     network,
+    new_tables,
     quiet,
 )
 
@@ -279,4 +280,13 @@ def _compile(fingerprint: str, cache: bool) -> Loops:
 @functools.cache
 def loops() -> Loops:
     """Compile the loops, or load them from disk."""
-    return cast(Loops, compiled(_compile, "waves.py"))
+    return compiled("the codec of label maps", _compile, _rehearse, "waves.py")
+
+
+def _rehearse(run: Loops) -> None:
+    truth, starts, _ = run.survey(np.eye(2, dtype=np.int32), 2)
+    work, bits, state = new_work(2), np.zeros(4, np.int32), np.zeros(STATE, np.int64)
+    labels = np.zeros((2 + TOP + 1, 2 + LEFT + RIGHT), np.int32)
+    run.advance(bits, state, labels, starts, *new_tables(), *work)
+    run.answer(state, truth, work.rows, bits)
+    run.nearest(labels, work.rows[0], np.zeros(RANKS, np.int32))
