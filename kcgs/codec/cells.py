@@ -95,7 +95,8 @@ class Grid(NamedTuple):
         below = outside + self.rows * self.columns
         at = np.where(outside < top, outside, np.where(row < self.rows, beside, below))
         row, column = np.divmod(inside, self.columns)
-        at = np.sort(np.concatenate([(row + self.margin) * wide + column + self.margin, at]))
+        # both are in order, which a stable sort makes use of
+        at = np.sort(np.concatenate([(row + self.margin) * wide + column + self.margin, at]), kind="stable")
         row, column = np.divmod(at, wide)
         return np.stack([column - self.margin, row - self.margin], -1)
 
