@@ -25,6 +25,7 @@ until no cell has a 7.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -67,9 +68,9 @@ class Grid(NamedTuple):
     @property
     def most_margin(self) -> int:
         """How many cells there may be beyond each side of the picture."""
-        most = _CELLS_OUTSIDE + 16 * self.rows * self.columns
-        allowed = range(_MOST_MARGIN, -1, -1)
-        return next(m for m in allowed if (self.rows + 2 * m) * (self.columns + 2 * m) <= most)
+        # the largest m with (rows + 2 m) (columns + 2 m) at most so many more than those inside
+        more, both = _CELLS_OUTSIDE + 15 * self.rows * self.columns, self.rows + self.columns
+        return min((math.isqrt(both * both + 4 * more) - both) // 4, _MOST_MARGIN)
 
     @property
     def num_outside(self) -> int:
@@ -94,7 +95,8 @@ class Grid(NamedTuple):
         below = outside + self.rows * self.columns
         at = np.where(outside < top, outside, np.where(row < self.rows, beside, below))
         row, column = np.divmod(inside, self.columns)
-        at = np.sort(np.concatenate([(row + self.margin) * wide + column + self.margin, at]))
+        # both are in order, which a stable sort makes use of
+        at = np.sort(np.concatenate([(row + self.margin) * wide + column + self.margin, at]), kind="stable")
         row, column = np.divmod(at, wide)
         return np.stack([column - self.margin, row - self.margin], -1)
 

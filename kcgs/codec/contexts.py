@@ -34,9 +34,10 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numba import njit
@@ -44,15 +45,20 @@ from numba import njit
 from .prior import HIDDEN, LATENT, TEMPLATE, load_prior
 
 log = logging.getLogger("kcgs")
+T = TypeVar("T")
 
 LEFT, RIGHT, TOP = 8, 9, 6  # margins around the map
 CLIP = 3071  # largest logit, in 1/256
 HEADS, INPUTS = 2, 4  # decisions: which of two candidates, or neither; estimates that are mixed
-# columns of a pixel's row: its place, the candidates, whether it is decided by bits, its label
-X, Y, FIRST, SECOND, CODED, LABEL, COLUMNS = 0, 1, 2, 3, 4, 5, 6
-
-# columns of a decision: its three counters, the mixer's weights, the chance
+# columns of a pixel's row: its place, the candidates, whether it is decided by bits, its label; then for each decision
+# the estimates, and the three counters, the mixer's weights, the chance; then the template, and the network's units
+X, Y, FIRST, SECOND, CODED, LABEL, INPUT = 0, 1, 2, 3, 4, 5, 6
+SLOT = INPUT + HEADS * INPUTS
 CHOSEN, MIXED, DECISION = 3, 4, 5
+FEATURE = SLOT + HEADS * DECISION
+_LATENT = FEATURE + len(TEMPLATE)
+_HIDDEN = _LATENT + LATENT
+COLUMNS = _HIDDEN + HIDDEN
 
 # where the counters of each context begin
 _BASES = np.array([[0, 1 << 6, (1 << 6) + (1 << 11)], [67648, 67649, 67649 + 3**4]], np.int32)
@@ -74,8 +80,7 @@ _STRETCH = (np.searchsorted(SQUASH, np.arange(4096) * 16 + 8) - CLIP).astype(np.
 class Tables(NamedTuple):
     """What adapts."""
 
-    chance: Any  # [slots] uint16, 1/65536
-    seen: Any  # [slots] uint8
+    counters: Any  # [slots, 2] uint16: the chance in 1/65536, how often it was seen
     weights: Any  # [HEADS, 4, INPUTS] int32, 1/65536
 
 
@@ -83,7 +88,7 @@ def new_tables() -> Tables:
     """Return what every stream starts with."""
     weights = np.empty((HEADS, 4, INPUTS), np.int32)
     weights[:] = _MIXER
-    return Tables(np.zeros(_SLOTS, np.uint16), np.zeros(_SLOTS, np.uint8), weights)
+    return Tables(np.zeros((_SLOTS, 2), np.uint16), weights)
 
 
 inner = cast(Any, njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
@@ -103,115 +108,140 @@ def quiet(labels, y, x):  # type: ignore[no-untyped-def]
 
 
 @inner
-def describe(labels, y, x, row, feature):  # type: ignore[no-untyped-def]
+def describe(labels, y, x, row):  # type: ignore[no-untyped-def]
     """Find the two candidates, and which of them each pixel of the template is."""
     first = labels[y, x - 1]
     second = -1
     for t in range(len(_DX)):
         label = labels[y + _DY[t], x + _DX[t]]
         if label == first:
-            feature[t] = 0
+            row[FEATURE + t] = 0
         elif second < 0 or label == second:
             second = label
-            feature[t] = 1
+            row[FEATURE + t] = 1
         else:
-            feature[t] = 2
+            row[FEATURE + t] = 2
     row[FIRST] = first
     row[SECOND] = second
 
 
 @inner
-def network(feature, out):  # type: ignore[no-untyped-def]
-    """Two layers of rectified sums of small integers; out: logits in 1/256."""
-    hidden = _BIAS1.copy()
-    for t in range(len(feature)):
-        if feature[t] > 0:
-            row = _LAYER1[t, feature[t] - 1]
-            for j in range(HIDDEN):
-                hidden[j] += row[j]
-    latent = _BIAS2.copy()
+def network(row):  # type: ignore[no-untyped-def]
+    """Two layers of rectified sums of small integers; the first estimate of each decision, a logit in 1/256."""
+    # lengths that a compiler cannot know: it would write known loops out, and not use vectors, at three times the time
+    latent, hidden = row[_LATENT : len(row) - HIDDEN], row[_HIDDEN:]
+    for j in range(len(hidden)):
+        hidden[j] = _BIAS1[j]
+    for t in range(len(_DX)):
+        kind = row[FEATURE + t]
+        if kind > 0:
+            weights = _LAYER1[t, kind - 1]
+            for j in range(len(hidden)):
+                hidden[j] += weights[j]
+    for k in range(len(latent)):
+        latent[k] = _BIAS2[k]
     for j in range(HIDDEN):
         value = min(hidden[j], 4095)
         if value > 0:
-            row = _LAYER2[j]
-            for k in range(LATENT):
-                latent[k] += value * row[k]
+            weights = _LAYER2[j]
+            for k in range(len(latent)):
+                latent[k] += value * weights[k]
     for h in range(HEADS):
         total = _BIAS3[h]
         for k in range(LATENT):
             total += min(max(latent[k] >> 6, 0), 4095) * _LAYER3[k, h]
-        out[h, 0] = min(max(total >> 4, -CLIP), CLIP)
+        row[INPUT + h * INPUTS] = min(max(total >> 4, -CLIP), CLIP)
 
 
 @inner
-def contexts(feature, slots):  # type: ignore[no-untyped-def]
+def contexts(row):  # type: ignore[no-untyped-def]
     """Find the counters of a pixel: by its nearest 6, 11 and 16; and for the other decision all, by 4 and by 8."""
     bits = 0
     for t in range(1, 17):
-        bits = bits << 1 | (feature[t] > 0)
+        bits = bits << 1 | (row[FEATURE + t] > 0)
         if t == 6:
-            slots[0, 0] = _BASES[0, 0] + bits
+            row[SLOT] = _BASES[0, 0] + bits
         elif t == 11:
-            slots[0, 1] = _BASES[0, 1] + bits
+            row[SLOT + 1] = _BASES[0, 1] + bits
         elif t == 16:
-            slots[0, 2] = _BASES[0, 2] + bits
+            row[SLOT + 2] = _BASES[0, 2] + bits
     digits = 0
     for t in range(1, 9):
-        digits = digits * 3 + feature[t]
+        digits = digits * 3 + row[FEATURE + t]
         if t == 4:
-            slots[1, 1] = _BASES[1, 1] + digits
+            row[SLOT + DECISION + 1] = _BASES[1, 1] + digits
         elif t == 8:
-            slots[1, 2] = _BASES[1, 2] + digits
-    slots[1, 0] = _BASES[1, 0]
+            row[SLOT + DECISION + 2] = _BASES[1, 2] + digits
+    row[SLOT + DECISION] = _BASES[1, 0]
 
 
 @inner
-def mix(tables, work, i, h):  # type: ignore[no-untyped-def]
+def mix(tables, row, h):  # type: ignore[no-untyped-def]
     """Weigh the network and the counters into one chance."""
-    inputs = work.inputs[i, h]
-    seen = 0
+    inputs, slots = row[INPUT + h * INPUTS :], row[SLOT + h * DECISION :]
+    seen: Any = 0
     for c in range(3):
-        slot = work.slots[i, h, c]
-        seen = tables.seen[slot]
-        inputs[c + 1] = _STRETCH[tables.chance[slot] >> 4] if seen > 0 else inputs[0]
+        counter = tables.counters[slots[c]]
+        seen = counter[1]
+        inputs[c + 1] = _STRETCH[counter[0] >> 4] if seen > 0 else inputs[0]
     chosen = 0 if seen == 0 else 1 if seen < 5 else 2 if seen < 12 else 3
     total: Any = np.int64(0)
     for k in range(INPUTS):
         total += np.int64(tables.weights[h, chosen, k]) * inputs[k]
     logit: Any = min(max(total >> 16, -CLIP), CLIP)
-    work.slots[i, h, CHOSEN] = chosen
-    work.slots[i, h, MIXED] = min(max(SQUASH[logit + CLIP], _SURE), 65536 - _SURE)
-    return work.slots[i, h, MIXED] / 65536
+    slots[CHOSEN] = chosen
+    slots[MIXED] = min(max(SQUASH[logit + CLIP], _SURE), 65536 - _SURE)
+    return slots[MIXED] / 65536
 
 
 @inner
-def learn(tables, work, i, h, bit):  # type: ignore[no-untyped-def]
+def learn(tables, row, h, bit):  # type: ignore[no-untyped-def]
     """Move the weights along the error, and the counters to the bit."""
-    error = (bit << 16) - work.slots[i, h, MIXED]
-    weights = tables.weights[h, work.slots[i, h, CHOSEN]]
+    inputs, slots = row[INPUT + h * INPUTS :], row[SLOT + h * DECISION :]
+    error = (bit << 16) - slots[MIXED]
+    weights = tables.weights[h, slots[CHOSEN]]
     for k in range(INPUTS):
-        step = np.int64(work.inputs[i, h, k]) * error * _RATE
+        step = np.int64(inputs[k]) * error * _RATE
         weight = weights[k] + ((step + (1 << (_SHIFT - 1))) >> _SHIFT)
         weights[k] = min(max(weight, -_HEAVIEST), _HEAVIEST)
     for c in range(3):
-        slot = work.slots[i, h, c]
-        seen: Any = np.int64(tables.seen[slot])
-        chance: Any = np.int64(tables.chance[slot])
+        counter = tables.counters[slots[c]]
+        chance: Any = np.int64(counter[0])
+        seen: Any = np.int64(counter[1])
         if seen == 0:
-            chance = np.int64(SQUASH[work.inputs[i, h, 0] + CLIP])
+            chance = np.int64(SQUASH[inputs[0] + CLIP])
             seen = 2
         chance += ((bit << 16) - chance) * 2 // (2 * seen + 3)
-        tables.chance[slot] = min(max(chance, 32), 65504)
-        tables.seen[slot] = min(seen + 1, _MEMORY)
+        counter[0] = min(max(chance, 32), 65504)
+        counter[1] = min(seen + 1, _MEMORY)
 
 
-def compiled(compiler: Callable[[str, bool], Any], *sources: str) -> Any:
-    """Compile loops that call those of this file, kept on disk by what is in the sources."""
-    digest = hashlib.sha256()
-    for name in ("contexts.py", "prior.py", "prior.bin", *sources):
-        digest.update((Path(__file__).parent / name).read_bytes())
+def compiled(name: str, compiler: Callable[[str, bool], T], rehearse: Callable[[T], None], *sources: str) -> T:
+    """Compile loops that call those of this file, kept on disk by what is in the sources; say how long it took.
+
+    Args:
+        name: of what they do.
+        compiler: makes them of a fingerprint, and of whether to keep them on disk.
+        rehearse: calls each of them once, for it is then that they compile.
+        sources: files that they are in, besides this one.
+    """
+    start, digest = time.perf_counter(), hashlib.sha256()
+    for source in ("contexts.py", "prior.py", "prior.bin", *sources):
+        digest.update((Path(__file__).parent / source).read_bytes())
     try:
-        return compiler(digest.hexdigest(), True)
+        loops = compiler(digest.hexdigest(), True)
     except RuntimeError:  # numba finds no folder that it may write to
         log.warning("kcgs: no folder to keep the compiled codec in; set NUMBA_CACHE_DIR to one")
-        return compiler(digest.hexdigest(), False)
+        loops = compiler(digest.hexdigest(), False)
+    rehearse(loops)
+    made = any(len(loop.overloads) > sum(loop.stats.cache_hits.values()) for loop in cast(Any, loops))
+    kept = all(loop.stats.cache_path for loop in cast(Any, loops))
+    log.log(
+        logging.WARNING if made else logging.INFO,
+        "kcgs: %s %s in %.1f s%s",
+        "compiled" if made else "loaded",
+        name,
+        time.perf_counter() - start,
+        ", kept on disk for next time" if made and kept else "",
+    )
+    return loops

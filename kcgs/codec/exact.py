@@ -35,5 +35,6 @@ def turn(share: Floats) -> tuple[Floats, Floats]:
 def _polynomial(coefficients: list[float], x: Floats) -> Floats:
     total = np.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
-        total = total * x + coefficient
+        total *= x
+        total += coefficient
     return total

@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 from .cells import Cells
 from .errors import CodecError
 from .models import Choices, Magnitudes
-from .quantize import SIZES, Classes, Codes, Quantizer
+from .quantize import SIZES, Classes, Codes, Quantizer, Restored
 from .rangecoder import Coder
 
 Integers = NDArray[np.int64]
@@ -83,8 +83,8 @@ class Layers:
 
     def code(
         self, coder: Coder, energy: int, codes: Codes | None, ids: Integers | None, most: int
-    ) -> tuple[Codes, Integers]:
-        """Code the layer of one energy.
+    ) -> tuple[Restored, Integers]:
+        """Code the layer of one energy; return its Gaussians and their regions.
 
         Args:
             coder: writes or reads.
@@ -112,7 +112,7 @@ class Layers:
         size = np.repeat(np.arange(64)[::-1], counts[::-1]) + SIZES[0]
         classes = Classes(np.full(start, energy), size)
         found = self._code_numbers(coder, classes, np.concatenate(cells), codes)
-        return found, self._code_regions(coder, found, ids)
+        return found, self._code_regions(coder, found.means, ids)
 
     def _code_counts(self, coder: Coder, counts: Integers | None) -> Integers:
         one = np.ones(1, np.int64)
@@ -128,7 +128,7 @@ class Layers:
             found[size] = (low + coder.uniform(np.maximum(low, 1), None if value is None else value - low))[0]
         return found
 
-    def _code_numbers(self, coder: Coder, classes: Classes, cell: Integers, codes: Codes | None) -> Codes:
+    def _code_numbers(self, coder: Coder, classes: Classes, cell: Integers, codes: Codes | None) -> Restored:
         quantizer = self.quantizer
         steps, side = quantizer.steps(classes), quantizer.cell_side(classes)
         zero = np.zeros(len(cell), np.int64)
@@ -136,13 +136,16 @@ class Layers:
         ratio = self._ratio.code(coder, _RATIO_SCALE / steps.ratio[0], zero, None if codes is None else codes.ratio)
         if (ratio > quantizer.most_ratio(steps)).any():
             raise CodecError(f"a ratio must be at most {quantizer.most_ratio(steps)[0]} steps; got {ratio.max()}")
-        angle = coder.uniform(quantizer.angles(ratio, steps), None if codes is None else codes.angle)
+        turns = quantizer.angles(ratio, steps)
+        angle = coder.uniform(turns, None if codes is None else codes.angle)
         # how many steps the amplitude of a Gaussian of this energy has
         loud = math.ldexp(math.sqrt(math.pi / (12.0 * quantizer.noise)), int(classes.energy[0]))
         colors = self._code_colors(coder, len(cell), loud, None if codes is None else codes.colors)
-        parts = quantizer.parts(quantizer.restore_shape(classes, scale, ratio, angle), classes, side)
+        shape = quantizer.restore_shape(classes, steps, scale, ratio, angle / turns)
+        parts = quantizer.parts(shape, steps, side)
         place = [coder.uniform(parts[:, axis], None if codes is None else codes.place[:, axis]) for axis in range(2)]
-        return Codes(classes, scale, ratio, angle, colors, cell, np.stack(place, -1))
+        found = Codes(classes, scale, ratio, angle, colors, cell, np.stack(place, -1))
+        return quantizer.restore_rest(found, steps, shape, side)
 
     def _code_colors(self, coder: Coder, count: int, loud: float, colors: Integers | None) -> Integers:
         channels: list[Integers] = []
@@ -158,10 +161,10 @@ class Layers:
             channels.append(np.where(sign == 1, -size, size))
         return np.stack(channels, -1)
 
-    def _code_regions(self, coder: Coder, codes: Codes, ids: Integers | None) -> Integers:
+    def _code_regions(self, coder: Coder, means: NDArray[np.float32], ids: Integers | None) -> Integers:
         if self.lookup is None or self.regions == 1:
-            return np.zeros(len(codes.scale), np.int64)
-        under = self.lookup(self.quantizer.restore_centres(codes))
+            return np.zeros(len(means), np.int64)
+        under = self.lookup(means)
         strays = None if ids is None else (ids != under).astype(np.int64)
         strays = self._stays.code(coder, np.zeros(len(under), np.int64), strays)
         away = np.flatnonzero(strays)

@@ -223,20 +223,22 @@ def _code_pixels(coder: Coder, truth: Any, starts: Any, regions: int) -> Any:
     labels = np.zeros((height + TOP + 1, width + LEFT + RIGHT), np.int32)
     state = np.zeros(STATE, np.int64)
     state[REGIONS] = regions
+    memory = (state, labels, starts, *tables, *work)
     escapes = _Escapes(coder, run, labels, regions)
-    asked = 0
-    while rows := run.advance(state, labels, starts, tables, work):
+    answers = np.zeros(2 * height, np.int32)
+    bits, asked = answers[:0], 0
+    while rows := run.advance(bits, *memory):
         decided = int(state[DECIDED])
         used = decided if regions == 2 else 2 * decided
         asked += decided
         if asked > _MOST_ASKED:
             raise _Laborious(f"data must ask for at most {_MOST_ASKED} pixels near contours; got more")
         if not coder.reads:
-            run.answer(state, truth, work)
+            run.answer(state, truth, work.rows, answers)
         if used:
-            work.bits[:used] = coder.bits(work.chances[:used], work.bits[:used])
-        if regions > 2 and (rows > decided or work.bits[:decided].any()):
-            escapes.code(work.rows[:rows], work.bits[:decided] != 0)
+            bits = coder.bits(work.chances[:used], answers[:used])
+        if regions > 2 and (rows > decided or np.count_nonzero(bits[:decided])):
+            escapes.code(work.rows[:rows], bits[:decided] != 0)
     return labels[TOP : TOP + height, LEFT : LEFT + width]
 
 

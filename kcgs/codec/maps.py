@@ -71,7 +71,7 @@ def smooth_map(regions: RegionMap, rate: float) -> RegionMap:
 
 def decode_map(data: bytes, size: tuple[int, int], num_regions: int) -> RegionMap:
     """Read a map of `num_regions` regions for a picture of `size`."""
-    from .labels import compact, decode_labels
+    from .labels import decode_labels
 
     stream = ByteReader(data)
     k = stream.varint("labels along a side of a pixel", 1, MOST_SUPERSAMPLE)
@@ -79,19 +79,25 @@ def decode_map(data: bytes, size: tuple[int, int], num_regions: int) -> RegionMa
         raise CodecError(f"a map must have at most {MOST_LABELS} labels; got {size} times {k} squared")
     labels = stream.take(stream.varint("length of the labels", 1, len(data)))
     found = decode_labels(labels, k * size[0], k * size[1], max_regions=num_regions)
-    ids, index = compact(found)
-    if len(ids) != num_regions:
-        raise CodecError(f"the map must have {num_regions} regions; got {len(ids)}")
     count = stream.varint("contour widths", 1, min(_MOST_WIDTH + 1, len(data)))
     distinct = [stream.varint("a contour width", 0, _MOST_WIDTH) / _FORTIETHS for _ in range(count)]
-    if count == 1:
-        widths: float | dict[tuple[int, int], float] = distinct[0]
-    else:
-        pairs = _touching(index, num_regions)
-        places = _code_places(Reader(stream.take(len(data) - stream.at)), len(pairs), count, None)
-        named = zip(pairs.tolist(), places.tolist(), strict=True)
-        widths = {(int(ids[a]), int(ids[b])): distinct[place] for (a, b), place in named}
-    return RegionMap.from_labels(torch.from_numpy(found), widths, supersample=k)
+    if count == 1 and stream.at != len(data):
+        raise CodecError(f"the map must end after {stream.at} bytes; got {len(data)}")
+    widths = distinct[0] if count == 1 else _read_widths(stream.take(len(data) - stream.at), found, distinct)
+    regions = RegionMap.from_labels(torch.from_numpy(found), widths, supersample=k)
+    if regions.num_regions != num_regions:
+        raise CodecError(f"the map must have {num_regions} regions; got {regions.num_regions}")
+    return regions
+
+
+def _read_widths(data: bytes, labels: Integers, distinct: list[float]) -> dict[tuple[int, int], float]:
+    from .labels import compact
+
+    ids, index = compact(labels)
+    pairs = _touching(index, len(ids))
+    places = _code_places(Reader(data), len(pairs), len(distinct), None)
+    named = zip(ids[pairs].tolist(), places.tolist(), strict=True)
+    return {(a, b): distinct[place] for (a, b), place in named}
 
 
 def _round(width: float) -> int:

@@ -27,6 +27,8 @@ the group's sum is added to the shape at once.
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,7 +55,7 @@ def _bounds() -> tuple[Integers, Integers]:
 
 
 _LOW, _HIGH = _bounds()
-_EDGES = np.append(_LOW, _HIGH[-1]).astype(np.float64)
+_MIDDLES = np.maximum(np.append(_LOW, _HIGH[-1]) - 0.5, 0.0)  # between the sizes about each bound
 
 
 class Magnitudes:
@@ -69,7 +71,7 @@ class Magnitudes:
 
     def code(self, coder: Coder, scale: float, context: Integers, sizes: Integers | None) -> Integers:
         """Code one size for each context [n]; `scale` is what size is measured in, above 0."""
-        tables = np.stack([self._table(shape, scale) for shape in self._shape])
+        tables = self._tables(scale)
         bucket = None if sizes is None else np.searchsorted(_LOW, sizes, side="right") - 1
         bucket = coder.choose(tables, context, bucket)
         width = _HIGH[bucket] - _LOW[bucket]
@@ -78,26 +80,28 @@ class Magnitudes:
         return found
 
     def _learn(self, scale: float, context: Integers, sizes: Integers) -> None:
-        # a size stands for what rounds to it; in whole parts, whose sums no order changes
+        # a size stands for what rounds to it; in whole parts, whose sums no order changes: equal ones at once
         edges = np.arange(_BINS + 1) * (scale * _WIDTH)
         edges[-1] = np.inf
-        learned = np.zeros(self._shape.shape, np.int64)
-        for part in batches(len(sizes)):
-            low, high = np.maximum(sizes[part] - 0.5, 0.0)[:, None], (sizes[part] + 0.5)[:, None]
-            overlap = np.clip(np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1]), 0.0, None) / (high - low)
-            np.add.at(learned, context[part], np.floor(overlap * _PARTS + 0.5).astype(np.int64))
+        contexts = len(self._shape)
+        kinds, counts = np.unique(sizes * contexts + context, return_counts=True)
+        learned = np.zeros(self._shape.shape)
+        for part in batches(len(kinds)):
+            size, row = np.divmod(kinds[part], contexts)
+            low, high = np.maximum(size - 0.5, 0.0)[:, None], (size + 0.5)[:, None]
+            overlap = np.maximum(np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1]), 0.0) / (high - low)
+            share = np.floor(overlap * _PARTS + 0.5) * counts[part, None]
+            at = row[:, None] * _BINS + np.arange(_BINS)
+            learned += np.bincount(at.ravel(), share.ravel(), learned.size).reshape(learned.shape)
         self._shape += learned / _PARTS
 
-    @staticmethod
-    def _table(shape: Floats, scale: float) -> Floats:
-        # the share of each bucket: the integral of the shape between its bounds, by linear interpolation
-        total = np.zeros(_BINS + 1)
-        for i in range(_BINS):  # not cumsum: its order of summation is its own
-            total[i + 1] = total[i] + shape[i]
-        edges = np.arange(_BINS + 1).astype(np.float64) * (scale * _WIDTH)
-        cumulative = _interpolate(np.maximum(_EDGES - 0.5, 0.0), edges, total)
-        table: Floats = (cumulative[1:] - cumulative[:-1]) + 1e-3 * total[-1] / _BUCKETS
-        return table
+    def _tables(self, scale: float) -> Floats:
+        # the share of each bucket: the integral of the shape between its bounds, by linear interpolation; its sums by
+        # hand, since numpy's have an order of their own
+        total = np.array([list(itertools.accumulate(shape, initial=0.0)) for shape in self._shape.tolist()])
+        edges: Floats = np.arange(_BINS + 1.0) * (scale * _WIDTH)
+        cumulative = _interpolate(_MIDDLES, edges, total)
+        return (cumulative[:, 1:] - cumulative[:, :-1]) + 1e-3 * total[:, -1:] / _BUCKETS
 
 
 class Choices:
@@ -114,7 +118,9 @@ class Choices:
 
 
 def _interpolate(x: Floats, edges: Floats, heights: Floats) -> Floats:
-    # numpy's own interpolation may order its operations otherwise
-    at = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
-    share = np.clip((x - edges[at]) / (edges[at + 1] - edges[at]), 0.0, 1.0)
-    return heights[at] + share * (heights[at + 1] - heights[at])
+    # numpy's own interpolation may order its operations otherwise; x is at or above the first edge
+    at = np.minimum(np.searchsorted(edges, x, side="right") - 1, len(edges) - 2)
+    share = np.minimum((x - edges[at]) / (edges[at + 1] - edges[at]), 1.0)
+    low = heights.take(at, 1)
+    found: Floats = low + share * (heights.take(at + 1, 1) - low)
+    return found

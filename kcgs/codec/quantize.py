@@ -87,6 +87,14 @@ class Codes(NamedTuple):
     place: Integers  # [N, 2] within the cell
 
 
+class Restored(NamedTuple):
+    """N Gaussians as they are drawn."""
+
+    means: NDArray[np.float32]  # [N, 2]
+    cholesky: NDArray[np.float32]  # [N, 3]
+    colors: NDArray[np.float32]  # [N, C]
+
+
 class Steps(NamedTuple):
     """How fine each number is."""
 
@@ -167,7 +175,7 @@ class Quantizer:
                 f"up to {np.abs(colors).max():.3g}"
             )
         codes = opposed.astype(np.int64)
-        shape = self.restore_shape(classes, within, ratios, angles)
+        shape = self.restore_shape(classes, steps, within, ratios, angles / turns)
         cell, place = self._locate(means, shape, steps, self.cell_side(classes))
         return Codes(classes, within, ratios, angles, codes, cell, place)
 
@@ -178,48 +186,42 @@ class Quantizer:
     def angles(self, ratios: Integers, steps: Steps) -> Integers:
         """Return how many angles there are at each ratio: one for circles."""
         log = 2.0 * ratios * steps.ratio
-        stretch = 0.5 * (exp2(log) - exp2(-log))
+        grown, shrunk = exp2(np.stack([log, -log]))
+        stretch = 0.5 * (grown - shrunk)
         turns = np.clip(np.floor(math.pi * stretch / steps.angle + 0.5), 2, _MOST_LEVELS)
         return np.where(ratios == 0, 1, turns).astype(np.int64)
 
-    def restore_shape(self, classes: Classes, scale: Integers, ratio: Integers, angle: Integers) -> Floats:
-        """Return `cholesky` [N, 3]."""
-        steps = self.steps(classes)
+    def restore_shape(self, classes: Classes, steps: Steps, scale: Integers, ratio: Integers, share: Floats) -> Floats:
+        """Return `cholesky` [N, 3]; `share` is the angle's code by how many there are."""
         middle = OCTAVES * (classes.size + (scale + 0.5) / steps.scales)
         stretch = ratio * steps.ratio
-        major, minor = exp2(middle + stretch), exp2(middle - stretch)
-        cos, sin = turn(angle / self.angles(ratio, steps))
+        major, minor = exp2(np.stack([middle + stretch, middle - stretch]))
+        cos, sin = turn(share)
         along, across = major * cos, minor * sin
         l11 = np.sqrt(along * along + across * across)
         return np.stack([l11, (major * major - minor * minor) * cos * sin / l11, major * minor / l11], -1)
 
-    def parts(self, shape: Floats, classes: Classes, side: Integers) -> Integers:
+    def parts(self, shape: Floats, steps: Steps, side: Integers) -> Integers:
         """Return how many places there are in a cell, across and down [N, 2]."""
-        step = self.steps(classes).place[:, None] * shape[:, ::2]
+        step = steps.place[:, None] * shape[:, ::2]
         return np.clip(np.ceil(side[:, None] / step), 1, _MOST_LEVELS).astype(np.int64)
 
-    def restore(self, codes: Codes) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return means (N, 2), cholesky (N, 3), colors (N, C)."""
-        shape = self.restore_shape(codes.classes, codes.scale, codes.ratio, codes.angle)
-        colors = opponent(codes.colors * self.steps(codes.classes).color[:, None], back=True)
-        return self.restore_centres(codes, shape), shape.astype(np.float32), colors.astype(np.float32)
+    def restore(self, codes: Codes) -> Restored:
+        """Return the numbers of Gaussians."""
+        steps = self.steps(codes.classes)
+        share = codes.angle / self.angles(codes.ratio, steps)
+        shape = self.restore_shape(codes.classes, steps, codes.scale, codes.ratio, share)
+        return self.restore_rest(codes, steps, shape, self.cell_side(codes.classes))
 
-    def restore_centres(self, codes: Codes, shape: Floats | None = None) -> NDArray[np.float32]:
-        """Return means (N, 2)."""
-        classes, side = codes.classes, self.cell_side(codes.classes)
-        if shape is None:
-            shape = self.restore_shape(classes, codes.scale, codes.ratio, codes.angle)
-        parts = self.parts(shape, classes, side)
-        return (side[:, None] * (codes.cell + (codes.place + 0.5) / parts)).astype(np.float32)
-
-    def restore_layers(self, parts: list[Codes]) -> list[NDArray[np.float32]]:
-        """Return means (N, 2), cholesky (N, 3), colors (N, C) of one part after another."""
-        return [np.concatenate(arrays) for arrays in zip(*map(self.restore, parts), strict=True)]
+    def restore_rest(self, codes: Codes, steps: Steps, shape: Floats, side: Integers) -> Restored:
+        """Return the numbers of Gaussians whose shapes are known."""
+        means = side[:, None] * (codes.cell + (codes.place + 0.5) / self.parts(shape, steps, side))
+        colors = opponent(codes.colors * steps.color[:, None], back=True)
+        return Restored(means.astype(np.float32), shape.astype(np.float32), colors.astype(np.float32))
 
     def _locate(self, means: Floats, shape: Floats, steps: Steps, side: Integers) -> tuple[Integers, Integers]:
         """Round x, then y to where it counts: the error of x along the Gaussian's slant is made up for."""
-        parts = np.ceil(side[:, None] / (steps.place[:, None] * shape[:, ::2]))
-        parts = np.clip(parts, 1, _MOST_LEVELS).astype(np.int64)
+        parts = self.parts(shape, steps, side)
         sides, which = np.unique(side, return_inverse=True)
         margin = np.array([Grid.of_side(self.size, one).most_margin for one in sides.tolist()], np.int64)[which]
         cells, places = [], []

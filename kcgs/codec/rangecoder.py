@@ -20,6 +20,8 @@ _WINDOW = 64  # bits of the coder's state
 _MOST = 1 << 16  # largest alphabet of equally likely numbers
 _LEAST = 64  # chance of a Counter's bit
 _AT_ONCE = 1 << 12
+_FEW = 16  # symbols among which the library finds one faster by trying all than by a table
+_FOREIGN = "data must be an encoder's stream; got bytes that no encoder wrote"
 
 
 class Coder(Protocol):
@@ -78,9 +80,11 @@ class Writer:
     def choose(self, tables: Floats, rows: Integers, values: Integers | None) -> Integers:
         """Write values by a table each."""
         assert values is not None
-        model = self._models.Categorical(perfect=False)
-        for part in batches(len(rows)):
-            self._encoder.encode(values[part].astype(np.int32), model, tables[rows[part]])
+        if len(tables) == 1:
+            return self.repeat(tables[0], len(rows), values)
+        models = [self._models.Categorical(table, perfect=False) for table in tables]
+        for value, row in zip(values.tolist(), rows.tolist(), strict=True):
+            self._encoder.encode(value, models[row])
         return values
 
     def repeat(self, table: Floats, count: int, values: Integers | None) -> Integers:
@@ -134,23 +138,28 @@ class Reader:
     def uniform(self, sizes: Integers, values: Integers | None) -> Integers:
         """Read values that are equally likely."""
         found = np.zeros(len(sizes), np.int64)
-        told = sizes > 1
-        if told.any():
+        told = np.flatnonzero(sizes > 1)
+        if len(told):
             found[told] = self._decode(self._models.Uniform(), sizes[told].astype(np.int32))
         return found
 
     def choose(self, tables: Floats, rows: Integers, values: Integers | None) -> Integers:
         """Read values by a table each."""
-        model, found = self._models.Categorical(perfect=False), np.zeros(len(rows), np.int64)
-        for part in batches(len(rows)):
-            found[part] = self._decode(model, tables[rows[part]])
-        return found
+        if len(tables) == 1:
+            return self.repeat(tables[0], len(rows), values)
+        # one by one, since the library makes a model anew for each row of many tables
+        models, decode = [self._models.Categorical(table, perfect=False) for table in tables], self._decoder.decode
+        try:
+            return np.array([decode(models[row]) for row in rows.tolist()], np.int64)
+        except AssertionError:
+            raise CodecError(_FOREIGN) from None
 
     def repeat(self, table: Floats, count: int, values: Integers | None) -> Integers:
         """Read values by one table."""
         if not count:
             return np.zeros(0, np.int64)
-        return np.asarray(self._decode(self._models.Categorical(table, perfect=False), count), np.int64)
+        model = self._models.Categorical(table, lazy=len(table) < _FEW, perfect=False)
+        return np.asarray(self._decode(model, count), np.int64)
 
     def numbers(self, values: Any, size: int, count: int) -> Any:
         """Read numbers."""
@@ -160,7 +169,7 @@ class Reader:
         try:
             return self._decoder.decode(*model)
         except AssertionError:
-            raise CodecError("data must be an encoder's stream; got bytes that no encoder wrote") from None
+            raise CodecError(_FOREIGN) from None
 
 
 def batches(count: int) -> list[slice]:

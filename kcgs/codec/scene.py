@@ -138,11 +138,11 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
     parts, ids, count = [], [], 0
     for (energy, _), layer in zip(header.layers, layers, strict=False):
         most = most_gaussians(len(layer), header.channels, count)
-        codes, own = model.code(Reader(layer), energy, None, None, most)
-        parts.append(codes)
+        restored, own = model.code(Reader(layer), energy, None, None, most)
+        parts.append(restored)
         ids.append(own)
         count += len(own)
-    means, cholesky, colors = (torch.from_numpy(t) for t in quantizer.restore_layers(parts))
+    means, cholesky, colors = (torch.from_numpy(np.concatenate(t)) for t in zip(*parts, strict=True))
     region_ids = None if regions is None else regions.ids[torch.from_numpy(np.concatenate(ids))]
     try:
         field = GaussianField(means, cholesky, colors, region_ids, size=header.size)
@@ -295,13 +295,13 @@ def _lookup(regions: RegionMap | None) -> Lookup | None:
     if regions is None:
         return None
 
-    index = regions.index_of(regions.labels).numpy()
+    labels = regions.labels.numpy()
     height, width = regions.size
 
     def under(means: NDArray[np.float32]) -> Integers:
         column, row = np.floor(means).T
         at = np.clip(row, 0, height - 1).astype(np.int64), np.clip(column, 0, width - 1).astype(np.int64)
-        found: Integers = index[at].astype(np.int64)
-        return found
+        found: Integers = regions.index_of(torch.from_numpy(labels[at])).numpy()
+        return found.astype(np.int64)
 
     return under

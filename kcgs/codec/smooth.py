@@ -10,19 +10,32 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .contexts import CLIP, HEADS, LEFT, RIGHT, TOP, compiled, describe, inner, network, quiet
+from .contexts import (
+    CLIP,
+    COLUMNS,
+    FIRST,
+    INPUT,
+    INPUTS,
+    LEFT,
+    RIGHT,
+    SECOND,
+    TOP,
+    compiled,
+    describe,
+    inner,
+    network,
+    quiet,
+)
 from .labels import Labels, compact
-from .prior import TEMPLATE
 
 _START, _ESCAPE = 11.0, 4.0  # bits of a start's place, of a label that is no candidate
 _SWEEPS = 4
+_NO_COSTS = np.zeros((0, 1, 1), np.float32)
 
 
 class _Model(NamedTuple):
     cost: Any  # [2 * CLIP + 1] float64, bits of a 1 at this logit
-    scratch: Any  # [T] int8
-    row: Any  # int32
-    logits: Any  # [HEADS, 1] int32
+    row: Any  # [COLUMNS] int32
 
 
 class _Loops(NamedTuple):
@@ -41,15 +54,15 @@ def _bits(labels, top, bottom, left, right, several, model):  # type: ignore[no-
                 if label != labels[y, x - 1]:
                     total += _START
                 continue
-            describe(labels, y, x, model.row, model.scratch)
-            network(model.scratch, model.logits)
-            neither = label != model.row[2] and label != model.row[3]
+            describe(labels, y, x, model.row)
+            network(model.row)
+            neither = label != model.row[FIRST] and label != model.row[SECOND]
             if several:
-                logit = model.logits[1, 0]
+                logit = model.row[INPUT + INPUTS]
                 total += model.cost[CLIP + logit] + _ESCAPE if neither else model.cost[CLIP - logit]
             if not neither:
-                logit = model.logits[0, 0]
-                total += model.cost[CLIP - logit] if label == model.row[2] else model.cost[CLIP + logit]
+                logit = model.row[INPUT]
+                total += model.cost[CLIP - logit] if label == model.row[FIRST] else model.cost[CLIP + logit]
     return total
 
 
@@ -117,14 +130,19 @@ def _compile(fingerprint: str, cache: bool) -> _Loops:
 
 @functools.cache
 def _loops() -> _Loops:
-    return cast(_Loops, compiled(_compile, "smooth.py"))
+    return compiled("the estimates of contours", _compile, _rehearse, "smooth.py")
+
+
+def _rehearse(run: _Loops) -> None:
+    index = np.eye(2, dtype=np.int32)
+    run.measure(_frame(index), TOP, TOP + 1, LEFT, LEFT + 1, False, _model())
+    run.sweep(_frame(index), index, _NO_COSTS, np.full(2, 2), 0.0, True, False, _model())
 
 
 @functools.cache
 def _model() -> _Model:
     cost = np.log2(1 + np.exp(-np.arange(-CLIP, CLIP + 1) / 256))
-    scratch, row = np.zeros(len(TEMPLATE), np.int8), np.zeros(6, np.int32)
-    return _Model(cost, scratch, row, np.zeros((HEADS, 1), np.int32))
+    return _Model(cost, np.zeros(COLUMNS, np.int32))
 
 
 def _frame(index: Any) -> Any:
@@ -203,7 +221,7 @@ def smooth_labels(
     ids, index = compact(labels)
     if costs is not None and costs.shape != (len(ids), *labels.shape):
         raise ValueError(f"costs must have shape {(len(ids), *labels.shape)}; got {costs.shape}")
-    table = np.zeros((0, 1, 1), np.float32) if costs is None else np.asarray(costs, np.float32)
+    table = _NO_COSTS if costs is None else np.asarray(costs, np.float32)
     height, width = labels.shape
     sizes = np.bincount(index.reshape(-1), minlength=len(ids))
     frame = _frame(index)

@@ -267,11 +267,11 @@ def _compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     """
     highest = int(labels.max())
     if highest < 1 << 16:  # a table is ten times faster than sorting every pixel
-        present = torch.zeros(highest + 1, dtype=torch.bool, device=labels.device)
-        present[labels.flatten()] = True
+        present = torch.bincount(labels.flatten()) > 0
         ids = present.nonzero().flatten()
         table = torch.where(present, present.cumsum(0) - 1, -1)
-        return ids, table.to(torch.int32)[labels], torch.nn.functional.pad(table, (0, 1), value=-1)
+        index = table.to(torch.int32).index_select(0, labels.flatten()).view(labels.shape)
+        return ids, index, torch.nn.functional.pad(table, (0, 1), value=-1)
     ids, index = torch.unique(labels, return_inverse=True)
     return ids, index.to(torch.int32), None
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .widths import band_gain
+from .widths import band_gain, check_picture
 
 # squared error, channels averaged, that a pixel of contour must save: what its bits save where Gaussians spend them
 PRICE = 0.003
@@ -42,6 +42,7 @@ def merge_worthless(image: Tensor, labels: Tensor, price: float = PRICE) -> Tens
     """
     if not price >= 0.0:
         raise ValueError(f"price must be at least 0; got {price!r}")
+    check_picture(image, labels)
     ids, labels = torch.unique(labels, return_inverse=True)
     for _ in range(_ROUNDS):
         gains = band_gain(image, labels)

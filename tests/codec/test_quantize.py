@@ -37,7 +37,7 @@ class TestRoundTrip:
         assert (np.abs(scale - before) <= 0.75 * (0.5 + 1e-4) / steps.scales + 1e-6).all()
         # the centre is right to half a place across, and down where it counts: across the slant
         side = quantizer.cell_side(classes)
-        across, down = (side[:, None] / quantizer.parts(found, classes, side)).T
+        across, down = (side[:, None] / quantizer.parts(found, steps, side)).T
         off = found_means - means
         slanted = off[:, 1] - found[:, 1] / found[:, 0] * off[:, 0]
         assert (np.abs(off[:, 0]) <= (0.5 + 1e-4) * across + 1e-4).all()

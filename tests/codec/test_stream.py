@@ -128,3 +128,9 @@ class TestDamage:
     def test_what_is_left_over_is_refused(self, scene: Scene) -> None:
         with pytest.raises(CodecError, match="must end after"):
             decode(encode(*scene) + b"\0")
+
+    def test_what_is_left_over_in_a_map_is_refused(self, scene: Scene) -> None:
+        field, regions = scene
+        header, region_map, layers = unpack(encode(field, RegionMap.from_labels(regions.labels, 0.5)))
+        with pytest.raises(CodecError, match="the map must end after"):
+            decode(pack(header, region_map + b"\0", layers))

@@ -42,3 +42,9 @@ def test_a_higher_price_leaves_fewer() -> None:
 def test_bad_price() -> None:
     with pytest.raises(ValueError, match="price must be at least 0"):
         merge_worthless(noise(8, 8), torch.zeros(8, 8).long(), -1.0)
+
+
+@pytest.mark.parametrize("labels", [torch.zeros(8, 8), torch.zeros(8, 9).long(), torch.full((8, 8), -1)])
+def test_bad_labels(labels: Tensor) -> None:
+    with pytest.raises((TypeError, ValueError), match="labels"):
+        merge_worthless(noise(8, 8), labels)
