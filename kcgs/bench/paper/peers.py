@@ -22,8 +22,8 @@ from . import siren
 CODECS = {"JPEG": ("JPEG", "jpg"), "WebP": ("WEBP", "webp"), "AVIF": ("AVIF", "avif")}
 GAUSSIAN_TOOLS_TEXT = """No other tool that fits 2D Gaussians to pictures is in the table. The registry's list has
 `gsplat`, which draws on CUDA only; GaussianImage and Image-GS are not on it, and their code needs CUDA. `splatthis`
-0.3.2, which writes splats as SVG, does run on a processor: told to make 1,250 of a DAVIS frame in its profile `fast`, it
-was stopped after 285 core seconds, having done between 50 and 100 of its 500 iterations."""
+0.3.2, which writes splats as SVG, does run on a processor: told to make 1,250 of a DAVIS frame in its profile `fast`,
+it was stopped after 285 core seconds, having done between 50 and 100 of its 500 iterations."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
