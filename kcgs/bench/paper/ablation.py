@@ -8,7 +8,7 @@ from kcgs.bench.cells import count, db, markdown, signed
 from kcgs.bench.fits import check_made
 
 from . import figures, pictures, tables
-from .compare import by_picture, complete, counts, equal_bits, equal_n, mean, select
+from .compare import by_picture, equal_bits, equal_n, mean, select, shared
 from .methods import BASELINE, BEST, CLAMPED, PAPER, UNCLAMPED, method
 from .options import PUBLISHED_ITERATIONS, Options
 from .report import METRICS_TEXT, head, what_was_run, write
@@ -113,66 +113,59 @@ def _report(output: Path, store: Store, wanted: list[Trial], options: Options) -
 
 def paper_table(rows: list[Row]) -> str:
     """Our means beside the printed ones."""
-    header = ["N", "row", "pictures", "PSNR", "change", "EF-PSNR", "change", "bits per pixel", "decoded PSNR"]
+    header = ["N", "row", "images", "PSNR", "change", "EF-PSNR", "change", "bits per pixel", "decoded PSNR"]
     header += ["theirs: PSNR", "theirs: change", "theirs: EF-PSNR", "theirs: change"]
     lines = []
-    for n in sorted({n for m in PAPER_ROWS for n in counts(rows, m.name)}):
-        present = [m.name for m in PAPER_ROWS if n in counts(rows, m.name)]
-        shared = complete(rows, present, n)
+    for n, present, images in shared(rows, [m.name for m in PAPER_ROWS]):
         for name in present:
-            line = [count(n), SHOWN[name], str(len(shared))]
+            line = [count(n), SHOWN[name], str(len(images))]
             for quantity in ("psnr", "ef_psnr"):
-                line.append(db(_mean(rows, name, n, quantity, shared)))
-                first = _mean(rows, CLAMPED.name, n, quantity, shared)
-                line.append(signed(_mean(rows, name, n, quantity, shared) - first))
-            line.append(f"{_mean(rows, name, n, 'bits_per_pixel', shared):.3f}")
-            line.append(db(_mean(rows, name, n, "decoded_psnr", shared)))
+                line.append(db(_mean(rows, name, n, quantity, images)))
+                first = _mean(rows, CLAMPED.name, n, quantity, images)
+                line.append(signed(_mean(rows, name, n, quantity, images) - first))
+            line.append(f"{_mean(rows, name, n, 'bits_per_pixel', images):.3f}")
+            line.append(db(_mean(rows, name, n, "decoded_psnr", images)))
             lines.append(line + _printed(name, n))
     return markdown(header, lines)
 
 
 def our_table(rows: list[Row]) -> str:
     """What each part of ours is worth."""
-    header = ["N", "row", "pictures", "PSNR", "EF-PSNR", "bits per pixel", "decoded PSNR", "PSNR, change", "95 %"]
+    header = ["N", "row", "images", "PSNR", "EF-PSNR", "bits per pixel", "decoded PSNR", "PSNR, change", "95 %"]
     header += ["EF-PSNR, change", "95 %", "at equal bits: PSNR, change", "EF-PSNR, change"]
     lines = []
-    for n in sorted({n for m in OUR_ROWS for n in counts(rows, m.name)}):
-        present = [m.name for m in OUR_ROWS if n in counts(rows, m.name)]
-        shared = complete(rows, present, n)
+    for n, present, images in shared(rows, [m.name for m in OUR_ROWS]):
         for name in present:
-            line = [count(n), SHOWN[name], str(len(shared))]
-            line += [db(_mean(rows, name, n, q, shared)) for q in ("psnr", "ef_psnr")]
-            line.append(f"{_mean(rows, name, n, 'bits_per_pixel', shared):.3f}")
-            line.append(db(_mean(rows, name, n, "decoded_psnr", shared)))
-            lines.append(line + ([""] * 6 if name == BEST.name else _changes(rows, name, n, shared)))
+            line = [count(n), SHOWN[name], str(len(images))]
+            line += [db(_mean(rows, name, n, q, images)) for q in ("psnr", "ef_psnr")]
+            line.append(f"{_mean(rows, name, n, 'bits_per_pixel', images):.3f}")
+            line.append(db(_mean(rows, name, n, "decoded_psnr", images)))
+            lines.append(line + ([""] * 6 if name == BEST.name else _changes(rows, name, n, images)))
     return markdown(header, lines)
 
 
 def _figure(path: Path, rows: list[Row]) -> list[str]:
     """Draw the paper's rows against its first, and ours against best."""
-    panels = {}
-    for n in sorted({row.n for row in rows}):
-        for first, group, where in ((CLAMPED, PAPER_ROWS, "clamped baseline"), (BEST, OUR_ROWS, "best")):
-            present = [m.name for m in group if n in counts(rows, m.name)]
-            shared = complete(rows, present, n)
+    panels: dict[str, dict[str, tuple[float, float]]] = {}
+    for first, group, where in ((CLAMPED, PAPER_ROWS, "clamped baseline"), (BEST, OUR_ROWS, "best")):
+        for n, present, images in shared(rows, [m.name for m in group]):
             changes = {}
-            for name in present if first.name in present and shared else []:
-                if name != first.name:
-                    psnr, ef_psnr = (
-                        _mean(rows, name, n, q, shared) - _mean(rows, first.name, n, q, shared)
-                        for q in ("psnr", "ef_psnr")
-                    )
-                    changes[SHOWN[name]] = psnr, ef_psnr
+            for name in present if first.name in present and images else []:
+                psnr, ef_psnr = (
+                    _mean(rows, name, n, q, images) - _mean(rows, first.name, n, q, images) for q in ("psnr", "ef_psnr")
+                )
+                changes[SHOWN[name]] = psnr, ef_psnr
+            changes.pop(SHOWN[first.name], None)
             if changes:
-                panels[f"against {where}, N = {n:,}, pictures: {len(shared)}"] = changes
+                panels[f"against {where}, N = {n:,}, images: {len(images)}"] = changes
     if not panels:
         return []
     figures.plot_changes(path, panels)
-    return ["## Changes", "Means over the pictures that all rows of a panel have.", "![](changes.png)"]
+    return ["## Changes", "Means over the images that all rows of a panel have.", "![](changes.png)"]
 
 
-def _changes(rows: list[Row], name: str, n: int, shared: list[str]) -> list[str]:
-    here = [row for row in rows if row.picture in shared]
+def _changes(rows: list[Row], name: str, n: int, images: list[str]) -> list[str]:
+    here = [row for row in rows if row.picture in images]
     cells = []
     for quantity in ("psnr", "ef_psnr"):
         found = equal_n(here, name, BEST.name, n, quantity)
@@ -193,6 +186,6 @@ def _printed(name: str, n: int) -> list[str]:
     ]
 
 
-def _mean(rows: list[Row], name: str, n: int, quantity: str, shared: list[str]) -> float:
-    found = [row for row in select(rows, name, n) if row.picture in shared]
+def _mean(rows: list[Row], name: str, n: int, quantity: str, images: list[str]) -> float:
+    found = [row for row in select(rows, name, n) if row.picture in images]
     return mean(by_picture(found, quantity).values())

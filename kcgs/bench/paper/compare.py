@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -76,6 +76,13 @@ def complete(rows: Sequence[Row], methods: Iterable[str], n: int) -> list[str]:
     """Pictures that every method has at this N: means over others could not be compared."""
     has = [{row.picture for row in select(rows, method, n)} for method in methods]
     return [picture for picture in dict.fromkeys(row.picture for row in rows) if all(picture in found for found in has)]
+
+
+def shared(rows: Sequence[Row], methods: Sequence[str]) -> Iterator[tuple[int, list[str], list[str]]]:
+    """Go through all N: yield each with the methods that were run with it, and the pictures that all of these have."""
+    for n in sorted({n for name in methods for n in counts(rows, name)}):
+        present = [name for name in methods if n in counts(rows, name)]
+        yield n, present, complete(rows, present, n)
 
 
 def equal_n(rows: Sequence[Row], ours: str, other: str, n: int, quantity: str) -> Difference | None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -82,9 +83,13 @@ def plot_changes(path: Path, changes: Mapping[str, Mapping[str, tuple[float, flo
         path: PNG to write.
         changes: by title and row.
     """
-    tallest = max(map(len, changes.values()))
-    plot, axes = figure(1, len(changes), width=5.4 * len(changes), height=1.6 + 0.28 * tallest)
-    for axis, (title, rows) in zip(axes if len(changes) > 1 else [axes], changes.items(), strict=True):
+    tallest, columns = max(map(len, changes.values())), min(2, len(changes))
+    lines = -(-len(changes) // columns)
+    plot, axes = figure(lines, columns, width=5.4 * columns, height=0.5 + lines * (1.1 + 0.28 * tallest))
+    panels = np.ravel(axes)
+    for axis in panels[len(changes) :]:
+        axis.remove()
+    for axis, (title, rows) in zip(panels, changes.items(), strict=False):
         at = range(len(rows))[::-1]
         axis.axvline(0.0, color="black", linewidth=0.8)
         axis.plot([psnr for psnr, _ in rows.values()], at, "o", color=COLORS[0], label="PSNR")
@@ -93,7 +98,7 @@ def plot_changes(path: Path, changes: Mapping[str, Mapping[str, tuple[float, flo
         axis.set_ylim(-0.6, len(rows) - 0.4)
         axis.set(xlabel="change (dB)")
         axis.set_title(title, fontsize=8)
-    handles, names = (axes[0] if len(changes) > 1 else axes).get_legend_handles_labels()
+    handles, names = panels[0].get_legend_handles_labels()
     plot.legend(handles, names, loc="outside lower center", ncols=2)
     save_figure(plot, path)
 

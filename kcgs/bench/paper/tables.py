@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from kcgs.bench.cells import count, db, markdown, seconds, signed
 
-from .compare import QUANTITIES, Difference, by_picture, complete, counts, equal_bits, equal_n, mean, select
+from .compare import QUANTITIES, Difference, by_picture, counts, equal_bits, equal_n, mean, select, shared
 from .trials import Row
 
 _WAYS: dict[str, Callable[..., Difference | None]] = {"equal N": equal_n, "equal bits": equal_bits}
@@ -41,11 +41,9 @@ def quality(rows: Sequence[Row], methods: Sequence[str], names: dict[str, str] |
     header = ["N", "method", "iterations", "pictures", "PSNR", "MS-SSIM", "EF-PSNR", "edge SSIM", "bytes"]
     header += ["of these map", "bits per pixel", "decoded PSNR", "decoded EF-PSNR", "s", "core s"]
     lines = []
-    for n in sorted({n for name in methods for n in counts(rows, name)}):
-        present = [name for name in methods if n in counts(rows, name)]
-        shared = complete(rows, present, n)
+    for n, present, pictures in shared(rows, methods):
         for name in present:
-            found = [row for row in select(rows, name, n) if row.picture in shared]
+            found = [row for row in select(rows, name, n) if row.picture in pictures]
             if found:
                 shown = name if names is None else names[name]
                 line = [count(n), shown, count(found[0].iterations), str(len({row.picture for row in found}))]
