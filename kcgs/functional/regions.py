@@ -293,11 +293,16 @@ def _sample_labels(labels: Tensor, height: int, width: int, factor: int) -> Tens
         return ends, torch.stack([1 - offset, offset]).double()
 
     (rows, down), (cols, across) = neighbours(height, labels.shape[-2]), neighbours(width, labels.shape[-1])
-    corners = torch.stack([labels[..., r[:, None], c[None, :]] for r in rows for c in cols])
-    weights = torch.stack([d[:, None] * a[None, :] for d in down for a in across])
-    weights = weights.view(4, *[1] * (labels.ndim - 2), *weights.shape[1:])
-    scores = torch.stack([torch.where(corners == corner, weights, 0.0).sum(0) for corner in corners])
-    return corners.gather(0, scores.argmax(0, keepdim=True))[0]
+    corners = [labels.index_select(-2, r).index_select(-1, c) for r in rows for c in cols]
+    sampled = corners[0].clone()
+    # nearly everywhere the four are one label
+    mixed = (corners[1] != sampled).logical_or_(corners[2] != sampled).logical_or_(corners[3] != sampled)
+    at = mixed.nonzero(as_tuple=True)
+    own = torch.stack([corner[at] for corner in corners])
+    weights = torch.stack([d[at[-2]] * a[at[-1]] for d in down for a in across])
+    scores = torch.stack([torch.where(own == corner, weights, 0.0).sum(0) for corner in own])
+    sampled[at] = own.gather(0, scores.argmax(0, keepdim=True))[0]
+    return sampled
 
 
 def lookup_regions(means: Tensor, labels: Tensor) -> Tensor:
