@@ -24,10 +24,10 @@ below 5, below 12, or more. The chance of a 1, in 1/65536, is ``p = squash(clip(
 within 16 to 65520.
 
 **Learning.** Counters and weights change after a wave's last bit, pixel by pixel in the wave's order, decision 1, if
-there is one, before decision 0; with the x_i and p that the bit v was coded with. With ``e = 65536 v - p`` each weight
-becomes ``clip(w_i + ((6 * x_i * e + 2**17) >> 18), 2**22)``. Then each of the three counters: if its age is 0, it takes
-c = squash(x_0) and n = 2; then ``c += 2 * (65536 v - c) // (2 n + 3)``, kept within 32 to 65504, and n grows by 1, to
-40 at most.
+there is one, before decision 0; with the x_i, the p and the set of weights that the bit v was coded with. With ``e =
+65536 v - p`` each weight of the set becomes ``clip(w_i + ((6 * x_i * e + 2**17) >> 18), 2**22)``. Then each of the
+three counters: if its age is 0, it takes c = squash(x_0) and n = 2; then ``c += 2 * (65536 v - c) // (2 n + 3)``, kept
+within 32 to 65504, and n grows by 1, to 40 at most.
 """
 
 from __future__ import annotations

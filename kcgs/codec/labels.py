@@ -7,15 +7,15 @@ The stream, for a map of H x W pixels whose size the reader knows
 the symbols below, each word's highest byte first. Bytes of zero at the end are left out, and the last bytes are those
 that leave out most; a reader puts zeros behind the stream. It has three numbers of 64 bits: ``low`` is 0, ``range`` is
 2**64 - 1, ``point`` the first two words. The code of a symbol is ``(point - low) // step`` with ``step = range >> 24``;
-those from a to b mean it; then ``low += a * step``, ``range = (b - a) * step``, modulo 2**64; and if ``range`` is below
-2**32, all three move up by 32 bits, and ``point`` takes the next word in. Probabilities have 24 bits in constriction. A
-*bit of chance p* is its Bernoulli model with p in whole 1/65536, exact there. A *number of n* is its Uniform model, n
-at most 65536; for n = 1 nothing is coded. A larger n is coded as a number of ceil(n / 65536) (the value's part above 16
-bits, itself so if it must be), then one of 65536. A *fair bit* is a number of 2. *k plain bits* are numbers of 65536,
-lowest bits first, the last one of the 2**(k mod 16) that are left. A *magnitude* is the value's count of bits, a number
-of 64, then the plain bits below its highest one. A *learnt bit* has the chance ``ones / all``, rounded down to 1/65536
-and kept within 64 of 0 and of 65536; ``all`` starts at 4 and ``ones`` at 2 unless said otherwise; each bit adds 2 to
-``all``, and 2 to ``ones`` if it is 1.
+those from a to b - 1 mean it; then ``low += a * step``, ``range = (b - a) * step``, modulo 2**64; and if ``range`` is
+below 2**32, all three move up by 32 bits, and ``point`` takes the next word in. Probabilities have 24 bits in
+constriction. A *bit of chance p* is its Bernoulli model with p in whole 1/65536, exact there: the last 256 p of the
+2**24 codes mean 1. A *number of n* is its Uniform model (`models` says its codes), n at most 65536; for n = 1 nothing
+is coded. A larger n is coded as a number of ceil(n / 65536) (the value's part above 16 bits, itself so if it must be),
+then one of 65536. A *fair bit* is a number of 2. *k plain bits* are numbers of 65536, lowest bits first, the last one
+of the 2**(k mod 16) that are left. A *magnitude* is the value's count of bits, a number of 64, then the plain bits
+below its highest one. A *learnt bit* has the chance ``ones / all``, rounded down to 1/65536 and kept within 64 of 0 and
+of 65536; ``all`` starts at 4 and ``ones`` at 2; each bit adds 2 to ``all``, and 2 to ``ones`` if it is 1.
 
 **Regions.** Their number R: fair bits of 1 for floor(log2 R), a fair bit of 0, and so many plain bits of R. Then a fair
 bit: 0 if the ids of regions, in the order in which regions are numbered (below), are 0 to R - 1. Else the ids: sorted,
@@ -28,8 +28,8 @@ exceed 65536, up to 2**24), and that is all. Encoders choose this for maps that 
 **Order.** Pixels go in *waves*: x + 8 y is the same in a wave, waves go by that sum, a wave goes by y. Regions are
 numbered from 0 as they are met. Chances of a wave's bits depend on the waves before it only. Pixels outside the map
 have labels too: to the left of row y, that of pixel (0, y - 1), and 0 for y = 0; to the right of row y, that of its
-last pixel; above row 0 that of the pixel of row 0 in the same column if its wave is earlier, else that of the last
-pixel of row 0 whose wave is.
+last pixel; above row 0, that of the pixel of row 0 in the same column if its wave is earlier; up to 9 columns beyond
+the last such pixel, the label of that one; farther to the right, 0.
 
 **Starts.** A pixel is *quiet* if its neighbours (-2, 0), (-1, 0), (-2..7, -1) and (-1..3, -2) have one label. A quiet
 pixel with another label than these is a start. The number of starts is a magnitude. Then blocks are halved, the map
@@ -47,8 +47,7 @@ Then for each a bit that is 1 if it is the second (of those that are neither: 1,
 the model's, in `contexts`; all its arithmetic is in integers, ``>>`` and ``//`` round down. With R > 2 the labels of
 starts and of pixels that are neither follow, in the order of the wave:
 
-- if not all R regions have been met, a learnt bit: 1 for the next new one (``ones`` 2; one bit for starts, one for
-  others);
+- if not all R regions have been met, a learnt bit: 1 for the next new one (one bit for starts, one for others);
 - else for each of up to three labels in turn a learnt bit whether it is this one (three bits for starts, three for
   others); these are the nearest labels that are no candidates, see `waves`;
 - if it is none of them, the label, a number of as many as were met.

@@ -7,9 +7,9 @@ varint                  labels along a side of a pixel, k, at most 64
 varint, labels          length in bytes; the map of (k height, k width) as `labels` says
 varint                  W, how many different widths there are
 varint                  for each: the width in fortieths of a pixel
-widths                  if W > 1, to the end: for each two regions with labels side by side, a < b by positions
-                        among the sorted ids, in order: its place in that list, range coded by counts that start
-                        at 1 and are updated every 32 pairs
+widths                  if W > 1, to the end, bytes as `labels` says: for each two regions with labels side by side
+                        or one above the other, a < b by positions among the sorted ids, in order: its place in
+                        that list, by Choices (`models`) whose weights start at 1, in groups of 32 pairs
 ======================  ==================================================================================
 """
 

@@ -15,9 +15,9 @@ varint                  regions R; 1: no map, and nothing about regions follows
 varint                  if R > 1: length of the map in bytes
 varint                  layers
 varint, varint          for each layer: its energy, as steps down from the last one's (the first: from 40), length
-4                       CRC-32 of everything above, then of the map
+4                       CRC-32 (zlib's) of everything above with the map after it
 map                     if R > 1 (`maps`)
-layer                   for each: its bytes (`gaussians`), then 2 bytes, CRC-16 (polynomial 0x1021, from 0)
+layer                   for each: its bytes (`gaussians`), then 2 bytes, CRC-16 (XMODEM: polynomial 0x1021, from 0)
 ======================  ==================================================================================
 
 A file that ends early is a coarser picture, as long as its header and a layer are whole.

@@ -2,9 +2,9 @@
 
 The nearest labels of a pixel are found in squares about it, of radius 1 to 32: row by row from the top to its own, in
 the top row from left to right, in the others first the pixel at the left, then that at the right. Only pixels of
-earlier waves count, and those outside the map up to 6 rows above it, 8 columns at its left and 9 at its right. The
-labels that are not the pixel's candidates are listed as they come, each once, up to three. (A start has one candidate,
-the label of its neighbours.)
+earlier waves count, by x + 8 y also outside the map, and there those up to 6 rows above it, 8 columns at its left and 9
+at its right. The labels that are not the pixel's candidates are listed as they come, each once, up to three. (A start
+has one candidate, the label of its neighbours.)
 """
 
 from __future__ import annotations

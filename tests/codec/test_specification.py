@@ -18,65 +18,14 @@ from kcgs.codec.quantize import opponent
 from kcgs.codec.stream import Header, unpack
 
 from .conftest import make_scene
+from .symbols import Choices, Symbols
 
 LN2 = 0.6931471805599453
-SIXTY_FOUR = 2**64 - 1
 BUCKETS = [
     *range(16),
     *((1 << octave) + ((1 << octave) // 8) * i for octave in range(4, 24) for i in range(8)),
     1 << 24,
 ]
-
-
-class Symbols:
-    """`labels`, **Bytes**; `models`, categorical symbols and Uniforms."""
-
-    def __init__(self, data: bytes) -> None:
-        self.data, self.low, self.range = data, 0, SIXTY_FOUR
-        self.point = self.word() << 32 | self.word()
-
-    def word(self) -> int:
-        word, self.data = self.data[:4].ljust(4, b"\0"), self.data[4:]
-        return int.from_bytes(word, "big")
-
-    def code(self) -> int:
-        return ((self.point - self.low) & SIXTY_FOUR) // (self.range >> 24)
-
-    def found(self, a: int, b: int) -> None:
-        step = self.range >> 24
-        self.low, self.range = (self.low + a * step) & SIXTY_FOUR, (b - a) * step
-        if self.range < 2**32:
-            self.low, self.range = self.low << 32 & SIXTY_FOUR, self.range << 32
-            self.point = self.point << 32 & SIXTY_FOUR | self.word()
-
-    def uniform(self, n: int) -> int:
-        if n == 1:
-            return 0
-        width = 2**24 // n
-        value = min(self.code() // width, n - 1)
-        self.found(value * width, 2**24 if value == n - 1 else (value + 1) * width)
-        return value
-
-    def categorical(self, weights: list[float]) -> int:
-        sums = [0.0]
-        for weight in weights:
-            sums.append(sums[-1] + weight)
-        scale = (2**24 - len(weights)) / sums[-1]
-        begins = [*(math.floor(total * scale) + s for s, total in enumerate(sums[:-1])), 2**24]
-        value = bisect.bisect(begins, self.code()) - 1
-        self.found(begins[value], begins[value + 1])
-        return value
-
-
-class Choices:
-    def __init__(self, *weights: float) -> None:
-        self.weights = list(weights)
-
-    def read(self, symbols: Symbols, count: int = 1) -> list[int]:
-        found = [symbols.categorical(self.weights) for _ in range(count)]
-        for value in found:
-            self.weights[value] += 1
-        return found
 
 
 class Magnitudes:
