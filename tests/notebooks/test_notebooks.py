@@ -30,6 +30,7 @@ PRINTED = {
     "04_edit_by_region": r"\d+ % of the pixels have no share in the suit; all are unchanged",
     "05_export_to_onnx": r"largest difference of a value in \[0, 1\]: \d\.\de-0[4-9]",
     "06_differentiable_layer": r"after: loss 0\.\d+, PSNR +[12]\d\.\d\d dB",
+    "07_compact_files": r"kcgs: +\d[\d,]* bytes, PSNR [23]\d\.\d\d dB, EF-PSNR [23]\d\.\d\d dB",
 }
 SECONDS = 180
 _COMPILE = (
