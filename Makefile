@@ -21,7 +21,7 @@ demo: $(VENV)/.installed
 # The charts, a few minutes, and README's tables from all committed results.csv. Sequences of DAVIS take hours: see
 # `kcgs bench davis`, which goes on where it was stopped.
 report: $(VENV)/.installed
-	$(BIN)/kcgs bench charts -o notebooks/reports/charts
+	runs=$$(mktemp -d) && $(BIN)/kcgs bench charts -o notebooks/reports/charts --runs $$runs && rm -r $$runs
 	$(BIN)/python -m kcgs.bench.paper.readme
 
 test: $(VENV)/.installed

@@ -38,7 +38,7 @@ def test_a_changed_figure_shows(tmp_path: Path) -> None:
     write(tmp_path / "charts", rows, [])
     assert read_rows(tmp_path / "charts/results.csv") == rows
     text = results(tmp_path)
-    assert "| 20 | `best` | 700 | 1 | 38.60 | 31.20 | 0.050 | 38.60 | 2 |" in text
+    assert "| 20 | 20 | `best` | 700 | 1 | 38.60 | 31.20 | 0.050 | 38.60 | 2 |" in text
     assert put(f"a\n{BEGIN}\nold\n{END}\nb", text) == f"a\n{BEGIN}\n{text}\n{END}\nb"
     with pytest.raises(ValueError, match="README must have"):
         put("nothing", text)
@@ -53,4 +53,4 @@ def test_differences_are_paired(tmp_path: Path) -> None:
         [],
     )
     text = results(tmp_path)
-    assert "| 20 | best - paper | equal N | 5 | +0.20 | +0.14 to +0.26 | 5-0 | +0.00 |" in text
+    assert "| 20 | best - paper | equal N | 5 | +0.20 | +0.10 to +0.30 | 5-0 | +0.00 |" in text

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
-import torch
 from torch import Tensor
 
 from kcgs.engine import run_jobs
@@ -23,22 +22,16 @@ from kcgs.io import Scene, load, save
 from kcgs.nn.renderer import render_image
 
 from .measure import measure
-from .sizes import GAUSSIAN_BYTES, stored_bytes
 
 Job = TypeVar("Job")
 _NOTE = "made"
 
 
 class Place(NamedTuple):
-    """Where fits are made: the options --engine and --workers."""
+    """Where fits are made: the options --engine and --workers. A fit has one thread: all places give the same."""
 
     engine: str = "local"
     workers: int | None = None
-
-    @property
-    def threads(self) -> int:
-        """Threads of a fit: all that torch uses where it is alone in this process, otherwise one."""
-        return torch.get_num_threads() if self.is_here else 1
 
     @property
     def is_here(self) -> bool:
@@ -47,7 +40,7 @@ class Place(NamedTuple):
 
     def __str__(self) -> str:
         if self.is_here:
-            return f"one at a time on {self.threads} thread{'s' * (self.threads > 1)}"
+            return "one at a time on one thread"
         count = "as many as there are processors for" if self.workers is None else f"{self.workers}"
         return f"{count} at a time on one thread each, engine {self.engine}"
 
@@ -78,7 +71,7 @@ def make_all(
 
     console = Console(stderr=True)
     failed: list[str] = []
-    done = run_jobs(function, jobs, engine=place.engine, workers=place.workers, threads=place.threads)
+    done = run_jobs(function, jobs, engine=place.engine, workers=place.workers)
     with Progress(console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task(name(jobs[0]) if jobs else "", total=len(jobs))
         for number, ended in enumerate(done, 1):
@@ -144,17 +137,12 @@ class Fitted(NamedTuple):
     ms_ssim: float
     ef_ssim: float
     seconds: float
-    """Of the whole call, compilation excluded."""
+    """Of the whole call, compilation excluded: wall time, in which other work on the machine is."""
+    core_seconds: float
+    """Of the same call: processor time, all threads."""
     num_gaussians: int
-    map_bytes: int
-    """Of the label map that is stored, as lossless WebP."""
     stop_reason: str
     history: tuple[HistoryEntry, ...]
-
-    @property
-    def bytes(self) -> int:
-        """Size of the scene as reports count it: 7 bytes a Gaussian, and the label map."""
-        return GAUSSIAN_BYTES * self.num_gaussians + self.map_bytes
 
     def scene(self) -> Scene:
         """Read the scene."""
@@ -171,7 +159,7 @@ def ensure(specs: Iterable[Spec], folder: Path, *, engine: str = "local", worker
         specs: the fits; one that is there twice is made once.
         folder: made where it is missing; on a cluster all nodes must see it.
         engine: local or ray.
-        workers: fits at a time; None: one locally, with all threads, and on Ray what its processors allow.
+        workers: fits at a time; None: one locally, and on Ray what its processors allow.
 
     Returns:
         One result for each spec, in their order.
@@ -210,15 +198,15 @@ def _make(job: tuple[Path, Spec]) -> None:
     path, spec = job
     warm_up(spec.config)
     regions = RegionMap.from_labels(spec.regions) if isinstance(spec.regions, Tensor) else spec.regions
-    start = time.perf_counter()
+    start, core_start = time.perf_counter(), time.process_time()
     result = fit(spec.image, regions, spec.num_gaussians, config=spec.config, seed=spec.seed)
-    seconds = time.perf_counter() - start
+    seconds, core_seconds = time.perf_counter() - start, time.process_time() - core_start
     band = spec.band if spec.band is not None or regions is None else regions.labels
     made = {
         **measure(render_image(result.field, result.regions), spec.image, band),
         "seconds": seconds,
+        "core_seconds": core_seconds,
         "num_gaussians": len(result.field),
-        "map_bytes": stored_bytes(result.regions),
         "stop_reason": result.stop_reason,
         "history": result.history,
     }

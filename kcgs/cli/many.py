@@ -42,7 +42,7 @@ class Outcome(NamedTuple):
     """What the table gets."""
 
     fit: str
-    """Hash of the image, the mask and all settings."""
+    """Hash of the image, the mask and all settings; of a compressed file its own too."""
     figures: dict[str, float] | None
     """None: the file was there, and its figures are in the table."""
     core_seconds: float
@@ -56,16 +56,16 @@ def fit_one(order: Order) -> Outcome:
     # not wall time, which also counts what the machine does for others
     start = time.process_time()
     fit = _fingerprint(order)
-    is_there = _made_from(order) == fit
-    if is_there and order.known == fit:
-        return Outcome(fit, None, math.nan, ())
+    is_there = _is_made(order, fit)
+    if is_there and order.known == _mark(order, fit):
+        return Outcome(order.known, None, math.nan, ())
     # a warning of one image among many must say which image: the caller does
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         figures = _figures(order) if is_there else _fit(order, fit)
     core_seconds = math.nan if is_there else time.process_time() - start
     said = tuple(str(warning.message) for warning in caught if issubclass(warning.category, UserWarning))
-    return Outcome(fit, figures, core_seconds, said)
+    return Outcome(_mark(order, fit), figures, core_seconds, said)
 
 
 def _fit(order: Order, fit: str) -> dict[str, float]:
@@ -110,15 +110,22 @@ def _fingerprint(order: Order) -> str:
     return digest.hexdigest()[:20]
 
 
-def _made_from(order: Order) -> str | None:
+def _is_made(order: Order, fit: str) -> bool:
     from kcgs.io import load
 
+    if order.output.suffix == ".kcgs":
+        return order.output.is_file() and order.known == _mark(order, fit)
     try:
-        notes = load(order.output).metadata
-        # a compressed file has no notes: the table must know it
-        return order.known if order.output.suffix == ".kcgs" else notes.get(_NOTE)
+        return load(order.output).metadata.get(_NOTE) == fit
     except (FileNotFoundError, ValueError):
-        return None
+        return False
+
+
+def _mark(order: Order, fit: str) -> str:
+    """Return what the table says of an output: a compressed file has no notes, and is known by its bytes."""
+    if order.output.suffix != ".kcgs":
+        return fit
+    return f"{fit}-{hashlib.sha256(order.output.read_bytes()).hexdigest()[:8]}"
 
 
 @lru_cache(maxsize=4)

@@ -46,7 +46,7 @@ class TestEnsure:
         assert made[0].ef_psnr > 5 and made[0].history[-1].iteration == 5 and made[0].seconds > 0
         scene = made[0].scene()
         assert len(scene.field) == made[0].num_gaussians and scene.regions is not None
-        assert made[0].bytes == 7 * made[0].num_gaussians + made[0].map_bytes > made[0].map_bytes > 0
+        assert made[0].core_seconds > 0
         monkeypatch.setattr(fits, "fit", None)
         assert ensure([spec(seed=1)], tmp_path / "runs") == [made[1]]
 
@@ -59,9 +59,8 @@ class TestEnsure:
 
 class TestPlace:
     def test_words(self) -> None:
-        assert str(HERE).startswith(f"one at a time on {torch.get_num_threads()} thread")
+        assert str(HERE) == "one at a time on one thread"
         assert str(Place(workers=3)) == "3 at a time on one thread each, engine local"
-        assert Place("ray").threads == Place(workers=2).threads == 1
         assert "processors" in str(Place("ray"))
 
     def test_make_all(self) -> None:

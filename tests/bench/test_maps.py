@@ -161,7 +161,7 @@ class TestGains:
     def test_interval(self) -> None:
         values = [0.1, 0.2, 0.3, 0.9]
         low, high = interval(values)
-        assert 0.1 <= low < 0.375 < high <= 0.9
+        assert -0.3 < low < 0.1 and 0.9 < high < 1.1  # Student's is -0.19 to 0.94; the values are skew
         assert interval(values) == (low, high) and interval([0.3]) == pytest.approx((0.3, 0.3))
 
     def test_gain(self) -> None:

@@ -13,7 +13,7 @@ import torch
 
 import kcgs.bench
 from kcgs.bench.fits import HERE
-from kcgs.bench.paper import ablation, charts, convergence, davis, tables
+from kcgs.bench.paper import ablation, charts, convergence, davis, figures, tables
 from kcgs.bench.paper.compare import Curve, complete, equal_bits, equal_n
 from kcgs.bench.paper.methods import BASELINE, BEST, CLAMPED, PAPER, PAPER_CLAMPED, UNCLAMPED
 from kcgs.bench.paper.options import Options
@@ -21,7 +21,8 @@ from kcgs.bench.paper.peers import codec
 from kcgs.bench.paper.pictures import load, sequences
 from kcgs.bench.paper.siren import BYTES_A_WEIGHT, train, weights_of, width_for
 from kcgs.bench.paper.tables import Contest
-from kcgs.bench.paper.trials import Row, Store, Trial, plan
+from kcgs.bench.paper.trials import Row, Store, Trial, _learn, near, plan, rivals
+from kcgs.fit import HistoryEntry
 
 CONTEST = Contest("best", "best-baseline")
 
@@ -69,6 +70,32 @@ class TestCompare:
         assert found is not None and found.mean == pytest.approx(0.0)
         assert equal_bits(rows[:2], *CONTEST, 100, "psnr") is None  # nothing to interpolate between
 
+    def test_no_mean_of_what_happens_to_be_there(self) -> None:
+        rows = [row(p, psnr=31.0) for p in "ab"]
+        rows += [row("a", method="best-baseline", psnr=30.0, bytes=b, n=n) for b, n in ((500, 100), (2_000, 200))]
+        rows += [row("b", method="best-baseline", psnr=30.0, bytes=b, n=n) for b, n in ((1_500, 100), (2_000, 200))]
+        found = equal_bits(rows, *CONTEST, 100, "psnr")
+        assert found is not None and list(found.values) == ["a"] and found.asked == 2 and not found.is_complete
+        lines = tables.differences(rows, [CONTEST], [100]).splitlines()
+        assert "equal N | 2 | +1.00" in lines[2] and "equal bits | 1 of 2 |  |" in lines[3]
+        assert tables.unpaid(rows, *CONTEST) == "Nothing to compare."
+
+    def test_unpaid(self) -> None:
+        rows = [row(p, psnr=31.0) for p in "abcde"]
+        for low, word in ((29.0, "pays for itself in PSNR"), (31.5, "does not pay for itself in PSNR")):
+            others = [
+                row(p, method="best-baseline", psnr=low + 0.01 * i + (b > 1_000), bytes=b, n=n)
+                for i, p in enumerate("abcde")
+                for b, n in ((1_000, 100), (2_000, 200))
+            ]
+            text = tables.unpaid([*rows, *others], *CONTEST)
+            assert word in text and "10.0 % of the bytes" in text
+
+    def test_pictures_that_are_drawn(self) -> None:
+        rows = [row(p, n=n, method=m) for p in "abc" for n in (10, 20) for m in CONTEST if (p, n) != ("c", 20)]
+        rows += [row("a", n=30, method=m) for m in CONTEST] + [row("b", n=40)]
+        assert figures.sweep(rows, CONTEST) == ([10, 20], ["a", "b"])
+
     def test_words(self) -> None:
         rows = [row("a"), row("b", psnr=29.0)] + [row(p, method="best-baseline", psnr=29.5) for p in "ab"]
         lines = tables.losses(rows, [CONTEST]).splitlines()
@@ -76,6 +103,29 @@ class TestCompare:
         assert tables.losses([row(), row(method="best-baseline", psnr=20.0)], [CONTEST]) == "Nowhere."
         assert "0.30 dB here (b, N = 100, best)" in tables.rounding([rows[0], row("b", decoded_psnr=29.7)])
         assert "| 100 | best - best-baseline | equal N | 2 | +0.00 |" in tables.differences(rows, [CONTEST])
+
+
+class TestConvergence:
+    def test_against_paper(self) -> None:
+        history = tuple(HistoryEntry(i, 10.0 * i, 0.0, 20.0 + i, 19.0 + i, 5) for i in range(1, 6))
+        paper = row(method="paper", psnr=24.0, ef_psnr=23.0, seconds=50.0, core_seconds=25.0, history=history)
+        ours = row(psnr=25.0, seconds=40.0, core_seconds=40.0, history=history, ef_psnr=30.0)
+        found = [convergence.in_core_seconds(r) for r in (paper, ours)]
+        assert [entry.seconds for entry in found[0].history] == [5.0, 10.0, 15.0, 20.0, 25.0]
+        text = convergence.against_paper(found)
+        assert "took 25 s and ends at 24.00 dB" in text
+        assert "| best | 40 | 0.62 | 40 | 0.62 | 40 | +1.00 | +7.00 |" in text
+        assert "| best | 700 | 10 | 20 | 40 | 50 | 40 | 25.00 |" in convergence.reached(found, "psnr")
+
+
+class TestAblation:
+    def test_printed_figures_stand_beside_ours(self) -> None:
+        rows = [row(p, n=1_250, method=m.name, psnr=20.0 + i) for p in "ab" for i, m in enumerate(ablation.PAPER_ROWS)]
+        lines = ablation.paper_table(rows).splitlines()
+        assert len(lines) == 2 + 6 and "| 20.00 | +0.00 | 19.00 | +0.00 |" in lines[2] and "27.10" in lines[2]
+        assert "| 25.00 | +5.00 | 24.00 | +5.00 |" in lines[-1] and "27.31 | +0.21" in lines[-1]
+        rows = [row(p, n=1_250, method=m.name, psnr=30.0 - i) for p in "ab" for i, m in enumerate(ablation.OUR_ROWS)]
+        assert "-1.00" in ablation.our_table(rows).splitlines()[3]
 
 
 class TestPlan:
@@ -122,12 +172,31 @@ class TestStore:
         assert [r.method for r in store.rows(trials)] == ["gaussian-image"]
         made = store.read(trials[0])
         assert made is not None and made.bytes > 0 and made.decoded_psnr > made.psnr - 1
-        # as long as the last one would take is more than is left
-        assert store.obtain(trials, HERE, time.monotonic() + 60) == [] and len(store.rows(trials)) == 2
+        # as long as the last one took is more than is left
+        _learn(store.folder, trials[1], 100.0)
+        assert store.obtain(trials, HERE, time.monotonic() + 60) == [] and len(store.rows(trials)) == 1
+        assert store.obtain(trials, HERE, time.monotonic() + 200) == [] and len(store.rows(trials)) == 2
         assert store.read(trials[0]) == made
         assert store._expected(trials[0]._replace(picture="other")) > 0
         (store.folder / made.scene).unlink()
         assert store.read(trials[0]) is None  # a row without its scene cannot be drawn
+
+    def test_rivals_come_near(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        store, (ours, base) = Store(tmp_path, None), plan(["a"], [20], [BEST, BASELINE], iterations=1)
+        rows = {ours: row(n=20, bytes=1_000), base: row(n=20, method=BASELINE.name, bytes=200)}
+        monkeypatch.setattr(store, "read", rows.get)
+        for _ in range(4):  # bytes are not proportional to N
+            wanted = rivals(store, [ours, base], BEST, BASELINE)
+            for trial in wanted:
+                rows.setdefault(trial, row(n=trial.n, method=BASELINE.name, bytes=100 + 5 * trial.n))
+        sizes = [rows[trial].bytes for trial in wanted]
+        assert 1 < len(sizes) <= 4 and 1_000 <= sizes[-1] <= 1_060
+        found = near(rows.values(), rows[ours], BASELINE.name)
+        assert found is not None and found.bytes == sizes[-1]
+        rows[ours] = row(n=20, bytes=205)  # with as many Gaussians it has as many bytes
+        assert rivals(store, [ours, base], BEST, BASELINE) != [] and near([], rows[ours], BASELINE.name) is None
+        rows[ours] = row(n=20, bytes=195)
+        assert rivals(store, [ours, base], BEST, BASELINE) == []
 
     def test_keys(self, tmp_path: Path) -> None:
         store, trial = Store(tmp_path, None), Trial("disc", 5, BEST)

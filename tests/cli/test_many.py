@@ -87,7 +87,7 @@ class TestTable:
             assert int(row["bytes"]) == file.stat().st_size <= 200 and len(load(file).field) == int(
                 row["num_gaussians"]
             )
-        (files / "out/b.kcgs").write_bytes(b"not a file")
+        (files / "out/b.kcgs").write_bytes((files / "out/a.kcgs").read_bytes())  # another fit's
         (files / "out/c.kcgs").unlink()
         code, out, err = kcgs("photos/*.png", *settings)
         assert code == 0 and [json.loads(out)[key] for key in ("fitted", "kept")] == [2, 1], err

@@ -84,9 +84,16 @@ class TestCluster:
         assert scenes[0] == scenes[1]
 
     def test_bench_fits(self, tmp_path: Path) -> None:
-        config = FitConfig.from_recipe("paper", iterations=5)
-        specs = [Spec(torch.full((3, 24, 32), level), None, 4, config) for level in (0.25, 0.5)]
-        here, there = (ensure(specs, tmp_path / e, engine=e) for e in ("local", "ray"))
+        # as many Gaussians and steps as show how many threads there were
+        config = FitConfig.from_recipe("best", iterations=30)
+        images = torch.rand(2, 3, 96, 128, generator=torch.Generator().manual_seed(0))
+        specs = [Spec(image, (image[0] > 0.5).long(), 300, config) for image in images]
+        before = torch.get_num_threads()
+        torch.set_num_threads(2)
+        try:
+            here, there = (ensure(specs, tmp_path / e, engine=e) for e in ("local", "ray"))
+        finally:
+            torch.set_num_threads(before)
         for one, two in zip(here, there, strict=True):
             assert torch.equal(one.scene().field.means, two.scene().field.means)
             assert one.psnr == two.psnr and one.path.name == two.path.name

@@ -99,7 +99,7 @@ def _report(output: Path, store: Store, wanted: list[Trial], options: Options) -
     parts = head("Ablation", "ablation", options)
     parts += ["## What was run", what_was_run(rows, wanted, options), METRICS_TEXT]
     if rows:
-        contests = [Contest(m.name, CLAMPED.name) for m in PAPER_ROWS[2:]]
+        contests = [Contest(m.name, CLAMPED.name) for m in PAPER_ROWS[1:]]
         contests += [Contest(BEST.name, m.name) for m in OUR_ROWS[1:]]
         parts += ["## Where a part does harm", tables.losses(rows, contests)]
         parts += _figure(output / "changes.png", rows)
@@ -173,7 +173,7 @@ def _changes(rows: list[Row], name: str, n: int, images: list[str]) -> list[str]
         cells += ["" if found is None else signed(found.mean), spread]
     for quantity in ("psnr", "ef_psnr"):
         found = equal_bits(here, name, BEST.name, n, quantity)
-        cells.append("" if found is None else signed(found.mean))
+        cells.append("" if found is None or not found.is_complete else signed(found.mean))
     return cells
 
 

@@ -27,6 +27,12 @@ class Difference(NamedTuple):
     wins: int
     losses: int
     values: dict[str, float]
+    asked: int  # pictures that both methods have, of which some may have no value
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether it is a mean over all pictures: those that are left out are not so by chance."""
+        return len(self.values) == self.asked
 
     @property
     def worst(self) -> list[str]:
@@ -95,7 +101,8 @@ def equal_bits(rows: Sequence[Row], ours: str, other: str, n: int, quantity: str
     """Compare the decoded files with the other's at as many bytes, interpolated between its own of that picture."""
     quantity = f"decoded_{quantity}"
     first, sizes = (by_picture(select(rows, ours, n), q) for q in (quantity, "bytes"))
-    values = {p: first[p] - curve(rows, other, p, quantity).at(sizes[p]) for p in first}
+    both = {row.picture for row in select(rows, other)}
+    values = {p: first[p] - curve(rows, other, p, quantity).at(sizes[p]) for p in first if p in both}
     return summarize(values, quantity)
 
 
@@ -111,6 +118,7 @@ def curve(rows: Sequence[Row], method: str, picture: str, quantity: str) -> Curv
 
 def summarize(values: dict[str, float], quantity: str) -> Difference | None:
     """Sum up differences; undefined ones are left out. None: there are none."""
+    asked = len(values)
     values = {picture: value for picture, value in values.items() if math.isfinite(value)}
     if not values:
         return None
@@ -123,4 +131,5 @@ def summarize(values: dict[str, float], quantity: str) -> Difference | None:
         sum(value > tie for value in values.values()),
         sum(value < -tie for value in values.values()),
         values,
+        asked,
     )

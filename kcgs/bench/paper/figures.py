@@ -13,7 +13,7 @@ from torch import Tensor
 from kcgs.bench.plots import COLORS, figure, save_figure
 from kcgs.functional import edge_band
 
-from .compare import QUANTITIES, by_picture, complete, counts, mean, select
+from .compare import QUANTITIES, by_picture, mean, select, shared
 from .trials import Row
 
 _MARKERS = ("o", "s", "^", "D", "v", "P")
@@ -129,16 +129,27 @@ def _draw(axis: Any, picture: Tensor) -> None:
 def _means(
     rows: Sequence[Row], methods: Sequence[str], name: str, quantity: str, across: str
 ) -> list[tuple[float, float]]:
+    swept, images = sweep(rows, methods)
     points = []
-    for n in counts(rows, name):
-        present = [other for other in methods if n in counts(rows, other)]
-        shared = complete(rows, present, n)
-        # a point of few methods is over other pictures than its neighbours, or no sweep's at all
-        found = [row for row in select(rows, name, n) if row.picture in shared] if len(present) > 1 else []
+    for n in swept:
+        found = [row for row in select(rows, name, n) if row.picture in images]
         y = mean(by_picture(found, quantity).values())
         if y == y:
             points.append((mean(by_picture(found, across).values()), y))
     return points
+
+
+def sweep(rows: Sequence[Row], methods: Sequence[str]) -> tuple[list[int], list[str]]:
+    """Return the N that are drawn, and the pictures that all methods have at all of them.
+
+    An N that fewer than half of the pictures have, or a single method, is left out: a line must not go from the mean
+    over some pictures to the mean over others.
+    """
+    found = {n: images for n, present, images in shared(rows, methods) if len(present) > 1}
+    most = max(map(len, found.values()), default=0)
+    swept = {n: set(images) for n, images in found.items() if 2 * len(images) > most}
+    everywhere = set.intersection(*swept.values()) if swept else set()
+    return sorted(swept), sorted(everywhere)
 
 
 def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:

@@ -23,8 +23,9 @@ METRICS_TEXT = """PSNR and MS-SSIM are over the whole picture, EF-PSNR and edge 
 the given map, for every method alike; decibels, of values clipped to [0, 1]. `paper` is the paper's method, `gaussian-
 image` its baseline without clamp and `gaussian-image-clamp` with it, `best` ours, and `best-baseline` ours with the
 regions off, the baseline improved as much. All run on the same kernel. Differences are paired by picture, above zero
-where the first is better; intervals are 95 %, by bootstrap over pictures, where there are five or more. Seconds are
-wall time of a fit, which other work on the machine slows; core s is the processor time of fit and measurement."""
+where the first is better; intervals are 95 %, by bootstrap over pictures, widened for their small number, where
+there are five or more. Seconds are wall time of a fit, which other work on the machine slows; core s is its processor
+time. *N left* are the Gaussians that the end of a fit leaves."""
 
 
 def head(title: str, name: str, options: Options) -> list[str]:

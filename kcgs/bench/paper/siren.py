@@ -60,7 +60,7 @@ def train(image: Tensor, size: int, *, seconds: float, seed: int = 0) -> Trained
     Args:
         image: (3, H, W) in [0, 1].
         size: bytes of the weights.
-        seconds: wall time, drawing on the way not counted.
+        seconds: of a processor, drawing on the way not counted.
         seed: of start and pixels.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -73,14 +73,14 @@ def train(image: Tensor, size: int, *, seconds: float, seed: int = 0) -> Trained
     optimizer = torch.optim.Adam(network.parameters(), lr=_RATE)
     spent, count, due, history = 0.0, 0, seconds / 64, list[tuple[float, Tensor]]()
     while spent < seconds:
-        start = time.perf_counter()
+        start = time.process_time()
         for group in optimizer.param_groups:
             group["lr"] = _RATE * (0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * spent / seconds)))
         index = torch.randint(len(points), (_BATCH,), generator=generator)
         optimizer.zero_grad()
         (network(points[index]) + 0.5 - colors[index]).square().mean().backward()
         optimizer.step()
-        count, spent = count + 1, spent + time.perf_counter() - start
+        count, spent = count + 1, spent + time.process_time() - start
         if spent >= due:
             history.append((spent, _draw(network, points, image)))
             due *= 2

@@ -18,7 +18,9 @@ BITS_TEXT = """Bytes are the size of the scene's `.kcgs` file: Gaussians, region
 that a decoder needs, written by `kcgs.codec.encode(field, regions, quality=psnr + 14.5)`, without a look at the image.
 *Decoded* figures are those of the picture that this file decodes to."""
 EQUAL_BITS_TEXT = """At equal bits the decoded picture is compared with the other method's at the same number of bytes
-of the same picture: its curve is interpolated linearly over the logarithm of the bytes, between its own files."""
+of the same picture: its curve is interpolated linearly over the logarithm of the bytes, between its own files. Where
+that curve does not reach so many bytes, or so few, on some of the pictures, there is no mean: which ones are left is no
+chance."""
 
 
 class Contest(NamedTuple):
@@ -38,7 +40,7 @@ def similarity(value: float) -> str:
 
 def quality(rows: Sequence[Row], methods: Sequence[str], names: dict[str, str] | None = None) -> str:
     """Means over the pictures that every method has."""
-    header = ["N", "method", "iterations", "pictures", "PSNR", "MS-SSIM", "EF-PSNR", "edge SSIM", "bytes"]
+    header = ["N", "method", "iterations", "pictures", "PSNR", "MS-SSIM", "EF-PSNR", "edge SSIM", "N left", "bytes"]
     header += ["of these map", "bits per pixel", "decoded PSNR", "decoded EF-PSNR", "s", "core s"]
     lines = []
     for n, present, pictures in shared(rows, methods):
@@ -65,9 +67,10 @@ def differences(
     for contest, (way, compare) in product(contests, _WAYS.items()):
         for n in counts(rows, contest.ours) if at is None else at:
             found = {q: compare(rows, *contest, n, q) for q in quantities}
-            most = max((len(d.values) for d in found.values() if d is not None), default=0)
-            if most:
-                line = [count(n), str(contest), way, str(most)]
+            there = [d for d in found.values() if d is not None]
+            if there:
+                has, asked = (max(numbers) for numbers in zip(*((len(d.values), d.asked) for d in there), strict=True))
+                line = [count(n), str(contest), way, str(has) if has == asked else f"{has} of {asked}"]
                 lines.append(line + [cell for q, d in found.items() for cell in _difference_cells(d, q)])
     return markdown(header, lines)
 
@@ -76,11 +79,11 @@ def losses(rows: Sequence[Row], contests: Sequence[Contest], at: Sequence[int] |
     """Say on which pictures a method is below the other, worst first."""
     lines = []
     for contest, (way, compare) in product(contests, _WAYS.items()):
-        for n, quantity in product(counts(rows, contest.ours) if at is None else at, ("psnr", "ef_psnr")):
+        for n, quantity in product(counts(rows, contest.ours) if at is None else at, QUANTITIES):
             found = compare(rows, *contest, n, quantity)
             if found is not None and found.losses:
                 below = [p for p in found.worst if found.values[p] < 0][: found.losses]
-                which = ", ".join(f"{p} {signed(found.values[p])}" for p in below)
+                which = ", ".join(f"{p} {_difference(found.values[p], quantity)}" for p in below)
                 where = f"{way}, N = {n:,}, {QUANTITIES[quantity]}"
                 lines.append(f"- {contest}, {where}: {found.losses} of {len(found.values)}: {which}")
     return "\n".join(lines) or "Nowhere."
@@ -88,7 +91,7 @@ def losses(rows: Sequence[Row], contests: Sequence[Contest], at: Sequence[int] |
 
 def each(rows: Sequence[Row], methods: Sequence[str]) -> str:
     """One line a picture, N and method."""
-    header = ["picture", "N", "method", "PSNR", "MS-SSIM", "EF-PSNR", "edge SSIM", "bytes", "of these map"]
+    header = ["picture", "N", "method", "PSNR", "MS-SSIM", "EF-PSNR", "edge SSIM", "N left", "bytes", "of these map"]
     header += ["bits per pixel", "decoded PSNR", "decoded EF-PSNR", "s", "core s"]
     lines = []
     for picture in dict.fromkeys(row.picture for row in rows):
@@ -105,7 +108,7 @@ def unpaid(rows: Sequence[Row], ours: str, baseline: str) -> str:
     lines = []
     for n, quantity in product(counts(rows, ours), ("psnr", "ef_psnr")):
         found = equal_bits(rows, ours, baseline, n, quantity)
-        if found is not None:
+        if found is not None and found.is_complete:
             shares = [row.map_bytes / row.bytes for row in select(rows, ours, n)]
             word = "does not pay for itself" if found.mean < 0 else "pays for itself"
             if math.isnan(found.low):
@@ -134,15 +137,19 @@ def _means(found: list[Row], *, spread: bool = True) -> list[str]:
         write = db if quantity.endswith("psnr") else similarity
         deviation = f" ± {write(statistics.stdev(values))}" if spread and len(values) > 1 else ""
         cells.append(write(mean(values)) + deviation)
-    cells += [count(mean(by_picture(found, q).values())) for q in ("bytes", "map_bytes")]
+    cells += [count(mean(by_picture(found, q).values())) for q in ("num_gaussians", "bytes", "map_bytes")]
     cells.append(f"{mean(by_picture(found, 'bits_per_pixel').values()):.3f}")
     cells += [db(mean(by_picture(found, q).values())) for q in ("decoded_psnr", "decoded_ef_psnr")]
     return cells + [seconds(mean(by_picture(found, q).values())) for q in ("seconds", "core_seconds")]
 
 
 def _difference_cells(found: Difference | None, quantity: str) -> list[str]:
-    if found is None:
+    if found is None or not found.is_complete:
         return [""] * 3
-    write = signed if quantity.endswith("psnr") else lambda value: "" if math.isnan(value) else f"{value:+.4f}"
-    spread = "" if math.isnan(found.low) else f"{write(found.low)} to {write(found.high)}"
-    return [write(found.mean), spread, f"{found.wins}-{found.losses}"]
+    low, centre, high = (_difference(value, quantity) for value in (found.low, found.mean, found.high))
+    return [centre, f"{low} to {high}" if low else "", f"{found.wins}-{found.losses}"]
+
+
+def _difference(value: float, quantity: str) -> str:
+    """Write a difference in dB or of SSIMs."""
+    return signed(value) if quantity.endswith("psnr") or math.isnan(value) else f"{value:+.4f}"

@@ -26,6 +26,9 @@ from kcgs.nn.renderer import render_image
 from . import pictures
 from .methods import COVERAGE, QUICK_ITERATIONS, Method
 
+# what files of about as many bytes are aimed at, may have, and how many fits that may take
+_ABOVE, _NEAR, _TRIES = 1.03, 1.06, 4
+
 
 class Trial(NamedTuple):
     """What is fitted, with how many Gaussians, how."""
@@ -58,8 +61,8 @@ class Row:
     ms_ssim: float
     ef_psnr: float
     ef_ssim: float
-    seconds: float  # wall time of the whole call, compilation excluded; NaN: it was stopped meanwhile
-    core_seconds: float  # processor time of fit and measurement; NaN: the fit was there already
+    seconds: float  # wall time of the fit, compilation excluded
+    core_seconds: float  # its processor time
     num_gaussians: int  # what is left of n
     pixels: int
     bytes: int  # of the .kcgs file
@@ -125,6 +128,17 @@ class Store:
                 failed += make_all(self.make, part, place, name=str)
         return failed
 
+    def approach(
+        self, trials: Sequence[Trial], ours: Method, other: Method, place: Place, deadline: float | None = None
+    ) -> list[str]:
+        """Make files of another method of about as many bytes as ours; see `rivals`."""
+        failed: list[str] = []
+        for _ in range(_TRIES):
+            failed += self.obtain(rivals(self, trials, ours, other), place, deadline)
+            if failed:
+                break  # what could not be made would be tried again
+        return failed
+
     def _expected(self, trial: Trial) -> float:
         """Return the seconds that the slowest fit took with these settings and N."""
         return _known(self.folder).get(_settings(trial), 0.0)
@@ -158,17 +172,47 @@ def plan(
 
 
 def rivals(store: Store, trials: Iterable[Trial], ours: Method, other: Method) -> list[Trial]:
-    """Return fits of the other method with about the Gaussians that the bytes of ours buy, where that is more."""
+    """Return fits of the other method with about the Gaussians that the bytes of ours buy.
+
+    They are found one after another: those that are made already, and of each at most one that is not.
+    """
     trials = list(dict.fromkeys(trials))
     found = []
     for trial in trials:
         beside = next((t for t in trials if t.method == other and _is_beside(t, trial)), None)
         if trial.method == ours and beside is not None:
             mine, theirs = store.read(trial), store.read(beside)
-            if mine is not None and theirs is not None and mine.bytes > theirs.bytes:
-                # a little more than they buy, so that the curve reaches as far
-                found.append(beside._replace(n=1 + math.ceil(1.03 * theirs.n * mine.bytes / theirs.bytes)))
+            if mine is not None and theirs is not None:
+                found += _approach(store, beside, theirs, mine.bytes)
     return found
+
+
+def _approach(store: Store, first: Trial, row: Row, size: int) -> list[Trial]:
+    """Return fits ever nearer to `size` bytes, until one has as many, or little more, or is not made yet."""
+    made, found = {row.n: row.bytes}, list[Trial]()
+    while len(found) < _TRIES and not any(size <= count <= _NEAR * size for count in made.values()):
+        trial = first._replace(n=_guess(made, _ABOVE * size))
+        if trial.n in made:
+            break
+        found.append(trial)
+        reached = store.read(trial)
+        if reached is None:
+            break
+        made[trial.n] = reached.bytes
+    return found
+
+
+def _guess(made: dict[int, int], size: float) -> int:
+    """Return the N of so many bytes, by the line through the two nearest files, or through the only one and nothing."""
+    (n, count), (other, beside) = sorted([*made.items(), (0, 0)], key=lambda point: abs(point[1] - size))[:2]
+    return n + 1 if count == beside else max(1, 1 + math.ceil(n + (size - count) * (n - other) / (count - beside)))
+
+
+def near(rows: Iterable[Row], row: Row, method: str) -> Row | None:
+    """Return the file of another method with as many bytes as a row's, or little more, the nearest one."""
+    there = [r for r in rows if (r.picture, r.seed, r.method) == (row.picture, row.seed, method)]
+    there = [r for r in there if row.bytes <= r.bytes <= _NEAR * row.bytes]
+    return min(there, key=lambda r: r.bytes, default=None)
 
 
 def _is_beside(one: Trial, other: Trial) -> bool:
@@ -201,9 +245,8 @@ def _perform(trial: Trial, data: Path | None, folder: Path) -> Row:
     is_new = not spec.path(folder).is_file()
     if config.iterations > QUICK_ITERATIONS:  # the quick form's seconds mean nothing
         warm_up(config)
-    began, start = time.monotonic(), time.process_time()
+    began = time.monotonic()
     fitted = ensure_one(spec, folder)
-    core_seconds = time.process_time() - start if is_new else math.nan
     scene = fitted.scene()
     data_bytes = write_scene(scene.field, scene.regions, fitted.psnr)
     held = decode(data_bytes)
@@ -223,7 +266,7 @@ def _perform(trial: Trial, data: Path | None, folder: Path) -> Row:
         ef_psnr=fitted.ef_psnr,
         ef_ssim=fitted.ef_ssim,
         seconds=fitted.seconds,
-        core_seconds=core_seconds,
+        core_seconds=fitted.core_seconds,
         num_gaussians=fitted.num_gaussians,
         pixels=labels.numel(),
         bytes=len(data_bytes),
