@@ -42,7 +42,9 @@ def what_was_run(rows: Sequence[Row], wanted: Sequence[Trial], options: Options)
     lines = [f"- Pictures: {', '.join(dict.fromkeys(row.picture for row in rows)) or 'none'}."]
     published = sorted({t.config().iterations for t in wanted if t.method.is_published})
     own = sorted({t.config().iterations for t in wanted if not t.method.is_published})
-    if published:
+    if published == [FULL_ITERATIONS]:
+        lines.append(f"- Published recipes: their own {FULL_ITERATIONS:,} iterations.")
+    elif published:
         lines.append(
             f"- Published recipes: {' and '.join(f'{i:,}' for i in published)} iterations, not {FULL_ITERATIONS:,}, "
             "with their schedule shortened and larger steps, by the recipes' own rule: not the published figures."
