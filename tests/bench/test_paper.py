@@ -114,7 +114,7 @@ class TestConvergence:
         assert [entry.seconds for entry in found[0].history] == [5.0, 10.0, 15.0, 20.0, 25.0]
         text = convergence.against_paper(found)
         assert "took 25 s and ends at 24.00 dB" in text
-        assert "| best | 40 | 0.62 | 40 | 0.62 | 40 | +1.00 | +7.00 |" in text
+        assert "| best | 40 | 1 | 40 | 1 | 40 | +1.00 | +7.00 |" in text
         assert "| best | 700 | 10 | 20 | 40 | 50 | 40 | 25.00 |" in convergence.reached(found, "psnr")
 
 

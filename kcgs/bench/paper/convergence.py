@@ -13,7 +13,7 @@ from kcgs.bench.fits import HERE, check_made
 from kcgs.bench.plots import COLORS, figure, save_figure
 
 from . import peers, pictures, tables
-from .compare import select
+from .compare import QUANTITIES, select
 from .methods import BASELINE, BEST, CLAMPED, FULL_ITERATIONS, PAPER, REFINED, UNCLAMPED
 from .options import PUBLISHED_ITERATIONS, Options
 from .peers import Peer
@@ -31,7 +31,8 @@ _NETWORK_SHARE, _NETWORK_SECONDS, _QUICK_NETWORK_SECONDS = 0.2, 60.0, 0.5
 _QUALITIES = (20.0, 22.0, 24.0, 25.0, 26.0, 27.0, 28.0)
 _SPEED_TEXT = """All fits ran on the same kernel, on one thread. Seconds are those of a processor: the wall
 time at which a fit had a quality, times the share of a processor that the whole fit had, so that what else the machine
-did is not in them; the start of a fit is, compilation is not. *Never*: the fit ends below."""
+did is not in them; the start of a fit is, compilation is not. *Never*: the fit ends below. `paper` dips where it reads
+the regions' ids anew."""
 _PEER_TEXT = """JPEG, WebP and AVIF (Pillow) at the largest quality whose file is not above the bytes of the `.kcgs`
 file of `best`; SIREN: three hidden layers with sines, weights at half precision and nothing else counted, the widest
 that these bytes hold, Adam on random pixels for the seconds shown. The Gaussian rows are decoded files, that of
@@ -90,8 +91,10 @@ def _report(output: Path, store: Store, wanted: list[Trial], options: Options) -
     parts = head("Error against run time, and other codecs at the same bytes", "convergence", options)
     parts += ["## What was run", what_was_run(rows, wanted, options), METRICS_TEXT]
     if rows:
+        n = rows[0].n
         contests = (Contest(BEST.name, BASELINE.name), Contest(REFINED.name, BASELINE.name))
-        parts += ["## Where ours loses", tables.losses(rows, contests) + "\n" + beaten(rows, others)]
+        words = "\n".join(filter(None, [tables.losses([*rows, *at_our_bytes], contests, [n]), beaten(rows, others)]))
+        parts += ["## Where ours loses", words]
         _plot(output / "convergence.png", rows, others)
         parts += ["## Error against time", _SPEED_TEXT, "![](convergence.png)"]
         parts += ["### Against the paper's recipe", against_paper(rows)]
@@ -198,12 +201,11 @@ def beaten(rows: Sequence[Row], others: Sequence[Peer]) -> str:
         return ""
     lines = []
     for peer in others:
-        gaps = (peer.psnr - ours[0].decoded_psnr, peer.ef_psnr - ours[0].decoded_ef_psnr)
-        if max(gaps) > 0:
-            lines.append(
-                f"- {peer.name} is ahead of `best`, or behind where negative: PSNR {signed(gaps[0])} dB, "
-                f"EF-PSNR {signed(gaps[1])} dB, with {peer.bytes / ours[0].bytes:.2f} of its bytes"
-            )
+        gaps = {q: getattr(peer, q) - getattr(ours[0], f"decoded_{q}") for q in QUANTITIES}
+        ahead = [f"{QUANTITIES[q]} {tables.difference(gap, q)}" for q, gap in gaps.items() if gap > 0]
+        if ahead:
+            share = f"with {peer.bytes / ours[0].bytes:.2f} of its bytes"
+            lines.append(f"- {peer.name} is ahead of `best`, {share}: {', '.join(ahead)}")
     return "\n".join(lines)
 
 

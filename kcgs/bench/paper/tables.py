@@ -83,7 +83,7 @@ def losses(rows: Sequence[Row], contests: Sequence[Contest], at: Sequence[int] |
             found = compare(rows, *contest, n, quantity)
             if found is not None and found.losses:
                 below = [p for p in found.worst if found.values[p] < 0][: found.losses]
-                which = ", ".join(f"{p} {_difference(found.values[p], quantity)}" for p in below)
+                which = ", ".join(f"{p} {difference(found.values[p], quantity)}" for p in below)
                 where = f"{way}, N = {n:,}, {QUANTITIES[quantity]}"
                 lines.append(f"- {contest}, {where}: {found.losses} of {len(found.values)}: {which}")
     return "\n".join(lines) or "Nowhere."
@@ -146,10 +146,10 @@ def _means(found: list[Row], *, spread: bool = True) -> list[str]:
 def _difference_cells(found: Difference | None, quantity: str) -> list[str]:
     if found is None or not found.is_complete:
         return [""] * 3
-    low, centre, high = (_difference(value, quantity) for value in (found.low, found.mean, found.high))
+    low, centre, high = (difference(value, quantity) for value in (found.low, found.mean, found.high))
     return [centre, f"{low} to {high}" if low else "", f"{found.wins}-{found.losses}"]
 
 
-def _difference(value: float, quantity: str) -> str:
+def difference(value: float, quantity: str) -> str:
     """Write a difference in dB or of SSIMs."""
     return signed(value) if quantity.endswith("psnr") or math.isnan(value) else f"{value:+.4f}"
