@@ -161,9 +161,7 @@ def against_paper(rows: Sequence[Row]) -> str:
             cells = []
             for quantity in ("psnr", "ef_psnr"):
                 passed = seconds_to(row, quantity, getattr(paper, quantity))
-                cells += (
-                    ["never", ""] if math.isnan(passed) else [seconds(passed), f"{paper.core_seconds / passed:.2g}"]
-                )
+                cells += ["never", ""] if math.isnan(passed) else [seconds(passed), count(paper.core_seconds / passed)]
             cells += [seconds(row.core_seconds), signed(row.psnr - paper.psnr), signed(row.ef_psnr - paper.ef_psnr)]
             lines.append([row.method, *cells])
     text = (
