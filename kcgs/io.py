@@ -165,7 +165,7 @@ def _load_compressed(path: Path) -> Scene:
     if decoded.layers < decoded.num_layers:
         raise ValueError(
             f"cannot load {path}: it ends early, with {decoded.layers} of {decoded.num_layers} layers; "
-            "kcgs.codec.decode draws what is there"
+            "kcgs decode draws what is there"
         )
     return Scene(decoded.field, decoded.regions, {})
 

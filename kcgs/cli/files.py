@@ -33,7 +33,9 @@ def encode_command(
 ) -> None:
     """Compress a scene."""
     from kcgs.codec import decode, encode
+    from kcgs.functional import psnr
     from kcgs.io import load
+    from kcgs.nn.renderer import render_image
 
     check_output(output, ".kcgs")
     loaded = load(scene)
@@ -50,7 +52,9 @@ def encode_command(
     write_file(output, data)
     decoded = decode(data)
     height, width = decoded.field.size
+    shown = render_image(decoded.field, decoded.regions)
     report = {
+        "psnr_to_scene": float(psnr(shown, render_image(loaded.field, loaded.regions))),
         "num_gaussians": len(decoded.field),
         "regions": 1 if decoded.regions is None else decoded.regions.num_regions,
         "layers": decoded.num_layers,

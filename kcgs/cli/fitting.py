@@ -120,6 +120,7 @@ def measure_scene(
     return {
         **measure(drawn, picture, labels),
         "num_gaussians": len(field),
+        "regions": 1 if regions is None else regions.num_regions,
         "seconds": seconds,
         "bytes": written,
         "bits_per_pixel": 8 * written / (height * width),

@@ -123,12 +123,13 @@ def unpack(data: bytes) -> tuple[Header, bytes, list[bytes]]:
 
 
 def _read_layers(stream: ByteReader, header: Header) -> Iterator[bytes]:
-    for energy, length in header.layers:
+    for number, (_, length) in enumerate(header.layers, 1):
         if stream.at + length + _CRC_OF_LAYER > len(stream.data):
             return
         layer = stream.take(length)
         if binascii.crc_hqx(layer, 0) != int.from_bytes(stream.take(_CRC_OF_LAYER), "big"):
-            raise CodecError(f"the file is damaged: the checksum of its layer of energy {energy} is another")
+            sound = f"; its first {stream.at - length - _CRC_OF_LAYER} bytes are sound" if number > 1 else ""
+            raise CodecError(f"the file is damaged: the checksum of its layer {number} is another{sound}")
         yield layer
     if stream.at != len(stream.data):
         raise CodecError(f"the file must end after {stream.at} bytes; got {len(stream.data)}")
@@ -147,7 +148,7 @@ def _read_header(stream: ByteReader) -> tuple[Header, int]:
     if regions > 1:
         if size[0] * size[1] > MOST_LABELS:
             raise CodecError(f"a picture with regions must have at most {MOST_LABELS} pixels; got {size}")
-        length = stream.varint("length of the map", 1, len(stream.data))
+        length = stream.varint("length of the map", 1, 1 << 32)  # bytes that are not there end the file early
     count = stream.varint("layers", 1, ENERGIES[1] - ENERGIES[0] + 1)
     layers, energy = [], ENERGIES[1]
     for i in range(count):
