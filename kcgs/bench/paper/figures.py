@@ -38,6 +38,8 @@ def plot_against_n(path: Path, rows: Sequence[Row], methods: Sequence[str]) -> N
 
 def plot_against_bits(path: Path, rows: Sequence[Row], methods: Sequence[str]) -> None:
     """Draw PSNR and EF-PSNR of the decoded files against their bits per pixel."""
+    from matplotlib.ticker import LogLocator
+
     plot, axes = figure(1, 2, width=9.0, height=4.2)
     for axis, quantity in zip(axes, ("decoded_psnr", "decoded_ef_psnr"), strict=True):
         for index, name in enumerate(methods):
@@ -45,9 +47,9 @@ def plot_against_bits(path: Path, rows: Sequence[Row], methods: Sequence[str]) -
             axis.plot(*_columns(points), color=COLORS[index], marker=_MARKERS[index], markersize=4.5, label=name)
         axis.set(xlabel="bits per pixel of the .kcgs file", xscale="log")
         axis.set_ylabel(_AXES[quantity.removeprefix("decoded_")] + ", decoded")
+        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.xaxis.set_major_formatter("{x:g}")
-        axis.xaxis.set_minor_formatter("{x:.2g}")
-        axis.tick_params(axis="x", which="both", labelsize=7)
+        axis.xaxis.set_minor_formatter("")
     _legend_below(plot, axes[0])
     save_figure(plot, path)
 
