@@ -168,7 +168,7 @@ def ensure(specs: Iterable[Spec], folder: Path, *, engine: str = "local", worker
         RuntimeError: fits failed; the others are in the folder. The message names them.
 
     Example:
-        >>> import tempfile
+        >>> import tempfile, torch
         >>> config = FitConfig.from_recipe("paper", iterations=5)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     first, again = (ensure([Spec(torch.zeros(3, 16, 24), None, 4, config)], Path(folder)) for _ in "12")

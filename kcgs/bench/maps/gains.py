@@ -61,7 +61,7 @@ def interval(values: Sequence[float]) -> tuple[float, float]:
     low, high = np.percentile(drawn.mean(axis=1), (2.5, 97.5))
     if count == 1:
         return float(low), float(high)
-    wider = stats.t.ppf(0.975, count - 1) / stats.norm.ppf(0.975) * math.sqrt(count / (count - 1))
+    wider = float(stats.t.ppf(0.975, count - 1) / stats.norm.ppf(0.975)) * math.sqrt(count / (count - 1))
     return centre + wider * float(low - centre), centre + wider * float(high - centre)
 
 
