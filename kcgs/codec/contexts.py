@@ -32,8 +32,6 @@ within 32 to 65504, and n grows by 1, to 40 at most.
 
 from __future__ import annotations
 
-import hashlib
-import logging
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -42,9 +40,10 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 from numba import njit
 
+from kcgs.kernels.compiled import compile_kept, count_compiled, say
+
 from .prior import HIDDEN, LATENT, TEMPLATE, load_prior
 
-log = logging.getLogger("kcgs")
 T = TypeVar("T")
 
 LEFT, RIGHT, TOP = 8, 9, 6  # margins around the map
@@ -225,23 +224,9 @@ def compiled(name: str, compiler: Callable[[str, bool], T], rehearse: Callable[[
         rehearse: calls each of them once, for it is then that they compile.
         sources: files that they are in, besides this one.
     """
-    start, digest = time.perf_counter(), hashlib.sha256()
-    for source in ("contexts.py", "prior.py", "prior.bin", *sources):
-        digest.update((Path(__file__).parent / source).read_bytes())
-    try:
-        loops = compiler(digest.hexdigest(), True)
-    except RuntimeError:  # numba finds no folder that it may write to
-        log.warning("kcgs: no folder to keep the compiled codec in; set NUMBA_CACHE_DIR to one")
-        loops = compiler(digest.hexdigest(), False)
+    start, folder = time.perf_counter(), Path(__file__).parent
+    kept = [folder / source for source in ("contexts.py", "prior.py", "prior.bin", *sources)]
+    loops = compile_kept("codec", compiler, kept)
     rehearse(loops)
-    made = any(len(loop.overloads) > sum(loop.stats.cache_hits.values()) for loop in cast(Any, loops))
-    kept = all(loop.stats.cache_path for loop in cast(Any, loops))
-    log.log(
-        logging.WARNING if made else logging.INFO,
-        "kcgs: %s %s in %.1f s%s",
-        "compiled" if made else "loaded",
-        name,
-        time.perf_counter() - start,
-        ", kept on disk for next time" if made and kept else "",
-    )
+    say(name, start, count_compiled(loops) > 0, loops)
     return loops

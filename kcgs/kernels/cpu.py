@@ -6,20 +6,19 @@ float32 only. The first call compiles (seconds, once a machine and number of cha
 from __future__ import annotations
 
 import functools
-import hashlib
-import logging
 import math
 import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from .compiled import compile_kept, count_compiled, say
 from .form import lowest_exponent, support_radius
 from .function import Gradients, Steps, apply_kernel
 from .inputs import SplatInputs
@@ -29,8 +28,6 @@ from .strips import SIDE, Loops, Scene, compile_loops
 # fewer (Gaussian, band) entries than this are drawn by the calling thread: waking another costs as much
 _SERIAL_ENTRIES = 200
 _SOURCES = ("form.py", "simd.py", "lanes.py", "strips.py")
-
-log = logging.getLogger("kcgs")
 
 
 class _Plan(NamedTuple):
@@ -50,40 +47,21 @@ def splat(inputs: SplatInputs) -> Tensor:
 
 @functools.cache
 def _loops() -> Loops:
-    digest = hashlib.sha256()
-    for name in _SOURCES:
-        digest.update((Path(__file__).parent / name).read_bytes())
-    try:
-        return compile_loops(digest.hexdigest(), cache=True)
-    except RuntimeError:  # numba finds no folder that it may write to
-        log.warning("kcgs: no folder to keep the compiled CPU kernel in; set NUMBA_CACHE_DIR to one")
-        return compile_loops(digest.hexdigest(), cache=False)
-
-
-def _compiled() -> int:
-    return sum(len(loop.overloads) - sum(loop.stats.cache_hits.values()) for loop in cast(Any, _loops()))
+    return compile_kept("CPU kernel", compile_loops, [Path(__file__).parent / name for name in _SOURCES])
 
 
 @functools.cache
 def _prepare(tag: tuple[float, ...]) -> None:
     """Compile the loops for this number of channels, or load them from disk, and say how long it took."""
-    start, before = time.perf_counter(), _compiled()
+    start, before = time.perf_counter(), count_compiled(_loops())
     channels = len(tag)
     inputs = SplatInputs(
         torch.full((1, 1, 2), 8.0), torch.ones(1, 1, 3), torch.ones(1, 1, channels), None, None, (16, 16), 1e-4
     )
     planned = plan(inputs)
     differentiate(planned, inputs, render(planned, inputs), geometry=True)
-    compiled = _compiled() > before
-    kept = all(loop.stats.cache_path for loop in cast(Any, _loops()))
-    log.log(
-        logging.WARNING if compiled else logging.INFO,
-        "kcgs: %s the CPU kernel for %d channels in %.1f s%s",
-        "compiled" if compiled else "loaded",
-        channels,
-        time.perf_counter() - start,
-        ", kept on disk for next time" if compiled and kept else "",
-    )
+    made = count_compiled(_loops()) > before
+    say(f"the CPU kernel for {channels} channels", start, made, _loops())
 
 
 def _tag(channels: int) -> tuple[float, ...]:

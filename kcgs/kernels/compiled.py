@@ -1,0 +1,49 @@
+"""What compiled loops have in common: where they are kept, and the one line that says how long they took."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+log = logging.getLogger("kcgs")
+T = TypeVar("T")
+
+
+def compile_kept(name: str, compiler: Callable[[str, bool], T], sources: Iterable[Path]) -> T:
+    """Return what a compiler makes, kept on disk by what is in the sources, or in memory where no folder takes it.
+
+    Args:
+        name: of what the loops do.
+        compiler: makes them of a fingerprint, and of whether to keep them on disk.
+        sources: files that they are in.
+    """
+    digest = hashlib.sha256()
+    for source in sources:
+        digest.update(source.read_bytes())
+    try:
+        return compiler(digest.hexdigest(), True)
+    except RuntimeError:  # numba finds no folder that it may write to
+        log.warning("kcgs: no folder to keep the compiled %s in; set NUMBA_CACHE_DIR to one", name)
+        return compiler(digest.hexdigest(), False)
+
+
+def count_compiled(loops: Any) -> int:
+    """Return how many of the loops' forms were compiled, not read from disk."""
+    return sum(len(loop.overloads) - sum(loop.stats.cache_hits.values()) for loop in loops)
+
+
+def say(what: str, start: float, made: bool, loops: Any) -> None:
+    """Write one line: that loops were compiled, or loaded, since `start`, by `time.perf_counter`."""
+    kept = all(loop.stats.cache_path for loop in loops)
+    log.log(
+        logging.WARNING if made else logging.INFO,
+        "kcgs: %s %s in %.1f s%s",
+        "compiled" if made else "loaded",
+        what,
+        time.perf_counter() - start,
+        ", kept on disk for next time" if made and kept else "",
+    )
