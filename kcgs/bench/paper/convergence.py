@@ -33,11 +33,11 @@ _SPEED_TEXT = """All fits ran on the same kernel, on one thread. Seconds are tho
 time at which a fit had a quality, times the share of a processor that the whole fit had, so that what else the machine
 did is not in them; the start of a fit is, compilation is not. *Never*: the fit ends below. `paper` dips where it reads
 the regions' ids anew."""
-_PEER_TEXT = """JPEG, WebP and AVIF (Pillow) at the largest quality whose file is not above the bytes of the `.kcgs`
-file of `best`; SIREN: three hidden layers with sines, weights at half precision and nothing else counted, the widest
-that these bytes hold, Adam on random pixels for the seconds shown. The Gaussian rows are decoded files, that of
-`best-baseline` with as many Gaussians as make as many bytes, or up to 6 % more. The peers were given no contours;
-figures in the band are taken at the same contours."""
+_PEER_TEXT = """JPEG, WebP and AVIF, also tuned for PSNR (Pillow, best effort): the largest file that is not above
+the bytes of the `.kcgs` file of `best`, s that of this one file; SIREN: three hidden layers with sines, weights at
+half precision and nothing else counted, the widest that these bytes hold, Adam on random pixels for the seconds
+shown. The Gaussian rows are decoded files, that of `best-baseline` with as many Gaussians as make as many bytes, or
+up to 6 % more. The peers were given no contours; figures in the band are taken at the same contours."""
 
 
 def run(output: Path, options: Options) -> None:

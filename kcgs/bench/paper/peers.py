@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import time
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from PIL import Image, features
 from torch import Tensor
 
 from kcgs._atomic import atomic_path
 from kcgs.bench.measure import measure
+from kcgs.bench.rate.codecs import largest, open_file, present
 
 from . import siren
 
-CODECS = {"JPEG": ("JPEG", "jpg"), "WebP": ("WEBP", "webp"), "AVIF": ("AVIF", "avif")}
 GAUSSIAN_TOOLS_TEXT = """No other tool that fits 2D Gaussians to pictures is in the table. The registry's list has
 `gsplat`, which draws on CUDA only; GaussianImage and Image-GS are not on it, and their code needs CUDA. `splatthis`
 0.3.2, which writes splats as SVG, does run on a processor: told to make 1,250 of a DAVIS frame in its profile `fast`,
@@ -42,28 +37,16 @@ class Peer:
 
 
 def codecs(image: Tensor, labels: Tensor, size: int) -> list[Peer]:
-    """Encode with every codec that Pillow has, at the largest quality whose file is not above `size` bytes."""
-    return [codec(name, image, labels, size) for name, (_, key) in CODECS.items() if features.check(key)]
+    """Encode with every codec that Pillow has, at its best effort, into the largest file of at most `size` bytes."""
+    return [codec(name, image, labels, size) for name in present()]
 
 
 def codec(name: str, image: Tensor, labels: Tensor, size: int) -> Peer:
     """Encode with one codec; where even its smallest file is larger, that one, and a note says so."""
-    start = time.perf_counter()
-    low, high, best = 1, 100, b""
-    while low <= high:  # sizes rise with quality
-        quality = (low + high) // 2
-        data = _encode(name, image, quality)
-        if len(data) <= size:
-            best, low = data, quality + 1
-        else:
-            high = quality - 1
-    note = "" if best else "its smallest file is larger"
-    best = best or _encode(name, image, 0)
-    seconds = time.perf_counter() - start
-    with Image.open(BytesIO(best)) as file:
-        pixels = np.asarray(file.convert("RGB"))
-    picture = torch.from_numpy(pixels.copy()).permute(2, 0, 1).float() / 255
-    return _measured(picture, image, labels, name=name, bytes=len(best), seconds=seconds, note=note)
+    coded = largest(name, image, size)
+    note = "its smallest file is larger" if len(coded.data) > size else ""
+    told = {"name": name, "bytes": len(coded.data), "seconds": coded.seconds, "note": note}
+    return _measured(open_file(coded.data), image, labels, **told)
 
 
 def network(image: Tensor, labels: Tensor, size: int, seconds: float) -> Peer:
@@ -99,11 +82,3 @@ def _measured(picture: Tensor, image: Tensor, labels: Tensor, **told: Any) -> Pe
     figures = measure(picture, image, labels)
     shown: dict[str, Any] = {key: figures[key] for key in ("psnr", "ms_ssim", "ef_psnr", "ef_ssim")}
     return Peer(**shown, **told)
-
-
-def _encode(name: str, image: Tensor, quality: int) -> bytes:
-    levels = (image.clamp(0, 1) * 255 + 0.5).floor().to(torch.uint8).permute(1, 2, 0).numpy()
-    file, (codec_name, key) = BytesIO(), CODECS[name]
-    effort: dict[str, dict[str, Any]] = {"jpg": {"optimize": True}, "webp": {"method": 6}, "avif": {"speed": 4}}
-    Image.fromarray(np.ascontiguousarray(levels)).save(file, codec_name, quality=quality, **effort[key])
-    return file.getvalue()
