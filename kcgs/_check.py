@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
@@ -60,6 +64,38 @@ def check_ids(name: str, value: object, like: Tensor) -> Tensor:
     return tensor
 
 
+def check_count(name: str, value: object, least: int = 1, most: int | None = None) -> int:
+    """Return `value` if it is an integer (not a bool) of at least `least` and at most `most`."""
+    if isinstance(value, bool) or not hasattr(value, "__index__"):
+        raise TypeError(f"{name} must be an integer; got {value!r}")
+    count = operator.index(value)
+    if count < least or (most is not None and count > most):
+        allowed = f"at least {least}" if most is None else f"in [{least}, {most}]"
+        raise ValueError(f"{name} must be {allowed}; got {count}")
+    return count
+
+
+def check_number(
+    name: str, value: object, low: float = -math.inf, high: float = math.inf, *, unit: str = "", above: bool = False
+) -> float:
+    """Return `value` if it is a finite number (not a bool) in [low, high]; with `above`, in (low, high]."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise TypeError(f"{name} must be a number{unit and ' of ' + unit}; got {value!r}")
+    number = float(value)
+    inside = low < number <= high if above else low <= number <= high
+    if not (inside and math.isfinite(number)):
+        raise ValueError(f"{name} must be {_range(low, high, above)}{unit and ' ' + unit}; got {value!r}")
+    return number
+
+
+def _range(low: float, high: float, above: bool) -> str:
+    if high < math.inf:
+        return f"in {'(' if above else '['}{low:g}, {high:g}]"
+    if low == -math.inf:
+        return "finite"
+    return f"finite and {'above' if above else 'at least'} {low:g}"
+
+
 def check_cutoff(value: object) -> float:
     """Return the cutoff if it is a number in [0, 1)."""
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -99,3 +135,52 @@ def check_image(name: str, value: object) -> Tensor:
     if tensor.numel() == 0:
         raise ValueError(f"{name} must not be empty; got shape {tuple(tensor.shape)}")
     return tensor
+
+
+def as_image(name: str, value: object) -> Tensor:
+    """Return an image as one tensor (C, H, W) in [0, 1]: what a Tensor, an array or a PIL image shows.
+
+    Taken are a Tensor (C, H, W) or (1, C, H, W), a numpy array (H, W, C) or (H, W) of uint8, uint16 or floats in [0,
+    1], and a PIL image, whose palette is resolved and whose transparent pixels are composed on white.
+    """
+    if isinstance(value, np.ndarray):
+        image = _from_array(name, value)
+    elif hasattr(value, "getbands") and hasattr(value, "convert"):  # PIL, which need not be imported for this
+        image = _from_array(name, _pil_array(value))
+    elif isinstance(value, Tensor):
+        image = check_image(name, value)
+    else:
+        raise TypeError(f"{name} must be a Tensor, a numpy array or a PIL image; got {type(value).__name__}")
+    if image.ndim == 4:
+        if image.shape[0] != 1:
+            raise ValueError(f"{name} must be one image, (C, H, W) or (1, C, H, W); got {tuple(image.shape)}")
+        image = image[0]
+    check_image(name, image)
+    low, high = float(image.min()), float(image.max())
+    if low < 0 or high > 1:
+        raise ValueError(f"{name} must be in [0, 1]; got [{low:g}, {high:g}]")
+    return image
+
+
+def _from_array(name: str, array: NDArray[Any]) -> Tensor:
+    if array.ndim == 2:
+        array = array[..., None]
+    if array.ndim != 3 or array.shape[-1] > 4:
+        raise ValueError(f"{name} must be an array (H, W) or (H, W, C) with 1 to 4 channels; got shape {array.shape}")
+    if array.dtype in (np.uint8, np.uint16):
+        array = array.astype(np.float32) / np.float32(np.iinfo(array.dtype).max)
+    elif array.dtype not in (np.float32, np.float64):
+        raise TypeError(f"{name} must hold uint8, uint16, float32 or float64; got {array.dtype}")
+    return torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))
+
+
+def _pil_array(image: Any) -> NDArray[Any]:
+    if image.mode.startswith("I;16"):
+        return np.asarray(image, dtype=np.uint16)
+    if image.mode in ("1", "L"):
+        return np.asarray(image.convert("L"))
+    if "A" not in image.mode and "transparency" not in image.info:
+        return np.asarray(image.convert("RGB"))
+    pixels = np.asarray(image.convert("RGBA"), dtype=np.float32) / np.float32(255)
+    color, alpha = pixels[..., :3], pixels[..., 3:]
+    return np.clip(color * alpha + (1 - alpha), 0, 1)

@@ -1,0 +1,66 @@
+"""Checks that public functions share."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from kcgs._check import as_image, check_count, check_number
+
+
+class TestCheckCount:
+    @pytest.mark.parametrize("value", [True, 2.0, "2", None])
+    def test_refuses_what_is_no_integer(self, value: object) -> None:
+        with pytest.raises(TypeError, match="steps must be an integer; got "):
+            check_count("steps", value)
+
+    def test_range(self) -> None:
+        assert check_count("steps", np.int64(3)) == 3
+        with pytest.raises(ValueError, match="steps must be at least 1; got 0"):
+            check_count("steps", 0)
+        with pytest.raises(ValueError, match=r"steps must be in \[2, 16\]; got 17"):
+            check_count("steps", 17, 2, 16)
+
+
+class TestCheckNumber:
+    def test_range(self) -> None:
+        assert check_number("sigma", np.float32(0.5), 0, 8) == 0.5
+        with pytest.raises(ValueError, match=r"sigma must be in \(0, 8\] pixels; got 0.0"):
+            check_number("sigma", 0.0, 0, 8, unit="pixels", above=True)
+        with pytest.raises(ValueError, match="cost must be finite and at least 0; got nan"):
+            check_number("cost", float("nan"), 0)
+        with pytest.raises(TypeError, match="sigma must be a number of pixels; got True"):
+            check_number("sigma", True, unit="pixels")
+
+
+class TestAsImage:
+    def test_all_kinds_are_one_image(self) -> None:
+        levels = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
+        expected = torch.from_numpy(levels).permute(2, 0, 1).float() / 255
+        for image in (expected, expected[None], levels, levels.astype(np.float32) / 255, Image.fromarray(levels)):
+            assert torch.equal(as_image("image", image), expected)
+
+    def test_grey_deep_and_palette(self) -> None:
+        grey = np.arange(35, dtype=np.uint8).reshape(5, 7)
+        assert as_image("image", grey).shape == as_image("image", Image.fromarray(grey)).shape == (1, 5, 7)
+        assert float(as_image("image", np.full((5, 7), 65535, np.uint16)).min()) == 1.0
+        palette = Image.fromarray(grey).convert("P")
+        assert torch.equal(as_image("image", palette)[:1], as_image("image", grey))
+
+    def test_transparent_pixels_are_composed_on_white(self) -> None:
+        image = Image.new("RGBA", (4, 3), (0, 0, 0, 0))
+        assert bool((as_image("image", image) == 1.0).all())
+
+    def test_refuses(self) -> None:
+        with pytest.raises(ValueError, match=r"image must be in \[0, 1\]; got \[0, 2\]"):
+            as_image("image", torch.tensor([[[0.0, 2.0]]]))
+        with pytest.raises(TypeError, match="uint8, uint16, float32 or float64; got int64"):
+            as_image("image", np.zeros((3, 4, 3), np.int64))
+        with pytest.raises(ValueError, match="1 to 4 channels"):
+            as_image("image", np.zeros((3, 4, 5), np.float32))
+        with pytest.raises(ValueError, match="must be one image"):
+            as_image("image", torch.zeros(2, 3, 4, 4))
+        with pytest.raises(TypeError, match="a Tensor, a numpy array or a PIL image; got str"):
+            as_image("image", "photo.jpg")
