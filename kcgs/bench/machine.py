@@ -1,4 +1,4 @@
-"""What a report says of where it was made."""
+"""The machine that a report was made on."""
 
 from __future__ import annotations
 

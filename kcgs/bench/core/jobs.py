@@ -1,0 +1,85 @@
+"""Work that takes long: many jobs here or on other processors, with a progress bar on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple, TypeVar
+
+from rich.console import Console
+from rich.progress import Progress
+
+from kcgs.engine import run_jobs
+
+Job = TypeVar("Job")
+
+
+class Place(NamedTuple):
+    """Where fits are made: the options --engine and --workers. A fit has one thread: all places give the same."""
+
+    engine: str = "local"
+    workers: int | None = None
+
+    @property
+    def is_local(self) -> bool:
+        """Whether fits run one after another in this process."""
+        return self.engine == "local" and self.workers in (None, 1)
+
+    def __str__(self) -> str:
+        if self.is_local:
+            return "one at a time on one thread"
+        count = "as many as there are processors for" if self.workers is None else f"{self.workers}"
+        return f"{count} at a time on one thread each, engine {self.engine}"
+
+
+def make_all(
+    function: Callable[[Job], object], jobs: Sequence[Job], place: Place, *, name: Callable[[Job], str] = str
+) -> list[str]:
+    """Do jobs that keep what they make on disk themselves.
+
+    Args:
+        function: called with one job; importable by name, or a method of what can be pickled, in other processes.
+        jobs: what it is called with.
+        place: where.
+        name: what a job is called on the terminal, and where it fails.
+
+    Returns:
+        What failed, one line each; see `check_made`.
+    """
+    failed: list[str] = []
+    with _progress() as progress:
+        task = progress.add_task(name(jobs[0]) if jobs else "", total=len(jobs))
+        for number, ended in enumerate(run_jobs(function, jobs, engine=place.engine, workers=place.workers), 1):
+            if ended.error is not None:
+                failed.append(f"{name(jobs[ended.index])}: {ended.error}")
+            # in this process the next job is the one that runs
+            shown = min(number, len(jobs) - 1) if place.is_local else ended.index
+            progress.update(task, advance=1, description=name(jobs[shown]))
+    return failed
+
+
+def check_made(failed: Sequence[str]) -> None:
+    """Raise once all that could be done is done.
+
+    Args:
+        failed: what `make_all` returned.
+
+    Raises:
+        RuntimeError: a job failed; the message names all of them.
+    """
+    if failed:
+        raise RuntimeError(f"fits failed, {len(failed)} of them: {'; '.join(failed)}")
+
+
+def with_progress(steps: Sequence[tuple[str, Job]]) -> Iterator[Job]:
+    """Yield the second of each pair, with the first beside a bar."""
+    with _progress() as progress:
+        task = progress.add_task("", total=len(steps))
+        for name, step in steps:
+            progress.update(task, description=name)
+            yield step
+            progress.advance(task)
+
+
+def _progress() -> Progress:
+    console = Console(stderr=True)
+    return Progress(console=console, disable=not console.is_terminal)

@@ -1,0 +1,58 @@
+"""The options of an experiment."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from .jobs import Place
+
+
+class Options(NamedTuple):
+    """Options of all experiments; each says which it takes."""
+
+    data: Path | None = None
+    quick: bool = False
+    only: str | None = None
+    """Names of groups with commas between them; None: all."""
+    engine: str = "local"
+    workers: int | None = None
+    sequences: str | None = None
+    """Names with commas between them; None: all."""
+    budget_seconds: float | None = None
+    """For fits; None: all are made."""
+    seeds: int = 1
+    iterations: int | None = None
+    """Of the published recipes; None: the experiment's choice."""
+    runs: Path | None = None
+    """Folder of the fits; None: runs, in the output."""
+
+    @property
+    def place(self) -> Place:
+        """Where fits are made."""
+        return Place(self.engine, self.workers)
+
+    def deadline(self) -> float | None:
+        """Return the moment when no further fit is to begin, by the monotonic clock; None: never."""
+        return None if self.budget_seconds is None else time.monotonic() + self.budget_seconds
+
+    def check(self) -> None:
+        """Refuse numbers out of range.
+
+        Raises:
+            ValueError: one is.
+        """
+        for name in ("budget_seconds", "seeds", "iterations"):
+            value = getattr(self, name)
+            if value is not None and value <= 0:
+                raise ValueError(f"{name} must be above 0; got {value}")
+
+    def command(self, name: str) -> str:
+        """Write the command of an experiment, without the folders of whoever ran it."""
+        parts = [f"kcgs bench {name} -o DIR"]
+        for field, value in self._asdict().items():
+            if value != self._field_defaults[field]:
+                shown = "" if value is True else " DIR" if isinstance(value, Path) else f" {value}"
+                parts.append(f"--{field.replace('_', '-')}{shown}")
+        return " ".join(parts)

@@ -1,0 +1,91 @@
+"""Experiments by name: each is a module of `kcgs.bench` whose `run` has the decorator `experiment`.
+
+Modules whose name begins with an underscore help one of them.
+"""
+
+from __future__ import annotations
+
+import pkgutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from . import report as reports
+from .options import Options
+
+_PACKAGE = __package__.rpartition(".")[0]
+_ALWAYS = ("data", "quick")
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An experiment.
+
+    Args:
+        function: measures; called with the folder of the report, which is there, and the options.
+        takes: names of the options that it takes besides data and quick.
+        report: writes the report from the files in the folder; None: there is none.
+    """
+
+    function: Callable[[Path, Options], None]
+    takes: tuple[str, ...] = ()
+    report: reports.Report | None = None
+
+    def __call__(self, output: Path, options: Options) -> None:
+        """Measure."""
+        self.function(output, options)
+
+
+def experiment(
+    *takes: str, report: reports.Report | None = None
+) -> Callable[[Callable[[Path, Options], None]], Experiment]:
+    """Make a function the experiment that its module is named after.
+
+    Args:
+        takes: options besides data and quick, by name.
+        report: function (folder, how it was made) -> parts of report.md, the title first; it reads results.csv.
+    """
+    return lambda function: Experiment(function, takes, report)
+
+
+def available_experiments() -> tuple[str, ...]:
+    """Names that `kcgs bench` takes."""
+    modules = pkgutil.iter_modules(import_module(_PACKAGE).__path__)
+    return tuple(module.name for module in modules if module.name != "core" and not module.name.startswith("_"))
+
+
+def run(name: str, output: Path, *, redraw: bool = False, **settings: Any) -> None:
+    """Run an experiment and write its report into a folder.
+
+    Args:
+        name: of the experiment.
+        output: folder, which is made if it is not there.
+        redraw: measure nothing: write the report of an earlier run again from the results in the folder.
+        settings: fields of :class:`kcgs.bench.core.options.Options`; None: not given.
+
+    Raises:
+        ValueError: unknown name, an option that the experiment does not take, `redraw` for one without a report.
+        OSError: the folder cannot be made, or holds no results to redraw.
+    """
+    if name not in available_experiments():
+        raise ValueError(f"name must be one of {', '.join(available_experiments())}; got {name!r}")
+    found: Experiment = import_module(f"{_PACKAGE}.{name}").run
+    options = Options(**{key: value for key, value in settings.items() if value is not None})
+    changed = [key for key, value in options._asdict().items() if value != options._field_defaults[key]]
+    refused = [key for key in changed if key not in (*_ALWAYS, *found.takes)]
+    if refused:
+        takes = ", ".join((*_ALWAYS, *found.takes))
+        raise ValueError(f"{name} does not take {', '.join(refused)}; its options are {takes}")
+    if redraw:
+        if found.report is None:
+            raise ValueError(f"redraw is for experiments with a report; {name} has none")
+        reports.redraw(found.report, output)
+    else:
+        output.mkdir(parents=True, exist_ok=True)
+        found(output, options)
+    if found.report is not None:
+        from rich.console import Console
+
+        Console().print(f"{output}/report.md")

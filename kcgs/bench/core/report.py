@@ -1,0 +1,70 @@
+"""A report: what is written of results, below how and where they were made.
+
+Results are files in the report's folder (results.csv), and so is how they were made (made.json). A report is written
+from these files alone, when it is made and whenever it is made again.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from kcgs._atomic import atomic_path
+
+from .machine import describe
+
+QUICK_TEXT = "The short form, small images and few iterations: the numbers only show that all of it runs."
+
+
+class Made(NamedTuple):
+    """How results were made."""
+
+    command: str
+    quick: bool = False
+    machine: tuple[str, ...] = ()
+    """Lines below the command: processor, versions, where fits ran."""
+    notes: tuple[str, ...] = ()
+    """What a reader must know of this run: what is missing, and why."""
+
+
+# from the folder of the results to the report's parts, the title first
+Report = Callable[[Path, Made], Sequence[str]]
+
+
+def conclude(report: Report, output: Path, made: Made) -> None:
+    """Write down how results were made on this machine, and their report.
+
+    Args:
+        report: of the experiment.
+        output: folder with the results.
+        made: its machine is described here; lines that it has already follow.
+    """
+    made = made._replace(machine=(*describe(), *made.machine))
+    with atomic_path(output / "made.json") as temporary:
+        temporary.write_text(json.dumps(made._asdict(), indent=1) + "\n", encoding="utf-8")
+    redraw(report, output)
+
+
+def redraw(report: Report, output: Path) -> None:
+    """Write report.md and its figures from the files of an earlier run.
+
+    Args:
+        report: of the experiment.
+        output: folder with made.json and the results.
+
+    Raises:
+        FileNotFoundError: the folder has no made.json.
+    """
+    fields = json.loads((output / "made.json").read_text(encoding="utf-8"))
+    made = Made(**{**fields, "machine": tuple(fields["machine"]), "notes": tuple(fields["notes"])})
+    title, *parts = report(output, made)
+    head = [title, f"Made by `{made.command}`.", _listed(made.machine), QUICK_TEXT if made.quick else ""]
+    with atomic_path(output / "report.md") as temporary:
+        text = "\n\n".join(part for part in [*head, _listed(made.notes), *parts] if part)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def _listed(lines: Sequence[str]) -> str:
+    return "\n".join(f"- {line}" for line in lines)

@@ -1,0 +1,36 @@
+"""Tables in Markdown, and numbers as reports write them: what is not a number is an empty cell."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+
+def markdown(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """Lay out a table."""
+    return "\n".join("| " + " | ".join(row) + " |" for row in [header, ["---"] * len(header), *lines])
+
+
+def db(value: float) -> str:
+    """Write decibels."""
+    return "" if math.isnan(value) else f"{value:.2f}"
+
+
+def signed(value: float) -> str:
+    """Write a difference of decibels."""
+    return "" if math.isnan(value) else f"{round(value, 2) + 0.0:+.2f}"  # no -0.00
+
+
+def similarity(value: float) -> str:
+    """Write an SSIM."""
+    return "" if math.isnan(value) else f"{value:.4f}"
+
+
+def seconds(value: float) -> str:
+    """Write a wall time."""
+    return "" if math.isnan(value) else f"{value:.2g}" if value < 10 else f"{value:.0f}"
+
+
+def count(value: float) -> str:
+    """Write a whole number."""
+    return "" if math.isnan(value) else f"{value:,.0f}"
