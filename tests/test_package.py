@@ -17,7 +17,7 @@ ROOT = Path(kcgs.__file__).resolve().parent.parent
 # lower imports nothing higher; a folder may import itself and anything to its right
 LAYERS = [
     {"cli", "bench", "view"},
-    {"segment"},
+    {"rate", "segment"},
     {"fit", "io", "onnx", "data", "zoo"},
     {"codec"},
     {"nn"},

@@ -10,27 +10,12 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from kcgs.codec import QUALITIES, encode
+from kcgs.codec import encode
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
+from kcgs.rate import quality_for
 
 GAUSSIAN_BYTES = 7
-# dB of a file's picture against the scene's own above the scene's PSNR: the error grows by about a 28th, 0.15 dB,
-# and by more where so few Gaussians are rounded that errors do not average out
-MARGIN = 14.5
-
-
-def quality_for(psnr: float) -> float:
-    """Return the `quality` of a file that is nearly as good as its scene.
-
-    Args:
-        psnr: of the scene's picture, in dB.
-
-    Example:
-        >>> quality_for(30.0), quality_for(100.0)
-        (44.5, 90.0)
-    """
-    return min(max(psnr + MARGIN, QUALITIES[0]), QUALITIES[1])
 
 
 def write_scene(field: GaussianField, regions: RegionMap | None, psnr: float) -> bytes:

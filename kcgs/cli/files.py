@@ -25,10 +25,6 @@ def encode_command(
         Path | None,
         typer.Option(help="The image that the scene shows: Gaussians then make up for each other's rounding."),
     ] = None,
-    contour_rate: Annotated[
-        float,
-        typer.Option(min=0.0, help="Straighten contours where a bit saved is worth so many changed pixels; 0: exact."),
-    ] = 0.0,
     as_json: Json = False,
 ) -> None:
     """Compress a scene."""
@@ -41,12 +37,10 @@ def encode_command(
     loaded = load(scene)
     goal: dict[str, Any] = {"quality": quality, "target_bytes": target_bytes}
     if image is None:
-        data = encode(loaded.field, loaded.regions, contour_rate=contour_rate, **goal)
+        data = encode(loaded.field, loaded.regions, **goal)
     else:
-        if contour_rate:
-            raise typer.BadParameter("--contour-rate is for files made without --image")
         from kcgs.data import load_image
-        from kcgs.fit import compress
+        from kcgs.rate import compress
 
         data = compress(loaded.field, load_image(image), loaded.regions, **goal)
     write_file(output, data)

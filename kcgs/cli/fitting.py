@@ -44,10 +44,10 @@ def fit_into(
     notes: Mapping[str, str] | None = None,
 ) -> Fitted:
     """Fit, and write the scene, with notes in it, or the compressed file, as the suffix says."""
-    from kcgs.bench.sizes import quality_for
     from kcgs.codec import decode
-    from kcgs.fit import compress, fit, fit_bytes
+    from kcgs.fit import fit
     from kcgs.io import save
+    from kcgs.rate import compress, fit_bytes, quality_for
 
     if target_bytes is not None:
         done = fit_bytes(picture, labels, target_bytes, seed=seed, config=config, on_step=on_step)

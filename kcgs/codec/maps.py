@@ -60,15 +60,6 @@ def encode_map(regions: RegionMap) -> bytes:
     return head + writer.finish()
 
 
-def smooth_map(regions: RegionMap, rate: float) -> RegionMap:
-    """Straighten contours where a bit that is saved is worth `rate` pixels that change hands; all regions stay."""
-    from .smooth import smooth_labels
-
-    fine = regions.labels if regions.fine_labels is None else regions.fine_labels
-    smoothed = torch.from_numpy(smooth_labels(fine.cpu().numpy(), rate=rate))
-    return RegionMap.from_labels(smoothed, regions.softness, supersample=regions.supersample)
-
-
 def decode_map(data: bytes, size: tuple[int, int], num_regions: int) -> RegionMap:
     """Read a map of `num_regions` regions for a picture of `size`."""
     from .labels import decode_labels

@@ -18,7 +18,7 @@ from kcgs.nn import GaussianField
 
 from .errors import CodecError
 from .gaussians import Layers, Lookup, layer_order, pick
-from .maps import MOST_SUPERSAMPLE, decode_map, encode_map, smooth_map
+from .maps import MOST_SUPERSAMPLE, decode_map, encode_map
 from .quantize import NOISE_CODES, Classes, Codes, Quantizer
 from .rangecoder import Reader, Writer
 from .stream import (
@@ -59,7 +59,6 @@ def encode(
     *,
     quality: float | None = None,
     target_bytes: int | None = None,
-    contour_rate: float = 0.0,
 ) -> bytes:
     """Write a scene as a `.kcgs` file; the same scene gives the same bytes.
 
@@ -73,8 +72,6 @@ def encode(
             one region, which takes one byte.
         quality: PSNR in dB of the decoded picture against the scene's own, before clipping, 10 to 90; 46 by default.
         target_bytes: the finest file that is not larger, in place of `quality`.
-        contour_rate: 0: the map is kept without loss. Above, contours are straightened where a bit that is saved is
-            worth so many pixels that change hands, or more: 0.2 is little. Takes seconds; no region is lost.
 
     Returns:
         The file.
@@ -94,10 +91,6 @@ def encode(
     regions, ids = check_scene(field, regions)
     if quality is not None and target_bytes is not None:
         raise ValueError(f"quality and target_bytes exclude each other; got {quality!r} and {target_bytes!r}")
-    if not 0.0 <= contour_rate < math.inf:
-        raise ValueError(f"contour_rate must be at least 0; got {contour_rate!r}")
-    if regions is not None and contour_rate > 0.0:
-        regions = smooth_map(regions, contour_rate)
     region_map = None if regions is None else encode_map(regions)
     if target_bytes is None:
         code = noise_code_for(DEFAULT_QUALITY if quality is None else quality, field)

@@ -49,9 +49,9 @@ from kcgs.bench.rate.workshop import Workshop
 from kcgs.codec import encode
 from kcgs.data import save_image, save_labels
 from kcgs.fit import FitConfig, FitResult, HistoryEntry
-from kcgs.fit.compress import Compressed
 from kcgs.functional import RegionMap, ef_psnr, psnr
 from kcgs.nn import GaussianField
+from kcgs.rate import Compressed
 
 
 class Stub:

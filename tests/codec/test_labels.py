@@ -6,7 +6,6 @@ import hashlib
 import time
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from kcgs.codec import labels as labels_module
 from kcgs.codec.contexts import CLIP, SQUASH
 from kcgs.codec.labels import decode_labels, encode_labels
 from kcgs.codec.rangecoder import CodecError, Reader, Writer
-from kcgs.codec.smooth import bits_without, contour_bits, smooth_labels
 from kcgs.data import load_labels
 
 Labels = NDArray[np.int64]
@@ -164,49 +162,6 @@ class TestSize:
 
     def test_bsds(self, data_root: Path) -> None:
         assert self.ratio(sorted(data_root.glob("bsds/*/mask.png"))[::3]) < 0.38
-
-
-class TestEstimates:
-    def test_estimate_is_near_the_stream(self) -> None:
-        labels = shapes(2, (240, 320), 8)
-        assert contour_bits(labels) == pytest.approx(8 * len(encode_labels(labels)), rel=0.3)
-
-    def test_merging_saves_what_the_estimate_says(self) -> None:
-        labels = shapes(2, (240, 320), 8)
-        merged = np.where(labels == 4, 0, labels)
-        saved = bits_without(labels, 4, 0)
-        assert saved == pytest.approx(contour_bits(labels) - contour_bits(merged), abs=1.0)
-        assert saved > 50
-
-    def test_smoothing_shrinks_the_stream(self) -> None:
-        labels = shapes(1)
-        noise = np.random.default_rng(0).random(labels.shape) < 0.3
-        ragged = np.where(noise, np.roll(labels, 1, axis=1), labels)
-        smooth = smooth_labels(ragged, rate=0.3)
-        assert len(encode_labels(smooth)) < 0.85 * len(encode_labels(ragged))
-        assert (smooth != ragged).mean() < 0.05
-        assert np.array_equal(smooth, smooth_labels(ragged, rate=0.3))
-
-    def test_regions_stay(self) -> None:
-        labels = np.zeros((20, 20), np.int64)
-        labels[5, 5], labels[12, 12:14] = 7, 9
-        assert set(np.unique(smooth_labels(labels, rate=100.0))) == {0, 7, 9}
-        assert set(np.unique(smooth_labels(labels, rate=100.0, keep=False))) == {0}
-
-    def test_costs_decide(self) -> None:
-        labels = np.zeros((16, 16), np.int64)
-        labels[8:] = 1
-        labels[7, 5] = 1
-        costs = np.zeros((2, 16, 16), np.float32)
-        costs[0, 7, 5] = 1e6
-        assert smooth_labels(labels, costs, 1.0)[7, 5] == 1
-        with pytest.raises(ValueError, match="costs must have shape"):
-            smooth_labels(labels, costs[:1])
-
-    @pytest.mark.parametrize("labels", [np.zeros((4, 5), np.int64), np.full((1, 1), 9)])
-    def test_one_region_is_free(self, labels: Any) -> None:
-        assert contour_bits(labels) == 0
-        assert np.array_equal(smooth_labels(labels), labels)
 
 
 class TestWork:

@@ -145,18 +145,6 @@ class TestGoals:
         with pytest.raises(ValueError, match="target_bytes must be at least [0-9]+ for this scene; got 20"):
             encode(*scene, target_bytes=20)
 
-    def test_straighter_contours_cost_less(self) -> None:
-        field, regions = make_scene(300, (96, 144))
-        assert regions is not None
-        noisy = regions.labels.clone()
-        flip = torch.rand(96, 143, generator=torch.Generator().manual_seed(0)) < 0.3
-        noisy[:, 1:][flip] = regions.labels[:, :-1][flip]
-        exact, straight = (encode(field, noisy, quality=40, contour_rate=rate) for rate in (0.0, 0.3))
-        found = decode(straight).regions
-        assert found is not None and len(straight) < len(exact) - 10
-        assert torch.equal(found.ids, regions.ids)
-        assert (found.labels != noisy).float().mean() < 0.03
-
     def test_half_of_the_file_is_most_of_the_picture(self) -> None:
         field, regions = make_scene(400, (96, 144))
         data = encode(field, regions)
@@ -175,7 +163,6 @@ class TestRefusals:
             (lambda: encode(field, "x"), "regions must be a RegionMap"),  # type: ignore[arg-type]
             (lambda: encode(field, regions, quality=5), "quality must be in"),
             (lambda: encode(field, regions, quality=True), "quality must be a number"),
-            (lambda: encode(field, regions, contour_rate=-1.0), "contour_rate must be at least 0"),
             (lambda: encode(field, regions, quality=40, target_bytes=900), "exclude each other"),
             (lambda: encode(field, regions, target_bytes=1.5), "target_bytes must be an integer"),  # type: ignore[arg-type]
             (lambda: encode(field, regions.resize((9, 9))), "regions must be one map of size"),

@@ -11,7 +11,7 @@ from torch import Tensor
 from kcgs.bench.render.timing import threads
 from kcgs.bench.sizes import map_bytes
 from kcgs.codec import encode
-from kcgs.fit.compress import compress
+from kcgs.rate import compress
 
 from .codecs import AVIF, AVIF_PSNR, present
 from .pictures import (

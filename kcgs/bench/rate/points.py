@@ -87,11 +87,11 @@ def codec_digest() -> str:
     from kcgs.codec.stream import VERSION
 
     folder = Path(kcgs.codec.__file__).parent
-    sources = [*sorted(folder.glob("*.py")), *(folder.parent / "fit" / f"{n}.py" for n in ("compress", "fine_tune"))]
+    sources = [*sorted(folder.rglob("*.py")), *sorted((folder.parent / "rate").glob("*.py"))]
     digest = hashlib.sha256(bytes([VERSION]))
     for path in sources:
         digest.update(code_of(path.read_text(encoding="utf-8")).encode())
-    for path in sorted(folder.glob("*.bin")):
+    for path in sorted(folder.rglob("*.bin")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 

@@ -17,11 +17,11 @@ from kcgs.bench.fit.runs import warm_up
 from kcgs.bench.measure import measure
 from kcgs.codec import decode
 from kcgs.fit import FitConfig, fit
-from kcgs.fit.compress import compress, fit_bytes
 from kcgs.functional import RegionMap
 from kcgs.io import load, save
 from kcgs.nn import GaussianField
 from kcgs.nn.renderer import render_image
+from kcgs.rate import compress, fit_bytes
 
 from .codecs import CODECS, largest, open_file
 from .pictures import Picture, read

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from kcgs import FitConfig, GaussianField, RegionMap, fit
 from kcgs.codec import decode, encode
-from kcgs.fit import compress, fit_bytes
-from kcgs.fit.compress import count_for
 from kcgs.nn.renderer import render_image
+from kcgs.rate import compress, fit_bytes
+from kcgs.rate.compress import count_for
 
 Fitted = tuple[Tensor, GaussianField, RegionMap]
 SHORT = FitConfig.from_recipe("best", iterations=150)

@@ -13,6 +13,7 @@ from kcgs.codec.maps import encode_map
 from kcgs.codec.quantize import NOISE_CODES, Quantizer
 from kcgs.codec.scene import (
     DEFAULT_QUALITY,
+    QUALITIES,
     check_scene,
     decode,
     encode_codes,
@@ -20,13 +21,13 @@ from kcgs.codec.scene import (
     noise_code_for,
     numbers,
 )
+from kcgs.fit.config import FitConfig
+from kcgs.fit.loop import check_problem, fit
+from kcgs.fit.monitor import FitResult, HistoryEntry
 from kcgs.functional import RegionMap, merge_worthless
 from kcgs.nn import GaussianField
 
-from .config import FitConfig
 from .fine_tune import FineTuning
-from .loop import check_problem, fit
-from .monitor import FitResult, HistoryEntry
 
 # a Gaussian whose whole energy is below this many times the noise costs more bits than it saves: at the best rate a
 # bit saves 2 ln 2 D for each number, and a Gaussian has about 30
@@ -39,6 +40,9 @@ _POWER = 0.93
 # contours show: a picture with them may have this much more squared error, 0.1 dB
 _FAVOUR = 1.023
 _TRIAL_ITERATIONS, _TRIAL_TO_END = 80, 0.65
+# dB of a file's image against the scene's own above the scene's PSNR: the error grows by about a 28th, 0.15 dB,
+# and by more where so few Gaussians are rounded that errors do not average out
+_MARGIN = 14.5
 # coded lengths vary by so much as Gaussians are tuned
 _SLACK = 0.997
 
@@ -172,6 +176,19 @@ def fit_bytes(
     data = compress(result.field, image, result.regions, target_bytes=target_bytes, seed=seed)
     decoded = decode(data)
     return Compressed(data, decoded.field, decoded.regions, result)
+
+
+def quality_for(psnr: float) -> float:
+    """Return the `quality` of a file that is nearly as good as its scene.
+
+    Args:
+        psnr: of the scene's render against the image, in dB.
+
+    Example:
+        >>> quality_for(30.0), quality_for(100.0)
+        (44.5, 90.0)
+    """
+    return min(max(psnr + _MARGIN, QUALITIES[0]), QUALITIES[1])
 
 
 def count_for(num_bytes: float) -> int:
