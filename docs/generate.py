@@ -1,0 +1,173 @@
+"""Pages that the code itself can write: the reference, the commands, the recipes. conf.py calls `write`."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import tomllib
+import typing
+from importlib.resources import files
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+# What readers look for first heads its page; other modules follow in the order in which the package imports them.
+FIRST = ("kcgs.functional.splat", "kcgs.functional.regions")
+# Each public name is documented in the first of these packages that lists it in its `__all__`.
+PACKAGES = (
+    "kcgs",
+    "kcgs.functional",
+    "kcgs.nn",
+    "kcgs.fit",
+    "kcgs.rate",
+    "kcgs.codec",
+    "kcgs.segment",
+    "kcgs.onnx",
+    "kcgs.data",
+    "kcgs.engine",
+)
+PACKAGES = tuple(name for name in PACKAGES if importlib.util.find_spec(name))
+
+
+def write(folder: Path) -> None:
+    """Write all generated pages; a file whose text is as before keeps its date, so that Sphinx does not read it again.
+
+    Args:
+        folder: where they go; made where it is missing.
+    """
+    pages = {"commands.md": commands(), "recipes.md": recipes()}
+    documented: set[str] = set()
+    for name in PACKAGES:
+        pages[f"{name}.rst"] = reference(name, documented)
+    folder.mkdir(exist_ok=True)
+    for stale in {path.name for path in folder.iterdir()} - pages.keys():
+        (folder / stale).unlink()
+    for name, text in pages.items():
+        path = folder / name
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+def public_objects(package: str) -> dict[str, Any]:
+    """Return what a package lists in `__all__`, by name, in the order of its imports, less its version."""
+    module = importlib.import_module(package)
+    public = {name for name in module.__all__ if not name.startswith("__")}
+    return {name: thing for name, thing in vars(module).items() if name in public}
+
+
+def identity(name: str, thing: Any) -> str:
+    """Return the same string for the same thing under two public paths."""
+    home = getattr(thing, "__module__", None)
+    return f"{home}.{thing.__qualname__}" if home and hasattr(thing, "__qualname__") else f"{name} {id(thing)}"
+
+
+def reference(package: str, documented: set[str]) -> str:
+    """Return the reference page of a package: its names by the module that holds them, in that module's order.
+
+    Args:
+        package: its full name.
+        documented: identities of the things that earlier pages have; those of this page are added.
+    """
+    module = importlib.import_module(package)
+    parts = [_title(package, "="), _summary(module), f".. py:currentmodule:: {package}"]
+    groups: dict[str, list[str]] = {}
+    for name, thing in public_objects(package).items():
+        if identity(name, thing) in documented or inspect.ismodule(thing):
+            continue
+        documented.add(identity(name, thing))
+        groups.setdefault(getattr(thing, "__module__", package), []).append(name)
+    for home, names in sorted(
+        groups.items(), key=lambda group: FIRST.index(group[0]) if group[0] in FIRST else len(FIRST)
+    ):
+        if len(groups) > 1 and package != "kcgs" and home != package:
+            parts.append(_title(_heading(importlib.import_module(home)), "-"))
+        parts += [_directive(package, name, getattr(module, name)) for name in sorted(groups[home], key=_line(module))]
+    return "\n\n".join(parts) + "\n"
+
+
+def _title(text: str, underline: str) -> str:
+    return f"{text}\n{underline * len(text)}"
+
+
+def _summary(module: ModuleType) -> str:
+    return inspect.cleandoc(module.__doc__ or "")
+
+
+def _heading(module: ModuleType) -> str:
+    """Return the first sentence of a module's docstring, up to a colon, as a heading."""
+    return _summary(module).split("\n\n")[0].replace("\n", " ").partition(":")[0].rstrip(".").replace("`", "")
+
+
+def _line(module: ModuleType) -> Any:
+    """Return a key that sorts names by where they are defined."""
+
+    def key(name: str) -> int:
+        try:
+            return inspect.getsourcelines(getattr(module, name))[1]
+        except (OSError, TypeError):
+            return 0
+
+    return key
+
+
+def _directive(package: str, name: str, thing: Any) -> str:
+    if inspect.isclass(thing):
+        return f".. autoclass:: {package}.{name}\n   :members:\n   :exclude-members: model_config, model_post_init"
+    return f".. {'autofunction' if callable(thing) else 'autodata'}:: {package}.{name}"
+
+
+def commands() -> str:
+    """Return the commands with their arguments and options, as `kcgs COMMAND --help` says them."""
+    import typer
+
+    from kcgs.cli import app
+
+    group = typer.main.get_command(app)
+    return "\n\n".join(_command(name, command) for name, command in group.commands.items()) + "\n"  # type: ignore[attr-defined]
+
+
+def _command(name: str, command: Any) -> str:
+    context = command.make_context(name, [], resilient_parsing=True)
+    usage = " ".join(["kcgs", name, *command.collect_usage_pieces(context)])
+    # arguments first, each of them as it is written and what it is
+    params = sorted(command.params, key=lambda param: param.param_type_name != "argument")
+    records = [param.get_help_record(context) for param in params]
+    rows = [f"| `{_cell(written)}` | {_cell(text)} |" for written, text in filter(None, records)]
+    table = "\n".join(["| argument | what it is |", "|---|---|", *rows]) if rows else ""
+    return "\n\n".join([f"## kcgs {name}", f"```text\n{usage}\n```", inspect.cleandoc(command.help or ""), table])
+
+
+def _cell(text: str) -> str:
+    """Return text for a cell of a Markdown table."""
+    text = " ".join(text.split()).replace("<int range>", "<int>").replace("<float range>", "<float>")
+    return text.replace("|", "\\|")
+
+
+def recipes() -> str:
+    """Return the settings of a fit with their defaults, and each recipe with its differences from them."""
+    from kcgs.fit import FitConfig, available_recipes
+
+    rows = ["| setting | type | default | what it is |", "|---|---|---|---|"]
+    for name, field in FitConfig.model_fields.items():
+        rows.append(
+            f"| `{name}` | {_type(field.annotation)} | `{field.default!r}` | {_cell(field.description or '')} |"
+        )
+    parts = ["## The settings of a fit", "\n".join(rows), "## The recipes as they are in the package"]
+    for name in available_recipes():
+        text = (files("kcgs.recipes") / f"{name}.toml").read_text(encoding="utf-8")
+        comment = " ".join(line.lstrip("# ") for line in text.splitlines() if line.startswith("#"))
+        settings = "\n".join(line for line in text.splitlines() if not line.startswith("#")).strip()
+        assert tomllib.loads(settings) == tomllib.loads(text)
+        parts += [f"### {name}", comment, f"```toml\n{settings}\n```" if settings else "The defaults."]
+    return "\n\n".join(parts) + "\n"
+
+
+def _type(annotation: Any) -> str:
+    """Return a type as readers of settings know it: `float`, `"auto"`, one of several with "or" between."""
+    if typing.get_origin(annotation) is typing.Literal:
+        return " or ".join(f"`{value!r}`" for value in typing.get_args(annotation))
+    alternatives = [part for part in typing.get_args(annotation) if part is not type(None)]
+    if alternatives and typing.get_origin(annotation) is not tuple:
+        return " or ".join(map(_type, alternatives))
+    return f"`{getattr(annotation, '__name__', annotation)}`"

@@ -1,0 +1,71 @@
+"""The site: it builds without a warning, its reference has every public name, the README stays a front page."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import kcgs
+
+ROOT = Path(kcgs.__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+if not (DOCS / "conf.py").is_file():
+    pytest.skip("not a source checkout", allow_module_level=True)
+
+
+@pytest.fixture(scope="module")
+def generate() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("kcgs_docs_generate", DOCS / "generate.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build it as `make docs` does."""
+    for package in ("sphinx", "myst_nb", "furo", "sphinx_copybutton"):
+        if importlib.util.find_spec(package) is None:
+            pytest.skip("the site is built with the extra 'docs'")
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-d", str(folder / "doctrees")]
+    done = subprocess.run([*command, str(DOCS), str(folder / "html")], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder / "html"
+
+
+def documented(site: Path) -> set[str]:
+    """Return the full names in the site's inventory: after four lines of header, they begin its compressed lines."""
+    content = (site / "objects.inv").read_bytes().split(b"\n", 4)[4]
+    return {line.split()[0] for line in zlib.decompress(content).decode().splitlines()}
+
+
+def test_every_public_name_is_in_the_reference(site: Path, generate: ModuleType) -> None:
+    names = documented(site)
+    modules = {package: importlib.import_module(package) for package in generate.PACKAGES}
+    for package, module in modules.items():
+        for name in module.__all__:
+            if name.startswith("__"):
+                continue
+            thing = getattr(module, name)
+            same = {f"{p}.{name}" for p, m in modules.items() if getattr(m, name, None) is thing}
+            assert same & names, f"{package}.{name}"
+
+
+def test_every_page_has_commands_recipes_and_figures(site: Path, generate: ModuleType) -> None:
+    """What is generated from the code is in the pages that include it."""
+    from kcgs.fit import FitConfig, available_recipes
+
+    commands, recipes = ((site / f"{name}.html").read_text(encoding="utf-8") for name in ("command-line", "recipes"))
+    for name in ("fit", "render", "eval", "segment", "info", "encode", "decode", "export", "view", "bench", "fit-many"):
+        assert f'id="kcgs-{name}"' in commands
+    for name in (*FitConfig.model_fields, *available_recipes()):
+        assert name in recipes
