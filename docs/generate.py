@@ -77,9 +77,8 @@ def reference(package: str, documented: set[str]) -> str:
             continue
         documented.add(identity(name, thing))
         groups.setdefault(getattr(thing, "__module__", package), []).append(name)
-    for home, names in sorted(
-        groups.items(), key=lambda group: FIRST.index(group[0]) if group[0] in FIRST else len(FIRST)
-    ):
+    ahead = [home for home in FIRST if home in groups]
+    for home in ahead + [home for home in groups if home not in ahead]:
         if len(groups) > 1 and package != "kcgs" and home != package:
             parts.append(_title(_heading(importlib.import_module(home)), "-"))
         parts += [_directive(package, name, getattr(module, name)) for name in sorted(groups[home], key=_line(module))]
