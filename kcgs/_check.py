@@ -183,4 +183,5 @@ def _pil_array(image: Any) -> NDArray[Any]:
         return np.asarray(image.convert("RGB"))
     pixels = np.asarray(image.convert("RGBA"), dtype=np.float32) / np.float32(255)
     color, alpha = pixels[..., :3], pixels[..., 3:]
-    return np.clip(color * alpha + (1 - alpha), 0, 1)
+    composed: NDArray[Any] = np.clip(color * alpha + (1 - alpha), 0, 1)
+    return composed

@@ -180,7 +180,7 @@ def _serialize(field: GaussianField, regions: RegionMap | Tensor | None, metadat
     notes = _describe(field, regions, metadata)
     tensors = {name: getattr(field, name) for name in (*_REQUIRED, "opacities", "region_ids")}
     if regions is not None:
-        tensors["labels"] = regions.labels if regions.fine_labels is None else regions.fine_labels
+        tensors["labels"] = regions.fine_labels
     packed = {}
     for name, tensor in tensors.items():
         if tensor is not None:

@@ -117,7 +117,7 @@ class Spec(NamedTuple):
         regions = self.regions
         if isinstance(regions, RegionMap):
             digest.update(repr((regions.softness, regions.supersample)).encode())
-            regions = regions.labels if regions.fine_labels is None else regions.fine_labels
+            regions = regions.fine_labels
         _add(digest.update, regions)
         _add(digest.update, self.band)
         return digest.hexdigest()[:20]

@@ -52,7 +52,7 @@ def stored_bytes(regions: RegionMap | None) -> int:
     """Size of the map that a scene stores, the fine one where there is one; 0 without contours."""
     if regions is None:
         return 0
-    return map_bytes(regions.labels if regions.fine_labels is None else regions.fine_labels)
+    return map_bytes(regions.fine_labels)
 
 
 # a second's work, and most fits store the map that they were given

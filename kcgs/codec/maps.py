@@ -42,7 +42,7 @@ def encode_map(regions: RegionMap) -> bytes:
 
     if regions.labels.ndim != 2 or regions.resized:
         raise ValueError("regions must be one map of its own pixels, not a batch and not resized")
-    fine = regions.labels if regions.fine_labels is None else regions.fine_labels
+    fine = regions.fine_labels
     labels = encode_labels(fine.cpu().numpy())
     pairs = _touching(compact(fine.cpu().numpy())[1], regions.num_regions)
     softness, ids = regions.softness, regions.ids.tolist()

@@ -212,7 +212,7 @@ def _check_field(field: GaussianField) -> None:
 
 
 def _check_map(regions: RegionMap) -> None:
-    labels = regions.labels if regions.fine_labels is None else regions.fine_labels
+    labels = regions.fine_labels
     if labels.numel() > MOST_LABELS:
         raise ValueError(f"regions must have at most {MOST_LABELS} labels; got {tuple(labels.shape)}")
     if regions.supersample > MOST_SUPERSAMPLE:

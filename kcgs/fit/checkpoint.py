@@ -106,8 +106,7 @@ def _plain_map(regions: RegionMap | None) -> Any:
         return None
     softness = regions.softness
     pairs = softness if isinstance(softness, float) else [(*pair, width) for pair, width in softness.items()]
-    fine = regions.fine_labels
-    return (regions.labels if fine is None else fine), pairs, regions.supersample
+    return regions.fine_labels, pairs, regions.supersample
 
 
 def _rich_map(plain: Any) -> RegionMap | None:

@@ -90,7 +90,7 @@ def propose(
     """
     _check(residual, regions, count, sigmas)
     left = residual.detach().to(torch.float64 if residual.dtype == torch.float64 else torch.float32)
-    index = torch.zeros_like(left[0], dtype=torch.int32) if regions is None else regions._membership.index[0]
+    index = torch.zeros_like(left[0], dtype=torch.int32) if regions is None else regions.membership.index[0]
     labels = index.cpu().numpy()
     # below this the gain is rounding error: one pixel's, at the precision of the largest
     floor = (128 * torch.finfo(left.dtype).eps * float(left.abs().max())) ** 2

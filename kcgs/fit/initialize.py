@@ -187,7 +187,7 @@ def _region_index(size: tuple[int, ...], regions: RegionMap | None) -> tuple[Ind
     """Place of every pixel's region in the map's ids, (H, W), and the number of regions."""
     if regions is None:
         return np.zeros(size, np.int64), 1
-    return regions._membership.index[0].cpu().numpy().astype(np.int64), regions.num_regions
+    return regions.membership.index[0].cpu().numpy().astype(np.int64), regions.num_regions
 
 
 def _density(planes: Array, index: Indices) -> Array:

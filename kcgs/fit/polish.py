@@ -173,7 +173,7 @@ def _cells(field: GaussianField, image: Tensor, regions: RegionMap | None) -> li
     pattern = torch.zeros_like(at)
     supports = []
     for region in index[index >= 0].unique().tolist():
-        weights = regions._membership.weights(0, region, torch.float64).flatten()
+        weights = regions.membership.weights(0, region, torch.float64).flatten()
         support = weights.nonzero().flatten()
         supports.append(((index == region).nonzero().flatten(), support, weights[support]))
         pattern = torch.unique(2 * pattern + (weights > 0), return_inverse=True)[1]

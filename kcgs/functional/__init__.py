@@ -1,6 +1,6 @@
 """Stateless public operations: splatting, covariances, label maps, metrics."""
 
-from .contours import (
+from .boundaries import (
     BoundaryScore,
     boundary_f_score,
     coverage,
@@ -16,9 +16,10 @@ from .covariance import (
     scale_rotation_to_cholesky,
     support_extent,
 )
+from .labels import contour_edges, edge_band, lookup_regions, touching_pairs
 from .metrics import ef_psnr, ef_ssim, ms_ssim, psnr, ssim
 from .polygons import polygon_coverage, polygon_labels
-from .regions import RegionMap, edge_band, lookup_regions
+from .regions import PairWidths, RegionMap
 from .splat import region_splat
 from .widths import BandGain, band_gain, choose_widths
 from .worth import merge_worthless
@@ -26,6 +27,7 @@ from .worth import merge_worthless
 __all__ = [
     "BandGain",
     "BoundaryScore",
+    "PairWidths",
     "RegionMap",
     "band_gain",
     "boundary_f_score",
@@ -33,6 +35,7 @@ __all__ = [
     "cholesky_to_covariance",
     "cholesky_to_scale_rotation",
     "choose_widths",
+    "contour_edges",
     "covariance_to_cholesky",
     "coverage",
     "edge_alignment",
@@ -51,4 +54,5 @@ __all__ = [
     "smooth_contours",
     "ssim",
     "support_extent",
+    "touching_pairs",
 ]

@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool2d, pad
 
 from kcgs._check import check_image, check_labels
 
-from .regions import edge_band
+from .labels import edge_band
 
 _WINDOW = 11  # pixels; torchmetrics makes it int(3.5 sigma + 0.5) * 2 + 1 whatever kernel size it is given
 _SIGMA = 1.5

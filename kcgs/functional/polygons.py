@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcgs._check import check_floating, check_size, check_tensor
+from kcgs._check import check_count, check_floating, check_size, check_tensor
 
 _MOST_LABELS = 16384  # along a side, times the supersample
 
@@ -79,10 +79,9 @@ def polygon_labels(polygons: Tensor | Sequence[Tensor], size: tuple[int, int], s
 
     outlines = _check_polygons(polygons)
     height, width = check_size("size", size)
-    if isinstance(supersample, bool) or not isinstance(supersample, int):
-        raise TypeError(f"supersample must be an integer; got {supersample!r}")
-    if supersample < 1 or max(height, width) * supersample > _MOST_LABELS:
-        raise ValueError(f"supersample must be at least 1, and give at most {_MOST_LABELS} a side; got {supersample}")
+    supersample = check_count("supersample", supersample)
+    if max(height, width) * supersample > _MOST_LABELS:
+        raise ValueError(f"supersample must be at most {_MOST_LABELS} / {max(height, width)} at this size; got {supersample}")
     labels = torch.zeros(height * supersample, width * supersample, dtype=torch.int64)
     for number, outline in enumerate(outlines, 1):
         x, y = (outline.detach().double().cpu() * supersample - 0.5).unbind(1)

@@ -1,21 +1,22 @@
-"""Label maps: check, compact, look up at centres, soft contours, rescale, edge band."""
+"""RegionMap: a label map made ready for rendering, and everything that is done to one."""
 
 from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from kcgs._check import check_floating, check_labels, check_size
+from kcgs._check import check_count, check_labels, check_number, check_size
 from kcgs.kernels import Membership, Resampled
 
+from .labels import compact, largest_share, sample_labels, touching_pairs
+
 MAX_SOFTNESS = 64.0
-# places between two pixel centres that hard contours are sampled at
-_OFFSETS = 1024
 
 
 class PairWidths(Mapping[tuple[int, int], float]):
@@ -56,8 +57,9 @@ class RegionMap:
     rule). Above 0 the membership of region r is the blur of [M = r] by a Gaussian of that standard deviation, cut at
     4 standard deviations, normalised to sum to one: pixels farther than that from a contour are unchanged. With a
     width for each pair of regions a pixel is blurred by the width of its nearest contour. With ``supersample`` k the
-    map has k x k labels a pixel, and a pixel's membership is the mean over them; ``labels`` is then the label with
+    map has k x k labels per pixel, and a pixel's membership is the mean over them; ``labels`` is then the label with
     the largest share (the smallest on a tie), and regions too small to have any such pixel are regions still.
+    ``fine_labels`` is the map at its own resolution: ``labels`` itself where k is 1.
 
     Example:
         >>> regions = RegionMap.from_labels(torch.tensor([[3, 3, 7], [3, 7, 7]]))
@@ -68,9 +70,9 @@ class RegionMap:
     labels: Tensor  # (H, W) or (B, H, W) int64
     ids: Tensor  # (R,) int64, sorted
     softness: float | PairWidths = 0.0
-    fine_labels: Tensor | None = None  # (k * H, k * W) or (B, k * H, k * W) int64; None where k is 1
     supersample: int = 1  # k
-    _membership: Membership = field(repr=False, kw_only=True)
+    fine_labels: Tensor = field(repr=False, kw_only=True)  # (k * H, k * W) or (B, k * H, k * W) int64
+    membership: Membership = field(repr=False, kw_only=True)  # what the kernels evaluate
     _table: Tensor | None = field(repr=False, kw_only=True)
     _origin: RegionMap | None = field(default=None, repr=False, kw_only=True)  # what this was resized from
 
@@ -101,20 +103,36 @@ class RegionMap:
             (tensor([[1, 1]]), 2)
         """
         labels = check_labels("labels", labels)
-        _check_supersample(supersample, labels)
-        ids, index, table = _compact(labels)
+        supersample = _check_supersample(supersample, labels)
+        ids, index, table = compact(labels)
         width = _check_softness(softness, ids)
         by_index: float | Mapping[tuple[int, int], float] = width
         if isinstance(width, PairWidths):
             position = {region: at for at, region in enumerate(ids.tolist())}
             by_index = {(position[a], position[b]): value for (a, b), value in width.items()}
         index = index if index.ndim == 3 else index[None]
-        if supersample == 1:
-            return cls(labels, ids, width, _membership=Membership(index, len(ids), by_index), _table=table)
-        coarse = _largest_share(index, supersample)
-        membership = Membership(coarse, len(ids), by_index, fine=index)
-        shown = ids[coarse if labels.ndim == 3 else coarse[0]]
-        return cls(shown, ids, width, labels, supersample, _membership=membership, _table=table)
+        coarse = index if supersample == 1 else largest_share(index, supersample)
+        membership = Membership(coarse, len(ids), by_index, fine=None if supersample == 1 else index)
+        shown = labels if supersample == 1 else ids[coarse if labels.ndim == 3 else coarse[0]]
+        return cls(shown, ids, width, supersample, fine_labels=labels, membership=membership, _table=table)
+
+    @classmethod
+    def coerce(cls, value: object, name: str = "regions") -> RegionMap | None:
+        """Take a RegionMap, a label map Tensor (hard contours) or None for what it is.
+
+        Raises:
+            TypeError: anything else; the message calls it `name`.
+            ValueError: a Tensor that is no label map.
+
+        Example:
+            >>> RegionMap.coerce(torch.tensor([[3, 7]])).ids
+            tensor([3, 7])
+        """
+        if value is None or isinstance(value, RegionMap):
+            return value
+        if isinstance(value, Tensor):
+            return cls.from_labels(value)
+        raise TypeError(f"{name} must be a RegionMap, a label map Tensor or None; got {type(value).__name__}")
 
     @property
     def num_regions(self) -> int:
@@ -125,6 +143,11 @@ class RegionMap:
     def size(self) -> tuple[int, int]:
         """(height, width) in pixels."""
         return self.labels.shape[-2], self.labels.shape[-1]
+
+    @property
+    def index(self) -> Tensor:
+        """Position of each pixel's label among `ids`, (B, H, W) int32, also for one map."""
+        return self.membership.index
 
     @property
     def resized(self) -> bool:
@@ -140,18 +163,122 @@ class RegionMap:
         at = torch.searchsorted(self.ids, region_ids.contiguous()).clamp_max(self.num_regions - 1)
         return torch.where(self.ids[at] == region_ids, at, -1)
 
+    def weights(self, region_ids: int | Iterable[int], dtype: torch.dtype = torch.float64) -> Tensor:
+        r"""Evaluate the membership of a region at every pixel, or the sum over several.
+
+        Args:
+            region_ids: an id, or several; ids that the map does not hold have no pixels.
+            dtype: of the result; sums are taken in float64.
+
+        Returns:
+            :math:`(H, W)`, in [0, 1] up to rounding.
+
+        Raises:
+            ValueError: a batch of maps.
+
+        Example:
+            >>> regions = RegionMap.from_labels(torch.tensor([[3, 3, 7, 9]]))
+            >>> regions.weights([3, 9])
+            tensor([[1., 1., 0., 1.]], dtype=torch.float64)
+        """
+        if self.labels.ndim != 2:
+            raise ValueError(f"weights needs one map; got labels of shape {tuple(self.labels.shape)}")
+        chosen = [region_ids] if isinstance(region_ids, int) else sorted(set(region_ids))
+        places = self.index_of(torch.tensor(chosen, dtype=torch.int64, device=self.ids.device)).tolist()
+        found = [self.membership.weights(0, place, torch.float64) for place in places if place >= 0]
+        total = torch.zeros(self.size, dtype=torch.float64, device=self.labels.device)
+        return (sum(found[1:], found[0]) if found else total).to(dtype)
+
+    def relabel(
+        self, labels: Tensor, new_width: float | Literal["mean"] | Mapping[tuple[int, int], float] = 0.0
+    ) -> RegionMap:
+        r"""Make the map of other labels, with the supersampling and the contour widths of this one.
+
+        Where pairs of regions have widths, those of pairs whose ids are left stay.
+
+        Args:
+            labels: integer, at the map's own resolution, the shape of `fine_labels`.
+            new_width: of pairs that touch in the new map, did not before, and have none: a number; "mean", of the
+                widths that there are; or widths by pairs. Not read where one width holds for all.
+
+        Raises:
+            TypeError, ValueError: as :meth:`from_labels`; labels of another shape.
+
+        Example:
+            >>> regions = RegionMap.from_labels(torch.tensor([[1, 1, 2, 5]]), {(1, 2): 0.7})
+            >>> regions.relabel(torch.tensor([[1, 5, 5, 2]]), "mean").softness
+            PairWidths({(1, 2): 0.7, (1, 5): 0.7})
+        """
+        if labels.shape != self.fine_labels.shape:
+            raise ValueError(f"labels must have shape {tuple(self.fine_labels.shape)}; got {tuple(labels.shape)}")
+        softness: float | Mapping[tuple[int, int], float] = self.softness
+        if isinstance(softness, PairWidths):
+            widths = {**self._new_widths(labels, new_width), **softness}
+            left = set(labels.unique().tolist())
+            softness = {pair: width for pair, width in widths.items() if left.issuperset(pair)}
+        return RegionMap.from_labels(labels, softness, supersample=self.supersample)
+
+    def _new_widths(
+        self, labels: Tensor, width: float | Literal["mean"] | Mapping[tuple[int, int], float]
+    ) -> Mapping[tuple[int, int], float]:
+        assert isinstance(self.softness, PairWidths)
+        if isinstance(width, Mapping) or width == 0.0:
+            return width if isinstance(width, Mapping) else {}
+        if width == "mean":
+            width = sum(self.softness.values()) / len(self.softness)
+        return dict.fromkeys(touching_pairs(labels) - touching_pairs(self.fine_labels), width)
+
+    def merge(self, pairs: Iterable[tuple[int, int]]) -> tuple[RegionMap | None, Tensor]:
+        """Merge pairs of regions; what is merged has the least of their ids.
+
+        The width of a contour is then the mean of those that it is made of.
+
+        Args:
+            pairs: ids in the map.
+
+        Returns:
+            The map, None where one region is left, and the new id of each of `ids`, (R,).
+
+        Raises:
+            ValueError: an id that the map does not hold.
+
+        Example:
+            >>> regions, new_ids = RegionMap.from_labels(torch.tensor([[1, 4, 6]])).merge([(6, 4)])
+            >>> regions.labels, new_ids
+            (tensor([[1, 4, 4]]), tensor([1, 4, 4]))
+        """
+        root = {region: region for region in self.ids.tolist()}
+
+        def find(region: int) -> int:
+            if region not in root:
+                raise ValueError(f"pairs must hold ids of the map; got {region}")
+            while root[region] != region:
+                region = root[region]
+            return region
+
+        for one, other in pairs:
+            low, high = sorted((find(one), find(other)))
+            root[high] = low
+        new_ids = torch.tensor([find(region) for region in root], device=self.ids.device)
+        if len(new_ids.unique()) == 1:
+            return None, new_ids
+        labels = new_ids[self.index_of(self.fine_labels)]
+        softness = _merged_widths(self.softness, find)
+        return RegionMap.from_labels(labels, softness, supersample=self.supersample), new_ids
+
     def to(self, device: torch.device | str) -> RegionMap:
         """Return the map on another device."""
         device = torch.device(device)
         if device == self.labels.device:
             return self
+        labels = self.labels.to(device)
         return RegionMap(
-            self.labels.to(device),
+            labels,
             self.ids.to(device),
             self.softness,
-            None if self.fine_labels is None else self.fine_labels.to(device),
             self.supersample,
-            _membership=self._membership.to(device),
+            fine_labels=labels if self.supersample == 1 else self.fine_labels.to(device),
+            membership=self.membership.to(device),
             _table=None if self._table is None else self._table.to(device),
             _origin=None if self._origin is None else self._origin.to(device),
         )
@@ -161,8 +288,9 @@ class RegionMap:
 
         Hard contours stay hard: between pixel centres a point has the label with the largest share among its four
         neighbours (bilinear weights, of offsets rounded to odd multiples of 1/2048 pixel, so that no two labels tie).
-        With ``supersample`` k it is the fine map that is sampled: the result has k x k labels a pixel as before, spread
-        over the new pixel, or over one old pixel where that is smaller. Labels that are left with none are no regions.
+        With ``supersample`` k it is the fine map that is sampled: the result has k x k labels per pixel as before,
+        spread over the new pixel, or over one old pixel where that is smaller. Labels that are left with none are no
+        regions.
 
         Soft contours widen along with the map: between pixel centres a point has the bilinear mean of its four
         neighbours' memberships. ``softness`` says the new widths; all regions stay.
@@ -186,15 +314,15 @@ class RegionMap:
             return self._origin.resize((height, width))
         k = self.supersample
         if self.softness == 0.0:
-            fine = self.labels if self.fine_labels is None else self.fine_labels
-            return RegionMap.from_labels(_sample_labels(fine, height, width, k), supersample=k)
-        labels = _sample_labels(self.labels, height, width, 1)
+            return RegionMap.from_labels(sample_labels(self.fine_labels, height, width, k), supersample=k)
+        labels = sample_labels(self.labels, height, width, 1)
         index = self.index_of(labels).to(torch.int32)
         return RegionMap(
             labels,
             self.ids,
             _scaled(self.softness, math.sqrt(height * width / (self.size[0] * self.size[1]))),
-            _membership=Resampled(index if index.ndim == 3 else index[None], self._membership),
+            fine_labels=labels,
+            membership=Resampled(index if index.ndim == 3 else index[None], self.membership),
             _table=self._table,
             _origin=self,
         )
@@ -206,12 +334,19 @@ def _scaled(softness: float | PairWidths, scale: float) -> float | PairWidths:
     return PairWidths({pair: min(width * scale, MAX_SOFTNESS) for pair, width in softness.items()})
 
 
+def _merged_widths(softness: float | PairWidths, find: Callable[[int], int]) -> float | Mapping[tuple[int, int], float]:
+    if isinstance(softness, float):
+        return softness
+    widths: dict[tuple[int, int], list[float]] = {}
+    for (one, other), width in softness.items():
+        low, high = sorted((find(one), find(other)))
+        if low != high:
+            widths.setdefault((low, high), []).append(width)
+    return {pair: sum(found) / len(found) for pair, found in widths.items()}
+
+
 def _check_width(name: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{name} must be a number of pixels; got {value!r}")
-    if not 0.0 <= value <= MAX_SOFTNESS:
-        raise ValueError(f"{name} must be in [0, {MAX_SOFTNESS:g}] pixels; got {float(value)!r}")
-    return float(value)
+    return check_number(name, value, 0.0, MAX_SOFTNESS, unit="pixels")
 
 
 def _check_softness(softness: object, ids: Tensor) -> float | PairWidths:
@@ -234,147 +369,8 @@ def _check_softness(softness: object, ids: Tensor) -> float | PairWidths:
     return PairWidths(widths) if len(distinct) > 1 else distinct.pop() if distinct else 0.0
 
 
-def _check_supersample(supersample: object, labels: Tensor) -> None:
-    if isinstance(supersample, bool) or not isinstance(supersample, int):
-        raise TypeError(f"supersample must be an integer; got {supersample!r}")
-    if supersample < 1:
-        raise ValueError(f"supersample must be at least 1; got {supersample}")
-    if labels.shape[-2] % supersample or labels.shape[-1] % supersample:
-        raise ValueError(f"labels must have sides that supersample, {supersample}, divides; got {tuple(labels.shape)}")
-
-
-def _largest_share(index: Tensor, factor: int) -> Tensor:
-    """Give each block of factor x factor its most frequent label, the smallest on a tie."""
-    maps, height, width = index.shape
-    split = index.reshape(maps, height // factor, factor, width // factor, factor)
-    blocks = split.transpose(2, 3).flatten(-2)  # [B, H, W, factor**2]
-    best = blocks.amin(-1)
-    mixed = best != blocks.amax(-1)
-    ordered = blocks[mixed].sort(-1).values  # [P, factor**2], equal labels in runs
-    at = torch.arange(factor * factor, device=index.device)
-    starts = ordered != torch.nn.functional.pad(ordered[:, :-1], (1, 0), value=-1)
-    run = at - torch.where(starts, at, 0).cummax(-1).values  # place within its run
-    # the longest run, then the first
-    last = (run * (factor * factor) - at).argmax(-1, keepdim=True)
-    best[mixed] = ordered.gather(-1, last)[:, 0]
-    return best
-
-
-def _compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return the sorted ids, each pixel's position among them, and for small ids a table from id to position.
-
-    The table ends with -1, for ids beyond it and for -1.
-    """
-    highest = int(labels.max())
-    if highest < 1 << 16:  # a table is ten times faster than sorting every pixel
-        present = torch.bincount(labels.flatten()) > 0
-        ids = present.nonzero().flatten()
-        table = torch.where(present, present.cumsum(0) - 1, -1)
-        index = table.to(torch.int32).index_select(0, labels.flatten()).view(labels.shape)
-        return ids, index, torch.nn.functional.pad(table, (0, 1), value=-1)
-    ids, index = torch.unique(labels, return_inverse=True)
-    return ids, index.to(torch.int32), None
-
-
-def _sample_labels(labels: Tensor, height: int, width: int, factor: int) -> Tensor:
-    # in integers, so that any program that draws the map puts a pixel on the same side
-    def neighbours(new: int, old: int) -> tuple[Tensor, Tensor]:
-        pixels = old // factor
-        i = torch.arange(new, device=labels.device)[:, None]
-        j = torch.arange(factor, device=labels.device)
-        if pixels <= new:  # sub-pixels spread over a new pixel
-            at = pixels * (2 * (i * factor + j) + 1) - new
-        else:  # over an old one
-            at = factor * (2 * i + 1) * pixels + (2 * j - factor) * new
-        at = at.flatten()
-        low = torch.div(at, 2 * new, rounding_mode="floor")
-        offset = (torch.div((at - 2 * new * low) * _OFFSETS, 2 * new, rounding_mode="floor") + 0.5) / _OFFSETS
-        ends = torch.stack([low, low + 1]).clamp(0, old - 1)
-        return ends, torch.stack([1 - offset, offset]).double()
-
-    (rows, down), (cols, across) = neighbours(height, labels.shape[-2]), neighbours(width, labels.shape[-1])
-    corners = [labels.index_select(-2, r).index_select(-1, c) for r in rows for c in cols]
-    sampled = corners[0].clone()
-    # nearly everywhere the four are one label
-    mixed = (corners[1] != sampled).logical_or_(corners[2] != sampled).logical_or_(corners[3] != sampled)
-    at = mixed.nonzero(as_tuple=True)
-    own = torch.stack([corner[at] for corner in corners])
-    weights = torch.stack([d[at[-2]] * a[at[-1]] for d in down for a in across])
-    scores = torch.stack([torch.where(own == corner, weights, 0.0).sum(0) for corner in own])
-    sampled[at] = own.gather(0, scores.argmax(0, keepdim=True))[0]
-    return sampled
-
-
-def lookup_regions(means: Tensor, labels: Tensor) -> Tensor:
-    r"""Read the region under each centre: labels[floor(y), floor(x)], clamped to the image.
-
-    Args:
-        means: centres (x, y) in pixels, :math:`(N, 2)` or :math:`(B, N, 2)`.
-        labels: integer label map, :math:`(H, W)`, or :math:`(B, H, W)` with one map for each batch of centres.
-
-    Returns:
-        Ids, int64, :math:`(N,)` or :math:`(B, N)`.
-
-    Raises:
-        TypeError: wrong dtype.
-        ValueError: wrong shapes, values that are not finite, negative ids.
-
-    Example:
-        >>> lookup_regions(torch.tensor([[0.2, 0.9], [5.0, -3.0]]), torch.tensor([[1, 2], [3, 4]]))
-        tensor([1, 2])
-
-    Source: the paper's region assignment.
-    """
-    means = check_floating("means", means, last=2, dims=(2, 3))
-    labels = check_labels("labels", labels)
-    if labels.ndim == 3 and (means.ndim != 3 or means.shape[0] != labels.shape[0]):
-        raise ValueError(
-            f"labels of shape {tuple(labels.shape)} need means of shape ({labels.shape[0]}, N, 2); got "
-            f"{tuple(means.shape)}"
-        )
-    height, width = labels.shape[-2:]
-    cell = means.detach().floor()
-    x, y = cell[..., 0].clamp(0, width - 1).long(), cell[..., 1].clamp(0, height - 1).long()
-    if labels.ndim == 2:
-        return labels[y, x]
-    return labels.flatten(1).gather(1, y * width + x)
-
-
-def edge_band(labels: Tensor, width: float = 5) -> Tensor:
-    r"""Mark the pixels near a contour: those whose distance to a pixel of another label is at most `width`.
-
-    Convention: Euclidean distance between pixel centres, so that a pixel beside a change has distance 1. The band
-    lies on both sides of the contour.
-
-    Args:
-        labels: integer label map, :math:`(H, W)` or :math:`(B, H, W)`.
-        width: in pixels, at least 1.
-
-    Returns:
-        Boolean, shape of `labels`; all False where there is one region.
-
-    Raises:
-        TypeError: labels are not integer.
-        ValueError: wrong shape, negative ids, width below 1 or not finite.
-
-    Example:
-        >>> edge_band(torch.tensor([[0, 0, 0, 0, 9, 9]]), width=2).int()
-        tensor([[0, 0, 1, 1, 1, 1]], dtype=torch.int32)
-
-    Source: the paper's edge-focused evaluation (5 pixels inward and outward).
-    """
-    labels = check_labels("labels", labels)
-    if not (1 <= width < math.inf):
-        raise ValueError(f"width must be a finite number of at least 1 pixel; got {width!r}")
-    height, breadth = labels.shape[-2:]
-    band = torch.zeros_like(labels, dtype=torch.bool)
-    width = min(width, math.hypot(height, breadth))
-    for dy in range(min(int(width), height - 1) + 1):
-        reach = min(int(math.sqrt(width * width - dy * dy)), breadth - 1)
-        for dx in range(-reach if dy else 1, reach + 1):
-            here = (..., slice(0, height - dy), slice(max(0, -dx), breadth - max(0, dx)))
-            there = (..., slice(dy, height), slice(max(0, dx), breadth - max(0, -dx)))
-            differs = labels[here] != labels[there]
-            band[here] |= differs
-            band[there] |= differs
-    return band
+def _check_supersample(supersample: object, labels: Tensor) -> int:
+    count = check_count("supersample", supersample)
+    if labels.shape[-2] % count or labels.shape[-1] % count:
+        raise ValueError(f"labels must have sides that supersample, {count}, divides; got {tuple(labels.shape)}")
+    return count

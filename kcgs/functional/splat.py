@@ -119,14 +119,11 @@ def _resolve_regions(
         size = check_size("size", size)
     if region_ids is not None:
         region_ids = check_ids("region_ids", region_ids, means)
+    regions = RegionMap.coerce(regions)
     if regions is None:
         if size is None:
             raise ValueError("size must be given as (height, width) where regions is None; got None")
         return None, None, size
-    if isinstance(regions, Tensor):
-        regions = RegionMap.from_labels(regions)
-    elif not isinstance(regions, RegionMap):
-        raise TypeError(f"regions must be a RegionMap, a label map Tensor or None; got {type(regions).__name__}")
     check_tensor("region_ids", region_ids)
     assert region_ids is not None
     _check_fit(means, regions, size)
@@ -135,8 +132,8 @@ def _resolve_regions(
         index = index[None]
     if regions.num_regions == 1:
         # one region covers everything: no map, but strangers to it still draw nothing
-        return (None, None, regions.size) if bool((index >= 0).all()) else (index, regions._membership, regions.size)
-    return index, regions._membership, regions.size
+        return (None, None, regions.size) if bool((index >= 0).all()) else (index, regions.membership, regions.size)
+    return index, regions.membership, regions.size
 
 
 def _check_fit(means: Tensor, regions: RegionMap, size: tuple[int, int] | None) -> None:

@@ -19,6 +19,8 @@ from kcgs._check import check_floating, check_labels
 from kcgs.functional.regions import MAX_SOFTNESS
 from kcgs.kernels.membership import RADIUS_SIGMAS
 
+from .labels import contour_edges
+
 CANDIDATES = (0.0, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 MIN_CONTOUR = 12
 """Pixel edges a pair needs to be judged on its own."""
@@ -209,22 +211,16 @@ def _check_candidates(candidates: Sequence[float]) -> list[float]:
 def _place_windows(labels: Tensor) -> _Windows:
     """Find the pairs that share a pixel edge; put a window on every cell of the image that their contour crosses."""
     height, width = labels.shape
-    found = []
-    for dy, dx in ((0, 1), (1, 0)):
-        here, there = labels[: height - dy, : width - dx], labels[dy:, dx:]
-        rows, cols = (here != there).nonzero(as_tuple=True)
-        ends = torch.stack([here[rows, cols], there[rows, cols]], 1)
-        found.append(torch.cat([ends.amin(1, True), ends.amax(1, True), rows[:, None], cols[:, None]], 1))
-    edge = torch.cat(found)  # [E, 4] a, b, row, column
-    ids, end = edge[:, :2].unique(return_inverse=True)  # not unique(dim=0): that compares row by row, 20 times slower
+    ends, places = contour_edges(labels)
+    ids, end = ends.unique(return_inverse=True)  # not unique(dim=0): that compares row by row, 20 times slower
     code, pair, edges = (end[:, 0] * len(ids) + end[:, 1]).unique(return_inverse=True, return_counts=True)
     pairs = ids[torch.stack([code // max(1, len(ids)), code % max(1, len(ids))], 1)]
     cells_x = math.ceil(width / _CELL)
     cells = cells_x * math.ceil(height / _CELL)
-    key, cell, size = (pair * cells + edge[:, 2] // _CELL * cells_x + edge[:, 3] // _CELL).unique(
+    key, cell, size = (pair * cells + places[:, 0] // _CELL * cells_x + places[:, 1] // _CELL).unique(
         return_inverse=True, return_counts=True
     )
-    sums = torch.zeros(len(key), 2, dtype=torch.int64).index_add_(0, cell, edge[:, 2:])
+    sums = torch.zeros(len(key), 2, dtype=torch.int64).index_add_(0, cell, places)
     centers, of = (2 * sums + size[:, None]) // (2 * size[:, None]), key // cells
     kept = _spread(of, _PAIR_WINDOWS)
     kept = kept[_spread(torch.zeros_like(kept), _ALL_WINDOWS)]

@@ -326,7 +326,7 @@ def _with_flat(field: GaussianField, region_id: int, color: Tensor) -> GaussianF
 
 
 def _grid(regions: RegionMap) -> Tensor:
-    return regions.labels if regions.fine_labels is None else regions.fine_labels
+    return regions.fine_labels
 
 
 def _share(regions: RegionMap, region_ids: Iterable[int], like: Tensor) -> Tensor:
@@ -334,7 +334,7 @@ def _share(regions: RegionMap, region_ids: Iterable[int], like: Tensor) -> Tenso
     total = torch.zeros(regions.size, dtype=torch.float64, device=like.device)
     for region in regions.index_of(torch.tensor(sorted(set(region_ids)), device=regions.ids.device)).tolist():
         if region >= 0:  # a small one may be gone from a small map
-            total += regions._membership.weights(0, region, torch.float64)
+            total += regions.membership.weights(0, region, torch.float64)
     return total.clamp_max(1.0).to(like.dtype)
 
 

@@ -52,7 +52,7 @@ def margin(supersample: int) -> int:
 
 
 def _hard_tiles(regions: RegionMap, rows: int, cols: int) -> Tiles:
-    membership = regions._membership
+    membership = regions.membership
     grid, side = membership.grid[0].long().cpu(), TILE * membership.supersample
     halo = margin(membership.supersample)
     reach = torch.arange(-halo, side + halo)
@@ -74,7 +74,7 @@ def _hard_tiles(regions: RegionMap, rows: int, cols: int) -> Tiles:
 
 
 def _soft_tiles(regions: RegionMap, rows: int, cols: int) -> Tiles:
-    membership = regions._membership
+    membership = regions.membership
     height, width = regions.size
     # a window sees the tiles around it
     table = membership.tiles(TILE)

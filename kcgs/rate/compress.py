@@ -229,7 +229,7 @@ def _choose(
 
 def _contour_bits(regions: RegionMap) -> float:
     """Bits that the coder takes for a pixel of this map's contours."""
-    labels = regions.labels if regions.fine_labels is None else regions.fine_labels
+    labels = regions.fine_labels
     edges = int((labels[1:] != labels[:-1]).sum() + (labels[:, 1:] != labels[:, :-1]).sum())
     return 8 * _map_bytes(regions) / max(edges, 1)
 

@@ -260,7 +260,7 @@ def test_low_maps(seed: int) -> None:
 
 def check_map(regions: RegionMap, data: bytes) -> None:
     k, rows, widths = read_map(data, *regions.size)
-    labels = regions.labels if regions.fine_labels is None else regions.fine_labels
+    labels = regions.fine_labels
     assert k == regions.supersample and np.array_equal(rows, labels.numpy())
     soft = regions.softness
     assert widths == {pair: soft if isinstance(soft, float) else soft.get(pair, 0.0) for pair in widths}

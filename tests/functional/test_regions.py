@@ -37,7 +37,7 @@ class TestRegionMap:
     @pytest.mark.parametrize("softness", [0.3, 0.7, 2.0])
     def test_memberships_sum_to_one(self, softness: float) -> None:
         regions = RegionMap.from_labels(blobs(), softness)
-        shares = torch.stack([regions._membership.weights(0, r, torch.float64) for r in range(regions.num_regions)])
+        shares = torch.stack([regions.membership.weights(0, r, torch.float64) for r in range(regions.num_regions)])
         torch.testing.assert_close(shares.sum(0), torch.ones(45, 70, dtype=torch.float64))
         assert ((shares > 0) & (shares < 1)).any()
 
@@ -51,11 +51,11 @@ class TestRegionMap:
                 ndimage.gaussian_filter(a, softness, mode="constant", radius=radius) for a in (inside, inside * 0 + 1)
             )
             want = torch.from_numpy(blurred / ones)
-            assert (regions._membership.weights(0, r, torch.float64) - want).abs().max() < 1e-12
+            assert (regions.membership.weights(0, r, torch.float64) - want).abs().max() < 1e-12
 
     @pytest.mark.parametrize("softness", [0.0, 0.7, 5.0])
     def test_tile_tables_hold_the_same_weights(self, softness: float) -> None:
-        membership = RegionMap.from_labels(blobs(), softness)._membership
+        membership = RegionMap.from_labels(blobs(), softness).membership
         table = membership.tiles(TILE)
         cols = -(-70 // TILE)
         found = torch.zeros(membership.num_regions, 3 * TILE, cols * TILE, dtype=torch.float64)
@@ -71,7 +71,7 @@ class TestRegionMap:
         labels = torch.zeros(160, 160, dtype=torch.long)
         labels[:, 80:] = 1
         for softness, mixed in ((0.0, 0), (0.7, 20)):
-            table = RegionMap.from_labels(labels, softness)._membership.tiles(TILE)
+            table = RegionMap.from_labels(labels, softness).membership.tiles(TILE)
             assert len(table.planes) == 2 * mixed
             assert (table.plane < 0).sum() == 100 - mixed
 
@@ -121,15 +121,15 @@ class TestPairWidths:
 
     def test_pickle_copy_and_move(self) -> None:
         regions = RegionMap.from_labels(blobs((44, 70)), {(0, 1): 0.7, (2, 3): 1.0}, supersample=2)
-        regions._membership.tiles(TILE)
+        regions.membership.tiles(TILE)
         others = (pickle.loads(pickle.dumps(regions)), copy.deepcopy(regions), regions.to("meta"))
         for other in others:
             assert other.softness == regions.softness
             assert (other.supersample, other.size) == (2, (22, 35))
-            assert other.fine_labels is not None and other.fine_labels.shape == (44, 70)
-            assert other._membership.grid.shape == (1, 44, 70)
-        assert others[2].fine_labels is not None and others[2].fine_labels.device.type == "meta"
-        assert torch.equal(others[0]._membership.tiles(TILE).planes, regions._membership.tiles(TILE).planes)
+            assert other.fine_labels.shape == (44, 70)
+            assert other.membership.grid.shape == (1, 44, 70)
+        assert others[2].fine_labels.device.type == "meta"
+        assert torch.equal(others[0].membership.tiles(TILE).planes, regions.membership.tiles(TILE).planes)
 
     @pytest.mark.parametrize(
         ("softness", "error", "words"),
@@ -154,8 +154,8 @@ class TestPairWidths:
 class TestSupersample:
     def test_one_is_the_plain_map(self) -> None:
         regions = RegionMap.from_labels(blobs(), supersample=1)
-        assert regions.fine_labels is None and regions.supersample == 1
-        assert regions._membership.fine is None
+        assert regions.fine_labels is regions.labels and regions.supersample == 1
+        assert regions.membership.fine is None
 
     @pytest.mark.parametrize("factor", [2, 3, 4])
     def test_labels_have_the_largest_share(self, factor: int) -> None:
@@ -174,12 +174,12 @@ class TestSupersample:
         regions = RegionMap.from_labels(fine, supersample=2)
         assert regions.labels.unique().tolist() == [1]
         assert regions.ids.tolist() == [1, 5]
-        assert regions._membership.weights(0, 1, torch.float64).tolist() == [[0.0, 0.25], [0.0, 0.0]]
+        assert regions.membership.weights(0, 1, torch.float64).tolist() == [[0.0, 0.25], [0.0, 0.0]]
 
     def test_edges_at_sub_pixels_keep_their_place(self) -> None:
         fine = (torch.arange(80) >= 41).long().expand(8, 80)
         for softness in (0.0, 0.7):
-            share = RegionMap.from_labels(fine, softness, supersample=4)._membership.weights(0, 0, torch.float64)
+            share = RegionMap.from_labels(fine, softness, supersample=4).membership.weights(0, 0, torch.float64)
             assert share.sum(1).tolist() == pytest.approx([41 / 4] * 2, abs=1e-12)
 
     @pytest.mark.parametrize(
@@ -240,13 +240,13 @@ class TestResize:
         regions = RegionMap.from_labels(fine, softness, supersample=factor)  # type: ignore[arg-type]
         resized = regions.resize(size)
         assert resized.resize((45, 70)) is regions
-        table = resized._membership.tiles(16)
+        table = resized.membership.tiles(16)
         tiles_x = -(-size[1] // 16)
         for region in range(3):
-            own = regions._membership.weights(0, region, torch.float64)
+            own = regions.membership.weights(0, region, torch.float64)
             # torch's own bilinear resampling holds the border and puts pixels at their centres, as we do
             want = torch.nn.functional.interpolate(own[None, None], size, mode="bilinear", align_corners=False)[0, 0]
-            got = resized._membership.weights(0, region, torch.float64)
+            got = resized.membership.weights(0, region, torch.float64)
             assert (got - want).abs().max() < 1e-9
             for key, plane in zip(table.keys.tolist(), table.plane.tolist(), strict=True):
                 if key % 3 != region:
@@ -290,7 +290,7 @@ class TestResize:
         assert torch.equal(large.fine_labels, RegionMap.from_labels(fine).resize((128, 128)).labels)
         assert regions.resize((side, side)) is regions
         small = RegionMap.from_labels(fine, supersample=factor).resize((side // 2, side // 2))
-        shares = small._membership.weights(0, 1, torch.float64)
+        shares = small.membership.weights(0, 1, torch.float64)
         exact = torch.nn.functional.avg_pool2d(fine[None].double(), 2 * factor)[0]
         # sampled over one pixel of the old map, not averaged over two: as the Gaussians are
         assert (shares - exact).abs().max() <= 0.5 and (shares.mean() - exact.mean()).abs() < 1e-2

@@ -25,7 +25,7 @@ def ellipse(scale: int = 1) -> Tensor:
 def paint(labels: Tensor, width: float = 0.0, colors: Tensor = COLORS) -> Tensor:
     """Mix flat colours by the memberships of that width: the renderer's own definition."""
     regions = RegionMap.from_labels(labels, width)
-    shares = torch.stack([regions._membership.weights(0, r, torch.float32) for r in range(regions.num_regions)])
+    shares = torch.stack([regions.membership.weights(0, r, torch.float32) for r in range(regions.num_regions)])
     return torch.einsum("rhw,rc->chw", shares, colors)
 
 

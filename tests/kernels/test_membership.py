@@ -92,7 +92,7 @@ def stated(labels: Tensor, sigma: Any, region: int, factor: int = 1) -> Tensor:
 class TestDefinition:
     def test_pairs(self, seed: int, factor: int) -> None:
         labels = blobs(seed=seed)
-        membership = RegionMap.from_labels(labels, PAIRS, supersample=factor)._membership
+        membership = RegionMap.from_labels(labels, PAIRS, supersample=factor).membership
         sigma = width_of_pixels(labels.numpy(), PAIRS)
         assert set(np.unique(sigma)) == {0.0, 0.7, 1.1, 2.0}
         for region in range(4):
@@ -101,7 +101,7 @@ class TestDefinition:
 
     def test_one_width(self, seed: int, factor: int) -> None:
         labels = blobs(seed=seed)
-        membership = RegionMap.from_labels(labels, 0.9, supersample=factor)._membership
+        membership = RegionMap.from_labels(labels, 0.9, supersample=factor).membership
         for region in range(4):
             want = stated(labels, np.full(labels.shape, 0.9), region, factor)
             assert (membership.weights(0, region, torch.float64) - want).abs().max() < 1e-12
@@ -113,14 +113,14 @@ class TestTables:
     def test_hold_the_dense_weights(self, softness: Widths, factor: int) -> None:
         maps = torch.stack([blobs((factor * 37, factor * 53), seed=s, grain=8 * factor + 1) for s in (0, 1)])
         maps[0, : factor * 20, : factor * 18] = 3  # tiles with a region of their own
-        membership = RegionMap.from_labels(maps, softness, supersample=factor)._membership
+        membership = RegionMap.from_labels(maps, softness, supersample=factor).membership
         for tile in (TILE, 5):
             for batch in (0, 1):
                 dense = [membership.weights(batch, r, torch.float64) for r in range(4)]
                 assert (from_tiles(membership, tile, batch) - torch.stack(dense)).abs().max() < 1e-12
 
     def test_sum_to_one(self, softness: Widths, factor: int) -> None:
-        membership = RegionMap.from_labels(blobs(), softness, supersample=factor)._membership
+        membership = RegionMap.from_labels(blobs(), softness, supersample=factor).membership
         shares = shares_of(membership)
         assert (shares.sum(0) - 1).abs().max() < 1e-12
         assert shares.min() >= 0
@@ -130,8 +130,8 @@ class TestTables:
 class TestPairWidths:
     def test_junction(self) -> None:
         widths = {(0, 1): 0.0, (0, 2): 0.7, (1, 2): 2.0}
-        shares = shares_of(RegionMap.from_labels(junction(), widths)._membership)
-        apart = {pair: shares_of(RegionMap.from_labels(junction(), w)._membership) for pair, w in widths.items()}
+        shares = shares_of(RegionMap.from_labels(junction(), widths).membership)
+        apart = {pair: shares_of(RegionMap.from_labels(junction(), w).membership) for pair, w in widths.items()}
         # far from the junction each contour is as if it were alone
         assert torch.equal(shares[:, :10, 20:40], apart[0, 1][:, :10, 20:40])
         assert (shares[:, :, :20] - apart[0, 2][:, :, :20]).abs().max() < 1e-12
@@ -140,35 +140,35 @@ class TestPairWidths:
 
     def test_hard_pair_beside_a_soft_pair(self) -> None:
         labels = (torch.arange(60) // 20).expand(20, 60)
-        shares = shares_of(RegionMap.from_labels(labels, {(1, 2): 1.5})._membership)
+        shares = shares_of(RegionMap.from_labels(labels, {(1, 2): 1.5}).membership)
         assert torch.equal(shares[:, :, :30], torch.stack([labels == r for r in range(3)])[:, :, :30].double())
-        soft = shares_of(RegionMap.from_labels(labels, 1.5)._membership)
+        soft = shares_of(RegionMap.from_labels(labels, 1.5).membership)
         assert torch.equal(shares[:, :, 31:], soft[:, :, 31:])
         assert (shares[2, :, 39] > 0.3).all()
 
     def test_equal_widths_of_the_contours_are_one_width(self) -> None:
         labels = (torch.arange(60) // 20).expand(20, 60)  # 0 and 2 do not touch
         regions = RegionMap.from_labels(labels, {(0, 1): 0.7, (1, 2): 0.7, (0, 2): 3.0})
-        assert regions._membership.levels.widths == (0.7,)
-        table, plain = (r._membership.tiles(TILE) for r in (regions, RegionMap.from_labels(labels, 0.7)))
+        assert regions.membership.levels.widths == (0.7,)
+        table, plain = (r.membership.tiles(TILE) for r in (regions, RegionMap.from_labels(labels, 0.7)))
         assert all(torch.equal(a, b) for a, b in zip(table, plain, strict=True))
 
     def test_contours_without_a_width_are_hard(self) -> None:
         labels = (torch.arange(60) // 20).expand(20, 60)
         regions = RegionMap.from_labels(labels, {(0, 2): 3.0})
-        assert regions._membership.tiles(TILE).planes.dtype == torch.bool
-        assert regions._membership.radius == 0
+        assert regions.membership.tiles(TILE).planes.dtype == torch.bool
+        assert regions.membership.radius == 0
 
     def test_batch_with_a_map_of_one_region(self) -> None:
         maps = torch.stack([junction(), torch.ones(SIZE).long()])
-        membership = RegionMap.from_labels(maps, {(0, 1): 0.7, (1, 2): 1.0})._membership
+        membership = RegionMap.from_labels(maps, {(0, 1): 0.7, (1, 2): 1.0}).membership
         assert torch.equal(membership.weights(1, 1, torch.float64), torch.ones(SIZE).double())
         assert torch.equal(from_tiles(membership, TILE, 1)[1], torch.ones(SIZE).double())
 
     def test_only_tiles_that_see_a_contour_have_planes(self) -> None:
         labels = torch.zeros(160, 160, dtype=torch.long)
         labels[:, 80:], labels[:, 144:] = 1, 2
-        table = RegionMap.from_labels(labels, {(0, 1): 0.7})._membership.tiles(TILE)
+        table = RegionMap.from_labels(labels, {(0, 1): 0.7}).membership.tiles(TILE)
         assert len(table.planes) == 2 * 20
         # between 1 and 2 no pixel is soft, and their contour is a border of tiles
         assert (table.plane < 0).sum() == 80
@@ -178,7 +178,7 @@ class TestCoverage:
     @pytest.mark.parametrize("factor", [2, 4])
     def test_is_the_average_of_the_mask(self, factor: int) -> None:
         fine = blobs((factor * 37, factor * 53))
-        membership = RegionMap.from_labels(fine, supersample=factor)._membership
+        membership = RegionMap.from_labels(fine, supersample=factor).membership
         one_hot = torch.stack([fine == r for r in range(4)]).double()
         want = torch.nn.functional.avg_pool2d(one_hot, factor)
         assert torch.equal(shares_of(membership), want)
@@ -188,7 +188,7 @@ class TestCoverage:
         fine = torch.zeros(320, 320, dtype=torch.long)
         fine[:, 161:] = 1
         for softness, mixed in ((0.0, 10), (0.7, 20)):
-            table = RegionMap.from_labels(fine, softness, supersample=2)._membership.tiles(TILE)
+            table = RegionMap.from_labels(fine, softness, supersample=2).membership.tiles(TILE)
             assert len(table.planes) == 2 * mixed
             assert (table.plane < 0).sum() == 100 - mixed
 
@@ -198,11 +198,11 @@ class TestCoverage:
         regions = RegionMap.from_labels(fine, supersample=2)
         assert torch.equal(regions.labels, labels)
         plain = RegionMap.from_labels(labels)
-        assert torch.equal(shares_of(regions._membership), shares_of(plain._membership))
+        assert torch.equal(shares_of(regions.membership), shares_of(plain.membership))
 
 
 def test_to_keeps_everything(device: torch.device) -> None:
-    membership = RegionMap.from_labels(blobs(), PAIRS, supersample=2)._membership
+    membership = RegionMap.from_labels(blobs(), PAIRS, supersample=2).membership
     moved = membership.to(device)
     assert moved.grid.device.type == device.type
     assert (from_tiles(moved, TILE) - from_tiles(membership, TILE)).abs().max() < 1e-12

@@ -106,7 +106,7 @@ def _rows_visited(scene, height, width):  # type: ignore[no-untyped-def]
 
 def evaluated_pairs(scene: Workload, cutoff: float) -> int:
     """Count the (pixel, Gaussian) pairs that the CPU kernel evaluates: whole rows of 16 pixels."""
-    membership, size = scene.regions._membership, scene.regions.size
+    membership, size = scene.regions.membership, scene.regions.size
     index = scene.regions.index_of(scene.region_ids)[None]
     inputs = SplatInputs(scene.means[None], scene.cholesky[None], scene.colors[None], index, membership, size, cutoff)
     return int(_rows_visited(plan(inputs).scene, *size)) * SIDE

@@ -99,7 +99,7 @@ def images_per_second(scene: Workload, cutoff: float, repeats: int) -> float:
 
 def overhead(scene: Workload, cutoff: float, repeats: int) -> tuple[float, float]:
     """Time the CPU kernel alone, and through the module and autograd: median seconds, forward and backward."""
-    membership, size = scene.regions._membership, scene.regions.size
+    membership, size = scene.regions.membership, scene.regions.size
     index = scene.regions.index_of(scene.region_ids)[None]
     inputs = SplatInputs(scene.means[None], scene.cholesky[None], scene.colors[None], index, membership, size, cutoff)
     field = GaussianField(scene.means, scene.cholesky, scene.colors, scene.region_ids, size=size)

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from kcgs._check import check_image, check_labels
+from kcgs._check import check_count, check_image, check_labels, check_number
 
-from .regions import edge_band
+from .labels import edge_band
 
 # Edge alignment: the blur before the gradient; how far a contour may lie beside its edge; the pixels about the contour
 # that are left out, which the edge itself fills; and how far those that it is compared with lie away.
@@ -60,10 +60,8 @@ def smooth_contours(labels: Tensor, supersample: int = 4, sigma: float = 1.5) ->
     labels = check_labels("labels", labels)
     if labels.ndim != 2:
         raise ValueError(f"labels must have shape (H, W); got {tuple(labels.shape)}")
-    if isinstance(supersample, bool) or not isinstance(supersample, int) or not 2 <= supersample <= 16:
-        raise ValueError(f"supersample must be an integer in [2, 16]; got {supersample!r}")
-    if not 0.0 < sigma <= 8.0:
-        raise ValueError(f"sigma must be in (0, 8] pixels; got {sigma!r}")
+    supersample = check_count("supersample", supersample, 2, 16)
+    sigma = check_number("sigma", sigma, 0.0, 8.0, unit="pixels", above=True)
     fine = labels.cpu().repeat_interleave(supersample, 0).repeat_interleave(supersample, 1).numpy()
     out, best = fine.copy(), np.zeros(fine.shape, np.float32)
     reach = math.ceil(3 * sigma * supersample)
@@ -101,11 +99,10 @@ def coverage(labels: Tensor, factor: int) -> Tensor:
                 [[0.0000, 0.7500]]])
     """
     labels = check_labels("labels", labels)
-    if isinstance(factor, bool) or not isinstance(factor, int):
-        raise TypeError(f"factor must be an integer; got {factor!r}")
+    factor = check_count("factor", factor)
     height, width = labels.shape[-2:]
-    if factor < 1 or height % factor or width % factor:
-        raise ValueError(f"factor must be at least 1 and divide the sides of labels, {(height, width)}; got {factor}")
+    if height % factor or width % factor:
+        raise ValueError(f"factor must be a divisor of the sides of labels, {(height, width)}; got {factor}")
     split = labels.reshape(*labels.shape[:-2], height // factor, factor, width // factor, factor)
     # one region at a time: all indicators at once would take R times the fine map
     return torch.stack([(split == region).float().mean((-3, -1)) for region in labels.unique()], dim=-3)
@@ -146,8 +143,7 @@ def boundary_f_score(labels: Tensor, reference: Tensor, tolerance: float = 2.0) 
             f"reference must have the shape and device of labels, {tuple(labels.shape)} on {labels.device}; got "
             f"{tuple(reference.shape)} on {reference.device}"
         )
-    if not 0 <= tolerance < math.inf:
-        raise ValueError(f"tolerance must be a finite number of at least 0 pixels; got {tolerance!r}")
+    check_number("tolerance", tolerance, 0, unit="pixels")
     size = labels.shape[-2:]
     pairs = zip(labels.reshape(-1, *size).cpu().numpy(), reference.reshape(-1, *size).cpu().numpy(), strict=True)
     shares = [_matched(_boundary(mine), _boundary(other), tolerance) for mine, other in pairs]
