@@ -17,12 +17,12 @@ from .covariance import (
     support_extent,
 )
 from .labels import contour_edges, edge_band, lookup_regions, touching_pairs
+from .merging import merge_regions
 from .metrics import ef_psnr, ef_ssim, ms_ssim, psnr, ssim
 from .polygons import polygon_coverage, polygon_labels
 from .regions import PairWidths, RegionMap
 from .splat import region_splat
 from .widths import BandGain, band_gain, choose_widths
-from .worth import merge_worthless
 
 __all__ = [
     "BandGain",
@@ -44,7 +44,7 @@ __all__ = [
     "ef_psnr",
     "ef_ssim",
     "lookup_regions",
-    "merge_worthless",
+    "merge_regions",
     "ms_ssim",
     "polygon_coverage",
     "polygon_labels",

@@ -81,7 +81,9 @@ def polygon_labels(polygons: Tensor | Sequence[Tensor], size: tuple[int, int], s
     height, width = check_size("size", size)
     supersample = check_count("supersample", supersample)
     if max(height, width) * supersample > _MOST_LABELS:
-        raise ValueError(f"supersample must be at most {_MOST_LABELS} / {max(height, width)} at this size; got {supersample}")
+        raise ValueError(
+            f"supersample must be at most {_MOST_LABELS} / {max(height, width)} at this size; got {supersample}"
+        )
     labels = torch.zeros(height * supersample, width * supersample, dtype=torch.int64)
     for number, outline in enumerate(outlines, 1):
         x, y = (outline.detach().double().cpu() * supersample - 0.5).unbind(1)

@@ -165,7 +165,7 @@ def _best_width(error: list[float], tie: float, widths: list[float]) -> float:
 
 def _measure(image: Tensor, labels: Tensor, candidates: Sequence[float]) -> tuple[_Windows, _Errors, list[float]]:
     """Check the arguments; place the windows; return each pair's errors, and the widths they are of, ascending."""
-    image, labels = check_picture(image, labels)
+    image, labels = check_problem(image, labels)
     widths = _check_candidates(candidates)
     windows = _place_windows(labels)
     half, halo = max(_HALF, math.ceil(2 * widths[-1])), math.ceil(RADIUS_SIGMAS * widths[-1])
@@ -185,7 +185,7 @@ def _measure(image: Tensor, labels: Tensor, candidates: Sequence[float]) -> tupl
     return windows, total, widths
 
 
-def check_picture(image: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+def check_problem(image: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     """Return an image (C, H, W) and a label map of its size."""
     image = check_floating("image", image, dims=(3,))
     labels = check_labels("labels", labels)

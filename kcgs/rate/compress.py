@@ -24,7 +24,7 @@ from kcgs.codec.scene import (
 from kcgs.fit.config import FitConfig
 from kcgs.fit.loop import check_problem, fit
 from kcgs.fit.monitor import FitResult, HistoryEntry
-from kcgs.functional import RegionMap, merge_worthless
+from kcgs.functional import RegionMap, merge_regions
 from kcgs.nn import GaussianField
 
 from .fine_tune import FineTuning
@@ -220,7 +220,7 @@ def _choose(
     saved = _POWER * _TRIAL_TO_END * without * image.shape[-2] * image.shape[-1] / (8 * target_bytes)
     price = saved * _contour_bits(regions)
     if config.release and regions.softness == 0.0 and regions.supersample == 1:
-        regions = RegionMap.from_labels(merge_worthless(image, regions.labels, price))
+        regions = RegionMap.from_labels(merge_regions(image, regions.labels, price))
     left = target_bytes - _map_bytes(regions)
     if regions.num_regions == 1 or count_for(left) < regions.num_regions:
         return None, price

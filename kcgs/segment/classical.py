@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from kcgs.functional import merge_worthless
+from kcgs.functional import merge_regions
 from kcgs.segment.base import check_segment_image, register
 from kcgs.segment.cleanup import (
     absorb_specks,
@@ -43,7 +43,7 @@ def auto(image: Tensor, *, max_regions: int = 30, min_size: int | None = None) -
 
     The method of Felzenszwalb and Huttenlocher, with its scale halved up to twice while fewer than 4 regions
     come out that are not nearly flat; contours snap to edges, pieces under ``min_size`` are absorbed;
-    regions unite whose contour saves less error than it costs (`merge_worthless`), and then the most similar
+    regions unite whose contour saves less error than it costs (`merge_regions`), and then the most similar
     neighbours until ``max_regions`` are left. A scene that needs no contour gives one region. On 21 photos of
     BSDS500 some three fifths of the contours lie within 3 pixels of human ones, and of the human ones are
     found; borders of texture alone are not seen. With 400 Gaussians a fit gains 0.76 dB by these maps, and
@@ -77,7 +77,7 @@ def auto(image: Tensor, *, max_regions: int = 30, min_size: int | None = None) -
             best = _cut_out(best, _photo_regions(pixels, scale, min_size), min_size)
             if best.max() + 1 >= _FEWEST or _spread(pixels, best) < _FLAT:
                 break
-    worthy = order_by_area(merge_worthless(pixels, best)) if best.max() > 0 else best
+    worthy = order_by_area(merge_regions(pixels, best)) if best.max() > 0 else best
     return order_by_area(merge_similar(pixels, worthy, max_regions)).to(image.device)
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs.functional import merge_worthless
+from kcgs.functional import merge_regions
 from kcgs.segment import segment
 
 
@@ -18,7 +18,7 @@ def test_keeps_what_shows_and_unites_what_does_not() -> None:
     image = 0.3 + 0.02 * noise(64, 96)
     image[:, :, 60:] += 0.4
     labels = (torch.arange(96) // 30).expand(64, 96)  # contours at 30, which is nothing, 60 and 90
-    merged = merge_worthless(image, labels)
+    merged = merge_regions(image, labels)
     assert merged.unique().tolist() == [0, 2]
     assert (merged[:, :60] == 0).all() and (merged[:, 60:] == 2).all()
 
@@ -27,24 +27,24 @@ def test_one_region_where_the_scene_needs_none() -> None:
     y, x = torch.meshgrid(torch.linspace(0, 1, 90), torch.linspace(0, 1, 120), indexing="ij")
     ramp = (0.5 * x + 0.3 * y).expand(3, -1, -1)
     cells = (torch.arange(90)[:, None] // 30) * 4 + torch.arange(120) // 30
-    assert len(merge_worthless(ramp, cells).unique()) == 1
+    assert len(merge_regions(ramp, cells).unique()) == 1
     assert segment(ramp).max() == 0
     assert segment((ramp + 0.05 * noise(90, 120)).clamp(0, 1)).max() == 0
 
 
-def test_a_higher_price_leaves_fewer() -> None:
+def test_a_higher_cost_leaves_fewer() -> None:
     image = torch.stack([torch.arange(8.0).repeat_interleave(12) ** 1.5 / 20] * 3)[:, None].expand(3, 64, 96)
     labels = (torch.arange(96) // 12).expand(64, 96)
-    counts = [len(merge_worthless(image, labels, price).unique()) for price in (0.0, 0.005, 0.02, 1.0)]
+    counts = [len(merge_regions(image, labels, cost).unique()) for cost in (0.0, 0.005, 0.02, 1.0)]
     assert counts[0] == 8 and counts == sorted(counts, reverse=True) and counts[-1] == 1
 
 
-def test_bad_price() -> None:
-    with pytest.raises(ValueError, match="price must be at least 0"):
-        merge_worthless(noise(8, 8), torch.zeros(8, 8).long(), -1.0)
+def test_bad_cost() -> None:
+    with pytest.raises(ValueError, match="merge_cost must be finite and at least 0"):
+        merge_regions(noise(8, 8), torch.zeros(8, 8).long(), -1.0)
 
 
 @pytest.mark.parametrize("labels", [torch.zeros(8, 8), torch.zeros(8, 9).long(), torch.full((8, 8), -1)])
 def test_bad_labels(labels: Tensor) -> None:
     with pytest.raises((TypeError, ValueError), match="labels"):
-        merge_worthless(noise(8, 8), labels)
+        merge_regions(noise(8, 8), labels)
