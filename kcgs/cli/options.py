@@ -75,7 +75,7 @@ def make_config(
     settings = {"iterations": iterations, "max_seconds": max_seconds, "target_psnr": target_psnr}
     given: dict[str, Any] = {key: value for key, value in settings.items() if value is not None}
     if keep_contours:
-        return FitConfig.from_recipe(recipe, backend=backend.value, refine=False, release=False, **given)
+        return FitConfig.from_recipe(recipe, backend=backend.value, move_contours=False, merge_regions=False, **given)
     if regions == "auto":
         # nobody gave these contours, so none are to be kept near
         free = FitConfig.from_recipe("best-refined")

@@ -7,6 +7,12 @@ from typing import Any
 
 from .config import FitConfig
 
+# how often Gaussians are added, and between which fractions of the fit
+DENSIFY_STEPS = 10
+_DENSIFY_BEGIN, DENSIFY_END = 0.05, 0.5
+# factor on the learning rate at the end of a cosine; at each step, and the fraction of the fit between steps
+COSINE_END = 0.1
+_STEP_DECAY, _STEP_EVERY = 0.5, 0.4
 # PSNR (dB) that annealing still adds when growth ends
 _ANNEALING_GAIN = 0.6
 # PSNR (dB) that twice as many Gaussians add, on photos
@@ -34,18 +40,17 @@ class Schedule:
 
     def rate(self, progress: float) -> float:
         """Factor on the learning rate."""
-        if self.config.schedule == "step":
-            return self.config.decay ** int(progress / self.config.decay_every)
-        return _cosine(progress, self.config.decay)
+        if self.config.optimizer == "frame":
+            return _cosine(progress)
+        return _STEP_DECAY ** int(progress / _STEP_EVERY)
 
     def wanted(self, progress: float) -> int:
         """How many Gaussians there should be."""
-        begin, end = self.config.grow_between
-        if progress < begin:
+        if progress < _DENSIFY_BEGIN:
             return self.first
-        share = 1.0 if end <= begin else (progress - begin) / (end - begin)
-        step = min(self.config.grow_steps, 1 + int(share * (self.config.grow_steps - 1)))
-        return self.first + round((self.total - self.first) * step / self.config.grow_steps)
+        share = (progress - _DENSIFY_BEGIN) / (DENSIFY_END - _DENSIFY_BEGIN)
+        step = min(DENSIFY_STEPS, 1 + int(share * (DENSIFY_STEPS - 1)))
+        return self.first + round((self.total - self.first) * step / DENSIFY_STEPS)
 
     def observe(self, progress: float, psnr: float) -> None:
         """Take note of a measured PSNR."""
@@ -78,7 +83,7 @@ class TargetSchedule(Schedule):
         if self.phase == "growth":
             return 1.0
         length, height = (_ANNEALING, 1.0) if self.phase == "annealing" else (_ATTEMPT, 0.3)
-        return max(self.config.decay, height * _cosine((progress - self.since) / length, self.config.decay))
+        return max(COSINE_END, height * _cosine((progress - self.since) / length))
 
     def wanted(self, progress: float) -> int:
         """How many Gaussians there should be."""
@@ -111,10 +116,10 @@ class TargetSchedule(Schedule):
 
 def make_schedule(config: FitConfig, num_gaussians: int, alive: int) -> Schedule:
     """Make the schedule that the settings ask for."""
-    if config.target_psnr is not None and config.grow_from < 1.0:
+    if config.target_psnr is not None and config.densify_from < 1.0:
         return TargetSchedule(config, num_gaussians, alive, config.target_psnr)
     return Schedule(config, num_gaussians, alive)
 
 
-def _cosine(progress: float, floor: float) -> float:
-    return floor + (1 - floor) * 0.5 * (1 + math.cos(math.pi * min(max(progress, 0.0), 1.0)))
+def _cosine(progress: float) -> float:
+    return COSINE_END + (1 - COSINE_END) * 0.5 * (1 + math.cos(math.pi * min(max(progress, 0.0), 1.0)))

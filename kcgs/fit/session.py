@@ -21,7 +21,7 @@ from .monitor import FitResult, Gaussians, Monitor, StopReason
 from .polish import is_flat, polish
 from .refine import accept_moves, refine_contours
 from .release import choose_contours, release
-from .schedule import make_schedule
+from .schedule import DENSIFY_END, make_schedule
 
 # share of its pixels that a region must keep when contours are smoothed
 _LEAST_AREA = 0.7
@@ -48,6 +48,10 @@ _GROWTH_PATIENCE = 2.0
 _GROWTH_SIGMAS = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
 
 
+# about how many entries the history gets
+_HISTORY_POINTS = 100
+# fractions of the iterations: between refreshes of the region ids, and their end
+_REFRESH_EVERY, _REFRESH_UNTIL = 0.02, 0.5
 # share of a picture's values that are 0 or 1, from which on Gaussians that overshoot them are of use
 _SATURATED = 0.25
 
@@ -63,13 +67,12 @@ class Session:
         self.clamps = _is_saturated(image) if config.clamp == "auto" else config.clamp
         self.monitor = Monitor(image, regions, start)
         self.seed, self.num_gaussians = seed, num_gaussians
-        drafts = config.draft_cutoff is not None and config.target_psnr is None
-        self.cutoff: float = config.draft_cutoff if drafts else config.cutoff  # type: ignore[assignment]
+        self.cutoff = max(config.cutoff, config.draft_cutoff if config.target_psnr is None else 0.0)
         self.begin(_regions_to_draw(image, regions, num_gaussians, config))
         # a map that came with widths keeps them
         self.chooses_widths = config.softness == "auto" and regions is not None and regions.softness == 0.0
         in_time = self.monitor.seconds() < _START_SHARE * (config.max_seconds or math.inf)
-        if config.release and self.drawn is not None and self.drawn.supersample == 1 and in_time:
+        if config.merge_regions and self.drawn is not None and self.drawn.supersample == 1 and in_time:
             choose_contours(self)
         if self.drawn is not None and self.drawn.num_regions > num_gaussians:
             _warn_of_empty_regions(self.drawn.num_regions, num_gaussians)
@@ -119,12 +122,12 @@ class Session:
         self.iteration += 1
 
     def log_is_due(self, progress: float) -> bool:
-        """Say whether the history wants an entry: `history_points` over the fit, by iterations or by the clock."""
+        """Say whether the history wants an entry: about 100 over the fit, by iterations or by the clock."""
         if self.config.target_psnr is not None and self.iteration % max(1, self.config.iterations // 100) == 0:
             return True  # the search for a target goes by what is measured
         if self.config.max_seconds is None:
-            return self.iteration % max(1, self.config.iterations // self.config.history_points) == 0
-        return progress * self.config.history_points >= len(self.monitor.history)
+            return self.iteration % max(1, self.config.iterations // _HISTORY_POINTS) == 0
+        return progress * _HISTORY_POINTS >= len(self.monitor.history)
 
     def log(self, picture: Tensor, gaussians: Gaussians | None = None) -> None:
         """Measure the picture of these Gaussians, or of those of the moment, and write it down."""
@@ -136,16 +139,16 @@ class Session:
     def refresh_ids(self) -> None:
         """Read the ids again under the centres, where the recipe does so and it is time."""
         config = self.config
-        every = max(1, round(config.refresh_every * config.iterations))
+        every = max(1, round(_REFRESH_EVERY * config.iterations))
         if self.drawn is None or not config.warmup or self.iteration % every:
             return
-        if 0 < self.iteration <= config.refresh_until * config.iterations:
+        if 0 < self.iteration <= _REFRESH_UNTIL * config.iterations:
             self.ids = refresh_ids(self.descent.tensors()[0], self.ids, self.drawn)
 
     @torch.no_grad()
     def grow(self, progress: float) -> None:
         """Add Gaussians where the error is, after moving the contours, if that is due."""
-        end = self.config.grow_between[1]
+        end = DENSIFY_END
         wanted = self.schedule.wanted(progress)
         start = self.monitor.seconds()
         # against the clock, growth must leave time for the descent
@@ -167,7 +170,7 @@ class Session:
 
     def settle(self, progress: float) -> None:
         """Move the contours after growth, if that is due."""
-        end = self.config.grow_between[1]
+        end = DENSIFY_END
         if progress >= end + (1 - end) * (self.settlings + 1) / (_SETTLINGS + 1) and self.settlings < _SETTLINGS:
             self.settlings += 1
             self.refine(1.0)
@@ -176,7 +179,7 @@ class Session:
     def refine(self, largest_rise: float, choose: bool = False) -> None:
         """Move the contours where that raises the squared error about them by no more than this factor."""
         config, before, start = self.config, self.drawn, self.monitor.seconds()
-        if not config.refine or before is None or before.supersample > 1:
+        if not config.move_contours or before is None or before.supersample > 1:
             return
         if self.refining > _REFINEMENT_SHARE * (config.max_seconds or math.inf):
             return
@@ -186,7 +189,7 @@ class Session:
             before,
             given=self.anchor,
             max_distance=None if config.max_move == "any" else config.max_move,
-            length_weight=config.contour_price,
+            length_weight=config.contour_cost,
             backend=config.backend,
         )
         if moved is not before:
@@ -203,7 +206,7 @@ class Session:
 
     def release(self, progress: float) -> None:
         """Let go, once, the contours that a trial finds no help."""
-        if not self.config.release or self.released or progress < self.config.grow_between[1]:
+        if not self.config.merge_regions or self.released or progress < DENSIFY_END:
             return
         self.released = True
         cost = _TRIAL_ITERATIONS * self.monitor.seconds() / max(1, self.iteration)
@@ -223,7 +226,7 @@ class Session:
         best = self.monitor.best
         assert best is not None
         field, regions, config = best.field(self.size), best.regions, self.config
-        if config.polish and reason == "iterations" and is_flat(self.image, regions, len(field)):
+        if config.refine_flat and reason == "iterations" and is_flat(self.image, regions, len(field)):
             field = self._polished(field, regions)
         left = PruneResult(field, 0, 0.0)
         if config.prune > 0:
@@ -270,7 +273,7 @@ def _regions_to_draw(
     if config.softness != "auto":
         return RegionMap.from_labels(regions.labels, config.softness)
     widths = choose_widths(image, regions.labels)
-    if config.polish and config.refine and any(widths.values()) and is_flat(image, regions, num_gaussians):
+    if config.refine_flat and config.move_contours and any(widths.values()) and is_flat(image, regions, num_gaussians):
         # a chart's edges are smooth curves: their coverage says more than a blur
         smooth = RegionMap.from_labels(smooth_contours(regions.labels, _SUPERSAMPLE), supersample=_SUPERSAMPLE)
         if _keeps_areas(regions, smooth):
@@ -282,12 +285,12 @@ def _initialize(
     image: Tensor, num_gaussians: int, drawn: RegionMap | None, config: FitConfig, seed: int
 ) -> tuple[GaussianField, float]:
     least = 1 if drawn is None else drawn.num_regions
-    first = math.ceil(config.grow_from * num_gaussians)
-    if config.target_psnr is not None and config.grow_from < 1.0:
+    first = math.ceil(config.densify_from * num_gaussians)
+    if config.target_psnr is not None and config.densify_from < 1.0:
         # num_gaussians is the most there may be, and says nothing of how many are needed
         first = min(first, math.ceil(image.shape[1] * image.shape[2] / _TARGET_SPACING**2))
     count = min(num_gaussians, max(least, first))
-    sigma = config.init_sigma or max(1.0, 0.5 * math.sqrt(image.shape[1] * image.shape[2] / count))
+    sigma = max(1.0, 0.5 * math.sqrt(image.shape[1] * image.shape[2] / count))
     if config.initializer == "random":
         return random_field(image, count, sigma, drawn, seed), sigma
     return INITIALIZERS[config.initializer](image, count, drawn, seed, config.backend), sigma

@@ -171,7 +171,7 @@ def fit_bytes(
         raise ValueError(f"target_bytes must be at least 1; got {target_bytes}")
     regions, price = _choose(image, regions, target_bytes, config, seed)
     count = count_for(target_bytes - _map_bytes(regions))
-    config = config.model_copy(update={"contour_price": price})
+    config = config.model_copy(update={"contour_cost": price})
     result = fit(image, regions, count, seed=seed, config=config, on_step=on_step)
     data = compress(result.field, image, result.regions, target_bytes=target_bytes, seed=seed)
     decoded = decode(data)
@@ -205,10 +205,10 @@ def _choose(
 ) -> tuple[RegionMap | None, float]:
     """Return the map, or None where its bytes do more as Gaussians, and what a pixel of contour must save."""
     if regions is None or regions.num_regions == 1:
-        return None, config.contour_price
+        return None, config.contour_cost
     iterations = min(_TRIAL_ITERATIONS, config.iterations)
     # by iterations, so that the same arguments give the same file
-    shorter = {"iterations": iterations, "max_seconds": None, "release": False, "polish": False}
+    shorter = {"iterations": iterations, "max_seconds": None, "merge_regions": False, "refine_flat": False}
     trial = config.model_copy(update=shorter)
 
     def error(drawn: RegionMap | None, left: int) -> float:
@@ -219,7 +219,7 @@ def _choose(
     # what a bit saves, where it is spent on Gaussians
     saved = _POWER * _TRIAL_TO_END * without * image.shape[-2] * image.shape[-1] / (8 * target_bytes)
     price = saved * _contour_bits(regions)
-    if config.release and regions.softness == 0.0 and regions.supersample == 1:
+    if config.merge_regions and regions.softness == 0.0 and regions.supersample == 1:
         regions = RegionMap.from_labels(merge_regions(image, regions.labels, price))
     left = target_bytes - _map_bytes(regions)
     if regions.num_regions == 1 or count_for(left) < regions.num_regions:

@@ -74,7 +74,7 @@ class TestBest:
 
     def test_growth_off_starts_whole(self) -> None:
         image, labels = scene()
-        assert fit(image, labels, 40, config=quick(grow_from=1.0)).history[0].num_gaussians == 40
+        assert fit(image, labels, 40, config=quick(densify_from=1.0)).history[0].num_gaussians == 40
 
     @pytest.mark.parametrize("initializer", ["random", "gradient", "kmeans"])
     def test_starts(self, initializer: str) -> None:
@@ -105,7 +105,7 @@ class TestBest:
 class TestContours:
     def test_kept_where_they_are_to_be_kept(self) -> None:
         image, labels = scene()
-        result = fit(image, labels, 40, config=quick(refine=False))
+        result = fit(image, labels, 40, config=quick(move_contours=False))
         assert result.regions is not None
         assert torch.equal(result.regions.labels, labels)
 
@@ -122,16 +122,16 @@ class TestContours:
         y, x = torch.meshgrid(torch.arange(48), torch.arange(64), indexing="ij")
         smooth = torch.stack([0.5 + 0.3 * torch.sin(0.11 * x + 0.07 * k * y) for k in range(3)])
         board = (x // 6 + y // 6) % 2
-        result = fit(smooth, board, 24, config=quick(refine=False))
+        result = fit(smooth, board, 24, config=quick(move_contours=False))
         assert result.regions is None
         assert result.field.region_ids is None
-        assert fit(smooth, board, 24, config=quick(refine=False, release=False)).regions is not None
+        assert fit(smooth, board, 24, config=quick(move_contours=False, merge_regions=False)).regions is not None
         assert fit(image, labels, 24, config=quick()).regions is not None
 
     def test_of_three_regions_two_become_one(self) -> None:
         image, labels = scene()
         split = torch.where((labels == 0) & (torch.arange(64) >= 50), 7, labels)
-        regions = fit(image, split, 40, config=quick(iterations=200, refine=False)).regions
+        regions = fit(image, split, 40, config=quick(iterations=200, move_contours=False)).regions
         assert regions is not None
         assert regions.ids.tolist() in ([0, 1], [0, 1, 7])
         assert bool((regions.labels[labels == 1] == 1).all())
@@ -300,17 +300,17 @@ class TestHardCases:
         assert float(result.field.cholesky.detach().abs().max()) <= limit
         assert float(result.field.means.detach().abs().max()) <= 4 * limit
 
-    @pytest.mark.parametrize("rate", [1e-6, 10.0, 1e6])
+    @pytest.mark.parametrize("rate", [1e-5, 100.0, 1e7])
     def test_extreme_learning_rates(self, rate: float) -> None:
         image, labels = scene()
-        result = fit(image, labels, 30, config=quick(learning_rate=rate, color_rate=min(rate, 1.0)))
+        result = fit(image, labels, 30, config=quick(learning_rate_factor=rate))
         assert bool(torch.isfinite(render_image(result.field, result.regions)).all())
 
     def test_fewer_gaussians_than_regions(self) -> None:
         image, _ = scene()
         labels = torch.arange(48)[:, None] // 12 * 4 + torch.arange(64) // 16
         with pytest.warns(UserWarning, match="11 of 16 regions get no Gaussian and stay black"):
-            result = fit(image, labels, 5, config=quick(iterations=10, release=False, refine=False))
+            result = fit(image, labels, 5, config=quick(iterations=10, move_contours=False, merge_regions=False))
         assert len(result.field) <= 5
 
 
@@ -338,19 +338,11 @@ class TestReviewed:
 
     def test_kept_contours_are_exact_on_charts_too(self) -> None:
         image, labels = chart_pie()
-        config = quick(iterations=5, refine=False, release=False)
+        config = quick(iterations=5, move_contours=False, merge_regions=False)
         regions = fit(image, labels, 20, config=config).regions
         assert regions is not None
         assert torch.equal(regions.labels, labels)
         assert regions.supersample == 1
-
-    def test_target_does_not_depend_on_the_history(self) -> None:
-        image, labels = scene()
-        sizes = {
-            len(fit(image, labels, 400, config=quick(iterations=300, target_psnr=28.0, history_points=h)).field)
-            for h in (100, 5)
-        }
-        assert len(sizes) == 1
 
     def test_stopped_among_drafts_returns_the_best(self) -> None:
         image, labels = scene()
@@ -361,7 +353,7 @@ class TestReviewed:
     def test_divergence_while_contours_are_tried(self) -> None:
         image, labels = scene()
         with pytest.warns(UserWarning, match="diverged"):
-            result = fit(image, labels, 30, config=quick(learning_rate=1e30, color_rate=1e30))
+            result = fit(image, labels, 30, config=quick(learning_rate_factor=1e30))
         assert bool(torch.isfinite(render_image(result.field, result.regions)).all())
 
     def test_the_named_backend_is_the_one_that_draws(self, monkeypatch: pytest.MonkeyPatch) -> None:

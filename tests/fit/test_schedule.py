@@ -10,7 +10,7 @@ import torch
 from kcgs import FitConfig, RegionMap
 from kcgs.fit.refine import accept_moves
 from kcgs.fit.release import merge_pairs, nearest_contour
-from kcgs.fit.schedule import Schedule, TargetSchedule, make_schedule
+from kcgs.fit.schedule import COSINE_END, DENSIFY_STEPS, Schedule, TargetSchedule, make_schedule
 
 
 def config(**settings: object) -> FitConfig:
@@ -23,14 +23,14 @@ class TestSchedule:
         counts = [schedule.wanted(p / 1000) for p in range(1001)]
         assert counts[0] == counts[49] == 50
         assert counts[-1] == schedule.wanted(0.5) == 1000
-        assert len(set(counts)) == config().grow_steps + 1
+        assert len(set(counts)) == DENSIFY_STEPS + 1
         assert all(b >= a for a, b in pairwise(counts))
 
     def test_rate_falls_from_one_to_decay(self) -> None:
         schedule = Schedule(config(), 10, 10)
         rates = [schedule.rate(p / 10) for p in range(11)]
         assert rates[0] == 1
-        assert rates[-1] == pytest.approx(config().decay)
+        assert rates[-1] == pytest.approx(COSINE_END)
         assert all(b < a for a, b in pairwise(rates))
 
     def test_progress_is_the_scarcer_of_iterations_and_seconds(self) -> None:
@@ -42,7 +42,7 @@ class TestSchedule:
 class TestTarget:
     def test_only_recipes_that_grow_search(self) -> None:
         assert isinstance(make_schedule(config(target_psnr=30.0), 100, 5), TargetSchedule)
-        assert not isinstance(make_schedule(config(target_psnr=30.0, grow_from=1.0), 100, 5), TargetSchedule)
+        assert not isinstance(make_schedule(config(target_psnr=30.0, densify_from=1.0), 100, 5), TargetSchedule)
 
     def test_grows_anneals_and_adds_what_is_missing(self) -> None:
         schedule = TargetSchedule(config(), 1000, 100, 30.0)

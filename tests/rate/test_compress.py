@@ -35,7 +35,7 @@ def photo(astronaut: Tensor) -> tuple[Tensor, Tensor]:
 @pytest.fixture(scope="module")
 def fitted(photo: tuple[Tensor, Tensor]) -> Fitted:
     image, labels = photo
-    result = fit(image, labels, 300, config=SHORT.model_copy(update={"release": False}))
+    result = fit(image, labels, 300, config=SHORT.model_copy(update={"merge_regions": False}))
     assert result.regions is not None
     return image, result.field, result.regions
 

@@ -60,9 +60,9 @@ TIMED = ("paper", "time")
 COMPARED = {"davis": BEST, "bsds": REFINED, "astronaut": BEST}
 
 _RECIPES: dict[str, tuple[str, dict[str, Any]]] = {
-    KEPT: ("best", {"refine": False, "release": False}),
+    KEPT: ("best", {"move_contours": False, "merge_regions": False}),
     PAPER: ("paper", {"iterations": PAPER_ITERATIONS}),
-    COVERAGE: ("best", {"refine": False, "softness": 0.0}),
+    COVERAGE: ("best", {"move_contours": False, "softness": 0.0}),
     LIMITED: ("best", {"max_seconds": SECONDS}),
     SHORT: ("best-baseline", {"iterations": SHORT_ITERATIONS}),
 }

@@ -26,10 +26,10 @@ PAPER_ROWS = (CLAMPED, UNCLAMPED, GUIDED, GUIDED_UNCLAMPED, WARMED, PAPER)
 OUR_ROWS = (
     BEST,
     method("best without k-means start", "best", initializer="random"),
-    method("best without growth", "best", grow_from=1.0),
+    method("best without growth", "best", densify_from=1.0),
     method("best without soft contours", "best", softness=0.0),
     method("best with L1 loss", "best", loss="l1"),
-    method("best with contours as given", "best", refine=False, release=False),
+    method("best with contours as given", "best", move_contours=False, merge_regions=False),
     BASELINE,
 )
 SHOWN = {

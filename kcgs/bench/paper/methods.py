@@ -43,7 +43,7 @@ BASELINE = method("best-baseline")
 BEST = method("best")
 REFINED = method("best-refined")
 # hard contours at many labels a pixel, which pictures with exact contours have
-COVERAGE = method("best, sub-pixel coverage", "best", refine=False, softness=0.0)
+COVERAGE = method("best, sub-pixel coverage", "best", move_contours=False, softness=0.0)
 
 
 @lru_cache
