@@ -1,0 +1,239 @@
+"""The library as the golden cases call it: where an API changes, this file changes, and no recorded value does."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import sys
+import tempfile
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from torch import Tensor
+
+import kcgs
+from kcgs import FitConfig, GaussianField, RegionMap, nn, segment
+from kcgs import functional as F
+from kcgs.codec import decode, encode
+from kcgs.fit import fit
+from kcgs.fit.colors import solve_colors
+from kcgs.fit.grow import propose
+from kcgs.fit.polish import polish
+from kcgs.fit.refine import refine_contours
+from kcgs.nn.renderer import render_image
+from kcgs.onnx import generic_decoder, scene_decoder
+from kcgs.rate import compress, fit_bytes
+
+ROOT = Path(kcgs.__file__).resolve().parent.parent
+Softness = float | dict[tuple[int, int], float]
+
+
+class Parts(NamedTuple):
+    """A scene as the cases make it: Gaussians, and a label map or None."""
+
+    means: Tensor
+    cholesky: Tensor
+    colors: Tensor
+    ids: Tensor | None = None
+    labels: Tensor | None = None
+    size: tuple[int, int] = (0, 0)
+    softness: Softness = 0.0
+    supersample: int = 1
+    opacities: Tensor | None = None
+
+
+def _field(p: Parts) -> GaussianField:
+    return GaussianField(p.means, p.cholesky, p.colors, p.ids, p.opacities, size=p.size)
+
+
+def _regions(p: Parts) -> RegionMap | None:
+    return None if p.labels is None else RegionMap.from_labels(p.labels, p.softness, supersample=p.supersample)
+
+
+def _of_map(regions: RegionMap | None) -> dict[str, Any]:
+    if regions is None:
+        return {"labels": None}
+    softness = regions.softness if isinstance(regions.softness, float) else sorted(regions.softness.items())
+    return {"labels": regions.fine_labels, "softness": softness, "supersample": regions.supersample}
+
+
+def _of_scene(field: GaussianField, regions: RegionMap | None) -> dict[str, Any]:
+    tensors = {"means": field.means, "cholesky": field.cholesky, "colors": field.colors}
+    return {**tensors, "ids": field.region_ids, "opacities": field.opacities, **_of_map(regions)}
+
+
+def run_fit(image: Tensor, p: Parts | None, num_gaussians: int, recipe: str, **settings: Any) -> dict[str, Any]:
+    """Fit an image with the map of `p`."""
+    config = FitConfig.from_recipe(recipe, **settings)
+    result = fit(image, None if p is None else _regions(p), num_gaussians, seed=3, config=config)
+    history = [[e.iteration, e.loss, e.psnr, e.ef_psnr, e.num_gaussians] for e in result.history]
+    ending = {"stop": result.stop_reason, "removed": result.removed, "change": result.change}
+    return {**_of_scene(result.field, result.regions), "history": torch.tensor(history, dtype=torch.float64), **ending}
+
+
+def to_file(p: Parts, **settings: Any) -> bytes:
+    """Encode a scene as `.kcgs`."""
+    return encode(_field(p), _regions(p), **settings)
+
+
+def from_file(data: bytes, **settings: Any) -> dict[str, Any]:
+    """Decode `.kcgs`."""
+    decoded = decode(data, **settings)
+    return {**_of_scene(decoded.field, decoded.regions), "layers": (decoded.layers, decoded.num_layers)}
+
+
+def run_compress(p: Parts, image: Tensor, **settings: Any) -> bytes:
+    """Encode a scene with an eye on its image."""
+    return compress(_field(p), image, _regions(p), seed=3, **settings)
+
+
+def run_fit_bytes(image: Tensor, p: Parts | None, num_bytes: int, recipe: str, **settings: Any) -> dict[str, Any]:
+    """Fit an image to a number of bytes."""
+    config = FitConfig.from_recipe(recipe, **settings)
+    done = fit_bytes(image, None if p is None else _regions(p), num_bytes, seed=3, config=config)
+    return {"data": done.data, **_of_scene(done.field, done.regions)}
+
+
+def saved(p: Parts, metadata: dict[str, str] | None = None) -> tuple[bytes, dict[str, Any]]:
+    """Save a scene as `.safetensors`; return the file, and what it loads as."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.safetensors"
+        kcgs.save(path, _field(p), _regions(p), metadata=metadata)
+        scene = kcgs.load(path)
+        return path.read_bytes(), {**_of_scene(scene.field, scene.regions), "metadata": scene.metadata}
+
+
+def decoder_of(p: Parts, **settings: Any) -> onnx.ModelProto:
+    """Build the ONNX decoder of one scene."""
+    return scene_decoder(_field(p), _regions(p), **settings)
+
+
+def decoder_of_any(**settings: Any) -> onnx.ModelProto:
+    """Build the generic ONNX decoder."""
+    return generic_decoder(**settings)
+
+
+def run_onnx(model: onnx.ModelProto, feeds: dict[str, Any]) -> Tensor:
+    """Run a decoder on one thread."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    return torch.from_numpy(session.run(["image"], {k: np.asarray(v) for k, v in feeds.items()})[0])
+
+
+def run_decode_script(files: list[bytes], options: list[str]) -> Tensor:
+    """Run export/decode.py on a decoder and, for a generic one, a scene; return what it writes."""
+    spec = importlib.util.spec_from_file_location("kcgs_golden_decode", ROOT / "export" / "decode.py")
+    assert spec is not None and spec.loader is not None
+    script: ModuleType = sys.modules.setdefault(spec.name, importlib.util.module_from_spec(spec))
+    spec.loader.exec_module(script)
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder) / name for name in ("decoder.onnx", "scene.safetensors")[: len(files)]]
+        for path, data in zip(paths, files, strict=True):
+            path.write_bytes(data)
+        output = Path(folder) / "out.npy"
+        args: argparse.Namespace = script.parse([*map(str, paths), "-o", str(output), "--threads", "1", *options])
+        script.decode(args)
+        return torch.from_numpy(np.load(output))
+
+
+def splat(p: Parts, **settings: Any) -> Tensor:
+    """Evaluate the splat of tensors that may hold gradients; `size` is that of the map."""
+    return F.region_splat(p.means, p.cholesky, p.colors, p.ids, _regions(p), **settings)
+
+
+def render(p: Parts, size: tuple[int, int] | None = None) -> Tensor:
+    """Render a scene as a viewer shows it."""
+    return render_image(_field(p), _regions(p), size)
+
+
+def resized_map(p: Parts, size: tuple[int, int]) -> dict[str, Any]:
+    """Return a map at another size."""
+    regions = _regions(p)
+    assert regions is not None
+    return _of_map(regions.resize(size))
+
+
+def run_segment(image: Tensor, method: str, **options: Any) -> Tensor:
+    """Run a segmenter by name."""
+    return segment.segment(image, method, **options)
+
+
+def cleanups(image: Tensor, labels: Tensor) -> dict[str, Tensor]:
+    """Every function that cleans a label map."""
+    return {
+        "connected": segment.connected_regions(labels),
+        "by-area": segment.order_by_area(labels),
+        "specks": segment.absorb_specks(labels, 20),
+        "similar": segment.merge_similar(image, segment.connected_regions(labels), 3),
+        "snap": segment.snap_contours(image, labels, reach=2),
+    }
+
+
+def contour_functions(image: Tensor, labels: Tensor, other: Tensor) -> dict[str, Any]:
+    """What is measured on and done to contours."""
+    return {
+        "smooth": F.smooth_contours(labels, 4),
+        "smooth-wide": F.smooth_contours(labels, 2, sigma=3.0),
+        "widths": sorted(F.choose_widths(image, labels).items()),
+        "gain": sorted((pair, tuple(gain)) for pair, gain in F.band_gain(image, labels).items()),
+        "merge": F.merge_regions(image, labels),
+        "merge-dear": F.merge_regions(image, labels, 0.05),
+        "f-score": tuple(map(float, F.boundary_f_score(labels, other))),
+        "alignment": F.edge_alignment(image, labels),
+        "band": F.edge_band(labels),
+    }
+
+
+def metrics(image: Tensor, other: Tensor, labels: Tensor) -> dict[str, Tensor]:
+    """Every metric of a pair of images."""
+    plain = {name: getattr(F, name)(image, other) for name in ("psnr", "ssim", "ms_ssim")}
+    return plain | {name: getattr(F, name)(image, other, labels) for name in ("ef_psnr", "ef_ssim")}
+
+
+def edits(p: Parts, region: int, background: Tensor) -> dict[str, Any]:
+    """Every edit of one region."""
+    field, regions = _field(p), _regions(p)
+    assert regions is not None
+    recolored = nn.recolor_region(field, region, torch.tensor([0.5, 1.0, 1.5]), 0.1)
+    return {
+        "move": _of_scene(*nn.move_region(field, regions, region, (3, -2))),
+        "delete": _of_scene(*nn.delete_region(field, regions, region)),
+        "recolor": _of_scene(recolored, regions),
+        "extract": nn.extract_region(field, regions, region),
+        "extract-larger": nn.extract_region(field, regions, region, (2 * p.size[0], 2 * p.size[1])),
+        "background": nn.replace_background(field, regions, [region], background),
+    }
+
+
+def run_prune(p: Parts, tolerance: float) -> dict[str, Any]:
+    """Prune a scene."""
+    left = nn.prune(_field(p), _regions(p), tolerance)
+    return {**_of_scene(left.field, None), "removed": left.removed, "change": left.change}
+
+
+def run_propose(p: Parts, residual: Tensor, count: int) -> tuple[Any, ...]:
+    """Find Gaussians to add."""
+    return tuple(propose(residual, _regions(p), count, sigmas=(0.7, 1.8, 4.7)))
+
+
+def run_refine_contours(p: Parts, image: Tensor, **settings: Any) -> dict[str, Any]:
+    """Move contours."""
+    regions = _regions(p)
+    assert regions is not None
+    return _of_map(refine_contours(_field(p), image, regions, **settings))
+
+
+def run_solve_colors(p: Parts, image: Tensor, **settings: Any) -> Tensor:
+    """Solve for the colours."""
+    return solve_colors(_field(p), image, _regions(p), **settings).colors
+
+
+def run_polish(p: Parts, image: Tensor, **settings: Any) -> dict[str, Any]:
+    """Refine all parameters by Levenberg-Marquardt, with no limit of time."""
+    return _of_scene(polish(_field(p), image, _regions(p), max_seconds=1e9, **settings), None)
