@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_cutoff, check_floating
-from kcgs.kernels.form import support_radius
+from kcgs.kernels.whitened import support_radius
 
 
 def check_cholesky(name: str, value: object) -> Tensor:

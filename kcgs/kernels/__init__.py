@@ -1,6 +1,6 @@
 """Ways to evaluate the splat and its gradient; private: call `kcgs.functional.region_splat`."""
 
-from .inputs import SplatInputs
+from .autograd import SplatInputs
 from .membership import Membership
 from .registry import BACKENDS, resolve
 from .resampled import Resampled

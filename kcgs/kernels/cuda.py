@@ -1,7 +1,7 @@
-"""The splat in Triton: an image tile of 16 x 16 pixels a program, and on the way back a piece of a tile's list.
+"""The splat in Triton, in float32: a program renders a tile of 16 x 16 pixels, or differentiates a piece of its list.
 
-Forward, a thread owns pixels and walks the tile's Gaussians; backward, it owns a Gaussian and walks the tile's pixels,
-so that every sum is a thread's own: no atomics, and the same bits every time. float32 only.
+Forward, a thread owns pixels and walks the tile's Gaussians; backward, it owns a Gaussian and walks the tile's pixels.
+Every sum has one owner: no atomics, and the same bits every time.
 """
 
 from __future__ import annotations
@@ -11,25 +11,23 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .binning import TILE, Pairs, bin_gaussians, coefficients, grid_of, sum_runs
-from .form import moments_to_gradients
-from .function import Gradients, Steps, apply_kernel
-from .inputs import SplatInputs
+from .autograd import Gradients, SplatInputs, Steps, apply_kernel
 from .membership import Membership
+from .tiles import TILE, Pairs, bin_gaussians, coefficients, expand_runs, grid_of, split_into_tiles, sum_runs
+from .whitened import sums_to_gradients
 
 try:
     import triton
     import triton.language as tl
-except ImportError:  # told by splat
+except ImportError:  # splat says so
     triton = None
 
-_PIXELS = TILE * TILE
 _MOMENTS = 5
 # channels that a thread holds at once
 _MOST_CHANNELS = 8
-# Gaussians of a program of the backward, one a thread of its one warp
+# Gaussians of a program of the backward, one for each thread of its one warp
 _PIECE = 32
-_DRAW_WARPS = 4
+_RENDER_WARPS = 4
 # multiply and add in one: Triton 3.9 warns where it is not said, and 3.10 will leave it out
 _OPTIONS = {"enable_fp_fusion": True}
 
@@ -40,8 +38,8 @@ class _Plan(NamedTuple):
     start: Tensor  # [tiles + 1] int64
     coefficients: Tensor  # [P, 5]: z1 = k0 + k1 x, z2 = k2 + k3 x + k4 y in tile-centred pixels
     gaussian: Tensor  # [P] int64, b * N + i
-    plane: Tensor | None  # [P] int64 row of planes, -1: weight 1
-    planes: Tensor | None  # [K, 256] float32
+    mask: Tensor | None  # [P] int64 row of masks, -1: weight 1
+    masks: Tensor | None  # [K, 256] float32
     order: Tensor  # [P] int64, the pair's place in the order of the Gaussians
     counts: Tensor  # [B * N] int64, pairs of each Gaussian
 
@@ -60,23 +58,23 @@ def splat(inputs: SplatInputs) -> Tensor:
 
 def _interpreted() -> bool:
     """Whether TRITON_INTERPRET=1 was set when triton was imported: the kernels run in numpy, on CPU tensors."""
-    return triton is not None and not isinstance(_draw_tile, triton.JITFunction)
+    return triton is not None and not isinstance(_render_tile, triton.JITFunction)
 
 
 def _make_plan(inputs: SplatInputs) -> _Plan:
     pairs = bin_gaussians(inputs)
     order = torch.argsort(pairs.tile, stable=True)
     counts = _starts(pairs.gaussian, inputs.means.shape[0] * inputs.means.shape[1]).diff()
-    plane, planes = None, None
-    if pairs.plane is not None and inputs.membership is not None:
-        plane, planes = pairs.plane[order], inputs.membership.derived("cuda", _planes)
-    pairs = Pairs(pairs.gaussian[order], pairs.tile[order], plane, pairs.origin[order])
+    mask, masks = None, None
+    if pairs.mask is not None and inputs.membership is not None:
+        mask, masks = pairs.mask[order], inputs.membership.derived("cuda", _masks)
+    pairs = Pairs(pairs.gaussian[order], pairs.tile[order], mask, pairs.origin[order])
     start = _starts(pairs.tile, grid_of(inputs).total)
-    return _Plan(start, coefficients(pairs, inputs), pairs.gaussian, pairs.plane, planes, order, counts)
+    return _Plan(start, coefficients(pairs, inputs), pairs.gaussian, pairs.mask, masks, order, counts)
 
 
-def _planes(membership: Membership) -> Tensor:
-    return membership.tiles(TILE).planes.to(torch.float32)
+def _masks(membership: Membership) -> Tensor:
+    return membership.tiles(TILE).masks.to(torch.float32)
 
 
 def _starts(values: Tensor, total: int) -> Tensor:
@@ -86,15 +84,15 @@ def _starts(values: Tensor, total: int) -> Tensor:
 
 def _lists(plan: _Plan, inputs: SplatInputs) -> tuple[Any, ...]:
     # where there are no maps, any address will do: it is not read
-    plane = plan.gaussian if plan.plane is None else plan.plane
-    planes = plan.coefficients if plan.planes is None else plan.planes
-    return plan.start, plan.coefficients, plan.gaussian, plane, planes, inputs.cutoff
+    mask = plan.gaussian if plan.mask is None else plan.mask
+    masks = plan.coefficients if plan.masks is None else plan.masks
+    return plan.start, plan.coefficients, plan.gaussian, mask, masks, inputs.cutoff
 
 
 def _constants(plan: _Plan, inputs: SplatInputs) -> dict[str, Any]:
     channels = inputs.colors.shape[-1]
     block = min(_MOST_CHANNELS, 1 << (channels - 1).bit_length())
-    return {"SIDE": TILE, "CHANNELS": channels, "BLOCK": block, "MAPPED": plan.plane is not None}
+    return {"SIDE": TILE, "CHANNELS": channels, "BLOCK": block, "MAPPED": plan.mask is not None}
 
 
 def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
@@ -104,7 +102,7 @@ def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
     constants = _constants(plan, inputs)
     programs = grid.total, -(-channels // constants["BLOCK"])
     with torch.cuda.device_of(image):
-        _draw_tile[programs](
+        _render_tile[programs](
             image,
             colors,
             grid.rows,
@@ -112,7 +110,7 @@ def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
             *inputs.size,
             *_lists(plan, inputs),
             **constants,
-            num_warps=_DRAW_WARPS,
+            num_warps=_RENDER_WARPS,
             **_OPTIONS,
         )
     return image
@@ -124,35 +122,18 @@ def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: boo
         return (means, cholesky, colors) if geometry else (None, None, colors)
     channels = inputs.colors.shape[-1]
     terms = inputs.colors.new_empty(len(plan.order), channels + (_MOMENTS if geometry else 0))
-    tile, first = _pieces(plan)
+    # pieces of the tiles' lists: their tiles and first pairs
+    tile, piece = expand_runs((plan.start.diff() + _PIECE - 1) // _PIECE)
+    first = plan.start[tile] + piece * _PIECE
+    by_tile = split_into_tiles(grad).permute(0, 1, 2, 4, 5, 3).reshape(-1, TILE * TILE, channels).contiguous()
     # channels first, so that the compiler gives whole Gaussians to threads
     colors = inputs.colors.detach().flatten(0, 1).T.contiguous()
-    arguments = terms, plan.order, tile, first, _by_tile(grad, inputs), colors, colors.shape[1]
+    arguments = terms, plan.order, tile, first, by_tile, colors, colors.shape[1]
     constants = {**_constants(plan, inputs), "GEOMETRY": geometry, "PIECE": _PIECE}
     with torch.cuda.device_of(terms):
         _gather_piece[(len(tile),)](*arguments, *_lists(plan, inputs), **constants, num_warps=1, **_OPTIONS)
     total = sum_runs(terms, plan.counts).unflatten(0, inputs.means.shape[:2])
-    if not geometry:
-        return None, None, total
-    colors, first_moments, second_moments = total.split([channels, 2, 3], -1)
-    return *moments_to_gradients(first_moments, second_moments, inputs.cholesky), colors
-
-
-def _pieces(plan: _Plan) -> tuple[Tensor, Tensor]:
-    """Cut every tile's list into pieces: their tiles and first pairs."""
-    pieces = (plan.start.diff() + _PIECE - 1) // _PIECE
-    tile = torch.repeat_interleave(pieces)
-    rank = torch.arange(len(tile), device=tile.device) - (pieces.cumsum(0) - pieces)[tile]
-    return tile, plan.start[tile] + rank * _PIECE
-
-
-def _by_tile(grad: Tensor, inputs: SplatInputs) -> Tensor:
-    """Lay an image out as [tiles, 256, C], zero outside."""
-    grid = grid_of(inputs)
-    height, width = inputs.size
-    grad = torch.nn.functional.pad(grad, (0, grid.cols * TILE - width, 0, grid.rows * TILE - height))
-    grad = grad.unflatten(3, (grid.cols, TILE)).unflatten(2, (grid.rows, TILE)).permute(0, 2, 4, 3, 5, 1)
-    return grad.reshape(grid.total, _PIXELS, -1).contiguous()
+    return sums_to_gradients(total, channels, inputs.cholesky)
 
 
 def _jit(function: Any) -> Any:
@@ -168,7 +149,7 @@ def _weigh(k0, k1, k2, k3, k4, x, y, cutoff):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def _draw_tile(  # type: ignore[no-untyped-def]
+def _render_tile(  # type: ignore[no-untyped-def]
     image,
     colors,
     rows,
@@ -178,8 +159,8 @@ def _draw_tile(  # type: ignore[no-untyped-def]
     start,
     coefficients,
     gaussian,
-    plane,
-    planes,
+    mask_of,
+    masks,
     cutoff,
     SIDE: tl.constexpr,
     CHANNELS: tl.constexpr,
@@ -196,9 +177,9 @@ def _draw_tile(  # type: ignore[no-untyped-def]
         k = coefficients + 5 * i
         _, _, weight = _weigh(tl.load(k), tl.load(k + 1), tl.load(k + 2), tl.load(k + 3), tl.load(k + 4), x, y, cutoff)
         if MAPPED:
-            which = tl.load(plane + i)
-            if which >= 0:
-                weight *= tl.load(planes + which * (SIDE * SIDE) + pixel)
+            which_mask = tl.load(mask_of + i)
+            if which_mask >= 0:
+                weight *= tl.load(masks + which_mask * (SIDE * SIDE) + pixel)
         color = tl.load(colors + tl.load(gaussian + i) * CHANNELS + channel, mask=channel < CHANNELS, other=0.0)
         value += color * weight[None, :]
 
@@ -222,8 +203,8 @@ def _gather_piece(  # type: ignore[no-untyped-def]
     start,
     coefficients,
     gaussian,
-    plane,
-    planes,
+    mask_of,
+    masks,
     cutoff,
     SIDE: tl.constexpr,
     CHANNELS: tl.constexpr,
@@ -241,7 +222,7 @@ def _gather_piece(  # type: ignore[no-untyped-def]
     k4 = tl.load(k + 4, mask=valid, other=0.0)
     which = tl.load(gaussian + entry, mask=valid, other=0)
     if MAPPED:
-        row_of = tl.load(plane + entry, mask=valid, other=-1)
+        which_mask = tl.load(mask_of + entry, mask=valid, other=-1)
 
     width: tl.constexpr = CHANNELS + (5 if GEOMETRY else 0)
     at = terms + tl.load(order + entry, mask=valid, other=0) * width
@@ -257,7 +238,7 @@ def _gather_piece(  # type: ignore[no-untyped-def]
                 z1, z2, weight = _weigh(k0, k1, k2, k3, k4, column - (SIDE - 1) / 2, row - (SIDE - 1) / 2, cutoff)
                 pixel = row * SIDE + column
                 if MAPPED:
-                    weight *= tl.load(planes + row_of * (SIDE * SIDE) + pixel, mask=row_of >= 0, other=1.0)
+                    weight *= tl.load(masks + which_mask * (SIDE * SIDE) + pixel, mask=which_mask >= 0, other=1.0)
                 local = tl.load(grad + (tile * (SIDE * SIDE) + pixel) * CHANNELS + channel, mask=known, other=0.0)
                 sums += local * weight[None, :]
                 if GEOMETRY:

@@ -1,17 +1,12 @@
-"""How much of each pixel belongs to each region: s_r(x, y).
+"""How much of each pixel belongs to each region: the region weights s_r(x, y).
 
-Hard (softness 0): s_r = [M = r]. Soft: the Gaussian blur of [M = r], of standard deviation `softness` pixels, cut at
-`RADIUS_SIGMAS` standard deviations and normalised to sum to one over the regions, so that outside the image nothing
-weighs. Where every pair of regions has a width of its own, a pixel takes the width of its nearest contour. Where the
-map is finer than the image, all this holds on the fine map, and a pixel has the mean over its sub-pixels. At another
-size a soft membership is that of the map's own pixels, interpolated (`resampled.py`).
-A tile deep inside a region has s_r = 1 everywhere and is stored as nothing but its label.
+`RegionMap` defines them. A tile deep inside a region has s_r = 1 everywhere and is stored as nothing but its label.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -31,8 +26,15 @@ class TileMembership(NamedTuple):
     """
 
     keys: Tensor  # [K] int64, sorted: tile * num_regions + region
-    plane: Tensor  # [K] int64, row of `planes`, -1 where the region is alone in its tile
-    planes: Tensor  # [P, tile * tile] bool (hard, one label a pixel) or float64
+    mask: Tensor  # [K] int64, row of `masks`, -1 where the region is alone in its tile
+    masks: Tensor  # [P, tile * tile], the weights: bool (hard, one label per pixel) or float64
+
+    @classmethod
+    def assemble(cls, single: Tensor, keys: Tensor, masks: Tensor) -> TileMembership:
+        """Put the keys of tiles with one region between those of regions with masks."""
+        all_keys, order = torch.cat([single, keys]).sort()
+        rows = torch.arange(len(keys), device=keys.device)
+        return cls(all_keys, torch.cat([torch.full_like(single, -1), rows])[order], masks)
 
 
 class Levels(NamedTuple):
@@ -96,17 +98,17 @@ class Membership:
         """Evaluate s_r of one region over one whole map, (H, W): the definition, without tables."""
         inside = (self.grid[batch] == region).to(torch.float64)
         widths, level = self.levels
-        share = torch.zeros_like(inside)
+        weights = torch.zeros_like(inside)
         for position, width in enumerate(widths):
             blurred = self._blur(inside, width)
-            share = blurred if level is None else torch.where(level[batch] == position, blurred, share)
-        return _pool(share, self.supersample).to(dtype)
+            weights = blurred if level is None else torch.where(level[batch] == position, blurred, weights)
+        return _pool(weights, self.supersample).to(dtype)
 
     def _blur(self, inside: Tensor, width: float) -> Tensor:
         if width == 0.0:
             return inside
         axes = [torch.arange(n, device=inside.device) for n in inside.shape]
-        rows, cols = (self._weights_at(at[:, None] - at[None, :], width) for at in axes)
+        rows, cols = (self._weights_at(axis[:, None] - axis[None, :], width) for axis in axes)
         total = rows.sum(1)[:, None] * cols.sum(1)[None, :]
         return (rows @ inside @ cols.T) / total
 
@@ -148,36 +150,34 @@ class Membership:
         ]
         several = torch.cat([single[:0], *parts])
         several = several if level is None else several.unique()
-        planes = self._planes(several, tile)
-        all_keys, order = torch.cat([single * self.num_regions + label[single], several]).sort()
-        rows = torch.arange(len(several), device=several.device)
-        return TileMembership(all_keys, torch.cat([torch.full_like(single, -1), rows])[order], planes)
+        masks = self._masks(several, tile)
+        return TileMembership.assemble(single * self.num_regions + label[single], several, masks)
 
     def _keys(self, tiles: Tensor, side: int, reach: int) -> list[Tensor]:
         """List tile * num_regions + region of all that the pixels of some tiles can see, in sorted pieces."""
         view = _windows(self.grid, side, reach, -1)
         keys = []
-        for some in tiles.split(max(1, _PATCH_ELEMENTS // (side + 2 * reach) ** 2)):
-            seen = view[_place(some, view)].flatten(1)
-            keys.append(torch.unique((some[:, None] * self.num_regions + seen)[seen >= 0]))
+        for chunk in tiles.split(max(1, _PATCH_ELEMENTS // (side + 2 * reach) ** 2)):
+            seen = view[_place(chunk, view)].flatten(1)
+            keys.append(torch.unique((chunk[:, None] * self.num_regions + seen)[seen >= 0]))
         return keys
 
-    def _planes(self, keys: Tensor, tile: int) -> Tensor:
+    def _masks(self, keys: Tensor, tile: int) -> Tensor:
         """Weights of each key's region over its tile."""
         cols = -(-self.index.shape[2] // tile)
         per_map = cols * -(-self.index.shape[1] // tile)
         tiles, region = keys // self.num_regions, keys % self.num_regions
         batch, row, col = tiles // per_map, tiles // cols % (per_map // cols) * tile, tiles % cols * tile
-        planes = self.window_shares(batch, region, row, col, (tile, tile)).flatten(1)
+        masks = self.window_weights(batch, region, row, col, (tile, tile)).flatten(1)
         hard = self.supersample == 1 and self.levels.widths == (0.0,)
-        return planes.bool() if hard else planes
+        return masks.bool() if hard else masks
 
-    def window_shares(self, batch: Tensor, region: Tensor, rows: Tensor, cols: Tensor, span: tuple[int, int]) -> Tensor:
+    def window_weights(self, batch: Tensor, region: Tensor, rows: Tensor, cols: Tensor, span: Sequence[int]) -> Tensor:
         """Evaluate s_r over windows of pixels.
 
         Args:
             batch: (P,), image of each window.
-            region: (P,), whose weights.
+            region: (P,).
             rows: (P,), first row; windows may reach beyond the image, where the weights mean nothing.
             cols: (P,), first column.
             span: height and width of the windows.
@@ -187,33 +187,33 @@ class Membership:
         """
         k, (widths, level) = self.supersample, self.levels
         sides = (k * span[0], k * span[1])
-        shares = torch.zeros(len(region), *span, dtype=torch.float64, device=region.device)
+        weights = torch.zeros(len(region), *span, dtype=torch.float64, device=region.device)
         reach = max(self._reach(width) for width in widths)
         windows = torch.arange(len(region), device=region.device)
-        for some in windows.split(max(1, _PATCH_ELEMENTS // ((sides[0] + 2 * reach) * (sides[1] + 2 * reach)))):
-            place, ids = (batch[some], k * rows[some], k * cols[some]), region[some]
+        for chunk in windows.split(max(1, _PATCH_ELEMENTS // ((sides[0] + 2 * reach) * (sides[1] + 2 * reach)))):
+            place, ids = (batch[chunk], k * rows[chunk], k * cols[chunk]), region[chunk]
             if level is None:
-                shares[some] = _pool(self._blurred(place, ids, sides, widths[0]), k)
+                weights[chunk] = _pool(self._blurred(place, ids, sides, widths[0]), k)
                 continue
             levels = self._read(level, place, sides, 0)[0]
             for position, width in enumerate(widths):
-                own = levels == position
-                held = own.flatten(1).any(1).nonzero().flatten()
-                if len(held):
-                    blurred = self._blurred(tuple(part[held] for part in place), ids[held], sides, width)
-                    shares[some[held]] += _pool(torch.where(own[held], blurred, 0.0), k)
-        return shares
+                inside = levels == position
+                found = inside.flatten(1).any(1).nonzero().flatten()
+                if len(found):
+                    blurred = self._blurred(tuple(part[found] for part in place), ids[found], sides, width)
+                    weights[chunk[found]] += _pool(torch.where(inside[found], blurred, 0.0), k)
+        return weights
 
     def _read(
         self, grid: Tensor, place: tuple[Tensor, ...], sides: tuple[int, int], reach: int
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return windows of a grid with a halo, held at its border, and which of their rows and columns are inside."""
-        at, there = [], []
+        lines, inside = [], []
         for first, side, length in zip(place[1:], sides, grid.shape[1:], strict=True):
             line = first[:, None] + torch.arange(-reach, side + reach, device=grid.device)
-            at.append(line.clamp(0, length - 1))
-            there.append((line == at[-1]).double())
-        return grid[place[0][:, None, None], at[0][:, :, None], at[1][:, None, :]], there[0], there[1]
+            lines.append(line.clamp(0, length - 1))
+            inside.append((line == lines[-1]).double())
+        return grid[place[0][:, None, None], lines[0][:, :, None], lines[1][:, None, :]], inside[0], inside[1]
 
     def _blurred(self, place: tuple[Tensor, ...], region: Tensor, sides: tuple[int, int], width: float) -> Tensor:
         """Blur [M = r] over windows of the grid, of one width."""
@@ -262,25 +262,24 @@ def _find_levels(membership: Membership) -> Levels:
 def _across(labels: Any) -> Any:
     """Label on the other side of the contour that a pixel touches (above, left, right, below: the first); else -1."""
     other = np.full_like(labels, -1)
-    most, least = slice(1, None), slice(None, -1)
-    whole = slice(None)
-    for here, there in (
-        ((most, whole), (least, whole)),
-        ((whole, most), (whole, least)),
-        ((whole, least), (whole, most)),
-        ((least, whole), (most, whole)),
+    later, earlier, every = slice(1, None), slice(None, -1), slice(None)
+    for pixel, neighbour in (
+        ((later, every), (earlier, every)),
+        ((every, later), (every, earlier)),
+        ((every, earlier), (every, later)),
+        ((earlier, every), (later, every)),
     ):
-        found = (labels[here] != labels[there]) & (other[here] < 0)
-        other[here][found] = labels[there][found]
+        found = (labels[pixel] != labels[neighbour]) & (other[pixel] < 0)
+        other[pixel][found] = labels[neighbour][found]
     return other
 
 
-def _pool(shares: Tensor, factor: int) -> Tensor:
+def _pool(weights: Tensor, factor: int) -> Tensor:
     """Mean over the sub-pixels of each pixel: (..., k * H, k * W) to (..., H, W)."""
     if factor == 1:
-        return shares
-    height, width = shares.shape[-2:]
-    return shares.reshape(*shares.shape[:-2], height // factor, factor, width // factor, factor).mean((-3, -1))
+        return weights
+    height, width = weights.shape[-2:]
+    return weights.reshape(*weights.shape[:-2], height // factor, factor, width // factor, factor).mean((-3, -1))
 
 
 def _pad(grid: Tensor, side: int, reach: int, outside: int) -> Tensor:
@@ -315,8 +314,8 @@ def _levels_held(grid: Tensor, level: Tensor | None, count: int, side: int) -> T
     rows, cols = -(-height // side), -(-width // side)
     if level is None:
         return torch.ones(maps * rows * cols, 1, dtype=torch.bool, device=grid.device)
-    at = [torch.arange(n, device=grid.device) for n in grid.shape]
-    tile = (at[0][:, None, None] * rows + at[1][:, None] // side) * cols + at[2] // side
+    image, y, x = (torch.arange(n, device=grid.device) for n in grid.shape)
+    tile = (image[:, None, None] * rows + y[:, None] // side) * cols + x // side
     holds = torch.zeros(maps * rows * cols * count, dtype=torch.bool, device=grid.device)
     holds[(tile * count + level).flatten()] = True
     return holds.view(-1, count)

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .form import Z_LIMIT
-from .inputs import SplatInputs
+from .autograd import SplatInputs
+from .whitened import Z_LIMIT
 
 _CHUNK_ELEMENTS = 1 << 22
 
@@ -22,7 +22,7 @@ def splat(inputs: SplatInputs) -> Tensor:
     height, width = inputs.size
     batch, _, channels = inputs.colors.shape
     image = inputs.colors.new_zeros(batch, height * width, channels)
-    # part of the graph, even if nothing is drawn
+    # part of the graph, even if there is nothing to render
     image = image + sum((0.0 * t).sum() for t in inputs[:3])
     for b in range(batch):
         for chosen, weights in _regions(inputs, b):
@@ -52,7 +52,7 @@ def _regions(inputs: SplatInputs, b: int) -> Iterator[tuple[Tensor, Tensor | Non
 def _region_sum(
     inputs: SplatInputs, means: Tensor, cholesky: Tensor, colors: Tensor, pixels: Tensor, weights: Tensor | None
 ) -> Tensor:
-    """Draw Gaussians (N, ...) at flat pixel indices (P,), which gives (P, C)."""
+    """Evaluate Gaussians (N, ...) at flat pixel indices (P,), which gives (P, C)."""
     x, y = ((v.to(means.dtype) + 0.5) for v in (pixels % inputs.size[1], pixels // inputs.size[1]))
     step = max(1, _CHUNK_ELEMENTS // max(1, len(means)))
     if len(pixels) <= step:
@@ -64,28 +64,28 @@ def _region_sum(
 
 
 class _Chunks(torch.autograd.Function):
-    """`_dense_sum` chunk by chunk, each drawn again when it is differentiated."""
+    """`_dense_sum` chunk by chunk, each evaluated again when it is differentiated."""
 
     @staticmethod
     def forward(ctx: Any, points: list[Any], cutoff: float, *gaussians: Tensor) -> Tensor:
         ctx.points, ctx.cutoff = points, cutoff
         ctx.save_for_backward(*gaussians)
-        return torch.cat([_dense_sum(x, y, share, gaussians, cutoff) for x, y, share in points])
+        return torch.cat([_dense_sum(x, y, region, gaussians, cutoff) for x, y, region in points])
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         again = torch.is_grad_enabled()
         gaussians = ctx.saved_tensors if again else [t.detach().requires_grad_() for t in ctx.saved_tensors]
         total = [torch.zeros_like(t) for t in gaussians]
-        for (x, y, share), part in zip(ctx.points, grad.split([len(p[0]) for p in ctx.points]), strict=True):
+        for (x, y, region), part in zip(ctx.points, grad.split([len(p[0]) for p in ctx.points]), strict=True):
             with torch.enable_grad():
-                value = _dense_sum(x, y, share, gaussians, ctx.cutoff)
+                value = _dense_sum(x, y, region, gaussians, ctx.cutoff)
             terms = torch.autograd.grad(value, gaussians, part, create_graph=again)
             total = [t + term for t, term in zip(total, terms, strict=True)]
         return (None, None, *total)
 
 
-def _dense_sum(x: Tensor, y: Tensor, share: Tensor | None, gaussians: Sequence[Tensor], cutoff: float) -> Tensor:
+def _dense_sum(x: Tensor, y: Tensor, region: Tensor | None, gaussians: Sequence[Tensor], cutoff: float) -> Tensor:
     means, cholesky, colors = gaussians
     l11, l21, l22 = cholesky.unbind(-1)
     # far beyond any weight that is not zero, and squares stay finite: no inf * 0 in the backward
@@ -94,4 +94,4 @@ def _dense_sum(x: Tensor, y: Tensor, share: Tensor | None, gaussians: Sequence[T
     weight = torch.exp(-0.5 * (z1 * z1 + z2 * z2))
     weight = torch.where(weight >= cutoff, weight, 0.0)
     value = weight @ colors  # [P, C]
-    return value if share is None else value * share[:, None]
+    return value if region is None else value * region[:, None]

@@ -10,7 +10,7 @@ from importlib import import_module, util
 import torch
 from torch import Tensor
 
-from .inputs import SplatInputs
+from .autograd import SplatInputs
 
 BACKENDS = ("auto", "reference", "tiled", "cpu", "cuda")
 
@@ -26,7 +26,7 @@ def _has_triton() -> bool:
     if util.find_spec("triton") is not None:
         return True
     warnings.warn(
-        "Triton is not installed: drawing on CUDA takes the slower 'tiled' (pip install triton)", stacklevel=2
+        "Triton is not installed: rendering on CUDA takes the slower 'tiled' (pip install triton)", stacklevel=2
     )
     return False
 
@@ -54,5 +54,5 @@ def _kernel(name: str) -> Kernel:
 
 @torch._disable_dynamo  # type: ignore[attr-defined]  # the public name imports the compiler
 def _untraced(name: str, inputs: SplatInputs) -> Tensor:
-    """Draw outside of the compiled graph: the compiler would trace into numba and Triton."""
+    """Render outside of the compiled graph: the compiler would trace into numba and Triton."""
     return _kernel(name)(inputs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -13,18 +14,18 @@ _CHUNK_ELEMENTS = 1 << 21
 
 
 class _Axis(NamedTuple):
-    """Where the pixels of one axis lie between the map's own."""
+    """Where the pixels of one axis lie between those of the map."""
 
     low: Tensor  # [n] int64, the neighbour before
     high: Tensor  # [n] int64, the one after, both clamped to the map
-    share: Tensor  # [n] float64, of the one after
+    weight: Tensor  # [n] float64, of the one after
 
 
 class Resampled(Membership):
     """Membership of a soft map at another size.
 
     A point between the centres of four pixels has the bilinear mean of their memberships; beyond the outermost centres
-    the border's are held. At the map's own size that would be the map itself.
+    those of the border are held. At the size of the map that would be the map itself.
     """
 
     def __init__(self, index: Tensor, source: Membership) -> None:
@@ -32,7 +33,7 @@ class Resampled(Membership):
 
         Args:
             index: (B, H, W), labels at the new size.
-            source: the map at its own.
+            source: the map at its own size.
         """
         super().__init__(index, source.num_regions, source.softness)
         self.source = source
@@ -43,43 +44,42 @@ class Resampled(Membership):
 
     def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
         """Evaluate s_r of one region over one whole map, (H, W): the definition, without tables."""
-        share = self.source.weights(batch, region, torch.float64)
+        weights = self.source.weights(batch, region, torch.float64)
         down, across = (
-            _matrix(axis, torch.zeros(1, dtype=torch.int64, device=share.device), n)[0]
-            for axis, n in zip(self._axes(1), share.shape, strict=True)
+            _matrix(axis, torch.zeros(1, dtype=torch.int64, device=weights.device), n)[0]
+            for axis, n in zip(self._axes(1), weights.shape, strict=True)
         )
-        return (down @ share @ across.T).to(dtype)
+        return (down @ weights @ across.T).to(dtype)
 
     def _axes(self, tile: int) -> tuple[_Axis, _Axis]:
         """Return rows and columns, filled up with the last one to whole tiles."""
-        old = self.source.index.shape[1:]
-        device = self.index.device
-        return tuple(_axis(new, there, tile, device) for new, there in zip(self.index.shape[1:], old, strict=True))  # type: ignore[return-value]
+        sizes = zip(self.index.shape[1:], self.source.index.shape[1:], strict=True)
+        return tuple(_axis(new, old, tile, self.index.device) for new, old in sizes)  # type: ignore[return-value]
 
     def _build_tiles(self, tile: int) -> TileMembership:
         maps = self.index.shape[0]
         axes = self._axes(tile)
         firsts = [axis.low[::tile] for axis in axes]
         spans = [int((axis.high[tile - 1 :: tile] - first).max()) + 1 for axis, first in zip(axes, firsts, strict=True)]
-        weights = [
+        down, across = (
             _matrix(_Axis(*(part.view(-1, tile) for part in axis)), first, span)
             for axis, first, span in zip(axes, firsts, spans, strict=True)
-        ]  # [tiles of the axis, tile, span] each
+        )  # [tiles of the axis, tile, span] each
         place = torch.cartesian_prod(*[torch.arange(n, device=firsts[0].device) for n in (maps, *map(len, firsts))])
         batch, row, col = place.unbind(1)
-        keys, label = self._keys_seen(batch, firsts[0][row], firsts[1][col], (spans[0], spans[1]))
+        keys, label = self._keys_seen(batch, firsts[0][row], firsts[1][col], spans)
         tiles, region = keys // self.num_regions, keys % self.num_regions
-        planes, step = [], max(1, _CHUNK_ELEMENTS // (spans[0] * spans[1] + tile * tile))
-        for t, r in zip(tiles.split(step), region.split(step), strict=True):
-            at = row[t], col[t]
-            shares = self.source.window_shares(batch[t], r, firsts[0][at[0]], firsts[1][at[1]], (spans[0], spans[1]))
-            planes.append((weights[0][at[0]] @ shares @ weights[1][at[1]].mT).flatten(1))
-        return _assemble(keys, torch.cat(planes) if planes else self._no_planes(tile), label, self.num_regions)
+        masks = torch.zeros(len(keys), tile * tile, dtype=torch.float64, device=keys.device)
+        step = max(1, _CHUNK_ELEMENTS // (spans[0] * spans[1] + tile * tile))
+        for chunk in torch.arange(len(keys), device=keys.device).split(step):
+            t, y, x = tiles[chunk], row[tiles[chunk]], col[tiles[chunk]]
+            window = self.source.window_weights(batch[t], region[chunk], firsts[0][y], firsts[1][x], spans)
+            masks[chunk] = (down[y] @ window @ across[x].mT).flatten(1)
+        seen = (masks > 0).any(1)
+        single = (label >= 0).nonzero().flatten()
+        return TileMembership.assemble(single * self.num_regions + label[single], keys[seen], masks[seen])
 
-    def _no_planes(self, tile: int) -> Tensor:
-        return torch.zeros(0, tile * tile, dtype=torch.float64, device=self.index.device)
-
-    def _keys_seen(self, batch: Tensor, rows: Tensor, cols: Tensor, span: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    def _keys_seen(self, batch: Tensor, rows: Tensor, cols: Tensor, span: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Return the sorted keys of tiles that may be mixed, and the label of each other tile, -1 for those."""
         source = self.source
         k, grid = source.supersample, source.grid
@@ -87,14 +87,14 @@ class Resampled(Membership):
         y, x = (torch.arange(-reach, k * n + reach, device=grid.device) for n in span)
         keys, label = [], torch.full_like(batch, -1)
         tiles = torch.arange(len(batch), device=grid.device)
-        for some in tiles.split(max(1, _CHUNK_ELEMENTS // (len(y) * len(x)))):
-            at_y = (k * rows[some, None] + y).clamp(0, grid.shape[1] - 1)
-            at_x = (k * cols[some, None] + x).clamp(0, grid.shape[2] - 1)
-            seen = grid[batch[some, None, None], at_y[:, :, None], at_x[:, None, :]].flatten(1)
+        for chunk in tiles.split(max(1, _CHUNK_ELEMENTS // (len(y) * len(x)))):
+            at_y = (k * rows[chunk, None] + y).clamp(0, grid.shape[1] - 1)
+            at_x = (k * cols[chunk, None] + x).clamp(0, grid.shape[2] - 1)
+            seen = grid[batch[chunk, None, None], at_y[:, :, None], at_x[:, None, :]].flatten(1)
             low, high = seen.aminmax(dim=1)
             single = low == high
-            label[some[single]] = high[single].long()
-            mixed = some[~single]
+            label[chunk[single]] = high[single].long()
+            mixed = chunk[~single]
             keys.append(torch.unique(mixed[:, None] * self.num_regions + seen[~single]))
         return torch.cat(keys), label
 
@@ -110,15 +110,5 @@ def _matrix(axis: _Axis, first: Tensor, span: int) -> Tensor:
     """Matrix from the pixels of a window to those between them, (tiles, n, span)."""
     at = torch.arange(span, device=first.device) + first.view(-1, 1, 1)
     low, high = (side.reshape(len(first), -1, 1) == at for side in axis[:2])
-    share = axis.share.reshape(len(first), -1, 1)
-    return low * (1 - share) + high * share
-
-
-def _assemble(keys: Tensor, planes: Tensor, label: Tensor, num_regions: int) -> TileMembership:
-    """Drop what is zero, and put the tiles of one region between the others."""
-    some = planes.amax(1) > 0 if len(planes) else torch.zeros(0, dtype=torch.bool, device=keys.device)
-    keys, planes = keys[some], planes[some]
-    single = (label >= 0).nonzero().flatten()
-    all_keys, order = torch.cat([single * num_regions + label[single], keys]).sort()
-    rows = torch.arange(len(keys), device=keys.device)
-    return TileMembership(all_keys, torch.cat([torch.full_like(single, -1), rows])[order], planes)
+    weight = axis.weight.reshape(len(first), -1, 1)
+    return low * (1 - weight) + high * weight

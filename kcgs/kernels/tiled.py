@@ -12,10 +12,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .binning import TILE, Pairs, bin_gaussians, coefficients, grid_of, sum_runs
-from .form import lowest_exponent, moments_to_gradients
-from .function import Gradients, Steps, apply_kernel
-from .inputs import SplatInputs
+from .autograd import Gradients, SplatInputs, Steps, apply_kernel
+from .tiles import TILE, Pairs, bin_gaussians, coefficients, expand_runs, grid_of, split_into_tiles, sum_runs
+from .whitened import lowest_exponent, sums_to_gradients
 
 _CHUNK_ELEMENTS = 1 << 18
 _LONGEST_LIST = 1024
@@ -35,7 +34,7 @@ class _Plan(NamedTuple):
     batches: list[_Batch]
     segment_tile: Tensor  # [S] int64, ascending
     coefficients: Tensor  # [P + 1, 5]: z1 = k0 + k1 x, z2 = k2 + k3 x + k4 y in tile-centred pixels
-    planes: Tensor | None
+    masks: Tensor | None  # [K, 256], in the dtype of the inputs
 
 
 def splat(inputs: SplatInputs) -> Tensor:
@@ -45,28 +44,25 @@ def splat(inputs: SplatInputs) -> Tensor:
 
 def _make_plan(inputs: SplatInputs) -> _Plan:
     pairs = bin_gaussians(inputs)
-    membership = inputs.membership
-    planes = None
-    if pairs.plane is not None and membership is not None:
-        planes = membership.tiles(TILE).planes.to(inputs.means.dtype)
+    masks = None
+    if pairs.mask is not None and inputs.membership is not None:
+        masks = inputs.membership.tiles(TILE).masks.to(inputs.means.dtype)
 
     # segments: a tile's list cut into pieces of at most _LONGEST_LIST
     order = torch.argsort(pairs.tile, stable=True)
     tiles, lengths = torch.unique_consecutive(pairs.tile[order], return_counts=True)
-    pieces = -(-lengths // _LONGEST_LIST)
-    owner = torch.repeat_interleave(pieces)
-    piece = torch.arange(len(owner), device=owner.device) - (pieces.cumsum(0) - pieces)[owner]
+    owner, piece = expand_runs(-(-lengths // _LONGEST_LIST))
     start = (lengths.cumsum(0) - lengths)[owner] + piece * _LONGEST_LIST
     length = (lengths[owner] - piece * _LONGEST_LIST).clamp_max(_LONGEST_LIST)
     mixed = torch.zeros_like(length, dtype=torch.bool)
-    if pairs.plane is not None:
-        mixed = pairs.plane[order][start] >= 0
+    if pairs.mask is not None:
+        mixed = pairs.mask[order][start] >= 0
     batches = [
         batch
         for kind in (False, True)
         for batch in _batches((mixed == kind).nonzero().flatten(), start, length, order, kind)
     ]
-    return _Plan(pairs, batches, tiles[owner], _padded(coefficients(pairs, inputs)), planes)
+    return _Plan(pairs, batches, tiles[owner], _padded(coefficients(pairs, inputs)), masks)
 
 
 def _batches(chosen: Tensor, start: Tensor, length: Tensor, order: Tensor, mixed: bool) -> Iterator[_Batch]:
@@ -96,7 +92,7 @@ def _bases(like: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _weights(plan: _Plan, batch: _Batch, bases: tuple[Tensor, Tensor], cutoff: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return z1, z2 and the weight, membership included, each [T, G, 256]."""
+    """Return z1, z2 and the weight, times that of the region, each [T, G, 256]."""
     k = plan.coefficients[batch.entries]
     z1 = k[..., :2] @ bases[0]
     z2 = k[..., 2:] @ bases[1]
@@ -104,9 +100,9 @@ def _weights(plan: _Plan, batch: _Batch, bases: tuple[Tensor, Tensor], cutoff: f
     if cutoff > 0.0:
         weight.mul_(weight >= cutoff)
     if batch.mixed:
-        assert plan.planes is not None and plan.pairs.plane is not None
-        rows = torch.cat([plan.pairs.plane, plan.pairs.plane.new_zeros(1)])[batch.entries]
-        weight.mul_(plan.planes[rows])
+        assert plan.masks is not None and plan.pairs.mask is not None
+        mask = torch.cat([plan.pairs.mask, plan.pairs.mask.new_zeros(1)])[batch.entries]
+        weight.mul_(plan.masks[mask])
     return z1, z2, weight
 
 
@@ -133,12 +129,7 @@ def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
 
 
 def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
-    grid = grid_of(inputs)
-    height, width = inputs.size
-    grad = torch.nn.functional.pad(grad, (0, grid.cols * TILE - width, 0, grid.rows * TILE - height))
-    grad = grad.unflatten(3, (grid.cols, TILE)).unflatten(2, (grid.rows, TILE)).permute(0, 2, 4, 1, 3, 5)
-    grad = grad.reshape(grid.total, -1, _PIXELS)  # [tiles, C, 256]
-
+    grad = split_into_tiles(grad).flatten(0, 2).flatten(2)  # [tiles, C, 256]
     colors, bases = _padded_colors(plan, inputs), _bases(inputs.means)
     channels = colors.shape[-1]
     sums = colors.new_zeros(len(colors), (5 if geometry else 0) + channels)
@@ -151,11 +142,7 @@ def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: boo
         sums[batch.entries] = torch.cat(parts, -1)
     counts = torch.bincount(plan.pairs.gaussian, minlength=inputs.means.shape[0] * inputs.means.shape[1])
     total = sum_runs(sums[:-1], counts).unflatten(0, inputs.means.shape[:2])
-    colors = total[..., :channels]
-    if not geometry:
-        return None, None, colors
-    first, second = total[..., channels : channels + 2], total[..., channels + 2 :]
-    return *moments_to_gradients(first, second, inputs.cholesky), colors
+    return sums_to_gradients(total, channels, inputs.cholesky)
 
 
 def _moments(z1: Tensor, z2: Tensor, value: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ import onnx
 import torch
 
 from kcgs._check import check_cutoff
-from kcgs.kernels.form import lowest_exponent, support_radius
+from kcgs.kernels.whitened import lowest_exponent, support_radius
 
 from .graph import FLOAT, Array, Graph, Value
 from .metadata import header

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap
-from kcgs.kernels.form import support_radius
+from kcgs.kernels.whitened import support_radius
 from kcgs.nn import GaussianField
 
 TILE = 16
@@ -96,7 +96,7 @@ def _soft_tiles(regions: RegionMap, rows: int, cols: int) -> Tiles:
     )
     y, x = (tile // cols), (tile % cols)
     device = membership.index.device
-    shares = membership.window_shares(
+    shares = membership.window_weights(
         torch.zeros_like(tile).to(device),
         region.to(device),
         (y * TILE - 1).to(device),

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kcgs.kernels.form import Z_LIMIT
+from kcgs.kernels.whitened import Z_LIMIT
 
 from .graph import FLOAT, Graph, Value
 from .groups import Baked, Group

@@ -357,12 +357,12 @@ class TestReviewed:
         assert bool(torch.isfinite(render_image(result.field, result.regions)).all())
 
     def test_the_named_backend_is_the_one_that_draws(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        import kcgs.kernels.cpu
+        import kcgs.kernels.cpu.kernel
 
         def refuse(*_: object) -> None:
             raise AssertionError("another kernel was asked for")
 
-        monkeypatch.setattr(kcgs.kernels.cpu, "plan", refuse)
+        monkeypatch.setattr(kcgs.kernels.cpu.kernel, "plan", refuse)
         image, labels = scene((16, 20))
         fit(image, labels, 6, config=quick(iterations=12, backend="tiled"))
 

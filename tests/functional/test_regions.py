@@ -14,7 +14,7 @@ from torch import Tensor
 from kcgs import RegionMap
 from kcgs.functional import edge_band, lookup_regions
 from kcgs.functional.regions import PairWidths
-from kcgs.kernels.binning import TILE
+from kcgs.kernels.tiles import TILE
 
 
 def blobs(size: tuple[int, int] = (45, 70), regions: int = 4, seed: int = 0) -> Tensor:
@@ -59,10 +59,10 @@ class TestRegionMap:
         table = membership.tiles(TILE)
         cols = -(-70 // TILE)
         found = torch.zeros(membership.num_regions, 3 * TILE, cols * TILE, dtype=torch.float64)
-        for key, plane in zip(table.keys.tolist(), table.plane.tolist(), strict=True):
+        for key, mask in zip(table.keys.tolist(), table.mask.tolist(), strict=True):
             tile, region = divmod(key, membership.num_regions)
             y, x = tile // cols * TILE, tile % cols * TILE
-            weights = torch.ones(TILE, TILE).double() if plane < 0 else table.planes[plane].double().view(TILE, TILE)
+            weights = torch.ones(TILE, TILE).double() if mask < 0 else table.masks[mask].double().view(TILE, TILE)
             found[region, y : y + TILE, x : x + TILE] = weights
         for r in range(membership.num_regions):
             torch.testing.assert_close(found[r, :45, :70], membership.weights(0, r, torch.float64))
@@ -72,8 +72,8 @@ class TestRegionMap:
         labels[:, 80:] = 1
         for softness, mixed in ((0.0, 0), (0.7, 20)):
             table = RegionMap.from_labels(labels, softness).membership.tiles(TILE)
-            assert len(table.planes) == 2 * mixed
-            assert (table.plane < 0).sum() == 100 - mixed
+            assert len(table.masks) == 2 * mixed
+            assert (table.mask < 0).sum() == 100 - mixed
 
     def test_pickle_and_copy(self) -> None:
         regions = RegionMap.from_labels(blobs(), 0.7)
@@ -129,7 +129,7 @@ class TestPairWidths:
             assert other.fine_labels.shape == (44, 70)
             assert other.membership.grid.shape == (1, 44, 70)
         assert others[2].fine_labels.device.type == "meta"
-        assert torch.equal(others[0].membership.tiles(TILE).planes, regions.membership.tiles(TILE).planes)
+        assert torch.equal(others[0].membership.tiles(TILE).masks, regions.membership.tiles(TILE).masks)
 
     @pytest.mark.parametrize(
         ("softness", "error", "words"),
@@ -248,12 +248,12 @@ class TestResize:
             want = torch.nn.functional.interpolate(own[None, None], size, mode="bilinear", align_corners=False)[0, 0]
             got = resized.membership.weights(0, region, torch.float64)
             assert (got - want).abs().max() < 1e-9
-            for key, plane in zip(table.keys.tolist(), table.plane.tolist(), strict=True):
+            for key, mask in zip(table.keys.tolist(), table.mask.tolist(), strict=True):
                 if key % 3 != region:
                     continue
                 y, x = key // 3 // tiles_x * 16, key // 3 % tiles_x * 16
                 part = want[y : y + 16, x : x + 16]
-                shares = torch.ones(16, 16).double() if plane < 0 else table.planes[plane].view(16, 16)
+                shares = torch.ones(16, 16).double() if mask < 0 else table.masks[mask].view(16, 16)
                 assert (shares[: part.shape[0], : part.shape[1]] - part).abs().max() < 1e-9
                 want[y : y + 16, x : x + 16] = 0.0
             assert want.abs().max() < 1e-9, "tiles without the key have none of the region"

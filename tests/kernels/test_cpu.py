@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kcgs import RegionMap
 from kcgs.functional import region_splat
-from kcgs.kernels.simd import EXP2
+from kcgs.kernels.cpu.simd import EXP2
 
 RANDOM = torch.Generator()
 
@@ -40,7 +40,7 @@ def threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def draw(scene: tuple[Tensor, ...], softness: float = 0.7) -> list[Tensor]:
+def render(scene: tuple[Tensor, ...], softness: float = 0.7) -> list[Tensor]:
     inputs = [t.clone().requires_grad_() for t in scene[:3]]
     regions = RegionMap.from_labels(scene[4], softness)
     image = region_splat(*inputs, scene[3], regions, backend="cpu")
@@ -53,23 +53,23 @@ def test_same_bits_for_any_number_of_threads(scene: tuple[Tensor, ...]) -> None:
     results = []
     for count in (1, 2, 3, 7):
         torch.set_num_threads(count)
-        results.append(draw(scene))
+        results.append(render(scene))
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
 @pytest.mark.parametrize("softness", [0.0, 0.7])
 def test_scalar_twins_agree(scene: tuple[Tensor, ...], softness: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    vector = draw(scene, softness)
+    vector = render(scene, softness)
     monkeypatch.setenv("KCGS_SIMD", "0")
-    scalar = draw(scene, softness)
+    scalar = render(scene, softness)
     assert not all(torch.equal(a, b) for a, b in zip(vector, scalar, strict=True))
     for a, b in zip(vector, scalar, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * float(b.abs().max()))
 
 
 def test_only_colours(scene: tuple[Tensor, ...]) -> None:
-    full = draw(scene)[3]
+    full = render(scene)[3]
     colors = scene[2].clone().requires_grad_()
     image = region_splat(*scene[:2], colors, scene[3], RegionMap.from_labels(scene[4], 0.7), backend="cpu")
     image.square().sum().backward()
@@ -82,7 +82,7 @@ def test_exp2_polynomial() -> None:
     assert EXP2[0] == 1.0
 
 
-def test_slanted_needles_are_found_in_every_strip() -> None:
+def test_slanted_needles_are_found_in_every_tile() -> None:
     angles = torch.linspace(0.01, math.pi, 40, dtype=torch.float64)
     cos, sin = angles.cos(), angles.sin()
     l11 = torch.hypot(300 * cos, 0.4 * sin)
@@ -106,7 +106,7 @@ def test_gradient_that_is_not_contiguous(scene: tuple[Tensor, ...]) -> None:
 
 
 def test_works_after_a_fork(scene: tuple[Tensor, ...]) -> None:
-    want = draw(scene)[0]
+    want = render(scene)[0]
     if not hasattr(os, "fork"):
         pytest.skip("no fork on this system")
     code = (
@@ -120,7 +120,7 @@ def test_works_after_a_fork(scene: tuple[Tensor, ...]) -> None:
         "sys.exit(0 if pid == 0 else os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))\n"
     )
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, timeout=120)
-    assert torch.equal(draw(scene)[0], want)
+    assert torch.equal(render(scene)[0], want)
 
 
 def test_float64_is_refused_by_name(scene: tuple[Tensor, ...]) -> None:
@@ -135,7 +135,7 @@ def test_auto_is_this_kernel(scene: tuple[Tensor, ...]) -> None:
 
 
 def first_calls(environment: dict[str, str]) -> list[str]:
-    """Draw twice in a new process; return what it said."""
+    """Render twice in a new process; return what it said."""
     code = (
         "import logging, torch; logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
         "from kcgs.functional import region_splat\n"

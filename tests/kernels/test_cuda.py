@@ -37,8 +37,8 @@ def test_agrees_with_the_reference() -> None:
 
 
 TYPES = {
-    **dict.fromkeys(("start", "gaussian", "plane", "order", "tiles", "firsts"), "*i64"),
-    **dict.fromkeys(("image", "colors", "coefficients", "planes", "terms", "grad"), "*fp32"),
+    **dict.fromkeys(("start", "gaussian", "mask_of", "order", "tiles", "firsts"), "*i64"),
+    **dict.fromkeys(("image", "colors", "coefficients", "masks", "terms", "grad"), "*fp32"),
     **dict.fromkeys(("rows", "cols", "height", "width", "count"), "i32"),
     "cutoff": "fp32",
 }
@@ -60,14 +60,14 @@ def test_compiles_without_a_gpu(
     common = {"SIDE": 16, "CHANNELS": channels, "BLOCK": block, "MAPPED": mapped}
     gather = {**common, "GEOMETRY": True, "PIECE": cuda._PIECE}
     for kernel, constants, warps in (
-        (cuda._draw_tile, common, cuda._DRAW_WARPS),
+        (cuda._render_tile, common, cuda._RENDER_WARPS),
         (cuda._gather_piece, gather, 1),
     ):
         signature = {name: TYPES.get(name, "constexpr") for name in kernel.arg_names}
         source = triton.compiler.ASTSource(kernel, signature, constants)
         target = GPUTarget("cuda", capability, 32)
         ptx = triton.compile(source, target=target, options={"num_warps": warps, **cuda._OPTIONS}).asm["ptx"]
-        # a thread owns its sums: lanes exchange nothing
+        # a thread owns its sums: threads exchange nothing
         assert "ex2.approx" in ptx
         assert "shfl" not in ptx
 

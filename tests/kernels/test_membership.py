@@ -13,8 +13,8 @@ from torch import Tensor
 
 from kcgs import RegionMap
 from kcgs.functional import region_splat
-from kcgs.kernels.binning import TILE
 from kcgs.kernels.membership import Membership
+from kcgs.kernels.tiles import TILE
 
 Widths = float | dict[tuple[int, int], float]
 PAIRS: dict[tuple[int, int], float] = {(0, 1): 0.7, (1, 2): 2.0, (0, 3): 1.1, (2, 3): 0.7}
@@ -33,7 +33,7 @@ def junction(size: tuple[int, int] = SIZE) -> Tensor:
     return torch.where(y < size[0] // 2, (x > size[1] // 2).long(), 2)
 
 
-def shares_of(membership: Membership) -> Tensor:
+def weights_of(membership: Membership) -> Tensor:
     """Dense weights of all regions of the first map, (R, H, W)."""
     return torch.stack([membership.weights(0, r, torch.float64) for r in range(membership.num_regions)])
 
@@ -44,13 +44,13 @@ def from_tiles(membership: Membership, tile: int, batch: int = 0) -> Tensor:
     height, width = membership.index.shape[1:]
     rows, cols = -(-height // tile), -(-width // tile)
     found = torch.zeros(membership.num_regions, rows * tile, cols * tile, dtype=torch.float64)
-    for key, plane in zip(table.keys.tolist(), table.plane.tolist(), strict=True):
+    for key, mask in zip(table.keys.tolist(), table.mask.tolist(), strict=True):
         place, region = divmod(key, membership.num_regions)
         image, place = divmod(place, rows * cols)
         if image != batch:
             continue
         y, x = place // cols * tile, place % cols * tile
-        weights = torch.ones(tile, tile).double() if plane < 0 else table.planes[plane].double().view(tile, tile)
+        weights = torch.ones(tile, tile).double() if mask < 0 else table.masks[mask].double().view(tile, tile)
         found[region, y : y + tile, x : x + tile] = weights
     return found[:, :height, :width]
 
@@ -121,7 +121,7 @@ class TestTables:
 
     def test_sum_to_one(self, softness: Widths, factor: int) -> None:
         membership = RegionMap.from_labels(blobs(), softness, supersample=factor).membership
-        shares = shares_of(membership)
+        shares = weights_of(membership)
         assert (shares.sum(0) - 1).abs().max() < 1e-12
         assert shares.min() >= 0
         assert ((shares > 0) & (shares < 1)).any() == (softness != 0.0 or factor > 1)
@@ -130,8 +130,8 @@ class TestTables:
 class TestPairWidths:
     def test_junction(self) -> None:
         widths = {(0, 1): 0.0, (0, 2): 0.7, (1, 2): 2.0}
-        shares = shares_of(RegionMap.from_labels(junction(), widths).membership)
-        apart = {pair: shares_of(RegionMap.from_labels(junction(), w).membership) for pair, w in widths.items()}
+        shares = weights_of(RegionMap.from_labels(junction(), widths).membership)
+        apart = {pair: weights_of(RegionMap.from_labels(junction(), w).membership) for pair, w in widths.items()}
         # far from the junction each contour is as if it were alone
         assert torch.equal(shares[:, :10, 20:40], apart[0, 1][:, :10, 20:40])
         assert (shares[:, :, :20] - apart[0, 2][:, :, :20]).abs().max() < 1e-12
@@ -140,9 +140,9 @@ class TestPairWidths:
 
     def test_hard_pair_beside_a_soft_pair(self) -> None:
         labels = (torch.arange(60) // 20).expand(20, 60)
-        shares = shares_of(RegionMap.from_labels(labels, {(1, 2): 1.5}).membership)
+        shares = weights_of(RegionMap.from_labels(labels, {(1, 2): 1.5}).membership)
         assert torch.equal(shares[:, :, :30], torch.stack([labels == r for r in range(3)])[:, :, :30].double())
-        soft = shares_of(RegionMap.from_labels(labels, 1.5).membership)
+        soft = weights_of(RegionMap.from_labels(labels, 1.5).membership)
         assert torch.equal(shares[:, :, 31:], soft[:, :, 31:])
         assert (shares[2, :, 39] > 0.3).all()
 
@@ -156,7 +156,7 @@ class TestPairWidths:
     def test_contours_without_a_width_are_hard(self) -> None:
         labels = (torch.arange(60) // 20).expand(20, 60)
         regions = RegionMap.from_labels(labels, {(0, 2): 3.0})
-        assert regions.membership.tiles(TILE).planes.dtype == torch.bool
+        assert regions.membership.tiles(TILE).masks.dtype == torch.bool
         assert regions.membership.radius == 0
 
     def test_batch_with_a_map_of_one_region(self) -> None:
@@ -165,13 +165,13 @@ class TestPairWidths:
         assert torch.equal(membership.weights(1, 1, torch.float64), torch.ones(SIZE).double())
         assert torch.equal(from_tiles(membership, TILE, 1)[1], torch.ones(SIZE).double())
 
-    def test_only_tiles_that_see_a_contour_have_planes(self) -> None:
+    def test_only_tiles_that_see_a_contour_have_masks(self) -> None:
         labels = torch.zeros(160, 160, dtype=torch.long)
         labels[:, 80:], labels[:, 144:] = 1, 2
         table = RegionMap.from_labels(labels, {(0, 1): 0.7}).membership.tiles(TILE)
-        assert len(table.planes) == 2 * 20
+        assert len(table.masks) == 2 * 20
         # between 1 and 2 no pixel is soft, and their contour is a border of tiles
-        assert (table.plane < 0).sum() == 80
+        assert (table.mask < 0).sum() == 80
 
 
 class TestCoverage:
@@ -181,7 +181,7 @@ class TestCoverage:
         membership = RegionMap.from_labels(fine, supersample=factor).membership
         one_hot = torch.stack([fine == r for r in range(4)]).double()
         want = torch.nn.functional.avg_pool2d(one_hot, factor)
-        assert torch.equal(shares_of(membership), want)
+        assert torch.equal(weights_of(membership), want)
         assert torch.equal(from_tiles(membership, TILE), want)
 
     def test_interior_tiles_store_no_weights(self) -> None:
@@ -189,8 +189,8 @@ class TestCoverage:
         fine[:, 161:] = 1
         for softness, mixed in ((0.0, 10), (0.7, 20)):
             table = RegionMap.from_labels(fine, softness, supersample=2).membership.tiles(TILE)
-            assert len(table.planes) == 2 * mixed
-            assert (table.plane < 0).sum() == 100 - mixed
+            assert len(table.masks) == 2 * mixed
+            assert (table.mask < 0).sum() == 100 - mixed
 
     def test_copies_of_pixels_change_nothing(self) -> None:
         labels = blobs()
@@ -198,7 +198,7 @@ class TestCoverage:
         regions = RegionMap.from_labels(fine, supersample=2)
         assert torch.equal(regions.labels, labels)
         plain = RegionMap.from_labels(labels)
-        assert torch.equal(shares_of(regions.membership), shares_of(plain.membership))
+        assert torch.equal(weights_of(regions.membership), weights_of(plain.membership))
 
 
 def test_to_keeps_everything(device: torch.device) -> None:
@@ -243,7 +243,7 @@ class TestKernels:
         regions = RegionMap.from_labels(blobs((factor * 6, factor * 7), grain=3), softness, supersample=factor)
         *leaves, ids = self.gaussians(5, (6, 7), torch.float64)
 
-        def draw(*gaussians: Tensor) -> Tensor:
+        def render(*gaussians: Tensor) -> Tensor:
             return region_splat(*gaussians, ids, regions, cutoff=0.0, backend=backend)
 
-        assert torch.autograd.gradcheck(draw, [leaf.requires_grad_() for leaf in leaves])
+        assert torch.autograd.gradcheck(render, [leaf.requires_grad_() for leaf in leaves])

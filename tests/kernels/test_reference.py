@@ -36,9 +36,9 @@ def test_chunks_change_nothing(monkeypatch: pytest.MonkeyPatch, chunk: int) -> N
     means, colors = (3 * torch.rand(2, k, generator=generator, dtype=torch.float64) for k in (2, 1))
     factors = torch.tensor([[1.0, 0.2, 0.8], [0.7, -0.1, 1.2]], dtype=torch.float64)
 
-    def draw(*gaussians: Tensor) -> Tensor:
+    def render(*gaussians: Tensor) -> Tensor:
         return region_splat(*gaussians, torch.tensor([0, 1]), labels, cutoff=0.0, backend="reference")
 
     inputs = [t.requires_grad_() for t in (means, factors, colors)]
-    assert torch.autograd.gradcheck(draw, inputs)
-    assert torch.autograd.gradgradcheck(draw, inputs)
+    assert torch.autograd.gradcheck(render, inputs)
+    assert torch.autograd.gradgradcheck(render, inputs)

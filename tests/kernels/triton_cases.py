@@ -13,7 +13,7 @@ from kcgs.kernels import Membership, SplatInputs, cuda, reference
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 GPU = DEVICE.type == "cuda"
 # The interpreter takes most of a second for a piece of a tile's list, however few pixels and Gaussians it has: cases
-# are as small as what they are about lets them be, and larger where a GPU draws them.
+# are as small as what they are about lets them be, and larger where a GPU renders them.
 if cuda._interpreted():
     # it would patch the whole language anew at every call of a function; plain Python is a part of what calls it
     cuda._weigh = cuda._weigh.fn
@@ -50,7 +50,7 @@ def make_inputs(
     return SplatInputs(*arrays, index, membership, size, cutoff)
 
 
-def draw(kernel: object, inputs: SplatInputs, wanted: tuple[bool, ...] = (True, True, True)) -> list[Tensor]:
+def render(kernel: object, inputs: SplatInputs, wanted: tuple[bool, ...] = (True, True, True)) -> list[Tensor]:
     """Return the image and the wanted gradients."""
     arrays = [t.detach().clone().requires_grad_(w) for t, w in zip(inputs[:3], wanted, strict=True)]
     image = kernel(SplatInputs(*arrays, *inputs[3:]))
@@ -59,8 +59,8 @@ def draw(kernel: object, inputs: SplatInputs, wanted: tuple[bool, ...] = (True, 
 
 
 def assert_matches_reference(inputs: SplatInputs, tolerance: float = 5e-6) -> None:
-    got = draw(cuda.splat, inputs)
-    want = draw(reference.splat, SplatInputs(*(t.double() for t in inputs[:3]), *inputs[3:]))
+    got = render(cuda.splat, inputs)
+    want = render(reference.splat, SplatInputs(*(t.double() for t in inputs[:3]), *inputs[3:]))
     for a, b in zip(got, want, strict=True):
         assert a.dtype == torch.float32 and a.shape == b.shape
         assert b.abs().max() > 1e-3
@@ -96,7 +96,7 @@ def test_batch(maps: int, size: tuple[int, int]) -> None:
 def test_tile_inside_one_region_beside_mixed_tiles() -> None:
     inputs = make_inputs(size=(16, 48), regions=2)
     assert inputs.membership is not None
-    assert len(inputs.membership.tiles(16).keys) > (inputs.membership.tiles(16).plane < 0).sum() > 0
+    assert len(inputs.membership.tiles(16).keys) > (inputs.membership.tiles(16).mask < 0).sum() > 0
     assert_matches_reference(inputs)
 
 
@@ -114,17 +114,17 @@ def test_slanted_needles() -> None:
     cholesky = torch.stack([l11, (1e8 - 1) * sin * cos / l11, 1e4 / l11], -1).float()[None].to(DEVICE)
     inputs = make_inputs(size=(16, 20) if GPU else (16, 16))._replace(cholesky=cholesky)
     want = reference.splat(SplatInputs(*(t.double() for t in inputs[:3]), *inputs[3:]))
-    got = draw(cuda.splat, inputs)
+    got = render(cuda.splat, inputs)
     assert (got[0] - want).abs().max() < 1e-5 * 20
     assert all(torch.isfinite(t).all() for t in got)
 
 
 def test_only_what_is_asked() -> None:
     inputs = make_inputs(size=(9, 16), regions=2)
-    _, means, cholesky, colors = draw(cuda.splat, inputs)
-    assert torch.equal(draw(cuda.splat, inputs, (False, False, True))[1], colors)
-    assert torch.equal(draw(cuda.splat, inputs, (True, False, False))[1], means)
-    assert torch.equal(draw(cuda.splat, inputs, (False, True, False))[1], cholesky)
+    _, means, cholesky, colors = render(cuda.splat, inputs)
+    assert torch.equal(render(cuda.splat, inputs, (False, False, True))[1], colors)
+    assert torch.equal(render(cuda.splat, inputs, (True, False, False))[1], means)
+    assert torch.equal(render(cuda.splat, inputs, (False, True, False))[1], cholesky)
 
 
 def test_gradient_that_is_not_contiguous() -> None:
@@ -138,10 +138,10 @@ def test_gradient_that_is_not_contiguous() -> None:
 
 @pytest.mark.parametrize("count", [0, 3])
 @pytest.mark.parametrize("regions", [1, 2])
-def test_nothing_to_draw(count: int, regions: int) -> None:
+def test_nothing_to_render(count: int, regions: int) -> None:
     inputs = make_inputs(count, regions=regions)
     inputs = inputs._replace(means=torch.full_like(inputs.means, 1e6))
-    image, *gradients = draw(cuda.splat, inputs)
+    image, *gradients = render(cuda.splat, inputs)
     assert torch.equal(image, torch.zeros(1, 3, 16, 20, device=DEVICE))
     for gradient, array in zip(gradients, inputs[:3], strict=True):
         assert torch.equal(gradient, torch.zeros_like(array))
@@ -149,5 +149,5 @@ def test_nothing_to_draw(count: int, regions: int) -> None:
 
 def test_same_bits_every_time() -> None:
     inputs = make_inputs(400 if GPU else 20, size=(9, 16), regions=3, softness=0.7)
-    first, second = draw(cuda.splat, inputs), draw(cuda.splat, inputs)
+    first, second = render(cuda.splat, inputs), render(cuda.splat, inputs)
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))

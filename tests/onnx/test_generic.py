@@ -19,7 +19,7 @@ from torch import Tensor
 
 import kcgs
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer
-from kcgs.kernels.form import support_radius
+from kcgs.kernels.whitened import support_radius
 from kcgs.onnx.generic import MAX_WEIGHTS, generic_decoder
 
 ERROR = {0.0: 1e-4, 1e-6: 1e-4, 1e-4: 1e-3}  # allowed, by cutoff

@@ -1,6 +1,6 @@
 """The most that this processor could do: the arithmetic of the CPU kernel with nothing read and nothing written.
 
-The loops are those of the kernel (`kcgs.kernels.simd`), with the pixels' loads and stores left out.
+The loops are those of the kernel (`kcgs.kernels.cpu.simd`), with the pixels' loads and stores left out.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
-from kcgs.kernels import simd
-from kcgs.kernels.cpu import plan
-from kcgs.kernels.inputs import SplatInputs
-from kcgs.kernels.strips import SIDE, _enter_strip, _find_plane
+from kcgs.kernels import SplatInputs
+from kcgs.kernels.cpu import simd
+from kcgs.kernels.cpu.kernel import plan
+from kcgs.kernels.cpu.loops import _enter_tile, _find_mask
+from kcgs.kernels.cpu.simd import SIDE
 
 from .workloads import Workload
 
@@ -27,7 +28,7 @@ _CHANNELS = 3
 def _registers(context: Any, builder: Any, signature: Any, arguments: Any, backward: bool) -> Any:
     start = ir.Constant(ir.IntType(64), 0)
     coefficients = simd._pointer(context, builder, signature.args[1], arguments[1], start)
-    geometry = simd._Strip(builder, coefficients, arguments[2])
+    geometry = simd._Columns(builder, coefficients, arguments[2])
     color = simd._constant(0.5)
     count = _CHANNELS + 3 if backward else _CHANNELS
     row, sums, close = simd._rows(builder, start, arguments[0], [simd._constant(0.0)] * count)
@@ -89,17 +90,17 @@ def seconds_for(pairs: float, *, backward: bool, threads: int = 1) -> float:
 
 
 @njit
-def _rows_visited(scene, height, width):  # type: ignore[no-untyped-def]
+def _rows_visited(lists, height, width):  # type: ignore[no-untyped-def]
     rows, cols = -(-height // SIDE), -(-width // SIDE)
     coefficients = np.empty(5, np.float32)
     total = 0
-    for band in range(rows):
-        for e in range(scene.start[band], scene.start[band + 1]):
-            i = scene.entries[e, 0]
-            for s in range(scene.entries[e, 1], scene.entries[e, 2]):
-                if scene.num_regions > 0 and not _find_plane(scene, band * cols + s, scene.regions[i])[1]:
+    for row in range(rows):
+        for e in range(lists.start[row], lists.start[row + 1]):
+            i = lists.entries[e, 0]
+            for col in range(lists.entries[e, 1], lists.entries[e, 2]):
+                if lists.num_regions > 0 and not _find_mask(lists, row * cols + col, lists.regions[i])[1]:
                     continue
-                first, last = _enter_strip(scene.gaussians[i], s, band, height, width, scene.radius, coefficients)
+                first, last = _enter_tile(lists.gaussians[i], row, col, height, width, lists.radius, coefficients)
                 total += max(0, last - first)
     return total
 
@@ -109,4 +110,4 @@ def evaluated_pairs(scene: Workload, cutoff: float) -> int:
     membership, size = scene.regions.membership, scene.regions.size
     index = scene.regions.index_of(scene.region_ids)[None]
     inputs = SplatInputs(scene.means[None], scene.cholesky[None], scene.colors[None], index, membership, size, cutoff)
-    return int(_rows_visited(plan(inputs).scene, *size)) * SIDE
+    return int(_rows_visited(plan(inputs).lists, *size)) * SIDE

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import region_splat
-from kcgs.kernels import SplatInputs, cpu
+from kcgs.kernels import SplatInputs
+from kcgs.kernels.cpu import kernel
 from kcgs.nn import GaussianField, RegionSplatRenderer
 
 from .peers import PEERS
@@ -107,9 +108,9 @@ def overhead(scene: Workload, cutoff: float, repeats: int) -> tuple[float, float
     alone, whole = [], []
     for _ in range(repeats + 1):
         start = time.perf_counter()
-        planned = cpu.plan(inputs)
-        cpu.render(planned, inputs)
-        cpu.differentiate(planned, inputs, probe[None], geometry=True)
+        planned = kernel.plan(inputs)
+        kernel.render(planned, inputs)
+        kernel.differentiate(planned, inputs, probe[None], geometry=True)
         middle = time.perf_counter()
         field.zero_grad(set_to_none=True)
         render(field, scene.regions).backward(probe)

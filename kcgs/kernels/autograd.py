@@ -1,4 +1,4 @@
-"""The autograd function that every kernel with a backward of its own shares."""
+"""What a kernel is: the inputs that every kernel takes, and the autograd function of those with their own backward."""
 
 from __future__ import annotations
 
@@ -9,9 +9,24 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .inputs import SplatInputs
+from .membership import Membership
 
 Gradients = tuple[Tensor | None, Tensor | None, Tensor]
+
+
+class SplatInputs(NamedTuple):
+    """Arguments of one splat, checked and batched by the public function.
+
+    Floating tensors share one dtype (float32 or float64) and one device.
+    """
+
+    means: Tensor  # [B, N, 2] pixels
+    cholesky: Tensor  # [B, N, 3] pixels
+    colors: Tensor  # [B, N, C]
+    region_index: Tensor | None  # [B, N] int64, position in the sorted list of regions; -1: not in the map
+    membership: Membership | None  # None: one region covers everything
+    size: tuple[int, int]  # (height, width)
+    cutoff: float
 
 
 class Steps(NamedTuple):

@@ -1,6 +1,6 @@
-"""The splat on the CPU: numba, explicit 16-wide vectors, bands of rows shared among threads.
+"""The CPU kernel as torch sees it: what the loops read, how threads share them, what they return.
 
-float32 only. The first call compiles (seconds, once a machine and number of channels) or loads the compiled code.
+The first call compiles (seconds, once for each machine and number of channels) or loads the compiled code.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .compiled import compile_kept, count_compiled, say
-from .form import lowest_exponent, support_radius
-from .function import Gradients, Steps, apply_kernel
-from .inputs import SplatInputs
-from .membership import Membership
-from .strips import SIDE, Loops, Scene, compile_loops
+from ..autograd import Gradients, SplatInputs, Steps, apply_kernel
+from ..compiled import compile_kept, count_compiled, say
+from ..membership import Membership
+from ..whitened import lowest_exponent, support_radius
+from .loops import Lists, Loops, compile_loops
+from .simd import SIDE
 
-# fewer (Gaussian, band) entries than this are drawn by the calling thread: waking another costs as much
+# fewer entries of the lists than this are left to the calling thread: waking another costs as much
 _SERIAL_ENTRIES = 200
-_SOURCES = ("form.py", "simd.py", "lanes.py", "strips.py")
+_SOURCES = ("../whitened.py", "simd.py", "scalar.py", "loops.py")
 
 
 class _Plan(NamedTuple):
-    scene: Scene
+    lists: Lists
     order: Any  # [N] int64, sorted to given
 
 
@@ -69,12 +69,12 @@ def _tag(channels: int) -> tuple[float, ...]:
 
 
 def plan(inputs: SplatInputs) -> _Plan:
-    """List which Gaussians touch which band, for the loops."""
+    """List which Gaussians touch which tiles, for the loops."""
     batch, count, _ = inputs.colors.shape
     height, width = inputs.size
     means, factors, colors = (_array(t) for t in inputs[:3])
     images = np.repeat(np.arange(batch), count)
-    order = _neighbours(means, images, height, width)
+    order = _sort(means, images, height, width)
     images = images[order]
     table = _NO_TABLE
     regions = np.zeros(batch * count, np.int64)
@@ -84,18 +84,18 @@ def plan(inputs: SplatInputs) -> _Plan:
     radius = support_radius(inputs.cutoff, torch.float32)
     exponent = lowest_exponent(torch.float32)
     lowest = np.float32(max(math.log(inputs.cutoff) if inputs.cutoff > 0 else exponent, exponent) / math.log(2))
-    gaussians, start, entries = _loops().list_bands(
+    gaussians, start, entries = _loops().list_tiles(
         means, factors, order, regions, images, batch, height, width, radius
     )
-    return _Plan(Scene(gaussians, colors[order].ravel(), regions, start, entries, *table, radius, lowest), order)
+    return _Plan(Lists(gaussians, colors[order].ravel(), regions, start, entries, *table, radius, lowest), order)
 
 
-def _neighbours(means: Any, images: Any, height: int, width: int) -> Any:
-    """Order by image, band and x: what is near in the picture becomes near in memory."""
+def _sort(means: Any, images: Any, height: int, width: int) -> Any:
+    """Order by image, row of tiles and x: neighbours in the image become neighbours in memory."""
     rows = -(-height // SIDE)
-    band = images * (rows + 2) + np.clip(np.floor(means[:, 1] / SIDE), -1, rows)
+    row = images * (rows + 2) + np.clip(np.floor(means[:, 1] / SIDE), -1, rows)
     # stable: what other Gaussians do must not change the order of these
-    return np.argsort(band * (width + 2.0) + np.clip(means[:, 0], -1, width), kind="stable")
+    return np.argsort(row * (width + 2.0) + np.clip(means[:, 0], -1, width), kind="stable")
 
 
 def _array(tensor: Tensor) -> Any:
@@ -113,40 +113,32 @@ def _table(membership: Membership) -> tuple[Any, ...]:
     keys = tiles.keys.numpy()
     count = maps * -(-height // SIDE) * -(-width // SIDE)
     start = np.searchsorted(keys, np.arange(count + 1) * membership.num_regions)
-    planes = tiles.planes.to(torch.float32).flatten().numpy()
-    return membership.num_regions, maps, keys, start, tiles.plane.numpy(), planes
+    masks = tiles.masks.to(torch.float32).flatten().numpy()
+    return membership.num_regions, maps, keys, start, tiles.mask.numpy(), masks
 
 
 def render(planned: _Plan, inputs: SplatInputs) -> Tensor:
-    """Draw (B, C, H, W)."""
+    """Render (B, C, H, W)."""
     batch, _, channels = inputs.colors.shape
     # numpy asks for huge pages where an array is large: first use costs a quarter of what torch.empty's does
     image = torch.from_numpy(np.empty((batch, channels, *inputs.size), np.float32))
     tag = _tag(channels)
-    loop = _loops().draw
-
-    def draw(offset: int, step: int) -> None:
-        loop(planned.scene, offset, step, image.numpy(), tag)
-
-    _share(draw, planned.scene)
+    loop = _loops().render
+    _run_threads(lambda offset, step: loop(planned.lists, offset, step, image.numpy(), tag), planned.lists)
     return image
 
 
 def differentiate(planned: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
     """Give the gradients of means, cholesky (unless only colours are asked for) and colors."""
     channels = inputs.colors.shape[-1]
-    terms = np.empty((len(planned.scene.entries), channels + (5 if geometry else 0)), np.float32)
+    terms = np.empty((len(planned.lists.entries), channels + (5 if geometry else 0)), np.float32)
     tag = _tag(channels)
     values = grad.resolve_neg().contiguous().numpy()
     loop = _loops().gather
-
-    def gather(offset: int, step: int) -> None:
-        loop(planned.scene, offset, step, values, terms, geometry, tag)
-
-    _share(gather, planned.scene)
+    _run_threads(lambda offset, step: loop(planned.lists, offset, step, values, terms, geometry, tag), planned.lists)
     means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs[:3])
     flat = [t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors)]
-    _loops().finish(planned.scene, planned.order, terms, *flat)
+    _loops().finish(planned.lists, planned.order, terms, *flat)
     return (means, cholesky, colors) if geometry else (None, None, colors)
 
 
@@ -156,10 +148,10 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="kcgs")
 
 
-def _share(work: Callable[[int, int], None], scene: Scene) -> None:
-    """Run work(offset, step) over all bands with torch's number of threads, the caller's among them."""
-    threads = min(torch.get_num_threads(), len(scene.start) - 1)
-    if threads < 2 or len(scene.entries) < _SERIAL_ENTRIES:
+def _run_threads(work: Callable[[int, int], None], lists: Lists) -> None:
+    """Run work(offset, step) over all rows of tiles with torch's number of threads, the caller's among them."""
+    threads = min(torch.get_num_threads(), len(lists.start) - 1)
+    if threads < 2 or len(lists.entries) < _SERIAL_ENTRIES:
         work(0, 1)
         return
     others = [_pool(os.getpid(), torch.get_num_threads() - 1).submit(work, t, threads) for t in range(1, threads)]

@@ -1,13 +1,6 @@
-r"""The arithmetic that all kernels share: whitened coordinates and what follows from them.
+"""Whitened coordinates z = L^-1 (p - mu) by forward substitution, and gradients from their moments.
 
-With Sigma = L L^T and d = p - mu, the exponent is q = |z|^2 with z = L^-1 d, by forward substitution
-
-    z1 = dx / l11,    z2 = (dy - l21 z1) / l22.
-
-This is a completed square taken from L itself: no conic is ever formed, so nothing cancels however stiff the Gaussian.
-The gradient needs only the moments of z. With v = w * dLoss/dw,
-
-    dLoss/dmu = L^-T sum(v z),    dLoss/dL = lower(L^-T sum(v z z^T)).
+All kernels share this arithmetic; docs/performance.md has the formulas.
 """
 
 from __future__ import annotations
@@ -16,6 +9,8 @@ import math
 
 import torch
 from torch import Tensor
+
+from .autograd import Gradients
 
 # |z| is cut here, where every weight is zero: its square is still finite in float32
 Z_LIMIT = 1e15
@@ -35,21 +30,24 @@ def support_radius(cutoff: float, dtype: torch.dtype) -> float:
     return math.sqrt(max(-2.0 * exponent, 0.0))
 
 
-def moments_to_gradients(first: Tensor, second: Tensor, cholesky: Tensor) -> tuple[Tensor, Tensor]:
-    """Turn moments of z into gradients.
+def sums_to_gradients(sums: Tensor, channels: int, cholesky: Tensor) -> Gradients:
+    """Turn sums over the pixels into gradients, with g = dLoss/dI and v = w g^T c.
 
     Args:
-        first: sum of v z, (..., 2).
-        second: sum of v (z1 z1, z1 z2, z2 z2), (..., 3).
+        sums: of w g, (..., C); then, if geometry is asked for, of v (z1, z2, z1 z1, z1 z2, z2 z2), (..., C + 5).
+        channels: C.
         cholesky: (..., 3).
 
     Returns:
-        Gradients of the means (..., 2) and of the Cholesky factors (..., 3), in the dtype of `cholesky`.
+        Gradients of the means (..., 2) and of the Cholesky factors (..., 3), in the dtype of `cholesky`, or None; of
+        the colours (..., C).
     """
+    colors = sums[..., :channels]
+    if sums.shape[-1] == channels:
+        return None, None, colors
     l11, l21, l22 = cholesky.double().unbind(-1)
-    s1, s2 = first.double().unbind(-1)
-    s11, s12, s22 = second.double().unbind(-1)
+    s1, s2, s11, s12, s22 = sums[..., channels:].double().unbind(-1)
     slope = l21 / l22
     means = torch.stack([(s1 - slope * s2) / l11, s2 / l22], -1)
     factors = torch.stack([(s11 - slope * s12) / l11, s12 / l22, s22 / l22], -1)
-    return means.to(cholesky.dtype), factors.to(cholesky.dtype)
+    return means.to(cholesky.dtype), factors.to(cholesky.dtype), colors

@@ -1,9 +1,7 @@
-"""Sixteen pixels at a time: the inner loops of the CPU kernel as explicit vector code.
+"""The inner loops of the CPU kernel as explicit vector code: a row of a tile, 16 pixels, at a time.
 
-LLVM does not vectorise these loops by itself, so they are written in its own terms, sixteen float32 lanes wide;
-it splits them into what the processor has. Each loop has a scalar twin in `lanes.py` with the same arguments.
-
-A strip is 16 columns of a band of 16 rows. Its pixels lie in memory as [row][channel][column].
+LLVM does not vectorise these loops by itself, but splits vectors of 16 float32 into what the processor has. Each loop
+has a scalar twin in `scalar.py` with the same arguments. The pixels of a tile lie in memory as [row][channel][column].
 """
 
 from __future__ import annotations
@@ -16,12 +14,12 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-LANES = 16
+SIDE = 16  # of a tile, and elements of a vector
 _FLOAT = ir.FloatType()
 _INT = ir.IntType(32)
 _LONG = ir.IntType(64)
-_VECTOR = ir.VectorType(_FLOAT, LANES)
-_VECTOR_INT = ir.VectorType(_INT, LANES)
+_VECTOR = ir.VectorType(_FLOAT, SIDE)
+_VECTOR_INT = ir.VectorType(_INT, SIDE)
 
 
 def exp2_coefficients(degree: int = 5) -> list[float]:
@@ -35,12 +33,12 @@ EXP2 = exp2_coefficients()
 
 
 def _constant(value: float) -> ir.Constant:
-    return ir.Constant(_VECTOR, [ir.Constant(_FLOAT, float(np.float32(value)))] * LANES)
+    return ir.Constant(_VECTOR, [ir.Constant(_FLOAT, float(np.float32(value)))] * SIDE)
 
 
 def _call(builder: Any, name: str, *arguments: Any) -> Any:
     function = cgutils.get_or_insert_function(
-        builder.module, ir.FunctionType(_VECTOR, [_VECTOR] * len(arguments)), f"llvm.{name}.v{LANES}f32"
+        builder.module, ir.FunctionType(_VECTOR, [_VECTOR] * len(arguments)), f"llvm.{name}.v{SIDE}f32"
     )
     return builder.call(function, arguments)
 
@@ -51,7 +49,7 @@ def _broadcast(builder: Any, value: Any) -> Any:
 
 
 def _ramp() -> ir.Constant:
-    return ir.Constant(_VECTOR, [ir.Constant(_FLOAT, lane - (LANES - 1) / 2) for lane in range(LANES)])
+    return ir.Constant(_VECTOR, [ir.Constant(_FLOAT, column - (SIDE - 1) / 2) for column in range(SIDE)])
 
 
 def _exp2(builder: Any, exponent: Any) -> Any:
@@ -62,8 +60,8 @@ def _exp2(builder: Any, exponent: Any) -> Any:
     for coefficient in reversed(EXP2[:-1]):
         value = _call(builder, "fma", value, rest, _constant(coefficient))
     bits = builder.shl(
-        builder.add(builder.fptosi(whole, _VECTOR_INT), ir.Constant(_VECTOR_INT, [127] * LANES)),
-        ir.Constant(_VECTOR_INT, [23] * LANES),
+        builder.add(builder.fptosi(whole, _VECTOR_INT), ir.Constant(_VECTOR_INT, [127] * SIDE)),
+        ir.Constant(_VECTOR_INT, [23] * SIDE),
     )
     return builder.fmul(value, builder.bitcast(bits, _VECTOR))
 
@@ -74,17 +72,17 @@ def _pointer(context: Any, builder: Any, array_type: Any, array: Any, offset: An
 
 
 def _load(builder: Any, pointer: Any, step: int = 0) -> Any:
-    at = builder.gep(pointer, [ir.Constant(_LONG, step * LANES)])
-    return builder.load(builder.bitcast(at, _VECTOR.as_pointer()), align=4)
+    start = builder.gep(pointer, [ir.Constant(_LONG, step * SIDE)])
+    return builder.load(builder.bitcast(start, _VECTOR.as_pointer()), align=4)
 
 
 def _store(builder: Any, value: Any, pointer: Any, step: int = 0) -> None:
-    at = builder.gep(pointer, [ir.Constant(_LONG, step * LANES)])
-    builder.store(value, builder.bitcast(at, _VECTOR.as_pointer()), align=4)
+    start = builder.gep(pointer, [ir.Constant(_LONG, step * SIDE)])
+    builder.store(value, builder.bitcast(start, _VECTOR.as_pointer()), align=4)
 
 
-class _Strip:
-    """A Gaussian over the columns of a strip: its coordinates, and its weight along a row."""
+class _Columns:
+    """A Gaussian over the columns of a tile: its whitened coordinates, and its weight along a row."""
 
     def __init__(self, builder: Any, coefficients: Any, lowest: Any) -> None:
         self.builder = builder
@@ -97,15 +95,15 @@ class _Strip:
         self.slope = _broadcast(builder, k[4])
         self.lowest = _broadcast(builder, lowest)
 
-    def weight(self, row: Any, plane: Any) -> tuple[Any, Any]:
-        """Second coordinate and weight; `row` counts from the middle of the band, `plane` is a pointer or None."""
+    def weight(self, row: Any, mask: Any) -> tuple[Any, Any]:
+        """Second coordinate and weight; `row` counts from the middle of the tile, `mask` is a pointer or None."""
         builder = self.builder
         second = _call(builder, "fma", self.slope, _broadcast(builder, row), self.base)
         exponent = _call(builder, "fma", builder.fneg(second), second, self.negative)
         seen = builder.fcmp_ordered(">=", exponent, self.lowest)
         weight = builder.select(seen, _exp2(builder, exponent), _constant(0.0))
-        if plane is not None:
-            weight = builder.fmul(weight, _load(builder, plane))
+        if mask is not None:
+            weight = builder.fmul(weight, _load(builder, mask))
         return second, weight
 
 
@@ -148,7 +146,7 @@ def _rows(builder: Any, first: Any, last: Any, carried: list[Any]) -> Any:
 
 
 def _middle(builder: Any, row: Any) -> Any:
-    return builder.fadd(builder.sitofp(row, _FLOAT), ir.Constant(_FLOAT, -(LANES - 1) / 2))
+    return builder.fadd(builder.sitofp(row, _FLOAT), ir.Constant(_FLOAT, -(SIDE - 1) / 2))
 
 
 class _Call:
@@ -159,23 +157,23 @@ class _Call:
         self.builder = builder
         self.channels = types_of[-1].count
         self.first, self.last = arguments[2:4]
-        self.strip = _pointer(context, builder, types_of[0], arguments[0], arguments[1])
+        self.pixels = _pointer(context, builder, types_of[0], arguments[0], arguments[1])
         coefficients = _pointer(context, builder, types_of[4], arguments[4], start)
         colors = _pointer(context, builder, types_of[6], arguments[6], arguments[7])
-        self.planes = _pointer(context, builder, types_of[8], arguments[8], arguments[9])
+        self.masks = _pointer(context, builder, types_of[8], arguments[8], arguments[9])
         self.plain = builder.icmp_signed("<", arguments[9], start)
         self.colors = [_broadcast(builder, _element(builder, colors, c)) for c in range(self.channels)]
-        self.geometry = _Strip(builder, coefficients, arguments[5])
+        self.geometry = _Columns(builder, coefficients, arguments[5])
 
     def at_row(self, row: Any, masked: bool) -> tuple[Any, Any, Any]:
         """Second coordinate, weight, and pointer to the pixels of a row."""
         builder = self.builder
-        plane = builder.gep(self.planes, [builder.mul(row, ir.Constant(row.type, LANES))]) if masked else None
-        second, weight = self.geometry.weight(_middle(builder, row), plane)
-        return second, weight, builder.gep(self.strip, [builder.mul(row, ir.Constant(row.type, LANES * self.channels))])
+        mask = builder.gep(self.masks, [builder.mul(row, ir.Constant(row.type, SIDE))]) if masked else None
+        second, weight = self.geometry.weight(_middle(builder, row), mask)
+        return second, weight, builder.gep(self.pixels, [builder.mul(row, ir.Constant(row.type, SIDE * self.channels))])
 
     def each_kind(self, emit: Any) -> None:
-        """Emit a loop for rows without membership weights, and one for rows with them."""
+        """Emit a loop for rows without a mask, and one for rows with one."""
         with self.builder.if_else(self.plain) as (then, otherwise):
             with then:
                 emit(False)
@@ -185,9 +183,9 @@ class _Call:
 
 @intrinsic
 def add_rows(  # type: ignore[no-untyped-def]
-    typing_context, strip, at, first, last, coefficients, lowest, colors, color_at, planes, plane_at, tag
+    typing_context, pixels, offset, first, last, coefficients, lowest, colors, color_at, masks, mask_at, tag
 ):
-    """strip[row, c, :] += weight[row, :] * colors[c] for rows first ... last - 1; plane_at < 0: no membership."""
+    """pixels[row, c, :] += weight[row, :] * colors[c] for rows first ... last - 1; mask_at < 0: no mask."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         call = _Call(context, builder, signature.args, arguments)
@@ -203,14 +201,27 @@ def add_rows(  # type: ignore[no-untyped-def]
         return context.get_dummy_value()
 
     long = types.int64
-    return types.void(strip, long, long, long, coefficients, types.float32, colors, long, planes, long, tag), generate
+    return types.void(pixels, long, long, long, coefficients, types.float32, colors, long, masks, long, tag), generate
 
 
 @intrinsic
 def gather_rows(  # type: ignore[no-untyped-def]
-    typing_context, strip, at, first, last, coefficients, lowest, colors, color_at, planes, plane_at, sums, moments, tag
+    typing_context,
+    pixels,
+    offset,
+    first,
+    last,
+    coefficients,
+    lowest,
+    colors,
+    color_at,
+    masks,
+    mask_at,
+    sums,
+    moments,
+    tag,
 ):
-    """Add to sums[k, lane] over rows: w g_c for every channel c, then, with v = w sum_c g_c colors_c and where
+    """Add to sums[k, column] over rows: w g_c for every channel c, then, with v = w sum_c g_c colors_c and where
     `moments` is true, v z1, v z2, v z1 z1, v z1 z2, v z2 z2."""  # noqa: D205, D209
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -251,12 +262,12 @@ def gather_rows(  # type: ignore[no-untyped-def]
 
     long = types.int64
     return types.void(
-        strip, long, long, long, coefficients, types.float32, colors, long, planes, long, sums, types.boolean, tag
+        pixels, long, long, long, coefficients, types.float32, colors, long, masks, long, sums, types.boolean, tag
     ), generate
 
 
 def _add_moments(builder: Any, first: Any, sums: list[Any], sums_at: Any, channels: int) -> None:
-    # z1 is the same in every row of the strip: it multiplies the sums, not the terms
+    # z1 is the same in every row of the tile: it multiplies the sums, not the terms
     total, along, square = sums
     once = builder.fmul(total, first)
     for k, term in enumerate([once, along, builder.fmul(once, first), builder.fmul(along, first), square]):
@@ -264,13 +275,13 @@ def _add_moments(builder: Any, first: Any, sums: list[Any], sums_at: Any, channe
 
 
 @intrinsic
-def lane_sum(typing_context, sums, index):  # type: ignore[no-untyped-def]
-    """Sum of the sixteen lanes of row `index`, in a fixed order."""
+def sum_columns(typing_context, sums, index):  # type: ignore[no-untyped-def]
+    """Sum of the sixteen columns of row `index`, in a fixed order."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        at = builder.mul(arguments[1], ir.Constant(_LONG, LANES))
-        value = _load(builder, _pointer(context, builder, signature.args[0], arguments[0], at))
-        width = LANES
+        start = builder.mul(arguments[1], ir.Constant(_LONG, SIDE))
+        value = _load(builder, _pointer(context, builder, signature.args[0], arguments[0], start))
+        width = SIDE
         while width > 1:
             width //= 2
             kind = ir.VectorType(_INT, width)

@@ -1,7 +1,7 @@
-"""The loops of the CPU kernel: bands of 16 rows, and in each its Gaussians, strip by strip of 16 columns.
+"""The loops of the CPU kernel: over rows of tiles, the Gaussians of each, and the tiles that each touches.
 
-A band belongs to one thread, so nothing is shared and the result does not depend on the number of threads. Within a
-strip only the rows that the ellipse crosses are visited.
+A row of tiles belongs to one thread, so the result does not depend on the number of threads. Within a tile only the
+rows of pixels that the ellipse crosses are visited.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numba import njit
 
-from .form import Z_LIMIT
-from .lanes import add_rows, gather_rows
-from .simd import lane_sum
+from ..whitened import Z_LIMIT
+from .scalar import add_rows, gather_rows
+from .simd import SIDE, sum_columns
 
-SIDE = 16
 # z * SCALE, squared, is an exponent of 2
 SCALE = math.sqrt(0.5 / math.log(2.0))
 # pixels by which geometry in float64 is kept on the safe side of the weights in float32
@@ -33,20 +32,20 @@ COLUMNS = 11
 _inner = cast(Any, njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 
 
-class Scene(NamedTuple):
+class Lists(NamedTuple):
     """Everything the loops read, as arrays."""
 
     gaussians: Any  # [N, COLUMNS] float64, sorted
     colors: Any  # [N * C] float32
     regions: Any  # [N] int64
-    start: Any  # [bands + 1] int64
-    entries: Any  # [E, 3] int32: Gaussian, first strip, last strip + 1
+    start: Any  # [rows of tiles + 1] int64 into entries
+    entries: Any  # [E, 3] int32: Gaussian, first tile, last tile + 1
     num_regions: int  # 0: no map
     maps: int  # label maps, 1 or as many as images
     keys: Any  # [K] int64, tile * num_regions + region
     tile_start: Any  # [tiles + 1] int64 into keys
-    plane: Any  # [K] int64 row of planes, -1: alone in its tile
-    planes: Any  # [P * 256] float32
+    mask: Any  # [K] int64 row of masks, -1: alone in its tile
+    masks: Any  # [P * 256] float32
     radius: float  # largest |z|
     lowest: Any  # float32, least exponent of 2
 
@@ -90,11 +89,11 @@ def _row_range(g, height, width, radius):  # type: ignore[no-untyped-def]
 
 
 @_inner
-def _strip_range(g, band, height, width, radius):  # type: ignore[no-untyped-def]
-    # the ellipse's columns within the band, by the factor of (y, x)
+def _tile_range(g, row, height, width, radius):  # type: ignore[no-untyped-def]
+    # the ellipse's columns within the row of tiles, by the factor of (y, x)
     h = g[HEIGHT]
-    top = max((band * SIDE + 0.5 - MARGIN - g[MY]) / h, -radius)
-    bottom = min((min(band * SIDE + SIDE, height) - 0.5 + MARGIN - g[MY]) / h, radius)
+    top = max((row * SIDE + 0.5 - MARGIN - g[MY]) / h, -radius)
+    bottom = min((min(row * SIDE + SIDE, height) - 0.5 + MARGIN - g[MY]) / h, radius)
     along, across = g[L11] * g[L21] / h, g[L11] * g[L22] / h
     right = g[MX] + _highest(along, across, g[PEAK], top, bottom, radius) + MARGIN
     left = g[MX] - _highest(along, across, g[PEAK], -bottom, -top, radius) - MARGIN
@@ -104,59 +103,59 @@ def _strip_range(g, band, height, width, radius):  # type: ignore[no-untyped-def
 
 
 @_inner
-def _list_bands(gaussians, regions, images, rows, batch, height, width, radius):  # type: ignore[no-untyped-def]
-    """Start of each band in the list, and the list: Gaussian, first strip, last strip + 1."""
+def _list_tiles(gaussians, regions, images, rows, batch, height, width, radius):  # type: ignore[no-untyped-def]
+    """Start of each row of tiles in the list, and the list: Gaussian, first tile, last tile + 1."""
     count = gaussians.shape[0]
     start = np.zeros(batch * rows + 1, np.int64)
     span = np.zeros((count, 2), np.int64)
     for i in range(count):
         if regions[i] >= 0:
             span[i, 0], span[i, 1] = _row_range(gaussians[i], height, width, radius)
-        for band in range(span[i, 0], span[i, 1]):
-            start[images[i] * rows + band + 1] += 1
-    for b in range(batch * rows):
-        start[b + 1] += start[b]
-    at = start[:-1].copy()
+        for row in range(span[i, 0], span[i, 1]):
+            start[images[i] * rows + row + 1] += 1
+    for r in range(batch * rows):
+        start[r + 1] += start[r]
+    end = start[:-1].copy()
     entries = np.empty((start[-1], 3), np.int32)
     for i in range(count):
-        for band in range(span[i, 0], span[i, 1]):
-            b = images[i] * rows + band
-            first, last = _strip_range(gaussians[i], band, height, width, radius)
-            entries[at[b], 0], entries[at[b], 1], entries[at[b], 2] = i, first, last
-            at[b] += 1
+        for row in range(span[i, 0], span[i, 1]):
+            e = end[images[i] * rows + row]
+            first, last = _tile_range(gaussians[i], row, height, width, radius)
+            entries[e, 0], entries[e, 1], entries[e, 2] = i, first, last
+            end[images[i] * rows + row] += 1
     return start, entries
 
 
 @_inner
-def _find_plane(scene, tile, region):  # type: ignore[no-untyped-def]
-    """Offset of the membership weights: negative where the region is alone in the tile; and whether it is there."""
-    key = tile * scene.num_regions + region
-    low, high = scene.tile_start[tile], scene.tile_start[tile + 1]
+def _find_mask(lists, tile, region):  # type: ignore[no-untyped-def]
+    """Offset of the region's mask, negative where it is alone in the tile; and whether it is in the tile."""
+    key = tile * lists.num_regions + region
+    low, high = lists.tile_start[tile], lists.tile_start[tile + 1]
     end = high
     while low < high:
         middle = (low + high) // 2
-        if scene.keys[middle] < key:
+        if lists.keys[middle] < key:
             low = middle + 1
         else:
             high = middle
-    if low == end or scene.keys[low] != key:
+    if low == end or lists.keys[low] != key:
         return -1, False
-    return scene.plane[low] * SIDE * SIDE, True
+    return lists.mask[low] * SIDE * SIDE, True
 
 
 @_inner
-def _enter_strip(g, strip, band, height, width, radius, coefficients):  # type: ignore[no-untyped-def]
-    """Set the coefficients of z * SCALE about the strip's middle; return the rows, first and last + 1, to visit."""
-    left = max((strip * SIDE + 0.5 - MARGIN - g[MX]) * g[INVERSE], -radius)
-    right = min((min(strip * SIDE + SIDE, width) - 0.5 + MARGIN - g[MX]) * g[INVERSE], radius)
+def _enter_tile(g, row, col, height, width, radius, coefficients):  # type: ignore[no-untyped-def]
+    """Set the coefficients of z * SCALE about the tile's middle; return the rows, first and last + 1, to visit."""
+    left = max((col * SIDE + 0.5 - MARGIN - g[MX]) * g[INVERSE], -radius)
+    right = min((min(col * SIDE + SIDE, width) - 0.5 + MARGIN - g[MX]) * g[INVERSE], radius)
     if left > right:
         return 0, 0
-    base = band * SIDE
+    base = row * SIDE
     bottom = g[MY] + _highest(g[L21], g[L22], g[PEAK], left, right, radius) + MARGIN
     top = g[MY] - _highest(g[L21], g[L22], g[PEAK], -right, -left, radius) - MARGIN
     first = math.ceil(max(top - 0.5, float(base)))
     last = math.floor(min(bottom - 0.5, min(base + SIDE, height) - 1.0))
-    x, y = strip * SIDE + SIDE / 2 - g[MX], base + SIDE / 2 - g[MY]
+    x, y = col * SIDE + SIDE / 2 - g[MX], base + SIDE / 2 - g[MY]
     coefficients[0] = _bounded(g[RISE1] * x)
     coefficients[1] = g[RISE1]
     coefficients[2] = _bounded(g[RISE3] * y + g[RISE2] * x)
@@ -166,94 +165,94 @@ def _enter_strip(g, strip, band, height, width, radius, coefficients):  # type: 
 
 
 @_inner
-def _write_band(strip, image, b, band, cols):  # type: ignore[no-untyped-def]
+def _write_row(pixels, image, b, row, cols):  # type: ignore[no-untyped-def]
     channels, height, width = image.shape[1:]
-    for r in range(min(SIDE, height - band * SIDE)):
+    for r in range(min(SIDE, height - row * SIDE)):
         for c in range(channels):
-            line = image[b, c, band * SIDE + r]
-            for s in range(width // SIDE):
-                at = ((s * SIDE + r) * channels + c) * SIDE
+            line = image[b, c, row * SIDE + r]
+            for col in range(width // SIDE):
+                start = ((col * SIDE + r) * channels + c) * SIDE
                 for k in range(SIDE):
-                    line[s * SIDE + k] = strip[at + k]
-            at = (((cols - 1) * SIDE + r) * channels + c) * SIDE
+                    line[col * SIDE + k] = pixels[start + k]
+            start = (((cols - 1) * SIDE + r) * channels + c) * SIDE
             for k in range(width - width // SIDE * SIDE):
-                line[width // SIDE * SIDE + k] = strip[at + k]
+                line[width // SIDE * SIDE + k] = pixels[start + k]
 
 
 @_inner
-def _read_band(strip, image, b, band, cols):  # type: ignore[no-untyped-def]
+def _read_row(pixels, image, b, row, cols):  # type: ignore[no-untyped-def]
     channels, height, width = image.shape[1:]
-    for r in range(min(SIDE, height - band * SIDE)):
+    for r in range(min(SIDE, height - row * SIDE)):
         for c in range(channels):
-            line = image[b, c, band * SIDE + r]
-            for s in range(width // SIDE):
-                at = ((s * SIDE + r) * channels + c) * SIDE
+            line = image[b, c, row * SIDE + r]
+            for col in range(width // SIDE):
+                start = ((col * SIDE + r) * channels + c) * SIDE
                 for k in range(SIDE):
-                    strip[at + k] = line[s * SIDE + k]
-            at = (((cols - 1) * SIDE + r) * channels + c) * SIDE
+                    pixels[start + k] = line[col * SIDE + k]
+            start = (((cols - 1) * SIDE + r) * channels + c) * SIDE
             for k in range(width - width // SIDE * SIDE):
-                strip[at + k] = line[width // SIDE * SIDE + k]
+                pixels[start + k] = line[width // SIDE * SIDE + k]
 
 
 @_inner
-def _draw_band(scene, band, image, strip, coefficients, tag):  # type: ignore[no-untyped-def]
+def _render_row(lists, row, image, pixels, coefficients, tag):  # type: ignore[no-untyped-def]
     channels, height, width = image.shape[1:]
     rows, cols = -(-height // SIDE), -(-width // SIDE)
-    per_strip = SIDE * SIDE * channels
-    for k in range(len(strip)):
-        strip[k] = 0.0
-    plane_at, there = -1, True
-    for e in range(scene.start[band], scene.start[band + 1]):
-        i = scene.entries[e, 0]
-        for s in range(scene.entries[e, 1], scene.entries[e, 2]):
-            if scene.num_regions > 0:
-                plane_at, there = _find_plane(scene, band % (scene.maps * rows) * cols + s, scene.regions[i])
-            if not there:
+    per_tile = SIDE * SIDE * channels
+    for k in range(len(pixels)):
+        pixels[k] = 0.0
+    mask_at, present = -1, True
+    for e in range(lists.start[row], lists.start[row + 1]):
+        i = lists.entries[e, 0]
+        for col in range(lists.entries[e, 1], lists.entries[e, 2]):
+            if lists.num_regions > 0:
+                mask_at, present = _find_mask(lists, row % (lists.maps * rows) * cols + col, lists.regions[i])
+            if not present:
                 continue
-            first, last = _enter_strip(scene.gaussians[i], s, band % rows, height, width, scene.radius, coefficients)
+            first, last = _enter_tile(lists.gaussians[i], row % rows, col, height, width, lists.radius, coefficients)
             if first < last:
                 add_rows(
-                    strip, s * per_strip, first, last, coefficients, scene.lowest, scene.colors, i * channels,
-                    scene.planes, plane_at, tag,
+                    pixels, col * per_tile, first, last, coefficients, lists.lowest, lists.colors, i * channels,
+                    lists.masks, mask_at, tag,
                 )  # fmt: skip
-    _write_band(strip, image, band // rows, band % rows, cols)
+    _write_row(pixels, image, row // rows, row % rows, cols)
 
 
 @_inner
-def _gather_band(scene, band, grad, strip, coefficients, sums, out, moments, tag):  # type: ignore[no-untyped-def]
+def _gather_row(lists, row, grad, pixels, coefficients, sums, out, moments, tag):  # type: ignore[no-untyped-def]
     channels, height, width = grad.shape[1:]
     rows, cols = -(-height // SIDE), -(-width // SIDE)
-    per_strip = SIDE * SIDE * channels
-    _read_band(strip, grad, band // rows, band % rows, cols)
-    plane_at, there = -1, True
-    for e in range(scene.start[band], scene.start[band + 1]):
-        i = scene.entries[e, 0]
+    per_tile = SIDE * SIDE * channels
+    _read_row(pixels, grad, row // rows, row % rows, cols)
+    mask_at, present = -1, True
+    for e in range(lists.start[row], lists.start[row + 1]):
+        i = lists.entries[e, 0]
         for k in range(len(sums)):
             sums[k] = 0.0
-        for s in range(scene.entries[e, 1], scene.entries[e, 2]):
-            if scene.num_regions > 0:
-                plane_at, there = _find_plane(scene, band % (scene.maps * rows) * cols + s, scene.regions[i])
-            if not there:
+        for col in range(lists.entries[e, 1], lists.entries[e, 2]):
+            if lists.num_regions > 0:
+                mask_at, present = _find_mask(lists, row % (lists.maps * rows) * cols + col, lists.regions[i])
+            if not present:
                 continue
-            first, last = _enter_strip(scene.gaussians[i], s, band % rows, height, width, scene.radius, coefficients)
+            first, last = _enter_tile(lists.gaussians[i], row % rows, col, height, width, lists.radius, coefficients)
             if first < last:
                 gather_rows(
-                    strip, s * per_strip, first, last, coefficients, scene.lowest, scene.colors, i * channels,
-                    scene.planes, plane_at, sums, moments, tag,
+                    pixels, col * per_tile, first, last, coefficients, lists.lowest, lists.colors, i * channels,
+                    lists.masks, mask_at, sums, moments, tag,
                 )  # fmt: skip
         for k in range(out.shape[1]):
-            out[e, k] = lane_sum(sums, k)  # type: ignore[call-arg]
+            out[e, k] = sum_columns(sums, k)  # type: ignore[call-arg]
 
 
 @_inner
-def _finish(scene, order, out, means, cholesky, colors):  # type: ignore[no-untyped-def]
+def _finish(lists, order, out, means, cholesky, colors):  # type: ignore[no-untyped-def]
     count, channels = colors.shape
     total = np.zeros((count, out.shape[1]))
     for e in range(out.shape[0]):
         for k in range(out.shape[1]):
-            total[scene.entries[e, 0], k] += out[e, k]
+            total[lists.entries[e, 0], k] += out[e, k]
     for i in range(count):
-        t, g, to = total[i], scene.gaussians[i], order[i]
+        t, g, to = total[i], lists.gaussians[i], order[i]
         for c in range(channels):
             colors[to, c] = t[c]
         if out.shape[1] > channels:
@@ -269,8 +268,8 @@ def _finish(scene, order, out, means, cholesky, colors):  # type: ignore[no-unty
 class Loops(NamedTuple):
     """The compiled entry points."""
 
-    list_bands: Callable[..., Any]
-    draw: Callable[..., None]
+    list_tiles: Callable[..., Any]
+    render: Callable[..., None]
     gather: Callable[..., None]
     finish: Callable[..., None]
 
@@ -284,39 +283,39 @@ def compile_loops(fingerprint: str, cache: bool) -> Loops:
     entry = cast(Any, njit)(cache=cache, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
 
     @entry
-    def list_bands(means, factors, order, regions, images, batch, height, width, radius):  # type: ignore[no-untyped-def]
-        """Make the table of Gaussians, the start of each band in the list, and the list."""
+    def list_tiles(means, factors, order, regions, images, batch, height, width, radius):  # type: ignore[no-untyped-def]
+        """Make the table of Gaussians, the start of each row of tiles in the list, and the list."""
         fingerprint  # noqa: B018
         table = _tabulate(means, factors, order, radius)
-        start, entries = _list_bands(table, regions, images, -(-height // SIDE), batch, height, width, radius)
+        start, entries = _list_tiles(table, regions, images, -(-height // SIDE), batch, height, width, radius)
         return table, start, entries
 
     @entry
-    def draw(scene, offset, step, image, tag):  # type: ignore[no-untyped-def]
-        """Draw every `step`-th band from `offset`: image[b, c, y, x]."""
+    def render(lists, offset, step, image, tag):  # type: ignore[no-untyped-def]
+        """Render every `step`-th row of tiles from `offset`: image[b, c, y, x]."""
         fingerprint  # noqa: B018
         batch, channels, height, width = image.shape
-        strip = np.empty(-(-width // SIDE) * SIDE * SIDE * channels, np.float32)
+        pixels = np.empty(-(-width // SIDE) * SIDE * SIDE * channels, np.float32)
         coefficients = np.empty(5, np.float32)
-        for band in range(offset, batch * -(-height // SIDE), step):
-            _draw_band(scene, band, image, strip, coefficients, tag)
+        for row in range(offset, batch * -(-height // SIDE), step):
+            _render_row(lists, row, image, pixels, coefficients, tag)
 
     @entry
-    def gather(scene, offset, step, grad, out, moments, tag):  # type: ignore[no-untyped-def]
-        """Fill out[e] for the entries of every `step`-th band: C colour gradients, then five moments of z * SCALE."""
+    def gather(lists, offset, step, grad, out, moments, tag):  # type: ignore[no-untyped-def]
+        """Fill out[e] for the entries of every `step`-th row of tiles: C colour gradients, 5 moments of z * SCALE."""
         fingerprint  # noqa: B018
         batch, channels, height, width = grad.shape
-        strip = np.zeros(-(-width // SIDE) * SIDE * SIDE * channels, np.float32)
+        pixels = np.zeros(-(-width // SIDE) * SIDE * SIDE * channels, np.float32)
         coefficients = np.empty(5, np.float32)
         sums = np.empty((channels + 5) * SIDE, np.float32)
-        for band in range(offset, batch * -(-height // SIDE), step):
-            if scene.start[band] < scene.start[band + 1]:
-                _gather_band(scene, band, grad, strip, coefficients, sums, out, moments, tag)
+        for row in range(offset, batch * -(-height // SIDE), step):
+            if lists.start[row] < lists.start[row + 1]:
+                _gather_row(lists, row, grad, pixels, coefficients, sums, out, moments, tag)
 
     @entry
-    def finish(scene, order, out, means, cholesky, colors):  # type: ignore[no-untyped-def]
+    def finish(lists, order, out, means, cholesky, colors):  # type: ignore[no-untyped-def]
         """Add up each Gaussian's entries in float64 and turn moments into gradients, in the caller's order."""
         fingerprint  # noqa: B018
-        _finish(scene, order, out, means, cholesky, colors)
+        _finish(lists, order, out, means, cholesky, colors)
 
-    return Loops(list_bands, draw, gather, finish)
+    return Loops(list_tiles, render, gather, finish)

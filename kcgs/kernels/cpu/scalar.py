@@ -1,0 +1,97 @@
+"""The scalar twins of the vector loops, and the choice between them.
+
+The choice is made when a kernel is compiled, by the type of its `tag`: a tuple as long as the image has channels, of
+integers for the vector loops and of floats for the scalar ones.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit, types
+from numba.extending import overload
+
+from . import simd
+from .simd import SIDE
+
+_MIDDLE = (SIDE - 1) / 2
+
+
+@njit
+def _weight(coefficients, row, column, lowest):  # type: ignore[no-untyped-def]
+    x, y = np.float32(column - _MIDDLE), np.float32(row - _MIDDLE)
+    first = coefficients[0] + coefficients[1] * x
+    second = coefficients[2] + coefficients[3] * x + coefficients[4] * y
+    exponent = -first * first - second * second
+    weight = np.exp2(exponent) if exponent >= lowest else np.float32(0.0)
+    return first, second, weight
+
+
+@njit
+def _scalar_add_rows(  # type: ignore[no-untyped-def]
+    pixels, offset, first, last, coefficients, lowest, colors, color_at, masks, mask_at, tag
+):
+    channels = len(tag)
+    for row in range(first, last):
+        for column in range(SIDE):
+            _, _, weight = _weight(coefficients, row, column, lowest)
+            if mask_at >= 0:
+                weight *= masks[mask_at + row * SIDE + column]
+            for c in range(channels):
+                pixels[offset + (row * channels + c) * SIDE + column] += weight * colors[color_at + c]
+
+
+@njit
+def _scalar_gather_rows(  # type: ignore[no-untyped-def]
+    pixels, offset, first, last, coefficients, lowest, colors, color_at, masks, mask_at, sums, moments, tag
+):
+    channels = len(tag)
+    for row in range(first, last):
+        for column in range(SIDE):
+            z1, z2, weight = _weight(coefficients, row, column, lowest)
+            if mask_at >= 0:
+                weight *= masks[mask_at + row * SIDE + column]
+            value = np.float32(0.0)
+            for c in range(channels):
+                g = pixels[offset + (row * channels + c) * SIDE + column]
+                value += g * colors[color_at + c]
+                sums[c * SIDE + column] += weight * g
+            if not moments:
+                continue
+            value *= weight
+            k = channels * SIDE + column
+            sums[k] += value * z1
+            sums[k + SIDE] += value * z2
+            sums[k + 2 * SIDE] += value * z1 * z1
+            sums[k + 3 * SIDE] += value * z1 * z2
+            sums[k + 4 * SIDE] += value * z2 * z2
+
+
+def add_rows(*arguments: Any) -> None:
+    """Add a Gaussian to rows of a tile; only inside compiled code."""
+    raise NotImplementedError
+
+
+def gather_rows(*arguments: Any) -> None:
+    """Add a Gaussian's gradient terms over rows of a tile; only inside compiled code."""
+    raise NotImplementedError
+
+
+def _choose(vector: Any, scalar: Any, arguments: tuple[Any, ...]) -> Any:
+    chosen = vector if isinstance(arguments[-1].dtype, types.Integer) else scalar
+
+    def call(*arguments):  # type: ignore[no-untyped-def]
+        return chosen(*arguments)
+
+    return call
+
+
+@overload(add_rows)
+def _choose_add_rows(*arguments):  # type: ignore[no-untyped-def]
+    return _choose(simd.add_rows, _scalar_add_rows, arguments)
+
+
+@overload(gather_rows)
+def _choose_gather_rows(*arguments):  # type: ignore[no-untyped-def]
+    return _choose(simd.gather_rows, _scalar_gather_rows, arguments)

@@ -1,0 +1,142 @@
+"""Which Gaussian touches which tile: the lists that the tiled kernels and the ONNX decoders walk."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .autograd import SplatInputs
+from .whitened import Z_LIMIT, support_radius
+
+TILE = 16
+
+
+class TileGrid(NamedTuple):
+    """Tiles over a batch of images, numbered in raster order, batch first."""
+
+    batch: int
+    rows: int
+    cols: int
+
+    @property
+    def total(self) -> int:
+        """Number of tiles over the whole batch."""
+        return self.batch * self.rows * self.cols
+
+
+class Pairs(NamedTuple):
+    """One entry for every (Gaussian, tile) that may give a weight, ordered by Gaussian."""
+
+    gaussian: Tensor  # [P] int64, b * N + i
+    tile: Tensor  # [P] int64
+    mask: Tensor | None  # [P] int64 row of TileMembership.masks, -1: weight 1; None where no map is used
+    origin: Tensor  # [P, 2] float64, tile's centre minus the Gaussian's mean
+
+
+def grid_of(inputs: SplatInputs) -> TileGrid:
+    """Tiles that cover the batch."""
+    height, width = inputs.size
+    return TileGrid(inputs.means.shape[0], -(-height // TILE), -(-width // TILE))
+
+
+def bin_gaussians(inputs: SplatInputs) -> Pairs:
+    """List the tiles that each Gaussian's support touches and that hold its region."""
+    grid = grid_of(inputs)
+    means, cholesky = (t.detach().double().flatten(0, 1) for t in inputs[:2])
+    radius = support_radius(inputs.cutoff, inputs.means.dtype)
+    gaussian, place, origin = bounding_tiles(means, cholesky, radius, inputs.size)
+
+    keep = _reaches(origin, cholesky[gaussian], radius)
+    image = gaussian // inputs.means.shape[1]
+    tile = (image * grid.rows + place[:, 1]) * grid.cols + place[:, 0]
+    mask = None
+    if inputs.membership is not None and inputs.region_index is not None:
+        shared = inputs.membership.index.shape[0] == 1
+        local = tile - image * grid.rows * grid.cols if shared else tile
+        region = inputs.region_index.flatten()[gaussian]
+        table = inputs.membership.tiles(TILE)
+        position, present = find_keys(table.keys, local, region, inputs.membership.num_regions)
+        keep &= present
+        mask = table.mask[position[keep]]
+    return Pairs(gaussian[keep], tile[keep], mask, origin[keep])
+
+
+def bounding_tiles(
+    means: Tensor, cholesky: Tensor, radius: float, size: tuple[int, int], *, between: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
+    """List the tiles that the bounding box of each Gaussian's support touches.
+
+    Args:
+        means: float64, (N, 2).
+        cholesky: float64, (N, 3).
+        radius: of the support, in standard deviations.
+        size: (height, width) of the image.
+        between: whether to touch is to hold any point of a tile; else the centre of one of its pixels in the image.
+
+    Returns:
+        For each pair, ordered by Gaussian: the Gaussian (P,), the tile's column and row (P, 2), and the tile's centre
+        minus the Gaussian's mean (P, 2).
+    """
+    l11, l21, l22 = cholesky.unbind(-1)
+    extent = torch.stack([l11, torch.hypot(l21, l22)], -1) * radius * (1 + 1e-5) + 1e-3
+    last = torch.tensor([size[1] - 1, size[0] - 1], device=means.device, dtype=means.dtype)
+    if between:
+        last = (last / TILE).floor() * TILE + (TILE - 1)
+        low, high = (means - extent).floor(), (means + extent).floor()
+    else:
+        low, high = (means - extent - 0.5).ceil(), (means + extent - 0.5).floor()
+    seen = ((low <= high) & (high >= 0) & (low <= last)).all(-1)
+    first, final = ((at.clamp_min(0).minimum(last) / TILE).floor().long() for at in (low, high))
+    across, down = (final - first + 1).unbind(-1)
+    gaussian, rank = expand_runs(torch.where(seen, across * down, 0))
+    across = across[gaussian]
+    place = first[gaussian] + torch.stack([rank % across, rank // across], -1)
+    return gaussian, place, place * float(TILE) + TILE / 2 - means[gaussian]
+
+
+def _reaches(origin: Tensor, cholesky: Tensor, radius: float) -> Tensor:
+    # the bounding box bounds z1; a slanted needle is thin in z2, whose least value over the tile is this
+    l11, l21, l22 = cholesky.unbind(-1)
+    slope = l21 / l11
+    half = (TILE - 1) / 2
+    nearest = (origin[:, 1] - slope * origin[:, 0]).abs() - half * (1 + slope.abs())
+    return nearest <= radius * (1 + 1e-5) * l22 + 1e-3
+
+
+def find_keys(keys: Tensor, tile: Tensor, region: Tensor, num_regions: int) -> tuple[Tensor, Tensor]:
+    """Find where tile * num_regions + region lies in sorted keys, and say whether it is there; region -1 is nowhere."""
+    key = torch.where(region >= 0, tile * num_regions + region, -1)
+    position = torch.searchsorted(keys, key).clamp_max(len(keys) - 1)
+    return position, keys[position] == key
+
+
+def coefficients(pairs: Pairs, inputs: SplatInputs) -> Tensor:
+    """Coefficients of z in tile-centred pixels, [P, 5]: z1 = k0 + k1 x, z2 = k2 + k3 x + k4 y; made in float64."""
+    l11, l21, l22 = inputs.cholesky.detach().double().flatten(0, 1)[pairs.gaussian].unbind(-1)
+    x, y = pairs.origin.unbind(-1)
+    slope = l21 / l11
+    rows = torch.stack([x / l11, 1 / l11, (y - slope * x) / l22, -slope / l22, 1 / l22], -1)
+    return rows.clamp(-Z_LIMIT, Z_LIMIT).to(inputs.means.dtype)
+
+
+def split_into_tiles(image: Tensor) -> Tensor:
+    """View (B, C, H, W) as (B, rows, cols, C, TILE, TILE), zero outside."""
+    height, width = image.shape[-2:]
+    padded = torch.nn.functional.pad(image, (0, -width % TILE, 0, -height % TILE))
+    batch, channels, *sides = padded.shape
+    return padded.reshape(batch, channels, sides[0] // TILE, TILE, sides[1] // TILE, TILE).permute(0, 2, 4, 1, 3, 5)
+
+
+def expand_runs(counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Return, for each member of consecutive runs of these lengths, which run it is of and its place there."""
+    run = torch.repeat_interleave(counts)
+    return run, torch.arange(len(run), device=run.device) - (counts.cumsum(0) - counts)[run]
+
+
+def sum_runs(values: Tensor, counts: Tensor) -> Tensor:
+    """Sum consecutive runs of rows: the same order of addition every time, on any device."""
+    if len(counts) == 0:
+        return values.new_zeros(0, values.shape[-1])
+    return torch.segment_reduce(values, "sum", lengths=counts, axis=0, initial=0.0)
