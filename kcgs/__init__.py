@@ -2,8 +2,8 @@
 
 from .fit import FitConfig, FitResult, fit
 from .functional import RegionMap
-from .io import Scene, load, save
 from .nn import GaussianField, RegionSplatRenderer
+from .scene import Scene, load, save
 
 __version__ = "0.1.0"
 

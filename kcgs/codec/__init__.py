@@ -1,6 +1,6 @@
 """The compressed file `.kcgs`."""
 
 from .errors import CodecError
-from .scene import DEFAULT_QUALITY, QUALITIES, Decoded, decode, encode
+from .scene import DEFAULT_QUALITY, QUALITIES, Decoded, decode, deserialize, encode, serialize
 
-__all__ = ["DEFAULT_QUALITY", "QUALITIES", "CodecError", "Decoded", "decode", "encode"]
+__all__ = ["DEFAULT_QUALITY", "QUALITIES", "CodecError", "Decoded", "decode", "deserialize", "encode", "serialize"]

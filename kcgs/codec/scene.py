@@ -15,6 +15,7 @@ from kcgs._check import check_floating
 from kcgs.functional import RegionMap
 from kcgs.functional.covariance import check_cholesky
 from kcgs.nn import GaussianField
+from kcgs.scene import Scene
 
 from .errors import CodecError
 from .gaussians import Layers, Lookup, layer_order, pick
@@ -142,6 +143,21 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
     except ValueError as error:
         raise CodecError(f"the file holds no Gaussians that can be drawn: {error}") from error
     return Decoded(field, regions, len(layers), len(header.layers))
+
+
+def serialize(scene: Scene) -> bytes:
+    """Write a scene as `encode` does by default, for `kcgs.save`."""
+    return encode(scene.field, scene.regions)
+
+
+def deserialize(data: bytes) -> Scene:
+    """Read a whole file, for `kcgs.load`."""
+    decoded = decode(data)
+    if decoded.layers < decoded.num_layers:
+        raise CodecError(
+            f"it ends early, with {decoded.layers} of {decoded.num_layers} layers; kcgs decode renders what is there"
+        )
+    return Scene(decoded.field, decoded.regions)
 
 
 def encode_codes(

@@ -6,7 +6,7 @@ import math
 import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -282,6 +282,20 @@ class RegionMap:
             _table=None if self._table is None else self._table.to(device),
             _origin=None if self._origin is None else self._origin.to(device),
         )
+
+    def state(self) -> dict[str, Any]:
+        """Return what :meth:`from_state` makes the same map of: tensors, numbers, tuples and None only."""
+        if self._origin is not None:
+            return {**self._origin.state(), "size": self.size}
+        widths = self.softness if isinstance(self.softness, float) else tuple(self.softness.items())
+        return {"labels": self.fine_labels, "softness": widths, "supersample": self.supersample, "size": self.size}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> RegionMap:
+        """Make the map that :meth:`state` describes."""
+        widths = state["softness"]
+        softness = widths if isinstance(widths, float) else {tuple(pair): width for pair, width in widths}
+        return cls.from_labels(state["labels"], softness, supersample=state["supersample"]).resize(state["size"])
 
     def resize(self, size: tuple[int, int]) -> RegionMap:
         """Sample the map at another resolution; contours are smoothed, not stepped.

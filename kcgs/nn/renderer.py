@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol, runtime_checkable
+
 import torch
 from torch import Tensor, nn
 
@@ -9,6 +11,14 @@ from kcgs._check import check_cutoff, check_size
 from kcgs.functional import RegionMap, region_splat
 
 from .field import GaussianField
+
+
+@runtime_checkable
+class SceneLike(Protocol):
+    """Gaussians with the map to render them with, such as :class:`kcgs.Scene`."""
+
+    field: GaussianField
+    regions: RegionMap | None
 
 
 class RegionSplatRenderer(nn.Module):
@@ -21,6 +31,7 @@ class RegionSplatRenderer(nn.Module):
         cutoff: weights below it are skipped, in [0, 1); see :func:`kcgs.functional.region_splat`.
         clamp: clip the image to [0, 1].
         backend: auto, reference, tiled, cpu or cuda.
+        keepdim: give (C, H, W) for an unbatched field; False: always (B, C, H, W), as Kornia's modules take it.
 
     Raises:
         ValueError: cutoff out of range.
@@ -31,36 +42,39 @@ class RegionSplatRenderer(nn.Module):
         (torch.Size([3, 32, 48]), torch.Size([3, 64, 96]))
     """
 
-    def __init__(self, cutoff: float = 1e-4, clamp: bool = False, backend: str = "auto") -> None:
+    def __init__(self, cutoff: float = 1e-4, clamp: bool = False, backend: str = "auto", keepdim: bool = True) -> None:
         super().__init__()
         self.cutoff = check_cutoff(cutoff)
         self.clamp = clamp
         self.backend = backend
+        self.keepdim = keepdim
 
     def forward(
         self,
-        field: GaussianField | tuple[GaussianField, RegionMap | Tensor | None],
+        field: GaussianField | SceneLike,
         regions: RegionMap | Tensor | None = None,
         size: tuple[int, int] | None = None,
     ) -> Tensor:
         """Render.
 
         Args:
-            field: the Gaussians; or a pair (field, regions), such as a loaded scene, so that the renderer can be the
+            field: the Gaussians; or a :class:`kcgs.Scene`, which brings its map along, so that the renderer can be the
                 first link of an `nn.Sequential`.
-            regions: label map of the field's size or of `size`; None: the field's ids are not used.
+            regions: label map of the field's size or of `size`; None: the scene's, or the field's ids are not used.
             size: (height, width) of the image; None: the field's.
 
         Returns:
-            Image, :math:`(C, H, W)`, or :math:`(B, C, H, W)` for a batched field.
+            Image, :math:`(C, H, W)`, or :math:`(B, C, H, W)` for a batched field or with ``keepdim=False``.
 
         Raises:
             TypeError, ValueError: as :func:`kcgs.functional.region_splat`; regions without region ids.
         """
-        if isinstance(field, tuple):
-            field, regions, *_ = field
         if not isinstance(field, GaussianField):
-            raise TypeError(f"field must be a GaussianField; got {type(field).__name__}")
+            if not isinstance(field, SceneLike):
+                raise TypeError(f"field must be a GaussianField or a Scene; got {type(field).__name__}")
+            scene = field
+            field = scene.field
+            regions = scene.regions if regions is None else regions
         target = field.size if size is None else check_size("size", size)
         means, cholesky = field.means, field.cholesky
         if target != field.size:
@@ -79,23 +93,23 @@ class RegionSplatRenderer(nn.Module):
             cutoff=self.cutoff,
             backend=self.backend,
         )
+        if not self.keepdim and image.ndim == 3:
+            image = image[None]
         return image.clamp(0.0, 1.0) if self.clamp else image
 
     @staticmethod
     def _fit_regions(field: GaussianField, regions: RegionMap | Tensor, target: tuple[int, int]) -> RegionMap:
         if field.region_ids is None:
             raise ValueError("field must have region_ids where regions are given; call field.assign_regions(regions)")
-        if isinstance(regions, Tensor):
-            regions = RegionMap.from_labels(regions)
-        elif not isinstance(regions, RegionMap):
-            raise TypeError(f"regions must be a RegionMap, a label map Tensor or None; got {type(regions).__name__}")
-        if regions.size not in (target, field.size):
-            raise ValueError(f"regions must have the size {field.size} of the field or {target}; got {regions.size}")
-        return regions.resize(target)
+        coerced = RegionMap.coerce(regions)
+        assert coerced is not None
+        if coerced.size not in (target, field.size):
+            raise ValueError(f"regions must have the size {field.size} of the field or {target}; got {coerced.size}")
+        return coerced.resize(target)
 
     def extra_repr(self) -> str:
         """Show the settings."""
-        return f"cutoff={self.cutoff:g}, clamp={self.clamp}, backend={self.backend!r}"
+        return f"cutoff={self.cutoff:g}, clamp={self.clamp}, backend={self.backend!r}, keepdim={self.keepdim}"
 
 
 def render_image(field: GaussianField, regions: RegionMap | None = None, size: tuple[int, int] | None = None) -> Tensor:

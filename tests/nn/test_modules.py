@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from kcgs import GaussianField, RegionMap, RegionSplatRenderer
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 
 SIZE = (24, 36)
 
@@ -158,7 +158,7 @@ class TestRenderer:
             render(field, labels[:5])
         with pytest.raises(ValueError, match="field must have region_ids"):
             render(GaussianField.random(3, SIZE), labels)
-        with pytest.raises(TypeError, match="field must be a GaussianField; got Tensor"):
+        with pytest.raises(TypeError, match="field must be a GaussianField or a Scene; got Tensor"):
             render(labels)
         with pytest.raises(ValueError, match="cutoff must be in"):
             RegionSplatRenderer(cutoff=2.0)
@@ -166,10 +166,8 @@ class TestRenderer:
 
 class TestComposition:
     def test_sequential_with_kornia(self, field: GaussianField, labels: Tensor) -> None:
-        chain = nn.Sequential(
-            RegionSplatRenderer(), nn.Unflatten(0, (1, 3)), kornia.filters.GaussianBlur2d((3, 3), (1.0, 1.0))
-        )
-        image = chain((field, RegionMap.from_labels(labels)))
+        chain = nn.Sequential(RegionSplatRenderer(keepdim=False), kornia.filters.GaussianBlur2d((3, 3), (1.0, 1.0)))
+        image = chain(Scene(field, labels))
         loss = kornia.losses.ssim_loss(image, torch.full_like(image, 0.5), window_size=5)
         loss.backward()
         assert image.shape == (1, 3, *SIZE)

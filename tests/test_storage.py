@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 import kcgs
-from kcgs import GaussianField, RegionMap
-from kcgs.io import FORMAT, MAX_SIDE, Scene, load, save, scene_bytes
-from kcgs.nn import RegionSplatRenderer
+from kcgs import GaussianField, RegionMap, Scene, load, save
+from kcgs.scene import scene_bytes
+from kcgs.storage import FORMAT, MAX_SIDE
 
 SIZE = (9, 11)
 Softness = float | dict[tuple[int, int], float]
@@ -90,7 +90,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def saved(path: Path) -> Path:
-    save(path, make_field(), RegionMap.from_labels(labels_with(7), 0.75), metadata={"title": "a"})
+    save(path, Scene(make_field(), RegionMap.from_labels(labels_with(7), 0.75), metadata={"title": "a"}))
     return path
 
 
@@ -103,7 +103,7 @@ class TestRoundTrip:
         with torch.no_grad():
             field.colors[0, 0], field.colors[0, 1] = -0.0, 1e-42 if dtype == torch.float32 else 5e-324
         regions = RegionMap.from_labels(labels_with(7), softness)
-        assert save(path, field, regions) == path.stat().st_size
+        assert save(path, Scene(field, regions)) == path.stat().st_size
         scene = load(path)
         assert_same_scene(scene, field, regions)
         assert scene.metadata == {}
@@ -114,30 +114,30 @@ class TestRoundTrip:
         fine = labels_with(7, (27, 33)) % 20
         fine[:, 20:] = 3
         regions = RegionMap.from_labels(fine[None] if batched else fine, softness, supersample=3)
-        save(path, make_field(), regions)
+        save(path, Scene(make_field(), regions))
         scene = load(path)
         assert_same_scene(scene, make_field(), regions)
-        first, second = (RegionSplatRenderer()(make_field(), r) for r in (regions, scene.regions))
+        first, second = (Scene(make_field(), r)() for r in (regions, scene.regions))
         assert torch.equal(first, second)
 
     @pytest.mark.parametrize("channels", [1, 4])
     def test_without_regions(self, path: Path, channels: int) -> None:
         field = make_field(channels=channels)
-        save(path, field)
+        save(path, Scene(field))
         assert_same_scene(load(path), field, None)
 
     def test_without_region_ids(self, path: Path) -> None:
         field = GaussianField.random(5, (4, 6), seed=0)
-        save(path, field)
+        save(path, Scene(field))
         assert_same_scene(load(path), field, None)
 
     def test_label_map_tensor_means_hard_contours(self, path: Path) -> None:
-        save(path, make_field(), labels_with(7).to(torch.int16))
+        save(path, Scene(make_field(), labels_with(7).to(torch.int16)))
         assert_same_scene(load(path), make_field(), RegionMap.from_labels(labels_with(7)))
 
     def test_label_map_of_another_size(self, path: Path) -> None:
         regions = RegionMap.from_labels(labels_with(7, (18, 22)))
-        save(path, make_field(), regions)
+        save(path, Scene(make_field(), regions))
         assert_same_scene(load(path), make_field(), regions)
 
     @pytest.mark.parametrize("batched_labels", [False, True])
@@ -147,12 +147,12 @@ class TestRoundTrip:
         stacked[0][1] += 1.5
         field = GaussianField(*stacked, size=SIZE)
         labels = torch.stack([labels_with(7), labels_with(7).flip(0)]) if batched_labels else labels_with(7)
-        save(path, field, labels)
+        save(path, Scene(field, labels))
         assert_same_scene(load(path), field, RegionMap.from_labels(labels))
 
     def test_no_gaussians(self, path: Path) -> None:
         field = make_field().subset(torch.zeros(13, dtype=torch.bool))
-        save(path, field, labels_with(7))
+        save(path, Scene(field, labels_with(7)))
         assert len(load(path).field) == 0
         assert_same_scene(load(path), field, RegionMap.from_labels(labels_with(7)))
 
@@ -162,24 +162,24 @@ class TestRoundTrip:
         parts = [torch.nn.Parameter(part) for part in block.split([2, 3, 3], dim=1)]
         field = GaussianField(*parts, size=SIZE)
         assert not any(getattr(field, name).is_contiguous() for name in names)
-        save(path, field)
+        save(path, Scene(field))
         assert_same_scene(load(path), field, None)
 
-    def test_draws_the_same_picture(self, saved: Path) -> None:
+    def test_renders_the_same_image(self, saved: Path) -> None:
         scene = load(saved)
-        expected = RegionSplatRenderer()(make_field(), RegionMap.from_labels(labels_with(7), 0.75))
-        image = RegionSplatRenderer()(scene.field, scene.regions)
+        expected = Scene(make_field(), RegionMap.from_labels(labels_with(7), 0.75))()
+        image = scene()
         assert torch.equal(image, expected)
         assert image.std() > 0.01
 
     def test_loaded_field_can_be_trained(self, saved: Path) -> None:
         scene = load(saved)
-        RegionSplatRenderer()(scene.field, scene.regions).sum().backward()
+        scene().sum().backward()
         assert scene.field.colors.grad is not None and scene.field.colors.grad.abs().max() > 0
 
     def test_loaded_scene_does_not_depend_on_the_file(self, path: Path) -> None:
         regions = RegionMap.from_labels(labels_with(1 << 40))  # int64, which needs no conversion
-        save(path, make_field(highest=1 << 40), regions)
+        save(path, Scene(make_field(highest=1 << 40), regions))
         scene = load(path)
         content = path.read_bytes()
         with path.open("r+b") as file:
@@ -202,7 +202,7 @@ class TestFormat:
     )
     def test_smallest_integers(self, path: Path, highest: int, dtype: str) -> None:
         regions = RegionMap.from_labels(labels_with(highest))
-        save(path, make_field(highest=highest), regions)
+        save(path, Scene(make_field(highest=highest), regions))
         header, _ = read_header(path)
         assert (header["labels"]["dtype"], header["region_ids"]["dtype"]) == (dtype, dtype)
         assert_same_scene(load(path), make_field(highest=highest), regions)
@@ -223,22 +223,22 @@ class TestFormat:
     def test_version_2_only_where_version_1_cannot_say_it(self, path: Path) -> None:
         labels = labels_with(7)
         every_pair = {(a, b): 0.75 for b in (0, 1, 2, 3, 7) for a in range(min(b, 4))}
-        save(path, make_field(), RegionMap.from_labels(labels, 0.75))
+        save(path, Scene(make_field(), RegionMap.from_labels(labels, 0.75)))
         plain = path.read_bytes()
-        save(path, make_field(), RegionMap.from_labels(labels, every_pair, supersample=1))
+        save(path, Scene(make_field(), RegionMap.from_labels(labels, every_pair, supersample=1)))
         assert path.read_bytes() == plain
-        save(path, make_field(), RegionMap.from_labels(labels, {(7, 3): 0.5, (0, 1): 0.25}))
+        save(path, Scene(make_field(), RegionMap.from_labels(labels, {(7, 3): 0.5, (0, 1): 0.25})))
         notes = read_header(path)[0]["__metadata__"]
         assert (notes["format_version"], notes["softness"]) == ("2", "[[0,1,0.25],[3,7,0.5]]")
         assert "supersample" not in notes
-        save(path, make_field(), RegionMap.from_labels(labels_with(7, (18, 22)), 0.5, supersample=2))
+        save(path, Scene(make_field(), RegionMap.from_labels(labels_with(7, (18, 22)), 0.5, supersample=2)))
         header = read_header(path)[0]
         notes = header["__metadata__"]
         assert (notes["format_version"], notes["softness"], notes["supersample"]) == ("2", "0.5", "2")
         assert header["labels"]["shape"] == [18, 22]
 
     def test_absent_things_take_no_room(self, path: Path) -> None:
-        save(path, make_field(opacities=False))
+        save(path, Scene(make_field(opacities=False)))
         header, body = read_header(path)
         assert header.keys() == {"__metadata__", "means", "cholesky", "colors", "region_ids"}
         assert len(body) == 13 * (8 * 4 + 1)
@@ -246,12 +246,12 @@ class TestFormat:
 
     def test_header_keeps_floats_aligned(self, path: Path) -> None:
         for length in range(8):
-            save(path, make_field(), metadata={"title": "x" * length})
+            save(path, Scene(make_field(), metadata={"title": "x" * length}))
             assert struct.unpack("<Q", path.read_bytes()[:8])[0] % 8 == 0
 
     def test_metadata(self, path: Path) -> None:
         notes = {"ü\n\"'\\": "\0 é 🖼", "format": "mine", "": "", "user.user.": "x", "height": "-1"}
-        save(path, make_field(), metadata=notes)
+        save(path, Scene(make_field(), metadata=notes))
         assert load(path).metadata == notes
 
     def test_same_scene_same_bytes(self, tmp_path: Path) -> None:
@@ -260,45 +260,44 @@ class TestFormat:
         for turn in range(8):
             target = tmp_path / f"{turn}.safetensors"
             ordered = dict(sorted(notes.items(), reverse=bool(turn % 2)))
-            save(target, make_field(), labels_with(7), metadata=ordered)
+            save(target, Scene(make_field(), labels_with(7), metadata=ordered))
             contents.add(target.read_bytes())
         assert len(contents) == 1
 
     def test_same_bytes_from_another_process(self, saved: Path, tmp_path: Path) -> None:
         again = tmp_path / "again.safetensors"
-        code = (
-            "import sys; from kcgs.io import load, save; s = load(sys.argv[1]);"
-            "save(sys.argv[2], s.field, s.regions, metadata=s.metadata)"
-        )
+        code = "import sys; from kcgs import load, save; save(sys.argv[2], load(sys.argv[1]))"
         subprocess.run([sys.executable, "-c", code, str(saved), str(again)], check=True)
         assert again.read_bytes() == saved.read_bytes()
 
     def test_scene_bytes(self, path: Path) -> None:
         field, labels = make_field(), labels_with(7)
-        assert scene_bytes(field) == save(path, field)
-        assert scene_bytes(field, labels, metadata={"a": "b"}) == save(path, field, labels, metadata={"a": "b"})
-        assert scene_bytes(field) < scene_bytes(field, labels)
+        assert scene_bytes(Scene(field)) == save(path, Scene(field))
+        assert scene_bytes(Scene(field, labels, metadata={"a": "b"})) == save(
+            path, Scene(field, labels, metadata={"a": "b"})
+        )
+        assert scene_bytes(Scene(field)) < scene_bytes(Scene(field, labels))
 
 
 class TestSaveRefuses:
     @pytest.mark.parametrize("name", ["scene", "scene.pt", "scene.safetensors.png", "safetensors"])
     def test_other_suffixes(self, tmp_path: Path, name: str) -> None:
-        with pytest.raises(ValueError, match=r"path must end in \.safetensors; got"):
-            save(tmp_path / name, make_field())
+        with pytest.raises(ValueError, match=r"path must end in \.safetensors or \.kcgs; got"):
+            save(tmp_path / name, Scene(make_field()))
         assert list(tmp_path.iterdir()) == []
 
     def test_wrong_types(self, path: Path) -> None:
         field = make_field()
         with pytest.raises(TypeError, match="field must be a GaussianField; got dict"):
-            save(path, {"means": field.means})  # type: ignore[arg-type]
-        with pytest.raises(TypeError, match="regions must be a RegionMap, a label map or None; got list"):
-            save(path, field, [[0, 1]])  # type: ignore[arg-type]
+            save(path, Scene({"means": field.means}))  # type: ignore[arg-type]
+        with pytest.raises(TypeError, match="regions must be a RegionMap, a label map Tensor or None; got list"):
+            save(path, Scene(field, [[0, 1]]))  # type: ignore[arg-type]
         with pytest.raises(TypeError, match="metadata must map str to str; got 'n': 3"):
-            save(path, field, metadata={"n": 3})  # type: ignore[dict-item]
+            save(path, Scene(field, metadata={"n": 3}))  # type: ignore[dict-item]
         with pytest.raises(ValueError, match="surrogates not allowed"):
-            save(path, field, metadata={"title": "\ud800"})
+            save(path, Scene(field, metadata={"title": "\ud800"}))
         with pytest.raises(TypeError, match="metadata must map str to str; got str"):
-            save(path, field, metadata="title")  # type: ignore[arg-type]
+            save(path, Scene(field, metadata="title"))  # type: ignore[arg-type]
         assert not path.exists()
 
     @pytest.mark.parametrize(
@@ -316,22 +315,22 @@ class TestSaveRefuses:
         with torch.no_grad():
             getattr(field, name)[2] = value
         with pytest.raises(ValueError, match=message):
-            save(saved, field)
+            save(saved, Scene(field))
         assert saved.read_bytes() == before
         assert list(saved.parent.iterdir()) == [saved]
 
     def test_absurd_sizes_and_batches(self, path: Path) -> None:
         field = GaussianField.random(3, (4, MAX_SIDE + 1), seed=0)
         with pytest.raises(ValueError, match="width must be a whole number of 1 to 1048576"):
-            save(path, field)
+            save(path, Scene(field))
         with pytest.raises(ValueError, match="labels must hold 1 map or one for each of 1 images; got 2"):
-            save(path, make_field(), torch.zeros(2, *SIZE).long())
+            save(path, Scene(make_field(), torch.zeros(2, *SIZE).long()))
         with pytest.raises(ValueError, match="labels must be at most 1048576 pixels a side"):
-            save(path, make_field(), torch.zeros(1, MAX_SIDE + 1, dtype=torch.uint8))
+            save(path, Scene(make_field(), torch.zeros(1, MAX_SIDE + 1, dtype=torch.uint8)))
 
     def test_missing_folder(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError, match="nowhere"):
-            save(tmp_path / "nowhere" / "scene.safetensors", make_field())
+            save(tmp_path / "nowhere" / "scene.safetensors", Scene(make_field()))
 
 
 def _drop(name: str) -> Callable[[dict[str, Any]], None]:
@@ -350,7 +349,7 @@ class TestLoadRefuses:
     def test_missing_file_and_folder(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError, match=r"absent\.safetensors"):
             load(tmp_path / "absent.safetensors")
-        with pytest.raises(IsADirectoryError):
+        with pytest.raises(ValueError, match=r"path must end in \.safetensors or \.kcgs; got"):
             load(tmp_path)
 
     @pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n" + bytes(100), b"\x80\x04}q\0.", b"\xff" * 64])
@@ -402,8 +401,8 @@ class TestLoadRefuses:
             (_entry("region_ids", shape=[1, 13]), "region_ids must have shape"),
             (_entry("labels", shape=[99]), "labels must have 2 or 3 dimensions"),
             (_entry("labels", shape=[3, 3, 11]), "labels must hold 1 map"),
-            (_entry("means", shape=[13, 3]), "deserializing header"),
-            (_entry("means", data_offsets=[0, 10**12]), "deserializing header"),
+            (_entry("means", shape=[13, 3]), "while deserializing"),
+            (_entry("means", data_offsets=[0, 10**12]), "while deserializing"),
         ],
     )
     def test_header(self, saved: Path, edit: Callable[[dict[str, Any]], None], message: str) -> None:
@@ -438,7 +437,7 @@ class TestLoadRefuses:
     )
     def test_header_of_version_2(self, path: Path, name: str, value: str, message: str) -> None:
         widths = {(0, 1): 0.5, (1, 2): 0.75}
-        save(path, make_field(), RegionMap.from_labels(labels_with(7, (18, 22)) % 20, widths, supersample=2))
+        save(path, Scene(make_field(), RegionMap.from_labels(labels_with(7, (18, 22)) % 20, widths, supersample=2)))
         header, body = read_header(path)
         load(path)
         header["__metadata__"][name] = value
@@ -465,7 +464,7 @@ class TestLoadRefuses:
 
     @pytest.mark.parametrize("name", ["labels", "region_ids"])
     def test_negative_ids(self, path: Path, name: str) -> None:
-        save(path, make_field(highest=70000), labels_with(70000))
+        save(path, Scene(make_field(highest=70000), labels_with(70000)))
         header, body = read_header(path)
         at = header[name]["data_offsets"][0]
         write_header(path, header, body[:at] + struct.pack("<i", -1) + body[at + 4 :])

@@ -1,0 +1,238 @@
+"""Scene: Gaussians and the label map to render them with, in memory and on disk."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from kcgs._atomic import atomic_path
+from kcgs.functional import RegionMap
+from kcgs.nn import GaussianField, RegionSplatRenderer
+
+FORMATS = {".safetensors": "kcgs.storage", ".kcgs": "kcgs.codec"}
+"""File formats by suffix: a module, imported on use, with ``serialize(scene)`` and ``deserialize(data)``."""
+
+
+class Scene(nn.Module):
+    r"""Gaussians, the label map that confines them, and notes.
+
+    Convention: `to`, `state_dict`, `copy.deepcopy` and `pickle` keep the map and the notes too. `load_state_dict` takes
+    the map and the notes of the state in place of its own.
+
+    Args:
+        field: N Gaussians, or a batch of them.
+        regions: a RegionMap, or an integer label map, :math:`(H, W)` or :math:`(B, H, W)`, with hard contours; None:
+            nothing is confined.
+        metadata: notes, str to str, which files keep.
+
+    Raises:
+        TypeError: an argument of the wrong type.
+        ValueError: no label map.
+
+    Example:
+        >>> labels = (torch.arange(48) >= 24).long().expand(32, 48)
+        >>> scene = Scene(GaussianField.random(10, (32, 48), regions=labels, seed=0), labels)
+        >>> scene.render().shape, scene.render(size=(64, 96)).shape
+        (torch.Size([3, 32, 48]), torch.Size([3, 64, 96]))
+    """
+
+    def __init__(
+        self,
+        field: GaussianField,
+        regions: RegionMap | Tensor | None = None,
+        metadata: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__()
+        if not isinstance(field, GaussianField):
+            raise TypeError(f"field must be a GaussianField; got {type(field).__name__}")
+        self.field = field
+        self.regions = RegionMap.coerce(regions)
+        self.metadata = _check_metadata(metadata)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) in pixels of the image that the Gaussians refer to."""
+        return self.field.size
+
+    def __len__(self) -> int:
+        """Number of Gaussians per image."""
+        return len(self.field)
+
+    def __iter__(self) -> Any:  # transitional
+        return iter((self.field, self.regions, self.metadata))
+
+    def forward(self, size: tuple[int, int] | None = None) -> Tensor:
+        """Render, differentiably and not clipped; other settings: :class:`kcgs.RegionSplatRenderer`.
+
+        Args:
+            size: (height, width); None: the scene's own. Contours stay sharp at every size.
+
+        Returns:
+            Image, :math:`(C, H, W)`, or :math:`(B, C, H, W)` for a batch.
+
+        Raises:
+            TypeError, ValueError: as :func:`kcgs.functional.region_splat`; a map without region ids.
+        """
+        image: Tensor = RegionSplatRenderer()(self.field, self.regions, size)
+        return image
+
+    def render(self, size: tuple[int, int] | None = None) -> Tensor:
+        """Render what one shows or saves: clipped to [0, 1], without a graph.
+
+        Args:
+            size: (height, width); None: the scene's own.
+
+        Returns:
+            Image, :math:`(C, H, W)`, or :math:`(B, C, H, W)` for a batch.
+
+        Raises:
+            TypeError, ValueError: as :meth:`forward`.
+        """
+        with torch.no_grad():
+            image: Tensor = self(size)
+            return image.clamp(0.0, 1.0)
+
+    def save(self, path: str | os.PathLike[str]) -> int:
+        """Write the scene, as :func:`kcgs.save` does; return the bytes of the file."""
+        return save(path, self)
+
+    def extra_repr(self) -> str:
+        """Show the map and the notes; the field shows itself."""
+        regions = "no regions" if self.regions is None else f"{self.regions.num_regions} regions"
+        return f"size={self.size}, {regions}" + (f", metadata={self.metadata}" if self.metadata else "")
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Map and notes, for `state_dict`."""
+        return {"regions": None if self.regions is None else self.regions.state(), "metadata": self.metadata}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Map and notes, from `load_state_dict`."""
+        regions = state["regions"]
+        device = self.field.means.device
+        self.regions = None if regions is None else RegionMap.from_state(regions).to(device)
+        self.metadata = _check_metadata(state["metadata"])
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Scene:
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        if self.regions is not None:
+            self.regions = self.regions.to(self.field.means.device)
+        return self
+
+
+def save(path: str | os.PathLike[str], scene: Any, regions: Any = None, *, metadata: Any = None) -> int:
+    """Write a scene; the file appears whole or not at all, and the same scene gives the same bytes.
+
+    Args:
+        path: ends in .safetensors, which keeps every bit, or in .kcgs, which rounds as
+            :func:`kcgs.codec.encode` does by default and keeps no notes; its folder must exist.
+        scene: N Gaussians, or (.safetensors only) a batch of them.
+
+    Returns:
+        Size of the file in bytes.
+
+    Raises:
+        TypeError: no scene.
+        ValueError: another suffix, values that are not finite, l11 or l22 not positive, sizes above 2**20, a batch
+            of label maps that does not fit the field.
+        FileNotFoundError: the folder does not exist.
+
+    Example:
+        >>> import tempfile
+        >>> scene = Scene(GaussianField.random(10, (32, 48), seed=0), metadata={"title": "ten blobs"})
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     size = save(f"{folder}/scene.safetensors", scene)
+        ...     loaded = load(f"{folder}/scene.safetensors")
+        >>> torch.equal(loaded.field.colors, scene.field.colors), loaded.regions, loaded.metadata
+        (True, None, {'title': 'ten blobs'})
+    """
+    path = Path(path)
+    if isinstance(scene, GaussianField):  # transitional
+        scene = Scene(scene, regions, metadata)
+    content = _serialized(scene, _format(path))
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+    return len(content)
+
+
+def scene_bytes(scene: Any, regions: Any = None, *, metadata: Any = None, suffix: str = ".safetensors") -> int:
+    """Size in bytes of the file that :func:`save` would write.
+
+    Args:
+        scene: as there.
+        suffix: .safetensors or .kcgs.
+
+    Returns:
+        Bytes.
+
+    Raises:
+        TypeError, ValueError: as :func:`save`.
+
+    Example:
+        >>> scene_bytes(Scene(GaussianField.random(1000, (32, 48), seed=0))) > 1000 * 8 * 4
+        True
+    """
+    if isinstance(scene, GaussianField):  # transitional
+        scene = Scene(scene, regions, metadata)
+    return len(_serialized(scene, _format(Path(f"scene{suffix}"))))
+
+
+def load(path: str | os.PathLike[str]) -> Scene:
+    """Read a scene.
+
+    Args:
+        path: a .safetensors file that :func:`save` wrote, or a whole .kcgs file; the beginning of one is read by
+            :func:`kcgs.codec.decode`.
+
+    Returns:
+        The scene, on the CPU; from .safetensors bit for bit as saved. Region ids and labels are int64.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: another suffix; the file is damaged, no scene, or of another format version; the message names
+            the path.
+
+    Example:
+        >>> import tempfile
+        >>> field = GaussianField.random(10, (32, 48), seed=0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = f"{folder}/scene.safetensors"
+        ...     _ = save(path, Scene(field, torch.zeros(32, 48).long()))
+        ...     scene = load(path)
+        >>> scene.size, scene.regions.num_regions, scene.metadata
+        ((32, 48), 1, {})
+    """
+    path = Path(path)
+    deserialize: Callable[[bytes], Scene] = _format(path).deserialize
+    data = path.read_bytes()
+    try:
+        return deserialize(data)
+    except ValueError as error:
+        raise ValueError(f"cannot load {path}: {error}") from error
+
+
+def _format(path: Path) -> Any:
+    if path.suffix not in FORMATS:
+        raise ValueError(f"path must end in {' or '.join(FORMATS)}; got {str(path)!r}")
+    return import_module(FORMATS[path.suffix])
+
+
+def _serialized(scene: Scene, format: Any) -> bytes:
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
+    content: bytes = format.serialize(scene)
+    return content
+
+
+def _check_metadata(metadata: object) -> dict[str, str]:
+    if metadata is not None and not isinstance(metadata, Mapping):
+        raise TypeError(f"metadata must map str to str; got {type(metadata).__name__}")
+    for key, value in (metadata or {}).items():
+        if not isinstance(key, str) or not isinstance(value, str):
+            raise TypeError(f"metadata must map str to str; got {key!r}: {value!r}")
+    return dict(metadata or {})

@@ -1,0 +1,108 @@
+"""Scene as a module: it renders, moves, copies and keeps its map."""
+
+from __future__ import annotations
+
+import copy
+import io
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene, load, save
+
+SIZE = (20, 30)
+MAPS = {
+    "none": None,
+    "hard": RegionMap.from_labels((torch.arange(30) // 11).expand(SIZE)),
+    "soft": RegionMap.from_labels((torch.arange(30) // 11).expand(SIZE), 0.8),
+    "pairs": RegionMap.from_labels((torch.arange(30) // 11).expand(SIZE), {(0, 1): 0.5, (1, 2): 1.5}),
+    "fine": RegionMap.from_labels((torch.arange(60) // 23).expand(40, 60), supersample=2),
+    "resized": RegionMap.from_labels((torch.arange(60) // 23).expand(40, 60), 1.0).resize(SIZE),
+}
+
+
+def make_scene(name: str = "soft") -> Scene:
+    regions = MAPS[name]
+    field = GaussianField.random(40, SIZE, regions=regions, seed=0)
+    return Scene(field, regions, {"title": name})
+
+
+@pytest.mark.parametrize("name", MAPS)
+class TestKeepsItsMap:
+    def test_deepcopy_and_pickle(self, name: str) -> None:
+        scene = make_scene(name)
+        for other in (copy.deepcopy(scene), pickle.loads(pickle.dumps(scene))):
+            assert torch.equal(other(), scene()) and other.metadata == {"title": name}
+
+    def test_state_dict(self, name: str) -> None:
+        scene = make_scene(name)
+        file = io.BytesIO()
+        torch.save(scene.state_dict(), file)
+        file.seek(0)
+        other = Scene(GaussianField.random(40, SIZE, seed=1))
+        other.load_state_dict(torch.load(file, weights_only=True))
+        assert torch.equal(other(), scene()) and other.metadata == {"title": name}
+        assert (other.regions is None) == (name == "none")
+
+    def test_safetensors(self, name: str, tmp_path: Path) -> None:
+        if name == "resized":
+            pytest.skip("a file keeps the labels of the new size, which are another map")
+        scene = make_scene(name)
+        assert scene.save(tmp_path / "scene.safetensors") == (tmp_path / "scene.safetensors").stat().st_size
+        assert torch.equal(load(tmp_path / "scene.safetensors")(), scene())
+
+
+class TestModule:
+    def test_forward_is_the_renderer(self) -> None:
+        scene = make_scene()
+        assert torch.equal(scene(), RegionSplatRenderer()(scene.field, scene.regions))
+        assert torch.equal(scene((40, 60)), RegionSplatRenderer()(scene, size=(40, 60)))
+        scene().sum().backward()
+        assert scene.field.colors.grad is not None and bool(scene.field.colors.grad.any())
+
+    def test_render_is_clipped_without_a_graph(self) -> None:
+        scene = make_scene()
+        with torch.no_grad():
+            scene.field.colors.mul_(50.0)
+        image = scene.render()
+        assert not image.requires_grad and 0.0 <= float(image.min()) and float(image.max()) == 1.0
+
+    def test_to_moves_the_map(self) -> None:
+        scene = make_scene().to("meta")
+        assert scene.regions is not None and scene.regions.labels.device.type == "meta"
+        assert make_scene().double().field.means.dtype == torch.float64
+
+    def test_label_tensor_means_hard_contours(self) -> None:
+        labels = (torch.arange(30) // 11).expand(SIZE)
+        regions = Scene(make_scene("hard").field, labels).regions
+        assert regions is not None and regions.softness == 0.0
+
+    def test_repr_is_a_few_lines(self) -> None:
+        assert "3 regions" in repr(make_scene()) and len(repr(make_scene()).splitlines()) <= 4
+        assert len(make_scene()) == 40 and make_scene().size == SIZE
+
+    def test_bad_input(self) -> None:
+        field = GaussianField.random(3, SIZE, seed=0)
+        with pytest.raises(TypeError, match="field must be a GaussianField; got Scene"):
+            Scene(Scene(field))  # type: ignore[arg-type]
+        with pytest.raises(TypeError, match="regions must be a RegionMap, a label map Tensor or None; got str"):
+            Scene(field, "map.png")  # type: ignore[arg-type]
+        with pytest.raises(TypeError, match="metadata must map str to str; got 'n': 3"):
+            Scene(field, metadata={"n": 3})  # type: ignore[dict-item]
+
+
+class TestFiles:
+    def test_kcgs(self, tmp_path: Path) -> None:
+        path = tmp_path / "photo.kcgs"
+        size = save(path, make_scene("hard"))
+        assert size == path.stat().st_size < make_scene("hard").save(tmp_path / "scene.safetensors")
+        assert len(load(path)) <= 40 and load(path).regions is not None
+
+    def test_cut_file_is_refused_with_its_name(self, tmp_path: Path) -> None:
+        path = tmp_path / "photo.kcgs"
+        save(path, make_scene("hard"))
+        path.write_bytes(path.read_bytes()[:-3])
+        with pytest.raises(ValueError, match=rf"cannot load {path}: .*ends early"):
+            load(path)
