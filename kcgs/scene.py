@@ -125,7 +125,7 @@ class Scene(nn.Module):
         return self
 
 
-def save(path: str | os.PathLike[str], scene: Any, regions: Any = None, *, metadata: Any = None) -> int:
+def save(path: str | os.PathLike[str], scene: Any, regions: Any = None, *, metadata: Any = None) -> int:  # noqa: D417
     """Write a scene; the file appears whole or not at all, and the same scene gives the same bytes.
 
     Args:
@@ -160,7 +160,7 @@ def save(path: str | os.PathLike[str], scene: Any, regions: Any = None, *, metad
     return len(content)
 
 
-def scene_bytes(scene: Any, regions: Any = None, *, metadata: Any = None, suffix: str = ".safetensors") -> int:
+def scene_bytes(scene: Any, regions: Any = None, *, metadata: Any = None, suffix: str = ".safetensors") -> int:  # noqa: D417
     """Size in bytes of the file that :func:`save` would write.
 
     Args:
