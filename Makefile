@@ -18,8 +18,8 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 demo: $(VENV)/.installed
 	$(BIN)/kcgs bench demo -o demo
 
-# The charts, a few minutes, and README's tables from all committed results.csv. Sequences of DAVIS take hours: see
-# `kcgs bench davis`, which goes on where it was stopped.
+# The charts, a few minutes, and the tables of docs/results.md from all committed results.csv. Sequences of DAVIS take
+# hours: see `kcgs bench davis`, which goes on where it was stopped.
 report: $(VENV)/.installed
 	runs=$$(mktemp -d) && $(BIN)/kcgs bench charts -o notebooks/reports/charts --runs $$runs && rm -r $$runs
 	$(BIN)/python -m kcgs.bench.paper.readme

@@ -33,6 +33,7 @@ html_static_path = ["static"]
 html_css_files = ["kcgs.css"]
 html_theme_options = {"navigation_with_keys": True}
 html_copy_source = False
+smartquotes = False  # --option stays as it is typed
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
 

@@ -122,8 +122,8 @@ def commands() -> str:
 
     from kcgs.cli import app
 
-    group = typer.main.get_command(app)
-    return "\n\n".join(_command(name, command) for name, command in group.commands.items()) + "\n"  # type: ignore[attr-defined]
+    group: Any = typer.main.get_command(app)
+    return "\n\n".join(_command(name, command) for name, command in sorted(group.commands.items())) + "\n"
 
 
 def _command(name: str, command: Any) -> str:

@@ -1,4 +1,4 @@
-"""What README.md says of results is what the committed results.csv files say."""
+"""What docs/results.md says is what the committed results.csv files say."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def row(method: str, psnr: float, picture: str = "pie") -> Row:
 def test_results_are_those_of_the_reports() -> None:
     if not REPORTS.is_dir():
         pytest.skip("not a source checkout")
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert put(readme, results(REPORTS)) == readme, "make report, or python -m kcgs.bench.paper.readme"
+    page = (ROOT / "docs/results.md").read_text(encoding="utf-8")
+    assert put(page, results(REPORTS)) == page, "make report, or python -m kcgs.bench.paper.readme"
 
 
 def test_a_changed_figure_shows(tmp_path: Path) -> None:
@@ -40,7 +40,7 @@ def test_a_changed_figure_shows(tmp_path: Path) -> None:
     text = results(tmp_path)
     assert "| 20 | 20 | `best` | 700 | 1 | 38.60 | 31.20 | 0.050 | 38.60 | 2 |" in text
     assert put(f"a\n{BEGIN}\nold\n{END}\nb", text) == f"a\n{BEGIN}\n{text}\n{END}\nb"
-    with pytest.raises(ValueError, match="README must have"):
+    with pytest.raises(ValueError, match="page must have"):
         put("nothing", text)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import re
 import subprocess
 import sys
 import zlib
@@ -16,6 +17,8 @@ import kcgs
 
 ROOT = Path(kcgs.__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
+README = ROOT / "README.md"
+README_LINES = 160
 if not (DOCS / "conf.py").is_file():
     pytest.skip("not a source checkout", allow_module_level=True)
 
@@ -69,3 +72,24 @@ def test_every_page_has_commands_recipes_and_figures(site: Path, generate: Modul
         assert f'id="kcgs-{name}"' in commands
     for name in (*FitConfig.model_fields, *available_recipes()):
         assert name in recipes
+
+
+def test_readme_is_a_front_page() -> None:
+    text = README.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= README_LINES
+    for link in re.findall(r"\]\(([^)#:]+)\)", text):
+        assert (ROOT / link).exists(), link
+
+
+def test_readme_has_the_figures_of_the_results() -> None:
+    """Its table is a part of that of DAVIS: PSNR and EF-PSNR of four methods, and nothing else."""
+    row = re.compile(r"\| ([\d,]+) \| [\d,]+ \| `([\w-]+)` \| [\d,]+ \| \d+ \| ([\d.]+) \| ([\d.]+) \|")
+    known: dict[tuple[str, str], str] = {}
+    for n, method, psnr, ef_psnr in row.findall((DOCS / "results.md").read_text(encoding="utf-8")):
+        known.setdefault((method, n), f"{psnr} / {ef_psnr}")
+    lines = [line.strip("|").split("|") for line in README.read_text(encoding="utf-8").splitlines() if "|" in line]
+    counts = [cell.strip().removeprefix("N = ") for cell in lines[0][1:]]
+    for title, *cells in lines[2:]:
+        method = title.split("`")[1]
+        for n, cell in zip(counts, cells, strict=True):
+            assert cell.strip() == known[method, n], (method, n)

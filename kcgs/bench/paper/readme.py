@@ -1,4 +1,4 @@
-"""The results that README.md shows, from the committed results.csv files: `python -m kcgs.bench.paper.readme`."""
+"""The tables of docs/results.md, from the committed results.csv files: `python -m kcgs.bench.paper.readme`."""
 
 from __future__ import annotations
 
@@ -47,22 +47,22 @@ def results(reports: Path) -> str:
     return "\n\n".join(filter(None, parts))
 
 
-def put(readme: str, text: str) -> str:
-    """Return the README with these results between the marks.
+def put(page: str, text: str) -> str:
+    """Return the page with these tables between the marks.
 
     Raises:
         ValueError: the marks are not there.
     """
-    before, begin, rest = readme.partition(BEGIN)
+    before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):
-        raise ValueError(f"README must have {BEGIN!r} and {END!r}")
+        raise ValueError(f"the page must have {BEGIN!r} and {END!r}")
     return f"{before}{BEGIN}\n{text}\n{END}{after}"
 
 
 def main() -> None:
-    """Put the results into the README of the current folder."""
-    path = Path("README.md")
+    """Put the tables into docs/results.md of the current folder."""
+    path = Path("docs/results.md")
     text = put(path.read_text(encoding="utf-8"), results(Path("notebooks/reports")))
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -1,0 +1,49 @@
+"""The figures of these pages that kcgs makes: `python docs/figures.py`. The SVGs are made by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import torch
+from torch import Tensor
+
+from kcgs import RegionMap
+from kcgs.functional import region_splat
+
+IMAGES = Path(__file__).resolve().parent / "images"
+SIZE = (160, 240)
+SOFTNESS = 6.0  # pixels
+
+
+def membership(path: Path) -> None:
+    """Render the same two Gaussians without regions, with a hard contour and with a soft one, and a row of each."""
+    means = torch.tensor([[80.0, 80.0], [160.0, 80.0]])
+    cholesky = torch.tensor([[40.0, 0.0, 40.0]] * 2)
+    colors = torch.tensor([[0.95, 0.6, 0.0], [0.2, 0.6, 0.95]])
+    ids = torch.tensor([0, 1])
+    labels = (torch.arange(SIZE[1]) >= SIZE[1] // 2).long().expand(SIZE).contiguous()
+    renders: dict[str, Tensor] = {
+        "without regions": region_splat(means, cholesky, colors, size=SIZE),
+        "hard contour": region_splat(means, cholesky, colors, ids, RegionMap.from_labels(labels)),
+        "soft contour": region_splat(means, cholesky, colors, ids, RegionMap.from_labels(labels, softness=SOFTNESS)),
+    }
+    figure, axes = plt.subplots(
+        2, 3, figsize=(9, 3.6), layout="constrained", sharex=True, height_ratios=(2, 1), squeeze=False
+    )
+    for (above, below), (name, render) in zip(axes.T, renders.items(), strict=True):
+        above.imshow(render.clamp(0, 1).permute(1, 2, 0), extent=(0, SIZE[1], SIZE[0], 0))
+        above.set_title(name)
+        above.set_yticks([])
+        above.axhline(80, color="white", linewidth=0.8, linestyle="--")
+        for channel, color in enumerate(("#D55E00", "#009E73", "#0072B2")):
+            below.plot(torch.arange(SIZE[1]) + 0.5, render[channel, 80], color=color)
+        below.set(ylim=(0, 1.1), xlabel="x, pixels")
+        below.grid(alpha=0.3)
+    axes[1, 0].set_ylabel("R, G, B along\nthe dashed line")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    membership(IMAGES / "membership.png")
