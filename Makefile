@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-.PHONY: demo report test test-all notebooks docs lint clean
+.PHONY: page wheel demo report test test-all notebooks docs lint clean
 
 # The stamp is newer than what it was made from, or the environment is made again.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -14,6 +14,13 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS)]'
 	touch $@
+
+# The viewer's page, which a wheel then holds.
+page:
+	npm --prefix export/web ci && npm --prefix export/web run build
+
+wheel: page $(VENV)/.installed
+	$(BIN)/python -m build --no-isolation
 
 demo: $(VENV)/.installed
 	$(BIN)/kcgs bench demo -o demo

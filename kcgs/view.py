@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any, ClassVar
 from urllib.parse import quote, urlencode
 
+from kcgs._shipped import shipped_folder
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.onnx import scene_decoder, write_model
 
-_PAGE = Path(__file__).resolve().parent.parent / "export" / "web" / "dist"
+_PAGE = shipped_folder("web", checkout="export/web/dist")
 
 
 class _Handler(SimpleHTTPRequestHandler):
@@ -81,7 +82,7 @@ def serve(
         port: 0 for any that is free.
         browser: whether to open a window.
         say: takes the line that says where the page is.
-        page: folder of the built page; None: that of the checkout this package runs from.
+        page: folder of the built page; None: the package's own.
 
     Raises:
         FileNotFoundError: the page is not built, or there is no such image.
@@ -90,8 +91,8 @@ def serve(
     page = _PAGE if page is None else page
     if not (page / "index.html").is_file():
         raise FileNotFoundError(
-            f"the viewer's page is not built: {page / 'index.html'} is not there; in a checkout, run "
-            "npm --prefix export/web ci && npm --prefix export/web run build"
+            f"the viewer's page is not built: there is no {page / 'index.html'}; install a wheel that holds it, or run "
+            "`make page` in a checkout"
         )
     if original is not None and not original.is_file():
         raise FileNotFoundError(f"--original must be an image file; {original} is not there")

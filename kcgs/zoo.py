@@ -1,4 +1,4 @@
-"""The fitted scenes that come with a checkout, by name."""
+"""The fitted scenes that come with the package, by name."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import json
 from pathlib import Path
 from typing import NamedTuple
 
-_FOLDER = Path(__file__).resolve().parent.parent / "models"
+from kcgs._shipped import shipped_folder
+
+_FOLDER = shipped_folder("models", checkout="models")
 PREFIX = "zoo:"
 
 
 class Entry(NamedTuple):
-    """A scene of the zoo, as `models/manifest.json` has it."""
+    """A scene of the zoo, as its manifest has it."""
 
     name: str
     title: str
@@ -34,17 +36,15 @@ def entries(folder: Path | None = None) -> list[Entry]:
     """Read the manifest.
 
     Args:
-        folder: the zoo's; None: that of the checkout this package runs from.
+        folder: the zoo's; None: the package's own.
 
     Raises:
-        FileNotFoundError: there is none; an installed package has no zoo.
+        FileNotFoundError: there is no manifest.
         ValueError: the manifest is damaged.
     """
     path = (folder or _FOLDER) / "manifest.json"
     if not path.is_file():
-        raise FileNotFoundError(
-            f"there is no zoo at {path.parent}: fitted scenes come with a checkout, not with a wheel"
-        )
+        raise FileNotFoundError(f"there is no zoo of fitted scenes: {path} is not there; install kcgs again")
     try:
         return [Entry(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))["entries"]]
     except (ValueError, KeyError, TypeError) as error:

@@ -193,7 +193,7 @@ def ensure_one(spec: Spec, folder: Path) -> Fitted:
 
 
 def _make(job: tuple[Path, Spec]) -> None:
-    from .fit.runs import warm_up
+    from kcgs.fit import warm_up
 
     path, spec = job
     warm_up(spec.config)

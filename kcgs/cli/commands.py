@@ -86,7 +86,7 @@ def fit_command(
         )  # fmt: skip
     result = fitted.result
     if plot is not None:
-        from kcgs.bench.plots import plot_history
+        from kcgs.plots import plot_history
 
         plot_history(plot, {recipe: result.history})
     if progress.interrupted:

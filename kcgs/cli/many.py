@@ -133,7 +133,7 @@ def _warm_up(config: FitConfig, segments: bool) -> None:
     """Load and compile what a worker needs once: no image's cost shall count it."""
     import torch
 
-    from kcgs.bench.fit.runs import warm_up
+    from kcgs.fit import warm_up
     from kcgs.nn import GaussianField
 
     warm_up(config)

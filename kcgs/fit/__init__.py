@@ -3,6 +3,7 @@
 from .config import FitConfig, available_recipes
 from .loop import fit
 from .monitor import FitResult, HistoryEntry
+from .warm_up import warm_up
 
 __all__ = [
     "FitConfig",
@@ -10,4 +11,5 @@ __all__ = [
     "HistoryEntry",
     "available_recipes",
     "fit",
+    "warm_up",
 ]

@@ -147,5 +147,5 @@ class TestView:
             urllib.request.urlopen(urllib.request.Request(root, headers={"Host": "elsewhere.example"}))
 
     def test_page_that_is_not_built(self, tmp_path: Path) -> None:
-        with pytest.raises(FileNotFoundError, match="npm --prefix export/web"):
+        with pytest.raises(FileNotFoundError, match="make page"):
             serve(GaussianField.random(5, (8, 9)), None, page=tmp_path)

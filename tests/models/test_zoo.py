@@ -62,7 +62,7 @@ def test_entry(entry: Entry) -> None:
 
 class TestErrors:
     def test_no_zoo(self, tmp_path: Path) -> None:
-        with pytest.raises(FileNotFoundError, match="with a checkout"):
+        with pytest.raises(FileNotFoundError, match="no zoo of fitted scenes"):
             entries(tmp_path)
 
     def test_unknown_name(self) -> None:

@@ -5,15 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from functools import lru_cache
 from pathlib import Path
-
-import torch
 
 from kcgs._atomic import atomic_path
 from kcgs.bench.measure import measure
 from kcgs.bench.sizes import GAUSSIAN_BYTES, stored_bytes
-from kcgs.fit import FitConfig, HistoryEntry, fit
+from kcgs.fit import HistoryEntry, fit, warm_up
 from kcgs.nn.renderer import render_image
 
 from .cases import BASELINE, COMPARED, Case, load
@@ -116,13 +113,3 @@ def perform(case: Case, data: Path | None) -> Run:
         history=tuple(result.history),
         **figures,
     )
-
-
-@lru_cache(maxsize=64)
-def warm_up(config: FitConfig) -> None:
-    """Compile what this recipe needs: no fit's clock shall count it."""
-    ramp = torch.linspace(0.0, 1.0, 96)
-    image = torch.stack([ramp.expand(64, 96), 1 - ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96)])
-    labels = (ramp > 0.6).long().expand(64, 96).contiguous()
-    short = config.model_copy(update={"iterations": min(config.iterations, 20), "max_seconds": None})
-    fit(image, labels, 24, config=short)

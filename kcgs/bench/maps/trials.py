@@ -14,12 +14,11 @@ import torch
 from torch import Tensor
 
 from kcgs.bench.fit.cases import BASELINE, REFINED, Case, make_case
-from kcgs.bench.fit.runs import warm_up
 from kcgs.bench.sizes import write_scene
 from kcgs.codec import Decoded, decode
 from kcgs.codec.maps import encode_map
 from kcgs.data import load_image
-from kcgs.fit import fit
+from kcgs.fit import fit, warm_up
 from kcgs.functional import RegionMap, ef_psnr, psnr
 from kcgs.io import Scene, load, save
 from kcgs.nn.renderer import render_image

@@ -13,10 +13,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from kcgs.bench.fit.runs import warm_up
 from kcgs.bench.measure import measure
 from kcgs.codec import decode
-from kcgs.fit import FitConfig, fit
+from kcgs.fit import FitConfig, fit, warm_up
 from kcgs.functional import RegionMap
 from kcgs.io import load, save
 from kcgs.nn import GaussianField

@@ -1,0 +1,57 @@
+"""Figures that look alike: colours that people with any colour vision tell apart, files written whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kcgs._atomic import atomic_path
+
+if TYPE_CHECKING:
+    from kcgs.fit import HistoryEntry
+
+# of Okabe and Ito
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+
+
+def figure(rows: int, cols: int, *, width: float, height: float) -> tuple[Any, Any]:
+    """Make a figure of `rows` x `cols` axes, sizes in inches; no window is ever opened."""
+    from cycler import cycler
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with rc_context({"axes.prop_cycle": cycler(color=COLORS), "axes.grid": True, "grid.alpha": 0.3, "font.size": 9}):
+        plot = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(plot)
+        axes = plot.subplots(rows, cols, squeeze=rows == 1)
+    return plot, axes
+
+
+def save_figure(plot: Any, path: Path) -> None:
+    """Write the figure."""
+    with atomic_path(path) as temporary:
+        plot.savefig(temporary, dpi=130)
+
+
+def plot_history(path: Path, histories: Mapping[str, Sequence[HistoryEntry]]) -> None:
+    """Plot PSNR and EF-PSNR of fits against seconds and against iterations.
+
+    Args:
+        path: PNG to write.
+        histories: of fits, by name.
+    """
+    plot, axes = figure(1, 2, width=9.5, height=3.8)
+    for axis, field, unit in ((axes[0], "seconds", "seconds"), (axes[1], "iteration", "iterations")):
+        for index, (name, history) in enumerate(histories.items()):
+            x = [getattr(entry, field) for entry in history]
+            axis.plot(x, [entry.psnr for entry in history], color=COLORS[index], label=f"{name}, PSNR")
+            edge = [entry.ef_psnr for entry in history]
+            if any(value == value for value in edge):
+                axis.plot(x, edge, "--", color=COLORS[index], label=f"{name}, EF-PSNR (contours)")
+        axis.set(xlabel=unit, ylabel="dB")
+        axis.legend(loc="lower right")
+    axes[0].set_title("error against run time")
+    axes[1].set_title("error against iterations")
+    save_figure(plot, path)
