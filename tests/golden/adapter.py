@@ -161,6 +161,8 @@ def resized_map(p: Parts, size: tuple[int, int]) -> dict[str, Any]:
 
 def run_segment(image: Tensor, method: str, **options: Any) -> Tensor:
     """Run a segmenter by name."""
+    if options.get("snap") is True:
+        options["snap"] = 2  # what True meant
     return segment.segment(image, method, **options)
 
 
@@ -169,7 +171,7 @@ def cleanups(image: Tensor, labels: Tensor) -> dict[str, Tensor]:
     return {
         "connected": segment.connected_regions(labels),
         "by-area": segment.order_by_area(labels),
-        "specks": segment.absorb_specks(labels, 20),
+        "specks": segment.merge_small(labels, 20),
         "similar": segment.merge_similar(image, segment.connected_regions(labels), 3),
         "snap": segment.snap_contours(image, labels, reach=2),
     }

@@ -1,27 +1,27 @@
 """Label maps that exist already: masks on disk, annotations of DAVIS."""
 
 import os
-from typing import Unpack
 
 from torch import Tensor
 
-from kcgs.segment.base import check_segment_image, register
-from kcgs.segment.sources import CleanupOptions, cleanup_of
+from kcgs.segment.registry import Cleanup, register
+
+# Nothing is cleaned unless asked: no piece is too small, and a label in several pieces is one region.
+_AS_STORED = Cleanup(min_size=1, connected=False)
 
 
-@register("file")
-def file(image: Tensor, *, path: str | os.PathLike[str], **cleanup: Unpack[CleanupOptions]) -> Tensor:
+@register("file", _AS_STORED)
+def file(image: Tensor, *, path: str | os.PathLike[str]) -> Tensor:
     """Take the regions of an image from a mask on disk.
 
     Unless asked, nothing is cleaned: no piece is too small, and a label in several pieces is one region.
 
     Args:
-        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].
+        image: as `segment` takes it.
         path: what `kcgs.data.load_labels` reads.
-        cleanup: ``min_size``, ``snap``, ``max_regions`` and ``connected`` of `Cleanup`.
 
     Returns:
-        :math:`(H, W)` int64 with ids 0 to R - 1 by decreasing area.
+        The label map that `segment` returns.
 
     Raises:
         FileNotFoundError: ``path`` does not exist.
@@ -38,34 +38,26 @@ def file(image: Tensor, *, path: str | os.PathLike[str], **cleanup: Unpack[Clean
     """
     from kcgs.data import load_labels
 
-    check_segment_image(image)
-    return _checked(image, load_labels(path), str(path), cleanup)
+    return load_labels(path)
 
 
-@register("davis")
+@register("davis", _AS_STORED)
 def davis(
-    image: Tensor,
-    *,
-    root: str | os.PathLike[str],
-    sequence: str,
-    frame: int = 0,
-    resolution: str = "480p",
-    **cleanup: Unpack[CleanupOptions],
+    image: Tensor, *, root: str | os.PathLike[str], sequence: str, frame: int = 0, resolution: str = "480p"
 ) -> Tensor:
     """Take the regions of a frame of DAVIS from its annotation.
 
     Unless asked, nothing is cleaned: no piece is too small, and an object in several pieces is one region.
 
     Args:
-        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1], the frame.
+        image: as `segment` takes it, the frame.
         root: the folder that holds ``JPEGImages`` and ``Annotations``.
         sequence: its name.
         frame: its number; 0 is the first.
         resolution: the folder below these two.
-        cleanup: ``min_size``, ``snap``, ``max_regions`` and ``connected`` of `Cleanup`.
 
     Returns:
-        :math:`(H, W)` int64 with ids 0 to R - 1 by decreasing area.
+        The label map that `segment` returns.
 
     Raises:
         FileNotFoundError: ``root`` has another layout, or the frame is missing.
@@ -77,17 +69,6 @@ def davis(
     """
     from kcgs.data import Davis
 
-    check_segment_image(image)
     if not isinstance(sequence, str):
         raise TypeError(f"sequence must be a name; got {sequence!r}")
-    labels = Davis(root, resolution=resolution, sequences=[sequence], frame=frame)[0].labels
-    return _checked(image, labels, f"sequence {sequence!r}", cleanup)
-
-
-def _checked(image: Tensor, labels: Tensor, name: str, cleanup: CleanupOptions) -> Tensor:
-    rules = cleanup_of(cleanup, min_size=1, connected=False)
-    if labels.shape != image.shape[-2:]:
-        raise ValueError(
-            f"the mask must have the image's size {tuple(image.shape[-2:])}; got {tuple(labels.shape)} in {name}"
-        )
-    return rules.apply(image.detach(), labels).labels
+    return Davis(root, resolution=resolution, sequences=[sequence], frame=frame)[0].labels

@@ -1,41 +1,28 @@
 """Segment Anything: kornia's, and SAM 2 through transformers, prompted by points, boxes or a grid."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, NamedTuple, Protocol, Unpack
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from kcgs._check import check_floating, check_integer
-from kcgs.segment.base import check_segment_image
-from kcgs.segment.cleanup import check_count
-from kcgs.segment.sources import (
-    IMAGENET_MEAN,
-    IMAGENET_STD,
-    CleanupOptions,
-    Segmentation,
-    check_share,
-    cleanup_of,
-    first_line,
-    load_pretrained,
-    normalized,
-    register_scored,
-    require,
-)
+from kcgs._check import check_count, check_floating, check_integer, check_number
+from kcgs.segment.networks import IMAGENET_MEAN, IMAGENET_STD, first_line, load_pretrained, preprocess
+from kcgs.segment.registry import Prediction, register
 
 _KORNIA_MODELS = ("vit_b", "vit_l", "vit_h", "mobile_sam")
-_AT_ONCE = 16  # Prompts a pass.
+_AT_ONCE = 16  # Prompts per pass.
 _MAX_SIDE = 1024  # What the models see; masks of larger images are made at this size and enlarged.
 _STABILITY_OFFSET = 1.0  # Of Segment Anything's own automatic generator.
-_IOU_STRIP = 1 << 16  # Pixels of all masks that are compared at a time.
+_IOU_PIXELS = 1 << 16  # Of all masks, that are compared at a time.
 
 
 class Prompts(NamedTuple):
-    """One prompt a row: either boxes, or points with their labels."""
+    """A prompt in each row: either boxes, or points with their labels."""
 
     boxes: Tensor | None
     """:math:`(K, 4)` left, top, right, bottom in pixels."""
@@ -47,13 +34,11 @@ class Prompts(NamedTuple):
     """Whether nobody pointed at anything: poor masks are then dropped."""
 
 
-class _Predictor(Protocol):
-    def predict(self, boxes: Tensor | None, points: Tensor | None, labels: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return logits (K, C, H, W) and predicted overlaps (K, C) of the masks of K prompts."""
-        ...
+# From boxes, points and their labels of K prompts to logits (K, C, H, W) and predicted overlaps (K, C) of masks.
+_Predict = Callable[[Tensor | None, Tensor | None, Tensor | None], tuple[Tensor, Tensor]]
 
 
-@register_scored("sam")
+@register("sam")
 def sam(
     image: Tensor,
     *,
@@ -66,19 +51,18 @@ def sam(
     min_score: float = 0.88,
     min_stability: float = 0.95,
     max_overlap: float = 0.7,
-    **cleanup: Unpack[CleanupOptions],
-) -> Segmentation:
+) -> Prediction:
     """Segment by Segment Anything (Kirillov et al., ICCV 2023) or SAM 2 (Ravi et al., ICLR 2025).
 
     A box, or a set of points, asks for one object and gets its best mask. Without either, a grid of points
-    asks for everything, and of its masks (three a point) those stay that the model scores at least
+    asks for everything, and of its masks (three per point) those stay that the model scores at least
     ``min_score``, that hardly depend on the threshold, and that overlap no better one by more than
     ``max_overlap`` (intersection over union). Masks are painted from large to small, so that the smaller lies
     over the larger, of equal ones the better over the worse; each connected piece of what no mask covers is a
     region too.
 
     Args:
-        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1], any size.
+        image: as `segment` takes it, any size.
         model: "vit_b", "vit_l", "vit_h" or "mobile_sam" for Segment Anything by kornia, or a
             ``kornia.models.sam.SamConfig``; else SAM 2 by transformers: a hub id such as
             "facebook/sam2.1-hiera-tiny", a local folder, or a loaded ``Sam2Model``.
@@ -87,39 +71,34 @@ def sam(
         points: :math:`(K, 2)`, or :math:`(K, P, 2)` for K objects of P points each, (x, y) in pixels.
         point_labels: integers of the shape of ``points`` less its last dimension, 1 in the object and 0
             outside; None: all 1.
-        grid: points a side where there are neither boxes nor points, at least 1.
+        grid: points along each side where there are neither boxes nor points, at least 1.
         min_score: of the grid's masks, in [0, 1], against the overlap that the model predicts.
         min_stability: of the grid's masks, in [0, 1]: overlap of the mask at logits above 1 and above -1.
         max_overlap: in [0, 1].
-        cleanup: ``min_size``, ``snap``, ``max_regions`` and ``connected`` of `Cleanup`.
 
     Returns:
-        :math:`(H, W)` int64 with ids 0 to R - 1 by decreasing area; `segment_with_scores` adds :math:`(R,)`
-        scores, the predicted overlap of each mask, NaN for what no mask covers.
+        The label map that `segment` returns; `segment_with_scores` adds :math:`(R,)` scores, the predicted overlap of
+        each mask, NaN for what no mask covers.
 
     Raises:
         FileNotFoundError: ``checkpoint``, or the folder that ``model`` is the path of, does not exist.
-        ImportError: the library is not installed.
         TypeError: an argument has another type.
         ValueError: an argument has another shape or is out of its range, or the weights do not fit the model.
 
     Example:
         ``segment(image, "sam", model="vit_b", checkpoint="sam_vit_b_01ec64.pth")``
     """
-    pixels = torch.from_numpy(check_segment_image(image)).permute(2, 0, 1).to(image.device)
-    rules = cleanup_of(cleanup)
     given = {"boxes": boxes, "points": points, "point_labels": point_labels}
-    prompts = _check_prompts(pixels, **{name: _as_tensor(name, values) for name, values in given.items()}, grid=grid)
+    prompts = _check_prompts(image, **{name: _as_tensor(name, values) for name, values in given.items()}, grid=grid)
     for name, value in (("min_score", min_score), ("min_stability", min_stability), ("max_overlap", max_overlap)):
-        check_share(name, value)
-    pixels, prompts = _shrunk(pixels, prompts)
-    predictor = _predictor(pixels, model, checkpoint)
+        check_number(name, value, 0, 1)
+    small, prompts = _shrunk(image, prompts)
     floors = (min_score, min_stability) if prompts.is_grid else None
-    masks, scores = _predict(predictor, prompts, floors)
+    masks, scores = _predict_masks(_predictor(small, model, checkpoint), prompts, floors)
     kept = keep_apart(masks, scores, max_overlap)
     maps = torch.stack([part.double() for part in paint_masks(masks[kept], scores[kept])])
     labels, painted = F.interpolate(maps[None], image.shape[-2:], mode="nearest-exact")[0]
-    return rules.apply(image.detach(), labels.long(), painted)
+    return Prediction(labels.long(), painted)
 
 
 def keep_apart(masks: Tensor, scores: Tensor, max_overlap: float) -> Tensor:
@@ -133,9 +112,9 @@ def keep_apart(masks: Tensor, scores: Tensor, max_overlap: float) -> Tensor:
     order = scores.argsort(descending=True, stable=True)
     flat = masks[order].flatten(1)
     shared = torch.zeros(len(flat), len(flat), device=masks.device)
-    for start in range(0, flat.shape[1], _IOU_STRIP):
-        strip = flat[:, start : start + _IOU_STRIP].float()
-        shared += strip @ strip.T
+    for start in range(0, flat.shape[1], _IOU_PIXELS):
+        part = flat[:, start : start + _IOU_PIXELS].float()
+        shared += part @ part.T
     areas = shared.diagonal()
     union = areas[:, None] + areas[None] - shared
     too_much = (shared > max_overlap * union).tolist()
@@ -172,26 +151,26 @@ def paint_masks(masks: Tensor, scores: Tensor) -> tuple[Tensor, Tensor]:
     return labels, painted
 
 
-def _shrunk(pixels: Tensor, prompts: Prompts) -> tuple[Tensor, Prompts]:
+def _shrunk(image: Tensor, prompts: Prompts) -> tuple[Tensor, Prompts]:
     """Return image and prompts at the size that masks are made at."""
-    share = _MAX_SIDE / max(pixels.shape[1:])
+    share = _MAX_SIDE / max(image.shape[1:])
     if share >= 1:
-        return pixels, prompts
-    size = [max(1, round(side * share)) for side in pixels.shape[1:]]
-    small = F.interpolate(pixels[None], size, mode="bilinear", align_corners=False, antialias=True)[0]
-    scale = pixels.new_tensor([size[1] / pixels.shape[2], size[0] / pixels.shape[1]])
+        return image, prompts
+    size = [max(1, round(side * share)) for side in image.shape[1:]]
+    small = F.interpolate(image[None], size, mode="bilinear", align_corners=False, antialias=True)[0]
+    scale = image.new_tensor([size[1] / image.shape[2], size[0] / image.shape[1]])
     boxes = None if prompts.boxes is None else (prompts.boxes.reshape(-1, 2, 2) * scale).flatten(1)
     points = None if prompts.points is None else prompts.points * scale
     return small, prompts._replace(boxes=boxes, points=points)
 
 
-def _predict(predictor: _Predictor, prompts: Prompts, floors: tuple[float, float] | None) -> tuple[Tensor, Tensor]:
+def _predict_masks(predict: _Predict, prompts: Prompts, floors: tuple[float, float] | None) -> tuple[Tensor, Tensor]:
     """Return masks (M, H, W) and scores (M,): the best of each prompt, or those above both floors."""
     count = len(prompts.boxes if prompts.boxes is not None else prompts.points)  # type: ignore[arg-type]
     masks, scores = [], []
     for start in range(0, count, _AT_ONCE):
-        some = [None if part is None else part[start : start + _AT_ONCE] for part in prompts[:3]]
-        logits, overlaps = predictor.predict(*some)
+        chosen = [None if part is None else part[start : start + _AT_ONCE] for part in prompts[:3]]
+        logits, overlaps = predict(*chosen)
         if floors is None:
             best = overlaps.argmax(dim=1)
             rows = torch.arange(len(best), device=best.device)
@@ -207,73 +186,73 @@ def _predict(predictor: _Predictor, prompts: Prompts, floors: tuple[float, float
     return torch.cat(masks), torch.cat(scores)
 
 
-class _KorniaSam:
-    """Segment Anything by kornia, with one image set."""
-
-    def __init__(self, pixels: Tensor, model: Any, checkpoint: str | os.PathLike[str] | None) -> None:
-        models = require("kornia.models.sam", "kornia", "sam")
-        visual = require("kornia.contrib.visual_prompter", "kornia", "sam")
-        config = models.SamConfig(model) if isinstance(model, str) else model
-        if checkpoint is None and config.checkpoint is None and config.model_type is None:
-            raise ValueError("checkpoint must be given for a SamConfig of one's own; got None")
-        source = os.fspath(checkpoint if checkpoint is not None else config.checkpoint or "")
-        if source and "://" not in source and not Path(source).expanduser().is_file():
-            raise FileNotFoundError(f"no checkpoint at {source}")
-        fields = {**vars(config), "checkpoint": source or None, "pretrained": not source}
-        try:
-            self._prompter = visual.VisualPrompter(models.SamConfig(**fields), device=pixels.device)
-        except Exception as error:  # Whatever a damaged file, other weights or a missing network raises.
-            name = source or f"the released weights of {config.model_type!r}"
-            # torch's own words advise to run whatever code is in the file
-            why = "it is no file of weights" if isinstance(error, UnpicklingError) else first_line(error)
-            raise ValueError(f"cannot load {name} as Segment Anything {model!r}: {why}") from error
-        self._prompter.model.eval()
-        self._prompter.set_image(pixels)
-
-    def predict(self, boxes: Tensor | None, points: Tensor | None, labels: Tensor | None) -> tuple[Tensor, Tensor]:
-        # kornia counts pixel centres in whole numbers.
-        result = self._prompter.predict(
-            None if points is None else points - 0.5,
-            labels,
-            boxes,
-            multimask_output=boxes is None and points is not None and points.shape[1] == 1,
-        )
-        return result._original_res_logits, result.scores
-
-
-class _Sam2:
-    """SAM 2 by transformers, with one image set."""
-
-    def __init__(self, pixels: Tensor, model: Any) -> None:
-        self._model = load_pretrained("Sam2Model", model, "sam", pixels.device)
-        side = self._model.prompt_encoder.input_image_size
-        self._size = (pixels.shape[1], pixels.shape[2])
-        resized = F.interpolate(pixels[None], (side, side), mode="bilinear", align_corners=False, antialias=True)
-        self._scale = pixels.new_tensor([side / self._size[1], side / self._size[0]])
-        with torch.no_grad():
-            self._embeddings = self._model.get_image_embeddings(normalized(resized, IMAGENET_MEAN, IMAGENET_STD))
-
-    @torch.no_grad()
-    def predict(self, boxes: Tensor | None, points: Tensor | None, labels: Tensor | None) -> tuple[Tensor, Tensor]:
-        # The prompt encoder adds half a pixel of its own.
-        result = self._model(
-            image_embeddings=list(self._embeddings),
-            input_points=None if points is None else (points * self._scale - 0.5)[None],
-            input_labels=None if labels is None else labels[None],
-            input_boxes=None if boxes is None else (boxes.reshape(-1, 2, 2) * self._scale - 0.5).reshape(1, -1, 4),
-            multimask_output=boxes is None and points is not None and points.shape[1] == 1,
-        )
-        logits = F.interpolate(result.pred_masks[0].float(), self._size, mode="bilinear", align_corners=False)
-        return logits, result.iou_scores[0].float()
-
-
-def _predictor(pixels: Tensor, model: Any, checkpoint: str | os.PathLike[str] | None) -> _Predictor:
+def _predictor(image: Tensor, model: Any, checkpoint: str | os.PathLike[str] | None) -> _Predict:
+    """Return what predicts masks of an image by prompts."""
     is_kornia = model in _KORNIA_MODELS if isinstance(model, str) else type(model).__module__.startswith("kornia.")
     if is_kornia:
-        return _KorniaSam(pixels, model, checkpoint)
+        return _kornia_predictor(image, model, checkpoint)
     if checkpoint is not None:
         raise ValueError(f"checkpoint goes with {', '.join(_KORNIA_MODELS)} or a SamConfig; got it with {model!r}")
-    return _Sam2(pixels, model)
+    return _sam2_predictor(image, model)
+
+
+def _is_one_point(boxes: Tensor | None, points: Tensor | None) -> bool:
+    """Whether a prompt is ambiguous, so that the model gives three masks for it."""
+    return boxes is None and points is not None and points.shape[1] == 1
+
+
+def _kornia_predictor(image: Tensor, model: Any, checkpoint: str | os.PathLike[str] | None) -> _Predict:
+    from kornia.contrib.visual_prompter import VisualPrompter
+    from kornia.models.sam.model import SamConfig
+
+    config = SamConfig(model) if isinstance(model, str) else model
+    if checkpoint is None and config.checkpoint is None and config.model_type is None:
+        raise ValueError("checkpoint must be given for a SamConfig of one's own; got None")
+    source = os.fspath(checkpoint if checkpoint is not None else config.checkpoint or "")
+    if source and "://" not in source and not Path(source).expanduser().is_file():
+        raise FileNotFoundError(f"no checkpoint at {source}")
+    fields = {**vars(config), "checkpoint": source or None, "pretrained": not source}
+    try:
+        prompter = VisualPrompter(SamConfig(**fields), device=image.device)
+    except Exception as error:  # Whatever a damaged file, other weights or a missing network raises.
+        name = source or f"the released weights of {config.model_type!r}"
+        # torch's own words advise to run whatever code is in the file
+        why = "it is no file of weights" if isinstance(error, UnpicklingError) else first_line(error)
+        raise ValueError(f"cannot load {name} as Segment Anything {model!r}: {why}") from error
+    prompter.model.eval()
+    prompter.set_image(image)
+
+    def predict(boxes: Tensor | None, points: Tensor | None, labels: Tensor | None) -> tuple[Tensor, Tensor]:
+        # kornia counts pixel centres in whole numbers.
+        shifted = None if points is None else points - 0.5
+        result = prompter.predict(shifted, labels, boxes, multimask_output=_is_one_point(boxes, points))
+        return torch.as_tensor(result._original_res_logits), result.scores
+
+    return predict
+
+
+def _sam2_predictor(image: Tensor, model: Any) -> _Predict:
+    network = load_pretrained("Sam2Model", model, image.device)
+    side, size = network.prompt_encoder.input_image_size, (image.shape[1], image.shape[2])
+    scale = image.new_tensor([side / size[1], side / size[0]])
+    shown = preprocess(image, (side, side), IMAGENET_MEAN, IMAGENET_STD)
+    with torch.no_grad():
+        embeddings = list(network.get_image_embeddings(shown))
+
+    @torch.no_grad()
+    def predict(boxes: Tensor | None, points: Tensor | None, labels: Tensor | None) -> tuple[Tensor, Tensor]:
+        # The prompt encoder adds half a pixel of its own.
+        result = network(
+            image_embeddings=embeddings,
+            input_points=None if points is None else (points * scale - 0.5)[None],
+            input_labels=None if labels is None else labels[None],
+            input_boxes=None if boxes is None else (boxes.reshape(-1, 2, 2) * scale - 0.5).reshape(1, -1, 4),
+            multimask_output=_is_one_point(boxes, points),
+        )
+        logits = F.interpolate(result.pred_masks[0].float(), size, mode="bilinear", align_corners=False)
+        return logits, result.iou_scores[0].float()
+
+    return predict
 
 
 def _as_tensor(name: str, values: Tensor | Sequence[Any] | None) -> Tensor | None:
@@ -288,30 +267,29 @@ def _as_tensor(name: str, values: Tensor | Sequence[Any] | None) -> Tensor | Non
 
 
 def _check_prompts(
-    pixels: Tensor, *, boxes: Tensor | None, points: Tensor | None, point_labels: Tensor | None, grid: int
+    image: Tensor, *, boxes: Tensor | None, points: Tensor | None, point_labels: Tensor | None, grid: int
 ) -> Prompts:
     check_count("grid", grid)
-    height, width = pixels.shape[1:]
+    height, width = image.shape[1:]
     if boxes is not None and points is not None:
         raise ValueError("boxes and points must not both be given")
     if point_labels is not None and points is None:
         raise ValueError("point_labels must come with points")
     if boxes is not None:
-        boxes = check_floating("boxes", boxes, last=4, dims=(2,)).to(pixels)
+        boxes = check_floating("boxes", boxes, last=4, dims=(2,)).to(image)
         if not len(boxes) or not (boxes[:, :2] < boxes[:, 2:]).all():
             raise ValueError(f"boxes must be left, top, right, bottom with left < right, top < bottom; got {boxes}")
         return Prompts(boxes, None, None, False)
     if points is None:
-        x = (torch.arange(grid, device=pixels.device) + 0.5) / grid
-        y, x = torch.meshgrid(x * height, x * width, indexing="ij")
-        points = torch.stack([x, y], dim=-1).reshape(-1, 1, 2)
+        steps = (torch.arange(grid, device=image.device) + 0.5) / grid
+        points = torch.cartesian_prod(steps * height, steps * width).flip(-1)[:, None]
         return Prompts(None, points, points.new_ones(points.shape[:2], dtype=torch.int64), True)
-    points = check_floating("points", points, last=2, dims=(2, 3)).to(pixels)
+    points = check_floating("points", points, last=2, dims=(2, 3)).to(image)
     if points.numel() == 0:
         raise ValueError(f"points must hold at least one point; got shape {tuple(points.shape)}")
     if point_labels is None:
         point_labels = torch.ones(points.shape[:-1], dtype=torch.int64)
-    point_labels = check_integer("point_labels", point_labels).long().to(pixels.device)
+    point_labels = check_integer("point_labels", point_labels).long().to(image.device)
     if point_labels.shape != points.shape[:-1] or not ((point_labels == 0) | (point_labels == 1)).all():
         raise ValueError(f"point_labels must be 0 or 1, of shape {tuple(points.shape[:-1])}; got {point_labels}")
     if points.ndim == 2:

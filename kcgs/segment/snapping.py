@@ -1,12 +1,14 @@
 """Putting the contours of a label map where the image has its edges."""
 
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs.segment.base import check_segment_image
-from kcgs.segment.cleanup import Labels, RegionGraph, compact, lab_sums, rgb_to_lab, to_array
+from kcgs._check import check_count
+from kcgs.segment.cleanup import Labels, RegionGraph, lab_and_regions, lab_sums
 
 # A region with a smaller share of its pixels further than `reach` inside is a ribbon.
 _CORE_SHARE = 0.1
@@ -16,7 +18,7 @@ _JUST_NOTICEABLE = 2.3  # A distance in Lab.
 _GRADIENT_SIGMA = 0.7
 
 
-def snap_contours(image: Tensor, labels: Tensor, *, reach: int = 2) -> Tensor:
+def snap_contours(image: Any, labels: Tensor, *, reach: int = 2) -> Tensor:
     """Move contours by up to some pixels onto the image's strongest edge.
 
     Segmenters that smooth the image leave contours a pixel or two beside its edges, put whiskers along them
@@ -47,15 +49,8 @@ def snap_contours(image: Tensor, labels: Tensor, *, reach: int = 2) -> Tensor:
     from scipy.ndimage import binary_dilation
     from skimage.segmentation import watershed
 
-    lab = rgb_to_lab(check_segment_image(image))
-    values = to_array(labels)
-    if lab.shape[:2] != values.shape:
-        raise ValueError(f"labels must have the image's size; got {values.shape} and {lab.shape[:2]}")
-    if isinstance(reach, bool) or not isinstance(reach, int):
-        raise TypeError(f"reach must be an integer; got {reach!r}")
-    if reach < 1:
-        raise ValueError(f"reach must be at least 1; got {reach}")
-    ids, regions = compact(values)
+    check_count("reach", reach)
+    lab, ids, regions = lab_and_regions(image, labels)
     fixed = _fixed(lab, regions, reach)
     # The watershed runs in the band that is open and on its rim: the inside of regions has no say in it.
     seeds = np.where(fixed, regions + 1, 0)
@@ -72,7 +67,7 @@ def _fixed(lab: NDArray[np.float32], regions: Labels, reach: int) -> NDArray[np.
     core = minimum_filter(regions, size, mode="nearest") == maximum_filter(regions, size, mode="nearest")
     areas = np.bincount(regions.ravel())
     thin = np.bincount(regions[core], minlength=len(areas)) < _CORE_SHARE * areas
-    if thin.all():  # Dissolving them would leave nothing to grow from.
+    if thin.all():  # Dissolving them would leave no seed.
         return np.ones_like(core)
     graph = RegionGraph(regions)
     means = lab_sums(lab, regions) / areas[:, None]

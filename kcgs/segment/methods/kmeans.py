@@ -7,10 +7,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs.segment.base import check_segment_image, register
-from kcgs.segment.classical import check_reach, clean, smallest_size
-from kcgs.segment.cleanup import check_count, check_number, connected_regions, merge_similar, order_by_area, rgb_to_lab
-from kcgs.segment.contours import snap_contours
+from kcgs._check import check_count, check_number
+from kcgs.segment.cleanup import clean, connected_regions, rgb_to_lab
+from kcgs.segment.registry import Cleanup, register
 
 # Where k is not given: as few colours as leave this share of the variance, or are nearly flat (root mean square
 # distance in Lab), at most so many.
@@ -22,36 +21,24 @@ _STEPS = 20
 _SAMPLE = 100_000
 
 
-@register("kmeans")
-def kmeans(
-    image: Tensor,
-    *,
-    num_colors: int | None = None,
-    sigma: float = 1.0,
-    max_regions: int = 20,
-    min_size: int | None = None,
-    snap: bool | int = True,
-) -> Tensor:
+@register("kmeans", Cleanup(snap=2, max_regions=20))
+def kmeans(image: Tensor, *, num_clusters: int | None = None, sigma: float = 1.0, min_size: int) -> Tensor:
     """Cluster the colours by k-means in CIE Lab, take the connected pieces, and merge the most similar neighbours.
 
     The start is no random one: the widest cluster is halved across its longest axis until there are enough. On 21
     photos of BSDS500, 0.37 of the contours lie within 3 pixels of human ones, and 0.63 of the human ones are found.
 
     Args:
-        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].
-        num_colors: k, at least 1; None: the fewest, at most 8, that leave a tenth of the colours' variance.
-        sigma: smoothing beforehand, in pixels, at least 0; the contours then snap to the image's own edges.
-        max_regions: the most regions to return, at least 1.
-        min_size: pixels of the smallest region, at least 1; None: 0.4 % of the image (small images: more).
-        snap: move contours by up to so many pixels onto the image's edges; True: 2, False: 0.
+        image: as `segment` takes it.
+        num_clusters: k, at least 1; None: the fewest, at most 8, that leave a tenth of the colours' variance.
+        sigma: standard deviation of the smoothing beforehand, in pixels, at least 0.
+        min_size: of `Cleanup`, as are ``max_regions``, ``snap`` and ``connected``.
 
     Returns:
-        :math:`(H, W)` int64, 4-connected regions with ids 0 to R - 1 by decreasing area.
+        The label map that `segment` returns.
 
     Raises:
-        TypeError: ``image`` is no floating tensor or a count no integer.
-        ValueError: ``image`` has another shape, non-finite values or values outside [0, 1], or a number is
-            out of its range.
+        TypeError, ValueError: as `segment`; a number is out of its range.
 
     Example:
         >>> image = torch.zeros(3, 20, 30)
@@ -59,25 +46,18 @@ def kmeans(
         >>> kmeans(image, sigma=0.0)[0, ::10].tolist()
         [0, 1, 2]
     """
-    pixels = check_segment_image(image)
-    if num_colors is not None:
-        check_count("num_colors", num_colors)
-    check_number("sigma", sigma)
-    check_count("max_regions", max_regions)
-    reach = check_reach(snap)
-    min_size = smallest_size(pixels.shape[0] * pixels.shape[1], min_size)
+    if num_clusters is not None:
+        check_count("num_clusters", num_clusters)
+    check_number("sigma", sigma, 0)
     from scipy.cluster.vq import vq
     from scipy.ndimage import gaussian_filter
 
-    lab = rgb_to_lab(pixels).astype(np.float64)
+    lab = rgb_to_lab(image).astype(np.float64)
     lab = gaussian_filter(lab, (sigma, sigma, 0), mode="nearest").reshape(-1, 3)
-    nearest = vq(lab, _centres(lab[:: math.ceil(len(lab) / _SAMPLE)], num_colors))[0]
-    clusters = torch.from_numpy(nearest.astype(np.int64)).view(pixels.shape[:2])
+    nearest = vq(lab, _centres(lab[:: math.ceil(len(lab) / _SAMPLE)], num_clusters))[0]
+    clusters = torch.from_numpy(nearest.astype(np.int64)).view(image.shape[1:])
     # Not kornia.contrib's: there corners join pieces, and the one by pooling cuts what is longer than its steps.
-    pieces = clean(connected_regions(clusters), min_size)
-    if reach:
-        pieces = clean(snap_contours(image, pieces, reach=reach), min_size)
-    return order_by_area(merge_similar(image, pieces, max_regions)).to(image.device)
+    return clean(connected_regions(clusters), min_size)
 
 
 def _centres(colors: NDArray[np.float64], number: int | None) -> NDArray[np.float64]:

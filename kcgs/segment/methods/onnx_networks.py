@@ -4,7 +4,7 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Unpack
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -12,23 +12,9 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import check_size
-from kcgs.segment.base import check_segment_image
-from kcgs.segment.cleanup import check_number
-from kcgs.segment.names import check_names, read_names
-from kcgs.segment.sources import (
-    IMAGENET_MEAN,
-    IMAGENET_STD,
-    CleanupOptions,
-    Segmentation,
-    check_share,
-    cleanup_of,
-    first_line,
-    largest_map,
-    normalized,
-    register_scored,
-    require,
-)
+from kcgs._check import check_number, check_size
+from kcgs.segment.networks import IMAGENET_MEAN, IMAGENET_STD, first_line, largest_map, preprocess
+from kcgs.segment.registry import Prediction, register
 
 Kind = Literal["auto", "logits", "probability", "label", "saliency"]
 _KINDS = ("auto", "logits", "probability", "label", "saliency")
@@ -41,16 +27,7 @@ _DTYPES = {
 _SUM_TOLERANCE = 1e-2  # Of probabilities over the classes; half precision leaves some 1e-3.
 
 
-class Preprocessing(NamedTuple):
-    """How an image becomes a network's input: resized, times ``scale``, less ``mean``, over ``std``."""
-
-    size: tuple[int, int] | None
-    mean: tuple[float, ...]
-    std: tuple[float, ...]
-    scale: float
-
-
-@register_scored("onnx")
+@register("onnx")
 def onnx(
     image: Tensor,
     *,
@@ -61,14 +38,13 @@ def onnx(
     size: tuple[int, int] | None = None,
     mean: Sequence[float] = IMAGENET_MEAN,
     std: Sequence[float] = IMAGENET_STD,
-    scale: float = 1.0,
+    max_value: float = 1.0,
     names: Sequence[str] | str | os.PathLike[str] | None = None,
-    **cleanup: Unpack[CleanupOptions],
-) -> Segmentation:
+) -> Prediction:
     """Segment by a network in ONNX, run by onnxruntime on the CPU.
 
-    The image is resized to the network's input (bilinear, antialiased), multiplied by ``scale``, less ``mean``,
-    over ``std``; what comes out is resized to the image. Kinds of output, C classes:
+    The image is resized to the network's input (bilinear, antialiased), multiplied by ``max_value``, less
+    ``mean``, over ``std``; what comes out is resized to the image. Kinds of output, C classes:
 
     - "logits", (1, C, h, w): the largest wins, scored by its softmax; with C = 1 a sigmoid above ``threshold``.
     - "probability", (1, C, h, w): the largest wins and is the score; with C = 1 a value above ``threshold``.
@@ -79,27 +55,24 @@ def onnx(
     and sum to 1 for probabilities, and the rest for logits.
 
     Args:
-        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1], any size.
+        image: as `segment` takes it, any size.
         model: an ONNX file with one input (1, 3, h, w), or an ``onnxruntime.InferenceSession``.
         kind: what the output holds.
         output: the output's position or name.
-        threshold: of one-channel outputs, in [0, 1].
+        threshold: of the foreground's score, in [0, 1], for one-channel outputs.
         size: (h, w) of an input whose size is free; None: the image's own.
-        mean: three numbers, in units of the scaled image.
-        std: three numbers above 0, in units of the scaled image.
-        scale: 255 for a network that takes [0, 255].
-        names: of the classes, class 0 first, or a text file with one a line; of one-channel outputs two, the
+        mean: three numbers, in the network's units.
+        std: three numbers above 0, in the network's units.
+        max_value: what the network takes for white: 255 where it takes [0, 255].
+        names: of the classes, class 0 first, or a text file with one on each line; of one-channel outputs two, the
             background's first.
-        cleanup: ``min_size``, ``snap``, ``max_regions`` and ``connected`` of `Cleanup`.
 
     Returns:
-        :math:`(H, W)` int64 with ids 0 to R - 1 by decreasing area; `segment_with_scores` adds :math:`(R,)`
-        scores, the foreground's and one less it for the background, and each region's name where there are
-        ``names``.
+        The label map that `segment` returns; `segment_with_scores` adds :math:`(R,)` scores, the foreground's and one
+        less it for the background, and each region's name where there are ``names``.
 
     Raises:
         FileNotFoundError: ``model`` does not exist.
-        ImportError: onnxruntime is not installed.
         TypeError: an argument has another type.
         ValueError: an argument is out of its range, ``model`` is no such network or does not run, or its
             output is not of ``kind``.
@@ -108,19 +81,20 @@ def onnx(
         ``segment(image, "onnx", model="u2netp.onnx")`` puts the salient object and the rest apart (U-2-Net,
         Qin et al., Pattern Recognition 2020).
     """
-    pixels = torch.from_numpy(check_segment_image(image)).permute(2, 0, 1)
-    rules = cleanup_of(cleanup)
     if kind not in _KINDS:
         raise ValueError(f"kind must be one of {', '.join(_KINDS)}; got {kind!r}")
-    threshold, words = check_share("threshold", threshold), read_names(names)
-    raw = run_network(pixels, model, output, check_preprocessing(size, mean, std, scale), "onnx")
-    labels, scores = decode_output(raw, kind, threshold, (pixels.shape[1], pixels.shape[2]))
-    if words is not None:
-        _check_names(words, raw, labels, scored=scores is not None)
-    return rules.apply(image.detach(), labels, scores, words)
+    check_number("threshold", threshold, 0, 1)
+    words = read_names(names)
+    raw = _run(image.cpu(), model, output, size, mean, std, max_value)
+    labels, scores = decode_output(raw, kind, threshold, (image.shape[1], image.shape[2]))
+    if words is not None and scores is None and int(labels.max()) >= len(words):
+        raise ValueError(f"names must be at least {int(labels.max()) + 1}, one for each class; got {len(words)}")
+    if words is not None and scores is not None:
+        _check_names(words, max(2, raw.shape[1] if raw.ndim == 4 else 1))
+    return Prediction(labels, scores, words)
 
 
-@register_scored("lseg")
+@register("lseg")
 def lseg(
     image: Tensor,
     *,
@@ -130,33 +104,30 @@ def lseg(
     size: tuple[int, int] | None = None,
     mean: Sequence[float] = (0.5, 0.5, 0.5),
     std: Sequence[float] = (0.5, 0.5, 0.5),
-    scale: float = 1.0,
+    max_value: float = 1.0,
     temperature: float = 0.07,
     names: Sequence[str] | str | os.PathLike[str] | None = None,
-    **cleanup: Unpack[CleanupOptions],
-) -> Segmentation:
+) -> Prediction:
     """Segment by language as LSeg does (Li et al., ICLR 2022): pixel features against text embeddings.
 
     Args:
-        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1], any size.
+        image: as `segment` takes it, any size.
         model: LSeg's image encoder in ONNX, (1, 3, h, w) to features (1, D, h', w'), or a session.
-        embeddings: an .npy file with one CLIP text embedding a class, (K, D), or that array.
+        embeddings: an .npy file with a CLIP text embedding for each class, (K, D), or that array.
         output: the output's position or name.
         size: (h, w) of an input whose size is free; None: the image's own.
-        mean: three numbers, in units of the scaled image.
-        std: three numbers above 0, in units of the scaled image.
-        scale: 255 for a network that takes [0, 255].
+        mean: three numbers, in the network's units.
+        std: three numbers above 0, in the network's units.
+        max_value: what the network takes for white: 255 where it takes [0, 255].
         temperature: above 0; the score is the softmax of cosine similarities over it.
-        names: of the classes, one an embedding, or a text file with one a line.
-        cleanup: ``min_size``, ``snap``, ``max_regions`` and ``connected`` of `Cleanup`.
+        names: of the classes, one for each embedding, or a text file with one on each line.
 
     Returns:
-        :math:`(H, W)` int64, the class of largest cosine similarity, cleaned; ids 0 to R - 1 by decreasing
-        area. `segment_with_scores` adds :math:`(R,)` scores, and each region's name where there are ``names``.
+        The label map that `segment` returns, of the classes of largest cosine similarity; `segment_with_scores` adds
+        :math:`(R,)` scores, and each region's name where there are ``names``.
 
     Raises:
         FileNotFoundError: a file does not exist.
-        ImportError: onnxruntime is not installed.
         TypeError: an argument has another type.
         ValueError: an argument is out of its range, a file cannot be read, or features and embeddings differ
             in length.
@@ -164,51 +135,87 @@ def lseg(
     Example:
         ``segment(image, "lseg", model="lseg.onnx", embeddings="dog-grass-other.npy")``
     """
-    pixels = torch.from_numpy(check_segment_image(image)).permute(2, 0, 1)
-    rules = cleanup_of(cleanup)
-    check_number("temperature", temperature, positive=True)
+    check_number("temperature", temperature, 0, above=True)
     texts, words = _embeddings(embeddings), read_names(names)
     if words is not None:
-        check_names(words, len(texts))
-    features = run_network(pixels, model, output, check_preprocessing(size, mean, std, scale), "lseg")
+        _check_names(words, len(texts))
+    features = _run(image.cpu(), model, output, size, mean, std, max_value)
     if features.ndim != 4 or features.shape[1] != texts.shape[1]:
         raise ValueError(
             f"features must have shape (1, {texts.shape[1]}, h, w) for embeddings {tuple(texts.shape)}; "
             f"got {tuple(features.shape)}"
         )
     similarity = torch.einsum("bdhw,kd->bkhw", F.normalize(features.float(), dim=1), F.normalize(texts, dim=1))
-    classes, _, scores = largest_map(similarity / temperature, (pixels.shape[1], pixels.shape[2]))
-    return rules.apply(image.detach(), classes, scores, words)
+    classes, _, scores = largest_map(similarity / temperature, (image.shape[1], image.shape[2]))
+    return Prediction(classes, scores, words)
 
 
-def check_preprocessing(
-    size: tuple[int, int] | None, mean: Sequence[float], std: Sequence[float], scale: float
-) -> Preprocessing:
-    """Return checked options."""
-    for name, values in (("mean", mean), ("std", std)):
-        if not isinstance(values, Sequence) or not all(isinstance(value, int | float) for value in values):
-            raise TypeError(f"{name} must be three numbers; got {values!r}")
-        if len(values) != 3 or not all(math.isfinite(value) for value in values):
-            raise ValueError(f"{name} must be three numbers; got {values!r}")
-    if min(std) <= 0:
-        raise ValueError(f"std must be above 0; got {std!r}")
-    check_number("scale", scale, positive=True)
-    return Preprocessing(None if size is None else check_size("size", size), tuple(mean), tuple(std), float(scale))
+def read_names(names: Sequence[str] | str | os.PathLike[str] | None) -> list[str] | None:
+    """Return names of classes in the order of their numbers, class 0 first.
+
+    Args:
+        names: the names, or a text file with one on each line, UTF-8; None: there are none.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        TypeError: ``names`` is neither a path nor a list of strings.
+        ValueError: the file is no text, or there is no name.
+
+    Example:
+        >>> read_names(["sky", "dog"])
+        ['sky', 'dog']
+    """
+    if names is None:
+        return None
+    if isinstance(names, str | os.PathLike):
+        path = Path(names)
+        if not path.is_file():
+            raise FileNotFoundError(f"no names of classes at {path}")
+        try:
+            lines = path.read_text(encoding="utf-8").splitlines()
+        except UnicodeDecodeError as error:
+            raise ValueError(f"cannot read {path} as UTF-8 text with a name on each line") from error
+        # an empty line within counts: the numbers of the classes are those of the lines
+        names = [line.strip() for line in "\n".join(lines).rstrip().split("\n")]
+    if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
+        raise TypeError(f"names must be a list of strings, or a text file with one on each line; got {names!r}")
+    if not any(names):
+        raise ValueError("names must have at least one name; got none")
+    return list(names)
 
 
-def run_network(
-    pixels: Tensor, model: str | os.PathLike[str] | Any, output: int | str, how: Preprocessing, used_by: str
+def _check_names(names: Sequence[str], classes: int) -> None:
+    if len(names) != classes:
+        raise ValueError(f"names must be {classes}, one for each class, class 0 first; got {len(names)}")
+
+
+def _run(
+    image: Tensor,
+    model: str | os.PathLike[str] | Any,
+    output: int | str,
+    size: tuple[int, int] | None,
+    mean: Sequence[float],
+    std: Sequence[float],
+    max_value: float,
 ) -> Tensor:
     """Run a network on (3, H, W) and return one of its outputs."""
-    session, name = _session(model, used_by)
+    for option, numbers in (("mean", mean), ("std", std)):
+        if not isinstance(numbers, Sequence) or isinstance(numbers, str):
+            raise TypeError(f"{option} must be three numbers; got {numbers!r}")
+        if len(numbers) != 3:
+            raise ValueError(f"{option} must be three numbers; got {numbers!r}")
+        for number in numbers:
+            check_number(option, number, 0 if option == "std" else -math.inf, above=option == "std")
+    check_number("max_value", max_value, 0, above=True)
+    asked = None if size is None else check_size("size", size)
+    session, name = _session(model)
     if len(session.get_inputs()) != 1:
         raise ValueError(f"{name} must have one input; got {[entry.name for entry in session.get_inputs()]}")
     entry = session.get_inputs()[0]
     if entry.type not in _DTYPES:
         raise ValueError(f"the input of {name} must be one of {', '.join(_DTYPES)}; got {entry.type}")
-    height, width = _input_size(entry.shape, how.size, (pixels.shape[1], pixels.shape[2]), name)
-    resized = F.interpolate(pixels[None], (height, width), mode="bilinear", align_corners=False, antialias=True)
-    values = normalized(resized * how.scale, how.mean, how.std).numpy()
+    seen = _input_size(entry.shape, asked, (image.shape[1], image.shape[2]), name)
+    values = preprocess(image, seen, mean, std, max_value).numpy()
     if entry.type == "tensor(uint8)":
         values = np.rint(values).clip(0, 255)
     try:
@@ -224,7 +231,7 @@ def run_network(
 def decode_output(raw: Tensor, kind: Kind, threshold: float, size: tuple[int, int]) -> tuple[Tensor, Tensor | None]:
     """Return labels and scores (H, W) from what a network put out."""
     if kind == "auto":
-        kind = _told_kind(raw)
+        kind = _guess_kind(raw)
     if kind == "label":
         classes = raw.flatten(0, -3) if raw.ndim > 2 else raw[None]
         if len(classes) != 1 or (classes != classes.round()).any() or classes.min() < 0:
@@ -246,16 +253,7 @@ def decode_output(raw: Tensor, kind: Kind, threshold: float, size: tuple[int, in
     return classes, shares if kind == "logits" else values
 
 
-def _check_names(names: list[str], raw: Tensor, labels: Tensor, *, scored: bool) -> None:
-    """Refuse names that do not go with the classes of a network's output."""
-    if scored:
-        channels = raw.shape[1] if raw.ndim == 4 else 1
-        check_names(names, max(2, channels))
-    elif int(labels.max()) >= len(names):
-        raise ValueError(f"names must be at least {int(labels.max()) + 1}, one a class; got {len(names)}")
-
-
-def _told_kind(raw: Tensor) -> Kind:
+def _guess_kind(raw: Tensor) -> Kind:
     if not raw.is_floating_point():
         return "label"
     within = bool(raw.min() >= 0) and bool(raw.max() <= 1)
@@ -265,8 +263,9 @@ def _told_kind(raw: Tensor) -> Kind:
     return "probability" if within and bool((sums - 1).abs().max() < _SUM_TOLERANCE) else "logits"
 
 
-def _session(model: Any, used_by: str) -> tuple[Any, str]:
-    onnxruntime = require("onnxruntime", "onnxruntime", used_by)
+def _session(model: Any) -> tuple[Any, str]:
+    import onnxruntime
+
     if isinstance(model, onnxruntime.InferenceSession):
         return model, "the network"
     path = Path(model)
@@ -284,12 +283,12 @@ def _session(model: Any, used_by: str) -> tuple[Any, str]:
 
 
 def _input_size(
-    shape: Sequence[object], asked: tuple[int, int] | None, own: tuple[int, int], name: str
+    shape: Sequence[object], asked: tuple[int, int] | None, image_size: tuple[int, int], name: str
 ) -> tuple[int, int]:
     fixed = [side if isinstance(side, int) and side > 0 else None for side in shape]
     if len(fixed) != 4 or fixed[0] not in (1, None) or fixed[1] not in (3, None):
         raise ValueError(f"the input of {name} must be (1, 3, h, w); got {list(shape)}")
-    height, width = (given or wanted for given, wanted in zip(fixed[2:], asked or own, strict=True))
+    height, width = (given or wanted for given, wanted in zip(fixed[2:], asked or image_size, strict=True))
     if asked is not None and (height, width) != asked:
         raise ValueError(f"size must be the {height} x {width} that {name} is made for; got {asked}")
     return height, width
