@@ -18,8 +18,8 @@ def evaluate(scene: Scene, image: Any, labels: RegionMap | Tensor | None = None)
 
     Args:
         scene: unbatched.
-        image: of the scene's size and channels in [0, 1]: :math:`(C, H, W)`, a numpy array (H, W, C) of uint8 or floats,
-            or a PIL image.
+        image: of the scene's size and channels in [0, 1]: :math:`(C, H, W)`, a numpy array (H, W, C) of uint8 or
+            floats, or a PIL image.
         labels: the map whose contours the edge-focused figures look at; None: the scene's own.
 
     Returns:

@@ -24,9 +24,7 @@ def check_field(scene: Scene) -> GaussianField:
     return scene.field
 
 
-def check_scene(
-    scene: Scene, region_ids: object, target: tuple[int, int] | None = None
-) -> tuple[RegionMap, Tensor]:
+def check_scene(scene: Scene, region_ids: object, target: tuple[int, int] | None = None) -> tuple[RegionMap, Tensor]:
     """Return the map, of the scene's size or the target's, and the ids as a tensor on its device."""
     size, regions = check_field(scene).size, scene.regions
     target = size if target is None else target
