@@ -1,50 +1,16 @@
-"""The model of label maps: what a pixel may be, given the pixels before it. Loops in integers, compiled by numba.
+"""The model of label maps: what a pixel may be, given the pixels before it (docs/format.md, "Chances of a pixel").
 
-All numbers are integers, ``>>`` and ``//`` round down, ``clip(v, m)`` is v kept within -m to m. Arrays named here are
-those of `prior`; the stream that the bits stand in is specified in `labels`.
-
-**Features.** The template lists pixels (dx, dy) before this one: those of row 0 from dx = -8 to -1, of row -1 from -8
-to 7, -2: -7 to 8, -3: -6 to 7, -4: -5 to 6, -5: -3 to 4, -6: -2 to 3; by dx**2 + dy**2, then the nearest row first,
-then from the left. The first one, (-1, 0), has the first candidate; the second candidate is the first other label in
-the list. Feature f_t of place t, from 0, is 0, 1 or 2: the label is the first candidate, the second, or neither.
-
-**Network.** With ``a_j = bias1_j`` plus ``layer1[t, f_t - 1, j]`` for all t with f_t > 0, kept within 0 to 4095, and
-``b_k = (bias2_k + sum_j a_j * layer2[j, k]) >> 6``, kept within 0 to 4095, the logit of decision h, in 1/256, is ``x_0
-= clip((bias3_h + sum_k b_k * layer3[k, h]) >> 4, 3071)``. Decision 0 is whether the pixel has the second candidate
-rather than the first, decision 1 whether it has neither.
-
-**Counters.** A decision looks at three of them, in tables of its own: decision 0 at those of which of f_1 to f_6, of
-f_1 to f_11, of f_1 to f_16 are not 0; decision 1 at a single one, and at those of the values f_1 to f_4, and f_1 to
-f_8. A counter has a chance c, in 1/65536, and an age n, 0 at first. Its logit x_i, i from 1 to 3, is ``stretch(c >>
-4)``, and x_0 while n is 0. With ``squash(x)`` the whole number nearest to 65536 / (1 + e**(-x / 256)), ``stretch(q)``
-is the least x from -3071 on with squash(x) at least 16 q + 8.
-
-**Chance.** Each decision has four sets of weights w_0 to w_3, all ``mixer`` at first; its third counter chooses: n = 0,
-below 5, below 12, or more. The chance of a 1, in 1/65536, is ``p = squash(clip(sum_i w_i * x_i >> 16, 3071))``, kept
-within 16 to 65520.
-
-**Learning.** Counters and weights change after a wave's last bit, pixel by pixel in the wave's order, decision 1, if
-there is one, before decision 0; with the x_i, the p and the set of weights that the bit v was coded with. With ``e =
-65536 v - p`` each weight of the set becomes ``clip(w_i + ((6 * x_i * e + 2**17) >> 18), 2**22)``. Then each of the
-three counters: if its age is 0, it takes c = squash(x_0) and n = 2; then ``c += 2 * (65536 v - c) // (2 n + 3)``, kept
-within 32 to 65504, and n grows by 1, to 40 at most.
+Loops in integers, compiled by numba: ``>>`` and ``//`` round down.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numba import njit
 
-from kcgs.kernels.compiled import compile_kept, count_compiled, say
-
 from .prior import HIDDEN, LATENT, TEMPLATE, load_prior
-
-T = TypeVar("T")
 
 LEFT, RIGHT, TOP = 8, 9, 6  # margins around the map
 CLIP = 3071  # largest logit, in 1/256
@@ -213,20 +179,3 @@ def learn(tables, row, h, bit):  # type: ignore[no-untyped-def]
         chance += ((bit << 16) - chance) * 2 // (2 * seen + 3)
         counter[0] = min(max(chance, 32), 65504)
         counter[1] = min(seen + 1, _MEMORY)
-
-
-def compiled(name: str, compiler: Callable[[str, bool], T], rehearse: Callable[[T], None], *sources: str) -> T:
-    """Compile loops that call those of this file, kept on disk by what is in the sources; say how long it took.
-
-    Args:
-        name: of what they do.
-        compiler: makes them of a fingerprint, and of whether to keep them on disk.
-        rehearse: calls each of them once, for it is then that they compile.
-        sources: files that they are in, besides this one.
-    """
-    start, folder = time.perf_counter(), Path(__file__).parent
-    kept = [folder / source for source in ("contexts.py", "prior.py", "prior.bin", *sources)]
-    loops = compile_kept("codec", compiler, kept)
-    rehearse(loops)
-    say(name, start, count_compiled(loops) > 0, loops)
-    return loops

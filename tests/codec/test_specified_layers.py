@@ -1,4 +1,4 @@
-"""A decoder of layers, written from the words of the docstrings: plain numbers, and nothing of the codec's own."""
+"""A decoder of layers, written from the words of docs/format.md: plain numbers, and of the codec only its tables."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import torch
 
 from kcgs.codec import Decoded, decode, encode
 from kcgs.codec.exact import exp2, turn
-from kcgs.codec.gaussians import _GREY, _HUE, _HUE2, _RATIO
-from kcgs.codec.quantize import opponent
-from kcgs.codec.stream import Header, unpack
+from kcgs.codec.file import Header, unpack
+from kcgs.codec.gaussians.layers import _GREY, _HUE, _HUE2, _RATIO
+from kcgs.codec.gaussians.quantize import opponent
 
 from .conftest import make_scene
 from .symbols import Choices, Symbols
@@ -72,7 +72,7 @@ class File:
 
     def __init__(self, header: Header, index: Any, regions: int) -> None:
         self.size, self.channels, self.index, self.regions = header.size, header.channels, index, regions
-        self.noise = power(-header.noise_code / 32)
+        self.distortion = power(-header.qp / 32)
         self.lengths = Choices(2.0, *[1.0] * 9, *[0.3] * 12)
         self.margins = Choices(3.0, *[1.0] * 4, *[0.3] * 4)
         self.stays = Choices(20.0, 0.5)
@@ -124,7 +124,7 @@ class File:
         last = first + symbols.uniform(64 - first)
         counts = {s - 8: self.read_length(symbols, self.lengths) for s in range(first, last + 1)}
         kinds = [(s, *at) for s in sorted(counts, reverse=True) if counts[s] for at in self.cells(symbols, counts[s])]
-        u = math.sqrt(12 * self.noise / math.pi * power(-2 * e - 1))
+        u = math.sqrt(12 * self.distortion / math.pi * power(-2 * e - 1))
         scales = min(max(math.floor(0.75 / (u * (math.sqrt(0.5) / LN2)) + 0.5), 1), 2**20)
         step = max(u * (1 / LN2), 12 / 2**20)
         scale = [symbols.uniform(scales) for _ in kinds]
@@ -152,12 +152,12 @@ class File:
             x = np.float32(sides[i] * (column + (across[i] + 0.5) / parts[i][0]))
             y = np.float32(sides[i] * (row + (down[i] + 0.5) / parts[i][1]))
             area = min(math.pi * power(1.5 * (s + 0.5)), float(self.size[0] * self.size[1]))
-            told = np.array([colors[i]]) * math.sqrt(12 * self.noise / area)
+            told = np.array([colors[i]]) * math.sqrt(12 * self.distortion / area)
             found.append([x, y, *shapes[i], *opponent(told, back=True)[0]])
         return list(zip(found, self.read_regions(symbols, found), strict=True))
 
     def read_colors(self, symbols: Symbols, e: int, count: int) -> list[list[int]]:
-        loud = math.sqrt(math.pi / (12 * self.noise)) * 2.0**e
+        loud = math.sqrt(math.pi / (12 * self.distortion)) * 2.0**e
         colors: list[list[int]] = [[] for _ in range(count)]
         for channel in range(self.channels):
             contexts = [(abs(c[-1]) > 0.35 * loud) + (abs(c[-1]) > 0.8 * loud) if channel else 0 for c in colors]

@@ -1,20 +1,21 @@
-"""A map from wave to wave: which pixels are to be decided, with what chances, and what follows from the answers.
+"""A label map from wavefront to wavefront: which pixels are to be decided, with what chances, and what follows.
 
-The nearest labels of a pixel are found in squares about it, of radius 1 to 32: row by row from the top to its own, in
-the top row from left to right, in the others first the pixel at the left, then that at the right. Only pixels of
-earlier waves count, by x + 8 y also outside the map, and there those up to 6 rows above it, 8 columns at its left and 9
-at its right. The labels that are not the pixel's candidates are listed as they come, each once, up to three. (A start
-has one candidate, the label of its neighbours.)
+A wavefront is the pixels of equal x + 8 y; what it asks depends on earlier ones only (docs/format.md). Rows continue
+with their last label until a decision changes it, so that only pixels near contours are looked at.
 """
 
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numba import njit
+
+from kcgs.kernels.compiled import compile_kept, count_compiled, say
 
 from .contexts import (
     CODED,
@@ -28,7 +29,6 @@ from .contexts import (
     Tables,
     X,
     Y,
-    compiled,
     contexts,
     describe,
     inner,
@@ -39,17 +39,18 @@ from .contexts import (
     quiet,
 )
 
-SLANT = 8  # pixels (x, y) of equal x + SLANT * y make a wave
+SLANT = 8  # pixels (x, y) of equal x + SLANT * y make a wavefront
 RANKS = 3  # nearest labels that one that is neither candidate is compared with
 _FAR = 32  # pixels within which they are looked for
-# entries of the state: the wave, its rows, those of them that bits decide; regions in all
-WAVE, ROWS, DECIDED, REGIONS, STATE = 0, 1, 2, 3, 4
-# of a row of the map: its last pixel that differs from the one before, the next start, the wave until which it is quiet
-_CHANGE, _START, _WAKE, _LINE = 0, 1, 2, 3
+# entries of the state: the wavefront, its rows, those of them that bits decide; regions in all
+FRONT, ROWS, DECIDED, REGIONS, STATE = 0, 1, 2, 3, 4
+# of a row of the map: its last pixel that differs from the one before, the next seed, the wavefront until which it is
+# quiet
+_CHANGE, _SEED, _WAKE, _LINE = 0, 1, 2, 3
 
 
 class Work(NamedTuple):
-    """What belongs to the pixels of one wave, and to the rows of the map."""
+    """What belongs to the pixels of one wavefront, and to the rows of the map."""
 
     rows: Any  # [H, COLUMNS] int32
     chances: Any  # [2 * H] float64, of a bit that is 1
@@ -57,7 +58,7 @@ class Work(NamedTuple):
 
 
 def new_work(height: int) -> Work:
-    """Return room for the pixels of a wave."""
+    """Return room for the pixels of a wavefront."""
     lines = np.zeros((TOP + height + 2, _LINE), np.int32)
     return Work(np.zeros((height, COLUMNS), np.int32), np.zeros(2 * height), lines)
 
@@ -97,45 +98,45 @@ def _put(labels, y, x, label):  # type: ignore[no-untyped-def]
 
 @inner
 def _settle(state, labels, bits, tables, work):  # type: ignore[no-untyped-def]
-    """Give the wave's pixels their labels and learn from them."""
+    """Give the wavefront's pixels their labels and learn from them."""
     decided = state[DECIDED]
     escapes = decided if state[REGIONS] > 2 else 0
-    at = 0
+    asked = 0
     for n in range(state[ROWS]):
         row = work.rows[n]
         if row[CODED]:
             escaped = False
             if escapes > 0:
-                escaped = bits[at] != 0
-                learn(tables, row, 1, bits[at])
+                escaped = bits[asked] != 0
+                learn(tables, row, 1, bits[asked])
             if not escaped:
-                bit = bits[escapes + at]
+                bit = bits[escapes + asked]
                 learn(tables, row, 0, bit)
                 row[LABEL] = row[SECOND] if bit else row[FIRST]
-            at += 1
+            asked += 1
         _set(labels, row[Y], row[X], row[LABEL], work.lines)
 
 
 @inner
-def _next_start(events, j, i, line):  # type: ignore[no-untyped-def]
-    at = max(line[_START], i)
-    while at < events.shape[1] and events[j, at] == 0:
-        at += 1
-    line[_START] = at
-    return at
+def _next_seed(seeds, j, i, line):  # type: ignore[no-untyped-def]
+    column = max(line[_SEED], i)
+    while column < seeds.shape[1] and seeds[j, column] == 0:
+        column += 1
+    line[_SEED] = column
+    return column
 
 
 @inner
-def _look(state, labels, events, work):  # type: ignore[no-untyped-def]
-    """List the pixels of a wave that are to be decided; the others have their label, since rows continue."""
-    height, width = events.shape
-    wave = state[WAVE]
-    for j in range(max(0, -((width - 1 - wave) // SLANT)), min(height - 1, wave // SLANT) + 1):
+def _look(state, labels, seeds, work):  # type: ignore[no-untyped-def]
+    """List the pixels of a wavefront that are to be decided; the others have their label, since rows continue."""
+    height, width = seeds.shape
+    front = state[FRONT]
+    for j in range(max(0, -((width - 1 - front) // SLANT)), min(height - 1, front // SLANT) + 1):
         line = work.lines[j + TOP]
-        if line[_WAKE] > wave:
+        if line[_WAKE] > front:
             continue
-        x, y = wave - SLANT * j + LEFT, j + TOP
-        start = _next_start(events, j, x - LEFT, line) + LEFT
+        x, y = front - SLANT * j + LEFT, j + TOP
+        seed = _next_seed(seeds, j, x - LEFT, line) + LEFT
         n = state[ROWS]
         row = work.rows[n]
         if not _still(labels, y, x, work.lines):
@@ -143,30 +144,30 @@ def _look(state, labels, events, work):  # type: ignore[no-untyped-def]
             row[X], row[Y], row[CODED] = x, y, 1
             state[ROWS] += 1
             state[DECIDED] += 1
-        elif x == start:
+        elif x == seed:
             row[X], row[Y], row[CODED], row[FIRST], row[SECOND] = x, y, 0, labels[y, x - 1], -1
             row[LABEL] = 1 - row[FIRST]  # unless there are more than two regions
             state[ROWS] += 1
         else:
             _put(labels, y, x, labels[y, x - 1])
             if y >= TOP + 2 and work.lines[y - 2, _CHANGE] < x:
-                line[_WAKE] = wave + start - x
+                line[_WAKE] = front + seed - x
 
 
 @inner
 def _weigh(state, tables, work):  # type: ignore[no-untyped-def]
     """Fill in the chances: first of being neither candidate, then of being the second."""
     escapes = state[DECIDED] if state[REGIONS] > 2 else 0
-    at = 0
+    asked = 0
     for n in range(state[ROWS]):
         row = work.rows[n]
         if row[CODED]:
             network(row)
             contexts(row)
             if escapes > 0:
-                work.chances[at] = mix(tables, row, 1)
-            work.chances[escapes + at] = mix(tables, row, 0)
-            at += 1
+                work.chances[asked] = mix(tables, row, 1)
+            work.chances[escapes + asked] = mix(tables, row, 0)
+            asked += 1
 
 
 @inner
@@ -194,14 +195,14 @@ def _nearest(labels, row, found):  # type: ignore[no-untyped-def]
 
 @inner
 def _survey(index, regions):  # type: ignore[no-untyped-def]
-    """Number the labels in the order in which waves meet them; mark pixels unlike their uniform surroundings."""
+    """Number the labels in the order in which wavefronts meet them; mark pixels unlike their uniform surroundings."""
     height, width = index.shape
     number = np.full(regions, -1, np.int32)
     order = np.empty(regions, np.int32)
     count = 0
-    for wave in range(width + SLANT * (height - 1)):
-        for j in range(max(0, -((width - 1 - wave) // SLANT)), min(height - 1, wave // SLANT) + 1):
-            label = index[j, wave - SLANT * j]
+    for front in range(width + SLANT * (height - 1)):
+        for j in range(max(0, -((width - 1 - front) // SLANT)), min(height - 1, front // SLANT) + 1):
+            label = index[j, front - SLANT * j]
             if number[label] < 0:
                 number[label] = count
                 order[count] = label
@@ -209,30 +210,30 @@ def _survey(index, regions):  # type: ignore[no-untyped-def]
         if count == regions:
             break
     truth = np.empty(index.shape, np.int32)
-    events = np.zeros(index.shape, np.uint8)
+    seeds = np.zeros(index.shape, np.uint8)
     labels = np.zeros((height + TOP + 1, width + LEFT + RIGHT), np.int32)
     for j in range(height):
         for i in range(width):
             x, y = i + LEFT, j + TOP
             truth[j, i] = number[index[j, i]]
-            events[j, i] = truth[j, i] != labels[y, x - 1] and quiet(labels, y, x)
+            seeds[j, i] = truth[j, i] != labels[y, x - 1] and quiet(labels, y, x)
             _put(labels, y, x, truth[j, i])
-    return truth, events, order
+    return truth, seeds, order
 
 
 @inner
 def _answer(state, truth, rows, bits):  # type: ignore[no-untyped-def]
     """Look the answers up in a map that is known."""
     escapes = state[DECIDED] if state[REGIONS] > 2 else 0
-    at = 0
+    asked = 0
     for n in range(state[ROWS]):
         row = rows[n]
         row[LABEL] = truth[row[Y] - TOP, row[X] - LEFT]
         if row[CODED]:
             if escapes > 0:
-                bits[at] = row[LABEL] != row[FIRST] and row[LABEL] != row[SECOND]
-            bits[escapes + at] = row[LABEL] != row[FIRST]
-            at += 1
+                bits[asked] = row[LABEL] != row[FIRST] and row[LABEL] != row[SECOND]
+            bits[escapes + asked] = row[LABEL] != row[FIRST]
+            asked += 1
 
 
 class Loops(NamedTuple):
@@ -250,19 +251,19 @@ def _compile(fingerprint: str, cache: bool) -> Loops:
 
     @entry
     def advance(  # type: ignore[no-untyped-def]
-        bits, state, labels, events, counters, weights, rows, chances, lines
+        bits, state, labels, seeds, counters, weights, rows, chances, lines
     ):
-        """Take the answers for a wave in, go on to the next that has questions and return their number."""
+        """Take the answers for a wavefront in, go on to the next that has questions and return their number."""
         fingerprint  # noqa: B018
         # arrays by themselves take a third of the time to hand over
         tables, work = Tables(counters, weights), Work(rows, chances, lines)
-        height, width = events.shape
+        height, width = seeds.shape
         _settle(state, labels, bits, tables, work)
         state[ROWS] = 0
         state[DECIDED] = 0
-        while state[ROWS] == 0 and state[WAVE] < width - 1 + SLANT * (height - 1):
-            state[WAVE] += 1
-            _look(state, labels, events, work)
+        while state[ROWS] == 0 and state[FRONT] < width - 1 + SLANT * (height - 1):
+            state[FRONT] += 1
+            _look(state, labels, seeds, work)
         _weigh(state, tables, work)
         return state[ROWS]
 
@@ -286,14 +287,20 @@ def _compile(fingerprint: str, cache: bool) -> Loops:
 
 @functools.cache
 def loops() -> Loops:
-    """Compile the loops, or load them from disk."""
-    return compiled("the codec of label maps", _compile, _rehearse, "waves.py")
+    """Compile the loops, or load them from disk; say how long it took."""
+    began, folder = time.perf_counter(), Path(__file__).parent
+    kept = [folder / source for source in ("contexts.py", "prior.py", "prior.bin", "wavefront.py")]
+    made = compile_kept("codec", _compile, kept)
+    _rehearse(made)
+    say("the codec of label maps", began, count_compiled(made) > 0, made)
+    return made
 
 
 def _rehearse(run: Loops) -> None:
-    truth, starts, _ = run.survey(np.eye(2, dtype=np.int32), 2)
+    """Call each entry point once, for it is then that they compile."""
+    truth, seeds, _ = run.survey(np.eye(2, dtype=np.int32), 2)
     work, bits, state = new_work(2), np.zeros(4, np.int32), np.zeros(STATE, np.int64)
     labels = np.zeros((2 + TOP + 1, 2 + LEFT + RIGHT), np.int32)
-    run.advance(bits, state, labels, starts, *new_tables(), *work)
+    run.advance(bits, state, labels, seeds, *new_tables(), *work)
     run.answer(state, truth, work.rows, bits)
     run.nearest(labels, work.rows[0], np.zeros(RANKS, np.int32))

@@ -9,7 +9,7 @@ import torch
 
 from kcgs import GaussianField, RegionMap
 from kcgs.codec import CodecError, Decoded, decode, encode
-from kcgs.codec.stream import pack, unpack
+from kcgs.codec.file import pack, unpack
 
 from .conftest import make_scene
 
@@ -71,7 +71,7 @@ def hostile(data: bytes, generator: random.Random) -> bytes:
         header = header._replace(size=generator.choice(sizes))
     else:
         name, values = generator.choice(
-            [("channels", [1, 2, 4, 900]), ("noise_code", [-512, 0, 1023]), ("regions", [1, 2, 4, 70000])]
+            [("channels", [1, 2, 4, 900]), ("qp", [-512, 0, 1023]), ("regions", [1, 2, 4, 70000])]
         )
         header = header._replace(**{name: generator.choice(values)})
     header = header._replace(layers=tuple((e, len(x)) for (e, _), x in zip(header.layers, layers, strict=True)))

@@ -192,7 +192,7 @@ class TestRefusals:
 
     def test_what_no_decoder_takes(self) -> None:
         wide = GaussianField.random(5, (1, (1 << 20) + 1), seed=0)
-        with pytest.raises(ValueError, match="size must be at most 1048576 pixels a side"):
+        with pytest.raises(ValueError, match="size must be at most 1048576 pixels per side"):
             encode(wide)
         field, _ = make_scene(regions=1)
         deep = GaussianField(field.means, field.cholesky, torch.ones(60, 1025), size=field.size)
