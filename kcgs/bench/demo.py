@@ -1,71 +1,86 @@
-"""The first look: one photo, the baseline and the contour-aware fit side by side."""
+"""The first look: one photo, ordinary Gaussians beside contour-aware ones: `kcgs bench demo`."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
+from kcgs.bench.measure import measure
 from kcgs.data import colorize_labels, save_image, save_labels
-from kcgs.fit import FitConfig, FitResult, HistoryEntry, fit
-from kcgs.functional import edge_band
-from kcgs.io import save
-from kcgs.nn.renderer import render_image
+from kcgs.fit import FitConfig, FitResult, HistoryEntry, fit, warm_up
+from kcgs.plots import COLORS, plot_history
+from kcgs.scene import Scene, load
 from kcgs.segment import segment
 
-from .measure import measure
-from .plots import figure, save_figure
+from ._workloads import astronaut
+from .core.options import Options
+from .core.registry import experiment
 
 if TYPE_CHECKING:
+    from PIL.Image import Image
     from rich.progress import Progress
     from torch import Tensor
 
 NUM_GAUSSIANS = 400
-QUICK_STRIDE = 4
-QUICK_GAUSSIANS = 60
-QUICK_ITERATIONS = 20
-RECIPES = {"baseline": "best-baseline", "contour-aware": "best"}
+QUICK_STRIDE, QUICK_GAUSSIANS, QUICK_ITERATIONS = 4, 60, 20
+# the map is found, not given: its contours may move anywhere
+RECIPES = {"baseline": "best-baseline", "contour-aware": "best-refined"}
+TITLES = {"baseline": "ordinary 2D Gaussians", "contour-aware": "kcgs: contour-aware"}
+# close-ups of contours: top, left and side as shares of the photo's side
+CLOSE_UPS = ((0.27, 0.39, 0.25), (0.29, 0.66, 0.25))
 
 
-def run(output: Path, *, data: Path | None = None, quick: bool = False) -> None:
-    """Fit scikit-image's astronaut twice and write pictures, scenes and the error-against-time plot.
+class Panel(NamedTuple):
+    """A column of the comparison."""
 
-    Args:
-        output: folder for all of it.
-        data: not read; what every bench takes.
-        quick: a quarter of the size, fewer Gaussians, few iterations.
-    """
+    title: str
+    lines: tuple[str, str]
+    image: Tensor
+
+
+@experiment()
+def run(output: Path, options: Options) -> None:
+    """Fit scikit-image's astronaut twice; write images, scenes, comparison.png and error-against-time.png."""
     from rich.console import Console
     from rich.progress import Progress
+    from rich.table import Table
 
-    image, count = _astronaut(), NUM_GAUSSIANS
-    if quick:
+    image, count = astronaut(), NUM_GAUSSIANS
+    if options.quick:
         image, count = torch.nn.functional.avg_pool2d(image, QUICK_STRIDE), QUICK_GAUSSIANS
     labels = segment(image)
     save_image(output / "original.png", image)
     save_image(output / "regions.png", colorize_labels(labels))
     save_labels(output / "labels.png", labels)
-    # the map was found, not given: its contours may move
-    settings: dict[str, Any] = {"max_move": "any", **({"iterations": QUICK_ITERATIONS} if quick else {})}
+    settings = {"iterations": QUICK_ITERATIONS} if options.quick else {}
     console = Console(stderr=True)
     results: dict[str, FitResult] = {}
+    panels = [Panel("original", (f"{image.shape[2]} x {image.shape[1]} pixels", ""), image)]
+    table = Table("", "PSNR (dB)", "EF-PSNR (dB)", "seconds", "bytes", title=f"{count} Gaussians")
     with Progress(console=console, disable=not console.is_terminal) as progress:
         for name, recipe in RECIPES.items():
-            results[name] = _fit(image, labels, count, FitConfig.from_recipe(recipe, **settings), name, progress)
-            save(output / f"{name}.safetensors", results[name].field, results[name].regions)
-    pictures = {name: render_image(r.field, r.regions) for name, r in results.items()}
-    for name, picture in pictures.items():
-        save_image(output / f"{name}.png", picture)
-    _plot_history(output / "error-against-time.png", results)
-    _plot_strip(output / "comparison.png", image, labels, pictures)
-    _print_table(pictures, image, labels, results, f"{count} Gaussians, pictures in {output}/")
-
-
-def _astronaut() -> Tensor:
-    from skimage import data as photos
-
-    return torch.from_numpy(photos.astronaut()).permute(2, 0, 1).float() / 255
+            config = FitConfig.from_recipe(recipe, **settings)
+            if not options.quick:
+                warm_up(config)  # the clock counts no compilation
+            results[name] = result = _fit(image, labels, count, config, name, progress)
+            scene = Scene(result.field, result.regions)
+            scene.save(output / f"{name}.safetensors")
+            size = scene.save(output / f"{name}.kcgs")
+            rendered = load(output / f"{name}.kcgs").render()  # what so many bytes give
+            save_image(output / f"{name}.png", rendered)
+            figures = measure(rendered, image, labels)
+            psnr, ef_psnr = f"{figures['psnr']:.2f}", f"{figures['ef_psnr']:.2f}"
+            table.add_row(name, psnr, ef_psnr, f"{result.history[-1].seconds:.1f}", f"{size:,}")
+            parts = f"{len(scene)} Gaussians" + ("" if scene.regions is None else " and contours")
+            lines = f"{parts}, {size / 1e3:.1f} kB", f"PSNR {psnr} dB, EF-PSNR {ef_psnr} dB"
+            panels.append(Panel(TITLES[name], lines, rendered))
+    plot_history(output / "error-against-time.png", {name: result.history for name, result in results.items()})
+    compose(panels).save(output / "comparison.png")
+    Console().print(table)
+    Console().print(f"images and scenes in {output}/")
 
 
 def _fit(image: Tensor, labels: Tensor, count: int, config: FitConfig, name: str, progress: Progress) -> FitResult:
@@ -77,49 +92,33 @@ def _fit(image: Tensor, labels: Tensor, count: int, config: FitConfig, name: str
     return fit(image, labels, count, config=config, on_step=step)
 
 
-def _plot_history(path: Path, results: dict[str, FitResult]) -> None:
-    plot, axes = figure(1, 2, width=9.0, height=3.6)
-    for name, result in results.items():
-        seconds = [h.seconds for h in result.history]
-        axes[0].plot(seconds, [h.psnr for h in result.history], label=name)
-        axes[1].plot(seconds, [h.ef_psnr for h in result.history], label=name)
-    for axis, title in zip(axes, ("PSNR, whole image", "EF-PSNR, 5 pixels around contours"), strict=True):
-        axis.set(xlabel="seconds", ylabel="dB", title=title, xscale="log")
-        axis.legend(loc="lower right")
-    save_figure(plot, path)
+def compose(panels: Sequence[Panel], *, side: int = 512, gap: int = 12) -> Image:
+    """Lay out columns of a title, two lines, the image, and the same two close-ups of each, no pixel smoothed.
 
+    Args:
+        panels: square images of the same size.
+        side: of an image, in pixels of the result.
+        gap: between columns.
+    """
+    from PIL import Image, ImageDraw, ImageFont
 
-def _plot_strip(path: Path, image: Tensor, labels: Tensor, pictures: dict[str, Tensor]) -> None:
-    side = labels.shape[1] // 4
-    y, x = _busiest_window(labels, side)
-    panels = {"original": image, "regions": colorize_labels(labels), **pictures}
-    plot, axes = figure(2, len(panels), width=2.6 * len(panels), height=5.4)
-    for column, (name, panel) in enumerate(panels.items()):
-        axes[0, column].imshow(panel.permute(1, 2, 0).numpy())
-        axes[0, column].set_title(name)
-        axes[1, column].imshow(panel[:, y : y + side, x : x + side].permute(1, 2, 0).numpy(), interpolation="nearest")
-    for axis in axes.flat:
-        axis.set_axis_off()
-    save_figure(plot, path)
-
-
-def _busiest_window(labels: Tensor, side: int) -> tuple[int, int]:
-    band = edge_band(labels).float()[None, None]
-    stride = side // 8
-    density = torch.nn.functional.avg_pool2d(band, side, stride)[0, 0]
-    row, column = divmod(int(density.argmax()), density.shape[1])
-    return row * stride, column * stride
-
-
-def _print_table(
-    pictures: dict[str, Tensor], image: Tensor, labels: Tensor, results: dict[str, FitResult], title: str
-) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table("", "PSNR (dB)", "EF-PSNR (dB)", "seconds", title=title)
-    for name, picture in pictures.items():
-        figures = measure(picture, image, labels)
-        seconds = results[name].history[-1].seconds
-        table.add_row(name, f"{figures['psnr']:.2f}", f"{figures['ef_psnr']:.2f}", f"{seconds:.1f}")
-    Console().print(table)
+    top, close = 136, (side - gap) // 2
+    size = len(panels) * (side + gap) + gap, top + side + gap + close + gap
+    canvas = Image.new("RGB", size, "white")
+    pen = ImageDraw.Draw(canvas)
+    for column, panel in enumerate(panels):
+        left = gap + column * (side + gap)
+        for text, height, font_size in zip((panel.title, *panel.lines), (30, 74, 108), (36, 26, 26), strict=True):
+            font = ImageFont.load_default(font_size)
+            pen.text((left + side / 2, height), text, fill="black", font=font, anchor="mm")
+        pixels = (255 * panel.image.clamp(0, 1)).round().byte().permute(1, 2, 0).numpy()
+        image = Image.fromarray(pixels).resize((side, side), Image.Resampling.NEAREST)
+        canvas.paste(image, (left, top))
+        for index, (y, x, share) in enumerate(CLOSE_UPS):
+            box = round(side * x), round(side * y), round(side * (x + share)), round(side * (y + share))
+            corner = left + index * (close + gap), top + side + gap
+            canvas.paste(image.crop(box).resize((close, close), Image.Resampling.NEAREST), corner)
+            pen.rectangle((*corner, corner[0] + close - 1, corner[1] + close - 1), outline=COLORS[index], width=5)
+            frame = (left + box[0], top + box[1], left + box[2], top + box[3])
+            pen.rectangle(frame, outline=COLORS[index], width=3)
+    return canvas

@@ -3,125 +3,130 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 
-from kcgs import GaussianField, RegionMap, RegionSplatRenderer
-from kcgs.bench import run
-from kcgs.bench.decode.decoders import (
+from kcgs import GaussianField, RegionSplatRenderer
+from kcgs.bench import _decoders, run
+from kcgs.bench._decode_report import Row, cutoff_name
+from kcgs.bench._decoders import (
     CPU,
     DECODERS,
     GENERIC,
     SCENE,
     TILED,
-    Files,
-    can_draw,
-    open_decoder,
+    Subject,
+    decoders_of,
+    fitted_subjects,
+    open_and_render,
+    standard_subjects,
     truth,
+    why_not_fitted,
     write_files,
 )
-from kcgs.bench.decode.findings import Findings, Row, cutoff_name
-from kcgs.bench.decode.report import write
-from kcgs.bench.decode.scenes import Scene, fitted_scenes, standard_scenes, why_not_fitted
-from kcgs.bench.decode.timing import Entrant, opening, peak_memory, race, ratio
+from kcgs.bench.core.clocks import median_ratio, peak_bytes
+from kcgs.bench.core.options import Options
+from kcgs.bench.decode import Entrant, opening, race
+from kcgs.scene import Scene
 
 
 @pytest.fixture(scope="module")
-def scenes() -> dict[str, Scene]:
-    return {scene.contours: scene for scene in standard_scenes(quick=True)}
+def subjects() -> dict[str, Subject]:
+    return {subject.contours: subject for subject in standard_subjects(quick=True)}
 
 
-def test_standard_scenes(scenes: dict[str, Scene]) -> None:
-    assert list(scenes) == ["none", "hard", "soft"]
-    assert [can_draw(GENERIC, scene) for scene in scenes.values()] == [True, True, False]
-    full = standard_scenes(quick=False)
-    assert [scene.name for scene in full] == [f"{w} {c}" for w in ("W1", "W2") for c in ("none", "hard", "soft")]
-    assert {(scene.size, len(scene.field)) for scene in full} == {((480, 854), 1_250), ((480, 854), 7_500)}
-    assert full[1].regions is not None and full[1].regions.num_regions == 6
+def test_standard_subjects(subjects: dict[str, Subject]) -> None:
+    assert list(subjects) == ["none", "hard", "soft"]
+    assert [GENERIC in decoders_of(subject.scene) for subject in subjects.values()] == [True, True, False]
+    full = standard_subjects(quick=False)
+    assert [subject.name for subject in full] == [f"{w} {c}" for w in ("W1", "W2") for c in ("none", "hard", "soft")]
+    assert {(subject.scene.size, len(subject.scene)) for subject in full} == {((480, 854), 1_250), ((480, 854), 7_500)}
+    assert full[1].scene.regions is not None and full[1].scene.regions.num_regions == 6
 
 
 @pytest.mark.parametrize("contours", ["none", "hard", "soft"])
 @pytest.mark.parametrize("factor", [1, 2])
-def test_all_draw_the_same_picture(scenes: dict[str, Scene], tmp_path: Path, contours: str, factor: int) -> None:
-    scene = scenes[contours]
+def test_all_render_the_same_image(subjects: dict[str, Subject], tmp_path: Path, contours: str, factor: int) -> None:
+    scene = subjects[contours].scene
     size = (factor * scene.size[0], factor * scene.size[1])
     files = write_files(tmp_path / "files", scene, 1e-6)
     with torch.no_grad():
         want = RegionSplatRenderer(cutoff=1e-6)(scene.field, scene.regions, size)
     assert (truth(scene, size) - want).abs().max() < 2e-5
     assert want.std() > 0.05
-    for name in DECODERS:
-        if can_draw(name, scene):
-            picture = open_decoder(name, files, size, 1)()
-            assert picture.shape == want.shape
-            assert (picture - want).abs().max() < 1e-4, name
+    for name in decoders_of(scene):
+        image = open_and_render(name, files, size)
+        assert image.shape == want.shape
+        assert (image - want).abs().max() < 1e-4, name
 
 
 @pytest.mark.parametrize("contours", ["none", "hard", "soft"])
-def test_truth_is_that_of_the_reference(scenes: dict[str, Scene], contours: str) -> None:
-    scene = scenes[contours]
+def test_truth_is_that_of_the_reference(subjects: dict[str, Subject], contours: str) -> None:
+    scene = subjects[contours].scene
     exact = truth(scene, scene.size)
     assert exact.dtype == torch.float64
     assert (exact - truth(scene, scene.size, dense=True)).abs().max() < 1e-10
 
 
-def test_opacities_are_drawn(tmp_path: Path) -> None:
+def test_opacities_are_rendered(tmp_path: Path) -> None:
     plain = GaussianField.random(20, (32, 48), regions=torch.zeros(32, 48).long(), seed=0)
     field = GaussianField(
         plain.means, plain.cholesky, plain.colors, plain.region_ids, torch.linspace(0, 1, 20), size=plain.size
     )
-    scene = Scene("x", "made by rule", field, RegionMap.from_labels(torch.zeros(32, 48).long()))
+    scene = Scene(field, torch.zeros(32, 48).long())
     files, exact = write_files(tmp_path / "files", scene, 1e-4), truth(scene, (32, 48))
     for name in DECODERS:
-        assert (open_decoder(name, files, (32, 48), 1)() - exact).abs().max() < 1e-3
+        assert (open_and_render(name, files, (32, 48)) - exact).abs().max() < 1e-3
 
 
 def test_race_takes_turns() -> None:
-    drawn: list[tuple[str, int]] = []
+    rendered: list[tuple[str, int]] = []
 
-    def draw(name: str) -> torch.Tensor:
-        drawn.append((name, torch.get_num_threads()))
+    def render(name: str) -> torch.Tensor:
+        rendered.append((name, torch.get_num_threads()))
         return torch.zeros(())
 
-    draws = {Entrant(name, n, 1e-4): lambda name=name: draw(name) for name, n in (("a", 1), ("b", 2))}
-    seconds = race(draws, 3)
-    assert drawn == [("a", 1)] * 2 + [("b", 2)] * 2 + ([("a", 1)] * 2 + [("b", 2)] * 2) * 2
+    renders = {Entrant(name, n, 1e-4): lambda name=name: render(name) for name, n in (("a", 1), ("b", 2))}
+    seconds = race(renders, 3)
+    assert rendered == ([("a", 1)] * 2 + [("b", 2)] * 2) * 3
     assert [len(times) for times in seconds.values()] == [3, 3]
-    assert ratio([2.0, 9.0, 4.0], [1.0, 1.0, 2.0]) == 2.0
+    assert median_ratio([2.0, 9.0, 4.0], [1.0, 1.0, 2.0]) == 2.0
 
 
-def test_opening_and_memory(scenes: dict[str, Scene], tmp_path: Path) -> None:
-    small = write_files(tmp_path / "small", scenes["hard"], 1e-4)
-    took = opening(SCENE, small, (96, 128), 1)
-    assert 0 < took.load < took.first
+def test_opening_and_memory(subjects: dict[str, Subject], tmp_path: Path) -> None:
+    small = write_files(tmp_path / "small", subjects["hard"].scene, 1e-4)
+    taken = opening(SCENE, small, (96, 128), 1)
+    assert 0 < taken["load"] < taken["first image"]
     count, size = 3_000, (600, 800)
-    large = Scene("large", "made by rule", GaussianField.random(count, size, seed=0), None)
-    files = write_files(tmp_path / "large", large, 1e-4)
-    picture = 12 * size[0] * size[1] / 1e6
+    files = write_files(tmp_path / "large", Scene(GaussianField.random(count, size, seed=0)), 1e-4)
+    image = 12 * size[0] * size[1]
     ballast = torch.ones(60_000_000)  # a parent larger than the child must not hide the child's peak
-    peak = peak_memory(TILED, files, size, small)
+    job, warm_up = (open_and_render, TILED, files, size), (open_and_render, TILED, small, (48, 64))
+    peak = peak_bytes(partial, job, warm_up)
     del ballast
-    assert math.isnan(peak) or picture < peak < 2_000
+    assert math.isnan(peak) or image < peak < 2e9
 
 
 def test_fits_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "--data" in (why_not_fitted(None, False) or "") and fitted_scenes(tmp_path / "scenes", None, False) == []
-    assert "DAVIS" in (why_not_fitted(tmp_path, False) or "")
-    assert not (tmp_path / "scenes").exists()
-    (first,) = fitted_scenes(tmp_path / "scenes", None, True)
+    assert "--data" in (why_not_fitted(Options()) or "") and fitted_subjects(tmp_path, Options()) == []
+    assert "DAVIS" in (why_not_fitted(Options(data=tmp_path)) or "")
+    assert not list(tmp_path.iterdir())
+    (first,) = fitted_subjects(tmp_path, Options(quick=True))
 
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("fitted again")
 
-    monkeypatch.setattr("kcgs.bench.decode.scenes.fit", refuse)
-    (again,) = fitted_scenes(tmp_path / "scenes", None, True)
-    assert again.source == first.source and torch.equal(again.field.means, first.field.means)
-    monkeypatch.setattr("kcgs.bench.decode.scenes.QUICK_ITERATIONS", 21)
-    with pytest.raises(AssertionError, match="fitted again"):
-        fitted_scenes(tmp_path / "scenes", None, True)
+    monkeypatch.setattr("kcgs.bench.fits.fit", refuse)
+    (again,) = fitted_subjects(tmp_path, Options(quick=True))
+    assert again.source == first.source and torch.equal(again.scene.field.means, first.scene.field.means)
+    monkeypatch.setattr(_decoders, "QUICK_ITERATIONS", 19)
+    with pytest.raises(RuntimeError, match="fitted again"):
+        fitted_subjects(tmp_path, Options(quick=True))
 
 
 def test_cutoffs_are_written_as_people_do() -> None:
@@ -130,9 +135,10 @@ def test_cutoffs_are_written_as_people_do() -> None:
 
 def test_quick_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # processes of their own are another test's
-    monkeypatch.setattr("kcgs.bench.decode.experiment.peak_memory", _pretend)
+    monkeypatch.setattr("kcgs.bench.decode.peak_bytes", lambda *_: 1e6)
     run("decode", tmp_path, quick=True)
-    made = {"report.md", "results.csv", "error-against-time.png", "speed.png", "scenes"}
+    made = {"report.md", "error-against-time.png", "speed.png", "made.json", "runs"}
+    made |= {"results.csv", "scenes.csv", "left-out.csv"}
     assert {path.name for path in tmp_path.iterdir()} == made
     with (tmp_path / "results.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -150,13 +156,8 @@ def test_quick_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for words in ("onnxruntime, generic", "small soft", "soft weights: contours are hard", "kcgs bench decode"):
         assert words in report
     # the long form's tables, from the same numbers
-    kinds = {"threads": int, "cutoff": float, "value": float}
-    numbers = [Row(**{key: kinds.get(key, str)(value) for key, value in row.items()}) for row in rows]
-    (tmp_path / "long").mkdir()
-    write(tmp_path / "long", Findings(numbers, standard_scenes(quick=True), {}, "no data", False))
-    report = (tmp_path / "long" / "report.md").read_text()
-    assert "goals" in report and "(met)" in report and "Without fitted scenes: no data." in report
-
-
-def _pretend(name: str, files: Files, size: tuple[int, int], small: Files) -> float:
-    return 1.0
+    about = json.loads((tmp_path / "made.json").read_text())
+    (tmp_path / "made.json").write_text(json.dumps({**about, "quick": False, "notes": ["Without fitted scenes."]}))
+    run("decode", tmp_path, redraw=True)
+    report = (tmp_path / "report.md").read_text()
+    assert "goals" in report and "(met)" in report and "Without fitted scenes." in report

@@ -292,7 +292,7 @@ class TestFiles:
             kcgs.bench.run("fit", tmp_path, only="chart")
         with pytest.raises(ValueError, match="only asks for 'davis', but no --data"):
             run(tmp_path, only="charts,davis")
-        with pytest.raises(ValueError, match="only is for experiments with groups"):
+        with pytest.raises(ValueError, match="demo does not take only"):
             kcgs.bench.run("demo", tmp_path, only="charts")
 
 

@@ -14,8 +14,9 @@ from kcgs.cli import main
 from kcgs.data import load_image, load_labels, overlay_labels, save_image, save_labels
 from kcgs.fit.initialize import kmeans_field
 from kcgs.functional import RegionMap
-from kcgs.segment import Prediction, register
-from kcgs.segment.registry import _methods
+from kcgs.segment import Cleanup, Segmentation, register_scored
+from kcgs.segment.base import _methods
+from kcgs.segment.sources import _scored
 
 
 @pytest.fixture
@@ -64,7 +65,7 @@ class TestSegment:
     def test_options_are_json_or_text(
         self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        options = ("--option", "sigma=0.0", "--option", "num_clusters=2", "--option", "snap=0")
+        options = ("--option", "sigma=0.0", "--option", "num_colors=2", "--option", "snap=false")
         arguments = ("segment", "photo.png", "-o", "out.npy", "--method", "kmeans", *options)
         code, out, err = kcgs(*arguments, capsys=capsys, monkeypatch=monkeypatch)
         assert code == 0, err
@@ -95,12 +96,14 @@ class TestSegment:
     def test_names_and_scores(
         self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        def named(image: Tensor, *, classes: list[str]) -> Prediction:
+        def named(image: Tensor, *, classes: list[str]) -> Segmentation:
             labels = load_labels("mask.png")
-            return Prediction(labels, torch.where(labels > 0, 0.75, float("nan")), classes)
+            scores = torch.where(labels > 0, 0.75, float("nan"))
+            return Cleanup().apply(image, labels, scores, classes)
 
-        monkeypatch.setattr("kcgs.segment.registry._methods", dict(_methods))
-        register("named")(named)
+        monkeypatch.setattr("kcgs.segment.base._methods", dict(_methods))
+        monkeypatch.setattr("kcgs.segment.sources._scored", dict(_scored))
+        register_scored("named")(named)
         arguments = ("segment", "photo.png", "-o", "out.png", "--method", "named")
         arguments += ("--option", 'classes=["the wall", "a [red] door"]')
         _, out, _ = kcgs(*arguments, "--json", capsys=capsys, monkeypatch=monkeypatch)

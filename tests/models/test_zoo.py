@@ -1,4 +1,4 @@
-"""Every scene of the zoo is what its manifest says, and draws what it was fitted to."""
+"""Every scene of the zoo is what its manifest says, and renders what it was fitted to."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import pytest
 import torch
 
 import kcgs
-from kcgs.bench.zoo import PLANS, picture, run
+from kcgs.bench import run
+from kcgs.bench.zoo import PLANS, read
 from kcgs.fit import FitConfig
 from kcgs.functional import psnr
-from kcgs.io import load
-from kcgs.nn.renderer import render_image
+from kcgs.scene import load
 from kcgs.zoo import Entry, entries, find
 
 MODELS = Path(kcgs.__file__).resolve().parent.parent / "models"
@@ -37,9 +37,9 @@ def test_entry(entry: Entry) -> None:
     path = find(f"zoo:{entry.name}")
     assert path.stat().st_size == entry.bytes
     scene = load(path)
-    assert len(scene.field) == entry.num_gaussians
-    image, _ = picture(PLANS[entry.name].picture)
-    assert float(psnr(render_image(scene.field, scene.regions), image)) == pytest.approx(entry.psnr, abs=0.02)
+    assert len(scene) == entry.num_gaussians
+    image, _ = read(PLANS[entry.name].image)
+    assert float(psnr(scene.render(), image)) == pytest.approx(entry.psnr, abs=0.02)
     folder = path.parent
     FitConfig(**json.loads((folder / "recipe.json").read_text()))
     assert entry.licence in (folder / "card.md").read_text() and (folder / "preview.jpg").is_file()
@@ -55,9 +55,9 @@ def test_entry(entry: Entry) -> None:
             "view": np.array([0, 0, image.shape[2], image.shape[1]], np.float32),
             "visible": np.ones(entry.num_regions, np.float32),
         }
-        (drawn,) = session.run(None, feeds)
-        want = render_image(scene.field, scene.regions, size)
-        assert (torch.from_numpy(drawn)[0].clamp(0, 1) - want).abs().max() < 1e-3
+        (rendered,) = session.run(None, feeds)
+        want = scene.render(size)
+        assert (torch.from_numpy(rendered)[0].clamp(0, 1) - want).abs().max() < 1e-3
 
 
 class TestErrors:
@@ -85,8 +85,8 @@ class TestErrors:
 
 
 def test_zoo_can_be_made(tmp_path: Path) -> None:
-    run(tmp_path, quick=True, only="chart-2x3")
+    run("zoo", tmp_path, quick=True, only="chart-2x3")
     (made,) = entries(tmp_path)
     assert made.name == "chart-2x3" and find("chart-2x3", tmp_path).is_file()
     with pytest.raises(ValueError, match="only must name scenes"):
-        run(tmp_path, only="chart-3x2")
+        run("zoo", tmp_path, only="chart-3x2")

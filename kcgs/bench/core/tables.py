@@ -31,6 +31,15 @@ def seconds(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.2g}" if value < 10 else f"{value:.0f}"
 
 
+def number(value: float) -> str:
+    """Write a measured number with three digits, whole from a hundred on."""
+    if math.isnan(value):
+        return ""
+    if value == 0 or abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.1e}" if abs(value) < 0.01 else f"{value:.3g}"
+
+
 def count(value: float) -> str:
     """Write a whole number."""
     return "" if math.isnan(value) else f"{value:,.0f}"

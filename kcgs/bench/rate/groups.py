@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from kcgs.bench.render.timing import threads
+from kcgs.bench.core.clocks import threads
 from kcgs.bench.sizes import map_bytes
 from kcgs.codec import encode
 from kcgs.rate import compress

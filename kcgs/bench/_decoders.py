@@ -1,0 +1,199 @@
+"""What `kcgs bench decode` races: scenes, and their decoders from files on disk to a function that renders."""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcgs.data import Davis
+from kcgs.fit import FitConfig
+from kcgs.functional import RegionMap
+from kcgs.nn import GaussianField
+from kcgs.onnx import generic_decoder, scene_decoder, write_model
+from kcgs.scene import Scene, load
+from kcgs.segment import segment
+
+from ._render_runs import renderer
+from ._workloads import STANDARD, astronaut, workload
+from .core.options import Options
+from .fits import Spec, ensure
+
+SCENE, GENERIC, CPU, TILED = "onnxruntime, scene", "onnxruntime, generic", "torch, cpu", "torch, tiled"
+DECODERS = (SCENE, GENERIC, CPU, TILED)
+YARDSTICK = CPU
+# the truth: what it leaves out of a sum is far below float32's rounding
+TRUTH_CUTOFF = 1e-12
+CONTOURS = ("none", "hard", "soft")
+SOFTNESS = 0.7
+SEQUENCE = "blackswan"
+RECIPE = "best"
+QUICK_SIZE, QUICK_COUNT, QUICK_ITERATIONS = (96, 128), 60, 20
+# height, width, N
+WORKLOADS = {name: STANDARD[name] for name in ("W1", "W2")}
+
+
+class Subject(NamedTuple):
+    """A scene to decode."""
+
+    name: str
+    source: str
+    scene: Scene
+    is_fitted: bool = False
+
+    @property
+    def contours(self) -> str:
+        """none, hard or soft, as a decoder's metadata has it."""
+        regions = self.scene.regions
+        if regions is None or regions.num_regions == 1:
+            return "none"
+        return "hard" if regions.softness == 0.0 else "soft"
+
+
+class Files(NamedTuple):
+    """What decoders read, and the cutoff that they have."""
+
+    scene: Path
+    decoder: Path
+    generic: Path
+    cutoff: float
+    seconds: float
+    """That making and writing them took."""
+
+
+def standard_subjects(quick: bool) -> list[Subject]:
+    """Make the renderer benchmark's workloads, each with no regions, with hard contours and with soft ones."""
+    made = []
+    for name, numbers in {"small": (*QUICK_SIZE, QUICK_COUNT)}.items() if quick else WORKLOADS.items():
+        hard = workload(*numbers)
+        assert hard.regions is not None
+        field = hard.field
+        plain = GaussianField(field.means, field.cholesky, field.colors, size=field.size)
+        soft = Scene(field, RegionMap.from_labels(hard.regions.labels, SOFTNESS))
+        for contours, scene in zip(CONTOURS, (Scene(plain), hard, soft), strict=True):
+            made.append(Subject(f"{name} {contours}", f"workload {name} of `kcgs bench render`", scene))
+    return made
+
+
+def fitted_subjects(output: Path, options: Options) -> list[Subject]:
+    """Fit an image; fits are kept, so that the next run need not make them again."""
+    if why_not_fitted(options) is not None:
+        return []
+    counts, settings = [n for _, _, n in WORKLOADS.values()], {}
+    if options.quick or options.data is None:
+        name, image = "astronaut", astronaut()[:, ::4, ::4].contiguous()
+        labels, counts, settings = segment(image), [QUICK_COUNT], {"iterations": QUICK_ITERATIONS}
+    else:
+        name, image, labels = Davis(options.data / "DAVIS", sequences=[SEQUENCE])[SEQUENCE]
+    config = FitConfig.from_recipe(RECIPE, **settings)
+    specs = [Spec(image, labels, n, config, name=f"{name} {n}") for n in counts]
+    made = []
+    for spec, fitted in zip(specs, ensure(specs, options.runs or output / "runs"), strict=True):
+        source = f"{name} fitted by recipe {RECIPE} with {spec.num_gaussians:,} Gaussians, {fitted.psnr:.2f} dB"
+        made.append(Subject(spec.name, source, fitted.scene(), is_fitted=True))
+    return made
+
+
+def why_not_fitted(options: Options) -> str | None:
+    """Say why there are no fitted scenes; None: there are."""
+    if options.quick:
+        return None
+    if options.data is None:
+        return "no folder with images was given (--data)"
+    return None if (options.data / "DAVIS").is_dir() else "there is no folder DAVIS in the data"
+
+
+def small_scene() -> Scene:
+    """Make a scene to warm up with, 48 x 64."""
+    labels = (torch.arange(64) > 30).long().expand(48, 64)
+    return Scene(GaussianField.random(40, (48, 64), regions=labels, seed=0), labels)
+
+
+def write_files(folder: Path, scene: Scene, cutoff: float) -> Files:
+    """Write a scene and its decoders into a folder, which is made."""
+    start = time.perf_counter()
+    folder.mkdir(parents=True)
+    paths = folder / "scene.safetensors", folder / "scene.onnx", folder / "generic.onnx"
+    scene.save(paths[0])
+    write_model(scene_decoder(scene.field, scene.regions, cutoff=cutoff), paths[1])
+    write_model(generic_decoder(cutoff=cutoff), paths[2])
+    return Files(*paths, cutoff, time.perf_counter() - start)
+
+
+def decoders_of(scene: Scene) -> list[str]:
+    """List the decoders that render this scene: the generic one has hard contours only, one label per pixel."""
+    regions = scene.regions
+    is_plain = regions is None or (regions.softness == 0.0 and regions.supersample == 1)
+    return [name for name in DECODERS if name != GENERIC or is_plain]
+
+
+def open_decoder(name: str, files: Files, size: tuple[int, int], threads: int) -> Callable[[], Tensor]:
+    """Read the files and return what renders (C, H, W) at that size.
+
+    Args:
+        name: among `DECODERS`.
+        files: of the scene.
+        size: (height, width).
+        threads: of onnxruntime; torch renders on as many as it is told to use.
+    """
+    if name == SCENE:
+        return _session(files.decoder, {"size": np.array(size, np.int64)}, threads)
+    placed = _resized(load(files.scene), size)
+    if name == GENERIC:
+        return _session(files.generic, _generic_feeds(placed), threads)
+    return lambda: _splat(placed, {CPU: "cpu", TILED: "tiled"}[name], files.cutoff)
+
+
+def open_and_render(name: str, files: Files, size: tuple[int, int]) -> Tensor:
+    """Open a decoder and render one image, on one thread."""
+    return open_decoder(name, files, size, 1)()
+
+
+def truth(scene: Scene, size: tuple[int, int], *, dense: bool = False) -> Tensor:
+    """Render in float64: tile by tile at a cutoff next to nothing, or the whole dense sum of the reference."""
+    exact = _resized(copy.deepcopy(scene).double(), size)
+    return _splat(exact, "reference", 0.0) if dense else _splat(exact, "tiled", TRUTH_CUTOFF)
+
+
+def _resized(scene: Scene, size: tuple[int, int]) -> Scene:
+    """Scale the Gaussians and sample the map anew: once, for all images of that size."""
+    field, regions = scene.field, scene.regions
+    down, across = size[0] / field.size[0], size[1] / field.size[1]
+    means, cholesky, colors = (t.detach() for t in (field.means, field.cholesky, field.merged_colors()))
+    means = means * means.new_tensor([across, down])
+    cholesky = cholesky * cholesky.new_tensor([across, down, down])
+    region_ids = None if regions is None else field.region_ids
+    placed = GaussianField(means, cholesky, colors, region_ids, size=size)
+    return Scene(placed, None if regions is None else regions.resize(size))
+
+
+def _splat(scene: Scene, backend: str, cutoff: float) -> Tensor:
+    with torch.inference_mode():
+        return renderer(backend)(scene, cutoff)
+
+
+def _session(path: Path, feeds: dict[str, Any], threads: int) -> Callable[[], Tensor]:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    # idle threads would go on spinning while the next decoder is timed
+    options.add_session_config_entry("session.force_spinning_stop", "1")
+    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    return lambda: torch.from_numpy(session.run(["image"], feeds)[0])[0]
+
+
+def _generic_feeds(scene: Scene) -> dict[str, Any]:
+    field = scene.field
+    labels, region_ids = torch.zeros(field.size, dtype=torch.int64), torch.zeros(len(field), dtype=torch.int64)
+    if scene.regions is not None and field.region_ids is not None:
+        labels, region_ids = scene.regions.labels, field.region_ids
+    tensors = {"means": field.means, "cholesky": field.cholesky, "colors": field.colors}
+    tensors |= {"region_ids": region_ids, "labels": labels}
+    return {name: tensor.detach().numpy() for name, tensor in tensors.items()}

@@ -1,0 +1,72 @@
+"""Scenes made by rule, so that anybody can render the same."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from kcgs.functional import RegionMap, lookup_regions, scale_rotation_to_cholesky
+from kcgs.nn import GaussianField
+from kcgs.scene import Scene
+
+# mean number of Gaussians whose 3-sigma ellipse holds a pixel
+COVERAGE = 12.0
+NEEDLES_SIZE = (96, 128)
+# height, width, N
+STANDARD = {
+    "W3": (200, 300, 20),
+    "W1": (480, 854, 1_250),
+    "W2": (480, 854, 7_500),
+    "W4": (2160, 3840, 50_000),
+}
+
+
+def workload(height: int, width: int, count: int, *, spread: float | None = None) -> Scene:
+    """Scatter `count` Gaussians of random shape over six regions with hard contours: five blocks and a disc.
+
+    Args:
+        height: pixels.
+        width: pixels.
+        count: N.
+        spread: standard deviation in pixels; None: such that the mean coverage is 12.
+    """
+    generator = torch.Generator().manual_seed(0)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    sigma = math.sqrt(height * width * COVERAGE / (count * 9 * math.pi)) if spread is None else spread
+    means = uniform(count, 2) * torch.tensor([width, height])
+    slant = 0.3 * torch.randn(count, generator=generator)
+    cholesky = sigma * torch.stack([0.5 + uniform(count), slant, 0.5 + uniform(count)], -1)
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    blocks = (x * 3 // width + 3 * (y * 2 // height)) % 5
+    disc = (x - width / 2) ** 2 + (y - height / 2) ** 2 < (height / 4) ** 2
+    labels = torch.where(disc, 5, blocks)
+    region_ids = lookup_regions(means, labels)
+    field = GaussianField(means, cholesky, uniform(count, 3), region_ids, size=(height, width))
+    return Scene(field, RegionMap.from_labels(labels))
+
+
+def standard(name: str) -> Scene:
+    """Make one of the standard workloads."""
+    return workload(*STANDARD[name])
+
+
+def needles(sigma: float, anisotropy: float, count: int = 37) -> Scene:
+    """Make Gaussians of one shape turned from 0 to pi, the singular angles among them; float32."""
+    angle = torch.linspace(0, math.pi, count, dtype=torch.float64)
+    scales = torch.tensor([sigma * anisotropy, sigma], dtype=torch.float64).expand(count, 2)
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(count, 2, generator=generator) * torch.tensor([NEEDLES_SIZE[1], NEEDLES_SIZE[0]])
+    cholesky = scale_rotation_to_cholesky(scales, angle).float()
+    return Scene(GaussianField(means, cholesky, torch.ones(count, 1), size=NEEDLES_SIZE))
+
+
+def astronaut() -> Tensor:
+    """Return scikit-image's photo."""
+    from skimage import data as photos
+
+    return torch.from_numpy(photos.astronaut()).permute(2, 0, 1).float() / 255

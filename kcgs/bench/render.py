@@ -1,0 +1,222 @@
+"""How fast and how exactly each backend renders: `kcgs bench render`."""
+
+from __future__ import annotations
+
+import copy
+import statistics
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcgs.kernels.cpu import kernel
+from kcgs.nn import RegionSplatRenderer
+
+from ._render_report import EXPONENT, SIGMAS, Row, report
+from ._render_runs import (
+    MOST_PAIRS,
+    PEERS,
+    Timing,
+    backends,
+    evaluated_pairs,
+    held_pairs,
+    images_per_second,
+    kernel_inputs,
+    limit_seconds,
+    once,
+    prepare,
+    probe_of,
+    renderer,
+    timed,
+)
+from ._workloads import needles, standard, workload
+from .core.clocks import clock, in_turns, median_ratio, peak_bytes, threads
+from .core.jobs import with_progress
+from .core.options import Options
+from .core.registry import experiment
+from .core.report import Made, conclude
+from .core.rows import write_rows
+
+CUTOFFS = (1 / 255, 1e-3, 1e-4, 1e-6, 0.0)
+DEFAULT_CUTOFF = 1e-4
+SPEED_CUTOFFS = (1 / 255, DEFAULT_CUTOFF)
+# the dense reference is timed where it takes seconds
+DENSE = ("W3",)
+ANISOTROPIES = (1.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
+
+
+@experiment(report=report)
+def run(output: Path, options: Options) -> None:
+    """Measure speed, memory, error against run time, growth and stiffness."""
+    quick = options.quick
+    rounds = 1 if quick else 5
+    names = ("W3",) if quick else ("W3", "W1", "W2", "W4")
+    steps: list[tuple[str, Callable[[], list[Row]]]] = [
+        # first, since peers leave a gigabyte of memory in pieces behind them
+        *((f"kernel and limit {name}", partial(_beside_limit, name, 3 * rounds)) for name in names),
+        *((f"speed {name}", partial(_speed, name, rounds)) for name in names),
+        *((f"overhead {name}", partial(_overhead, name, 4 * rounds)) for name in names[:2]),
+        *((f"memory {name}", partial(_memory, name)) for name in (names if quick else ("W1", "W2", "W4"))),
+        ("error against run time", partial(_errors, "W3" if quick else "W1", rounds)),
+        ("growth", partial(_growth, rounds, quick)),
+        ("stiffness", _stiffness),
+    ]
+    rows = [row for step in with_progress(steps) for row in step()]
+    write_rows(output / "results.csv", Row, rows)
+    conclude(report, output, Made(options.command("render"), quick))
+
+
+def _case(name: str, cutoff: float) -> str:
+    return f"{name} cutoff {cutoff:.2g}"
+
+
+def _timing_rows(case: str, backend: str, count: int, timings: list[Timing]) -> list[Row]:
+    medians = {q: 1e3 * statistics.median(getattr(t, q) for t in timings) for q in ("forward", "backward", "sum")}
+    return [Row("speed", case, backend, count, quantity, value, "ms") for quantity, value in medians.items()]
+
+
+def _beside_limit(name: str, rounds: int) -> list[Row]:
+    """Time the CPU kernel and the limit in turns, on one thread and on two."""
+    scene, rows = standard(name), []
+    for cutoff in SPEED_CUTOFFS:
+        pairs, case = evaluated_pairs(scene, cutoff), _case(name, cutoff)
+
+        def limit(count: int, pairs: int = pairs) -> Timing:
+            return Timing(*(limit_seconds(pairs, backward=kind, threads=count) for kind in (False, True)))
+
+        def splat(count: int, cutoff: float = cutoff) -> Timing:
+            with threads(count):
+                return once(renderer("cpu"), scene, cutoff)[0]
+
+        pace = {"limit": limit, "cpu": splat}
+        actions = {(who, n): partial(time_it, n) for n in (1, 2) for who, time_it in pace.items()}
+        timings = {key: values[1:] for key, values in in_turns(actions, rounds + 1).items()}
+        sums = {key: [timing.sum for timing in values] for key, values in timings.items()}
+        rows.append(Row("limit", case, "limit", 1, "pairs", pairs / 1e6, "M"))
+        for (who, n), values in timings.items():
+            rows += _timing_rows(case, who, n, values)
+        share = median_ratio(sums["limit", 1], sums["cpu", 1])
+        rows.append(Row("limit", case, "cpu", 1, "share", share, "1"))
+        gains = {who: median_ratio(sums[who, 1], sums[who, 2]) for who in pace}
+        rows += [Row("limit", case, who, 2, "gain", gain, "1") for who, gain in gains.items()]
+        rows.append(Row("limit", case, "cpu", 2, "images", images_per_second(scene, cutoff, rounds), "1/s"))
+    return rows
+
+
+def _speed(name: str, rounds: int) -> list[Row]:
+    scene, rows = standard(name), []
+    for cutoff in SPEED_CUTOFFS:
+        names = [*(b for b in backends() if b != "cpu"), *(["reference"] if name in DENSE else [])]
+        names += [peer for peer in PEERS if held_pairs(peer, scene, cutoff) <= MOST_PAIRS]
+        for backend in names:
+            for count in (1,) if backend in PEERS else (1, 2):
+                with threads(count):
+                    timings = timed(backend, scene, cutoff, rounds)
+                rows += _timing_rows(_case(name, cutoff), backend, count, timings)
+    return rows
+
+
+def _overhead(name: str, rounds: int) -> list[Row]:
+    """Time the CPU kernel alone, and through the module and autograd, forward and backward."""
+    scene = standard(name)
+    inputs, probe = kernel_inputs(scene, DEFAULT_CUTOFF), probe_of(scene.size, 3, torch.float32)
+    render = RegionSplatRenderer(cutoff=DEFAULT_CUTOFF, backend="cpu")
+
+    def alone() -> None:
+        planned = kernel.plan(inputs)
+        kernel.render(planned, inputs)
+        kernel.differentiate(planned, inputs, probe[None], geometry=True)
+
+    def whole() -> None:
+        scene.zero_grad(set_to_none=True)
+        render(scene).backward(probe)
+
+    actions = {"kernel alone": partial(clock, alone), "module and autograd": partial(clock, whole)}
+    with threads(1):
+        seconds = in_turns(actions, rounds + 1)
+    medians = {quantity: 1e3 * statistics.median(values[1:]) for quantity, values in seconds.items()}
+    return [Row("overhead", name, "cpu", 1, quantity, value, "ms") for quantity, value in medians.items()]
+
+
+def _memory(name: str) -> list[Row]:
+    scene, rows = standard(name), []
+    for backend in ("cpu", "tiled", *PEERS):
+        if backend not in PEERS or held_pairs(backend, scene, DEFAULT_CUTOFF) <= MOST_PAIRS:
+            peak = peak_bytes(prepare, (backend, name, DEFAULT_CUTOFF), (backend, "W3", DEFAULT_CUTOFF))
+            rows.append(Row("memory", name, backend, 1, "peak", peak / 2**20, "MiB"))
+    return rows
+
+
+def _errors(name: str, rounds: int) -> list[Row]:
+    scene, rows = standard(name), []
+    _, want, want_gradients = once(renderer("reference"), copy.deepcopy(scene).double(), 0.0)
+    for backend in backends():
+        for cutoff in CUTOFFS:
+            with threads(1):
+                timings = timed(backend, scene, cutoff, rounds)
+                _, image, gradients = once(renderer(backend), scene, cutoff)
+            error = (image - want).abs()
+            pairs = list(zip(gradients, want_gradients, strict=True))
+            row = partial(Row, "error", _case(name, cutoff), backend, 1)
+            rows += [
+                row("sum", 1e3 * statistics.median(t.sum for t in timings), "ms"),
+                row("image max", float(error.max()), "1"),
+                row("image rms", _rms(error), "1"),
+                row("gradient max", max(_largest(g - w) / _largest(w) for g, w in pairs), "relative to the largest"),
+                row("gradient rms", max(_rms(g - w) / _rms(w) for g, w in pairs), "relative to the rms"),
+            ]
+    return rows
+
+
+def _largest(values: Tensor) -> float:
+    return float(values.abs().max())
+
+
+def _rms(values: Tensor) -> float:
+    return float(values.square().mean().sqrt())
+
+
+def _growth(rounds: int, quick: bool) -> list[Row]:
+    counts = (100, 400) if quick else (100, 400, 1_600, 6_400, 25_600)
+    heights = (60, 120) if quick else (120, 240, 480, 960, 1_920)
+    sizes = [(h, h * 16 // 9) for h in heights]
+    grown = {
+        "Gaussians": {f"N = {n}": workload(480, 854, n, spread=8.0) for n in counts},
+        "pixels": {f"{h} x {w}": workload(h, w, max(1, h * h // 300)) for h, w in sizes},
+    }
+    rows = []
+    for axis, scenes in grown.items():
+        pairs = [evaluated_pairs(scene, DEFAULT_CUTOFF) for scene in scenes.values()]
+        for backend in backends():
+            seconds = []
+            for name, scene, count in zip(scenes, scenes.values(), pairs, strict=True):
+                with threads(1):
+                    seconds.append(statistics.median(t.sum for t in timed(backend, scene, DEFAULT_CUTOFF, rounds)))
+                row = partial(Row, "growth", f"{axis}: {name}", backend, 1)
+                rows += [row("pairs", count / 1e6, "M"), row("sum", 1e3 * seconds[-1], "ms")]
+            slope = float(np.polyfit(np.log(pairs), np.log(seconds), 1)[0])
+            rows.append(Row("growth", axis, backend, 1, EXPONENT, slope, "1"))
+    return rows
+
+
+def _stiffness() -> list[Row]:
+    """Hold needles turned through all angles against float64."""
+    rows = []
+    for sigma in SIGMAS:
+        for anisotropy in ANISOTROPIES:
+            scene = needles(sigma, anisotropy)
+            _, want, want_gradients = once(renderer("reference"), copy.deepcopy(scene).double(), 0.0)
+            for backend in [*backends(), "reference"]:
+                _, image, gradients = once(renderer(backend), scene, 0.0)
+                worst = max(_by_component(g, w) for g, w in zip(gradients, want_gradients, strict=True))
+                row = partial(Row, "stiffness", f"sigma {sigma:g} anisotropy {anisotropy:g}", backend, 1)
+                rows += [row("image", _largest(image - want), "1"), row("gradient", worst, "relative to the largest")]
+    return rows
+
+
+def _by_component(got: Tensor, want: Tensor) -> float:
+    # a needle's two directions differ by its anisotropy
+    return float(((got - want).abs() / want.abs().amax(0).clamp_min(1e-12)).max())

@@ -1,1 +1,0 @@
-"""Gaussians as whole numbers in layers."""
