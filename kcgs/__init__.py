@@ -1,5 +1,6 @@
 """kcgs: contour-aware 2D Gaussian splatting of images, as differentiable torch modules."""
 
+from .evaluate import evaluate
 from .fit import FitConfig, FitResult, fit
 from .functional import RegionMap
 from .nn import GaussianField, RegionSplatRenderer
@@ -15,6 +16,7 @@ __all__ = [
     "RegionSplatRenderer",
     "Scene",
     "__version__",
+    "evaluate",
     "fit",
     "load",
     "save",

@@ -105,9 +105,9 @@ def check_cutoff(value: object) -> float:
     return float(value)
 
 
-def check_labels(name: str, value: object) -> Tensor:
+def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3)) -> Tensor:
     """Return a label map as int64: integer, (H, W) or (B, H, W), at least one pixel, no negative id."""
-    tensor = check_integer(name, value, dims=(2, 3))
+    tensor = check_integer(name, value, dims=dims)
     if tensor.numel() == 0:
         raise ValueError(f"{name} must have at least one pixel; got shape {tuple(tensor.shape)}")
     tensor = tensor.long()
@@ -137,11 +137,12 @@ def check_image(name: str, value: object) -> Tensor:
     return tensor
 
 
-def as_image(name: str, value: object) -> Tensor:
+def as_image(name: str, value: object, tolerance: float = 0.0) -> Tensor:
     """Return an image as one tensor (C, H, W) in [0, 1]: what a Tensor, an array or a PIL image shows.
 
     Taken are a Tensor (C, H, W) or (1, C, H, W), a numpy array (H, W, C) or (H, W) of uint8, uint16 or floats in [0,
     1], and a PIL image, whose palette is resolved and whose transparent pixels are composed on white.
+    Values may pass [0, 1] by `tolerance`.
     """
     if isinstance(value, np.ndarray):
         image = _from_array(name, value)
@@ -156,8 +157,8 @@ def as_image(name: str, value: object) -> Tensor:
             raise ValueError(f"{name} must be one image, (C, H, W) or (1, C, H, W); got {tuple(image.shape)}")
         image = image[0]
     check_image(name, image)
-    low, high = float(image.min()), float(image.max())
-    if low < 0 or high > 1:
+    low, high = float(image.detach().min()), float(image.detach().max())
+    if low < -tolerance or high > 1 + tolerance:
         raise ValueError(f"{name} must be in [0, 1]; got [{low:g}, {high:g}]")
     return image
 

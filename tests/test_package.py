@@ -28,7 +28,17 @@ LAYERS = [
 
 
 def test_public_names() -> None:
-    for name in ("GaussianField", "RegionSplatRenderer", "RegionMap", "FitConfig", "fit", "load", "save"):
+    for name in (
+        "GaussianField",
+        "RegionSplatRenderer",
+        "RegionMap",
+        "FitConfig",
+        "Scene",
+        "evaluate",
+        "fit",
+        "load",
+        "save",
+    ):
         assert name in kcgs.__all__
         assert hasattr(kcgs, name)
     for name in ("region_splat", "edge_band", "psnr", "ssim", "ms_ssim", "ef_psnr", "ef_ssim"):

@@ -1,6 +1,7 @@
-"""The compressed file `.kcgs`."""
+"""The compressed file `.kcgs`; docs/format.md specifies it."""
 
+from .decode import Decoded, decode, deserialize
+from .encode import DEFAULT_QUALITY, QUALITIES, encode, serialize
 from .errors import CodecError
-from .scene import DEFAULT_QUALITY, QUALITIES, Decoded, decode, deserialize, encode, serialize
 
 __all__ = ["DEFAULT_QUALITY", "QUALITIES", "CodecError", "Decoded", "decode", "deserialize", "encode", "serialize"]

@@ -6,21 +6,15 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs.codec.maps import encode_map
-from kcgs.codec.quantize import NOISE_CODES, Quantizer
-from kcgs.codec.scene import (
-    DEFAULT_QUALITY,
-    QUALITIES,
-    check_scene,
-    decode,
-    encode_codes,
-    finest,
-    noise_code_for,
-    numbers,
-)
+from kcgs._check import check_count
+from kcgs.codec import QUALITIES, decode
+from kcgs.codec.encode import SceneWriter
+from kcgs.codec.gaussians.quantize import QPS, Parameters, Quantizer
 from kcgs.fit.config import FitConfig
 from kcgs.fit.loop import check_problem, fit
 from kcgs.fit.monitor import FitResult, HistoryEntry
@@ -29,9 +23,9 @@ from kcgs.nn import GaussianField
 
 from .fine_tune import FineTuning
 
-# a Gaussian whose whole energy is below this many times the noise costs more bits than it saves: at the best rate a
-# bit saves 2 ln 2 D for each number, and a Gaussian has about 30
-_WORTH = 20.0
+# a Gaussian whose whole energy is below this many times the distortion costs more bits than it saves: at the best rate
+# a bit saves 2 ln 2 D for each number, and a Gaussian has about 30
+_PAYING = 20.0
 # bits of a Gaussian where rounding costs half a dB, at `_COUNT` of them, and for each doubling
 _BITS, _COUNT, _BITS_AN_OCTAVE = 31.0, 2100, 1.9
 _HEADER_BYTES = 60
@@ -97,28 +91,24 @@ def compress(
         >>> len(compress(field, image, target_bytes=150)) <= 150
         True
     """
-    regions, ids = check_scene(field, regions)
+    writer = SceneWriter(field, regions)
     image = _check_image(image, field)
-    if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
-        raise ValueError(f"iterations must be an integer of at least 1; got {iterations!r}")
-    if quality is not None and target_bytes is not None:
-        raise ValueError(f"quality and target_bytes exclude each other; got {quality!r} and {target_bytes!r}")
-    region_map = None if regions is None else encode_map(regions)
+    check_count("iterations", iterations)
 
-    def begin(code: int) -> tuple[FineTuning, torch.Tensor]:
-        quantizer = Quantizer(code, field.size)
-        kept = _worth(field, quantizer)
-        return FineTuning(field.subset(kept), image, regions, quantizer, seed), kept
+    def write(qp: int, steps: int) -> bytes:
+        quantizer = Quantizer(qp, writer.size)
+        kept = _pays(writer.gaussians, quantizer)
+        gaussians = Parameters(*(numbers[kept] for numbers in writer.gaussians))
+        ids = None if field.region_ids is None else field.region_ids.cpu()[torch.from_numpy(kept)]
+        tuning = FineTuning(gaussians, ids, image, writer.regions, quantizer, seed)
+        return writer.write(quantizer, tuning.run(steps), writer.ids[kept])
 
-    def write(tuning: FineTuning, kept: Tensor, steps: int) -> bytes:
-        return encode_codes(tuning.quantizer, tuning.run(steps), ids[kept.numpy()], regions, region_map)
-
+    qp = writer.qp_for(quality, target_bytes)
     if target_bytes is None:
-        code = noise_code_for(DEFAULT_QUALITY if quality is None else quality, field)
-        return write(*begin(code), iterations)
-    highest, plain = finest(lambda code: write(*begin(code), 0), target_bytes, field, share=_SLACK)
-    for code in range(highest, NOISE_CODES[0] - 1, -1):
-        data = write(*begin(code), iterations)
+        return write(qp, iterations)
+    highest, plain = writer.finest(lambda qp: write(qp, 0), target_bytes, share=_SLACK)
+    for qp in range(highest, QPS[0] - 1, -1):
+        data = write(qp, iterations)
         if len(data) <= target_bytes:
             return data
     return plain
@@ -165,10 +155,7 @@ def fit_bytes(
     """
     config = FitConfig.from_recipe(recipe) if config is None else config
     image, regions = check_problem(image, regions)
-    if isinstance(target_bytes, bool) or not isinstance(target_bytes, int):
-        raise TypeError(f"target_bytes must be an integer; got {target_bytes!r}")
-    if target_bytes < 1:
-        raise ValueError(f"target_bytes must be at least 1; got {target_bytes}")
+    check_count("target_bytes", target_bytes)
     regions, price = _choose(image, regions, target_bytes, config, seed)
     count = count_for(target_bytes - _map_bytes(regions))
     config = config.model_copy(update={"contour_cost": price})
@@ -235,17 +222,21 @@ def _contour_bits(regions: RegionMap) -> float:
 
 
 def _map_bytes(regions: RegionMap | None) -> int:
-    return 0 if regions is None or regions.num_regions == 1 else len(encode_map(regions))
+    if regions is None or regions.num_regions == 1:
+        return 0
+    from kcgs.codec.labels import encode_map  # loads numba
+
+    return len(encode_map(regions))
 
 
-def _worth(field: GaussianField, quantizer: Quantizer) -> Tensor:
+def _pays(gaussians: Parameters, quantizer: Quantizer) -> NDArray[np.bool_]:
     """Say which Gaussians pay for their bits; one at least."""
-    _, cholesky, colors = (torch.from_numpy(t) for t in numbers(field))
-    area = (math.pi * cholesky[:, 0] * cholesky[:, 2]).clamp_max(field.size[0] * field.size[1])
+    _, cholesky, colors = (torch.from_numpy(numbers) for numbers in gaussians)
+    area = (math.pi * cholesky[:, 0] * cholesky[:, 2]).clamp_max(quantizer.size[0] * quantizer.size[1])
     energy = colors.square().sum(-1) * area
-    kept = energy >= _WORTH * quantizer.noise
+    kept = energy >= _PAYING * quantizer.distortion
     kept[energy.argmax()] = True
-    return kept
+    return kept.numpy()
 
 
 def _check_image(image: Tensor, field: GaussianField) -> Tensor:

@@ -2,7 +2,7 @@ r"""Rounding that the rest makes up for.
 
 Gaussians overlap, so what rounding one of them does to the picture its neighbours can partly undo, as long as they may
 still move. So they are rounded a few at a time, shapes first and colours last, and those that are still free descend
-meanwhile. A step is a gradient divided by the known curvature of the squared error (:mod:`kcgs.codec.quantize`), with
+meanwhile. A step is a gradient divided by the known curvature of the squared error (docs/format.md), with
 momentum; there is nothing to adapt.
 """
 
@@ -13,10 +13,8 @@ import math
 import torch
 from torch import Tensor
 
-from kcgs.codec.quantize import Codes, Quantizer
-from kcgs.codec.scene import numbers
+from kcgs.codec.gaussians.quantize import Codes, Parameters, Quantizer
 from kcgs.functional import RegionMap, region_splat
-from kcgs.nn import GaussianField
 
 # share of the iterations in which shapes are rounded; colours are in the rest
 _SHAPES = 0.65
@@ -32,24 +30,30 @@ class FineTuning:
     """Gaussians on their way to whole numbers.
 
     Args:
-        field: Gaussians of one image.
+        gaussians: in float64.
+        region_ids: their regions.
         image: (C, H, W) that they are to show.
-        regions: the map to draw with.
+        regions: the map to render with.
         quantizer: says what they may be rounded to.
         seed: of the order in which they are rounded.
     """
 
     def __init__(
-        self, field: GaussianField, image: Tensor, regions: RegionMap | None, quantizer: Quantizer, seed: int = 0
+        self,
+        gaussians: Parameters,
+        region_ids: Tensor | None,
+        image: Tensor,
+        regions: RegionMap | None,
+        quantizer: Quantizer,
+        seed: int = 0,
     ) -> None:
-        self.image, self.regions, self.quantizer, self.size = image, regions, quantizer, field.size
-        self.ids = None if field.region_ids is None else field.region_ids.to(image.device)
-        means, cholesky, colors = numbers(field)
-        self.classes = quantizer.classify(cholesky, colors)
-        self.free = [torch.from_numpy(t).to(image) for t in (means, cholesky, colors)]
+        self.region_ids, self.image, self.regions, self.quantizer = region_ids, image, regions, quantizer
+        self.classes = quantizer.classify(gaussians)
+        self.free = [torch.from_numpy(numbers).to(image) for numbers in gaussians]
+        count, channels = gaussians.colors.shape
         generator = torch.Generator().manual_seed(seed)
-        self.turn = torch.rand(2, len(field), generator=generator).to(image)
-        self.speed = torch.zeros(len(field), 5 + colors.shape[1]).to(image)
+        self.turn = torch.rand(2, count, generator=generator).to(image)
+        self.speed = torch.zeros(count, 5 + channels).to(image)
 
     def run(self, iterations: int) -> Codes:
         """Round everything in so many iterations, and return the whole numbers."""
@@ -62,8 +66,8 @@ class FineTuning:
 
     def codes(self) -> Codes:
         """Return what the Gaussians round to now."""
-        means, cholesky, colors = (t.double().numpy() for t in self.free)
-        return self.quantizer.quantize(means, cholesky, colors, self.classes)
+        gaussians = Parameters(*(numbers.double().numpy() for numbers in self.free))
+        return self.quantizer.quantize(gaussians, self.classes)
 
     def _step(self, shaped: Tensor, colored: Tensor) -> None:
         rounded = [torch.from_numpy(t).to(self.image) for t in self.quantizer.restore(self.codes())]
@@ -88,12 +92,12 @@ class FineTuning:
         """Return Newton's steps of each number alone: of centre and factor in the Gaussian's frame, of colours."""
         leaves = [t.detach().requires_grad_() for t in (means, cholesky, colors)]
         x, factors, c = leaves
-        picture = region_splat(x, factors, c, self.ids, self.regions, size=self.size, cutoff=_DRAFT_CUTOFF)
-        picture.backward(picture.detach() - self.image)
+        size = self.quantizer.size
+        render = region_splat(x, factors, c, self.region_ids, self.regions, size=size, cutoff=_DRAFT_CUTOFF)
+        render.backward(render.detach() - self.image)
         (gx, gy), (g11, g21, g22) = self._gradient(x).unbind(-1), self._gradient(factors).unbind(-1)
         l11, l21, l22 = cholesky.unbind(-1)
-        height, width = self.size
-        area = (math.pi * l11 * l22).clamp_max(height * width)
+        area = (math.pi * l11 * l22).clamp_max(size[0] * size[1])
         energy = (colors.square().sum(-1) * area).clamp_min(_FAINT)
         # half the second derivatives of the squared error, as the gradient is half the first
         frame = [

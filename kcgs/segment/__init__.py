@@ -1,23 +1,31 @@
 """Where label maps come from."""
 
-from kcgs.segment.base import Segmenter, available_methods, register, segment
-from kcgs.segment.classical import auto, felzenszwalb, slic
-from kcgs.segment.cleanup import absorb_specks, connected_regions, merge_similar, order_by_area
-from kcgs.segment.contours import snap_contours
-from kcgs.segment.edges import watershed
-from kcgs.segment.kmeans import kmeans
-from kcgs.segment.mask_files import davis, file
-from kcgs.segment.mask_models import sam
-from kcgs.segment.onnx_model import lseg, onnx
-from kcgs.segment.patch_features import dino
-from kcgs.segment.sources import Cleanup, Segmentation, register_scored, segment_with_scores
-from kcgs.segment.text_prompts import text
+from kcgs.segment.cleanup import connected_regions, merge_similar, merge_small, order_by_area
+from kcgs.segment.methods.classical import auto, felzenszwalb, slic
+from kcgs.segment.methods.edges import watershed
+from kcgs.segment.methods.kmeans import kmeans
+from kcgs.segment.methods.mask_files import davis, file
+from kcgs.segment.methods.onnx_networks import lseg, onnx
+from kcgs.segment.methods.patch_features import dino
+from kcgs.segment.methods.segment_anything import sam
+from kcgs.segment.methods.text_prompts import text
+from kcgs.segment.registry import (
+    Cleanup,
+    Prediction,
+    Segmentation,
+    Segmenter,
+    available_methods,
+    register,
+    segment,
+    segment_with_scores,
+)
+from kcgs.segment.snapping import snap_contours
 
 __all__ = [
     "Cleanup",
+    "Prediction",
     "Segmentation",
     "Segmenter",
-    "absorb_specks",
     "auto",
     "available_methods",
     "connected_regions",
@@ -28,10 +36,10 @@ __all__ = [
     "kmeans",
     "lseg",
     "merge_similar",
+    "merge_small",
     "onnx",
     "order_by_area",
     "register",
-    "register_scored",
     "sam",
     "segment",
     "segment_with_scores",

@@ -1,15 +1,19 @@
 """Turning raw label maps into few, clean, connected regions."""
 
 import heapq
-import math
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import check_integer
-from kcgs.segment.base import check_segment_image
+from kcgs._check import as_image, check_count, check_labels
+from kcgs.functional import contour_edges
+from kcgs.functional.labels import compact
+
+# By how much values may pass [0, 1], as resizing and colour conversion leave them.
+_TOLERANCE = 1e-3
 
 Labels = NDArray[np.int64]
 Colors = NDArray[np.float64]
@@ -32,7 +36,7 @@ def connected_regions(labels: Tensor) -> Tensor:
         >>> connected_regions(torch.tensor([[5, 2, 5], [5, 2, 2]])).tolist()
         [[0, 1, 2], [0, 1, 1]]
     """
-    return torch.from_numpy(components(to_array(labels))).to(labels.device)
+    return torch.from_numpy(_components(to_regions(labels)[1])).to(labels.device)
 
 
 def order_by_area(labels: Tensor) -> Tensor:
@@ -52,7 +56,7 @@ def order_by_area(labels: Tensor) -> Tensor:
         >>> order_by_area(torch.tensor([[9, 4, 4], [9, 4, 7]])).tolist()
         [[1, 0, 0], [1, 0, 2]]
     """
-    _, regions = compact(to_array(labels))
+    _, regions = to_regions(labels)
     areas = np.bincount(regions.ravel())
     first = np.empty_like(areas)
     first[regions.ravel()[::-1]] = np.arange(regions.size)[::-1]  # Of repeated indices the last one counts.
@@ -61,11 +65,11 @@ def order_by_area(labels: Tensor) -> Tensor:
     return torch.from_numpy(rank[regions]).to(labels.device)
 
 
-def absorb_specks(labels: Tensor, min_size: int) -> Tensor:
+def merge_small(labels: Tensor, min_size: int) -> Tensor:
     """Give every 4-connected piece under ``min_size`` pixels to the neighbour it has most border with.
 
-    The smallest piece goes first, and a piece that grew to ``min_size`` by what it took in stays. Of
-    neighbours with equal borders the larger takes it, then the one whose first pixel comes earlier.
+    The smallest piece goes first, and a piece that reaches ``min_size`` by merging stays. Of neighbours with equal
+    borders the larger takes it, then the one whose first pixel comes earlier.
 
     Args:
         labels: :math:`(H, W)` integer, any non-negative ids.
@@ -76,16 +80,15 @@ def absorb_specks(labels: Tensor, min_size: int) -> Tensor:
 
     Raises:
         TypeError: ``labels`` is no integer tensor or ``min_size`` no integer.
-        ValueError: ``labels`` is not two-dimensional, is empty or has negative ids, or ``min_size`` is below
-            1.
+        ValueError: ``labels`` is not two-dimensional, is empty or has negative ids, or ``min_size`` is below 1.
 
     Example:
-        >>> absorb_specks(torch.tensor([[3, 3, 3, 8], [3, 1, 3, 8]]), min_size=2).tolist()
+        >>> merge_small(torch.tensor([[3, 3, 3, 8], [3, 1, 3, 8]]), min_size=2).tolist()
         [[3, 3, 3, 8], [3, 3, 3, 8]]
     """
-    values = to_array(labels)
+    ids, regions = to_regions(labels)
     check_count("min_size", min_size)
-    pieces = components(values)
+    pieces = _components(regions)
     graph = RegionGraph(pieces)
     queue = [(int(area), piece) for piece, area in enumerate(graph.areas) if area < min_size]
     heapq.heapify(queue)
@@ -98,12 +101,12 @@ def absorb_specks(labels: Tensor, min_size: int) -> Tensor:
         graph.merge(piece, target)
         if graph.areas[target] < min_size:
             heapq.heappush(queue, (int(graph.areas[target]), target))
-    ids = np.empty(len(graph.areas), dtype=np.int64)
-    ids[pieces.ravel()] = values.ravel()
-    return torch.from_numpy(ids[graph.roots()][pieces]).to(labels.device)
+    region_of_piece = np.empty(len(graph.areas), dtype=np.int64)
+    region_of_piece[pieces.ravel()] = regions.ravel()
+    return torch.from_numpy(ids[region_of_piece[graph.roots()]][pieces]).to(labels.device)
 
 
-def merge_similar(image: Tensor, labels: Tensor, max_regions: int) -> Tensor:
+def merge_similar(image: Any, labels: Tensor, max_regions: int | None) -> Tensor:
     """Merge the two adjacent regions nearest in mean colour until at most ``max_regions`` are left.
 
     Colours are compared as CIE Lab (D65); a merged region has the mean of all its pixels.
@@ -111,7 +114,7 @@ def merge_similar(image: Tensor, labels: Tensor, max_regions: int) -> Tensor:
     Args:
         image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].
         labels: :math:`(H, W)` integer, any non-negative ids.
-        max_regions: how many regions may stay, at least 1.
+        max_regions: how many regions may stay, at least 1; None: all.
 
     Returns:
         :math:`(H, W)` int64; a merged region has the id of its largest part.
@@ -125,15 +128,19 @@ def merge_similar(image: Tensor, labels: Tensor, max_regions: int) -> Tensor:
         >>> merge_similar(image, torch.tensor([[4, 5, 6]]), max_regions=2).tolist()
         [[4, 4, 6]]
     """
-    pixels = check_segment_image(image)
-    values = to_array(labels)
-    if pixels.shape[:2] != values.shape:
-        raise ValueError(f"labels must have the image's size; got {values.shape} and {pixels.shape[:2]}")
+    if max_regions is None:
+        return labels
     check_count("max_regions", max_regions)
-    ids, regions = compact(values)
+    lab, ids, regions = lab_and_regions(image, labels)
     graph = RegionGraph(regions)
-    _merge_nearest(graph, lab_sums(rgb_to_lab(pixels), regions), max_regions)
+    _merge_nearest(graph, lab_sums(lab, regions), max_regions)
     return torch.from_numpy(ids[graph.roots()][regions]).to(labels.device)
+
+
+def clean(labels: Tensor, min_size: int) -> Tensor:
+    """Return 4-connected regions of at least ``min_size`` pixels, by decreasing area."""
+    # Pieces of one region become one piece where what lay between them joins it: connect after merging.
+    return order_by_area(connected_regions(merge_small(labels, min_size)))
 
 
 class RegionGraph:
@@ -149,12 +156,8 @@ class RegionGraph:
         count = len(self.areas)
         self.borders: list[dict[int, int]] = [{} for _ in range(count)]
         self._parents = np.arange(count)
-        sides = ((labels[:, :-1], labels[:, 1:]), (labels[:-1], labels[1:]))
-        first, second = (np.concatenate([pair[k].ravel() for pair in sides]) for k in (0, 1))
-        differs = first != second
-        first, second = first[differs], second[differs]
-        pairs = np.minimum(first, second) * count + np.maximum(first, second)
-        keys, lengths = np.unique(pairs, return_counts=True)
+        pairs = contour_edges(torch.from_numpy(labels))[0].numpy()
+        keys, lengths = np.unique(pairs[:, 0] * count + pairs[:, 1], return_counts=True)
         for key, length in zip(keys.tolist(), lengths.tolist(), strict=True):
             a, b = divmod(key, count)
             self.borders[a][b] = self.borders[b][a] = length
@@ -210,11 +213,16 @@ def _merge_nearest(graph: RegionGraph, sums: Colors, max_regions: int) -> None:
             heapq.heappush(queue, (distance(low, high), low, high, graph.areas[low], graph.areas[high]))
 
 
-def rgb_to_lab(pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return (H, W, 3) sRGB as CIE Lab (D65), L in [0, 100]."""
+def to_pixels(image: Tensor) -> NDArray[np.float32]:
+    """Return a checked image as (H, W, 3)."""
+    return image.permute(1, 2, 0).cpu().numpy()
+
+
+def rgb_to_lab(image: Tensor) -> NDArray[np.float32]:
+    """Return a checked image (3, H, W) as CIE Lab (D65), (H, W, 3) with L in [0, 100]."""
     from skimage.color import rgb2lab
 
-    return np.asarray(rgb2lab(pixels), dtype=np.float32)
+    return np.asarray(rgb2lab(to_pixels(image)), dtype=np.float32)
 
 
 def lab_sums(lab: NDArray[np.float32], regions: Labels) -> Colors:
@@ -223,46 +231,31 @@ def lab_sums(lab: NDArray[np.float32], regions: Labels) -> Colors:
     return np.stack([np.bincount(flat, weights=lab[..., k].ravel()) for k in range(3)], axis=1)
 
 
-def compact(values: Labels) -> tuple[Labels, Labels]:
-    """Return the ids in use, sorted, and the map with every id replaced by its place among them."""
-    if values.max() >= 4 * values.size:
-        ids, places = np.unique(values, return_inverse=True)
-        return ids, places.reshape(values.shape).astype(np.int64)
-    used = np.bincount(values.ravel()) > 0  # Several times faster than sorting, where ids are not huge.
-    return np.flatnonzero(used), (np.cumsum(used) - 1)[values]
-
-
-def components(values: Labels) -> Labels:
+def _components(regions: Labels) -> Labels:
     """Return the 4-connected pieces, numbered from 0 in raster order."""
     from skimage.measure import label
 
     # Shifted to 1 and up: everything is foreground for the labelling, id 0 included.
-    pieces = label(compact(values)[1] + 1, background=0, connectivity=1)
-    return np.asarray(pieces, dtype=np.int64) - 1
+    return np.asarray(label(regions + 1, background=0, connectivity=1), dtype=np.int64) - 1
 
 
-def to_array(labels: Tensor) -> Labels:
-    """Return a checked label map as (H, W) int64."""
-    labels = check_integer("labels", labels, dims=(2,))
-    if labels.numel() == 0:
-        raise ValueError(f"labels must have at least one pixel; got shape {tuple(labels.shape)}")
-    labels = labels.long()
-    if int(labels.min()) < 0:
-        raise ValueError(f"labels must hold non-negative ids; got {int(labels.min())}")
-    return labels.cpu().numpy()
+def to_regions(labels: Tensor) -> tuple[Labels, Labels]:
+    """Return the ids of a checked label map, sorted, and the position of every pixel's id among them, (H, W)."""
+    ids, index, _ = compact(check_labels("labels", labels, dims=(2,)).cpu())
+    return ids.numpy(), index.numpy().astype(np.int64)
 
 
-def check_count(name: str, value: int) -> None:
-    """Raise unless ``value`` is a whole number of at least 1."""
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise TypeError(f"{name} must be an integer; got {value!r}")
-    if value < 1:
-        raise ValueError(f"{name} must be at least 1; got {value}")
+def check_segment_image(image: Any) -> Tensor:
+    """Return a checked image as (3, H, W) float32 in [0, 1], grey repeated, in memory pixel by pixel."""
+    tensor = as_image("image", image, tolerance=_TOLERANCE).detach()
+    if tensor.shape[0] not in (1, 3):
+        raise ValueError(f"image must have shape (3, H, W) or (1, H, W); got {tuple(tensor.shape)}")
+    return tensor.float().clamp(0, 1).expand(3, -1, -1).permute(1, 2, 0).contiguous().permute(2, 0, 1)
 
 
-def check_number(name: str, value: float, *, positive: bool = False) -> None:
-    """Refuse what is no number, not finite, below 0, or 0 where it must be positive."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{name} must be a number; got {value!r}")
-    if not (math.isfinite(value) and (value > 0 if positive else value >= 0)):
-        raise ValueError(f"{name} must be a number {'above' if positive else 'of at least'} 0; got {value}")
+def lab_and_regions(image: Any, labels: Tensor) -> tuple[NDArray[np.float32], Labels, Labels]:
+    """Return a checked image as CIE Lab (H, W, 3), and a checked label map of its size as `to_regions` does."""
+    image, (ids, regions) = check_segment_image(image), to_regions(labels)
+    if image.shape[1:] != regions.shape:
+        raise ValueError(f"labels must have the image's size; got {regions.shape} and {tuple(image.shape[1:])}")
+    return rgb_to_lab(image), ids, regions

@@ -14,9 +14,8 @@ from kcgs.cli import main
 from kcgs.data import load_image, load_labels, overlay_labels, save_image, save_labels
 from kcgs.fit.initialize import kmeans_field
 from kcgs.functional import RegionMap
-from kcgs.segment import Cleanup, Segmentation, register_scored
-from kcgs.segment.base import _methods
-from kcgs.segment.sources import _scored
+from kcgs.segment import Prediction, register
+from kcgs.segment.registry import _methods
 
 
 @pytest.fixture
@@ -65,7 +64,7 @@ class TestSegment:
     def test_options_are_json_or_text(
         self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        options = ("--option", "sigma=0.0", "--option", "num_colors=2", "--option", "snap=false")
+        options = ("--option", "sigma=0.0", "--option", "num_clusters=2", "--option", "snap=0")
         arguments = ("segment", "photo.png", "-o", "out.npy", "--method", "kmeans", *options)
         code, out, err = kcgs(*arguments, capsys=capsys, monkeypatch=monkeypatch)
         assert code == 0, err
@@ -96,14 +95,12 @@ class TestSegment:
     def test_names_and_scores(
         self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        def named(image: Tensor, *, classes: list[str]) -> Segmentation:
+        def named(image: Tensor, *, classes: list[str]) -> Prediction:
             labels = load_labels("mask.png")
-            scores = torch.where(labels > 0, 0.75, float("nan"))
-            return Cleanup().apply(image, labels, scores, classes)
+            return Prediction(labels, torch.where(labels > 0, 0.75, float("nan")), classes)
 
-        monkeypatch.setattr("kcgs.segment.base._methods", dict(_methods))
-        monkeypatch.setattr("kcgs.segment.sources._scored", dict(_scored))
-        register_scored("named")(named)
+        monkeypatch.setattr("kcgs.segment.registry._methods", dict(_methods))
+        register("named")(named)
         arguments = ("segment", "photo.png", "-o", "out.png", "--method", "named")
         arguments += ("--option", 'classes=["the wall", "a [red] door"]')
         _, out, _ = kcgs(*arguments, "--json", capsys=capsys, monkeypatch=monkeypatch)

@@ -32,7 +32,7 @@ class Prior:
     """`prior`."""
 
     def __init__(self) -> None:
-        data = (Path(kcgs.codec.__file__).parent / "prior.bin").read_bytes()
+        data = (Path(kcgs.codec.__file__).parent / "labels" / "prior.bin").read_bytes()
 
         def take(kind: str, *shape: int) -> Any:
             nonlocal data

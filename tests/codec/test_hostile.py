@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import tracemalloc
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from kcgs.codec import CodecError, decode
-from kcgs.codec.cells import Cells, Grid, _code_fill
-from kcgs.codec.gaussians import Layers
-from kcgs.codec.labels import _Left
-from kcgs.codec.quantize import Quantizer
+from kcgs.codec.file import Header, pack
+from kcgs.codec.gaussians.layers import LayerCoder
+from kcgs.codec.gaussians.occupancy import Grid, Occupancy, _code_counts
+from kcgs.codec.gaussians.quantize import Quantizer
+from kcgs.codec.labels.ids import Remaining
 from kcgs.codec.rangecoder import Writer
-from kcgs.codec.stream import Header, pack
 
-from .test_stream import assert_sound
+from .test_file import assert_sound
 
 
 class Forger(Writer):
@@ -42,8 +43,8 @@ class Forger(Writer):
         return super().choose(tables, rows, values)
 
 
-class ForgedCells(Cells):
-    """Makes cells up that are as many as were told."""
+class ForgedOccupancy(Occupancy):
+    """Makes up the cells of as many Gaussians as the layer names."""
 
     def code(self, coder: Any, count: int, cell: Any) -> Any:
         grid, generator = Grid.over(self._size, count), coder._generator
@@ -53,20 +54,20 @@ class ForgedCells(Cells):
         return super().code(coder, count, cell[np.lexsort(cell.T)])
 
 
-class ForgedLayers(Layers):
-    """Tells any classes of size, but few Gaussians of each."""
+class ForgedLayers(LayerCoder):
+    """Names any classes of size, but few Gaussians of each."""
 
-    def _code_counts(self, coder: Any, counts: Any) -> Any:
+    def _code_counts(self, coder: Any, codes: Any) -> Any:
         counts = np.zeros(64, np.int64)
         counts[coder._generator.choice([0, 1, 20, 35, 36], 2)] = coder._generator.integers(1, 80, 2)
-        return super()._code_counts(coder, counts)
+        return super()._code_counts(coder, SimpleNamespace(size=np.repeat(np.arange(64), counts) - 8))
 
 
 def forge(header: Header, generator: np.random.Generator) -> bytes:
     """Write layers of nonsense, up to one that even their writer refuses."""
-    quantizer = Quantizer(header.noise_code, header.size)
-    model, layers, energies = ForgedLayers(quantizer, header.channels, 1, None), [], []
-    model._cells = ForgedCells(header.size)
+    quantizer = Quantizer(header.qp, header.size)
+    model, layers, energies = ForgedLayers(quantizer, header.channels, None), [], []
+    model._occupancy = ForgedOccupancy(header.size)
     for energy, _ in header.layers:
         forger = Forger(generator)
         try:
@@ -78,13 +79,13 @@ def forge(header: Header, generator: np.random.Generator) -> bytes:
     return pack(header._replace(layers=tuple(energies)), b"", layers) if layers else b""
 
 
-def test_any_number_that_can_be_told() -> None:
+def test_any_number_that_a_file_can_hold() -> None:
     generator, sound = np.random.default_rng(0), 0
     for _ in range(300):
         energies = np.unique(generator.choice([-24, -23, 0, 5, 39, 40], 3))[::-1]
         size = [(1, 1), (7, 9), (300, 400), (1, 1 << 20), (1 << 20, 1 << 20)][generator.integers(5)]
-        noise_code, channels = generator.choice([-512, 0, 300, 1023]), generator.choice([1, 3, 4, 20])
-        data = forge(Header(size, int(channels), int(noise_code), 1, tuple((int(e), 1) for e in energies)), generator)
+        qp, channels = generator.choice([-512, 0, 300, 1023]), generator.choice([1, 3, 4, 20])
+        data = forge(Header(size, int(channels), int(qp), 1, tuple((int(e), 1) for e in energies)), generator)
         if data:
             assert_sound(decode(data))
             sound += 1
@@ -96,9 +97,7 @@ def write_counts(first: int, count: int) -> Writer:
     writer, one = Writer(), np.ones(1, np.int64)
     writer.uniform(64 * one, first * one)
     writer.uniform((64 - first) * one, 0 * one)
-    length = count.bit_length()
-    Layers(Quantizer(0, (9, 9)), 1, 1, None)._lengths.code(writer, 0 * one, length * one)
-    writer.uniform(one << (length - 1), (count - (1 << (length - 1))) * one)
+    LayerCoder(Quantizer(0, (9, 9)), 1, None)._count.code(writer, count)
     return writer
 
 
@@ -112,8 +111,8 @@ def test_a_class_that_there_is_not(position: int) -> None:
 def test_a_ratio_that_there_is_not() -> None:
     writer, zero = write_counts(5, 1), np.zeros(1, np.int64)
     quantizer = Quantizer(-512, (9, 9))
-    model = Layers(quantizer, 1, 1, None)
-    model._cells.code(writer, 1, np.zeros((1, 2), np.int64))
+    model = LayerCoder(quantizer, 1, None)
+    model._occupancy.code(writer, 1, np.zeros((1, 2), np.int64))
     model._ratio.code(writer, 1.0, zero, zero + (1 << 23))
     layer = writer.finish()
     with pytest.raises(CodecError, match="a ratio must be at most 0 steps"):
@@ -123,9 +122,9 @@ def test_a_ratio_that_there_is_not() -> None:
 def test_many_cells_take_little_memory() -> None:
     cells, nothing = 1 << 20, np.zeros(0, np.int64)
     writer = write_counts(5, 60_000)
-    model = Cells((cells, 1))
+    model = Occupancy((cells, 1))
     model._code_margin(writer, Grid.over((cells, 1), 60_000), np.zeros((1, 2), np.int64))
-    _code_fill(writer, 60_000 / cells, cells, nothing, 60_000)
+    _code_counts(writer, 60_000 / cells, cells, nothing, 60_000)
     layer = writer.finish().ljust(7500, b"\0")
     tracemalloc.start()
     with pytest.raises(CodecError, match="cells must hold 60000 Gaussians; got 0"):
@@ -137,7 +136,7 @@ def test_many_cells_take_little_memory() -> None:
 def test_what_is_left_by_rank() -> None:
     generator = np.random.default_rng(0)
     for count in (1, 2, 7, 8, 100):
-        left, expected = _Left(count), list(range(count))
+        left, expected = Remaining(count), list(range(count))
         while expected:
             rank = int(generator.integers(len(expected)))
             assert left.rank(expected[rank]) == rank

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
 
-from kcgs.codec import labels as labels_module
-from kcgs.codec.contexts import CLIP, SQUASH
-from kcgs.codec.labels import decode_labels, encode_labels
-from kcgs.codec.rangecoder import CodecError, Reader, Writer
+from kcgs.codec import CodecError
+from kcgs.codec.labels import coding, decode_labels, encode_labels
+from kcgs.codec.labels.contexts import CLIP, SQUASH
+from kcgs.codec.rangecoder import Reader, Writer
 from kcgs.data import load_labels
 
 Labels = NDArray[np.int64]
@@ -172,7 +172,7 @@ class TestWork:
         specks = np.random.default_rng(0).random((80, 120))
         labels = np.where(specks < 0.02, (specks * 300).astype(np.int64), np.arange(120) // 18)
         modelled = encode_labels(labels)
-        monkeypatch.setattr(labels_module, limit, 50)
+        monkeypatch.setattr(coding, limit, 50)
         with pytest.raises(CodecError, match="data must"):
             decode_labels(modelled, 80, 120, max_regions=7)
         plain = encode_labels(labels)

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from kcgs import RegionMap
 from kcgs.codec import decode
-from kcgs.codec.labels import encode_labels
-from kcgs.codec.maps import encode_map
+from kcgs.codec.labels import encode_labels, encode_map
 
 from .chances import TEMPLATE, Decision, Pixel
 from .symbols import Bits, Bytes, Choices, Learnt, Symbols

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 import kcgs
-from kcgs import FitConfig, GaussianField, RegionMap, nn, segment
+from kcgs import FitConfig, GaussianField, RegionMap, Scene, editing, nn, segment
 from kcgs import functional as F
 from kcgs.codec import decode, encode
 from kcgs.fit import fit
@@ -161,6 +161,8 @@ def resized_map(p: Parts, size: tuple[int, int]) -> dict[str, Any]:
 
 def run_segment(image: Tensor, method: str, **options: Any) -> Tensor:
     """Run a segmenter by name."""
+    if options.get("snap") is True:
+        options["snap"] = 2  # what True meant
     return segment.segment(image, method, **options)
 
 
@@ -169,7 +171,7 @@ def cleanups(image: Tensor, labels: Tensor) -> dict[str, Tensor]:
     return {
         "connected": segment.connected_regions(labels),
         "by-area": segment.order_by_area(labels),
-        "specks": segment.absorb_specks(labels, 20),
+        "specks": segment.merge_small(labels, 20),
         "similar": segment.merge_similar(image, segment.connected_regions(labels), 3),
         "snap": segment.snap_contours(image, labels, reach=2),
     }
@@ -198,17 +200,20 @@ def metrics(image: Tensor, other: Tensor, labels: Tensor) -> dict[str, Tensor]:
 
 def edits(p: Parts, region: int, background: Tensor) -> dict[str, Any]:
     """Every edit of one region."""
-    field, regions = _field(p), _regions(p)
-    assert regions is not None
-    recolored = nn.recolor_region(field, region, torch.tensor([0.5, 1.0, 1.5]), 0.1)
+    scene = Scene(_field(p), _regions(p))
+    larger = (2 * p.size[0], 2 * p.size[1])
     return {
-        "move": _of_scene(*nn.move_region(field, regions, region, (3, -2))),
-        "delete": _of_scene(*nn.delete_region(field, regions, region)),
-        "recolor": _of_scene(recolored, regions),
-        "extract": nn.extract_region(field, regions, region),
-        "extract-larger": nn.extract_region(field, regions, region, (2 * p.size[0], 2 * p.size[1])),
-        "background": nn.replace_background(field, regions, [region], background),
+        "move": _of(editing.move_region(scene, region, (3, -2))),
+        "delete": _of(editing.delete_region(scene, region)),
+        "recolor": _of(editing.recolor_region(scene, region, torch.tensor([0.5, 1.0, 1.5]), 0.1)),
+        "extract": editing.render_region(scene, region),
+        "extract-larger": editing.render_region(scene, region, larger),
+        "background": editing.render_over(scene, [region], background),
     }
+
+
+def _of(scene: Scene) -> dict[str, Any]:
+    return _of_scene(scene.field, scene.regions)
 
 
 def run_prune(p: Parts, tolerance: float) -> dict[str, Any]:

@@ -1,20 +1,30 @@
-"""A scene edited region by region, against what the picture must show then."""
+"""A scene edited region by region, against what the image must show then."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import pytest
 import torch
 from torch import Tensor
 
-from kcgs import GaussianField, RegionMap, RegionSplatRenderer
-from kcgs.nn import delete_region, extract_region, move_region, recolor_region, replace_background
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
+from kcgs.editing import (
+    delete_region,
+    extract_region,
+    move_region,
+    recolor_region,
+    render_over,
+    render_region,
+    replace_background,
+)
 
 SIZE = (48, 64)
 BOX, DISC, GROUND = 4, 9, 1
 
 
 def shapes(scale: int = 1) -> Tensor:
-    """Draw a box and a disc on a ground, `scale` labels along a side of a pixel."""
+    """Make a box and a disc on a ground, `scale` labels along a side of a pixel."""
     y, x = ((torch.arange(n * scale) + 0.5) / scale for n in SIZE)
     labels = torch.full((SIZE[0] * scale, SIZE[1] * scale), GROUND)
     labels[((y > 18) & (y < 30))[:, None] & ((x > 16) & (x < 28))[None, :]] = BOX
@@ -35,154 +45,181 @@ def regions(request: pytest.FixtureRequest) -> RegionMap:
     return MAPS[request.param]()
 
 
-def field_of(regions: RegionMap, opacities: bool = False) -> GaussianField:
-    field = GaussianField.random(150, SIZE, regions=regions, seed=0)
-    if not opacities:
-        return field
-    alpha = torch.linspace(0.2, 1.0, len(field))
-    return GaussianField(field.means, field.cholesky, field.colors, field.region_ids, alpha, size=SIZE)
+def scene_of(regions: RegionMap | Tensor, opacities: bool = False) -> Scene:
+    size = regions.size if isinstance(regions, RegionMap) else (regions.shape[0], regions.shape[1])
+    field = GaussianField.random(150, size, regions=regions, seed=0)
+    if opacities:
+        alpha = torch.linspace(0.2, 1.0, len(field))
+        field = GaussianField(field.means, field.cholesky, field.colors, field.region_ids, alpha, size=size)
+    return Scene(field, regions, {"title": "shapes"})
 
 
-def draw(field: GaussianField, regions: RegionMap, size: tuple[int, int] | None = None) -> Tensor:
-    return RegionSplatRenderer()(field, regions, size).detach()
+def map_of(scene: Scene) -> RegionMap:
+    assert scene.regions is not None
+    return scene.regions
 
 
-def cut(field: GaussianField, regions: RegionMap, region: int, size: tuple[int, int] | None = None) -> Tensor:
-    return extract_region(field, regions, region, size).detach()
+def ids_of(scene: Scene) -> Tensor:
+    assert scene.field.region_ids is not None
+    return scene.field.region_ids
 
 
-class TestExtract:
+def cut(scene: Scene, region: int, size: tuple[int, int] | None = None) -> Tensor:
+    return render_region(scene, region, size).detach()
+
+
+class TestRenderRegion:
     @pytest.mark.parametrize("size", [None, (96, 128), (30, 50)])
-    def test_all_regions_together_are_the_picture(self, regions: RegionMap, size: tuple[int, int] | None) -> None:
-        field = field_of(regions, opacities=True)
-        cuts = torch.stack([cut(field, regions, r, size) for r in regions.ids.tolist()])
+    def test_all_regions_together_are_the_image(self, regions: RegionMap, size: tuple[int, int] | None) -> None:
+        scene = scene_of(regions, opacities=True)
+        cuts = torch.stack([cut(scene, r, size) for r in regions.ids.tolist()])
         torch.testing.assert_close(cuts[:, 3].sum(0), torch.ones(size or SIZE), rtol=0, atol=1e-6)
-        picture = (cuts[:, :3] * cuts[:, 3:]).sum(0)
-        torch.testing.assert_close(picture, draw(field, regions, size), rtol=0, atol=1e-5)
+        image = (cuts[:, :3] * cuts[:, 3:]).sum(0)
+        torch.testing.assert_close(image, scene(size).detach(), rtol=0, atol=1e-5)
 
     def test_hard_alpha_is_the_mask(self) -> None:
         regions = MAPS["hard"]()
-        rgba = cut(field_of(regions), regions, DISC)
+        rgba = cut(scene_of(regions), DISC)
         assert torch.equal(rgba[3], (regions.labels == DISC).float())
         assert not rgba[:3, regions.labels != DISC].any()
 
     def test_colour_is_straight_under_a_soft_contour(self) -> None:
         """A region of one colour has that colour wherever it has any share, however small."""
         regions = MAPS["soft"]()
-        field = recolor_region(field_of(regions), DISC, 0.0, torch.tensor([0.9, 0.5, 0.1]))
-        rgba = cut(field, regions, DISC)
-        held = rgba[3] > 0
-        assert 0 < rgba[3, held].min() < 1e-3 < 0.999 < rgba[3].max()
-        want = torch.tensor([0.9, 0.5, 0.1])[:, None].expand(-1, int(held.sum()))
-        torch.testing.assert_close(rgba[:3, held], want, rtol=0, atol=1e-5)
-        assert not rgba[:3, ~held].any()
+        scene = recolor_region(scene_of(regions), DISC, 0.0, torch.tensor([0.9, 0.5, 0.1]))
+        rgba = cut(scene, DISC)
+        inside = rgba[3] > 0
+        assert 0 < rgba[3, inside].min() < 1e-3 < 0.999 < rgba[3].max()
+        want = torch.tensor([0.9, 0.5, 0.1])[:, None].expand(-1, int(inside.sum()))
+        torch.testing.assert_close(rgba[:3, inside], want, rtol=0, atol=1e-5)
+        assert not rgba[:3, ~inside].any()
 
     def test_region_without_gaussians_is_black(self) -> None:
         regions = MAPS["hard"]()
-        field = field_of(regions)
-        assert field.region_ids is not None
-        rgba = cut(field.subset(field.region_ids != BOX), regions, BOX)
+        scene = scene_of(regions)
+        rgba = cut(Scene(scene.field.subset(ids_of(scene) != BOX), regions), BOX)
         assert not rgba[:3].any() and rgba[3].sum() == 144
 
     def test_gradients_reach_the_field(self, regions: RegionMap) -> None:
-        field = field_of(regions)
-        rgba = extract_region(field, regions, DISC)
+        scene = scene_of(regions)
+        rgba = render_region(scene, DISC)
         (rgba[:3] * rgba[3:]).square().sum().backward()
-        assert field.means.grad is not None and field.region_ids is not None
-        moved = field.means.grad.abs().sum(-1) > 0
-        assert moved.any() and not moved[field.region_ids != DISC].any()
+        assert scene.field.means.grad is not None
+        moved = scene.field.means.grad.abs().sum(-1) > 0
+        assert moved.any() and not moved[ids_of(scene) != DISC].any()
+
+    def test_several_regions_are_their_blend(self, regions: RegionMap) -> None:
+        scene = scene_of(regions)
+        rgba, disc, box = render_region(scene, [BOX, DISC]).detach(), cut(scene, DISC), cut(scene, BOX)
+        torch.testing.assert_close(rgba[3], disc[3] + box[3], rtol=0, atol=1e-6)
+        want = disc[:3] * disc[3] + box[:3] * box[3]
+        torch.testing.assert_close(rgba[:3] * rgba[3], want, rtol=0, atol=1e-5)
+
+
+class TestExtract:
+    def test_only_the_region_is_left(self, regions: RegionMap) -> None:
+        scene = scene_of(regions)
+        rgba = cut(scene, DISC)
+        alone = extract_region(scene, DISC)
+        torch.testing.assert_close(alone().detach(), rgba[:3] * rgba[3], rtol=0, atol=1e-5)
+        assert alone.metadata == scene.metadata and set(ids_of(alone).tolist()) == {DISC}
+        both = extract_region(scene, [DISC, BOX])
+        assert set(ids_of(both).tolist()) == {BOX, DISC}
 
 
 class TestMove:
     @pytest.mark.parametrize("offset", [(-5, -3), (-7, 6), (0, 0)])
     def test_cut_out_is_shifted(self, regions: RegionMap, offset: tuple[int, int]) -> None:
-        field = field_of(regions)
-        before = cut(field, regions, BOX)
-        moved = move_region(field, regions, BOX, offset)
-        after = cut(*moved, BOX)
+        scene = scene_of(regions)
+        before = cut(scene, BOX)
+        moved = move_region(scene, BOX, offset)
+        after = cut(moved, BOX)
         torch.testing.assert_close(after, before.roll((offset[1], offset[0]), (1, 2)), rtol=0, atol=1e-5)
 
     def test_by_half_a_pixel_of_a_finer_map(self) -> None:
         regions = MAPS["fine"]()
-        moved = move_region(field_of(regions), regions, DISC, (-0.5, 1))
-        assert moved.regions.fine_labels is not None and regions.fine_labels is not None
+        moved = move_region(scene_of(regions), DISC, (-0.5, 1))
         disc = (regions.fine_labels == DISC).roll((2, -1), (0, 1))
-        assert torch.equal(moved.regions.fine_labels == DISC, disc)
+        assert torch.equal(map_of(moved).fine_labels == DISC, disc)
+
+    def test_two_regions_move_together(self) -> None:
+        scene = scene_of(MAPS["hard"]())
+        moved = map_of(move_region(scene, [BOX, DISC], (-4, 2))).labels
+        for region in (BOX, DISC):
+            assert torch.equal(moved == region, (map_of(scene).labels == region).roll((2, -4), (0, 1)))
 
     def test_nothing_else_changes(self, regions: RegionMap) -> None:
-        field = field_of(regions)
-        means, labels = field.means.detach().clone(), regions.labels.clone()
-        moved = move_region(field, regions, BOX, (-4, 0))
-        assert field.region_ids is not None
-        still = field.region_ids != BOX
+        scene = scene_of(regions)
+        means, labels = scene.field.means.detach().clone(), regions.labels.clone()
+        moved = move_region(scene, BOX, (-4, 0))
+        still = ids_of(scene) != BOX
         assert torch.equal(moved.field.means[still], means[still])
-        assert torch.equal(field.means, means) and torch.equal(regions.labels, labels)
+        assert torch.equal(scene.field.means, means) and torch.equal(regions.labels, labels)
         far = slice(36, None)  # columns that no blur reaches
-        assert torch.equal(draw(*moved)[..., far], draw(field, regions)[..., far])
+        assert torch.equal(moved().detach()[..., far], scene().detach()[..., far])
 
     def test_what_it_leaves_and_what_it_covers(self) -> None:
         regions = MAPS["hard"]()
-        moved = move_region(field_of(regions), regions, BOX, (20, 0)).regions.labels
+        moved = map_of(move_region(scene_of(regions), BOX, (20, 0))).labels
         assert (moved[18:30, 36:48] == BOX).all() and int((moved == BOX).sum()) == 144
         assert (moved[18:30, 16:28] == GROUND).all()
         assert int((moved == DISC).sum()) < int((regions.labels == DISC).sum())
 
-    def test_out_of_the_picture(self) -> None:
+    def test_out_of_the_image(self) -> None:
         regions = MAPS["hard"]()
-        gone = move_region(field_of(regions), regions, BOX, (1000, 0))
-        assert gone.regions.ids.tolist() == [GROUND, DISC]
-        part = move_region(field_of(regions), regions, BOX, (-22, 0)).regions.labels
+        gone = move_region(scene_of(regions), BOX, (1000, 0))
+        assert map_of(gone).ids.tolist() == [GROUND, DISC]
+        part = map_of(move_region(scene_of(regions), BOX, (-22, 0))).labels
         assert int((part == BOX).sum()) == 12 * 6
 
     def test_widths_of_new_neighbours(self) -> None:
         """The box has never touched the disc: their contour becomes as soft as the box has been."""
-        moved = move_region(field_of(MAPS["pairs"]()), MAPS["pairs"](), BOX, (20, 0)).regions
+        moved = map_of(move_region(scene_of(MAPS["pairs"]()), BOX, (20, 0)))
         assert moved.softness == {(GROUND, BOX): 1.0, (GROUND, DISC): 0.5, (BOX, DISC): 1.0}  # type: ignore[comparison-overlap]
 
 
 class TestRecolor:
     @pytest.mark.parametrize("opacities", [False, True])
     @pytest.mark.parametrize("gain", [0.5, torch.tensor([1.5, 0.0, 1.0]), torch.rand(3, 3)], ids=["1", "C", "CxC"])
-    def test_picture_changes_by_the_formula(self, regions: RegionMap, gain: Tensor | float, opacities: bool) -> None:
-        field, bias = field_of(regions, opacities), torch.tensor([0.2, 0.0, -0.1])
-        changed = recolor_region(field, DISC, gain, bias)
-        assert len(changed) == len(field) + 1
-        before, after = cut(field, regions, DISC), cut(changed, regions, DISC)
+    def test_image_changes_by_the_formula(self, regions: RegionMap, gain: Tensor | float, opacities: bool) -> None:
+        scene, bias = scene_of(regions, opacities), torch.tensor([0.2, 0.0, -0.1])
+        changed = recolor_region(scene, DISC, gain, bias)
+        assert len(changed) == len(scene) + 1
+        before, after = cut(scene, DISC), cut(changed, DISC)
         matrix = gain if isinstance(gain, Tensor) and gain.ndim == 2 else torch.eye(3) * gain
         want = torch.einsum("ij,jhw->ihw", matrix, before[:3]) + bias[:, None, None]
         torch.testing.assert_close(after[:3], torch.where(after[3] > 0, want, 0.0), rtol=0, atol=2e-5)
-        torch.testing.assert_close(cut(changed, regions, BOX), cut(field, regions, BOX))
+        torch.testing.assert_close(cut(changed, BOX), cut(scene, BOX))
 
     @pytest.mark.parametrize("backend", ["reference", "tiled", "cpu"])
     def test_bias_is_flat_on_every_backend(self, backend: str) -> None:
         regions = MAPS["hard"]()
-        field = recolor_region(field_of(regions), BOX, 0.0, 0.7)
-        picture = RegionSplatRenderer(backend=backend)(field, regions)[:, regions.labels == BOX]
-        torch.testing.assert_close(picture, torch.full_like(picture, 0.7), rtol=0, atol=2e-6)
+        scene = recolor_region(scene_of(regions), BOX, 0.0, 0.7)
+        values = RegionSplatRenderer(backend=backend)(scene)[:, regions.labels == BOX]
+        torch.testing.assert_close(values, torch.full_like(values, 0.7), rtol=0, atol=2e-6)
 
     def test_without_bias_no_gaussian_is_added(self) -> None:
-        field = field_of(MAPS["hard"]())
-        again = recolor_region(field, BOX, 1.0)
-        assert len(again) == len(field) and torch.equal(again.colors, field.colors)
+        scene = scene_of(MAPS["hard"]())
+        again = recolor_region(scene, BOX, 1.0)
+        assert len(again) == len(scene) and torch.equal(again.field.colors, scene.field.colors)
 
 
 class TestDelete:
     def test_no_trace_of_the_colour(self, regions: RegionMap) -> None:
         """Only the box is red: without it nothing is."""
-        field = field_of(regions)
+        scene = scene_of(regions)
         for region, gain in ((BOX, (1.0, 0.0, 0.0)), (DISC, (0.0, 1.0, 1.0)), (GROUND, (0.0, 1.0, 1.0))):
-            field = recolor_region(field, region, torch.tensor(gain))
-        assert draw(field, regions)[0].max() > 0.1
-        rest = delete_region(field, regions, BOX)
-        assert draw(*rest)[0].abs().max() == 0.0
-        assert rest.regions.ids.tolist() == [GROUND, DISC]
-        assert rest.field.region_ids is not None and not (rest.field.region_ids == BOX).any()
-        assert rest.regions.supersample == regions.supersample
+            scene = recolor_region(scene, region, torch.tensor(gain))
+        assert scene().detach()[0].max() > 0.1
+        rest = delete_region(scene, BOX)
+        assert rest().detach()[0].abs().max() == 0.0
+        assert map_of(rest).ids.tolist() == [GROUND, DISC] and not (ids_of(rest) == BOX).any()
+        assert map_of(rest).supersample == regions.supersample
+        assert map_of(delete_region(scene, [BOX, DISC])).ids.tolist() == [GROUND]
 
     def test_pixels_go_to_the_nearest(self) -> None:
         labels = torch.tensor([[1, 1, 2, 2, 2, 3, 3], [1, 2, 2, 2, 2, 2, 3]])
-        field = GaussianField.random(20, (2, 7), regions=labels, seed=0)
-        left = delete_region(field, labels, 2).regions.labels
+        left = map_of(delete_region(scene_of(labels), 2)).labels
         # the middle one above is 2 from both and falls to the smaller id; below, both are nearer by the other row
         assert left.tolist() == [[1, 1, 1, 1, 3, 3, 3], [1, 1, 1, 1, 3, 3, 3]]
 
@@ -190,8 +227,7 @@ class TestDelete:
         generator = torch.Generator().manual_seed(0)
         coarse = torch.randint(0, 5, (6, 8), generator=generator)
         labels = coarse.repeat_interleave(4, 0).repeat_interleave(4, 1)
-        field = GaussianField.random(50, (24, 32), regions=labels, seed=0)
-        got = delete_region(field, labels, 2).regions.labels
+        got = map_of(delete_region(scene_of(labels), 2)).labels
         stays = (labels != 2).nonzero()
         for y, x in (labels == 2).nonzero().tolist():
             squared = (stays - torch.tensor([y, x])).square().sum(1)
@@ -199,73 +235,99 @@ class TestDelete:
         assert torch.equal(got[labels != 2], labels[labels != 2])
 
 
-class TestReplaceBackground:
+class TestRenderOver:
     def test_shares_blend(self, regions: RegionMap) -> None:
-        field, background = field_of(regions), torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(1))
-        cuts = {r: cut(field, regions, r) for r in (BOX, DISC, GROUND)}
-        got = replace_background(field, regions, GROUND, background)
+        scene, background = scene_of(regions), torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(1))
+        cuts = {r: cut(scene, r) for r in (BOX, DISC, GROUND)}
+        got = render_over(scene, GROUND, background)
         want = sum(cuts[r][:3] * cuts[r][3:] for r in (BOX, DISC)) + background * cuts[GROUND][3:]
         torch.testing.assert_close(got, want, rtol=0, atol=1e-5)
 
-    def test_its_own_background_gives_the_picture_back(self, regions: RegionMap) -> None:
-        field = field_of(regions)
-        own = cut(field, regions, GROUND)[:3]
-        torch.testing.assert_close(
-            replace_background(field, regions, [GROUND], own), draw(field, regions), rtol=0, atol=1e-5
-        )
+    def test_its_own_background_gives_the_image_back(self, regions: RegionMap) -> None:
+        scene = scene_of(regions)
+        own = cut(scene, GROUND)[:3]
+        torch.testing.assert_close(render_over(scene, [GROUND], own), scene().detach(), rtol=0, atol=1e-5)
 
     def test_all_of_it_is_the_background_at_its_size(self, regions: RegionMap) -> None:
         background = torch.rand(3, 100, 70, generator=torch.Generator().manual_seed(1))
-        got = replace_background(field_of(regions), regions, regions.ids.tolist(), background)
+        got = render_over(scene_of(regions), regions.ids.tolist(), background)
         torch.testing.assert_close(got, background, rtol=0, atol=1e-6)
 
     def test_gradients_reach_background_and_field(self) -> None:
         regions, background = MAPS["soft"](), torch.rand(3, *SIZE, requires_grad=True)
-        field = field_of(regions)
-        replace_background(field, regions, [GROUND], background).sum().backward()
-        assert background.grad is not None and field.colors.grad is not None
-        torch.testing.assert_close(background.grad[0], cut(field, regions, GROUND)[3])
-        assert field.region_ids is not None and not field.colors.grad[field.region_ids == GROUND].any()
-        assert field.colors.grad[field.region_ids != GROUND].any()
+        scene = scene_of(regions)
+        render_over(scene, [GROUND], background).sum().backward()
+        colors = scene.field.colors
+        assert background.grad is not None and colors.grad is not None
+        torch.testing.assert_close(background.grad[0], cut(scene, GROUND)[3])
+        assert not colors.grad[ids_of(scene) == GROUND].any() and bool(colors.grad[ids_of(scene) != GROUND].any())
+
+
+class TestReplaceBackground:
+    @pytest.mark.parametrize("size", [SIZE, (30, 80)])
+    def test_the_rest_stays_and_the_background_shows(self, size: tuple[int, int]) -> None:
+        scene = scene_of(MAPS["hard"]())
+        other = Scene(GaussianField.random(60, size, seed=3))
+        got = replace_background(scene, GROUND, other)
+        image, ground = got().detach(), map_of(scene).labels == GROUND
+        torch.testing.assert_close(image[:, ~ground], scene().detach()[:, ~ground], rtol=0, atol=1e-6)
+        torch.testing.assert_close(image[:, ground], other(SIZE).detach()[:, ground], rtol=0, atol=1e-5)
+        assert got.metadata == scene.metadata
+
+    def test_regions_of_the_background_stay_apart(self) -> None:
+        scene, other = scene_of(MAPS["soft"]()), scene_of((torch.arange(64) // 20).expand(SIZE), opacities=True)
+        got = replace_background(scene, [GROUND, BOX], other)
+        assert map_of(got).ids.tolist() == [DISC, *range(DISC + 1, DISC + 5)]
+        hard = replace_background(Scene(scene.field, map_of(scene).labels), [GROUND, BOX], other)
+        outside = map_of(scene).labels != DISC
+        torch.testing.assert_close(hard().detach()[:, outside], other().detach()[:, outside], rtol=0, atol=1e-5)
 
 
 class TestErrors:
     @pytest.mark.parametrize(
         ("edit", "error", "words"),
         [
-            (lambda f, r: move_region(f, r, 2, (1, 0)), ValueError, "one of the 3 ids in the map; got 2"),
-            (lambda f, r: move_region(f, r, BOX, (0.5, 0)), ValueError, "whole multiples of 1 pixel"),
-            (lambda f, r: move_region(f, r, BOX, (float("nan"), 0)), ValueError, "whole multiples of 1 pixel"),
-            (lambda f, r: move_region(f, r, BOX, (1,)), ValueError, r"offset must be \(dx, dy\)"),
-            (lambda f, r: delete_region(f, r.resize((96, 128)), BOX), ValueError, r"one map of the size \(48, 64\)"),
-            (lambda f, r: delete_region(f, torch.zeros(SIZE).long(), 0), ValueError, "another region"),
-            (lambda f, r: delete_region(f, r, "box"), TypeError, "region_id must be an integer; got 'box'"),
-            (lambda f, r: delete_region(f, "r", BOX), TypeError, "a RegionMap or a label map Tensor; got str"),
-            (lambda f, r: recolor_region(f, 77, 0.5), ValueError, "one of the field's; got 77"),
-            (lambda f, r: recolor_region(f, BOX, torch.ones(2)), ValueError, r"gain must have shape .*got \(2,\)"),
-            (lambda f, r: recolor_region(f, BOX, "red"), TypeError, "gain must be a number or a Tensor"),
-            (lambda f, r: recolor_region(f, BOX, 1.0, torch.eye(3)), ValueError, "bias must have shape"),
-            (lambda f, r: extract_region(f, r, BOX, (0, 4)), ValueError, "size must be at least 1 x 1"),
-            (lambda f, r: extract_region(GaussianField.random(3, SIZE), r, BOX), ValueError, "must have region_ids"),
-            (lambda f, r: extract_region("f", r, BOX), TypeError, "field must be a GaussianField"),
-            (lambda f, r: extract_region(f, shapes().expand(2, -1, -1), BOX), ValueError, "one map of the size"),
-            (lambda f, r: replace_background(f, r, BOX, torch.zeros(1, 4, 4)), ValueError, r"shape \(3, H, W\)"),
-            (lambda f, r: replace_background(f, r, [3], torch.zeros(3, 4, 4)), ValueError, "3 ids in the map; got 3"),
+            (lambda s: move_region(s, 2, (1, 0)), ValueError, "among the map's 3 ids, 1, 4, 9; got 2"),
+            (lambda s: move_region(s, BOX, (0.5, 0)), ValueError, "whole multiples of 1 pixel"),
+            (lambda s: move_region(s, BOX, (float("nan"), 0)), ValueError, "whole multiples of 1 pixel"),
+            (lambda s: move_region(s, BOX, (1,)), ValueError, r"offset must be \(dx, dy\)"),
+            (lambda s: delete_region(resized(s), BOX), ValueError, r"one map of the size \(48, 64\)"),
+            (lambda s: delete_region(s, [BOX, DISC, GROUND]), ValueError, "leave a region .*got all 3"),
+            (lambda s: delete_region(s, []), ValueError, "region_ids must hold an id"),
+            (lambda s: delete_region(s, "box"), TypeError, "region_ids must be an integer; got 'b'"),
+            (lambda s: delete_region((s.field, s.regions), BOX), TypeError, "scene must be a Scene; got tuple"),
+            (lambda s: delete_region(Scene(s.field), BOX), ValueError, "scene must have a label map"),
+            (lambda s: recolor_region(s, 77, 0.5), ValueError, r"scene's Gaussians, \[1, 4, 9\]; got 77"),
+            (lambda s: recolor_region(s, BOX, torch.ones(2)), ValueError, r"gain must have shape .*got \(2,\)"),
+            (lambda s: recolor_region(s, BOX, "red"), TypeError, "gain must be a number"),
+            (lambda s: recolor_region(s, BOX, 1.0, torch.eye(3)), ValueError, "bias must have shape"),
+            (lambda s: render_region(s, BOX, (0, 4)), ValueError, "size must be at least 1 x 1"),
+            (lambda s: render_region(Scene(GaussianField.random(3, SIZE), s.regions), BOX), ValueError, "region ids"),
+            (lambda s: render_region(Scene(s.field, shapes().expand(2, -1, -1)), BOX), ValueError, "one map of the"),
+            (lambda s: render_over(s, BOX, torch.zeros(1, 4, 4)), ValueError, r"shape \(3, H, W\)"),
+            (lambda s: render_over(s, [3], torch.zeros(3, 4, 4)), ValueError, "3 ids, 1, 4, 9; got 3"),
+            (lambda s: replace_background(s, BOX, torch.zeros(3, 4, 4)), TypeError, "background must be a Scene"),
+            (lambda s: replace_background(s, BOX, grey()), ValueError, "have 3 channels; got colors of shape"),
         ],
     )
-    def test_bad_input(self, edit: object, error: type[Exception], words: str) -> None:
-        regions = MAPS["hard"]()
+    def test_bad_input(self, edit: Callable[[Scene], object], error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):
-            edit(field_of(regions), regions)  # type: ignore[operator]
+            edit(scene_of(MAPS["hard"]()))
 
     def test_batched(self) -> None:
         two = [torch.ones(2, 5, n) for n in (2, 3, 3)]
         field = GaussianField(*two, torch.zeros(2, 5, dtype=torch.long), size=SIZE)
-        with pytest.raises(ValueError, match="field must not be batched"):
-            recolor_region(field, 0, 0.5)
+        with pytest.raises(ValueError, match="scene must not be batched"):
+            recolor_region(Scene(field), 0, 0.5)
 
     def test_resized_soft_map(self) -> None:
-        regions = RegionMap.from_labels(shapes(), 0.8).resize((96, 128))
-        field = GaussianField.random(20, (96, 128), regions=regions, seed=0)
-        with pytest.raises(ValueError, match="must not be resized"):
-            move_region(field, regions, BOX, (2, 0))
+        with pytest.raises(ValueError, match="must not have a resized map"):
+            move_region(scene_of(RegionMap.from_labels(shapes(), 0.8).resize((96, 128))), BOX, (2, 0))
+
+
+def resized(scene: Scene) -> Scene:
+    return Scene(scene.field, map_of(scene).resize((96, 128)))
+
+
+def grey() -> Scene:
+    return Scene(GaussianField.random(3, SIZE, channels=1, seed=0))

@@ -86,7 +86,7 @@ class TestCompress:
         image, field, regions = fitted
         for changed, match in (
             ({"image": image[:, :50]}, "image must have shape"),
-            ({"iterations": 0}, "iterations must be an integer"),
+            ({"iterations": 0}, "iterations must be at least 1; got 0"),
             ({"quality": 40, "target_bytes": 900}, "exclude each other"),
             ({"target_bytes": 40}, "target_bytes must be at least [0-9]+ for this scene; got 40"),
         ):

@@ -144,16 +144,17 @@ class TestEveryMethod:
     @pytest.mark.parametrize(
         ("image", "error", "message"),
         [
-            (np.zeros((3, 4, 4)), TypeError, "image must be a Tensor"),
+            (np.zeros((3, 4, 4)), ValueError, r"image must have shape .*; got \(4, 3, 4\)"),
+            ([0.5], TypeError, "image must be a Tensor, a numpy array or a PIL image; got list"),
             (torch.zeros(3, 4, 4, dtype=torch.uint8), TypeError, "image must have a real floating dtype"),
             (torch.zeros(4, 4, 4), ValueError, r"image must have shape \(3, H, W\) or \(1, H, W\); got \(4, 4, 4\)"),
             (torch.zeros(2, 4, 4), ValueError, "image must have shape"),
             (torch.zeros(4, 4), ValueError, "image must have"),
-            (torch.zeros(1, 3, 4, 4), ValueError, "image must have"),
-            (torch.zeros(3, 0, 4), ValueError, "image must have"),
+            (torch.zeros(2, 3, 4, 4), ValueError, "image must be one image"),
+            (torch.zeros(3, 0, 4), ValueError, "image must not be empty"),
             (torch.full((3, 4, 4), float("nan")), ValueError, "image must be finite"),
-            (torch.full((3, 4, 4), 255.0), ValueError, r"image must lie in \[0, 1\]; got \[255, 255\]"),
-            (torch.full((3, 4, 4), -0.01), ValueError, r"image must lie in \[0, 1\]"),
+            (torch.full((3, 4, 4), 255.0), ValueError, r"image must be in \[0, 1\]; got \[255, 255\]"),
+            (torch.full((3, 4, 4), -0.01), ValueError, r"image must be in \[0, 1\]"),
         ],
     )
     def test_bad_image(self, method: str, image: Any, error: type[Exception], message: str) -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from torch import Tensor
 
-from kcgs.segment import absorb_specks, connected_regions, merge_similar, order_by_area, snap_contours
+from kcgs.segment import connected_regions, merge_similar, merge_small, order_by_area, snap_contours
 
 MAPS = hnp.arrays(
     np.int64, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.sampled_from([0, 1, 2, 9, 10**9])
@@ -84,39 +84,39 @@ class TestOrderByArea:
             order_by_area(labels)
 
 
-class TestAbsorbSpecks:
+class TestMergeSmall:
     def test_longest_border_wins(self) -> None:
         labels = torch.tensor([[1, 1, 1, 2], [1, 7, 2, 2], [2, 2, 2, 2]])
         # The speck has one side with 1 above, one left, one with 2 right and one below: equal, 2 is larger.
-        assert absorb_specks(labels, 2)[1, 1] == 2
+        assert merge_small(labels, 2)[1, 1] == 2
         labels = torch.tensor([[1, 1, 1, 2], [1, 7, 7, 2], [1, 1, 2, 2], [2, 2, 2, 2]])
-        assert absorb_specks(labels, 3)[1, 1:3].tolist() == [1, 1]
+        assert merge_small(labels, 3)[1, 1:3].tolist() == [1, 1]
 
     def test_equal_neighbours_the_earlier_wins(self) -> None:
-        assert absorb_specks(torch.tensor([[5, 5, 9, 4, 4]]), 2).tolist() == [[5, 5, 5, 4, 4]]
+        assert merge_small(torch.tensor([[5, 5, 9, 4, 4]]), 2).tolist() == [[5, 5, 5, 4, 4]]
 
     def test_specks_may_join_to_a_region(self) -> None:
         labels = torch.tensor([[0, 0, 0, 0, 0, 0], [0, 1, 2, 3, 0, 0], [0, 1, 2, 3, 0, 0], [0, 0, 0, 0, 0, 0]])
-        result = absorb_specks(labels, 3)
+        result = merge_small(labels, 3)
         assert len(result.unique()) <= 2
         assert (result == 0).sum() >= (labels == 0).sum()
 
     def test_pieces_of_a_large_region_are_specks_too(self) -> None:
         labels = torch.tensor([[4, 4, 8, 8, 4], [4, 4, 8, 8, 8]])
-        assert absorb_specks(labels, 2).tolist() == [[4, 4, 8, 8, 8], [4, 4, 8, 8, 8]]
+        assert merge_small(labels, 2).tolist() == [[4, 4, 8, 8, 8], [4, 4, 8, 8, 8]]
 
     def test_ids_of_the_others_stay(self) -> None:
         labels = torch.tensor([[10**9, 10**9, 255, 0, 0]])
-        assert absorb_specks(labels, 1).tolist() == labels.tolist()
-        assert set(absorb_specks(labels, 2).unique().tolist()) == {0, 10**9}
+        assert merge_small(labels, 1).tolist() == labels.tolist()
+        assert set(merge_small(labels, 2).unique().tolist()) == {0, 10**9}
 
     def test_one_region_smaller_than_the_minimum(self) -> None:
-        assert absorb_specks(torch.full((2, 2), 6), 100).tolist() == [[6, 6], [6, 6]]
+        assert merge_small(torch.full((2, 2), 6), 100).tolist() == [[6, 6], [6, 6]]
 
     @given(MAPS, st.integers(1, 20))
     @settings(max_examples=80, deadline=None)
     def test_no_speck_is_left(self, labels: Tensor, min_size: int) -> None:
-        result = absorb_specks(labels, min_size)
+        result = merge_small(labels, min_size)
         areas = connected_regions(result).flatten().bincount()
         assert len(areas) == 1 or areas.min() >= min_size
         assert torch.isin(result, labels).all()
@@ -131,21 +131,21 @@ class TestAbsorbSpecks:
 
         noise = torch.randint(0, 2, (480, 854), generator=torch.Generator().manual_seed(0))
         start = time.process_time()
-        result = absorb_specks(noise, 50)
+        result = merge_small(noise, 50)
         assert time.process_time() - start < 10
         assert connected_regions(result).flatten().bincount().min() >= 50
 
     @pytest.mark.parametrize(("labels", "error"), BAD_LABELS)
     def test_bad_labels(self, labels: Any, error: type[Exception]) -> None:
         with pytest.raises(error, match="labels must"):
-            absorb_specks(labels, 2)
+            merge_small(labels, 2)
 
     @pytest.mark.parametrize(
         ("min_size", "error"), [(0, ValueError), (-1, ValueError), (2.0, TypeError), (True, TypeError)]
     )
     def test_bad_min_size(self, min_size: Any, error: type[Exception]) -> None:
         with pytest.raises(error, match=r"min_size must be .* got"):
-            absorb_specks(torch.zeros(2, 2, dtype=torch.int64), min_size)
+            merge_small(torch.zeros(2, 2, dtype=torch.int64), min_size)
 
 
 class TestMergeSimilar:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcgs.segment import segment, segment_with_scores
-from kcgs.segment.patch_features import patch_features
+from kcgs.segment.methods.patch_features import patch_features
 
 transformers = pytest.importorskip("transformers", reason="needs the extra: pip install 'kcgs[segment]'")
 
@@ -40,7 +40,7 @@ def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return path
 
 
-def picture(width: int = 120) -> Tensor:
+def two_colors(width: int = 120) -> Tensor:
     image = torch.zeros(3, 80, width)
     image[0, :, 51:] = 1.0
     image[1, 37:, 51:] = 1.0
@@ -49,7 +49,7 @@ def picture(width: int = 120) -> Tensor:
 
 class TestDino:
     def test_label_map(self, folder: Path) -> None:
-        labels, scores, _ = segment_with_scores(picture(), "dino", model=folder, clusters=3, size=112)
+        labels, scores, _ = segment_with_scores(two_colors(), "dino", model=folder, num_clusters=3, longer_side=112)
         areas = labels.flatten().bincount()
         assert labels.shape == (80, 120)
         assert labels.dtype == torch.int64
@@ -61,24 +61,24 @@ class TestDino:
 
     def test_same_every_time_and_no_global_seed_moves(self, folder: Path) -> None:
         state = torch.get_rng_state()
-        first = segment(picture(), "dino", model=str(folder), size=112, max_regions=4)
+        first = segment(two_colors(), "dino", model=str(folder), longer_side=112, max_regions=4)
         assert torch.equal(torch.get_rng_state(), state)
         torch.rand(3)
-        assert torch.equal(segment(picture(), "dino", model=str(folder), size=112, max_regions=4), first)
+        assert torch.equal(segment(two_colors(), "dino", model=str(folder), longer_side=112, max_regions=4), first)
         assert int(first.max()) + 1 <= 4
 
     def test_features(self, folder: Path) -> None:
         model = transformers.AutoModel.from_pretrained(folder)
         patch = model.config.patch_size
-        features = patch_features(picture(), model, 8 * patch)
+        features = patch_features(two_colors(), model, 8 * patch)
         assert features.shape == (round(80 / 120 * 8), 8, 24)
-        features = patch_features(picture(), folder, patch)
+        features = patch_features(two_colors(), folder, patch)
         assert features.shape == (1, 1, 24)
 
     def test_one_cluster_and_tiny_images(self, folder: Path) -> None:
-        assert int(segment(picture(), "dino", model=folder, clusters=1, size=64).max()) == 0
-        assert segment(torch.zeros(1, 1, 1), "dino", model=folder, size=64).tolist() == [[0]]
-        assert segment(torch.rand(3, 1, 50), "dino", model=folder, size=64).shape == (1, 50)
+        assert int(segment(two_colors(), "dino", model=folder, num_clusters=1, longer_side=64).max()) == 0
+        assert segment(torch.zeros(1, 1, 1), "dino", model=folder, longer_side=64).tolist() == [[0]]
+        assert segment(torch.rand(3, 1, 50), "dino", model=folder, longer_side=64).shape == (1, 50)
 
 
 @pytest.fixture(scope="module")
@@ -99,23 +99,23 @@ def linear(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class TestColors:
     def test_contours_lie_on_pixel_edges(self, linear: Path) -> None:
         """Neither 51 nor 37 is a border of patches of 8 pixels."""
-        labels = segment(picture(), "dino", model=linear, clusters=3, size=120)
-        truth = (picture()[0] + picture()[1]).long()
+        labels = segment(two_colors(), "dino", model=linear, num_clusters=3, longer_side=120)
+        truth = (two_colors()[0] + two_colors()[1]).long()
         assert int(labels.max()) + 1 == 3
         joint = (truth * 3 + labels).flatten().bincount(minlength=9).reshape(3, 3)
         assert float(joint.max(dim=1).values.sum() / joint.sum()) > 0.98
 
     def test_the_number_is_chosen(self, linear: Path) -> None:
-        assert int(segment(picture(), "dino", model=linear, size=120).max()) + 1 == 3
-        assert int(segment(torch.full((3, 80, 120), 0.4), "dino", model=linear, size=120).max()) == 0
+        assert int(segment(two_colors(), "dino", model=linear, longer_side=120).max()) + 1 == 3
+        assert int(segment(torch.full((3, 80, 120), 0.4), "dino", model=linear, longer_side=120).max()) == 0
 
 
 class TestErrors:
     def test_folder(self, tmp_path: Path) -> None:
-        with pytest.raises(ValueError, match=f"cannot load '{tmp_path}' as AutoModel for 'dino'"):
-            segment(picture(), "dino", model=tmp_path)
-        with pytest.raises(FileNotFoundError, match=r"no folder with a model for 'dino' at .*gone"):
-            segment(picture(), "dino", model=tmp_path / "gone")
+        with pytest.raises(ValueError, match=f"cannot load '{tmp_path}' as AutoModel"):
+            segment(two_colors(), "dino", model=tmp_path)
+        with pytest.raises(FileNotFoundError, match=r"no folder with a model at .*gone"):
+            segment(two_colors(), "dino", model=tmp_path / "gone")
 
     @pytest.mark.parametrize("damage", ["truncated", "other"])
     def test_weights(self, tmp_path: Path, linear: Path, damage: str) -> None:
@@ -126,13 +126,13 @@ class TestErrors:
             (tmp_path / "model.safetensors").write_bytes((linear / "model.safetensors").read_bytes()[:300])
         else:
             save_file({"weight": torch.zeros(3)}, tmp_path / "model.safetensors", metadata={"format": "pt"})
-        with pytest.raises(ValueError, match=f"cannot load '{tmp_path}' as AutoModel for 'dino'"):
-            segment(picture(), "dino", model=tmp_path)
+        with pytest.raises(ValueError, match=f"cannot load '{tmp_path}' as AutoModel"):
+            segment(two_colors(), "dino", model=tmp_path)
 
-    @pytest.mark.parametrize("option", ["clusters", "max_clusters", "size", "min_size"])
+    @pytest.mark.parametrize("option", ["num_clusters", "max_clusters", "longer_side", "min_size"])
     def test_options(self, linear: Path, option: str) -> None:
         with pytest.raises(ValueError, match=f"{option} must be at least 1; got 0"):
-            segment(picture(), "dino", model=linear, **{option: 0})
+            segment(two_colors(), "dino", model=linear, **{option: 0})
 
     def test_no_patches(self) -> None:
         model = transformers.CLIPTextModel(
@@ -141,4 +141,4 @@ class TestErrors:
             )
         )
         with pytest.raises(ValueError, match="must be a vision transformer with patches; got CLIPTextModel"):
-            segment(picture(), "dino", model=model)
+            segment(two_colors(), "dino", model=model)

@@ -10,7 +10,7 @@ from kornia.contrib import connected_components, connected_components_union_find
 
 from kcgs.data import chart_pie
 from kcgs.segment import connected_regions, kmeans
-from kcgs.segment.kmeans import _centres
+from kcgs.segment.methods.kmeans import _centres
 
 
 def patches(*colors: tuple[float, float, float]) -> torch.Tensor:
@@ -43,19 +43,19 @@ def test_every_patch_is_a_region() -> None:
 
 
 def test_budget_merges_the_most_similar() -> None:
-    labels = kmeans(patches(RED, (0.75, 0.12, 0.1), BLUE), num_colors=3, sigma=0.0, max_regions=2)
+    labels = kmeans(patches(RED, (0.75, 0.12, 0.1), BLUE), num_clusters=3, sigma=0.0, max_regions=2)
     assert labels[0, ::16].tolist() == [0, 0, 1]
 
 
 def test_chart_comes_back() -> None:
     chart = chart_pie()
-    labels = kmeans(chart.image, num_colors=9)
+    labels = kmeans(chart.image, num_clusters=9)
     assert len(labels.unique()) >= 6
     shares = [(labels[chart.labels == region].bincount().max() / (chart.labels == region).sum()) for region in range(9)]
     assert sum(float(share) > 0.98 for share in shares) >= 8
 
 
-@pytest.mark.parametrize("options", [{}, {"num_colors": 5}, {"snap": False, "sigma": 2.0}])
+@pytest.mark.parametrize("options", [{}, {"num_clusters": 5}, {"snap": 0, "sigma": 2.0}])
 def test_promises(options: dict[str, float]) -> None:
     image = torch.from_numpy(skimage.data.coffee()).permute(2, 0, 1).float()[:, ::2, ::2] / 255
     labels = kmeans(image, max_regions=12, **options)  # type: ignore[arg-type]
@@ -81,8 +81,8 @@ def test_why_pieces_are_not_kornias() -> None:
 @pytest.mark.parametrize(
     ("options", "error"),
     [
-        ({"num_colors": 0}, ValueError),
-        ({"num_colors": 2.0}, TypeError),
+        ({"num_clusters": 0}, ValueError),
+        ({"num_clusters": 2.0}, TypeError),
         ({"sigma": -1.0}, ValueError),
         ({"max_regions": 0}, ValueError),
         ({"min_size": 0}, ValueError),

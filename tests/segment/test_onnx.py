@@ -132,8 +132,8 @@ class TestNames:
     @pytest.mark.parametrize(
         ("tail", "names", "message"),
         [
-            ("", ["red", "green"], "names must be 3, one a class, class 0 first; got 2"),
-            ("ArgMax", ["red", "green"], "names must be at least 3, one a class; got 2"),
+            ("", ["red", "green"], "names must be 3, one for each class, class 0 first; got 2"),
+            ("ArgMax", ["red", "green"], "names must be at least 3, one for each class; got 2"),
         ],
     )
     def test_of_another_number(self, tmp_path: Path, tail: str, names: list[str], message: str) -> None:
@@ -143,12 +143,12 @@ class TestNames:
 
 
 class TestPreprocessing:
-    def test_mean_std_scale(self, tmp_path: Path) -> None:
+    def test_mean_std_white(self, tmp_path: Path) -> None:
         # Of 255 times red less 100, over 50, less 2: above 0 where red is above 200 / 255.
         path = mixing(tmp_path / "net.onnx", [[1.0, 0.0, 0.0]])
         image = torch.full((3, 20, 20), 195 / 255)
         image[0, :, 12:] = 205 / 255
-        options: dict[str, Any] = {"mean": (200.0, 0.0, 0.0), "std": (5.0, 1.0, 1.0), "scale": 255.0}
+        options: dict[str, Any] = {"mean": (200.0, 0.0, 0.0), "std": (5.0, 1.0, 1.0), "max_value": 255.0}
         labels, scores, _ = segment_with_scores(image, "onnx", model=path, kind="logits", **options)
         assert torch.equal(labels, (torch.arange(20) >= 12).long().expand(20, 20))
         assert scores is not None
@@ -162,7 +162,7 @@ class TestPreprocessing:
 
     def test_chosen_size_and_bytes(self, tmp_path: Path) -> None:
         path = mixing(tmp_path / "net.onnx", EYE, source=TensorProto.UINT8)
-        labels = segment(two_colors(), "onnx", model=path, size=(48, 80), scale=255.0, kind="logits", **PLAIN)
+        labels = segment(two_colors(), "onnx", model=path, size=(48, 80), max_value=255.0, kind="logits", **PLAIN)
         assert torch.equal(labels, LEFT)
 
     def test_gray_image_and_session(self, tmp_path: Path) -> None:
@@ -189,8 +189,8 @@ class TestErrors:
             ({"output": 3}, r"output must be a position or one of the outputs \['out'\]"),
             ({"output": "in"}, "output must be"),
             ({"mean": (0.0,)}, "mean must be three numbers"),
-            ({"std": (0.0, 1.0, 1.0)}, "std must be above 0"),
-            ({"scale": 0.0}, "scale must be"),
+            ({"std": (0.0, 1.0, 1.0)}, "std must be finite and above 0"),
+            ({"max_value": 0.0}, "max_value must be"),
             ({"kind": "saliency"}, "saliency output must have one channel"),
             ({"kind": "label"}, "labels must be whole numbers"),
             ({"min_size": 0}, "min_size must be"),
@@ -201,7 +201,7 @@ class TestErrors:
         with pytest.raises(ValueError, match=message):
             segment(two_colors(), "onnx", model=path, **options)
 
-    @pytest.mark.parametrize("options", [{"mean": "half"}, {"std": (1.0, "one", 1.0)}, {"scale": "255"}])
+    @pytest.mark.parametrize("options", [{"mean": "half"}, {"std": (1.0, "one", 1.0)}, {"max_value": "255"}])
     def test_numbers(self, tmp_path: Path, options: dict[str, Any]) -> None:
         with pytest.raises(TypeError, match=f"{next(iter(options))} must be .*number.*; got"):
             segment(two_colors(), "onnx", model=mixing(tmp_path / "net.onnx", EYE), **options)
@@ -237,7 +237,7 @@ class TestLseg:
         path = mixing(tmp_path / "encoder.onnx", EYE)
         with pytest.raises(ValueError, match=r"features must have shape \(1, 5, h, w\)"):
             segment(two_colors(), "lseg", model=path, embeddings=np.ones((2, 5), dtype=np.float32))
-        with pytest.raises(ValueError, match="names must be 2, one a class"):
+        with pytest.raises(ValueError, match="names must be 2, one for each class"):
             segment(two_colors(), "lseg", model=path, embeddings=np.ones((2, 3), dtype=np.float32), names=["sea"])
         with pytest.raises(ValueError, match="floating array"):
             segment(two_colors(), "lseg", model=path, embeddings=np.ones((2, 3), dtype=int))

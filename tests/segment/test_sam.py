@@ -9,7 +9,7 @@ from kornia.models.sam import Sam, SamConfig
 from torch import Tensor
 
 from kcgs.segment import segment, segment_with_scores
-from kcgs.segment.mask_models import keep_apart, paint_masks
+from kcgs.segment.methods.segment_anything import keep_apart, paint_masks
 
 TINY = SamConfig(
     encoder_embed_dim=8, encoder_depth=1, encoder_num_heads=1, encoder_global_attn_indexes=(), checkpoint=None
@@ -17,7 +17,7 @@ TINY = SamConfig(
 LOOSE: dict[str, Any] = {"grid": 2, "min_score": 0.0, "min_stability": 0.0}
 
 
-def picture() -> Tensor:
+def two_colors() -> Tensor:
     image = torch.zeros(3, 48, 64)
     image[0, 10:30, 10:40] = 1.0
     image[1, 25:45, 30:60] = 0.7
@@ -112,31 +112,31 @@ class TestPrompts:
 
     def test_boxes(self, options: dict[str, Any]) -> None:
         boxes = torch.tensor([[10.0, 10.0, 40.0, 30.0], [30.0, 25.0, 60.0, 45.0]])
-        labels, scores, _ = segment_with_scores(picture(), "sam", boxes=boxes, **options)
+        labels, scores, _ = segment_with_scores(two_colors(), "sam", boxes=boxes, **options)
         assert_map(labels, scores)
-        assert torch.equal(labels, segment(picture(), "sam", boxes=boxes, **options))
-        assert torch.equal(labels, segment(picture(), "sam", boxes=boxes.int().tolist(), **options))
+        assert torch.equal(labels, segment(two_colors(), "sam", boxes=boxes, **options))
+        assert torch.equal(labels, segment(two_colors(), "sam", boxes=boxes.int().tolist(), **options))
 
     def test_points(self, options: dict[str, Any]) -> None:
         points = torch.tensor([[[20.0, 20.0], [50.0, 40.0]]])
         labels, scores, _ = segment_with_scores(
-            picture(), "sam", points=points, point_labels=torch.tensor([[1, 0]]), **options
+            two_colors(), "sam", points=points, point_labels=torch.tensor([[1, 0]]), **options
         )
         assert_map(labels, scores)
-        assert_map(*segment_with_scores(picture(), "sam", points=points[0], **options)[:2])
+        assert_map(*segment_with_scores(two_colors(), "sam", points=points[0], **options)[:2])
 
     def test_lists(self, options: dict[str, Any]) -> None:
-        labels = segment(picture(), "sam", points=[[20, 20], [50, 40.5]], point_labels=[1, 0], **options)
+        labels = segment(two_colors(), "sam", points=[[20, 20], [50, 40.5]], point_labels=[1, 0], **options)
         points = torch.tensor([[20.0, 20.0], [50.0, 40.5]])
         assert torch.equal(
-            labels, segment(picture(), "sam", points=points, point_labels=torch.tensor([1, 0]), **options)
+            labels, segment(two_colors(), "sam", points=points, point_labels=torch.tensor([1, 0]), **options)
         )
         for wrong in ({"boxes": [[1, 2], [3]]}, {"points": "here"}, {"points": [[1, 2]], "point_labels": [0.5]}):
             with pytest.raises(TypeError, match=f"{list(wrong)[-1]} must"):
-                segment(picture(), "sam", **wrong, **options)
+                segment(two_colors(), "sam", **wrong, **options)
 
     def test_grid(self, options: dict[str, Any]) -> None:
-        labels, scores, _ = segment_with_scores(picture(), "sam", max_regions=5, min_size=4, **LOOSE, **options)
+        labels, scores, _ = segment_with_scores(two_colors(), "sam", max_regions=5, min_size=4, **LOOSE, **options)
         assert_map(labels, scores)
         assert 1 < len(labels.unique()) <= 5
 
@@ -150,7 +150,7 @@ class TestPrompts:
         assert torch.equal(labels, expected.repeat_interleave(2, 0).repeat_interleave(2, 1))
 
     def test_no_mask_is_good_enough(self, options: dict[str, Any]) -> None:
-        labels, scores, _ = segment_with_scores(picture(), "sam", grid=1, min_stability=1.0, **options)
+        labels, scores, _ = segment_with_scores(two_colors(), "sam", grid=1, min_stability=1.0, **options)
         assert int(labels.max()) == 0
         assert scores is not None
         assert scores.isnan().all()
@@ -172,15 +172,15 @@ class TestPrompts:
     )
     def test_bad_prompt(self, options: dict[str, Any], prompt: dict[str, Any], message: str) -> None:
         with pytest.raises(ValueError, match=message):
-            segment(picture(), "sam", **prompt, **options)
+            segment(two_colors(), "sam", **prompt, **options)
 
 
 class TestKorniaCheckpoint:
     def test_missing(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError, match=r"no checkpoint at .*gone.pth"):
-            segment(picture(), "sam", checkpoint=tmp_path / "gone.pth")
+            segment(two_colors(), "sam", checkpoint=tmp_path / "gone.pth")
         with pytest.raises(ValueError, match="checkpoint must be given"):
-            segment(picture(), "sam", model=TINY)
+            segment(two_colors(), "sam", model=TINY)
 
     @pytest.mark.parametrize("damage", ["truncated", "text", "other"])
     def test_damaged(self, tmp_path: Path, kornia_checkpoint: Path, damage: str) -> None:
@@ -192,7 +192,7 @@ class TestKorniaCheckpoint:
         else:
             torch.save({"weight": torch.zeros(3)}, path)
         with pytest.raises(ValueError, match=r"cannot load .*bad.pth as Segment Anything") as error:
-            segment(picture(), "sam", model=TINY, checkpoint=path)
+            segment(two_colors(), "sam", model=TINY, checkpoint=path)
         said = str(error.value).replace(str(path), "")  # which is as long as the machine has it
         assert len(said) < 450 and "weights_only" not in said
         if damage == "other":
@@ -201,7 +201,7 @@ class TestKorniaCheckpoint:
     @pytest.mark.slow
     def test_weights_of_another_size(self, kornia_checkpoint: Path) -> None:
         with pytest.raises(ValueError, match=r"cannot load .*tiny.pth as Segment Anything 'mobile_sam'"):
-            segment(picture(), "sam", model="mobile_sam", checkpoint=kornia_checkpoint)
+            segment(two_colors(), "sam", model="mobile_sam", checkpoint=kornia_checkpoint)
 
     @pytest.mark.slow
     def test_mobile_sam(self, tmp_path: Path) -> None:
@@ -210,7 +210,7 @@ class TestKorniaCheckpoint:
             torch.save(Sam.from_config(SamConfig("mobile_sam")).state_dict(), tmp_path / "mobile.pth")
         boxes = torch.tensor([[10.0, 10.0, 40.0, 30.0]])
         found = segment_with_scores(
-            picture(), "sam", model="mobile_sam", checkpoint=tmp_path / "mobile.pth", boxes=boxes
+            two_colors(), "sam", model="mobile_sam", checkpoint=tmp_path / "mobile.pth", boxes=boxes
         )
         assert_map(found.labels, found.scores)
 
@@ -220,19 +220,19 @@ class TestSam2Checkpoint:
         (tmp_path / "config.json").write_bytes((sam2_folder / "config.json").read_bytes())
         weights = (sam2_folder / "model.safetensors").read_bytes()
         (tmp_path / "model.safetensors").write_bytes(weights[: len(weights) // 2])
-        with pytest.raises(ValueError, match=f"cannot load '{tmp_path}' as Sam2Model for 'sam'"):
-            segment(picture(), "sam", model=tmp_path)
+        with pytest.raises(ValueError, match=f"cannot load '{tmp_path}' as Sam2Model"):
+            segment(two_colors(), "sam", model=tmp_path)
 
     def test_not_a_model(self, tmp_path: Path, sam2_folder: Path) -> None:
         with pytest.raises(ValueError, match="cannot load .* as Sam2Model"):
-            segment(picture(), "sam", model=tmp_path)
+            segment(two_colors(), "sam", model=tmp_path)
         with pytest.raises(ValueError, match="checkpoint goes with vit_b"):
-            segment(picture(), "sam", model=sam2_folder, checkpoint=sam2_folder / "model.safetensors")
+            segment(two_colors(), "sam", model=sam2_folder, checkpoint=sam2_folder / "model.safetensors")
 
     def test_other_weights(self, tmp_path: Path, sam2_folder: Path) -> None:
         from safetensors.torch import save_file
 
         (tmp_path / "config.json").write_bytes((sam2_folder / "config.json").read_bytes())
         save_file({"weight": torch.zeros(3)}, tmp_path / "model.safetensors", metadata={"format": "pt"})
-        with pytest.raises(ValueError, match="as Sam2Model for 'sam': it lacks"):
-            segment(picture(), "sam", model=tmp_path)
+        with pytest.raises(ValueError, match="as Sam2Model: it lacks"):
+            segment(two_colors(), "sam", model=tmp_path)

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import PIL.Image
 import pytest
 import torch
 from torch import Tensor
@@ -12,22 +13,26 @@ from torch import Tensor
 from kcgs.data import Davis, save_image, save_labels
 from kcgs.segment import (
     Cleanup,
+    Prediction,
     Segmentation,
     available_methods,
-    register_scored,
+    register,
     sam,
     segment,
     segment_with_scores,
 )
-from kcgs.segment.base import _methods
-from kcgs.segment.names import read_names
-from kcgs.segment.sources import _scored, require
+from kcgs.segment.methods.onnx_networks import read_names
+from kcgs.segment.registry import _methods
 
 
 def two_colors(height: int = 20, width: int = 30, split: int = 10) -> Tensor:
     image = torch.zeros(3, height, width)
     image[..., split:] = 1.0
     return image
+
+
+def clean(labels: Tensor, scores: Tensor | None = None, names: list[str] | None = None, **options: Any) -> Segmentation:
+    return Cleanup(**options).apply(two_colors(), Prediction(labels, scores, names))
 
 
 class TestRegistry:
@@ -43,31 +48,54 @@ class TestRegistry:
         with pytest.raises(ValueError, match="method must be one of"):
             segment_with_scores(two_colors(), "magic")
 
-    def test_scored_and_plain_agree(self) -> None:
-        @register_scored("test-scored")
-        def halves(image: Tensor) -> Segmentation:
-            labels = (torch.arange(image.shape[-1]) >= 10).long().expand(image.shape[-2:])
-            return Cleanup(min_size=1).apply(image, labels, labels * 0.5 + 0.25)
+    def test_scored_and_plain_agree(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("kcgs.segment.registry._methods", dict(_methods))
 
-        try:
-            labels, scores, _ = segment_with_scores(two_colors(), "test-scored")
-            assert torch.equal(labels, segment(two_colors(), "test-scored"))
-            assert torch.equal(labels, halves(two_colors()))
-            assert scores is not None
-            assert scores.tolist() == [0.75, 0.25]  # The larger right side comes first.
-            with pytest.raises(ValueError, match="already"):
-                register_scored("test-scored")(halves)  # type: ignore[arg-type]
-        finally:
-            del _methods["test-scored"], _scored["test-scored"]
+        @register("test", Cleanup(min_size=1))
+        def halves(image: Tensor) -> Prediction:
+            labels = (torch.arange(image.shape[-1]) >= 10).long().expand(image.shape[-2:])
+            return Prediction(labels, labels * 0.5 + 0.25)
+
+        labels, scores, _ = segment_with_scores(two_colors(), "test")
+        assert torch.equal(labels, segment(two_colors(), "test"))
+        assert torch.equal(labels, halves(two_colors()))
+        assert scores is not None
+        assert scores.tolist() == [0.75, 0.25]  # The larger right side comes first.
+        with pytest.raises(ValueError, match="already"):
+            register("test")
+
+    def test_method_gets_a_checked_image_and_the_cleanup_that_follows(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("kcgs.segment.registry._methods", dict(_methods))
+        seen = []
+
+        @register("test", Cleanup(max_regions=7))
+        def whole(image: Tensor, *, power: float = 1.0, min_size: int, max_regions: int | None) -> Tensor:
+            seen.append((image.dtype, tuple(image.shape), power, min_size, max_regions))
+            return torch.zeros(image.shape[1:], dtype=torch.int64)
+
+        gray = torch.full((1, 20, 30), 0.5, dtype=torch.float64, requires_grad=True)
+        assert int(segment(gray, "test").max()) == 0
+        segment(gray, "test", power=2.0, min_size=9, max_regions=None)
+        assert seen == [(torch.float32, (3, 20, 30), 1.0, 24, 7), (torch.float32, (3, 20, 30), 2.0, 9, None)]
+        assert list(inspect.signature(whole).parameters) == [
+            "image", "power", "snap", "min_size", "connected", "max_regions"
+        ]  # fmt: skip
+
+    def test_labels_of_another_size(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("kcgs.segment.registry._methods", dict(_methods))
+        register("test")(lambda image: torch.zeros(2, 2, dtype=torch.int64))
+        with pytest.raises(ValueError, match=r"method 'test' must have the image's size \(20, 30\); got \(2, 2\)"):
+            segment(two_colors(), "test")
+
+    def test_images_of_other_kinds(self) -> None:
+        pixels = (two_colors().permute(1, 2, 0) * 255).byte().numpy()
+        for image in (pixels, PIL.Image.fromarray(pixels), two_colors()[None], pixels[..., 0]):
+            assert torch.equal(segment(image, "kmeans"), segment(two_colors(), "kmeans"))
 
     def test_signature_says_what_is_returned(self) -> None:
         signature = inspect.signature(sam)
         assert signature.return_annotation is Tensor
-        assert "checkpoint" in signature.parameters
-
-    def test_missing_library(self) -> None:
-        with pytest.raises(ImportError, match=r"method 'x' needs kcgs_nowhere: pip install 'kcgs\[segment\]'"):
-            require("kcgs_nowhere.models", "'kcgs[segment]'", "x")
+        assert {"checkpoint", "snap", "min_size", "connected", "max_regions"} <= set(signature.parameters)
 
     @pytest.mark.parametrize(
         ("method", "library", "options", "line"),
@@ -75,7 +103,7 @@ class TestRegistry:
             ("dino", "transformers", {"model": "some/model"}, r"pip install 'kcgs\[segment\]'"),
             ("text", "transformers", {"model": "some/model", "prompts": ["a", "b"]}, r"pip install 'kcgs\[segment\]'"),
             ("sam", "transformers", {"model": "some/model"}, r"pip install 'kcgs\[segment\]'"),
-            ("sam", "kornia.models.sam", {}, "pip install kornia"),
+            ("sam", "kornia.models.sam.model", {}, "pip install kornia"),
             ("onnx", "onnxruntime", {"model": "net.onnx"}, "pip install onnxruntime"),
             ("auto", "skimage.segmentation", {}, "pip install scikit-image"),
             ("slic", "skimage.segmentation", {}, "pip install scikit-image"),
@@ -98,11 +126,11 @@ class TestNames:
         classes = (torch.arange(30) >= 12).long().repeat(20, 1) * 2
         classes[:, 28:] = 0
         classes[5, 20] = 1
-        found = Cleanup().apply(two_colors(), classes, names=["sky", "bird", "dog"])
+        found = clean(classes, names=["sky", "bird", "dog"])
         assert found.names == {0: "dog", 1: "sky", 2: "sky"}  # The bird was a speck; sky is in two pieces.
-        merged = Cleanup(max_regions=1).apply(two_colors(), classes, names=["sky", "bird", "dog"])
+        merged = clean(classes, names=["sky", "bird", "dog"], max_regions=1)
         assert merged.names == {0: "dog"}
-        assert Cleanup().apply(two_colors(), classes).names is None
+        assert clean(classes).names is None
 
     def test_file(self, tmp_path: Path) -> None:
         path = tmp_path / "names.txt"
@@ -133,27 +161,27 @@ class TestCleanup:
         return labels
 
     def test_defaults(self) -> None:
-        result, scores, _ = Cleanup().apply(two_colors(), self.labels())
+        result, scores, _ = clean(self.labels())
         assert scores is None
-        assert result.flatten().bincount().tolist() == [320, 240, 40]  # The speck is gone, the strip a region.
+        assert result.flatten().bincount().tolist() == [320, 240, 40]  # The speck is gone, the right margin a region.
 
     def test_nothing(self) -> None:
-        result = Cleanup(min_size=1, connected=False).apply(two_colors(), self.labels()).labels
+        result = clean(self.labels(), min_size=1, connected=False).labels
         assert result.flatten().bincount().tolist() == [319, 280, 1]
 
     def test_contours_snap(self) -> None:
-        result = Cleanup(snap=3).apply(two_colors(), (torch.arange(30) >= 12).long().repeat(20, 1)).labels
+        result = clean((torch.arange(30) >= 12).long().repeat(20, 1), snap=3).labels
         assert torch.equal(result, (torch.arange(30) < 10).long().repeat(20, 1))
 
     def test_budget(self) -> None:
-        result = Cleanup(max_regions=2).apply(two_colors(), self.labels()).labels
+        result = clean(self.labels(), max_regions=2).labels
         assert int(result.max()) + 1 == 2
 
     def test_scores_are_means_of_what_is_known(self) -> None:
         painted = torch.full((20, 30), float("nan"))
         painted[:10, :12] = 0.5
         painted[10:, :6] = 0.9
-        _, scores, _ = Cleanup().apply(two_colors(), self.labels(), painted)
+        _, scores, _ = clean(self.labels(), painted)
         assert scores is not None
         assert scores.isnan().tolist() == [True, False, True]
         assert float(scores[1]) == pytest.approx((120 * 0.5 + 60 * 0.9) / 180)
@@ -190,13 +218,13 @@ class TestFile:
 
     def test_other_size(self, tmp_path: Path) -> None:
         save_labels(tmp_path / "mask.png", torch.zeros(4, 5, dtype=torch.int64))
-        with pytest.raises(ValueError, match=r"size \(20, 30\); got \(4, 5\) in .*mask.png"):
+        with pytest.raises(ValueError, match=r"'file' must have the image's size \(20, 30\); got \(4, 5\)"):
             segment(two_colors(), "file", path=tmp_path / "mask.png")
 
     def test_missing_and_unreadable(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError, match=r"gone.png"):
             segment(two_colors(), "file", path=tmp_path / "gone.png")
-        (tmp_path / "bad.png").write_bytes(b"no picture")
+        (tmp_path / "bad.png").write_bytes(b"no image")
         with pytest.raises(ValueError, match=r"bad.png"):
             segment(two_colors(), "file", path=tmp_path / "bad.png")
 
@@ -222,7 +250,7 @@ class TestDavis:
         self.make(tmp_path)
         with pytest.raises(ValueError, match="no sequence 'dogs'"):
             segment(two_colors(), "davis", root=tmp_path, sequence="dogs")
-        with pytest.raises(ValueError, match="in sequence 'cows'"):
+        with pytest.raises(ValueError, match=r"'davis' must have the image's size \(21, 30\); got \(20, 30\)"):
             segment(two_colors(21), "davis", root=tmp_path, sequence="cows")
         with pytest.raises(FileNotFoundError):
             segment(two_colors(), "davis", root=tmp_path / "gone", sequence="cows")
@@ -252,15 +280,15 @@ class TestOneCleanup:
 
     @pytest.mark.parametrize("method", ["felzenszwalb", "slic", "watershed", "kmeans"])
     def test_snapping_is_optional(self, photo: Tensor, method: str) -> None:
-        maps = {snap: segment(photo, method, snap=snap) for snap in (False, True, 4)}
-        assert torch.equal(maps[False], segment(photo, method, snap=0))
-        assert torch.equal(maps[True], segment(photo, method, snap=2))
-        assert len({tuple(labels.flatten().tolist()) for labels in maps.values()}) == 3
+        maps = [segment(photo, method, snap=snap) for snap in (0, 2, 4)]
+        assert len({tuple(labels.flatten().tolist()) for labels in maps}) == 3
         with pytest.raises(ValueError, match="snap must be at least 0; got -1"):
             segment(photo, method, snap=-1)
-        with pytest.raises(TypeError, match=r"snap must be a number of pixels, .*got 1.5"):
-            segment(photo, method, snap=1.5)
+        for wrong in (1.5, True):
+            with pytest.raises(TypeError, match="snap must be an integer; got"):
+                segment(photo, method, snap=wrong)
 
     def test_unknown_option(self, tmp_path: Path) -> None:
-        with pytest.raises(TypeError, match="no option 'nams'; clean-up takes min_size, snap, max_regions, connected"):
+        message = "'onnx' has no option 'nams'; it takes model, .*, names, snap, min_size, connected, max_regions$"
+        with pytest.raises(TypeError, match=message):
             segment(two_colors(), "onnx", model=tmp_path / "net.onnx", nams=["sky"])

@@ -48,7 +48,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def picture() -> Tensor:
+def two_colors() -> Tensor:
     image = torch.zeros(3, 60, 90)
     image[0, :, 30:] = 1.0
     image[1, 25:, 50:] = 0.8
@@ -67,12 +67,12 @@ def assert_map(labels: Tensor, scores: Tensor | None) -> None:
 
 class TestText:
     def test_prompts(self, folder: Path) -> None:
-        labels, scores, names = segment_with_scores(picture(), "text", prompts=PROMPTS, model=folder, size=64)
+        labels, scores, names = segment_with_scores(two_colors(), "text", prompts=PROMPTS, model=folder, side=64)
         assert_map(labels, scores)
         assert names is not None
         assert list(names) == labels.unique().tolist()
         assert set(names.values()) <= set(PROMPTS)
-        assert torch.equal(labels, segment(picture(), "text", prompts=PROMPTS, model=str(folder), size=64))
+        assert torch.equal(labels, segment(two_colors(), "text", prompts=PROMPTS, model=str(folder), side=64))
 
     def test_equals_the_model_itself(self, folder: Path) -> None:
         model = transformers.CLIPSegForImageSegmentation.from_pretrained(folder)
@@ -83,7 +83,7 @@ class TestText:
         shown = ((image - mean[:, None, None]) / std[:, None, None]).expand(3, -1, -1, -1)
         with torch.no_grad():
             truth = model(pixel_values=shown, input_ids=tokens["input_ids"]).logits.argmax(dim=0)
-        options: dict[str, Any] = {"prompts": PROMPTS, "size": 64, "min_size": 1, "connected": False}
+        options: dict[str, Any] = {"prompts": PROMPTS, "side": 64, "min_size": 1, "connected": False}
         labels = segment(image, "text", model=model, tokenizer=tokenizer, **options)
         found = segment_with_scores(image, "text", model=model, tokenizer=tokenizer, **options)
         assert torch.equal(found.labels, labels)
@@ -91,17 +91,17 @@ class TestText:
         pairs = (truth * 3 + labels).unique()  # Each class is one region: the numbers alone differ.
         assert len(pairs) == len(truth.unique()) == len(labels.unique())
 
-    @pytest.mark.parametrize("background", [0.0, 0.5, 1.0])
-    def test_background(self, folder: Path, background: float) -> None:
-        options: dict[str, Any] = {"prompts": ["a dog"], "background": background, "model": folder, "size": 64}
-        labels, scores, names = segment_with_scores(picture(), "text", connected=False, **options)
+    @pytest.mark.parametrize("threshold", [0.0, 0.5, 1.0])
+    def test_background(self, folder: Path, threshold: float) -> None:
+        options: dict[str, Any] = {"prompts": ["a dog"], "threshold": threshold, "model": folder, "side": 64}
+        labels, scores, names = segment_with_scores(two_colors(), "text", connected=False, **options)
         assert_map(labels, scores)
-        if background in (0.0, 1.0):
+        if threshold in (0.0, 1.0):
             assert int(labels.max()) == 0
-            assert names == {0: "background" if background else "a dog"}
+            assert names == {0: "background" if threshold else "a dog"}
 
     def test_long_prompts_are_cut(self, folder: Path) -> None:
-        assert segment(picture(), "text", prompts=["dog " * 40, "cat"], model=folder, size=64).shape == (60, 90)
+        assert segment(two_colors(), "text", prompts=["dog " * 40, "cat"], model=folder, side=64).shape == (60, 90)
 
 
 class TestErrors:
@@ -111,15 +111,15 @@ class TestErrors:
             ({"prompts": "dog"}, TypeError, "prompts must be a list of strings"),
             ({"prompts": ["dog", 3]}, TypeError, "prompts must be a list of strings"),
             ({"prompts": ["dog"]}, ValueError, "prompts must be at least 2 non-empty"),
-            ({"prompts": [], "background": 0.5}, ValueError, "prompts must be at least 1 non-empty"),
+            ({"prompts": [], "threshold": 0.5}, ValueError, "prompts must be at least 1 non-empty"),
             ({"prompts": ["dog", " "]}, ValueError, "prompts must be"),
-            ({"prompts": ["dog", "cat"], "background": 2.0}, ValueError, "background must be in"),
-            ({"prompts": ["dog", "cat"], "size": 0}, ValueError, "size must be at least 1"),
+            ({"prompts": ["dog", "cat"], "threshold": 2.0}, ValueError, "threshold must be in"),
+            ({"prompts": ["dog", "cat"], "side": 0}, ValueError, "side must be at least 1"),
         ],
     )
     def test_options(self, folder: Path, options: dict[str, Any], error: type[Exception], message: str) -> None:
         with pytest.raises(error, match=message):
-            segment(picture(), "text", model=folder, **options)
+            segment(two_colors(), "text", model=folder, **options)
 
     @pytest.mark.parametrize("damage", ["no weights", "truncated", "no tokenizer"])
     def test_folder(self, tmp_path: Path, folder: Path, damage: str) -> None:
@@ -133,9 +133,9 @@ class TestErrors:
         else:
             (path / "model.safetensors").unlink()
         with pytest.raises(ValueError, match=f"(cannot load|the tokenizer of) .*{path}"):
-            segment(picture(), "text", prompts=PROMPTS, model=path)
+            segment(two_colors(), "text", prompts=PROMPTS, model=path)
 
     def test_loaded_model_needs_its_tokenizer(self, folder: Path) -> None:
         model = transformers.CLIPSegForImageSegmentation.from_pretrained(folder)
         with pytest.raises(ValueError, match="tokenizer must be given"):
-            segment(picture(), "text", prompts=PROMPTS, model=model)
+            segment(two_colors(), "text", prompts=PROMPTS, model=model)

@@ -13,7 +13,7 @@ from torch import Tensor
 from kcgs.data import load_image, load_labels
 from kcgs.functional import boundary_f_score, edge_alignment
 from kcgs.segment import connected_regions, watershed
-from kcgs.segment.edges import _deepest_minima, _edge_strength, _minima
+from kcgs.segment.methods.edges import _deepest_minima, _edge_strength, _minima
 
 
 def coffee() -> Tensor:
@@ -45,19 +45,19 @@ class TestMinima:
 
 
 def test_edge_strength_is_the_slope_of_lightness() -> None:
-    pixels = np.repeat(np.linspace(0.4, 0.6, 21, dtype=np.float32)[None, :, None], 9, 0).repeat(3, 2)
+    image = torch.linspace(0.4, 0.6, 21).expand(3, 9, -1)
     from skimage.color import rgb2lab
 
-    lightness = rgb2lab(pixels)[4, :, 0]
-    assert _edge_strength(pixels, 0.0)[4, 10] == pytest.approx((lightness[11] - lightness[9]) / 2, abs=1e-3)
+    lightness = rgb2lab(image.permute(1, 2, 0).numpy())[4, :, 0]
+    assert _edge_strength(image, 0.0)[4, 10] == pytest.approx((lightness[11] - lightness[9]) / 2, abs=1e-3)
 
 
-def test_level_picture_is_one_region() -> None:
+def test_level_image_is_one_region() -> None:
     assert (watershed(torch.full((3, 20, 30), 0.3)) == 0).all()
-    assert (watershed(torch.full((3, 20, 30), 0.3), markers=5) == 0).all()
+    assert (watershed(torch.full((3, 20, 30), 0.3), num_segments=5) == 0).all()
 
 
-@pytest.mark.parametrize("options", [{}, {"markers": 60}, {"snap": False}, {"sigma": 0.0, "depth": 0.0}])
+@pytest.mark.parametrize("options", [{}, {"num_segments": 60}, {"snap": 0}, {"sigma": 0.0, "depth": 0.0}])
 def test_promises(options: dict[str, float]) -> None:
     image = coffee()
     labels = watershed(image, max_regions=8, **options)  # type: ignore[arg-type]
@@ -80,8 +80,8 @@ def test_deeper_minima_are_fewer_regions() -> None:
         ({"sigma": float("nan")}, ValueError),
         ({"depth": -0.1}, ValueError),
         ({"depth": float("inf")}, ValueError),
-        ({"markers": 0}, ValueError),
-        ({"markers": 2.5}, TypeError),
+        ({"num_segments": 0}, ValueError),
+        ({"num_segments": 2.5}, TypeError),
         ({"max_regions": 0}, ValueError),
         ({"min_size": 0}, ValueError),
     ],

@@ -16,7 +16,7 @@ from torch import Tensor
 from kcgs.bench.fit.cases import BASELINE, REFINED, Case, make_case
 from kcgs.bench.sizes import write_scene
 from kcgs.codec import Decoded, decode
-from kcgs.codec.maps import encode_map
+from kcgs.codec.labels import encode_map
 from kcgs.data import load_image
 from kcgs.fit import fit, warm_up
 from kcgs.functional import RegionMap, ef_psnr, psnr

@@ -17,7 +17,7 @@ from kcgs.bench.fits import Place, Spec, ensure_one, make_all
 from kcgs.bench.measure import measure
 from kcgs.bench.sizes import write_scene
 from kcgs.codec import decode
-from kcgs.codec.maps import encode_map
+from kcgs.codec.labels import encode_map
 from kcgs.fit import FitConfig, HistoryEntry, warm_up
 from kcgs.io import Scene, load
 from kcgs.nn.renderer import render_image

@@ -84,7 +84,7 @@ class Store:
 def codec_digest() -> str:
     """Hash the format's version and the code that writes files; comments and docstrings do not count."""
     import kcgs.codec
-    from kcgs.codec.stream import VERSION
+    from kcgs.codec.file import VERSION
 
     folder = Path(kcgs.codec.__file__).parent
     sources = [*sorted(folder.rglob("*.py")), *sorted((folder.parent / "rate").glob("*.py"))]

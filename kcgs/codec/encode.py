@@ -1,0 +1,192 @@
+"""Scenes as `.kcgs` bytes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcgs._check import check_count, check_floating, check_number
+from kcgs.functional import RegionMap
+from kcgs.functional.covariance import check_cholesky
+from kcgs.nn import GaussianField
+from kcgs.scene import Scene
+
+from .file import MOST_CHANNELS, MOST_SIDE, SPARE, Header, most_gaussians, pack
+from .gaussians.layers import LayerCoder
+from .gaussians.quantize import QPS, Classes, Codes, Parameters, Quantizer
+from .rangecoder import Writer
+
+# of the decoded image against the scene's own, in dB
+QUALITIES = (10.0, 90.0)
+DEFAULT_QUALITY = 46.0
+
+
+def encode(
+    field: GaussianField,
+    regions: RegionMap | Tensor | None = None,
+    *,
+    quality: float | None = None,
+    target_bytes: int | None = None,
+) -> bytes:
+    """Write a scene as a `.kcgs` file; the same scene gives the same bytes.
+
+    Convention: the image that was fitted is not looked at. Every parameter is rounded so that it adds the same squared
+    error to the render; where centres are far outside the image, they are brought nearer. Gaussians whose colour rounds
+    to black are left out. The map is kept without loss, but contour widths are rounded to fortieths of a pixel.
+    :func:`kcgs.rate.compress` makes up for most of the error where the image is at hand.
+
+    Args:
+        field: N Gaussians of one image; opacities are merged into the colours.
+        regions: the map to render with (a Tensor means hard contours); None, or a map of one region: one region, which
+            takes one byte.
+        quality: PSNR in dB of the decoded render against the scene's own, before clipping, 10 to 90; 46 by default.
+        target_bytes: the finest file that is not larger, in place of `quality`.
+
+    Returns:
+        The file.
+
+    Raises:
+        TypeError: an argument of the wrong type.
+        ValueError: a batch, no Gaussians, values that are not finite, region ids that the map does not hold, both
+            `quality` and `target_bytes`, numbers out of range, more than a file may hold (:mod:`kcgs.codec.file`),
+            a target that the coarsest file misses.
+
+    Example:
+        >>> from kcgs.codec import decode
+        >>> field = GaussianField.random(100, (32, 48), seed=0)
+        >>> data = encode(field, quality=40)
+        >>> len(data) < 1000, decode(data).field.size
+        (True, (32, 48))
+    """
+    writer = SceneWriter(field, regions)
+    qp = writer.qp_for(quality, target_bytes)
+    if target_bytes is None:
+        return writer.write_rounded(qp)
+    return writer.finest(writer.write_rounded, target_bytes)[1]
+
+
+def serialize(scene: Scene) -> bytes:
+    """Write a scene at the default quality, for :func:`kcgs.save`."""
+    return encode(scene.field, scene.regions)
+
+
+class SceneWriter:
+    """A scene that files are written of, at any quantization parameter; its map is coded once.
+
+    Args:
+        field: N Gaussians of one image.
+        regions: the map to render with.
+
+    Raises:
+        TypeError, ValueError: as :func:`encode`.
+    """
+
+    def __init__(self, field: GaussianField, regions: RegionMap | Tensor | None) -> None:
+        _check_field(field)
+        self.size, self.channels = field.size, field.colors.shape[-1]
+        tensors = field.means, field.cholesky, field.merged_colors()
+        self.gaussians = Parameters(*(t.detach().cpu().double().numpy() for t in tensors))
+        regions = RegionMap.coerce(regions)
+        self.regions = None if regions is None or regions.num_regions == 1 else regions.to("cpu")
+        self.ids = np.zeros(len(field), np.int64)  # as positions among the map's ids
+        self.region_map = b""
+        if self.regions is not None:
+            from .labels import encode_map  # loads numba
+
+            self.ids = _positions(field, self.regions)
+            self.region_map = encode_map(self.regions)
+
+    def qp_for(self, quality: float | None, target_bytes: int | None = None) -> int:
+        """Return the quantization parameter at which rounding costs this PSNR, in dB, against the unrounded scene."""
+        if quality is not None and target_bytes is not None:
+            raise ValueError(f"quality and target_bytes exclude each other; got {quality!r} and {target_bytes!r}")
+        decibels = check_number("quality", DEFAULT_QUALITY if quality is None else quality, *QUALITIES, unit="dB")
+        samples = self.channels * self.size[0] * self.size[1]
+        distortion = samples * 10 ** (-decibels / 10) / self._count_numbers()
+        return min(max(math.floor(-32 * math.log2(max(distortion, 1e-12)) + 0.5), QPS[0]), QPS[1])
+
+    def finest(self, write: Callable[[int], bytes], target_bytes: int, *, share: float = 1.0) -> tuple[int, bytes]:
+        """Return the quantization parameter of the largest file of at most `share` of `target_bytes`, and the file.
+
+        A step of the parameter is 1/32 of a bit for each number of a Gaussian, so that a few files tell which.
+        """
+        most = round(share * check_count("target_bytes", target_bytes))
+        low, high = QPS[0], self.qp_for(QUALITIES[1])
+        qp, best = min(max(self.qp_for(DEFAULT_QUALITY), low), high), None
+        slope = self._count_numbers() / (8 * 32)
+        while low <= high:
+            data = write(qp)
+            if len(data) <= most:
+                best, low = (qp, data), qp + 1
+            else:
+                least, high = len(data), qp - 1
+            qp = min(max(qp + math.floor((most - len(data)) / slope), low), high)
+        if best is None:
+            needed = math.ceil(least / share)
+            raise ValueError(f"target_bytes must be at least {needed} for this scene; got {target_bytes}")
+        return best
+
+    def write_rounded(self, qp: int) -> bytes:
+        """Write the file of Gaussians that are rounded one by one."""
+        quantizer = Quantizer(qp, self.size)
+        classes = quantizer.classify(self.gaussians)
+        seen = quantizer.is_seen(self.gaussians.colors, classes)
+        if not seen.any():
+            seen[0] = True
+        kept = Parameters(*(numbers[seen] for numbers in self.gaussians))
+        codes = quantizer.quantize(kept, Classes(*(numbers[seen] for numbers in classes)))
+        return self.write(quantizer, codes, self.ids[seen])
+
+    def write(self, quantizer: Quantizer, codes: Codes, ids: NDArray[np.int64]) -> bytes:
+        """Write the file of Gaussians that are whole numbers already, with the positions of their regions' ids."""
+        order = codes.order()
+        codes, ids = codes.pick(order), ids[order]
+        model, layers, told = LayerCoder(quantizer, self.channels, self.regions), [], []
+        energies, starts, counts = np.unique(-codes.energy, return_index=True, return_counts=True)
+        for energy, start, count in zip((-energies).tolist(), starts.tolist(), counts.tolist(), strict=True):
+            writer, part = Writer(), slice(start, start + count)
+            model.code(writer, energy, codes.pick(part), ids[part], len(ids))
+            # each Gaussian takes more than a bit, but zeros at the end are left out
+            layers.append(writer.finish().ljust(-(-(count - SPARE) // 8), b"\0"))
+            told.append((energy, len(layers[-1])))
+        header = Header(self.size, self.channels, quantizer.qp, model.num_regions, tuple(told))
+        return pack(header, self.region_map, layers)
+
+    def _count_numbers(self) -> int:
+        return len(self.ids) * (5 + self.channels)
+
+
+def _check_field(field: GaussianField) -> None:
+    """Refuse what no file can hold; a parameter may have been changed since the field was made."""
+    if not isinstance(field, GaussianField):
+        raise TypeError(f"field must be a GaussianField; got {type(field).__name__}")
+    if field.means.ndim != 2 or len(field) == 0:
+        raise ValueError(f"field must hold the Gaussians of one image; got means of shape {tuple(field.means.shape)}")
+    check_floating("means", field.means.detach().float())
+    check_cholesky("cholesky", field.cholesky.detach().float())
+    check_floating("colors", field.merged_colors().detach().float())
+    channels = field.colors.shape[-1]
+    for limit, most, found in (
+        ("size must be at most {} pixels per side", MOST_SIDE, max(field.size)),
+        ("colors must have at most {} channels", MOST_CHANNELS, channels),
+        (f"field must hold at most {{}} Gaussians of {channels} channels", most_gaussians(channels), len(field)),
+    ):
+        if found > most:
+            raise ValueError(f"{limit.format(most)}; got {found}")
+
+
+def _positions(field: GaussianField, regions: RegionMap) -> NDArray[np.int64]:
+    """Return the position of each Gaussian's region among the map's ids."""
+    if regions.labels.ndim != 2 or regions.size != field.size:
+        raise ValueError(f"regions must be one map of size {field.size}; got {tuple(regions.labels.shape)}")
+    if field.region_ids is None:
+        raise ValueError("field must have region_ids where regions are given; call field.assign_regions(regions)")
+    region_ids = field.region_ids.cpu()
+    index = regions.index_of(region_ids)
+    if (index < 0).any():
+        raise ValueError(f"region_ids must be ids of the map; got {int(region_ids[index < 0][0])}")
+    return index.numpy()

@@ -1,0 +1,1 @@
+"""Gaussians as whole numbers in layers."""

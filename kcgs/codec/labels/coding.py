@@ -1,0 +1,163 @@
+"""Label maps without loss: a few hundred bytes for a photo's regions (docs/format.md)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kcgs.codec.adaptive import AdaptiveBit
+from kcgs.codec.errors import CodecError
+from kcgs.codec.rangecoder import Coder, Reader, Writer
+from kcgs.functional.labels import compact
+
+from .contexts import CODED, LABEL, LEFT, RIGHT, TOP, new_tables
+from .ids import code_ids
+from .seeds import code_seeds
+from .wavefront import DECIDED, RANKS, REGIONS, STATE, Loops, loops, new_work
+
+# what a reader may be asked to work through: seconds
+_MOST_ASKED, _MOST_ESCAPES = 1 << 23, 1 << 18
+Labels = NDArray[np.int64]
+_NOISY = np.array([2.0**-10])  # chance of a map that the model makes larger
+
+
+def encode_labels(labels: Labels) -> bytes:
+    """Write a label map.
+
+    Args:
+        labels: (H, W), ids of 0 to 2**63 - 1.
+
+    Returns:
+        The map without its height and width; the same map gives the same bytes everywhere.
+
+    Example:
+        >>> halves = np.repeat([[5], [9]], 32, axis=0) + np.zeros((1, 64), np.int64)
+        >>> len(encode_labels(halves)) < 12
+        True
+    """
+    ids, index = (found.numpy() for found in compact(torch.from_numpy(labels))[:2])
+    if len(ids) == 1:
+        writer = Writer()
+        code_ids(writer, ids.tolist(), 1)
+        return writer.finish()
+    truth, seeds, order = loops().survey(index, len(ids))
+    numbered = ids[order].tolist()
+
+    def begin(noisy: int) -> Writer:
+        writer = Writer()
+        code_ids(writer, numbered, len(ids))
+        writer.bits(_NOISY, np.array([noisy], np.int32))
+        return writer
+
+    try:
+        writer = begin(0)
+        _code_pixels(writer, truth, seeds, len(ids))
+        data = writer.finish()
+        if 8 * len(data) <= labels.size * math.log2(len(ids)) + 64:
+            return data
+    except _Laborious:
+        pass  # noise, or nearly
+    writer = begin(1)
+    writer.numbers(truth.reshape(-1), len(ids), labels.size)
+    return writer.finish()
+
+
+def decode_labels(data: bytes, height: int, width: int, *, max_regions: int) -> Labels:
+    """Read a label map.
+
+    Args:
+        data: what `encode_labels` returned.
+        height: of the map.
+        width: of the map.
+        max_regions: more are refused.
+
+    Returns:
+        (H, W) int64.
+
+    Raises:
+        CodecError: the bytes are no such map.
+
+    Example:
+        >>> labels = np.array([[7, 7, 3], [7, 3, 3]])
+        >>> (decode_labels(encode_labels(labels), 2, 3, max_regions=2) == labels).all()
+        np.True_
+    """
+    reader = Reader(data)
+    ids = np.array(code_ids(reader, [], min(max_regions, height * width)), np.int64)
+    if len(ids) == 1:
+        return np.full((height, width), ids[0], np.int64)
+    if reader.bits(_NOISY, np.zeros(1, np.int32))[0]:
+        index = reader.numbers(None, len(ids), height * width).reshape(height, width)
+    else:
+        index = _code_pixels(reader, np.zeros((0, 0), np.int32), np.zeros((height, width), np.uint8), len(ids))
+    labels: Labels = ids[index]
+    return labels
+
+
+def _code_pixels(coder: Coder, truth: Any, seeds: Any, regions: int) -> Any:
+    """Code a map of numbered regions; a reader ignores `truth` and fills in `seeds`."""
+    run = loops()
+    code_seeds(coder, seeds)
+    height, width = seeds.shape
+    tables, work = new_tables(), new_work(height)
+    labels = np.zeros((height + TOP + 1, width + LEFT + RIGHT), np.int32)
+    state = np.zeros(STATE, np.int64)
+    state[REGIONS] = regions
+    memory = (state, labels, seeds, *tables, *work)
+    escapes = _Escapes(coder, run, labels, regions)
+    answers = np.zeros(2 * height, np.int32)
+    bits, asked = answers[:0], 0
+    while rows := run.advance(bits, *memory):
+        decided = int(state[DECIDED])
+        used = decided if regions == 2 else 2 * decided
+        asked += decided
+        if asked > _MOST_ASKED:
+            raise _Laborious(f"data must ask for at most {_MOST_ASKED} pixels near contours; got more")
+        if not coder.reads:
+            run.answer(state, truth, work.rows, answers)
+        if used:
+            bits = coder.bits(work.chances[:used], answers[:used])
+        if regions > 2 and (rows > decided or np.count_nonzero(bits[:decided])):
+            escapes.code(work.rows[:rows], bits[:decided] != 0)
+    return labels[TOP : TOP + height, LEFT : LEFT + width]
+
+
+class _Laborious(CodecError):
+    """A map that would take minutes to read."""
+
+
+class _Escapes:
+    """Labels of pixels that are neither candidate."""
+
+    def __init__(self, coder: Coder, run: Loops, labels: Any, regions: int) -> None:
+        self._coder, self._run, self._labels, self._regions = coder, run, labels, regions
+        self._met, self._count = 1, 0
+        # of seeds, and of others
+        self._new = [AdaptiveBit(), AdaptiveBit()]
+        self._rank = [[AdaptiveBit() for _ in range(RANKS)] for _ in range(2)]
+        self._found = np.zeros(RANKS, np.int32)
+
+    def code(self, rows: Any, neither: Any) -> None:
+        """Code the labels of a wavefront."""
+        asked = rows[:, CODED] == 0
+        asked[~asked] = neither
+        self._count += int(asked.sum())
+        if self._count > _MOST_ESCAPES:
+            raise _Laborious(f"data must hold at most {_MOST_ESCAPES} labels that no neighbour has; got more")
+        for place in np.flatnonzero(asked):
+            rows[place, LABEL] = self._code(rows[place])
+
+    def _code(self, row: Any) -> int:
+        label, coded = int(row[LABEL]), int(row[CODED])
+        if self._met < self._regions and self._new[coded].code(self._coder, label == self._met):
+            self._met += 1
+            return self._met - 1
+        for rank in range(self._run.nearest(self._labels, row, self._found)):
+            guess = int(self._found[rank])
+            if self._rank[coded][rank].code(self._coder, label == guess):
+                return guess
+        return self._coder.number(label, self._met)

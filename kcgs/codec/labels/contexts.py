@@ -1,0 +1,181 @@
+"""The model of label maps: what a pixel may be, given the pixels before it (docs/format.md, "Chances of a pixel").
+
+Loops in integers, compiled by numba: ``>>`` and ``//`` round down.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numba import njit
+
+from .prior import HIDDEN, LATENT, TEMPLATE, load_prior
+
+LEFT, RIGHT, TOP = 8, 9, 6  # margins around the map
+CLIP = 3071  # largest logit, in 1/256
+HEADS, INPUTS = 2, 4  # decisions: which of two candidates, or neither; estimates that are mixed
+# columns of a pixel's row: its place, the candidates, whether it is decided by bits, its label; then for each decision
+# the estimates, and the three counters, the mixer's weights, the chance; then the template, and the network's units
+X, Y, FIRST, SECOND, CODED, LABEL, INPUT = 0, 1, 2, 3, 4, 5, 6
+SLOT = INPUT + HEADS * INPUTS
+CHOSEN, MIXED, DECISION = 3, 4, 5
+FEATURE = SLOT + HEADS * DECISION
+_LATENT = FEATURE + len(TEMPLATE)
+_HIDDEN = _LATENT + LATENT
+COLUMNS = _HIDDEN + HIDDEN
+
+# where the counters of each context begin
+_BASES = np.array([[0, 1 << 6, (1 << 6) + (1 << 11)], [67648, 67649, 67649 + 3**4]], np.int32)
+_SLOTS = 67649 + 3**4 + 3**8
+_RATE, _SHIFT = 6, 18  # the mixer's step
+_HEAVIEST = 1 << 22
+_MEMORY = 40  # decisions that a counter remembers
+_SURE = 16  # least chance, in 1/65536
+
+
+# constants of the loops: the template, the network, 65536 / (1 + e**(-x / 256)) for logits from -CLIP, its inverse.
+# No value of the third but 32768 is within 1e-6 of a half before it is rounded: any machine's exp gives the same table.
+_DX, _DY = (np.array(axis, np.int32) for axis in zip(*TEMPLATE, strict=True))
+_LAYER1, _BIAS1, _LAYER2, _BIAS2, _LAYER3, _BIAS3, _MIXER = load_prior()
+SQUASH = np.rint(65536 / (1 + np.exp(np.arange(CLIP, -CLIP - 1, -1) / 256))).astype(np.int32)
+_STRETCH = (np.searchsorted(SQUASH, np.arange(4096) * 16 + 8) - CLIP).astype(np.int32)
+
+
+class Tables(NamedTuple):
+    """What adapts."""
+
+    counters: Any  # [slots, 2] uint16: the chance in 1/65536, how often it was seen
+    weights: Any  # [HEADS, 4, INPUTS] int32, 1/65536
+
+
+def new_tables() -> Tables:
+    """Return what every stream starts with."""
+    weights = np.empty((HEADS, 4, INPUTS), np.int32)
+    weights[:] = _MIXER
+    return Tables(np.zeros((_SLOTS, 2), np.uint16), weights)
+
+
+inner = cast(Any, njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+
+
+@inner
+def quiet(labels, y, x):  # type: ignore[no-untyped-def]
+    """Tell whether the pixels around (x, y) that come before it have one label."""
+    label = labels[y, x - 1]
+    for i in range(x - 2, x + 8):
+        if labels[y - 1, i] != label:
+            return False
+    for i in range(x - 1, x + 4):
+        if labels[y - 2, i] != label:
+            return False
+    return labels[y, x - 2] == label
+
+
+@inner
+def describe(labels, y, x, row):  # type: ignore[no-untyped-def]
+    """Find the two candidates, and which of them each pixel of the template is."""
+    first = labels[y, x - 1]
+    second = -1
+    for t in range(len(_DX)):
+        label = labels[y + _DY[t], x + _DX[t]]
+        if label == first:
+            row[FEATURE + t] = 0
+        elif second < 0 or label == second:
+            second = label
+            row[FEATURE + t] = 1
+        else:
+            row[FEATURE + t] = 2
+    row[FIRST] = first
+    row[SECOND] = second
+
+
+@inner
+def network(row):  # type: ignore[no-untyped-def]
+    """Two layers of rectified sums of small integers; the first estimate of each decision, a logit in 1/256."""
+    # lengths that a compiler cannot know: it would write known loops out, and not use vectors, at three times the time
+    latent, hidden = row[_LATENT : len(row) - HIDDEN], row[_HIDDEN:]
+    for j in range(len(hidden)):
+        hidden[j] = _BIAS1[j]
+    for t in range(len(_DX)):
+        kind = row[FEATURE + t]
+        if kind > 0:
+            weights = _LAYER1[t, kind - 1]
+            for j in range(len(hidden)):
+                hidden[j] += weights[j]
+    for k in range(len(latent)):
+        latent[k] = _BIAS2[k]
+    for j in range(HIDDEN):
+        value = min(hidden[j], 4095)
+        if value > 0:
+            weights = _LAYER2[j]
+            for k in range(len(latent)):
+                latent[k] += value * weights[k]
+    for h in range(HEADS):
+        total = _BIAS3[h]
+        for k in range(LATENT):
+            total += min(max(latent[k] >> 6, 0), 4095) * _LAYER3[k, h]
+        row[INPUT + h * INPUTS] = min(max(total >> 4, -CLIP), CLIP)
+
+
+@inner
+def contexts(row):  # type: ignore[no-untyped-def]
+    """Find the counters of a pixel: by its nearest 6, 11 and 16; and for the other decision all, by 4 and by 8."""
+    bits = 0
+    for t in range(1, 17):
+        bits = bits << 1 | (row[FEATURE + t] > 0)
+        if t == 6:
+            row[SLOT] = _BASES[0, 0] + bits
+        elif t == 11:
+            row[SLOT + 1] = _BASES[0, 1] + bits
+        elif t == 16:
+            row[SLOT + 2] = _BASES[0, 2] + bits
+    digits = 0
+    for t in range(1, 9):
+        digits = digits * 3 + row[FEATURE + t]
+        if t == 4:
+            row[SLOT + DECISION + 1] = _BASES[1, 1] + digits
+        elif t == 8:
+            row[SLOT + DECISION + 2] = _BASES[1, 2] + digits
+    row[SLOT + DECISION] = _BASES[1, 0]
+
+
+@inner
+def mix(tables, row, h):  # type: ignore[no-untyped-def]
+    """Weigh the network and the counters into one chance."""
+    inputs, slots = row[INPUT + h * INPUTS :], row[SLOT + h * DECISION :]
+    seen: Any = 0
+    for c in range(3):
+        counter = tables.counters[slots[c]]
+        seen = counter[1]
+        inputs[c + 1] = _STRETCH[counter[0] >> 4] if seen > 0 else inputs[0]
+    chosen = 0 if seen == 0 else 1 if seen < 5 else 2 if seen < 12 else 3
+    total: Any = np.int64(0)
+    for k in range(INPUTS):
+        total += np.int64(tables.weights[h, chosen, k]) * inputs[k]
+    logit: Any = min(max(total >> 16, -CLIP), CLIP)
+    slots[CHOSEN] = chosen
+    slots[MIXED] = min(max(SQUASH[logit + CLIP], _SURE), 65536 - _SURE)
+    return slots[MIXED] / 65536
+
+
+@inner
+def learn(tables, row, h, bit):  # type: ignore[no-untyped-def]
+    """Move the weights along the error, and the counters to the bit."""
+    inputs, slots = row[INPUT + h * INPUTS :], row[SLOT + h * DECISION :]
+    error = (bit << 16) - slots[MIXED]
+    weights = tables.weights[h, slots[CHOSEN]]
+    for k in range(INPUTS):
+        step = np.int64(inputs[k]) * error * _RATE
+        weight = weights[k] + ((step + (1 << (_SHIFT - 1))) >> _SHIFT)
+        weights[k] = min(max(weight, -_HEAVIEST), _HEAVIEST)
+    for c in range(3):
+        counter = tables.counters[slots[c]]
+        chance: Any = np.int64(counter[0])
+        seen: Any = np.int64(counter[1])
+        if seen == 0:
+            chance = np.int64(SQUASH[inputs[0] + CLIP])
+            seen = 2
+        chance += ((bit << 16) - chance) * 2 // (2 * seen + 3)
+        counter[0] = min(max(chance, 32), 65504)
+        counter[1] = min(seen + 1, _MEMORY)

@@ -1,0 +1,306 @@
+"""A label map from wavefront to wavefront: which pixels are to be decided, with what chances, and what follows.
+
+A wavefront is the pixels of equal x + 8 y; what it asks depends on earlier ones only (docs/format.md). Rows continue
+with their last label until a decision changes it, so that only pixels near contours are looked at.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numba import njit
+
+from kcgs.kernels.compiled import compile_kept, count_compiled, say
+
+from .contexts import (
+    CODED,
+    COLUMNS,
+    FIRST,
+    LABEL,
+    LEFT,
+    RIGHT,
+    SECOND,
+    TOP,
+    Tables,
+    X,
+    Y,
+    contexts,
+    describe,
+    inner,
+    learn,
+    mix,
+    network,
+    new_tables,
+    quiet,
+)
+
+SLANT = 8  # pixels (x, y) of equal x + SLANT * y make a wavefront
+RANKS = 3  # nearest labels that one that is neither candidate is compared with
+_FAR = 32  # pixels within which they are looked for
+# entries of the state: the wavefront, its rows, those of them that bits decide; regions in all
+FRONT, ROWS, DECIDED, REGIONS, STATE = 0, 1, 2, 3, 4
+# of a row of the map: its last pixel that differs from the one before, the next seed, the wavefront until which it is
+# quiet
+_CHANGE, _SEED, _WAKE, _LINE = 0, 1, 2, 3
+
+
+class Work(NamedTuple):
+    """What belongs to the pixels of one wavefront, and to the rows of the map."""
+
+    rows: Any  # [H, COLUMNS] int32
+    chances: Any  # [2 * H] float64, of a bit that is 1
+    lines: Any  # [TOP + H + 2, _LINE] int32
+
+
+def new_work(height: int) -> Work:
+    """Return room for the pixels of a wavefront."""
+    lines = np.zeros((TOP + height + 2, _LINE), np.int32)
+    return Work(np.zeros((height, COLUMNS), np.int32), np.zeros(2 * height), lines)
+
+
+@inner
+def _still(labels, y, x, lines):  # type: ignore[no-untyped-def]
+    """Tell the same as `quiet`, by the last change in each row, which in the row above is not beyond what it reads."""
+    if y < TOP + 2:
+        return quiet(labels, y, x)
+    label = labels[y, x - 1]
+    if lines[y, _CHANGE] > x - 2 or lines[y - 1, _CHANGE] > x - 2:
+        return False
+    if labels[y - 1, x] != label or labels[y - 2, x] != label:
+        return False
+    return lines[y - 2, _CHANGE] < x or quiet(labels, y, x)
+
+
+@inner
+def _set(labels, y, x, label, lines):  # type: ignore[no-untyped-def]
+    if label != labels[y, x - 1]:
+        lines[y, _CHANGE] = x
+        for below in range(3):  # these rows see it
+            lines[y + below, _WAKE] = 0
+    _put(labels, y, x, label)
+
+
+@inner
+def _put(labels, y, x, label):  # type: ignore[no-untyped-def]
+    """Give a pixel its label, and what repeats it: the rest of its row, until that changes, and the margins."""
+    if label != labels[y, x - 1]:
+        labels[y, x:] = label
+    if y == TOP:
+        labels[:TOP, x : x + RIGHT + 1] = label
+    if x == LEFT:
+        labels[y + 1] = label
+
+
+@inner
+def _settle(state, labels, bits, tables, work):  # type: ignore[no-untyped-def]
+    """Give the wavefront's pixels their labels and learn from them."""
+    decided = state[DECIDED]
+    escapes = decided if state[REGIONS] > 2 else 0
+    asked = 0
+    for n in range(state[ROWS]):
+        row = work.rows[n]
+        if row[CODED]:
+            escaped = False
+            if escapes > 0:
+                escaped = bits[asked] != 0
+                learn(tables, row, 1, bits[asked])
+            if not escaped:
+                bit = bits[escapes + asked]
+                learn(tables, row, 0, bit)
+                row[LABEL] = row[SECOND] if bit else row[FIRST]
+            asked += 1
+        _set(labels, row[Y], row[X], row[LABEL], work.lines)
+
+
+@inner
+def _next_seed(seeds, j, i, line):  # type: ignore[no-untyped-def]
+    column = max(line[_SEED], i)
+    while column < seeds.shape[1] and seeds[j, column] == 0:
+        column += 1
+    line[_SEED] = column
+    return column
+
+
+@inner
+def _look(state, labels, seeds, work):  # type: ignore[no-untyped-def]
+    """List the pixels of a wavefront that are to be decided; the others have their label, since rows continue."""
+    height, width = seeds.shape
+    front = state[FRONT]
+    for j in range(max(0, -((width - 1 - front) // SLANT)), min(height - 1, front // SLANT) + 1):
+        line = work.lines[j + TOP]
+        if line[_WAKE] > front:
+            continue
+        x, y = front - SLANT * j + LEFT, j + TOP
+        seed = _next_seed(seeds, j, x - LEFT, line) + LEFT
+        n = state[ROWS]
+        row = work.rows[n]
+        if not _still(labels, y, x, work.lines):
+            describe(labels, y, x, row)
+            row[X], row[Y], row[CODED] = x, y, 1
+            state[ROWS] += 1
+            state[DECIDED] += 1
+        elif x == seed:
+            row[X], row[Y], row[CODED], row[FIRST], row[SECOND] = x, y, 0, labels[y, x - 1], -1
+            row[LABEL] = 1 - row[FIRST]  # unless there are more than two regions
+            state[ROWS] += 1
+        else:
+            _put(labels, y, x, labels[y, x - 1])
+            if y >= TOP + 2 and work.lines[y - 2, _CHANGE] < x:
+                line[_WAKE] = front + seed - x
+
+
+@inner
+def _weigh(state, tables, work):  # type: ignore[no-untyped-def]
+    """Fill in the chances: first of being neither candidate, then of being the second."""
+    escapes = state[DECIDED] if state[REGIONS] > 2 else 0
+    asked = 0
+    for n in range(state[ROWS]):
+        row = work.rows[n]
+        if row[CODED]:
+            network(row)
+            contexts(row)
+            if escapes > 0:
+                work.chances[asked] = mix(tables, row, 1)
+            work.chances[escapes + asked] = mix(tables, row, 0)
+            asked += 1
+
+
+@inner
+def _nearest(labels, row, found):  # type: ignore[no-untyped-def]
+    """List up to RANKS labels other than the candidates, by distance from a pixel; return how many."""
+    count = 0
+    for radius in range(1, _FAR + 1):
+        for j in range(-radius, 1):
+            step = 1 if j == -radius else 2 * radius
+            for i in range(-radius, radius + 1, step):
+                y, x = row[Y] + j, row[X] + i
+                if i + SLANT * j >= 0 or y < 0 or x < 0 or x >= labels.shape[1]:
+                    continue
+                label = labels[y, x]
+                known = label == row[FIRST] or label == row[SECOND]
+                for k in range(count):
+                    known |= found[k] == label
+                if not known:
+                    found[count] = label
+                    count += 1
+                    if count == RANKS:
+                        return count
+    return count
+
+
+@inner
+def _survey(index, regions):  # type: ignore[no-untyped-def]
+    """Number the labels in the order in which wavefronts meet them; mark pixels unlike their uniform surroundings."""
+    height, width = index.shape
+    number = np.full(regions, -1, np.int32)
+    order = np.empty(regions, np.int32)
+    count = 0
+    for front in range(width + SLANT * (height - 1)):
+        for j in range(max(0, -((width - 1 - front) // SLANT)), min(height - 1, front // SLANT) + 1):
+            label = index[j, front - SLANT * j]
+            if number[label] < 0:
+                number[label] = count
+                order[count] = label
+                count += 1
+        if count == regions:
+            break
+    truth = np.empty(index.shape, np.int32)
+    seeds = np.zeros(index.shape, np.uint8)
+    labels = np.zeros((height + TOP + 1, width + LEFT + RIGHT), np.int32)
+    for j in range(height):
+        for i in range(width):
+            x, y = i + LEFT, j + TOP
+            truth[j, i] = number[index[j, i]]
+            seeds[j, i] = truth[j, i] != labels[y, x - 1] and quiet(labels, y, x)
+            _put(labels, y, x, truth[j, i])
+    return truth, seeds, order
+
+
+@inner
+def _answer(state, truth, rows, bits):  # type: ignore[no-untyped-def]
+    """Look the answers up in a map that is known."""
+    escapes = state[DECIDED] if state[REGIONS] > 2 else 0
+    asked = 0
+    for n in range(state[ROWS]):
+        row = rows[n]
+        row[LABEL] = truth[row[Y] - TOP, row[X] - LEFT]
+        if row[CODED]:
+            if escapes > 0:
+                bits[asked] = row[LABEL] != row[FIRST] and row[LABEL] != row[SECOND]
+            bits[escapes + asked] = row[LABEL] != row[FIRST]
+            asked += 1
+
+
+class Loops(NamedTuple):
+    """The compiled entry points."""
+
+    advance: Callable[..., int]
+    answer: Callable[..., None]
+    nearest: Callable[..., int]
+    survey: Callable[..., Any]
+
+
+def _compile(fingerprint: str, cache: bool) -> Loops:
+    """Make the entry points; they compile when called and are kept on disk (`cache`) by `fingerprint`."""
+    entry = cast(Any, njit)(cache=cache, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
+
+    @entry
+    def advance(  # type: ignore[no-untyped-def]
+        bits, state, labels, seeds, counters, weights, rows, chances, lines
+    ):
+        """Take the answers for a wavefront in, go on to the next that has questions and return their number."""
+        fingerprint  # noqa: B018
+        # arrays by themselves take a third of the time to hand over
+        tables, work = Tables(counters, weights), Work(rows, chances, lines)
+        height, width = seeds.shape
+        _settle(state, labels, bits, tables, work)
+        state[ROWS] = 0
+        state[DECIDED] = 0
+        while state[ROWS] == 0 and state[FRONT] < width - 1 + SLANT * (height - 1):
+            state[FRONT] += 1
+            _look(state, labels, seeds, work)
+        _weigh(state, tables, work)
+        return state[ROWS]
+
+    @entry
+    def answer(state, truth, rows, bits):  # type: ignore[no-untyped-def]
+        fingerprint  # noqa: B018
+        _answer(state, truth, rows, bits)
+
+    @entry
+    def nearest(labels, row, found):  # type: ignore[no-untyped-def]
+        fingerprint  # noqa: B018
+        return _nearest(labels, row, found)
+
+    @entry
+    def survey(index, regions):  # type: ignore[no-untyped-def]
+        fingerprint  # noqa: B018
+        return _survey(index, regions)
+
+    return Loops(advance, answer, nearest, survey)
+
+
+@functools.cache
+def loops() -> Loops:
+    """Compile the loops, or load them from disk; say how long it took."""
+    began, folder = time.perf_counter(), Path(__file__).parent
+    kept = [folder / source for source in ("contexts.py", "prior.py", "prior.bin", "wavefront.py")]
+    made = compile_kept("codec", _compile, kept)
+    _rehearse(made)
+    say("the codec of label maps", began, count_compiled(made) > 0, made)
+    return made
+
+
+def _rehearse(run: Loops) -> None:
+    """Call each entry point once, for it is then that they compile."""
+    truth, seeds, _ = run.survey(np.eye(2, dtype=np.int32), 2)
+    work, bits, state = new_work(2), np.zeros(4, np.int32), np.zeros(STATE, np.int64)
+    labels = np.zeros((2 + TOP + 1, 2 + LEFT + RIGHT), np.int32)
+    run.advance(bits, state, labels, seeds, *new_tables(), *work)
+    run.answer(state, truth, work.rows, bits)
+    run.nearest(labels, work.rows[0], np.zeros(RANKS, np.int32))

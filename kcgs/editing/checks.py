@@ -1,0 +1,91 @@
+"""What an edit may be asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import torch
+from torch import Tensor
+
+from kcgs._check import check_count, check_floating, check_number
+from kcgs.functional import RegionMap
+from kcgs.nn import GaussianField
+from kcgs.scene import Scene
+
+
+def check_field(scene: Scene) -> GaussianField:
+    """Return the field of an unbatched scene whose Gaussians have region ids."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
+    if scene.field.means.ndim != 2:
+        raise ValueError(f"scene must not be batched; got means of shape {tuple(scene.field.means.shape)}")
+    if scene.field.region_ids is None:
+        raise ValueError("scene must have region ids; call scene.field.assign_regions(regions)")
+    return scene.field
+
+
+def check_scene(scene: Scene, region_ids: object, target: tuple[int, int] | None = None) -> tuple[RegionMap, Tensor]:
+    """Return the map, of the scene's size or the target's, and the ids as a tensor on its device."""
+    size, regions = check_field(scene).size, scene.regions
+    target = size if target is None else target
+    if regions is None:
+        raise ValueError("scene must have a label map; got regions None")
+    if regions.labels.ndim != 2 or regions.size not in (size, target):
+        allowed = f"{size}" if target == size else f"{size} or {target}"
+        raise ValueError(f"scene must have one map of the size {allowed}; got {tuple(regions.labels.shape)}")
+    wanted = check_ids(region_ids)
+    known = set(regions.ids.tolist())
+    for region in wanted:
+        if region not in known:
+            raise ValueError(f"region_ids must be among the map's {len(known)} ids, {_some(known)}; got {region}")
+    return regions, torch.tensor(wanted, device=regions.ids.device)
+
+
+def check_editable(scene: Scene, region_ids: object) -> tuple[RegionMap, Tensor]:
+    """Return what `check_scene` does, if the map may change and a region is left."""
+    regions, chosen = check_scene(scene, region_ids)
+    if regions.resized:
+        raise ValueError("scene must not have a resized map: edit the map at its own size, then resize it")
+    if regions.num_regions == len(chosen):
+        raise ValueError(f"region_ids must leave a region that takes over pixels; got all {len(chosen)} regions")
+    return regions, chosen
+
+
+def check_ids(region_ids: object) -> list[int]:
+    """Return the ids, each once, sorted."""
+    several = region_ids if isinstance(region_ids, Iterable) else [region_ids]
+    wanted = sorted({check_count("region_ids", region, 0) for region in several})
+    if not wanted:
+        raise ValueError("region_ids must hold an id; got none")
+    return wanted
+
+
+def check_offset(offset: Sequence[float], supersample: int) -> tuple[int, int]:
+    """Return the offset in labels."""
+    if len(offset) != 2:
+        raise ValueError(f"offset must be (dx, dy); got {offset!r}")
+    steps = [float(d) * supersample for d in offset]
+    if any(step != step or abs(step) > 1e8 or abs(step - round(step)) > 1e-6 for step in steps):
+        unit = "1 pixel" if supersample == 1 else f"1/{supersample} pixel, the spacing of the labels"
+        raise ValueError(f"offset must be whole multiples of {unit}; got {offset!r}")
+    return round(steps[0]), round(steps[1])
+
+
+def color_tensor(name: str, value: Tensor | float, colors: Tensor, shapes: list[tuple[int, ...]]) -> Tensor:
+    """Return a number or a tensor of one of these shapes in the dtype and on the device of the colours."""
+    number = value if isinstance(value, Tensor) else colors.new_tensor(check_number(name, value))
+    tensor = check_floating(name, number).detach().to(colors)
+    if tuple(tensor.shape) not in shapes:
+        raise ValueError(f"{name} must have shape {' or '.join(map(str, shapes))}; got {tuple(tensor.shape)}")
+    return tensor
+
+
+def ids_of(field: GaussianField) -> Tensor:
+    """Return the region ids that `check_field` has seen."""
+    assert field.region_ids is not None
+    return field.region_ids
+
+
+def _some(ids: set[int]) -> str:
+    shown = [str(region) for region in sorted(ids)[:20]]
+    return ", ".join(shown) + (" ..." if len(ids) > 20 else "")

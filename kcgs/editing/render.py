@@ -1,0 +1,97 @@
+"""Images of some regions alone, and of a scene over another image."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from kcgs._check import check_image, check_size
+from kcgs.nn import GaussianField, RegionSplatRenderer
+from kcgs.scene import Scene
+
+from .checks import check_field, check_scene, ids_of
+
+
+def render_region(scene: Scene, region_ids: int | Iterable[int], size: tuple[int, int] | None = None) -> Tensor:
+    r"""Render regions alone, with their share of each pixel as alpha.
+
+    Convention: colours are straight, not multiplied by alpha, and not clipped: what the regions paint where they have
+    the pixel to themselves, also under a soft contour. They are 0 where alpha is. Shares of all regions add up to one,
+    so that the sum of alpha times colour over all of them is the image. Differentiable, as the renderer is.
+
+    Args:
+        scene: unbatched, with a map of its own size or of `size`.
+        region_ids: an id in the map, or several.
+        size: (height, width) of the result; None: the scene's.
+
+    Returns:
+        RGBA, :math:`(4, H, W)`; :math:`(C + 1, H, W)` for C channels.
+
+    Raises:
+        TypeError: wrong types.
+        ValueError: a batch, no map or one of another size, an unknown id.
+
+    Example:
+        >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])
+        >>> scene = Scene(GaussianField.random(9, (1, 6), regions=labels, seed=0), labels)
+        >>> render_region(scene, 3)[3].tolist()
+        [[0.0, 0.0, 1.0, 1.0, 1.0, 0.0]]
+    """
+    target = check_field(scene).size if size is None else check_size("size", size)
+    regions, chosen = check_scene(scene, region_ids, target)
+    regions = regions.resize(target)
+    weights = {region: regions.weights(region) for region in chosen.tolist()}
+    total = torch.stack([*weights.values()]).sum(0)
+    alpha = total.clamp_max(1.0).to(scene.field.colors.dtype)
+    colors = scene.field.colors.new_zeros(scene.field.colors.shape[-1], *target)
+    for region, weight in weights.items():
+        # rendered alone and not confined, which is the colour itself: nothing is divided by a small alpha
+        alone = RegionSplatRenderer()(_part(scene.field, ids_of(scene.field) == region), None, target)
+        share = (weight / torch.where(total > 0, total, 1.0)).to(alone.dtype)
+        colors = colors + torch.where(alpha > 0, alone * share, 0.0)
+    return torch.cat([colors, alpha[None]])
+
+
+def render_over(scene: Scene, region_ids: int | Iterable[int], image: Tensor) -> Tensor:
+    r"""Render the scene with an image in place of some regions, at the size of that image.
+
+    Convention: the image gets the share of each pixel that those regions had, so that soft contours blend with it as
+    they did with them. Not clipped. Differentiable in the scene and in the image.
+
+    Args:
+        scene: unbatched, with a map of its own size or of the image's.
+        region_ids: the regions that make the background now: an id in the map, or several.
+        image: :math:`(C, H, W)`, as many channels as the scene has; any size.
+
+    Returns:
+        Image, :math:`(C, H, W)`.
+
+    Raises:
+        TypeError: wrong types.
+        ValueError: a batch, no map or one of another size, an unknown id, another number of channels.
+
+    Example:
+        >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])
+        >>> scene = Scene(GaussianField.random(9, (1, 6), regions=labels, seed=0), labels)
+        >>> render_over(scene, [0, 5], torch.full((3, 1, 6), 0.25))[0, 0, [0, 1, 5]].tolist()
+        [0.25, 0.25, 0.25]
+    """
+    image = check_image("image", image)
+    channels = check_field(scene).colors.shape[-1]
+    if image.ndim != 3 or image.shape[0] != channels:
+        raise ValueError(f"image must have shape ({channels}, H, W); got {tuple(image.shape)}")
+    target = (image.shape[-2], image.shape[-1])
+    regions, gone = check_scene(scene, region_ids, target)
+    stays = _part(scene.field, ~torch.isin(ids_of(scene.field), gone))
+    rendered: Tensor = RegionSplatRenderer()(stays, regions, target)
+    share = regions.resize(target).weights(gone.tolist()).clamp_max(1.0).to(rendered.dtype)
+    return rendered + share * image.to(rendered)
+
+
+def _part(field: GaussianField, mask: Tensor) -> GaussianField:
+    """Take the Gaussians that `mask` selects, in the graph."""
+    opacities = None if field.opacities is None else field.opacities[mask]
+    means, cholesky, colors = (t[mask] for t in (field.means, field.cholesky, field.colors))
+    return GaussianField(means, cholesky, colors, ids_of(field)[mask], opacities, size=field.size)

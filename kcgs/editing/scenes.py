@@ -1,0 +1,283 @@
+"""Move, recolour, delete and extract regions, and put other scenes behind them: a new scene each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from kcgs.functional import PairWidths, RegionMap, touching_pairs
+from kcgs.nn import GaussianField
+from kcgs.scene import Scene
+
+from .checks import check_editable, check_field, check_ids, check_offset, check_scene, color_tensor, ids_of
+
+# standard deviation of a Gaussian that is flat over the image, in its longer sides: 1 to 3 in 10^7
+_FLAT = 1e3
+
+
+def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[float]) -> Scene:
+    """Move regions: their Gaussians and their labels, over whatever lies there.
+
+    Convention: pixels that they leave take the label of the nearest pixel of another region (Euclidean; of equal
+    distances, the smallest id), and show what the Gaussians of that region paint there; pixels that leave the image
+    are lost. A region that is covered whole is no region any more, and its Gaussians paint nothing. Where pairs of
+    regions have widths, the contour with a region that a moved one did not touch before takes the mean width of those
+    it had.
+
+    Args:
+        scene: unbatched, with a map of its own size, not a resized one.
+        region_ids: an id in the map, or several, which move together.
+        offset: (dx, dy) in pixels, whole; with ``supersample`` k, whole multiples of 1/k.
+
+    Returns:
+        A new scene, without a graph.
+
+    Raises:
+        TypeError: wrong types.
+        ValueError: a batch, no map or one of another size, an unknown id, all regions, an offset between labels.
+
+    Example:
+        >>> labels = torch.tensor([[0, 7, 7, 0, 0, 0]])
+        >>> scene = Scene(GaussianField.random(5, (1, 6), regions=labels, seed=0), labels)
+        >>> move_region(scene, 7, (2, 0)).regions.labels
+        tensor([[0, 0, 0, 7, 7, 0]])
+    """
+    regions, chosen = check_editable(scene, region_ids)
+    steps = check_offset(offset, regions.supersample)
+    before = regions.fine_labels
+    inside = torch.isin(before, chosen)
+    labels = _fill(before, inside)
+    rows, cols = (_overlap(n, step) for n, step in zip(before.shape, steps[::-1], strict=True))
+    landed = torch.zeros_like(inside)
+    landed[rows[1], cols[1]] = inside[rows[0], cols[0]]
+    source = torch.zeros_like(before)
+    source[rows[1], cols[1]] = before[rows[0], cols[0]]
+    labels[landed] = source[landed]
+
+    moved = _copy(scene.field)
+    with torch.no_grad():
+        shift = moved.means.new_tensor(steps) / regions.supersample
+        moved.means += torch.where(torch.isin(ids_of(moved), chosen)[:, None], shift, 0.0)
+    return Scene(moved, regions.relabel(labels, _new_widths(regions, chosen.tolist())), scene.metadata)
+
+
+def recolor_region(
+    scene: Scene, region_ids: int | Iterable[int], gain: Tensor | float, bias: Tensor | float | None = None
+) -> Scene:
+    r"""Change the colours of regions, c' = gain c + bias, exactly so in the image.
+
+    Convention: a gain acts on the colours of the Gaussians. A bias does not (pixels are sums of Gaussians, not means):
+    it is one more Gaussian per region, flat over the whole image.
+
+    Args:
+        scene: unbatched, with region ids.
+        region_ids: an id that some of its Gaussians have, or several.
+        gain: a number, one for each channel :math:`(C)`, or a matrix :math:`(C, C)`.
+        bias: a number, or one for each channel :math:`(C)`; None: none, and no Gaussian more.
+
+    Returns:
+        A new scene, without a graph.
+
+    Raises:
+        TypeError: wrong types.
+        ValueError: a batch, an id that no Gaussian has, wrong shapes, values that are not finite.
+
+    Example:
+        >>> labels = torch.zeros(4, 6, dtype=torch.long)
+        >>> scene = Scene(GaussianField.random(5, (4, 6), regions=labels, seed=0), labels)
+        >>> negative = recolor_region(scene, 0, -1.0, 1.0)
+        >>> torch.allclose(scene() + negative(), torch.ones(3, 4, 6), atol=1e-5)
+        True
+    """
+    field = check_field(scene)
+    wanted = check_ids(region_ids)
+    known = set(ids_of(field).tolist())
+    for region in wanted:
+        if region not in known:
+            raise ValueError(f"region_ids must be ids of the scene's Gaussians, {sorted(known)}; got {region}")
+    chosen = torch.isin(ids_of(field), torch.tensor(wanted, device=field.means.device))
+    channels = field.colors.shape[-1]
+    matrix = color_tensor("gain", gain, field.colors, [(), (channels,), (channels, channels)])
+    colors = field.colors.detach().clone()
+    colors[chosen] = colors[chosen] @ matrix.T if matrix.ndim == 2 else colors[chosen] * matrix
+    result = _copy(field, colors=colors)
+    if bias is not None:
+        flat = color_tensor("bias", bias, field.colors, [(), (channels,)]).expand(channels)
+        for region in wanted:
+            result = _with_flat(result, region, flat)
+    return Scene(result, scene.regions, scene.metadata)
+
+
+def delete_region(scene: Scene, region_ids: int | Iterable[int]) -> Scene:
+    """Delete regions: their Gaussians go, their pixels fall to their neighbours.
+
+    Convention: each of their pixels takes the label of the nearest pixel that stays (Euclidean; of equal distances, the
+    smallest id), and shows what the Gaussians of that region paint there: nothing, black, where they do not reach.
+    Where pairs of regions have widths, contours between regions that did not touch before are hard.
+
+    Args:
+        scene: unbatched, with a map of its own size, not a resized one.
+        region_ids: an id in the map, or several.
+
+    Returns:
+        A new scene, without a graph.
+
+    Raises:
+        TypeError: wrong types.
+        ValueError: a batch, no map or one of another size, an unknown id, all regions.
+
+    Example:
+        >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])
+        >>> scene = Scene(GaussianField.random(9, (1, 6), regions=labels, seed=0), labels)
+        >>> delete_region(scene, 3).regions.labels
+        tensor([[0, 0, 0, 0, 5, 5]])
+    """
+    regions, chosen = check_editable(scene, region_ids)
+    labels = _fill(regions.fine_labels, torch.isin(regions.fine_labels, chosen))
+    field = scene.field.subset(~torch.isin(ids_of(scene.field), chosen))
+    return Scene(field, regions.relabel(labels), scene.metadata)
+
+
+def extract_region(scene: Scene, region_ids: int | Iterable[int]) -> Scene:
+    """Keep the Gaussians of some regions: the scene shows them where they were, and black elsewhere.
+
+    :func:`render_region` gives them with their share of each pixel as alpha.
+
+    Args:
+        scene: unbatched, with a map.
+        region_ids: an id in the map, or several.
+
+    Returns:
+        A new scene, without a graph.
+
+    Raises:
+        TypeError: wrong types.
+        ValueError: a batch, no map or one of another size, an unknown id.
+
+    Example:
+        >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])
+        >>> scene = Scene(GaussianField.random(9, (1, 6), regions=labels, seed=0), labels)
+        >>> extract_region(scene, 3).field.region_ids.unique()
+        tensor([3])
+    """
+    regions, chosen = check_scene(scene, region_ids)
+    return Scene(scene.field.subset(torch.isin(ids_of(scene.field), chosen)), regions, scene.metadata)
+
+
+def replace_background(scene: Scene, region_ids: int | Iterable[int], background: Scene) -> Scene:
+    """Put another scene in place of some regions, stretched to the size of this one.
+
+    Convention: the regions of the background, or it as one region, get ids above those of the scene. Where pairs of
+    regions of the scene have widths, contours that are new take their mean.
+
+    Args:
+        scene: unbatched, with a map of its own size, not a resized one.
+        region_ids: the regions that make the background now: an id in the map, or several.
+        background: unbatched, with as many channels.
+
+    Returns:
+        A new scene, without a graph.
+
+    Raises:
+        TypeError: wrong types.
+        ValueError: a batch, no map or one of another size, an unknown id, another number of channels.
+
+    Example:
+        >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])
+        >>> scene = Scene(GaussianField.random(9, (1, 6), regions=labels, seed=0), labels)
+        >>> other = Scene(GaussianField.random(4, (2, 12), seed=1))
+        >>> replace_background(scene, [0, 5], other).regions.labels
+        tensor([[6, 6, 3, 3, 3, 6]])
+    """
+    regions, chosen = check_scene(scene, region_ids)
+    if not isinstance(background, Scene):
+        raise TypeError(f"background must be a Scene; got {type(background).__name__}")
+    other, field = background.field, scene.field
+    if other.means.ndim != 2 or other.colors.shape[-1] != field.colors.shape[-1]:
+        raise ValueError(
+            f"background must not be batched and have {field.colors.shape[-1]} channels; got colors of shape "
+            f"{tuple(other.colors.shape)}"
+        )
+    first = int(regions.ids.max()) + 1
+    inside = torch.isin(regions.fine_labels, chosen)
+    behind = torch.full_like(regions.fine_labels, first)
+    ids = torch.full_like(ids_of(field), first)[:1].expand(len(other))
+    if background.regions is not None and other.region_ids is not None:
+        fine = RegionMap.from_labels(background.regions.fine_labels).resize((inside.shape[0], inside.shape[1]))
+        behind, ids = fine.labels.to(behind.device) + first, other.region_ids.to(behind.device) + first
+    labels = torch.where(inside, behind, regions.fine_labels)
+    down, across = (new / old for new, old in zip(scene.size, other.size, strict=True))
+    stays = field.subset(~torch.isin(ids_of(field), chosen))
+    stretched = [
+        (stays.means, other.means.detach() * other.means.new_tensor([across, down])),
+        (stays.cholesky, other.cholesky.detach() * other.cholesky.new_tensor([across, down, down])),
+        (stays.merged_colors(), other.merged_colors().detach()),
+    ]
+    means, cholesky, colors = (torch.cat([ours.detach(), theirs.to(ours)]) for ours, theirs in stretched)
+    both = torch.cat([ids_of(stays), ids])
+    joined = GaussianField(means, cholesky, colors, both, size=scene.size).subset(torch.isin(both, labels))
+    return Scene(joined, regions.relabel(labels, "mean"), scene.metadata)
+
+
+def _copy(field: GaussianField, colors: Tensor | None = None) -> GaussianField:
+    copy = field.subset(torch.ones(len(field), dtype=torch.bool, device=field.means.device))
+    if colors is not None:
+        with torch.no_grad():
+            copy.colors.copy_(colors)
+    return copy
+
+
+def _with_flat(field: GaussianField, region_id: int, color: Tensor) -> GaussianField:
+    height, width = field.size
+    sigma = _FLAT * max(height, width)
+    rows = [(field.means, [width / 2, height / 2]), (field.cholesky, [sigma, 0.0, sigma]), (field.colors, color)]
+    means, cholesky, colors = (torch.cat([t.detach(), torch.as_tensor(row).to(t)[None]]) for t, row in rows)
+    ids = torch.cat([ids_of(field), ids_of(field).new_tensor([region_id])])
+    opacities = None
+    if field.opacities is not None:
+        opacities = torch.cat([field.opacities.detach(), field.opacities.new_ones(1)])
+    return GaussianField(means, cholesky, colors, ids, opacities, size=field.size)
+
+
+def _fill(labels: Tensor, hole: Tensor) -> Tensor:
+    """Give pixels of the hole the label of the nearest other pixel, of equals the smallest."""
+    from scipy.ndimage import distance_transform_edt
+
+    # the nearest pixel touches the hole: one step from it towards any pixel of the hole is nearer
+    lines = [hole.any(axis).nonzero().flatten() for axis in (1, 0)]
+    rows, cols = (slice(max(0, int(at[0]) - 1), int(at[-1]) + 2) for at in lines)
+    part, inside = labels[rows, cols], hole[rows, cols]
+    touching = torch.nn.functional.max_pool2d(inside[None].float(), 3, 1, 1)[0] > 0
+    best = torch.full(part.shape, torch.inf, dtype=torch.float64)
+    filled = part.cpu().clone()
+    for region in part[touching & ~inside].unique().tolist():
+        distance = torch.from_numpy(distance_transform_edt((part != region).cpu().numpy()))
+        nearer = inside.cpu() & (distance < best)
+        best[nearer], filled[nearer] = distance[nearer], region
+    result = labels.clone()
+    result[rows, cols] = filled.to(labels.device)
+    return result
+
+
+def _overlap(length: int, step: int) -> tuple[slice, slice]:
+    """Which places of an axis stay on it, before and after a step."""
+    step = max(-length, min(length, step))
+    return slice(max(0, -step), length - max(0, step)), slice(max(0, step), length - max(0, -step))
+
+
+def _new_widths(regions: RegionMap, moved: list[int]) -> Mapping[tuple[int, int], float]:
+    """Give a moved region and those that it did not touch the mean width of the contours that it had."""
+    widths = regions.softness
+    new: dict[tuple[int, int], float] = {}
+    if not isinstance(widths, PairWidths):
+        return new
+    touching = touching_pairs(regions.fine_labels)
+    for region in moved:
+        touched = {other for pair in touching if region in pair for other in pair} - {region}
+        had = [widths.get((region, neighbour), 0.0) for neighbour in touched]
+        usual = sum(had) / max(1, len(had))
+        for far in {*regions.ids.tolist()} - {region} - touched - set(moved):
+            new[min(region, far), max(region, far)] = usual
+    return new

@@ -1,0 +1,7 @@
+"""The methods of segmentation: each module in this folder registers its own, and a new one needs no other file."""
+
+from importlib import import_module
+from pkgutil import iter_modules
+
+for _module in iter_modules(__path__):
+    import_module(f"{__name__}.{_module.name}")

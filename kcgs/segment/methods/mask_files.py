@@ -1,0 +1,74 @@
+"""Label maps that exist already: masks on disk, annotations of DAVIS."""
+
+import os
+
+from torch import Tensor
+
+from kcgs.segment.registry import Cleanup, register
+
+# Nothing is cleaned unless asked: no piece is too small, and a label in several pieces is one region.
+_AS_STORED = Cleanup(min_size=1, connected=False)
+
+
+@register("file", _AS_STORED)
+def file(image: Tensor, *, path: str | os.PathLike[str]) -> Tensor:
+    """Take the regions of an image from a mask on disk.
+
+    Unless asked, nothing is cleaned: no piece is too small, and a label in several pieces is one region.
+
+    Args:
+        image: as `segment` takes it.
+        path: what `kcgs.data.load_labels` reads.
+
+    Returns:
+        The label map that `segment` returns.
+
+    Raises:
+        FileNotFoundError: ``path`` does not exist.
+        TypeError: an argument has another type.
+        ValueError: the file is no label map or has another size than the image.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from kcgs.data import save_labels
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_labels(f"{folder}/mask.png", torch.tensor([[255, 0, 0]]))
+        ...     file(torch.zeros(3, 1, 3), path=f"{folder}/mask.png").tolist()
+        [[1, 0, 0]]
+    """
+    from kcgs.data import load_labels
+
+    return load_labels(path)
+
+
+@register("davis", _AS_STORED)
+def davis(
+    image: Tensor, *, root: str | os.PathLike[str], sequence: str, frame: int = 0, resolution: str = "480p"
+) -> Tensor:
+    """Take the regions of a frame of DAVIS from its annotation.
+
+    Unless asked, nothing is cleaned: no piece is too small, and an object in several pieces is one region.
+
+    Args:
+        image: as `segment` takes it, the frame.
+        root: the folder that holds ``JPEGImages`` and ``Annotations``.
+        sequence: its name.
+        frame: its number; 0 is the first.
+        resolution: the folder below these two.
+
+    Returns:
+        The label map that `segment` returns.
+
+    Raises:
+        FileNotFoundError: ``root`` has another layout, or the frame is missing.
+        TypeError: an argument has another type.
+        ValueError: there is no such sequence, or its annotation has another size than the image.
+
+    Example:
+        ``segment(Davis(root)["cows"].image, "davis", root=root, sequence="cows")``
+    """
+    from kcgs.data import Davis
+
+    if not isinstance(sequence, str):
+        raise TypeError(f"sequence must be a name; got {sequence!r}")
+    return Davis(root, resolution=resolution, sequences=[sequence], frame=frame)[0].labels
