@@ -1,5 +1,6 @@
 """How `make docs` builds the site: Sphinx, MyST, furo. Pages that the code can write are written by generate.py."""
 
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -23,7 +24,7 @@ project_copyright = "the kcgs authors, Apache-2.0"
 version = release = kcgs.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "sphinx_copybutton"]
-exclude_patterns = ["_build", "generated/commands.md", "generated/recipes.md"]
+exclude_patterns = ["_build", "generated/*.md"]
 # "```python" blocks of our pages are run by tests/docs, with >>> or without
 pygments_style = "friendly"
 pygments_dark_style = "monokai"
@@ -33,7 +34,6 @@ html_static_path = ["static"]
 html_css_files = ["kcgs.css"]
 html_theme_options = {"navigation_with_keys": True}
 html_copy_source = False
-smartquotes = False  # --option stays as it is typed
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
 
@@ -51,6 +51,8 @@ autodoc_typehints_format = "short"
 python_maximum_signature_line_length = 88
 napoleon_numpy_docstring = False
 napoleon_custom_sections = [("Convention", "notes_style"), ("Source", "notes_style")]
+
+attributes: dict[str, list[str]] = {}
 
 
 def copy_notebooks() -> None:
@@ -75,6 +77,25 @@ def mark_paragraphs(app: Sphinx, what: str, name: str, obj: object, options: obj
                 lines[i] = f"**{word}.** {line.removeprefix(f'{word}: ')}"
 
 
+def save_colons(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Keep what is said of an attribute from napoleon, which takes all before a colon for its type."""
+    if what == "attribute":
+        attributes[name] = lines[:]
+        lines.clear()
+
+
+def restore_colons(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Put it back after napoleon."""
+    lines[:] = attributes.pop(name, lines)
+
+
+def hide_private(
+    app: Sphinx, what: str, name: str, obj: object, options: object, signature: str | None, returned: str | None
+) -> tuple[str, str | None] | None:
+    """Leave out the arguments of a class that is not built by hand: some of them are private."""
+    return ("", returned) if what == "class" and signature and re.search(r"\b_[a-z]", signature) else None
+
+
 def link_repository(app: Sphinx, docname: str, source: list[str]) -> None:
     """Let links to ../notebooks, which work where the repository is read, lead to the copies that the site has."""
     source[0] = source[0].replace("](../notebooks/", "](notebooks/")
@@ -97,7 +118,10 @@ def setup(app: Sphinx) -> None:
     generate.write(HERE / "generated")
     copy_notebooks()
     app.add_html_math_renderer("mathml", (visit_inline_math, None), (visit_block_math, None))
-    app.connect("autodoc-process-docstring", mark_paragraphs)
+    app.connect("autodoc-process-docstring", save_colons, priority=400)  # napoleon has 500
+    app.connect("autodoc-process-docstring", restore_colons, priority=600)
+    app.connect("autodoc-process-docstring", mark_paragraphs, priority=700)
+    app.connect("autodoc-process-signature", hide_private)
     app.connect("source-read", link_repository)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import inspect
+import re
 import tomllib
 import typing
 from importlib.resources import files
@@ -13,7 +14,9 @@ from types import ModuleType
 from typing import Any
 
 # What readers look for first heads its page; other modules follow in the order in which the package imports them.
-FIRST = ("kcgs.functional.splat", "kcgs.functional.regions")
+FIRST = ("kcgs.scene", "kcgs.functional.splat", "kcgs.functional.regions", "kcgs.segment.registry")
+# What torch and pydantic call, not readers.
+PROTOCOL = "extra_repr, get_extra_state, set_extra_state, model_config, model_post_init"
 # Each public name is documented in the first of these packages that lists it in its `__all__`.
 PACKAGES = (
     "kcgs",
@@ -36,7 +39,7 @@ def write(folder: Path) -> None:
     Args:
         folder: where they go; made where it is missing.
     """
-    pages = {"commands.md": commands(), "recipes.md": recipes()}
+    pages = {"commands.md": commands(), "recipes.md": recipes(), "segmenters.md": segmenters()}
     documented: set[str] = set()
     for name in PACKAGES:
         pages[f"{name}.rst"] = reference(name, documented)
@@ -112,7 +115,7 @@ def _line(module: ModuleType) -> Any:
 
 def _directive(package: str, name: str, thing: Any) -> str:
     if inspect.isclass(thing):
-        return f".. autoclass:: {package}.{name}\n   :members:\n   :exclude-members: model_config, model_post_init"
+        return f".. autoclass:: {package}.{name}\n   :members:\n   :exclude-members: {PROTOCOL}"
     return f".. {'autofunction' if callable(thing) else 'autodata'}:: {package}.{name}"
 
 
@@ -132,15 +135,34 @@ def _command(name: str, command: Any) -> str:
     # arguments first, each of them as it is written and what it is
     params = sorted(command.params, key=lambda param: param.param_type_name != "argument")
     records = [param.get_help_record(context) for param in params]
-    rows = [f"| `{_cell(written)}` | {_cell(text)} |" for written, text in filter(None, records)]
+    rows = [f"| `{_plain(written)}` | {_cell(text)} |" for written, text in filter(None, records)]
     table = "\n".join(["| argument | what it is |", "|---|---|", *rows]) if rows else ""
     return "\n\n".join([f"## kcgs {name}", f"```text\n{usage}\n```", inspect.cleandoc(command.help or ""), table])
 
 
-def _cell(text: str) -> str:
-    """Return text for a cell of a Markdown table."""
+def _plain(text: str) -> str:
+    """Return text for a cell of a Markdown table, on one line and with numbers called as readers know them."""
     text = " ".join(text.split()).replace("<int range>", "<int>").replace("<float range>", "<float>")
     return text.replace("|", "\\|")
+
+
+def _cell(text: str) -> str:
+    """Return the same with the options that it mentions set as code."""
+    return re.sub(r"(?<![\w`-])--[a-z][a-z-]+", r"`\g<0>`", _plain(text))
+
+
+def segmenters() -> str:
+    """Return a table of the methods of `kcgs.segment`: the first sentence of each, and its own options."""
+    import kcgs.segment
+
+    shared = inspect.signature(kcgs.segment.Cleanup).parameters
+    rows = ["| method | how | its options |", "|---|---|---|"]
+    for name in kcgs.segment.available_methods():
+        function = getattr(kcgs.segment, name)
+        own = [f"`{key}`" for key in list(inspect.signature(function).parameters)[1:] if key not in shared]
+        sentence = inspect.cleandoc(function.__doc__ or "").split("\n\n")[0]
+        rows.append(f"| {{py:func}}`~kcgs.segment.{name}` | {_cell(sentence)} | {', '.join(own)} |")
+    return "\n".join(rows) + "\n"
 
 
 def recipes() -> str:
