@@ -22,12 +22,22 @@ from .rangecoder import Reader
 class Decoded(NamedTuple):
     """What a file holds."""
 
-    field: GaussianField
-    regions: RegionMap | None  # None: one region
+    scene: Scene
+    """Without regions where there is one."""
     layers: int
     """How many layers were there."""
     num_layers: int
     """How many there are in the whole file."""
+
+    @property
+    def field(self) -> GaussianField:  # transitional
+        """Gaussians."""
+        return self.scene.field
+
+    @property
+    def regions(self) -> RegionMap | None:  # transitional
+        """Map."""
+        return self.scene.regions
 
 
 def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
@@ -46,9 +56,9 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
 
     Example:
         >>> from kcgs.codec import encode
-        >>> data = encode(GaussianField.random(200, (32, 48), seed=0))
+        >>> data = encode(Scene(GaussianField.random(200, (32, 48), seed=0)))
         >>> whole, part = decode(data), decode(data, max_bytes=len(data) // 2)
-        >>> whole.layers == whole.num_layers, part.layers < part.num_layers, len(part.field) < len(whole.field)
+        >>> whole.layers == whole.num_layers, part.layers < part.num_layers, len(part.scene) < len(whole.scene)
         (True, True, True)
     """
     if not isinstance(data, bytes | bytearray | memoryview):
@@ -75,7 +85,7 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
         field = GaussianField(means, cholesky, colors, region_ids, size=header.size)
     except ValueError as error:
         raise CodecError(f"the file holds no Gaussians that can be rendered: {error}") from error
-    return Decoded(field, regions, len(layers), len(header.layers))
+    return Decoded(Scene(field, regions), len(layers), len(header.layers))
 
 
 def deserialize(data: bytes) -> Scene:
@@ -85,4 +95,4 @@ def deserialize(data: bytes) -> Scene:
         raise CodecError(
             f"it ends early, with {decoded.layers} of {decoded.num_layers} layers; kcgs decode renders what is there"
         )
-    return Scene(decoded.field, decoded.regions)
+    return decoded.scene

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from kcgs._check import check_count, check_floating, check_number
 from kcgs.functional import RegionMap
@@ -25,12 +25,8 @@ QUALITIES = (10.0, 90.0)
 DEFAULT_QUALITY = 46.0
 
 
-def encode(
-    field: GaussianField,
-    regions: RegionMap | Tensor | None = None,
-    *,
-    quality: float | None = None,
-    target_bytes: int | None = None,
+def encode(  # noqa: D417
+    scene: Any, regions: Any = None, *, quality: float | None = None, target_bytes: int | None = None
 ) -> bytes:
     """Write a scene as a `.kcgs` file; the same scene gives the same bytes.
 
@@ -40,9 +36,8 @@ def encode(
     :func:`kcgs.rate.compress` makes up for most of the error where the image is at hand.
 
     Args:
-        field: N Gaussians of one image; opacities are merged into the colours.
-        regions: the map to render with (a Tensor means hard contours); None, or a map of one region: one region, which
-            takes one byte.
+        scene: N Gaussians of one image; opacities are merged into the colours, and notes are not kept. A map of one
+            region takes one byte.
         quality: PSNR in dB of the decoded render against the scene's own, before clipping, 10 to 90; 46 by default.
         target_bytes: the finest file that is not larger, in place of `quality`.
 
@@ -57,12 +52,13 @@ def encode(
 
     Example:
         >>> from kcgs.codec import decode
-        >>> field = GaussianField.random(100, (32, 48), seed=0)
-        >>> data = encode(field, quality=40)
-        >>> len(data) < 1000, decode(data).field.size
+        >>> data = encode(Scene(GaussianField.random(100, (32, 48), seed=0)), quality=40)
+        >>> len(data) < 1000, decode(data).scene.size
         (True, (32, 48))
     """
-    writer = SceneWriter(field, regions)
+    if isinstance(scene, GaussianField):  # transitional
+        scene = Scene(scene, regions)
+    writer = SceneWriter(scene)
     qp = writer.qp_for(quality, target_bytes)
     if target_bytes is None:
         return writer.write_rounded(qp)
@@ -71,26 +67,27 @@ def encode(
 
 def serialize(scene: Scene) -> bytes:
     """Write a scene at the default quality, for :func:`kcgs.save`."""
-    return encode(scene.field, scene.regions)
+    return encode(scene)
 
 
 class SceneWriter:
     """A scene that files are written of, at any quantization parameter; its map is coded once.
 
     Args:
-        field: N Gaussians of one image.
-        regions: the map to render with.
+        scene: N Gaussians of one image.
 
     Raises:
         TypeError, ValueError: as :func:`encode`.
     """
 
-    def __init__(self, field: GaussianField, regions: RegionMap | Tensor | None) -> None:
+    def __init__(self, scene: Scene) -> None:
+        if not isinstance(scene, Scene):
+            raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
+        field, regions = scene.field, scene.regions
         _check_field(field)
         self.size, self.channels = field.size, field.colors.shape[-1]
         tensors = field.means, field.cholesky, field.merged_colors()
         self.gaussians = Parameters(*(t.detach().cpu().double().numpy() for t in tensors))
-        regions = RegionMap.coerce(regions)
         self.regions = None if regions is None or regions.num_regions == 1 else regions.to("cpu")
         self.ids = np.zeros(len(field), np.int64)  # as positions among the map's ids
         self.region_map = b""
@@ -162,10 +159,8 @@ class SceneWriter:
 
 def _check_field(field: GaussianField) -> None:
     """Refuse what no file can hold; a parameter may have been changed since the field was made."""
-    if not isinstance(field, GaussianField):
-        raise TypeError(f"field must be a GaussianField; got {type(field).__name__}")
     if field.means.ndim != 2 or len(field) == 0:
-        raise ValueError(f"field must hold the Gaussians of one image; got means of shape {tuple(field.means.shape)}")
+        raise ValueError(f"scene must hold the Gaussians of one image; got means of shape {tuple(field.means.shape)}")
     check_floating("means", field.means.detach().float())
     check_cholesky("cholesky", field.cholesky.detach().float())
     check_floating("colors", field.merged_colors().detach().float())
@@ -173,7 +168,7 @@ def _check_field(field: GaussianField) -> None:
     for limit, most, found in (
         ("size must be at most {} pixels per side", MOST_SIDE, max(field.size)),
         ("colors must have at most {} channels", MOST_CHANNELS, channels),
-        (f"field must hold at most {{}} Gaussians of {channels} channels", most_gaussians(channels), len(field)),
+        (f"scene must hold at most {{}} Gaussians of {channels} channels", most_gaussians(channels), len(field)),
     ):
         if found > most:
             raise ValueError(f"{limit.format(most)}; got {found}")
@@ -184,7 +179,7 @@ def _positions(field: GaussianField, regions: RegionMap) -> NDArray[np.int64]:
     if regions.labels.ndim != 2 or regions.size != field.size:
         raise ValueError(f"regions must be one map of size {field.size}; got {tuple(regions.labels.shape)}")
     if field.region_ids is None:
-        raise ValueError("field must have region_ids where regions are given; call field.assign_regions(regions)")
+        raise ValueError("scene must have region_ids for its regions; call scene.field.assign_regions(scene.regions)")
     region_ids = field.region_ids.cpu()
     index = regions.index_of(region_ids)
     if (index < 0).any():

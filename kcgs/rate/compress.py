@@ -20,6 +20,7 @@ from kcgs.fit.loop import check_problem, fit
 from kcgs.fit.monitor import FitResult, HistoryEntry
 from kcgs.functional import RegionMap, merge_regions
 from kcgs.nn import GaussianField
+from kcgs.scene import Scene
 
 from .fine_tune import FineTuning
 
@@ -91,7 +92,7 @@ def compress(
         >>> len(compress(field, image, target_bytes=150)) <= 150
         True
     """
-    writer = SceneWriter(field, regions)
+    writer = SceneWriter(Scene(field, regions))
     image = _check_image(image, field)
     check_count("iterations", iterations)
 

@@ -20,8 +20,7 @@ runner = CliRunner()
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    field, regions = make_scene(120, (48, 64))
-    save(tmp_path / "scene.safetensors", field, regions)
+    save(tmp_path / "scene.safetensors", make_scene(120, (48, 64)))
     return tmp_path / "scene.safetensors"
 
 

@@ -7,12 +7,12 @@ import math
 import pytest
 import torch
 
-from kcgs import GaussianField, RegionMap
+from kcgs import GaussianField, RegionMap, Scene
 
 
 def make_scene(
     count: int = 60, size: tuple[int, int] = (24, 36), regions: int = 3, channels: int = 3, seed: int = 0
-) -> tuple[GaussianField, RegionMap | None]:
+) -> Scene:
     """Gaussians of all sizes, angles and strengths, some outside the image, over stripes with curved borders."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -30,18 +30,16 @@ def make_scene(
     cholesky = torch.stack([l11, xy / l11, a * b / l11], -1)
     colors = (2 * uniform(count, channels) - 1) * 3.0 ** (-3 * uniform(count, 1))
     if regions == 1:
-        return GaussianField(means, cholesky, colors, size=size), None
+        return Scene(GaussianField(means, cholesky, colors, size=size))
     row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     stripe = (column + 3 * torch.sin(row / 5.0)) * regions / width
     labels = 5 + 7 * stripe.long().clamp(0, regions - 1)
     ids = labels.unique()[torch.randint(regions, (count,), generator=generator)]
     pairs = labels.unique().tolist()
     widths = {(pairs[i], pairs[i + 1]): 0.25 * (i % 5) for i in range(regions - 1)}
-    return GaussianField(means, cholesky, colors, ids, size=size), RegionMap.from_labels(labels, widths)
+    return Scene(GaussianField(means, cholesky, colors, ids, size=size), RegionMap.from_labels(labels, widths))
 
 
 @pytest.fixture
-def scene() -> tuple[GaussianField, RegionMap]:
-    field, regions = make_scene()
-    assert regions is not None
-    return field, regions
+def scene() -> Scene:
+    return make_scene()

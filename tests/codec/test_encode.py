@@ -9,45 +9,46 @@ from pathlib import Path
 import pytest
 import torch
 
-from kcgs import GaussianField, RegionMap, load
+from kcgs import GaussianField, RegionMap, Scene, load
 from kcgs.codec import decode, encode
 from kcgs.functional import region_splat
-from kcgs.nn.renderer import render_image
 
 from .conftest import make_scene
 
-Scene = tuple[GaussianField, RegionMap]
+
+def exact_render(scene: Scene) -> torch.Tensor:
+    field = scene.field
+    means, cholesky, colors = (t.detach().double() for t in (field.means, field.cholesky, field.merged_colors()))
+    return region_splat(means, cholesky, colors, field.region_ids, scene.regions, size=scene.size, cutoff=0.0)
 
 
-def picture(field: GaussianField, regions: RegionMap | None) -> torch.Tensor:
-    tensors = (t.detach().double() for t in (field.means, field.cholesky, field.merged_colors()))
-    means, cholesky, colors = tensors
-    return region_splat(means, cholesky, colors, field.region_ids, regions, size=field.size, cutoff=0.0)
+def psnr_between(one: Scene, other: Scene) -> float:
+    return -10 * math.log10(float((exact_render(one) - exact_render(other)).square().mean()))
 
 
-def psnr_between(one: GaussianField, other: GaussianField, regions: RegionMap | None) -> float:
-    error = (picture(one, regions) - picture(other, regions)).square().mean()
-    return -10 * math.log10(float(error))
+def changed(scene: Scene, **tensors: torch.Tensor) -> Scene:
+    """Return the Gaussians of a scene without its map, with other tensors."""
+    given = {name: getattr(scene.field, name) for name in ("means", "cholesky", "colors")} | tensors
+    return Scene(GaussianField(**given, size=scene.size))
 
 
 class TestRoundTrip:
     @pytest.mark.parametrize("regions", [1, 2, 5])
     @pytest.mark.parametrize("channels", [1, 3, 4])
     def test_what_is_decoded_encodes_to_itself(self, regions: int, channels: int) -> None:
-        field, map_ = make_scene(80, regions=regions, channels=channels)
-        first = decode(encode(field, map_, quality=40))
-        assert first.layers == first.num_layers and first.field.size == field.size
-        assert first.field.colors.shape[-1] == channels
-        if map_ is None:
-            assert first.regions is None and first.field.region_ids is None
+        scene = make_scene(80, regions=regions, channels=channels)
+        first = decode(encode(scene, quality=40))
+        found = first.scene
+        assert first.layers == first.num_layers and found.size == scene.size
+        assert found.field.colors.shape[-1] == channels
+        if scene.regions is None:
+            assert found.regions is None and found.field.region_ids is None
         else:
-            assert first.regions is not None and torch.equal(first.regions.labels, map_.labels)
-            assert first.regions.softness == map_.softness
+            assert found.regions is not None and torch.equal(found.regions.labels, scene.regions.labels)
+            assert found.regions.softness == scene.regions.softness
 
     def test_gaussians_keep_their_regions(self, scene: Scene) -> None:
-        field, regions = scene
-        found = decode(encode(field, regions, quality=70)).field
-        assert found.region_ids is not None and field.region_ids is not None
+        found = decode(encode(scene, quality=70)).scene.field
 
         # as a multiset of (rounded centre, id): the order is the file's
         def keys(f: GaussianField) -> set[tuple[int, ...]]:
@@ -56,13 +57,13 @@ class TestRoundTrip:
                 (*row.tolist(), int(i)) for row, i in zip(f.means.detach().round().int(), f.region_ids, strict=True)
             }
 
-        assert len(keys(found) & keys(field)) > 0.7 * len(field)
+        assert len(keys(found) & keys(scene.field)) > 0.7 * len(scene)
 
     def test_same_bytes_each_time(self, scene: Scene) -> None:
-        assert encode(*scene) == encode(*scene)
+        assert encode(scene) == encode(scene)
 
     def test_same_bits_everywhere(self) -> None:
-        found = decode((Path(__file__).parent / "golden.kcgs").read_bytes())
+        found = decode((Path(__file__).parent / "golden.kcgs").read_bytes()).scene
         field, regions = found.field, found.regions
         assert regions is not None and field.region_ids is not None
         tensors = (field.means, field.cholesky, field.colors, field.region_ids, regions.labels)
@@ -70,51 +71,44 @@ class TestRoundTrip:
         assert hashlib.sha256(bits).hexdigest()[:16] == "51255d36c798f4b7"
 
     def test_sub_pixel_map(self) -> None:
-        field, _ = make_scene(regions=1)
+        field = make_scene(regions=1).field
         fine = (torch.arange(72) > 31).long().expand(48, 72)
         regions = RegionMap.from_labels(fine, supersample=2)
         field = GaussianField(field.means, field.cholesky, field.colors, torch.arange(60) % 2, size=field.size)
-        found = decode(encode(field, regions)).regions
+        found = decode(encode(Scene(field, regions))).scene.regions
         assert found is not None and found.supersample == 2
-        assert found.fine_labels is not None and torch.equal(found.fine_labels, fine)
+        assert torch.equal(found.fine_labels, fine)
 
     def test_opacities_are_merged(self) -> None:
-        field, _ = make_scene(regions=1)
-        seen = GaussianField(
-            field.means, field.cholesky, field.colors, opacities=torch.full((60,), 0.5), size=field.size
-        )
-        halves = GaussianField(field.means, field.cholesky, 0.5 * field.colors.detach(), size=field.size)
-        assert encode(seen) == encode(halves)
+        scene = make_scene(regions=1)
+        faded = changed(scene, opacities=torch.full((60,), 0.5))
+        assert encode(faded) == encode(changed(scene, colors=0.5 * scene.field.colors.detach()))
 
     def test_one_region_takes_one_byte(self) -> None:
-        field, _ = make_scene(regions=1)
-        whole = RegionMap.from_labels(torch.full((24, 36), 9))
-        with_ids = GaussianField(field.means, field.cholesky, field.colors, torch.full((60,), 9), size=field.size)
-        assert encode(with_ids, whole) == encode(field)
+        scene = make_scene(regions=1)
+        confined = changed(scene, region_ids=torch.full((60,), 9)).field
+        assert encode(Scene(confined, torch.full((24, 36), 9))) == encode(scene)
 
     def test_black_ones_are_left_out(self) -> None:
-        field, _ = make_scene(regions=1)
-        colors = field.colors.detach().clone()
+        scene = make_scene(regions=1)
+        colors = scene.field.colors.detach().clone()
         colors[10:] = 1e-7
-        found = decode(encode(GaussianField(field.means, field.cholesky, colors, size=field.size)))
-        assert len(found.field) <= 10
+        assert len(decode(encode(changed(scene, colors=colors))).scene) <= 10
 
     def test_nothing_but_black(self) -> None:
-        field, _ = make_scene(regions=1)
-        black = GaussianField(field.means, field.cholesky, torch.zeros(60, 3), size=field.size)
-        found = decode(encode(black))
-        assert len(found.field) == 1 and not render_image(found.field, None).any()
+        found = decode(encode(changed(make_scene(regions=1), colors=torch.zeros(60, 3)))).scene
+        assert len(found) == 1 and not found.render().any()
 
     @pytest.mark.parametrize("size", [(1, 1), (1, 300), (3, 5)])
-    def test_tiny_pictures(self, size: tuple[int, int]) -> None:
-        field = GaussianField.random(5, size, seed=0)
-        assert decode(encode(field, quality=60)).field.size == size
+    def test_tiny_images(self, size: tuple[int, int]) -> None:
+        scene = Scene(GaussianField.random(5, size, seed=0))
+        assert decode(encode(scene, quality=60)).scene.size == size
 
     def test_extreme_gaussians(self) -> None:
         means = torch.tensor([[5.0, 5.0], [-4000.0, 9.0], [8.0, 8.0], [1.0, 1.0]])
         cholesky = torch.tensor([[0.1, 0.0, 0.1], [30.0, 0.0, 9000.0], [0.1, 40.0, 0.1], [50.0, 0.0, 50.0]])
         colors = torch.tensor([[1e-3, 0.0, 0.0], [2.0, 2.0, 2.0], [9.0, -9.0, 0.0], [1e4, 1e4, 1e4]])
-        found = decode(encode(GaussianField(means, cholesky, colors, size=(20, 20)), quality=60)).field
+        found = decode(encode(Scene(GaussianField(means, cholesky, colors, size=(20, 20))), quality=60)).scene.field
         assert torch.isfinite(found.means).all() and (found.cholesky[:, ::2] > 0).all()
 
     def test_many_of_one_kind_in_one_place(self) -> None:
@@ -125,49 +119,47 @@ class TestRoundTrip:
             torch.ones(3000, 1),
             size=(1, 1),
         )
-        assert len(decode(encode(many, quality=10)).field) == 3000
+        assert len(decode(encode(Scene(many), quality=10)).scene) == 3000
 
 
 class TestGoals:
     @pytest.mark.parametrize("quality", [30.0, 45.0, 60.0])
     def test_quality(self, quality: float) -> None:
-        field, regions = make_scene(400, (96, 144), regions=1)
-        found = decode(encode(field, regions, quality=quality)).field
+        scene = make_scene(400, (96, 144), regions=1)
+        found = decode(encode(scene, quality=quality)).scene
         # Gaussians that leave the image add less than the whole ones that are reckoned with
-        assert quality - 1.0 < psnr_between(field, found, None) < quality + 6.0
+        assert quality - 1.0 < psnr_between(scene, found) < quality + 6.0
 
     def test_target(self) -> None:
-        field, regions = make_scene(300, (96, 144))
-        sizes = [len(encode(field, regions, target_bytes=target)) for target in (900, 1500, 2500)]
+        scene = make_scene(300, (96, 144))
+        sizes = [len(encode(scene, target_bytes=target)) for target in (900, 1500, 2500)]
         assert all(0.97 * target < size <= target for size, target in zip(sizes, (900, 1500, 2500), strict=True))
 
     def test_target_that_cannot_be(self, scene: Scene) -> None:
         with pytest.raises(ValueError, match="target_bytes must be at least [0-9]+ for this scene; got 20"):
-            encode(*scene, target_bytes=20)
+            encode(scene, target_bytes=20)
 
-    def test_half_of_the_file_is_most_of_the_picture(self) -> None:
-        field, regions = make_scene(400, (96, 144))
-        data = encode(field, regions)
-        psnrs = [
-            -10 * math.log10(float((picture(part.field, regions) - picture(field, regions)).square().mean()))
-            for part in (decode(data, max_bytes=len(data) * share // 10) for share in (3, 5, 8, 10))
-        ]
+    def test_half_of_the_file_is_most_of_the_image(self) -> None:
+        scene = make_scene(400, (96, 144))
+        data = encode(scene)
+        parts = [decode(data, max_bytes=len(data) * share // 10).scene for share in (3, 5, 8, 10)]
+        psnrs = [psnr_between(Scene(part.field, scene.regions), scene) for part in parts]
         assert psnrs == sorted(psnrs) and psnrs[-1] > psnrs[0] + 10
 
 
 class TestRefusals:
     def test_arguments(self, scene: Scene) -> None:
-        field, regions = scene
+        field, regions = scene.field, scene.regions
+        other = Scene(field, torch.zeros(24, 36).long() + torch.arange(36) // 18)
         for call, match in (
-            (lambda: encode(None), "field must be a GaussianField"),  # type: ignore[arg-type]
-            (lambda: encode(field, "x"), "regions must be a RegionMap"),  # type: ignore[arg-type]
-            (lambda: encode(field, regions, quality=5), "quality must be in"),
-            (lambda: encode(field, regions, quality=True), "quality must be a number"),
-            (lambda: encode(field, regions, quality=40, target_bytes=900), "exclude each other"),
-            (lambda: encode(field, regions, target_bytes=1.5), "target_bytes must be an integer"),  # type: ignore[arg-type]
-            (lambda: encode(field, regions.resize((9, 9))), "regions must be one map of size"),
-            (lambda: encode(field, torch.zeros(24, 36).long() + torch.arange(36) // 18), "region_ids must be ids"),
-            (lambda: encode(field.subset(slice(0, 0))), "must"),
+            (lambda: encode(None), "scene must be a Scene"),
+            (lambda: encode(scene, quality=5), "quality must be in"),
+            (lambda: encode(scene, quality=True), "quality must be a number"),
+            (lambda: encode(scene, quality=40, target_bytes=900), "exclude each other"),
+            (lambda: encode(scene, target_bytes=1.5), "target_bytes must be an integer"),
+            (lambda: encode(Scene(field, regions.resize((9, 9)))), "regions must be one map of size"),
+            (lambda: encode(other), "region_ids must be ids"),
+            (lambda: encode(Scene(field.subset(slice(0, 0)))), "must"),
             (lambda: decode("x"), "data must be bytes"),  # type: ignore[arg-type]
             (lambda: decode(b"x", max_bytes=0), "max_bytes must be at least 1"),
         ):
@@ -184,31 +176,28 @@ class TestRefusals:
         ],
     )
     def test_values_that_were_changed(self, scene: Scene, name: str, value: float, match: str) -> None:
-        field, regions = scene
         with torch.no_grad():
-            getattr(field, name)[3, 0] = value
+            getattr(scene.field, name)[3, 0] = value
         with pytest.raises(ValueError, match=match):
-            encode(field, regions)
+            encode(scene)
 
     def test_what_no_decoder_takes(self) -> None:
-        wide = GaussianField.random(5, (1, (1 << 20) + 1), seed=0)
+        wide = Scene(GaussianField.random(5, (1, (1 << 20) + 1), seed=0))
         with pytest.raises(ValueError, match="size must be at most 1048576 pixels per side"):
             encode(wide)
-        field, _ = make_scene(regions=1)
-        deep = GaussianField(field.means, field.cholesky, torch.ones(60, 1025), size=field.size)
+        scene = make_scene(regions=1)
         with pytest.raises(ValueError, match="colors must have at most 1024 channels; got 1025"):
-            encode(deep)
-        ids = torch.zeros(60, dtype=torch.long)
+            encode(changed(scene, colors=torch.ones(60, 1025)))
         fine = RegionMap.from_labels((torch.arange(65 * 24) >= 99).long()[:, None].expand(-1, 65 * 36), supersample=65)
         with pytest.raises(ValueError, match="supersample must be at most 64; got 65"):
-            encode(GaussianField(field.means, field.cholesky, field.colors, ids, size=field.size), fine)
+            encode(Scene(changed(scene, region_ids=torch.zeros(60, dtype=torch.long)).field, fine))
 
     def test_load_reads_it(self, scene: Scene, tmp_path: object) -> None:
         path = f"{tmp_path}/scene.kcgs"
-        data = encode(*scene)
+        data = encode(scene)
         with open(path, "wb") as file:
             file.write(data)
-        assert torch.equal(load(path).field.means, decode(data).field.means)
+        assert torch.equal(load(path).field.means, decode(data).scene.field.means)
         with open(path, "wb") as file:
             file.write(data[:-20])
         with pytest.raises(ValueError, match=r"cannot load .*scene.kcgs: it ends early"):

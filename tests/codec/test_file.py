@@ -1,4 +1,4 @@
-"""Damage: one clear error, or a coarser picture."""
+"""Damage: one clear error, or a coarser scene."""
 
 from __future__ import annotations
 
@@ -7,17 +7,15 @@ import random
 import pytest
 import torch
 
-from kcgs import GaussianField, RegionMap
+from kcgs import RegionMap, Scene
 from kcgs.codec import CodecError, Decoded, decode, encode
 from kcgs.codec.file import pack, unpack
 
 from .conftest import make_scene
 
-Scene = tuple[GaussianField, RegionMap]
-
 
 def survives(data: bytes) -> bool:
-    """Decode; say whether that was a picture, which must then be a sound one."""
+    """Decode; say whether that was a scene, which must then be a sound one."""
     try:
         found = decode(data)
     except CodecError as error:
@@ -28,13 +26,13 @@ def survives(data: bytes) -> bool:
 
 
 def assert_sound(found: Decoded) -> None:
-    field = found.field
+    field, regions = found.scene.field, found.scene.regions
     for numbers in (field.means, field.cholesky, field.colors):
         assert torch.isfinite(numbers).all()
     assert (field.cholesky[:, ::2] > 0).all()
-    if found.regions is not None:
-        assert field.region_ids is not None and (found.regions.index_of(field.region_ids) >= 0).all()
-        assert found.regions.size == field.size
+    if regions is not None:
+        assert field.region_ids is not None and (regions.index_of(field.region_ids) >= 0).all()
+        assert regions.size == field.size
 
 
 def damaged(data: bytes, generator: random.Random) -> bytes:
@@ -79,7 +77,7 @@ def hostile(data: bytes, generator: random.Random) -> bytes:
 
 
 def attack(count: int, seed: int) -> None:
-    data = encode(*make_scene())
+    data = encode(make_scene())
     generator = random.Random(seed)
     whole = cut = 0
     for _ in range(count // 2):
@@ -88,7 +86,7 @@ def attack(count: int, seed: int) -> None:
         survives(hostile(data, generator))
     for _ in range(20):
         whole += survives(hostile(data, generator))
-    assert cut > 0 and whole > 0  # some are pictures still
+    assert cut > 0 and whole > 0  # some are scenes still
 
 
 class TestDamage:
@@ -100,14 +98,14 @@ class TestDamage:
         attack(10_000, seed=1)
 
     def test_a_flipped_bit_is_found(self, scene: Scene) -> None:
-        data = encode(*scene)
+        data = encode(scene)
         for at in range(0, len(data), 7):
             content = bytearray(data)
             content[at] ^= 16
             assert not survives(bytes(content))
 
-    def test_every_cut_is_a_coarser_picture_or_refused(self, scene: Scene) -> None:
-        data = encode(*scene)
+    def test_every_cut_is_a_coarser_scene_or_refused(self, scene: Scene) -> None:
+        data = encode(scene)
         counts = []
         for length in range(0, len(data), 3):
             try:
@@ -117,8 +115,8 @@ class TestDamage:
                 continue
             assert_sound(found)
             assert found.layers < found.num_layers
-            counts.append(len(found.field))
-        assert counts == sorted(counts) and counts[0] < counts[-1] < len(scene[0])
+            counts.append(len(found.scene))
+        assert counts == sorted(counts) and counts[0] < counts[-1] < len(scene)
 
     @pytest.mark.parametrize("data", [b"", b"k", b"kcgs", b"kcgs\2", b"PNG0" * 9, bytes(100)])
     def test_no_file_at_all(self, data: bytes) -> None:
@@ -127,10 +125,10 @@ class TestDamage:
 
     def test_what_is_left_over_is_refused(self, scene: Scene) -> None:
         with pytest.raises(CodecError, match="must end after"):
-            decode(encode(*scene) + b"\0")
+            decode(encode(scene) + b"\0")
 
     def test_what_is_left_over_in_a_map_is_refused(self, scene: Scene) -> None:
-        field, regions = scene
-        header, region_map, layers = unpack(encode(field, RegionMap.from_labels(regions.labels, 0.5)))
+        soft = RegionMap.from_labels(scene.regions.labels, 0.5)
+        header, region_map, layers = unpack(encode(Scene(scene.field, soft)))
         with pytest.raises(CodecError, match="the map must end after"):
             decode(pack(header, region_map + b"\0", layers))

@@ -43,8 +43,8 @@ def shapes(seed: int, size: tuple[int, int] = (120, 160), count: int = 6) -> Lab
 
 def webp_bytes(labels: Labels) -> int:
     file = BytesIO()
-    picture = Image.fromarray(labels.astype(np.uint8))
-    picture.save(file, "WEBP", lossless=True, quality=100, method=6, exact=True)
+    image = Image.fromarray(labels.astype(np.uint8))
+    image.save(file, "WEBP", lossless=True, quality=100, method=6, exact=True)
     return len(file.getvalue())
 
 
@@ -150,7 +150,7 @@ class TestStream:
 
 
 class TestSize:
-    """Against lossless WebP; the network was trained on other maps, of other pictures."""
+    """Against lossless WebP; the network was trained on other maps, of other images."""
 
     def ratio(self, paths: list[Path]) -> float:
         assert paths

@@ -18,7 +18,7 @@ Floats = np.ndarray
 
 
 def arrays(count: int = 200, size: tuple[int, int] = (96, 144), seed: int = 0) -> Parameters:
-    field, _ = make_scene(count, size, 1, seed=seed)
+    field = make_scene(count, size, 1, seed=seed).field
     return Parameters(*(t.detach().double().numpy() for t in (field.means, field.cholesky, field.colors)))
 
 

@@ -181,19 +181,19 @@ class File:
 
 def as_the_words_say(data: bytes, known: Decoded) -> None:
     header, _, layers = unpack(data)
-    index = None if known.regions is None else known.regions.index_of(known.regions.labels).numpy()
+    field, regions = known.scene.field, known.scene.regions
+    index = None if regions is None else regions.index_of(regions.labels).numpy()
     file = File(header, index, header.regions)
     found = [
         row
         for (energy, _), layer in zip(header.layers, layers, strict=True)
         for row in file.layer(Symbols(layer), energy)
     ]
-    field = known.field
     expected = torch.cat([field.means, field.cholesky, field.colors], -1).detach().numpy()
     assert np.array_equal(np.array([numbers for numbers, _ in found]).astype(np.float32), expected)
-    if known.regions is not None:
+    if regions is not None:
         assert field.region_ids is not None
-        assert [id for _, id in found] == known.regions.index_of(field.region_ids).tolist()
+        assert [id for _, id in found] == regions.index_of(field.region_ids).tolist()
 
 
 def test_golden() -> None:
@@ -203,5 +203,5 @@ def test_golden() -> None:
 
 @pytest.mark.parametrize(("regions", "channels", "quality"), [(1, 1, 20.0), (3, 3, 50.0), (2, 4, 80.0)])
 def test_others(regions: int, channels: int, quality: float) -> None:
-    data = encode(*make_scene(120, regions=regions, channels=channels, seed=3), quality=quality)
+    data = encode(make_scene(120, regions=regions, channels=channels, seed=3), quality=quality)
     as_the_words_say(data, decode(data))

@@ -281,7 +281,7 @@ def test_widths() -> None:
 
 def test_golden() -> None:
     data = (Path(__file__).parent / "golden.kcgs").read_bytes()
-    regions = decode(data).regions
+    regions = decode(data).scene.regions
     assert regions is not None
     found, height, width = map_of(data)
     assert (height, width) == regions.size
