@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from kcgs.functional.regions import MAX_SOFTNESS
+from kcgs.functional import MAX_SOFTNESS
 from kcgs.kernels import BACKENDS
 
 

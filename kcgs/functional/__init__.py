@@ -20,11 +20,13 @@ from .labels import contour_edges, edge_band, lookup_regions, touching_pairs
 from .merging import merge_regions
 from .metrics import ef_psnr, ef_ssim, ms_ssim, psnr, ssim
 from .polygons import polygon_coverage, polygon_labels
-from .regions import PairWidths, RegionMap
+from .regions import RegionMap
+from .softness import MAX_SOFTNESS, PairWidths
 from .splat import region_splat
 from .widths import BandGain, band_gain, choose_widths
 
 __all__ = [
+    "MAX_SOFTNESS",
     "BandGain",
     "BoundaryScore",
     "PairWidths",

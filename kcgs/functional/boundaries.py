@@ -31,7 +31,7 @@ class BoundaryScore(NamedTuple):
 
 
 def smooth_contours(labels: Tensor, supersample: int = 4, sigma: float = 1.5) -> Tensor:
-    r"""Draw a label map's contours as the smooth curves that its staircases stand for, on a finer grid.
+    r"""Sample a label map on a finer grid, its contours being the smooth curves that their staircases stand for.
 
     Each indicator is blurred by a Gaussian, and every fine pixel takes the label with the largest blur: straight
     edges come back within a few hundredths of a pixel, corners sharper than `sigma` are rounded, and regions
@@ -40,7 +40,7 @@ def smooth_contours(labels: Tensor, supersample: int = 4, sigma: float = 1.5) ->
 
     Args:
         labels: integer, :math:`(H, W)`, non-negative.
-        supersample: fine pixels a pixel's side, 2 to 16.
+        supersample: fine pixels along a pixel's side, 2 to 16.
         sigma: standard deviation of the blur in pixels, above 0, at most 8.
 
     Returns:
@@ -82,7 +82,7 @@ def coverage(labels: Tensor, factor: int) -> Tensor:
 
     Args:
         labels: integer, :math:`(kH, kW)` or :math:`(B, kH, kW)`, non-negative.
-        factor: fine pixels a pixel's side, k, at least 1.
+        factor: fine pixels along a pixel's side, k, at least 1.
 
     Returns:
         float32, :math:`(R, H, W)` or :math:`(B, R, H, W)`, regions in the order of ``labels.unique()`` (of the whole
@@ -154,7 +154,7 @@ def boundary_f_score(labels: Tensor, reference: Tensor, tolerance: float = 2.0) 
 def edge_alignment(image: Tensor, labels: Tensor) -> Tensor:
     r"""Say how well a map's contours lie on the edges of an image: in [0, 1], 1 on edges, 0.5 by chance.
 
-    The mean of :func:`edge_alignment_map`. Of 51 maps drawn by people (21 of BSDS500, 30 of DAVIS 2017) 90 % lie
+    The mean of :func:`edge_alignment_map`. Of 51 maps made by people (21 of BSDS500, 30 of DAVIS 2017) 90 % lie
     between 0.65 and 0.93 and none below 0.63; mirrored, the same maps give 0.44 to 0.54. Below 0.58 a map hardly
     belongs to the image.
 
@@ -236,8 +236,8 @@ def _ranks(edges: Tensor, contour: Tensor, near: Tensor) -> Tensor:
     for part in contour.nonzero().split(1 << 14):
         rows, columns = part.unbind(1)
         around = padded[(rows[:, None] + offsets)[:, :, None], (columns[:, None] + offsets)[:, None, :]].flatten(1)
-        here = edges[rows, columns][:, None]
-        weaker = (around < here).sum(1) + 0.5 * (around == here).sum(1)
+        strength = edges[rows, columns][:, None]
+        weaker = (around < strength).sum(1) + 0.5 * (around == strength).sum(1)
         ranks[rows, columns] = (weaker / around.isfinite().sum(1)).to(edges.dtype)  # 0 of 0 is NaN
     return ranks
 
@@ -264,6 +264,6 @@ def _window(inside: Any, reach: int) -> tuple[slice, slice]:
     """Bounding box of a mask, grown by `reach`."""
     spans = []
     for axis in (1, 0):
-        at = np.flatnonzero(inside.any(axis))
-        spans.append(slice(max(0, int(at[0]) - reach), int(at[-1]) + reach + 1))
+        lines = np.flatnonzero(inside.any(axis))
+        spans.append(slice(max(0, int(lines[0]) - reach), int(lines[-1]) + reach + 1))
     return spans[0], spans[1]

@@ -80,11 +80,11 @@ def edge_band(labels: Tensor, width: float = 5) -> Tensor:
     for dy in range(min(int(width), height - 1) + 1):
         reach = min(int(math.sqrt(width * width - dy * dy)), breadth - 1)
         for dx in range(-reach if dy else 1, reach + 1):
-            here = (..., slice(0, height - dy), slice(max(0, -dx), breadth - max(0, dx)))
-            there = (..., slice(dy, height), slice(max(0, dx), breadth - max(0, -dx)))
-            differs = labels[here] != labels[there]
-            band[here] |= differs
-            band[there] |= differs
+            first = (..., slice(0, height - dy), slice(max(0, -dx), breadth - max(0, dx)))
+            second = (..., slice(dy, height), slice(max(0, dx), breadth - max(0, -dx)))
+            differs = labels[first] != labels[second]
+            band[first] |= differs
+            band[second] |= differs
     return band
 
 
@@ -142,11 +142,11 @@ def largest_share(index: Tensor, factor: int) -> Tensor:
     best = blocks.amin(-1)
     mixed = best != blocks.amax(-1)
     ordered = blocks[mixed].sort(-1).values  # [P, factor**2], equal labels in runs
-    at = torch.arange(factor * factor, device=index.device)
+    places = torch.arange(factor * factor, device=index.device)
     starts = ordered != torch.nn.functional.pad(ordered[:, :-1], (1, 0), value=-1)
-    run = at - torch.where(starts, at, 0).cummax(-1).values  # place within its run
+    run = places - torch.where(starts, places, 0).cummax(-1).values  # place within its run
     # the longest run, then the first
-    last = (run * (factor * factor) - at).argmax(-1, keepdim=True)
+    last = (run * (factor * factor) - places).argmax(-1, keepdim=True)
     best[mixed] = ordered.gather(-1, last)[:, 0]
     return best
 
@@ -176,12 +176,12 @@ def sample_labels(labels: Tensor, height: int, width: int, factor: int) -> Tenso
         i = torch.arange(new, device=labels.device)[:, None]
         j = torch.arange(factor, device=labels.device)
         if pixels <= new:  # sub-pixels spread over a new pixel
-            at = pixels * (2 * (i * factor + j) + 1) - new
+            points = pixels * (2 * (i * factor + j) + 1) - new
         else:  # over an old one
-            at = factor * (2 * i + 1) * pixels + (2 * j - factor) * new
-        at = at.flatten()
-        low = torch.div(at, 2 * new, rounding_mode="floor")
-        offset = (torch.div((at - 2 * new * low) * _OFFSETS, 2 * new, rounding_mode="floor") + 0.5) / _OFFSETS
+            points = factor * (2 * i + 1) * pixels + (2 * j - factor) * new
+        points = points.flatten()
+        low = torch.div(points, 2 * new, rounding_mode="floor")
+        offset = (torch.div((points - 2 * new * low) * _OFFSETS, 2 * new, rounding_mode="floor") + 0.5) / _OFFSETS
         ends = torch.stack([low, low + 1]).clamp(0, old - 1)
         return ends, torch.stack([1 - offset, offset]).double()
 
@@ -190,9 +190,9 @@ def sample_labels(labels: Tensor, height: int, width: int, factor: int) -> Tenso
     sampled = corners[0].clone()
     # nearly everywhere the four are one label
     mixed = (corners[1] != sampled).logical_or_(corners[2] != sampled).logical_or_(corners[3] != sampled)
-    at = mixed.nonzero(as_tuple=True)
-    own = torch.stack([corner[at] for corner in corners])
-    weights = torch.stack([d[at[-2]] * a[at[-1]] for d in down for a in across])
-    scores = torch.stack([torch.where(own == corner, weights, 0.0).sum(0) for corner in own])
-    sampled[at] = own.gather(0, scores.argmax(0, keepdim=True))[0]
+    places = mixed.nonzero(as_tuple=True)
+    candidates = torch.stack([corner[places] for corner in corners])
+    weights = torch.stack([d[places[-2]] * a[places[-1]] for d in down for a in across])
+    scores = torch.stack([torch.where(candidates == corner, weights, 0.0).sum(0) for corner in candidates])
+    sampled[places] = candidates.gather(0, scores.argmax(0, keepdim=True))[0]
     return sampled

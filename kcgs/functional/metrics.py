@@ -1,7 +1,7 @@
 r"""How far an image is from another: PSNR, SSIM and MS-SSIM over the image, PSNR and SSIM along the contours.
 
 Convention: images are :math:`(C, H, W)` or :math:`(B, C, H, W)` with any number of channels, clipped to [0,
-1] before anything else, data range 1. Every metric gives one number an image: 0-dim for an unbatched pair,
+1] before anything else, data range 1. Every metric gives one number per image: 0-dim for an unbatched pair,
 :math:`(B)` for a batch. Half precision is computed and returned in float32; two dtypes meet in the wider one.
 """
 

@@ -49,7 +49,7 @@ def polygon_coverage(polygons: Tensor | Sequence[Tensor], size: tuple[int, int])
 
 
 def polygon_labels(polygons: Tensor | Sequence[Tensor], size: tuple[int, int], supersample: int = 1) -> Tensor:
-    r"""Draw polygons into a label map: 0 where there is none, 1 to R for the polygons, later ones over earlier ones.
+    r"""Rasterise polygons into a label map: 0 where there is none, 1 to R for the polygons, the later over the earlier.
 
     A label is that of its pixel's centre; centres on an outline belong to it, so that polygons with a common edge leave
     no gap. With ``supersample`` the map is what :meth:`RegionMap.from_labels` takes with the same number. Not
@@ -118,10 +118,10 @@ def _coverage(outline: Tensor, height: int, width: int) -> Tensor:
     right = torch.maximum(near, far).detach().floor().clamp(-1, width - 2).long() + 1
     of, step = _expand(right - left + 1)
     column = left[of] + step
-    here = _right_of(near[of], far[of], column)
+    inside = _right_of(near[of], far[of], column)
     before = torch.where(step > 0, _right_of(near[of], far[of], column - 1), 0.0)
     added = outline.new_zeros(height * width)
-    added = added.index_add(0, row[of] * width + column, drop[of] * (here - before))
+    added = added.index_add(0, row[of] * width + column, drop[of] * (inside - before))
     return added.view(height, width).cumsum(1)
 
 

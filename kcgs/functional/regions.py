@@ -3,50 +3,18 @@
 from __future__ import annotations
 
 import math
-import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from kcgs._check import check_count, check_labels, check_number, check_size
+from kcgs._check import check_count, check_labels, check_size
 from kcgs.kernels import Membership, Resampled
 
 from .labels import compact, largest_share, sample_labels, touching_pairs
-
-MAX_SOFTNESS = 64.0
-
-
-class PairWidths(Mapping[tuple[int, int], float]):
-    """Contour width in pixels of pairs of regions: an immutable mapping with ids a < b, read in either order.
-
-    Example:
-        >>> widths = PairWidths({(1, 2): 0.7, (1, 5): 0.0})
-        >>> widths[2, 1], widths
-        (0.7, PairWidths({(1, 2): 0.7, (1, 5): 0.0}))
-    """
-
-    __slots__ = ("_widths",)
-
-    def __init__(self, widths: Mapping[tuple[int, int], float]) -> None:
-        self._widths = dict(sorted(((min(pair), max(pair)), width) for pair, width in widths.items()))
-
-    def __getitem__(self, pair: tuple[int, int]) -> float:
-        return self._widths[min(pair), max(pair)]
-
-    def __iter__(self) -> Iterator[tuple[int, int]]:
-        return iter(self._widths)
-
-    def __len__(self) -> int:
-        return len(self._widths)
-
-    def __hash__(self) -> int:
-        return hash(tuple(self._widths.items()))
-
-    def __repr__(self) -> str:
-        return f"PairWidths({self._widths})"
+from .softness import PairWidths, check_softness, merged_widths, scaled_widths
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +73,7 @@ class RegionMap:
         labels = check_labels("labels", labels)
         supersample = _check_supersample(supersample, labels)
         ids, index, table = compact(labels)
-        width = _check_softness(softness, ids)
+        width = check_softness(softness, ids)
         by_index: float | Mapping[tuple[int, int], float] = width
         if isinstance(width, PairWidths):
             position = {region: at for at, region in enumerate(ids.tolist())}
@@ -158,10 +126,10 @@ class RegionMap:
         """Return the position of each id among `ids`, -1 where the map does not hold it."""
         if self._table is not None:
             # not self._table[...]: that wakes torch's threads, which then spin beside the kernel's
-            at = region_ids.clamp(-1, len(self._table) - 1).flatten() % len(self._table)
-            return self._table.index_select(0, at).view(region_ids.shape)
-        at = torch.searchsorted(self.ids, region_ids.contiguous()).clamp_max(self.num_regions - 1)
-        return torch.where(self.ids[at] == region_ids, at, -1)
+            places = region_ids.clamp(-1, len(self._table) - 1).flatten() % len(self._table)
+            return self._table.index_select(0, places).view(region_ids.shape)
+        places = torch.searchsorted(self.ids, region_ids.contiguous()).clamp_max(self.num_regions - 1)
+        return torch.where(self.ids[places] == region_ids, places, -1)
 
     def weights(self, region_ids: int | Iterable[int], dtype: torch.dtype = torch.float64) -> Tensor:
         r"""Evaluate the membership of a region at every pixel, or the sum over several.
@@ -263,7 +231,7 @@ class RegionMap:
         if len(new_ids.unique()) == 1:
             return None, new_ids
         labels = new_ids[self.index_of(self.fine_labels)]
-        softness = _merged_widths(self.softness, find)
+        softness = merged_widths(self.softness, find)
         return RegionMap.from_labels(labels, softness, supersample=self.supersample), new_ids
 
     def to(self, device: torch.device | str) -> RegionMap:
@@ -334,53 +302,12 @@ class RegionMap:
         return RegionMap(
             labels,
             self.ids,
-            _scaled(self.softness, math.sqrt(height * width / (self.size[0] * self.size[1]))),
+            scaled_widths(self.softness, math.sqrt(height * width / (self.size[0] * self.size[1]))),
             fine_labels=labels,
             membership=Resampled(index if index.ndim == 3 else index[None], self.membership),
             _table=self._table,
             _origin=self,
         )
-
-
-def _scaled(softness: float | PairWidths, scale: float) -> float | PairWidths:
-    if not isinstance(softness, PairWidths):
-        return min(softness * scale, MAX_SOFTNESS)
-    return PairWidths({pair: min(width * scale, MAX_SOFTNESS) for pair, width in softness.items()})
-
-
-def _merged_widths(softness: float | PairWidths, find: Callable[[int], int]) -> float | Mapping[tuple[int, int], float]:
-    if isinstance(softness, float):
-        return softness
-    widths: dict[tuple[int, int], list[float]] = {}
-    for (one, other), width in softness.items():
-        low, high = sorted((find(one), find(other)))
-        if low != high:
-            widths.setdefault((low, high), []).append(width)
-    return {pair: sum(found) / len(found) for pair, found in widths.items()}
-
-
-def _check_width(name: str, value: object) -> float:
-    return check_number(name, value, 0.0, MAX_SOFTNESS, unit="pixels")
-
-
-def _check_softness(softness: object, ids: Tensor) -> float | PairWidths:
-    """Return the width if all pairs have the same, else the widths of pairs."""
-    if not isinstance(softness, Mapping):
-        return _check_width("softness", softness)
-    known: set[int] = set(ids.tolist())
-    widths: dict[tuple[int, int], float] = {}
-    for pair, value in softness.items():
-        if not isinstance(pair, tuple) or len(pair) != 2 or not all(hasattr(i, "__index__") for i in pair):
-            raise TypeError(f"softness must map pairs of ids to widths; got the key {pair!r}")
-        low, high = sorted(map(operator.index, pair))
-        if low == high or not known.issuperset((low, high)):
-            raise ValueError(f"softness must map pairs of two different ids in the map; got {pair!r}")
-        if (low, high) in widths:
-            raise ValueError(f"softness must name a pair once; got {(low, high)} and {(high, low)}")
-        widths[low, high] = _check_width(f"softness of {pair}", value)
-    every_pair = len(widths) == len(known) * (len(known) - 1) // 2
-    distinct = {*widths.values()} | (set() if every_pair else {0.0})
-    return PairWidths(widths) if len(distinct) > 1 else distinct.pop() if distinct else 0.0
 
 
 def _check_supersample(supersample: object, labels: Tensor) -> int:

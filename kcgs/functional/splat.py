@@ -1,4 +1,4 @@
-"""The one public way to draw Gaussians."""
+"""The one public way to render Gaussians."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kcgs.kernels import Membership, SplatInputs, resolve
 from .covariance import check_cholesky
 from .regions import RegionMap
 
-# float32 arithmetic stays finite inside these bounds, which are far beyond any picture
+# float32 arithmetic stays finite inside these bounds, which are far beyond any image
 MEAN_LIMIT = 1e8
 SCALE_LIMITS = (1e-6, 1e8)
 
@@ -29,12 +29,12 @@ def region_splat(
     cutoff: float = 1e-4,
     backend: str = "auto",
 ) -> Tensor:
-    r"""Draw an image as a sum of anisotropic Gaussians, each confined to its region of a label map.
+    r"""Render an image as a sum of anisotropic Gaussians, each confined to its region of a label map.
 
     .. math:: I(p) = \sum_i s_{r_i}(p) \exp\left(-\tfrac12 (p - \mu_i)^T \Sigma_i^{-1} (p - \mu_i)\right) c_i
 
     Convention: points are (x, y) in pixels and pixel (j, i) is sampled at (j + 0.5, i + 0.5); a Gaussian whose id the
-    map does not hold draws nothing; N = 0 gives a black image. Half precision is computed in float32. The result is
+    map does not hold paints nothing; N = 0 gives a black image. Half precision is computed in float32. The result is
     not clamped. Once differentiable in means, cholesky and colors, by `backward` and `torch.autograd.grad`;
     `torch.func.grad`, `vjp` and `jvp` work with backend "reference" only, and `vmap` is refused: give the batch as B.
 
@@ -131,7 +131,7 @@ def _resolve_regions(
     if index.ndim == 1:
         index = index[None]
     if regions.num_regions == 1:
-        # one region covers everything: no map, but strangers to it still draw nothing
+        # one region covers everything: no map, but Gaussians of other ids still paint nothing
         return (None, None, regions.size) if bool((index >= 0).all()) else (index, regions.membership, regions.size)
     return index, regions.membership, regions.size
 

@@ -1,6 +1,6 @@
-"""How wide a contour is, and whether the picture has one there: read from the pixels, for each pair of neighbours.
+"""How wide a contour is, and whether the image has one there: read from the pixels, for each pair of neighbours.
 
-Along a contour lie square windows. In each the picture is explained as sum_r s_r F_r, with s_r the memberships of one
+Along a contour lie square windows. In each the image is explained as sum_r s_r F_r, with s_r the memberships of one
 width and F_r linear in x and y: a least-squares problem with a closed form. Mixed pixels are thereby explained as
 mixtures and spoil no colour, and a thin region needs no pure pixel. The width with the least error summed over the
 windows of a pair is that pair's.
@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_floating, check_labels
-from kcgs.functional.regions import MAX_SOFTNESS
 from kcgs.kernels.membership import RADIUS_SIGMAS
 
 from .labels import contour_edges
+from .softness import MAX_SOFTNESS
 
 CANDIDATES = (0.0, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 MIN_CONTOUR = 12
@@ -32,7 +32,7 @@ _CHUNK_ELEMENTS = 1 << 18  # label pixels that a chunk of windows sees: small en
 # Noise of 0.02 against colours and slopes (over half a window) of 0.3: keeps a region that hardly shows from
 # explaining everything with an absurd colour.
 _RIDGE = (0.02 / 0.3) ** 2
-_TIE = 1e-7  # mean squared error that counts as none: a tenth of the rounding of 8-bit pictures
+_TIE = 1e-7  # mean squared error that counts as none: a tenth of the rounding of 8-bit images
 _STEP = 0.05
 
 
@@ -67,10 +67,10 @@ class _Errors(NamedTuple):
 def choose_widths(
     image: Tensor, labels: Tensor, *, candidates: Sequence[float] = CANDIDATES
 ) -> dict[tuple[int, int], float]:
-    r"""Choose the width of the contour between each two neighbouring regions that explains the picture best.
+    r"""Choose the width of the contour between each two neighbouring regions that explains the image best.
 
     Convention: the width is the standard deviation of the blur of [M = r], as in `RegionMap`. The least candidate wins
-    where others gain less than a mean square of 1e-7, a tenth of the rounding of 8-bit pictures. A winner between two
+    where others gain less than a mean square of 1e-7, a tenth of the rounding of 8-bit images. A winner between two
     positive candidates is refined by a parabola to 0.05 pixels. Pairs with fewer than 12 pixel edges get the width
     that is best for all together.
 
@@ -107,10 +107,10 @@ def choose_widths(
 def band_gain(
     image: Tensor, labels: Tensor, *, candidates: Sequence[float] = CANDIDATES
 ) -> dict[tuple[int, int], BandGain]:
-    r"""Predict whether the contour between each two neighbouring regions is one of the picture.
+    r"""Predict whether the contour between each two neighbouring regions is one of the image.
 
     Convention: both errors are means over the pixels of the two regions within about 6 pixels of their contour (more
-    where 2 candidates reach farther), tapered, in squared units of the picture. Pairs with fewer than 12 pixel edges
+    where 2 candidates reach farther), tapered, in squared units of the image. Pairs with fewer than 12 pixel edges
     get the mean of all together.
 
     Known limits: on 21 photos with human label maps, a share above 0.1 holds for 84 % of the pairs with at least 40
@@ -170,15 +170,15 @@ def _measure(image: Tensor, labels: Tensor, candidates: Sequence[float]) -> tupl
     windows = _place_windows(labels)
     half, halo = max(_HALF, math.ceil(2 * widths[-1])), math.ceil(RADIUS_SIGMAS * widths[-1])
     side, span = 2 * half + 1, 2 * (half + halo) + 1
-    picture = torch.nn.functional.pad(image, (half,) * 4).unfold(1, side, 1).unfold(2, side, 1)
+    windowed = torch.nn.functional.pad(image, (half,) * 4).unfold(1, side, 1).unfold(2, side, 1)
     ids = torch.nn.functional.pad(labels, (half + halo,) * 4, value=-1).unfold(0, span, 1).unfold(1, span, 1)
     kernels = [_blur_matrix(w, side, halo) for w in widths]
     count = len(windows.pairs)
     total = _Errors(*(torch.zeros(count, *tail, dtype=torch.float64) for tail in ((len(widths),), (), ())))
     step = max(1, _CHUNK_ELEMENTS // span**2)
-    for at, pair in zip(windows.centers.split(step), windows.pair.split(step), strict=True):
-        rows, cols = at.unbind(1)
-        pixels = picture[:, rows, cols].flatten(2).permute(1, 2, 0)
+    for centers, pair in zip(windows.centers.split(step), windows.pair.split(step), strict=True):
+        rows, cols = centers.unbind(1)
+        pixels = windowed[:, rows, cols].flatten(2).permute(1, 2, 0)
         part = _window_errors(pixels, ids[rows, cols], windows.pairs[pair], kernels)
         for into, values in zip(total, part, strict=True):
             into.index_add_(0, pair, values)

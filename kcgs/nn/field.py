@@ -28,7 +28,7 @@ class GaussianField(nn.Module):
         cholesky: factors (l11, l21, l22) in pixels, l11, l22 > 0, :math:`(N, 3)` or :math:`(B, N, 3)`.
         colors: any range, :math:`(N, C)` or :math:`(B, N, C)`.
         region_ids: integer, non-negative, :math:`(N)` or :math:`(B, N)`; None: not confined.
-        opacities: the paper's alpha, :math:`(N)` or :math:`(B, N)`, multiplied into the colours when drawn; None:
+        opacities: the paper's alpha, :math:`(N)` or :math:`(B, N)`, multiplied into the colours when rendered; None:
             already multiplied.
         size: (height, width) of the image that the pixel units refer to.
 
@@ -98,7 +98,7 @@ class GaussianField(nn.Module):
         return check_ids("region_ids", region_ids, self.means).clone()
 
     def __len__(self) -> int:
-        """Number of Gaussians an image."""
+        """Number of Gaussians per image."""
         return self.means.shape[-2]
 
     @classmethod
@@ -113,7 +113,7 @@ class GaussianField(nn.Module):
         seed: int | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> GaussianField:
-        """Draw centres uniformly over the image, round Gaussians, uniform colours that add up to about grey.
+        """Sample centres uniformly over the image, round Gaussians, uniform colours that add up to about grey.
 
         Args:
             num_gaussians: N, at least 0.
@@ -121,7 +121,7 @@ class GaussianField(nn.Module):
             channels: C, at least 1.
             sigma: standard deviation in pixels; None: half the side of the area that each Gaussian serves.
             regions: assign each Gaussian the region under its centre.
-            seed: of the draw; None: torch's global generator.
+            seed: of the samples; None: torch's global generator.
             dtype: float32 or float64.
 
         Raises:

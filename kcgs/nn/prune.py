@@ -1,4 +1,4 @@
-"""Leave out the Gaussians that the picture does not need."""
+"""Leave out the Gaussians that the image does not need."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def prune(
     """Remove as many Gaussians as go without changing any value of the image by more than `tolerance`.
 
     Those that paint least go first. The bound holds for all that are removed together, not one by one: the image that
-    they draw with the absolute values of their colours stays under it everywhere.
+    they render with the absolute values of their colours stays under it everywhere.
 
     Args:
         field: unbatched.
-        regions: what the field is drawn with.
+        regions: what the field is rendered with.
         tolerance: largest change of a value of the image, at least 0; 0 removes what paints nothing.
         cutoff: of the renderer.
         backend: of the renderer.

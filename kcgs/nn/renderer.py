@@ -22,7 +22,7 @@ class SceneLike(Protocol):
 
 
 class RegionSplatRenderer(nn.Module):
-    r"""Draw a field, at its own size or any other.
+    r"""Render a field, at its own size or any other.
 
     Convention: at another size the Gaussians are scaled and the label map is sampled again, so that contours stay
     sharp. The module holds no state.
@@ -113,7 +113,7 @@ class RegionSplatRenderer(nn.Module):
 
 
 def render_image(field: GaussianField, regions: RegionMap | None = None, size: tuple[int, int] | None = None) -> Tensor:
-    """Draw without a graph, clipped to [0, 1]: what a viewer shows, (C, H, W)."""
+    """Render without a graph, clipped to [0, 1]: what a viewer shows, (C, H, W)."""
     with torch.no_grad():
         image: Tensor = RegionSplatRenderer(clamp=True)(field, regions, size)
     return image

@@ -12,8 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from kcgs import RegionMap
-from kcgs.functional import edge_band, lookup_regions
-from kcgs.functional.regions import PairWidths
+from kcgs.functional import PairWidths, edge_band, lookup_regions
 from kcgs.kernels.tiles import TILE
 
 

@@ -14,7 +14,7 @@ from kcgs.codec.file import MOST_LABELS, MOST_REGIONS, ByteReader, varint
 from kcgs.codec.rangecoder import Coder, Reader, Writer
 from kcgs.functional import RegionMap
 from kcgs.functional.labels import touching_pairs
-from kcgs.functional.regions import MAX_SOFTNESS, PairWidths
+from kcgs.functional import MAX_SOFTNESS, PairWidths
 
 from .coding import decode_labels, encode_labels
 

@@ -1,0 +1,85 @@
+"""How wide contours are: one width for a whole map, or one for each pair of regions."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterator, Mapping
+
+from torch import Tensor
+
+from kcgs._check import check_number
+
+MAX_SOFTNESS = 64.0  # pixels
+
+
+class PairWidths(Mapping[tuple[int, int], float]):
+    """Contour width in pixels of pairs of regions: an immutable mapping with ids a < b, read in either order.
+
+    Example:
+        >>> widths = PairWidths({(1, 2): 0.7, (1, 5): 0.0})
+        >>> widths[2, 1], widths
+        (0.7, PairWidths({(1, 2): 0.7, (1, 5): 0.0}))
+    """
+
+    __slots__ = ("_widths",)
+
+    def __init__(self, widths: Mapping[tuple[int, int], float]) -> None:
+        self._widths = dict(sorted(((min(pair), max(pair)), width) for pair, width in widths.items()))
+
+    def __getitem__(self, pair: tuple[int, int]) -> float:
+        return self._widths[min(pair), max(pair)]
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        return iter(self._widths)
+
+    def __len__(self) -> int:
+        return len(self._widths)
+
+    def __hash__(self) -> int:
+        return hash(tuple(self._widths.items()))
+
+    def __repr__(self) -> str:
+        return f"PairWidths({self._widths})"
+
+
+def check_softness(softness: object, ids: Tensor) -> float | PairWidths:
+    """Return the width if all pairs have the same, else the widths of pairs."""
+    if not isinstance(softness, Mapping):
+        return _check_width("softness", softness)
+    known: set[int] = set(ids.tolist())
+    widths: dict[tuple[int, int], float] = {}
+    for pair, value in softness.items():
+        if not isinstance(pair, tuple) or len(pair) != 2 or not all(hasattr(i, "__index__") for i in pair):
+            raise TypeError(f"softness must map pairs of ids to widths; got the key {pair!r}")
+        low, high = sorted(map(operator.index, pair))
+        if low == high or not known.issuperset((low, high)):
+            raise ValueError(f"softness must map pairs of two different ids in the map; got {pair!r}")
+        if (low, high) in widths:
+            raise ValueError(f"softness must name a pair once; got {(low, high)} and {(high, low)}")
+        widths[low, high] = _check_width(f"softness of {pair}", value)
+    every_pair = len(widths) == len(known) * (len(known) - 1) // 2
+    distinct = {*widths.values()} | (set() if every_pair else {0.0})
+    return PairWidths(widths) if len(distinct) > 1 else distinct.pop() if distinct else 0.0
+
+
+def _check_width(name: str, value: object) -> float:
+    return check_number(name, value, 0.0, MAX_SOFTNESS, unit="pixels")
+
+
+def scaled_widths(softness: float | PairWidths, scale: float) -> float | PairWidths:
+    """Return the widths of a map that is scaled, at most `MAX_SOFTNESS`."""
+    if not isinstance(softness, PairWidths):
+        return min(softness * scale, MAX_SOFTNESS)
+    return PairWidths({pair: min(width * scale, MAX_SOFTNESS) for pair, width in softness.items()})
+
+
+def merged_widths(softness: float | PairWidths, find: Callable[[int], int]) -> float | Mapping[tuple[int, int], float]:
+    """Return the widths where regions merge, `find` giving the new id: the mean of those that a contour is made of."""
+    if isinstance(softness, float):
+        return softness
+    widths: dict[tuple[int, int], list[float]] = {}
+    for (one, other), width in softness.items():
+        low, high = sorted((find(one), find(other)))
+        if low != high:
+            widths.setdefault((low, high), []).append(width)
+    return {pair: sum(found) / len(found) for pair, found in widths.items()}
