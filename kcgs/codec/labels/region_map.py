@@ -12,9 +12,8 @@ from kcgs.codec.adaptive import AdaptiveSymbol
 from kcgs.codec.errors import CodecError
 from kcgs.codec.file import MOST_LABELS, MOST_REGIONS, ByteReader, varint
 from kcgs.codec.rangecoder import Coder, Reader, Writer
-from kcgs.functional import RegionMap
+from kcgs.functional import MAX_SOFTNESS, PairWidths, RegionMap
 from kcgs.functional.labels import touching_pairs
-from kcgs.functional import MAX_SOFTNESS, PairWidths
 
 from .coding import decode_labels, encode_labels
 
