@@ -88,6 +88,17 @@ def check_number(
     return number
 
 
+def check_numbers(
+    name: str, value: object, count: int, low: float = -math.inf, high: float = math.inf, *, above: bool = False
+) -> tuple[float, ...]:
+    """Return `value` if it is a sequence of `count` numbers, each as `check_number` takes it."""
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise TypeError(f"{name} must be {count} numbers; got {value!r}")
+    if len(value) != count:
+        raise ValueError(f"{name} must be {count} numbers; got {value!r}")
+    return tuple(check_number(name, number, low, high, above=above) for number in value)
+
+
 def _range(low: float, high: float, above: bool) -> str:
     if high < math.inf:
         return f"in {'(' if above else '['}{low:g}, {high:g}]"

@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from kcgs._check import as_image, check_count, check_number
+from kcgs._check import as_image, check_count, check_number, check_numbers
 
 
 class TestCheckCount:
@@ -35,6 +35,18 @@ class TestCheckNumber:
             check_number("sigma", True, unit="pixels")
 
 
+class TestCheckNumbers:
+    def test_count_type_and_range(self) -> None:
+        assert check_numbers("mean", (0, 0.5, 1), 3, 0, 1) == (0.0, 0.5, 1.0)
+        for wrong in ("abc", 0.5, None):
+            with pytest.raises(TypeError, match="mean must be 3 numbers; got"):
+                check_numbers("mean", wrong, 3)
+        with pytest.raises(ValueError, match="mean must be 3 numbers; got"):
+            check_numbers("mean", [0.5], 3)
+        with pytest.raises(ValueError, match="mean must be finite and above 0; got 0"):
+            check_numbers("mean", [1, 0, 1], 3, 0, above=True)
+
+
 class TestAsImage:
     def test_all_kinds_are_one_image(self) -> None:
         levels = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
@@ -52,6 +64,10 @@ class TestAsImage:
     def test_transparent_pixels_are_composed_on_white(self) -> None:
         image = Image.new("RGBA", (4, 3), (0, 0, 0, 0))
         assert bool((as_image("image", image) == 1.0).all())
+
+    def test_tolerance(self) -> None:
+        image = torch.tensor([[[0.0, 1.0005]]])
+        assert torch.equal(as_image("image", image, tolerance=1e-3), image)
 
     def test_refuses(self) -> None:
         with pytest.raises(ValueError, match=r"image must be in \[0, 1\]; got \[0, 2\]"):

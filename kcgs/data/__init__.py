@@ -1,4 +1,4 @@
-"""Pictures, label maps and data sets."""
+"""Images, label maps and data sets."""
 
 from kcgs.data.charts import ChartSample, chart_2x3, chart_pie
 from kcgs.data.davis import Davis, DavisFrame

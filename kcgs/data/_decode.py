@@ -27,7 +27,7 @@ _LOSSLESS_FORMATS = ("PNG", "GIF", "BMP")
 
 
 class Samples(NamedTuple):
-    """The samples of one picture."""
+    """The samples of one image."""
 
     values: Array
     """(H, W, C): grey, grey and alpha, RGB or RGBA for C = 1 to 4, alpha not multiplied in."""
@@ -63,7 +63,7 @@ def decode(data: bytes, path: str | os.PathLike[str], *, indices: bool = False) 
         The samples.
 
     Raises:
-        ValueError: the bytes are no whole image, or hold samples with no meaning as a picture.
+        ValueError: the bytes are no whole image, or hold samples with no meaning as an image.
     """
     try:
         samples = _tiff(data) if data.startswith(_TIFF) else None
@@ -72,7 +72,7 @@ def decode(data: bytes, path: str | os.PathLike[str], *, indices: bool = False) 
                 image.load()
                 samples = _pillow(data, image, indices)
         if samples.values.ndim != 3 or samples.values.size == 0:
-            raise ValueError(f"it holds samples of shape {samples.values.shape}, expected a picture")
+            raise ValueError(f"it holds samples of shape {samples.values.shape}, expected an image")
         return samples
     except MemoryError:
         raise
@@ -83,14 +83,14 @@ def decode(data: bytes, path: str | os.PathLike[str], *, indices: bool = False) 
 
 
 def _pillow(data: bytes, image: Image.Image, indices: bool) -> Samples:
-    if _is_deep_color_png(data):
+    if data.startswith(_PNG) and data[24] == 16 and data[25] in (2, 4, 6):  # 16 bits of colour or of grey and alpha
         values, white = _deep_png(data, image), 65535.0
     else:
         values, white = _stored(data, image) if indices else _shown(image)
     values = values[..., None] if values.ndim == 2 else values
     key = image.info.get("transparency")
     if key is not None and values.dtype == np.uint16 and values.shape[-1] in (1, 3) and not indices:
-        # Pillow applies colour keys to 8-bit pictures only.
+        # Pillow applies colour keys to 8-bit images only.
         opaque = (values != np.asarray(key)).any(axis=-1, keepdims=True)
         values = np.concatenate([values, np.where(opaque, 65535, 0).astype(np.uint16)], axis=-1)
     if image.format != "TIFF":  # Pillow turns those on loading.
@@ -108,7 +108,8 @@ def _shown(image: Image.Image) -> tuple[Array, float]:
             raise ValueError("32-bit integer samples have no stated white, expected 8 or 16 bits")
         return np.asarray(image).astype(np.uint16), 65535.0
     if image.mode == "F":
-        return _checked_float(np.asarray(image)), 1.0
+        _check_range(np.asarray(image))
+        return np.asarray(image), 1.0
     if image.has_transparency_data:
         image = image.convert("LA" if image.mode in ("LA", "La") else "RGBA")
     elif image.mode not in ("L", "RGB"):
@@ -128,11 +129,7 @@ def _stored(data: bytes, image: Image.Image) -> tuple[Array, float]:
     if image.mode in ("P", "L", "LA", "RGB", "RGBA", "I", "F") or image.mode.startswith("I;16"):
         values = np.asarray(image)
         return (values.astype(np.uint16) if image.mode.startswith("I;16") else values), 255.0
-    raise ValueError(f"label maps are grey, palette or RGB pictures; got mode {image.mode}")
-
-
-def _is_deep_color_png(data: bytes) -> bool:
-    return data.startswith(_PNG) and data[24] == 16 and data[25] in (2, 4, 6)
+    raise ValueError(f"label maps are grey, palette or RGB images; got mode {image.mode}")
 
 
 def _deep_png(data: bytes, image: Image.Image) -> Array:
@@ -142,8 +139,8 @@ def _deep_png(data: bytes, image: Image.Image) -> Array:
         # as that, the file decodes to the high and low bytes of both samples.
         header = data[12:24] + bytes([8, 6]) + data[26:29]
         relabelled = data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
-        with Image.open(BytesIO(relabelled)) as picture:
-            halves = np.asarray(picture).astype(np.uint16)
+        with Image.open(BytesIO(relabelled)) as bytewise:
+            halves = np.asarray(bytewise).astype(np.uint16)
         return halves[..., 0::2] * np.uint16(256) + halves[..., 1::2]
     from kornia_rs.io import decode_image_png_u16
 
@@ -152,7 +149,7 @@ def _deep_png(data: bytes, image: Image.Image) -> Array:
 
 
 def _tiff(data: bytes) -> Samples | None:
-    """Return a TIFF picture that Pillow would reduce or refuse; None for the others."""
+    """Return a TIFF image that Pillow would reduce or refuse; None for the others."""
     import tifffile
 
     with tifffile.TiffFile(BytesIO(data)) as file:
@@ -161,39 +158,31 @@ def _tiff(data: bytes) -> Samples | None:
         unsigned = page.sampleformat == 1
         if not (gray or rgb) or (unsigned and page.bitspersample in (1, 8)):
             return None
-        _check_pixels(page.imagewidth * page.imagelength * max(1, page.samplesperpixel // 4))
+        # Refuse what a damaged or hostile header claims, by the limit that Pillow has for its own formats.
+        count, limit = page.imagewidth * page.imagelength * max(1, page.samplesperpixel // 4), Image.MAX_IMAGE_PIXELS
+        if limit is not None and count > 2 * limit:
+            raise ValueError(f"its header claims {count} pixels, more than twice the limit of {limit}")
         values = page.asarray()
         lossless = int(page.compression) in _LOSSLESS_TIFF
         orientation = page.tags[_ORIENTATION].value if _ORIENTATION in page.tags else 1
     if page.axes not in ("YX", "YXS", "SYX"):
-        raise ValueError(f"the first page has axes {page.axes}, expected one picture")
+        raise ValueError(f"the first page has axes {page.axes}, expected one image")
     values = values[..., None] if page.axes == "YX" else values
     values = np.moveaxis(values, 0, -1) if page.axes == "SYX" else values
     extra = int(page.extrasamples[0]) if page.extrasamples else 0
     values = values[..., : (3 if rgb else 1) + (extra in (1, 2))]
-    white = _tiff_white(values, page)
+    white = None
+    if values.dtype.kind == "f":
+        white = 1.0
+        _check_range(values)
+    elif values.dtype.kind == "u" and page.bitspersample <= 16:
+        white = float(2**page.bitspersample - 1)
     if int(page.photometric) == 0:
         values = values.copy()
         values[..., 0] = (white or np.iinfo(values.dtype).max) - values[..., 0]
     if extra == 1:
         values = _straight(values)
     return Samples(_upright(values, orientation), white, "TIFF", lossless)
-
-
-def _check_pixels(count: int) -> None:
-    """Refuse what a damaged or hostile header claims, by the limit that Pillow has for its own formats."""
-    limit = Image.MAX_IMAGE_PIXELS
-    if limit is not None and count > 2 * limit:
-        raise ValueError(f"its header claims {count} pixels, more than twice the limit of {limit}")
-
-
-def _tiff_white(values: Array, page: Any) -> float | None:
-    if values.dtype.kind == "f":
-        _checked_float(values)
-        return 1.0
-    if values.dtype.kind == "u" and page.bitspersample <= 16:
-        return float(2**page.bitspersample - 1)
-    return None
 
 
 def _straight(values: Array) -> Array:
@@ -205,16 +194,15 @@ def _straight(values: Array) -> Array:
     return np.concatenate([color.astype(values.dtype), values[..., -1:]], axis=-1)
 
 
-def _checked_float(values: Array) -> Array:
+def _check_range(values: Array) -> None:
     low, high = float(values.min()), float(values.max())
     if not (low >= 0.0 and high <= 1.0):  # Also true of NaN.
         raise ValueError(f"float samples must lie in [0, 1]; got [{low:g}, {high:g}]")
-    return values
 
 
 def _upright(values: Array, orientation: int) -> Array:
     """Apply an EXIF orientation to (H, W, C)."""
-    if orientation >= 5:  # 5 to 8 are 1, 6: 3 flips of the transposed picture.
+    if orientation >= 5:  # 5 to 8 are 1, 6: 3 flips of the transposed image.
         values = values.swapaxes(0, 1)
     if orientation in (2, 3, 6, 7):
         values = values[:, ::-1]

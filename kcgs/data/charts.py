@@ -1,10 +1,12 @@
-"""The two colour charts: pictures whose regions are known exactly."""
+"""The two colour charts: images whose regions are known exactly."""
 
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from kcgs._check import check_count
 
 _BLOCKS = (
     ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
@@ -39,7 +41,7 @@ class ChartSample(NamedTuple):
 
 
 def chart_2x3(scale: int = 1) -> ChartSample:
-    """Draw two rows of three flat blocks: red, green, blue over dark green, orange, purple.
+    """Make two rows of three flat blocks: red, green, blue over dark green, orange, purple.
 
     Args:
         scale: how many times the size of 200 rows by 300 columns, at least 1.
@@ -56,7 +58,7 @@ def chart_2x3(scale: int = 1) -> ChartSample:
         >>> tuple(image.shape), labels[150, 250].item(), image[:, 150, 250].tolist()
         ((3, 200, 300), 5, [0.5, 0.0, 0.5])
     """
-    _check_scale(scale)
+    check_count("scale", scale)
     blocks = torch.tensor(_BLOCKS)
     rows, columns = blocks.shape[:2]
     ids = torch.arange(rows * columns).reshape(rows, columns)
@@ -66,7 +68,7 @@ def chart_2x3(scale: int = 1) -> ChartSample:
 
 
 def chart_pie(scale: int = 1) -> ChartSample:
-    """Draw a disc of eight flat sectors on white, its edges anti-aliased.
+    """Make a disc of eight flat sectors on white, its edges anti-aliased.
 
     The disc is centred and has a radius of 130 pixels at ``scale=1``; clockwise from the top the sectors are
     red, orange, yellow, green, cyan, blue, purple and magenta. A pixel is the mean of 8 x 8 samples.
@@ -89,7 +91,7 @@ def chart_pie(scale: int = 1) -> ChartSample:
         >>> tuple(chart_pie(scale=2).labels.shape)
         (600, 600)
     """
-    _check_scale(scale)
+    check_count("scale", scale)
     centers = torch.arange(_PIE_SIZE * scale, dtype=torch.float64) + 0.5
     labels = _pie_region(centers[None, :], centers[:, None], scale)
     palette = torch.tensor([(1.0, 1.0, 1.0), *_SECTORS])
@@ -110,10 +112,3 @@ def _pie_region(x: Tensor, y: Tensor, scale: int) -> Tensor:
     turn = torch.atan2(x, -y) + _PIE_START  # Clockwise from the top, where the first sector is centred.
     sector = (turn / (2 * torch.pi / len(_SECTORS))).floor().long() % len(_SECTORS)
     return torch.where(x**2 + y**2 < _PIE_RADIUS**2, sector + 1, 0)
-
-
-def _check_scale(scale: int) -> None:
-    if isinstance(scale, bool) or not isinstance(scale, int):
-        raise TypeError(f"scale must be an integer; got {scale!r}")
-    if scale < 1:
-        raise ValueError(f"scale must be at least 1; got {scale}")

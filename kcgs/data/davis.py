@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from kcgs._check import check_count
 from kcgs.data.images import load_image
 from kcgs.data.labels import load_labels
 
@@ -22,7 +23,7 @@ class DavisFrame(NamedTuple):
 
 
 class Davis:
-    """A folder of DAVIS in its official layout, one frame a sequence.
+    """A folder of DAVIS in its official layout, one frame of each sequence.
 
     The layout is ``JPEGImages/480p/SEQUENCE/00000.jpg`` and ``Annotations/480p/SEQUENCE/00000.png``.
     Sequences that have a folder in both trees are listed; files are read on access.
@@ -60,10 +61,7 @@ class Davis:
         frame: int = 0,
     ) -> None:
         """List the sequences; the class says what the arguments mean."""
-        if isinstance(frame, bool) or not isinstance(frame, int):
-            raise TypeError(f"frame must be an integer; got {frame!r}")
-        if frame < 0:
-            raise ValueError(f"frame must be at least 0; got {frame}")
+        check_count("frame", frame, least=0)
         self._images = Path(root) / "JPEGImages" / resolution
         self._annotations = Path(root) / "Annotations" / resolution
         self._frame = frame
@@ -91,7 +89,11 @@ class Davis:
             IndexError: no such position.
             ValueError: no such name, or the annotation has another size than the frame.
         """
-        name = self._name(key)
+        if isinstance(key, bool) or not isinstance(key, int | str):
+            raise TypeError(f"a frame is looked up by position or sequence name; got {key!r}")
+        if isinstance(key, int) and not -len(self) <= key < len(self):
+            raise IndexError(f"there are {len(self)} sequences; got position {key}")
+        name = self._sequences[key] if isinstance(key, int) else self._select([key], self._sequences)[0]
         image_path = self._images / name / f"{self._frame:05d}.jpg"
         labels_path = self._annotations / name / f"{self._frame:05d}.png"
         for path in (image_path, labels_path):
@@ -104,15 +106,6 @@ class Davis:
                 f"got {tuple(image.shape[-2:])} in {image_path} and {tuple(labels.shape)} in {labels_path}"
             )
         return DavisFrame(name, image, labels)
-
-    def _name(self, key: int | str) -> str:
-        if isinstance(key, str):
-            return self._select([key], self._sequences)[0]
-        if isinstance(key, bool) or not isinstance(key, int):
-            raise TypeError(f"a frame is looked up by position or sequence name; got {key!r}")
-        if not -len(self) <= key < len(self):
-            raise IndexError(f"there are {len(self)} sequences; got position {key}")
-        return self._sequences[key]
 
     def _list(self) -> list[str]:
         trees = (self._images, self._annotations)

@@ -1,9 +1,10 @@
-"""Pictures on disk and (C, H, W) tensors."""
+"""Images on disk and (C, H, W) tensors."""
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -12,8 +13,8 @@ from PIL import Image
 from torch import Tensor
 
 from kcgs._atomic import atomic_path
-from kcgs._check import check_floating
-from kcgs.data._decode import Samples, decode, read_file
+from kcgs._check import as_image, check_numbers
+from kcgs.data._decode import decode, read_file
 
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 _MODES = {1: "L", 3: "RGB", 4: "RGBA"}
@@ -34,16 +35,16 @@ def load_image(
     channels: Literal["RGB", "L", "RGBA"] = "RGB",
     background: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> Tensor:
-    """Read a picture as a tensor.
+    """Read an image as a tensor.
 
-    PNG, JPEG, WebP, TIFF, GIF, BMP and whatever else Pillow reads; of several frames, the first. EXIF
-    orientation is applied. PNG and TIFF with 16 bits a channel keep them; float TIFF must lie in [0, 1]. CMYK
-    becomes RGB by Pillow's plain formula; colour profiles are not applied.
+    PNG, JPEG, WebP, TIFF, GIF, BMP and whatever else Pillow reads; of several frames, the first. EXIF orientation is
+    applied. PNG and TIFF with 16 bits per channel keep them; float TIFF must lie in [0, 1]. CMYK becomes RGB by
+    Pillow's plain formula; colour profiles are not applied.
 
     Args:
         path: the file.
-        channels: what to return. "RGB" repeats grey three times; "L" is Rec. 601 luma, 0.299 R + 0.587 G +
-            0.114 B; "RGBA" adds an alpha of 1 to opaque pictures.
+        channels: what to return. "RGB" repeats grey three times; "L" is Rec. 601 luma, 0.299 R + 0.587 G + 0.114 B;
+            "RGBA" adds an alpha of 1 to opaque images.
         background: the colour (R, G, B) in [0, 1] under transparent pixels, for "RGB" and "L".
 
     Returns:
@@ -52,8 +53,8 @@ def load_image(
     Raises:
         FileNotFoundError: ``path`` does not exist.
         TypeError: ``background`` holds no numbers.
-        ValueError: the file is truncated or no image, its samples have no defined white (32-bit integers,
-            floats outside [0, 1]), or an argument is not one of the above.
+        ValueError: the file is truncated or no image, its samples have no defined white (32-bit integers, floats
+            outside [0, 1]), or an argument is not one of the above.
 
     Example:
         >>> import tempfile
@@ -65,9 +66,11 @@ def load_image(
     """
     if channels not in _MODES.values():
         raise ValueError(f'channels must be "RGB", "L" or "RGBA"; got {channels!r}')
-    under = _check_background(background)
+    under = np.asarray(check_numbers("background", background, 3, 0, 1), dtype=np.float32)
     samples = decode(read_file(path), path)
-    pixels = _normalized(samples, path)
+    if samples.white is None:
+        raise ValueError(f"cannot read {path}: {samples.values.dtype} samples have no stated white")
+    pixels = samples.values.astype(np.float32) / np.float32(samples.white)
     color, alpha = pixels, np.ones_like(pixels[..., :1])
     if pixels.shape[-1] in (2, 4):
         color, alpha = pixels[..., :-1], pixels[..., -1:]
@@ -83,20 +86,20 @@ def load_image(
     return _to_tensor(color)
 
 
-def save_image(path: str | os.PathLike[str], image: Tensor) -> None:
-    """Write a picture with 8 bits a channel, whole or not at all.
+def save_image(path: str | os.PathLike[str], image: Any) -> None:
+    """Write an image with 8 bits per channel, whole or not at all.
 
-    Values are clipped to [0, 1] and rounded to the nearest of 256 levels. The suffix picks the format: .png,
-    .webp, .tif, .tiff and .bmp keep the levels exactly, .jpg and .jpeg are quality 95 without chroma
-    subsampling.
+    Values are clipped to [0, 1] and rounded to the nearest of 256 levels. The suffix picks the format: .png, .webp,
+    .tif, .tiff and .bmp keep the levels exactly, .jpg and .jpeg are quality 95 without chroma subsampling.
 
     Args:
         path: the file to write; its folder must exist.
-        image: :math:`(C, H, W)` floating, C = 1 (grey), 3 (RGB) or 4 (RGBA, not for JPEG and BMP).
+        image: :math:`(C, H, W)` floating, C = 1 (grey), 3 (RGB) or 4 (RGBA, not for JPEG and BMP); or a numpy array (H,
+            W, C), or a PIL image.
 
     Raises:
         FileNotFoundError: the folder of ``path`` does not exist.
-        TypeError: ``image`` is no floating tensor.
+        TypeError: ``image`` is no image.
         ValueError: ``image`` has another shape or non-finite values, or the suffix names no format for it.
 
     Example:
@@ -106,8 +109,8 @@ def save_image(path: str | os.PathLike[str], image: Tensor) -> None:
         ...     (load_image(f"{folder}/a.png", channels="L") * 255).round().tolist()
         [[[0.0, 128.0, 255.0]]]
     """
-    image = check_floating("image", image, dims=(3,))
-    if image.shape[0] not in _MODES or image.numel() == 0:
+    image = as_image("image", image, tolerance=math.inf)
+    if image.shape[0] not in _MODES:
         raise ValueError(f"image must have shape (1, H, W), (3, H, W) or (4, H, W); got {tuple(image.shape)}")
     suffix = Path(path).suffix.lower()
     if suffix not in _WRITERS:
@@ -117,23 +120,9 @@ def save_image(path: str | os.PathLike[str], image: Tensor) -> None:
         raise ValueError(f"path must end in .png, .webp or .tif to hold alpha; got {str(path)!r}")
     levels = (image.detach().float().clamp(0, 1) * 255 + 0.5).floor().to(torch.uint8)
     pixels = levels.permute(1, 2, 0).cpu().numpy()
-    picture = Image.fromarray(np.ascontiguousarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels))
+    stored = Image.fromarray(np.ascontiguousarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels))
     with atomic_path(path) as temporary:
-        picture.save(temporary, format=name, **options)
-
-
-def _check_background(background: Sequence[float]) -> NDArray[np.float32]:
-    if not isinstance(background, Sequence) or not all(isinstance(v, int | float) for v in background):
-        raise TypeError(f"background must be three numbers (R, G, B); got {background!r}")
-    if len(background) != 3 or not all(0 <= value <= 1 for value in background):
-        raise ValueError(f"background must be three numbers (R, G, B) in [0, 1]; got {background!r}")
-    return np.asarray(background, dtype=np.float32)
-
-
-def _normalized(samples: Samples, path: str | os.PathLike[str]) -> NDArray[np.float32]:
-    if samples.white is None:
-        raise ValueError(f"cannot read {path}: {samples.values.dtype} samples have no stated white")
-    return samples.values.astype(np.float32) / np.float32(samples.white)
+        stored.save(temporary, format=name, **options)
 
 
 def _to_tensor(pixels: NDArray[np.float32]) -> Tensor:

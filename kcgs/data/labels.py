@@ -1,8 +1,10 @@
-"""Label maps on disk, and as pictures to look at."""
+"""Label maps on disk, and as images to look at."""
 
+import math
 import os
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,11 +12,12 @@ from PIL import Image
 from torch import Tensor
 
 from kcgs._atomic import atomic_path
-from kcgs._check import check_floating, check_integer
+from kcgs._check import as_image, check_count, check_labels
 from kcgs.data._decode import Array, decode, read_file
+from kcgs.functional import touching_pairs
 
 MAX_COLORS = 4096
-"""A picture with more distinct colours is taken for a photo, not for a label map."""
+"""An image with more distinct colours is taken for a photo, not for a label map."""
 
 _GOLDEN = 0.6180339887498949  # Steps of this share of the hue circle keep any run of hues spread out.
 _SATURATION = (0.85, 0.55, 0.95, 0.40, 0.75)
@@ -38,7 +41,7 @@ def load_labels(path: str | os.PathLike[str]) -> Tensor:
 
     What counts as the label depends on what the file stores:
 
-    - palette pictures such as DAVIS 2017: the palette index, whatever its colour;
+    - palette images such as DAVIS 2017: the palette index, whatever its colour;
     - grey of 1 to 16 bits, and integer TIFF: the stored value, so a 0/255 mask has the labels 0 and 255;
     - RGB and RGBA: every distinct colour is a region, numbered from 0 in the order of R, then G, B and A; all
       fully transparent pixels count as one colour;
@@ -72,10 +75,8 @@ def load_labels(path: str | os.PathLike[str]) -> Tensor:
             f"got {samples.format} at {path}, whose compression can change labels"
         )
     values = samples.values
-    if values.shape[-1] == 2:
-        if (values[..., 1] != values[0, 0, 1]).any():
-            raise ValueError(f"grey label maps must have no varying transparency; got {path}")
-        values = values[..., :1]
+    if values.shape[-1] == 2 and (values[..., 1] != values[0, 0, 1]).any():
+        raise ValueError(f"grey label maps must have no varying transparency; got {path}")
     if values.shape[-1] >= 3:
         return _from_colors(values, path)
     return _checked(values[..., 0], path)
@@ -84,7 +85,7 @@ def load_labels(path: str | os.PathLike[str]) -> Tensor:
 def save_labels(path: str | os.PathLike[str], labels: Tensor) -> None:
     """Write a label map losslessly, whole or not at all.
 
-    A .png is an 8-bit palette picture whose index is the label if all ids are below 256, else 16-bit grey.
+    A .png is an 8-bit palette image whose index is the label if all ids are below 256, else 16-bit grey.
 
     Args:
         path: the file to write, .png or .npy; its folder must exist.
@@ -106,7 +107,7 @@ def save_labels(path: str | os.PathLike[str], labels: Tensor) -> None:
     suffix = Path(path).suffix.lower()
     if suffix not in (".png", ".npy"):
         raise ValueError(f"path must end in .png or .npy; got {str(path)!r}")
-    values = _check_map(labels).cpu().numpy()
+    values = check_labels("labels", labels, dims=(2,)).cpu().numpy()
     highest = int(values.max())
     if suffix == ".npy":
         with atomic_path(path) as temporary:
@@ -114,11 +115,11 @@ def save_labels(path: str | os.PathLike[str], labels: Tensor) -> None:
         return
     if highest > 65535:
         raise ValueError(f"labels for a .png must be at most 65535; got {highest}: renumber or save as .npy")
-    picture = Image.fromarray(values.astype(np.uint8 if highest < 256 else np.uint16))
+    stored = Image.fromarray(values.astype(np.uint8 if highest < 256 else np.uint16))
     if highest < 256:
-        picture.putpalette((label_colors(256) * 255 + 0.5).floor().to(torch.uint8).flatten().tolist())
+        stored.putpalette((label_colors(256) * 255 + 0.5).floor().to(torch.uint8).flatten().tolist())
     with atomic_path(path) as temporary:
-        picture.save(temporary, format="PNG")
+        stored.save(temporary, format="PNG")
 
 
 def label_colors(n: int) -> Tensor:
@@ -138,10 +139,7 @@ def label_colors(n: int) -> Tensor:
         >>> tuple(label_colors(8).shape)
         (8, 3)
     """
-    if isinstance(n, bool) or not isinstance(n, int):
-        raise TypeError(f"n must be an integer; got {n!r}")
-    if n < 0:
-        raise ValueError(f"n must be at least 0; got {n}")
+    check_count("n", n, least=0)
     index = torch.arange(n, dtype=torch.float64)
     hue = (index * _GOLDEN).frac()
     cycle = torch.arange(n) % len(_VALUE)
@@ -167,29 +165,29 @@ def colorize_labels(labels: Tensor) -> Tensor:
         ValueError: ``labels`` has another shape, is empty or has negative ids.
 
     Example:
-        >>> picture = colorize_labels(torch.tensor([[0, 255, 0]]))
-        >>> tuple(picture.shape), bool((picture[:, 0, 0] == picture[:, 0, 2]).all())
+        >>> image = colorize_labels(torch.tensor([[0, 255, 0]]))
+        >>> tuple(image.shape), bool((image[:, 0, 0] == image[:, 0, 2]).all())
         ((3, 1, 3), True)
     """
-    ids, rank = torch.unique(_check_map(labels), return_inverse=True)
+    ids, rank = torch.unique(check_labels("labels", labels, dims=(2,)), return_inverse=True)
     return label_colors(len(ids)).to(labels.device)[rank].permute(2, 0, 1).contiguous()
 
 
-def overlay_labels(image: Tensor, labels: Tensor) -> Tensor:
-    """Draw a label map over its image: the image in grey, every region tinted, contours white between black.
+def overlay_labels(image: Any, labels: Tensor) -> Tensor:
+    """Show a label map over its image: the image in grey, every region tinted, contours white between black.
 
     The seven colours of Okabe and Ito are told apart with any colour vision. Regions that touch have different
     ones, unless seven neighbours leave none.
 
     Args:
-        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].
+        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1]; or a numpy array (H, W, C), or a PIL image.
         labels: :math:`(H, W)` integer, any non-negative ids.
 
     Returns:
         :math:`(3, H, W)` float32 RGB in [0, 1], on the CPU.
 
     Raises:
-        TypeError: ``image`` is no floating or ``labels`` no integer tensor.
+        TypeError: ``image`` is no image or ``labels`` no integer tensor.
         ValueError: other shapes, sizes that differ, negative ids.
 
     Example:
@@ -202,8 +200,8 @@ def overlay_labels(image: Tensor, labels: Tensor) -> Tensor:
     from skimage.color import label2rgb
     from skimage.segmentation import mark_boundaries
 
-    image = check_floating("image", image, dims=(3,)).detach()
-    regions = _check_map(labels).unique(return_inverse=True)[1].cpu()
+    image = as_image("image", image, tolerance=math.inf).detach()
+    regions = check_labels("labels", labels, dims=(2,)).unique(return_inverse=True)[1].cpu()
     if image.shape[0] not in (1, 3) or image.shape[1:] != regions.shape:
         raise ValueError(
             f"image must have shape (3, H, W) or (1, H, W) with the size of labels, {tuple(regions.shape)}; got "
@@ -212,34 +210,21 @@ def overlay_labels(image: Tensor, labels: Tensor) -> Tensor:
     pixels = image.float().clamp(0, 1).expand(3, -1, -1).permute(1, 2, 0).cpu().numpy()
     colors = _neighbour_colors(regions)[regions].numpy()
     tinted = label2rgb(colors, pixels, colors=_SAFE_COLORS, alpha=_TINT, bg_label=-1)
-    drawn = mark_boundaries(tinted, regions.numpy(), color=(1, 1, 1), outline_color=(0, 0, 0), mode="inner")
-    return torch.from_numpy(drawn).permute(2, 0, 1).float().clamp(0, 1)
+    marked = mark_boundaries(tinted, regions.numpy(), color=(1, 1, 1), outline_color=(0, 0, 0), mode="inner")
+    return torch.from_numpy(marked).permute(2, 0, 1).float().clamp(0, 1)
 
 
 def _neighbour_colors(regions: Tensor) -> Tensor:
     """Return each region's colour by number: in turn, the first that none of its neighbours has."""
-    sides = ((regions[:, :-1], regions[:, 1:]), (regions[:-1], regions[1:]))
-    pairs = torch.cat([torch.stack([a.flatten(), b.flatten()], 1)[(a != b).flatten()] for a, b in sides])
-    neighbours: dict[int, set[int]] = {}
-    for a, b in pairs.unique(dim=0).tolist():
-        neighbours.setdefault(a, set()).add(b)
-        neighbours.setdefault(b, set()).add(a)
+    earlier: dict[int, list[int]] = {}
+    for low, high in touching_pairs(regions):
+        earlier.setdefault(high, []).append(low)
     colors: list[int] = []
     for region in range(int(regions.max()) + 1):
-        taken = {colors[other] for other in neighbours.get(region, ()) if other < region}
+        taken = {colors[other] for other in earlier.get(region, ())}
         free = [color for color in range(len(_SAFE_COLORS)) if color not in taken]
         colors.append(free[0] if free else region % len(_SAFE_COLORS))
     return torch.tensor(colors)
-
-
-def _check_map(labels: Tensor) -> Tensor:
-    labels = check_integer("labels", labels, dims=(2,))
-    if labels.numel() == 0:
-        raise ValueError(f"labels must have at least one pixel; got shape {tuple(labels.shape)}")
-    labels = labels.long()
-    if int(labels.min()) < 0:
-        raise ValueError(f"labels must be non-negative; got {int(labels.min())}")
-    return labels
 
 
 def _from_npy(data: bytes, path: str | os.PathLike[str]) -> Tensor:
@@ -266,7 +251,7 @@ def _checked(values: Array, path: str | os.PathLike[str]) -> Tensor:
 
 def _from_colors(values: Array, path: str | os.PathLike[str]) -> Tensor:
     if values.dtype.kind != "u":
-        raise ValueError(f"label pictures hold unsigned integers; got {values.dtype} in {path}")
+        raise ValueError(f"label images hold unsigned integers; got {values.dtype} in {path}")
     bits = np.uint64(values.dtype.itemsize * 8)
     packed = np.zeros(values.shape[:2], dtype=np.uint64)
     for channel in range(values.shape[-1]):
@@ -276,7 +261,7 @@ def _from_colors(values: Array, path: str | os.PathLike[str]) -> Tensor:
     colors, ids = np.unique(packed, return_inverse=True)
     if len(colors) > MAX_COLORS:
         raise ValueError(
-            f"label pictures have at most {MAX_COLORS} distinct colours; got {len(colors)} in {path}, "
+            f"label images have at most {MAX_COLORS} distinct colours; got {len(colors)} in {path}, "
             "which looks like a photo or a mask that went through lossy compression"
         )
     return torch.from_numpy(ids.reshape(packed.shape).astype(np.int64))

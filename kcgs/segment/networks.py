@@ -48,7 +48,7 @@ def load_pretrained(class_name: str, model: Any, device: torch.device) -> Any:
 
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, with what it announces, not too long; or the error's kind."""
-    lines = [line.strip() for line in str(error).strip().splitlines()]
+    lines = [" ".join(line.split()) for line in str(error).splitlines() if line.split()]
     if not lines:
         return type(error).__name__
     text = " ".join(lines[:2]) if lines[0].endswith(":") else lines[0]
@@ -64,14 +64,9 @@ def preprocess(
 
 
 def largest_map(maps: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Enlarge maps one at a time, so that many classes of a large image fit, and find the largest.
+    """Enlarge maps (1, C, h, w) to ``size``; return index, value and softmax of the largest at every pixel.
 
-    Args:
-        maps: :math:`(1, C, h, w)`.
-        size: (height, width).
-
-    Returns:
-        Its index, its value and its softmax, each of ``size``.
+    One at a time is enlarged, so that many classes of a large image fit.
     """
     best = torch.full(size, -torch.inf, device=maps.device)
     total, index = best.clone(), torch.zeros(size, dtype=torch.int64, device=maps.device)

@@ -5,7 +5,7 @@ import inspect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -43,12 +43,8 @@ class Prediction(NamedTuple):
     """What the labels are called, from 0 on; None: the method knows no names."""
 
 
-class Segmenter(Protocol):
-    """A registered method: an image in, its label map out, as `segment` describes both."""
-
-    def __call__(self, image: Any, **options: Any) -> Tensor:
-        """Return the label map of ``image``."""
-        ...
+# A registered method: an image and options in, a label map out, as `segment` describes them.
+Segmenter = Callable[..., Tensor]
 
 
 @dataclass(frozen=True)
@@ -231,8 +227,7 @@ def segment(image: Any, method: str = "auto", **options: Any) -> Tensor:
 
     Raises:
         TypeError: ``image`` is no image, or the method has no such option.
-        ValueError: ``method`` is unknown, or ``image`` has another shape, non-finite values or values outside
-            [0, 1].
+        ValueError: ``method`` is unknown, or ``image`` has another shape, non-finite values or values outside [0, 1].
         ImportError: the method's library is not installed; the message has the line that installs it.
 
     Example:

@@ -21,11 +21,10 @@ _GRADIENT_SIGMA = 0.7
 def snap_contours(image: Any, labels: Tensor, *, reach: int = 2) -> Tensor:
     """Move contours by up to some pixels onto the image's strongest edge.
 
-    Segmenters that smooth the image leave contours a pixel or two beside its edges, put whiskers along them
-    and make ribbons of blurred edges. Here every region keeps what lies further than ``reach`` inside it, and
-    the rest goes by watershed on the gradient in CIE Lab. Ribbons whose colour is a mixture of the regions on
-    their two sides, or hardly another than one of them, are dissolved; other regions too thin to have an
-    inside stay as they are.
+    Segmenters that smooth the image leave contours a pixel or two beside its edges, put whiskers along them and make
+    ribbons of blurred edges. Here every region keeps what lies further than ``reach`` inside it, and the rest goes by
+    watershed on the gradient in CIE Lab. Ribbons whose colour is a mixture of the regions on their two sides, or hardly
+    another than one of them, are dissolved; other regions too thin to have an inside stay as they are.
 
     Args:
         image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].

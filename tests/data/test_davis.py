@@ -19,12 +19,12 @@ def add_frame(root: Path, sequence: str, frame: int = 0, *, resolution: str = "4
     Image.new("RGB", (12, 8), (10 * frame, 100, 200)).save(images / f"{frame:05d}.jpg", quality=95)
     mask = np.zeros((8, 12), np.uint8)
     mask[2:5, 3:9] = 255 if year == 2016 else 1
-    picture = Image.fromarray(mask)
+    stored = Image.fromarray(mask)
     if year == 2017:
         mask[5:7, 3:9] = 2
-        picture = Image.fromarray(mask)
-        picture.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
-    picture.save(annotations / f"{frame:05d}.png")
+        stored = Image.fromarray(mask)
+        stored.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
+    stored.save(annotations / f"{frame:05d}.png")
 
 
 @pytest.fixture

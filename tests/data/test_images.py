@@ -83,7 +83,7 @@ class TestChannels:
         Image.new("RGB", (3, 3), "white").save(tmp_path / "a.png")
         assert load_image(tmp_path / "a.png", channels="L").max() == 1.0
 
-    def test_rgba_of_opaque_picture(self, tmp_path: Path) -> None:
+    def test_rgba_of_opaque_image(self, tmp_path: Path) -> None:
         Image.fromarray(random_samples(3)).save(tmp_path / "a.png")
         image = load_image(tmp_path / "a.png", channels="RGBA")
         assert image.shape == (4, HEIGHT, WIDTH)
@@ -111,12 +111,12 @@ class TestChannels:
 
     @pytest.mark.parametrize("background", [(1, 1), (0, 0, 0, 1), (0, 0, 1.1), (-0.1, 0, 0), (0, 0, float("nan"))])
     def test_background_out_of_range(self, tmp_path: Path, background: Any) -> None:
-        with pytest.raises(ValueError, match="background must be three numbers"):
+        with pytest.raises(ValueError, match="background must be"):
             load_image(tmp_path / "a.png", background=background)
 
     @pytest.mark.parametrize("background", ["white", None, 1.0, ("0", "0", "0")])
     def test_background_of_another_type(self, tmp_path: Path, background: Any) -> None:
-        with pytest.raises(TypeError, match="background must be three numbers"):
+        with pytest.raises(TypeError, match="background must be"):
             load_image(tmp_path / "a.png", background=background)
 
 
@@ -142,15 +142,15 @@ class TestModes:
         np.testing.assert_allclose(pixels(straight), samples[..., [0, 0, 0, 1]] / 255, atol=1e-7)
 
     def test_palette(self, tmp_path: Path) -> None:
-        picture = Image.fromarray(random_samples(3)).quantize(16)
-        picture.save(tmp_path / "a.png")
-        expected = np.asarray(picture.convert("RGB")) / 255
+        stored = Image.fromarray(random_samples(3)).quantize(16)
+        stored.save(tmp_path / "a.png")
+        expected = np.asarray(stored.convert("RGB")) / 255
         np.testing.assert_allclose(pixels(load_image(tmp_path / "a.png")), expected, atol=1e-7)
 
     def test_palette_with_transparency(self, tmp_path: Path) -> None:
-        picture = Image.fromarray(np.array([[0, 1, 2]], np.uint8))
-        picture.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
-        picture.save(tmp_path / "a.png", transparency=bytes([0, 51, 255]))
+        stored = Image.fromarray(np.array([[0, 1, 2]], np.uint8))
+        stored.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
+        stored.save(tmp_path / "a.png", transparency=bytes([0, 51, 255]))
         image = load_image(tmp_path / "a.png", background=(0, 0, 0))
         np.testing.assert_allclose(pixels(image)[0], [[0.0, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 1.0]], atol=1e-6)
 
@@ -275,7 +275,7 @@ class TestFloatTiff:
 
     def test_volume_is_refused(self, tmp_path: Path) -> None:
         tifffile.imwrite(tmp_path / "a.tif", np.ones((16, 16, 16), np.uint16), volumetric=True, tile=(16, 16, 16))
-        with pytest.raises(ValueError, match="expected one picture"):
+        with pytest.raises(ValueError, match="expected one image"):
             load_image(tmp_path / "a.tif")
 
 
@@ -288,8 +288,8 @@ class TestOrientation:
         corner[8:, 16:] = (0, 0, 255)
         exif = Image.Exif()
         exif[274] = orientation
-        picture = Image.fromarray(corner)
-        picture.save(tmp_path / f"a.{suffix}", exif=exif, quality=100)
+        stored = Image.fromarray(corner)
+        stored.save(tmp_path / f"a.{suffix}", exif=exif, quality=100)
         with Image.open(tmp_path / f"a.{suffix}") as stored:
             expected = np.asarray(ImageOps.exif_transpose(stored).convert("RGB"))
         assert expected.shape[:2] == ((16, 24) if orientation < 5 else (24, 16))
@@ -390,23 +390,29 @@ class TestSave:
     def test_clips_and_rounds_half_up(self, tmp_path: Path) -> None:
         values = torch.tensor([[[-3.0, 0.0, 0.49 / 255, 0.5 / 255, 100.5 / 255, 254.6 / 255, 1.0, 7.0]]])
         save_image(tmp_path / "a.png", values.double())
-        with Image.open(tmp_path / "a.png") as picture:
-            assert np.asarray(picture).tolist() == [[0, 0, 0, 1, 101, 255, 255, 255]]
+        with Image.open(tmp_path / "a.png") as stored:
+            assert np.asarray(stored).tolist() == [[0, 0, 0, 1, 101, 255, 255, 255]]
 
     @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
     def test_any_floating_type_with_gradient(self, tmp_path: Path, dtype: torch.dtype) -> None:
         save_image(tmp_path / "a.png", torch.full((3, 2, 2), 0.5, dtype=dtype, requires_grad=True))
         torch.testing.assert_close(load_image(tmp_path / "a.png"), torch.full((3, 2, 2), 128 / 255))
 
-    @pytest.mark.parametrize("shape", [(2, 4, 4), (5, 4, 4), (4, 4), (1, 3, 4, 4), (3, 0, 4)])
+    @pytest.mark.parametrize("shape", [(2, 4, 4), (5, 4, 4), (4, 4), (2, 3, 4, 4), (3, 0, 4)])
     def test_shape(self, tmp_path: Path, shape: tuple[int, ...]) -> None:
-        with pytest.raises(ValueError, match="image must have"):
+        with pytest.raises(ValueError, match="image must (have|be one image|not be empty)"):
             save_image(tmp_path / "a.png", torch.zeros(shape))
 
-    @pytest.mark.parametrize("image", [torch.zeros(3, 4, 4, dtype=torch.uint8), np.zeros((3, 4, 4)), None])
+    @pytest.mark.parametrize("image", [torch.zeros(3, 4, 4, dtype=torch.uint8), np.zeros((4, 4, 3), int), None])
     def test_type(self, tmp_path: Path, image: Any) -> None:
         with pytest.raises(TypeError, match="image must"):
             save_image(tmp_path / "a.png", image)
+
+    def test_arrays_and_pil_images(self, tmp_path: Path) -> None:
+        samples = random_samples(3)
+        for image in (samples, Image.fromarray(samples), samples / 255):
+            save_image(tmp_path / "a.png", image)
+            np.testing.assert_allclose(pixels(load_image(tmp_path / "a.png")), samples / 255, atol=1e-7)
 
     def test_not_finite(self, tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="image must be finite"):

@@ -19,34 +19,34 @@ from kcgs.data import colorize_labels, label_colors, load_labels, save_labels
 MAP = np.array([[0, 1, 1, 5], [0, 3, 5, 5]], np.uint8)
 
 
-def save_picture(path: Path, picture: Image.Image, **options: Any) -> Path:
-    picture.save(path, **options)
+def save_as(path: Path, image: Image.Image, **options: Any) -> Path:
+    image.save(path, **options)
     return path
 
 
 class TestLoad:
     def test_palette_index_is_the_label(self, tmp_path: Path) -> None:
-        picture = Image.fromarray(MAP)
+        image = Image.fromarray(MAP)
         # Equal colours for different indices, as careless tools write them: the index must count.
-        picture.putpalette([9, 9, 9] * 6)
-        labels = load_labels(save_picture(tmp_path / "a.png", picture))
+        image.putpalette([9, 9, 9] * 6)
+        labels = load_labels(save_as(tmp_path / "a.png", image))
         assert labels.dtype == torch.int64
         np.testing.assert_array_equal(labels, MAP)
 
     def test_palette_of_few_bits_with_transparency(self, tmp_path: Path) -> None:
-        picture = Image.fromarray(MAP)
-        picture.putpalette(list(range(18)))
-        path = save_picture(tmp_path / "a.png", picture, bits=4, transparency=0)
+        image = Image.fromarray(MAP)
+        image.putpalette(list(range(18)))
+        path = save_as(tmp_path / "a.png", image, bits=4, transparency=0)
         np.testing.assert_array_equal(load_labels(path), MAP)
 
     def test_binary_mask_keeps_0_and_255(self, tmp_path: Path) -> None:
         mask = (MAP > 2).astype(np.uint8) * 255
-        labels = load_labels(save_picture(tmp_path / "a.png", Image.fromarray(mask)))
+        labels = load_labels(save_as(tmp_path / "a.png", Image.fromarray(mask)))
         assert labels.unique().tolist() == [0, 255]
         np.testing.assert_array_equal(labels, mask)
 
     def test_one_bit(self, tmp_path: Path) -> None:
-        labels = load_labels(save_picture(tmp_path / "a.png", Image.fromarray(MAP > 2)))
+        labels = load_labels(save_as(tmp_path / "a.png", Image.fromarray(MAP > 2)))
         np.testing.assert_array_equal(labels, MAP > 2)
 
     def test_four_bit_gray_is_not_stretched(self, tmp_path: Path) -> None:
@@ -65,15 +65,15 @@ class TestLoad:
     def test_sixteen_bit_gray(self, tmp_path: Path) -> None:
         values = MAP.astype(np.uint16) * 9000
         for suffix in ("png", "tif"):
-            path = save_picture(tmp_path / f"a.{suffix}", Image.fromarray(values))
+            path = save_as(tmp_path / f"a.{suffix}", Image.fromarray(values))
             np.testing.assert_array_equal(load_labels(path), values)
 
     def test_gray_with_constant_alpha(self, tmp_path: Path) -> None:
-        picture = Image.fromarray(np.dstack([MAP, np.full_like(MAP, 255)]))
-        np.testing.assert_array_equal(load_labels(save_picture(tmp_path / "a.png", picture)), MAP)
+        image = Image.fromarray(np.dstack([MAP, np.full_like(MAP, 255)]))
+        np.testing.assert_array_equal(load_labels(save_as(tmp_path / "a.png", image)), MAP)
 
     def test_gray_with_varying_alpha(self, tmp_path: Path) -> None:
-        path = save_picture(tmp_path / "a.png", Image.fromarray(np.dstack([MAP, MAP])))
+        path = save_as(tmp_path / "a.png", Image.fromarray(np.dstack([MAP, MAP])))
         with pytest.raises(ValueError, match="no varying transparency"):
             load_labels(path)
 
@@ -84,50 +84,50 @@ class TestLoad:
 
     @pytest.mark.parametrize("suffix", ["gif", "bmp", "tif", "webp"])
     def test_other_lossless_formats(self, tmp_path: Path, suffix: str) -> None:
-        picture = Image.fromarray(np.kron(MAP, np.ones((4, 4), np.uint8)))
-        picture.putpalette([v for k in range(6) for v in (k * 40, 255 - k * 40, 7)])
+        image = Image.fromarray(np.kron(MAP, np.ones((4, 4), np.uint8)))
+        image.putpalette([v for k in range(6) for v in (k * 40, 255 - k * 40, 7)])
         options = {"gif": {"optimize": False}, "webp": {"lossless": True}}.get(suffix, {})
-        picture = picture.convert("RGB") if suffix == "webp" else picture
-        labels = load_labels(save_picture(tmp_path / f"a.{suffix}", picture, **options))
+        image = image.convert("RGB") if suffix == "webp" else image
+        labels = load_labels(save_as(tmp_path / f"a.{suffix}", image, **options))
         # WebP has colours only: regions 0, 1, 3, 5 become 0, 1, 2, 3.
         expected = np.searchsorted([0, 1, 3, 5], MAP) if suffix == "webp" else MAP
         np.testing.assert_array_equal(labels[::4, ::4], expected)
 
     def test_colors_are_numbered_in_packed_order(self, tmp_path: Path) -> None:
         colors = np.array([[[255, 0, 0], [0, 0, 255]], [[0, 255, 0], [0, 0, 255]]], np.uint8)
-        path = save_picture(tmp_path / "a.png", Image.fromarray(colors))
+        path = save_as(tmp_path / "a.png", Image.fromarray(colors))
         assert load_labels(path).tolist() == [[2, 0], [1, 0]]
 
     def test_invisible_colors_are_one_region(self, tmp_path: Path) -> None:
         colors = np.array([[[9, 9, 9, 0], [5, 5, 5, 0], [5, 5, 5, 255], [5, 5, 5, 128]]], np.uint8)
-        path = save_picture(tmp_path / "a.png", Image.fromarray(colors))
+        path = save_as(tmp_path / "a.png", Image.fromarray(colors))
         assert load_labels(path).tolist() == [[0, 0, 2, 1]]
 
     def test_photo_is_refused(self, tmp_path: Path) -> None:
-        path = save_picture(tmp_path / "a.png", Image.fromarray(skimage.data.astronaut()))
+        path = save_as(tmp_path / "a.png", Image.fromarray(skimage.data.astronaut()))
         with pytest.raises(ValueError, match=r"at most 4096 distinct colours; got \d+ in .*a\.png"):
             load_labels(path)
 
     def test_4096_colors_are_accepted(self, tmp_path: Path) -> None:
         index = np.arange(4097)
         colors = np.stack([index >> 8, index & 255, 0 * index], axis=-1).astype(np.uint8)[None]
-        labels = load_labels(save_picture(tmp_path / "a.png", Image.fromarray(colors[:, :4096])))
+        labels = load_labels(save_as(tmp_path / "a.png", Image.fromarray(colors[:, :4096])))
         np.testing.assert_array_equal(labels[0], np.arange(4096))
         with pytest.raises(ValueError, match="got 4097"):
-            load_labels(save_picture(tmp_path / "b.png", Image.fromarray(colors)))
+            load_labels(save_as(tmp_path / "b.png", Image.fromarray(colors)))
 
     @pytest.mark.parametrize(
         ("name", "options"),
         [("a.jpg", {}), ("a.webp", {"quality": 90}), ("a.tif", {"compression": "jpeg"}), ("a.png", {"format": "JPEG"})],
     )
     def test_lossy_files_are_refused(self, tmp_path: Path, name: str, options: dict[str, Any]) -> None:
-        path = save_picture(tmp_path / name, Image.fromarray(MAP).convert("RGB"), **options)
+        path = save_as(tmp_path / name, Image.fromarray(MAP).convert("RGB"), **options)
         with pytest.raises(ValueError, match=r"must be a label map in a lossless format .* got"):
             load_labels(path)
 
     def test_cmyk_is_refused(self, tmp_path: Path) -> None:
-        path = save_picture(tmp_path / "a.tif", Image.new("CMYK", (4, 4)))
-        with pytest.raises(ValueError, match="grey, palette or RGB pictures; got mode CMYK"):
+        path = save_as(tmp_path / "a.tif", Image.new("CMYK", (4, 4)))
+        with pytest.raises(ValueError, match="grey, palette or RGB images; got mode CMYK"):
             load_labels(path)
 
     def test_float_tiff_is_refused(self, tmp_path: Path) -> None:
@@ -216,12 +216,12 @@ class TestSave:
         save_labels(tmp_path / "a.png", torch.from_numpy(MAP).to(dtype))
         np.testing.assert_array_equal(load_labels(tmp_path / "a.png"), MAP)
 
-    def test_small_ids_are_an_eight_bit_palette_picture(self, tmp_path: Path) -> None:
+    def test_small_ids_are_an_eight_bit_palette_image(self, tmp_path: Path) -> None:
         save_labels(tmp_path / "a.png", torch.tensor([[0, 1, 255]]))
-        with Image.open(tmp_path / "a.png") as picture:
-            assert picture.mode == "P"
-            assert np.asarray(picture).tolist() == [[0, 1, 255]]
-            colors = np.asarray(picture.convert("RGB"))[0]
+        with Image.open(tmp_path / "a.png") as image:
+            assert image.mode == "P"
+            assert np.asarray(image).tolist() == [[0, 1, 255]]
+            colors = np.asarray(image.convert("RGB"))[0]
         assert len({tuple(color) for color in colors.tolist()}) == 3
 
     def test_large_ids_are_sixteen_bit_gray(self, tmp_path: Path) -> None:
@@ -249,7 +249,7 @@ class TestSave:
             save_labels(tmp_path / "a.png", torch.zeros(shape, dtype=torch.int64))
 
     def test_negative(self, tmp_path: Path) -> None:
-        with pytest.raises(ValueError, match="labels must be non-negative; got -2"):
+        with pytest.raises(ValueError, match="labels must hold non-negative ids; got -2"):
             save_labels(tmp_path / "a.npy", torch.tensor([[-2]]))
 
     def test_missing_folder(self, tmp_path: Path) -> None:
@@ -289,10 +289,10 @@ class TestColors:
 
     def test_colorize_any_ids(self) -> None:
         labels = torch.tensor([[0, 255, 10**12], [255, 255, 0]])
-        picture = colorize_labels(labels)
-        assert picture.shape == (3, 2, 3)
-        assert torch.equal(picture.permute(1, 2, 0)[0], label_colors(3))
-        assert torch.equal(picture[:, 1], label_colors(3)[[1, 1, 0]].T)
+        image = colorize_labels(labels)
+        assert image.shape == (3, 2, 3)
+        assert torch.equal(image.permute(1, 2, 0)[0], label_colors(3))
+        assert torch.equal(image[:, 1], label_colors(3)[[1, 1, 0]].T)
 
     def test_colorize_bad_labels(self) -> None:
         with pytest.raises(TypeError, match="labels must"):

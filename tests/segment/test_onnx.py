@@ -188,7 +188,7 @@ class TestErrors:
             ({"threshold": 2.0}, "threshold must be in"),
             ({"output": 3}, r"output must be a position or one of the outputs \['out'\]"),
             ({"output": "in"}, "output must be"),
-            ({"mean": (0.0,)}, "mean must be three numbers"),
+            ({"mean": (0.0,)}, "mean must be 3 numbers"),
             ({"std": (0.0, 1.0, 1.0)}, "std must be finite and above 0"),
             ({"max_value": 0.0}, "max_value must be"),
             ({"kind": "saliency"}, "saliency output must have one channel"),

@@ -90,6 +90,12 @@ class TestOverlap:
         assert float(scores[0, 0]) == pytest.approx(0.1)
         assert int(scores.isnan().sum()) == 4
 
+    def test_labels_and_scores(self) -> None:
+        masks = torch.tensor([[[True, True, True, False]], [[False, True, False, False]]])
+        labels, scores = paint_masks(masks, torch.tensor([0.9, 0.8]))
+        assert labels.tolist() == [[1, 2, 1, 0]]
+        assert scores[0].tolist() == pytest.approx([0.9, 0.8, 0.9, float("nan")], nan_ok=True)
+
     def test_doubles_go(self) -> None:
         masks = torch.zeros(4, 10, 10, dtype=torch.bool)
         masks[0, :5] = masks[1, :6] = masks[2, 5:] = True

@@ -6,7 +6,6 @@ from torch import Tensor
 
 from kcgs.segment.registry import Cleanup, register
 
-# Nothing is cleaned unless asked: no piece is too small, and a label in several pieces is one region.
 _AS_STORED = Cleanup(min_size=1, connected=False)
 
 

@@ -1,10 +1,9 @@
 """Any segmentation network in ONNX, and LSeg as an ONNX image encoder."""
 
-import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -12,12 +11,11 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import check_number, check_size
+from kcgs._check import check_number, check_numbers, check_size
 from kcgs.segment.networks import IMAGENET_MEAN, IMAGENET_STD, first_line, largest_map, preprocess
 from kcgs.segment.registry import Prediction, register
 
 Kind = Literal["auto", "logits", "probability", "label", "saliency"]
-_KINDS = ("auto", "logits", "probability", "label", "saliency")
 _DTYPES = {
     "tensor(float)": np.float32,
     "tensor(float16)": np.float16,
@@ -43,16 +41,16 @@ def onnx(
 ) -> Prediction:
     """Segment by a network in ONNX, run by onnxruntime on the CPU.
 
-    The image is resized to the network's input (bilinear, antialiased), multiplied by ``max_value``, less
-    ``mean``, over ``std``; what comes out is resized to the image. Kinds of output, C classes:
+    The image is resized to the network's input (bilinear, antialiased), multiplied by ``max_value``, less ``mean``,
+    over ``std``; what comes out is resized to the image. Kinds of output, C classes:
 
     - "logits", (1, C, h, w): the largest wins, scored by its softmax; with C = 1 a sigmoid above ``threshold``.
     - "probability", (1, C, h, w): the largest wins and is the score; with C = 1 a value above ``threshold``.
     - "saliency", (1, 1, h, w): stretched to [0, 1] as U-2-Net's own code does, then above ``threshold``.
     - "label", (1, h, w) or (1, 1, h, w): class numbers; they have no scores.
 
-    "auto" takes integers for labels, one channel within [0, 1] for saliency, several that are not negative
-    and sum to 1 for probabilities, and the rest for logits.
+    "auto" takes integers for labels, one channel within [0, 1] for saliency, several that are not negative and sum to 1
+    for probabilities, and the rest for logits.
 
     Args:
         image: as `segment` takes it, any size.
@@ -74,15 +72,15 @@ def onnx(
     Raises:
         FileNotFoundError: ``model`` does not exist.
         TypeError: an argument has another type.
-        ValueError: an argument is out of its range, ``model`` is no such network or does not run, or its
-            output is not of ``kind``.
+        ValueError: an argument is out of its range, ``model`` is no such network or does not run, or its output is not
+            of ``kind``.
 
     Example:
         ``segment(image, "onnx", model="u2netp.onnx")`` puts the salient object and the rest apart (U-2-Net,
         Qin et al., Pattern Recognition 2020).
     """
-    if kind not in _KINDS:
-        raise ValueError(f"kind must be one of {', '.join(_KINDS)}; got {kind!r}")
+    if kind not in get_args(Kind):
+        raise ValueError(f"kind must be one of {', '.join(get_args(Kind))}; got {kind!r}")
     check_number("threshold", threshold, 0, 1)
     words = read_names(names)
     raw = _run(image.cpu(), model, output, size, mean, std, max_value)
@@ -114,11 +112,11 @@ def lseg(
         image: as `segment` takes it, any size.
         model: LSeg's image encoder in ONNX, (1, 3, h, w) to features (1, D, h', w'), or a session.
         embeddings: an .npy file with a CLIP text embedding for each class, (K, D), or that array.
-        output: the output's position or name.
-        size: (h, w) of an input whose size is free; None: the image's own.
-        mean: three numbers, in the network's units.
-        std: three numbers above 0, in the network's units.
-        max_value: what the network takes for white: 255 where it takes [0, 255].
+        output: as in `onnx`.
+        size: as in `onnx`.
+        mean: as in `onnx`.
+        std: as in `onnx`.
+        max_value: as in `onnx`.
         temperature: above 0; the score is the softmax of cosine similarities over it.
         names: of the classes, one for each embedding, or a text file with one on each line.
 
@@ -129,8 +127,7 @@ def lseg(
     Raises:
         FileNotFoundError: a file does not exist.
         TypeError: an argument has another type.
-        ValueError: an argument is out of its range, a file cannot be read, or features and embeddings differ
-            in length.
+        ValueError: an argument is out of its range, a file cannot be read, or features and embeddings differ in length.
 
     Example:
         ``segment(image, "lseg", model="lseg.onnx", embeddings="dog-grass-other.npy")``
@@ -151,20 +148,7 @@ def lseg(
 
 
 def read_names(names: Sequence[str] | str | os.PathLike[str] | None) -> list[str] | None:
-    """Return names of classes in the order of their numbers, class 0 first.
-
-    Args:
-        names: the names, or a text file with one on each line, UTF-8; None: there are none.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        TypeError: ``names`` is neither a path nor a list of strings.
-        ValueError: the file is no text, or there is no name.
-
-    Example:
-        >>> read_names(["sky", "dog"])
-        ['sky', 'dog']
-    """
+    """Return names of classes, class 0 first, from a list or a text file (UTF-8) with one on each line."""
     if names is None:
         return None
     if isinstance(names, str | os.PathLike):
@@ -175,8 +159,8 @@ def read_names(names: Sequence[str] | str | os.PathLike[str] | None) -> list[str
             lines = path.read_text(encoding="utf-8").splitlines()
         except UnicodeDecodeError as error:
             raise ValueError(f"cannot read {path} as UTF-8 text with a name on each line") from error
-        # an empty line within counts: the numbers of the classes are those of the lines
-        names = [line.strip() for line in "\n".join(lines).rstrip().split("\n")]
+        # An empty line within counts: the numbers of the classes are those of the lines.
+        names = [" ".join(line.split()) for line in "\n".join(lines).rstrip().split("\n")]
     if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
         raise TypeError(f"names must be a list of strings, or a text file with one on each line; got {names!r}")
     if not any(names):
@@ -199,13 +183,8 @@ def _run(
     max_value: float,
 ) -> Tensor:
     """Run a network on (3, H, W) and return one of its outputs."""
-    for option, numbers in (("mean", mean), ("std", std)):
-        if not isinstance(numbers, Sequence) or isinstance(numbers, str):
-            raise TypeError(f"{option} must be three numbers; got {numbers!r}")
-        if len(numbers) != 3:
-            raise ValueError(f"{option} must be three numbers; got {numbers!r}")
-        for number in numbers:
-            check_number(option, number, 0 if option == "std" else -math.inf, above=option == "std")
+    check_numbers("mean", mean, 3)
+    check_numbers("std", std, 3, 0, above=True)
     check_number("max_value", max_value, 0, above=True)
     asked = None if size is None else check_size("size", size)
     session, name = _session(model)
@@ -218,10 +197,9 @@ def _run(
     values = preprocess(image, seen, mean, std, max_value).numpy()
     if entry.type == "tensor(uint8)":
         values = np.rint(values).clip(0, 255)
+    wanted = _output_name(session, output, name)
     try:
-        results = session.run([_output_name(session, output, name)], {entry.name: values.astype(_DTYPES[entry.type])})
-    except ValueError:
-        raise
+        results = session.run([wanted], {entry.name: values.astype(_DTYPES[entry.type])})
     except Exception as error:  # onnxruntime's own exceptions share no base class.
         raise ValueError(f"{name} does not run on {values.shape}: {first_line(error)}") from error
     result = np.asarray(results[0])

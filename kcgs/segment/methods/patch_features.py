@@ -30,16 +30,15 @@ def dino(
 ) -> Prediction:
     """Segment by k-means of the patch features of a self-supervised vision transformer.
 
-    Features are made unit length. k-means starts from the feature farthest from the mean, then from those
-    farthest from the starts there are, so that it is the same every time. Memberships of the patches (softmax of
-    cosine similarity to the centres) are enlarged to pixels and follow the image's edges by guided filtering
-    (He et al., TPAMI 2013), two patches wide; the largest wins and is the score.
+    Features are made unit length. k-means starts from the feature farthest from the mean, then from those farthest from
+    the starts there are, so that it is the same every time. Memberships of the patches (softmax of cosine similarity to
+    the centres) are enlarged to pixels and follow the image's edges by guided filtering (He et al., TPAMI 2013), two
+    patches wide; the largest wins and is the score.
 
     Args:
         image: as `segment` takes it, any size.
-        model: a hub id, a local folder or a loaded model of transformers: DINO ("facebook/dino-vits16"),
-            DINOv2 with or without registers, DINOv3 ("facebook/dinov3-vits16-pretrain-lvd1689m"), or another
-            plain vision transformer.
+        model: a hub id, a local folder or a loaded model of transformers: DINO ("facebook/dino-vits16"), DINOv2 with or
+            without registers, DINOv3 ("facebook/dinov3-vits16-pretrain-lvd1689m"), or another plain vision transformer.
         num_clusters: k, at least 1; None: one more as long as it explains 3 % of the variance of the features.
         max_clusters: the most that are tried then, at least 1.
         longer_side: of the image that the model sees, in pixels, rounded to whole patches, at least 1.

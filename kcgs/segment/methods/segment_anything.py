@@ -22,20 +22,16 @@ _IOU_PIXELS = 1 << 16  # Of all masks, that are compared at a time.
 
 
 class Prompts(NamedTuple):
-    """A prompt in each row: either boxes, or points with their labels."""
+    """A prompt in each row: points with their labels, or the corners of a box."""
 
-    boxes: Tensor | None
-    """:math:`(K, 4)` left, top, right, bottom in pixels."""
-    points: Tensor | None
+    points: Tensor
     """:math:`(K, P, 2)` (x, y) in pixels."""
-    point_labels: Tensor | None
-    """:math:`(K, P)`: 1 in the object, 0 outside."""
-    is_grid: bool
-    """Whether nobody pointed at anything: poor masks are then dropped."""
+    labels: Tensor | None
+    """:math:`(K, P)`: 1 in the object, 0 outside; None: the two points are the corners of a box."""
 
 
-# From boxes, points and their labels of K prompts to logits (K, C, H, W) and predicted overlaps (K, C) of masks.
-_Predict = Callable[[Tensor | None, Tensor | None, Tensor | None], tuple[Tensor, Tensor]]
+# From points and labels of K prompts to logits (K, C, H, W) and predicted overlaps (K, C) of masks.
+_Predict = Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]]
 
 
 @register("sam")
@@ -54,23 +50,22 @@ def sam(
 ) -> Prediction:
     """Segment by Segment Anything (Kirillov et al., ICCV 2023) or SAM 2 (Ravi et al., ICLR 2025).
 
-    A box, or a set of points, asks for one object and gets its best mask. Without either, a grid of points
-    asks for everything, and of its masks (three per point) those stay that the model scores at least
-    ``min_score``, that hardly depend on the threshold, and that overlap no better one by more than
-    ``max_overlap`` (intersection over union). Masks are painted from large to small, so that the smaller lies
-    over the larger, of equal ones the better over the worse; each connected piece of what no mask covers is a
-    region too.
+    A box, or a set of points, asks for one object and gets its best mask. Without either, a grid of points asks for
+    everything, and of its masks (three per point) those stay that the model scores at least ``min_score``, that hardly
+    depend on the threshold, and that overlap no better one by more than ``max_overlap`` (intersection over union).
+    Masks are painted from large to small, so that the smaller lies over the larger, of equal ones the better over the
+    worse; each connected piece of what no mask covers is a region too.
 
     Args:
         image: as `segment` takes it, any size.
         model: "vit_b", "vit_l", "vit_h" or "mobile_sam" for Segment Anything by kornia, or a
-            ``kornia.models.sam.SamConfig``; else SAM 2 by transformers: a hub id such as
-            "facebook/sam2.1-hiera-tiny", a local folder, or a loaded ``Sam2Model``.
+            ``kornia.models.sam.SamConfig``; else SAM 2 by transformers: a hub id such as "facebook/sam2.1-hiera-tiny",
+            a local folder, or a loaded ``Sam2Model``.
         checkpoint: the weights of a kornia model, a file or URL; None: the released ones, downloaded once.
         boxes: :math:`(K, 4)` left, top, right, bottom in pixels; these three may be lists too.
         points: :math:`(K, 2)`, or :math:`(K, P, 2)` for K objects of P points each, (x, y) in pixels.
-        point_labels: integers of the shape of ``points`` less its last dimension, 1 in the object and 0
-            outside; None: all 1.
+        point_labels: integers of the shape of ``points`` less its last dimension, 1 in the object and 0 outside; None:
+            all 1.
         grid: points along each side where there are neither boxes nor points, at least 1.
         min_score: of the grid's masks, in [0, 1], against the overlap that the model predicts.
         min_stability: of the grid's masks, in [0, 1]: overlap of the mask at logits above 1 and above -1.
@@ -88,12 +83,13 @@ def sam(
     Example:
         ``segment(image, "sam", model="vit_b", checkpoint="sam_vit_b_01ec64.pth")``
     """
-    given = {"boxes": boxes, "points": points, "point_labels": point_labels}
-    prompts = _check_prompts(image, **{name: _as_tensor(name, values) for name, values in given.items()}, grid=grid)
+    check_count("grid", grid)
     for name, value in (("min_score", min_score), ("min_stability", min_stability), ("max_overlap", max_overlap)):
         check_number(name, value, 0, 1)
+    nobody_asks = boxes is None and points is None and point_labels is None
+    prompts = _grid_prompts(image, grid) if nobody_asks else _check_prompts(image, boxes, points, point_labels)
     small, prompts = _shrunk(image, prompts)
-    floors = (min_score, min_stability) if prompts.is_grid else None
+    floors = (min_score, min_stability) if nobody_asks else None
     masks, scores = _predict_masks(_predictor(small, model, checkpoint), prompts, floors)
     kept = keep_apart(masks, scores, max_overlap)
     maps = torch.stack([part.double() for part in paint_masks(masks[kept], scores[kept])])
@@ -102,12 +98,9 @@ def sam(
 
 
 def keep_apart(masks: Tensor, scores: Tensor, max_overlap: float) -> Tensor:
-    """Return the indices of masks that overlap no better kept one too much, best first.
+    """Return the indices of masks (M, H, W) that overlap no better kept one too much, best first.
 
-    Args:
-        masks: :math:`(M, H, W)` boolean.
-        scores: :math:`(M,)`; of equal ones the earlier is the better.
-        max_overlap: intersection over union, in [0, 1].
+    Overlap is intersection over union. Of equal scores (M,) the earlier is the better.
     """
     order = scores.argsort(descending=True, stable=True)
     flat = masks[order].flatten(1)
@@ -126,20 +119,9 @@ def keep_apart(masks: Tensor, scores: Tensor, max_overlap: float) -> Tensor:
 
 
 def paint_masks(masks: Tensor, scores: Tensor) -> tuple[Tensor, Tensor]:
-    """Paint masks from large to small, of equal ones the better last.
+    """Paint masks (M, H, W) from large to small, of equal ones the better by scores (M,) last.
 
-    Args:
-        masks: :math:`(M, H, W)` boolean.
-        scores: :math:`(M,)`.
-
-    Returns:
-        :math:`(H, W)` int64, 0 where there is no mask, and the score of each pixel's mask, NaN where none is.
-
-    Example:
-        >>> masks = torch.tensor([[[True, True, True, False]], [[False, True, False, False]]])
-        >>> labels, scores = paint_masks(masks, torch.tensor([0.9, 0.8]))
-        >>> labels.tolist(), [round(score, 1) for score in scores[0].tolist()]
-        ([[1, 2, 1, 0]], [0.9, 0.8, 0.9, nan])
+    Returned are labels (H, W), 0 where there is no mask, and the score of each pixel's mask, NaN where none is.
     """
     labels = torch.zeros(masks.shape[1:], dtype=torch.int64, device=masks.device)
     painted = torch.full(masks.shape[1:], float("nan"), device=masks.device)
@@ -159,23 +141,20 @@ def _shrunk(image: Tensor, prompts: Prompts) -> tuple[Tensor, Prompts]:
     size = [max(1, round(side * share)) for side in image.shape[1:]]
     small = F.interpolate(image[None], size, mode="bilinear", align_corners=False, antialias=True)[0]
     scale = image.new_tensor([size[1] / image.shape[2], size[0] / image.shape[1]])
-    boxes = None if prompts.boxes is None else (prompts.boxes.reshape(-1, 2, 2) * scale).flatten(1)
-    points = None if prompts.points is None else prompts.points * scale
-    return small, prompts._replace(boxes=boxes, points=points)
+    return small, prompts._replace(points=prompts.points * scale)
 
 
 def _predict_masks(predict: _Predict, prompts: Prompts, floors: tuple[float, float] | None) -> tuple[Tensor, Tensor]:
     """Return masks (M, H, W) and scores (M,): the best of each prompt, or those above both floors."""
-    count = len(prompts.boxes if prompts.boxes is not None else prompts.points)  # type: ignore[arg-type]
     masks, scores = [], []
-    for start in range(0, count, _AT_ONCE):
-        chosen = [None if part is None else part[start : start + _AT_ONCE] for part in prompts[:3]]
-        logits, overlaps = predict(*chosen)
+    for start in range(0, len(prompts.points), _AT_ONCE):
+        rows = slice(start, start + _AT_ONCE)
+        logits, overlaps = predict(prompts.points[rows], None if prompts.labels is None else prompts.labels[rows])
         if floors is None:
             best = overlaps.argmax(dim=1)
-            rows = torch.arange(len(best), device=best.device)
-            masks.append(logits[rows, best] > 0)
-            scores.append(overlaps[rows, best])
+            each = torch.arange(len(best), device=best.device)
+            masks.append(logits[each, best] > 0)
+            scores.append(overlaps[each, best])
         else:
             logits, overlaps = logits.flatten(0, 1), overlaps.flatten()
             inner = (logits > _STABILITY_OFFSET).flatten(1).sum(dim=1)
@@ -194,11 +173,6 @@ def _predictor(image: Tensor, model: Any, checkpoint: str | os.PathLike[str] | N
     if checkpoint is not None:
         raise ValueError(f"checkpoint goes with {', '.join(_KORNIA_MODELS)} or a SamConfig; got it with {model!r}")
     return _sam2_predictor(image, model)
-
-
-def _is_one_point(boxes: Tensor | None, points: Tensor | None) -> bool:
-    """Whether a prompt is ambiguous, so that the model gives three masks for it."""
-    return boxes is None and points is not None and points.shape[1] == 1
 
 
 def _kornia_predictor(image: Tensor, model: Any, checkpoint: str | os.PathLike[str] | None) -> _Predict:
@@ -222,10 +196,11 @@ def _kornia_predictor(image: Tensor, model: Any, checkpoint: str | os.PathLike[s
     prompter.model.eval()
     prompter.set_image(image)
 
-    def predict(boxes: Tensor | None, points: Tensor | None, labels: Tensor | None) -> tuple[Tensor, Tensor]:
-        # kornia counts pixel centres in whole numbers.
-        shifted = None if points is None else points - 0.5
-        result = prompter.predict(shifted, labels, boxes, multimask_output=_is_one_point(boxes, points))
+    def predict(points: Tensor, labels: Tensor | None) -> tuple[Tensor, Tensor]:
+        if labels is None:
+            result = prompter.predict(boxes=points.flatten(1), multimask_output=False)
+        else:  # kornia counts pixel centres in whole numbers; one point alone is ambiguous and gets three masks.
+            result = prompter.predict(points - 0.5, labels, multimask_output=points.shape[1] == 1)
         return torch.as_tensor(result._original_res_logits), result.scores
 
     return predict
@@ -240,58 +215,51 @@ def _sam2_predictor(image: Tensor, model: Any) -> _Predict:
         embeddings = list(network.get_image_embeddings(shown))
 
     @torch.no_grad()
-    def predict(boxes: Tensor | None, points: Tensor | None, labels: Tensor | None) -> tuple[Tensor, Tensor]:
-        # The prompt encoder adds half a pixel of its own.
-        result = network(
-            image_embeddings=embeddings,
-            input_points=None if points is None else (points * scale - 0.5)[None],
-            input_labels=None if labels is None else labels[None],
-            input_boxes=None if boxes is None else (boxes.reshape(-1, 2, 2) * scale - 0.5).reshape(1, -1, 4),
-            multimask_output=_is_one_point(boxes, points),
-        )
+    def predict(points: Tensor, labels: Tensor | None) -> tuple[Tensor, Tensor]:
+        scaled = points * scale - 0.5  # The prompt encoder adds half a pixel of its own.
+        prompt = {"input_points": scaled[None], "input_labels": None if labels is None else labels[None]}
+        if labels is None:
+            prompt = {"input_boxes": scaled.reshape(1, -1, 4)}
+        is_one_point = labels is not None and points.shape[1] == 1
+        result = network(image_embeddings=embeddings, multimask_output=is_one_point, **prompt)
         logits = F.interpolate(result.pred_masks[0].float(), size, mode="bilinear", align_corners=False)
         return logits, result.iou_scores[0].float()
 
     return predict
 
 
-def _as_tensor(name: str, values: Tensor | Sequence[Any] | None) -> Tensor | None:
-    """Return what may be a list, as from the command line, as a tensor; its shape is checked later."""
-    if values is None or isinstance(values, Tensor):
-        return values
-    try:
-        tensor = torch.tensor(values)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"{name} must be a tensor, or lists of numbers of one length; got {values!r}") from error
-    return tensor if name == "point_labels" else tensor.float()
+def _grid_prompts(image: Tensor, grid: int) -> Prompts:
+    steps = (torch.arange(grid, device=image.device) + 0.5) / grid
+    points = torch.cartesian_prod(steps * image.shape[1], steps * image.shape[2]).flip(-1)[:, None]
+    return Prompts(points, points.new_ones(points.shape[:2], dtype=torch.int64))
 
 
-def _check_prompts(
-    image: Tensor, *, boxes: Tensor | None, points: Tensor | None, point_labels: Tensor | None, grid: int
-) -> Prompts:
-    check_count("grid", grid)
-    height, width = image.shape[1:]
+def _check_prompts(image: Tensor, boxes: Any, points: Any, point_labels: Any) -> Prompts:
     if boxes is not None and points is not None:
         raise ValueError("boxes and points must not both be given")
     if point_labels is not None and points is None:
         raise ValueError("point_labels must come with points")
     if boxes is not None:
-        boxes = check_floating("boxes", boxes, last=4, dims=(2,)).to(image)
+        boxes = check_floating("boxes", _as_tensor("boxes", boxes, torch.float32), last=4, dims=(2,)).to(image)
         if not len(boxes) or not (boxes[:, :2] < boxes[:, 2:]).all():
             raise ValueError(f"boxes must be left, top, right, bottom with left < right, top < bottom; got {boxes}")
-        return Prompts(boxes, None, None, False)
-    if points is None:
-        steps = (torch.arange(grid, device=image.device) + 0.5) / grid
-        points = torch.cartesian_prod(steps * height, steps * width).flip(-1)[:, None]
-        return Prompts(None, points, points.new_ones(points.shape[:2], dtype=torch.int64), True)
-    points = check_floating("points", points, last=2, dims=(2, 3)).to(image)
+        return Prompts(boxes.reshape(-1, 2, 2), None)
+    points = check_floating("points", _as_tensor("points", points, torch.float32), last=2, dims=(2, 3)).to(image)
     if points.numel() == 0:
         raise ValueError(f"points must hold at least one point; got shape {tuple(points.shape)}")
     if point_labels is None:
         point_labels = torch.ones(points.shape[:-1], dtype=torch.int64)
-    point_labels = check_integer("point_labels", point_labels).long().to(image.device)
-    if point_labels.shape != points.shape[:-1] or not ((point_labels == 0) | (point_labels == 1)).all():
-        raise ValueError(f"point_labels must be 0 or 1, of shape {tuple(points.shape[:-1])}; got {point_labels}")
-    if points.ndim == 2:
-        points, point_labels = points[:, None], point_labels[:, None]
-    return Prompts(None, points, point_labels, False)
+    labels = check_integer("point_labels", _as_tensor("point_labels", point_labels)).long().to(image.device)
+    if labels.shape != points.shape[:-1] or not ((labels == 0) | (labels == 1)).all():
+        raise ValueError(f"point_labels must be 0 or 1, of shape {tuple(points.shape[:-1])}; got {labels}")
+    return Prompts(points, labels) if points.ndim == 3 else Prompts(points[:, None], labels[:, None])
+
+
+def _as_tensor(name: str, values: Any, dtype: torch.dtype | None = None) -> Tensor:
+    """Return what may be a list, as from the command line, as a tensor."""
+    if isinstance(values, Tensor):
+        return values
+    try:
+        return torch.tensor(values, dtype=dtype)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"{name} must be a tensor, or lists of numbers of one length; got {values!r}") from error

@@ -74,7 +74,7 @@ def _check_prompts(prompts: Sequence[str], threshold: float | None) -> list[str]
     if threshold is not None:
         check_number("threshold", threshold, 0, 1)
     fewest = 1 if threshold is not None else 2
-    if len(prompts) < fewest or not all(prompt.strip() for prompt in prompts):
+    if len(prompts) < fewest or not all(prompt.split() for prompt in prompts):
         raise ValueError(
             f"prompts must be at least {fewest} non-empty strings, 2 where threshold is None; got {list(prompts)!r}"
         )
