@@ -2,12 +2,12 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy>=1.26", "onnxruntime>=1.20"]
 # ///
-"""Decode kcgs pictures with numpy and onnxruntime alone.
+"""Decode kcgs scenes with numpy and onnxruntime alone.
 
-    python decode.py decoder.onnx -o picture.png --scale 4
-    python decode.py generic.onnx scene.safetensors -o picture.png
+    python decode.py decoder.onnx -o image.png --scale 4
+    python decode.py generic.onnx scene.safetensors -o image.png
 
-The first kind of decoder holds a scene, the second draws any scene of hard contours.
+The first kind of decoder holds a scene, the second renders any scene of hard contours.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _FLOATS = {"F32": "<f4", "F64": "<f8"}
 _INTEGERS = {"U8": "u1", "U16": "<u2", "I32": "<i4", "I64": "<i8"}
 _REQUIRED = ("means", "cholesky", "colors")
 _TENSORS = dict.fromkeys((*_REQUIRED, "opacities"), _FLOATS) | dict.fromkeys(("region_ids", "labels"), _INTEGERS)
-_LARGEST, _SMALLEST = 1e8, 1e-6  # pixels: what kcgs itself draws
+_LARGEST, _SMALLEST = 1e8, 1e-6  # pixels: what kcgs itself renders
 _COLOR_TYPES = {1: 0, 3: 2, 4: 6}  # of PNG, by number of channels
 
 Array = np.ndarray[Any, Any]
@@ -74,7 +74,7 @@ class Decoder:
 
 @dataclass(frozen=True)
 class Scene:
-    """Gaussians, and the labels to draw them with (None: one region)."""
+    """Gaussians, and the labels to render them with (None: one region)."""
 
     means: Array  # (N, 2)
     cholesky: Array  # (N, 3)
@@ -124,7 +124,7 @@ def _check_decoder(path: Path, session: onnxruntime.InferenceSession, notes: Map
 
 
 def run(decoder: Decoder, feeds: Mapping[str, Array], size: tuple[int, int]) -> Array:
-    """Draw once, (C, H, W)."""
+    """Render once, (C, H, W)."""
     try:
         image: Array = decoder.session.run(["image"], dict(feeds))[0]
     except Exception as error:  # as above
@@ -135,7 +135,7 @@ def run(decoder: Decoder, feeds: Mapping[str, Array], size: tuple[int, int]) -> 
 
 
 def scene_feeds(decoder: Decoder, args: argparse.Namespace) -> tuple[dict[str, Array], tuple[int, int]]:
-    """Inputs of a scene decoder, and the picture's size."""
+    """Inputs of a scene decoder, and the image's size."""
     own = _note_side(decoder.path, decoder.notes, "height"), _note_side(decoder.path, decoder.notes, "width")
     for option, given, name in (("--view", args.view, "view"), ("--region", args.region, "visible")):
         if given is not None and name not in decoder.inputs:
@@ -154,7 +154,7 @@ def scene_feeds(decoder: Decoder, args: argparse.Namespace) -> tuple[dict[str, A
 
 
 def generic_feeds(scene: Scene, args: argparse.Namespace) -> tuple[dict[str, Array], tuple[int, int]]:
-    """Inputs of a generic decoder, and the picture's size."""
+    """Inputs of a generic decoder, and the image's size."""
     size = target_size(args, scene.size)
     left, top, right, bottom = args.view or (0.0, 0.0, float(scene.size[1]), float(scene.size[0]))
     down, across = size[0] / (bottom - top), size[1] / (right - left)
@@ -190,7 +190,7 @@ def _chosen(ids: Array, known: Array, wanted: Sequence[int] | None) -> Array:
 
 
 def target_size(args: argparse.Namespace, own: tuple[int, int]) -> tuple[int, int]:
-    """Height and width of the picture: as asked, or those of the view at a scale."""
+    """Height and width of the image: as asked, or those of the view at a scale."""
     if args.size is not None:
         sides = args.size
     else:
@@ -199,7 +199,7 @@ def target_size(args: argparse.Namespace, own: tuple[int, int]) -> tuple[int, in
         sides = [min(side * args.scale, MAX_SIDE + 1.0) for side in (height, width)]
         sides = [max(1, round(side)) for side in sides]
     if not all(1 <= side <= MAX_SIDE for side in sides):
-        raise DecodeError(f"the picture must have 1 to {MAX_SIDE} pixels a side; got {sides[1]}x{sides[0]}")
+        raise DecodeError(f"the image must have 1 to {MAX_SIDE} pixels a side; got {sides[1]}x{sides[0]}")
     return sides[0], sides[1]
 
 
@@ -234,7 +234,7 @@ def _neighbours(count: int, start: float, extent: float, length: int) -> tuple[A
 
 
 def read_scene(path: Path) -> Scene:
-    """Read a scene that a generic decoder can draw."""
+    """Read a scene that a generic decoder can render."""
     tensors, notes = _read_safetensors(path)
     if notes.get("format") != _SCENE_FORMAT or notes.get("format_version") not in _SCENE_VERSIONS:
         found = notes.get("format"), notes.get("format_version")
@@ -264,7 +264,7 @@ def _check_contours(path: Path, notes: Mapping[str, str]) -> None:
     for name, plain in (("softness", 0.0), ("supersample", 1.0)):
         if name in notes and _number(notes[name]) != plain:
             what = f"soft or finer contours ({name} {_short(notes[name])})"
-            raise DecodeError(f"{path} has {what}; a generic decoder draws hard ones: export the scene's own decoder")
+            raise DecodeError(f"{path} has {what}; a generic decoder renders hard ones: export the scene's own decoder")
 
 
 def _check_shapes(path: Path, tensors: Mapping[str, Array]) -> None:
@@ -358,7 +358,7 @@ def _whole(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_picture(path: Path, image: Array) -> None:
+def write_image(path: Path, image: Array) -> None:
     """Write (C, H, W) as an 8-bit PNG or, unclipped, as .npy; the file appears whole or not at all."""
     if not np.isfinite(image).all():
         raise DecodeError(f"the decoder gave NaN or infinite values, {(~np.isfinite(image)).sum()} of {image.size}")
@@ -375,7 +375,7 @@ def encode_png(levels: Array) -> bytes:
     """Encode (C, H, W) of uint8, C = 1, 3 or 4."""
     channels, height, width = levels.shape
     lines = np.ascontiguousarray(levels.transpose(1, 2, 0)).reshape(height, width * channels)
-    # filter 2, the difference to the line above: smooth pictures get smaller
+    # filter 2, the difference to the line above: smooth images get smaller
     filtered = np.empty((height, 1 + width * channels), np.uint8)
     filtered[:, 0] = 2
     filtered[0, 1:] = lines[0]
@@ -441,9 +441,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     target = parser.add_mutually_exclusive_group()
     target.add_argument("--scale", type=_scale, default=1.0, help="magnification")
     target.add_argument("--size", type=_size, metavar="WxH", help="width and height in pixels")
-    view_help = "part of the scene that fills the picture, in its pixels (--view=-5,... where the first is negative)"
+    view_help = "part of the scene that fills the image, in its pixels (--view=-5,... where the first is negative)"
     parser.add_argument("--view", type=_view, metavar="LEFT,TOP,RIGHT,BOTTOM", help=view_help)
-    parser.add_argument("--region", type=int, nargs="+", action="extend", metavar="ID", help="draw only these regions")
+    parser.add_argument("--region", type=int, nargs="+", action="extend", metavar="ID", help="only these regions")
     parser.add_argument(
         "--providers", type=lambda text: text.split(","), default=["CPUExecutionProvider"], help="separated by commas"
     )
@@ -454,7 +454,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def decode(args: argparse.Namespace) -> dict[str, object]:
-    """Decode one picture, write it, and return what there is to report."""
+    """Decode one image, write it, and return what there is to report."""
     check_output(args.output)
     decoder = open_decoder(args.decoder, args.providers, args.threads)
     if decoder.notes["kind"] == "scene":
@@ -470,7 +470,7 @@ def decode(args: argparse.Namespace) -> dict[str, object]:
         start = time.perf_counter()
         image = run(decoder, feeds, size)
         times.append((time.perf_counter() - start) * 1e3)
-    write_picture(args.output, image)
+    write_image(args.output, image)
     return {
         "output": str(args.output),
         "kind": decoder.notes["kind"],
@@ -492,7 +492,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with np.errstate(all="ignore"):  # values out of range are refused where they matter
             report = decode(args)
     except (DecodeError, MemoryError, KeyboardInterrupt) as error:
-        what = {MemoryError: "not enough memory for this picture", KeyboardInterrupt: "interrupted, nothing written"}
+        what = {MemoryError: "not enough memory for this image", KeyboardInterrupt: "interrupted, nothing written"}
         print("decode.py:", what.get(type(error), error), file=sys.stderr)
         return 130 if isinstance(error, KeyboardInterrupt) else 1
     if args.json:

@@ -16,6 +16,7 @@ from kcgs._shipped import shipped_folder
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.onnx import scene_decoder, write_model
+from kcgs.scene import Scene
 
 _PAGE = shipped_folder("web", checkout="export/web/dist")
 
@@ -97,7 +98,7 @@ def serve(
     if original is not None and not original.is_file():
         raise FileNotFoundError(f"--original must be an image file; {original} is not there")
     with tempfile.TemporaryDirectory() as folder:
-        model = scene_decoder(field, regions, interactive=True)
+        model = scene_decoder(Scene(field, regions), interactive=True)
         write_model(model, Path(folder) / "decoder.onnx")
         query = {"decoder": "scene/decoder.onnx", "name": name}
         if original is not None:

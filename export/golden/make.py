@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs import GaussianField, RegionMap, RegionSplatRenderer
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.onnx import scene_decoder, write_model
 
 Array = np.ndarray[Any, Any]
@@ -23,7 +23,7 @@ Array = np.ndarray[Any, Any]
 SIZE = (20, 34)
 # enlarged and reduced, by another factor across than down and no whole one
 OTHER_SIZES = ((24, 41), (11, 17))
-# the view is a cut of the picture enlarged ZOOM times, whole pixels of it: (left, top, right, bottom)
+# the view is a cut of the image enlarged ZOOM times, whole pixels of it: (left, top, right, bottom)
 ZOOM = 4
 CUT = (61, 42, 79, 56)
 _IRRATIONAL = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29)
@@ -60,7 +60,7 @@ def uniform(count: int, columns: int, seed: int) -> Tensor:
 
 
 def make_labels(ids: tuple[int, ...], supersample: int) -> Tensor:
-    """Draw a disc, a diagonal and a bar, as many as there are ids."""
+    """Label a disc, a diagonal and a bar, as many as there are ids."""
     y, x = torch.meshgrid(*((torch.arange(supersample * n) + 0.5) / supersample for n in SIZE), indexing="ij")
     index = (x + 0.6 * y > 21.3).long() * (len(ids) > 2)
     index[(x - 12.2) ** 2 + (y - 9.1) ** 2 < 37] = len(ids) - 1
@@ -69,8 +69,8 @@ def make_labels(ids: tuple[int, ...], supersample: int) -> Tensor:
     return torch.tensor(ids)[index]
 
 
-def make_scene(case: Case) -> tuple[GaussianField, RegionMap | None]:
-    """Spread Gaussians of all shapes over the picture and beyond its border."""
+def make_scene(case: Case) -> Scene:
+    """Spread Gaussians of all shapes over the image and beyond its border."""
     regions = None
     if case.ids:
         regions = RegionMap.from_labels(
@@ -86,52 +86,50 @@ def make_scene(case: Case) -> tuple[GaussianField, RegionMap | None]:
     numbers = [t.float() for t in (means, cholesky, colors)]
     opacities = (0.3 + 0.7 * uniform(count, 1, 7)[:, 0]).float() if case.opacities else None
     field = GaussianField(*numbers, opacities=opacities, size=SIZE)
-    return (field if regions is None else field.assign_regions(regions)), regions
+    return Scene(field if regions is None else field.assign_regions(regions), regions)
 
 
-def draw(
-    field: GaussianField, regions: RegionMap | None, size: tuple[int, int], cutoff: float, factors: Tensor | None = None
-) -> Array:
-    """Draw by the dense sum in float64, rounded to float32 at the end.
+def render(scene: Scene, size: tuple[int, int], cutoff: float, factors: Tensor | None = None) -> Array:
+    """Render by the dense sum in float64, rounded to float32 at the end.
 
     Args:
-        field: the Gaussians.
-        regions: label map, or None.
+        scene: the Gaussians and their map.
         size: (height, width).
         cutoff: weights below it are skipped.
         factors: on each Gaussian's colour.
     """
+    field = scene.field
     colors = field.merged_colors().detach().double()
     means, cholesky = field.means.detach().double(), field.cholesky.detach().double()
     if factors is not None:
         colors = colors * factors.double()[:, None]
     exact = GaussianField(means, cholesky, colors, field.region_ids, size=field.size)
     with torch.no_grad():
-        image: Tensor = RegionSplatRenderer(cutoff=cutoff, backend="reference")(exact, regions, size)
+        image: Tensor = RegionSplatRenderer(cutoff=cutoff, backend="reference")(exact, scene.regions, size)
     return image.float().numpy()
 
 
 def make_arrays(case: Case) -> dict[str, Array]:
     """Collect what NAME.npz holds; README.md says what each array is."""
-    field, regions = make_scene(case)
+    scene = make_scene(case)
+    field, regions = scene.field, scene.regions
     tensors = {"means": field.means, "cholesky": field.cholesky, "colors": field.colors, "opacities": field.opacities}
     arrays = {name: tensor.detach().numpy() for name, tensor in tensors.items() if tensor is not None}
     arrays |= {"height": np.array(SIZE[0]), "width": np.array(SIZE[1]), "cutoff": np.array(case.cutoff)}
     for size in (SIZE, *OTHER_SIZES):
-        arrays[f"image_{size[0]}x{size[1]}"] = draw(field, regions, size, case.cutoff)
+        arrays[f"image_{size[0]}x{size[1]}"] = render(scene, size, case.cutoff)
     left, top, right, bottom = CUT
-    large = draw(field, regions, (ZOOM * SIZE[0], ZOOM * SIZE[1]), case.cutoff)
+    large = render(scene, (ZOOM * SIZE[0], ZOOM * SIZE[1]), case.cutoff)
     arrays["view"] = np.array(CUT, np.float32) / ZOOM
     arrays["image_view"] = np.ascontiguousarray(large[:, top:bottom, left:right])
     if regions is None or field.region_ids is None:
         return arrays
-    labels = regions.labels if regions.fine_labels is None else regions.fine_labels
-    smallest = np.min_scalar_type(int(regions.ids.max()))
-    arrays |= {"region_ids": field.region_ids.numpy().astype(smallest), "labels": labels.numpy().astype(smallest)}
+    for name, tensor in (("region_ids", field.region_ids), ("labels", regions.fine_labels)):
+        arrays[name] = tensor.numpy().astype(np.min_scalar_type(int(regions.ids.max())))
     arrays["supersample"] = np.array(case.supersample)
     pairs = case.softness
     arrays["softness"] = np.array([(*k, v) for k, v in pairs.items()] if isinstance(pairs, Mapping) else pairs)
-    widths, level = regions._membership.levels
+    widths, level = regions.membership.levels
     if level is not None:
         # where contours are equally near, which one a pixel takes is nobody else's to know
         arrays["contour_width"] = torch.tensor(widths)[level[0].long()].float().numpy()
@@ -139,7 +137,7 @@ def make_arrays(case: Case) -> dict[str, Array]:
     visible[case.hidden] = 0
     arrays["visible"] = visible.numpy()
     factors = visible[regions.index_of(field.region_ids)]
-    arrays["image_visible"] = draw(field, regions, SIZE, case.cutoff, factors)
+    arrays["image_visible"] = render(scene, SIZE, case.cutoff, factors)
     return arrays
 
 
@@ -147,8 +145,7 @@ def make(folder: Path) -> None:
     """Write NAME.npz and NAME.onnx of every case into a folder."""
     for name, case in CASES.items():
         np.savez_compressed(folder / f"{name}.npz", **make_arrays(case))
-        field, regions = make_scene(case)
-        write_model(scene_decoder(field, regions, cutoff=case.cutoff, interactive=True), folder / f"{name}.onnx")
+        write_model(scene_decoder(make_scene(case), cutoff=case.cutoff, interactive=True), folder / f"{name}.onnx")
 
 
 if __name__ == "__main__":

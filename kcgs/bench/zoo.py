@@ -85,7 +85,7 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
     folder.mkdir(parents=True, exist_ok=True)
     size = scene.save(folder / "scene.safetensors")
     _write(folder / "recipe.json", config.model_dump_json(indent=1) + "\n")
-    decoder = _write_decoder(folder / "decoder.onnx", scene, recipe)
+    decoder = _write_decoder(folder / "decoder.onnx", scene)
     if decoder is not None:
         # to compare with in the viewer
         save_image(folder / ("original.webp" if recipe == "best" else "original.jpg"), image)
@@ -114,9 +114,9 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
     return entry
 
 
-def _write_decoder(path: Path, scene: Scene, recipe: str) -> Path | None:
+def _write_decoder(path: Path, scene: Scene) -> Path | None:
     """Write the decoder, with its inputs for views and regions, where it is small."""
-    model = scene_decoder(scene.field, scene.regions, interactive=True, recipe=recipe)
+    model = scene_decoder(scene, interactive=True)
     if model.ByteSize() > _LARGEST_DECODER:
         path.unlink(missing_ok=True)
         return None

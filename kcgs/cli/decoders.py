@@ -59,15 +59,7 @@ def export(
             raise ValueError("--kind generic draws hard contours of whole pixels; this scene's are soft or finer")
         model = generic_decoder(cutoff=cutoff, clamp=clamp)
     else:
-        model = scene_decoder(
-            loaded.field,
-            loaded.regions,
-            cutoff=cutoff,
-            clamp=clamp,
-            precision=precision.value,
-            interactive=interactive,
-            recipe=loaded.metadata.get("recipe", ""),
-        )
+        model = scene_decoder(loaded, cutoff=cutoff, clamp=clamp, precision=precision.value, interactive=interactive)
     written = write_model(model, output)
     facts = describe_decoder(model)
     print_report({**facts, "bytes": written} if as_json else _readable(facts, written), as_json, str(output))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from kcgs.kernels.tiles import TILE
+
 from .graph import FLOAT, INT64, Graph, Value
-from .lists import TILE
 
 # places between two pixel centres that hard contours are sampled at, as in `RegionMap.resize`
 _OFFSETS = 1024
@@ -20,23 +21,21 @@ class Axis:
     `TILE` pixels, with some pixels to spare at the ends of runs. Places are integers over a common denominator: pixel i
     is at (2 n start + (2 i + 1) (end - start)) / 2 n, so that a contour's pixels fall on the same side everywhere, and
     not all runtimes have float64.
+
+    Args:
+        graph: the graph.
+        size: int64 (1,), pixels of the output.
+        length: pixels of the scene.
+        ends: float32 (1,) each, the part of the scene that fills the output; None: all of it.
     """
 
     def __init__(self, graph: Graph, size: Value, length: int, ends: tuple[Value, Value] | None = None) -> None:
-        """Take the sizes.
-
-        Args:
-            graph: the graph.
-            size: int64 (1,), pixels of the output.
-            length: pixels of the scene.
-            ends: float32 (1,) each, the part of the scene that fills the output; None: all of it.
-        """
         g = self.g = graph
         self.size, self.tiles = size, -(-length // TILE)
         if ends is None:
             start, extent = g.constant([0]), g.constant([length * _PARTS])
         else:
-            start, end = (g("Cast", g("Mul", at, np.float32(_PARTS)), to=INT64) for at in ends)
+            start, end = (g("Cast", g("Mul", bound, np.float32(_PARTS)), to=INT64) for bound in ends)
             extent = g("Sub", end, start)
         self.extent, self.parts = extent, g("Mul", size, 2 * _PARTS)  # of the scene; of a pixel of it
         self.step = g("Div", g("Cast", extent, to=FLOAT), g("Cast", g("Mul", size, _PARTS), to=FLOAT))
@@ -89,20 +88,20 @@ class Axis:
         # a view may go beyond the scene, where the border's are held
         last = factor * TILE + 2 * halo - 1
         if soft:
-            at = g("Div", g("Cast", self.local, to=FLOAT), g("Cast", self.parts, to=FLOAT))
-            at = g("Clip", g("Add", at, np.float32(halo - 0.5)), np.float32(0), np.float32(last))
-            at = g("Unsqueeze", at, g.constant([2]))
+            position = g("Div", g("Cast", self.local, to=FLOAT), g("Cast", self.parts, to=FLOAT))
+            position = g("Clip", g("Add", position, np.float32(halo - 0.5)), np.float32(0), np.float32(last))
+            position = g("Unsqueeze", position, g.constant([2]))
         else:
             # sub-pixels spread over a pixel of the output, or one of the scene where that is smaller
             whole = g("Mul", self.extent, 2)
             spread = g("Where", g("Less", whole, self.parts), whole, self.parts)
             j = g.constant(2 * np.arange(factor) + 1 - factor)
             # all in halves of a part of a label; from the first label's centre
-            at = g("Mul", g("Unsqueeze", self.local, g.constant([2])), 2 * factor)
-            at = g("Add", g("Add", at, g("Mul", j, spread)), g("Mul", self.parts, 2 * halo - 1))
-            offsets = g("Max", g("Div", g("Mul", at, _OFFSETS // 2), self.parts), 0)
+            position = g("Mul", g("Unsqueeze", self.local, g.constant([2])), 2 * factor)
+            position = g("Add", g("Add", position, g("Mul", j, spread)), g("Mul", self.parts, 2 * halo - 1))
+            offsets = g("Max", g("Div", g("Mul", position, _OFFSETS // 2), self.parts), 0)
             offsets = g("Min", offsets, last * _OFFSETS - 1)
-            at = g("Div", g("Cast", g("Add", g("Mul", offsets, 2), 1), to=FLOAT), np.float32(2 * _OFFSETS))
-            at = g("Reshape", at, g.constant([0, -1, 1]))
+            position = g("Div", g("Cast", g("Add", g("Mul", offsets, 2), 1), to=FLOAT), np.float32(2 * _OFFSETS))
+            position = g("Reshape", position, g.constant([0, -1, 1]))
         window = np.arange(factor * TILE + 2 * halo, dtype=np.float32)
-        return g("Relu", g("Sub", np.float32(1), g("Abs", g("Sub", at, window))))
+        return g("Relu", g("Sub", np.float32(1), g("Abs", g("Sub", position, window))))

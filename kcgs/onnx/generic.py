@@ -1,7 +1,7 @@
-r"""Any scene's decoder: one graph that takes the Gaussians and the label map as inputs.
+"""Any scene's decoder: one graph that takes the Gaussians and the label map as inputs.
 
-Three loops bound the memory: over bands of rows, over the tiles of a band, over chunks of the Gaussians that a tile
-needs. A band keeps the Gaussians whose support reaches it, a tile those of a band whose support and region reach it.
+Three loops bound the memory: over rows of tiles, over the tiles of a row, over chunks of the Gaussians that a tile
+needs. A row keeps the Gaussians whose support reaches it, a tile those of its row whose support and region reach it.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import numpy as np
 import onnx
 import torch
 
-from kcgs._check import check_cutoff
+from kcgs._check import check_count, check_cutoff
 from kcgs.kernels.whitened import lowest_exponent, support_radius
 
 from .graph import FLOAT, Array, Graph, Value
 from .metadata import header
 
 _SIDE = 32  # of a tile, in pixels
-_CHUNK = 64  # Gaussians drawn at once
+_CHUNK = 64  # Gaussians evaluated at once
 _OPSET = 20  # reductions of flags
 MAX_WEIGHTS = _CHUNK * _SIDE * _SIDE
 """Most (Gaussian, pixel) weights that exist at a time."""
@@ -52,17 +52,17 @@ class _Scene(NamedTuple):
         return support_radius(self.cutoff, torch.float32) * _SCALE * _SLACK
 
 
-class _Band(NamedTuple):
-    """The rows of a band and the M Gaussians whose support reaches them."""
+class _Row(NamedTuple):
+    """The pixels of a row of tiles and the M Gaussians whose support reaches them."""
 
     labels: Value  # [_SIDE, W]
     frame: Value  # [5, M]
     tags: Value  # [2, M]
-    down: Value  # [1, M]: from the mean to the band's middle
+    down: Value  # [1, M]: from the mean to the row's middle
 
 
 class _Tile(NamedTuple):
-    """The pixels of a tile and the K Gaussians that may paint them."""
+    """The pixels of a tile and the K Gaussians that may reach them."""
 
     labels: Value  # [_SIDE, _SIDE]
     present: Value  # [U], the ids in labels
@@ -75,12 +75,12 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = False, channels: int 
     r"""Build the decoder of any scene that has hard contours, or none.
 
     Convention: inputs ``means`` float32 :math:`(N, 2)` and ``cholesky`` float32 :math:`(N, 3)` in pixels of the
-    picture, ``colors`` float32 :math:`(N, C)` with the opacities multiplied in, ``region_ids`` int64 :math:`(N)` and
+    image, ``colors`` float32 :math:`(N, C)` with the opacities multiplied in, ``region_ids`` int64 :math:`(N)` and
     ``labels`` int64 :math:`(H, W)`, any non-negative ids; output ``image`` float32 :math:`(1, C, H, W)`. A scene
-    without regions has zeros for ids and labels. All sizes vary; what the picture itself takes apart, memory is that
-    of the Gaussians and of :data:`MAX_WEIGHTS` weights.
+    without regions has zeros for ids and labels. All sizes vary; beside the image itself, memory is that of
+    the Gaussians and of :data:`MAX_WEIGHTS` weights.
 
-    Known limit: whitened in float32, a needle of anisotropy 1,000 is drawn to about 2e-5 of its colour.
+    Known limit: whitened in float32, a needle of anisotropy 1,000 is off by about 2e-5 of its colour.
 
     Args:
         cutoff: weights below it are zero, in [0, 1); 0 leaves out what is zero in float32.
@@ -103,14 +103,11 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = False, channels: int 
     if not isinstance(clamp, bool):
         raise TypeError(f"clamp must be True or False; got {clamp!r}")
     if channels is not None:
-        if isinstance(channels, bool) or not isinstance(channels, int):
-            raise TypeError(f"channels must be an integer or None; got {channels!r}")
-        if channels < 1:
-            raise ValueError(f"channels must be at least 1; got {channels}")
+        channels = check_count("channels", channels)
     graph = Graph(opset=_OPSET)
     depth = "C" if channels is None else channels
     scene = _declare(graph, depth, cutoff)
-    image = _draw(graph, scene)
+    image = _render(graph, scene)
     if clamp:
         image = graph("Clip", image, _floats(0), _floats(1))
     return graph.finish({"image": image}, np.float32, [[1, depth, "H", "W"]], _metadata(cutoff, clamp))
@@ -157,10 +154,10 @@ def _declare(graph: Graph, depth: int | str, cutoff: float) -> _Scene:
     )
 
 
-def _draw(graph: Graph, scene: _Scene) -> Value:
-    """Draw all bands and put them together, (1, C, H, W)."""
+def _render(graph: Graph, scene: _Scene) -> Value:
+    """Render all rows of tiles and put them together, (1, C, H, W)."""
     down, across = (graph("Div", graph("Add", n, _SIDE - 1), _SIDE) for n in (scene.height, scene.width))
-    body = graph.body(lambda inner: _draw_band(inner, scene, across), "bands")
+    body = graph.body(lambda inner: _render_row(inner, scene, across), "bands")
     tiles = graph("Loop", down, graph.constant(True), body=body)  # [down, across, C, _PIXELS]
 
     def shape(*sizes: Value | int) -> Value:
@@ -177,9 +174,9 @@ def _draw(graph: Graph, scene: _Scene) -> Value:
     return graph("Slice", image, graph.constant([0, 0]), end, graph.constant([2, 3]))
 
 
-def _span(graph: Graph, at: Value, length: Value) -> tuple[Value, Value]:
-    """Return the pixels of band or tile `at`, the last one repeated past the edge, and the middle."""
-    start = graph("Mul", at, _SIDE)
+def _span(graph: Graph, number: Value, length: Value) -> tuple[Value, Value]:
+    """Return the pixels of a row or column of tiles, the last one repeated past the edge, and the middle."""
+    start = graph("Mul", number, _SIDE)
     pixels = graph("Add", graph.constant(np.arange(_SIDE)), start)
     middle = graph("Add", graph("Cast", start, to=FLOAT), _floats(_SIDE / 2))
     return graph("Min", pixels, graph("Sub", length, 1)), middle
@@ -190,34 +187,34 @@ def _keep(graph: Graph, keep: Value, *columns: Value) -> list[Value]:
     return [graph("Compress", matrix, flat, axis=1) for matrix in columns]
 
 
-def _draw_band(graph: Graph, scene: _Scene, across: Value) -> list[Value]:
-    at, go_on = graph.input("band", np.int64, []), graph.input("band_goes_on", np.bool_, [])
-    rows, middle = _span(graph, at, scene.height)
+def _render_row(graph: Graph, scene: _Scene, across: Value) -> list[Value]:
+    number, go_on = graph.input("band", np.int64, []), graph.input("band_goes_on", np.bool_, [])
+    rows, middle = _span(graph, number, scene.height)
     away = graph("Sub", middle, graph("Slice", scene.frame, *map(graph.constant, ([1], [2], [0]))))
     near = graph("LessOrEqual", graph("Abs", away), graph("Add", scene.reach, _floats(_HALF)))
     frame, tags, down = _keep(graph, near, scene.frame, scene.tags, away)
-    band = _Band(graph("Gather", scene.labels, rows, axis=0), frame, tags, down)
-    body = graph.body(lambda inner: _draw_tile(inner, scene, band), "tiles")
+    row = _Row(graph("Gather", scene.labels, rows, axis=0), frame, tags, down)
+    body = graph.body(lambda inner: _render_tile(inner, scene, row), "tiles")
     return [graph("Identity", go_on), graph("Loop", across, graph.constant(True), body=body)]
 
 
-def _draw_tile(graph: Graph, scene: _Scene, band: _Band) -> list[Value]:
-    at, go_on = graph.input("tile", np.int64, []), graph.input("tile_goes_on", np.bool_, [])
-    columns, middle = _span(graph, at, scene.width)
-    tile = _enter_tile(graph, scene, band, graph("Gather", band.labels, columns, axis=1), middle)
+def _render_tile(graph: Graph, scene: _Scene, row: _Row) -> list[Value]:
+    number, go_on = graph.input("tile", np.int64, []), graph.input("tile_goes_on", np.bool_, [])
+    columns, middle = _span(graph, number, scene.width)
+    tile = _enter_tile(graph, scene, row, graph("Gather", row.labels, columns, axis=1), middle)
     count = graph("Gather", graph("Shape", tile.tags), 1)
     chunks = graph("Div", graph("Add", count, _CHUNK - 1), _CHUNK)
     channels = graph("Shape", scene.colors, start=0, end=1)
     black = graph("Expand", _floats(0), graph("Concat", channels, graph.constant([_PIXELS]), axis=0))
-    body = graph.body(lambda inner: _draw_chunk(inner, scene, tile), "chunks")
+    body = graph.body(lambda inner: _add_chunk(inner, scene, tile), "chunks")
     return [graph("Identity", go_on), graph("Loop", chunks, graph.constant(True), black, body=body)]
 
 
-def _enter_tile(graph: Graph, scene: _Scene, band: _Band, labels: Value, middle: Value) -> _Tile:
-    """Whiten from the tile's middle and keep the Gaussians that may paint the tile."""
-    x, _, inverse1, slope, inverse2 = graph.apply("Split", [band.frame], 5, axis=0, num_outputs=5)
+def _enter_tile(graph: Graph, scene: _Scene, row: _Row, labels: Value, middle: Value) -> _Tile:
+    """Whiten from the tile's middle and keep the Gaussians that may reach the tile."""
+    x, _, inverse1, slope, inverse2 = graph.apply("Split", [row.frame], 5, axis=0, num_outputs=5)
     across = graph("Sub", middle, x)
-    down = graph("Sub", band.down, graph("Mul", slope, across))
+    down = graph("Sub", row.down, graph("Mul", slope, across))
     shear = graph("Neg", graph("Mul", slope, inverse2))
     # how far z goes from the middle to the pixel that is farthest
     spread1 = graph("Mul", inverse1, _floats(_HALF))
@@ -229,41 +226,41 @@ def _enter_tile(graph: Graph, scene: _Scene, band: _Band, labels: Value, middle:
             (graph("Mul", down, inverse2), spread2),
         )
     ]
-    ids = graph("Slice", band.tags, *map(graph.constant, ([0], [1], [0])))
+    ids = graph("Slice", row.tags, *map(graph.constant, ([0], [1], [0])))
     present = graph("Unique", labels, sorted=1)
     # the ends of a sorted list: onnxruntime's ReduceMin and ReduceMax err on int64 beyond 32 bits
-    low, high = (graph("Gather", present, at) for at in (0, -1))
+    low, high = (graph("Gather", present, end) for end in (0, -1))
     # exact where the tile has one region; else the ids between are left to the chunks, whose memory is bounded
     known = graph("And", graph("LessOrEqual", low, ids), graph("LessOrEqual", ids, high))
     keep = graph("And", graph("And", *near), known)
     whitened = graph("Concat", across, inverse1, down, shear, inverse2, axis=0)
-    return _Tile(labels, present, graph("Equal", low, high), *_keep(graph, keep, whitened, band.tags))
+    return _Tile(labels, present, graph("Equal", low, high), *_keep(graph, keep, whitened, row.tags))
 
 
-def _draw_chunk(graph: Graph, scene: _Scene, tile: _Tile) -> list[Value]:
-    at, go_on = graph.input("chunk", np.int64, []), graph.input("chunk_goes_on", np.bool_, [])
-    picture = graph.input("picture", np.float32, ["channels", _PIXELS])
-    start = graph("Unsqueeze", graph("Mul", at, _CHUNK), graph.constant([0]))
+def _add_chunk(graph: Graph, scene: _Scene, tile: _Tile) -> list[Value]:
+    number, go_on = graph.input("chunk", np.int64, []), graph.input("chunk_goes_on", np.bool_, [])
+    total = graph.input("picture", np.float32, ["channels", _PIXELS])
+    start = graph("Unsqueeze", graph("Mul", number, _CHUNK), graph.constant([0]))
     end = graph("Add", start, _CHUNK)
     whitened, tags = (graph("Slice", matrix, start, end, graph.constant([1])) for matrix in (tile.whitened, tile.tags))
 
     def one_region(inner: Graph) -> list[Value]:
-        return [_paint(inner, scene, whitened, tags, None)]
+        return [_evaluate(inner, scene, whitened, tags, None)]
 
     def several_regions(inner: Graph) -> list[Value]:
         ids = inner("Gather", tags, 0, axis=0)
         same = inner("Equal", inner("Unsqueeze", ids, inner.constant([1])), tile.present)  # [K, U]
-        mine, places = _keep(inner, inner("ReduceMax", same, inner.constant([1])), whitened, tags)
-        return [_paint(inner, scene, mine, places, tile.labels)]
+        kept, places = _keep(inner, inner("ReduceMax", same, inner.constant([1])), whitened, tags)
+        return [_evaluate(inner, scene, kept, places, tile.labels)]
 
     branches = {
         "then_branch": graph.body(one_region, "one_region"),
         "else_branch": graph.body(several_regions, "several_regions"),
     }
-    return [graph("Identity", go_on), graph("Add", picture, graph("If", tile.single, **branches))]
+    return [graph("Identity", go_on), graph("Add", total, graph("If", tile.single, **branches))]
 
 
-def _paint(graph: Graph, scene: _Scene, whitened: Value, tags: Value, labels: Value | None) -> Value:
+def _evaluate(graph: Graph, scene: _Scene, whitened: Value, tags: Value, labels: Value | None) -> Value:
     """Sum colour times weight over K Gaussians, [C, _PIXELS]; labels: only where they equal the Gaussian's id."""
     offsets = np.arange(_SIDE) - _HALF
     x, y = _floats(offsets), _floats(offsets[:, None])
@@ -277,8 +274,8 @@ def _paint(graph: Graph, scene: _Scene, whitened: Value, tags: Value, labels: Va
     kept = graph("GreaterOrEqual", weight, _floats(scene.cutoff)) if scene.cutoff > 0.0 else None
     ids, place = graph.apply("Split", [tags], 2, axis=0, num_outputs=2)
     if labels is not None:
-        mine = graph("Equal", graph("Unsqueeze", ids, graph.constant([2, 3])), labels)
-        kept = mine if kept is None else graph("And", kept, mine)
+        same = graph("Equal", graph("Unsqueeze", ids, graph.constant([2, 3])), labels)
+        kept = same if kept is None else graph("And", kept, same)
     if kept is not None:
         weight = graph("Where", kept, weight, _floats(0))
     colors = graph("Gather", scene.colors, graph("Squeeze", place, graph.constant([0])), axis=1)

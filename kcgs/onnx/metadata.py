@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from importlib.metadata import version
 
 import onnx
 
-from kcgs.functional import RegionMap
-from kcgs.nn import GaussianField
+from kcgs.scene import Scene
 
-from .groups import Group
-from .lists import Entries, Tiles
+from .layout import Layout
 
 FORMAT = "kcgs.decoder"
 FORMAT_VERSION = "1"
@@ -31,60 +28,42 @@ def header(kind: str, cutoff: float, clamp: bool) -> dict[str, str]:
     }
 
 
-def describe(
-    field: GaussianField,
-    regions: RegionMap | None,
-    tiles: Tiles,
-    groups: Sequence[Group],
-    entries: Entries,
-    *,
-    recipe: str,
-    cutoff: float,
-    clamp: bool,
-) -> dict[str, str]:
+def describe(scene: Scene, layout: Layout, *, cutoff: float, clamp: bool) -> dict[str, str]:
     """Collect the facts, what was left out among them."""
+    field, regions = scene.field, scene.regions
     count = 1 if regions is None else regions.num_regions
-    ids = [0] if regions is None else regions.ids.tolist()
-    kind = "none" if count == 1 else "hard" if regions is None or regions.softness == 0.0 else "soft"
+    contours = "none" if count == 1 else "hard" if regions is None or regions.softness == 0.0 else "soft"
     return {
         **header("scene", cutoff, clamp),
-        "recipe": recipe,
+        "recipe": scene.metadata.get("recipe", ""),
         "height": str(field.size[0]),
         "width": str(field.size[1]),
         "channels": str(field.colors.shape[-1]),
         "num_gaussians": str(len(field)),
         "num_regions": str(count),
-        "region_ids": json.dumps(ids),
-        "contours": kind,
-        "left_out": json.dumps(_left_out(field, kind, tiles, groups, entries, clamp)),
+        "region_ids": json.dumps([0] if regions is None else regions.ids.tolist()),
+        "contours": contours,
+        "left_out": json.dumps(_left_out(scene, contours, layout, clamp)),
     }
 
 
-def _left_out(
-    field: GaussianField, kind: str, tiles: Tiles, groups: Sequence[Group], entries: Entries, clamp: bool
-) -> list[str]:
-    total = tiles.rows * tiles.cols
-    drawn = sum(len(group.tiles) for group in groups)
-    unseen = len(field) - len(entries.gaussian.unique())
-    said = []
-    if kind == "none":
-        said.append("regions: the scene has one")
-    else:
-        said.append(f"memberships in {total - len(tiles.windows)} of {total} tiles, which have one region")
-    if kind == "hard":
-        said.append("soft weights: contours are hard")
-    if not clamp:
-        said.append("the clip to [0, 1]")
-    if field.opacities is not None:
-        said.append("opacities: merged into the colours")
-    if unseen:
-        said.append(f"{unseen} Gaussians that touch no pixel")
-    if drawn < total:
-        said.append(f"{total - drawn} tiles that nothing touches")
-    said.append(
-        f"all but {100 * len(entries.tile) / max(1, total * len(field)):.2g} % of the pairs of Gaussian and tile"
-    )
-    return said
+def _left_out(scene: Scene, contours: str, layout: Layout, clamp: bool) -> list[str]:
+    total, windows = layout.tiles.total, len(layout.tiles.windows)
+    touched = sum(len(group.tiles) for group in layout.groups)
+    unseen = len(scene) - len(layout.gaussians.means)
+    pairs = sum(int(group.lengths.sum()) for group in layout.groups)
+    one_region = f"memberships in {total - windows} of {total} tiles, which have one region"
+    facts = {
+        "regions: the scene has one": contours == "none",
+        one_region: contours != "none",
+        "soft weights: contours are hard": contours == "hard",
+        "the clip to [0, 1]": not clamp,
+        "opacities: merged into the colours": scene.field.opacities is not None,
+        f"{unseen} Gaussians that touch no pixel": unseen > 0,
+        f"{total - touched} tiles that nothing touches": touched < total,
+        f"all but {100 * pairs / max(1, total * len(scene)):.2g} % of the pairs of Gaussian and tile": True,
+    }
+    return [fact for fact, holds in facts.items() if holds]
 
 
 def describe_decoder(model: onnx.ModelProto) -> dict[str, object]:
@@ -97,8 +76,9 @@ def describe_decoder(model: onnx.ModelProto) -> dict[str, object]:
         The metadata; lists as lists.
 
     Example:
+        >>> from kcgs import GaussianField
         >>> from kcgs.onnx import scene_decoder
-        >>> model = scene_decoder(GaussianField.random(10, (32, 48), seed=0))
+        >>> model = scene_decoder(Scene(GaussianField.random(10, (32, 48), seed=0)))
         >>> describe_decoder(model)["num_gaussians"]
         '10'
     """

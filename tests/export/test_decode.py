@@ -1,4 +1,4 @@
-"""export/decode.py: alone in an environment without torch and kcgs, its pictures, its refusals."""
+"""export/decode.py: alone in an environment without torch and kcgs, its images, its refusals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from PIL import Image
 from torch import Tensor
 
 import kcgs
-from kcgs import GaussianField, RegionMap, RegionSplatRenderer, save
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene, save
 from kcgs.data import save_image
 from kcgs.nn.renderer import render_image
 from kcgs.onnx import generic_decoder, scene_decoder, write_model
@@ -158,7 +158,7 @@ def write_header(path: Path, header: object, body: bytes) -> None:
     path.write_bytes(struct.pack("<Q", len(text)) + text + body)
 
 
-class TestGenericPictures:
+class TestGenericImages:
     @pytest.mark.parametrize("channels", [1, 3, 4])
     @pytest.mark.parametrize(
         ("options", "size"),
@@ -275,7 +275,7 @@ class TestSceneDecoders:
     def test_a_scene_of_the_library(self, decode: Any, tmp_path: Path, softness: float) -> None:
         field, regions = make_field(), RegionMap.from_labels(make_labels(), softness)
         decoder, output = tmp_path / "decoder.onnx", tmp_path / "out.png"
-        write_model(scene_decoder(field, regions, interactive=True), decoder)
+        write_model(scene_decoder(Scene(field, regions), interactive=True), decoder)
         assert decode(decoder, "-o", output, "--scale", 2) == Result(0, "", "")
         want = library_levels(tmp_path, field, regions, (74, 106))
         assert np.abs(read(output) - want).max() <= 1
@@ -376,7 +376,7 @@ class TestRefusals:
     @pytest.mark.parametrize("options", [["--size", "2000000x3"], ["--size", "0x3"], ["--scale", "1e300"]])
     def test_absurd_sizes(self, files: Files, refuses: Any, options: list[str]) -> None:
         for inputs in ((files.plain,), (files.generic, files.scene)):
-            refuses(r"the picture must have 1 to 1048576 pixels a side; got \d+x\d+$", *inputs, *options)
+            refuses(r"the image must have 1 to 1048576 pixels a side; got \d+x\d+$", *inputs, *options)
 
     @pytest.mark.parametrize("error", [MemoryError(), MemoryError("Unable to allocate 8 TiB"), KeyboardInterrupt()])
     def test_stopped(self, files: Files, refuses: Any, monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
@@ -474,7 +474,9 @@ class TestRefusals:
             (RegionMap.from_labels(fine, supersample=2), "supersample 2"),
         ):
             save(path, make_field(), regions)
-            refuses(rf"{path} has soft or finer contours \({what}\); a generic decoder draws hard", files.generic, path)
+            refuses(
+                rf"{path} has soft or finer contours \({what}\); a generic decoder renders hard", files.generic, path
+            )
 
     @pytest.mark.parametrize(
         ("edit", "pattern"),
@@ -544,7 +546,7 @@ class TestRefusals:
         write_header(path, header, body[:at] + struct.pack("<i", -1) + body[at + 4 :])
         refuses(f"{path}: labels must be non-negative; got -1", files.generic, path)
 
-    def test_damage_is_drawn_or_refused(self, files: Files, decode: Any, tmp_path: Path) -> None:
+    def test_damage_is_rendered_or_refused(self, files: Files, decode: Any, tmp_path: Path) -> None:
         content = files.scene.read_bytes()
         rng = random.Random(0)
         path, output = tmp_path / "damaged", tmp_path / "out.png"

@@ -1,4 +1,4 @@
-"""export/golden: torch's kernels, stored and fresh decoders all draw what the cases expect."""
+"""export/golden: torch's kernels, stored and fresh decoders all render what the cases expect."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 import torch
 
 import kcgs
-from kcgs import GaussianField, RegionMap, RegionSplatRenderer
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.onnx import generic_decoder, scene_decoder
 
 ROOT = Path(kcgs.__file__).resolve().parent.parent
@@ -71,7 +71,7 @@ def assert_same(got: Any, want: np.ndarray) -> None:
 
 
 def assert_decodes(session: onnxruntime.InferenceSession, case: Arrays) -> None:
-    """Draw every picture of a case."""
+    """Render every image of a case."""
     height, width = size_of(case)
     every = np.ones_like(case["visible"]) if "visible" in case else np.ones(1, np.float32)
     whole = np.array([0, 0, width, height], np.float32)
@@ -139,7 +139,7 @@ class TestCases:
 
 class TestTorch:
     @pytest.mark.parametrize("kernel", ["cpu", "tiled"])
-    def test_draws_them(self, case: Arrays, kernel: str) -> None:
+    def test_renders_them(self, case: Arrays, kernel: str) -> None:
         field, regions = scene_of(case)
         render = RegionSplatRenderer(cutoff=float(case["cutoff"]), backend=kernel)
         with torch.no_grad():
@@ -171,7 +171,7 @@ class Described:
         self.ids = np.unique(case["labels"]) if "labels" in case else np.zeros(1)
         self.of = np.searchsorted(self.ids, case["region_ids"]) if "labels" in case else np.zeros(len(self.colors), int)
 
-    def picture(self, size: tuple[int, ...], view: Any = None, factors: Any = None) -> np.ndarray:
+    def image(self, size: tuple[int, ...], view: Any = None, factors: Any = None) -> np.ndarray:
         left, top, right, bottom = (0, 0, self.size[1], self.size[0]) if view is None else view.tolist()
         across, down = (right - left) / size[1], (bottom - top) / size[0]
         x, y = left + (np.arange(size[1]) + 0.5) * across, top + (np.arange(size[0]) + 0.5) * down
@@ -226,13 +226,13 @@ class Described:
 
 
 class TestDescription:
-    def test_is_enough_to_draw_them(self, case: Arrays) -> None:
+    def test_is_enough_to_render_them(self, case: Arrays) -> None:
         decoder = Described(case)
         for size, want in wholes(case).items():
-            assert_same(decoder.picture(size), want)
-        assert_same(decoder.picture(case["image_view"].shape[1:], view=case["view"]), case["image_view"])
+            assert_same(decoder.image(size), want)
+        assert_same(decoder.image(case["image_view"].shape[1:], view=case["view"]), case["image_view"])
         if "visible" in case:
-            assert_same(decoder.picture(size_of(case), factors=case["visible"]), case["image_visible"])
+            assert_same(decoder.image(size_of(case), factors=case["visible"]), case["image_visible"])
 
 
 class TestOnnx:
@@ -247,7 +247,7 @@ class TestOnnx:
 
     def test_fresh_decoder(self, case: Arrays) -> None:
         field, regions = scene_of(case)
-        model = scene_decoder(field, regions, cutoff=float(case["cutoff"]), interactive=True)
+        model = scene_decoder(Scene(field, regions), cutoff=float(case["cutoff"]), interactive=True)
         assert_decodes(onnxruntime.InferenceSession(model.SerializeToString()), case)
 
     @pytest.mark.parametrize("name", HARD)

@@ -110,7 +110,8 @@ def saved(p: Parts, metadata: dict[str, str] | None = None) -> tuple[bytes, dict
 
 def decoder_of(p: Parts, **settings: Any) -> onnx.ModelProto:
     """Build the ONNX decoder of one scene."""
-    return scene_decoder(_field(p), _regions(p), **settings)
+    metadata = {"recipe": settings.pop("recipe")} if "recipe" in settings else None
+    return scene_decoder(Scene(_field(p), _regions(p), metadata), **settings)
 
 
 def decoder_of_any(**settings: Any) -> onnx.ModelProto:

@@ -272,8 +272,8 @@ class TestGraph:
             ({"cutoff": "1e-4"}, TypeError, r"cutoff must be a number in \[0, 1\); got '1e-4'"),
             ({"clamp": 1}, TypeError, "clamp must be True or False; got 1"),
             ({"channels": 0}, ValueError, "channels must be at least 1; got 0"),
-            ({"channels": 3.0}, TypeError, "channels must be an integer or None; got 3.0"),
-            ({"channels": True}, TypeError, "channels must be an integer or None; got True"),
+            ({"channels": 3.0}, TypeError, "channels must be an integer; got 3.0"),
+            ({"channels": True}, TypeError, "channels must be an integer; got True"),
         ],
     )
     def test_refuses(self, arguments: dict[str, object], error: type[Exception], message: str) -> None:

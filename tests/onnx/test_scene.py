@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs import GaussianField, RegionMap, RegionSplatRenderer
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.functional import region_splat
 from kcgs.onnx import describe_decoder, scene_decoder, write_model
 
@@ -17,7 +17,7 @@ SIZES = [(37, 53), (74, 106), (111, 160), (20, 31), (1, 1), (5, 300)]
 
 
 def blobs(size: tuple[int, int], count: int, seed: int = 0) -> Tensor:
-    """Cells about random points: `count` regions, ids not consecutive."""
+    """Voronoi regions of random points: `count` regions, ids not consecutive."""
     generator = torch.Generator().manual_seed(seed)
     points = torch.rand(count, 2, generator=generator) * torch.tensor(size)
     y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in size), indexing="ij")
@@ -46,14 +46,14 @@ def session_of(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
 
 
 def decode(session: onnxruntime.InferenceSession, size: tuple[int, int], **feeds: object) -> Tensor:
-    (picture,) = session.run(None, {"size": np.array(size), **feeds})
-    return torch.from_numpy(picture)[0]
+    (image,) = session.run(None, {"size": np.array(size), **feeds})
+    return torch.from_numpy(image)[0]
 
 
 def assert_same(
     field: GaussianField, regions: RegionMap | None, sizes: list[tuple[int, int]], cutoff: float = 1e-4, **options: bool
 ) -> None:
-    session = session_of(scene_decoder(field, regions, cutoff=cutoff, **options))  # type: ignore[arg-type]
+    session = session_of(scene_decoder(Scene(field, regions), cutoff=cutoff, **options))  # type: ignore[arg-type]
     bound = 1e-3 if cutoff >= 1e-4 else 1e-4
     for size in sizes:
         with torch.no_grad():
@@ -67,7 +67,7 @@ def assert_same(
 def test_every_constant_is_read(interactive: bool) -> None:
     """The runtime says so of others, at every load."""
     regions = RegionMap.from_labels(blobs((37, 53), 4), 0.8)
-    graphs = [scene_decoder(scattered(40, (37, 53), regions), regions, interactive=interactive).graph]
+    graphs = [scene_decoder(Scene(scattered(40, (37, 53), regions), regions), interactive=interactive).graph]
     read: set[str] = set()
     stored: set[str] = set()
     for graph in graphs:  # grows by the graphs inside
@@ -77,7 +77,7 @@ def test_every_constant_is_read(interactive: bool) -> None:
     assert stored and stored <= read
 
 
-class TestPicture:
+class TestImage:
     @pytest.mark.parametrize("cutoff", [1e-4, 1e-6, 0.0])
     @pytest.mark.parametrize("kind", ["none", "hard", "soft", "pairs", "fine"])
     def test_any_size(self, kind: str, cutoff: float) -> None:
@@ -104,7 +104,7 @@ class TestPicture:
         size = (64, 96)
         regions = RegionMap.from_labels(blobs(size, 4), 0.7)
         field = scattered(count, size, regions)
-        field.colors.data /= max(1, count // 300)  # a picture, not a sum of thousands
+        field.colors.data /= max(1, count // 300)  # an image, not a sum of thousands
         assert_same(field, regions, [size, (100, 100)])
 
     @pytest.mark.parametrize("channels", [1, 4])
@@ -130,13 +130,13 @@ class TestPicture:
             size=(48, 64),
         )
         assert_same(field, None, [(48, 64), (96, 128), (47, 65)])
-        assert "1 Gaussians that touch no pixel" in describe_decoder(scene_decoder(field))["left_out"]  # type: ignore[operator]
+        assert "1 Gaussians that touch no pixel" in describe_decoder(scene_decoder(Scene(field)))["left_out"]  # type: ignore[operator]
 
-    def test_nothing_to_draw(self) -> None:
+    def test_nothing_to_render(self) -> None:
         field = GaussianField(
             torch.tensor([[-1e4, 0.0]]), torch.tensor([[1.0, 0.0, 1.0]]), torch.ones(1, 3), size=(20, 30)
         )
-        assert decode(session_of(scene_decoder(field)), (40, 50)).abs().max() == 0
+        assert decode(session_of(scene_decoder(Scene(field))), (40, 50)).abs().max() == 0
 
     def test_opacities_and_clamp(self) -> None:
         field = GaussianField(
@@ -152,7 +152,7 @@ class TestPicture:
         field = scattered(30, size, regions)
         field.region_ids[::2] = 999
         assert_same(field, regions, [size, (33, 71)])
-        session = session_of(scene_decoder(field, regions, interactive=True))
+        session = session_of(scene_decoder(Scene(field, regions), interactive=True))
         view, every = np.array([0, 0, 50, 40], np.float32), np.ones(count, np.float32)
         with torch.no_grad():
             assert (
@@ -165,7 +165,7 @@ class TestInteractive:
         size = (48, 80)
         regions = RegionMap.from_labels(blobs(size, 5), 0.6)
         field = scattered(150, size, regions)
-        session = session_of(scene_decoder(field, regions, interactive=True))
+        session = session_of(scene_decoder(Scene(field, regions), interactive=True))
         whole = np.array([0, 0, 80, 48], np.float32)
         every = np.ones(5, np.float32)
         with torch.no_grad():
@@ -192,7 +192,7 @@ class TestInteractive:
         labels = blobs(size, 5)
         regions = RegionMap.from_labels(labels, softness)
         field = scattered(60, size, regions)
-        session = session_of(scene_decoder(field, regions, interactive=True))
+        session = session_of(scene_decoder(Scene(field, regions), interactive=True))
         held = torch.nn.functional.pad(labels[None, None].double(), (pad,) * 4, mode="replicate")[0, 0].long()
         shares = [regions.membership.weights(0, r, torch.float64) for r in range(5)]
         shares = [torch.nn.functional.pad(s[None, None], (pad,) * 4, mode="replicate")[0, 0] for s in shares]
@@ -212,7 +212,7 @@ class TestInteractive:
     def test_far_in(self) -> None:
         size = (48, 80)
         regions = RegionMap.from_labels(blobs(size, 5))
-        session = session_of(scene_decoder(scattered(150, size, regions), regions, interactive=True))
+        session = session_of(scene_decoder(Scene(scattered(150, size, regions), regions), interactive=True))
         view = np.array([40, 24, 40.5, 24.4], np.float32)
         assert torch.isfinite(decode(session, (400, 500), view=view, visible=np.ones(5, np.float32))).all()
 
@@ -225,7 +225,7 @@ class TestFile:
         hard = RegionMap.from_labels(labels)
         field = scattered(30, size, hard)
         field.means.data[0] = -1e4
-        facts = describe_decoder(scene_decoder(field, hard, recipe="best"))
+        facts = describe_decoder(scene_decoder(Scene(field, hard, {"recipe": "best"})))
         assert facts["region_ids"] == [0, 7] and facts["recipe"] == "best" and facts["contours"] == "hard"
         assert facts["format"] == "kcgs.decoder" and facts["height"] == "64" and facts["precision"] == "fp32"
         said = " ".join(facts["left_out"])  # type: ignore[arg-type]
@@ -234,7 +234,7 @@ class TestFile:
             and "soft weights" in said
             and "Gaussians that touch no pixel" in said
         )
-        plain = describe_decoder(scene_decoder(scattered(30, size)))
+        plain = describe_decoder(scene_decoder(Scene(scattered(30, size))))
         assert plain["contours"] == "none" and "regions: the scene has one" in plain["left_out"]  # type: ignore[operator]
 
     def test_leaves_out_operators(self) -> None:
@@ -243,36 +243,41 @@ class TestFile:
         labels[:, 40:] = 1
 
         def operators(field: GaussianField, regions: RegionMap | None, **options: bool) -> set[str]:
-            return {node.op_type for node in scene_decoder(field, regions, **options).graph.node}  # type: ignore[arg-type]
+            return {node.op_type for node in scene_decoder(Scene(field, regions), **options).graph.node}  # type: ignore[arg-type]
 
         soft, hard = (RegionMap.from_labels(labels, s) for s in (0.7, 0.0))
         field = scattered(30, size, hard)
         none, some = operators(field, None), operators(field, hard)
         assert "ReduceMax" in some and not any(name.startswith("Scatter") for name in some | operators(field, soft))
         assert "Clip" in operators(field, None, clamp=True)
-        counts = [len(scene_decoder(field, m).graph.node) for m in (None, hard)]
+        counts = [len(scene_decoder(Scene(field, m)).graph.node) for m in (None, hard)]
         assert counts[0] < counts[1]
         assert not {"Loop", "If", "NonZero"} & (none | some)
 
     def test_recipe_of_any_name(self) -> None:
-        assert describe_decoder(scene_decoder(scattered(3, (20, 30)), recipe="[mine] v2"))["recipe"] == "[mine] v2"
+        assert (
+            describe_decoder(scene_decoder(Scene(scattered(3, (20, 30)), metadata={"recipe": "[mine] v2"})))["recipe"]
+            == "[mine] v2"
+        )
 
     def test_same_scene_same_bytes(self) -> None:
         field = scattered(30, (40, 60))
-        assert len({scene_decoder(field).SerializeToString(deterministic=True) for _ in range(2)}) == 1
+        assert len({scene_decoder(Scene(field)).SerializeToString(deterministic=True) for _ in range(2)}) == 1
 
     def test_bytes_of_a_scene_with_regions(self, tmp_path: object) -> None:
-        from kcgs.io import scene_bytes
+        from kcgs.scene import scene_bytes
 
         size = (480, 854)
         regions = RegionMap.from_labels(blobs(size, 6), 0.7)
         field = scattered(1250, size, regions)
         field.cholesky.data *= 0.2
-        assert write_model(scene_decoder(field, regions), f"{tmp_path}/d.onnx") < 2.5 * scene_bytes(field, regions)
+        assert write_model(scene_decoder(Scene(field, regions)), f"{tmp_path}/d.onnx") < 2.5 * scene_bytes(
+            Scene(field, regions)
+        )
 
     def test_half_precision(self) -> None:
         field = scattered(40, (40, 60))
-        exact, half = (scene_decoder(field, precision=p) for p in ("fp32", "fp16"))
+        exact, half = (scene_decoder(Scene(field), precision=p) for p in ("fp32", "fp16"))
         assert describe_decoder(half)["precision"] == "fp16"
         assert half.ByteSize() < exact.ByteSize()
         change = (decode(session_of(exact), (80, 120)) - decode(session_of(half), (80, 120))).abs().max()
@@ -283,36 +288,45 @@ class TestFile:
         field.colors.data = torch.tensor([[90.03], [-90.03], [70.02], [-70.02]]).repeat(1, 3)
         field.means.data, field.cholesky.data = torch.full((4, 2), 20.3), torch.tensor([[9.01, 0.3, 8.7]]).repeat(4, 1)
         field.cholesky.data += 0.003 * torch.arange(4)[:, None]
-        with pytest.raises(ValueError, match=r"precision must be fp32 .* changes a value of the picture by 0\.\d+"):
-            scene_decoder(field, precision="fp16")
+        with pytest.raises(ValueError, match=r"precision must be fp32 .* changes a value of the image by 0\.\d+"):
+            scene_decoder(Scene(field), precision="fp16")
 
 
 class TestBadInput:
     @pytest.mark.parametrize(
         ("change", "words"),
         [
-            ({"field": 3}, "field must be a GaussianField"),
-            ({"regions": "x"}, "regions must be a RegionMap"),
-            ({"regions": torch.zeros(3, 4).long()}, "regions must be one map of the field's size"),
-            ({"regions": torch.zeros(2, 20, 30).long()}, "regions must be one map"),
-            ({"regions": torch.zeros(20, 30).long()}, "field must have region_ids"),
+            ({"scene": scattered(5, (20, 30))}, "scene must be a Scene; got GaussianField"),
             ({"precision": "fp8"}, "precision must be one of"),
             ({"cutoff": 2.0}, "cutoff must"),
         ],
     )  # fmt: skip
     def test_says_what_is_wrong(self, change: dict[str, object], words: str) -> None:
         with pytest.raises((ValueError, TypeError), match=words):
-            scene_decoder(**{"field": scattered(5, (20, 30)), **change})  # type: ignore[arg-type]
+            scene_decoder(**{"scene": Scene(scattered(5, (20, 30))), **change})  # type: ignore[arg-type]
+
+    @pytest.mark.parametrize(
+        ("shape", "words"),
+        [
+            ((3, 4), "regions must be one map of the field's size"),
+            ((2, 20, 30), "regions must be one map"),
+            ((20, 30), "field must have region_ids"),
+        ],
+    )
+    def test_map_that_does_not_fit(self, shape: tuple[int, ...], words: str) -> None:
+        with pytest.raises(ValueError, match=words):
+            scene_decoder(Scene(scattered(5, (20, 30)), torch.zeros(shape).long()))
 
     def test_resized_map(self) -> None:
         regions = RegionMap.from_labels(blobs((20, 30), 3), 0.7)
         field = scattered(5, (40, 60), regions.resize((40, 60)))
         with pytest.raises(ValueError, match="resized"):
-            scene_decoder(field, regions.resize((40, 60)))
+            scene_decoder(Scene(field, regions.resize((40, 60))))
 
     def test_batch(self) -> None:
-        with pytest.raises(ValueError, match="unbatched"):
-            scene_decoder(GaussianField(torch.rand(2, 3, 2), torch.ones(2, 3, 3), torch.rand(2, 3, 3), size=(8, 8)))
+        batch = GaussianField(torch.rand(2, 3, 2), torch.ones(2, 3, 3), torch.rand(2, 3, 3), size=(8, 8))
+        with pytest.raises(ValueError, match="scene must not be a batch"):
+            scene_decoder(Scene(batch))
 
 
 @pytest.mark.filterwarnings("ignore:.*:DeprecationWarning", "ignore:.*:FutureWarning", "ignore:.*:UserWarning")
@@ -329,7 +343,7 @@ def test_chains_with_kornia(tmp_path: object) -> None:
         dynamo=True, opset_version=18, dynamic_shapes=({**shape},), external_data=False, verbose=False,
     )  # fmt: skip
     field = scattered(20, (32, 48))
-    chain = ONNXSequential(scene_decoder(field), onnx.load(path), io_maps=[[("image", "color")]])
+    chain = ONNXSequential(scene_decoder(Scene(field)), onnx.load(path), io_maps=[[("image", "color")]])
     (got,) = chain(np.array([40, 50]))
     with torch.no_grad():
         want = RgbToGrayscale()(RegionSplatRenderer()(field, size=(40, 50))[None])

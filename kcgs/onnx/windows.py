@@ -1,62 +1,58 @@
-"""Memberships of the blocks of a graph."""
+"""Region weights of the blocks of a graph, sampled from the windows of tiles with several regions."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from kcgs.functional import RegionMap
+from kcgs.kernels.tiles import TILE
 
 from .axis import Axis
 from .graph import FLOAT, Graph, Value
-from .lists import TILE, Tiles, margin
+from .layout import Group, Integers
+from .tiles import Tiles, margin
 
 _STEPS = 65535
 
 
 class Windows:
-    """Samples memberships from the windows of tiles with several regions."""
+    """Samples region weights at the pixels of blocks, whose rows and columns are `down` and `across`."""
 
-    def __init__(self, graph: Graph, tiles: Tiles, down: Axis, across: Axis, factor: int, soft: bool) -> None:
-        """Take the windows.
-
-        Args:
-            graph: the graph.
-            tiles: with their windows.
-            down: rows.
-            across: columns.
-            factor: labels along a side of a pixel; 1 where contours are soft.
-            soft: whether contours are.
-        """
-        self.g, self.tiles, self.factor, self.soft = graph, tiles, factor, soft
+    def __init__(self, graph: Graph, tiles: Tiles, down: Axis, across: Axis, regions: RegionMap) -> None:
+        soft = self.soft = regions.softness != 0.0
+        factor = self.factor = 1 if soft else regions.supersample  # labels along a side of a pixel
+        self.g, self.tiles = graph, tiles
         self.side = factor * TILE + 2 * margin(factor)
         self.across = across.weights(factor, margin(factor), soft)
         self.down = graph("Transpose", down.weights(factor, margin(factor), soft), perm=[0, 2, 1])
         self.sides = across.side, down.side
 
-    def shares(self, chosen: NDArray[np.int64], regions: int, slots: Value, row: Value, col: Value) -> Value:
-        """Sample the memberships of blocks, (B, K, 1, P), column by column.
+    def weights(self, group: Group, slots: Value, row: Value, col: Value) -> Value:
+        """Sample the region weights of blocks, (B, K, 1, P), column by column.
 
         Args:
-            chosen: tiles of the group, (T,).
-            regions: K, at least those of every tile.
-            slots: the tile of each block, by place among the chosen, (B,).
+            group: with K regions, at least those of every tile.
+            slots: the tile of each block, by place in the group, (B,).
             row: row of each block, (B,).
             col: its column, (B,).
         """
-        g = self.g
-        windows = self._soft(chosen, regions) if self.soft else self._hard(chosen, regions)  # [T, K, S, S]
+        g, sample = self.g, self._soft if self.soft else self._hard
+        windows = sample(group.tiles, group.regions)  # [T, K, S, S]
         one = g.constant([1])
-        across, down = (g("Unsqueeze", g("Gather", w, at), one) for w, at in ((self.across, col), (self.down, row)))
-        shares = g("MatMul", g("MatMul", across, g("Gather", windows, slots)), down)
+        across, down = (
+            g("Unsqueeze", g("Gather", w, block), one) for w, block in ((self.across, col), (self.down, row))
+        )
+        weights = g("MatMul", g("MatMul", across, g("Gather", windows, slots)), down)
         if not self.soft:
-            best = g("ReduceMax", shares, one, keepdims=1)
-            shares = g("Cast", g("Equal", shares, best), to=FLOAT)
+            best = g("ReduceMax", weights, one, keepdims=1)
+            weights = g("Cast", g("Equal", weights, best), to=FLOAT)
         if self.factor > 1:
             k = g.constant([self.factor])
-            split = g("Concat", g.constant([0, regions]), self.sides[0], k, self.sides[1], k, axis=0)
-            shares = g("ReduceMean", g("Reshape", shares, split), g.constant([3, 5]), keepdims=0)
-        return g("Reshape", shares, g.constant([0, 0, 1, -1]))
+            split = g("Concat", g.constant([0, group.regions]), self.sides[0], k, self.sides[1], k, axis=0)
+            weights = g("ReduceMean", g("Reshape", weights, split), g.constant([3, 5]), keepdims=0)
+        return g("Reshape", weights, g.constant([0, 0, 1, -1]))
 
-    def _soft(self, chosen: NDArray[np.int64], regions: int) -> Value:
+    def _soft(self, chosen: Integers, regions: int) -> Value:
         """All but the last region's are stored, in 65,535 steps; they sum to one."""
         g = self.g
         windows = [self.tiles.windows[tile].numpy() for tile in chosen.tolist()]
@@ -65,14 +61,14 @@ class Windows:
         place = np.arange(regions)
         # which of the stored a region has; the one beyond them is zero
         which = np.where(place < counts - 1, np.cumsum(counts - 1)[:, None] - counts + 1 + place, len(stored))
-        planes = g("Cast", g.whole(np.round(stored * _STEPS).astype(np.int64)), to=FLOAT)
-        planes = g("Pad", g("Mul", planes, np.float32(1 / _STEPS)), np.array([0, 0, 0, 1, 0, 0]))
-        shares = g("Gather", planes, g.whole(which))
-        rest = g("Sub", np.float32(1), g("ReduceSum", shares, g.constant([1]), keepdims=1))
+        masks = g("Cast", g.whole(np.round(stored * _STEPS).astype(np.int64)), to=FLOAT)
+        masks = g("Pad", g("Mul", masks, np.float32(1 / _STEPS)), np.array([0, 0, 0, 1, 0, 0]))
+        weights = g("Gather", masks, g.whole(which))
+        rest = g("Sub", np.float32(1), g("ReduceSum", weights, g.constant([1]), keepdims=1))
         last = g("Cast", g.constant((place == counts - 1)[:, :, None, None]), to=FLOAT)
-        return g("Add", shares, g("Mul", rest, last))
+        return g("Add", weights, g("Mul", rest, last))
 
-    def _hard(self, chosen: NDArray[np.int64], regions: int) -> Value:
+    def _hard(self, chosen: Integers, regions: int) -> Value:
         """Labels are stored in as few bits as tell a tile's regions apart."""
         g = self.g
         labels = np.stack([self.tiles.windows[tile].numpy() for tile in chosen.tolist()]).swapaxes(1, 2)
