@@ -22,6 +22,7 @@ PACKAGES = (
     "kcgs",
     "kcgs.functional",
     "kcgs.nn",
+    "kcgs.editing",
     "kcgs.fit",
     "kcgs.rate",
     "kcgs.codec",
