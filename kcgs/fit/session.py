@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap, choose_widths, region_splat, smooth_contours
-from kcgs.nn import GaussianField, PruneResult, prune
+from kcgs.nn import GaussianField
+from kcgs.pruning import PruneResult, prune
+from kcgs.scene import Scene
 
 from .assign import refresh_ids
 from .config import FitConfig
@@ -228,10 +230,10 @@ class Session:
         field, regions, config = best.field(self.size), best.regions, self.config
         if config.refine_flat and reason == "iterations" and is_flat(self.image, regions, len(field)):
             field = self._polished(field, regions)
-        left = PruneResult(field, 0, 0.0)
+        left = PruneResult(Scene(field, regions), 0, 0.0)
         if config.prune > 0:
-            left = prune(field, regions, config.prune, cutoff=config.cutoff, backend=config.backend)
-        return FitResult(left.field, regions, self.monitor.history, reason, config, left.removed, left.change)
+            left = prune(left.scene, config.prune, cutoff=config.cutoff, backend=config.backend)
+        return FitResult(left.scene.field, regions, self.monitor.history, reason, config, left.removed, left.change)
 
     def _polished(self, field: GaussianField, regions: RegionMap | None) -> GaussianField:
         """Take a flat scene to its last digits, and write them down."""

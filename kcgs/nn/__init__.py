@@ -1,12 +1,9 @@
-"""Modules: a set of Gaussians, the renderer that renders it; pruning."""
+"""Modules: a set of Gaussians, and the renderer that renders it."""
 
 from .field import GaussianField
-from .prune import PruneResult, prune
 from .renderer import RegionSplatRenderer
 
 __all__ = [
     "GaussianField",
-    "PruneResult",
     "RegionSplatRenderer",
-    "prune",
 ]

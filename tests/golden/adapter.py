@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 import kcgs
-from kcgs import FitConfig, GaussianField, RegionMap, Scene, editing, nn, segment
+from kcgs import FitConfig, GaussianField, RegionMap, Scene, editing, segment
 from kcgs import functional as F
 from kcgs.codec import decode, encode
 from kcgs.fit import fit
@@ -27,6 +27,7 @@ from kcgs.fit.polish import polish
 from kcgs.fit.refine import refine_contours
 from kcgs.nn.renderer import render_image
 from kcgs.onnx import generic_decoder, scene_decoder
+from kcgs.pruning import prune
 from kcgs.rate import compress, fit_bytes
 
 ROOT = Path(kcgs.__file__).resolve().parent.parent
@@ -219,8 +220,8 @@ def _of(scene: Scene) -> dict[str, Any]:
 
 def run_prune(p: Parts, tolerance: float) -> dict[str, Any]:
     """Prune a scene."""
-    left = nn.prune(_field(p), _regions(p), tolerance)
-    return {**_of_scene(left.field, None), "removed": left.removed, "change": left.change}
+    left = prune(Scene(_field(p), _regions(p)), tolerance)
+    return {**_of_scene(left.scene.field, None), "removed": left.removed, "change": left.change}
 
 
 def run_propose(p: Parts, residual: Tensor, count: int) -> tuple[Any, ...]:
