@@ -1,4 +1,4 @@
-"""How likely a pixel's candidates are, written from the words of `contexts` and `prior`: for the decoder of maps."""
+"""How likely a pixel's candidates are, written from docs/format.md: for the decoder of maps."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STRETCH = [bisect.bisect_left(RISE, 16 * q + 8) - 3071 for q in range(4096)]
 
 
 class Prior:
-    """`prior`."""
+    """The tables of the label model."""
 
     def __init__(self) -> None:
         data = (Path(kcgs.codec.__file__).parent / "labels" / "prior.bin").read_bytes()

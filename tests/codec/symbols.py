@@ -1,4 +1,4 @@
-"""What files are made of, as the docstrings say it: a range decoder of plain numbers, for the decoders beside it."""
+"""What files are made of, as docs/format.md says it: a range decoder of plain numbers, for the decoders beside it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ SIXTY_FOUR = 2**64 - 1
 
 
 class Symbols:
-    """`labels`, **Bytes**; `models`, categorical symbols and Uniforms."""
+    """The range coder; categorical symbols and Uniforms."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.low, self.range = data, 0, SIXTY_FOUR
@@ -71,7 +71,7 @@ class Learnt:
 
 
 class Bits(Symbols):
-    """`labels`, **Bytes**."""
+    """Bits, numbers, unbounded numbers, adaptive bits."""
 
     def bit(self, chance: int) -> int:
         border = 2**24 - 256 * chance
@@ -99,7 +99,7 @@ class Bits(Symbols):
 
 
 class Bytes:
-    """`stream`."""
+    """The file."""
 
     def __init__(self, data: bytes) -> None:
         self.data = data

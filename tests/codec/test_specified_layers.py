@@ -68,14 +68,14 @@ def power(x: float) -> float:
 
 
 class File:
-    """`gaussians`, `cells`, `quantize`."""
+    """Gaussians."""
 
     def __init__(self, header: Header, index: Any, regions: int) -> None:
         self.size, self.channels, self.index, self.regions = header.size, header.channels, index, regions
         self.distortion = power(-header.qp / 32)
         self.lengths = Choices(2.0, *[1.0] * 9, *[0.3] * 12)
         self.margins = Choices(3.0, *[1.0] * 4, *[0.3] * 4)
-        self.stays = Choices(20.0, 0.5)
+        self.strays = Choices(20.0, 0.5)
         self.colors = [Magnitudes(_GREY), Magnitudes(_HUE, 3), Magnitudes(_HUE2, 3)]
         self.ratio = Magnitudes(_RATIO)
         self.outside, self.seen = 0.5, 20
@@ -173,7 +173,7 @@ class File:
         height, width = self.size
         at = [(min(max(math.floor(y), 0), height - 1), min(max(math.floor(x), 0), width - 1)) for x, y, *_ in found]
         ids = [int(self.index[place]) for place in at]
-        strays = [i for i, stray in enumerate(self.stays.read(symbols, len(ids))) if stray]
+        strays = [i for i, stray in enumerate(self.strays.read(symbols, len(ids))) if stray]
         for i in strays:
             ids[i] = (ids[i] + 1 + symbols.uniform(self.regions - 1)) % self.regions
         return ids

@@ -1,4 +1,4 @@
-"""A decoder of label maps, written from the words of the docstrings: plain numbers, and of the codec only its table."""
+"""A decoder of label maps, written from the words of docs/format.md: plain numbers, and of the codec only its table."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ QUIET = [(-2, 0), (-1, 0), *((dx, -1) for dx in range(-2, 8)), *((dx, -2) for dx
 
 
 class Map:
-    """`labels`, **Order** to **Pixels**; `waves`."""
+    """Labels: from the wavefront to pixels."""
 
     def __init__(self, bits: Bits, height: int, width: int, regions: int) -> None:
         self.bits, self.height, self.width, self.regions = bits, height, width, regions

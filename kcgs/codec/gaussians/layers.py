@@ -56,7 +56,7 @@ class LayerCoder:
             AdaptiveMagnitude(_WEIGHT * _HUE2, 3),
         ]
         self._ratio = AdaptiveMagnitude(_WEIGHT * _RATIO)
-        self._stays = AdaptiveSymbol(np.array([20.0, 0.5]))
+        self._strays = AdaptiveSymbol(np.array([20.0, 0.5]))
         self._count = AdaptiveNumber(np.array([2.0, *[1.0] * 9, *[0.3] * (_MOST_BITS - 9)]))
         self._occupancy = Occupancy(quantizer.size)
 
@@ -140,7 +140,7 @@ class LayerCoder:
             return np.zeros(len(means), np.int64)
         labels = lookup_regions(torch.from_numpy(means), self.regions.labels)
         under = self.regions.index_of(labels).numpy().astype(np.int64)
-        strays = self._stays.code(coder, len(under), None if ids is None else (ids != under).astype(np.int64))
+        strays = self._strays.code(coder, len(under), None if ids is None else (ids != under).astype(np.int64))
         away = np.flatnonzero(strays)
         # any but the one under it
         others = None if ids is None else (ids[away] - under[away] - 1) % self.num_regions
