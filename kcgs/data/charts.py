@@ -50,8 +50,7 @@ def chart_2x3(scale: int = 1) -> ChartSample:
         The chart, (200 scale, 300 scale); labels 0 to 5 in reading order.
 
     Raises:
-        TypeError: ``scale`` is no integer.
-        ValueError: ``scale`` is below 1.
+        TypeError, ValueError: ``scale`` is no integer of at least 1.
 
     Example:
         >>> image, labels = chart_2x3()
@@ -81,8 +80,7 @@ def chart_pie(scale: int = 1) -> ChartSample:
         The chart, (300 scale, 300 scale); label 0 is the background, 1 to 8 the sectors.
 
     Raises:
-        TypeError: ``scale`` is no integer.
-        ValueError: ``scale`` is below 1.
+        TypeError, ValueError: ``scale`` is no integer of at least 1.
 
     Example:
         >>> image, labels = chart_pie()

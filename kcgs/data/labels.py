@@ -132,8 +132,7 @@ def label_colors(n: int) -> Tensor:
         :math:`(n, 3)` float32 RGB in [0, 1].
 
     Raises:
-        TypeError: ``n`` is no integer.
-        ValueError: ``n`` is negative.
+        TypeError, ValueError: ``n`` is no integer of at least 0.
 
     Example:
         >>> tuple(label_colors(8).shape)
@@ -161,8 +160,7 @@ def colorize_labels(labels: Tensor) -> Tensor:
         :math:`(3, H, W)` float32 RGB in [0, 1], on the device of ``labels``.
 
     Raises:
-        TypeError: ``labels`` is no integer tensor.
-        ValueError: ``labels`` has another shape, is empty or has negative ids.
+        TypeError, ValueError: ``labels`` is no integer map (H, W) of non-negative ids, or is empty.
 
     Example:
         >>> image = colorize_labels(torch.tensor([[0, 255, 0]]))

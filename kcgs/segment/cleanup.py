@@ -29,8 +29,7 @@ def connected_regions(labels: Tensor) -> Tensor:
         :math:`(H, W)` int64 with ids 0 to R - 1 in raster order of each piece's first pixel.
 
     Raises:
-        TypeError: ``labels`` is no integer tensor.
-        ValueError: ``labels`` is not two-dimensional, is empty or has negative ids.
+        TypeError, ValueError: ``labels`` is no integer map (H, W) of non-negative ids, or is empty.
 
     Example:
         >>> connected_regions(torch.tensor([[5, 2, 5], [5, 2, 2]])).tolist()
@@ -49,8 +48,7 @@ def order_by_area(labels: Tensor) -> Tensor:
         :math:`(H, W)` int64 with ids 0 to R - 1.
 
     Raises:
-        TypeError: ``labels`` is no integer tensor.
-        ValueError: ``labels`` is not two-dimensional, is empty or has negative ids.
+        TypeError, ValueError: ``labels`` is no integer map (H, W) of non-negative ids, or is empty.
 
     Example:
         >>> order_by_area(torch.tensor([[9, 4, 4], [9, 4, 7]])).tolist()
@@ -79,8 +77,8 @@ def merge_small(labels: Tensor, min_size: int) -> Tensor:
         :math:`(H, W)` int64; remaining pieces keep their ids.
 
     Raises:
-        TypeError: ``labels`` is no integer tensor or ``min_size`` no integer.
-        ValueError: ``labels`` is not two-dimensional, is empty or has negative ids, or ``min_size`` is below 1.
+        TypeError, ValueError: ``labels`` is no integer map (H, W) of non-negative ids, or is empty; ``min_size`` is no
+            integer of at least 1.
 
     Example:
         >>> merge_small(torch.tensor([[3, 3, 3, 8], [3, 1, 3, 8]]), min_size=2).tolist()

@@ -113,7 +113,48 @@ def _names(labels: Tensor, classes: Tensor, names: Sequence[str]) -> dict[int, s
 
 
 _CLEANUP = tuple(field.name for field in fields(Cleanup))
-_methods: dict[str, Callable[..., Segmentation]] = {}
+
+
+class _Method:
+    """A registered function with its defaults of the clean-up options."""
+
+    def __init__(self, name: str, function: Callable[..., Tensor | Prediction], cleanup: Cleanup) -> None:
+        self.name, self.function, self.cleanup = name, function, cleanup
+        signature = inspect.signature(function)
+        parameters = [parameter for key, parameter in signature.parameters.items() if key not in _CLEANUP]
+        shared = [
+            inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=getattr(cleanup, key)) for key in _CLEANUP
+        ]
+        self.shared = [key for key in _CLEANUP if key in signature.parameters]
+        self.signature = signature.replace(parameters=[*parameters, *shared], return_annotation=Tensor)
+
+    def __call__(self, image: Any, **options: Any) -> Segmentation:
+        """Check the image, run the function, and clean what it returns."""
+        for option in options:
+            if option not in self.signature.parameters:
+                known = ", ".join(list(self.signature.parameters)[1:])
+                raise TypeError(f"segmentation method {self.name!r} has no option {option!r}; it takes {known}")
+        cleanup = replace(self.cleanup, **{key: options.pop(key) for key in _CLEANUP if key in options})
+        pixels = check_segment_image(image)
+        cleanup = replace(cleanup, min_size=cleanup.smallest(pixels[0].numel()))
+        try:
+            found = self.function(pixels, **options, **{key: getattr(cleanup, key) for key in self.shared})
+        except ImportError as error:
+            module = (error.name or "").partition(".")[0]
+            if module in ("", "kcgs"):
+                raise
+            line = f"pip install {_PACKAGES.get(module, module)}"
+            raise ImportError(f"segmentation method {self.name!r} needs {module}: {line} ({error})") from error
+        found = Prediction(found) if isinstance(found, Tensor) else found
+        if found.labels.shape != pixels.shape[1:]:
+            raise ValueError(
+                f"labels from segmentation method {self.name!r} must have the image's size "
+                f"{tuple(pixels.shape[1:])}; got {tuple(found.labels.shape)}"
+            )
+        return cleanup.apply(pixels, found)
+
+
+_methods: dict[str, _Method] = {}
 
 
 def register(name: str, cleanup: Cleanup | None = None) -> Callable[[Callable[..., Tensor | Prediction]], Segmenter]:
@@ -147,57 +188,18 @@ def register(name: str, cleanup: Cleanup | None = None) -> Callable[[Callable[..
         raise ValueError(f"name must be a non-empty string; got {name!r}")
     if name in _methods:
         raise ValueError(f"there is a segmentation method {name!r} already")
-    defaults = cleanup or Cleanup()
 
     def add(function: Callable[..., Tensor | Prediction]) -> Segmenter:
-        signature = _signature(function, defaults)
-        shared = [key for key in _CLEANUP if key in inspect.signature(function).parameters]
-
-        def run(image: Any, **options: Any) -> Segmentation:
-            for option in options:
-                if option not in signature.parameters:
-                    known = ", ".join(list(signature.parameters)[1:])
-                    raise TypeError(f"segmentation method {name!r} has no option {option!r}; it takes {known}")
-            rules = replace(defaults, **{key: options.pop(key) for key in _CLEANUP if key in options})
-            pixels = check_segment_image(image)
-            rules = replace(rules, min_size=rules.smallest(pixels[0].numel()))
-            try:
-                found = function(pixels, **options, **{key: getattr(rules, key) for key in shared})
-            except ImportError as error:
-                module = (error.name or "").partition(".")[0]
-                if module in ("", "kcgs"):
-                    raise
-                package = _PACKAGES.get(module, module)
-                raise ImportError(
-                    f"segmentation method {name!r} needs {module}: pip install {package} ({error})"
-                ) from error
-            found = Prediction(found) if isinstance(found, Tensor) else found
-            if found.labels.shape != pixels.shape[1:]:
-                raise ValueError(
-                    f"labels from segmentation method {name!r} must have the image's size {tuple(pixels.shape[1:])}; "
-                    f"got {tuple(found.labels.shape)}"
-                )
-            return rules.apply(pixels, found)
+        method = _methods[name] = _Method(name, function, cleanup or Cleanup())
 
         @functools.wraps(function)
         def segmenter(image: Any, **options: Any) -> Tensor:
-            return run(image, **options).labels
+            return method(image, **options).labels
 
-        segmenter.__signature__ = signature  # type: ignore[attr-defined]
-        _methods[name] = run
+        segmenter.__signature__ = method.signature  # type: ignore[attr-defined]
         return segmenter
 
     return add
-
-
-def _signature(function: Callable[..., Any], defaults: Cleanup) -> inspect.Signature:
-    """Return the function's own parameters, then the clean-up options with the method's defaults."""
-    signature = inspect.signature(function)
-    own = [parameter for key, parameter in signature.parameters.items() if key not in _CLEANUP]
-    shared = [
-        inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=getattr(defaults, key)) for key in _CLEANUP
-    ]
-    return signature.replace(parameters=[*own, *shared], return_annotation=Tensor)
 
 
 def available_methods() -> list[str]:
