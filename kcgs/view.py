@@ -13,8 +13,6 @@ from typing import Any, ClassVar
 from urllib.parse import quote, urlencode
 
 from kcgs._shipped import shipped_folder
-from kcgs.functional import RegionMap
-from kcgs.nn import GaussianField
 from kcgs.onnx import scene_decoder, write_model
 from kcgs.scene import Scene
 
@@ -63,8 +61,7 @@ class _Handler(SimpleHTTPRequestHandler):
 
 
 def serve(
-    field: GaussianField,
-    regions: RegionMap | None,
+    scene: Scene,
     *,
     name: str = "scene",
     original: Path | None = None,
@@ -76,8 +73,7 @@ def serve(
     """Export a scene to a temporary folder and serve the viewer on loopback until Ctrl-C.
 
     Args:
-        field: unbatched.
-        regions: what the field is drawn with.
+        scene: unbatched.
         name: the page's title for it.
         original: an image file to compare with.
         port: 0 for any that is free.
@@ -98,7 +94,7 @@ def serve(
     if original is not None and not original.is_file():
         raise FileNotFoundError(f"--original must be an image file; {original} is not there")
     with tempfile.TemporaryDirectory() as folder:
-        model = scene_decoder(Scene(field, regions), interactive=True)
+        model = scene_decoder(scene, interactive=True)
         write_model(model, Path(folder) / "decoder.onnx")
         query = {"decoder": "scene/decoder.onnx", "name": name}
         if original is not None:

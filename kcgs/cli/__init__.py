@@ -1,14 +1,15 @@
 """The command `kcgs`."""
 
 import logging
+import re
 import sys
 
 import typer
 
-from . import batch, commands, decoders, files, segmentation  # each puts its commands into `app`
+from . import bench, decoders, fit, many, scenes, segmentation  # each puts its commands into `app`
 from .common import app
 
-__all__ = ["app", "batch", "commands", "decoders", "files", "main", "segmentation"]
+__all__ = ["app", "bench", "decoders", "fit", "main", "many", "scenes", "segmentation"]
 
 
 def main() -> None:
@@ -18,5 +19,14 @@ def main() -> None:
     try:
         app(prog_name="kcgs")
     except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
-        typer.echo(f"kcgs: {' '.join(str(error).split()) or type(error).__name__}", err=True)
+        message = " ".join(str(error).split()) or type(error).__name__
+        typer.echo(f"kcgs: {_name_options(message, sys.argv[1])}", err=True)
         sys.exit(1)
+
+
+def _name_options(message: str, command: str) -> str:
+    """Name the options of a command where the library's message begins with the name of an argument."""
+    for parameter in typer.main.get_command(app).commands[command].params:  # type: ignore[attr-defined]
+        option = max(parameter.opts, key=len) if parameter.param_type_name == "option" else parameter.metavar
+        message = re.sub(rf"^{parameter.name}\b(?=:| must)", option, message)
+    return message

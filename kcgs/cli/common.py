@@ -1,4 +1,4 @@
-"""What the commands share: arguments, tables, progress."""
+"""What the commands share: the app, arguments, reports, progress."""
 
 from __future__ import annotations
 
@@ -47,6 +47,7 @@ def _scene_path(text: str) -> Path:
 SceneFile = Annotated[
     Path, typer.Argument(help="Scene file (.safetensors or .kcgs), or zoo:NAME.", metavar="SCENE", parser=_scene_path)
 ]
+ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
 
@@ -60,12 +61,12 @@ def check_output(path: Path, *suffixes: str, option: str = "--output") -> None:
         raise FileNotFoundError(f"{option} needs an existing folder; {str(path.resolve().parent)!r} is not there")
 
 
-def write_file(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all."""
+def write_file(path: Path, data: bytes) -> int:
+    """Write a file whole or not at all; return its bytes."""
     from kcgs._atomic import atomic_path
 
     with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
+        return temporary.write_bytes(data)
 
 
 def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
@@ -86,22 +87,11 @@ def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
 class Progress:
     """Bar on standard error, only on a terminal, and Ctrl-C as a wish to stop; a second Ctrl-C ends the program."""
 
-    def __init__(self, iterations: int, max_seconds: float | None) -> None:
-        from rich.console import Console
-        from rich.progress import Progress as Bar
-        from rich.progress import TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    def __init__(self, iterations: int) -> None:
+        from rich.progress import TextColumn, TimeElapsedColumn
 
         self.interrupted = False
-        self._max_seconds = max_seconds
-        console = Console(stderr=True)
-        self._bar = Bar(
-            *Bar.get_default_columns()[:2],
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[quality]}"),
-            console=console,
-            disable=not console.is_terminal,
-        )
+        self._bar = progress_bar(TimeElapsedColumn(), TextColumn("{task.fields[quality]}"))
         self._task = self._bar.add_task("fit", total=iterations, quality="")
 
     def __enter__(self) -> Progress:
@@ -121,3 +111,13 @@ class Progress:
         """Show the iteration; say whether to stop."""
         self._bar.update(self._task, completed=iteration, quality=f"{entry.psnr:.2f} dB")
         return self.interrupted
+
+
+def progress_bar(*columns: Any) -> Any:
+    """Make a bar on standard error, shown only on a terminal, with columns beside its own and the remaining time."""
+    from rich.console import Console
+    from rich.progress import Progress, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    first = Progress.get_default_columns()[:2]
+    return Progress(*first, *columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal)

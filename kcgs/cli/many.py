@@ -1,144 +1,214 @@
-"""What `kcgs fit-many` does with one image, in whichever process that happens."""
+"""The command that fits many images, and its table."""
 
 from __future__ import annotations
 
-import hashlib
+import csv
+import glob
 import math
-import time
-import warnings
-from functools import lru_cache
+import os
+import statistics
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Annotated, Any, Literal
 
-from .fitting import fit_into, measure_scene, read_regions
+import typer
 
-if TYPE_CHECKING:
-    from kcgs.fit import FitConfig
+from kcgs._atomic import atomic_path
+from kcgs.engine import Done, run_jobs
 
-# of the note in a scene that says what it was made from
-_NOTE = "fit"
+from . import options
+from .common import IMAGES, Json, app, print_report, progress_bar
+from .many_jobs import Order, Outcome, fit_one
 
-
-class Order(NamedTuple):
-    """An image to be fitted, and how."""
-
-    image: Path
-    output: Path
-    regions: str
-    """auto, none, or where the masks are."""
-    masks: tuple[Path, ...]
-    """The files there that have the image's stem, one where all is well."""
-    num_gaussians: int
-    target_bytes: int | None
-    """Of a `.kcgs` file; None: as many Gaussians as said."""
-    recipe: str
-    config: FitConfig
-    seed: int
-    known: str
-    """Which fit the table has figures of."""
+_MILLION = 1_000_000
+_METRICS = ("psnr", "ssim", "ms_ssim", "ef_psnr", "ef_ssim", "num_gaussians", "seconds", "bytes", "bits_per_pixel")
+_COLUMNS = ("image", *_METRICS, "error", "core_seconds", "fit")
 
 
-class Outcome(NamedTuple):
-    """What the table gets."""
+@app.command("fit-many")
+def fit_many_command(
+    patterns: Annotated[
+        list[str], typer.Argument(metavar="PATTERN...", help="Images, folders of images, or quoted patterns.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the scenes or files, and results.csv.")],
+    regions: Annotated[
+        str,
+        typer.Option(metavar="DIR|auto|none", help="Folder of masks with the images' stems, or auto, or none."),
+    ] = "auto",
+    num_gaussians: options.Gaussians = None,
+    recipe: options.Recipe = "best",
+    iterations: options.Iterations = None,
+    max_seconds: options.MaxSeconds = None,
+    target_psnr: options.TargetPsnr = None,
+    target_bytes: options.TargetBytes = None,
+    suffix: Annotated[
+        Literal[".safetensors", ".kcgs"] | None,
+        typer.Option(help="What is written; default: .safetensors, with --target-bytes .kcgs."),
+    ] = None,
+    keep_contours: options.KeepContours = False,
+    seed: options.Seed = 0,
+    backend: options.KernelName = "auto",
+    engine: options.EngineName = "local",
+    workers: Annotated[int | None, typer.Option(min=1, help="Images at a time; default: cores / --threads.")] = None,
+    threads: Annotated[int, typer.Option(min=1, help="Threads of each fit.")] = 1,
+    price: Annotated[
+        float | None, typer.Option("--price-per-core-hour", min=0.0, help="In dollars: what a million images cost.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Fit many images, each into a scene or a compressed file of its own.
 
-    fit: str
-    """Hash of the image, the mask and all settings; of a compressed file its own too."""
-    figures: dict[str, float] | None
-    """None: the file was there, and its figures are in the table."""
-    core_seconds: float
-    """Processor time of all that was done for the image, in all threads; NaN: nothing was fitted."""
-    warnings: tuple[str, ...]
-
-
-def fit_one(order: Order) -> Outcome:
-    """Fit an image and write its scene or file, unless it is there from the same image and settings."""
-    _warm_up(order.config, order.regions == "auto")
-    # not wall time, which also counts what the machine does for others
-    start = time.process_time()
-    fit = _fingerprint(order)
-    is_there = _is_made(order, fit)
-    if is_there and order.known == _mark(order, fit):
-        return Outcome(order.known, None, math.nan, ())
-    # a warning of one image among many must say which image: the caller does
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        figures = _figures(order) if is_there else _fit(order, fit)
-    core_seconds = math.nan if is_there else time.process_time() - start
-    said = tuple(str(warning.message) for warning in caught if issubclass(warning.category, UserWarning))
-    return Outcome(_mark(order, fit), figures, core_seconds, said)
-
-
-def _fit(order: Order, fit: str) -> dict[str, float]:
-    from kcgs.data import load_image
-
-    picture = load_image(order.image)
-    labels = read_regions(_source(order), picture, warnings.warn)
-    fitted = fit_into(
-        order.output, picture, labels, order.num_gaussians, order.target_bytes,
-        recipe=order.recipe, seed=order.seed, config=order.config,
-        on_step=None, checkpoint=None, resume=False, notes={_NOTE: fit},
+    The same command again goes on where an earlier one was stopped: what is there from the same image, mask
+    and settings is kept. One image's failure stops no other; with any, the exit status is 1.
+    """
+    if target_bytes is not None and suffix == ".safetensors":
+        options.exclude("--target-bytes", suffix=suffix)
+    request = options.fit_request(
+        num_gaussians=num_gaussians, target_bytes=target_bytes, recipe=recipe, seed=seed, backend=backend,
+        keep_contours=keep_contours, iterations=iterations, max_seconds=max_seconds, target_psnr=target_psnr,
     )  # fmt: skip
-    seconds = fitted.result.history[-1].seconds
-    return measure_scene(fitted.field, fitted.regions, picture, labels, seconds, fitted.written)
+    images = _expand(patterns)
+    masks = {} if regions in ("auto", "none") else _masks(Path(regions))
+    # absolute: a worker on a cluster has a working folder of its own
+    output.mkdir(parents=True, exist_ok=True)
+    folder, table = output.absolute(), Table(output / "results.csv")
+    ending = suffix or (".safetensors" if target_bytes is None else ".kcgs")
 
+    def order(image: Path) -> Order:
+        target = folder / f"{image.stem}{ending}"
+        return Order(image, target, regions, masks.get(image.stem, ()), request, table.get(image).get("fit", ""))
 
-def _figures(order: Order) -> dict[str, float]:
-    """Measure a scene whose figures were lost with the process that should have written them."""
-    from kcgs.data import load_image
-    from kcgs.io import load
-
-    picture, scene = load_image(order.image), load(order.output)
-    labels = read_regions(_source(order), picture, warnings.warn)
-    return measure_scene(scene.field, scene.regions, picture, labels, math.nan, order.output.stat().st_size)
-
-
-def _source(order: Order) -> str:
-    if order.regions in ("auto", "none"):
-        return order.regions
-    if len(order.masks) != 1:
-        found = ", ".join(path.name for path in order.masks) or "none"
-        raise ValueError(f"{order.regions} must hold one mask {order.image.stem}.*; found {found}")
-    return str(order.masks[0])
-
-
-def _fingerprint(order: Order) -> str:
-    settings = order.config.model_dump_json(), order.num_gaussians, order.target_bytes, order.output.suffix, order.seed
-    source = _source(order)
-    digest = hashlib.sha256(repr(settings).encode())
-    digest.update(order.image.read_bytes())
-    digest.update(Path(source).read_bytes() if order.masks else source.encode())
-    return digest.hexdigest()[:20]
-
-
-def _is_made(order: Order, fit: str) -> bool:
-    from kcgs.io import load
-
-    if order.output.suffix == ".kcgs":
-        return order.output.is_file() and order.known == _mark(order, fit)
+    orders = [order(image) for image in images]
+    if workers is None and engine == "local":
+        workers = max(1, _cores() // threads)
+    # one image needs no process of its own
+    workers = None if workers is None else min(workers, len(orders))
+    done = run_jobs(fit_one, orders, engine=engine, workers=workers, threads=threads)
     try:
-        return load(order.output).metadata.get(_NOTE) == fit
-    except (FileNotFoundError, ValueError):
-        return False
+        kept, failed = _write_down(done, images, table)
+    finally:
+        table.write()
+    report = _summary(table, images, kept, failed, price)
+    print_report(report if as_json else {k: v for k, v in report.items() if v is not None}, as_json, str(output))
+    for line in failed.values():
+        typer.echo(f"kcgs: {line}", err=True)
+    if failed:
+        raise typer.Exit(1)
 
 
-def _mark(order: Order, fit: str) -> str:
-    """Return what the table says of an output: a compressed file has no notes, and is known by its bytes."""
-    if order.output.suffix != ".kcgs":
-        return fit
-    return f"{fit}-{hashlib.sha256(order.output.read_bytes()).hexdigest()[:8]}"
+class Table:
+    """Rows by the stem of their image; those of an earlier call are kept."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._rows: dict[str, dict[str, str]] = {}
+        if path.is_file():
+            with path.open(newline="", encoding="utf-8") as file:
+                # a row that was cut off by a kill is not there
+                rows = [row for row in csv.DictReader(file) if set(row) == set(_COLUMNS) and None not in row.values()]
+            self._rows = {Path(row["image"]).stem: row for row in rows}
+        self.write()
+
+    def get(self, image: Path) -> dict[str, str]:
+        """Return an image's row, empty where there is none."""
+        return self._rows.get(image.stem, {})
+
+    def put(self, image: Path, **values: Any) -> None:
+        """Set an image's row, and write it down at once; what is not said is left empty."""
+        row = {"image": str(image), **{name: _text(values.get(name, "")) for name in _COLUMNS[1:]}}
+        self._rows[image.stem] = row
+        with self._path.open("a", newline="", encoding="utf-8") as file:
+            csv.DictWriter(file, _COLUMNS).writerow(row)
+
+    def write(self) -> None:
+        """Write the table anew, sorted, one row per image: appended rows are in the order in which fits end."""
+        with atomic_path(self._path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, _COLUMNS)
+            writer.writeheader()
+            writer.writerows(self._rows[stem] for stem in sorted(self._rows))
+
+    def column(self, name: str, images: list[Path]) -> list[float]:
+        """Return the numbers of a column, where there are any."""
+        return [float(text) for image in images if (text := self.get(image).get(name))]
 
 
-@lru_cache(maxsize=4)
-def _warm_up(config: FitConfig, segments: bool) -> None:
-    """Load and compile what a worker needs once: no image's cost shall count it."""
-    import torch
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.6g}"
+    return str(value)
 
-    from kcgs.fit import warm_up
-    from kcgs.nn import GaussianField
 
-    warm_up(config)
-    # as large as MS-SSIM needs
-    ramp = torch.linspace(0.0, 1.0, 192).expand(3, 192, 192)
-    picture = torch.where(ramp > 0.4, 0.2 * ramp, 0.5 + 0.5 * ramp)
-    labels = read_regions("auto" if segments else "none", picture, warnings.warn)
-    measure_scene(GaussianField.random(8, (192, 192), seed=0), None, picture, labels, None, 0)
+def _expand(patterns: list[str]) -> list[Path]:
+    """Return the images that patterns mean, as absolute paths, each once; two with one stem are refused."""
+    images: dict[Path, None] = {}
+    for pattern in patterns:
+        path = Path(pattern)
+        if path.is_file():
+            found = [path]
+        else:
+            names = path.iterdir() if path.is_dir() else map(Path, glob.glob(pattern, recursive=True))
+            found = sorted(name for name in names if name.suffix.lower() in IMAGES and name.is_file())
+        if not found:
+            raise ValueError(f"PATTERN must name images; nothing found for {pattern!r}")
+        images |= dict.fromkeys(name.absolute() for name in found)
+    by_stem: dict[str, Path] = {}
+    for image in images:
+        other = by_stem.setdefault(image.stem, image)
+        if other != image:
+            raise ValueError(f"images must have different stems, after which scenes are named; got {other} and {image}")
+    return list(images)
+
+
+def _masks(folder: Path) -> dict[str, tuple[Path, ...]]:
+    if not folder.is_dir():
+        raise ValueError(f"--regions must be auto, none or a folder of masks; got {str(folder)!r}")
+    found: dict[str, tuple[Path, ...]] = {}
+    for path in sorted(folder.absolute().iterdir()):
+        if path.suffix.lower() in (*IMAGES, ".npy", ".gif"):
+            found[path.stem] = (*found.get(path.stem, ()), path)
+    return found
+
+
+def _cores() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _write_down(done: Iterable[Done[Outcome]], images: list[Path], table: Table) -> tuple[int, dict[Path, str]]:
+    """Put what ends into the table; return how many were kept, and what to say of those that failed."""
+    from rich.progress import MofNCompleteColumn
+
+    kept, failed = 0, dict[Path, str]()
+    with progress_bar(MofNCompleteColumn()) as progress:
+        task = progress.add_task("fit", total=len(images))
+        for ended in done:
+            image, outcome = images[ended.index], ended.result
+            if outcome is None:
+                failed[image] = f"{image.name}: {ended.error}"
+                table.put(image, error=str(ended.error))
+            elif outcome.metrics is None:
+                kept += 1
+            else:
+                kept += math.isnan(outcome.core_seconds)
+                table.put(image, **outcome.metrics, core_seconds=outcome.core_seconds, fit=outcome.fit)
+            for warning in () if outcome is None else outcome.warnings:
+                progress.console.print(f"{image.name}: {warning}", markup=False, highlight=False, soft_wrap=True)
+            progress.update(task, advance=1, description=f"fit, {len(failed)} failed" if failed else "fit")
+    return kept, failed
+
+
+def _summary(
+    table: Table, images: list[Path], kept: int, failed: dict[Path, str], price: float | None
+) -> dict[str, Any]:
+    """Sum up the images of this call; cost is that of all of them that were ever measured in this folder."""
+    good = [image for image in images if image not in failed]
+    counts = {"images": len(images), "fitted": len(good) - kept, "kept": kept, "failed": len(failed)}
+    report: dict[str, Any] = dict(counts)
+    for name in ("psnr", "ef_psnr", "num_gaussians", "bits_per_pixel", "core_seconds"):
+        values = table.column(name, good)
+        report[f"mean_{name}"] = statistics.fmean(values) if values else None
+    seconds = report["mean_core_seconds"]
+    hours = None if seconds is None else seconds * _MILLION / 3600
+    report["core_hours_per_million"] = hours
+    report["dollars_per_million"] = None if hours is None or price is None else hours * price
+    return report

@@ -1,9 +1,8 @@
-"""Options that several commands have, and the settings of a fit that they stand for."""
+"""Options that several commands have, and the fit that they request."""
 
 from __future__ import annotations
 
-from enum import Enum
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
 
@@ -13,30 +12,15 @@ if TYPE_CHECKING:
 DEFAULT_GAUSSIANS = 1000
 
 
-class Backend(str, Enum):
-    """Kernels that can be named."""
-
-    auto = "auto"
-    reference = "reference"
-    tiled = "tiled"
-    cpu = "cpu"
-    cuda = "cuda"
-
-
-class Engine(str, Enum):
-    """Where independent jobs run."""
-
-    local = "local"
-    ray = "ray"
-
-
+Backend = Literal["auto", "reference", "tiled", "cpu", "cuda"]
+Engine = Literal["local", "ray"]
 Gaussians = Annotated[
     int | None,
     typer.Option("-n", "--num-gaussians", min=1, help=f"Number of Gaussians; default: {DEFAULT_GAUSSIANS}."),
 ]
 Recipe = Annotated[str, typer.Option(help="Recipe by name.")]
 Iterations = Annotated[int | None, typer.Option(min=1, help="Default: the recipe's.")]
-MaxSeconds = Annotated[float | None, typer.Option(help="The best picture in this wall time.")]
+MaxSeconds = Annotated[float | None, typer.Option(help="The best fit in this wall time.")]
 TargetPsnr = Annotated[
     float | None, typer.Option(help="As few Gaussians as reach this PSNR in dB, at most --num-gaussians.")
 ]
@@ -49,35 +33,63 @@ KernelName = Annotated[Backend, typer.Option(help="Kernel.")]
 EngineName = Annotated[
     Engine, typer.Option(help="local: processes of this machine; ray: the cluster at RAY_ADDRESS, or one started here.")
 ]
+Scale = Annotated[float | None, typer.Option(help="Magnification.")]
+Size = Annotated[str | None, typer.Option(metavar="WxH", help="Width and height in pixels.")]
 
 
-def check_budget(target_bytes: int | None, **excluded: object) -> None:
-    """Refuse what a size in bytes leaves no room for: options by their names, None where they were not given."""
-    for name, given in excluded.items():
-        if target_bytes is not None and given is not None:
-            option = "--" + name.replace("_", "-")
-            raise typer.BadParameter(f"--target-bytes chooses the Gaussians itself and excludes {option}")
+class FitRequest(NamedTuple):
+    """What is asked of a fit besides the image and its regions."""
+
+    num_gaussians: int
+    target_bytes: int | None
+    """Of a `.kcgs` file, which then chooses the number of Gaussians; None: as many as said."""
+    recipe: str
+    config: FitConfig
+    seed: int
 
 
-def make_config(
-    recipe: str,
-    regions: str,
+def fit_request(
     *,
+    num_gaussians: int | None,
+    target_bytes: int | None,
+    recipe: str,
+    seed: int,
+    backend: Backend,
+    keep_contours: bool,
     iterations: int | None,
     max_seconds: float | None,
     target_psnr: float | None,
-    keep_contours: bool,
-    backend: Backend,
-) -> FitConfig:
-    """Return the settings that the options ask for."""
+) -> FitRequest:
+    """Return what the options ask for; None where one was not given."""
     from kcgs.fit import FitConfig
 
+    if target_bytes is not None:
+        exclude("--target-bytes", num_gaussians=num_gaussians, target_psnr=target_psnr)
     settings = {"iterations": iterations, "max_seconds": max_seconds, "target_psnr": target_psnr}
-    given: dict[str, Any] = {key: value for key, value in settings.items() if value is not None}
+    given = {key: value for key, value in settings.items() if value is not None}
     if keep_contours:
-        return FitConfig.from_recipe(recipe, backend=backend.value, move_contours=False, merge_regions=False, **given)
-    if regions == "auto":
-        # nobody gave these contours, so none are to be kept near
-        free = FitConfig.from_recipe("best-refined")
-        given |= {"max_move": free.max_move, "contour_rise": free.contour_rise}
-    return FitConfig.from_recipe(recipe, backend=backend.value, **given)
+        given |= {"move_contours": False, "merge_regions": False}
+    config = FitConfig.from_recipe(recipe, backend=backend, **given)
+    return FitRequest(num_gaussians or DEFAULT_GAUSSIANS, target_bytes, recipe, config, seed)
+
+
+def exclude(option: str, **others: object) -> None:
+    """Refuse options beside another one; None where one was not given."""
+    for name, given in others.items():
+        if given is not None:
+            raise typer.BadParameter(f"{option} excludes --{name.replace('_', '-')}")
+
+
+def target_size(size: tuple[int, int], scale: float | None, wanted: str | None) -> tuple[int, int]:
+    """Return the (height, width) that the options --scale and --size ask for."""
+    if scale is not None and wanted is not None:
+        raise typer.BadParameter("give --scale or --size, not both")
+    if wanted is not None:
+        width, _, height = wanted.lower().partition("x")
+        if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
+            raise typer.BadParameter(f"--size must be WxH, such as 640x480; got {wanted!r}")
+        return int(height), int(width)
+    factor = 1.0 if scale is None else scale
+    if not 0 < factor < float("inf"):
+        raise typer.BadParameter(f"--scale must be positive; got {scale!r}")
+    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))

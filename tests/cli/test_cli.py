@@ -14,9 +14,10 @@ import pytest
 import torch
 from PIL import Image
 
-from kcgs import load
+from kcgs import FitConfig, fit, load
 from kcgs.cli import main
 from kcgs.data import load_image, load_labels, save_image, save_labels
+from kcgs.segment import segment
 
 KEYS = {
     *("psnr", "ssim", "ms_ssim", "ef_psnr", "ef_ssim"),
@@ -110,6 +111,16 @@ class TestFit:
         assert kcgs("render", "scene.safetensors", "-o", "large.png", "--scale", "2", capsys=capsys)[0] == 0
         assert load_image("large.png").shape == (3, 80, 120)
 
+    def test_the_same_scene_as_in_python(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        image = load_image("photo.png")
+        assert kcgs("fit", "photo.png", "-n", "12", "--iterations", "40", capsys=capsys)[0] == 0
+        scene = load("photo.safetensors")
+        result = fit(image, segment(image), 12, config=FitConfig(iterations=40))
+        for name in ("means", "cholesky", "colors", "region_ids"):
+            assert torch.equal(getattr(scene.field, name), getattr(result.field, name)), name
+        assert scene.regions is not None and result.regions is not None
+        assert torch.equal(scene.regions.fine_labels, result.regions.fine_labels)
+
     def test_default_output_is_named_after_the_image(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
         code, out, err = kcgs("fit", "photo.png", "-n", "3", "--iterations", "2", capsys=capsys)
         assert code == 0, err
@@ -153,14 +164,14 @@ class TestRender:
 
     def test_size(self, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert kcgs("render", str(scene), "-o", "a.png", "--size", "90x50", capsys=capsys)[0] == 0
-        with Image.open("a.png") as picture:
-            assert picture.size == (90, 50)
+        with Image.open("a.png") as render:
+            assert render.size == (90, 50)
 
     def test_region(self, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert kcgs("render", str(scene), "-o", "a.png", "--region", "1", capsys=capsys)[0] == 0
-        picture = load_image("a.png")
+        render = load_image("a.png")
         outside = load_labels("mask.png") == 0
-        assert picture[:, outside].max() == 0 and picture.max() > 0
+        assert render[:, outside].max() == 0 and render.max() > 0
 
     @pytest.mark.parametrize(
         ("arguments", "code", "words"),
@@ -200,25 +211,25 @@ class TestFailures:
             (("fit", "photo.png", "--backend", "gpu"), 2, "'gpu' is not one of"),
             (("fit", "nothing.png"), 1, "nothing.png"),
             (("fit", "text.png"), 1, "text.png"),
-            (("fit", "photo.png", "--recipe", "none-such"), 1, "recipe must be one of"),
+            (("fit", "photo.png", "--recipe", "none-such"), 1, "--recipe must be one of"),
             (("fit", "photo.png", "--resume"), 2, "--resume needs --checkpoint"),
             (("fit", "photo.png", "--plot", "plot.txt"), 1, "--plot must end in .png"),
-            (("bench", "render", "-o", "out", "--only", "speed"), 1, "only"),
+            (("bench", "render", "-o", "out", "--only", "speed"), 1, "does not take only"),
             (("fit", "photo.png", "--regions", "nothing.png"), 1, "nothing.png"),
-            (("fit", "photo.png", "--regions", "small.png"), 1, "regions must be one map of the image's size"),
+            (("fit", "photo.png", "--regions", "small.png"), 1, "--regions must be one map of the image's size"),
             (("fit", "photo.png", "-o", "scene.pt"), 1, "must end in .safetensors"),
             (("fit", "photo.png", "-o", "scene.KCGS"), 1, "must end in .safetensors"),
             (("fit", "photo.png", "-o", "nowhere/scene.safetensors"), 1, "needs an existing folder"),
-            (("fit", "photo.png", "--max-seconds", "-1"), 1, "max_seconds"),
+            (("fit", "photo.png", "--max-seconds", "-1"), 1, "--max-seconds"),
             (("info", "text.png"), 1, "text.png"),
-            (("bench", "none-such", "-o", "out"), 1, "name must be one of demo, render"),
-            (("segment", "photo.png", "-o", "a.png", "--method", "magic"), 1, "method"),
+            (("bench", "none-such", "-o", "out"), 1, "NAME must be one of "),
+            (("segment", "photo.png", "-o", "a.png", "--method", "magic"), 1, "--method must be one of"),
         ],
     )
     def test_one_line_and_an_exit_code(
         self, files: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], code: int, words: str
     ) -> None:
-        Path("text.png").write_text("this is no picture")
+        Path("text.png").write_text("this is no image")
         save_labels("small.png", torch.zeros(4, 4, dtype=torch.long))
         before = sorted(p.name for p in files.iterdir())
         got, out, err = kcgs(*arguments, capsys=capsys)
@@ -233,6 +244,6 @@ def test_bench_demo_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     code, out, err = kcgs("bench", "demo", "-o", str(tmp_path / "demo"), "--quick", capsys=capsys)
     assert code == 0, err
     written = {p.name for p in (tmp_path / "demo").iterdir()}
-    pictures = {"original.png", "regions.png", "baseline.png", "contour-aware.png", "error-against-time.png"}
-    assert pictures <= written
+    images = {"original.png", "regions.png", "baseline.png", "contour-aware.png", "error-against-time.png"}
+    assert images <= written
     assert "contour-aware" in out and "EF-PSNR" in out

@@ -15,9 +15,8 @@ import onnxruntime
 import pytest
 import torch
 
-from kcgs import GaussianField, RegionMap, load, save
+from kcgs import GaussianField, RegionMap, Scene, load, save
 from kcgs.cli import main
-from kcgs.nn.renderer import render_image
 from kcgs.view import serve
 
 
@@ -35,7 +34,7 @@ def scene(tmp_path: Path) -> Path:
     regions = RegionMap.from_labels(labels, 0.7)
     field = GaussianField.random(30, (32, 48), seed=0)
     field.assign_regions(regions)
-    save(tmp_path / "scene.safetensors", field, regions, metadata={"recipe": "best"})
+    save(tmp_path / "scene.safetensors", Scene(field, regions, {"recipe": "best"}))
     return tmp_path / "scene.safetensors"
 
 
@@ -51,14 +50,13 @@ class TestExport:
     def test_generic_and_half(self, monkeypatch: pytest.MonkeyPatch, scene: Path) -> None:
         out = scene.with_name("generic.onnx")
         soft = load(scene)
-        save(scene, soft.field, RegionMap.from_labels(soft.regions.labels))
+        save(scene, Scene(soft.field, soft.regions.labels))
         assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic") == 0
         assert len(onnxruntime.InferenceSession(str(out)).get_inputs()) == 5
         assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic", "--interactive") == 2
         assert run(monkeypatch, "export", str(scene), "-o", str(out), "--precision", "fp16", "--clamp") == 0
         (drawn,) = onnxruntime.InferenceSession(str(out)).run(None, {"size": np.array([32, 48])})
-        loaded = load(scene)
-        want = render_image(loaded.field, loaded.regions).numpy()
+        want = load(scene).render().numpy()
         assert np.abs(drawn[0] - want).max() < 1 / 255
 
     @pytest.mark.parametrize(
@@ -114,10 +112,10 @@ class TestView:
         (tmp_path / "page" / "index.html").write_text("<p>page</p>")
         (tmp_path / "photo.PNG").write_bytes(b"png")
         said: list[str] = []
-        field = GaussianField.random(5, (8, 9), seed=0)
+        scene = Scene(GaussianField.random(5, (8, 9), seed=0))
         serving = threading.Thread(
             target=serve,
-            args=(field, None),
+            args=(scene,),
             kwargs={
                 "browser": False,
                 "say": said.append,
@@ -148,4 +146,4 @@ class TestView:
 
     def test_page_that_is_not_built(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError, match="make page"):
-            serve(GaussianField.random(5, (8, 9)), None, page=tmp_path)
+            serve(Scene(GaussianField.random(5, (8, 9))), page=tmp_path)

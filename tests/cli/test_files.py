@@ -58,13 +58,13 @@ class TestEncode:
 
 
 class TestDecode:
-    def test_picture_and_its_beginning(self, scene: Path, tmp_path: Path) -> None:
+    def test_whole_and_its_beginning(self, scene: Path, tmp_path: Path) -> None:
         file, whole, part = tmp_path / "a.kcgs", tmp_path / "a.png", tmp_path / "b.png"
         run("encode", scene, "-o", file)
         run("decode", file, "-o", whole)
         half = len(file.read_bytes()) // 2
         result = runner.invoke(app, ["decode", str(file), "-o", str(part), "--bytes", str(half)])
-        assert result.exit_code == 0 and "a coarser picture" in result.stderr
+        assert result.exit_code == 0 and "a coarser image" in result.stderr
         assert load_image(whole).shape == load_image(part).shape == (3, 48, 64)
         assert not torch.equal(load_image(whole), load_image(part))
 

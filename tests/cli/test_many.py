@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from kcgs import load
-from kcgs.cli import main, many
+from kcgs.cli import main, many_jobs
 from kcgs.data import save_image, save_labels
 
 SETTINGS = ("-n", "12", "--iterations", "5", "--regions", "none", "-o", "out")
@@ -24,9 +24,9 @@ SETTINGS = ("-n", "12", "--iterations", "5", "--regions", "none", "-o", "out")
 
 @pytest.fixture
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Make three pictures, two masks, and a picture that is none."""
+    """Make three images, two masks, and a file that is no image."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(many, "_warm_up", lambda config, segments: None)
+    monkeypatch.setattr(many_jobs, "_warm_up", lambda config, segments: None)
     for folder in ("photos", "masks", "broken"):
         (tmp_path / folder).mkdir()
     for index, name in enumerate(("a", "b", "c")):
@@ -35,7 +35,7 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         save_image(f"photos/{name}.png", torch.where(labels.bool(), torch.tensor([0.9, 0.4, 0.1])[:, None, None], 0.3))
         if name != "c":
             save_labels(f"masks/{name}.png", labels)
-    (tmp_path / "broken/d.png").write_bytes(b"no picture")
+    (tmp_path / "broken/d.png").write_bytes(b"no image")
     return tmp_path
 
 

@@ -128,9 +128,9 @@ class TestSegment:
     @pytest.mark.parametrize(
         ("arguments", "code", "words"),
         [
-            (("--method", "magic"), 1, "method must be one of"),
+            (("--method", "magic"), 1, "--method must be one of"),
             (("--option", "colour=3"), 1, "colour"),
-            (("--option", "max_regions=many"), 1, "max_regions must be an integer; got 'many'"),
+            (("--option", "max_regions=many"), 1, "--max-regions must be an integer; got 'many'"),
             (("--option", "nonsense"), 2, "--option must be KEY=VALUE; got 'nonsense'"),
             (("--option", "a=1", "--option", "a=2"), 2, "--option a is given twice"),
             (("--max-regions", "0"), 2, "greater than or equal to 1"),

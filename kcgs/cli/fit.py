@@ -1,0 +1,172 @@
+"""The command that fits an image, and what it shares with the one that fits many."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+
+from . import options
+from .common import ImageFile, Json, Progress, app, check_output, print_report, write_file
+from .segmentation import misalignment
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kcgs.fit import FitResult
+    from kcgs.scene import Scene
+
+
+@app.command("fit")
+def fit_command(
+    image: ImageFile,
+    regions: Annotated[
+        str,
+        typer.Option(metavar="MASK|auto|none", help="Label-map file, or auto (segment the image), or none."),
+    ] = "auto",
+    num_gaussians: options.Gaussians = None,
+    recipe: options.Recipe = "best",
+    iterations: options.Iterations = None,
+    max_seconds: options.MaxSeconds = None,
+    target_psnr: options.TargetPsnr = None,
+    target_bytes: options.TargetBytes = None,
+    keep_contours: options.KeepContours = False,
+    seed: options.Seed = 0,
+    backend: options.KernelName = "auto",
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Scene (.safetensors) or file (.kcgs); default: IMAGE's name, here."),
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="Plot error against run time into this PNG.")] = None,
+    checkpoint: Annotated[Path | None, typer.Option(help="Keep the fit's state in this file as it goes.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from --checkpoint, where it exists.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Fit Gaussians to an image and save the scene."""
+    from kcgs.data import load_image
+
+    suffixes = (".safetensors", ".kcgs") if target_bytes is None else (".kcgs",)
+    output = Path(f"{image.stem}{suffixes[0]}") if output is None else output
+    check_output(output, *suffixes)
+    if plot is not None:
+        check_output(plot, ".png", option="--plot")
+    if resume and checkpoint is None:
+        raise typer.BadParameter("--resume needs --checkpoint")
+    if target_bytes is not None:
+        options.exclude("--target-bytes", checkpoint=checkpoint)
+    request = options.fit_request(
+        num_gaussians=num_gaussians, target_bytes=target_bytes, recipe=recipe, seed=seed, backend=backend,
+        keep_contours=keep_contours, iterations=iterations, max_seconds=max_seconds, target_psnr=target_psnr,
+    )  # fmt: skip
+    target = load_image(image)
+    labels = read_regions(regions, target, partial(typer.echo, err=True))
+    with Progress(request.config.iterations) as progress:
+        fitted = fit_into(output, target, labels, request, on_step=progress.step, checkpoint=checkpoint, resume=resume)
+    result = fitted.result
+    if plot is not None:
+        from kcgs.plots import plot_history
+
+        plot_history(plot, {recipe: result.history})
+    if progress.interrupted:
+        typer.echo(f"interrupted: saved the best so far to {output}", err=True)
+    title = f"{output}: {len(fitted.scene)} Gaussians, stopped by {result.stop_reason}"
+    if result.removed:
+        title += f"; {result.removed} useless ones removed, which changed no value by more than {result.change:.1g}"
+    report = measure_scene(fitted.scene, target, labels, fitted.num_bytes, result.history[-1].seconds)
+    print_report(report, as_json, title)
+
+
+class Fitted(NamedTuple):
+    """A fit, and what was written of it."""
+
+    result: FitResult
+    scene: Scene
+    """As it is in the file."""
+    num_bytes: int
+
+
+def fit_into(
+    output: Path,
+    image: Tensor,
+    labels: Tensor | None,
+    request: options.FitRequest,
+    *,
+    on_step: Any = None,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    notes: Mapping[str, str] | None = None,
+) -> Fitted:
+    """Fit, and write the scene, with notes in it, or the compressed file, as the suffix says."""
+    from kcgs.fit import fit
+    from kcgs.rate import compress, fit_bytes, quality_for
+    from kcgs.scene import Scene, load
+
+    if request.target_bytes is not None:
+        done = fit_bytes(image, labels, request.target_bytes, config=request.config, seed=request.seed, on_step=on_step)
+        return Fitted(done.result, Scene(done.field, done.regions), write_file(output, done.data))
+    result = fit(
+        image, labels, request.num_gaussians,
+        config=request.config, seed=request.seed, on_step=on_step, checkpoint=checkpoint, resume=resume,
+    )  # fmt: skip
+    if output.suffix != ".kcgs":
+        scene = Scene(result.field, result.regions, {"recipe": request.recipe, **(notes or {})})
+        return Fitted(result, scene, scene.save(output))
+    quality = quality_for(max(entry.psnr for entry in result.history))
+    data = compress(result.field, image, result.regions, quality=quality, seed=request.seed)
+    write_file(output, data)
+    return Fitted(result, load(output), len(data))
+
+
+def read_regions(regions: str, image: Tensor, warn: Callable[[str], None]) -> Tensor | None:
+    """Return the label map that the option --regions names.
+
+    Args:
+        regions: a file; auto: found in the image; none: there is none.
+        image: (C, H, W).
+        warn: called with a sentence where a file's contours do not seem to be the image's.
+    """
+    if regions == "none":
+        return None
+    if regions == "auto":
+        from kcgs.segment import segment
+
+        return segment(image)
+    from kcgs.data import load_labels
+
+    labels = load_labels(Path(regions))
+    doubt = misalignment(image, labels, regions)
+    if doubt is not None:
+        warn(doubt)
+    return labels
+
+
+def measure_scene(
+    scene: Scene, image: Tensor, labels: Tensor | None, num_bytes: int, seconds: float | None = None
+) -> dict[str, Any]:
+    """Compare a scene with its image: what `fit` and `eval` print.
+
+    Args:
+        scene: as it is in the file.
+        image: (C, H, W).
+        labels: whose contours the edge-focused metrics look at.
+        num_bytes: of the file.
+        seconds: of the fit; None: those of the rendering.
+    """
+    from kcgs.evaluate import measure
+
+    start = time.perf_counter()
+    render = scene.render()
+    seconds = time.perf_counter() - start if seconds is None else seconds
+    height, width = scene.size
+    return {
+        **measure(render, image, labels),
+        "num_gaussians": len(scene),
+        "regions": 1 if scene.regions is None else scene.regions.num_regions,
+        "seconds": seconds,
+        "bytes": num_bytes,
+        "bits_per_pixel": 8 * num_bytes / (height * width),
+    }
