@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from kcgs.bench.measure import measure
 from kcgs.data import colorize_labels, save_image, save_labels
+from kcgs.evaluate import measure
 from kcgs.fit import FitConfig, FitResult, HistoryEntry, fit, warm_up
 from kcgs.plots import COLORS, plot_history
 from kcgs.scene import Scene, load

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from kcgs._atomic import atomic_path
-from kcgs.bench.measure import measure
 from kcgs.data import chart_2x3, chart_pie, save_image
+from kcgs.evaluate import evaluate
 from kcgs.fit import FitConfig, fit
 from kcgs.onnx import scene_decoder, write_model
 from kcgs.scene import Scene
@@ -92,7 +92,7 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
     height, width = scene.size
     shrink = _PREVIEW / max(height, width)
     save_image(folder / "preview.jpg", scene.render((max(1, round(height * shrink)), max(1, round(width * shrink)))))
-    figures = measure(scene.render(), image, labels)
+    figures = evaluate(scene, image, labels)
     edge = figures["ef_psnr"]
     entry = Entry(
         name=name,
