@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,12 +24,14 @@ from kcgs.segment import segment
 
 from ._render_runs import renderer
 from ._workloads import STANDARD, astronaut, workload
+from .core.clocks import clock, in_turns, threads
 from .core.options import Options
 from .fits import Spec, ensure
 
 SCENE, GENERIC, CPU, TILED = "onnxruntime, scene", "onnxruntime, generic", "torch, cpu", "torch, tiled"
 DECODERS = (SCENE, GENERIC, CPU, TILED)
 YARDSTICK = CPU
+OPENING = ("load", "first image")
 # the truth: what it leaves out of a sum is far below float32's rounding
 TRUTH_CUTOFF = 1e-12
 CONTOURS = ("none", "hard", "soft")
@@ -37,6 +41,17 @@ RECIPE = "best"
 QUICK_SIZE, QUICK_COUNT, QUICK_ITERATIONS = (96, 128), 60, 20
 # height, width, N
 WORKLOADS = {name: STANDARD[name] for name in ("W1", "W2")}
+
+
+Render = Callable[[], Tensor]
+
+
+class Entrant(NamedTuple):
+    """Who runs: a decoder, its threads, its cutoff."""
+
+    decoder: str
+    threads: int
+    cutoff: float
 
 
 class Subject(NamedTuple):
@@ -133,7 +148,7 @@ def decoders_of(scene: Scene) -> list[str]:
     return [name for name in DECODERS if name != GENERIC or is_plain]
 
 
-def open_decoder(name: str, files: Files, size: tuple[int, int], threads: int) -> Callable[[], Tensor]:
+def open_decoder(name: str, files: Files, size: tuple[int, int], threads: int) -> Render:
     """Read the files and return what renders (C, H, W) at that size.
 
     Args:
@@ -153,6 +168,36 @@ def open_decoder(name: str, files: Files, size: tuple[int, int], threads: int) -
 def open_and_render(name: str, files: Files, size: tuple[int, int]) -> Tensor:
     """Open a decoder and render one image, on one thread."""
     return open_decoder(name, files, size, 1)()
+
+
+def race(renders: Mapping[Entrant, Render], rounds: int) -> dict[Entrant, list[float]]:
+    """Time rendering in turns; seconds of each round.
+
+    Each renders twice in its turn, and the second counts: the first finds the caches, and maybe a processor, still
+    taken by the one before.
+    """
+
+    def second(entrant: Entrant) -> float:
+        with threads(entrant.threads):
+            renders[entrant]()
+            return clock(renders[entrant])
+
+    return in_turns({entrant: partial(second, entrant) for entrant in renders}, rounds)
+
+
+def opening(name: str, files: Files, size: tuple[int, int], rounds: int) -> dict[str, float]:
+    """Time a decoder from its files, on one thread: until ready to render, and until the first image is there.
+
+    Returns:
+        Medians in seconds after one run to warm up.
+    """
+    runs = []
+    with threads(1):
+        for _ in range(rounds + 1):
+            opened: list[Render] = []
+            load = clock(lambda: opened.append(open_decoder(name, files, size, 1)))  # noqa: B023
+            runs.append((load, load + clock(opened[0])))
+    return dict(zip(OPENING, map(statistics.median, zip(*runs[1:], strict=True)), strict=True))
 
 
 def truth(scene: Scene, size: tuple[int, int], *, dense: bool = False) -> Tensor:
@@ -178,7 +223,7 @@ def _splat(scene: Scene, backend: str, cutoff: float) -> Tensor:
         return renderer(backend)(scene, cutoff)
 
 
-def _session(path: Path, feeds: dict[str, Any], threads: int) -> Callable[[], Tensor]:
+def _session(path: Path, feeds: dict[str, Any], threads: int) -> Render:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import copy
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,8 +15,8 @@ from torch import Tensor
 
 from kcgs.kernels.cpu import kernel
 from kcgs.nn import RegionSplatRenderer
+from kcgs.plots import COLORS, figure, save_figure
 
-from ._render_report import EXPONENT, SIGMAS, Row, report
 from ._render_runs import (
     MOST_PAIRS,
     PEERS,
@@ -36,16 +37,92 @@ from ._workloads import needles, standard, workload
 from .core.clocks import clock, in_turns, median_ratio, peak_bytes, threads
 from .core.jobs import with_progress
 from .core.options import Options
+from .core.readings import Readings
 from .core.registry import experiment
 from .core.report import Made, conclude
-from .core.rows import write_rows
+from .core.rows import read_rows, write_rows
 
 CUTOFFS = (1 / 255, 1e-3, 1e-4, 1e-6, 0.0)
 DEFAULT_CUTOFF = 1e-4
 SPEED_CUTOFFS = (1 / 255, DEFAULT_CUTOFF)
 # the dense reference is timed where it takes seconds
 DENSE = ("W3",)
+# of a needle's thin axis, and how the figure shows it
+SIGMAS = {0.05: ":", 0.5: "--", 5.0: "-"}
 ANISOTROPIES = (1.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
+EXPONENT = "exponent of time in pairs"
+
+_SPEED_TEXT = """Milliseconds, medians; through `region_splat` and autograd, validation included. Coverage is 12
+Gaussians per pixel (3 sigma), with 6 regions. W3 is 200x300 with 20 Gaussians, W1 480x854 with 1,250, W2 480x854 with
+7,500, W4 2160x3840 with 50,000. `limit` is the same arithmetic for the same pairs with nothing read and nothing
+written; `to cpu` is the ratio of sums on one thread. The plain-torch peers run on one thread; where they are missing
+they need too much memory."""
+_LIMIT_TEXT = """Pairs are those of a pixel and a Gaussian that the kernel evaluates. Kernel and limit are timed in
+turns; the kernel's share of the limit, and the gains of a second thread, are medians of the ratios of neighbouring
+runs. The limit's own gain is what a second thread gives on this machine. Images per second are through
+`RegionSplatRenderer`, without gradients."""
+_OVERHEAD_TEXT = "The kernel alone, and through `RegionSplatRenderer` and autograd; forward and backward, one thread."
+_MEMORY_TEXT = "MiB added by rendering one image and its gradients, in a process of its own."
+_ERROR_TEXT = """One thread. Image error against the float64 reference at cutoff 0, colours in [0, 1]; gradient error
+relative to the largest gradient (max) or the rms gradient (rms), the worst of means, cholesky and colors."""
+_GROWTH_TEXT = """Forward and backward against evaluated pairs, one thread. An exponent of 1 is a constant cost per
+pair; it is below 1 where the fixed costs of an image (filling and reading its pixels) weigh less as pairs grow."""
+_STIFFNESS_TEXT = """37 needles of one shape, turned from 0 to 180 degrees, rendered in float32 at cutoff 0 against
+float64. Image error relative to a colour of 1; gradient error relative to the largest of its component. The parameters
+are the same float32 numbers on both sides: what is measured is the arithmetic."""
+
+
+class Row(NamedTuple):
+    """One measured number."""
+
+    section: str
+    case: str
+    backend: str
+    threads: int
+    quantity: str
+    value: float
+    unit: str
+
+
+def report(folder: Path, made: Made) -> list[str]:
+    """Write the figures, and return the parts of the report."""
+    measured = Readings(read_rows(folder / "results.csv", Row))
+    rows = Readings([*measured, *_derived(measured)])
+    sections = {name: rows.select(section=name) for name in rows.names("section")}
+    errors, growth, stiffness = (sections[name] for name in ("error", "growth", "stiffness"))
+    _plot_error(errors, folder / "error-against-time.png")
+    _plot_growth(growth, folder / "growth.png")
+    _plot_stiffness(stiffness, folder / "stiffness.png")
+    parts = ["# Rendering: speed, error, stability", "## Speed", _SPEED_TEXT]
+    parts += [sections["speed"].table("case", "backend", across=["quantity", "threads"])]
+    parts += ["## Against the limit of the processor", _LIMIT_TEXT]
+    parts += [sections["limit"].table("case", across=["backend", "quantity", "threads"])]
+    parts += ["## Overhead of the module", _OVERHEAD_TEXT, sections["overhead"].table("case")]
+    parts += ["## Peak memory", _MEMORY_TEXT, sections["memory"].table("backend", across=["case"])]
+    parts += ["## Error against run time", _ERROR_TEXT, "![](error-against-time.png)", errors.table("backend", "case")]
+    parts += [
+        "## Growth",
+        _GROWTH_TEXT,
+        "![](growth.png)",
+        growth.select(quantity=EXPONENT).table("backend", across=["case"]),
+    ]
+    stiff = stiffness.table("case", across=["backend", "quantity"])
+    return [*parts, "## Stiffness", _STIFFNESS_TEXT, "![](stiffness.png)", stiff]
+
+
+def _derived(rows: Readings) -> Iterator[Row]:
+    """Yield what follows from measured numbers: ratios to the CPU kernel, its rates, the module's overhead."""
+    kernel = rows.select(section="speed", backend="cpu", threads=1)
+    for row in rows.select(section="speed", quantity="sum", threads=1):
+        ratio = row.value / kernel.value(case=row.case, quantity="sum")
+        yield row._replace(quantity="to cpu", value=ratio, unit="1")
+    for row in rows.select(section="limit", quantity="pairs"):
+        for quantity in ("forward", "backward"):
+            rate = row.value / kernel.value(case=row.case, quantity=quantity)
+            yield row._replace(backend="cpu", quantity=quantity, value=rate, unit="Gpairs/s")
+    for row in rows.select(section="overhead", quantity="kernel alone"):
+        more = rows.value(section="overhead", case=row.case, quantity="module and autograd") / row.value - 1
+        yield row._replace(quantity="more", value=100 * more, unit="%")
 
 
 @experiment(report=report)
@@ -220,3 +297,46 @@ def _stiffness() -> list[Row]:
 def _by_component(got: Tensor, want: Tensor) -> float:
     # a needle's two directions differ by its anisotropy
     return float(((got - want).abs() / want.abs().amax(0).clamp_min(1e-12)).max())
+
+
+def _plot_error(rows: Readings, path: Path) -> None:
+    plot, axes = figure(1, 2, width=9.5, height=3.8)
+    cutoffs = Readings(row._replace(case=row.case.split()[-1]) for row in rows)
+    for axis, quantity in zip(axes, ("image max", "gradient max"), strict=True):
+        for name in rows.names("backend"):
+            line = cutoffs.select(backend=name)
+            line.plot(axis, "case", "sum", quantity, annotate=True, marker="o", label=name)
+        axis.set(xlabel="milliseconds, forward and backward", ylabel=f"{quantity} error")
+        axis.legend()
+    axes[0].set_title("points: cutoff")
+    save_figure(plot, path)
+
+
+def _plot_growth(rows: Readings, path: Path) -> None:
+    plot, axes = figure(1, 2, width=9.5, height=3.8)
+    for axis, kind in zip(axes, ("Gaussians", "pixels"), strict=True):
+        for name in rows.names("backend"):
+            line = Readings(row for row in rows.select(backend=name) if row.case.startswith(f"{kind}:"))
+            label = f"{name}, exponent {rows.value(case=kind, backend=name, quantity=EXPONENT):.2f}"
+            line.plot(axis, "case", "pairs", "sum", marker="o", label=label)
+        axis.set(xlabel="million evaluated pairs", ylabel="milliseconds")
+        axis.set_title(f"growing {'N' if kind == 'Gaussians' else kind}")
+        axis.legend()
+    save_figure(plot, path)
+
+
+def _plot_stiffness(rows: Readings, path: Path) -> None:
+    plot, axes = figure(1, 2, width=9.5, height=3.8)
+    for axis, quantity in zip(axes, ("image", "gradient"), strict=True):
+        for color, name in zip(COLORS, rows.names("backend"), strict=False):
+            lines: dict[float, list[tuple[float, float]]] = {}
+            for row in rows.select(backend=name, quantity=quantity):
+                _, sigma, _, anisotropy = row.case.split()
+                lines.setdefault(float(sigma), []).append((float(anisotropy), max(row.value, 1e-9)))
+            for sigma, points in lines.items():
+                label = name if sigma == max(lines) else None
+                axis.plot(*zip(*points, strict=True), SIGMAS[sigma], color=color, marker=".", label=label)
+        axis.set(xlabel="anisotropy", ylabel=f"{quantity} error, max", xscale="log", yscale="log")
+        axis.legend()
+    axes[0].set_title("thin sigma: 5 px solid, 0.5 px dashed, 0.05 px dotted")
+    save_figure(plot, path)

@@ -13,17 +13,19 @@ import torch
 
 from kcgs import GaussianField, RegionSplatRenderer
 from kcgs.bench import _decoders, run
-from kcgs.bench._decode_report import Row, cutoff_name
 from kcgs.bench._decoders import (
     CPU,
     DECODERS,
     GENERIC,
     SCENE,
     TILED,
+    Entrant,
     Subject,
     decoders_of,
     fitted_subjects,
     open_and_render,
+    opening,
+    race,
     standard_subjects,
     truth,
     why_not_fitted,
@@ -31,7 +33,7 @@ from kcgs.bench._decoders import (
 )
 from kcgs.bench.core.clocks import median_ratio, peak_bytes
 from kcgs.bench.core.options import Options
-from kcgs.bench.decode import Entrant, opening, race
+from kcgs.bench.decode import Row, cutoff_name
 from kcgs.scene import Scene
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import product
 from typing import Any
 
@@ -11,7 +11,7 @@ from .tables import markdown, number
 
 
 class Readings(list[Any]):
-    """Rows with a field `value`, a number, and fields that say what was measured.
+    """Rows with a field `value`, a number, and fields that say what was measured: a `quantity`, its `unit` and others.
 
     Example:
         >>> from typing import NamedTuple
@@ -19,11 +19,12 @@ class Readings(list[Any]):
         ...     case: str
         ...     quantity: str
         ...     value: float
-        >>> rows = Readings([Row("a", "ms", 1.0), Row("b", "ms", 2.0), Row("b", "MB", 3.5)])
-        >>> rows.value(case="b", quantity="ms"), rows.value(case="c"), rows.names("case")
+        ...     unit: str
+        >>> rows = Readings([Row("a", "time", 1.0, "ms"), Row("b", "time", 2.0, "ms"), Row("b", "memory", 3.5, "MB")])
+        >>> rows.value(case="b", quantity="time"), rows.value(case="c"), rows.names("case")
         (2.0, nan, ['a', 'b'])
-        >>> print(rows.table(["case"], {"time": {"quantity": "ms"}, "memory": {"quantity": "MB"}}))
-        | case | time | memory |
+        >>> print(rows.table("case"))
+        | case | time, ms | memory, MB |
         | --- | --- | --- |
         | a | 1 |  |
         | b | 2 | 3.5 |
@@ -45,21 +46,44 @@ class Readings(list[Any]):
         """Return what a field holds, each once, in order."""
         return list(dict.fromkeys(getattr(row, field) for row in self))
 
-    def table(self, index: Sequence[str], columns: Mapping[str, Column]) -> str:
-        """Lay out a Markdown table with a line for each combination of the index fields that occurs.
+    def table(self, *index: str, across: Sequence[str] = ("quantity",)) -> str:
+        """Lay out all numbers as a Markdown table.
 
         Args:
-            index: fields in the first columns.
-            columns: by header.
+            index: fields of which each combination that occurs has a line.
+            across: fields of which each combination has a column; one thread is not said.
         """
-        lines = []
-        for key in product(*(self.names(field) for field in index)):
-            line = self.select(**dict(zip(index, key, strict=True)))
-            if line:
-                cells = [column(line) if callable(column) else line.value(**column) for column in columns.values()]
-                lines.append([*map(str, key), *(c if isinstance(c, str) else number(c) for c in cells)])
-        return markdown([*index, *columns], lines)
+        cells, titles = {}, {}
+        for row in self:
+            line, column = (tuple(getattr(row, field) for field in fields) for fields in (index, across))
+            cells[line, column] = number(row.value)
+            titles[column] = _title(row, across)
+        lines = {line for line, _ in cells}
+        ordered = [line for line in product(*map(self.names, index)) if line in lines]
+        body = [[*map(str, line), *(cells.get((line, column), "") for column in titles)] for line in ordered]
+        return markdown([*index, *titles.values()], body)
+
+    def plot(self, axis: Any, along: str, x: str, y: str, *, annotate: bool = False, **style: Any) -> None:
+        """Plot a line through the quantities `x` and `y` of each name that the field `along` has, on log axes.
+
+        Args:
+            axis: of matplotlib.
+            along: field.
+            x: quantity.
+            y: quantity.
+            annotate: whether each point says its name.
+            style: of the line.
+        """
+        names = self.names(along)
+        points = [[self.value(**{along: name, "quantity": quantity}) for quantity in (x, y)] for name in names]
+        axis.plot(*zip(*points, strict=True), **style)
+        axis.set(xscale="log", yscale="log")
+        for name, point in zip(names, points, strict=True) if annotate else ():
+            axis.annotate(name, point, textcoords="offset points", xytext=(4, 4), fontsize=7)
 
 
-# fields of the number that a cell holds, or a function of the line's rows
-Column = Mapping[str, object] | Callable[[Readings], float | str]
+def _title(row: Any, across: Sequence[str]) -> str:
+    parts = [str(getattr(row, field)) for field in across if field != "threads"]
+    parts += [row.unit] if "quantity" in across and row.unit != "1" else []
+    parts += [f"{row.threads} threads"] if "threads" in across and row.threads > 1 else []
+    return ", ".join(parts)
