@@ -113,7 +113,7 @@ def _parse_options(pairs: list[str]) -> dict[str, Any]:
 
 def _table(picture: Tensor, found: Segmentation) -> tuple[list[dict[str, Any]], float]:
     """Return a row for each region, and the alignment of the whole map; None is what is not known."""
-    from kcgs.fit.initialize import gaussian_shares
+    from kcgs.fit.kmeans import gaussian_shares
     from kcgs.functional import RegionMap, edge_alignment_map
 
     aligned = edge_alignment_map(picture, found.labels).flatten()

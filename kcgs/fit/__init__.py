@@ -1,15 +1,8 @@
-"""An image in, a field out."""
+"""An image in, a scene out."""
 
 from .config import FitConfig, available_recipes
 from .loop import fit
-from .monitor import FitResult, HistoryEntry
+from .state import FitResult, HistoryEntry
 from .warm_up import warm_up
 
-__all__ = [
-    "FitConfig",
-    "FitResult",
-    "HistoryEntry",
-    "available_recipes",
-    "fit",
-    "warm_up",
-]
+__all__ = ["FitConfig", "FitResult", "HistoryEntry", "available_recipes", "fit", "warm_up"]

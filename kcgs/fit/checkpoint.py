@@ -10,42 +10,39 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from kcgs._atomic import atomic_path
 from kcgs.functional import RegionMap
 
-from .config import FitConfig
-from .monitor import Gaussians, HistoryEntry
+from .state import FitState, Gaussians, HistoryEntry
 
 # a checkpoint is written when the fit has run this many times as long as the last one took to write
 _PATIENCE = 100.0
-_VERSION = 1
+_VERSION = 2
+_KEPT = ("cutoff", "region_ids", "anchor", "iteration", "first", "wanted", "densifications", "late_moves", "merged")
 
 
 class Checkpoint:
-    """A file that holds a fit's state, written whole or not at all, and only by the problem that it belongs to."""
+    """A file that holds a fit's state, written whole or not at all, and only by the problem that it belongs to.
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        image: Tensor,
-        regions: RegionMap | None,
-        config: FitConfig,
-        num_gaussians: int,
-        seed: int,
-    ) -> None:
+    Args:
+        path: of the file; its folder must exist.
+        state: the start of the fit.
+        given: the map that the fit was given.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], state: FitState, given: RegionMap | None) -> None:
         self.path = Path(path)
         if not self.path.resolve().parent.is_dir():
             raise FileNotFoundError(f"checkpoint needs an existing folder; {str(self.path.parent)!r} is not there")
-        self.problem = _fingerprint(image, regions, config, num_gaussians, seed)
+        self.problem = _fingerprint(state, given)
         self._next = 0.0
 
     def due(self) -> bool:
         """Say whether it is time to write; writing costs about a hundredth of the fit."""
         return time.perf_counter() >= self._next
 
-    def write(self, state: dict[str, Any]) -> None:
+    def write(self, state: FitState) -> None:
         """Put the state in the file's place."""
         start = time.perf_counter()
         with atomic_path(self.path) as temporary, temporary.open("wb") as file:
@@ -53,17 +50,17 @@ class Checkpoint:
         end = time.perf_counter()
         self._next = end + _PATIENCE * (end - start)
 
-    def read(self) -> dict[str, Any] | None:
-        """Return the state, or None where there is no file yet.
+    def read_into(self, state: FitState) -> bool:
+        """Take up the state of the file, and say whether there is one.
 
         Raises:
             ValueError: the file is not a checkpoint, or that of another problem.
         """
         if not self.path.exists():
-            return None
+            return False
         try:
-            state = torch.load(self.path, weights_only=True)
-            version, problem = state["version"], state["problem"]
+            kept = torch.load(self.path, weights_only=True)
+            version, problem = kept["version"], kept["problem"]
         except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"checkpoint {str(self.path)!r} is damaged, or no checkpoint of a fit") from error
         if version != _VERSION or problem != self.problem:
@@ -71,47 +68,52 @@ class Checkpoint:
                 f"checkpoint {str(self.path)!r} belongs to another fit: image, regions, settings, num_gaussians and "
                 "seed must be those it was written with"
             )
-        return _rich(state)
+        _take_up(state, kept)
+        return True
 
 
-def _fingerprint(image: Tensor, regions: RegionMap | None, config: FitConfig, num_gaussians: int, seed: int) -> str:
-    digest = hashlib.sha256(f"{config.model_dump_json()} {num_gaussians} {seed} {tuple(image.shape)}".encode())
-    digest.update(image.cpu().numpy().tobytes())
-    if regions is not None:
-        labels, *rest = _plain_map(regions)
-        digest.update(repr(rest).encode())
-        digest.update(labels.cpu().numpy().tobytes())
+def _fingerprint(state: FitState, given: RegionMap | None) -> str:
+    size = tuple(state.image.shape)
+    digest = hashlib.sha256(f"{state.config.model_dump_json()} {state.num_gaussians} {state.seed} {size}".encode())
+    digest.update(state.image.cpu().numpy().tobytes())
+    if given is not None:
+        digest.update(repr((given.softness, given.supersample)).encode())
+        digest.update(given.fine_labels.cpu().numpy().tobytes())
     return digest.hexdigest()
 
 
-def _plain(state: dict[str, Any]) -> dict[str, Any]:
+def _plain(state: FitState) -> dict[str, Any]:
     """Use nothing but tensors, numbers, strings, lists and dicts, which load without running code."""
-    best = state["monitor"]["best"]
-    monitor = {**state["monitor"], "history": [tuple(h) for h in state["monitor"]["history"]]}
-    monitor["best"] = None if best is None else (*best[:4], _plain_map(best.regions))
-    return {**state, "drawn": _plain_map(state["drawn"]), "monitor": monitor}
+    search = state.search
+    return {
+        **{name: getattr(state, name) for name in _KEPT},
+        "optimizer": state.optimizer.state_dict(),
+        "regions": _plain_map(state.regions),
+        "search": None if search is None else (search.wanted, search.phase, search.since),
+        "seconds": state.seconds(),
+        "history": [tuple(entry) for entry in state.history],
+        "best_psnr": state.best_psnr,
+        "best": None if state.best is None else (*state.best[:4], _plain_map(state.best.regions)),
+    }
 
 
-def _rich(state: dict[str, Any]) -> dict[str, Any]:
-    monitor = state["monitor"]
-    monitor["history"] = [HistoryEntry(*h) for h in monitor["history"]]
-    if monitor["best"] is not None:
-        means, cholesky, colors, ids, drawn = monitor["best"]
-        monitor["best"] = Gaussians(means, cholesky, colors, ids, _rich_map(drawn))
-    return {**state, "drawn": _rich_map(state["drawn"])}
+def _take_up(state: FitState, kept: dict[str, Any]) -> None:
+    for name in (*_KEPT, "best_psnr"):
+        setattr(state, name, kept[name])
+    state.optimizer.load_state_dict(kept["optimizer"])
+    state.regions = _rich_map(kept["regions"])
+    if state.search is not None:
+        state.search.wanted, state.search.phase, state.search.since = kept["search"]
+    state.started = time.perf_counter() - kept["seconds"]
+    state.history = [HistoryEntry(*entry) for entry in kept["history"]]
+    if kept["best"] is not None:
+        means, cholesky, colors, region_ids, regions = kept["best"]
+        state.best = Gaussians(means, cholesky, colors, region_ids, _rich_map(regions))
 
 
-def _plain_map(regions: RegionMap | None) -> Any:
-    if regions is None:
-        return None
-    softness = regions.softness
-    pairs = softness if isinstance(softness, float) else [(*pair, width) for pair, width in softness.items()]
-    return regions.fine_labels, pairs, regions.supersample
+def _plain_map(regions: RegionMap | None) -> dict[str, Any] | None:
+    return None if regions is None else regions.state()
 
 
-def _rich_map(plain: Any) -> RegionMap | None:
-    if plain is None:
-        return None
-    labels, pairs, supersample = plain
-    softness = pairs if isinstance(pairs, float) else {(int(a), int(b)): width for a, b, width in pairs}
-    return RegionMap.from_labels(labels, softness, supersample=supersample)
+def _rich_map(plain: dict[str, Any] | None) -> RegionMap | None:
+    return None if plain is None else RegionMap.from_state(plain)

@@ -49,6 +49,9 @@ class FitConfig(BaseModel):
 
     # The Gaussians
     initializer: Literal["random", "gradient", "kmeans"] = Field("kmeans", description="where the first centres are")
+    densify: Literal["matching-pursuit", "largest-error"] = Field(
+        "matching-pursuit", description="where Gaussians are added; largest-error: as Image-GS"
+    )
     densify_from: float = Field(
         0.05, gt=0.0, le=1.0, description="fraction of N at the start, the others are added; 1: all"
     )
@@ -70,9 +73,11 @@ class FitConfig(BaseModel):
     merge_regions: bool = Field(True, description="merge regions where a trial says that their contour does not help")
 
     # The descent
-    loss: Literal["l1", "l2"] = "l2"
+    loss: Literal["l1", "l2", "l1+ssim"] = Field("l2", description="l1+ssim: L1 + 0.1 (1 - SSIM), as Image-GS")
     optimizer: Literal["frame", "adan", "adam"] = Field(
-        "frame", description="frame: Adam in each Gaussian's own frame; adan: as GaussianImage; each has its own rates"
+        "frame",
+        description="frame: Adam in each Gaussian's own frame; adan: as GaussianImage; adam: as Image-GS; each has its "
+        "own parameters and learning rates",
     )
     learning_rate_factor: float = Field(1.0, gt=0.0, description="factor on all learning rates of the optimizer")
     refine_flat: bool = Field(
@@ -96,25 +101,29 @@ class FitConfig(BaseModel):
             raise ValueError(f"softness must be 'auto' or in [0, {MAX_SOFTNESS:g}] pixels; got {self.softness!r}")
         if self.max_move != "any" and self.max_move < 1.0:
             raise ValueError(f"max_move must be 'any' or at least 1 pixel; got {self.max_move!r}")
-        if self.densify_from < 1.0 and self.optimizer != "frame":
-            raise ValueError(f"densify_from below 1 needs optimizer 'frame'; got {self.optimizer!r}")
 
     @classmethod
-    def from_recipe(cls, recipe: str, **overrides: Any) -> FitConfig:
-        """Read a recipe by name and change some of its settings.
+    def from_recipe(cls, recipe: str | FitConfig, **settings: Any) -> FitConfig:
+        """Take a recipe and change some of its settings.
 
         Args:
-            recipe: a name from :func:`available_recipes`.
-            overrides: settings by name.
+            recipe: a name from :func:`available_recipes`, or settings.
+            settings: by name.
 
         Raises:
+            TypeError: a recipe of another type.
             ValueError: unknown recipe or setting, or a value out of range.
         """
-        if recipe not in available_recipes():
+        if isinstance(recipe, FitConfig):
+            values = recipe.model_dump()
+        elif not isinstance(recipe, str):
+            raise TypeError(f"recipe must be a name or a FitConfig; got {type(recipe).__name__}")
+        elif recipe not in available_recipes():
             raise ValueError(f"recipe must be one of {', '.join(available_recipes())}; got {recipe!r}")
-        settings = tomllib.loads((files("kcgs.recipes") / f"{recipe}.toml").read_text(encoding="utf-8"))
+        else:
+            values = tomllib.loads((files("kcgs.recipes") / f"{recipe}.toml").read_text(encoding="utf-8"))
         try:
-            return cls(**{**settings, **overrides})
+            return cls(**{**values, **settings})
         except ValidationError as error:
             raise ValueError(_one_line(error)) from error
 

@@ -21,4 +21,4 @@ def warm_up(config: FitConfig) -> None:
     image = torch.stack([ramp.expand(64, 96), 1 - ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96)])
     labels = (ramp > 0.6).long().expand(64, 96).contiguous()
     short = config.model_copy(update={"iterations": min(config.iterations, 20), "max_seconds": None})
-    fit(image, labels, 24, config=short)
+    fit(image, labels, 24, recipe=short)

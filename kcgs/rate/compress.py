@@ -17,7 +17,7 @@ from kcgs.codec.encode import SceneWriter
 from kcgs.codec.gaussians.quantize import QPS, Parameters, Quantizer
 from kcgs.fit.config import FitConfig
 from kcgs.fit.loop import check_problem, fit
-from kcgs.fit.monitor import FitResult, HistoryEntry
+from kcgs.fit.state import FitResult, HistoryEntry
 from kcgs.functional import RegionMap, merge_regions
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene

@@ -24,6 +24,7 @@ from kcgs.data import save_image, save_labels
 from kcgs.fit import FitConfig, FitResult, HistoryEntry
 from kcgs.functional import RegionMap, ef_psnr, psnr
 from kcgs.nn import GaussianField
+from kcgs.scene import Scene
 
 
 class Stub:
@@ -47,7 +48,7 @@ class Stub:
         if drawn is not None:
             field.assign_regions(drawn)
         history = [HistoryEntry(i, 0.1 + 0.1 * i, 1.0, 10.0 + i, 9.0 + i, n) for i in range(4)]
-        return FitResult(field, drawn, history, "iterations", config)
+        return FitResult(Scene(field, drawn), history, "iterations", config)
 
 
 def _measure(picture: Tensor, image: Tensor, labels: Tensor | None) -> dict[str, float]:

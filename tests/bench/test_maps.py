@@ -47,7 +47,7 @@ class Stub:
             halves = torch.arange(image.shape[2]) >= image.shape[2] // 2
             regions = RegionMap.from_labels((halves & self.keeps_contours).long().expand(image.shape[1:]).contiguous())
             field.assign_regions(regions)
-        return FitResult(field, regions, [HistoryEntry(1, 0.1, 1.0, 10.0, 9.0, n)], "iterations", config)
+        return FitResult(Scene(field, regions), [HistoryEntry(1, 0.1, 1.0, 10.0, 9.0, n)], "iterations", config)
 
 
 @pytest.fixture

@@ -52,6 +52,7 @@ from kcgs.fit import FitConfig, FitResult, HistoryEntry
 from kcgs.functional import RegionMap, ef_psnr, psnr
 from kcgs.nn import GaussianField
 from kcgs.rate import Compressed
+from kcgs.scene import Scene
 
 
 class Stub:
@@ -84,7 +85,7 @@ class Stub:
     def _result(image: Tensor, labels: Tensor | None, n: int, config: FitConfig) -> FitResult:
         field = GaussianField.random(n, tuple(image.shape[1:]), sigma=8.0, regions=labels, seed=n)
         regions = None if labels is None else RegionMap.from_labels(labels)
-        return FitResult(field, regions, [HistoryEntry(1, 0.1, 1.0, 10.0, 9.0, n)], "iterations", config)
+        return FitResult(Scene(field, regions), [HistoryEntry(1, 0.1, 1.0, 10.0, 9.0, n)], "iterations", config)
 
 
 @pytest.fixture

@@ -37,7 +37,7 @@ def same(a: object, b: object) -> bool:
     fields = ("means", "cholesky", "colors", "region_ids")
     return all(
         (x is None and y is None) or torch.equal(x, y)
-        for x, y in ((getattr(a.field, n), getattr(b.field, n)) for n in fields)  # type: ignore[attr-defined]
+        for x, y in ((getattr(a.scene.field, n), getattr(b.scene.field, n)) for n in fields)  # type: ignore[attr-defined]
     )
 
 
@@ -45,74 +45,74 @@ def same(a: object, b: object) -> bool:
 def fitted() -> FitResult:
     """The scene by 40 Gaussians: what it is, several tests ask."""
     image, labels = scene()
-    return fit(image, labels, 40, config=quick())
+    return fit(image, labels, 40, recipe=quick())
 
 
 class TestBest:
     def test_is_the_default_and_better_than_paper(self, fitted: FitResult) -> None:
         image, labels = scene()
-        ours, theirs = fitted, fit(image, labels, 40, config=quick("paper"))
+        ours, theirs = fitted, fit(image, labels, 40, recipe=quick("paper"))
         assert ours.history[-1].psnr > theirs.history[-1].psnr + 1
         assert inspect.signature(fit).parameters["recipe"].default == "best"
 
     def test_contours_help(self) -> None:
         image, labels = scene()
-        with_, without = (fit(image, labels, 30, config=quick(r)).history[-1] for r in ("best", "best-baseline"))
+        with_, without = (fit(image, labels, 30, recipe=quick(r)).history[-1] for r in ("best", "best-baseline"))
         assert with_.psnr > without.psnr + 0.5
         assert with_.ef_psnr > without.ef_psnr + 0.5
 
     def test_psnr_is_that_of_the_scene_as_drawn_by_default(self, fitted: FitResult) -> None:
-        drawn = render_image(fitted.field, fitted.regions)
+        drawn = render_image(fitted.scene.field, fitted.scene.regions)
         assert fitted.history[-1].psnr == pytest.approx(float(psnr(drawn, scene()[0])), abs=0.01)
 
     def test_grows_to_n(self) -> None:
         image, labels = scene()
-        counts = [h.num_gaussians for h in fit(image, labels, 60, config=quick(prune=0.0)).history]
+        counts = [h.num_gaussians for h in fit(image, labels, 60, recipe=quick(prune=0.0)).history]
         assert counts[0] < 10
         assert counts[-1] == 60
         assert all(b >= a for a, b in pairwise(counts))
 
     def test_growth_off_starts_whole(self) -> None:
         image, labels = scene()
-        assert fit(image, labels, 40, config=quick(densify_from=1.0)).history[0].num_gaussians == 40
+        assert fit(image, labels, 40, recipe=quick(densify_from=1.0)).history[0].num_gaussians == 40
 
     @pytest.mark.parametrize("initializer", ["random", "gradient", "kmeans"])
     def test_starts(self, initializer: str) -> None:
         image, labels = scene()
-        assert fit(image, labels, 40, config=quick(initializer=initializer)).history[-1].psnr > 25
+        assert fit(image, labels, 40, recipe=quick(initializer=initializer)).history[-1].psnr > 25
 
     def test_same_seed_same_bits(self, fitted: FitResult) -> None:
         image, labels = scene()
-        a, b = fitted, fit(image, labels, 40, config=quick(), seed=0)
+        a, b = fitted, fit(image, labels, 40, recipe=quick(), seed=0)
         assert same(a, b)
-        assert a.regions is not None and b.regions is not None
-        assert torch.equal(a.regions.labels, b.regions.labels)
+        assert a.scene.regions is not None and b.scene.regions is not None
+        assert torch.equal(a.scene.regions.labels, b.scene.regions.labels)
 
     @pytest.mark.parametrize("channels", [1, 4, 9])
     def test_any_number_of_channels(self, channels: int) -> None:
         image, labels = scene()
         picture = torch.cat([image, image, image])[:channels]
-        result = fit(picture, labels, 40, config=quick())
-        assert result.field.colors.shape[1] == channels
+        result = fit(picture, labels, 40, recipe=quick())
+        assert result.scene.field.colors.shape[1] == channels
         assert result.history[-1].psnr > 25
 
     def test_float64(self) -> None:
         image, labels = scene((20, 24))
-        result = fit(image.double(), labels, 8, config=quick(iterations=20))
-        assert result.field.means.dtype == torch.float64
+        result = fit(image.double(), labels, 8, recipe=quick(iterations=20))
+        assert result.scene.field.means.dtype == torch.float64
 
 
 class TestContours:
     def test_kept_where_they_are_to_be_kept(self) -> None:
         image, labels = scene()
-        result = fit(image, labels, 40, config=quick(move_contours=False))
-        assert result.regions is not None
-        assert torch.equal(result.regions.labels, labels)
+        result = fit(image, labels, 40, recipe=quick(move_contours=False))
+        assert result.scene.regions is not None
+        assert torch.equal(result.scene.regions.labels, labels)
 
     def test_move_back_to_the_edge_but_not_farther_than_allowed(self) -> None:
         image, labels = scene()
         given = labels.roll(2, 1)
-        moved = fit(image, given, 40, config=quick(iterations=200)).regions
+        moved = fit(image, given, 40, recipe=quick(iterations=200)).scene.regions
         assert moved is not None
         assert (moved.labels != labels).sum() < 0.3 * (given != labels).sum()
         assert not bool(((moved.labels != given) & ~edge_band(given, 3)).any())
@@ -122,16 +122,16 @@ class TestContours:
         y, x = torch.meshgrid(torch.arange(48), torch.arange(64), indexing="ij")
         smooth = torch.stack([0.5 + 0.3 * torch.sin(0.11 * x + 0.07 * k * y) for k in range(3)])
         board = (x // 6 + y // 6) % 2
-        result = fit(smooth, board, 24, config=quick(move_contours=False))
-        assert result.regions is None
-        assert result.field.region_ids is None
-        assert fit(smooth, board, 24, config=quick(move_contours=False, merge_regions=False)).regions is not None
-        assert fit(image, labels, 24, config=quick()).regions is not None
+        result = fit(smooth, board, 24, recipe=quick(move_contours=False))
+        assert result.scene.regions is None
+        assert result.scene.field.region_ids is None
+        assert fit(smooth, board, 24, recipe=quick(move_contours=False, merge_regions=False)).scene.regions is not None
+        assert fit(image, labels, 24, recipe=quick()).scene.regions is not None
 
     def test_of_three_regions_two_become_one(self) -> None:
         image, labels = scene()
         split = torch.where((labels == 0) & (torch.arange(64) >= 50), 7, labels)
-        regions = fit(image, split, 40, config=quick(iterations=200, move_contours=False)).regions
+        regions = fit(image, split, 40, recipe=quick(iterations=200, move_contours=False)).scene.regions
         assert regions is not None
         assert regions.ids.tolist() in ([0, 1], [0, 1, 7])
         assert bool((regions.labels[labels == 1] == 1).all())
@@ -144,7 +144,7 @@ class TestContours:
             torch.nn.functional.pad(image[:, None], (6, 6, 6, 6), mode="replicate"),
             kernel[..., None] * kernel[..., None, :],
         )[:, 0]
-        regions = fit(blurred, labels, 30, config=quick(iterations=5)).regions
+        regions = fit(blurred, labels, 30, recipe=quick(iterations=5)).scene.regions
         assert regions is not None
         assert isinstance(regions.softness, float)
         assert 1.0 < regions.softness < 2.2
@@ -154,17 +154,17 @@ class TestTarget:
     def test_few_gaussians_for_it(self) -> None:
         image, labels = scene((96, 128))
         config = quick(iterations=600, target_psnr=30.0)
-        result = fit(image, labels, 2000, config=config)
+        result = fit(image, labels, 2000, recipe=config)
         assert result.stop_reason == "target_psnr"
-        assert float(psnr(render_image(result.field, result.regions), image)) >= 29.99
-        fewer = fit(image, labels, max(2, round(0.6 * len(result.field))), config=quick(iterations=600))
+        assert float(psnr(result.scene.render(), image)) >= 29.99
+        fewer = fit(image, labels, max(2, round(0.6 * len(result.scene.field))), recipe=quick(iterations=600))
         assert max(h.psnr for h in fewer.history) < 30.0
 
     def test_out_of_reach(self) -> None:
         image, labels = scene()
-        result = fit(image, labels, 10, config=quick(iterations=150, target_psnr=60.0))
+        result = fit(image, labels, 10, recipe=quick(iterations=150, target_psnr=60.0))
         assert result.stop_reason == "iterations"
-        assert len(result.field) <= 10
+        assert len(result.scene.field) <= 10
 
 
 class TestClock:
@@ -172,7 +172,7 @@ class TestClock:
         # a clock that only being read moves on: a busy machine would have done too little when the time is up
         monkeypatch.setattr("time.perf_counter", map(lambda tick: 0.005 * tick, count()).__next__)
         image, labels = scene()
-        result = fit(image, labels, 40, config=quick(iterations=10**6, max_seconds=1.5))
+        result = fit(image, labels, 40, recipe=quick(iterations=10**6, max_seconds=1.5))
         assert result.stop_reason == "seconds"
         assert result.history[-1].num_gaussians == 40
         assert result.history[-1].psnr > 25
@@ -182,22 +182,22 @@ class TestClock:
 class TestEnd:
     def test_useless_gaussians_go(self) -> None:
         image, labels = torch.full((3, 24, 32), 0.5), torch.zeros(24, 32, dtype=torch.long)
-        result = fit(image, labels, 50, config=quick(prune=0.05))
+        result = fit(image, labels, 50, recipe=quick(prune=0.05))
         assert result.removed > 0
-        assert len(result.field) == 50 - result.removed or len(result.field) < 50
+        assert len(result.scene.field) == 50 - result.removed or len(result.scene.field) < 50
         assert result.change <= 0.05
 
     @pytest.mark.parametrize(("chart", "least"), [(chart_2x3, 70.0), (chart_pie, 38.0)])
     def test_charts(self, chart: object, least: float) -> None:
         image, labels = chart()  # type: ignore[operator]
         result = fit(image, labels, 20)
-        assert float(psnr(render_image(result.field, result.regions), image)) > least
+        assert float(psnr(result.scene.render(), image)) > least
 
     def test_pie_with_sub_pixel_coverage(self) -> None:
         image = chart_pie().image
         fine = RegionMap.from_labels(chart_pie(8).labels, supersample=8)
-        result = fit(image, fine, 20, config=quick(iterations=100))
-        assert float(psnr(render_image(result.field, result.regions), image)) > 60
+        result = fit(image, fine, 20, recipe=quick(iterations=100))
+        assert float(psnr(result.scene.render(), image)) > 60
 
 
 class _Killed(BaseException):
@@ -210,7 +210,7 @@ RECIPES = ["best", "best-baseline", "paper"]
 @pytest.fixture(scope="module")
 def uninterrupted() -> dict[str, FitResult]:
     image, labels = scene()
-    return {recipe: fit(image, labels, 30, config=quick(recipe)) for recipe in RECIPES}
+    return {recipe: fit(image, labels, 30, recipe=quick(recipe)) for recipe in RECIPES}
 
 
 class TestCheckpoint:
@@ -227,8 +227,8 @@ class TestCheckpoint:
                 raise _Killed
 
         with pytest.raises(_Killed):
-            fit(image, labels, 30, config=config, checkpoint=file, on_step=kill)
-        resumed = fit(image, labels, 30, config=config, checkpoint=file, resume=True)
+            fit(image, labels, 30, recipe=config, checkpoint=file, on_step=kill)
+        resumed = fit(image, labels, 30, recipe=config, checkpoint=file, resume=True)
         assert same(whole, resumed)
         timeless = [[h._replace(seconds=0.0) for h in result.history] for result in (whole, resumed)]
         assert timeless[0] == timeless[1]
@@ -236,14 +236,14 @@ class TestCheckpoint:
     def test_finished_gives_the_same_again(self, tmp_path: Path) -> None:
         image, labels = scene()
         first, again = (
-            fit(image, labels, 30, config=quick(), checkpoint=tmp_path / "state", resume=True) for _ in range(2)
+            fit(image, labels, 30, recipe=quick(), checkpoint=tmp_path / "state", resume=True) for _ in range(2)
         )
         assert same(first, again)
 
     def test_another_problem_is_refused(self, tmp_path: Path) -> None:
         image, labels = scene()
         file = tmp_path / "state"
-        fit(image, labels, 30, config=quick(iterations=3), checkpoint=file)
+        fit(image, labels, 30, recipe=quick(iterations=3), checkpoint=file)
         before = file.read_bytes()
         for change in ({"seed": 1}, {"image": 1 - image}, {"num_gaussians": 31}, {"config": quick(iterations=4)}):
             arguments = {"image": image, "num_gaussians": 30, "config": quick(iterations=3), **change}
@@ -256,12 +256,12 @@ class TestCheckpoint:
         file = tmp_path / "state"
         file.write_bytes(b"nothing of the kind")
         with pytest.raises(ValueError, match="is damaged, or no checkpoint"):
-            fit(image, labels, 30, config=quick(), checkpoint=file, resume=True)
+            fit(image, labels, 30, recipe=quick(), checkpoint=file, resume=True)
 
     def test_needs_a_folder(self, tmp_path: Path) -> None:
         image, labels = scene()
         with pytest.raises(FileNotFoundError, match="checkpoint needs an existing folder"):
-            fit(image, labels, 30, config=quick(), checkpoint=tmp_path / "none" / "state")
+            fit(image, labels, 30, recipe=quick(), checkpoint=tmp_path / "none" / "state")
 
 
 def hard_cases() -> dict[str, tuple[Tensor, Tensor, int]]:
@@ -286,32 +286,32 @@ class TestHardCases:
     @pytest.mark.parametrize("name", hard_cases())
     def test_no_collapse(self, name: str) -> None:
         image, labels, count = hard_cases()[name]
-        result = fit(image, labels, count, config=quick(iterations=80))
-        picture = render_image(result.field, result.regions)
+        result = fit(image, labels, count, recipe=quick(iterations=80))
+        picture = result.scene.render()
         assert bool(torch.isfinite(picture).all())
         exact = [h for h in result.history if h.iteration >= 70]  # drawn as the result is
         reached = float(psnr(picture, image))
         assert reached >= max(h.psnr for h in exact) - 0.1 or reached > 60
         assert reached > 5
-        if not len(result.field):
+        if not len(result.scene.field):
             return
         # a polished Gaussian may be as wide as 100 diagonals, any other as one
         limit = (1.01 if reached < 60 and name != "saturated" else 101) * math.hypot(*image.shape[1:])
-        assert float(result.field.cholesky.detach().abs().max()) <= limit
-        assert float(result.field.means.detach().abs().max()) <= 4 * limit
+        assert float(result.scene.field.cholesky.detach().abs().max()) <= limit
+        assert float(result.scene.field.means.detach().abs().max()) <= 4 * limit
 
     @pytest.mark.parametrize("rate", [1e-5, 100.0, 1e7])
     def test_extreme_learning_rates(self, rate: float) -> None:
         image, labels = scene()
-        result = fit(image, labels, 30, config=quick(learning_rate_factor=rate))
-        assert bool(torch.isfinite(render_image(result.field, result.regions)).all())
+        result = fit(image, labels, 30, recipe=quick(learning_rate_factor=rate))
+        assert bool(torch.isfinite(result.scene.render()).all())
 
     def test_fewer_gaussians_than_regions(self) -> None:
         image, _ = scene()
         labels = torch.arange(48)[:, None] // 12 * 4 + torch.arange(64) // 16
         with pytest.warns(UserWarning, match="11 of 16 regions get no Gaussian and stay black"):
-            result = fit(image, labels, 5, config=quick(iterations=10, move_contours=False, merge_regions=False))
-        assert len(result.field) <= 5
+            result = fit(image, labels, 5, recipe=quick(iterations=10, move_contours=False, merge_regions=False))
+        assert len(result.scene.field) <= 5
 
 
 class TestReviewed:
@@ -323,9 +323,9 @@ class TestReviewed:
             labels[5 + 10 * (k // 4) : 8 + 10 * (k // 4), 5 + 10 * (k % 4) : 8 + 10 * (k % 4)] = k + 1
         shades = torch.linspace(0.1, 0.9, 9)[torch.randperm(9, generator=torch.Generator().manual_seed(0))]
         image = torch.nn.functional.avg_pool2d(shades[labels].repeat(1, 1, 1), 3, 1, 1).expand(3, -1, -1)
-        result = fit(image, labels, 12, config=quick(iterations=60))
-        assert result.regions is not None
-        assert result.regions.num_regions >= 8
+        result = fit(image, labels, 12, recipe=quick(iterations=60))
+        assert result.scene.regions is not None
+        assert result.scene.regions.num_regions >= 8
 
     @pytest.mark.parametrize("recipe", ["best", "best-baseline", "paper"])
     def test_a_region_that_wins_no_pixel(self, recipe: str) -> None:
@@ -334,27 +334,27 @@ class TestReviewed:
         fine[31, 31] = 7
         regions = RegionMap.from_labels(fine, supersample=3)
         assert regions.num_regions == 3
-        assert fit(image, regions, 12, config=quick(recipe, iterations=30)).history[-1].psnr > 10
+        assert fit(image, regions, 12, recipe=quick(recipe, iterations=30)).history[-1].psnr > 10
 
     def test_kept_contours_are_exact_on_charts_too(self) -> None:
         image, labels = chart_pie()
         config = quick(iterations=5, move_contours=False, merge_regions=False)
-        regions = fit(image, labels, 20, config=config).regions
+        regions = fit(image, labels, 20, recipe=config).scene.regions
         assert regions is not None
         assert torch.equal(regions.labels, labels)
         assert regions.supersample == 1
 
     def test_stopped_among_drafts_returns_the_best(self) -> None:
         image, labels = scene()
-        result = fit(image, labels, 30, config=quick(), on_step=lambda i, _: i == 51)
-        reached = float(psnr(render_image(result.field, result.regions), image))
+        result = fit(image, labels, 30, recipe=quick(), on_step=lambda i, _: i == 51)
+        reached = float(psnr(result.scene.render(), image))
         assert reached >= max(h.psnr for h in result.history) - 0.15
 
     def test_divergence_while_contours_are_tried(self) -> None:
         image, labels = scene()
         with pytest.warns(UserWarning, match="diverged"):
-            result = fit(image, labels, 30, config=quick(learning_rate_factor=1e30))
-        assert bool(torch.isfinite(render_image(result.field, result.regions)).all())
+            result = fit(image, labels, 30, recipe=quick(learning_rate_factor=1e30))
+        assert bool(torch.isfinite(result.scene.render()).all())
 
     def test_the_named_backend_is_the_one_that_draws(self, monkeypatch: pytest.MonkeyPatch) -> None:
         import kcgs.kernels.cpu.kernel
@@ -364,9 +364,9 @@ class TestReviewed:
 
         monkeypatch.setattr(kcgs.kernels.cpu.kernel, "plan", refuse)
         image, labels = scene((16, 20))
-        fit(image, labels, 6, config=quick(iterations=12, backend="tiled"))
+        fit(image, labels, 6, recipe=quick(iterations=12, backend="tiled"))
 
     def test_resume_needs_a_checkpoint(self) -> None:
         image, labels = scene()
         with pytest.raises(ValueError, match="resume needs checkpoint"):
-            fit(image, labels, 5, config=quick(iterations=2), resume=True)
+            fit(image, labels, 5, recipe=quick(iterations=2), resume=True)

@@ -1,67 +1,120 @@
-"""When things happen: growth, learning rate, and the search for the fewest Gaussians."""
+"""When things happen: additions, learning rates, the search for the fewest Gaussians; moves of contours."""
 
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import pytest
 import torch
 
 from kcgs import FitConfig, RegionMap
-from kcgs.fit.refine import accept_moves
-from kcgs.fit.release import merge_pairs, nearest_contour
-from kcgs.fit.schedule import COSINE_END, DENSIFY_STEPS, Schedule, TargetSchedule, make_schedule
+from kcgs.fit.contour_moves import accept_moves
+from kcgs.fit.optimizers import FrameAdam, GaussianImageAdan
+from kcgs.fit.search import TargetSearch
+from kcgs.fit.start import start
+from kcgs.fit.state import FitState
+from kcgs.fit.strategies import Densify, MoveContours, Strategy, make_strategies
+from kcgs.fit.strategies.merge_regions import nearest_contour
+from kcgs.nn import GaussianField
 
 
-def config(**settings: object) -> FitConfig:
-    return FitConfig.from_recipe("best", **settings)
+def state_of(num_gaussians: int, started: float = 0.0, **settings: Any) -> FitState:
+    return start(torch.rand(1, 8, 8), None, num_gaussians, FitConfig(**settings), 0, started)
 
 
-class TestSchedule:
-    def test_growth_is_even_and_ends_at_n(self) -> None:
-        schedule = Schedule(config(), 1000, 50)
-        counts = [schedule.wanted(p / 1000) for p in range(1001)]
+class TestDensify:
+    def test_additions_are_even_and_end_at_n(self) -> None:
+        densify, state = Densify(), state_of(1000)
+        counts = [densify.wanted(p / 1000, state) for p in range(1001)]
         assert counts[0] == counts[49] == 50
-        assert counts[-1] == schedule.wanted(0.5) == 1000
-        assert len(set(counts)) == DENSIFY_STEPS + 1
+        assert counts[-1] == densify.wanted(0.5, state) == 1000
+        assert len(set(counts)) == densify.steps + 1
         assert all(b >= a for a, b in pairwise(counts))
 
-    def test_rate_falls_from_one_to_decay(self) -> None:
-        schedule = Schedule(config(), 10, 10)
-        rates = [schedule.rate(p / 10) for p in range(11)]
+    def test_is_due_where_more_are_wanted(self) -> None:
+        densify, state = Densify(), state_of(100)
+        assert not densify.due(0.04, state)
+        assert densify.due(0.05, state)
+
+
+class TestLearningRates:
+    def test_ours_falls_to_a_tenth(self) -> None:
+        optimizer = FrameAdam(GaussianField.random(3, (8, 8), seed=0), 1.0)
+        rates = [optimizer.decay(p / 10) for p in range(11)]
         assert rates[0] == 1
-        assert rates[-1] == pytest.approx(COSINE_END)
+        assert rates[-1] == pytest.approx(optimizer.final_decay)
         assert all(b < a for a, b in pairwise(rates))
 
-    def test_progress_is_the_scarcer_of_iterations_and_seconds(self) -> None:
-        schedule = Schedule(config(max_seconds=4.0, iterations=100), 10, 10)
-        assert schedule.progress(50, 1.0) == 0.5
-        assert schedule.progress(10, 3.0) == 0.75
+    def test_the_published_one_halves_and_is_larger_in_short_fits(self) -> None:
+        field = GaussianField.random(3, (8, 8), seed=0)
+        optimizer = GaussianImageAdan(field, 2.0, 12_500, 1.0)
+        assert [optimizer.decay(p) for p in (0.0, 0.39, 0.4, 0.8, 1.0)] == [1, 1, 0.5, 0.25, 0.25]
+        assert optimizer.rates == [2e-3, 4e-3, 2e-3]
+        assert GaussianImageAdan(field, 1.0, 1, 1.0).rates == [2e-2] * 3
+
+    def test_the_factor_scales_all(self) -> None:
+        field = GaussianField.random(3, (8, 8), seed=0)
+        for make in (lambda f: FrameAdam(field, f).rates, lambda f: GaussianImageAdan(field, 1.0, 50_000, f).rates):
+            torch.testing.assert_close(torch.as_tensor(make(3.0)), 3 * torch.as_tensor(make(1.0)))
+
+
+class TestProgress:
+    def test_is_the_scarcer_of_iterations_and_seconds(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        state = state_of(10, max_seconds=4.0, iterations=100)
+        monkeypatch.setattr("time.perf_counter", lambda: 1.0)
+        state.iteration = 50
+        assert state.progress() == 0.5
+        monkeypatch.setattr("time.perf_counter", lambda: 3.0)
+        assert state.progress() == 0.75
+
+
+class TestStrategies:
+    def test_are_those_that_the_settings_ask_for(self) -> None:
+        def names(**settings: Any) -> list[str]:
+            return [type(strategy).__name__ for strategy in make_strategies(FitConfig(**settings))]
+
+        assert names() == ["EndDrafts", "Densify", "MoveContours", "MergeRegions"]
+        off = {"move_contours": False, "merge_regions": False}
+        assert names(warmup=True, **off) == ["EndDrafts", "RefreshIds", "Densify"]
+
+    def test_late_moves_are_even(self) -> None:
+        strategy: Strategy = MoveContours(rise=1.5, after=0.5)
+        state, due = state_of(10), []
+        for p in range(101):
+            if strategy.due(p / 100, state):
+                state.late_moves += 1
+                due.append(p / 100)
+        assert due == [0.6, 0.7, 0.8, 0.9]
 
 
 class TestTarget:
-    def test_only_recipes_that_grow_search(self) -> None:
-        assert isinstance(make_schedule(config(target_psnr=30.0), 100, 5), TargetSchedule)
-        assert not isinstance(make_schedule(config(target_psnr=30.0, densify_from=1.0), 100, 5), TargetSchedule)
+    def test_only_recipes_that_densify_search(self) -> None:
+        assert state_of(100, target_psnr=30.0).search is not None
+        assert state_of(100, target_psnr=30.0, densify_from=1.0).search is None
 
-    def test_grows_anneals_and_adds_what_is_missing(self) -> None:
-        schedule = TargetSchedule(config(), 1000, 100, 30.0)
-        schedule.observe(0.05, 20.0)
-        assert schedule.wanted(0.05) > 100
-        grown = schedule.wanted(0.1)
-        schedule.observe(0.1, 29.5)
-        assert schedule.rate(0.1) == 1
-        schedule.observe(0.3, 29.7)
-        assert schedule.wanted(0.3) == grown
-        assert schedule.rate(0.3) < 1
-        schedule.observe(0.51, 29.9)
-        assert grown < schedule.wanted(0.51) < 1.1 * grown
+    def test_densifies_anneals_and_adds_what_is_missing(self) -> None:
+        search = TargetSearch(30.0, 1000, 100)
+
+        def rate(progress: float) -> float:
+            return search.rate(progress, lambda p: 1 - 0.9 * p)
+
+        search.observe(0.05, 20.0)
+        assert search.wanted > 100
+        many = search.wanted
+        search.observe(0.1, 29.5)
+        assert rate(0.1) == 1
+        search.observe(0.3, 29.7)
+        assert search.wanted == many
+        assert rate(0.3) < 1
+        search.observe(0.51, 29.9)
+        assert many < search.wanted < 1.1 * many
 
     def test_never_beyond_the_most(self) -> None:
-        schedule = TargetSchedule(config(), 120, 100, 60.0)
+        search = TargetSearch(60.0, 120, 100)
         for k in range(1, 60):
-            schedule.observe(k / 20, 20.0)
-        assert schedule.wanted(3.0) == 120
+            search.observe(k / 20, 20.0)
+        assert search.wanted == 120
 
 
 class TestMaps:
@@ -80,26 +133,14 @@ class TestMaps:
         labels = torch.zeros(20, 20, dtype=torch.long)
         labels[5:7, 5:7], labels[12:, 12:] = 1, 2
         after = torch.where(labels == 1, 0, labels)
-        after[0, 0] = 1  # elsewhere, and not worth it
+        after[0, 0] = 1  # elsewhere, where it does not pay
         gain = torch.ones(20, 20)
         gain[:3, :3] = -1.0
         before = RegionMap.from_labels(labels)
         assert accept_moves(before, RegionMap.from_labels(after), gain) is before
 
-    def test_merging(self) -> None:
-        labels = torch.tensor([0, 3, 5, 9]).repeat_interleave(4).expand(6, -1)
-        regions = RegionMap.from_labels(labels, {(0, 3): 1.0, (3, 5): 0.5, (5, 9): 2.0})
-        ids = torch.tensor([9, 5, 3, 0])
-        merged, new = merge_pairs(regions, ids, [(5, 9)])
-        assert merged is not None and new is not None
-        assert merged.ids.tolist() == [0, 3, 5]
-        assert new.tolist() == [5, 5, 3, 0]
-        assert dict(merged.softness) == {(0, 3): 1.0, (3, 5): 0.5}  # type: ignore[arg-type]
-        assert merge_pairs(regions, ids, [(0, 3), (3, 5), (5, 9)]) == (None, None)
-        assert merge_pairs(regions, ids, []) == (regions, ids)
-
     def test_nearest_contour(self) -> None:
-        own, other, distance = nearest_contour(torch.tensor([[4, 4, 4, 7, 7]]))
-        assert own.tolist() == [[4, 4, 4, 7, 7]]
-        assert other.tolist() == [[7, 7, 7, 4, 4]]
+        labels, across, distance = nearest_contour(torch.tensor([[4, 4, 4, 7, 7]]))
+        assert labels.tolist() == [[4, 4, 4, 7, 7]]
+        assert across.tolist() == [[7, 7, 7, 4, 4]]
         assert distance.tolist() == [[2, 1, 0, 0, 1]]

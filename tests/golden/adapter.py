@@ -22,9 +22,9 @@ from kcgs import functional as F
 from kcgs.codec import decode, encode
 from kcgs.fit import fit
 from kcgs.fit.colors import solve_colors
-from kcgs.fit.grow import propose
-from kcgs.fit.polish import polish
-from kcgs.fit.refine import refine_contours
+from kcgs.fit.contour_moves import refine_contours
+from kcgs.fit.levenberg_marquardt import levenberg_marquardt
+from kcgs.fit.pursuit import propose
 from kcgs.nn.renderer import render_image
 from kcgs.onnx import generic_decoder, scene_decoder
 from kcgs.pruning import prune
@@ -56,6 +56,10 @@ def _regions(p: Parts) -> RegionMap | None:
     return None if p.labels is None else RegionMap.from_labels(p.labels, p.softness, supersample=p.supersample)
 
 
+def _scene(p: Parts) -> kcgs.Scene:
+    return kcgs.Scene(_field(p), _regions(p))
+
+
 def _of_map(regions: RegionMap | None) -> dict[str, Any]:
     if regions is None:
         return {"labels": None}
@@ -70,11 +74,14 @@ def _of_scene(field: GaussianField, regions: RegionMap | None) -> dict[str, Any]
 
 def run_fit(image: Tensor, p: Parts | None, num_gaussians: int, recipe: str, **settings: Any) -> dict[str, Any]:
     """Fit an image with the map of `p`."""
-    config = FitConfig.from_recipe(recipe, **settings)
-    result = fit(image, None if p is None else _regions(p), num_gaussians, seed=3, config=config)
+    result = fit(image, None if p is None else _regions(p), num_gaussians, recipe=recipe, seed=3, **settings)
     history = [[e.iteration, e.loss, e.psnr, e.ef_psnr, e.num_gaussians] for e in result.history]
     ending = {"stop": result.stop_reason, "removed": result.removed, "change": result.change}
-    return {**_of_scene(result.field, result.regions), "history": torch.tensor(history, dtype=torch.float64), **ending}
+    return {
+        **_of_scene(result.scene.field, result.scene.regions),
+        "history": torch.tensor(history, dtype=torch.float64),
+        **ending,
+    }
 
 
 def to_file(p: Parts, **settings: Any) -> bytes:
@@ -231,16 +238,15 @@ def run_propose(p: Parts, residual: Tensor, count: int) -> tuple[Any, ...]:
 
 def run_refine_contours(p: Parts, image: Tensor, **settings: Any) -> dict[str, Any]:
     """Move contours."""
-    regions = _regions(p)
-    assert regions is not None
-    return _of_map(refine_contours(_field(p), image, regions, **settings))
+    return _of_map(refine_contours(_scene(p), image, **settings))
 
 
 def run_solve_colors(p: Parts, image: Tensor, **settings: Any) -> Tensor:
     """Solve for the colours."""
-    return solve_colors(_field(p), image, _regions(p), **settings).colors
+    return solve_colors(_scene(p), image, **settings).field.colors
 
 
 def run_polish(p: Parts, image: Tensor, **settings: Any) -> dict[str, Any]:
     """Refine all parameters by Levenberg-Marquardt, with no limit of time."""
-    return _of_scene(polish(_field(p), image, _regions(p), max_seconds=1e9, **settings), None)
+    refined = levenberg_marquardt(_scene(p), image, max_seconds=1e9, **settings)
+    return _of_scene(refined.field, None)

@@ -9,12 +9,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs._check import check_cutoff, check_image
-from kcgs.functional import RegionMap, edge_band
+from kcgs._check import check_count, check_cutoff, check_image, check_number
+from kcgs.functional import RegionMap, edge_band, region_splat
 from kcgs.functional.splat import SCALE_LIMITS
 from kcgs.nn import GaussianField
+from kcgs.scene import Scene
 
-from .colors import Drawing, check_map, check_problem, is_better
+from .colors import check_map, check_problem, is_better
+from .frame import move
 
 # a Gaussian as wide as 100 diagonals is constant over the image to 2.6e-6 (root mean square, 111 dB)
 _SIGMA_LIMITS = (0.05, 100.0)  # pixels, diagonals
@@ -37,60 +39,57 @@ _FLAT_SAMPLES = 1 << 16
 
 @torch.inference_mode(False)
 @torch.no_grad()
-def polish(
-    field: GaussianField,
+def levenberg_marquardt(
+    scene: Scene,
     image: Tensor,
-    regions: RegionMap | None,
     *,
     max_steps: int = 100,
     max_seconds: float = 10.0,
     cutoff: float = 0.0,
     sigma_range: tuple[float, float] | None = None,
     backend: str = "auto",
-) -> GaussianField:
+) -> Scene:
     r"""Fit all parameters of a small scene to the last digit, by Levenberg-Marquardt in float64.
 
     Convention: a step moves a Gaussian in its own frame, :math:`\mu + L d` and :math:`L \exp K`, K lower triangular;
-    colours are eliminated, with 1e-9 a pixel charged for their squares, so that near-duplicates take none that float32
-    cannot hold. Gaussians that share no pixel are fitted apart; where it helps, the largest of each region starts as a
-    constant. The same field each time, unless the clock stops it.
+    colours are eliminated, with 1e-9 per pixel charged for their squares, so that near-duplicates take none that
+    float32 cannot hold. Gaussians that share no pixel are fitted apart; where it helps, the largest of each region
+    starts as a constant. The same scene each time, unless the clock stops it.
 
     Args:
-        field: Gaussians of one image; opacities are merged into the colours.
-        image: :math:`(C, H, W)`, of the field's size, channels and device.
-        regions: the map to draw with, hard or soft; None: one region.
+        scene: Gaussians of one image, hard or soft contours; opacities are merged into the colours.
+        image: :math:`(C, H, W)`, of the scene's size, channels and device.
         max_steps: for each group of Gaussians that share pixels, at least 1.
         max_seconds: of wall time in all, checked between steps.
-        cutoff: weights below it are skipped; draw with the same.
+        cutoff: weights below it are skipped; render with the same.
         sigma_range: bounds of l11 and l22 in pixels, the upper also of abs(l21); None: 0.05 to 100 image diagonals,
             where flat regions end. Centres stay within 3 diagonals of the image.
         backend: kernel that the result is compared with the start with.
 
     Returns:
-        A new field; `field` itself where the squared error, drawn in its dtype, did not fall, or rose once clipped.
+        A new scene; `scene` itself where the squared error, rendered in its dtype, did not fall, or rose once clipped.
 
     Raises:
         TypeError, ValueError: wrong types; a batched field; sizes, channels, devices that differ; numbers out of range.
 
     Example:
-        >>> from kcgs.functional import region_splat
-        >>> regions = RegionMap.from_labels(torch.arange(30).expand(20, 30) // 15)
-        >>> field = GaussianField.random(6, (20, 30), regions=regions, seed=1)
-        >>> field = polish(field, regions.labels.expand(3, 20, 30) * 0.5 + 0.2, regions)
-        >>> region_splat(field.means, field.cholesky, field.colors, field.region_ids, regions)[0, 9, 13:17]
-        tensor([0.2000, 0.2000, 0.7000, 0.7000], grad_fn=<SliceBackward0>)
+        >>> labels = torch.arange(30).expand(20, 30) // 15
+        >>> scene = Scene(GaussianField.random(6, (20, 30), regions=labels, seed=1), labels)
+        >>> levenberg_marquardt(scene, labels.expand(3, 20, 30) * 0.5 + 0.2).render()[0, 9, 13:17]
+        tensor([0.2000, 0.2000, 0.7000, 0.7000])
 
     Source: Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares problems whose
     variables separate", 1973; Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", 1963.
     """
     start = time.perf_counter()
-    image = check_problem(field, image, regions, max_steps)
-    if not max_seconds > 0:
-        raise ValueError(f"max_seconds must be positive; got {max_seconds!r}")
+    image = check_problem(scene, image)
+    field, regions, max_steps = scene.field, scene.regions, check_count("max_steps", max_steps)
+    if max_seconds != math.inf:
+        check_number("max_seconds", max_seconds, 0.0, above=True)
     bounds = _Bounds.of(field, sigma_range)
     cutoff = check_cutoff(cutoff)
     whole = [t.detach().clone() for t in (field.means, field.cholesky, field.merged_colors())]
-    before = Drawing(field, regions, cutoff, backend).draw(whole[2])
+    before = _render(scene, whole, cutoff, backend)
     kept = bounds.clamp(whole[0].double(), whole[1].double())
     flat = _sheets(*kept, field, regions, bounds.sigma[1])
     groups = _groups(_cells(field, image, regions), len(field))
@@ -106,9 +105,17 @@ def polish(
         state = _measure(cells, means, cholesky, state.colors, cutoff)
         for tensor, value in zip(whole, state[:3], strict=True):
             tensor[members] = value.to(image.dtype)
-    polished = GaussianField(whole[0], whole[1], whole[2], field.region_ids, size=field.size)
-    after = Drawing(polished, regions, cutoff, backend).draw(polished.colors)
-    return polished if is_better(after, before, image) else field
+    if not is_better(_render(scene, whole, cutoff, backend), before, image):
+        return scene
+    means, cholesky, colors = whole
+    return Scene(GaussianField(means, cholesky, colors, field.region_ids, size=field.size), regions, scene.metadata)
+
+
+def _render(scene: Scene, gaussians: list[Tensor], cutoff: float, backend: str) -> Tensor:
+    ids = None if scene.regions is None else scene.field.region_ids
+    settings = {"size": scene.size, "cutoff": cutoff, "backend": backend}
+    means, cholesky, colors = gaussians
+    return region_splat(means, cholesky, colors, ids, scene.regions, **settings)  # type: ignore[arg-type]
 
 
 class _Bounds(NamedTuple):
@@ -140,12 +147,12 @@ def _sheets(
 ) -> tuple[Tensor, Tensor]:
     """Make the largest Gaussian of each region constant: where flat regions end, if slow steps do not get stuck."""
     means, cholesky = means.clone(), cholesky.clone()
-    index, at = torch.zeros_like(means[:, 0]), means.new_zeros(field.size)
+    index, index_map = torch.zeros_like(means[:, 0]), means.new_zeros(field.size)
     if regions is not None and field.region_ids is not None:
-        index, at = regions.index_of(field.region_ids), regions.index_of(regions.labels)
+        index, index_map = regions.index_of(field.region_ids), regions.index[0]
     area = cholesky[:, 0] * cholesky[:, 2]
     for region in index[index >= 0].unique().tolist():
-        inside = (at == region).nonzero().double()
+        inside = (index_map == region).nonzero().double()
         if len(inside):
             largest = torch.where(index == region, area, -1.0).argmax()
             means[largest] = inside.mean(0).flip(0) + 0.5
@@ -165,15 +172,15 @@ class _Cell(NamedTuple):
 def _cells(field: GaussianField, image: Tensor, regions: RegionMap | None) -> list[_Cell]:
     """Sort the pixels by the regions that have Gaussians and a weight there."""
     target = image.flatten(1).double()
-    at = torch.arange(target.shape[1], device=image.device)
-    points = torch.stack([at % image.shape[2] + 0.5, at // image.shape[2] + 0.5]).double()
+    places = torch.arange(target.shape[1], device=image.device)
+    points = torch.stack([places % image.shape[2] + 0.5, places // image.shape[2] + 0.5]).double()
     if regions is None or field.region_ids is None:
         return [_Cell(torch.arange(len(field), device=image.device), points, target, None)]
     index = regions.index_of(field.region_ids)
-    pattern = torch.zeros_like(at)
+    pattern = torch.zeros_like(places)
     supports = []
     for region in index[index >= 0].unique().tolist():
-        weights = regions.membership.weights(0, region, torch.float64).flatten()
+        weights = regions.weights(int(regions.ids[region])).flatten()
         support = weights.nonzero().flatten()
         supports.append(((index == region).nonzero().flatten(), support, weights[support]))
         pattern = torch.unique(2 * pattern + (weights > 0), return_inverse=True)[1]
@@ -199,8 +206,8 @@ def _groups(cells: list[_Cell], count: int) -> list[tuple[Tensor, list[_Cell]]]:
     result = []
     for name in group[torch.cat([cell.members for cell in cells])].unique().tolist():
         members = (group == name).nonzero().flatten()
-        own = [cell for cell in cells if int(group[cell.members[0]]) == name]
-        result.append((members, [c._replace(members=torch.searchsorted(members, c.members)) for c in own]))
+        inside = [cell for cell in cells if int(group[cell.members[0]]) == name]
+        result.append((members, [c._replace(members=torch.searchsorted(members, c.members)) for c in inside]))
     return result
 
 
@@ -241,18 +248,18 @@ def _measure(cells: list[_Cell], means: Tensor, cholesky: Tensor, colors: Tensor
     cost = ridge * float(colors.square().sum())
     for cell in cells:
         rows = (torch.arange(_FEATURES, device=colors.device)[:, None] * count + cell.members).flatten()
-        own, ours = colors.new_zeros(len(rows), len(rows)), colors.new_zeros(len(rows), colors.shape[1])
+        products, sums = colors.new_zeros(len(rows), len(rows)), colors.new_zeros(len(rows), colors.shape[1])
         step = max(1, _CHUNK_ELEMENTS // len(rows))
         for begin in range(0, cell.points.shape[1], step):
             part = slice(begin, begin + step)
             features = _features(cell, part, means, cholesky, cutoff)
             residual = cell.target[:, part] - colors[cell.members].T @ features[0]
             features = features.flatten(0, 1)
-            own.addmm_(features, features.T)
-            ours.addmm_(features, residual.T)
+            products.addmm_(features, features.T)
+            sums.addmm_(features, residual.T)
             cost += float(residual.square().sum())
-        gram[rows[:, None], rows] += own
-        moments[rows] += ours
+        gram[rows[:, None], rows] += products
+        moments[rows] += sums
     # of the cost with the charge; what follows from other colours is linear in them, or quadratic: no second pass
     gram.diagonal()[:count] += ridge
     moments[:count] -= ridge * colors
@@ -277,14 +284,6 @@ def _step(state: _State, damping: float) -> tuple[Tensor, Tensor]:
     return step, -follow @ (step[..., None] * state.colors).flatten(0, 1)
 
 
-def _moved(state: _State, step: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mu + L d and L exp K, to first order in k21."""
-    d1, d2, k11, k21, k22 = step
-    l11, l21, l22 = state.cholesky.unbind(-1)
-    means = state.means + torch.stack([l11 * d1, l21 * d1 + l22 * d2], -1)
-    return means, torch.stack([l11 * k11.exp(), l21 * k11.exp() + l22 * k21, l22 * k22.exp()], -1)
-
-
 def _descend(
     cells: list[_Cell], state: _State, bounds: _Bounds, cutoff: float, max_steps: int, deadline: float
 ) -> _State:
@@ -294,7 +293,8 @@ def _descend(
         if small >= _PATIENCE or damping > _MOST_DAMPING or time.perf_counter() > deadline:
             break
         step, colors = _step(state, damping)
-        trial = _measure(cells, *bounds.clamp(*_moved(state, step)), state.colors + colors, cutoff)
+        moved = move(state.means, state.cholesky, step.T, exact=False)
+        trial = _measure(cells, *bounds.clamp(*moved), state.colors + colors, cutoff)
         if trial.cost < state.cost:
             small = small + 1 if trial.cost > (1 - _LEAST_GAIN) * state.cost else 0
             state, damping = trial, max(damping / 5, _LEAST_DAMPING)
@@ -304,7 +304,7 @@ def _descend(
 
 
 def is_flat(image: Tensor, regions: RegionMap | None, num_gaussians: int) -> bool:
-    r"""Say whether :func:`polish` is worth its time on a scene: few Gaussians, and an image smooth inside its regions.
+    r"""Say whether :func:`levenberg_marquardt` pays on a scene: few Gaussians, and an image smooth inside its regions.
 
     Convention: at most 64 Gaussians, no fewer than regions, and 80 % of the pixels (of about 65,536 on a grid) farther
     than 2 pixels from a contour within 1.5 / 255 of the best quadratic in x and y of their region. Charts have 100 %,

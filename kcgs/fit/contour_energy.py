@@ -1,4 +1,4 @@
-"""The moves of contour refinement: what a label costs where, and which pixels change hands."""
+"""The moves of contour refinement: what a label costs where, and which pixels change their label."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.functional import RegionMap, edge_band, region_splat
-from kcgs.nn import GaussianField
+from kcgs.scene import Scene
 
 Ints = NDArray[np.int64]
 Labels = NDArray[np.int32]
@@ -47,23 +47,23 @@ def unequal(padded: Labels) -> int:
     return sum(int(np.count_nonzero((a != b) & (np.minimum(a, b) >= 0))) for a, b in pairs)
 
 
-class Costs:
-    """Blurred squared error of each region's own picture, kept inside the region's box.
+class RegionCosts:
+    """Blurred squared error of each region's Gaussians rendered alone, kept inside the region's box.
 
     Pixels are flat indices into the image with a rim of `pad`.
     """
 
     def __init__(
         self,
-        field: GaussianField,
+        scene: Scene,
         image: Tensor,
-        regions: RegionMap,
         boxes: Ints,
         pad: int,
         blur: float,
-        **drawing: Any,
+        **rendering: Any,
     ) -> None:
-        assert field.region_ids is not None
+        field, regions = scene.field, scene.regions
+        assert regions is not None and field.region_ids is not None
         owners = regions.to(field.means.device).index_of(field.region_ids)
         colors = field.merged_colors()
         image = image.to(colors.device, colors.dtype)
@@ -73,12 +73,11 @@ class Costs:
             y, x = max(0, top - margin), max(0, left - margin)
             target = image[:, y : bottom + margin, x : right + margin]
             if top < bottom:
-                mine = (owners == region).nonzero().flatten()
-                means = field.means[mine] - field.means.new_tensor([x, y])
-                picture = region_splat(
-                    means, field.cholesky[mine], colors[mine], size=(target.shape[1], target.shape[2]), **drawing
-                )
-                error = _blur(_blur((picture - target).square_().mean(0), blur).T, blur).T
+                members = (owners == region).nonzero().flatten()
+                means = field.means[members] - field.means.new_tensor([x, y])
+                size = (target.shape[1], target.shape[2])
+                rendered = region_splat(means, field.cholesky[members], colors[members], size=size, **rendering)
+                error = _blur(_blur((rendered - target).square_().mean(0), blur).T, blur).T
                 parts.append(error[top - y : bottom - y, left - x : right - x].cpu().numpy().ravel())
         self._values = np.concatenate(parts)
         self._stride = image.shape[2] + 2 * pad
@@ -110,10 +109,10 @@ def _blur(rows: Tensor, sigma: float) -> Tensor:
     return total.div_(torch.from_numpy(within).to(total)[:, None])
 
 
-class Contours:
-    """A label map on the move, flat and with a rim of -1, so that a pixel's neighbours are sums of indices."""
+class MovingLabels:
+    """A label map that changes, flat and with a rim of -1, so that a pixel's neighbours are sums of indices."""
 
-    def __init__(self, index: Labels, costs: Costs, length_weight: float, pad: int, smallest: int) -> None:
+    def __init__(self, index: Labels, costs: RegionCosts, length_weight: float, pad: int, smallest: int) -> None:
         padded = np.pad(index, pad, constant_values=-1)
         self.map = padded[pad:-pad, pad:-pad]
         self._labels, self._before = padded.reshape(-1), padded.flatten()
@@ -129,8 +128,8 @@ class Contours:
         self._given = np.zeros(0, np.int32)
         self._allowing = disc(0, 0)[1:]
 
-    def hold(self, rim: Mask, distance: int) -> None:
-        """Hold the pixels that each region keeps, unless it has that many beyond the distance that contours move."""
+    def fix_cores(self, rim: Mask, distance: int) -> None:
+        """Fix the pixels that each region keeps, unless it has that many beyond the distance that contours move."""
         from scipy.ndimage import distance_transform_cdt
 
         depth = distance_transform_cdt(~rim, "chessboard")
@@ -139,12 +138,12 @@ class Contours:
         region = self.map[y, x]
         order = np.lexsort((-depth[y, x], region))
         rank = np.arange(len(order)) - np.searchsorted(region[order], region[order])
-        held = order[rank < self._floor[region[order]]]
-        self._free[y[held], x[held]] = False
+        fixed = order[rank < self._floor[region[order]]]
+        self._free[y[fixed], x[fixed]] = False
 
     def bound(self, given: Labels, distance: float) -> None:
         """Allow a pixel only the labels that `given` has within the distance."""
-        # repeated beyond the border: what is there is nearer still
+        # repeated beyond the border: what lies across it is nearer still
         self._given = np.pad(given, self._pad, mode="edge").reshape(-1)
         self._allowing = disc(distance, self._stride)
         self._free &= edge_band(torch.from_numpy(given + 1), distance).numpy()
@@ -155,14 +154,14 @@ class Contours:
         pixels, colour = (y + self._pad) * self._stride + x + self._pad, 2 * (y % 2) + x % 2
         near, present = disc(reach, self._stride), self._labels.copy()
         for c in range(4):
-            some = pixels[colour == c]
-            self._improve(some, present[some[:, None] + near])
+            chosen = pixels[colour == c]
+            self._improve(chosen, present[chosen[:, None] + near])
         return not np.array_equal(present, self._labels)
 
     def _improve(self, pixels: Ints, candidates: Labels) -> None:
-        around, own = self._labels[pixels[:, None] + self._eight], self._labels[pixels]
-        best, least = own.copy(), self._cost(pixels, own, around)
-        for rows, labels in _others(candidates, own):
+        around, present = self._labels[pixels[:, None] + self._eight], self._labels[pixels]
+        best, least = present.copy(), self._cost(pixels, present, around)
+        for rows, labels in _others(candidates, present):
             cost = self._cost(pixels[rows], labels, around[rows])
             better = np.flatnonzero(cost < least[rows])
             better = better[self._allowed(pixels[rows[better]], labels[better])]
@@ -182,7 +181,7 @@ class Contours:
             found[left] = (seen == labels[left, None]).any(axis=1)
         return found
 
-    def absorb(self) -> bool:
+    def give_away_pieces(self) -> bool:
         """Give away the small pieces that came up, the smallest first, and say whether any went.
 
         Each time there is one piece fewer, so that this comes to an end.
@@ -203,16 +202,16 @@ class Contours:
         return bool(changed.any())
 
     def _taker(self, piece: Ints, areas: Ints) -> int:
-        """Return the adjacent label under which the piece costs least; its own where it is to stay."""
-        own = int(self._labels[piece[0]])
-        was_small = bool((self._specks[piece] & (self._before[piece] == own)).any())
-        if was_small or areas[own] - len(piece) < self._floor[own]:
-            return own
-        best, least = own, math.inf
+        """Return the adjacent label under which the piece costs least; its present one where it is to stay."""
+        present = int(self._labels[piece[0]])
+        was_small = bool((self._specks[piece] & (self._before[piece] == present)).any())
+        if was_small or areas[present] - len(piece) < self._floor[present]:
+            return present
+        best, least = present, math.inf
         around = self._labels[piece[:, None] + self._eight]
         for target in np.unique(self._labels[piece[:, None] + self._sides]).tolist():
             labels = np.full(len(piece), target, np.int32)
-            if target in (own, -1) or not self._allowed(piece, labels).all():
+            if target in (present, -1) or not self._allowed(piece, labels).all():
                 continue
             cost = float(self._cost(piece, labels, around).sum())
             if cost < least:
@@ -245,13 +244,13 @@ def small_pieces(labels: Labels, smallest: int) -> tuple[Ints, Ints]:
     return small, pieces[small]
 
 
-def _others(around: Labels, own: Labels) -> Iterator[tuple[Ints, Labels]]:
-    """Yield (rows, labels) until every label in a row of `around` (P, K) but the pixel's own and -1 came up once."""
-    rows = np.arange(len(own))
-    left = (around != own[:, None]) & (around >= 0)
+def _others(around: Labels, present: Labels) -> Iterator[tuple[Ints, Labels]]:
+    """Yield (rows, labels) until every label in a row of `around` (P, K) but the present one and -1 came up once."""
+    rows = np.arange(len(present))
+    left = (around != present[:, None]) & (around >= 0)
     while len(rows):
-        some = left.any(axis=1)
-        rows, around, left = rows[some], around[some], left[some]
+        open_rows = left.any(axis=1)
+        rows, around, left = rows[open_rows], around[open_rows], left[open_rows]
         labels = around[np.arange(len(rows)), left.argmax(axis=1)]
         yield rows, labels
         left &= around != labels[:, None]

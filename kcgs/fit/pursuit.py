@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from kcgs.functional import RegionMap, region_splat
+from kcgs._check import check_count
+from kcgs.functional import RegionMap
+from kcgs.nn import GaussianField
+
+from .colors import ColorOperator
+from .conjugate_gradients import conjugate_gradients
 
 # reach of the discrete Gaussians, in standard deviations
 _REACH = 3.0
@@ -23,7 +28,8 @@ _CANDIDATES = (16, 4096)
 # two Gaussians whose normalised inner product is above this explain the same error: 2.5 sigma apart, at one scale
 _OVERLAP = 0.2
 # steps towards the joint solution for the colours: more follow the approximation, not the error
-_CG_STEPS = 3
+_COLOR_STEPS = 3
+_CUTOFF = 1e-4
 
 Array = NDArray[Any]
 
@@ -49,15 +55,15 @@ class _Candidates(NamedTuple):
     norm: Array  # [M], <g, g>
     gain: Array  # [M], fall of the squared error
 
-    def take(self, at: NDArray[np.int64]) -> _Candidates:
+    def take(self, positions: NDArray[np.int64]) -> _Candidates:
         """Return those at these positions."""
-        return _Candidates(*(column[at] for column in self))
+        return _Candidates(*(column[positions] for column in self))
 
 
 def propose(
     residual: Tensor, regions: RegionMap | None, count: int, *, sigmas: Sequence[float], backend: str = "auto"
 ) -> Proposal:
-    r"""Find round Gaussians that lower the squared error most when they are added to the picture.
+    r"""Find round Gaussians that lower the squared error most when they are added to the render.
 
     A Gaussian g of region r and colour :math:`\langle g, e \rangle_r / \langle g, g \rangle_r` lowers the squared
     error of the residual e by :math:`\sum_c \langle g, e_c \rangle_r^2 / \langle g, g \rangle_r`, the products taken
@@ -69,7 +75,7 @@ def propose(
     randomness; of equal gains the first in raster order wins.
 
     Args:
-        residual: image minus picture, floating, :math:`(C, H, W)`.
+        residual: image minus render, floating, :math:`(C, H, W)`.
         regions: one map of that size; None: one region.
         count: most Gaussians to propose, at least 0; fewer come only where none lowers the error.
         sigmas: standard deviations to try, in pixels, positive.
@@ -89,21 +95,21 @@ def propose(
         (tensor([[22., 12.]]), tensor(1.5000))
     """
     _check(residual, regions, count, sigmas)
-    left = residual.detach().to(torch.float64 if residual.dtype == torch.float64 else torch.float32)
-    index = torch.zeros_like(left[0], dtype=torch.int32) if regions is None else regions.membership.index[0]
+    error = residual.detach().to(torch.float64 if residual.dtype == torch.float64 else torch.float32)
+    index = torch.zeros_like(error[0], dtype=torch.int32) if regions is None else regions.index[0]
     labels = index.cpu().numpy()
     # below this the gain is rounding error: one pixel's, at the precision of the largest
-    floor = (128 * torch.finfo(left.dtype).eps * float(left.abs().max())) ** 2
+    floor = (128 * torch.finfo(error.dtype).eps * float(error.abs().max())) ** 2
     parts: list[Proposal] = []
     while (wanted := count - sum(len(part.means) for part in parts)) > 0:
-        chosen = _pursue(_search(left, labels, sigmas, wanted), wanted, floor)
+        chosen = _pursue(_search(error, labels, sigmas, wanted), wanted, floor)
         if not len(chosen.x):
             break
-        part, picture = _solve(chosen, left, labels, regions, backend)
+        part, rendered = _solve(chosen, error, labels, regions, backend)
         if not bool(part.colors.any()):
             break
         parts.append(part)
-        left = left - picture
+        error = error - rendered
     return _join(parts, residual, regions)
 
 
@@ -114,8 +120,7 @@ def _check(residual: Tensor, regions: RegionMap | None, count: int, sigmas: Sequ
         raise ValueError(
             f"regions must be one map of size {tuple(residual.shape[1:])}; got {tuple(regions.labels.shape)}"
         )
-    if count < 0:
-        raise ValueError(f"count must be at least 0; got {count}")
+    check_count("count", count, 0)
     if not sigmas or not all(0 < sigma < math.inf for sigma in sigmas):
         raise ValueError(f"sigmas must be positive numbers of pixels; got {tuple(sigmas)}")
 
@@ -186,16 +191,16 @@ def _best_of_cells(
     values = best.cpu().numpy()
     kept = np.flatnonzero(values > 0)
     kept = kept[_strongest(values[kept], limit)]
-    at = where[torch.from_numpy(kept).to(where.device)]
-    cells = at.cpu().numpy()
+    chosen = where[torch.from_numpy(kept).to(where.device)]
+    cells = chosen.cpu().numpy()
     return _Candidates(
-        np.full(len(at), region),
+        np.full(len(cells), region),
         corner[0] + (cells % gain.shape[1] + 0.5) * block,
         corner[1] + (cells // gain.shape[1] + 0.5) * block,
-        np.full(len(at), sigma),
-        np.full(len(at), block),
-        inner.flatten(1)[:, at].T.cpu().numpy(),
-        norm.flatten()[at].cpu().numpy(),
+        np.full(len(cells), sigma),
+        np.full(len(cells), block),
+        inner.flatten(1)[:, chosen].T.cpu().numpy(),
+        norm.flatten()[chosen].cpu().numpy(),
         values[kept],
     )
 
@@ -262,40 +267,35 @@ def _pursue(candidates: _Candidates, count: int, floor: float) -> _Candidates:
 def _solve(
     chosen: _Candidates, residual: Tensor, labels: NDArray[np.int32], regions: RegionMap | None, backend: str
 ) -> tuple[Proposal, Tensor]:
-    """Snap the centres to pixels of their region, solve for the colours, and draw."""
+    """Snap the centres to pixels of their region, solve for the colours, and render."""
     centres = _pixel_of_region(chosen, labels)
     means, sigma = torch.from_numpy(centres).to(residual), torch.from_numpy(chosen.sigma).to(residual)
     cholesky = torch.stack([sigma, torch.zeros_like(sigma), sigma], -1)
     ids = None
     if regions is not None:
         ids = regions.ids[torch.from_numpy(chosen.region).to(residual.device)]
-    start = torch.zeros(len(sigma), len(residual)).to(residual)
-    size = (residual.shape[1], residual.shape[2])
-
-    def draw(colors: Tensor) -> Tensor:
-        return region_splat(means, cholesky, colors, ids, regions, size=size, backend=backend)
-
-    with torch.enable_grad():
-        start.requires_grad_()
-        inner = torch.autograd.grad(draw(start), start, residual)[0]
-    colors = torch.from_numpy(_joint_colors(chosen, centres, inner.cpu().double().numpy())).to(residual)
+    black = torch.zeros(len(sigma), len(residual)).to(residual)
+    field = GaussianField(means, cholesky, black, ids, size=(residual.shape[1], residual.shape[2]))
+    operator = ColorOperator(field, regions, black, _CUTOFF, backend)
+    inner = operator.adjoint(residual)
+    colors = _joint_colors(chosen, centres, inner.cpu().double().numpy()).to(residual)
     with torch.no_grad():
-        picture = draw(colors)
+        rendered = operator.render(colors)
         # the products above are approximate: steps of the best length make the fall of the error certain
         hard = regions is None or regions.softness == 0
         # under a soft contour regions mix: one length for all
         index = torch.from_numpy(labels if hard else np.zeros_like(labels)).to(residual.device, torch.int64)
-        length = _best_lengths(picture, residual, index)
+        length = _best_lengths(rendered, residual, index)
         part = torch.from_numpy(chosen.region if hard else np.zeros_like(chosen.region)).to(index)
-        return Proposal(means, cholesky, colors * length[part, None], ids), picture * length[index]
+        return Proposal(means, cholesky, colors * length[part, None], ids), rendered * length[index]
 
 
-def _best_lengths(picture: Tensor, residual: Tensor, index: Tensor) -> Tensor:
-    """Factor of the picture that leaves the least squared error, for each part of the image, (R,)."""
-    ahead, square = (
-        torch.bincount(index.flatten(), (picture * other).sum(0).flatten()) for other in (residual, picture)
+def _best_lengths(rendered: Tensor, residual: Tensor, index: Tensor) -> Tensor:
+    """Factor of the render that leaves the least squared error, for each part of the image, (R,)."""
+    product, square = (
+        torch.bincount(index.flatten(), (rendered * other).sum(0).flatten()) for other in (residual, rendered)
     )
-    return (ahead / square.clamp_min(torch.finfo(picture.dtype).tiny)).to(picture.dtype)
+    return (product / square.clamp_min(torch.finfo(rendered.dtype).tiny)).to(rendered.dtype)
 
 
 def _pixel_of_region(chosen: _Candidates, labels: NDArray[np.int32]) -> NDArray[np.float64]:
@@ -314,7 +314,7 @@ def _pixel_of_region(chosen: _Candidates, labels: NDArray[np.int32]) -> NDArray[
     return np.stack([cols + 0.5, rows + 0.5], -1)
 
 
-def _joint_colors(chosen: _Candidates, centres: NDArray[np.float64], inner: NDArray[np.float64]) -> NDArray[np.float64]:
+def _joint_colors(chosen: _Candidates, centres: NDArray[np.float64], inner: NDArray[np.float64]) -> Tensor:
     """Solve (overlaps) c = <g, residual> by conjugate gradients, (K, C); overlaps are those of the plane."""
     root = np.sqrt(chosen.norm.astype(np.float64))[:, None]
     # single precision: the step that follows makes up for it, at a third of the time
@@ -323,18 +323,15 @@ def _joint_colors(chosen: _Candidates, centres: NDArray[np.float64], inner: NDAr
     distance = np.square(x[:, None] - x) + np.square(y[:, None] - y)
     overlap = 2 * np.sqrt(square[:, None] * square) / both * np.exp(distance / both * -0.5)
     overlap *= chosen.region[:, None] == chosen.region
-    left = (inner / root).astype(np.float32)
-    solved, way = np.zeros_like(left), left.copy()
-    size = np.square(left).sum(0)
-    for _ in range(_CG_STEPS):
-        ahead = overlap @ way
-        step = size / np.maximum((way * ahead).sum(0), 1e-30)
-        solved += step * way
-        left -= step * ahead
-        fresh = np.square(left).sum(0)
-        way = left + fresh / np.maximum(size, 1e-30) * way
-        size = fresh
-    return solved / root
+    products = torch.from_numpy((inner / root).astype(np.float32))
+    solved = conjugate_gradients(
+        torch.zeros_like(products),
+        products,
+        lambda p: torch.from_numpy(overlap @ p.numpy()),
+        _COLOR_STEPS,
+        dot=lambda a, b: torch.from_numpy((a.numpy() * b.numpy()).sum(0)),
+    )
+    return torch.from_numpy(solved.numpy() / root)
 
 
 def _join(parts: list[Proposal], residual: Tensor, regions: RegionMap | None) -> Proposal:

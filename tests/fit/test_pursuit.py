@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs.fit.grow import Proposal, _search, propose
+from kcgs.fit.pursuit import Proposal, _search, propose
 from kcgs.functional import RegionMap, lookup_regions, region_splat
 
 SIGMAS = (0.7, 1.13, 1.8, 2.9, 4.6, 7.5)
@@ -45,7 +45,7 @@ class TestGain:
         # error that varies no faster than the Gaussians, as that which they are chosen for
         residual = noise(channels, (40, 52), smooth=int(4 * sigma) | 1).double()
         regions = halves((40, 52))
-        found = _search(residual, regions.membership.index[0].numpy(), (sigma,), 4)
+        found = _search(residual, regions.index[0].numpy(), (sigma,), 4)
         assert set(found.region) == {0, 1}
         for i in np.argsort(-found.gain)[:12]:
             mask = regions.labels == regions.ids[int(found.region[i])]

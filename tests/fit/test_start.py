@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 from torch import Tensor
 
 from kcgs import RegionMap
-from kcgs.fit.initialize import INITIALIZERS, kmeans_field, random_field, sampled_field
+from kcgs.fit.kmeans import kmeans_field
+from kcgs.fit.start import gradient_field, random_field
 from kcgs.functional import lookup_regions, psnr, region_splat
 from kcgs.nn import GaussianField
 
-NAMES = sorted(INITIALIZERS)
+STARTS = {
+    "random": lambda image, count, regions, seed: random_field(image, count, 4.0, regions, seed),
+    "gradient": gradient_field,
+    "kmeans": kmeans_field,
+}
+NAMES = sorted(STARTS)
 
 
 def scene(size: tuple[int, int] = (48, 64), channels: int = 3) -> tuple[Tensor, Tensor]:
@@ -38,69 +42,60 @@ class TestEvery:
     def test_counts_shapes_and_ids(self, name: str, count: int, channels: int) -> None:
         image, labels = scene(channels=channels)
         regions = RegionMap.from_labels(labels)
-        field = INITIALIZERS[name](image, count, regions, 0)
+        field = STARTS[name](image, count, regions, 0)
         assert len(field) == count and field.size == (48, 64) and field.colors.shape == (count, channels)
         assert field.region_ids is not None and bool((regions.index_of(field.region_ids) >= 0).all())
         assert all(torch.isfinite(t).all() for t in (field.means, field.cholesky, field.colors))
 
     def test_without_regions(self, name: str) -> None:
-        field = INITIALIZERS[name](scene()[0], 30, None, 0)
+        field = STARTS[name](scene()[0], 30, None, 0)
         assert len(field) == 30 and field.region_ids is None
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     def test_keeps_the_dtype(self, name: str, dtype: torch.dtype) -> None:
         image, labels = scene()
-        assert INITIALIZERS[name](image.to(dtype), 30, RegionMap.from_labels(labels), 0).colors.dtype == dtype
+        assert STARTS[name](image.to(dtype), 30, RegionMap.from_labels(labels), 0).colors.dtype == dtype
 
     def test_same_seed_same_bits(self, name: str) -> None:
         image, labels = scene()
-        a, b, c = (INITIALIZERS[name](image, 60, RegionMap.from_labels(labels), seed) for seed in (2, 2, 3))
+        a, b, c = (STARTS[name](image, 60, RegionMap.from_labels(labels), seed) for seed in (2, 2, 3))
         for part in ("means", "cholesky", "colors", "region_ids"):
             assert torch.equal(getattr(a, part), getattr(b, part))
         assert not torch.equal(a.means, c.means)
 
     def test_more_gaussians_than_pixels(self, name: str) -> None:
         labels = torch.tensor([[0, 0, 5], [0, 9, 9]])
-        field = INITIALIZERS[name](torch.rand(2, 2, 3), 50, RegionMap.from_labels(labels), 0)
+        field = STARTS[name](torch.rand(2, 2, 3), 50, RegionMap.from_labels(labels), 0)
         assert len(field) == 50 and len(field.means.unique(dim=0)) == 50
 
     def test_parameters_without_graph_under_any_mode(self, name: str) -> None:
         image, labels = scene()
         with torch.no_grad():
-            field = INITIALIZERS[name](image, 10, RegionMap.from_labels(labels), 0)
+            field = STARTS[name](image, 10, RegionMap.from_labels(labels), 0)
         assert all(p.requires_grad and p.is_leaf for p in field.parameters())
-
-
-class TestRandom:
-    def test_is_random_field_with_a_sigma_of_half_the_spacing(self) -> None:
-        image, labels = scene()
-        regions = RegionMap.from_labels(labels)
-        named = INITIALIZERS["random"](image, 12, regions, 7)
-        plain = random_field(image, 12, 0.5 * math.sqrt(48 * 64 / 12), regions, 7)
-        assert torch.equal(named.means, plain.means) and torch.equal(named.cholesky, plain.cholesky)
 
 
 class TestGradient:
     def test_centres_follow_the_detail(self) -> None:
-        field = sampled_field(scene()[0], 200, None, 0)
+        field = gradient_field(scene()[0], 200, None, 0)
         share = float((field.means[:, 0] < 32).float().mean())
         assert share > 0.7
 
     def test_flat_image_is_covered_evenly_at_its_level(self) -> None:
         image = torch.full((1, 60, 60), 0.4)
-        field = sampled_field(image, 200, None, 0)
+        field = gradient_field(image, 200, None, 0)
         assert float((field.means[:, 0] < 30).float().mean()) == pytest.approx(0.5, abs=0.1)
         assert float(draw(field, None)[:, 10:-10, 10:-10].mean()) == pytest.approx(0.4, rel=0.15)
 
     def test_no_pixel_twice(self) -> None:
-        assert len(sampled_field(scene()[0], 1000, None, 0).means.floor().unique(dim=0)) == 1000
+        assert len(gradient_field(scene()[0], 1000, None, 0).means.floor().unique(dim=0)) == 1000
 
 
 class TestKmeans:
     def test_beats_the_others(self) -> None:
         image, labels = scene()
         regions = RegionMap.from_labels(labels)
-        quality = {n: float(psnr(draw(f(image, 150, regions, 0), regions), image)) for n, f in INITIALIZERS.items()}
+        quality = {n: float(psnr(draw(f(image, 150, regions, 0), regions), image)) for n, f in STARTS.items()}
         assert quality["kmeans"] > 5 + max(quality["random"], quality["gradient"])
 
     def test_every_region_has_one(self) -> None:

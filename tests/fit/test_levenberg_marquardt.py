@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from kcgs import GaussianField, RegionMap
+from kcgs import GaussianField, RegionMap, Scene
 from kcgs.data import chart_2x3, chart_pie
 from kcgs.fit.colors import solve_colors
-from kcgs.fit.polish import _Bounds, _cells, _measure, _moved, is_flat, polish
+from kcgs.fit.frame import move
+from kcgs.fit.levenberg_marquardt import _Bounds, _cells, _measure, is_flat, levenberg_marquardt
 from kcgs.functional import psnr, region_splat
 
 SIZE = (18, 26)
@@ -35,14 +37,22 @@ def an_image(channels: int = 3) -> Tensor:
     return torch.rand(channels, *SIZE, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
 
-def draw(field: GaussianField, regions: RegionMap | None, cutoff: float = 0.0) -> Tensor:
+def rendered(field: GaussianField, regions: RegionMap | None, cutoff: float = 0.0) -> Tensor:
     ids = None if regions is None else field.region_ids
     colors = field.merged_colors()
     return region_splat(field.means, field.cholesky, colors, ids, regions, size=field.size, cutoff=cutoff).detach()
 
 
 def error(field: GaussianField, regions: RegionMap | None, image: Tensor, cutoff: float = 0.0) -> float:
-    return float((draw(field, regions, cutoff).double() - image).square().sum())
+    return float((rendered(field, regions, cutoff).double() - image).square().sum())
+
+
+def solved_colors(field: Any, image: Tensor, regions: RegionMap | None, **settings: Any) -> GaussianField:
+    return solve_colors(Scene(field, regions), image, **settings).field
+
+
+def refined_all(field: Any, image: Tensor, regions: RegionMap | None, **settings: Any) -> GaussianField:
+    return levenberg_marquardt(Scene(field, regions), image, **settings).field
 
 
 MAPS = pytest.mark.parametrize("regions", [None, a_map(), a_map(0.8)], ids=["none", "hard", "soft"])
@@ -67,7 +77,7 @@ class TestSolveColors:
         ]
         matrix = torch.stack(units).flatten(1).T
         best = torch.linalg.lstsq(matrix, image.flatten(1).T).solution
-        solved = solve_colors(field, image, regions, steps=60, cutoff=0.0, damping=0.0)
+        solved = solved_colors(field, image, regions, steps=60, cutoff=0.0, damping=0.0)
         torch.testing.assert_close(solved.colors.detach(), best, rtol=1e-6, atol=1e-7)
         assert torch.equal(solved.means, field.means) and torch.equal(solved.cholesky, field.cholesky)
 
@@ -75,7 +85,7 @@ class TestSolveColors:
     def test_any_number_of_steps_lowers_the_error(self, steps: int) -> None:
         regions, image = a_map(0.7), an_image().float()
         field = a_field(regions).float()
-        assert error(solve_colors(field, image, regions, steps=steps), regions, image, 1e-4) < error(
+        assert error(solved_colors(field, image, regions, steps=steps), regions, image, 1e-4) < error(
             field, regions, image, 1e-4
         )
 
@@ -84,11 +94,11 @@ class TestSolveColors:
         with torch.no_grad():
             field.means[1] = field.means[0] + 1e-3
             field.cholesky[1] = field.cholesky[0]
-        assert float(solve_colors(field, image, None, steps=200).colors.detach().abs().max()) < 3
+        assert float(solved_colors(field, image, None, steps=200).colors.detach().abs().max()) < 3
 
     def test_nothing_to_gain_gives_the_start(self) -> None:
         field = a_field(None)
-        assert solve_colors(field, draw(field, None, 1e-4), None) is field
+        assert solved_colors(field, rendered(field, None, 1e-4), None) is field
 
     def test_unseen_gaussians_and_opacities(self) -> None:
         regions = a_map()
@@ -100,18 +110,18 @@ class TestSolveColors:
             start.means[1] = 5000.0
         opacities = torch.linspace(0.1, 1, len(start), dtype=torch.float64)
         field = GaussianField(start.means, start.cholesky, start.colors, ids, opacities, size=SIZE)
-        for solved in (solve_colors(field, an_image(), regions), polish(field, an_image(), regions, max_steps=5)):
+        for solved in (solved_colors(field, an_image(), regions), refined_all(field, an_image(), regions, max_steps=5)):
             assert solved is not field and solved.opacities is None
             assert torch.equal(solved.colors[0], field.merged_colors()[0])
 
     def test_where_gradients_are_off(self) -> None:
         with torch.inference_mode():
             field, image = a_field(None), an_image()
-            solved, polished = solve_colors(field, image, None), polish(field, image, None, max_steps=2)
-        assert solved.colors.requires_grad and polished.colors.requires_grad
+            solved, refined = solved_colors(field, image, None), refined_all(field, image, None, max_steps=2)
+        assert solved.colors.requires_grad and refined.colors.requires_grad
 
 
-class TestPolish:
+class TestLevenbergMarquardt:
     @MAPS
     def test_derivatives_are_those_of_autograd(self, regions: RegionMap | None) -> None:
         field, image = a_field(regions, 2), an_image(2)
@@ -119,15 +129,15 @@ class TestPolish:
         state = _measure(_cells(field, image, regions), *start, 0.0)
         count = len(field)
 
-        def picture(step: Tensor, colors: Tensor) -> Tensor:
-            means, cholesky = _moved(state, step.view(5, count))
+        def render(step: Tensor, colors: Tensor) -> Tensor:
+            means, cholesky = move(state.means, state.cholesky, step.view(5, count).T, exact=False)
             ids = None if regions is None else field.region_ids
             return region_splat(means, cholesky, colors, ids, regions, size=SIZE, cutoff=0.0, backend="reference")
 
         zero = torch.zeros(5 * count, dtype=torch.float64)
-        jacobian, by_color = torch.autograd.functional.jacobian(picture, (zero, state.colors))
+        jacobian, by_color = torch.autograd.functional.jacobian(render, (zero, state.colors))
         jacobian = jacobian.flatten(0, 2)  # [C H W, 5 N]
-        residual = (image - picture(zero, state.colors)).flatten()
+        residual = (image - render(zero, state.colors)).flatten()
         alike = (state.colors @ state.colors.T).repeat(5, 5)
         gram = state.gram[1:, :, 1:].reshape(5 * count, -1) * alike
         torch.testing.assert_close(gram, jacobian.T @ jacobian, rtol=1e-9, atol=1e-9)
@@ -143,10 +153,10 @@ class TestPolish:
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     def test_better_than_colors_alone(self, regions: RegionMap | None, channels: int, dtype: torch.dtype) -> None:
         field, image = a_field(regions, channels).to(dtype), an_image(channels).to(dtype)
-        polished = polish(field, image, regions, max_steps=10)
-        solved = solve_colors(field, image, regions, steps=60, cutoff=0.0)
-        assert polished.means.dtype == dtype
-        assert error(polished, regions, image) < 0.99 * error(solved, regions, image)
+        refined = refined_all(field, image, regions, max_steps=10)
+        solved = solved_colors(field, image, regions, steps=60, cutoff=0.0)
+        assert refined.means.dtype == dtype
+        assert error(refined, regions, image) < 0.99 * error(solved, regions, image)
 
     def test_finds_a_scene_again(self) -> None:
         regions = a_map(0.8)
@@ -155,25 +165,25 @@ class TestPolish:
         with torch.no_grad():
             start.means += 0.3
             start.cholesky[:, ::2] *= 1.1
-        image = draw(truth, regions).clamp(0, 1)
-        assert torch.equal(image, draw(truth, regions))
-        polished = polish(start, image, regions)
-        assert float(psnr(draw(polished, regions), image)) > 90
+        image = rendered(truth, regions).clamp(0, 1)
+        assert torch.equal(image, rendered(truth, regions))
+        refined = refined_all(start, image, regions)
+        assert float(psnr(rendered(refined, regions), image)) > 90
 
     def test_never_worse(self) -> None:
         field = a_field(None)
-        assert polish(field, draw(field, None), None) is field
+        assert refined_all(field, rendered(field, None), None) is field
         # bounds that leave nothing good
-        image = draw(field, None)
-        assert polish(field, image, None, sigma_range=(0.05, 0.06)) is field
+        image = rendered(field, None)
+        assert refined_all(field, image, None, sigma_range=(0.05, 0.06)) is field
 
     @MAPS
     def test_bounds(self, regions: RegionMap | None) -> None:
         field, image = a_field(regions), an_image()
         limits = (1.5, 6.0)
-        polished = polish(field, image, regions, sigma_range=limits, max_steps=30)
-        assert polished is not field
-        means, cholesky = polished.means.detach(), polished.cholesky.detach()
+        refined = refined_all(field, image, regions, sigma_range=limits, max_steps=30)
+        assert refined is not field
+        means, cholesky = refined.means.detach(), refined.cholesky.detach()
         assert limits[0] <= float(cholesky[:, ::2].min()) and float(cholesky.abs().max()) <= limits[1]
         reach = 3 * math.hypot(*SIZE)
         assert -reach <= float(means.min()) and float(means.max()) <= reach + max(SIZE)
@@ -189,12 +199,12 @@ class TestPolish:
     def test_constant_region_in_float32(self) -> None:
         image = torch.full((3, 60, 90), 0.3)
         field = GaussianField.random(1, (60, 90), sigma=20.0, seed=0)
-        assert float(psnr(draw(polish(field, image, None), None), image)) > 105
+        assert float(psnr(rendered(refined_all(field, image, None), None), image)) > 105
 
     def test_same_bits(self) -> None:
         regions, image = a_map(0.8), an_image().float()
         field = a_field(regions).float()
-        first, second = (polish(field, image, regions, max_steps=5, max_seconds=60) for _ in range(2))
+        first, second = (refined_all(field, image, regions, max_steps=5, max_seconds=60) for _ in range(2))
         for name in ("means", "cholesky", "colors"):
             assert torch.equal(getattr(first, name), getattr(second, name))
 
@@ -205,7 +215,7 @@ class TestPolish:
         field = a_field(regions)
         start = [t.detach() for t in (field.means, field.cholesky, field.colors)]
         whole = _measure(_cells(field, image, regions), *start, 0.0)
-        monkeypatch.setattr(sys.modules[polish.__module__], "_CHUNK_ELEMENTS", 100)
+        monkeypatch.setattr(sys.modules[levenberg_marquardt.__module__], "_CHUNK_ELEMENTS", 100)
         parts = _measure(_cells(field, image, regions), *start, 0.0)
         torch.testing.assert_close(parts.gram, whole.gram)
         torch.testing.assert_close(parts.cost, whole.cost)
@@ -218,8 +228,8 @@ class TestCharts:
         field = GaussianField.random(20, (200, 300), sigma=30.0, seed=0)
         with torch.no_grad():
             field.means[:6] = torch.tensor([[x, y] for y in (50.0, 150.0) for x in (50.0, 150.0, 250.0)])
-        polished = polish(field.assign_regions(regions), image, regions)
-        assert float(psnr(draw(polished, regions), image)) > 105
+        refined = refined_all(field.assign_regions(regions), image, regions)
+        assert float(psnr(rendered(refined, regions), image)) > 105
 
     def test_pie_with_exact_coverage(self) -> None:
         image, labels = chart_pie()
@@ -229,9 +239,9 @@ class TestCharts:
         with torch.no_grad():
             field.means[0] = 2.0
             field.means[1:9] = 150 + 90 * torch.stack([angle.sin(), -angle.cos()], -1)
-        polished = polish(field.assign_regions(regions), image, regions, max_steps=3)
-        assert polished.region_ids is not None and len(polished.region_ids.unique()) == 9
-        assert float(psnr(draw(polished, regions), image)) > 90
+        refined = refined_all(field.assign_regions(regions), image, regions, max_steps=3)
+        assert refined.region_ids is not None and len(refined.region_ids.unique()) == 9
+        assert float(psnr(rendered(refined, regions), image)) > 90
 
     @pytest.mark.parametrize("chart", [chart_2x3, chart_pie])
     def test_are_flat(self, chart: object) -> None:
@@ -262,17 +272,17 @@ class TestIsFlat:
 
 
 class TestBadInput:
-    @pytest.mark.parametrize("call", [solve_colors, polish])
+    @pytest.mark.parametrize("call", [solved_colors, refined_all])
     @pytest.mark.parametrize(
         ("change", "failure", "words"),
         [
             ({"field": 3}, TypeError, "field must be a GaussianField; got int"),
             ({"image": torch.zeros(3, 4, 4)}, ValueError, r"image must have shape \(3, 18, 26\); got \(3, 4, 4\)"),
             ({"image": torch.full((3, *SIZE), math.nan)}, ValueError, "image must be finite"),
-            ({"regions": torch.zeros(SIZE)}, TypeError, "regions must be a RegionMap or None; got Tensor"),
+            ({"regions": torch.zeros(SIZE).long()[None]}, ValueError, "regions must be one map"),
             ({"regions": RegionMap.from_labels(torch.zeros(4, 4).long())}, ValueError, "regions must be one map"),
-            ({"regions": a_map()}, ValueError, "field must have region_ids"),
-            ({"field": GaussianField.random(0, SIZE)}, ValueError, "field must hold the Gaussians of one image"),
+            ({"regions": a_map()}, ValueError, "scene must have region_ids"),
+            ({"field": GaussianField.random(0, SIZE)}, ValueError, "scene must hold the Gaussians of one image"),
             ({"cutoff": 1.0}, ValueError, "cutoff must be in"),
         ],
     )
@@ -283,15 +293,15 @@ class TestBadInput:
 
     def test_own(self) -> None:
         field, image = a_field(None), an_image()
-        with pytest.raises(ValueError, match="steps must be an integer of at least 1; got 0"):
-            solve_colors(field, image, None, steps=0)
+        with pytest.raises(ValueError, match="steps must be at least 1; got 0"):
+            solved_colors(field, image, None, steps=0)
         with pytest.raises(ValueError, match="damping must be finite"):
-            solve_colors(field, image, None, damping=-1.0)
-        with pytest.raises(ValueError, match="steps must be an integer of at least 1; got 0"):
-            polish(field, image, None, max_steps=0)
-        with pytest.raises(ValueError, match="max_seconds must be positive"):
-            polish(field, image, None, max_seconds=0.0)
+            solved_colors(field, image, None, damping=-1.0)
+        with pytest.raises(ValueError, match="max_steps must be at least 1; got 0"):
+            refined_all(field, image, None, max_steps=0)
+        with pytest.raises(ValueError, match="max_seconds must be finite and above 0"):
+            refined_all(field, image, None, max_seconds=0.0)
         with pytest.raises(ValueError, match="sigma_range must rise"):
-            polish(field, image, None, sigma_range=(3.0, 2.0))
+            refined_all(field, image, None, sigma_range=(3.0, 2.0))
         with pytest.raises(ValueError, match=r"image must have shape \(C, H, W\)"):
             is_flat(torch.zeros(1, 3, 4, 4), None, 5)

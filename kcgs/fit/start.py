@@ -1,0 +1,204 @@
+"""The start of a fit: the map to render with, and the first Gaussians."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcgs.functional import RegionMap, choose_widths, edge_band, smooth_contours
+from kcgs.nn import GaussianField
+
+from .config import FitConfig
+from .kmeans import kmeans_field
+from .levenberg_marquardt import is_flat
+from .optimizers import FrameAdam, GaussianImageAdan, GaussianOptimizer, ImageGSAdam
+from .sampling import sample_pixels, spread_repeats
+from .search import TargetSearch
+from .state import FitState
+
+# share of its pixels that a region must keep when contours are smoothed, and the supersampling of smooth contours
+_LEAST_AREA, _SUPERSAMPLE = 0.7, 4
+# a fit to a target starts with a Gaussian for each square of so many pixels
+_TARGET_SPACING = 64
+# share of an image's values that are 0 or 1, from which on Gaussians that overshoot them are of use
+_SATURATED = 0.25
+# share of the gradient in the density of Image-GS's centres; the rest is uniform
+_GRADIENT_SHARE = 0.7
+# thinner than this, in pixels, a Gaussian would fall between the pixel centres
+_LEAST_SIGMA = 0.5
+
+
+def start(
+    image: Tensor, regions: RegionMap | None, num_gaussians: int, config: FitConfig, seed: int, started: float
+) -> FitState:
+    """Return the state of a fit at its start; see :func:`kcgs.fit.fit`."""
+    band = None if regions is None else edge_band(regions.labels).flatten().nonzero().flatten()
+    state = FitState(
+        image,
+        config,
+        num_gaussians,
+        seed,
+        started,
+        clamp=_is_saturated(image) if config.clamp == "auto" else config.clamp,
+        band=None if band is None or not len(band) else band,
+        # a map that comes with widths keeps them
+        chooses_widths=config.softness == "auto" and regions is not None and regions.softness == 0.0,
+        cutoff=max(config.cutoff, config.draft_cutoff if config.target_psnr is None else 0.0),
+    )
+    begin(state, _regions_to_render(image, regions, num_gaussians, config))
+    return state
+
+
+def begin(state: FitState, regions: RegionMap | None) -> None:
+    """Put the first Gaussians into a state, confined to these regions, and forget what it did before."""
+    config = state.config
+    field, sigma = _first_field(state, regions)
+    state.regions, state.region_ids = regions, field.region_ids
+    state.anchor = None if regions is None else regions.labels
+    state.optimizer = _make_optimizer(config, field, sigma)
+    state.first = state.wanted = len(field)
+    state.iteration = 0
+    searches = config.target_psnr is not None and config.densify_from < 1.0
+    state.search = TargetSearch(config.target_psnr, state.num_gaussians, len(field)) if searches else None  # type: ignore[arg-type]
+
+
+def _make_optimizer(config: FitConfig, field: GaussianField, sigma: float) -> GaussianOptimizer:
+    if config.optimizer == "adan":
+        return GaussianImageAdan(field, sigma, config.iterations, config.learning_rate_factor)
+    return (FrameAdam if config.optimizer == "frame" else ImageGSAdam)(field, config.learning_rate_factor)
+
+
+def _is_saturated(image: Tensor) -> bool:
+    return bool(((image == 0.0) | (image == 1.0)).float().mean() >= _SATURATED)
+
+
+def _regions_to_render(
+    image: Tensor, regions: RegionMap | None, num_gaussians: int, config: FitConfig
+) -> RegionMap | None:
+    if regions is None or not config.guidance or regions.num_regions == 1:
+        return None
+    # a map that comes with widths, or with sub-pixel coverage, says how sharp it is
+    if regions.softness != 0.0 or regions.supersample > 1 or config.softness == 0.0:
+        return regions
+    if config.softness != "auto":
+        return RegionMap.from_labels(regions.labels, config.softness)
+    widths = choose_widths(image, regions.labels)
+    if config.refine_flat and config.move_contours and any(widths.values()) and is_flat(image, regions, num_gaussians):
+        # a chart's edges are smooth curves: their coverage says more than a blur
+        smooth = RegionMap.from_labels(smooth_contours(regions.labels, _SUPERSAMPLE), supersample=_SUPERSAMPLE)
+        if _keeps_areas(regions, smooth):
+            return smooth
+    return RegionMap.from_labels(regions.labels, widths)
+
+
+def _keeps_areas(regions: RegionMap, smooth: RegionMap) -> bool:
+    """Say whether smooth contours leave every region, thin ones too, most of its pixels."""
+    count = regions.num_regions
+    before, after = (
+        regions.index_of(labels).flatten().bincount(minlength=count) for labels in (regions.labels, smooth.labels)
+    )
+    return bool((after >= _LEAST_AREA * before).all())
+
+
+def _first_field(state: FitState, regions: RegionMap | None) -> tuple[GaussianField, float]:
+    """Return the first Gaussians and about how wide they are."""
+    image, config, seed = state.image, state.config, state.seed
+    pixels = image.shape[1] * image.shape[2]
+    first = math.ceil(config.densify_from * state.num_gaussians)
+    if config.target_psnr is not None and config.densify_from < 1.0:
+        # num_gaussians is the most there may be, and says nothing of how many are needed
+        first = min(first, math.ceil(pixels / _TARGET_SPACING**2))
+    count = min(state.num_gaussians, max(1 if regions is None else regions.num_regions, first))
+    sigma = max(1.0, 0.5 * math.sqrt(pixels / count))
+    if config.initializer == "random":
+        return random_field(image, count, sigma, regions, seed), sigma
+    if config.initializer == "gradient":
+        return gradient_field(image, count, regions, seed), sigma
+    return kmeans_field(image, count, regions, seed, config.backend), sigma
+
+
+def random_field(
+    image: Tensor, num_gaussians: int, sigma: float, regions: RegionMap | None, seed: int
+) -> GaussianField:
+    """Scatter round Gaussians uniformly over the image; no region starts empty while another has two.
+
+    Args:
+        image: (C, H, W); gives size, channels, dtype and device.
+        num_gaussians: N.
+        sigma: standard deviation in pixels.
+        regions: the map whose ids they get; None: none.
+        seed: of the places.
+    """
+    size = (image.shape[1], image.shape[2])
+    field = GaussianField.random(
+        num_gaussians, size, channels=image.shape[0], sigma=sigma, seed=seed, dtype=image.dtype
+    ).to(image.device)
+    if regions is None:
+        return field
+    field.assign_regions(regions)
+    with torch.no_grad():
+        _fill_empty_regions(field, regions, seed)
+    return field.assign_regions(regions)
+
+
+def _fill_empty_regions(field: GaussianField, regions: RegionMap, seed: int) -> None:
+    """Move Gaussians from the regions with most into those with none, the largest first, to a random pixel there."""
+    assert field.region_ids is not None
+    generator = torch.Generator().manual_seed(seed)
+    index = regions.index_of(field.region_ids)
+    counts = index.bincount(minlength=regions.num_regions)
+    areas = regions.index_of(regions.labels.flatten()).bincount(minlength=regions.num_regions)
+    # a region may have no pixel of its own, with a map finer than the image
+    empty = [r for r in areas.argsort(descending=True, stable=True).tolist() if counts[r] == 0 and areas[r] > 0]
+    for region in empty:
+        donor = int(counts.argmax())
+        if counts[donor] < 2:
+            return
+        moved = int((index == donor).nonzero()[-1])
+        pixels = (regions.labels == regions.ids[region]).nonzero()
+        y, x = pixels[int(torch.randint(len(pixels), (1,), generator=generator))].tolist()
+        field.means[moved] = field.means.new_tensor([x + 0.5, y + 0.5])
+        index[moved] = region
+        counts[donor] -= 1
+        counts[region] += 1
+
+
+def gradient_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:
+    """Sample centres where the image changes, as Image-GS does: 0.7 Sobel gradient magnitude + 0.3 uniform.
+
+    Round Gaussians of half the expected spacing, coloured like the pixel under them, so scaled that their sum is
+    about the image. Pixels are sampled without replacement while there are as many as Gaussians.
+
+    Args:
+        image: (C, H, W); gives size, channels, dtype and device.
+        num_gaussians: N, at least 1.
+        regions: the map whose ids they get; None: none.
+        seed: of the places.
+
+    Example:
+        >>> image = torch.zeros(1, 20, 40)
+        >>> image[:, :, 20:] = 1.0
+        >>> field = gradient_field(image, 50, None, seed=0)
+        >>> bool(((field.means[:, 0] - 20).abs() < 2).float().mean() > 0.4)
+        True
+    """
+    from scipy.ndimage import sobel
+
+    rng = np.random.default_rng(seed)
+    planes = image.detach().cpu().double().numpy()
+    slope = np.sqrt(sum(sobel(planes, axis) ** 2 for axis in (1, 2)).mean(0)).ravel()
+    share = _GRADIENT_SHARE if slope.any() else 0.0
+    chance = share * slope / max(slope.sum(), 1e-300) + (1 - share) / slope.size
+    pixels = sample_pixels(chance, num_gaussians, rng)
+    places = np.stack([pixels % planes.shape[2], pixels // planes.shape[2]], -1) + 0.5
+    centres = spread_repeats(places, pixels, rng)
+    sigma = np.maximum(0.5 / np.sqrt(num_gaussians * chance[pixels]), _LEAST_SIGMA)
+    # Gaussians of half the spacing add up to pi / 2
+    colors = planes.reshape(len(planes), -1).T[pixels] / (math.pi / 2)
+    cholesky = np.stack([sigma, np.zeros_like(sigma), sigma], -1)
+    tensors = (torch.from_numpy(values).to(image) for values in (centres, cholesky, colors))
+    field = GaussianField(*tensors, size=(image.shape[1], image.shape[2]))
+    return field if regions is None else field.assign_regions(regions)

@@ -1,0 +1,134 @@
+"""What a fit knows and gives back: plain data, which the loop and the strategies read and change."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from torch import Tensor
+
+from kcgs.functional import RegionMap
+from kcgs.nn import GaussianField
+from kcgs.scene import Scene
+
+from .config import FitConfig
+from .optimizers import GaussianOptimizer
+from .search import TargetSearch
+
+StopReason = Literal["iterations", "seconds", "target_psnr", "callback", "diverged"]
+
+
+class HistoryEntry(NamedTuple):
+    """One point of the curve of error against run time."""
+
+    iteration: int
+    seconds: float
+    loss: float
+    psnr: float
+    ef_psnr: float
+    num_gaussians: int
+
+
+class FitResult(NamedTuple):
+    """What a fit gives back."""
+
+    scene: Scene
+    """Without regions where nothing is confined."""
+    history: list[HistoryEntry]
+    stop_reason: StopReason
+    config: FitConfig
+    removed: int = 0
+    """Gaussians that were left out at the end."""
+    change: float = 0.0
+    """No value of the render changed by more when they were."""
+
+    @property
+    def field(self) -> GaussianField:  # transitional
+        """Gaussians."""
+        return self.scene.field
+
+    @property
+    def regions(self) -> RegionMap | None:  # transitional
+        """Map."""
+        return self.scene.regions
+
+
+class Gaussians(NamedTuple):
+    """What is rendered: Gaussians, their region ids, and the map."""
+
+    means: Tensor  # [N, 2]
+    cholesky: Tensor  # [N, 3]
+    colors: Tensor  # [N, C]
+    region_ids: Tensor | None  # [N]
+    regions: RegionMap | None
+
+    def detached(self) -> Gaussians:
+        """Copy, without the graph."""
+        means, cholesky, colors = (t.detach().clone() for t in self[:3])
+        return Gaussians(means, cholesky, colors, self.region_ids, self.regions)
+
+    def scene(self, size: tuple[int, int]) -> Scene:
+        """Make a scene of them."""
+        means, cholesky, colors = (t.detach() for t in self[:3])
+        return Scene(GaussianField(means, cholesky, colors, self.region_ids, size=size), self.regions)
+
+
+@dataclass
+class FitState:
+    """A fit in progress; `start` fills it, strategies change it, and a checkpoint keeps what is not the problem."""
+
+    # The problem
+    image: Tensor  # [C, H, W]
+    config: FitConfig
+    num_gaussians: int
+    seed: int
+    started: float  # reading of the clock
+    clamp: bool  # clip the render to [0, 1] in training
+    band: Tensor | None  # pixels near a contour of the given map, where EF-PSNR is measured
+    chooses_widths: bool  # the map came without widths, and the config asks for some
+
+    # What is rendered
+    cutoff: float
+    regions: RegionMap | None = None
+    region_ids: Tensor | None = None  # of the Gaussians
+    optimizer: GaussianOptimizer = dataclasses.field(init=False)  # holds the Gaussians
+    anchor: Tensor | None = None  # labels that contours may not move far from
+
+    # What has happened
+    iteration: int = 0
+    first: int = 0  # Gaussians at the start
+    wanted: int = 0  # Gaussians that were asked for so far
+    search: TargetSearch | None = None  # where the fewest Gaussians are to be found
+    densifications: int = 0
+    late_moves: int = 0  # of contours, after densification
+    merged: bool = False  # the trial that merges regions is over
+    moving_seconds: float = 0.0  # spent on moving contours
+    densify_after: float = 0.0  # seconds
+
+    # What was measured
+    history: list[HistoryEntry] = dataclasses.field(default_factory=list)
+    best: Gaussians | None = None
+    best_psnr: float = float("-inf")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the image."""
+        return self.image.shape[1], self.image.shape[2]
+
+    def seconds(self) -> float:
+        """Wall time since the fit began."""
+        return time.perf_counter() - self.started
+
+    def progress(self) -> float:
+        """Share of the fit that is done: of its iterations or of its seconds, whichever is more.
+
+        Learning rates and strategies go by it, so that a fit ends in time whichever runs out first.
+        """
+        done = self.iteration / self.config.iterations
+        return done if self.config.max_seconds is None else max(done, self.seconds() / self.config.max_seconds)
+
+    def gaussians(self) -> Gaussians:
+        """Return what is rendered now."""
+        return Gaussians(*self.optimizer.gaussians(), self.region_ids, self.regions)

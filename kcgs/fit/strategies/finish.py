@@ -1,0 +1,58 @@
+"""The end of a fit: the best state, refined and pruned."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from kcgs.fit.descent import log, render
+from kcgs.fit.levenberg_marquardt import is_flat, levenberg_marquardt
+from kcgs.fit.state import FitResult, FitState, Gaussians, StopReason
+from kcgs.pruning import prune
+from kcgs.scene import Scene
+
+from .drafts import EndDrafts
+
+
+@dataclass(frozen=True)
+class Finish:
+    """Measure the last state, take the best, refine it where it is flat, and remove what it does not need."""
+
+    least_seconds: float = 0.01
+    """What the refinement gets, though the clock be run down."""
+
+    def apply(self, state: FitState, reason: StopReason) -> FitResult:
+        """Return the result of a fit that ended for this reason."""
+        config = state.config
+        drafted = None
+        if state.cutoff != config.cutoff:
+            drafted = state.best
+            EndDrafts().apply(state)
+        with torch.no_grad():
+            if drafted is not None:
+                log(state, render(state, drafted), drafted)
+            if reason != "diverged" and state.optimizer.is_finite():
+                log(state, render(state))
+        assert state.best is not None
+        scene = state.best.scene(state.size)
+        if config.refine_flat and reason == "iterations" and is_flat(state.image, scene.regions, len(scene)):
+            scene = self._refined(state, scene)
+        if config.prune == 0:
+            return FitResult(scene, state.history, reason, config)
+        left = prune(scene, config.prune, cutoff=config.cutoff, backend=config.backend)
+        return FitResult(left.scene, state.history, reason, config, left.removed, left.change)
+
+    def _refined(self, state: FitState, scene: Scene) -> Scene:
+        """Refine a flat scene to its last digits, and write them down."""
+        config, seconds = state.config, math.inf
+        if config.max_seconds is not None:
+            seconds = max(self.least_seconds, config.max_seconds - state.seconds())
+        settings = {"max_seconds": seconds, "cutoff": config.cutoff, "backend": config.backend}
+        scene = levenberg_marquardt(scene, state.image, **settings)  # type: ignore[arg-type]
+        means, cholesky, colors = (t.detach() for t in (scene.field.means, scene.field.cholesky, scene.field.colors))
+        gaussians = Gaussians(means, cholesky, colors, scene.field.region_ids, scene.regions)
+        with torch.no_grad():
+            log(state, render(state, gaussians), gaussians)
+        return scene

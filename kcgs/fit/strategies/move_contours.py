@@ -1,0 +1,76 @@
+"""Contours follow the image while the Gaussians do."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from kcgs.fit.contour_moves import accept_moves, refine_contours
+from kcgs.fit.descent import squared_error
+from kcgs.fit.state import FitState
+from kcgs.functional import RegionMap, choose_widths
+
+
+@dataclass(frozen=True)
+class MoveContours:
+    """Move the contours where that explains the image better.
+
+    Before some of the additions a move may raise the squared error about it, for the Gaussians adapt to it; see
+    :class:`Densify`. Later it must lower it: that is when this strategy is due.
+    """
+
+    rise: float
+    """Factor by which a move may raise the squared error about it while Gaussians are added."""
+    after: float
+    """Share of the fit after which moves must lower the error: the end of densification."""
+    times: int = 4
+    """How often contours move then, evenly over the rest."""
+    additions_per_move: int = 2
+    """Contours move before every second addition."""
+    additions_per_choice: int = 4
+    """Before every fourth addition their widths are chosen anew."""
+    time_share: float = 0.1
+    """Share of the seconds that a fit may spend on moves."""
+
+    def due(self, progress: float, state: FitState) -> bool:
+        """Say whether it is time for a move that must lower the error."""
+        if state.late_moves >= self.times:
+            return False
+        return progress >= self.after + (1 - self.after) * (state.late_moves + 1) / (self.times + 1)
+
+    def apply(self, state: FitState) -> None:
+        """Move the contours where that lowers the error at once."""
+        state.late_moves += 1
+        self.move(state, 1.0)
+
+    def before_addition(self, state: FitState) -> None:
+        """Move the contours, and choose their widths, before those additions that it is due before."""
+        if state.densifications % self.additions_per_move == 0:
+            choose = state.densifications % self.additions_per_choice == self.additions_per_move
+            self.move(state, self.rise, choose and state.chooses_widths)
+
+    @torch.no_grad()
+    def move(self, state: FitState, rise: float, choose_anew: bool = False) -> None:
+        """Move the contours where that raises the squared error about them by no more than this factor."""
+        config, before, start = state.config, state.regions, state.seconds()
+        if before is None or before.supersample > 1:
+            return
+        if state.moving_seconds > self.time_share * (config.max_seconds or math.inf):
+            return
+        moved = refine_contours(
+            state.gaussians().scene(state.size),
+            state.image,
+            given=state.anchor,
+            max_distance=None if config.max_move == "any" else config.max_move,
+            length_weight=config.contour_cost,
+            backend=config.backend,
+        )
+        if moved is not before:
+            gain = rise * squared_error(state) - squared_error(state, state.gaussians()._replace(regions=moved))
+            moved = accept_moves(before, moved, gain)
+        if choose_anew:
+            moved = RegionMap.from_labels(moved.labels, choose_widths(state.image, moved.labels))
+        state.regions = moved
+        state.moving_seconds += state.seconds() - start
