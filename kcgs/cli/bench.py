@@ -28,12 +28,15 @@ def bench(
     ] = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Fits with so many seeds each.")] = None,
     iterations: Annotated[int | None, typer.Option(min=1, help="Of the published recipes.")] = None,
+    redraw: Annotated[
+        bool, typer.Option("--redraw", help="Measure nothing: write the report again from the results in the folder.")
+    ] = False,
     runs: Annotated[Path | None, typer.Option(help="Folder of the fits, which experiments may share.")] = None,
 ) -> None:
-    """Run an experiment and write its report. The last five options are for ablation, charts, convergence, davis."""
+    """Run an experiment and write its report. An option that the experiment does not take is refused."""
     from kcgs.bench import run
 
     run(
         name, output, data=data, quick=quick, only=only, engine=engine, workers=workers,
-        sequences=sequences, budget_seconds=budget_seconds, seeds=seeds, iterations=iterations, runs=runs,
+        sequences=sequences, budget_seconds=budget_seconds, seeds=seeds, iterations=iterations, runs=runs, redraw=redraw or None,
     )  # fmt: skip

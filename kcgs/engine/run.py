@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from functools import partial
 from typing import TypeVar
 
@@ -22,9 +21,8 @@ def run_jobs(
     engine: str = "local",
     workers: int | None = None,
     threads: int | None = None,
-    on_done: Callable[[Done[Result]], None] | None = None,
 ) -> Iterator[Done[Result]]:
-    """Do independent jobs, and hand over each as it ends.
+    """Do independent jobs, and yield each as it ends.
 
     Convention: a job that raises, or whose worker process is killed, takes no other with it. A killed worker is
     replaced and its job tried once more. Every job runs on `threads` threads, so that it has the same result on either
@@ -37,7 +35,6 @@ def run_jobs(
         engine: ``local``, or ``ray``: on the cluster at RAY_ADDRESS, or one on this machine that is shut down again.
         workers: jobs at a time. None: 1 locally, on Ray what its processors allow. With 1, ``local`` is this process.
         threads: of each job; None: 1.
-        on_done: called with each job that has ended, before it is handed over.
 
     Returns:
         An iterator over all jobs in the order in which they end; nothing runs before the first is asked for.
@@ -62,22 +59,14 @@ def run_jobs(
         from . import cluster
 
         cluster.load()  # at once, not after the caller's preparations
-        return _hand_over(cluster.run(function, jobs, workers, threads), on_done)
+        return cluster.run(function, jobs, workers, threads)
     if workers is None or workers == 1:
-        return _hand_over(_one_after_another(function, jobs, threads), on_done)
+        return _one_after_another(function, jobs, threads)
     from . import pool
 
-    return _hand_over(pool.run(function, jobs, workers, threads), on_done)
+    return pool.run(function, jobs, workers, threads)
 
 
 def _one_after_another(function: Callable[[Job], Result], jobs: Sequence[Job], threads: int) -> Iterator[Done[Result]]:
     for index, job in enumerate(jobs):
         yield perform(index, partial(function, job), threads)
-
-
-def _hand_over(found: Iterator[Done[Result]], on_done: Callable[[Done[Result]], None] | None) -> Iterator[Done[Result]]:
-    with closing(found):  # type: ignore[type-var]  # all three are generators
-        for done in found:
-            if on_done is not None:
-                on_done(done)
-            yield done

@@ -55,9 +55,9 @@ class TestExport:
         assert len(onnxruntime.InferenceSession(str(out)).get_inputs()) == 5
         assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic", "--interactive") == 2
         assert run(monkeypatch, "export", str(scene), "-o", str(out), "--precision", "fp16", "--clamp") == 0
-        (drawn,) = onnxruntime.InferenceSession(str(out)).run(None, {"size": np.array([32, 48])})
+        (image,) = onnxruntime.InferenceSession(str(out)).run(None, {"size": np.array([32, 48])})
         want = load(scene).render().numpy()
-        assert np.abs(drawn[0] - want).max() < 1 / 255
+        assert np.abs(image[0] - want).max() < 1 / 255
 
     @pytest.mark.parametrize(
         ("arguments", "words"),

@@ -77,9 +77,9 @@ class TestSegment:
     def test_share_of_gaussians_is_what_a_fit_starts_with(
         self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        picture = load_image("photo.png")
-        picture[:, 12:36, 8:28] += 0.1 * torch.rand(24, 20, generator=torch.Generator().manual_seed(0)) - 0.1
-        save_image("photo.png", picture)
+        image = load_image("photo.png")
+        image[:, 12:36, 8:28] += 0.1 * torch.rand(24, 20, generator=torch.Generator().manual_seed(0)) - 0.1
+        save_image("photo.png", image)
         arguments = ("segment", "photo.png", "-o", "out.png", "--method", "file", "--option", "path=mask.png")
         _, out, _ = kcgs(*arguments, "--json", capsys=capsys, monkeypatch=monkeypatch)
         shares = [row["gaussian_share"] for row in json.loads(out)["table"]]
@@ -166,13 +166,13 @@ class TestWarning:
 
 
 class TestOverlay:
-    def test_neighbours_differ_and_contours_are_drawn(self) -> None:
+    def test_neighbours_differ_and_contours_show(self) -> None:
         labels = torch.arange(6).view(2, 3).repeat_interleave(20, 0).repeat_interleave(20, 1) * 5
-        picture = overlay_labels(torch.full((1, 40, 60), 0.5), labels)
-        assert picture.shape == (3, 40, 60)
-        inside = picture[:, 10::20, 10::20]
+        overlay = overlay_labels(torch.full((1, 40, 60), 0.5), labels)
+        assert overlay.shape == (3, 40, 60)
+        inside = overlay[:, 10::20, 10::20]
         assert (inside[:, 0] != inside[:, 1]).any(0).all() and (inside[:, :, 1:] != inside[:, :, :-1]).any(0).all()
-        assert (picture == 1).all(0).any() and (picture == 0).all(0).any()
+        assert (overlay == 1).all(0).any() and (overlay == 0).all(0).any()
 
     def test_size_must_fit(self) -> None:
         with pytest.raises(ValueError, match="image must have shape"):
