@@ -12,7 +12,7 @@ from kcgs.data import colorize_labels, save_image, save_labels
 from kcgs.evaluate import measure
 from kcgs.fit import FitConfig, FitResult, HistoryEntry, fit, warm_up
 from kcgs.plots import COLORS, plot_history
-from kcgs.scene import Scene, load
+from kcgs.scene import load
 from kcgs.segment import segment
 
 from ._workloads import astronaut
@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
 NUM_GAUSSIANS = 400
 QUICK_STRIDE, QUICK_GAUSSIANS, QUICK_ITERATIONS = 4, 60, 20
-# the map is found, not given: its contours may move anywhere
-RECIPES = {"baseline": "best-baseline", "contour-aware": "best-refined"}
+RECIPES = {"baseline": "best-baseline", "contour-aware": "best"}
 TITLES = {"baseline": "ordinary 2D Gaussians", "contour-aware": "kcgs: contour-aware"}
 # close-ups of contours: top, left and side as shares of the photo's side
 CLOSE_UPS = ((0.27, 0.39, 0.25), (0.29, 0.66, 0.25))
@@ -66,7 +65,7 @@ def run(output: Path, options: Options) -> None:
             if not options.quick:
                 warm_up(config)  # the clock counts no compilation
             results[name] = result = _fit(image, labels, count, config, name, progress)
-            scene = Scene(result.field, result.regions)
+            scene = result.scene
             scene.save(output / f"{name}.safetensors")
             size = scene.save(output / f"{name}.kcgs")
             rendered = load(output / f"{name}.kcgs").render()  # what so many bytes give
@@ -89,7 +88,7 @@ def _fit(image: Tensor, labels: Tensor, count: int, config: FitConfig, name: str
     def step(iteration: int, _: HistoryEntry) -> None:
         progress.update(task, completed=iteration)
 
-    return fit(image, labels, count, config=config, on_step=step)
+    return fit(image, labels, count, recipe=config, on_step=step)
 
 
 def compose(panels: Sequence[Panel], *, side: int = 512, gap: int = 12) -> Image:

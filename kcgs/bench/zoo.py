@@ -79,7 +79,7 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
     image, labels = read(plan.image)
     recipe = "best" if plan.image in _CHARTS else "best-refined"  # contours that were found may move freely
     config = FitConfig.from_recipe(recipe, **({"iterations": 20} if quick else {}))
-    fitted = fit(image, labels, plan.n, config=config)
+    fitted = fit(image, labels, plan.n, recipe=config).scene
     scene = Scene(fitted.field, fitted.regions, {"recipe": recipe, "title": plan.title})
     folder = output / name
     folder.mkdir(parents=True, exist_ok=True)
