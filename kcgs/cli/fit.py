@@ -110,13 +110,13 @@ def fit_into(
         return Fitted(done.result, Scene(done.field, done.regions), write_file(output, done.data))
     result = fit(
         image, labels, request.num_gaussians,
-        config=request.config, seed=request.seed, on_step=on_step, checkpoint=checkpoint, resume=resume,
+        recipe=request.config, seed=request.seed, on_step=on_step, checkpoint=checkpoint, resume=resume,
     )  # fmt: skip
     if output.suffix != ".kcgs":
-        scene = Scene(result.field, result.regions, {"recipe": request.recipe, **(notes or {})})
+        scene = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe, **(notes or {})})
         return Fitted(result, scene, scene.save(output))
     quality = quality_for(max(entry.psnr for entry in result.history))
-    data = compress(result.field, image, result.regions, quality=quality, seed=request.seed)
+    data = compress(result.scene.field, image, result.scene.regions, quality=quality, seed=request.seed)
     write_file(output, data)
     return Fitted(result, load(output), len(data))
 

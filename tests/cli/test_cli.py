@@ -14,7 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
-from kcgs import FitConfig, fit, load
+from kcgs import fit, load
 from kcgs.cli import main
 from kcgs.data import load_image, load_labels, save_image, save_labels
 from kcgs.segment import segment
@@ -115,11 +115,11 @@ class TestFit:
         image = load_image("photo.png")
         assert kcgs("fit", "photo.png", "-n", "12", "--iterations", "40", capsys=capsys)[0] == 0
         scene = load("photo.safetensors")
-        result = fit(image, segment(image), 12, config=FitConfig(iterations=40))
+        result = fit(image, segment(image), 12, iterations=40)
         for name in ("means", "cholesky", "colors", "region_ids"):
-            assert torch.equal(getattr(scene.field, name), getattr(result.field, name)), name
-        assert scene.regions is not None and result.regions is not None
-        assert torch.equal(scene.regions.fine_labels, result.regions.fine_labels)
+            assert torch.equal(getattr(scene.field, name), getattr(result.scene.field, name)), name
+        assert scene.regions is not None and result.scene.regions is not None
+        assert torch.equal(scene.regions.fine_labels, result.scene.regions.fine_labels)
 
     def test_default_output_is_named_after_the_image(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
         code, out, err = kcgs("fit", "photo.png", "-n", "3", "--iterations", "2", capsys=capsys)
