@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,13 +32,12 @@ def compile_kept(name: str, compiler: Callable[[str, bool], T], sources: Iterabl
         return compiler(digest.hexdigest(), False)
 
 
-def count_compiled(loops: Any) -> int:
-    """Return how many of the loops' forms were compiled, not read from disk."""
-    return sum(len(loop.overloads) - sum(loop.stats.cache_hits.values()) for loop in loops)
-
-
-def say(what: str, start: float, made: bool, loops: Any) -> None:
-    """Write one line: that loops were compiled, or loaded, since `start`, by `time.perf_counter`."""
+@contextmanager
+def announced(what: str, loops: Any) -> Iterator[None]:
+    """Write one line after the first calls of loops: that they were compiled, or loaded from disk, in how long."""
+    start, before = time.perf_counter(), _count_compiled(loops)
+    yield
+    made = _count_compiled(loops) > before
     kept = all(loop.stats.cache_path for loop in loops)
     log.log(
         logging.WARNING if made else logging.INFO,
@@ -47,3 +47,7 @@ def say(what: str, start: float, made: bool, loops: Any) -> None:
         time.perf_counter() - start,
         ", kept on disk for next time" if made and kept else "",
     )
+
+
+def _count_compiled(loops: Any) -> int:
+    return sum(len(loop.overloads) - sum(loop.stats.cache_hits.values()) for loop in loops)

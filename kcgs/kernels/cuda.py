@@ -99,20 +99,11 @@ def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
     grid, channels = grid_of(inputs), inputs.colors.shape[-1]
     image = inputs.colors.new_empty(grid.batch, channels, *inputs.size)
     colors = inputs.colors.detach().flatten(0, 1).contiguous()
+    arguments = image, colors, grid.rows, grid.cols, *inputs.size
     constants = _constants(plan, inputs)
     programs = grid.total, -(-channels // constants["BLOCK"])
     with torch.cuda.device_of(image):
-        _render_tile[programs](
-            image,
-            colors,
-            grid.rows,
-            grid.cols,
-            *inputs.size,
-            *_lists(plan, inputs),
-            **constants,
-            num_warps=_RENDER_WARPS,
-            **_OPTIONS,
-        )
+        _render_tile[programs](*arguments, *_lists(plan, inputs), **constants, num_warps=_RENDER_WARPS, **_OPTIONS)
     return image
 
 

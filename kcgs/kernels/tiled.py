@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .autograd import Gradients, SplatInputs, Steps, apply_kernel
 from .tiles import TILE, Pairs, bin_gaussians, coefficients, expand_runs, grid_of, split_into_tiles, sum_runs
-from .whitened import lowest_exponent, sums_to_gradients
+from .whitened import least_exponent, sums_to_gradients
 
 _CHUNK_ELEMENTS = 1 << 18
 _LONGEST_LIST = 1024
@@ -96,7 +96,7 @@ def _weights(plan: _Plan, batch: _Batch, bases: tuple[Tensor, Tensor], cutoff: f
     k = plan.coefficients[batch.entries]
     z1 = k[..., :2] @ bases[0]
     z2 = k[..., 2:] @ bases[1]
-    weight = (z1 * z1).addcmul_(z2, z2).mul_(-0.5).clamp_(min=lowest_exponent(k.dtype)).exp_()
+    weight = (z1 * z1).addcmul_(z2, z2).mul_(-0.5).clamp_(min=least_exponent(0.0, k.dtype)).exp_()
     if cutoff > 0.0:
         weight.mul_(weight >= cutoff)
     if batch.mixed:

@@ -19,15 +19,15 @@ Z_LIMIT = 1e15
 _LOWEST_EXPONENT = {torch.float32: -80.0, torch.float64: -700.0}
 
 
-def lowest_exponent(dtype: torch.dtype) -> float:
-    """Exponent below which a weight is not evaluated, whatever the cutoff: also where torch.exp turns slow."""
-    return _LOWEST_EXPONENT[dtype]
+def least_exponent(cutoff: float, dtype: torch.dtype) -> float:
+    """Exponent below which a weight is not evaluated; at cutoff 0 where exp() turns slow, and zero in the dtype."""
+    lowest = _LOWEST_EXPONENT[dtype]
+    return max(math.log(cutoff), lowest) if cutoff > 0.0 else lowest
 
 
 def support_radius(cutoff: float, dtype: torch.dtype) -> float:
     """Largest |z| at which a weight reaches `cutoff`; at cutoff 0, the largest that the dtype can tell from zero."""
-    exponent = lowest_exponent(dtype) if cutoff <= 0.0 else max(math.log(cutoff), lowest_exponent(dtype))
-    return math.sqrt(max(-2.0 * exponent, 0.0))
+    return math.sqrt(max(-2.0 * least_exponent(cutoff, dtype), 0.0))
 
 
 def sums_to_gradients(sums: Tensor, channels: int, cholesky: Tensor) -> Gradients:

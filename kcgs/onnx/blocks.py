@@ -36,8 +36,8 @@ class Blocks:
     def render(self, windows: Windows | None) -> Value:
         """Render the image, (1, C, H, W); windows are needed where any tile has several regions."""
         g, tiles, groups = self.g, self.layout.tiles, self.layout.groups
-        group_of = np.full(tiles.total, len(groups))
-        slot_of = np.zeros(tiles.total, np.int64)
+        group_of = np.full(len(tiles.regions), len(groups))
+        slot_of = np.zeros(len(tiles.regions), np.int64)
         for number, group in enumerate(groups):
             group_of[group.tiles], slot_of[group.tiles] = number, np.arange(len(group.tiles))
         one = g.constant([1])

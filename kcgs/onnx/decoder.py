@@ -9,7 +9,6 @@ import numpy as np
 import onnx
 
 from kcgs._check import check_cutoff
-from kcgs.functional import RegionMap
 from kcgs.scene import Scene
 
 from .axis import Axis
@@ -66,7 +65,7 @@ def scene_decoder(
         raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}; got {precision!r}")
     layout = lay_out(scene.field, scene.regions, cutoff)
     facts = describe(scene, layout, cutoff=cutoff, clamp=clamp)
-    plan = _Plan(scene.size, scene.regions, layout, cutoff, clamp, interactive)
+    plan = _Plan(scene, layout, cutoff, clamp, interactive)
     exact = plan.build("fp32", facts)
     if precision == "fp32":
         return exact
@@ -78,8 +77,7 @@ def scene_decoder(
 class _Plan(NamedTuple):
     """What a graph is built of."""
 
-    size: tuple[int, int]
-    regions: RegionMap | None
+    scene: Scene
     layout: Layout
     cutoff: float
     clamp: bool
@@ -87,7 +85,7 @@ class _Plan(NamedTuple):
 
     @property
     def num_regions(self) -> int:
-        return 1 if self.regions is None else self.regions.num_regions
+        return 1 if self.scene.regions is None else self.scene.regions.num_regions
 
     def build(self, precision: str, facts: Mapping[str, str]) -> onnx.ModelProto:
         """Build the graph."""
@@ -95,24 +93,25 @@ class _Plan(NamedTuple):
         down, across, visible = self._inputs(g)
         stored = Stored(g, self.layout, visible, half=precision == "fp16")
         blocks = Blocks(g, stored, down, across, self.cutoff)
-        windows = None
-        if self.regions is not None and any(group.regions > 1 for group in self.layout.groups):
-            windows = Windows(g, self.layout.tiles, down, across, self.regions)
+        regions, windows = self.scene.regions, None
+        if regions is not None and any(group.regions > 1 for group in self.layout.groups):
+            windows = Windows(g, self.layout.tiles, down, across, regions)
         image = blocks.render(windows)
         if self.clamp:
             image = g("Clip", image, np.float32(0), np.float32(1))
-        shape: list[int | str] = [1, stored.channels, "height", "width"]
-        return g.finish({"image": image}, np.float32, [shape], {**facts, "precision": precision})
+        shape = [1, stored.channels, "height", "width"]
+        return g.finish("image", image, np.float32, shape, {**facts, "precision": precision})
 
     def _inputs(self, g: Graph) -> tuple[Axis, Axis, Value | None]:
         size = g.input("size", np.int64, [2])
         rows, cols = g.apply("Split", [size], 2, axis=0, num_outputs=2)
+        height, width = self.scene.size
         if not self.interactive:
-            return Axis(g, rows, self.size[0]), Axis(g, cols, self.size[1]), None
+            return Axis(g, rows, height), Axis(g, cols, width), None
         view = g.input("view", np.float32, [4])
         left, top, right, bottom = g.apply("Split", [view], 4, axis=0, num_outputs=4)
         visible = g.input("visible", np.float32, [self.num_regions])
-        return Axis(g, rows, self.size[0], (top, bottom)), Axis(g, cols, self.size[1], (left, right)), visible
+        return Axis(g, rows, height, (top, bottom)), Axis(g, cols, width, (left, right)), visible
 
 
 def _check(scene: object) -> None:
@@ -139,11 +138,11 @@ def _check_change(exact: onnx.ModelProto, half: onnx.ModelProto, plan: _Plan) ->
 
     feeds: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = {}
     if plan.interactive:
-        feeds["view"] = np.array([0, 0, plan.size[1], plan.size[0]], np.float32)
+        feeds["view"] = np.array([0, 0, *plan.scene.size[::-1]], np.float32)
         feeds["visible"] = np.ones(plan.num_regions, np.float32)
     sessions = [onnxruntime.InferenceSession(m.SerializeToString()) for m in (exact, half)]
     for factor in (1, 2):
-        feeds["size"] = factor * np.array(plan.size)
+        feeds["size"] = factor * np.array(plan.scene.size)
         images = [session.run(None, feeds)[0] for session in sessions]
         change = float(np.abs(images[0] - images[1]).max())
         if not change < _LARGEST_CHANGE:

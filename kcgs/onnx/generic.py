@@ -15,7 +15,7 @@ import onnx
 import torch
 
 from kcgs._check import check_count, check_cutoff
-from kcgs.kernels.whitened import lowest_exponent, support_radius
+from kcgs.kernels.whitened import least_exponent, support_radius
 
 from .graph import FLOAT, Array, Graph, Value
 from .metadata import header
@@ -45,11 +45,7 @@ class _Scene(NamedTuple):
     height: Value
     width: Value
     cutoff: float
-
-    @property
-    def radius(self) -> float:
-        """Bound on |z|, in the unit of frame."""
-        return support_radius(self.cutoff, torch.float32) * _SCALE * _SLACK
+    radius: float  # of the support: bound on |z|, in the unit of frame
 
 
 class _Row(NamedTuple):
@@ -110,16 +106,10 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = False, channels: int 
     image = _render(graph, scene)
     if clamp:
         image = graph("Clip", image, _floats(0), _floats(1))
-    return graph.finish({"image": image}, np.float32, [[1, depth, "H", "W"]], _metadata(cutoff, clamp))
-
-
-def _metadata(cutoff: float, clamp: bool) -> dict[str, str]:
     left_out = ["soft weights: contours are hard", "opacities: the caller multiplies them into the colours"]
-    return {
-        **header("generic", cutoff, clamp),
-        "precision": "fp32",
-        "left_out": json.dumps(left_out if clamp else ["the clip to [0, 1]", *left_out]),
-    }
+    left_out = left_out if clamp else ["the clip to [0, 1]", *left_out]
+    facts = {**header("generic", cutoff, clamp), "precision": "fp32", "left_out": json.dumps(left_out)}
+    return graph.finish("image", image, np.float32, [1, depth, "H", "W"], facts)
 
 
 def _floats(values: object) -> Array:
@@ -151,6 +141,7 @@ def _declare(graph: Graph, depth: int | str, cutoff: float) -> _Scene:
         height=graph("Gather", size, 0),
         width=graph("Gather", size, 1),
         cutoff=cutoff,
+        radius=radius * _SCALE,
     )
 
 
@@ -168,8 +159,7 @@ def _render(graph: Graph, scene: _Scene) -> Value:
     channels = graph("Gather", graph("Shape", scene.colors), 0)
     image = graph("Reshape", tiles, shape(down, across, channels, _SIDE, _SIDE))
     image = graph("Transpose", image, perm=[2, 0, 3, 1, 4])
-    full = shape(1, channels, graph("Mul", down, _SIDE), graph("Mul", across, _SIDE))
-    image = graph("Reshape", image, full)
+    image = graph("Reshape", image, shape(1, channels, graph("Mul", down, _SIDE), graph("Mul", across, _SIDE)))
     end = shape(scene.height, scene.width)
     return graph("Slice", image, graph.constant([0, 0]), end, graph.constant([2, 3]))
 
@@ -219,12 +209,10 @@ def _enter_tile(graph: Graph, scene: _Scene, row: _Row, labels: Value, middle: V
     # how far z goes from the middle to the pixel that is farthest
     spread1 = graph("Mul", inverse1, _floats(_HALF))
     spread2 = graph("Mul", graph("Add", graph("Abs", shear), inverse2), _floats(_HALF))
+    z1, z2 = graph("Mul", across, inverse1), graph("Mul", down, inverse2)
     near = [
         graph("LessOrEqual", graph("Abs", z), graph("Add", spread, _floats(scene.radius)))
-        for z, spread in (
-            (graph("Mul", across, inverse1), spread1),
-            (graph("Mul", down, inverse2), spread2),
-        )
+        for z, spread in ((z1, spread1), (z2, spread2))
     ]
     ids = graph("Slice", row.tags, *map(graph.constant, ([0], [1], [0])))
     present = graph("Unique", labels, sorted=1)
@@ -270,7 +258,7 @@ def _evaluate(graph: Graph, scene: _Scene, whitened: Value, tags: Value, labels:
     z1 = graph("Mul", graph("Add", k0, x), k1)  # [1, K, 1, _SIDE]
     z2 = graph("Add", graph("Mul", graph("Add", k2, y), k4), graph("Mul", k3, x))  # [1, K, _SIDE, _SIDE]
     exponent = graph("Sub", graph("Neg", graph("Mul", z1, z1)), graph("Mul", z2, z2))
-    weight = graph("Exp", graph("Max", exponent, _floats(lowest_exponent(torch.float32))))
+    weight = graph("Exp", graph("Max", exponent, _floats(least_exponent(0.0, torch.float32))))
     kept = graph("GreaterOrEqual", weight, _floats(scene.cutoff)) if scene.cutoff > 0.0 else None
     ids, place = graph.apply("Split", [tags], 2, axis=0, num_outputs=2)
     if labels is not None:

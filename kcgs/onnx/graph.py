@@ -32,7 +32,7 @@ class Graph:
     Example:
         >>> graph = Graph()
         >>> size = graph.input("size", np.int64, [2])
-        >>> model = graph.finish({"area": graph("ReduceProd", size, keepdims=0)}, np.int64, [[]], {})
+        >>> model = graph.finish("area", graph("ReduceProd", size, keepdims=0), np.int64, [], {})
         >>> [node.op_type for node in model.graph.node]
         ['ReduceProd']
     """
@@ -97,16 +97,15 @@ class Graph:
 
     def finish(
         self,
-        outputs: Mapping[str, Value],
+        name: str,
+        value: Value,
         dtype: type[np.generic],
-        shapes: Sequence[Sequence[int | str]],
+        shape: Sequence[int | str],
         metadata: Mapping[str, str],
     ) -> onnx.ModelProto:
-        """Close the graph and check it."""
-        for (name, value), shape in zip(outputs.items(), shapes, strict=True):
-            value.name, value.dtype = name, ir.DataType.from_numpy(np.dtype(dtype))
-            value.shape = ir.Shape(list(shape))
-        model = ir.Model(self._close(list(outputs.values()), "decoder"), ir_version=_IR_VERSION, producer_name="kcgs")
+        """Close the graph, with its output, and check it."""
+        value.name, value.dtype, value.shape = name, ir.DataType.from_numpy(np.dtype(dtype)), ir.Shape(list(shape))
+        model = ir.Model(self._close([value], "decoder"), ir_version=_IR_VERSION, producer_name="kcgs")
         model.metadata_props.update(metadata)
         proto = ir.to_proto(model)
         onnx.checker.check_model(proto, full_check=True)

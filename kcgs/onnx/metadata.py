@@ -48,7 +48,7 @@ def describe(scene: Scene, layout: Layout, *, cutoff: float, clamp: bool) -> dic
 
 
 def _left_out(scene: Scene, contours: str, layout: Layout, clamp: bool) -> list[str]:
-    total, windows = layout.tiles.total, len(layout.tiles.windows)
+    total, windows = len(layout.tiles.regions), len(layout.tiles.windows)
     touched = sum(len(group.tiles) for group in layout.groups)
     unseen = len(scene) - len(layout.gaussians.means)
     pairs = sum(int(group.lengths.sum()) for group in layout.groups)

@@ -31,22 +31,14 @@ class Stored:
         if not groups:
             return
         g = graph
-        sizes = [group.entries.size for group in groups]
-        self._starts = np.concatenate([[0], np.cumsum(sizes)])
-        self._begins = np.concatenate(
-            [
-                start + np.arange(len(group.tiles)) * group.entries.shape[1]
-                for start, group in zip(self._starts[:-1], groups, strict=True)
-            ]
-        )  # of each tile's entries
+        self._starts = np.cumsum([0, *(group.entries.size for group in groups)])
+        steps = zip(self._starts, self._starts[1:], [group.entries.shape[1] for group in groups], strict=False)
+        self._begins = np.concatenate([np.arange(*step) for step in steps])  # of each tile's entries
         tile = self._tile_of_entries()
         entries = self._entries(tile)
-        if half:
-            with np.errstate(over="ignore"):  # what is too large shows in the image
-                stored = [g.constant(a.astype(np.float16)) for a in (self.gaussians.cholesky, self.gaussians.colors)]
-            cholesky, colors = (g("Cast", a, to=FLOAT) for a in stored)
-        else:
-            cholesky, colors = g.constant(self.gaussians.cholesky), g.constant(self.gaussians.colors)
+        with np.errstate(over="ignore"):  # what is too large for 16 bits shows in the image
+            stored = [a.astype(np.float16 if half else F32) for a in (self.gaussians.cholesky, self.gaussians.colors)]
+        cholesky, colors = (g("Cast", a, to=FLOAT) if half else a for a in [g.constant(a) for a in stored])
         if visible is not None:
             shown = g("Gather", visible, g.whole(self.gaussians.region))
             colors = g("Mul", colors, g("Unsqueeze", shown, g.constant([1])))

@@ -29,11 +29,6 @@ class Tiles(NamedTuple):
     windows: dict[int, Tensor]  # of each tile with several regions: [K, side, side] weights (soft), or [side, side]
     # positions in the tile's list of regions (hard)
 
-    @property
-    def total(self) -> int:
-        """Number of tiles."""
-        return self.rows * self.cols
-
 
 def find_tiles(regions: RegionMap | None, size: tuple[int, int]) -> Tiles:
     """Find the regions of every tile."""

@@ -89,7 +89,7 @@ def ramp_decoder(interactive: bool, height: str = "10") -> onnx.ModelProto:
     stacked = graph("Concat", *(graph("Unsqueeze", v, graph.constant([0, 1])) for v in planes), axis=1)
     image = graph("Div", stacked, np.array(16, np.float32))
     notes = {"format": "kcgs.decoder", "format_version": "1", "kind": "scene", "region_ids": "[7, 9]"}
-    return graph.finish({"image": image}, np.float32, [[1, 3, "H", "W"]], notes | {"height": height, "width": "12"})
+    return graph.finish("image", image, np.float32, [1, 3, "H", "W"], notes | {"height": height, "width": "12"})
 
 
 def ramp(size: tuple[int, int], view: tuple[float, ...] = (0, 0, 12, 10), blue: float = 3) -> np.ndarray:

@@ -7,7 +7,6 @@ with their last label until a decision changes it, so that only pixels near cont
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -15,7 +14,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numba import njit
 
-from kcgs.kernels.compiled import compile_kept, count_compiled, say
+from kcgs.kernels.compiled import announced, compile_kept
 
 from .contexts import (
     CODED,
@@ -288,11 +287,11 @@ def _compile(fingerprint: str, cache: bool) -> Loops:
 @functools.cache
 def loops() -> Loops:
     """Compile the loops, or load them from disk; say how long it took."""
-    began, folder = time.perf_counter(), Path(__file__).parent
+    folder = Path(__file__).parent
     kept = [folder / source for source in ("contexts.py", "prior.py", "prior.bin", "wavefront.py")]
     made = compile_kept("codec", _compile, kept)
-    _rehearse(made)
-    say("the codec of label maps", began, count_compiled(made) > 0, made)
+    with announced("the codec of label maps", made):
+        _rehearse(made)
     return made
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 import math
 import os
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -19,9 +18,9 @@ import torch
 from torch import Tensor
 
 from ..autograd import Gradients, SplatInputs, Steps, apply_kernel
-from ..compiled import compile_kept, count_compiled, say
+from ..compiled import announced, compile_kept
 from ..membership import Membership
-from ..whitened import lowest_exponent, support_radius
+from ..whitened import least_exponent, support_radius
 from .loops import Lists, Loops, compile_loops
 from .simd import SIDE
 
@@ -53,15 +52,11 @@ def _loops() -> Loops:
 @functools.cache
 def _prepare(tag: tuple[float, ...]) -> None:
     """Compile the loops for this number of channels, or load them from disk, and say how long it took."""
-    start, before = time.perf_counter(), count_compiled(_loops())
-    channels = len(tag)
-    inputs = SplatInputs(
-        torch.full((1, 1, 2), 8.0), torch.ones(1, 1, 3), torch.ones(1, 1, channels), None, None, (16, 16), 1e-4
-    )
-    planned = plan(inputs)
-    differentiate(planned, inputs, render(planned, inputs), geometry=True)
-    made = count_compiled(_loops()) > before
-    say(f"the CPU kernel for {channels} channels", start, made, _loops())
+    means, cholesky, colors = (torch.full((1, 1, n), 8.0) for n in (2, 3, len(tag)))
+    inputs = SplatInputs(means, cholesky, colors, None, None, (16, 16), 1e-4)
+    with announced(f"the CPU kernel for {len(tag)} channels", _loops()):
+        planned = plan(inputs)
+        differentiate(planned, inputs, render(planned, inputs), geometry=True)
 
 
 def _tag(channels: int) -> tuple[float, ...]:
@@ -82,8 +77,7 @@ def plan(inputs: SplatInputs) -> _Plan:
         table = inputs.membership.derived("cpu", _table)
         regions = inputs.region_index.flatten().numpy()[order]
     radius = support_radius(inputs.cutoff, torch.float32)
-    exponent = lowest_exponent(torch.float32)
-    lowest = np.float32(max(math.log(inputs.cutoff) if inputs.cutoff > 0 else exponent, exponent) / math.log(2))
+    lowest = np.float32(least_exponent(inputs.cutoff, torch.float32) / math.log(2))
     gaussians, start, entries = _loops().list_tiles(
         means, factors, order, regions, images, batch, height, width, radius
     )

@@ -78,20 +78,17 @@ def gather_rows(*arguments: Any) -> None:
     raise NotImplementedError
 
 
-def _choose(vector: Any, scalar: Any, arguments: tuple[Any, ...]) -> Any:
-    chosen = vector if isinstance(arguments[-1].dtype, types.Integer) else scalar
+def _choose(vector: Any, scalar: Any) -> Any:
+    def choose(*arguments):  # type: ignore[no-untyped-def]
+        chosen = vector if isinstance(arguments[-1].dtype, types.Integer) else scalar
 
-    def call(*arguments):  # type: ignore[no-untyped-def]
-        return chosen(*arguments)
+        def call(*arguments):  # type: ignore[no-untyped-def]
+            return chosen(*arguments)
 
-    return call
+        return call
 
-
-@overload(add_rows)
-def _choose_add_rows(*arguments):  # type: ignore[no-untyped-def]
-    return _choose(simd.add_rows, _scalar_add_rows, arguments)
+    return choose
 
 
-@overload(gather_rows)
-def _choose_gather_rows(*arguments):  # type: ignore[no-untyped-def]
-    return _choose(simd.gather_rows, _scalar_gather_rows, arguments)
+overload(add_rows)(_choose(simd.add_rows, _scalar_add_rows))
+overload(gather_rows)(_choose(simd.gather_rows, _scalar_gather_rows))
