@@ -88,12 +88,13 @@ def _plain(state: FitState) -> dict[str, Any]:
     return {
         **{name: getattr(state, name) for name in _KEPT},
         "optimizer": state.optimizer.state_dict(),
-        "regions": _plain_map(state.regions),
+        "regions": None if state.regions is None else state.regions.state(),
         "search": None if search is None else (search.wanted, search.phase, search.since),
         "seconds": state.seconds(),
         "history": [tuple(entry) for entry in state.history],
         "best_psnr": state.best_psnr,
-        "best": None if state.best is None else (*state.best[:4], _plain_map(state.best.regions)),
+        "best": None if state.best is None else state.best[:4],
+        "best_regions": None if state.best is None or state.best.regions is None else state.best.regions.state(),
     }
 
 
@@ -101,19 +102,13 @@ def _take_up(state: FitState, kept: dict[str, Any]) -> None:
     for name in (*_KEPT, "best_psnr"):
         setattr(state, name, kept[name])
     state.optimizer.load_state_dict(kept["optimizer"])
-    state.regions = _rich_map(kept["regions"])
+    state.regions, best_regions = (
+        None if kept[name] is None else RegionMap.from_state(kept[name]) for name in ("regions", "best_regions")
+    )
     if state.search is not None:
         state.search.wanted, state.search.phase, state.search.since = kept["search"]
     state.started = time.perf_counter() - kept["seconds"]
     state.history = [HistoryEntry(*entry) for entry in kept["history"]]
     if kept["best"] is not None:
-        means, cholesky, colors, region_ids, regions = kept["best"]
-        state.best = Gaussians(means, cholesky, colors, region_ids, _rich_map(regions))
-
-
-def _plain_map(regions: RegionMap | None) -> dict[str, Any] | None:
-    return None if regions is None else regions.state()
-
-
-def _rich_map(plain: dict[str, Any] | None) -> RegionMap | None:
-    return None if plain is None else RegionMap.from_state(plain)
+        means, cholesky, colors, region_ids = kept["best"]
+        state.best = Gaussians(means, cholesky, colors, region_ids, best_regions)

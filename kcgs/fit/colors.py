@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcgs._check import check_count, check_cutoff, check_image, check_number
+from kcgs._check import check_image
 from kcgs.functional import RegionMap, region_splat
 from kcgs.functional.splat import SCALE_LIMITS
 from kcgs.nn import GaussianField
@@ -47,7 +47,7 @@ def solve_colors(
         A new scene; `scene` itself where the squared error did not fall, or rose once clipped to [0, 1].
 
     Raises:
-        TypeError, ValueError: wrong types; a batched field; sizes, channels, devices that differ; numbers out of range.
+        TypeError, ValueError: wrong types; a batched field; sizes, channels, devices that differ.
 
     Example:
         >>> scene = Scene(GaussianField.random(5, (16, 24), seed=0))
@@ -59,9 +59,7 @@ def solve_colors(
     Source: Hestenes and Stiefel, "Methods of conjugate gradients for solving linear systems", 1952.
     """
     image = check_problem(scene, image)
-    steps = check_count("steps", steps)
-    check_number("damping", damping, 0.0)
-    field, regions, cutoff = scene.field, scene.regions, check_cutoff(cutoff)
+    field, regions = scene.field, scene.regions
     start = field.merged_colors().detach().clone()
     operator = ColorOperator(field, regions, start, cutoff, backend)
     # w^2 is a Gaussian of half the covariance
@@ -142,18 +140,12 @@ def check_problem(scene: Scene, image: Tensor) -> Tensor:
         raise ValueError(f"image must have shape {(field.colors.shape[-1], *field.size)}; got {tuple(image.shape)}")
     if image.device != field.means.device:
         raise ValueError(f"image must be on {field.means.device} with the scene; got {image.device}")
-    check_map(scene.regions, field.size)
+    labels = None if scene.regions is None else scene.regions.labels
+    if labels is not None and tuple(labels.shape) != field.size:
+        raise ValueError(f"regions must be one map of size {field.size}; got {tuple(labels.shape)}")
     if scene.regions is not None and field.region_ids is None:
         raise ValueError("scene must have region_ids where it has regions; call field.assign_regions(regions)")
     return image.detach().to(field.means.dtype, copy=True)
-
-
-def check_map(regions: RegionMap | None, size: tuple[int, int]) -> None:
-    """Refuse what is not one map of this size."""
-    if regions is not None and not isinstance(regions, RegionMap):
-        raise TypeError(f"regions must be a RegionMap or None; got {type(regions).__name__}")
-    if regions is not None and (regions.labels.ndim != 2 or regions.size != size):
-        raise ValueError(f"regions must be one map of size {size}; got {tuple(regions.labels.shape)}")
 
 
 def is_better(rendered: Tensor, before: Tensor, image: Tensor) -> bool:

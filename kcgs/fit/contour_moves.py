@@ -12,12 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs._check import check_count, check_labels, check_number
 from kcgs.functional import RegionMap, edge_band
 from kcgs.scene import Scene
 
 from .colors import check_problem
-from .contour_energy import MovingLabels, RegionCosts, bounding_boxes, index_map, unequal
+from .contour_energy import MovingLabels, RegionCosts, bounding_boxes, index_map
 
 
 @torch.no_grad()
@@ -37,10 +36,15 @@ def refine_contours(
 ) -> RegionMap:
     r"""Move contours to where the image is explained better, at most `max_distance` from the given map.
 
-    Lowers the energy of :func:`contour_energy` by exact coordinate descent: all pixels of one colour of a 2 x 2
-    colouring at once, which no two 8-neighbours share, so that no sweep raises it. Then 4-connected pieces under
-    `smallest` pixels that came up on the way are given to the adjacent label that costs least (a piece that continues
-    one that was that small before stays, and so does one that no adjacent label may take).
+    Lowers, by exact coordinate descent, the energy
+
+    .. math:: E = \sum_p (G * |I - F_{l(p)}|^2)(p) + \beta \sum_p \tfrac18 |\{q \in N_8(p): l(q) \ne l(p)\}|
+
+    F_r is the sum of region r's Gaussians without the constraint, the square is the mean over channels, G the blur,
+    normalised at the image's borders; beyond them there are no neighbours. All pixels of one colour of a 2 x 2
+    colouring move at once, which no two 8-neighbours share, so that no sweep raises the energy. Then 4-connected
+    pieces under `smallest` pixels that came up on the way are given to the adjacent label that costs least (a piece
+    that continues one that was that small before stays, and so does one that no adjacent label may take).
 
     Convention: no region is lost. Each keeps min(its pixels, `smallest`) pixels: in the sweeps that many of those
     farthest from its contour stay, and no piece is given away that would leave fewer. Deterministic.
@@ -52,8 +56,8 @@ def refine_contours(
             at each call, and no number of calls moves a contour farther.
         max_distance: pixels, at least 1: a pixel may get only a label that `given` has within this distance of it;
             None: no bound. The time grows with its square: for a few pixels.
-        length_weight: squared error that a pixel of contour must save, at least 0. A pixel alone among others costs 2
-            of it, a straight contour 0.75 per pixel.
+        length_weight: beta, the squared error that a pixel of contour must save, at least 0. A pixel alone among others
+            costs 2 of it, a straight contour 0.75 per pixel.
         reach: pixels, at least 1: in each sweep a pixel may get only a label that is within this distance of it.
         sweeps: at least 1.
         blur: standard deviation in pixels of the blur of the squared error, 0 to 16.
@@ -66,9 +70,7 @@ def refine_contours(
         get the mean width. The scene's map itself where nothing lowers the energy.
 
     Raises:
-        TypeError: arguments of the wrong type.
-        ValueError: no map, batched or supersampled maps, a batched field or one without ids, sizes or channels that do
-            not fit, numbers out of range.
+        TypeError, ValueError: as :func:`kcgs.fit.colors.check_problem`.
 
     Example:
         >>> image = torch.zeros(1, 8, 16)
@@ -82,14 +84,10 @@ def refine_contours(
 
     Source: Mumford and Shah's functional of 1989; Besag's iterated conditional modes of 1986.
     """
-    regions = _check(scene, image, length_weight, blur)
-    for name, count in {"reach": reach, "sweeps": sweeps, "smallest": smallest}.items():
-        check_count(name, count)
-    if max_distance is not None:
-        check_number("max_distance", max_distance, 1.0)
-    given = regions.labels if given is None else check_labels("given", given).to(regions.labels.device)
-    if given.shape != regions.labels.shape:
-        raise ValueError(f"given must have the shape {tuple(regions.labels.shape)}; got {tuple(given.shape)}")
+    check_problem(scene, image)
+    regions = scene.regions
+    assert regions is not None and regions.supersample == 1
+    given = regions.labels if given is None else given
     if regions.num_regions == 1:
         return regions
     index = index_map(regions, regions.labels)
@@ -142,64 +140,3 @@ def accept_moves(before: RegionMap, after: RegionMap, gain: Tensor) -> RegionMap
     if not bool(kept.any()) or len(torch.unique(labels)) < before.num_regions:
         return before
     return after.relabel(labels, "mean")
-
-
-@torch.no_grad()
-def contour_energy(
-    scene: Scene,
-    image: Tensor,
-    *,
-    length_weight: float = 0.003,
-    blur: float = 0.7,
-    cutoff: float = 1e-4,
-    backend: str = "auto",
-) -> float:
-    r"""Say what :func:`refine_contours` lowers.
-
-    .. math:: E = \sum_p (G * |I - F_{l(p)}|^2)(p) + \beta \sum_p \tfrac18 |\{q \in N_8(p): l(q) \ne l(p)\}|
-
-    F_r is the sum of region r's Gaussians without the constraint, the square is the mean over channels, G the blur,
-    normalised at the image's borders; beyond them there are no neighbours.
-
-    Args:
-        scene: this and the others as in :func:`refine_contours`.
-        image: :math:`(C, H, W)`.
-        length_weight: beta, the squared error that a pixel of contour must save.
-        blur: standard deviation of G in pixels.
-        cutoff: as in :func:`kcgs.functional.region_splat`.
-        backend: as there.
-
-    Returns:
-        Squared error, summed over pixels.
-
-    Raises:
-        TypeError, ValueError: as :func:`refine_contours`.
-
-    Example:
-        >>> from kcgs import GaussianField
-        >>> field = GaussianField(torch.ones(1, 2), torch.tensor([[9.0, 0.0, 9.0]]), torch.zeros(1, 1),
-        ...                       torch.tensor([0]), size=(2, 2))
-        >>> regions = RegionMap.from_labels(torch.tensor([[0, 0], [0, 1]]))
-        >>> round(contour_energy(Scene(field, regions), torch.full((1, 2, 2), 0.5), length_weight=0.4), 4)
-        1.3
-
-    Source: Mumford and Shah, "Optimal approximations by piecewise smooth functions", 1989.
-    """
-    regions = _check(scene, image, length_weight, blur)
-    index = index_map(regions, regions.labels)
-    boxes = bounding_boxes(index, regions.num_regions, 0)
-    costs = RegionCosts(scene, image, boxes, 0, blur, cutoff=cutoff, backend=backend)
-    data = costs.at(np.arange(index.size), index.ravel()).sum()
-    return float(data) + length_weight / 4 * unequal(np.pad(index, 1, constant_values=-1))
-
-
-def _check(scene: Scene, image: Tensor, length_weight: float, blur: float) -> RegionMap:
-    """Return the scene's map."""
-    check_problem(scene, image)
-    check_number("length_weight", length_weight, 0.0)
-    check_number("blur", blur, 0.0, 16.0)
-    if scene.regions is None:
-        raise ValueError("scene must have regions; got None")
-    if scene.regions.supersample > 1:
-        raise ValueError(f"regions must have one label per pixel; got supersample {scene.regions.supersample}")
-    return scene.regions

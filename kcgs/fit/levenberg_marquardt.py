@@ -9,13 +9,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs._check import check_count, check_cutoff, check_image, check_number
 from kcgs.functional import RegionMap, edge_band, region_splat
-from kcgs.functional.splat import SCALE_LIMITS
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
-from .colors import check_map, check_problem, is_better
+from .colors import check_problem, is_better
 from .frame import move
 
 # a Gaussian as wide as 100 diagonals is constant over the image to 2.6e-6 (root mean square, 111 dB)
@@ -70,7 +68,7 @@ def levenberg_marquardt(
         A new scene; `scene` itself where the squared error, rendered in its dtype, did not fall, or rose once clipped.
 
     Raises:
-        TypeError, ValueError: wrong types; a batched field; sizes, channels, devices that differ; numbers out of range.
+        TypeError, ValueError: as :func:`kcgs.fit.colors.check_problem`.
 
     Example:
         >>> labels = torch.arange(30).expand(20, 30) // 15
@@ -83,11 +81,8 @@ def levenberg_marquardt(
     """
     start = time.perf_counter()
     image = check_problem(scene, image)
-    field, regions, max_steps = scene.field, scene.regions, check_count("max_steps", max_steps)
-    if max_seconds != math.inf:
-        check_number("max_seconds", max_seconds, 0.0, above=True)
+    field, regions = scene.field, scene.regions
     bounds = _Bounds.of(field, sigma_range)
-    cutoff = check_cutoff(cutoff)
     whole = [t.detach().clone() for t in (field.means, field.cholesky, field.merged_colors())]
     before = _render(scene, whole, cutoff, backend)
     kept = bounds.clamp(whole[0].double(), whole[1].double())
@@ -128,8 +123,6 @@ class _Bounds(NamedTuple):
     def of(cls, field: GaussianField, sigma_range: tuple[float, float] | None) -> _Bounds:
         diagonal = math.hypot(*field.size)
         sigma = sigma_range or (_SIGMA_LIMITS[0], _SIGMA_LIMITS[1] * diagonal)
-        if not SCALE_LIMITS[0] <= sigma[0] <= sigma[1] <= SCALE_LIMITS[1]:
-            raise ValueError(f"sigma_range must rise, within {SCALE_LIMITS} pixels; got {sigma_range!r}")
         extent = torch.tensor(field.size[::-1], dtype=torch.float64, device=field.means.device)
         margin = torch.full_like(extent, _CENTRE_DIAGONALS * diagonal)
         return cls(sigma, (-margin, extent + margin))
@@ -315,19 +308,12 @@ def is_flat(image: Tensor, regions: RegionMap | None, num_gaussians: int) -> boo
         regions: of the image's size; None: the image is one region.
         num_gaussians: N.
 
-    Raises:
-        TypeError, ValueError: wrong types; an image that is not (C, H, W), regions of another size.
-
     Example:
         >>> image = torch.eye(2).repeat_interleave(20, 0).repeat_interleave(20, 1)[None]
         >>> is_flat(image, RegionMap.from_labels(image[0].long()), 20), is_flat(image, None, 20)
         (True, False)
     """
-    image = check_image("image", image).detach()
-    size = (image.shape[-2], image.shape[-1])
-    if image.ndim != 3:
-        raise ValueError(f"image must have shape (C, H, W); got {tuple(image.shape)}")
-    check_map(regions, size)
+    size = (image.shape[1], image.shape[2])
     if not (1 if regions is None else regions.num_regions) <= num_gaussians <= _FEW_GAUSSIANS:
         return False
     index = torch.zeros(size, dtype=torch.long, device=image.device)

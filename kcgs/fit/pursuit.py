@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from kcgs._check import check_count
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 
@@ -44,7 +43,7 @@ class Proposal(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Places worth trying, M of them."""
+    """Places to try, M of them."""
 
     region: Array  # [M], position in the map's ids
     x: Array  # [M], pixels
@@ -84,9 +83,6 @@ def propose(
     Returns:
         Means :math:`(K, 2)`, factors :math:`(K, 3)`, colours :math:`(K, C)`, region ids :math:`(K,)` or None.
 
-    Raises:
-        ValueError: residual or map of the wrong shape, a negative count, no sigmas or one that is not positive.
-
     Example:
         >>> residual = torch.zeros(3, 32, 48)
         >>> residual[:, 10:14, 20:24] = 0.5
@@ -94,7 +90,6 @@ def propose(
         >>> proposal.means.round(), proposal.cholesky[0, 0]
         (tensor([[22., 12.]]), tensor(1.5000))
     """
-    _check(residual, regions, count, sigmas)
     error = residual.detach().to(torch.float64 if residual.dtype == torch.float64 else torch.float32)
     index = torch.zeros_like(error[0], dtype=torch.int32) if regions is None else regions.index[0]
     labels = index.cpu().numpy()
@@ -111,18 +106,6 @@ def propose(
         parts.append(part)
         error = error - rendered
     return _join(parts, residual, regions)
-
-
-def _check(residual: Tensor, regions: RegionMap | None, count: int, sigmas: Sequence[float]) -> None:
-    if residual.ndim != 3 or not residual.is_floating_point() or residual.numel() == 0:
-        raise ValueError(f"residual must be floating, (C, H, W); got {residual.dtype} {tuple(residual.shape)}")
-    if regions is not None and tuple(regions.labels.shape) != tuple(residual.shape[1:]):
-        raise ValueError(
-            f"regions must be one map of size {tuple(residual.shape[1:])}; got {tuple(regions.labels.shape)}"
-        )
-    check_count("count", count, 0)
-    if not sigmas or not all(0 < sigma < math.inf for sigma in sigmas):
-        raise ValueError(f"sigmas must be positive numbers of pixels; got {tuple(sigmas)}")
 
 
 def _search(residual: Tensor, labels: NDArray[np.int32], sigmas: Sequence[float], count: int) -> _Candidates:

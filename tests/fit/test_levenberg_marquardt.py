@@ -290,18 +290,3 @@ class TestBadInput:
         good = {"field": a_field(None), "image": an_image(), "regions": None}
         with pytest.raises(failure, match=words):
             call(**{**good, **change})  # type: ignore[operator]
-
-    def test_own(self) -> None:
-        field, image = a_field(None), an_image()
-        with pytest.raises(ValueError, match="steps must be at least 1; got 0"):
-            solved_colors(field, image, None, steps=0)
-        with pytest.raises(ValueError, match="damping must be finite"):
-            solved_colors(field, image, None, damping=-1.0)
-        with pytest.raises(ValueError, match="max_steps must be at least 1; got 0"):
-            refined_all(field, image, None, max_steps=0)
-        with pytest.raises(ValueError, match="max_seconds must be finite and above 0"):
-            refined_all(field, image, None, max_seconds=0.0)
-        with pytest.raises(ValueError, match="sigma_range must rise"):
-            refined_all(field, image, None, sigma_range=(3.0, 2.0))
-        with pytest.raises(ValueError, match=r"image must have shape \(C, H, W\)"):
-            is_flat(torch.zeros(1, 3, 4, 4), None, 5)

@@ -163,20 +163,3 @@ class TestLimits:
         residual = torch.full((1, 64, 64), 0.3)
         left = residual - draw(propose(residual, None, 40, sigmas=SIGMAS), residual, None)
         assert left.square().sum() < 0.15 * residual.square().sum()
-
-    @pytest.mark.parametrize(
-        ("residual", "regions", "count", "sigmas", "message"),
-        [
-            (torch.zeros(4, 4), None, 1, SIGMAS, "residual"),
-            (torch.zeros(1, 4, 4).long(), None, 1, SIGMAS, "residual"),
-            (torch.zeros(1, 4, 4), halves((5, 4)), 1, SIGMAS, "regions"),
-            (torch.zeros(1, 4, 4), None, -1, SIGMAS, "count"),
-            (torch.zeros(1, 4, 4), None, 1, (), "sigmas"),
-            (torch.zeros(1, 4, 4), None, 1, (1.0, 0.0), "sigmas"),
-        ],
-    )
-    def test_bad_input(
-        self, residual: Tensor, regions: RegionMap | None, count: int, sigmas: tuple[float, ...], message: str
-    ) -> None:
-        with pytest.raises(ValueError, match=message):
-            propose(residual, regions, count, sigmas=sigmas)

@@ -12,10 +12,10 @@ from torch.nn.functional import pad
 from kcgs.fit.frame import local_gradient, move
 from kcgs.nn import GaussianField
 
-from .base import LARGEST_COLOR, LEAST_SIGMA
+from .base import LEAST_SIGMA, GaussianOptimizer
 
 
-class FrameAdam:
+class FrameAdam(GaussianOptimizer):
     r"""Adam in each Gaussian's own frame.
 
     A step moves the centre by d mu = L d and the factor by L <- L exp(K), K lower triangular: steps are fractions of
@@ -37,27 +37,24 @@ class FrameAdam:
     """The largest change of log scale, and of place in standard deviations, in one step."""
     outside = 2.0
     """How far outside the image a centre may lie, in its own standard deviations."""
-    widest = 1.0
-    """Image diagonals; a wider Gaussian is a constant."""
 
     def __init__(self, field: GaussianField, rate_factor: float) -> None:
-        height, width = field.size
-        self.extent = field.means.new_tensor([width, height])
-        self.limit = self.widest * math.hypot(height, width)
-        colors = field.merged_colors().detach().clone()
+        super().__init__(field)
+        colors = self.raw[-1]
         rates = [self.learning_rate] * 5 + [self.color_rate] * colors.shape[1]
-        self.rates = colors.new_tensor(rates) * rate_factor
-        self._set(field.means.detach().clone(), field.cholesky.detach().clone(), colors)
-        self.momentum = colors.new_zeros(len(colors), 5 + colors.shape[1])
+        self.rates = colors.detach().new_tensor(rates) * rate_factor
+        self.momentum = self.rates.new_zeros(len(colors), len(self.rates))
         self.square = torch.zeros_like(self.momentum)
-        self.age = colors.new_zeros(len(colors), 1)
+        self.age = self.rates.new_zeros(len(colors), 1)
 
-    def _set(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
-        self.means, self.cholesky, self.colors = (t.detach().requires_grad_() for t in (means, cholesky, colors))
+    def encode(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> list[Tensor]:
+        """Return the Gaussians as they are."""
+        return [means, cholesky, colors]
 
     def gaussians(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the Gaussians."""
-        return self.means, self.cholesky, self.colors
+        means, cholesky, colors = self.raw
+        return means, cholesky, colors
 
     def decay(self, progress: float) -> float:
         """Fall along a cosine."""
@@ -67,8 +64,9 @@ class FrameAdam:
     @torch.no_grad()
     def step(self, factor: float) -> None:
         """Move and forget the gradients."""
-        gradients = [torch.zeros_like(t) if t.grad is None else t.grad for t in self.gaussians()]
-        local = torch.cat([local_gradient(self.cholesky, *gradients[:2]), gradients[2]], -1)
+        means, cholesky, colors = self.raw
+        gradients = [torch.zeros_like(t) if t.grad is None else t.grad for t in self.raw]
+        local = torch.cat([local_gradient(cholesky, *gradients[:2]), gradients[2]], -1)
         beta1, beta2 = self.betas
         self.age += 1
         self.momentum.lerp_(local, 1 - beta1)
@@ -76,7 +74,7 @@ class FrameAdam:
         scale = (self.square / (1 - beta2**self.age)).sqrt_().add_(1e-12)
         change = self.momentum / (1 - beta1**self.age) / scale * (self.rates * -factor)
         step = change[:, :5].clamp(-self.largest_stretch, self.largest_stretch)
-        self._set(*self._bounded(*move(self.means, self.cholesky, step)), self.colors + change[:, 5:])
+        self.set_raw([*self._bounded(*move(means, cholesky, step)), colors + change[:, 5:]])
 
     def _bounded(self, means: Tensor, cholesky: Tensor) -> tuple[Tensor, Tensor]:
         l11, l21, l22 = cholesky.unbind(-1)
@@ -88,26 +86,15 @@ class FrameAdam:
     @torch.no_grad()
     def append(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
         """Add Gaussians; their averages start from nothing."""
-        added = (*self._bounded(means, cholesky), colors)
-        self._set(*(torch.cat([old.detach(), new]) for old, new in zip(self.gaussians(), added, strict=True)))
+        super().append(*self._bounded(means, cholesky), colors)
         more = (0, 0, 0, len(means))
         self.momentum, self.square, self.age = (pad(t, more) for t in (self.momentum, self.square, self.age))
 
-    def recolor(self, colors: Tensor) -> None:
-        """Replace the colours."""
-        self._set(self.means, self.cholesky, colors)
-
-    def is_finite(self) -> bool:
-        """Say whether every number is finite, and colours far from overflow."""
-        finite = torch.isfinite(self.means).all() & torch.isfinite(self.cholesky).all()
-        return bool(finite & (self.colors.detach().abs() < LARGEST_COLOR).all())
-
     def state_dict(self) -> dict[str, Any]:
         """Return Gaussians and averages."""
-        gaussians = [t.detach() for t in self.gaussians()]
-        return {"gaussians": gaussians, "momentum": self.momentum, "square": self.square, "age": self.age}
+        return {**super().state_dict(), "momentum": self.momentum, "square": self.square, "age": self.age}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up Gaussians and averages."""
-        self._set(*state["gaussians"])
+        super().load_state_dict(state)
         self.momentum, self.square, self.age = state["momentum"], state["square"], state["age"]

@@ -26,7 +26,6 @@ class ImageGSAdam(PublishedOptimizer):
     """
 
     learning_rates = (5e-4, 2e-3, 2e-3, 5e-3)
-    widest = 1.0
 
     def __init__(self, field: GaussianField, rate_factor: float) -> None:
         self.rates = [rate * rate_factor for rate in self.learning_rates]
