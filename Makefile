@@ -29,7 +29,7 @@ demo: $(VENV)/.installed
 # hours: see `kcgs bench davis`, which goes on where it was stopped.
 report: $(VENV)/.installed
 	runs=$$(mktemp -d) && $(BIN)/kcgs bench charts -o notebooks/reports/charts --runs $$runs && rm -r $$runs
-	$(BIN)/python -m kcgs.bench.paper.readme
+	$(BIN)/python -m kcgs.bench.core.pages
 
 test: $(VENV)/.installed
 	$(PYTEST) -m "not slow"

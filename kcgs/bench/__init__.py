@@ -1,5 +1,5 @@
 """The experiments and their reports."""
 
-from .registry import available_experiments, run
+from .core.registry import available_experiments, run
 
 __all__ = ["available_experiments", "run"]

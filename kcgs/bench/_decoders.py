@@ -14,19 +14,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs.data import Davis
-from kcgs.fit import FitConfig
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.onnx import generic_decoder, scene_decoder, write_model
 from kcgs.scene import Scene, load
-from kcgs.segment import segment
 
 from ._render_runs import renderer
-from ._workloads import STANDARD, astronaut, workload
+from ._workloads import STANDARD, workload
+from .core.cases import BEST, QUICK_ITERATIONS, Case
 from .core.clocks import clock, in_turns, threads
+from .core.jobs import check_made
 from .core.options import Options
-from .fits import Spec, ensure
+from .core.store import Store
 
 SCENE, GENERIC, CPU, TILED = "onnxruntime, scene", "onnxruntime, generic", "torch, cpu", "torch, tiled"
 DECODERS = (SCENE, GENERIC, CPU, TILED)
@@ -37,8 +36,7 @@ TRUTH_CUTOFF = 1e-12
 CONTOURS = ("none", "hard", "soft")
 SOFTNESS = 0.7
 SEQUENCE = "blackswan"
-RECIPE = "best"
-QUICK_SIZE, QUICK_COUNT, QUICK_ITERATIONS = (96, 128), 60, 20
+QUICK_SIZE, QUICK_COUNT, QUICK_STRIDE = (96, 128), 60, 4
 # height, width, N
 WORKLOADS = {name: STANDARD[name] for name in ("W1", "W2")}
 
@@ -100,18 +98,16 @@ def fitted_subjects(output: Path, options: Options) -> list[Subject]:
     """Fit an image; fits are kept, so that the next run need not make them again."""
     if why_not_fitted(options) is not None:
         return []
-    counts, settings = [n for _, _, n in WORKLOADS.values()], {}
+    quick: dict[str, Any] = {}
+    name, counts = SEQUENCE, [n for _, _, n in WORKLOADS.values()]
     if options.quick or options.data is None:
-        name, image = "astronaut", astronaut()[:, ::4, ::4].contiguous()
-        labels, counts, settings = segment(image), [QUICK_COUNT], {"iterations": QUICK_ITERATIONS}
-    else:
-        name, image, labels = Davis(options.data / "DAVIS", sequences=[SEQUENCE])[SEQUENCE]
-    config = FitConfig.from_recipe(RECIPE, **settings)
-    specs = [Spec(image, labels, n, config, name=f"{name} {n}") for n in counts]
+        name, counts, quick = "astronaut", [QUICK_COUNT], {"iterations": QUICK_ITERATIONS, "stride": QUICK_STRIDE}
+    cases, store = [Case(name, n, BEST, **quick) for n in counts], Store.open(output, options)
+    check_made(store.obtain(cases, options.place))
     made = []
-    for spec, fitted in zip(specs, ensure(specs, options.runs or output / "runs"), strict=True):
-        source = f"{name} fitted by recipe {RECIPE} with {spec.num_gaussians:,} Gaussians, {fitted.psnr:.2f} dB"
-        made.append(Subject(spec.name, source, fitted.scene(), is_fitted=True))
+    for case, row in zip(cases, store.rows(cases), strict=True):
+        source = f"{name} fitted by recipe {BEST.recipe} with {case.n:,} Gaussians, {row.psnr:.2f} dB"
+        made.append(Subject(f"{name} {case.n}", source, store.scene(case), is_fitted=True))
     return made
 
 

@@ -39,5 +39,5 @@ def bench(
     run(
         name, output, data=data, quick=quick, only=only, engine=engine, workers=workers,
         sequences=sequences, budget_seconds=budget_seconds, seeds=seeds, iterations=iterations, runs=runs,
-        redraw=redraw or None,
+        redraw=redraw,
     )  # fmt: skip

@@ -123,7 +123,7 @@ def test_fits_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("fitted again")
 
-    monkeypatch.setattr("kcgs.bench.fits.fit", refuse)
+    monkeypatch.setattr("kcgs.bench.core.store.fit", refuse)
     (again,) = fitted_subjects(tmp_path, Options(quick=True))
     assert again.source == first.source and torch.equal(again.scene.field.means, first.scene.field.means)
     monkeypatch.setattr(_decoders, "QUICK_ITERATIONS", 19)

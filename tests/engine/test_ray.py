@@ -12,12 +12,13 @@ from typing import Any
 import pytest
 import torch
 
-from kcgs.bench.fits import Spec, ensure
+from kcgs.bench.core.cases import BEST, Case
+from kcgs.bench.core.jobs import Place, check_made
+from kcgs.bench.core.store import Store
 from kcgs.cli import main
 from kcgs.data import save_image
 from kcgs.engine import Done, run_jobs
 from kcgs.engine.cluster import connected
-from kcgs.fit import FitConfig
 
 ray = pytest.importorskip("ray", reason="needs the package ray: pip install 'kcgs[ray]'")
 
@@ -85,15 +86,17 @@ class TestCluster:
 
     def test_bench_fits(self, tmp_path: Path) -> None:
         # as many Gaussians and steps as show how many threads there were
-        config = FitConfig.from_recipe("best", iterations=30)
-        images = torch.rand(2, 3, 96, 128, generator=torch.Generator().manual_seed(0))
-        specs = [Spec(image, (image[0] > 0.5).long(), 300, config) for image in images]
+        cases = [Case("disc", 300, BEST, seed, iterations=30, stride=3) for seed in (0, 1)]
         before = torch.get_num_threads()
         torch.set_num_threads(2)
         try:
-            here, there = (ensure(specs, tmp_path / e, engine=e) for e in ("local", "ray"))
+            stores = [Store(tmp_path / engine, None) for engine in ("local", "ray")]
+            for store in stores:
+                check_made(store.obtain(cases, Place(store.folder.name)))
         finally:
             torch.set_num_threads(before)
-        for one, two in zip(here, there, strict=True):
-            assert torch.equal(one.scene().field.means, two.scene().field.means)
-            assert one.psnr == two.psnr and one.path.name == two.path.name
+        for case in cases:
+            one, two = (store.scene(case) for store in stores)
+            assert torch.equal(one.field.means, two.field.means)
+            rows = [store.row(case) for store in stores]
+            assert rows[0] is not None and rows[1] is not None and rows[0].psnr == rows[1].psnr

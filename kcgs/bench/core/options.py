@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from .jobs import Place
+from .report import Made
 
 
 class Options(NamedTuple):
@@ -33,9 +35,9 @@ class Options(NamedTuple):
         """Where fits are made."""
         return Place(self.engine, self.workers)
 
-    def deadline(self) -> float | None:
-        """Return the moment when no further fit is to begin, by the monotonic clock; None: never."""
-        return None if self.budget_seconds is None else time.monotonic() + self.budget_seconds
+    def deadline(self, share: float = 1.0) -> float | None:
+        """Return when a share of the budget is over, by the monotonic clock; None: never."""
+        return None if self.budget_seconds is None else time.monotonic() + share * self.budget_seconds
 
     def check(self) -> None:
         """Refuse numbers out of range.
@@ -56,3 +58,7 @@ class Options(NamedTuple):
                 shown = "" if value is True else " DIR" if isinstance(value, Path) else f" {value}"
                 parts.append(f"--{field.replace('_', '-')}{shown}")
         return " ".join(parts)
+
+    def made(self, name: str, notes: Sequence[str] = ()) -> Made:
+        """Say how an experiment's results are made with these options."""
+        return Made(self.command(name), self.quick, (f"Fits: {self.place}",), tuple(notes))

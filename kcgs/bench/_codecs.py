@@ -1,0 +1,165 @@
+"""The other codecs, as Pillow has them, at the settings that make the most of their bytes."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from functools import lru_cache
+from io import BytesIO
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from PIL import Image, __version__, features
+from torch import Tensor
+
+from kcgs.functional import psnr
+
+JPEG, WEBP, AVIF, AVIF_PSNR = "JPEG", "WebP", "AVIF", "AVIF, tune=psnr"
+# one quality for each of AVIF's 64 quantizers: the others give the same files
+_AVIF_QUALITIES = tuple(sorted({((100 - q) * 63 + 50) // 100: q for q in range(101)}.values()))
+# what twice the bytes bring at low rates, where files of unequal sizes are compared
+_DB_PER_OCTAVE = 3.0
+_SUBSAMPLING = ({"subsampling": "4:2:0"}, {"subsampling": "4:4:4"})
+
+
+class Codec(NamedTuple):
+    """A codec: its settings that do not change, and those of which the better is taken."""
+
+    format: str
+    """Of Pillow."""
+    feature: str
+    """That Pillow must have."""
+    qualities: tuple[int, ...]
+    """Rising."""
+    settings: dict[str, Any]
+    variants: tuple[dict[str, Any], ...] = ({},)
+    draft: dict[str, Any] | None = None
+    """Settings that tell about which quality it will be, where the real ones are slow."""
+
+
+_AVIF = Codec("AVIF", "avif", _AVIF_QUALITIES, {"speed": 0, "max_threads": 1}, draft={"speed": 6})
+CODECS = {
+    JPEG: Codec("JPEG", "jpg", tuple(range(96)), {"optimize": True, "progressive": True}, _SUBSAMPLING),
+    WEBP: Codec("WEBP", "webp", tuple(range(101)), {"method": 6}),
+    AVIF: _AVIF,
+    # libaom's encoder minds other measures unless told; with that, full colour pays
+    AVIF_PSNR: _AVIF._replace(settings={**_AVIF.settings, "advanced": {"tune": "psnr"}}, variants=_SUBSAMPLING),
+}
+
+
+class Coded(NamedTuple):
+    """A file and how it was made."""
+
+    data: bytes
+    setting: str
+    seconds: float
+    """Of this one file, not of the search."""
+
+
+def present() -> list[str]:
+    """Name the codecs that this machine's Pillow has."""
+    return [name for name, codec in CODECS.items() if features.check(codec.feature)]
+
+
+def versions() -> str:
+    """Say what encodes."""
+    names = {"JPEG": "libjpeg_turbo", "WebP": "webp", "AVIF": "avif"}
+    return f"Pillow {__version__}; " + ", ".join(f"{shown} {features.version(name)}" for shown, name in names.items())
+
+
+def open_file(data: bytes) -> Tensor:
+    """Decode any of the files to (3, H, W) in [0, 1]."""
+    with Image.open(BytesIO(data)) as file:
+        pixels = np.asarray(file.convert("RGB"))
+    return torch.from_numpy(pixels.copy()).permute(2, 0, 1).float() / 255
+
+
+def largest(codec: str, image: Tensor, most: int, *, exact: bool = True, quick: bool = False) -> Coded:
+    """Make the largest file of at most `most` bytes, of the variants' the one with the higher PSNR.
+
+    Args:
+        codec: by name.
+        image: (3, H, W) in [0, 1].
+        most: bytes. Where the codec cannot go as low, the file is its smallest.
+        exact: False: about `most` will do, for a curve.
+        quick: AVIF at its draft's speed.
+    """
+    found = [_largest(CODECS[codec], variant, image, most, exact, quick) for variant in CODECS[codec].variants]
+    small = [coded for coded in found if len(coded.data) <= most]
+    if not small and exact:
+        return min(found, key=lambda coded: len(coded.data))
+
+    def merit(coded: Coded) -> float:
+        price = 0.0 if exact else _DB_PER_OCTAVE * math.log2(len(coded.data))
+        return float(psnr(open_file(coded.data), image)) - price
+
+    return max(small if exact else found, key=merit)
+
+
+def lossless_bytes(labels: Tensor) -> int:
+    """Size of a label map as lossless WebP, with quality 100 and method 6.
+
+    Args:
+        labels: (H, W) integer; the ids themselves cost nothing.
+
+    Example:
+        >>> halves = (torch.arange(64) > 30).long().expand(64, 64)
+        >>> 20 < lossless_bytes(halves) == lossless_bytes(7 * halves) < 100
+        True
+    """
+    index = torch.unique(labels, return_inverse=True)[1].cpu().numpy().astype(np.int32)
+    levels = np.stack([index >> 16, index >> 8, index], -1).astype(np.uint8)
+    file = BytesIO()
+    image = Image.fromarray(levels if index.max() > 255 else levels[..., 2].copy())
+    image.save(file, "WEBP", lossless=True, quality=100, method=6)
+    return file.getbuffer().nbytes
+
+
+def _largest(codec: Codec, variant: dict[str, Any], image: Tensor, most: int, exact: bool, quick: bool) -> Coded:
+    pixels = (image * 255).round().byte().permute(1, 2, 0).contiguous().numpy()
+    draft = {**codec.settings, **variant, **(codec.draft or {})}
+    settings = draft if quick else {**codec.settings, **variant}
+
+    def encode(place: int, options: dict[str, Any]) -> Coded:
+        hashable = tuple((k, tuple(v.items()) if isinstance(v, dict) else v) for k, v in options.items())
+        return _encode(codec.format, pixels.tobytes(), pixels.shape[:2], codec.qualities[place], hashable)
+
+    place = _last(len(codec.qualities), lambda place: len(encode(place, draft).data) <= most)
+    if exact and draft != settings:
+        place = _walk(len(codec.qualities), place, lambda place: len(encode(place, settings).data) <= most)
+    return encode(place, settings)
+
+
+def _last(count: int, fits: Callable[[int], bool]) -> int:
+    """Return the last place that fits, if those that fit come first; 0 where none does."""
+    low, high = 0, count - 1
+    while low < high:
+        middle = (low + high + 1) // 2
+        low, high = (middle, high) if fits(middle) else (low, middle - 1)
+    return low
+
+
+def _walk(count: int, place: int, fits: Callable[[int], bool]) -> int:
+    """Return the same, from a place that must be near."""
+    while place > 0 and not fits(place):
+        place -= 1
+    while place + 1 < count and fits(place + 1):
+        place += 1
+    return place
+
+
+# a slow codec's files at several targets are often the same
+@lru_cache(maxsize=256)
+def _encode(
+    kind: str, pixels: bytes, size: tuple[int, ...], quality: int, options: tuple[tuple[str, Any], ...]
+) -> Coded:
+    image = Image.frombytes("RGB", (size[1], size[0]), pixels)
+    named = {k: dict(v) if k == "advanced" else v for k, v in options}
+    file = BytesIO()
+    start = time.perf_counter()
+    image.save(file, kind, quality=quality, **named)
+    seconds = time.perf_counter() - start
+    setting = " ".join([f"quality {quality}", *(str(v) for k, v in options if k == "subsampling")])
+    return Coded(file.getvalue(), setting, seconds)

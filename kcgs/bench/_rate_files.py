@@ -1,0 +1,274 @@
+"""The files that bench rate measures, of kcgs and of other codecs, made once and kept."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import statistics
+import time
+from collections.abc import Callable
+from functools import cache, lru_cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from kcgs._atomic import atomic_path
+from kcgs.codec import decode
+from kcgs.evaluate import measure
+from kcgs.fit import FitConfig, warm_up
+from kcgs.scene import Scene, load
+from kcgs.segment import segment
+
+from ._codecs import CODECS, largest, open_file
+from ._library import compress, fit_bytes
+from .core import images
+from .core.cases import BEST, QUICK_ITERATIONS, Case
+from .core.store import Store
+
+KCGS, NO_REGIONS, FLOAT = "kcgs", "kcgs, no regions", "float scene"
+# of `compress`
+ITERATIONS, QUICK_TUNING = 100, 10
+# a fit's file is rounded until it costs so many dB; the dB above its PSNR at which that is tried first
+MOST_LOSS, FIRST_QUALITY = 0.15, 14.5
+QUICK_STRIDE = 2
+_TRIES, _NEAR = 4, 0.02
+Result = TypeVar("Result")
+
+
+class Point(NamedTuple):
+    """A file, or the scene before it is one."""
+
+    group: str
+    image: str
+    codec: str
+    asked: int
+    """Bytes that it may have; in the groups precision and speed: how many Gaussians."""
+    bytes: int
+    bpp: float
+    """Bits per pixel, everything included."""
+    setting: str = ""
+    psnr: float = math.nan
+    ms_ssim: float = math.nan
+    ef_psnr: float = math.nan
+    ef_ssim: float = math.nan
+    encode_seconds: float = math.nan
+    """Of kcgs: the fit included."""
+    decode_seconds: float = math.nan
+    num_gaussians: int = 0
+    regions: int = 0
+    """Of the map in the file, 1: there is none."""
+
+
+class Ask(NamedTuple):
+    """Which file: a point's first fields."""
+
+    group: str
+    image: str
+    codec: str
+    asked: int
+
+
+class Files:
+    """Makes files and keeps them, each beside its point, under a hash of all that it depends on.
+
+    Args:
+        folder: where they are kept.
+        data: folder of the images.
+        quick: the short form.
+        makes: False: only what is kept is there, so that a report is of what was finished.
+    """
+
+    def __init__(self, folder: Path, data: Path | None, quick: bool, makes: bool = True) -> None:
+        self.fits = Store(folder, data)
+        self.folder, self.data, self.quick, self.makes = folder, data, quick, makes
+        self.missed = 0  # how often something was not there that may not be made
+        self.config = BEST.config(QUICK_ITERATIONS if quick else None)
+        self.tuning = QUICK_TUNING if quick else ITERATIONS
+
+    def other(self, group: str, image: str, codec: str, most: int, *, exact: bool = True) -> Point | None:
+        """Return the largest file of another codec of at most `most` bytes; not `exact`: of about as many."""
+        ask = Ask(group, image, codec, most)
+
+        def make() -> tuple[Point, bytes]:
+            coded = largest(codec, self.sample(image)[0].image, most, exact=exact, quick=self.quick)
+            shown, seconds = timed(lambda: open_file(coded.data))
+            point = self._measured(ask, shown, len(coded.data))
+            point = point._replace(setting=coded.setting, encode_seconds=coded.seconds, decode_seconds=seconds)
+            return point, coded.data
+
+        return self.keep(ask, [*CODECS[codec], exact], make)
+
+    def fitted(self, group: str, image: str, most: int, *, regions: bool = True) -> Point | None:
+        """Return kcgs' file of a fit to so many bytes."""
+        ask = Ask(group, image, KCGS if regions else NO_REGIONS, most)
+
+        def make() -> tuple[Point, bytes]:
+            sample, segment_seconds = self.sample(image)
+            labels = sample.labels if regions else None
+            if not self.quick:
+                _warm_up(self.config)
+            start = time.perf_counter()
+            data, scene = fit_bytes(sample.image, labels, most, self.config)
+            seconds = time.perf_counter() - start + (segment_seconds if regions else 0.0)
+            scene.save(self.path(ask, self.settings("fit_bytes"), "safetensors"))
+            return self._of_file(ask, data)._replace(encode_seconds=seconds), data
+
+        return self.keep(ask, self.settings("fit_bytes"), make)
+
+    def rewritten(self, fitted: Point, most: int) -> Point | None:
+        """Return the same fit's file of at most `most` bytes, fewer than it was made for."""
+        first = Ask(*fitted[:4])
+        ask = first._replace(asked=most)
+
+        def make() -> tuple[Point, bytes]:
+            scene = load(self.path(first, self.settings("fit_bytes"), "safetensors"))
+            image = self.sample(ask.image)[0].image
+            start = time.perf_counter()
+            data = compress(scene, image, target_bytes=most, iterations=self.tuning)
+            seconds = fitted.encode_seconds + time.perf_counter() - start
+            return self._of_file(ask, data)._replace(encode_seconds=seconds), data
+
+        return self.keep(ask, [*self.settings("rewritten"), fitted.asked], make)
+
+    def case(self, image: str, n: int) -> Case:
+        """Return the fit of so many Gaussians."""
+        quick: dict[str, Any] = {"iterations": QUICK_ITERATIONS, "stride": QUICK_STRIDE} if self.quick else {}
+        return Case(image, n, BEST, **quick)
+
+    def scene(self, group: str, image: str, n: int) -> Point | None:
+        """Return the fit of so many Gaussians, as it is before it is a file."""
+        case = self.case(image, n)
+        if self.makes and self.fits.row(case) is None:
+            self.fits.make(case)
+        row = self.fits.row(case)
+        if row is None:
+            self.missed += 1
+            return None
+        figures = (row.psnr, row.ms_ssim, row.ef_psnr, row.ef_ssim)
+        point = Point(group, image, FLOAT, n, 0, 0.0, "", *figures, encode_seconds=row.seconds)
+        return _with_counts(point, self.fits.scene(case))
+
+    def rounded(self, scene: Point) -> Point | None:
+        """Return the smallest file of a scene, of a few tries, that loses at most `MOST_LOSS` dB."""
+        ask = Ask(scene.group, scene.image, KCGS, scene.asked)
+        loaded = partial(self.fits.scene, self.case(scene.image, scene.asked))
+
+        def make() -> tuple[Point, bytes]:
+            image, best, quality = self.sample(ask.image)[0].image, None, scene.psnr + FIRST_QUALITY
+            for _ in range(1 if self.quick else _TRIES):
+                start = time.perf_counter()
+                data = compress(loaded(), image, quality=quality, iterations=self.tuning)
+                seconds = time.perf_counter() - start
+                point = self._of_file(ask, data)._replace(setting=f"quality {quality:.2f}", encode_seconds=seconds)
+                loss = scene.psnr - point.psnr
+                if loss <= MOST_LOSS and (best is None or len(data) < len(best[1])):
+                    best = point, data
+                if 0 <= MOST_LOSS - loss < _NEAR:
+                    break
+                quality += step(quality - scene.psnr, loss)
+            return best or (point, data)
+
+        return self.keep(ask, [*self.settings("compress"), MOST_LOSS, FIRST_QUALITY, _TRIES], make)
+
+    def keep(self, ask: Ask, settings: Any, make: Callable[[], tuple[Point, bytes]]) -> Point | None:
+        """Return a point that is kept, or is made and kept with its file; None: it is not there."""
+        path = self.path(ask, settings, "json")
+        if not path.is_file() and self.makes:
+            point, data = make()
+            path.with_suffix(".file").write_bytes(data)
+            with atomic_path(path) as temporary:
+                temporary.write_text(json.dumps(point), encoding="utf-8")
+        if not path.is_file():
+            self.missed += 1
+            return None
+        return Point(*json.loads(path.read_text(encoding="utf-8")))
+
+    def path(self, ask: Ask, settings: Any, suffix: str) -> Path:
+        """Say where a file is, or would be."""
+        parts = json.dumps([*ask, self.quick, settings, Point._fields], sort_keys=True)
+        name = "-".join(map(str, ask))
+        name = "".join(c if c.isalnum() or c in "-." else "_" for c in name)
+        return self.folder / f"{name}-{hashlib.sha256(parts.encode()).hexdigest()[:16]}.{suffix}"
+
+    def settings(self, how: str) -> list[Any]:
+        """Return what a file of kcgs depends on."""
+        return [how, codec_digest(), self.config.model_dump(mode="json")]
+
+    def sample(self, image: str) -> tuple[images.Sample, float]:
+        """Read an image, and how long finding its map took where it has none."""
+        return _sample(image, self.data, QUICK_STRIDE if self.quick else 1)
+
+    def _of_file(self, ask: Ask, data: bytes) -> Point:
+        """Measure kcgs' own."""
+        shown, seconds = timed(lambda: render(data))
+        point = self._measured(ask, shown, len(data))
+        return _with_counts(point._replace(decode_seconds=seconds), decode(data).scene)
+
+    def _measured(self, ask: Ask, shown: Tensor, size: int) -> Point:
+        sample = self.sample(ask.image)[0]
+        figures: dict[str, Any] = measure(shown, sample.image, sample.labels)
+        del figures["ssim"]
+        return Point(*ask, size, 8 * size / sample.image[0].numel(), **figures)
+
+
+def render(data: bytes) -> Tensor:
+    """Decode a file of kcgs to its image."""
+    return decode(data).scene.render()
+
+
+def timed(call: Callable[[], Result], repeats: int = 3) -> tuple[Result, float]:
+    """Return what a call returns, and the median of its seconds after one call to warm up."""
+    result, seconds = call(), []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        result = call()
+        seconds.append(time.perf_counter() - start)
+    return result, statistics.median(seconds)
+
+
+def step(above: float, loss: float) -> float:
+    """Say by how much another quality, in dB, is to lose nearly `MOST_LOSS`; rounding's error adds to the fit's."""
+    share = 10 ** (loss / 10) - 1
+    if share <= 0:
+        return -3.0
+    wanted = 10 ** ((MOST_LOSS - _NEAR / 2) / 10) - 1
+    return min(max(10 * math.log10(share / wanted), 2.0 - above, -3.0), 6.0)
+
+
+@cache
+def codec_digest() -> str:
+    """Hash the code that writes files."""
+    import kcgs
+
+    root, digest = Path(kcgs.__file__).parent, hashlib.sha256()
+    for path in sorted(path for folder in ("codec", "rate") for path in (root / folder).rglob("*.[pb][yi]*")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _with_counts(point: Point, scene: Scene) -> Point:
+    regions = 1 if scene.regions is None else scene.regions.num_regions
+    return point._replace(num_gaussians=len(scene), regions=regions)
+
+
+@lru_cache(maxsize=2)
+def _sample(name: str, data: Path | None, stride: int) -> tuple[images.Sample, float]:
+    sample = images.load(name, data, stride)
+    if sample.labels is not None:
+        return sample, 0.0
+    segment(sample.image[:, :64, :64])  # what it imports is no part of its time
+    start = time.perf_counter()
+    labels = segment(sample.image)
+    return sample._replace(labels=labels), time.perf_counter() - start
+
+
+@lru_cache(maxsize=8)
+def _warm_up(config: FitConfig) -> None:
+    """Compile what a file needs: no clock shall count it."""
+    warm_up(config)
+    ramp = torch.linspace(0.0, 1.0, 96).expand(3, 64, 96)
+    short = config.model_copy(update={"iterations": min(config.iterations, 20), "max_seconds": None})
+    fit_bytes(ramp, (ramp[0] > 0.6).long().contiguous(), 300, short)

@@ -1,0 +1,119 @@
+"""The images that fits are made of, by name, with the label maps that they are given."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcgs.data import Davis, chart_2x3, chart_pie, load_image
+from kcgs.functional import RegionMap
+from kcgs.segment import segment
+
+CHARTS = ("2x3", "pie")
+# stand in where there is no data
+QUICK = ("astronaut", "disc")
+# a pixel of the pie is the mean of 8 x 8 samples: with so many labels per pixel its contours are exact
+COVERAGE_LABELS = 8
+
+
+class Sample(NamedTuple):
+    """An image and the label map whose contours the edge-focused figures look at."""
+
+    image: Tensor
+    """(3, H, W)."""
+    labels: Tensor | None
+    """(H, W); None: the image has none."""
+
+
+def davis(data: Path | None) -> Davis:
+    """Open DAVIS in the folder, or in its sub-folder DAVIS.
+
+    Raises:
+        ValueError: no folder.
+        FileNotFoundError: it has not the official layout.
+    """
+    if data is None:
+        raise ValueError("data must name a folder with DAVIS in it, --data DIR; got None")
+    return Davis(data / "DAVIS" if (data / "DAVIS").is_dir() else data)
+
+
+def sequences(data: Path | None, wanted: str | None, *, quick: bool) -> list[str]:
+    """List what is to be fitted: the sequences named, with commas between them, or all in alphabetical order.
+
+    Args:
+        data: as in `davis`; None is enough for the quick form, which has two images of its own then.
+        wanted: names; None: all, of the quick form two.
+        quick: whether it is the quick form.
+
+    Raises:
+        ValueError: no data, or no sequence of that name.
+    """
+    names = None if wanted is None else list(dict.fromkeys(wanted.replace(" ", "").split(",")))
+    if data is None and quick:
+        if not set(names or ()) <= set(QUICK):
+            raise ValueError(f"sequences must name some of {', '.join(QUICK)}; got {wanted!r}")
+        return names or list(QUICK)
+    frames = davis(data)
+    if names is None:
+        return frames.sequences[:2] if quick else frames.sequences
+    for name in names:
+        frames[name]
+    return names
+
+
+@lru_cache(maxsize=4)
+def load(name: str, data: Path | None, stride: int = 1) -> Sample:
+    """Read a chart, a stand-in, a photo of BSDS (a number) or Kodak (kodimN), or the first frame of a sequence.
+
+    Args:
+        name: of the image.
+        data: folder with DAVIS, bsds and kodak in it.
+        stride: one of so many pixels is taken.
+    """
+    image, labels = _read(name, data)
+    if stride > 1:
+        image = image[:, ::stride, ::stride].contiguous()
+        labels = None if labels is None else labels[::stride, ::stride].contiguous()
+    return Sample(image, labels)
+
+
+def coverage_map() -> RegionMap:
+    """Return the pie's contours as its own edges were sampled."""
+    return RegionMap.from_labels(chart_pie(COVERAGE_LABELS).labels, supersample=COVERAGE_LABELS)
+
+
+def astronaut() -> Tensor:
+    """Return scikit-image's photo."""
+    from skimage import data as photos
+
+    return torch.from_numpy(photos.astronaut()).permute(2, 0, 1).float() / 255
+
+
+def _read(name: str, data: Path | None) -> tuple[Tensor, Tensor | None]:
+    if name in CHARTS:
+        chart = chart_2x3() if name == "2x3" else chart_pie()
+        return chart.image, chart.labels
+    if name == "disc":
+        return _disc()
+    if name == "astronaut":
+        return astronaut(), segment(astronaut())
+    if data is not None and name.isdigit():
+        return load_image(data / "bsds" / name / "image.jpg"), None
+    if data is not None and name.startswith("kodim"):
+        return load_image(data / "kodak" / f"{name}.png"), None
+    frame = davis(data)[name]
+    return frame.image, frame.labels
+
+
+def _disc() -> tuple[Tensor, Tensor]:
+    """Make a disc with a pattern on a ramp, 320 x 400."""
+    y, x = torch.meshgrid(torch.arange(320.0), torch.arange(400.0), indexing="ij")
+    inside = (x - 180).square() + (y - 150).square() < 100**2
+    pattern = 0.5 + 0.3 * torch.sin(x / 23 + y / 41)
+    disc = torch.stack([pattern, 0.3 * pattern, 1 - pattern])
+    ramp = torch.stack([x / 800, 0.3 + y / 800, 0.6 - x / 1600])
+    return torch.where(inside, disc, ramp).contiguous(), inside.long()

@@ -1,0 +1,214 @@
+"""Fits on disk, each with the file that it makes and what both measure; what is there is not made again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+import warnings
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from kcgs._atomic import atomic_path
+from kcgs.codec import decode, encode
+from kcgs.codec.labels import encode_map
+from kcgs.evaluate import measure
+from kcgs.fit import HistoryEntry, fit, warm_up
+from kcgs.rate import quality_for
+from kcgs.scene import Scene, load
+from kcgs.segment import segment
+
+from .cases import QUICK_ITERATIONS, Case
+from .jobs import Place, make_all
+from .options import Options
+
+_FIGURES = ("psnr", "ms_ssim", "ef_psnr", "ef_ssim")
+
+
+class Row(NamedTuple):
+    """A finished fit: its image's figures, and those of the file that is all a decoder needs."""
+
+    image: str
+    n: int
+    method: str
+    seed: int
+    iterations: int
+    psnr: float
+    ms_ssim: float
+    ef_psnr: float
+    ef_ssim: float
+    seconds: float
+    """Wall time of the fit, compilation excluded."""
+    core_seconds: float
+    """Its processor time."""
+    num_gaussians: int
+    """What is left of n."""
+    pixels: int
+    bytes: int
+    """Of the .kcgs file."""
+    map_bytes: int
+    """Of these the label map's, contour widths included."""
+    decoded_psnr: float
+    decoded_ms_ssim: float
+    decoded_ef_psnr: float
+    decoded_ef_ssim: float
+    note: str = ""
+
+    @property
+    def bits_per_pixel(self) -> float:
+        """Size of the file."""
+        return 8 * self.bytes / self.pixels
+
+
+class Kept(NamedTuple):
+    """What is kept of a fit beside its scene."""
+
+    row: Row
+    history: tuple[HistoryEntry, ...]
+    given_regions: int
+    """Of the map that came in."""
+    segment_seconds: float
+    """That finding the map took; 0: it was given."""
+
+
+class Store:
+    """Fits in a folder, under a hash of all that they depend on; benches that share it share their fits.
+
+    Remove the folder to measure changed code anew.
+
+    Args:
+        folder: made where it is missing; on a cluster all nodes must see it.
+        data: folder of the images.
+    """
+
+    def __init__(self, folder: Path, data: Path | None) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder = folder.absolute()
+        self.data = None if data is None else data.absolute()
+
+    @classmethod
+    def open(cls, output: Path, options: Options) -> Store:
+        """Open the folder of the fits."""
+        return cls(output / "runs" if options.runs is None else options.runs, options.data)
+
+    def kept(self, case: Case) -> Kept | None:
+        """Return what is kept of a case; None: it is not there."""
+        path = self._path(case)
+        if not (path.is_file() and path.with_suffix(".safetensors").is_file()):
+            return None
+        fields = json.loads(path.read_text(encoding="utf-8"))
+        history = tuple(HistoryEntry(*entry) for entry in fields["history"])
+        return Kept(**{**fields, "row": Row(*fields["row"]), "history": history})
+
+    def row(self, case: Case) -> Row | None:
+        """Return the row of a case; None: it is not there."""
+        kept = self.kept(case)
+        return None if kept is None else kept.row
+
+    def rows(self, cases: Iterable[Case]) -> list[Row]:
+        """Return the rows that are there, each once."""
+        return [row for case in dict.fromkeys(cases) if (row := self.row(case)) is not None]
+
+    def scene(self, case: Case) -> Scene:
+        """Read the scene of a case."""
+        return load(self._path(case).with_suffix(".safetensors"))
+
+    def obtain(self, cases: Iterable[Case], place: Place, deadline: float | None = None) -> list[str]:
+        """Make what is missing, leaving out what would not be done by `deadline` of the monotonic clock.
+
+        Returns:
+            What failed.
+        """
+        missing = [case for case in dict.fromkeys(cases) if self.row(case) is None]
+        if deadline is None:
+            return make_all(self.make, missing, place)
+        parallel = 1 if place.is_local else place.workers or os.cpu_count() or 1
+        failed: list[str] = []
+        for first in range(0, len(missing), parallel):
+            part = missing[first : first + parallel]
+            if time.monotonic() + max(map(self._expected, part)) <= deadline:
+                failed += make_all(self.make, part, place)
+        return failed
+
+    def make(self, case: Case) -> None:
+        """Fit, encode, measure, and keep."""
+        begin = time.monotonic()
+        (image, labels), config = case.load(self.data), case.config()
+        if config.iterations > QUICK_ITERATIONS:  # the quick form's seconds mean nothing
+            warm_up(config)
+        segment_seconds = 0.0
+        if case.source == "none":
+            labels = None
+        elif case.source != "given":
+            _warm_up_source(case.source)
+            start = time.perf_counter()
+            labels = segment(image, case.source)
+            segment_seconds = time.perf_counter() - start
+        start, core_start = time.perf_counter(), time.process_time()
+        result = fit(image, case.regions(labels), case.n, recipe=config, seed=case.seed)
+        seconds, core_seconds = time.perf_counter() - start, time.process_time() - core_start
+        scene = result.scene
+        figures = measure(scene.render(), image, labels)
+        data = encode(scene, quality=quality_for(figures["psnr"]))
+        decoded = measure(decode(data).scene.render(), image, labels)
+        regions = scene.regions if scene.regions is not None and scene.regions.num_regions > 1 else None
+        row = Row(
+            image=case.image,
+            n=case.n,
+            method=case.method.name,
+            seed=case.seed,
+            iterations=config.iterations,
+            **{name: figures[name] for name in _FIGURES},  # type: ignore[arg-type]
+            seconds=seconds,
+            core_seconds=core_seconds,
+            num_gaussians=len(scene),
+            pixels=image[0].numel(),
+            bytes=len(data),
+            map_bytes=0 if regions is None else len(encode_map(regions)),
+            **{f"decoded_{name}": decoded[name] for name in _FIGURES},  # type: ignore[arg-type]
+        )
+        given_regions = 1 if labels is None else len(torch.unique(labels))
+        kept = Kept(row, tuple(result.history), given_regions, segment_seconds)
+        path = self._path(case)
+        scene.save(path.with_suffix(".safetensors"))
+        _write_json(path, kept._asdict())
+        self._learn(case, time.monotonic() - begin)
+
+    def _path(self, case: Case) -> Path:
+        parts = [case.image, case.seed, case.stride, case.source, str(self.data), Row._fields, case.settings()]
+        key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:20]
+        return self.folder / f"{case.image}-{case.n}-{key}.json"
+
+    def _expected(self, case: Case) -> float:
+        """Return the seconds that the slowest fit took with these settings and N."""
+        return self._known().get(case.settings(), 0.0)
+
+    def _known(self) -> dict[str, float]:
+        """Read how long fits took: a file beside them, so that one goes on with what an earlier call learned."""
+        path = self.folder / "seconds.json"
+        known: dict[str, float] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        return known
+
+    def _learn(self, case: Case, seconds: float) -> None:
+        known = self._known()
+        known[case.settings()] = max(seconds, known.get(case.settings(), 0.0))
+        _write_json(self.folder / "seconds.json", known)
+
+
+def _write_json(path: Path, value: object) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(value), encoding="utf-8")
+
+
+@lru_cache
+def _warm_up_source(source: str) -> None:
+    """Import what a source needs: no clock shall count it."""
+    ramp = torch.linspace(0.0, 1.0, 64)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        segment(torch.where(ramp > 0.4, 0.2 * ramp, 0.5 + 0.5 * ramp).expand(3, 48, 64), source)

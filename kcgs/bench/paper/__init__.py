@@ -1,1 +1,0 @@
-"""The paper's experiments: `kcgs bench charts`, `davis`, `ablation`, `convergence`."""

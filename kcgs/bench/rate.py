@@ -1,0 +1,380 @@
+"""Quality against the sizes of real files, beside other codecs: `kcgs bench rate`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcgs.codec import encode
+from kcgs.data import load_labels
+from kcgs.plots import COLORS, figure, save_figure
+
+from . import _rate_tables as tables
+from ._codecs import AVIF, AVIF_PSNR, JPEG, WEBP, lossless_bytes, present, versions
+from ._library import compress
+from ._rate_files import FIRST_QUALITY, KCGS, MOST_LOSS, NO_REGIONS, Ask, Files, Point, render, timed
+from ._rate_tables import (
+    DAVIS_CURVE,
+    DECODE,
+    EF_PSNR,
+    KODAK_CURVE,
+    LABELS,
+    LOSSLESS_WEBP,
+    MAPS,
+    MATCHED,
+    MOST_BYTES,
+    PLAIN,
+    PRECISION,
+    PSNR,
+    QUALITIES,
+    SPEED,
+    TUNED,
+)  # fmt: skip
+from .core import images
+from .core.clocks import threads
+from .core.figures import add_legend
+from .core.jobs import with_progress
+from .core.options import Options
+from .core.registry import experiment
+from .core.report import Made, conclude
+from .core.rows import read_rows, write_rows
+from .core.statistics import bounds_table
+
+# the folders of the data that a group reads
+GROUPS = {
+    MATCHED: ("DAVIS",),
+    PRECISION: ("DAVIS",),
+    MAPS: ("DAVIS", "bsds"),
+    DAVIS_CURVE: ("DAVIS",),
+    KODAK_CURVE: ("kodak",),
+    SPEED: ("DAVIS",),
+}
+FRAMES = (
+    *("blackswan", "dog", "train", "breakdance", "car-turn", "dance-jump", "mallard-water", "rollerblade"),
+    *("bmx-trees", "cows", "kite-surf", "paragliding-launch"),
+)
+_NAMES = {
+    MATCHED: FRAMES,
+    PRECISION: FRAMES[:4],
+    DAVIS_CURVE: FRAMES[:3],
+    KODAK_CURVE: ("kodim23", "kodim07", "kodim19"),
+    SPEED: FRAMES[:1],
+}
+QUICK_IMAGE, QUICK_BYTES = "disc", 700
+TARGETS, QUICK_TARGETS = (2_000, 4_000, 8_000, 16_000, 32_000), (450, 900)
+COUNTS, QUICK_COUNTS = (1_250, 7_500), (40,)
+SPEED_THREADS = 2
+# share of another file's bytes that is nearly as many
+_NEAR = 0.98
+# colour, line and marker of each codec, the same everywhere
+_STYLES = {
+    KCGS: (COLORS[1], "-", "o"),
+    NO_REGIONS: (COLORS[4], "--", "s"),
+    JPEG: (COLORS[7], ":", "v"),
+    WEBP: (COLORS[2], "-.", "^"),
+    AVIF: (COLORS[5], "--", "D"),
+    AVIF_PSNR: (COLORS[0], "-", "P"),
+}
+_INTRODUCTION = f"""Bytes are those of real files, everything in them included. `{KCGS}` is `kcgs.rate.fit_bytes` with
+the map that is given on DAVIS (the annotation of the first frame), and with the one that `kcgs.segment.segment` finds
+on Kodak; `{NO_REGIONS}` is the same without a map. The others are Pillow's: JPEG with optimize and progressive, 4:2:0
+or 4:4:4, whichever has the higher PSNR; WebP with method 6; AVIF with speed 0, as it comes and, as `{AVIF_PSNR}`, told
+to mind PSNR, in 4:2:0 or 4:4:4, whichever is better. PSNR is over the whole image, EF-PSNR and EF-SSIM within 5 pixels
+of the contours of that map. Gained is what kcgs has over the other, in dB. Intervals are the bootstrap's, 95 %, of the
+mean over images sampled in pairs. Seconds to encode are those of the final setting, the search for it excluded; of
+kcgs those of the whole fit and of finding the map, to decode until the image is there; medians, compilation excluded.
+What else the machine did meanwhile slows them."""
+_MATCHED_TEXT = f"""Every codec made its largest file of at most {MOST_BYTES:,} bytes, or its smallest if it cannot go
+as low. Kcgs was fitted to the bytes of the larger AVIF file; the fit was written again with the bytes of each other
+file, unless nearly as many were there already. Each file of another codec meets the largest of kcgs' that has no more
+bytes; of the codecs that cannot go as low, one of far fewer. Without regions kcgs was asked for the bytes that it was
+fitted to with them."""
+_CURVE_TEXT = """Files of about 2,000, 4,000, 8,000, 16,000 and 32,000 bytes; a codec that cannot go as low has its
+smallest file there. BD-rate is how many more bits kcgs takes for the same quality, in %, below zero where it saves
+bits; BD-PSNR how much better it is at the same bits. Both are means over where two curves overlap, log-rate over
+quality and quality over log-rate interpolated by monotone cubics (PCHIP); similarities count as -10 log10(1 - x)."""
+_SECTIONS = {
+    PRECISION: ("Bits per Gaussian", tables.precision_table, f"""A fit of N Gaussians with the annotation's contours,
+and the smallest of a few files by `kcgs.rate.compress` that loses at most {MOST_LOSS} dB of its PSNR. Header, map and
+checksums count. Gaussians that do not pay for their bits are left out of the file; bits are for each that is in it,
+and beside that for each of those fitted."""),
+    MAPS: ("Label maps", tables.maps_table, """Bytes of a label map alone, its size not included, beside Pillow's
+lossless WebP with quality 100 and method 6."""),
+    SPEED: ("Speed", tables.speed_table, f"""Medians on {SPEED_THREADS} threads: `kcgs.rate.compress`,
+`kcgs.codec.encode`, and a file decoded and rendered, in a process that has done so before."""),
+}  # fmt: skip
+
+# makes some files of one image; those that are not there, and may not be made, are left out
+Step = Callable[[], list[Point]]
+
+
+def report(output: Path, made: Made) -> list[str]:
+    """Write the report's parts."""
+    points = read_rows(output / "results.csv", Point)
+    parts = ["# Quality against bytes", _INTRODUCTION]
+    if not points:
+        return parts
+    parts += ["## Where kcgs loses", tables.losses(points)]
+    parts += [] if made.quick else ["## Bounds", bounds_table(tables.bounds(points))]
+    rivals = [rival for rival in tables.RIVALS if tables.pairs(points, rival)]
+    if rivals:
+        _plot_matched(points, rivals, output / "matched.png")
+        parts += [f"## At {MOST_BYTES:,} bytes: {MATCHED}", _MATCHED_TEXT]
+        parts += [tables.matched_means(points), "![](matched.png)"]
+    curves = [group for group in (DAVIS_CURVE, KODAK_CURVE) if group in tables.curve_groups(points)]
+    parts += ["## Curves", _CURVE_TEXT, tables.no_overlap(points)] if curves else []
+    for group in curves:
+        of_group = [p for p in points if p.group == group]
+        _plot_curves(of_group, output / f"{group}.png")
+        parts += [f"### {group}", f"Images: {', '.join(dict.fromkeys(p.image for p in of_group))}."]
+        parts += [tables.bd_means(points, group), f"![]({group}.png)", tables.bd_each(points, group)]
+    parts += [tables.dropped(points)] if curves or rivals else []
+    for group, (title, table, text) in _SECTIONS.items():
+        if any(p.group == group for p in points):
+            parts += [f"## {title}", text, table(points)]
+    for rival in rivals:
+        parts += [f"## Each frame at {MOST_BYTES:,} bytes: against {rival}", tables.each_frame(points, rival)]
+    return parts
+
+
+@experiment("only", report=report)
+def run(output: Path, options: Options) -> None:
+    """Compare files of kcgs with those of other codecs.
+
+    Every finished file is kept in `output`/files, so that the same call goes on where an earlier one was interrupted;
+    those of kcgs are made anew once the codec has changed. Remove the folder to measure changed fits anew.
+
+    Args:
+        output: folder.
+        options: data, a folder with DAVIS, bsds and kodak in it, of which the short form needs none; only, names of
+            groups: None: all that can be run but `speed`, whose clocks want a machine with nothing else to do.
+
+    Raises:
+        ValueError: `only` names no group, or one whose images are missing; there is nothing to run.
+    """
+    chosen = choose(options)
+    files = Files(output / "files", options.data, options.quick)
+    todo = [(f"{group}: {name}", step) for group in chosen for name, step in steps(group, files)]
+    try:
+        for step in with_progress(todo):
+            step()
+    finally:
+        points, notes = _collect(Files(files.folder, files.data, files.quick, makes=False), chosen)
+        write_rows(output / "results.csv", Point, points)
+        made = options.made("rate", notes)
+        conclude(report, output, made._replace(machine=(versions(), f"Threads: {torch.get_num_threads()}")))
+
+
+def choose(options: Options) -> list[str]:
+    """List the groups that are asked for."""
+    able = [group for group in GROUPS if options.quick or missing(group, options.data) is None]
+    if options.only is None:
+        if not able:
+            raise ValueError("data must be a folder with DAVIS, bsds or kodak in it; without one there is only quick")
+        return [group for group in able if options.quick or group != SPEED]
+    wanted = options.only.replace(" ", "").split(",")
+    for name in wanted:
+        if name not in GROUPS:
+            raise ValueError(f"only must name groups of {', '.join(GROUPS)}, with commas; got {options.only!r}")
+        if name not in able:
+            raise ValueError(f"only asks for {name!r}, but {missing(name, options.data)}")
+    return [group for group in GROUPS if group in wanted]
+
+
+def missing(group: str, data: Path | None) -> str | None:
+    """Say why a group cannot be run, None if it can."""
+    if data is None:
+        return "it needs a data folder"
+    for folder in GROUPS[group]:
+        if not (data / folder).is_dir():
+            return f"the data folder has no {folder}"
+    return None if names(group, data, False) else "the data folder has none of its images"
+
+
+def names(group: str, data: Path | None, quick: bool) -> list[str]:
+    """List a group's images."""
+    if quick:
+        return [] if group == KODAK_CURVE else [QUICK_IMAGE]  # one curve will do
+    assert data is not None
+    if group == KODAK_CURVE:
+        return [name for name in _NAMES[group] if (data / "kodak" / f"{name}.png").is_file()]
+    frames = images.davis(data).sequences
+    if group != MAPS:
+        return [name for name in _NAMES[group] if name in frames]
+    masks = sorted((data / "bsds").glob("*/mask*.png"), key=lambda path: (len(path.parent.name), path))
+    return [*(f"DAVIS/{name}" for name in frames), *(f"bsds/{path.parent.name}/{path.stem}" for path in masks)]
+
+
+def steps(group: str, files: Files) -> Iterator[tuple[str, Step]]:
+    """List what a group measures, by name."""
+    found = names(group, files.data, files.quick)
+    if group == MATCHED:
+        # without regions is the second thing to know, of all
+        yield from ((image, partial(_matched, files, image)) for image in found)
+        yield from ((f"{image}, no regions", partial(_matched_without, files, image)) for image in found)
+    elif group in (DAVIS_CURVE, KODAK_CURVE):
+        for image in found:
+            for most in QUICK_TARGETS if files.quick else TARGETS:
+                yield f"{image} {most:,}", partial(_on_curve, files, group, image, most)
+    elif group == MAPS:
+        yield from ((image, partial(_map, files, image)) for image in found)
+    else:
+        measured = {PRECISION: _precision, SPEED: _speed}[group]
+        for image in found:
+            for n in QUICK_COUNTS if files.quick else COUNTS:
+                yield f"{image} N = {n:,}", partial(measured, files, image, n)
+
+
+def _collect(kept: Files, chosen: Sequence[str]) -> tuple[list[Point], list[str]]:
+    """Return all points that are there, also of unfinished steps, and what is missing."""
+    points, notes = list[Point](), list[str]()
+    for group in GROUPS:
+        why = None if kept.quick else missing(group, kept.data)
+        if why is not None:
+            notes.append(f"{group}: {why}.")
+            continue
+        todo, whole = list(steps(group, kept)), 0
+        for _, step in todo:
+            before = kept.missed
+            found = step()
+            points += found
+            whole += bool(found) and kept.missed == before
+        if whole < len(todo):
+            why = "stopped before its end" if group in chosen else "not chosen"
+            notes.append(f"{group}: {why}, {whole} of {len(todo)} steps are finished.")
+    absent = [name for name in (JPEG, WEBP, AVIF) if name not in present()]
+    return points, [*notes, *(f"This Pillow has no {name}." for name in absent)]
+
+
+def _matched(files: Files, image: str) -> list[Point]:
+    """Make other codecs' files, then kcgs' of no more bytes than each.
+
+    A fit is made for the larger of AVIF's files. It is written again for the others, unless there is a file of nearly
+    as many bytes already, or they could not go as low.
+    """
+    most = QUICK_BYTES if files.quick else MOST_BYTES
+    others = _present(files.other(MATCHED, image, codec, most) for codec in present())
+    avif = sorted({p.bytes for p in others if p.codec in (AVIF, AVIF_PSNR)}, reverse=True) or [most]
+    first = files.fitted(MATCHED, image, avif[0]) if len(others) == len(present()) else None
+    if first is None:
+        return others
+    ours = [first, *(files.rewritten(first, smaller) for smaller in avif[1:])]
+    for point in others:
+        least = _NEAR * point.bytes if point.bytes <= most else 0.0
+        if not any(file is not None and least <= file.bytes <= point.bytes for file in ours):
+            ours.append(files.rewritten(first, point.bytes))
+    return [*others, *_present(ours)]
+
+
+def _matched_without(files: Files, image: str) -> list[Point]:
+    kept = Files(files.folder, files.data, files.quick, makes=False)
+    ours = [p for p in _matched(kept, image) if p.regions]
+    return _present([files.fitted(MATCHED, image, ours[0].asked, regions=False)] if ours else [])
+
+
+def _on_curve(files: Files, group: str, image: str, most: int) -> list[Point]:
+    points = [files.other(group, image, codec, most, exact=False) for codec in present()]
+    which = (True,) if files.quick else (True, False)
+    return _present([*points, *(files.fitted(group, image, most, regions=regions) for regions in which)])
+
+
+def _precision(files: Files, image: str, n: int) -> list[Point]:
+    scene = files.scene(PRECISION, image, n)
+    return [] if scene is None else _present([scene, files.rounded(scene)])
+
+
+def _map(files: Files, image: str) -> list[Point]:
+    from kcgs.codec.labels import encode_labels  # compiles loops
+
+    def make(codec: str) -> tuple[Point, bytes]:
+        labels = _read_map(files, image)
+        size = len(encode_labels(labels.numpy())) if codec == LABELS else lossless_bytes(labels)
+        return Point(MAPS, image, codec, 0, size, 8 * size / labels.numel(), regions=len(torch.unique(labels))), b""
+
+    return _present(
+        files.keep(Ask(MAPS, image, codec, 0), files.settings(MAPS), partial(make, codec))
+        for codec in (LABELS, LOSSLESS_WEBP)
+    )
+
+
+def _read_map(files: Files, image: str) -> Tensor:
+    folder, _, name = image.partition("/")
+    if files.quick or files.data is None:
+        labels = files.sample(image)[0].labels
+        assert labels is not None
+        return labels
+    return images.davis(files.data)[name].labels if folder == "DAVIS" else load_labels(files.data / f"{image}.png")
+
+
+def _speed(files: Files, image: str, n: int) -> list[Point]:
+    """Time files of the scene that the group of precision keeps."""
+    fitted = files.scene(PRECISION, image, n)
+    if fitted is None:
+        return []
+    repeats = 1 if files.quick else 5
+
+    def make(what: str) -> tuple[Point, bytes]:
+        scene, sample = files.fits.scene(files.case(image, n)), files.sample(image)[0].image
+        quality = fitted.psnr + FIRST_QUALITY
+        with threads(SPEED_THREADS):
+            if what == TUNED:
+                tuned = partial(compress, scene, sample, quality=quality, iterations=files.tuning)
+                data, seconds = timed(tuned, repeats)
+            else:
+                data, seconds = timed(partial(encode, scene, quality=quality), repeats)
+            if what == DECODE:
+                seconds = timed(lambda: render(data), 3 * repeats)[1]
+        field = "decode_seconds" if what == DECODE else "encode_seconds"
+        times: dict[str, Any] = {field: seconds, "num_gaussians": len(scene)}
+        return Point(SPEED, image, what, n, len(data), 8 * len(data) / sample[0].numel(), **times), data
+
+    settings = [*files.settings(SPEED), repeats, SPEED_THREADS]
+    return _present(
+        files.keep(Ask(SPEED, image, what, n), settings, partial(make, what)) for what in (TUNED, PLAIN, DECODE)
+    )
+
+
+def _present(points: Iterable[Point | None]) -> list[Point]:
+    return [point for point in points if point is not None]
+
+
+def _plot_curves(points: Sequence[Point], path: Path) -> None:
+    """Plot PSNR and EF-PSNR over bits per pixel, a row for each image."""
+    shown = list(dict.fromkeys(p.image for p in points))
+    plot, axes = figure(len(shown), 2, width=9.5, height=0.8 + 3.0 * len(shown))
+    rows = axes if len(shown) > 1 else [axes]
+    for image, row in zip(shown, rows, strict=True):
+        for axis, quality in zip(row, (PSNR, EF_PSNR), strict=True):
+            for codec, (color, line, marker) in _STYLES.items():
+                found = sorted((p.bpp, getattr(p, quality)) for p in points if (p.image, p.codec) == (image, codec))
+                if found:
+                    x, y = zip(*found, strict=True)
+                    axis.plot(x, y, line, marker=marker, color=color, markersize=4, linewidth=1.3, label=codec)
+            axis.set_xscale("log", base=2)
+            axis.xaxis.set_major_formatter("{x:g}")
+            axis.set(xlabel="bits per pixel", ylabel=f"{QUALITIES[quality][0]} (dB)", title=image)
+    add_legend(plot, rows[0][0], columns=len(_STYLES), where="upper")
+    save_figure(plot, path)
+
+
+def _plot_matched(points: Sequence[Point], rivals: Sequence[str], path: Path) -> None:
+    """Plot what each frame gains over each codec at no more bytes, frames by what they gain over AVIF."""
+    plot, axes = figure(1, 2, width=11.0, height=4.2)
+    order = tables.gains(tables.pairs(points, AVIF_PSNR if AVIF_PSNR in rivals else rivals[0]), PSNR)
+    frames = [] if order is None else order.worst
+    for axis, quality in zip(axes, (PSNR, EF_PSNR), strict=True):
+        axis.axhline(0.0, color="black", linewidth=0.8)
+        for codec in rivals:
+            color, _, marker = _STYLES[codec]
+            gain = tables.gains(tables.pairs(points, codec), quality)
+            found = [(frames.index(i), v) for i, v in (gain.values if gain else {}).items() if i in frames]
+            axis.plot([x for x, _ in found], [y for _, y in found], marker, color=color, label=codec)
+        axis.set_xticks(range(len(frames)), frames, rotation=60, ha="right", fontsize=8)
+        axis.set(ylabel=f"{QUALITIES[quality][0]} gained by kcgs (dB)")
+    add_legend(plot, axes[0], columns=len(rivals), where="upper")
+    save_figure(plot, path)

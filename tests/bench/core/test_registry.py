@@ -1,0 +1,52 @@
+"""Experiments by name, their options, and reports written again from kept results."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+import kcgs
+import kcgs.bench
+from kcgs.bench.core.options import Options
+
+REPORTS = Path(kcgs.__file__).resolve().parent.parent / "notebooks/reports"
+NAMES = ("ablation", "charts", "convergence", "davis", "maps", "rate")
+
+
+def test_names() -> None:
+    assert {*NAMES, "decode", "demo", "render", "zoo"} == set(kcgs.bench.available_experiments())
+    with pytest.raises(ValueError, match="name must be one of .*; got 'core'"):
+        kcgs.bench.run("core", Path())
+
+
+def test_wrong_questions(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="maps does not take seeds; its options are data, quick, engine"):
+        kcgs.bench.run("maps", tmp_path / "out", seeds=2)
+    with pytest.raises(ValueError, match="rate does not take workers"):
+        kcgs.bench.run("rate", tmp_path / "out", workers=2)
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(ValueError, match="charts does not take sequences"):
+        kcgs.bench.run("charts", tmp_path, quick=True, sequences="dog")
+    with pytest.raises(ValueError, match="budget_seconds must be above 0; got -1"):
+        kcgs.bench.run("davis", tmp_path, quick=True, budget_seconds=-1)
+    with pytest.raises(FileNotFoundError, match=r"made\.json"):
+        kcgs.bench.run("charts", tmp_path, redraw=True)
+
+
+def test_command() -> None:
+    options = Options(data=Path("x"), quick=True, sequences="dog", budget_seconds=8300, seeds=2, runs=Path("y"))
+    words = "--data DIR --quick --sequences dog --budget-seconds 8300 --seeds 2 --runs DIR"
+    assert options.command("davis") == f"kcgs bench davis -o DIR {words}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_committed_reports_are_written_from_their_results(tmp_path: Path, name: str) -> None:
+    if not REPORTS.is_dir():
+        pytest.skip("not a source checkout")
+    output = tmp_path / name
+    shutil.copytree(REPORTS / name, output)
+    (output / "report.md").unlink()
+    kcgs.bench.run(name, output, redraw=True)
+    assert (output / "report.md").read_text() == (REPORTS / name / "report.md").read_text(), "kcgs bench NAME --redraw"

@@ -1,0 +1,114 @@
+"""Fits on disk: what names them, what is made again, what a budget allows, files of as many bytes."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from kcgs.bench.core.cases import BASELINE, BEST, CLAMPED, PAPER, UNCLAMPED, Case, plan
+from kcgs.bench.core.images import load, sequences
+from kcgs.bench.core.jobs import Place, check_made, make_all
+from kcgs.bench.core.options import Options
+from kcgs.bench.core.rivals import near, rivals
+from kcgs.bench.core.store import Row, Store
+
+HERE = Place()
+QUICK = Options(quick=True)
+
+
+def row(n: int, size: int, method: str = "best", **values: Any) -> Row:
+    return Row("a", n, method, 0, 700, *[0.0] * 6, n, 8_000, size, 0, *[0.0] * 4, **values)
+
+
+class TestStore:
+    def test_budget_and_resuming(self, tmp_path: Path) -> None:
+        store = Store(tmp_path / "runs", None)
+        cases = plan(["disc"], [5], [UNCLAMPED, CLAMPED], QUICK, 3, 8)
+        assert store.obtain(cases, HERE, time.monotonic() - 1) == [] and store.rows(cases) == []
+        store.make(cases[0])
+        assert [r.method for r in store.rows(cases)] == ["gaussian-image"]
+        made = store.kept(cases[0])
+        assert made is not None and made.row.bytes > 0 and made.row.decoded_psnr > made.row.psnr - 1
+        assert made.history[-1].iteration == made.row.iterations and made.given_regions == 2
+        scene = store.scene(cases[0])
+        assert len(scene) == made.row.num_gaussians
+        # as long as the last one took is more than is left
+        store._learn(cases[1], 100.0)
+        assert store.obtain(cases, HERE, time.monotonic() + 60) == [] and len(store.rows(cases)) == 1
+        assert store.obtain([*cases, *cases], HERE, time.monotonic() + 200) == [] and len(store.rows(cases)) == 2
+        assert store.kept(cases[0]) == made
+        assert store._expected(cases[0]._replace(image="other")) > 0
+        store._path(cases[0]).with_suffix(".safetensors").unlink()
+        assert store.row(cases[0]) is None  # a row without its scene cannot be shown
+
+    def test_names(self, tmp_path: Path) -> None:
+        store, case = Store(tmp_path, None), Case("disc", 5, BEST)
+        changes: list[dict[str, Any]] = [
+            {"n": 6}, {"method": PAPER}, {"seed": 1}, {"stride": 2}, {"iterations": 9}, {"image": "pie"},
+            {"source": "slic"},
+        ]  # fmt: skip
+        paths = {store._path(case._replace(**change)) for change in changes}
+        assert len({store._path(case), Store(tmp_path, tmp_path)._path(case), *paths}) == 2 + len(changes)
+
+    def test_the_others_are_kept(self, tmp_path: Path) -> None:
+        store = Store(tmp_path, None)
+        wrong, right = plan(["disc"], [0, 4], [UNCLAMPED], QUICK, 3, 8)
+        failed = store.obtain([wrong, right], HERE)
+        with pytest.raises(RuntimeError, match="fits failed, 1 of them: disc, N = 0, gaussian-image: ValueError"):
+            check_made(failed)
+        assert len(store.rows([wrong, right])) == 1
+
+    def test_rivals_come_near(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        store, (ours, base) = Store(tmp_path, None), plan(["a"], [20], [BEST, BASELINE], Options(), 1, 1)
+        rows = {ours: row(20, 1_000), base: row(20, 200, BASELINE.name)}
+        monkeypatch.setattr(store, "row", rows.get)
+        for _ in range(4):  # bytes are not proportional to N
+            wanted = rivals(store, [ours, base], BEST, BASELINE)
+            for case in wanted:
+                rows.setdefault(case, row(case.n, 100 + 5 * case.n, BASELINE.name))
+        sizes = [rows[case].bytes for case in wanted]
+        assert 1 < len(sizes) <= 4 and 1_000 <= sizes[-1] <= 1_060
+        found = near(rows.values(), rows[ours], BASELINE.name)
+        assert found is not None and found.bytes == sizes[-1]
+        rows[ours] = row(20, 205)  # with as many Gaussians it has as many bytes
+        assert rivals(store, [ours, base], BEST, BASELINE) != [] and near([], rows[ours], BASELINE.name) is None
+        rows[ours] = row(20, 195)
+        assert rivals(store, [ours, base], BEST, BASELINE) == []
+
+
+class TestCases:
+    def test_published_recipes_have_their_iterations(self) -> None:
+        found = plan(["a"], [10], [BEST, PAPER], Options(seeds=2), 123, 4)
+        assert [(c.method, c.seed, c.config().iterations, c.stride) for c in found] == [
+            (m, s, i, 1) for s in (0, 1) for m, i in ((BEST, BEST.config().iterations), (PAPER, 123))
+        ]
+
+    def test_sequences(self) -> None:
+        assert sequences(None, None, quick=True) == ["astronaut", "disc"]
+        with pytest.raises(ValueError, match="sequences must name some of astronaut, disc; got 'dog'"):
+            sequences(None, "dog", quick=True)
+        with pytest.raises(ValueError, match="data must name a folder with DAVIS in it"):
+            sequences(None, None, quick=False)
+
+    def test_without_a_map(self) -> None:
+        sample = load("disc", None, 4)
+        assert sample.labels is not None and sample.image.shape == (3, 80, 100)
+        regions = Case("disc", 5, BEST).regions(sample.labels)
+        assert regions is not None and torch.equal(regions.labels, sample.labels)
+        assert Case("disc", 5, BEST).regions(None) is None
+
+
+class TestJobs:
+    def test_words(self) -> None:
+        assert str(HERE) == "one at a time on one thread"
+        assert str(Place(workers=3)) == "3 at a time on one thread each, engine local"
+        assert "processors" in str(Place("ray"))
+
+    def test_make_all(self) -> None:
+        assert make_all(int, ["1", "x"], HERE, name=repr)[0].startswith("'x': ValueError")
+        assert make_all(int, [], HERE) == []
+        check_made([])
