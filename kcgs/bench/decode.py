@@ -6,7 +6,7 @@ import json
 import math
 import os
 import statistics
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -27,7 +27,7 @@ from .core.readings import Readings
 from .core.registry import experiment
 from .core.report import Made, conclude
 from .core.rows import read_rows, write_rows
-from .core.tables import count, markdown, number
+from .core.tables import markdown, number
 
 CUTOFFS = (1e-2, 1 / 255, 1e-3, 1e-4, 1e-6)
 DEFAULT_CUTOFF = 1e-4
@@ -75,18 +75,6 @@ class Row(NamedTuple):
     unit: str
 
 
-class SceneRow(NamedTuple):
-    """What a report says of a scene."""
-
-    scene: str
-    height: int
-    width: int
-    num_gaussians: int
-    num_regions: int
-    contours: str
-    source: str
-
-
 class LeftOut(NamedTuple):
     """A sentence of what a decoder says that it does without."""
 
@@ -98,19 +86,19 @@ class LeftOut(NamedTuple):
 
 def report(folder: Path, made: Made) -> list[str]:
     """Write the figures, and return the parts of the report."""
-    rows, scenes = Readings(read_rows(folder / "results.csv", Row)), read_rows(folder / "scenes.csv", SceneRow)
-    speed, files, memory = (rows.select(section=name) for name in ("speed", "files", "memory"))
+    rows = Readings(read_rows(folder / "results.csv", Row))
+    scenes, speed, files, memory = (rows.select(section=name) for name in ("scenes", "speed", "files", "memory"))
     for row in files.select(decoder=SCENE, quantity="size"):
         ratio = row.value / files.value(scene=row.scene, decoder=YARDSTICK, quantity="size")
         files.append(row._replace(quantity=RATIO, value=ratio, unit="1"))
     errors = Readings(row._replace(cutoff=cutoff_name(row.cutoff)) for row in rows.select(section="error"))
     _plot_sweep(errors, folder / "error-against-time.png")
     _plot_speed(speed, folder / "speed.png")
-    parts = ["# Decoding: speed, error, memory, bytes", "## Scenes", _SCENES_TEXT, _plain_table(SceneRow, scenes)]
+    parts = ["# Decoding: speed, error, memory, bytes", "## Scenes", _SCENES_TEXT, scenes.table("scene")]
     parts += ["## Speed and error", _SPEED_TEXT, _truth_text(rows.select(section="truth")), "![](speed.png)"]
     parts += [speed.table("scene", "size", "decoder", across=["quantity", "threads"])]
     if not made.quick:
-        parts += ["## The scene decoder's goals", _GOAL_TEXT, _goal_table(Readings([*speed, *files]), scenes)]
+        parts += ["## The scene decoder's goals", _GOAL_TEXT, _goal_table(Readings([*scenes, *speed, *files]))]
     parts += ["## Error against time", _SWEEP_TEXT, "![](error-against-time.png)"]
     parts += [errors.table("scene", "decoder", "cutoff")]
     kinds = [Readings(row for row in files if (row.quantity in OPENING) is opens) for opens in (False, True)]
@@ -118,7 +106,7 @@ def report(folder: Path, made: Made) -> list[str]:
     parts += [kinds[1].table("scene", "decoder", across=["quantity", "size"])]
     parts += ["## Peak memory", _MEMORY_TEXT, memory.table("scene", "size", across=["decoder"])]
     left_out = read_rows(folder / "left-out.csv", LeftOut)
-    return [*parts, "## Left out by the decoders", _LEFT_OUT_TEXT, _plain_table(LeftOut, left_out)]
+    return [*parts, "## Left out by the decoders", _LEFT_OUT_TEXT, markdown(LeftOut._fields, left_out)]
 
 
 @experiment("runs", report=report)
@@ -127,20 +115,22 @@ def run(output: Path, options: Options) -> None:
     subjects = [*decoders.standard_subjects(options.quick), *decoders.fitted_subjects(output, options)]
     with TemporaryDirectory() as folder:
         race = _Race(Path(folder), subjects, options.quick)
-        write_rows(output / "results.csv", Row, [row for step in with_progress(list(race.steps())) for row in step()])
+        rows = [row for step in with_progress(list(race.steps())) for row in step()]
         write_rows(output / "left-out.csv", LeftOut, race.left_out())
-    write_rows(output / "scenes.csv", SceneRow, map(_describe, subjects))
+    write_rows(output / "results.csv", Row, [*(row for subject in subjects for row in _describe(subject)), *rows])
     missing = decoders.why_not_fitted(options)
     versions = "; ".join(f"{name} {version(name)}" for name in ("onnxruntime", "onnx", "onnx-ir"))
     waiting = f"OMP_WAIT_POLICY: {os.environ.get('OMP_WAIT_POLICY', 'not set')}"  # what torch's idle threads do
-    notes = () if missing is None else (f"Without fitted scenes: {missing}.",)
-    conclude(report, output, Made(options.command("decode"), options.quick, (versions, waiting), notes))
+    notes = [f"{subject.name}: {subject.source}, contours {subject.contours}" for subject in subjects]
+    notes += [] if missing is None else [f"Without fitted scenes: {missing}."]
+    conclude(report, output, Made(options.command("decode"), options.quick, (versions, waiting), tuple(notes)))
 
 
-def _describe(subject: Subject) -> SceneRow:
-    scene, regions = subject.scene, subject.scene.regions
-    count = 1 if regions is None else regions.num_regions
-    return SceneRow(subject.name, *scene.size, len(scene), count, subject.contours, subject.source)
+def _describe(subject: Subject) -> list[Row]:
+    (height, width), regions = subject.scene.size, subject.scene.regions
+    values = {"height": height, "width": width, "N": len(subject.scene)}
+    values["regions"] = 1 if regions is None else regions.num_regions
+    return [Row("scenes", subject.name, "native", "", 1, 0.0, name, value, "1") for name, value in values.items()]
 
 
 class _Race:
@@ -275,21 +265,16 @@ def _truth_text(rows: Readings) -> str:
     )
 
 
-def _goal_table(rows: Readings, scenes: list[SceneRow]) -> str:
+def _goal_table(rows: Readings) -> str:
     lines = []
-    for scene in scenes:
-        found = rows.select(scene=scene.scene, size="native", decoder=SCENE, threads=1)
+    for name in rows.names("scene"):
+        found = rows.select(scene=name, size="native", threads=1)
         # a fit has a few Gaussians fewer than it was asked for
-        goals = {"time": 10.0 if scene.num_gaussians <= 1_250 else 16.0, "to cpu": 3.0, "load": 500.0, RATIO: 2.5}
-        values = {quantity: found.value(quantity=quantity) for quantity in goals}
+        goals = {"time": 10.0 if found.value(quantity="N") <= 1_250 else 16.0, "to cpu": 3.0, "load": 500.0, RATIO: 2.5}
+        values = {quantity: found.value(quantity=quantity, decoder=SCENE) for quantity in goals}
         cells = [f"{number(values[q])} ({'met' if values[q] <= goals[q] else 'missed'})" for q in goals]
-        lines.append([scene.scene, *cells])
+        lines.append([name, *cells])
     return markdown(["scene", "ms", "to cpu", "load, ms", RATIO], lines)
-
-
-def _plain_table(kind: type[NamedTuple], rows: Sequence[NamedTuple]) -> str:
-    header = [field.replace("_", " ") for field in kind._fields]
-    return markdown(header, ([count(v) if isinstance(v, int) else v for v in row] for row in rows))
 
 
 def _plot_sweep(rows: Readings, path: Path) -> None:

@@ -17,22 +17,7 @@ from kcgs.kernels.cpu import kernel
 from kcgs.nn import RegionSplatRenderer
 from kcgs.plots import COLORS, figure, save_figure
 
-from ._render_runs import (
-    MOST_PAIRS,
-    PEERS,
-    Timing,
-    backends,
-    evaluated_pairs,
-    held_pairs,
-    images_per_second,
-    kernel_inputs,
-    limit_seconds,
-    once,
-    prepare,
-    probe_of,
-    renderer,
-    timed,
-)
+from . import _render_runs as runs
 from ._workloads import needles, standard, workload
 from .core.clocks import clock, in_turns, median_ratio, peak_bytes, threads
 from .core.jobs import with_progress
@@ -150,7 +135,7 @@ def _case(name: str, cutoff: float) -> str:
     return f"{name} cutoff {cutoff:.2g}"
 
 
-def _timing_rows(case: str, backend: str, count: int, timings: list[Timing]) -> list[Row]:
+def _timing_rows(case: str, backend: str, count: int, timings: list[runs.Timing]) -> list[Row]:
     medians = {q: 1e3 * statistics.median(getattr(t, q) for t in timings) for q in ("forward", "backward", "sum")}
     return [Row("speed", case, backend, count, quantity, value, "ms") for quantity, value in medians.items()]
 
@@ -159,14 +144,14 @@ def _beside_limit(name: str, rounds: int) -> list[Row]:
     """Time the CPU kernel and the limit in turns, on one thread and on two."""
     scene, rows = standard(name), []
     for cutoff in SPEED_CUTOFFS:
-        pairs, case = evaluated_pairs(scene, cutoff), _case(name, cutoff)
+        pairs, case = runs.evaluated_pairs(scene, cutoff), _case(name, cutoff)
 
-        def limit(count: int, pairs: int = pairs) -> Timing:
-            return Timing(*(limit_seconds(pairs, backward=kind, threads=count) for kind in (False, True)))
+        def limit(count: int, pairs: int = pairs) -> runs.Timing:
+            return runs.Timing(*(runs.limit_seconds(pairs, backward=kind, threads=count) for kind in (False, True)))
 
-        def splat(count: int, cutoff: float = cutoff) -> Timing:
+        def splat(count: int, cutoff: float = cutoff) -> runs.Timing:
             with threads(count):
-                return once(renderer("cpu"), scene, cutoff)[0]
+                return runs.once(runs.renderer("cpu"), scene, cutoff)[0]
 
         pace = {"limit": limit, "cpu": splat}
         actions = {(who, n): partial(time_it, n) for n in (1, 2) for who, time_it in pace.items()}
@@ -179,19 +164,19 @@ def _beside_limit(name: str, rounds: int) -> list[Row]:
         rows.append(Row("limit", case, "cpu", 1, "share", share, "1"))
         gains = {who: median_ratio(sums[who, 1], sums[who, 2]) for who in pace}
         rows += [Row("limit", case, who, 2, "gain", gain, "1") for who, gain in gains.items()]
-        rows.append(Row("limit", case, "cpu", 2, "images", images_per_second(scene, cutoff, rounds), "1/s"))
+        rows.append(Row("limit", case, "cpu", 2, "images", runs.images_per_second(scene, cutoff, rounds), "1/s"))
     return rows
 
 
 def _speed(name: str, rounds: int) -> list[Row]:
     scene, rows = standard(name), []
     for cutoff in SPEED_CUTOFFS:
-        names = [*(b for b in backends() if b != "cpu"), *(["reference"] if name in DENSE else [])]
-        names += [peer for peer in PEERS if held_pairs(peer, scene, cutoff) <= MOST_PAIRS]
+        names = [*(b for b in runs.backends() if b != "cpu"), *(["reference"] if name in DENSE else [])]
+        names += [peer for peer in runs.PEERS if runs.held_pairs(peer, scene, cutoff) <= runs.MOST_PAIRS]
         for backend in names:
-            for count in (1,) if backend in PEERS else (1, 2):
+            for count in (1,) if backend in runs.PEERS else (1, 2):
                 with threads(count):
-                    timings = timed(backend, scene, cutoff, rounds)
+                    timings = runs.timed(backend, scene, cutoff, rounds)
                 rows += _timing_rows(_case(name, cutoff), backend, count, timings)
     return rows
 
@@ -199,7 +184,7 @@ def _speed(name: str, rounds: int) -> list[Row]:
 def _overhead(name: str, rounds: int) -> list[Row]:
     """Time the CPU kernel alone, and through the module and autograd, forward and backward."""
     scene = standard(name)
-    inputs, probe = kernel_inputs(scene, DEFAULT_CUTOFF), probe_of(scene.size, 3, torch.float32)
+    inputs, probe = runs.kernel_inputs(scene, DEFAULT_CUTOFF), runs.probe_of(scene.size, 3, torch.float32)
     render = RegionSplatRenderer(cutoff=DEFAULT_CUTOFF, backend="cpu")
 
     def alone() -> None:
@@ -220,21 +205,21 @@ def _overhead(name: str, rounds: int) -> list[Row]:
 
 def _memory(name: str) -> list[Row]:
     scene, rows = standard(name), []
-    for backend in ("cpu", "tiled", *PEERS):
-        if backend not in PEERS or held_pairs(backend, scene, DEFAULT_CUTOFF) <= MOST_PAIRS:
-            peak = peak_bytes(prepare, (backend, name, DEFAULT_CUTOFF), (backend, "W3", DEFAULT_CUTOFF))
+    for backend in ("cpu", "tiled", *runs.PEERS):
+        if backend not in runs.PEERS or runs.held_pairs(backend, scene, DEFAULT_CUTOFF) <= runs.MOST_PAIRS:
+            peak = peak_bytes(runs.prepare, (backend, name, DEFAULT_CUTOFF), (backend, "W3", DEFAULT_CUTOFF))
             rows.append(Row("memory", name, backend, 1, "peak", peak / 2**20, "MiB"))
     return rows
 
 
 def _errors(name: str, rounds: int) -> list[Row]:
     scene, rows = standard(name), []
-    _, want, want_gradients = once(renderer("reference"), copy.deepcopy(scene).double(), 0.0)
-    for backend in backends():
+    _, want, want_gradients = runs.once(runs.renderer("reference"), copy.deepcopy(scene).double(), 0.0)
+    for backend in runs.backends():
         for cutoff in CUTOFFS:
             with threads(1):
-                timings = timed(backend, scene, cutoff, rounds)
-                _, image, gradients = once(renderer(backend), scene, cutoff)
+                timings = runs.timed(backend, scene, cutoff, rounds)
+                _, image, gradients = runs.once(runs.renderer(backend), scene, cutoff)
             error = (image - want).abs()
             pairs = list(zip(gradients, want_gradients, strict=True))
             row = partial(Row, "error", _case(name, cutoff), backend, 1)
@@ -266,12 +251,12 @@ def _growth(rounds: int, quick: bool) -> list[Row]:
     }
     rows = []
     for axis, scenes in grown.items():
-        pairs = [evaluated_pairs(scene, DEFAULT_CUTOFF) for scene in scenes.values()]
-        for backend in backends():
+        pairs = [runs.evaluated_pairs(scene, DEFAULT_CUTOFF) for scene in scenes.values()]
+        for backend in runs.backends():
             seconds = []
             for name, scene, count in zip(scenes, scenes.values(), pairs, strict=True):
                 with threads(1):
-                    seconds.append(statistics.median(t.sum for t in timed(backend, scene, DEFAULT_CUTOFF, rounds)))
+                    seconds.append(statistics.median(t.sum for t in runs.timed(backend, scene, DEFAULT_CUTOFF, rounds)))
                 row = partial(Row, "growth", f"{axis}: {name}", backend, 1)
                 rows += [row("pairs", count / 1e6, "M"), row("sum", 1e3 * seconds[-1], "ms")]
             slope = float(np.polyfit(np.log(pairs), np.log(seconds), 1)[0])
@@ -285,9 +270,9 @@ def _stiffness() -> list[Row]:
     for sigma in SIGMAS:
         for anisotropy in ANISOTROPIES:
             scene = needles(sigma, anisotropy)
-            _, want, want_gradients = once(renderer("reference"), copy.deepcopy(scene).double(), 0.0)
-            for backend in [*backends(), "reference"]:
-                _, image, gradients = once(renderer(backend), scene, 0.0)
+            _, want, want_gradients = runs.once(runs.renderer("reference"), copy.deepcopy(scene).double(), 0.0)
+            for backend in [*runs.backends(), "reference"]:
+                _, image, gradients = runs.once(runs.renderer(backend), scene, 0.0)
                 worst = max(_by_component(g, w) for g, w in zip(gradients, want_gradients, strict=True))
                 row = partial(Row, "stiffness", f"sigma {sigma:g} anisotropy {anisotropy:g}", backend, 1)
                 rows += [row("image", _largest(image - want), "1"), row("gradient", worst, "relative to the largest")]

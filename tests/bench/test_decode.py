@@ -140,12 +140,12 @@ def test_quick_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("kcgs.bench.decode.peak_bytes", lambda *_: 1e6)
     run("decode", tmp_path, quick=True)
     made = {"report.md", "error-against-time.png", "speed.png", "made.json", "runs"}
-    made |= {"results.csv", "scenes.csv", "left-out.csv"}
+    made |= {"results.csv", "left-out.csv"}
     assert {path.name for path in tmp_path.iterdir()} == made
     with (tmp_path / "results.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == list(Row._fields)
-    assert list(dict.fromkeys(row["section"] for row in rows)) == ["memory", "files", "speed", "error", "truth"]
+    assert list(dict.fromkeys(row["section"] for row in rows)) == ["scenes", "memory", "files", "speed", "error", "truth"]
     for row in rows:
         assert math.isfinite(float(row["value"]))
         if row["quantity"] == "max error" and row["section"] == "speed":
