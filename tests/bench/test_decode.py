@@ -145,7 +145,8 @@ def test_quick_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with (tmp_path / "results.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == list(Row._fields)
-    assert list(dict.fromkeys(row["section"] for row in rows)) == ["scenes", "memory", "files", "speed", "error", "truth"]
+    sections = ["scenes", "memory", "files", "speed", "error", "truth"]
+    assert list(dict.fromkeys(row["section"] for row in rows)) == sections
     for row in rows:
         assert math.isfinite(float(row["value"]))
         if row["quantity"] == "max error" and row["section"] == "speed":
