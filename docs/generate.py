@@ -6,7 +6,6 @@ import importlib
 import importlib.util
 import inspect
 import re
-import tomllib
 import typing
 from importlib.resources import files
 from pathlib import Path
@@ -167,21 +166,21 @@ def segmenters() -> str:
 
 
 def recipes() -> str:
-    """Return the settings of a fit with their defaults, and each recipe with its differences from them."""
+    """Return what each recipe is, the settings of a fit with their defaults, and the recipes as they are on disk."""
     from kcgs.fit import FitConfig, available_recipes
 
+    table, blocks = ["| recipe | what it is |", "|---|---|"], []
+    for name in available_recipes():
+        lines = (files("kcgs.recipes") / f"{name}.toml").read_text(encoding="utf-8").splitlines()
+        comment = " ".join(line.lstrip("# ") for line in lines if line.startswith("#"))
+        table.append(f"| [`{name}`](#{name}) | {_cell(comment)} |")
+        settings = [line for line in lines if line and not line.startswith("#")]
+        blocks += [f"### {name}", "```toml\n" + "\n".join(settings) + "\n```" if settings else "The defaults."]
     rows = ["| setting | type | default | what it is |", "|---|---|---|---|"]
     for name, field in FitConfig.model_fields.items():
-        rows.append(
-            f"| `{name}` | {_type(field.annotation)} | `{field.default!r}` | {_cell(field.description or '')} |"
-        )
-    parts = ["## The settings of a fit", "\n".join(rows), "## The recipes as they are in the package"]
-    for name in available_recipes():
-        text = (files("kcgs.recipes") / f"{name}.toml").read_text(encoding="utf-8")
-        comment = " ".join(line.lstrip("# ") for line in text.splitlines() if line.startswith("#"))
-        settings = "\n".join(line for line in text.splitlines() if not line.startswith("#")).strip()
-        assert tomllib.loads(settings) == tomllib.loads(text)
-        parts += [f"### {name}", comment, f"```toml\n{settings}\n```" if settings else "The defaults."]
+        text = _cell(field.description or "")
+        rows.append(f"| `{name}` | {_type(field.annotation)} | `{field.default!r}` | {text} |")
+    parts = ["\n".join(table), "## Settings", "\n".join(rows), "## The files", *blocks]
     return "\n\n".join(parts) + "\n"
 
 
