@@ -103,11 +103,11 @@ def fit_into(
     """Fit, and write the scene, with notes in it, or the compressed file, as the suffix says."""
     from kcgs.fit import fit
     from kcgs.rate import compress, fit_bytes, quality_for
-    from kcgs.scene import Scene, load
+    from kcgs.scene import Scene
 
     if request.target_bytes is not None:
-        done = fit_bytes(image, labels, request.target_bytes, config=request.config, seed=request.seed, on_step=on_step)
-        return Fitted(done.result, Scene(done.field, done.regions), write_file(output, done.data))
+        done = fit_bytes(image, labels, request.target_bytes, recipe=request.config, seed=request.seed, on_step=on_step)
+        return Fitted(done.result, done.scene, write_file(output, done.data))
     result = fit(
         image, labels, request.num_gaussians,
         recipe=request.config, seed=request.seed, on_step=on_step, checkpoint=checkpoint, resume=resume,
@@ -116,9 +116,8 @@ def fit_into(
         scene = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe, **(notes or {})})
         return Fitted(result, scene, scene.save(output))
     quality = quality_for(max(entry.psnr for entry in result.history))
-    data = compress(result.scene.field, image, result.scene.regions, quality=quality, seed=request.seed)
-    write_file(output, data)
-    return Fitted(result, load(output), len(data))
+    file = compress(result.scene, image, quality=quality, seed=request.seed)
+    return Fitted(result, file.scene, write_file(output, file.data))
 
 
 def read_regions(regions: str, image: Tensor, warn: Callable[[str], None]) -> Tensor | None:

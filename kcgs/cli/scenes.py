@@ -111,7 +111,7 @@ def encode(
         from kcgs.data import load_image
         from kcgs.rate import compress
 
-        data = compress(loaded.field, load_image(image), loaded.regions, **goal)
+        data = compress(loaded, load_image(image), **goal).data
     write_file(output, data)
     decoded = codec.decode(data)
     rounded = decoded.scene

@@ -1,5 +1,6 @@
-"""An image in, a file of so many bytes out."""
+"""Bytes traded for error: a scene and its image in, or an image alone, and a file of so many bytes out."""
 
-from .compress import Compressed, compress, fit_bytes, quality_for
+from .budget import FitBytesResult, fit_bytes
+from .compress import Compressed, compress, quality_for
 
-__all__ = ["Compressed", "compress", "fit_bytes", "quality_for"]
+__all__ = ["Compressed", "FitBytesResult", "compress", "fit_bytes", "quality_for"]

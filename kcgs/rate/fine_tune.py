@@ -1,9 +1,8 @@
-r"""Rounding that the rest makes up for.
+"""Rounding that the rest makes up for.
 
-Gaussians overlap, so what rounding one of them does to the picture its neighbours can partly undo, as long as they may
+Gaussians overlap, so what rounding one of them does to the image its neighbours can partly undo, as long as they may
 still move. So they are rounded a few at a time, shapes first and colours last, and those that are still free descend
-meanwhile. A step is a gradient divided by the known curvature of the squared error (docs/format.md), with
-momentum; there is nothing to adapt.
+meanwhile. A step is a gradient divided by the known curvature of the squared error (docs/format.md), with momentum.
 """
 
 from __future__ import annotations
@@ -14,15 +13,18 @@ import torch
 from torch import Tensor
 
 from kcgs.codec.gaussians.quantize import Codes, Parameters, Quantizer
+from kcgs.fit.frame import local_gradient, move
 from kcgs.functional import RegionMap, region_splat
 
 # share of the iterations in which shapes are rounded; colours are in the rest
 _SHAPES = 0.65
 _STEP, _MOMENTUM = 0.09, 0.9
-# the largest step, in standard deviations and in log scale
-_LARGEST = 0.2
+# the largest step, in standard deviations and in log scale; and the largest share of Newton's
+_LARGEST, _NEWTON = 0.2, 0.3
 # energies below it have next to no curvature: steps are as if they had this
 _FAINT = 1e-2
+# half the second derivatives of the squared error by a step in a Gaussian's frame, in units of its energy
+_CURVATURE = (0.5, 0.5, 0.75, 0.25, 0.75)
 _DRAFT_CUTOFF = 1e-3
 
 
@@ -70,47 +72,26 @@ class FineTuning:
         return self.quantizer.quantize(gaussians, self.classes)
 
     def _step(self, shaped: Tensor, colored: Tensor) -> None:
+        """Move what is free, against the render of what is rounded and what is not."""
         rounded = [torch.from_numpy(t).to(self.image) for t in self.quantizer.restore(self.codes())]
-        held = (shaped, shaped, colored)
-        drawn = [torch.where(hold, r, f) for hold, r, f in zip(held, rounded, self.free, strict=True)]
-        downhill = torch.cat(self._downhill(*drawn), -1)
-        self.speed = torch.where(
-            torch.cat([shaped.expand(-1, 5), colored.expand(-1, downhill.shape[1] - 5)], -1),
-            0.0,
-            _MOMENTUM * self.speed + downhill,
-        )
-        move = _STEP * self.speed
-        d1, d2, k11, k21, k22 = move[:, :5].clamp(-_LARGEST, _LARGEST).unbind(-1)
-        l11, l21, l22 = drawn[1].unbind(-1)
-        means = drawn[0] + torch.stack([l11 * d1, l21 * d1 + l22 * d2], -1)
-        stretch = torch.exp(k11)
-        cholesky = torch.stack([l11 * stretch, l21 * stretch + l22 * k21, l22 * torch.exp(k22)], -1)
-        moved = means, cholesky, drawn[2] + move[:, 5:]
-        self.free = [torch.where(hold, f, m) for hold, f, m in zip(held, self.free, moved, strict=True)]
+        fixed = (shaped, shaped, colored)
+        current = [torch.where(fix, r, f) for fix, r, f in zip(fixed, rounded, self.free, strict=True)]
+        downhill = self._downhill(*current)
+        stopped = torch.cat([shaped.expand(-1, 5), colored.expand(-1, downhill.shape[1] - 5)], -1)
+        self.speed = torch.where(stopped, 0.0, _MOMENTUM * self.speed + downhill)
+        step = _STEP * self.speed
+        means, cholesky = move(current[0], current[1], step[:, :5].clamp(-_LARGEST, _LARGEST), exact=False)
+        moved = means, cholesky, current[2] + step[:, 5:]
+        self.free = [torch.where(fix, f, m) for fix, f, m in zip(fixed, self.free, moved, strict=True)]
 
-    def _downhill(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> tuple[Tensor, Tensor]:
+    def _downhill(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
         """Return Newton's steps of each number alone: of centre and factor in the Gaussian's frame, of colours."""
-        leaves = [t.detach().requires_grad_() for t in (means, cholesky, colors)]
-        x, factors, c = leaves
         size = self.quantizer.size
+        x, factors, c = (t.detach().requires_grad_() for t in (means, cholesky, colors))
         render = region_splat(x, factors, c, self.region_ids, self.regions, size=size, cutoff=_DRAFT_CUTOFF)
-        render.backward(render.detach() - self.image)
-        (gx, gy), (g11, g21, g22) = self._gradient(x).unbind(-1), self._gradient(factors).unbind(-1)
-        l11, l21, l22 = cholesky.unbind(-1)
-        area = (math.pi * l11 * l22).clamp_max(size[0] * size[1])
+        gradients = torch.autograd.grad(render, (x, factors, c), render.detach() - self.image)
+        area = (math.pi * cholesky[:, 0] * cholesky[:, 2]).clamp_max(size[0] * size[1])
         energy = (colors.square().sum(-1) * area).clamp_min(_FAINT)
-        # half the second derivatives of the squared error, as the gradient is half the first
-        frame = [
-            (l11 * gx + l21 * gy) / (0.5 * energy),
-            l22 * gy / (0.5 * energy),
-            (l11 * g11 + l21 * g21) / (0.75 * energy),
-            l22 * g21 / (0.25 * energy),
-            l22 * g22 / (0.75 * energy),
-        ]
-        shape = torch.stack(frame, -1).clamp(-0.3, 0.3)
-        return -shape, -(self._gradient(c) / area[:, None])
-
-    @staticmethod
-    def _gradient(leaf: Tensor) -> Tensor:
-        assert leaf.grad is not None
-        return leaf.grad
+        curvature = torch.tensor(_CURVATURE).to(energy) * energy[:, None]
+        shape = (local_gradient(cholesky, *gradients[:2]) / curvature).clamp(-_NEWTON, _NEWTON)
+        return -torch.cat([shape, gradients[2] / area[:, None]], -1)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 import kcgs
-from kcgs import FitConfig, GaussianField, RegionMap, Scene, editing, segment
+from kcgs import GaussianField, RegionMap, Scene, editing, segment
 from kcgs import functional as F
 from kcgs.codec import decode, encode
 from kcgs.fit import fit
@@ -86,25 +86,24 @@ def run_fit(image: Tensor, p: Parts | None, num_gaussians: int, recipe: str, **s
 
 def to_file(p: Parts, **settings: Any) -> bytes:
     """Encode a scene as `.kcgs`."""
-    return encode(_field(p), _regions(p), **settings)
+    return encode(_scene(p), **settings)
 
 
 def from_file(data: bytes, **settings: Any) -> dict[str, Any]:
     """Decode `.kcgs`."""
     decoded = decode(data, **settings)
-    return {**_of_scene(decoded.field, decoded.regions), "layers": (decoded.layers, decoded.num_layers)}
+    return {**_of_scene(decoded.scene.field, decoded.scene.regions), "layers": (decoded.layers, decoded.num_layers)}
 
 
 def run_compress(p: Parts, image: Tensor, **settings: Any) -> bytes:
     """Encode a scene with an eye on its image."""
-    return compress(_field(p), image, _regions(p), seed=3, **settings)
+    return compress(_scene(p), image, seed=3, **settings).data
 
 
 def run_fit_bytes(image: Tensor, p: Parts | None, num_bytes: int, recipe: str, **settings: Any) -> dict[str, Any]:
     """Fit an image to a number of bytes."""
-    config = FitConfig.from_recipe(recipe, **settings)
-    done = fit_bytes(image, None if p is None else _regions(p), num_bytes, seed=3, config=config)
-    return {"data": done.data, **_of_scene(done.field, done.regions)}
+    done = fit_bytes(image, None if p is None else _regions(p), num_bytes, recipe=recipe, seed=3, **settings)
+    return {"data": done.data, **_of_scene(done.scene.field, done.scene.regions)}
 
 
 def saved(p: Parts, metadata: dict[str, str] | None = None) -> tuple[bytes, dict[str, Any]]:

@@ -1,0 +1,148 @@
+"""An image in, a file of so many bytes out: how many Gaussians, how finely rounded, and whether contours pay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from kcgs._check import check_count
+from kcgs.fit import FitConfig, FitResult, HistoryEntry, fit
+from kcgs.fit.loop import check_problem
+from kcgs.functional import RegionMap, merge_regions
+from kcgs.functional.labels import contour_edges
+from kcgs.scene import Scene
+
+from .compress import compress
+
+# bits per Gaussian where rounding costs half a dB, at `_COUNT` of them, and for each doubling
+_BITS, _COUNT, _BITS_PER_OCTAVE = 31.0, 2100, 1.9
+_HEADER_BYTES = 60
+# squared error falls with the power of the bytes
+_POWER = 0.93
+# contours show: an image with them may have this much more squared error, 0.1 dB
+_FAVOUR = 1.023
+_TRIAL_ITERATIONS, _TRIAL_TO_END = 80, 0.65
+
+
+class FitBytesResult(NamedTuple):
+    """A file, what it holds, and the fit that it was made from."""
+
+    data: bytes
+    scene: Scene
+    """As decoded."""
+    result: FitResult
+    """The fit, before rounding."""
+
+    @property
+    def field(self) -> Any:  # transitional
+        """Gaussians."""
+        return self.scene.field
+
+    @property
+    def regions(self) -> Any:  # transitional
+        """Map."""
+        return self.scene.regions
+
+
+def fit_bytes(
+    image: Any,
+    regions: RegionMap | Tensor | None = None,
+    num_bytes: int = 8000,
+    *,
+    recipe: str | FitConfig = "best",
+    seed: int = 0,
+    on_step: Callable[[int, HistoryEntry], bool | None] | None = None,
+    **settings: Any,
+) -> FitBytesResult:
+    """Fit an image to a budget of bytes, everything included.
+
+    One trade decides: what the last bit saves. The number of Gaussians is that at which another one, or more digits
+    for all, would save as much. A pixel of contour must save what the bits that the coder needs for it would save as
+    Gaussians, else it moves or its regions are merged. The map as a whole stays only where two short fits, with it and
+    with Gaussians for its bytes, say so, within 0.1 dB.
+
+    Args:
+        image: as in :func:`kcgs.fit.fit`.
+        regions: as there.
+        num_bytes: the file is not larger.
+        recipe: as there.
+        seed: as there.
+        on_step: as there, for the fit itself, not the trials.
+        settings: as there; `contour_cost` is replaced by the coder's, and `max_seconds` is for the fit alone, without
+            the trials and the rounding.
+
+    Returns:
+        The file, what it decodes to, and the fit.
+
+    Raises:
+        TypeError, ValueError: as :func:`kcgs.fit.fit`; a budget too small for a Gaussian and the map.
+
+    Example:
+        >>> import torch
+        >>> image = torch.linspace(0, 1, 48).expand(3, 32, 48)
+        >>> done = fit_bytes(image, None, 200, iterations=50)
+        >>> len(done.data) <= 200, done.scene.regions
+        (True, None)
+    """
+    recipe = settings.pop("config", None) or recipe  # transitional
+    config = FitConfig.from_recipe(recipe, **settings)
+    image, regions = check_problem(image, regions)
+    check_count("num_bytes", num_bytes)
+    regions, cost = _choose(image, regions, num_bytes, config, seed)
+    count = count_for(num_bytes - _map_bytes(regions))
+    result = fit(image, regions, count, recipe=config, seed=seed, on_step=on_step, contour_cost=cost)
+    data, scene = compress(result.scene, image, target_bytes=num_bytes, seed=seed)
+    return FitBytesResult(data, scene, result)
+
+
+def count_for(num_bytes: float) -> int:
+    """Return how many Gaussians make the best of so many bytes."""
+    bits = 8 * max(num_bytes - _HEADER_BYTES, 1)
+    count = bits / _BITS
+    for _ in range(4):
+        count = bits / max(_BITS + _BITS_PER_OCTAVE * math.log2(max(count, 1.0) / _COUNT), 8.0)
+    return max(1, round(count))
+
+
+def _choose(
+    image: Tensor, regions: RegionMap | None, num_bytes: int, config: FitConfig, seed: int
+) -> tuple[RegionMap | None, float]:
+    """Return the map, or None where its bytes do more as Gaussians, and what a pixel of contour must save."""
+    if regions is None or regions.num_regions == 1:
+        return None, config.contour_cost
+    # by iterations, so that the same arguments give the same file
+    trial = FitConfig.from_recipe(
+        config,
+        iterations=min(_TRIAL_ITERATIONS, config.iterations),
+        max_seconds=None,
+        merge_regions=False,
+        refine_flat=False,
+    )
+
+    def error(regions: RegionMap | None, left: int) -> float:
+        result = fit(image, regions, count_for(left), recipe=trial, seed=seed)
+        return float(10 ** (-max(entry.psnr for entry in result.history) / 10))
+
+    without = error(None, num_bytes)
+    # what a bit saves, where it is spent on Gaussians
+    saved = _POWER * _TRIAL_TO_END * without * image.shape[-2] * image.shape[-1] / (8 * num_bytes)
+    # a pixel of contour must save what its bits would
+    bits = 8 * _map_bytes(regions) / max(len(contour_edges(regions.fine_labels)[0]), 1)
+    cost = saved * bits
+    if config.merge_regions and regions.softness == 0.0 and regions.supersample == 1:
+        regions = RegionMap.from_labels(merge_regions(image, regions.labels, cost))
+    left = num_bytes - _map_bytes(regions)
+    if regions.num_regions == 1 or count_for(left) < regions.num_regions:
+        return None, cost
+    return (regions if error(regions, left) < _FAVOUR * without else None), cost
+
+
+def _map_bytes(regions: RegionMap | None) -> int:
+    if regions is None or regions.num_regions == 1:
+        return 0
+    from kcgs.codec.labels import encode_map  # loads numba
+
+    return len(encode_map(regions))

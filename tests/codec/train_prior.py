@@ -1,0 +1,187 @@
+"""Train the tables of the label model, `kcgs/codec/labels/prior.bin`, on label maps.
+
+    python tests/codec/train_prior.py MAP... -o prior.bin [--steps 8000] [--seed 0]
+    python tests/codec/train_prior.py --compare prior.bin MAP...
+
+Maps are files that `kcgs.data.load_labels` reads, for example what `kcgs segment` makes of photos; synthetic shapes are
+added to them. Each map is coded, also mirrored and turned, and what the coder asks of it are the examples: the template
+of a pixel, and which candidate it has. A network with the format's rounding is trained on them by Adam and written as
+integers. `--compare` codes maps with the tables that kcgs has and with those of a file, and prints the bytes of both.
+
+The tables that kcgs has were trained in this way on segmentations of Kodak photos and of scikit-image's, and on shapes.
+The list of those maps is lost, so their exact bytes cannot be made again; and they must not change, since all files
+depend on them. The starting weights of the mixer were found by trying and are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import kcgs
+from kcgs.codec.labels.contexts import CODED, FEATURE, FIRST, LABEL, LEFT, RIGHT, SECOND, TOP, new_tables
+from kcgs.codec.labels.prior import HIDDEN, LATENT, LAYOUT, TEMPLATE
+from kcgs.codec.labels.wavefront import DECIDED, REGIONS, STATE, loops, new_work
+from kcgs.data import load_labels
+
+MIXER = (46000, 7000, 7000, 8000)
+SHAPES, BATCH, PER_MAP = 60, 2048, 6000
+UNIT = 64  # weights and activations are whole 1 / UNIT
+_MEASURE = """
+import sys
+from kcgs.codec.labels import encode_labels
+from kcgs.data import load_labels
+for path in sys.argv[1:]:
+    print(len(encode_labels(load_labels(path).numpy())))
+"""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("maps", nargs="+", type=Path, metavar="MAP")
+    action = parser.add_mutually_exclusive_group(required=True)
+    action.add_argument("-o", "--output", type=Path)
+    action.add_argument("--compare", type=Path, metavar="PRIOR")
+    parser.add_argument("--steps", type=int, default=8000)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args(arguments)
+    if options.compare:
+        compare(options.compare.read_bytes(), options.maps)
+        return
+    maps = [load_labels(path).numpy() for path in options.maps]
+    options.output.write_bytes(pack(train(maps, options.steps, options.seed)))
+
+
+def examples(labels: Any) -> tuple[Any, Any]:
+    """Code a map; return the features of each pixel that is asked for [N, T], and what it is [N].
+
+    That is 0 or 1 for the first or the second candidate, 2 for neither.
+    """
+    ids, index = np.unique(labels, return_inverse=True)
+    run = loops()
+    truth, seeds, _ = run.survey(index.reshape(labels.shape).astype(np.int32), len(ids))
+    height, width = truth.shape
+    work, state = new_work(height), np.zeros(STATE, np.int64)
+    state[REGIONS] = len(ids)
+    padded = np.zeros((height + TOP + 1, width + LEFT + RIGHT), np.int32)
+    memory = (state, padded, seeds, *new_tables(), *work)
+    bits, features, kinds = np.zeros(2 * height, np.int32), [], []
+    while count := run.advance(bits, *memory):
+        run.answer(state, truth, work.rows, bits)
+        rows = work.rows[:count][work.rows[:count, CODED] == 1]
+        features.append(rows[:, FEATURE : FEATURE + len(TEMPLATE)].astype(np.int8))
+        kinds.append(np.where(rows[:, LABEL] == rows[:, FIRST], 0, np.where(rows[:, LABEL] == rows[:, SECOND], 1, 2)))
+        assert len(rows) == state[DECIDED]
+    if not kinds:
+        return np.zeros((0, len(TEMPLATE)), np.int8), np.zeros(0, np.int64)
+    return np.concatenate(features), np.concatenate(kinds)
+
+
+def shapes(generator: np.random.Generator) -> Any:
+    """Make a map of overlapping ellipses and half planes."""
+    height, width = generator.integers(100, 400, 2)
+    y, x = np.mgrid[:height, :width]
+    labels = np.zeros((height, width), np.int64)
+    for region in range(1, generator.integers(2, 12)):
+        angle, (cy, cx) = generator.uniform(0, np.pi), generator.uniform(0, 1, 2) * (height, width)
+        along = (x - cx) * np.cos(angle) + (y - cy) * np.sin(angle)
+        across = (y - cy) * np.cos(angle) - (x - cx) * np.sin(angle)
+        if generator.random() < 0.2:
+            labels[along > 0.4 * width] = region
+        else:
+            labels[(along / generator.uniform(5, 90)) ** 2 + (across / generator.uniform(5, 90)) ** 2 < 1] = region
+    return labels
+
+
+def train(maps: list[Any], steps: int, seed: int) -> list[Tensor]:
+    """Return the weights and biases of the three layers, in whole units."""
+    generator = np.random.default_rng(seed)
+    torch.manual_seed(seed)
+    found = []
+    for labels in [*maps, *(shapes(generator) for _ in range(SHAPES))]:
+        for turned in (labels, labels[::-1], labels[:, ::-1], labels.T):
+            features, kinds = examples(np.ascontiguousarray(turned))
+            chosen = generator.permutation(len(kinds))[:PER_MAP]
+            several = np.full(len(chosen), len(np.unique(labels)) > 2)
+            found.append((features[chosen], kinds[chosen], several))
+    features, kinds, several = (torch.from_numpy(np.concatenate(parts)) for parts in zip(*found, strict=True))
+    print(f"{len(kinds)} examples", file=sys.stderr)
+    sizes = [2 * len(TEMPLATE), HIDDEN, LATENT, 2]
+    parameters = [torch.randn(a, b) * a**-0.5 for a, b in pairwise(sizes)]
+    parameters = [t.requires_grad_() for w in parameters for t in (w, torch.zeros(w.shape[1]))]
+    optimizer = torch.optim.Adam(parameters, lr=4e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 4e-3, total_steps=steps)
+    for step in range(steps):
+        batch = torch.randint(len(kinds), (BATCH,))
+        kind, among = kinds[batch], several[batch]
+        logits = network(features[batch], parameters)
+        losses = torch.nn.functional.binary_cross_entropy_with_logits(
+            logits, torch.stack([(kind == 1).float(), (kind == 2).float()], 1), reduction="none"
+        )
+        loss = (losses[:, 0] * (kind < 2) + losses[:, 1] * among).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        if step % 1000 == 0 or step == steps - 1:
+            print(f"step {step}: {float(loss.detach()) / np.log(2):.4f} bits per pixel", file=sys.stderr)
+    return [rounded(t.detach(), scale, most) for t, (scale, most) in zip(parameters, limits(), strict=True)]
+
+
+def limits() -> list[tuple[int, int]]:
+    """Return the unit of each tensor, and the most that its type holds."""
+    return [(UNIT, 127), (UNIT, 32767), (UNIT, 127), (UNIT**2, 1 << 30), (UNIT, 127), (UNIT**2, 1 << 30)]
+
+
+def rounded(values: Tensor, scale: int, most: int) -> Tensor:
+    return (values * scale).round().clamp(-most, most) / scale
+
+
+def network(features: Tensor, parameters: list[Tensor]) -> Tensor:
+    """Evaluate the network with rounded weights, whose gradients pass the rounding."""
+    pairs = zip(parameters, limits(), strict=True)
+    values = [t + (rounded(t, scale, most) - t).detach() for t, (scale, most) in pairs]
+    x = torch.stack([features == 1, features == 2], -1).flatten(1).float()
+    for weight, bias in zip(values[:-2:2], values[1:-2:2], strict=True):
+        x = (x @ weight + bias).clamp(0, 4095 / UNIT)
+    return (x @ values[-2] + values[-1]).clamp(-12, 12)
+
+
+def pack(parameters: list[Tensor]) -> bytes:
+    """Write the tables as the format has them."""
+    whole = [(t * scale).round().long().numpy() for t, (scale, _) in zip(parameters, limits(), strict=True)]
+    tables = [whole[0].reshape(len(TEMPLATE), 2, HIDDEN), *whole[1:], np.array(MIXER)]
+    return b"".join(table.astype(kind).tobytes() for table, (kind, _) in zip(tables, LAYOUT, strict=True))
+
+
+def compare(prior: bytes, maps: list[Path]) -> None:
+    """Print the bytes of maps with the tables that kcgs has, and with others."""
+    package = Path(kcgs.__file__).parent
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.copytree(package, Path(folder) / "kcgs")
+        (Path(folder) / "kcgs" / "codec" / "labels" / "prior.bin").write_bytes(prior)
+        sizes = [measure(root, maps) for root in (package.parent, Path(folder))]
+    for path, present, other in zip(maps, *sizes, strict=True):
+        print(f"{path}: {present} {other}")
+    print(f"all: {sum(sizes[0])} {sum(sizes[1])}, {100 * (sum(sizes[1]) / sum(sizes[0]) - 1):+.1f} %")
+
+
+def measure(root: Path, maps: list[Path]) -> list[int]:
+    """Code maps in a process of its own, whose loops hold the tables of the kcgs at `root`."""
+    command = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(root)!r}){_MEASURE}", *map(str, maps)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=root)
+    return [int(line) for line in done.stdout.split()]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""Fits to a budget of bytes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from kcgs.codec import decode
+from kcgs.rate import fit_bytes
+from kcgs.rate.budget import count_for
+
+from .conftest import Photo, psnr
+
+
+class TestFitBytes:
+    @pytest.mark.parametrize("target", [600, 1500])
+    def test_file_fits(self, photo: Photo, target: int) -> None:
+        image, labels = photo
+        done = fit_bytes(image, labels, target, iterations=150)
+        assert 0.93 * target < len(done.data) <= target
+        assert torch.equal(decode(done.data).scene.field.means, done.scene.field.means)
+        assert psnr(done.scene, image) > 18
+
+    def test_more_bytes_are_better(self, photo: Photo) -> None:
+        image, labels = photo
+        psnrs = []
+        for target in (500, 1200, 2600):
+            done = fit_bytes(image, labels, target, iterations=150)
+            psnrs.append(psnr(done.scene, image))
+        assert psnrs[0] + 0.8 < psnrs[1] < psnrs[2] - 0.8
+
+    def test_a_map_that_does_not_pay_is_left_out(self, photo: Photo) -> None:
+        image, _ = photo
+        noise = torch.randint(0, 2, (30, 40), generator=torch.Generator().manual_seed(0))
+        speckled = noise.repeat_interleave(4, 0).repeat_interleave(4, 1)
+        assert fit_bytes(image, speckled, 900, iterations=150).scene.regions is None
+
+    def test_a_map_that_pays_stays(self) -> None:
+        image = torch.full((3, 96, 128), 0.1)
+        row, column = torch.meshgrid(torch.arange(96), torch.arange(128), indexing="ij")
+        disc = (column - 60) ** 2 + (row - 48) ** 2 < 35**2
+        image[:, disc] = 0.9
+        done = fit_bytes(image, disc.long(), 250, iterations=150)
+        assert done.scene.regions is not None and psnr(done.scene, image) > 35
+
+    def test_count_grows_with_bytes(self) -> None:
+        counts = [count_for(size) for size in (100, 1000, 8000, 50_000)]
+        assert counts == sorted(counts) and 1900 < counts[2] < 2300
+        assert count_for(1) == 1
+
+    def test_refusals(self) -> None:
+        image = torch.zeros(3, 16, 16)
+        with pytest.raises(TypeError, match="num_bytes must be an integer"):
+            fit_bytes(image, None, 1.5)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="num_bytes must be at least 1; got 0"):
+            fit_bytes(image, torch.arange(16).expand(16, 16), 0)
+        with pytest.raises(ValueError, match="target_bytes must be at least"):
+            fit_bytes(torch.rand(3, 16, 16), None, 12, iterations=150)
