@@ -6,7 +6,8 @@ import sys
 
 import typer
 
-from . import bench, decoders, fit, many, scenes, segmentation  # each puts its commands into `app`
+# each puts its commands into `app`, in the order of `kcgs --help`
+from . import fit, many, scenes, segmentation, decoders, bench  # isort: skip
 from .common import app
 
 __all__ = ["app", "bench", "decoders", "fit", "main", "many", "scenes", "segmentation"]

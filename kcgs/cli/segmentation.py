@@ -1,4 +1,4 @@
-"""The command that makes label maps, and what the others say about maps that users bring."""
+"""The command that makes label maps."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from kcgs.segment import Segmentation
 
-# contours that people traced reach 0.63 and more on their image, at most 0.54 on its mirror image
-_ALIGNED = 0.58
 # of the table of regions: title and format of each column
 _COLUMNS = {
     "id": ("id", "{}"),
@@ -72,21 +70,6 @@ def segment(
     print_report({**report, "table": rows} if as_json else report, as_json, str(output))
     if not as_json:
         _print_rows(rows)
-
-
-def misalignment(image: Tensor, labels: Tensor, name: str) -> str | None:
-    """Return a warning where a map's contours lie beside the image's edges; None: they do not."""
-    from kcgs.functional import edge_alignment
-
-    if labels.shape != image.shape[1:]:
-        return None  # the fit refuses it
-    alignment = float(edge_alignment(image, labels))
-    if alignment >= _ALIGNED:
-        return None
-    return (
-        f"warning: the contours of {name} hardly follow the image's edges: alignment {alignment:.2f}, where chance "
-        "gives 0.50 and good masks 0.63 or more; does the mask belong to this image?"
-    )
 
 
 def _parse_options(pairs: list[str]) -> dict[str, Any]:
