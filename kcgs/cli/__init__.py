@@ -29,5 +29,5 @@ def _name_options(message: str, command: str) -> str:
     """Name the options of a command where the library's message begins with the name of an argument."""
     for parameter in typer.main.get_command(app).commands[command].params:  # type: ignore[attr-defined]
         option = max(parameter.opts, key=len) if parameter.param_type_name == "option" else parameter.metavar
-        message = re.sub(rf"^{parameter.name}\b(?=:| must)", option, message)
+        message = re.sub(rf"^{parameter.name}\b(?=:| must| ')", option, message)
     return message

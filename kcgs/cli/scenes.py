@@ -9,7 +9,7 @@ import typer
 
 from .common import IMAGES, ImageFile, Json, SceneFile, app, check_output, print_report, write_file
 from .fit import measure_scene
-from .options import Scale, Size, target_size
+from .options import Scale, Size, exclude, target_size
 
 OutputImage = Annotated[Path, typer.Option("-o", "--output", help="Image file to write.")]
 
@@ -103,6 +103,8 @@ def encode(
     from kcgs.functional import psnr
 
     check_output(output, ".kcgs")
+    if target_bytes is not None:
+        exclude("--target-bytes", quality=quality)
     loaded = load(scene)
     goal: dict[str, Any] = {"quality": quality, "target_bytes": target_bytes}
     if image is None:

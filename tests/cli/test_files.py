@@ -52,6 +52,7 @@ class TestEncode:
         assert (tmp_path / "a.kcgs").stat().st_size <= 700
 
     def test_nothing_is_written_on_failure(self, scene: Path, tmp_path: Path) -> None:
+        run("encode", scene, "-o", tmp_path / "a.kcgs", "--target-bytes", 900, "--quality", 40, code=2)
         result = runner.invoke(app, ["encode", str(scene), "-o", str(tmp_path / "a.kcgs"), "--target-bytes", "9"])
         assert result.exit_code == 1 and "target_bytes must be at least" in str(result.exception)
         assert not (tmp_path / "a.kcgs").exists()
