@@ -27,12 +27,9 @@ _SUBSAMPLING = ({"subsampling": "4:2:0"}, {"subsampling": "4:4:4"})
 class Codec(NamedTuple):
     """A codec: its settings that do not change, and those of which the better is taken."""
 
-    format: str
-    """Of Pillow."""
-    feature: str
-    """That Pillow must have."""
-    qualities: tuple[int, ...]
-    """Rising."""
+    format: str  # of Pillow
+    feature: str  # that Pillow must have
+    qualities: tuple[int, ...]  # rising
     settings: dict[str, Any]
     variants: tuple[dict[str, Any], ...] = ({},)
     draft: dict[str, Any] | None = None
@@ -54,8 +51,7 @@ class Coded(NamedTuple):
 
     data: bytes
     setting: str
-    seconds: float
-    """Of this one file, not of the search."""
+    seconds: float  # of this one file, not of the search
 
 
 def present() -> list[str]:

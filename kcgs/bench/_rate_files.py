@@ -17,17 +17,20 @@ from torch import Tensor
 
 from kcgs._atomic import atomic_path
 from kcgs.codec import decode
+from kcgs.data import load_labels
 from kcgs.evaluate import measure
 from kcgs.fit import FitConfig, warm_up
+from kcgs.rate import compress, fit_bytes
 from kcgs.scene import Scene, load
-from kcgs.segment import segment
 
-from ._codecs import CODECS, largest, open_file
-from ._library import compress, fit_bytes
+from ._codecs import CODECS, largest, lossless_bytes, open_file
 from .core import images
 from .core.cases import BEST, QUICK_ITERATIONS, Case
-from .core.store import Store
+from .core.store import Store, find_labels
 
+MAPS = "maps"
+# codecs of label maps
+LABELS, LOSSLESS_WEBP = "kcgs.codec.labels", "WebP, lossless"
 KCGS, NO_REGIONS, FLOAT = "kcgs", "kcgs, no regions", "float scene"
 # of `compress`
 ITERATIONS, QUICK_TUNING = 100, 10
@@ -44,22 +47,18 @@ class Point(NamedTuple):
     group: str
     image: str
     codec: str
-    asked: int
-    """Bytes that it may have; in the groups precision and speed: how many Gaussians."""
+    asked: int  # bytes that it may have; in the groups precision and speed: how many Gaussians
     bytes: int
-    bpp: float
-    """Bits per pixel, everything included."""
+    bpp: float  # bits per pixel, everything included
     setting: str = ""
     psnr: float = math.nan
     ms_ssim: float = math.nan
     ef_psnr: float = math.nan
     ef_ssim: float = math.nan
-    encode_seconds: float = math.nan
-    """Of kcgs: the fit included."""
+    encode_seconds: float = math.nan  # of kcgs: the fit included
     decode_seconds: float = math.nan
     num_gaussians: int = 0
-    regions: int = 0
-    """Of the map in the file, 1: there is none."""
+    regions: int = 0  # of the map in the file, 1: there is none
 
 
 class Ask(NamedTuple):
@@ -88,7 +87,7 @@ class Files:
         self.config = BEST.config(QUICK_ITERATIONS if quick else None)
         self.tuning = QUICK_TUNING if quick else ITERATIONS
 
-    def other(self, group: str, image: str, codec: str, most: int, *, exact: bool = True) -> Point | None:
+    def other(self, group: str, image: str, codec: str, most: int, *, exact: bool = True) -> list[Point]:
         """Return the largest file of another codec of at most `most` bytes; not `exact`: of about as many."""
         ask = Ask(group, image, codec, most)
 
@@ -101,7 +100,7 @@ class Files:
 
         return self.keep(ask, [*CODECS[codec], exact], make)
 
-    def fitted(self, group: str, image: str, most: int, *, regions: bool = True) -> Point | None:
+    def fitted(self, group: str, image: str, most: int, *, regions: bool = True) -> list[Point]:
         """Return kcgs' file of a fit to so many bytes."""
         ask = Ask(group, image, KCGS if regions else NO_REGIONS, most)
 
@@ -111,14 +110,14 @@ class Files:
             if not self.quick:
                 _warm_up(self.config)
             start = time.perf_counter()
-            data, scene = fit_bytes(sample.image, labels, most, self.config)
+            made = fit_bytes(sample.image, labels, most, recipe=self.config)
             seconds = time.perf_counter() - start + (segment_seconds if regions else 0.0)
-            scene.save(self.path(ask, self.settings("fit_bytes"), "safetensors"))
-            return self._of_file(ask, data)._replace(encode_seconds=seconds), data
+            made.result.scene.save(self.path(ask, self.settings("fit_bytes"), "safetensors"))
+            return self._of_file(ask, made.data)._replace(encode_seconds=seconds), made.data
 
         return self.keep(ask, self.settings("fit_bytes"), make)
 
-    def rewritten(self, fitted: Point, most: int) -> Point | None:
+    def rewritten(self, fitted: Point, most: int) -> list[Point]:
         """Return the same fit's file of at most `most` bytes, fewer than it was made for."""
         first = Ask(*fitted[:4])
         ask = first._replace(asked=most)
@@ -127,7 +126,7 @@ class Files:
             scene = load(self.path(first, self.settings("fit_bytes"), "safetensors"))
             image = self.sample(ask.image)[0].image
             start = time.perf_counter()
-            data = compress(scene, image, target_bytes=most, iterations=self.tuning)
+            data = compress(scene, image, target_bytes=most, iterations=self.tuning).data
             seconds = fitted.encode_seconds + time.perf_counter() - start
             return self._of_file(ask, data)._replace(encode_seconds=seconds), data
 
@@ -138,7 +137,7 @@ class Files:
         quick: dict[str, Any] = {"iterations": QUICK_ITERATIONS, "stride": QUICK_STRIDE} if self.quick else {}
         return Case(image, n, BEST, **quick)
 
-    def scene(self, group: str, image: str, n: int) -> Point | None:
+    def scene(self, group: str, image: str, n: int) -> list[Point]:
         """Return the fit of so many Gaussians, as it is before it is a file."""
         case = self.case(image, n)
         if self.makes and self.fits.row(case) is None:
@@ -146,12 +145,12 @@ class Files:
         row = self.fits.row(case)
         if row is None:
             self.missed += 1
-            return None
+            return []
         figures = (row.psnr, row.ms_ssim, row.ef_psnr, row.ef_ssim)
         point = Point(group, image, FLOAT, n, 0, 0.0, "", *figures, encode_seconds=row.seconds)
-        return _with_counts(point, self.fits.scene(case))
+        return [_with_counts(point, self.fits.scene(case))]
 
-    def rounded(self, scene: Point) -> Point | None:
+    def rounded(self, scene: Point) -> list[Point]:
         """Return the smallest file of a scene, of a few tries, that loses at most `MOST_LOSS` dB."""
         ask = Ask(scene.group, scene.image, KCGS, scene.asked)
         loaded = partial(self.fits.scene, self.case(scene.image, scene.asked))
@@ -160,7 +159,7 @@ class Files:
             image, best, quality = self.sample(ask.image)[0].image, None, scene.psnr + FIRST_QUALITY
             for _ in range(1 if self.quick else _TRIES):
                 start = time.perf_counter()
-                data = compress(loaded(), image, quality=quality, iterations=self.tuning)
+                data = compress(loaded(), image, quality=quality, iterations=self.tuning).data
                 seconds = time.perf_counter() - start
                 point = self._of_file(ask, data)._replace(setting=f"quality {quality:.2f}", encode_seconds=seconds)
                 loss = scene.psnr - point.psnr
@@ -173,8 +172,27 @@ class Files:
 
         return self.keep(ask, [*self.settings("compress"), MOST_LOSS, FIRST_QUALITY, _TRIES], make)
 
-    def keep(self, ask: Ask, settings: Any, make: Callable[[], tuple[Point, bytes]]) -> Point | None:
-        """Return a point that is kept, or is made and kept with its file; None: it is not there."""
+    def label_map(self, image: str) -> list[Point]:
+        """Return the sizes of a label map alone; `image` is FOLDER/NAME."""
+        from kcgs.codec.labels import encode_labels  # compiles loops
+
+        def make(codec: str) -> tuple[Point, bytes]:
+            folder, _, name = image.partition("/")
+            if self.data is None or folder == image:
+                labels = self.sample(image)[0].labels
+                assert labels is not None
+            else:
+                is_davis = folder == "DAVIS"
+                labels = images.davis(self.data)[name].labels if is_davis else load_labels(self.data / f"{image}.png")
+            size, regions = lossless_bytes(labels), len(torch.unique(labels))
+            size = len(encode_labels(labels.numpy())) if codec == LABELS else size
+            return Point(MAPS, image, codec, 0, size, 8 * size / labels.numel(), regions=regions), b""
+
+        asks = [Ask(MAPS, image, codec, 0) for codec in (LABELS, LOSSLESS_WEBP)]
+        return [p for ask in asks for p in self.keep(ask, self.settings(MAPS), partial(make, ask.codec))]
+
+    def keep(self, ask: Ask, settings: Any, make: Callable[[], tuple[Point, bytes]]) -> list[Point]:
+        """Return a point that is kept, or is made and kept with its file; none where it is not there."""
         path = self.path(ask, settings, "json")
         if not path.is_file() and self.makes:
             point, data = make()
@@ -183,8 +201,8 @@ class Files:
                 temporary.write_text(json.dumps(point), encoding="utf-8")
         if not path.is_file():
             self.missed += 1
-            return None
-        return Point(*json.loads(path.read_text(encoding="utf-8")))
+            return []
+        return [Point(*json.loads(path.read_text(encoding="utf-8")))]
 
     def path(self, ask: Ask, settings: Any, suffix: str) -> Path:
         """Say where a file is, or would be."""
@@ -257,12 +275,8 @@ def _with_counts(point: Point, scene: Scene) -> Point:
 @lru_cache(maxsize=2)
 def _sample(name: str, data: Path | None, stride: int) -> tuple[images.Sample, float]:
     sample = images.load(name, data, stride)
-    if sample.labels is not None:
-        return sample, 0.0
-    segment(sample.image[:, :64, :64])  # what it imports is no part of its time
-    start = time.perf_counter()
-    labels = segment(sample.image)
-    return sample._replace(labels=labels), time.perf_counter() - start
+    labels, seconds = find_labels("given" if sample.labels is not None else "auto", *sample)
+    return sample._replace(labels=labels), seconds
 
 
 @lru_cache(maxsize=8)
@@ -271,4 +285,4 @@ def _warm_up(config: FitConfig) -> None:
     warm_up(config)
     ramp = torch.linspace(0.0, 1.0, 96).expand(3, 64, 96)
     short = config.model_copy(update={"iterations": min(config.iterations, 20), "max_seconds": None})
-    fit_bytes(ramp, (ramp[0] > 0.6).long().contiguous(), 300, short)
+    fit_bytes(ramp, (ramp[0] > 0.6).long().contiguous(), 300, recipe=short)

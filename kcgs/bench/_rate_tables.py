@@ -8,14 +8,12 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from ._codecs import AVIF, AVIF_PSNR, CODECS, JPEG, WEBP
-from ._rate_files import FLOAT, KCGS, NO_REGIONS, Point
+from ._rate_files import FLOAT, KCGS, LABELS, LOSSLESS_WEBP, MAPS, NO_REGIONS, Point
 from .core.statistics import Bound, Delta, Summary, delta, summarize
 from .core.tables import count, db, markdown, seconds, signed
 
 MATCHED, DAVIS_CURVE, KODAK_CURVE = "davis8k", "davis-curve", "kodak-curve"
-PRECISION, MAPS, SPEED = "precision", "maps", "speed"
-# codecs of label maps
-LABELS, LOSSLESS_WEBP = "kcgs.codec.labels", "WebP, lossless"
+PRECISION, SPEED = "precision", "speed"
 TUNED, PLAIN, DECODE = "encode, fine-tuned", "encode", "decode"
 PSNR, EF_PSNR = "psnr", "ef_psnr"
 # as tables call them, and their unit

@@ -19,14 +19,12 @@ _RATE = 1e-3
 class Trained(NamedTuple):
     """What training came to."""
 
-    render: Tensor
-    """(3, H, W) in [0, 1], of the rounded weights."""
+    render: Tensor  # (3, H, W) in [0, 1], of the rounded weights
     bytes: int
     width: int
     iterations: int
     seconds: float
-    history: list[tuple[float, Tensor]]
-    """Seconds, render."""
+    history: list[tuple[float, Tensor]]  # seconds, render
 
 
 class Sine(nn.Module):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from .core import figures, summaries
@@ -15,6 +14,7 @@ from .core.report import Made
 from .core.rows import read_rows
 from .core.stages import run_stages
 from .core.store import Row
+from .core.summaries import means
 from .core.tables import count, db, markdown, signed
 
 COUNTS = (1_250, 7_500)
@@ -55,7 +55,7 @@ PRINTED = {
     WARMED.name: {1_250: (27.06, 23.09), 7_500: (33.28, 29.44)},
     PAPER.name: {1_250: (27.31, 23.41), 7_500: (33.44, 29.18)},
 }
-_QUANTITIES = ("psnr", "ef_psnr")
+_QUANTITIES, _FILE = ("psnr", "ef_psnr"), ("bits_per_pixel", "decoded_psnr")
 _PAPER_TEXT = """Columns marked *theirs* are what the paper prints, means over all of DAVIS at 50,000 iterations;
 nobody measured them here. Changes are to the first row."""
 _OUR_TEXT = """Parts of `best` taken away one at a time. Changes are to `best`, paired by image, below zero where the
@@ -116,7 +116,7 @@ def paper_table(rows: list[Row]) -> str:
             for quantity in _QUANTITIES:
                 value = mean_over(found, quantity)
                 line += [db(value), signed(value - mean_over(first, quantity))]
-            lines.append([*line, *_file_cells(found), *_printed(name, n)])
+            lines.append([*line, *means(found, _FILE), *_printed(name, n)])
     return markdown(header, lines)
 
 
@@ -129,8 +129,7 @@ def our_table(rows: list[Row]) -> str:
         same = [row for row in rows if row.image in images]
         for name in present:
             found = select(same, name, n)
-            line = [count(n), SHOWN[name], str(len(images)), *(db(mean_over(found, q)) for q in _QUANTITIES)]
-            line += _file_cells(found)
+            line = [count(n), SHOWN[name], str(len(images)), *means(found, (*_QUANTITIES, *_FILE))]
             lines.append(line + ([""] * 6 if name == BEST.name else _changes(same, name, n)))
     return markdown(header, lines)
 
@@ -171,7 +170,3 @@ def _printed(name: str, n: int) -> list[str]:
         return [""] * 4
     pairs = zip(PRINTED[name][n], PRINTED[CLAMPED.name][n], strict=True)
     return [cell for value, base in pairs for cell in (db(value), signed(value - base))]
-
-
-def _file_cells(rows: Sequence[Row]) -> list[str]:
-    return [f"{mean_over(rows, 'bits_per_pixel'):.3f}", db(mean_over(rows, "decoded_psnr"))]

@@ -31,13 +31,9 @@ SHOWN = {
     COVERAGE.name: COVERAGE.name,
 }
 CONTESTS = (
-    Contest(PAPER.name, UNCLAMPED.name),
-    Contest(PAPER.name, CLAMPED.name),
-    Contest(PAPER.name, PAPER_CLAMPED.name),
+    *(Contest(PAPER.name, other.name) for other in (UNCLAMPED, CLAMPED, PAPER_CLAMPED)),
     Contest(PAPER_CLAMPED.name, CLAMPED.name),
-    Contest(BEST.name, BASELINE.name),
-    Contest(BEST.name, CLAMPED.name),
-    Contest(BEST.name, PAPER.name),
+    *(Contest(BEST.name, other.name) for other in (BASELINE, CLAMPED, PAPER)),
     Contest(BASELINE.name, CLAMPED.name),
 )
 _WINDOW = 60

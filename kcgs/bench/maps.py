@@ -60,30 +60,21 @@ class Result(NamedTuple):
     n: int
     source: str
     given_regions: int
-    regions: int
-    """In the end."""
-    bytes: int
-    """Of the scene's file."""
-    map_bytes: int
-    """Of these the final map's; 0: it has no contour."""
+    regions: int  # in the end
+    bytes: int  # of the scene's file
+    map_bytes: int  # of these the final map's; 0: it has no contour
     psnr: float
-    ef_psnr: float
-    """NaN: there is no contour."""
+    ef_psnr: float  # naN: there is no contour
     baseline_psnr: float
     baseline_ef_psnr: float
     segment_seconds: float
-    seconds: float
-    """Of the fit."""
+    seconds: float  # of the fit
     baseline_seconds: float
-    decoded_psnr: float = math.nan
-    """Of the file."""
+    decoded_psnr: float = math.nan  # of the file
     decoded_ef_psnr: float = math.nan
-    equal_n: int = 0
-    """Of the baseline that the bytes of the file buy; 0: it was not asked for."""
-    equal_bytes: int = 0
-    """Of that baseline's file."""
-    equal_psnr: float = math.nan
-    """Decoded."""
+    equal_n: int = 0  # of the baseline that the bytes of the file buy; 0: it was not asked for
+    equal_bytes: int = 0  # of that baseline's file
+    equal_psnr: float = math.nan  # decoded
     equal_ef_psnr: float = math.nan
 
     @property

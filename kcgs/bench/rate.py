@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from kcgs.codec import encode
-from kcgs.data import load_labels
 from kcgs.plots import COLORS, figure, save_figure
+from kcgs.rate import compress
 
 from . import _rate_tables as tables
-from ._codecs import AVIF, AVIF_PSNR, JPEG, WEBP, lossless_bytes, present, versions
-from ._library import compress
-from ._rate_files import FIRST_QUALITY, KCGS, MOST_LOSS, NO_REGIONS, Ask, Files, Point, render, timed
+from ._codecs import AVIF, AVIF_PSNR, JPEG, WEBP, present, versions
+from ._rate_files import FIRST_QUALITY, KCGS, MAPS, MOST_LOSS, NO_REGIONS, Ask, Files, Point, render, timed
 from ._rate_tables import (
     DAVIS_CURVE,
     DECODE,
     EF_PSNR,
     KODAK_CURVE,
-    LABELS,
-    LOSSLESS_WEBP,
-    MAPS,
     MATCHED,
     MOST_BYTES,
     PLAIN,
@@ -222,7 +217,7 @@ def steps(group: str, files: Files) -> Iterator[tuple[str, Step]]:
             for most in QUICK_TARGETS if files.quick else TARGETS:
                 yield f"{image} {most:,}", partial(_on_curve, files, group, image, most)
     elif group == MAPS:
-        yield from ((image, partial(_map, files, image)) for image in found)
+        yield from ((image, partial(files.label_map, image)) for image in found)
     else:
         measured = {PRECISION: _precision, SPEED: _speed}[group]
         for image in found:
@@ -258,73 +253,50 @@ def _matched(files: Files, image: str) -> list[Point]:
     as many bytes already, or they could not go as low.
     """
     most = QUICK_BYTES if files.quick else MOST_BYTES
-    others = _present(files.other(MATCHED, image, codec, most) for codec in present())
+    others = [p for codec in present() for p in files.other(MATCHED, image, codec, most)]
     avif = sorted({p.bytes for p in others if p.codec in (AVIF, AVIF_PSNR)}, reverse=True) or [most]
-    first = files.fitted(MATCHED, image, avif[0]) if len(others) == len(present()) else None
-    if first is None:
-        return others
-    ours = [first, *(files.rewritten(first, smaller) for smaller in avif[1:])]
-    for point in others:
-        least = _NEAR * point.bytes if point.bytes <= most else 0.0
-        if not any(file is not None and least <= file.bytes <= point.bytes for file in ours):
-            ours.append(files.rewritten(first, point.bytes))
-    return [*others, *_present(ours)]
+    ours = files.fitted(MATCHED, image, avif[0]) if len(others) == len(present()) else []
+    for first in ours[:1]:
+        for smaller in avif[1:]:
+            ours += files.rewritten(first, smaller)
+        for point in others:
+            least = _NEAR * point.bytes if point.bytes <= most else 0.0
+            if not any(least <= file.bytes <= point.bytes for file in ours):
+                ours += files.rewritten(first, point.bytes)
+    return [*others, *ours]
 
 
 def _matched_without(files: Files, image: str) -> list[Point]:
     kept = Files(files.folder, files.data, files.quick, makes=False)
     ours = [p for p in _matched(kept, image) if p.regions]
-    return _present([files.fitted(MATCHED, image, ours[0].asked, regions=False)] if ours else [])
+    return files.fitted(MATCHED, image, ours[0].asked, regions=False) if ours else []
 
 
 def _on_curve(files: Files, group: str, image: str, most: int) -> list[Point]:
-    points = [files.other(group, image, codec, most, exact=False) for codec in present()]
+    points = [p for codec in present() for p in files.other(group, image, codec, most, exact=False)]
     which = (True,) if files.quick else (True, False)
-    return _present([*points, *(files.fitted(group, image, most, regions=regions) for regions in which)])
+    return points + [p for regions in which for p in files.fitted(group, image, most, regions=regions)]
 
 
 def _precision(files: Files, image: str, n: int) -> list[Point]:
-    scene = files.scene(PRECISION, image, n)
-    return [] if scene is None else _present([scene, files.rounded(scene)])
-
-
-def _map(files: Files, image: str) -> list[Point]:
-    from kcgs.codec.labels import encode_labels  # compiles loops
-
-    def make(codec: str) -> tuple[Point, bytes]:
-        labels = _read_map(files, image)
-        size = len(encode_labels(labels.numpy())) if codec == LABELS else lossless_bytes(labels)
-        return Point(MAPS, image, codec, 0, size, 8 * size / labels.numel(), regions=len(torch.unique(labels))), b""
-
-    return _present(
-        files.keep(Ask(MAPS, image, codec, 0), files.settings(MAPS), partial(make, codec))
-        for codec in (LABELS, LOSSLESS_WEBP)
-    )
-
-
-def _read_map(files: Files, image: str) -> Tensor:
-    folder, _, name = image.partition("/")
-    if files.quick or files.data is None:
-        labels = files.sample(image)[0].labels
-        assert labels is not None
-        return labels
-    return images.davis(files.data)[name].labels if folder == "DAVIS" else load_labels(files.data / f"{image}.png")
+    scenes = files.scene(PRECISION, image, n)
+    return scenes + [p for scene in scenes for p in files.rounded(scene)]
 
 
 def _speed(files: Files, image: str, n: int) -> list[Point]:
     """Time files of the scene that the group of precision keeps."""
     fitted = files.scene(PRECISION, image, n)
-    if fitted is None:
+    if not fitted:
         return []
     repeats = 1 if files.quick else 5
 
     def make(what: str) -> tuple[Point, bytes]:
         scene, sample = files.fits.scene(files.case(image, n)), files.sample(image)[0].image
-        quality = fitted.psnr + FIRST_QUALITY
+        quality = fitted[0].psnr + FIRST_QUALITY
         with threads(SPEED_THREADS):
             if what == TUNED:
                 tuned = partial(compress, scene, sample, quality=quality, iterations=files.tuning)
-                data, seconds = timed(tuned, repeats)
+                (data, _), seconds = timed(tuned, repeats)
             else:
                 data, seconds = timed(partial(encode, scene, quality=quality), repeats)
             if what == DECODE:
@@ -334,13 +306,8 @@ def _speed(files: Files, image: str, n: int) -> list[Point]:
         return Point(SPEED, image, what, n, len(data), 8 * len(data) / sample[0].numel(), **times), data
 
     settings = [*files.settings(SPEED), repeats, SPEED_THREADS]
-    return _present(
-        files.keep(Ask(SPEED, image, what, n), settings, partial(make, what)) for what in (TUNED, PLAIN, DECODE)
-    )
-
-
-def _present(points: Iterable[Point | None]) -> list[Point]:
-    return [point for point in points if point is not None]
+    asks = [Ask(SPEED, image, what, n) for what in (TUNED, PLAIN, DECODE)]
+    return [p for ask in asks for p in files.keep(ask, settings, partial(make, ask.codec))]
 
 
 def _plot_curves(points: Sequence[Point], path: Path) -> None:

@@ -43,6 +43,7 @@ from kcgs.data import save_image, save_labels
 from kcgs.fit import FitConfig, FitResult, HistoryEntry
 from kcgs.functional import RegionMap, ef_psnr, psnr
 from kcgs.nn import GaussianField
+from kcgs.rate import Compressed, FitBytesResult
 from kcgs.scene import Scene
 
 
@@ -62,14 +63,14 @@ class Stub:
         self._ask("fit", n, labels)
         return self._result(image, labels, n, recipe)
 
-    def fit_bytes(self, image: Tensor, labels: Tensor | None, most: int, config: FitConfig) -> tuple[bytes, Scene]:
+    def fit_bytes(self, image: Tensor, labels: Tensor | None, most: int, *, recipe: FitConfig) -> FitBytesResult:
         self._ask("fit_bytes", most, labels)
-        scene = self._result(image, labels, 30, config).scene
-        return encode(scene, target_bytes=most), scene
+        result = self._result(image, labels, 30, recipe)
+        return FitBytesResult(encode(result.scene, target_bytes=most), result.scene, result)
 
-    def compress(self, scene: Scene, image: Tensor, *, iterations: int, **how: Any) -> bytes:
+    def compress(self, scene: Scene, image: Tensor, *, iterations: int, **how: Any) -> Compressed:
         self._ask("compress", how.get("target_bytes", 0), None if scene.regions is None else scene.regions.labels)
-        return encode(scene, **how)
+        return Compressed(encode(scene, **how), scene)
 
     @staticmethod
     def _result(image: Tensor, labels: RegionMap | Tensor | None, n: int, config: FitConfig) -> FitResult:
@@ -161,14 +162,14 @@ class TestFilesOnDisk:
     def test_keeps(self, tmp_path: Path) -> None:
         files, ask = Files(tmp_path / "files", None, False), Ask(MATCHED, "DAVIS/dog", KCGS, 100)
         dry = Files(files.folder, None, False, makes=False)
-        assert dry.keep(ask, 1, lambda: (point(), b"data")) is None and dry.missed == 1
-        assert files.keep(ask, 1, lambda: (point(), b"data")) == point()
-        assert dry.keep(ask, 1, lambda: (point(), b"data")) == point() and dry.missed == 1
+        assert dry.keep(ask, 1, lambda: (point(), b"data")) == [] and dry.missed == 1
+        assert files.keep(ask, 1, lambda: (point(), b"data")) == [point()]
+        assert dry.keep(ask, 1, lambda: (point(), b"data")) == [point()] and dry.missed == 1
         assert files.path(ask, 1, "file").read_bytes() == b"data"
         others = [(ask._replace(asked=101), 1), (ask._replace(codec=NO_REGIONS), 1), (ask, 2)]
         quick = Files(files.folder, None, True, makes=False)
-        assert all(dry.keep(*other, lambda: (point(), b"")) is None for other in others)
-        assert quick.keep(ask, 1, lambda: (point(), b"")) is None
+        assert not any(dry.keep(*other, lambda: (point(), b"")) for other in others)
+        assert quick.keep(ask, 1, lambda: (point(), b"")) == []
 
     def test_a_changed_codec_is_noticed(self, tmp_path: Path, stub: Stub, monkeypatch: pytest.MonkeyPatch) -> None:
         files = Files(tmp_path, None, True)
@@ -177,9 +178,9 @@ class TestFilesOnDisk:
         assert len(codec_digest()) == 64
         monkeypatch.setattr(_rate_files, "codec_digest", lambda: "another")
         dry = Files(tmp_path, None, True, makes=False)
-        assert dry.fitted(MATCHED, QUICK_IMAGE, 900) is None
-        assert dry.other(MATCHED, QUICK_IMAGE, JPEG, 900) is not None
-        assert files.fitted(MATCHED, QUICK_IMAGE, 900) is not None and len(stub.asked) == 2
+        assert dry.fitted(MATCHED, QUICK_IMAGE, 900) == []
+        assert len(dry.other(MATCHED, QUICK_IMAGE, JPEG, 900)) == 1
+        assert files.fitted(MATCHED, QUICK_IMAGE, 900) and len(stub.asked) == 2
 
 
 class TestPlan:
@@ -234,8 +235,8 @@ class TestMatched:
 
     def test_measures_the_file(self, tmp_path: Path, stub: Stub) -> None:
         files = Files(tmp_path, None, True)
-        found = files.fitted(MATCHED, QUICK_IMAGE, 600)
-        assert found is not None and found.regions == 2
+        (found,) = files.fitted(MATCHED, QUICK_IMAGE, 600)
+        assert found.regions == 2
         ask = Ask(MATCHED, QUICK_IMAGE, KCGS, 600)
         data = files.path(ask, files.settings("fit_bytes"), "file").read_bytes()
         image, labels = sample()
@@ -244,18 +245,18 @@ class TestMatched:
         assert found.bytes == len(data) <= 600 and found.bpp == 8 * len(data) / labels.numel()
         assert found.psnr == float(psnr(shown, image))
         assert found.ef_psnr == float(ef_psnr(shown, image, labels))
-        smaller = files.rewritten(found, 500)
-        assert smaller is not None and smaller.bytes <= 500 and smaller.encode_seconds > found.encode_seconds
+        (smaller,) = files.rewritten(found, 500)
+        assert smaller.bytes <= 500 and smaller.encode_seconds > found.encode_seconds
 
 
 class TestPrecision:
     def test_search(self, tmp_path: Path, stub: Stub, monkeypatch: pytest.MonkeyPatch) -> None:
         files = Files(tmp_path, None, True)
         files.quick = False
-        scene = files.scene(PRECISION, QUICK_IMAGE, 40)
-        assert scene is not None and scene.codec == FLOAT and scene.num_gaussians == 40
-        found = files.rounded(scene)
-        assert found is not None and found.bytes > 0 and scene.psnr - found.psnr <= _rate_files.MOST_LOSS
+        (scene,) = files.scene(PRECISION, QUICK_IMAGE, 40)
+        assert scene.codec == FLOAT and scene.num_gaussians == 40
+        (found,) = files.rounded(scene)
+        assert found.bytes > 0 and scene.psnr - found.psnr <= _rate_files.MOST_LOSS
         ((_, _, bits),) = bits_per_gaussian([scene, found])
         assert bits == 8 * found.bytes / found.num_gaussians
 

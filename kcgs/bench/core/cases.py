@@ -16,7 +16,7 @@ from . import images
 from .options import Options
 
 # recipes as published: 50,000 iterations take a quarter of an hour per photo on a processor core
-PUBLISHED = ("paper", "gaussian-image", "gaussian-image-clamp")
+PUBLISHED = ("paper", "gaussian-image", "gaussian-image-clamp", "image-gs")
 PUBLISHED_ITERATIONS = 2_000
 QUICK_ITERATIONS = 20
 
@@ -24,8 +24,7 @@ QUICK_ITERATIONS = 20
 class Method(NamedTuple):
     """A recipe with some of its settings changed."""
 
-    name: str
-    """In tables."""
+    name: str  # in tables
     recipe: str
     changes: tuple[tuple[str, Any], ...] = ()
 
@@ -52,6 +51,7 @@ def method(name: str, recipe: str | None = None, **changes: Any) -> Method:
 
 CLAMPED = method("gaussian-image-clamp")
 UNCLAMPED = method("gaussian-image")
+IMAGE_GS = method("image-gs")
 PAPER_CLAMPED = method("paper, clamp", "paper", clamp=True)
 PAPER = method("paper")
 BASELINE = method("best-baseline")
@@ -68,12 +68,9 @@ class Case(NamedTuple):
     n: int
     method: Method
     seed: int = 0
-    iterations: int | None = None
-    """None: the recipe's own."""
-    stride: int = 1
-    """One of so many pixels is taken."""
-    source: str = "given"
-    """Of the label map: the image's own, or a segmenter by name."""
+    iterations: int | None = None  # none: the recipe's own
+    stride: int = 1  # one of so many pixels is taken
+    source: str = "given"  # of the label map: the image's own, or a segmenter by name
 
     def config(self) -> FitConfig:
         """All settings."""

@@ -123,13 +123,8 @@ def window(labels: Tensor, height: int, width: int) -> tuple[slice, slice]:
 def _plot_means(axis: Any, rows: Sequence[Row], methods: Sequence[str], across: str, quantity: str) -> None:
     swept, images = sweep(rows, methods)
     for index, name in enumerate(methods):
-        found = [select(rows, name, n, images) for n in swept]
+        found = [same for n in swept if (same := select(rows, name, n, images))]
         points = [(mean_over(same, across), y) for same in found if (y := mean_over(same, quantity)) == y]
-        axis.plot(
-            [x for x, _ in points],
-            [y for _, y in points],
-            color=COLORS[index],
-            marker=MARKERS[index],
-            markersize=4.5,
-            label=name,
-        )
+        if points:
+            style = {"color": COLORS[index], "marker": MARKERS[index], "markersize": 4.5, "label": name}
+            axis.plot(*zip(*points, strict=True), **style)

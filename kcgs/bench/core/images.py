@@ -23,10 +23,8 @@ COVERAGE_LABELS = 8
 class Sample(NamedTuple):
     """An image and the label map whose contours the edge-focused figures look at."""
 
-    image: Tensor
-    """(3, H, W)."""
-    labels: Tensor | None
-    """(H, W); None: the image has none."""
+    image: Tensor  # (3, H, W)
+    labels: Tensor | None  # (H, W); None: the image has none
 
 
 def davis(data: Path | None) -> Davis:

@@ -16,19 +16,14 @@ class Options(NamedTuple):
 
     data: Path | None = None
     quick: bool = False
-    only: str | None = None
-    """Names of groups with commas between them; None: all."""
+    only: str | None = None  # names of groups with commas between them; None: all
     engine: str = "local"
     workers: int | None = None
-    sequences: str | None = None
-    """Names with commas between them; None: all."""
-    budget_seconds: float | None = None
-    """For fits; None: all are made."""
+    sequences: str | None = None  # names with commas between them; None: all
+    budget_seconds: float | None = None  # for fits; None: all are made
     seeds: int = 1
-    iterations: int | None = None
-    """Of the published recipes; None: the experiment's choice."""
-    runs: Path | None = None
-    """Folder of the fits; None: runs, in the output."""
+    iterations: int | None = None  # of the published recipes; None: the experiment's choice
+    runs: Path | None = None  # folder of the fits; None: runs, in the output
 
     @property
     def place(self) -> Place:

@@ -8,11 +8,11 @@ from pathlib import Path
 from kcgs._atomic import atomic_path
 
 from . import summaries
-from .cases import BASELINE, BEST, CLAMPED, PAPER, PUBLISHED, UNCLAMPED
+from .cases import BASELINE, BEST, CLAMPED, PAPER, PUBLISHED, UNCLAMPED, method
 from .compare import Contest, complete, mean_over, select
 from .rows import read_rows
 from .store import Row
-from .tables import count, db, markdown, seconds
+from .tables import count, markdown
 
 BEGIN, END = "<!-- results: made by `make report` -->", "<!-- end of results -->"
 _TITLES = {
@@ -61,12 +61,9 @@ def put(page: str, text: str) -> str:
 
 def _caveat(rows: Sequence[Row]) -> str:
     """Say that published recipes ran shorter than they were published."""
-    full = PAPER.config().iterations
-    short = {row.iterations for row in rows if row.method in PUBLISHED and row.iterations < full}
-    ran = " or ".join(f"{iterations:,}" for iterations in sorted(short))
-    return (
-        f"Published recipes ran {ran} of their {full:,} iterations: differences to them are not final." if ran else ""
-    )
+    ran = {(row.iterations, method(row.method).config().iterations) for row in rows if row.method in PUBLISHED}
+    short = " or ".join(f"{count(own)} of their {count(full)}" for own, full in sorted(ran) if own < full)
+    return f"Published recipes ran {short} iterations: differences to them are not final." if short else ""
 
 
 def _compared(rows: Sequence[Row]) -> list[int]:
@@ -83,15 +80,14 @@ def _table(rows: Sequence[Row], of_one: bool) -> str:
     for n in sorted({row.n for row in rows}) if of_one else _compared(rows):
         methods = list(dict.fromkeys(row.method for row in rows if row.n == n))
         shared = complete(rows, methods, n)
-        for method in methods if shared else ():
-            found = select(rows, method, n, shared)
+        for name in methods if shared else ():
+            found = select(rows, name, n, shared)
             # other codecs have neither Gaussians nor iterations
             counts = (n, mean_over(found, "num_gaussians"), found[0].iterations)
             asked, left, iterations = (count(value) if n else "" for value in counts)
-            line = [asked, left, f"`{method}`", iterations, str(len(shared))]
-            line += [db(mean_over(found, "psnr")), db(mean_over(found, "ef_psnr"))]
-            line += [f"{mean_over(found, 'bits_per_pixel'):.3f}", db(mean_over(found, "decoded_psnr"))]
-            lines.append([*line, seconds(mean_over(found, "core_seconds"))])
+            line = [asked, left, f"`{name}`", iterations, str(len(shared))]
+            fields = ("psnr", "ef_psnr", "bits_per_pixel", "decoded_psnr", "core_seconds")
+            lines.append([*line, *summaries.means(found, fields)])
     return markdown(header, lines)
 
 

@@ -23,10 +23,8 @@ class Made(NamedTuple):
 
     command: str
     quick: bool = False
-    machine: tuple[str, ...] = ()
-    """Lines below the command: processor, versions, where fits ran."""
-    notes: tuple[str, ...] = ()
-    """What a reader must know of this run: what is missing, and why."""
+    machine: tuple[str, ...] = ()  # lines below the command: processor, versions, where fits ran
+    notes: tuple[str, ...] = ()  # what a reader must know of this run: what is missing, and why
 
 
 # from the folder of the results to the report's parts, the title first

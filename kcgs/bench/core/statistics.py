@@ -29,10 +29,8 @@ class Summary(NamedTuple):
     high: float
     wins: int
     losses: int
-    values: dict[str, float]
-    """By image, without those where the difference is not defined."""
-    asked: int
-    """Images, with those where it is not."""
+    values: dict[str, float]  # by image, without those where the difference is not defined
+    asked: int  # images, with those where it is not
 
     @property
     def is_complete(self) -> bool:
@@ -57,12 +55,9 @@ class Bound(NamedTuple):
 class Delta(NamedTuple):
     """What one curve has over another; NaN where they do not overlap."""
 
-    rate: float
-    """In %, below zero where it needs fewer bits for the same quality."""
-    quality: float
-    """Above zero where it is better at the same bits."""
-    overlap: float
-    """Of their ranges of quality, in its unit."""
+    rate: float  # in %, below zero where it needs fewer bits for the same quality
+    quality: float  # above zero where it is better at the same bits
+    overlap: float  # of their ranges of quality, in its unit
 
 
 def mean(values: Iterable[float]) -> float:

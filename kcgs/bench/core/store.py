@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import time
 import warnings
 from collections.abc import Iterable
-from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from kcgs._atomic import atomic_path
 from kcgs.codec import decode, encode
 from kcgs.codec.labels import encode_map
 from kcgs.evaluate import measure
-from kcgs.fit import HistoryEntry, fit, warm_up
+from kcgs.fit import FitResult, HistoryEntry, fit, warm_up
 from kcgs.rate import quality_for
 from kcgs.scene import Scene, load
 from kcgs.segment import segment
@@ -42,17 +43,12 @@ class Row(NamedTuple):
     ms_ssim: float
     ef_psnr: float
     ef_ssim: float
-    seconds: float
-    """Wall time of the fit, compilation excluded."""
-    core_seconds: float
-    """Its processor time."""
-    num_gaussians: int
-    """What is left of n."""
+    seconds: float  # wall time of the fit, compilation excluded
+    core_seconds: float  # its processor time
+    num_gaussians: int  # what is left of n
     pixels: int
-    bytes: int
-    """Of the .kcgs file."""
-    map_bytes: int
-    """Of these the label map's, contour widths included."""
+    bytes: int  # of the .kcgs file
+    map_bytes: int  # of these the label map's, contour widths included
     decoded_psnr: float
     decoded_ms_ssim: float
     decoded_ef_psnr: float
@@ -70,10 +66,8 @@ class Kept(NamedTuple):
 
     row: Row
     history: tuple[HistoryEntry, ...]
-    given_regions: int
-    """Of the map that came in."""
-    segment_seconds: float
-    """That finding the map took; 0: it was given."""
+    given_regions: int  # of the map that came in
+    segment_seconds: float  # that finding the map took; 0: it was given
 
 
 class Store:
@@ -141,41 +135,15 @@ class Store:
         (image, labels), config = case.load(self.data), case.config()
         if config.iterations > QUICK_ITERATIONS:  # the quick form's seconds mean nothing
             warm_up(config)
-        segment_seconds = 0.0
-        if case.source == "none":
-            labels = None
-        elif case.source != "given":
-            _warm_up_source(case.source)
-            start = time.perf_counter()
-            labels = segment(image, case.source)
-            segment_seconds = time.perf_counter() - start
+        labels, segment_seconds = find_labels(case.source, image, labels)
         start, core_start = time.perf_counter(), time.process_time()
         result = fit(image, case.regions(labels), case.n, recipe=config, seed=case.seed)
         seconds, core_seconds = time.perf_counter() - start, time.process_time() - core_start
-        scene = result.scene
-        figures = measure(scene.render(), image, labels)
-        data = encode(scene, quality=quality_for(figures["psnr"]))
-        decoded = measure(decode(data).scene.render(), image, labels)
-        regions = scene.regions if scene.regions is not None and scene.regions.num_regions > 1 else None
-        row = Row(
-            image=case.image,
-            n=case.n,
-            method=case.method.name,
-            seed=case.seed,
-            iterations=config.iterations,
-            **{name: figures[name] for name in _FIGURES},  # type: ignore[arg-type]
-            seconds=seconds,
-            core_seconds=core_seconds,
-            num_gaussians=len(scene),
-            pixels=image[0].numel(),
-            bytes=len(data),
-            map_bytes=0 if regions is None else len(encode_map(regions)),
-            **{f"decoded_{name}": decoded[name] for name in _FIGURES},  # type: ignore[arg-type]
-        )
+        row = _measure(case, result, image, labels)._replace(seconds=seconds, core_seconds=core_seconds)
         given_regions = 1 if labels is None else len(torch.unique(labels))
         kept = Kept(row, tuple(result.history), given_regions, segment_seconds)
         path = self._path(case)
-        scene.save(path.with_suffix(".safetensors"))
+        result.scene.save(path.with_suffix(".safetensors"))
         _write_json(path, kept._asdict())
         self._learn(case, time.monotonic() - begin)
 
@@ -205,10 +173,37 @@ def _write_json(path: Path, value: object) -> None:
         temporary.write_text(json.dumps(value), encoding="utf-8")
 
 
-@lru_cache
-def _warm_up_source(source: str) -> None:
-    """Import what a source needs: no clock shall count it."""
-    ramp = torch.linspace(0.0, 1.0, 64)
+def _measure(case: Case, result: FitResult, image: Tensor, labels: Tensor | None) -> Row:
+    """Measure a scene and its file; seconds are put in by who has them."""
+    scene = result.scene
+    figures = measure(scene.render(), image, labels)
+    data = encode(scene, quality=quality_for(figures["psnr"]))
+    decoded = measure(decode(data).scene.render(), image, labels)
+    fields: dict[str, Any] = {name: figures[name] for name in _FIGURES}
+    fields |= {f"decoded_{name}": decoded[name] for name in _FIGURES}
+    return Row(
+        image=case.image,
+        n=case.n,
+        method=case.method.name,
+        seed=case.seed,
+        iterations=result.config.iterations,
+        **fields,
+        seconds=math.nan,
+        core_seconds=math.nan,
+        num_gaussians=len(scene),
+        pixels=image[0].numel(),
+        bytes=len(data),
+        map_bytes=len(encode_map(scene.regions)) if scene.regions is not None and scene.regions.num_regions > 1 else 0,
+    )
+
+
+def find_labels(source: str, image: Tensor, given: Tensor | None) -> tuple[Tensor | None, float]:
+    """Return the map of a source, and the seconds that finding it took, what it imports excluded."""
+    if source in ("given", "none"):
+        return (given if source == "given" else None), 0.0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        segment(torch.where(ramp > 0.4, 0.2 * ramp, 0.5 + 0.5 * ramp).expand(3, 48, 64), source)
+        segment(torch.linspace(0.0, 1.0, 64).expand(3, 48, 64), source)
+    start = time.perf_counter()
+    labels = segment(image, source)
+    return labels, time.perf_counter() - start

@@ -13,14 +13,25 @@ from .statistics import Summary, mean
 from .store import Row
 from .tables import count, db, markdown, seconds, signed, similarity
 
+_WRITERS: dict[str, Callable[[float], str]] = {
+    **dict.fromkeys(("psnr", "ef_psnr", "decoded_psnr", "decoded_ef_psnr"), db),
+    **dict.fromkeys(("ms_ssim", "ef_ssim"), similarity),
+    **dict.fromkeys(("num_gaussians", "bytes", "map_bytes"), count),
+    **dict.fromkeys(("seconds", "core_seconds"), seconds),
+    "bits_per_pixel": "{:.3f}".format,
+}
+_FIELDS = ["PSNR", "MS-SSIM", "EF-PSNR", "edge SSIM", "N left", "bytes", "of these map", "bits per pixel"]
+_FIELDS += ["decoded PSNR", "decoded EF-PSNR", "s", "core s"]
+_FILE_FIELDS = ["num_gaussians", "bytes", "map_bytes", "bits_per_pixel", "decoded_psnr", "decoded_ef_psnr"]
+_FILE_FIELDS += ["seconds", "core_seconds"]
 _KINDS: dict[str, Callable[..., Summary | None]] = {"equal N": equal_n, "equal bits": equal_bits}
 METRICS_TEXT = """PSNR and MS-SSIM are over the whole image, EF-PSNR and edge SSIM within 5 pixels of the contours of
-the given map, for every method alike; decibels, of values clipped to [0, 1]. `paper` is the paper's method, `gaussian-
-image` its baseline without clamp and `gaussian-image-clamp` with it, `best` ours, and `best-baseline` ours with the
-regions off, the baseline improved as much. All run on the same kernel. Differences are paired by image, above zero
-where the first is better; intervals are 95 %, by bootstrap over images, widened for their small number, where
-there are five or more. Seconds are wall time of a fit, which other work on the machine slows; core s is its processor
-time. *N left* are the Gaussians that the end of a fit leaves."""
+the given map, for every method alike; decibels, of values clipped to [0, 1]. `paper` is the paper's method,
+`gaussian-image` its baseline without clamp and `gaussian-image-clamp` with it, `image-gs` Image-GS on our renderer,
+`best` ours, and `best-baseline` ours with the regions off, the baseline improved as much. All run on the same kernel.
+Differences are paired by image, above zero where the first is better; intervals are 95 %, by bootstrap over images,
+widened for their small number, where there are five or more. Seconds are wall time of a fit, which other work on the
+machine slows; core s is its processor time. *N left* are the Gaussians that the end of a fit leaves."""
 BITS_TEXT = """Bytes are the size of the scene's `.kcgs` file: Gaussians, region ids, label map, contour widths, all
 that a decoder needs, written by `kcgs.codec.encode(scene, quality=psnr + 14.5)`, without a look at the image.
 *Decoded* figures are those of the image that this file decodes to."""
@@ -52,16 +63,13 @@ def what_was_run(rows: Sequence[Row], methods: Sequence[Method]) -> str:
 
 def quality(rows: Sequence[Row], methods: Sequence[str], names: dict[str, str] | None = None) -> str:
     """Means over the images that every method has."""
-    header = ["N", "method", "iterations", "images", "PSNR", "MS-SSIM", "EF-PSNR", "edge SSIM", "N left", "bytes"]
-    header += ["of these map", "bits per pixel", "decoded PSNR", "decoded EF-PSNR", "s", "core s"]
     lines = []
     for n, present, images in shared(rows, methods):
         for name in present if images else ():
             found = select(rows, name, n, images)
             shown = name if names is None else names[name]
-            line = [count(n), shown, count(found[0].iterations), str(len({row.image for row in found}))]
-            lines.append(line + _means(found))
-    return markdown(header, lines)
+            lines.append([count(n), shown, count(found[0].iterations), str(len(images)), *_cells(found)])
+    return markdown(["N", "method", "iterations", "images", *_FIELDS], lines)
 
 
 def differences(
@@ -102,15 +110,13 @@ def losses(rows: Sequence[Row], contests: Sequence[Contest], only: Sequence[int]
 
 def each(rows: Sequence[Row], methods: Sequence[str]) -> str:
     """One line per image, N and method."""
-    header = ["image", "N", "method", "PSNR", "MS-SSIM", "EF-PSNR", "edge SSIM", "N left", "bytes", "of these map"]
-    header += ["bits per pixel", "decoded PSNR", "decoded EF-PSNR", "s", "core s"]
     lines = []
     for image in dict.fromkeys(row.image for row in rows):
         for n, name in product(sorted({row.n for row in rows if row.image == image}), methods):
             found = select(rows, name, n, [image])
             if found:
-                lines.append([image, count(n), name, *_means(found)])
-    return markdown(header, lines)
+                lines.append([image, count(n), name, *_cells(found)])
+    return markdown(["image", "N", "method", *_FIELDS], lines)
 
 
 def unpaid(rows: Sequence[Row], ours: str, baseline: str) -> str:
@@ -149,18 +155,19 @@ def _iterations(rows: Sequence[Row], methods: Sequence[str]) -> str:
     return " and ".join(f"{n:,}" for n in sorted({row.iterations for row in rows if row.method in methods}))
 
 
-def _means(found: list[Row]) -> list[str]:
-    """Write means; of several images also the standard deviation."""
+def means(rows: Sequence[Row], names: Sequence[str]) -> list[str]:
+    """Write means over images of fields, by name."""
+    return [_WRITERS[name](mean_over(rows, name)) for name in names]
+
+
+def _cells(found: Sequence[Row]) -> list[str]:
+    """Write all means; of several images also the standard deviation."""
     cells = []
     for quantity in QUANTITIES:
         values = [value for value in by_image(found, quantity).values() if not math.isnan(value)]
-        write = db if quantity.endswith("psnr") else similarity
-        deviation = f" ± {write(statistics.stdev(values))}" if len(values) > 1 else ""
-        cells.append(write(mean(values)) + deviation)
-    cells += [count(mean_over(found, q)) for q in ("num_gaussians", "bytes", "map_bytes")]
-    cells.append(f"{mean_over(found, 'bits_per_pixel'):.3f}")
-    cells += [db(mean_over(found, q)) for q in ("decoded_psnr", "decoded_ef_psnr")]
-    return cells + [seconds(mean_over(found, q)) for q in ("seconds", "core_seconds")]
+        write = _WRITERS[quantity]
+        cells.append(write(mean(values)) + (f" ± {write(statistics.stdev(values))}" if len(values) > 1 else ""))
+    return cells + means(found, _FILE_FIELDS)
 
 
 def _difference_cells(found: Summary | None, quantity: str) -> list[str]:
