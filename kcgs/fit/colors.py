@@ -58,7 +58,7 @@ def solve_colors(
 
     Source: Hestenes and Stiefel, "Methods of conjugate gradients for solving linear systems", 1952.
     """
-    image = check_problem(scene, image)
+    image = check_scene(scene, image)
     field, regions = scene.field, scene.regions
     start = field.merged_colors().detach().clone()
     operator = ColorOperator(field, regions, start, cutoff, backend)
@@ -128,7 +128,7 @@ class ColorOperator:
         return torch.autograd.grad(self.rendered, self._leaf, image, retain_graph=True)[0]
 
 
-def check_problem(scene: Scene, image: Tensor) -> Tensor:
+def check_scene(scene: Scene, image: Tensor) -> Tensor:
     """Refuse what is not one image's scene beside that image; return the image in its dtype, ready for a graph."""
     if not isinstance(scene, Scene):
         raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")

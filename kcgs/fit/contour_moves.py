@@ -15,7 +15,7 @@ from torch import Tensor
 from kcgs.functional import RegionMap, edge_band
 from kcgs.scene import Scene
 
-from .colors import check_problem
+from .colors import check_scene
 from .contour_energy import MovingLabels, RegionCosts, bounding_boxes, index_map
 
 
@@ -70,7 +70,7 @@ def refine_contours(
         get the mean width. The scene's map itself where nothing lowers the energy.
 
     Raises:
-        TypeError, ValueError: as :func:`kcgs.fit.colors.check_problem`.
+        TypeError, ValueError: as :func:`kcgs.fit.colors.check_scene`.
 
     Example:
         >>> image = torch.zeros(1, 8, 16)
@@ -84,7 +84,7 @@ def refine_contours(
 
     Source: Mumford and Shah's functional of 1989; Besag's iterated conditional modes of 1986.
     """
-    check_problem(scene, image)
+    check_scene(scene, image)
     regions = scene.regions
     assert regions is not None and regions.supersample == 1
     given = regions.labels if given is None else given

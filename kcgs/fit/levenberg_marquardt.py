@@ -13,7 +13,7 @@ from kcgs.functional import RegionMap, edge_band, region_splat
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
-from .colors import check_problem, is_better
+from .colors import check_scene, is_better
 from .frame import move
 
 # a Gaussian as wide as 100 diagonals is constant over the image to 2.6e-6 (root mean square, 111 dB)
@@ -44,7 +44,6 @@ def levenberg_marquardt(
     max_steps: int = 100,
     max_seconds: float = 10.0,
     cutoff: float = 0.0,
-    sigma_range: tuple[float, float] | None = None,
     backend: str = "auto",
 ) -> Scene:
     r"""Fit all parameters of a small scene to the last digit, by Levenberg-Marquardt in float64.
@@ -52,7 +51,8 @@ def levenberg_marquardt(
     Convention: a step moves a Gaussian in its own frame, :math:`\mu + L d` and :math:`L \exp K`, K lower triangular;
     colours are eliminated, with 1e-9 per pixel charged for their squares, so that near-duplicates take none that
     float32 cannot hold. Gaussians that share no pixel are fitted apart; where it helps, the largest of each region
-    starts as a constant. The same scene each time, unless the clock stops it.
+    starts as a constant. l11 and l22 stay within 0.05 pixels and 100 image diagonals, where flat
+    regions end, and centres within 3 diagonals of the image. The same scene each time, unless the clock stops it.
 
     Args:
         scene: Gaussians of one image, hard or soft contours; opacities are merged into the colours.
@@ -60,15 +60,13 @@ def levenberg_marquardt(
         max_steps: for each group of Gaussians that share pixels, at least 1.
         max_seconds: of wall time in all, checked between steps.
         cutoff: weights below it are skipped; render with the same.
-        sigma_range: bounds of l11 and l22 in pixels, the upper also of abs(l21); None: 0.05 to 100 image diagonals,
-            where flat regions end. Centres stay within 3 diagonals of the image.
         backend: kernel that the result is compared with the start with.
 
     Returns:
         A new scene; `scene` itself where the squared error, rendered in its dtype, did not fall, or rose once clipped.
 
     Raises:
-        TypeError, ValueError: as :func:`kcgs.fit.colors.check_problem`.
+        TypeError, ValueError: as :func:`kcgs.fit.colors.check_scene`.
 
     Example:
         >>> labels = torch.arange(30).expand(20, 30) // 15
@@ -80,24 +78,24 @@ def levenberg_marquardt(
     variables separate", 1973; Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", 1963.
     """
     start = time.perf_counter()
-    image = check_problem(scene, image)
+    image = check_scene(scene, image)
     field, regions = scene.field, scene.regions
-    bounds = _Bounds.of(field, sigma_range)
+    bounds = _Bounds.of(field.size, field.means.device)
     whole = [t.detach().clone() for t in (field.means, field.cholesky, field.merged_colors())]
     before = _render(scene, whole, cutoff, backend)
     kept = bounds.clamp(whole[0].double(), whole[1].double())
     flat = _sheets(*kept, field, regions, bounds.sigma[1])
-    groups = _groups(_cells(field, image, regions), len(field))
-    for done, (members, cells) in enumerate(groups):
+    groups = _groups(_patches(field, image, regions), len(field))
+    for done, (members, patches) in enumerate(groups):
         deadline = time.perf_counter() + (start + max_seconds - time.perf_counter()) / (len(groups) - done)
         colors = whole[2][members].double()
         states = [
-            _measure(cells, means[members], cholesky[members], colors, cutoff) for means, cholesky in (kept, flat)
+            _measure(patches, means[members], cholesky[members], colors, cutoff) for means, cholesky in (kept, flat)
         ]
-        state = _descend(cells, min(states, key=lambda s: s.cost), bounds, cutoff, max_steps, deadline)
+        state = _descend(patches, min(states, key=lambda s: s.cost), bounds, cutoff, max_steps, deadline)
         # the colours that suit the geometry as it is kept
         means, cholesky = state.means.to(image.dtype).double(), state.cholesky.to(image.dtype).double()
-        state = _measure(cells, means, cholesky, state.colors, cutoff)
+        state = _measure(patches, means, cholesky, state.colors, cutoff)
         for tensor, value in zip(whole, state[:3], strict=True):
             tensor[members] = value.to(image.dtype)
     if not is_better(_render(scene, whole, cutoff, backend), before, image):
@@ -120,10 +118,10 @@ class _Bounds(NamedTuple):
     centre: tuple[Tensor, Tensor]  # [2] each
 
     @classmethod
-    def of(cls, field: GaussianField, sigma_range: tuple[float, float] | None) -> _Bounds:
-        diagonal = math.hypot(*field.size)
-        sigma = sigma_range or (_SIGMA_LIMITS[0], _SIGMA_LIMITS[1] * diagonal)
-        extent = torch.tensor(field.size[::-1], dtype=torch.float64, device=field.means.device)
+    def of(cls, size: tuple[int, int], device: torch.device) -> _Bounds:
+        diagonal = math.hypot(*size)
+        sigma = (_SIGMA_LIMITS[0], _SIGMA_LIMITS[1] * diagonal)
+        extent = torch.tensor(size[::-1], dtype=torch.float64, device=device)
         margin = torch.full_like(extent, _CENTRE_DIAGONALS * diagonal)
         return cls(sigma, (-margin, extent + margin))
 
@@ -153,7 +151,7 @@ def _sheets(
     return means, cholesky
 
 
-class _Cell(NamedTuple):
+class _Patch(NamedTuple):
     """Pixels that see the same Gaussians."""
 
     members: Tensor  # [n] which
@@ -162,13 +160,13 @@ class _Cell(NamedTuple):
     shares: Tensor | None  # [n, P] memberships; None: all one
 
 
-def _cells(field: GaussianField, image: Tensor, regions: RegionMap | None) -> list[_Cell]:
+def _patches(field: GaussianField, image: Tensor, regions: RegionMap | None) -> list[_Patch]:
     """Sort the pixels by the regions that have Gaussians and a weight there."""
     target = image.flatten(1).double()
     places = torch.arange(target.shape[1], device=image.device)
     points = torch.stack([places % image.shape[2] + 0.5, places // image.shape[2] + 0.5]).double()
     if regions is None or field.region_ids is None:
-        return [_Cell(torch.arange(len(field), device=image.device), points, target, None)]
+        return [_Patch(torch.arange(len(field), device=image.device), points, target, None)]
     index = regions.index_of(field.region_ids)
     pattern = torch.zeros_like(places)
     supports = []
@@ -177,29 +175,29 @@ def _cells(field: GaussianField, image: Tensor, regions: RegionMap | None) -> li
         support = weights.nonzero().flatten()
         supports.append(((index == region).nonzero().flatten(), support, weights[support]))
         pattern = torch.unique(2 * pattern + (weights > 0), return_inverse=True)[1]
-    cells = []
+    patches = []
     for pixels in pattern.argsort(stable=True).split(pattern.bincount().tolist()):
         seen = [s for s in supports if bool(torch.isin(pixels[0], s[1]))]
         if seen:
             shares = [w[torch.searchsorted(s, pixels)].expand(len(g), -1) for g, s, w in seen]
             members, share = torch.cat([s[0] for s in seen]), torch.cat(shares)
             whole = bool((share == 1).all())
-            cells.append(_Cell(members, points[:, pixels], target[:, pixels], None if whole else share))
-    return cells
+            patches.append(_Patch(members, points[:, pixels], target[:, pixels], None if whole else share))
+    return patches
 
 
-def _groups(cells: list[_Cell], count: int) -> list[tuple[Tensor, list[_Cell]]]:
-    """Split into Gaussians that share no pixel with others, and their cells, numbered within the group."""
-    if not cells:
+def _groups(patches: list[_Patch], count: int) -> list[tuple[Tensor, list[_Patch]]]:
+    """Split into Gaussians that share no pixel with others, and their patches, numbered within the group."""
+    if not patches:
         return []
-    group = torch.arange(count, device=cells[0].members.device)
-    for cell in cells:
-        joined = torch.isin(group, group[cell.members])
+    group = torch.arange(count, device=patches[0].members.device)
+    for patch in patches:
+        joined = torch.isin(group, group[patch.members])
         group[joined] = group[joined].min()
     result = []
-    for name in group[torch.cat([cell.members for cell in cells])].unique().tolist():
+    for name in group[torch.cat([patch.members for patch in patches])].unique().tolist():
         members = (group == name).nonzero().flatten()
-        inside = [cell for cell in cells if int(group[cell.members[0]]) == name]
+        inside = [patch for patch in patches if int(group[patch.members[0]]) == name]
         result.append((members, [c._replace(members=torch.searchsorted(members, c.members)) for c in inside]))
     return result
 
@@ -219,34 +217,34 @@ class _State(NamedTuple):
     cost: float  # sum of squared residuals, and what the colours are charged
 
 
-def _features(cell: _Cell, part: slice, means: Tensor, cholesky: Tensor, cutoff: float) -> Tensor:
-    """Evaluate the features of a cell's Gaussians at some of its pixels, (6, n, p)."""
-    (x, y), (l11, l21, l22) = means[cell.members].T[..., None], cholesky[cell.members].T[..., None]
-    z1 = (cell.points[0, part] - x) / l11
-    z2 = (cell.points[1, part] - y - l21 * z1) / l22
+def _features(patch: _Patch, part: slice, means: Tensor, cholesky: Tensor, cutoff: float) -> Tensor:
+    """Evaluate the features of a patch's Gaussians at some of its pixels, (6, n, p)."""
+    (x, y), (l11, l21, l22) = means[patch.members].T[..., None], cholesky[patch.members].T[..., None]
+    z1 = (patch.points[0, part] - x) / l11
+    z2 = (patch.points[1, part] - y - l21 * z1) / l22
     weight = torch.exp(-0.5 * (z1 * z1 + z2 * z2).clamp_max(_LARGEST_SQUARE))
     weight = torch.where(weight >= max(cutoff, _LEAST_WEIGHT), weight, 0.0)
-    if cell.shares is not None:
-        weight = weight * cell.shares[:, part]
+    if patch.shares is not None:
+        weight = weight * patch.shares[:, part]
     first, second = weight * z1, weight * z2
     return torch.stack([weight, first, second, first * z1, first * z2, second * z2])
 
 
-def _measure(cells: list[_Cell], means: Tensor, cholesky: Tensor, colors: Tensor, cutoff: float) -> _State:
+def _measure(patches: list[_Patch], means: Tensor, cholesky: Tensor, colors: Tensor, cutoff: float) -> _State:
     """Sum over the pixels, a chunk at a time, and move the colours to the best."""
     count = len(colors)
     gram = colors.new_zeros(_FEATURES * count, _FEATURES * count)
     moments = colors.new_zeros(_FEATURES * count, colors.shape[1])
-    ridge = _COLOR_COST * sum(cell.points.shape[1] for cell in cells)
+    ridge = _COLOR_COST * sum(patch.points.shape[1] for patch in patches)
     cost = ridge * float(colors.square().sum())
-    for cell in cells:
-        rows = (torch.arange(_FEATURES, device=colors.device)[:, None] * count + cell.members).flatten()
+    for patch in patches:
+        rows = (torch.arange(_FEATURES, device=colors.device)[:, None] * count + patch.members).flatten()
         products, sums = colors.new_zeros(len(rows), len(rows)), colors.new_zeros(len(rows), colors.shape[1])
         step = max(1, _CHUNK_ELEMENTS // len(rows))
-        for begin in range(0, cell.points.shape[1], step):
+        for begin in range(0, patch.points.shape[1], step):
             part = slice(begin, begin + step)
-            features = _features(cell, part, means, cholesky, cutoff)
-            residual = cell.target[:, part] - colors[cell.members].T @ features[0]
+            features = _features(patch, part, means, cholesky, cutoff)
+            residual = patch.target[:, part] - colors[patch.members].T @ features[0]
             features = features.flatten(0, 1)
             products.addmm_(features, features.T)
             sums.addmm_(features, residual.T)
@@ -278,7 +276,7 @@ def _step(state: _State, damping: float) -> tuple[Tensor, Tensor]:
 
 
 def _descend(
-    cells: list[_Cell], state: _State, bounds: _Bounds, cutoff: float, max_steps: int, deadline: float
+    patches: list[_Patch], state: _State, bounds: _Bounds, cutoff: float, max_steps: int, deadline: float
 ) -> _State:
     """Take steps that lower the cost, a more careful one after each that would not."""
     damping, small = 1e-2, 0
@@ -287,7 +285,7 @@ def _descend(
             break
         step, colors = _step(state, damping)
         moved = move(state.means, state.cholesky, step.T, exact=False)
-        trial = _measure(cells, *bounds.clamp(*moved), state.colors + colors, cutoff)
+        trial = _measure(patches, *bounds.clamp(*moved), state.colors + colors, cutoff)
         if trial.cost < state.cost:
             small = small + 1 if trial.cost > (1 - _LEAST_GAIN) * state.cost else 0
             state, damping = trial, max(damping / 5, _LEAST_DAMPING)

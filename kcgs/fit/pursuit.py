@@ -109,7 +109,7 @@ def propose(
 
 
 def _search(residual: Tensor, labels: NDArray[np.int32], sigmas: Sequence[float], count: int) -> _Candidates:
-    """Evaluate every place and scale of every region; keep the best of each cell, and of those the strongest."""
+    """Evaluate every place and scale of every region; keep the best of each square, and of those the strongest."""
     from scipy.ndimage import find_objects
 
     limit = max(_CANDIDATES[0] * count, _CANDIDATES[1])
@@ -133,7 +133,7 @@ def _search(residual: Tensor, labels: NDArray[np.int32], sigmas: Sequence[float]
                 averages, side = _halve(averages), 2 * side
             margin = math.ceil(_REACH * max(choices) / block)
             padded = pad(averages, (margin, margin, margin, margin))
-            found += [_best_of_cells(padded, margin, region, sigma, block, (left, top), limit) for sigma in choices]
+            found += [_best_of_squares(padded, margin, region, sigma, block, (left, top), limit) for sigma in choices]
     everywhere = _Candidates(*(np.concatenate(values) for values in zip(*found, strict=True)))
     strong = everywhere.take(_strongest(everywhere.gain, limit))
     return strong.take(np.lexsort((strong.sigma, strong.x, strong.y, strong.region)))
@@ -150,10 +150,10 @@ def _halve(planes: Tensor) -> Tensor:
     return (rows[..., ::2] + rows[..., 1::2]).mul_(0.25)
 
 
-def _best_of_cells(
+def _best_of_squares(
     padded: Tensor, margin: int, region: int, sigma: float, block: int, corner: tuple[int, int], limit: int
 ) -> _Candidates:
-    """Gains at every block of one region, at one scale; the best of each cell of blocks, the `limit` best of those.
+    """Gains at every block of one region, at one scale; the best of each square of blocks, the `limit` best of those.
 
     Args:
         padded: residual inside the region, zero outside, and the mask, averaged over blocks, (C + 1, h, w).
@@ -175,13 +175,13 @@ def _best_of_cells(
     kept = np.flatnonzero(values > 0)
     kept = kept[_strongest(values[kept], limit)]
     chosen = where[torch.from_numpy(kept).to(where.device)]
-    cells = chosen.cpu().numpy()
+    places = chosen.cpu().numpy()
     return _Candidates(
-        np.full(len(cells), region),
-        corner[0] + (cells % gain.shape[1] + 0.5) * block,
-        corner[1] + (cells // gain.shape[1] + 0.5) * block,
-        np.full(len(cells), sigma),
-        np.full(len(cells), block),
+        np.full(len(places), region),
+        corner[0] + (places % gain.shape[1] + 0.5) * block,
+        corner[1] + (places // gain.shape[1] + 0.5) * block,
+        np.full(len(places), sigma),
+        np.full(len(places), block),
         inner.flatten(1)[:, chosen].T.cpu().numpy(),
         norm.flatten()[chosen].cpu().numpy(),
         values[kept],

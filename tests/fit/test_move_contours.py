@@ -152,8 +152,7 @@ class TestMoves:
         refined = refine_contours(Scene(field, RegionMap.from_labels(step(given), softness)), image)
         assert torch.equal(refined.labels, step(12))
         assert refined.softness == softness
-        rendered = Scene(field, refined.labels).render()
-        assert torch.allclose(rendered, image, atol=1e-3)
+        assert torch.allclose(Scene(field, refined.labels).render(), image, atol=1e-3)
 
     def test_a_map_that_is_right_stays(self) -> None:
         regions = RegionMap.from_labels(step(12))
@@ -198,10 +197,10 @@ class TestMoves:
 
     def test_same_bits_and_inputs_untouched(self) -> None:
         field, image, regions = noisy_problem(3)
-        labels, rendered = regions.labels.clone(), image.clone()
+        labels, copy = regions.labels.clone(), image.clone()
         a, b = (refine_contours(Scene(field, regions), image) for _ in range(2))
         assert torch.equal(a.labels, b.labels)
-        assert torch.equal(regions.labels, labels) and torch.equal(image, rendered)
+        assert torch.equal(regions.labels, labels) and torch.equal(image, copy)
 
     def test_a_region_without_gaussians_is_black(self) -> None:
         field = flat_field({1: [1.0]}, (24, 40))
