@@ -63,10 +63,3 @@ def needles(sigma: float, anisotropy: float, count: int = 37) -> Scene:
     means = torch.rand(count, 2, generator=generator) * torch.tensor([NEEDLES_SIZE[1], NEEDLES_SIZE[0]])
     cholesky = scale_rotation_to_cholesky(scales, angle).float()
     return Scene(GaussianField(means, cholesky, torch.ones(count, 1), size=NEEDLES_SIZE))
-
-
-def astronaut() -> Tensor:
-    """Return scikit-image's photo."""
-    from skimage import data as photos
-
-    return torch.from_numpy(photos.astronaut()).permute(2, 0, 1).float() / 255

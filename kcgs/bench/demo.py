@@ -15,7 +15,7 @@ from kcgs.plots import COLORS, plot_history
 from kcgs.scene import load
 from kcgs.segment import segment
 
-from ._workloads import astronaut
+from .core.images import astronaut
 from .core.options import Options
 from .core.registry import experiment
 

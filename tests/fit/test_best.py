@@ -1,11 +1,10 @@
-"""Our recipe: growth, contours that move or go, targets, the clock, the end, resuming, hard cases."""
+"""Our recipe: densification, contours that move or go, targets, the clock, the end, hard cases."""
 
 from __future__ import annotations
 
 import inspect
 import math
 from itertools import count, pairwise
-from pathlib import Path
 
 import pytest
 import torch
@@ -198,70 +197,6 @@ class TestEnd:
         fine = RegionMap.from_labels(chart_pie(8).labels, supersample=8)
         result = fit(image, fine, 20, recipe=quick(iterations=100))
         assert float(psnr(result.scene.render(), image)) > 60
-
-
-class _Killed(BaseException):
-    pass
-
-
-RECIPES = ["best", "best-baseline", "paper"]
-
-
-@pytest.fixture(scope="module")
-def uninterrupted() -> dict[str, FitResult]:
-    image, labels = scene()
-    return {recipe: fit(image, labels, 30, recipe=quick(recipe)) for recipe in RECIPES}
-
-
-class TestCheckpoint:
-    @pytest.mark.parametrize("recipe", RECIPES)
-    @pytest.mark.parametrize("killed_at", [1, 47, 75, 119])
-    def test_resumed_is_uninterrupted(
-        self, tmp_path: Path, uninterrupted: dict[str, FitResult], recipe: str, killed_at: int
-    ) -> None:
-        image, labels = scene()
-        config, file, whole = quick(recipe), tmp_path / "state", uninterrupted[recipe]
-
-        def kill(iteration: int, _: object) -> None:
-            if iteration == killed_at:
-                raise _Killed
-
-        with pytest.raises(_Killed):
-            fit(image, labels, 30, recipe=config, checkpoint=file, on_step=kill)
-        resumed = fit(image, labels, 30, recipe=config, checkpoint=file, resume=True)
-        assert same(whole, resumed)
-        timeless = [[h._replace(seconds=0.0) for h in result.history] for result in (whole, resumed)]
-        assert timeless[0] == timeless[1]
-
-    def test_finished_gives_the_same_again(self, tmp_path: Path) -> None:
-        image, labels = scene()
-        first, again = (
-            fit(image, labels, 30, recipe=quick(), checkpoint=tmp_path / "state", resume=True) for _ in range(2)
-        )
-        assert same(first, again)
-
-    def test_another_problem_is_refused(self, tmp_path: Path) -> None:
-        image, labels = scene()
-        file = tmp_path / "state"
-        fit(image, labels, 30, recipe=quick(iterations=3), checkpoint=file)
-        before = file.read_bytes()
-        for change in ({"seed": 1}, {"image": 1 - image}, {"num_gaussians": 31}, {"config": quick(iterations=4)}):
-            arguments = {"image": image, "num_gaussians": 30, "config": quick(iterations=3), **change}
-            with pytest.raises(ValueError, match="belongs to another fit"):
-                fit(regions=labels, checkpoint=file, resume=True, **arguments)  # type: ignore[arg-type]
-        assert file.read_bytes() == before
-
-    def test_damaged_is_refused(self, tmp_path: Path) -> None:
-        image, labels = scene()
-        file = tmp_path / "state"
-        file.write_bytes(b"nothing of the kind")
-        with pytest.raises(ValueError, match="is damaged, or no checkpoint"):
-            fit(image, labels, 30, recipe=quick(), checkpoint=file, resume=True)
-
-    def test_needs_a_folder(self, tmp_path: Path) -> None:
-        image, labels = scene()
-        with pytest.raises(FileNotFoundError, match="checkpoint needs an existing folder"):
-            fit(image, labels, 30, recipe=quick(), checkpoint=tmp_path / "none" / "state")
 
 
 def hard_cases() -> dict[str, tuple[Tensor, Tensor, int]]:

@@ -9,9 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs import FitConfig, RegionMap, fit
+from kcgs import FitConfig, GaussianField, RegionMap, fit
 from kcgs.data import chart_2x3, chart_pie
 from kcgs.fit import available_recipes
+from kcgs.fit.optimizers import ImageGSAdam
 from kcgs.functional import ef_psnr, psnr
 
 
@@ -85,10 +86,56 @@ class TestResult:
         assert result.history[-1].psnr > 20
 
 
-class TestSwitches:
+class TestSettings:
     def test_recipes(self) -> None:
-        assert set(available_recipes()) >= {"paper", "gaussian-image", "gaussian-image-clamp"}
+        published = {"paper", "gaussian-image", "gaussian-image-clamp", "image-gs"}
+        assert set(available_recipes()) == {"best", "best-baseline", "best-refined", *published}
 
+    def test_the_defaults_are_the_recipe_best(self) -> None:
+        assert FitConfig() == FitConfig.from_recipe("best")
+        assert len(FitConfig.model_fields) <= 24
+
+    def test_a_recipe_by_name_or_whole_and_settings_over_it(self) -> None:
+        image, labels = disc()
+        named = fit(image, labels, 5, recipe="paper", iterations=7, softness=0.7)
+        whole = fit(image, labels, 5, recipe=FitConfig.from_recipe("paper", softness=0.7), iterations=7)
+        assert named.config == whole.config == FitConfig.from_recipe("paper", iterations=7, softness=0.7)
+        assert torch.equal(named.scene.field.means, whole.scene.field.means)
+        with pytest.raises(ValueError, match="iteration: Extra inputs are not permitted"):
+            fit(image, labels, 5, iteration=7)
+        with pytest.raises(TypeError, match="recipe must be a name or a FitConfig; got dict"):
+            fit(image, labels, 5, recipe={})  # type: ignore[arg-type]
+
+    def test_arrays_and_pil_images(self) -> None:
+        from PIL import Image
+
+        image, labels = disc()
+        pixels = (255 * image.permute(1, 2, 0)).round().to(torch.uint8)
+        want = fit(pixels.permute(2, 0, 1).float() / 255, labels, 5, recipe=quick(iterations=5)).scene.field
+        for given in (pixels.numpy(), pixels.numpy().astype("float32") / 255, Image.fromarray(pixels.numpy())):
+            got = fit(given, labels, 5, recipe=quick(iterations=5)).scene.field
+            assert torch.equal(got.means, want.means) and torch.equal(got.colors, want.colors)
+
+
+class TestImageGS:
+    def test_starts_with_half_and_adds_four_times(self) -> None:
+        image, labels = disc()
+        result = fit(image, labels, 40, recipe="image-gs", iterations=200)
+        counts = [h.num_gaussians for h in result.history]
+        assert sorted(set(counts)) == [20, 25, 30, 35, 40]
+        assert counts[0] == 20 and counts[-1] == 40
+        assert result.history[-1].psnr > result.history[0].psnr + 5
+        assert result.scene.regions is None and result.stop_reason == "iterations"
+
+    def test_parameters_are_the_gaussians(self) -> None:
+        field = GaussianField.random(9, (20, 30), seed=0)
+        with torch.no_grad():
+            field.cholesky[:, 1] = torch.linspace(-2, 2, 9)
+        means, cholesky, colors = ImageGSAdam(field, 1.0).gaussians()
+        torch.testing.assert_close((means, cholesky, colors), (field.means, field.cholesky, field.colors))
+
+
+class TestSwitches:
     @pytest.mark.parametrize("guidance", [True, False])
     @pytest.mark.parametrize("warmup", [True, False])
     @pytest.mark.parametrize("clamp", [True, False])

@@ -71,9 +71,9 @@ def dense_energy(field: GaussianField, image: Tensor, regions: RegionMap, weight
 
 def contour_energy(scene: Scene, image: Tensor, length_weight: float = 0.003, blur: float = 0.7) -> float:
     """What `refine_contours` lowers, by its parts."""
-    assert scene.regions is not None
-    index = index_map(scene.regions, scene.regions.labels)
-    boxes = bounding_boxes(index, scene.regions.num_regions, 0)
+    regions = scene.regions
+    index = index_map(regions, regions.labels)
+    boxes = bounding_boxes(index, regions.num_regions, 0)
     with torch.no_grad():
         costs = RegionCosts(scene, image, boxes, 0, blur, cutoff=1e-4, backend="auto")
     data = costs.at(np.arange(index.size), index.ravel()).sum()

@@ -103,26 +103,26 @@ def _code_pixels(coder: Coder, truth: Any, seeds: Any, regions: int) -> Any:
     run = loops()
     code_seeds(coder, seeds)
     height, width = seeds.shape
-    tables, work = new_tables(), new_work(height)
+    rows, chances, lines = new_work(height)
     labels = np.zeros((height + TOP + 1, width + LEFT + RIGHT), np.int32)
     state = np.zeros(STATE, np.int64)
     state[REGIONS] = regions
-    memory = (state, labels, seeds, *tables, *work)
+    memory = (state, labels, seeds, *new_tables(), rows, chances, lines)
     escapes = _Escapes(coder, run, labels, regions)
     answers = np.zeros(2 * height, np.int32)
     bits, asked = answers[:0], 0
-    while rows := run.advance(bits, *memory):
+    while count := run.advance(bits, *memory):
         decided = int(state[DECIDED])
         used = decided if regions == 2 else 2 * decided
         asked += decided
         if asked > _MOST_ASKED:
             raise _Laborious(f"data must ask for at most {_MOST_ASKED} pixels near contours; got more")
         if not coder.reads:
-            run.answer(state, truth, work.rows, answers)
+            run.answer(state, truth, rows, answers)
         if used:
-            bits = coder.bits(work.chances[:used], answers[:used])
-        if regions > 2 and (rows > decided or np.count_nonzero(bits[:decided])):
-            escapes.code(work.rows[:rows], bits[:decided] != 0)
+            bits = coder.bits(chances[:used], answers[:used])
+        if regions > 2 and (count > decided or np.count_nonzero(bits[:decided])):
+            escapes.code(rows[:count], bits[:decided] != 0)
     return labels[TOP : TOP + height, LEFT : LEFT + width]
 
 

@@ -5,7 +5,7 @@ Loops in integers, compiled by numba: ``>>`` and ``//`` round down.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 from numba import njit
@@ -42,18 +42,12 @@ SQUASH = np.rint(65536 / (1 + np.exp(np.arange(CLIP, -CLIP - 1, -1) / 256))).ast
 _STRETCH = (np.searchsorted(SQUASH, np.arange(4096) * 16 + 8) - CLIP).astype(np.int32)
 
 
-class Tables(NamedTuple):
-    """What adapts."""
+def new_tables() -> tuple[Any, Any]:
+    """Return what adapts, as every stream starts with it: counters, and weights of the mixer.
 
-    counters: Any  # [slots, 2] uint16: the chance in 1/65536, how often it was seen
-    weights: Any  # [HEADS, 4, INPUTS] int32, 1/65536
-
-
-def new_tables() -> Tables:
-    """Return what every stream starts with."""
-    weights = np.empty((HEADS, 4, INPUTS), np.int32)
-    weights[:] = _MIXER
-    return Tables(np.zeros((_SLOTS, 2), np.uint16), weights)
+    Counters are [slots, 2] uint16, a chance in 1/65536 and how often it was seen; weights [HEADS, 4, INPUTS] int32.
+    """
+    return np.zeros((_SLOTS, 2), np.uint16), np.tile(_MIXER, (HEADS, 4, 1))
 
 
 inner = cast(Any, njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
@@ -141,18 +135,18 @@ def contexts(row):  # type: ignore[no-untyped-def]
 
 
 @inner
-def mix(tables, row, h):  # type: ignore[no-untyped-def]
+def mix(counters, weights, row, h):  # type: ignore[no-untyped-def]
     """Weigh the network and the counters into one chance."""
     inputs, slots = row[INPUT + h * INPUTS :], row[SLOT + h * DECISION :]
     seen: Any = 0
     for c in range(3):
-        counter = tables.counters[slots[c]]
+        counter = counters[slots[c]]
         seen = counter[1]
         inputs[c + 1] = _STRETCH[counter[0] >> 4] if seen > 0 else inputs[0]
     chosen = 0 if seen == 0 else 1 if seen < 5 else 2 if seen < 12 else 3
     total: Any = np.int64(0)
     for k in range(INPUTS):
-        total += np.int64(tables.weights[h, chosen, k]) * inputs[k]
+        total += np.int64(weights[h, chosen, k]) * inputs[k]
     logit: Any = min(max(total >> 16, -CLIP), CLIP)
     slots[CHOSEN] = chosen
     slots[MIXED] = min(max(SQUASH[logit + CLIP], _SURE), 65536 - _SURE)
@@ -160,17 +154,17 @@ def mix(tables, row, h):  # type: ignore[no-untyped-def]
 
 
 @inner
-def learn(tables, row, h, bit):  # type: ignore[no-untyped-def]
+def learn(counters, weights, row, h, bit):  # type: ignore[no-untyped-def]
     """Move the weights along the error, and the counters to the bit."""
     inputs, slots = row[INPUT + h * INPUTS :], row[SLOT + h * DECISION :]
     error = (bit << 16) - slots[MIXED]
-    weights = tables.weights[h, slots[CHOSEN]]
+    chosen = weights[h, slots[CHOSEN]]
     for k in range(INPUTS):
         step = np.int64(inputs[k]) * error * _RATE
-        weight = weights[k] + ((step + (1 << (_SHIFT - 1))) >> _SHIFT)
-        weights[k] = min(max(weight, -_HEAVIEST), _HEAVIEST)
+        weight = chosen[k] + ((step + (1 << (_SHIFT - 1))) >> _SHIFT)
+        chosen[k] = min(max(weight, -_HEAVIEST), _HEAVIEST)
     for c in range(3):
-        counter = tables.counters[slots[c]]
+        counter = counters[slots[c]]
         chance: Any = np.int64(counter[0])
         seen: Any = np.int64(counter[1])
         if seen == 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -13,64 +13,45 @@ from kcgs.codec.rangecoder import Coder
 _SIZES = 8  # contexts, by how many are in the block
 
 
-class _Block(NamedTuple):
-    top: int
-    bottom: int
-    left: int
-    right: int
-    seeds: int
-
-    @property
-    def size(self) -> int:
-        return (self.bottom - self.top) * (self.right - self.left)
-
-    def halves(self) -> tuple[_Block, _Block]:
-        """Cut across the longer side; the first half is the smaller, counts are as the block's."""
-        if self.bottom - self.top >= self.right - self.left:
-            middle = (self.top + self.bottom) // 2
-            return self._replace(bottom=middle), self._replace(top=middle)
-        middle = (self.left + self.right) // 2
-        return self._replace(right=middle), self._replace(left=middle)
-
-    def of(self, seeds: Any) -> Any:
-        """Return the part of a map that the block covers."""
-        return seeds[self.top : self.bottom, self.left : self.right]
-
-
 def code_seeds(coder: Coder, seeds: Any) -> None:
     """Code which entries of `seeds`, (H, W) uint8, are 1; a reader sets them."""
-    height, width = seeds.shape
     count = coder.unbounded(int(np.count_nonzero(seeds)))
-    if count > height * width:
-        raise CodecError(f"data must mark at most {height * width} pixels; got {count}")
+    if count > seeds.size:
+        raise CodecError(f"data must mark at most {seeds.size} pixels; got {count}")
     extreme = [AdaptiveBit() for _ in range(_SIZES)]
-    waiting = [_Block(0, height, 0, width, count)]
+    waiting = [(seeds, count)]
     while waiting:
-        block = waiting.pop()
-        if block.seeds == 1:
-            _code_place(coder, block.of(seeds))
-        elif block.seeds == block.size:
-            block.of(seeds)[:] = 1
-        elif block.seeds:
-            waiting.extend(_code_halves(coder, block, seeds, extreme))
+        block, count = waiting.pop()
+        if count == 1:
+            _code_place(coder, block)
+        elif count == block.size:
+            block[:] = 1
+        elif count:
+            first, second = _halves(block)
+            inside = _code_count(coder, first, count, second.size, extreme[min(count.bit_length() - 2, _SIZES - 1)])
+            waiting += [(first, inside), (second, count - inside)]
 
 
-def _code_halves(coder: Coder, block: _Block, seeds: Any, extreme: list[AdaptiveBit]) -> tuple[_Block, _Block]:
+def _halves(block: Any) -> tuple[Any, Any]:
+    """Cut across the longer side; the first half is the smaller."""
+    height, width = block.shape
+    if height >= width:
+        return block[: height // 2], block[height // 2 :]
+    return block[:, : width // 2], block[:, width // 2 :]
+
+
+def _code_count(coder: Coder, half: Any, seeds: int, rest: int, extreme: AdaptiveBit) -> int:
     """Code how many of a block's seeds are in its first half: all, none, or some number between."""
-    first, second = block.halves()
-    low, high = max(0, block.seeds - second.size), min(block.seeds, first.size)
-    count = 0 if coder.reads else int(np.count_nonzero(first.of(seeds)))
-    if low < high:
-        model = extreme[min(block.seeds.bit_length() - 2, _SIZES - 1)]
-        if high - low < 2 or model.code(coder, count in (low, high)):
-            count = high if coder.fair(count == high) else low
-        else:
-            count = low + 1 + coder.number(count - low - 1, high - low - 1)
-    else:
-        count = low
-    if not low <= count <= high:
+    low, high = max(0, seeds - rest), min(seeds, half.size)
+    if low == high:
+        return low
+    count = 0 if coder.reads else int(np.count_nonzero(half))
+    if high - low < 2 or extreme.code(coder, count in (low, high)):
+        return high if coder.fair(count == high) else low
+    count = low + 1 + coder.number(count - low - 1, high - low - 1)
+    if count >= high:
         raise CodecError("data must mark pixels of the map")
-    return first._replace(seeds=count), second._replace(seeds=block.seeds - count)
+    return count
 
 
 def _code_place(coder: Coder, block: Any) -> None:

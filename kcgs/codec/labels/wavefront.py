@@ -25,7 +25,6 @@ from .contexts import (
     RIGHT,
     SECOND,
     TOP,
-    Tables,
     X,
     Y,
     contexts,
@@ -48,18 +47,10 @@ FRONT, ROWS, DECIDED, REGIONS, STATE = 0, 1, 2, 3, 4
 _CHANGE, _SEED, _WAKE, _LINE = 0, 1, 2, 3
 
 
-class Work(NamedTuple):
-    """What belongs to the pixels of one wavefront, and to the rows of the map."""
-
-    rows: Any  # [H, COLUMNS] int32
-    chances: Any  # [2 * H] float64, of a bit that is 1
-    lines: Any  # [TOP + H + 2, _LINE] int32
-
-
-def new_work(height: int) -> Work:
-    """Return room for the pixels of a wavefront."""
+def new_work(height: int) -> tuple[Any, Any, Any]:
+    """Return room for the pixels of a wavefront, the chances of their bits, and what is known of the map's rows."""
     lines = np.zeros((TOP + height + 2, _LINE), np.int32)
-    return Work(np.zeros((height, COLUMNS), np.int32), np.zeros(2 * height), lines)
+    return np.zeros((height, COLUMNS), np.int32), np.zeros(2 * height), lines
 
 
 @inner
@@ -96,24 +87,24 @@ def _put(labels, y, x, label):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _settle(state, labels, bits, tables, work):  # type: ignore[no-untyped-def]
+def _settle(state, labels, bits, counters, weights, rows, lines):  # type: ignore[no-untyped-def]
     """Give the wavefront's pixels their labels and learn from them."""
     decided = state[DECIDED]
     escapes = decided if state[REGIONS] > 2 else 0
     asked = 0
     for n in range(state[ROWS]):
-        row = work.rows[n]
+        row = rows[n]
         if row[CODED]:
             escaped = False
             if escapes > 0:
                 escaped = bits[asked] != 0
-                learn(tables, row, 1, bits[asked])
+                learn(counters, weights, row, 1, bits[asked])
             if not escaped:
                 bit = bits[escapes + asked]
-                learn(tables, row, 0, bit)
+                learn(counters, weights, row, 0, bit)
                 row[LABEL] = row[SECOND] if bit else row[FIRST]
             asked += 1
-        _set(labels, row[Y], row[X], row[LABEL], work.lines)
+        _set(labels, row[Y], row[X], row[LABEL], lines)
 
 
 @inner
@@ -126,19 +117,19 @@ def _next_seed(seeds, j, i, line):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _look(state, labels, seeds, work):  # type: ignore[no-untyped-def]
+def _look(state, labels, seeds, rows, lines):  # type: ignore[no-untyped-def]
     """List the pixels of a wavefront that are to be decided; the others have their label, since rows continue."""
     height, width = seeds.shape
     front = state[FRONT]
     for j in range(max(0, -((width - 1 - front) // SLANT)), min(height - 1, front // SLANT) + 1):
-        line = work.lines[j + TOP]
+        line = lines[j + TOP]
         if line[_WAKE] > front:
             continue
         x, y = front - SLANT * j + LEFT, j + TOP
         seed = _next_seed(seeds, j, x - LEFT, line) + LEFT
         n = state[ROWS]
-        row = work.rows[n]
-        if not _still(labels, y, x, work.lines):
+        row = rows[n]
+        if not _still(labels, y, x, lines):
             describe(labels, y, x, row)
             row[X], row[Y], row[CODED] = x, y, 1
             state[ROWS] += 1
@@ -149,23 +140,23 @@ def _look(state, labels, seeds, work):  # type: ignore[no-untyped-def]
             state[ROWS] += 1
         else:
             _put(labels, y, x, labels[y, x - 1])
-            if y >= TOP + 2 and work.lines[y - 2, _CHANGE] < x:
+            if y >= TOP + 2 and lines[y - 2, _CHANGE] < x:
                 line[_WAKE] = front + seed - x
 
 
 @inner
-def _weigh(state, tables, work):  # type: ignore[no-untyped-def]
+def _weigh(state, counters, weights, rows, chances):  # type: ignore[no-untyped-def]
     """Fill in the chances: first of being neither candidate, then of being the second."""
     escapes = state[DECIDED] if state[REGIONS] > 2 else 0
     asked = 0
     for n in range(state[ROWS]):
-        row = work.rows[n]
+        row = rows[n]
         if row[CODED]:
             network(row)
             contexts(row)
             if escapes > 0:
-                work.chances[asked] = mix(tables, row, 1)
-            work.chances[escapes + asked] = mix(tables, row, 0)
+                chances[asked] = mix(counters, weights, row, 1)
+            chances[escapes + asked] = mix(counters, weights, row, 0)
             asked += 1
 
 
@@ -249,21 +240,17 @@ def _compile(fingerprint: str, cache: bool) -> Loops:
     entry = cast(Any, njit)(cache=cache, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
 
     @entry
-    def advance(  # type: ignore[no-untyped-def]
-        bits, state, labels, seeds, counters, weights, rows, chances, lines
-    ):
+    def advance(bits, state, labels, seeds, counters, weights, rows, chances, lines):  # type: ignore[no-untyped-def]
         """Take the answers for a wavefront in, go on to the next that has questions and return their number."""
         fingerprint  # noqa: B018
-        # arrays by themselves take a third of the time to hand over
-        tables, work = Tables(counters, weights), Work(rows, chances, lines)
         height, width = seeds.shape
-        _settle(state, labels, bits, tables, work)
+        _settle(state, labels, bits, counters, weights, rows, lines)
         state[ROWS] = 0
         state[DECIDED] = 0
         while state[ROWS] == 0 and state[FRONT] < width - 1 + SLANT * (height - 1):
             state[FRONT] += 1
-            _look(state, labels, seeds, work)
-        _weigh(state, tables, work)
+            _look(state, labels, seeds, rows, lines)
+        _weigh(state, counters, weights, rows, chances)
         return state[ROWS]
 
     @entry
@@ -301,5 +288,5 @@ def _rehearse(run: Loops) -> None:
     work, bits, state = new_work(2), np.zeros(4, np.int32), np.zeros(STATE, np.int64)
     labels = np.zeros((2 + TOP + 1, 2 + LEFT + RIGHT), np.int32)
     run.advance(bits, state, labels, seeds, *new_tables(), *work)
-    run.answer(state, truth, work.rows, bits)
-    run.nearest(labels, work.rows[0], np.zeros(RANKS, np.int32))
+    run.answer(state, truth, work[0], bits)
+    run.nearest(labels, work[0][0], np.zeros(RANKS, np.int32))

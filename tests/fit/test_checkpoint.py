@@ -1,0 +1,99 @@
+"""A fit that was killed goes on where it stood."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs import FitConfig, fit
+from kcgs.fit import FitResult
+
+
+def scene(size: tuple[int, int] = (48, 64), seed: int = 0) -> tuple[Tensor, Tensor]:
+    """A textured disc on a textured ground."""
+    generator = torch.Generator().manual_seed(seed)
+    y, x = torch.meshgrid(torch.arange(size[0]) + 0.5, torch.arange(size[1]) + 0.5, indexing="ij")
+    labels = ((x - 30) ** 2 + (y - 24) ** 2 < 200).long()
+    waves = torch.rand(2, 3, 4, generator=generator)
+    texture = waves[..., 0, None, None] + torch.sin(0.3 * waves[..., 1, None, None] * x + waves[..., 2, None, None] * y)
+    ground, disc = 0.25 + 0.1 * texture[0], 0.65 + 0.1 * texture[1]
+    return torch.where(labels.bool(), disc, ground).clamp(0, 1), labels
+
+
+def quick(recipe: str = "best", **settings: object) -> FitConfig:
+    return FitConfig.from_recipe(recipe, **{"iterations": 120, **settings})
+
+
+def same(a: object, b: object) -> bool:
+    fields = ("means", "cholesky", "colors", "region_ids")
+    return all(
+        (x is None and y is None) or torch.equal(x, y)
+        for x, y in ((getattr(a.scene.field, n), getattr(b.scene.field, n)) for n in fields)  # type: ignore[attr-defined]
+    )
+
+
+class _Killed(BaseException):
+    pass
+
+
+RECIPES = ["best", "best-baseline", "paper"]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted() -> dict[str, FitResult]:
+    image, labels = scene()
+    return {recipe: fit(image, labels, 30, recipe=quick(recipe)) for recipe in RECIPES}
+
+
+class TestCheckpoint:
+    @pytest.mark.parametrize("recipe", RECIPES)
+    @pytest.mark.parametrize("killed_at", [1, 47, 75, 119])
+    def test_resumed_is_uninterrupted(
+        self, tmp_path: Path, uninterrupted: dict[str, FitResult], recipe: str, killed_at: int
+    ) -> None:
+        image, labels = scene()
+        config, file, whole = quick(recipe), tmp_path / "state", uninterrupted[recipe]
+
+        def kill(iteration: int, _: object) -> None:
+            if iteration == killed_at:
+                raise _Killed
+
+        with pytest.raises(_Killed):
+            fit(image, labels, 30, recipe=config, checkpoint=file, on_step=kill)
+        resumed = fit(image, labels, 30, recipe=config, checkpoint=file, resume=True)
+        assert same(whole, resumed)
+        timeless = [[h._replace(seconds=0.0) for h in result.history] for result in (whole, resumed)]
+        assert timeless[0] == timeless[1]
+
+    def test_finished_gives_the_same_again(self, tmp_path: Path) -> None:
+        image, labels = scene()
+        first, again = (
+            fit(image, labels, 30, recipe=quick(), checkpoint=tmp_path / "state", resume=True) for _ in range(2)
+        )
+        assert same(first, again)
+
+    def test_another_problem_is_refused(self, tmp_path: Path) -> None:
+        image, labels = scene()
+        file = tmp_path / "state"
+        fit(image, labels, 30, recipe=quick(iterations=3), checkpoint=file)
+        before = file.read_bytes()
+        for change in ({"seed": 1}, {"image": 1 - image}, {"num_gaussians": 31}, {"config": quick(iterations=4)}):
+            arguments = {"image": image, "num_gaussians": 30, "config": quick(iterations=3), **change}
+            with pytest.raises(ValueError, match="belongs to another fit"):
+                fit(regions=labels, checkpoint=file, resume=True, **arguments)  # type: ignore[arg-type]
+        assert file.read_bytes() == before
+
+    def test_damaged_is_refused(self, tmp_path: Path) -> None:
+        image, labels = scene()
+        file = tmp_path / "state"
+        file.write_bytes(b"nothing of the kind")
+        with pytest.raises(ValueError, match="is damaged, or no checkpoint"):
+            fit(image, labels, 30, recipe=quick(), checkpoint=file, resume=True)
+
+    def test_needs_a_folder(self, tmp_path: Path) -> None:
+        image, labels = scene()
+        with pytest.raises(FileNotFoundError, match="checkpoint needs an existing folder"):
+            fit(image, labels, 30, recipe=quick(), checkpoint=tmp_path / "none" / "state")
