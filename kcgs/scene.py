@@ -64,9 +64,6 @@ class Scene(nn.Module):
         """Number of Gaussians per image."""
         return len(self.field)
 
-    def __iter__(self) -> Any:  # transitional
-        return iter((self.field, self.regions, self.metadata))
-
     def forward(self, size: tuple[int, int] | None = None) -> Tensor:
         """Render, differentiably and not clipped; other settings: :class:`kcgs.RegionSplatRenderer`.
 
@@ -125,7 +122,7 @@ class Scene(nn.Module):
         return self
 
 
-def save(path: str | os.PathLike[str], scene: Any, regions: Any = None, *, metadata: Any = None) -> int:  # noqa: D417
+def save(path: str | os.PathLike[str], scene: Scene) -> int:
     """Write a scene; the file appears whole or not at all, and the same scene gives the same bytes.
 
     Args:
@@ -152,15 +149,13 @@ def save(path: str | os.PathLike[str], scene: Any, regions: Any = None, *, metad
         (True, None, {'title': 'ten blobs'})
     """
     path = Path(path)
-    if isinstance(scene, GaussianField):  # transitional
-        scene = Scene(scene, regions, metadata)
     content = _serialized(scene, _format(path))
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return len(content)
 
 
-def scene_bytes(scene: Any, regions: Any = None, *, metadata: Any = None, suffix: str = ".safetensors") -> int:  # noqa: D417
+def scene_bytes(scene: Scene, suffix: str = ".safetensors") -> int:
     """Size in bytes of the file that :func:`save` would write.
 
     Args:
@@ -177,8 +172,6 @@ def scene_bytes(scene: Any, regions: Any = None, *, metadata: Any = None, suffix
         >>> scene_bytes(Scene(GaussianField.random(1000, (32, 48), seed=0))) > 1000 * 8 * 4
         True
     """
-    if isinstance(scene, GaussianField):  # transitional
-        scene = Scene(scene, regions, metadata)
     return len(_serialized(scene, _format(Path(f"scene{suffix}"))))
 
 

@@ -121,4 +121,4 @@ def test_modules(
 @given(image=tensors((3, 8, 9)), labels=label_maps((8, 9)), n=st.sampled_from([1, 3, 0, -1, 2.0, True]))
 def test_fit(image: Tensor, labels: Tensor, n: int) -> None:
     config = FitConfig.from_recipe("paper", iterations=2)
-    works_or_refuses(lambda: fit(image, labels, n, config=config))
+    works_or_refuses(lambda: fit(image, labels, n, recipe=config))

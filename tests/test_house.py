@@ -17,7 +17,7 @@ LAYERS = [
     {"bench"},
     {"view", "zoo", "plots"},
     {"rate"},
-    {"fit", "codec", "onnx", "segment", "io"},
+    {"fit", "codec", "onnx", "segment"},
     {"data", "editing", "evaluate", "pruning", "storage"},
     {"scene"},
     {"nn"},

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 
 from kcgs._check import check_count
-from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
@@ -28,16 +27,6 @@ class Decoded(NamedTuple):
     """How many layers were there."""
     num_layers: int
     """How many there are in the whole file."""
-
-    @property
-    def field(self) -> GaussianField:  # transitional
-        """Gaussians."""
-        return self.scene.field
-
-    @property
-    def regions(self) -> RegionMap | None:  # transitional
-        """Map."""
-        return self.scene.regions
 
 
 def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:

@@ -74,7 +74,7 @@ def fit(
         (True, 2)
     """
     started = time.perf_counter()
-    config = FitConfig.from_recipe(settings.pop("config", recipe), **settings)  # transitional: config
+    config = FitConfig.from_recipe(recipe, **settings)
     image, regions = check_problem(image, regions)
     num_gaussians = check_count("num_gaussians", num_gaussians)
     seed = check_count("seed", seed, 0, 2**63 - 1)

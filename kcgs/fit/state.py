@@ -44,16 +44,6 @@ class FitResult(NamedTuple):
     change: float = 0.0
     """No value of the render changed by more when they were."""
 
-    @property
-    def field(self) -> GaussianField:  # transitional
-        """Gaussians."""
-        return self.scene.field
-
-    @property
-    def regions(self) -> RegionMap | None:  # transitional
-        """Map."""
-        return self.scene.regions
-
 
 class Gaussians(NamedTuple):
     """What is rendered: Gaussians, their region ids, and the map."""

@@ -51,7 +51,7 @@ def fitted_bytes(task: Task) -> bytes:
     ramp = torch.linspace(0.0, 1.0, 96)
     image = torch.stack([ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96), ramp.flip(0).expand(64, 96)])
     labels = (ramp > 0.3 + 0.1 * task.number).long().expand(64, 96).contiguous()
-    result = fit(image, labels, 40, config=FitConfig.from_recipe("best", iterations=10), seed=task.number)
+    result = fit(image, labels, 40, recipe=FitConfig.from_recipe("best", iterations=10), seed=task.number)
     path = task.folder / f"{os.getpid()}-{task.number}.safetensors"
-    save(path, result.field, result.regions)
+    save(path, result.scene)
     return path.read_bytes()
