@@ -40,7 +40,7 @@ def write(folder: Path) -> None:
         folder: where they go; made where it is missing.
     """
     pages = {"commands.md": commands(), "recipes.md": recipes(), "segmenters.md": segmenters()}
-    documented: set[str] = set()
+    documented: dict[str, str] = {}
     for name in PACKAGES:
         pages[f"{name}.rst"] = reference(name, documented)
     folder.mkdir(exist_ok=True)
@@ -65,21 +65,25 @@ def identity(name: str, thing: Any) -> str:
     return f"{home}.{thing.__qualname__}" if home and hasattr(thing, "__qualname__") else f"{name} {id(thing)}"
 
 
-def reference(package: str, documented: set[str]) -> str:
+def reference(package: str, documented: dict[str, str]) -> str:
     """Return the reference page of a package: its names by the module that holds them, in that module's order.
 
     Args:
         package: its full name.
-        documented: identities of the things that earlier pages have; those of this page are added.
+        documented: full names of the things that earlier pages have, by identity; those of this page are added.
     """
     module = importlib.import_module(package)
     parts = [_title(package, "="), _summary(module), f".. py:currentmodule:: {package}"]
     groups: dict[str, list[str]] = {}
+    elsewhere: list[str] = []
     for name, thing in public_objects(package).items():
-        if identity(name, thing) in documented or inspect.ismodule(thing):
+        if identity(name, thing) in documented:
+            elsewhere.append(f":py:obj:`~{documented[identity(name, thing)]}`")
             continue
-        documented.add(identity(name, thing))
+        documented[identity(name, thing)] = f"{package}.{name}"
         groups.setdefault(getattr(thing, "__module__", package), []).append(name)
+    if elsewhere:
+        parts.append(f"Also in this package, and described under the shorter path: {', '.join(sorted(elsewhere))}.")
     ahead = [home for home in FIRST if home in groups]
     for home in ahead + [home for home in groups if home not in ahead]:
         if len(groups) > 1 and package != "kcgs" and home != package:
