@@ -39,9 +39,7 @@ def commands(page: Path) -> list[list[str]]:
 
 
 def with_any(page_blocks: Any) -> list[Any]:
-    # compress of a scene is still to come
-    ahead = pytest.mark.xfail(strict=False)
-    return [pytest.param(p, id=p.stem, marks=[ahead] if p.stem == "files" else []) for p in PAGES if page_blocks(p)]
+    return [pytest.param(page, id=page.stem) for page in PAGES if page_blocks(page)]
 
 
 @pytest.fixture
