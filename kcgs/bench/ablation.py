@@ -81,16 +81,7 @@ def report(output: Path, made: Made) -> list[str]:
 
 @experiment("engine", "workers", "sequences", "budget_seconds", "seeds", "iterations", "runs", report=report)
 def run(output: Path, options: Options) -> None:
-    """Fit every row on first frames.
-
-    Args:
-        output: folder.
-        options: what is asked; with a budget, all rows of a sequence at 1,250 come before the next sequence.
-
-    Raises:
-        ValueError: no data, a sequence that is not there, numbers out of range.
-        RuntimeError: fits failed; the others are kept, and in the report.
-    """
+    """Fit every row on first frames; with a budget, a sequence has all rows at 1,250 before the next."""
     names = sequences(options.data, options.sequences, quick=options.quick)
     run_stages("ablation", report, output, options, [cases(names, options)])
 

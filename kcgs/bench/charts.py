@@ -72,16 +72,7 @@ def report(output: Path, made: Made) -> list[str]:
 
 @experiment("engine", "workers", "budget_seconds", "seeds", "iterations", "runs", report=report)
 def run(output: Path, options: Options) -> None:
-    """Fit the charts under the paper's four conditions and ours.
-
-    Args:
-        output: folder.
-        options: what is asked.
-
-    Raises:
-        ValueError: numbers out of range.
-        RuntimeError: fits failed; the others are kept, and in the report.
-    """
+    """Fit the charts under the paper's four conditions and ours."""
     options = options._replace(data=None)
     run_stages("charts", report, output, options, [cases(options)], matched=_OTHERS, finish=_finish)
 

@@ -84,13 +84,7 @@ def report(output: Path, made: Made) -> list[str]:
 def run(output: Path, options: Options) -> None:
     """Fit one image with every recipe, and store it by other means.
 
-    Args:
-        output: folder.
-        options: what is asked; of sequences the first is taken, without data a photo of scikit-image, or quick a disc.
-
-    Raises:
-        ValueError: a sequence that is not there, numbers out of range.
-        RuntimeError: fits failed; the others are kept, and in the report.
+    Of sequences the first is taken, without data a photo of scikit-image, or in the quick form a disc.
     """
     name = "disc" if options.quick else "astronaut"
     if options.data is not None:

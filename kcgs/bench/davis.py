@@ -54,16 +54,7 @@ def report(output: Path, made: Made) -> list[str]:
 
 @experiment("engine", "workers", "sequences", "budget_seconds", "seeds", "iterations", "runs", report=report)
 def run(output: Path, options: Options) -> None:
-    """Sweep N on first frames.
-
-    Args:
-        output: folder.
-        options: what is asked; with a budget, all methods of a sequence are run at the paper's two N before the next.
-
-    Raises:
-        ValueError: no data, a sequence that is not there, numbers out of range.
-        RuntimeError: fits failed; the others are kept, and in the report.
-    """
+    """Sweep N on first frames; with a budget, a sequence has all methods at the paper's two N before the next."""
     names = sequences(options.data, options.sequences, quick=options.quick)
     run_stages("davis", report, output, options, _stages(names, options), matched=(BASELINE,), finish=_show_worst)
 

@@ -127,17 +127,9 @@ def report(output: Path, made: Made) -> list[str]:
 
 @experiment("engine", "workers", "runs", report=report)
 def run(output: Path, options: Options) -> None:
-    """Fit with automatic maps and without.
+    """Fit with automatic maps and without; without data one photo is all there is.
 
     No fit's seconds are held against another's, so that they may run side by side; the report says where they ran.
-
-    Args:
-        output: folder.
-        options: what is asked; without data one photo is all there is.
-
-    Raises:
-        ValueError: there are no images in the data.
-        RuntimeError: fits failed; the others are kept, and in the report.
     """
     wanted, store = plan(options.data, options.quick), Store.open(output, options)
     failed: list[str] = []

@@ -142,15 +142,8 @@ def run(output: Path, options: Options) -> None:
     """Compare files of kcgs with those of other codecs.
 
     Every finished file is kept in `output`/files, so that the same call goes on where an earlier one was interrupted;
-    those of kcgs are made anew once the codec has changed. Remove the folder to measure changed fits anew.
-
-    Args:
-        output: folder.
-        options: data, a folder with DAVIS, bsds and kodak in it, of which the short form needs none; only, names of
-            groups: None: all that can be run but `speed`, whose clocks want a machine with nothing else to do.
-
-    Raises:
-        ValueError: `only` names no group, or one whose images are missing; there is nothing to run.
+    those of kcgs are made anew once the codec has changed. Remove the folder to measure changed fits anew. Without
+    `only`, all groups are run that can be but `speed`, whose clocks want a machine with nothing else to do.
     """
     chosen = choose(options)
     files = Files(output / "files", options.data, options.quick)
@@ -166,7 +159,11 @@ def run(output: Path, options: Options) -> None:
 
 
 def choose(options: Options) -> list[str]:
-    """List the groups that are asked for."""
+    """List the groups that are asked for.
+
+    Raises:
+        ValueError: `only` names no group, or one whose images are missing; there is nothing to run.
+    """
     able = [group for group in GROUPS if options.quick or missing(group, options.data) is None]
     if options.only is None:
         if not able:

@@ -7,24 +7,24 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+_PACKAGES = ("kcgs", "torch", "numba", "numpy", "kornia", "triton")
+
 
 def describe() -> list[str]:
     """Lines for a report: processor, cores, memory, versions."""
-    lines = [
-        f"Processor: {_processor()}, {os.cpu_count()} cores, {_memory()}; {platform.system()} {platform.machine()}"
+    where = f"{platform.system()} {platform.machine()}"
+    versions = ", ".join(f"{name} {_version(name)}" for name in _PACKAGES)
+    return [
+        f"Processor: {_processor()}, {os.cpu_count()} cores, {_memory()}; {where}",
+        f"Python {platform.python_version()}; {versions}",
     ]
-    names = ("kcgs", "torch", "numba", "numpy", "kornia", "triton")
-    lines.append(f"Python {platform.python_version()}; " + ", ".join(f"{n} {_version(n)}" for n in names))
-    return lines
 
 
 def _processor() -> str:
-    information = Path("/proc/cpuinfo")
-    if information.is_file():
-        for line in information.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or "unknown"
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    names = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or "unknown"
 
 
 def _memory() -> str:

@@ -41,7 +41,10 @@ class Experiment:
 def experiment(
     *takes: str, report: reports.Report | None = None
 ) -> Callable[[Callable[[Path, Options], None]], Experiment]:
-    """Make a function the experiment that its module is named after.
+    """Make a function (folder, options) the experiment that its module is named after.
+
+    The function writes results.csv and calls :func:`kcgs.bench.core.report.conclude`. It raises a ValueError where what
+    is asked cannot be done, and a RuntimeError at its end where fits failed; the others are kept, and in the report.
 
     Args:
         takes: options besides data and quick, by name.
