@@ -80,8 +80,8 @@ class TestCheckpoint:
         file = tmp_path / "state"
         fit(image, labels, 30, recipe=quick(iterations=3), checkpoint=file)
         before = file.read_bytes()
-        for change in ({"seed": 1}, {"image": 1 - image}, {"num_gaussians": 31}, {"config": quick(iterations=4)}):
-            arguments = {"image": image, "num_gaussians": 30, "config": quick(iterations=3), **change}
+        for change in ({"seed": 1}, {"image": 1 - image}, {"num_gaussians": 31}, {"recipe": quick(iterations=4)}):
+            arguments = {"image": image, "num_gaussians": 30, "recipe": quick(iterations=3), **change}
             with pytest.raises(ValueError, match="belongs to another fit"):
                 fit(regions=labels, checkpoint=file, resume=True, **arguments)  # type: ignore[arg-type]
         assert file.read_bytes() == before
