@@ -34,7 +34,8 @@ def results(reports: Path) -> str:
     for name, title in _TITLES.items():
         rows = read_rows(reports / name / "results.csv", Row)
         images = list(dict.fromkeys(row.image for row in rows))
-        parts += [f"**{title}** (`kcgs bench {name}`, `notebooks/reports/{name}/report.md`):"] if rows else []
+        made = f"Made by `kcgs bench {name}`: [its report](../notebooks/reports/{name}/report.md)."
+        parts += [f"## {title}", made] if rows else []
         # two charts are no sample of images: no means
         for group in [[image] for image in images] if name == "charts" else [images][: len(rows)]:
             words = f"{len(group)} images, {', '.join(group)}" if len(group) > 1 else f"One image, {group[0]}"
