@@ -110,7 +110,7 @@ def saved(p: Parts, metadata: dict[str, str] | None = None) -> tuple[bytes, dict
     """Save a scene as `.safetensors`; return the file, and what it loads as."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.safetensors"
-        kcgs.save(path, _field(p), _regions(p), metadata=metadata)
+        kcgs.save(path, Scene(_field(p), _regions(p), metadata))
         scene = kcgs.load(path)
         return path.read_bytes(), {**_of_scene(scene.field, scene.regions), "metadata": scene.metadata}
 
