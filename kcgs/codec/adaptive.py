@@ -20,6 +20,10 @@ _LEAST = 64  # chance of an adaptive bit, in 1 / ONE
 _PLAIN, _PER_OCTAVE = 16, 8
 _OCTAVES = (4, 24)
 _BUCKETS = _PLAIN + (_OCTAVES[1] - _OCTAVES[0]) * _PER_OCTAVE
+_EIGHTHS = [(1 << octave - 3) * eighth for octave in range(*_OCTAVES) for eighth in range(_PER_OCTAVE, 2 * _PER_OCTAVE)]
+_LOW = np.array([*range(_PLAIN), *_EIGHTHS], np.int64)
+_HIGH = np.append(_LOW[1:], 1 << _OCTAVES[1])
+_MIDDLES = np.maximum(np.append(_LOW, _HIGH[-1]) - 0.5, 0.0)  # between the magnitudes about each bound
 # bins of the shape that all scales share, in units of the scale
 _BINS, _WIDTH = 24, 0.125
 _PARTS = 256
@@ -75,18 +79,6 @@ class AdaptiveNumber:
         highest = 1 << (length - 1) if length else 0
         rest = None if value is None else np.array([value - highest])
         return highest + int(coder.uniform(np.array([max(highest, 1)]), rest)[0])
-
-
-def _bounds() -> tuple[Integers, Integers]:
-    starts = list(range(_PLAIN))
-    for octave in range(*_OCTAVES):
-        starts += [(1 << octave) + ((1 << octave) // _PER_OCTAVE) * i for i in range(_PER_OCTAVE)]
-    low = np.array(starts, np.int64)
-    return low, np.append(low[1:], 1 << _OCTAVES[1])
-
-
-_LOW, _HIGH = _bounds()
-_MIDDLES = np.maximum(np.append(_LOW, _HIGH[-1]) - 0.5, 0.0)  # between the magnitudes about each bound
 
 
 class AdaptiveMagnitude:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +24,7 @@ QUALITIES = (10.0, 90.0)
 DEFAULT_QUALITY = 46.0
 
 
-def encode(  # noqa: D417
-    scene: Any, regions: Any = None, *, quality: float | None = None, target_bytes: int | None = None
-) -> bytes:
+def encode(scene: Scene, *, quality: float | None = None, target_bytes: int | None = None) -> bytes:
     """Write a scene as a `.kcgs` file; the same scene gives the same bytes.
 
     Convention: the image that was fitted is not looked at. Every parameter is rounded so that it adds the same squared
@@ -51,13 +48,12 @@ def encode(  # noqa: D417
             a target that the coarsest file misses.
 
     Example:
+        >>> from kcgs import GaussianField
         >>> from kcgs.codec import decode
         >>> data = encode(Scene(GaussianField.random(100, (32, 48), seed=0)), quality=40)
         >>> len(data) < 1000, decode(data).scene.size
         (True, (32, 48))
     """
-    if isinstance(scene, GaussianField):  # transitional
-        scene = Scene(scene, regions)
     writer = SceneWriter(scene)
     qp = writer.qp_for(quality, target_bytes)
     if target_bytes is None:
@@ -131,26 +127,25 @@ class SceneWriter:
         """Write the file of Gaussians that are rounded one by one."""
         quantizer = Quantizer(qp, self.size)
         classes = quantizer.classify(self.gaussians)
-        seen = quantizer.is_seen(self.gaussians.colors, classes)
-        if not seen.any():
-            seen[0] = True
-        kept = Parameters(*(numbers[seen] for numbers in self.gaussians))
-        codes = quantizer.quantize(kept, Classes(*(numbers[seen] for numbers in classes)))
-        return self.write(quantizer, codes, self.ids[seen])
+        seen = quantizer.steps(classes).round_colors(self.gaussians.colors).any(1)
+        kept = np.flatnonzero(seen) if seen.any() else np.zeros(1, np.int64)
+        gaussians = Parameters(*(numbers[kept] for numbers in self.gaussians))
+        codes = quantizer.quantize(gaussians, Classes(*(numbers[kept] for numbers in classes)))
+        return self.write(quantizer, codes, self.ids[kept])
 
     def write(self, quantizer: Quantizer, codes: Codes, ids: NDArray[np.int64]) -> bytes:
         """Write the file of Gaussians that are whole numbers already, with the positions of their regions' ids."""
         order = codes.order()
         codes, ids = codes.pick(order), ids[order]
-        model, layers, told = LayerCoder(quantizer, self.channels, self.regions), [], []
+        model, layers, listed = LayerCoder(quantizer, self.channels, self.regions), [], []
         energies, starts, counts = np.unique(-codes.energy, return_index=True, return_counts=True)
         for energy, start, count in zip((-energies).tolist(), starts.tolist(), counts.tolist(), strict=True):
             writer, part = Writer(), slice(start, start + count)
             model.code(writer, energy, codes.pick(part), ids[part], len(ids))
             # each Gaussian takes more than a bit, but zeros at the end are left out
             layers.append(writer.finish().ljust(-(-(count - SPARE) // 8), b"\0"))
-            told.append((energy, len(layers[-1])))
-        header = Header(self.size, self.channels, quantizer.qp, model.num_regions, tuple(told))
+            listed.append((energy, len(layers[-1])))
+        header = Header(self.size, self.channels, quantizer.qp, model.num_regions, tuple(listed))
         return pack(header, self.region_map, layers)
 
     def _count_numbers(self) -> int:
@@ -159,19 +154,15 @@ class SceneWriter:
 
 def _check_field(field: GaussianField) -> None:
     """Refuse what no file can hold; a parameter may have been changed since the field was made."""
-    if field.means.ndim != 2 or len(field) == 0:
+    if field.means.ndim != 2:
         raise ValueError(f"scene must hold the Gaussians of one image; got means of shape {tuple(field.means.shape)}")
     check_floating("means", field.means.detach().float())
     check_cholesky("cholesky", field.cholesky.detach().float())
     check_floating("colors", field.merged_colors().detach().float())
     channels = field.colors.shape[-1]
-    for limit, most, found in (
-        ("size must be at most {} pixels per side", MOST_SIDE, max(field.size)),
-        ("colors must have at most {} channels", MOST_CHANNELS, channels),
-        (f"scene must hold at most {{}} Gaussians of {channels} channels", most_gaussians(channels), len(field)),
-    ):
-        if found > most:
-            raise ValueError(f"{limit.format(most)}; got {found}")
+    check_count("pixels per side", max(field.size), 1, MOST_SIDE)
+    check_count("channels", channels, 1, MOST_CHANNELS)
+    check_count("number of Gaussians", len(field), 1, most_gaussians(channels))
 
 
 def _positions(field: GaussianField, regions: RegionMap) -> NDArray[np.int64]:

@@ -25,7 +25,7 @@ _FEW = 16  # symbols among which the library finds one faster by trying all than
 class Coder(ABC):
     """Either side of a stream: what is written is returned, so is what is read; a reader ignores the values."""
 
-    reads: bool
+    reads = False
 
     def __init__(self) -> None:
         import constriction
@@ -101,8 +101,6 @@ class Coder(ABC):
 
 class Writer(Coder):
     """Turns symbols into bytes."""
-
-    reads = False
 
     def __init__(self) -> None:
         super().__init__()

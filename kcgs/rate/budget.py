@@ -36,16 +36,6 @@ class FitBytesResult(NamedTuple):
     result: FitResult
     """The fit, before rounding."""
 
-    @property
-    def field(self) -> Any:  # transitional
-        """Gaussians."""
-        return self.scene.field
-
-    @property
-    def regions(self) -> Any:  # transitional
-        """Map."""
-        return self.scene.regions
-
 
 def fit_bytes(
     image: Any,
@@ -87,7 +77,6 @@ def fit_bytes(
         >>> len(done.data) <= 200, done.scene.regions
         (True, None)
     """
-    recipe = settings.pop("config", None) or recipe  # transitional
     config = FitConfig.from_recipe(recipe, **settings)
     image, regions = check_problem(image, regions)
     check_count("num_bytes", num_bytes)
@@ -114,13 +103,9 @@ def _choose(
     if regions is None or regions.num_regions == 1:
         return None, config.contour_cost
     # by iterations, so that the same arguments give the same file
-    trial = FitConfig.from_recipe(
-        config,
-        iterations=min(_TRIAL_ITERATIONS, config.iterations),
-        max_seconds=None,
-        merge_regions=False,
-        refine_flat=False,
-    )
+    iterations = min(_TRIAL_ITERATIONS, config.iterations)
+    shorter = {"iterations": iterations, "max_seconds": None, "merge_regions": False, "refine_flat": False}
+    trial = FitConfig.from_recipe(config, **shorter)
 
     def error(regions: RegionMap | None, left: int) -> float:
         result = fit(image, regions, count_for(left), recipe=trial, seed=seed)

@@ -8,13 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from kcgs._check import as_image, check_count
 from kcgs.codec import QUALITIES, decode
 from kcgs.codec.encode import SceneWriter
 from kcgs.codec.gaussians.quantize import QPS, Parameters, Quantizer
-from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
 from .fine_tune import FineTuning
@@ -39,16 +37,15 @@ class Compressed(NamedTuple):
 
 @torch.inference_mode(False)
 @torch.enable_grad()
-def compress(  # noqa: D417
-    scene: Any,
+def compress(
+    scene: Scene,
     image: Any,
-    regions: Any = None,
     *,
     quality: float | None = None,
     target_bytes: int | None = None,
     iterations: int = 100,
     seed: int = 0,
-) -> Any:
+) -> Compressed:
     """Write a scene as a `.kcgs` file, rounded with an eye on the image that it shows.
 
     Gaussians are rounded a few at a time, and those that are still free make up for it: about a third less error than
@@ -75,11 +72,12 @@ def compress(  # noqa: D417
         >>> len(compress(scene, image, target_bytes=150).data) <= 150
         True
     """
-    if isinstance(scene, GaussianField):  # transitional
-        goal: dict[str, Any] = {"quality": quality, "target_bytes": target_bytes}
-        return compress(Scene(scene, regions), image, **goal, iterations=iterations, seed=seed).data
     writer = SceneWriter(scene)
-    target = _check_image(image, writer)
+    target = as_image("image", image)
+    if tuple(target.shape) != (writer.channels, *writer.size):
+        raise ValueError(f"image must have shape {(writer.channels, *writer.size)}; got {tuple(target.shape)}")
+    # a copy: an inference tensor cannot take part in a graph
+    target = target.detach().to("cpu", torch.float32, copy=True)
     qp = writer.qp_for(quality, target_bytes)
     check_count("iterations", iterations)
 
@@ -121,11 +119,3 @@ def _pays(gaussians: Parameters, quantizer: Quantizer) -> NDArray[np.bool_]:
     kept = energy >= _PAYING * quantizer.distortion
     kept[energy.argmax()] = True
     return kept.numpy()
-
-
-def _check_image(value: Any, writer: SceneWriter) -> Tensor:
-    image = as_image("image", value)
-    if tuple(image.shape) != (writer.channels, *writer.size):
-        raise ValueError(f"image must have shape {(writer.channels, *writer.size)}; got {tuple(image.shape)}")
-    # a copy: an inference tensor cannot take part in a graph
-    return image.detach().to("cpu", torch.float32, copy=True)

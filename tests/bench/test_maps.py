@@ -163,7 +163,7 @@ class TestResult:
         found = compare(store, case)
         assert found is not None and found.equal_n == rival.n and math.isfinite(found.equal_ef_gain)
         decoded, third = decode(file), store.scene(rival)
-        assert found.decoded_psnr == float(psnr(Scene(decoded.field, decoded.regions).render(), image))
+        assert found.decoded_psnr == float(psnr(decoded.scene.render(), image))
         assert found.equal_bytes == len(encode_like_reports(third, float(psnr(third.render(), image))))
 
     def test_without_a_contour(self, tmp_path: Path, data: Path, stub: Stub) -> None:

@@ -50,11 +50,8 @@ class LayerCoder:
     def __init__(self, quantizer: Quantizer, channels: int, regions: RegionMap | None) -> None:
         self.quantizer, self.channels, self.regions = quantizer, channels, regions
         self.num_regions = 1 if regions is None else regions.num_regions
-        self._colors = [
-            AdaptiveMagnitude(_WEIGHT * _GREY),
-            AdaptiveMagnitude(_WEIGHT * _HUE, 3),
-            AdaptiveMagnitude(_WEIGHT * _HUE2, 3),
-        ]
+        shapes = (_GREY, 1), (_HUE, 3), (_HUE2, 3)
+        self._colors = [AdaptiveMagnitude(_WEIGHT * bins, contexts) for bins, contexts in shapes]
         self._ratio = AdaptiveMagnitude(_WEIGHT * _RATIO)
         self._strays = AdaptiveSymbol(np.array([20.0, 0.5]))
         self._count = AdaptiveNumber(np.array([2.0, *[1.0] * 9, *[0.3] * (_MOST_BITS - 9)]))

@@ -124,34 +124,32 @@ class Occupancy:
 
 def _code_counts(coder: Coder, rate: float, cells: int, places: Integers | None, most: int) -> Integers:
     """Code which cell each Gaussian lies in, in order: one more with the probability rate / (1 + rate) each."""
-    more = rate / (1.0 + rate)
-    weights = np.array([1.0 - more, *[0.0] * _FULL])
-    for i in range(1, _FULL + 1):
-        weights[i] = weights[i - 1] * more
+    more, left = rate / (1.0 + rate), most
+    weights = np.multiply.accumulate([1.0 - more, *[more] * _FULL])
     weights[_FULL] /= 1.0 - more
-    occupied, counts, left = [], [], most
+
+    def code(count: int, wanted: Integers | None) -> Integers:
+        nonlocal left
+        found = coder.repeat(weights, count, None if wanted is None else np.minimum(wanted, _FULL))
+        left -= int(found.sum())
+        if left < 0:
+            raise CodecError(f"cells must hold {most} Gaussians; got more")
+        return found
+
+    occupied, counts = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for start in range(0, cells, _TOGETHER):
-        together = min(_TOGETHER, cells - start)
-        value = None
+        together, wanted = min(_TOGETHER, cells - start), None
         if places is not None:
             first, last = np.searchsorted(places, [start, start + together])
-            value = np.minimum(np.bincount(places[first:last] - start, minlength=together), _FULL)
-        found = coder.repeat(weights, together, value)
+            wanted = np.bincount(places[first:last] - start, minlength=together)
+        found = code(together, wanted)
         occupied.append(np.flatnonzero(found) + start)
         counts.append(found[found > 0])
-        left = _take(left, found, most)
-    where, count = (np.concatenate([np.zeros(0, np.int64), *parts]).astype(np.int64) for parts in (occupied, counts))
-    full = np.flatnonzero(count == _FULL)
+    where, count = np.concatenate(occupied), np.concatenate(counts)
     true = None if places is None else np.searchsorted(places, where, "right") - np.searchsorted(places, where)
+    full = np.flatnonzero(count == _FULL)
     while len(full):
-        found = coder.repeat(weights, len(full), None if true is None else np.minimum((true - count)[full], _FULL))
+        found = code(len(full), None if true is None else (true - count)[full])
         count[full] += found
-        left = _take(left, found, most)
         full = full[found == _FULL]
     return np.repeat(where, count)
-
-
-def _take(left: int, found: Integers, most: int) -> int:
-    if (taken := int(found.sum())) > left:
-        raise CodecError(f"cells must hold {most} Gaussians; got more")
-    return left - taken

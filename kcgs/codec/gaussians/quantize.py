@@ -109,6 +109,11 @@ class Steps(NamedTuple):
         step = self.place[:, None] * shape[:, ::2]
         return np.clip(np.ceil(self.side[:, None] / step), 1, _MOST_LEVELS).astype(np.int64)
 
+    def round_colors(self, colors: Floats) -> Floats:
+        """Return the codes of colours [N, C]."""
+        codes: Floats = np.floor(opponent(colors) / self.color[:, None] + 0.5)
+        return codes
+
     def restore(self, codes: Codes, shape: Floats) -> Parameters:
         """Return the parameters of Gaussians whose shapes are known."""
         means = self.side[:, None] * (codes.cell + (codes.place + 0.5) / self.places(shape))
@@ -159,12 +164,6 @@ class Quantizer:
             side=np.array(sides, np.int64)[group],
         )
 
-    def is_seen(self, colors: Floats, classes: Classes) -> NDArray[np.bool_]:
-        """Say which Gaussians do not round to black [N]."""
-        rounded = np.floor(opponent(colors) / self.steps(classes).color[:, None] + 0.5)
-        seen: NDArray[np.bool_] = (rounded != 0).any(1)
-        return seen
-
     def quantize(self, gaussians: Parameters, classes: Classes) -> Codes:
         """Round Gaussians; what leaves its class of size is brought back to its border."""
         steps = self.steps(classes)
@@ -175,7 +174,7 @@ class Quantizer:
         ratio = np.floor(np.clip(log_ratio, 0, _MOST_RATIO) / steps.ratio + 0.5).astype(np.int64)
         turns = steps.turns(ratio)
         angle = np.floor(radians / math.pi * turns + 0.5).astype(np.int64) % turns
-        opposed = np.floor(opponent(colors) / steps.color[:, None] + 0.5)
+        opposed = steps.round_colors(colors)
         if not (np.abs(opposed) < _MOST_COLOR).all():
             raise ValueError(
                 f"colors must be below {_MOST_COLOR:g} steps of {steps.color.min():.3g} at this quality; got colors "

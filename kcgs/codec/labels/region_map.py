@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from kcgs._check import check_count
 from kcgs.codec.adaptive import AdaptiveSymbol
 from kcgs.codec.errors import CodecError
 from kcgs.codec.file import MOST_LABELS, MOST_REGIONS, ByteReader, varint
@@ -27,12 +28,9 @@ def encode_map(regions: RegionMap) -> bytes:
     """Write a map with two regions or more; contour widths are rounded to fortieths of a pixel."""
     if regions.labels.ndim != 2 or regions.resized:
         raise ValueError("regions must be one map of its own pixels, not a batch and not resized")
-    if regions.fine_labels.numel() > MOST_LABELS:
-        raise ValueError(f"regions must have at most {MOST_LABELS} labels; got {tuple(regions.fine_labels.shape)}")
-    if regions.supersample > _MOST_SUPERSAMPLE:
-        raise ValueError(f"supersample must be at most {_MOST_SUPERSAMPLE}; got {regions.supersample}")
-    if regions.num_regions > MOST_REGIONS:
-        raise ValueError(f"regions must be at most {MOST_REGIONS}; got {regions.num_regions}")
+    check_count("supersample", regions.supersample, 1, _MOST_SUPERSAMPLE)
+    check_count("number of labels", regions.fine_labels.numel(), 1, MOST_LABELS)
+    check_count("number of regions", regions.num_regions, 1, MOST_REGIONS)
     labels = encode_labels(regions.fine_labels.cpu().numpy())
     softness = regions.softness
     if isinstance(softness, PairWidths):

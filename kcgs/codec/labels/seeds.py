@@ -23,7 +23,10 @@ def code_seeds(coder: Coder, seeds: Any) -> None:
     while waiting:
         block, count = waiting.pop()
         if count == 1:
-            _code_place(coder, block)
+            place = coder.number(0 if coder.reads else int(block.argmax()), block.size)
+            if place >= block.size:
+                raise CodecError("data must mark pixels of the map")
+            block[place // block.shape[1], place % block.shape[1]] = 1
         elif count == block.size:
             block[:] = 1
         elif count:
@@ -52,10 +55,3 @@ def _code_count(coder: Coder, half: Any, seeds: int, rest: int, extreme: Adaptiv
     if count >= high:
         raise CodecError("data must mark pixels of the map")
     return count
-
-
-def _code_place(coder: Coder, block: Any) -> None:
-    place = coder.number(0 if coder.reads else int(block.argmax()), block.size)
-    if place >= block.size:
-        raise CodecError("data must mark pixels of the map")
-    block[place // block.shape[1], place % block.shape[1]] = 1
