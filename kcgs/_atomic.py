@@ -9,20 +9,9 @@ from pathlib import Path
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` that takes its place when the block ends well.
+    """Yield a path beside `path`, of the same suffix, at which the block writes a file that takes its place at the end.
 
-    The temporary path has the suffix of ``path``, so writers that infer the format from the name do the
-    right thing. On any exception, Ctrl-C included, it is removed and whatever stood at ``path`` stays.
-
-    Args:
-        path: the file to write; its folder must exist.
-
-    Yields:
-        A path in the same folder that does not exist yet; the block must create a file there.
-
-    Raises:
-        FileNotFoundError: the folder of ``path`` does not exist, or the block wrote no file.
-        IsADirectoryError: ``path`` is a folder.
+    On any exception, Ctrl-C included, it is removed and whatever stood at `path` stays.
 
     Example:
         >>> import tempfile

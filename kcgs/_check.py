@@ -16,12 +16,14 @@ _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32)
 
 
-def check_tensor(name: str, value: object) -> Tensor:
-    """Return `value` if it is a dense tensor."""
+def check_tensor(name: str, value: object, dims: Sequence[int] = ()) -> Tensor:
+    """Return `value` if it is a dense tensor of an allowed rank."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a Tensor; got {type(value).__name__}")
     if value.layout != torch.strided or value.is_quantized:
         raise TypeError(f"{name} must be a dense tensor; got layout {value.layout}")
+    if dims and value.ndim not in dims:
+        raise ValueError(f"{name} must have {' or '.join(map(str, dims))} dimensions; got shape {tuple(value.shape)}")
     return value
 
 
@@ -29,11 +31,9 @@ def check_floating(
     name: str, value: object, last: int | None = None, dims: Sequence[int] = (), finite: bool = True
 ) -> Tensor:
     """Return `value` if it is a real floating tensor of an allowed rank and last dimension, and finite if asked."""
-    tensor = check_tensor(name, value)
+    tensor = check_tensor(name, value, dims)
     if tensor.dtype not in _FLOATS:
         raise TypeError(f"{name} must have a real floating dtype; got {tensor.dtype}")
-    if dims and tensor.ndim not in dims:
-        raise ValueError(f"{name} must have {' or '.join(map(str, dims))} dimensions; got shape {tuple(tensor.shape)}")
     if last is not None and (tensor.ndim == 0 or tensor.shape[-1] != last):
         raise ValueError(f"{name} must have shape (..., {last}); got {tuple(tensor.shape)}")
     if finite and not torch.isfinite(tensor).all():
@@ -43,11 +43,9 @@ def check_floating(
 
 def check_integer(name: str, value: object, dims: Sequence[int] = ()) -> Tensor:
     """Return `value` if it is an integer tensor of an allowed rank."""
-    tensor = check_tensor(name, value)
+    tensor = check_tensor(name, value, dims)
     if tensor.dtype not in _INTEGERS:
         raise TypeError(f"{name} must have an integer dtype; got {tensor.dtype}")
-    if dims and tensor.ndim not in dims:
-        raise ValueError(f"{name} must have {' or '.join(map(str, dims))} dimensions; got shape {tuple(tensor.shape)}")
     return tensor
 
 
@@ -131,10 +129,9 @@ def check_size(name: str, value: object) -> tuple[int, int]:
     """Return (height, width) if both are whole numbers of at least 1."""
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
         raise TypeError(f"{name} must be a pair (height, width); got {value!r}")
-    height, width = value
-    if any(isinstance(n, bool) or not hasattr(n, "__index__") for n in value):
+    if any(isinstance(side, bool) or not hasattr(side, "__index__") for side in value):
         raise TypeError(f"{name} must hold two integers (height, width); got {value!r}")
-    height, width = operator.index(height), operator.index(width)
+    height, width = map(operator.index, value)
     if height < 1 or width < 1:
         raise ValueError(f"{name} must be at least 1 x 1; got {value!r}")
     return height, width

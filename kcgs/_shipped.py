@@ -8,11 +8,6 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def shipped_folder(name: str, *, checkout: str) -> Path:
-    """Return where data are, which may be nowhere.
-
-    Args:
-        name: of the folder within an installed package.
-        checkout: the folder in a checkout, from its root.
-    """
+    """Return where data are, which may be nowhere: a folder of the installed package, or of the checkout's root."""
     inside = _PACKAGE / name
     return inside if inside.is_dir() else _PACKAGE.parent / checkout

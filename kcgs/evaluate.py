@@ -49,19 +49,7 @@ def evaluate(scene: Scene, image: Any, labels: RegionMap | Tensor | None = None)
 
 
 def measure(render: Tensor, image: Tensor, labels: Tensor | None = None) -> dict[str, float]:
-    r"""Compare two images, :math:`(C, H, W)`, in all the figures of :func:`evaluate`.
-
-    Args:
-        render: what is shown.
-        image: what should be.
-        labels: :math:`(H, W)`, the map whose contours the edge-focused figures look at; None: there are none.
-
-    Returns:
-        As :func:`evaluate`.
-
-    Raises:
-        TypeError, ValueError: as :func:`kcgs.functional.ef_ssim`.
-    """
+    """Compare a render with an image, (C, H, W), in all the figures of :func:`evaluate`; labels None: no contours."""
     with warnings.catch_warnings():
         # a missing figure is shown as missing
         warnings.simplefilter("ignore", RuntimeWarning)

@@ -36,12 +36,7 @@ def save_figure(plot: Any, path: Path) -> None:
 
 
 def plot_history(path: Path, histories: Mapping[str, Sequence[HistoryEntry]]) -> None:
-    """Plot PSNR and EF-PSNR of fits against seconds and against iterations.
-
-    Args:
-        path: PNG to write.
-        histories: of fits, by name.
-    """
+    """Plot PSNR and EF-PSNR of fits, by name, against seconds and against iterations, as a PNG."""
     plot, axes = figure(1, 2, width=9.5, height=3.8)
     for axis, field, unit in ((axes[0], "seconds", "seconds"), (axes[1], "iteration", "iterations")):
         for index, (name, history) in enumerate(histories.items()):

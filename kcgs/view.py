@@ -72,18 +72,9 @@ def serve(
 ) -> None:
     """Export a scene to a temporary folder and serve the viewer on loopback until Ctrl-C.
 
-    Args:
-        scene: unbatched.
-        name: the page's title for it.
-        original: an image file to compare with.
-        port: 0 for any that is free.
-        browser: whether to open a window.
-        say: takes the line that says where the page is.
-        page: folder of the built page; None: the package's own.
-
-    Raises:
-        FileNotFoundError: the page is not built, or there is no such image.
-        OSError: the port is taken.
+    `name` is the scene's title on the page, `original` an image file to compare with; port 0 is any that is free;
+    `browser` opens a window, `say` takes the line that says where the page is. `page` is the folder of the built page;
+    None: the package's own.
     """
     page = _PAGE if page is None else page
     if not (page / "index.html").is_file():

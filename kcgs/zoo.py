@@ -33,15 +33,7 @@ class Entry(NamedTuple):
 
 
 def entries(folder: Path | None = None) -> list[Entry]:
-    """Read the manifest.
-
-    Args:
-        folder: the zoo's; None: the package's own.
-
-    Raises:
-        FileNotFoundError: there is no manifest.
-        ValueError: the manifest is damaged.
-    """
+    """Read the manifest of a zoo's folder; None: the package's own."""
     path = (folder or _FOLDER) / "manifest.json"
     if not path.is_file():
         raise FileNotFoundError(f"there is no zoo of fitted scenes: {path} is not there; install kcgs again")
@@ -52,16 +44,7 @@ def entries(folder: Path | None = None) -> list[Entry]:
 
 
 def find(name: str, folder: Path | None = None) -> Path:
-    """Return the scene file of an entry, its hash checked.
-
-    Args:
-        name: of the entry, with or without "zoo:".
-        folder: as in :func:`entries`.
-
-    Raises:
-        FileNotFoundError: there is no zoo.
-        ValueError: no such entry, or a file that is not what the manifest says.
-    """
+    """Return the scene file of an entry, its hash checked; the name may begin with "zoo:"."""
     wanted = name.removeprefix(PREFIX)
     known = {entry.name: entry for entry in entries(folder)}
     if wanted not in known:

@@ -40,7 +40,7 @@ class Samples(NamedTuple):
 
 
 def read_file(path: str | os.PathLike[str]) -> bytes:
-    """Return the bytes of ``path``, or raise an error that names it."""
+    """Return the bytes of `path`, or raise an error that names it."""
     file = Path(path)
     if file.is_dir():
         raise ValueError(f"path must be a file; got the folder {file}")
@@ -51,19 +51,10 @@ def read_file(path: str | os.PathLike[str]) -> bytes:
 
 
 def decode(data: bytes, path: str | os.PathLike[str], *, indices: bool = False) -> Samples:
-    """Decode the first frame, turned upright as its EXIF orientation says.
+    """Decode the first frame, turned upright as its EXIF orientation says; errors name the path.
 
-    Args:
-        data: the file's bytes.
-        path: where they came from, for messages.
-        indices: give what label maps are stored as: palette indices instead of their colours, 1-, 2- and
-            4-bit grey unscaled, colour keys ignored.
-
-    Returns:
-        The samples.
-
-    Raises:
-        ValueError: the bytes are no whole image, or hold samples with no meaning as an image.
+    With `indices`, return what label maps are stored as: palette indices instead of their colours, 1-, 2- and 4-bit
+    grey unscaled, colour keys ignored.
     """
     try:
         samples = _tiff(data) if data.startswith(_TIFF) else None
@@ -95,17 +86,14 @@ def _pillow(data: bytes, image: Image.Image, indices: bool) -> Samples:
         values = np.concatenate([values, np.where(opaque, 65535, 0).astype(np.uint16)], axis=-1)
     if image.format != "TIFF":  # Pillow turns those on loading.
         values = _upright(values, image.getexif().get(_ORIENTATION, 1))
-    name = image.format or "unknown"
-    return Samples(values, white, name, _is_lossless(data, image))
+    return Samples(values, white, image.format or "unknown", _is_lossless(data, image))
 
 
 def _shown(image: Image.Image) -> tuple[Array, float]:
     """Return the colours that a viewer would show and their white."""
-    if image.mode.startswith("I;16"):
-        return np.asarray(image).astype(np.uint16), 65535.0
-    if image.mode == "I":
-        if image.format not in ("PNG", "PPM"):  # These two put 16-bit grey into 32-bit integers.
-            raise ValueError("32-bit integer samples have no stated white, expected 8 or 16 bits")
+    if image.mode == "I" and image.format not in ("PNG", "PPM"):  # These two put 16-bit grey into 32-bit integers.
+        raise ValueError("32-bit integer samples have no stated white, expected 8 or 16 bits")
+    if image.mode == "I" or image.mode.startswith("I;16"):
         return np.asarray(image).astype(np.uint16), 65535.0
     if image.mode == "F":
         _check_range(np.asarray(image))

@@ -80,7 +80,7 @@ def chart_pie(scale: int = 1) -> ChartSample:
         The chart, (300 scale, 300 scale); label 0 is the background, 1 to 8 the sectors.
 
     Raises:
-        TypeError, ValueError: ``scale`` is no integer of at least 1.
+        TypeError, ValueError: as `chart_2x3`.
 
     Example:
         >>> image, labels = chart_pie()

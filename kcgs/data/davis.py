@@ -82,13 +82,7 @@ class Davis:
         return (self[name] for name in self._sequences)
 
     def __getitem__(self, key: int | str) -> DavisFrame:
-        """Read a frame by position or by the name of its sequence.
-
-        Raises:
-            FileNotFoundError: the frame or its annotation is missing.
-            IndexError: no such position.
-            ValueError: no such name, or the annotation has another size than the frame.
-        """
+        """Read a frame by position or by the name of its sequence; the annotation has to have its size."""
         if isinstance(key, bool) or not isinstance(key, int | str):
             raise TypeError(f"a frame is looked up by position or sequence name; got {key!r}")
         if isinstance(key, int) and not -len(self) <= key < len(self):

@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
@@ -71,19 +70,19 @@ def load_image(
     if samples.white is None:
         raise ValueError(f"cannot read {path}: {samples.values.dtype} samples have no stated white")
     pixels = samples.values.astype(np.float32) / np.float32(samples.white)
-    color, alpha = pixels, np.ones_like(pixels[..., :1])
-    if pixels.shape[-1] in (2, 4):
-        color, alpha = pixels[..., :-1], pixels[..., -1:]
-    if channels == "RGBA":
-        color = np.broadcast_to(color, (*color.shape[:2], 3))
-        return _to_tensor(np.concatenate([color, alpha], axis=-1))
-    if pixels.shape[-1] in (2, 4):
+    has_alpha = pixels.shape[-1] in (2, 4)
+    alpha = pixels[..., -1:] if has_alpha else np.ones_like(pixels[..., :1])
+    color = pixels[..., :-1] if has_alpha else pixels
+    if has_alpha and channels != "RGBA":
         color = color * alpha + under * (1 - alpha)
-    if channels == "L" and color.shape[-1] == 3:
-        color = color @ _LUMA[:, None]
-    if channels == "RGB":
+    if channels == "L":
+        color = color @ _LUMA[:, None] if color.shape[-1] == 3 else color
+    else:
         color = np.broadcast_to(color, (*color.shape[:2], 3))
-    return _to_tensor(color)
+    if channels == "RGBA":
+        color = np.concatenate([color, alpha], axis=-1)
+    # Sums of weights that add up to 1 can pass it by a rounding error.
+    return torch.from_numpy(np.clip(color, 0, 1).transpose(2, 0, 1).copy())
 
 
 def save_image(path: str | os.PathLike[str], image: Any) -> None:
@@ -123,8 +122,3 @@ def save_image(path: str | os.PathLike[str], image: Any) -> None:
     stored = Image.fromarray(np.ascontiguousarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels))
     with atomic_path(path) as temporary:
         stored.save(temporary, format=name, **options)
-
-
-def _to_tensor(pixels: NDArray[np.float32]) -> Tensor:
-    # Sums of weights that add up to 1 can pass it by a rounding error.
-    return torch.from_numpy(np.clip(pixels, 0, 1).transpose(2, 0, 1).copy())

@@ -160,7 +160,7 @@ def colorize_labels(labels: Tensor) -> Tensor:
         :math:`(3, H, W)` float32 RGB in [0, 1], on the device of ``labels``.
 
     Raises:
-        TypeError, ValueError: ``labels`` is no integer map (H, W) of non-negative ids, or is empty.
+        TypeError, ValueError: as `save_labels`.
 
     Example:
         >>> image = colorize_labels(torch.tensor([[0, 255, 0]]))
@@ -185,8 +185,7 @@ def overlay_labels(image: Any, labels: Tensor) -> Tensor:
         :math:`(3, H, W)` float32 RGB in [0, 1], on the CPU.
 
     Raises:
-        TypeError: ``image`` is no image or ``labels`` no integer tensor.
-        ValueError: other shapes, sizes that differ, negative ids.
+        TypeError, ValueError: as `colorize_labels`; ``image`` is no image or has another size.
 
     Example:
         >>> halves = (torch.arange(8) >= 4).long().expand(6, 8)

@@ -69,8 +69,7 @@ def render_over(scene: Scene, region_ids: int | Iterable[int], image: Tensor) ->
         Image, :math:`(C, H, W)`.
 
     Raises:
-        TypeError: wrong types.
-        ValueError: a batch, no map or one of another size, an unknown id, another number of channels.
+        TypeError, ValueError: as :func:`render_region`; another number of channels.
 
     Example:
         >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])

@@ -56,7 +56,7 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
     source[rows[1], cols[1]] = before[rows[0], cols[0]]
     labels[landed] = source[landed]
 
-    moved = _copy(scene.field)
+    moved = scene.field.subset(torch.ones_like(ids_of(scene.field), dtype=torch.bool))
     with torch.no_grad():
         shift = moved.means.new_tensor(steps) / regions.supersample
         moved.means += torch.where(torch.isin(ids_of(moved), chosen)[:, None], shift, 0.0)
@@ -81,8 +81,7 @@ def recolor_region(
         A new scene, without a graph.
 
     Raises:
-        TypeError: wrong types.
-        ValueError: a batch, an id that no Gaussian has, wrong shapes, values that are not finite.
+        TypeError, ValueError: a batch, an id that no Gaussian has, wrong types or shapes, values that are not finite.
 
     Example:
         >>> labels = torch.zeros(4, 6, dtype=torch.long)
@@ -100,9 +99,10 @@ def recolor_region(
     chosen = torch.isin(ids_of(field), torch.tensor(wanted, device=field.means.device))
     channels = field.colors.shape[-1]
     matrix = color_tensor("gain", gain, field.colors, [(), (channels,), (channels, channels)])
-    colors = field.colors.detach().clone()
-    colors[chosen] = colors[chosen] @ matrix.T if matrix.ndim == 2 else colors[chosen] * matrix
-    result = _copy(field, colors=colors)
+    result = field.subset(torch.ones_like(chosen))
+    with torch.no_grad():
+        colors = result.colors[chosen]
+        result.colors[chosen] = colors @ matrix.T if matrix.ndim == 2 else colors * matrix
     if bias is not None:
         flat = color_tensor("bias", bias, field.colors, [(), (channels,)]).expand(channels)
         for region in wanted:
@@ -111,22 +111,11 @@ def recolor_region(
 
 
 def delete_region(scene: Scene, region_ids: int | Iterable[int]) -> Scene:
-    """Delete regions: their Gaussians go, their pixels fall to their neighbours.
+    """Delete regions: their Gaussians go, their pixels fall to their neighbours. Arguments: see :func:`move_region`.
 
     Convention: each of their pixels takes the label of the nearest pixel that stays (Euclidean; of equal distances, the
     smallest id), and shows what the Gaussians of that region paint there: nothing, black, where they do not reach.
     Where pairs of regions have widths, contours between regions that did not touch before are hard.
-
-    Args:
-        scene: unbatched, with a map of its own size, not a resized one.
-        region_ids: an id in the map, or several.
-
-    Returns:
-        A new scene, without a graph.
-
-    Raises:
-        TypeError: wrong types.
-        ValueError: a batch, no map or one of another size, an unknown id, all regions.
 
     Example:
         >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])
@@ -143,18 +132,8 @@ def delete_region(scene: Scene, region_ids: int | Iterable[int]) -> Scene:
 def extract_region(scene: Scene, region_ids: int | Iterable[int]) -> Scene:
     """Keep the Gaussians of some regions: the scene shows them where they were, and black elsewhere.
 
-    :func:`render_region` gives them with their share of each pixel as alpha.
-
-    Args:
-        scene: unbatched, with a map.
-        region_ids: an id in the map, or several.
-
-    Returns:
-        A new scene, without a graph.
-
-    Raises:
-        TypeError: wrong types.
-        ValueError: a batch, no map or one of another size, an unknown id.
+    Arguments are those of :func:`move_region`; the map may be resized. :func:`render_region` gives regions with their
+    share of each pixel as alpha.
 
     Example:
         >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])
@@ -181,8 +160,7 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
         A new scene, without a graph.
 
     Raises:
-        TypeError: wrong types.
-        ValueError: a batch, no map or one of another size, an unknown id, another number of channels.
+        TypeError, ValueError: as :func:`extract_region`; another number of channels.
 
     Example:
         >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])
@@ -221,14 +199,6 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
     return Scene(joined, regions.relabel(labels, "mean"), scene.metadata)
 
 
-def _copy(field: GaussianField, colors: Tensor | None = None) -> GaussianField:
-    copy = field.subset(torch.ones(len(field), dtype=torch.bool, device=field.means.device))
-    if colors is not None:
-        with torch.no_grad():
-            copy.colors.copy_(colors)
-    return copy
-
-
 def _with_flat(field: GaussianField, region_id: int, color: Tensor) -> GaussianField:
     height, width = field.size
     sigma = _FLAT * max(height, width)
@@ -247,7 +217,7 @@ def _fill(labels: Tensor, hole: Tensor) -> Tensor:
 
     # the nearest pixel touches the hole: one step from it towards any pixel of the hole is nearer
     lines = [hole.any(axis).nonzero().flatten() for axis in (1, 0)]
-    rows, cols = (slice(max(0, int(at[0]) - 1), int(at[-1]) + 2) for at in lines)
+    rows, cols = (slice(max(0, int(line[0]) - 1), int(line[-1]) + 2) for line in lines)
     part, inside = labels[rows, cols], hole[rows, cols]
     touching = torch.nn.functional.max_pool2d(inside[None].float(), 3, 1, 1)[0] > 0
     best = torch.full(part.shape, torch.inf, dtype=torch.float64)

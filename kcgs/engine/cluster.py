@@ -17,11 +17,7 @@ from .jobs import Done, Failure, environment, perform
 
 
 def load() -> ModuleType:
-    """Import ray.
-
-    Raises:
-        ImportError: it is not installed.
-    """
+    """Import ray, or say how to install it."""
     try:
         import ray
     except ImportError as error:
@@ -33,16 +29,7 @@ def load() -> ModuleType:
 def connected(workers: int | None, threads: int) -> Iterator[ModuleType]:
     """Yield ray with a cluster behind it; what was started or joined here is left again.
 
-    Args:
-        workers: jobs at a time that a cluster started here has processors for; None: as many as this machine has.
-        threads: of each job.
-
-    Yields:
-        The module ray.
-
-    Raises:
-        ImportError: ray is not installed.
-        ConnectionError: there is no cluster at RAY_ADDRESS.
+    A cluster that is started has processors for `workers` jobs of `threads` each; None: all of this machine.
     """
     ray = load()
     if ray.is_initialized():
@@ -69,7 +56,7 @@ def run(function: Callable[[Any], Any], jobs: Sequence[Any], workers: int | None
     """Do the jobs on the cluster; yield each as it ends."""
     with connected(workers, threads) as ray:
         # tried again here, not by Ray, which would do so for ever where memory runs out
-        remote = ray.remote(_perform).options(num_cpus=threads, max_retries=0)
+        remote = ray.remote(perform).options(num_cpus=threads, max_retries=0)
         room = _room(ray, threads) if workers is None else workers
         waiting = deque(range(len(jobs)))
         again: set[int] = set()
@@ -78,7 +65,8 @@ def run(function: Callable[[Any], Any], jobs: Sequence[Any], workers: int | None
             while waiting or running:
                 while waiting and len(running) < room:
                     index = waiting.popleft()
-                    running[remote.remote(index, function, jobs[index], threads)] = index, time.perf_counter()
+                    answer = remote.remote(index, partial(function, jobs[index]), threads)
+                    running[answer] = index, time.perf_counter()
                 for answer in ray.wait(list(running), num_returns=1)[0]:
                     index, since = running.pop(answer)
                     done, died = _take(ray, answer, index, since)
@@ -90,10 +78,6 @@ def run(function: Callable[[Any], Any], jobs: Sequence[Any], workers: int | None
         finally:
             for answer in running:
                 ray.cancel(answer, force=True)
-
-
-def _perform(index: int, function: Callable[[Any], Any], job: Any, threads: int) -> Done[Any]:
-    return perform(index, partial(function, job), threads)
 
 
 def _room(ray: ModuleType, threads: int) -> int:

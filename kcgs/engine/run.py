@@ -54,19 +54,14 @@ def run_jobs(
     for name, value in (("workers", workers), ("threads", threads)):
         if value is not None and value < 1:
             raise ValueError(f"{name} must be at least 1; got {value}")
-    threads = 1 if threads is None else threads
+    threads = threads or 1
     if engine == "ray":
         from . import cluster
 
         cluster.load()  # at once, not after the caller's preparations
         return cluster.run(function, jobs, workers, threads)
     if workers is None or workers == 1:
-        return _one_after_another(function, jobs, threads)
+        return (perform(index, partial(function, job), threads) for index, job in enumerate(jobs))
     from . import pool
 
     return pool.run(function, jobs, workers, threads)
-
-
-def _one_after_another(function: Callable[[Job], Result], jobs: Sequence[Job], threads: int) -> Iterator[Done[Result]]:
-    for index, job in enumerate(jobs):
-        yield perform(index, partial(function, job), threads)

@@ -55,24 +55,23 @@ def smooth_contours(labels: Tensor, supersample: int = 4, sigma: float = 1.5) ->
         >>> smooth_contours(steps.long(), 4).shape
         torch.Size([48, 96])
     """
-    from scipy.ndimage import gaussian_filter
+    from scipy.ndimage import find_objects, gaussian_filter
 
-    labels = check_labels("labels", labels)
-    if labels.ndim != 2:
-        raise ValueError(f"labels must have shape (H, W); got {tuple(labels.shape)}")
+    labels = check_labels("labels", labels, dims=(2,))
     supersample = check_count("supersample", supersample, 2, 16)
     sigma = check_number("sigma", sigma, 0.0, 8.0, unit="pixels", above=True)
-    fine = labels.cpu().repeat_interleave(supersample, 0).repeat_interleave(supersample, 1).numpy()
+    ids, index = np.unique(labels.cpu().numpy(), return_inverse=True)
+    fine = index.reshape(labels.shape).repeat(supersample, 0).repeat(supersample, 1)
     out, best = fine.copy(), np.zeros(fine.shape, np.float32)
     reach = math.ceil(3 * sigma * supersample)
-    for region in np.unique(fine):
-        inside = fine == region
-        window = _window(inside, reach)
-        share = gaussian_filter(inside[window].astype(np.float32), sigma * supersample, mode="nearest", truncate=3.0)
+    for region, box in enumerate(find_objects(fine + 1)):
+        window = tuple(slice(max(0, side.start - reach), side.stop + reach) for side in box)
+        inside = (fine[window] == region).astype(np.float32)
+        share = gaussian_filter(inside, sigma * supersample, mode="nearest", truncate=3.0)
         better = share > best[window]
         best[window][better] = share[better]
         out[window][better] = region
-    return torch.from_numpy(out).to(labels.device)
+    return torch.from_numpy(ids[out]).to(labels.device)
 
 
 def coverage(labels: Tensor, factor: int) -> Tensor:
@@ -154,20 +153,12 @@ def boundary_f_score(labels: Tensor, reference: Tensor, tolerance: float = 2.0) 
 def edge_alignment(image: Tensor, labels: Tensor) -> Tensor:
     r"""Say how well a map's contours lie on the edges of an image: in [0, 1], 1 on edges, 0.5 by chance.
 
-    The mean of :func:`edge_alignment_map`. Of 51 maps made by people (21 of BSDS500, 30 of DAVIS 2017) 90 % lie
-    between 0.65 and 0.93 and none below 0.63; mirrored, the same maps give 0.44 to 0.54. Below 0.58 a map hardly
-    belongs to the image.
-
-    Args:
-        image: floating, :math:`(C, H, W)` or :math:`(B, C, H, W)`.
-        labels: integer label map, :math:`(H, W)` or :math:`(B, H, W)`, on the device of the image.
+    The mean of :func:`edge_alignment_map`, which says what it takes and raises. Of 51 maps made by people (21 of
+    BSDS500, 30 of DAVIS 2017) 90 % lie between 0.65 and 0.93 and none below 0.63; mirrored, the same maps give 0.44 to
+    0.54. Below 0.58 a map hardly belongs to the image.
 
     Returns:
         0-dim or :math:`(B)`, not differentiable; NaN for a map without contour.
-
-    Raises:
-        TypeError: an argument has another type.
-        ValueError: shapes or devices that do not fit, no pixels, values that are not finite, negative ids.
 
     Example:
         >>> image = torch.zeros(3, 40, 60)
@@ -258,12 +249,3 @@ def _matched(mine: Any, other: Any, tolerance: float) -> tuple[float, float]:
         return float((distance_transform_edt(~those)[these] <= tolerance).mean()) if those.any() else 0.0
 
     return share(mine, other), share(other, mine)
-
-
-def _window(inside: Any, reach: int) -> tuple[slice, slice]:
-    """Bounding box of a mask, grown by `reach`."""
-    spans = []
-    for axis in (1, 0):
-        lines = np.flatnonzero(inside.any(axis))
-        spans.append(slice(max(0, int(lines[0]) - reach), int(lines[-1]) + reach + 1))
-    return spans[0], spans[1]

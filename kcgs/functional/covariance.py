@@ -84,8 +84,7 @@ def cholesky_to_conic(cholesky: Tensor) -> Tensor:
         Conics (A, B, C) with :math:`q = A\,dx^2 + 2 B\,dx\,dy + C\,dy^2`, :math:`(..., 3)`.
 
     Raises:
-        TypeError: not a floating tensor.
-        ValueError: wrong last dimension, not finite, or l11, l22 not positive.
+        TypeError, ValueError: as :func:`cholesky_to_covariance`.
 
     Example:
         >>> cholesky_to_conic(torch.tensor([2.0, 0.0, 4.0]))
@@ -138,8 +137,7 @@ def cholesky_to_scale_rotation(cholesky: Tensor) -> tuple[Tensor, Tensor]:
         towards y in radians, in (-pi/2, pi/2], :math:`(...)`.
 
     Raises:
-        TypeError: not a floating tensor.
-        ValueError: wrong last dimension, not finite, or l11, l22 not positive.
+        TypeError, ValueError: as :func:`cholesky_to_covariance`.
 
     Example:
         >>> scales, angle = cholesky_to_scale_rotation(torch.tensor([1.0, 0.0, 3.0]))
@@ -166,8 +164,7 @@ def support_extent(cholesky: Tensor, cutoff: float = 1e-4) -> Tensor:
         Extents along x and y in pixels, :math:`(..., 2)`.
 
     Raises:
-        TypeError: not a floating tensor.
-        ValueError: wrong last dimension, not finite, l11, l22 not positive, or a cutoff out of range.
+        TypeError, ValueError: as :func:`cholesky_to_covariance`; a cutoff out of range.
 
     Example:
         >>> support_extent(torch.tensor([1.0, 3.0, 4.0]), cutoff=0.01).round(decimals=3)

@@ -1,9 +1,4 @@
-r"""How far an image is from another: PSNR, SSIM and MS-SSIM over the image, PSNR and SSIM along the contours.
-
-Convention: images are :math:`(C, H, W)` or :math:`(B, C, H, W)` with any number of channels, clipped to [0,
-1] before anything else, data range 1. Every metric gives one number per image: 0-dim for an unbatched pair,
-:math:`(B)` for a batch. Half precision is computed and returned in float32; two dtypes meet in the wider one.
-"""
+"""How far an image is from another: PSNR, SSIM and MS-SSIM over the image, PSNR and SSIM along the contours."""
 
 from __future__ import annotations
 
@@ -28,10 +23,11 @@ _MS_SSIM_SIDE = (_WINDOW - 1) * 2 ** (len(_SCALE_WEIGHTS) - 1) + 1
 def psnr(image: Tensor, target: Tensor) -> Tensor:
     r"""Peak signal-to-noise ratio: :math:`-10 \log_{10}` of the mean squared error over pixels and channels.
 
-    Convention: both clipped to [0, 1], data range 1. Differentiable, except between identical images.
+    Convention, of all metrics: both are clipped to [0, 1], data range 1; one number per image. Half precision is
+    computed and returned in float32; two dtypes meet in the wider one. Differentiable, except between identical images.
 
     Args:
-        image: floating, :math:`(C, H, W)` or :math:`(B, C, H, W)`.
+        image: floating, :math:`(C, H, W)` or :math:`(B, C, H, W)`, any number of channels.
         target: same shape and device.
 
     Returns:
@@ -39,36 +35,25 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
 
     Raises:
         TypeError: not floating tensors.
-        ValueError: shapes or devices that differ, not 3 or 4 dimensions, no pixels, values that are not
-            finite.
+        ValueError: shapes or devices that differ, not 3 or 4 dimensions, no pixels, values that are not finite.
 
     Example:
         >>> psnr(torch.full((3, 8, 8), 0.6), torch.full((3, 8, 8), 0.5))
         tensor(20.0000)
     """
     image, target, batched = _check_pair(image, target)
-    return _per_image(_decibels((image - target).square().flatten(1).mean(1)), batched)
+    return _per_image(-10.0 * torch.log10((image - target).square().flatten(1).mean(1)), batched)
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     r"""Structural similarity: 11 x 11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03.
 
-    Convention: both clipped to [0, 1], data range 1; the mean over channels and over the positions where the
-    window lies inside the image, without padding. Differentiable. On CUDA float32 is computed in float64,
-    since the TF32 that convolutions may use there has too few digits for SSIM (errors up to 0.03 on
-    photographs).
-
-    Args:
-        image: floating, :math:`(C, H, W)` or :math:`(B, C, H, W)`.
-        target: same shape and device.
+    Convention: arguments, range and errors are those of :func:`psnr`; the mean over channels and over the positions
+    where the window lies inside the image, without padding. Differentiable. On CUDA float32 is computed in float64,
+    since the TF32 that convolutions may use there has too few digits for SSIM (errors up to 0.03 on photographs).
 
     Returns:
         In [-1, 1], 0-dim or :math:`(B)`. NaN, with a RuntimeWarning, where a side is below 11 pixels.
-
-    Raises:
-        TypeError: not floating tensors.
-        ValueError: shapes or devices that differ, not 3 or 4 dimensions, no pixels, values that are not
-            finite.
 
     Example:
         >>> stripes = torch.arange(256.0).reshape(1, 16, 16) % 2
@@ -87,23 +72,14 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
     r"""Multi-scale structural similarity over 5 scales with the published weights.
 
-    Convention: both clipped to [0, 1], data range 1; the window of :func:`ssim`, without padding; channels
-    apart, then averaged. A scale whose mean term is below zero counts as zero, since a fractional power of it
-    does not exist; the gradient is not finite there. Between scales 2 x 2 pixels are averaged, and a last row
-    or column without a partner with itself, as in the authors' program. pytorch-msssim pairs the first and
-    last with black: the same where every halved side is even, else up to 0.004 away (measured at 201 x 333).
-
-    Args:
-        image: floating, :math:`(C, H, W)` or :math:`(B, C, H, W)`.
-        target: same shape and device.
+    Convention: arguments, range and errors are those of :func:`psnr`, the window that of :func:`ssim`, without padding;
+    channels apart, then averaged. A scale whose mean term is below zero counts as zero, since a fractional power of it
+    does not exist; the gradient is not finite there. Between scales 2 x 2 pixels are averaged, and a last row or column
+    without a partner with itself, as in the authors' program. pytorch-msssim pairs the first and last with black: the
+    same where every halved side is even, else up to 0.004 away (measured at 201 x 333).
 
     Returns:
         In [0, 1], 0-dim or :math:`(B)`. NaN, with a RuntimeWarning, where a side is below 161 pixels.
-
-    Raises:
-        TypeError: not floating tensors.
-        ValueError: shapes or devices that differ, not 3 or 4 dimensions, no pixels, values that are not
-            finite.
 
     Example:
         >>> ramp = torch.linspace(0, 1, 161).expand(1, 161, 161)
@@ -120,7 +96,7 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
     image, target = image.flatten(0, 1)[:, None], target.flatten(0, 1)[:, None]
     product = image.new_ones(batch * channels)
     for weight in _SCALE_WEIGHTS[:-1]:
-        product = product * _contrast_structure(image, target).relu() ** weight
+        product = product * _ssim_map(image, target, contrast=True).relu() ** weight
         image, target = _halve(image), _halve(target)
     product = product * _valid_mean(_ssim_map(image, target)).relu() ** _SCALE_WEIGHTS[-1]
     return _per_image(product.reshape(batch, channels).mean(1), batched)
@@ -129,7 +105,7 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
 def ef_psnr(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> Tensor:
     r"""Edge-focused PSNR: the mean squared error is taken over the band along the contours only.
 
-    Convention: both clipped to [0, 1], data range 1; the band is :func:`edge_band`.
+    Convention: the range is that of :func:`psnr`, the band is :func:`edge_band`.
 
     Args:
         image: floating, :math:`(C, H, W)` or :math:`(B, C, H, W)`.
@@ -142,9 +118,7 @@ def ef_psnr(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> 
         label map has one region and so no band.
 
     Raises:
-        TypeError: not floating images or not an integer label map.
-        ValueError: shapes or devices that differ, no pixels, values that are not finite, negative ids, width
-            below 1.
+        TypeError, ValueError: as :func:`psnr` and :func:`edge_band`; labels of another size or device.
 
     Example:
         >>> labels = (torch.arange(20) >= 10).long().expand(20, 20)
@@ -157,30 +131,18 @@ def ef_psnr(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> 
     """
     image, target, batched = _check_pair(image, target)
     band = _check_band("ef_psnr", image, labels, width)
-    return _per_image(_decibels(_band_mean((image - target).square(), band)), batched)
+    return _per_image(-10.0 * torch.log10(_band_mean((image - target).square(), band)), batched)
 
 
 def ef_ssim(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> Tensor:
     r"""Edge-focused SSIM: the mean of the SSIM map over the band along the contours only.
 
-    Convention: both clipped to [0, 1], data range 1; the window of :func:`ssim`, and a map as large as the
-    image, which is mirrored at its border for that (border pixel not repeated); the band is
-    :func:`edge_band`.
-
-    Args:
-        image: floating, :math:`(C, H, W)` or :math:`(B, C, H, W)`.
-        target: same shape and device.
-        labels: integer label map on the same device, :math:`(H, W)` for every image or :math:`(B, H, W)`.
-        width: of the band on either side in pixels, at least 1.
+    Convention: arguments, band and errors are those of :func:`ef_psnr`, the window that of :func:`ssim`, and the map as
+    large as the image, which is mirrored at its border for that (border pixel not repeated).
 
     Returns:
-        In [-1, 1], 0-dim or :math:`(B)`. NaN, with a RuntimeWarning, where a side is below 11 pixels or the
-        label map has one region and so no band.
-
-    Raises:
-        TypeError: not floating images or not an integer label map.
-        ValueError: shapes or devices that differ, no pixels, values that are not finite, negative ids, width
-            below 1.
+        In [-1, 1], 0-dim or :math:`(B)`. NaN, with a RuntimeWarning, where a side is below 11 pixels or the label map
+        has one region and so no band.
 
     Example:
         >>> labels = (torch.arange(40) >= 20).long().expand(20, 40)
@@ -244,10 +206,6 @@ def _per_image(values: Tensor, batched: bool) -> Tensor:
     return values if batched else values[0]
 
 
-def _decibels(mse: Tensor) -> Tensor:
-    return -10.0 * torch.log10(mse)
-
-
 def _band_mean(values: Tensor, band: Tensor) -> Tensor:
     # an empty band gives 0 / 0, the NaN that was announced
     count = band.sum((1, 2, 3)) * values.shape[1]
@@ -264,18 +222,8 @@ def _halve(image: Tensor) -> Tensor:
     return avg_pool2d(pad(image, (0, width % 2, 0, height % 2), mode="replicate"), 2)
 
 
-def _ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """SSIM at every pixel, (B, C, H, W)."""
-    return _torchmetrics_ssim(image, target, return_full_image=True)
-
-
-def _contrast_structure(image: Tensor, target: Tensor) -> Tensor:
-    """Product of contrast and structure, mean over channels and the valid area, (B)."""
-    return _torchmetrics_ssim(image, target, return_contrast_sensitivity=True)
-
-
-def _torchmetrics_ssim(image: Tensor, target: Tensor, **what: bool) -> Tensor:
-    """Return the second of the two results that torchmetrics gives when asked for `what`."""
+def _ssim_map(image: Tensor, target: Tensor, *, contrast: bool = False) -> Tensor:
+    """SSIM at every pixel, (B, C, H, W); or of contrast and structure alone the mean over the valid area, (B)."""
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     # variances are differences of near-equal convolutions and need every digit: neither TF32 nor autocast
@@ -290,6 +238,7 @@ def _torchmetrics_ssim(image: Tensor, target: Tensor, **what: bool) -> Tensor:
             data_range=1.0,
             k1=0.01,
             k2=0.03,
-            **what,
+            return_full_image=not contrast,
+            return_contrast_sensitivity=contrast,
         )
     return result[1].to(image.dtype)

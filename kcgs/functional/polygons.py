@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcgs._check import check_count, check_floating, check_size, check_tensor
+from kcgs._check import check_count, check_floating, check_size
 
 _MOST_LABELS = 16384  # along a side, times the supersample
 
@@ -99,7 +99,7 @@ def _check_polygons(polygons: Tensor | Sequence[Tensor]) -> list[Tensor]:
     if not outlines:
         raise ValueError("polygons must hold at least one polygon; got none")
     for outline in outlines:
-        check_floating("polygons", check_tensor("polygons", outline), last=2, dims=(2,))
+        check_floating("polygons", outline, last=2, dims=(2,))
         if len(outline) < 3:
             raise ValueError(f"polygons must have at least 3 vertices each; got shape {tuple(outline.shape)}")
         if outline.dtype != outlines[0].dtype or outline.device != outlines[0].device:

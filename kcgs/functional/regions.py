@@ -71,12 +71,16 @@ class RegionMap:
             (tensor([[1, 1]]), 2)
         """
         labels = check_labels("labels", labels)
-        supersample = _check_supersample(supersample, labels)
+        supersample = check_count("supersample", supersample)
+        if labels.shape[-2] % supersample or labels.shape[-1] % supersample:
+            raise ValueError(
+                f"labels must have sides that supersample, {supersample}, divides; got {tuple(labels.shape)}"
+            )
         ids, index, table = compact(labels)
         width = check_softness(softness, ids)
         by_index: float | Mapping[tuple[int, int], float] = width
         if isinstance(width, PairWidths):
-            position = {region: at for at, region in enumerate(ids.tolist())}
+            position = {region: place for place, region in enumerate(ids.tolist())}
             by_index = {(position[a], position[b]): value for (a, b), value in width.items()}
         index = index if index.ndim == 3 else index[None]
         coarse = index if supersample == 1 else largest_share(index, supersample)
@@ -308,10 +312,3 @@ class RegionMap:
             _table=self._table,
             _origin=self,
         )
-
-
-def _check_supersample(supersample: object, labels: Tensor) -> int:
-    count = check_count("supersample", supersample)
-    if labels.shape[-2] % count or labels.shape[-1] % count:
-        raise ValueError(f"labels must have sides that supersample, {count}, divides; got {tuple(labels.shape)}")
-    return count

@@ -45,7 +45,7 @@ class PairWidths(Mapping[tuple[int, int], float]):
 def check_softness(softness: object, ids: Tensor) -> float | PairWidths:
     """Return the width if all pairs have the same, else the widths of pairs."""
     if not isinstance(softness, Mapping):
-        return _check_width("softness", softness)
+        return check_number("softness", softness, 0.0, MAX_SOFTNESS, unit="pixels")
     known: set[int] = set(ids.tolist())
     widths: dict[tuple[int, int], float] = {}
     for pair, value in softness.items():
@@ -56,14 +56,10 @@ def check_softness(softness: object, ids: Tensor) -> float | PairWidths:
             raise ValueError(f"softness must map pairs of two different ids in the map; got {pair!r}")
         if (low, high) in widths:
             raise ValueError(f"softness must name a pair once; got {(low, high)} and {(high, low)}")
-        widths[low, high] = _check_width(f"softness of {pair}", value)
+        widths[low, high] = check_number(f"softness of {pair}", value, 0.0, MAX_SOFTNESS, unit="pixels")
     every_pair = len(widths) == len(known) * (len(known) - 1) // 2
     distinct = {*widths.values()} | (set() if every_pair else {0.0})
     return PairWidths(widths) if len(distinct) > 1 else distinct.pop() if distinct else 0.0
-
-
-def _check_width(name: str, value: object) -> float:
-    return check_number(name, value, 0.0, MAX_SOFTNESS, unit="pixels")
 
 
 def scaled_widths(softness: float | PairWidths, scale: float) -> float | PairWidths:

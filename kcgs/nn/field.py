@@ -144,16 +144,10 @@ class GaussianField(nn.Module):
         return field if regions is None else field.assign_regions(regions)
 
     def assign_regions(self, regions: RegionMap | Tensor) -> GaussianField:
-        """Give every Gaussian the region under its centre, in place.
+        """Give every Gaussian the region under its centre, in place, and return the field.
 
         Args:
             regions: label map of the field's size, or a RegionMap of one.
-
-        Returns:
-            The field itself.
-
-        Raises:
-            TypeError, ValueError: not a label map of this size.
         """
         labels = regions.labels if isinstance(regions, RegionMap) else regions
         ids = lookup_regions(self.means, labels)
@@ -163,13 +157,10 @@ class GaussianField(nn.Module):
         return self
 
     def subset(self, mask: Tensor) -> GaussianField:
-        """Copy the Gaussians that `mask` selects.
+        """Copy the Gaussians that `mask` selects into a new field of unbatched parameters, without the graph.
 
         Args:
             mask: boolean (N), or integer indices (K).
-
-        Returns:
-            A new field of unbatched parameters, without the graph.
 
         Raises:
             TypeError: neither boolean nor integer.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcgs._check import as_image, check_count, check_labels
 from kcgs.functional import contour_edges
-from kcgs.functional.labels import compact
+from kcgs.functional.labels import compact, unique_pairs
 
 # By how much values may pass [0, 1], as resizing and colour conversion leave them.
 _TOLERANCE = 1e-3
@@ -77,8 +77,7 @@ def merge_small(labels: Tensor, min_size: int) -> Tensor:
         :math:`(H, W)` int64; remaining pieces keep their ids.
 
     Raises:
-        TypeError, ValueError: ``labels`` is no integer map (H, W) of non-negative ids, or is empty; ``min_size`` is no
-            integer of at least 1.
+        TypeError, ValueError: as `connected_regions`; ``min_size`` is no integer of at least 1.
 
     Example:
         >>> merge_small(torch.tensor([[3, 3, 3, 8], [3, 1, 3, 8]]), min_size=2).tolist()
@@ -92,9 +91,9 @@ def merge_small(labels: Tensor, min_size: int) -> Tensor:
     heapq.heapify(queue)
     while queue:
         area, piece = heapq.heappop(queue)
-        if graph.is_merged(piece) or area != graph.areas[piece] or not graph.borders[piece]:
-            continue
         borders = graph.borders[piece]
+        if area != graph.areas[piece] or not borders:  # an entry of before a merge
+            continue
         target = max(borders, key=lambda other: (borders[other], graph.areas[other], -other))
         graph.merge(piece, target)
         if graph.areas[target] < min_size:
@@ -118,8 +117,7 @@ def merge_similar(image: Any, labels: Tensor, max_regions: int | None) -> Tensor
         :math:`(H, W)` int64; a merged region has the id of its largest part.
 
     Raises:
-        TypeError: an argument has another type.
-        ValueError: ``image`` and ``labels`` differ in size, or a number is out of its range.
+        TypeError, ValueError: as `connected_regions`; ``image`` is none, of another size, or a number out of its range.
 
     Example:
         >>> image = torch.tensor([[[0.0, 0.1, 0.9]]])
@@ -142,27 +140,16 @@ def clean(labels: Tensor, min_size: int) -> Tensor:
 
 
 class RegionGraph:
-    """Which regions touch and along how many pixel sides, kept up to date while regions merge.
-
-    Args:
-        labels: (H, W) with every id from 0 to R - 1 in use.
-    """
+    """Which of the regions 0 to R - 1 touch and along how many pixel sides, kept up to date while regions merge."""
 
     def __init__(self, labels: Labels) -> None:
         """Count areas and shared sides."""
         self.areas: Labels = np.bincount(labels.ravel())
-        count = len(self.areas)
-        self.borders: list[dict[int, int]] = [{} for _ in range(count)]
-        self._parents = np.arange(count)
-        pairs = contour_edges(torch.from_numpy(labels))[0].numpy()
-        keys, lengths = np.unique(pairs[:, 0] * count + pairs[:, 1], return_counts=True)
-        for key, length in zip(keys.tolist(), lengths.tolist(), strict=True):
-            a, b = divmod(key, count)
+        self.borders: list[dict[int, int]] = [{} for _ in self.areas]
+        self._parents = np.arange(len(self.areas))
+        pairs, _, lengths = unique_pairs(contour_edges(torch.from_numpy(labels))[0])
+        for (a, b), length in zip(pairs.tolist(), lengths.tolist(), strict=True):
             self.borders[a][b] = self.borders[b][a] = length
-
-    def is_merged(self, region: int) -> bool:
-        """Say whether ``region`` went into another."""
-        return bool(self._parents[region] != region)
 
     def merge(self, source: int, target: int) -> None:
         """Let ``target`` take in its neighbour ``source``."""
@@ -189,7 +176,7 @@ def _merge_nearest(graph: RegionGraph, sums: Colors, max_regions: int) -> None:
     def distance(a: int, b: int) -> float:
         return float(np.linalg.norm(sums[a] / graph.areas[a] - sums[b] / graph.areas[b]))
 
-    # Distances change with every merge; entries of an earlier state are told by the regions' areas.
+    # Distances change with every merge; entries of before one are told by the regions' borders and areas.
     queue = [
         (distance(a, b), a, b, graph.areas[a], graph.areas[b])
         for a, others in enumerate(graph.borders)
@@ -200,7 +187,7 @@ def _merge_nearest(graph: RegionGraph, sums: Colors, max_regions: int) -> None:
     count = len(graph.areas)
     while count > max_regions:
         _, a, b, area_a, area_b = heapq.heappop(queue)
-        if graph.is_merged(a) or graph.is_merged(b) or (area_a, area_b) != (graph.areas[a], graph.areas[b]):
+        if b not in graph.borders[a] or (area_a, area_b) != (graph.areas[a], graph.areas[b]):
             continue
         source, target = (a, b) if area_a < area_b else (b, a)
         graph.merge(source, target)
@@ -233,8 +220,7 @@ def _components(regions: Labels) -> Labels:
     """Return the 4-connected pieces, numbered from 0 in raster order."""
     from skimage.measure import label
 
-    # Shifted to 1 and up: everything is foreground for the labelling, id 0 included.
-    return np.asarray(label(regions + 1, background=0, connectivity=1), dtype=np.int64) - 1
+    return np.asarray(label(regions, background=-1, connectivity=1), dtype=np.int64) - 1
 
 
 def to_regions(labels: Tensor) -> tuple[Labels, Labels]:

@@ -14,12 +14,7 @@ _LONGEST = 240  # Of an error's line: libraries list every weight.
 
 
 def load_pretrained(class_name: str, model: Any, device: torch.device) -> Any:
-    """Return a model of transformers in evaluation mode, from a folder, a hub id, or loaded already.
-
-    Raises:
-        FileNotFoundError: ``model`` can only be a folder, and there is none.
-        ValueError: it cannot be loaded, or the folder's weights do not fill the model.
-    """
+    """Return a model of transformers in evaluation mode, from a folder, a hub id, or loaded already."""
     import transformers
 
     if isinstance(model, torch.nn.Module):

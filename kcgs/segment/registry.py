@@ -59,8 +59,7 @@ class Cleanup:
         max_regions: the most similar neighbours merge (`merge_similar`) until so many are left; None leaves all.
 
     Raises:
-        TypeError: an option has another type.
-        ValueError: a number is out of its range.
+        TypeError, ValueError: an option has another type or is out of its range.
     """
 
     snap: int = 0
@@ -122,9 +121,8 @@ class _Method:
         self.name, self.function, self.cleanup = name, function, cleanup
         signature = inspect.signature(function)
         parameters = [parameter for key, parameter in signature.parameters.items() if key not in _CLEANUP]
-        shared = [
-            inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=getattr(cleanup, key)) for key in _CLEANUP
-        ]
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        shared = [inspect.Parameter(key, keyword, default=getattr(cleanup, key)) for key in _CLEANUP]
         self.shared = [key for key in _CLEANUP if key in signature.parameters]
         self.signature = signature.replace(parameters=[*parameters, *shared], return_annotation=Tensor)
 
@@ -203,12 +201,7 @@ def register(name: str, cleanup: Cleanup | None = None) -> Callable[[Callable[..
 
 
 def available_methods() -> list[str]:
-    """Return the names that `segment` knows, sorted.
-
-    Example:
-        >>> "auto" in available_methods()
-        True
-    """
+    """Return the names that `segment` knows, sorted."""
     return sorted(_methods)
 
 
@@ -242,19 +235,11 @@ def segment(image: Any, method: str = "auto", **options: Any) -> Tensor:
 
 
 def segment_with_scores(image: Any, method: str = "auto", **options: Any) -> Segmentation:
-    """Divide an image into regions by the named method; say how sure it is of each and what it is called.
-
-    Args:
-        image: as `segment` takes it.
-        method: one of `available_methods`.
-        options: keyword arguments of that method, and of clean-up.
+    """Divide an image into regions as `segment` does; say how sure the method is of each and what it is called.
 
     Returns:
         The label map that `segment` returns; a score in [0, 1] for every region, the mean over its pixels of what the
         method states as its score; and a name for every region, a prompt or a class. None where a method has none.
-
-    Raises:
-        TypeError, ValueError, ImportError: as `segment`.
 
     Example:
         >>> image = torch.zeros(3, 40, 60)

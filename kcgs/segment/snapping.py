@@ -35,8 +35,7 @@ def snap_contours(image: Any, labels: Tensor, *, reach: int = 2) -> Tensor:
         :math:`(H, W)` int64 with the ids of ``labels``; a region can come out in several pieces.
 
     Raises:
-        TypeError: an argument has another type.
-        ValueError: ``image`` and ``labels`` differ in size, or ``reach`` is below 1.
+        TypeError, ValueError: as `merge_similar`; ``reach`` is no integer of at least 1.
 
     Example:
         >>> image = torch.zeros(3, 8, 16)

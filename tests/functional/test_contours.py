@@ -43,7 +43,7 @@ def test_flat_maps_and_ids_stay() -> None:
         ({"supersample": 1}, r"supersample must be in \[2, 16\]; got 1"),
         ({"supersample": 2.0}, "supersample must be an integer"),
         ({"sigma": 0.0}, "sigma must be in"),
-        ({"labels": torch.zeros(1, 4, 4).long()}, "labels must have shape"),
+        ({"labels": torch.zeros(1, 4, 4).long()}, "labels must have 2 dimensions"),
         ({"labels": -torch.ones(4, 4).long()}, "labels"),
     ],
 )

@@ -46,14 +46,8 @@ def auto(image: Tensor, *, min_size: int) -> Tensor:
     loses 0.65 dB to Gaussians of as many bytes where a map is stored as lossless WebP (`kcgs bench maps`).
 
     Args:
-        image: as `segment` takes it, any size.
+        image: as `segment` takes it, any size; result and errors are those of `segment` too.
         min_size: of `Cleanup`, as are ``max_regions``, ``snap`` and ``connected``.
-
-    Returns:
-        The label map that `segment` returns.
-
-    Raises:
-        TypeError, ValueError: as `segment`.
 
     Example:
         >>> image = torch.zeros(3, 40, 60)
@@ -77,16 +71,10 @@ def felzenszwalb(image: Tensor, *, scale: float = 300.0, sigma: float = 1.0, min
     """Segment by the graph-based method of Felzenszwalb and Huttenlocher (IJCV 2004), in CIE Lab.
 
     Args:
-        image: as `segment` takes it.
+        image: as `segment` takes it; result and errors are those of `segment` too.
         scale: preference for larger regions, above 0. The same value suits a photo at any size.
         sigma: standard deviation of the smoothing beforehand, in pixels, at least 0.
         min_size: of `Cleanup`, as are ``max_regions``, ``snap`` and ``connected``.
-
-    Returns:
-        The label map that `segment` returns.
-
-    Raises:
-        TypeError, ValueError: as `segment`; a number is out of its range.
 
     Example:
         >>> image = torch.zeros(1, 20, 30)
@@ -114,16 +102,10 @@ def slic(image: Tensor, *, num_segments: int = 400, compactness: float = 10.0, m
     Regions come out of similar size; `auto` follows objects better.
 
     Args:
-        image: as `segment` takes it.
+        image: as `segment` takes it; result and errors are those of `segment` too.
         num_segments: about how many superpixels to merge, at least 1.
         compactness: weight of position against colour, above 0.
         max_regions: of `Cleanup`, as are ``min_size``, ``snap`` and ``connected``.
-
-    Returns:
-        The label map that `segment` returns.
-
-    Raises:
-        TypeError, ValueError: as `segment`; a number is out of its range.
 
     Example:
         >>> image = torch.zeros(3, 20, 30)

@@ -35,18 +35,12 @@ def watershed(
     photos of BSDS500, 0.53 of the contours lie within 3 pixels of human ones, and 0.46 of the human ones are found.
 
     Args:
-        image: as `segment` takes it.
+        image: as `segment` takes it; result and errors are those of `segment` too.
         sigma: standard deviation of the smoothing beforehand, in pixels, at least 0.
         depth: in Lab units per pixel, at least 0; lower: more basins to merge.
         num_segments: about how many basins to merge, at least 1, the deepest; None: as many as ``depth`` gives.
         min_size: of `Cleanup`, as are ``max_regions``, ``snap`` and ``connected``.
         max_regions: of `Cleanup`.
-
-    Returns:
-        The label map that `segment` returns.
-
-    Raises:
-        TypeError, ValueError: as `segment`; a number is out of its range.
 
     Example:
         >>> image = torch.zeros(3, 20, 30)

@@ -29,16 +29,10 @@ def kmeans(image: Tensor, *, num_clusters: int | None = None, sigma: float = 1.0
     photos of BSDS500, 0.37 of the contours lie within 3 pixels of human ones, and 0.63 of the human ones are found.
 
     Args:
-        image: as `segment` takes it.
+        image: as `segment` takes it; result and errors are those of `segment` too.
         num_clusters: k, at least 1; None: the fewest, at most 8, that leave a tenth of the colours' variance.
         sigma: standard deviation of the smoothing beforehand, in pixels, at least 0.
         min_size: of `Cleanup`, as are ``max_regions``, ``snap`` and ``connected``.
-
-    Returns:
-        The label map that `segment` returns.
-
-    Raises:
-        TypeError, ValueError: as `segment`; a number is out of its range.
 
     Example:
         >>> image = torch.zeros(3, 20, 30)

@@ -16,16 +16,12 @@ def file(image: Tensor, *, path: str | os.PathLike[str]) -> Tensor:
     Unless asked, nothing is cleaned: no piece is too small, and a label in several pieces is one region.
 
     Args:
-        image: as `segment` takes it.
+        image: as `segment` takes it; the result is that of `segment` too.
         path: what `kcgs.data.load_labels` reads.
-
-    Returns:
-        The label map that `segment` returns.
 
     Raises:
         FileNotFoundError: ``path`` does not exist.
-        TypeError: an argument has another type.
-        ValueError: the file is no label map or has another size than the image.
+        TypeError, ValueError: as `segment`; the file is no label map or has another size than the image.
 
     Example:
         >>> import tempfile, torch
@@ -49,19 +45,15 @@ def davis(
     Unless asked, nothing is cleaned: no piece is too small, and an object in several pieces is one region.
 
     Args:
-        image: as `segment` takes it, the frame.
+        image: as `segment` takes it, the frame; the result is that of `segment` too.
         root: the folder that holds ``JPEGImages`` and ``Annotations``.
         sequence: its name.
         frame: its number; 0 is the first.
         resolution: the folder below these two.
 
-    Returns:
-        The label map that `segment` returns.
-
     Raises:
         FileNotFoundError: ``root`` has another layout, or the frame is missing.
-        TypeError: an argument has another type.
-        ValueError: there is no such sequence, or its annotation has another size than the image.
+        TypeError, ValueError: as `segment`; no such sequence, or an annotation of another size than the image.
 
     Example:
         ``segment(Davis(root)["cows"].image, "davis", root=root, sequence="cows")``

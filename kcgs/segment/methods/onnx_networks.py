@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import check_number, check_numbers, check_size
+from kcgs._check import check_floating, check_number, check_numbers, check_size
 from kcgs.segment.networks import IMAGENET_MEAN, IMAGENET_STD, first_line, largest_map, preprocess
 from kcgs.segment.registry import Prediction, register
 
@@ -71,9 +71,8 @@ def onnx(
 
     Raises:
         FileNotFoundError: ``model`` does not exist.
-        TypeError: an argument has another type.
-        ValueError: an argument is out of its range, ``model`` is no such network or does not run, or its output is not
-            of ``kind``.
+        TypeError, ValueError: as `segment`; an argument is out of its range, ``model`` is no such network or does not
+            run, or its output is not of ``kind``.
 
     Example:
         ``segment(image, "onnx", model="u2netp.onnx")`` puts the salient object and the rest apart (U-2-Net,
@@ -121,13 +120,11 @@ def lseg(
         names: of the classes, one for each embedding, or a text file with one on each line.
 
     Returns:
-        The label map that `segment` returns, of the classes of largest cosine similarity; `segment_with_scores` adds
-        :math:`(R,)` scores, and each region's name where there are ``names``.
+        As `onnx`, the classes being those of largest cosine similarity.
 
     Raises:
         FileNotFoundError: a file does not exist.
-        TypeError: an argument has another type.
-        ValueError: an argument is out of its range, a file cannot be read, or features and embeddings differ in length.
+        TypeError, ValueError: as `segment`; a file cannot be read, or features and embeddings differ in length.
 
     Example:
         ``segment(image, "lseg", model="lseg.onnx", embeddings="dog-grass-other.npy")``
@@ -293,6 +290,4 @@ def _embeddings(embeddings: str | os.PathLike[str] | NDArray[Any]) -> Tensor:
         values = np.asarray(embeddings)
     if not isinstance(values, np.ndarray) or values.dtype.kind != "f" or values.ndim != 2 or values.size == 0:
         raise ValueError(f"embeddings must be a floating array (K, D); got {getattr(values, 'shape', values)}")
-    if not np.isfinite(values).all():
-        raise ValueError("embeddings must be finite")
-    return torch.from_numpy(values.astype(np.float32))
+    return check_floating("embeddings", torch.from_numpy(values.astype(np.float32)))

@@ -48,8 +48,7 @@ def dino(
 
     Raises:
         FileNotFoundError: ``model`` is the path of a folder that is not there.
-        TypeError: an argument has another type.
-        ValueError: an argument is out of its range, or ``model`` cannot be loaded or has no patches.
+        TypeError, ValueError: as `segment`; ``model`` cannot be loaded or has no patches.
 
     Example:
         ``segment(image, "dino", model="facebook/dinov2-small", num_clusters=6)``

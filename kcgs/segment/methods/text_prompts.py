@@ -45,8 +45,7 @@ def text(
 
     Raises:
         FileNotFoundError: ``model`` is the path of a folder that is not there.
-        TypeError: an argument has another type.
-        ValueError: an argument is out of its range, or ``model`` cannot be loaded.
+        TypeError, ValueError: as `segment`; an argument is out of its range, or ``model`` cannot be loaded.
 
     Example:
         ``segment(image, "text", prompts=["a cat", "a sofa", "the wall"])``
