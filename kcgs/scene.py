@@ -32,8 +32,7 @@ class Scene(nn.Module):
         metadata: notes, str to str, which files keep.
 
     Raises:
-        TypeError: an argument of the wrong type.
-        ValueError: no label map.
+        TypeError, ValueError: an argument of the wrong type; no label map.
 
     Example:
         >>> labels = (torch.arange(48) >= 24).long().expand(32, 48)

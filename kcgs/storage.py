@@ -118,11 +118,6 @@ def _assemble(tensors: dict[str, Tensor], notes: Mapping[str, str]) -> Scene:
         allowed = _PACKED if name in _INTEGER else _FLOATS
         if tensor.dtype not in allowed:
             raise ValueError(f"{name} must have a dtype among {allowed}; got {tensor.dtype}")
-    lead = tensors["means"].shape[:-1]
-    for name in ("cholesky", "colors"):
-        shape = tensors[name].shape
-        if shape[:-1] != lead or shape[-1] == 0:
-            raise ValueError(f"{name} must have shape {(*lead, '...')} to fit means; got {tuple(shape)}")
     integers = {name: tensors[name].to(torch.int64, copy=True) for name in _INTEGER if name in tensors}
     size = _read_side("height", notes), _read_side("width", notes)
     field = GaussianField(

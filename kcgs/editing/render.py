@@ -30,8 +30,7 @@ def render_region(scene: Scene, region_ids: int | Iterable[int], size: tuple[int
         RGBA, :math:`(4, H, W)`; :math:`(C + 1, H, W)` for C channels.
 
     Raises:
-        TypeError: wrong types.
-        ValueError: a batch, no map or one of another size, an unknown id.
+        TypeError, ValueError: wrong types; a batch, no map or one of another size, an unknown id.
 
     Example:
         >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])

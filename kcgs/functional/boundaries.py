@@ -47,8 +47,7 @@ def smooth_contours(labels: Tensor, supersample: int = 4, sigma: float = 1.5) ->
         int64, :math:`(kH, kW)`.
 
     Raises:
-        TypeError: labels are not an integer tensor.
-        ValueError: wrong shape, negative ids, a number out of range.
+        TypeError, ValueError: labels are not an integer tensor; wrong shape, negative ids, a number out of range.
 
     Example:
         >>> steps = torch.arange(24)[None] > 2 * torch.arange(12)[:, None]
@@ -202,9 +201,8 @@ def edge_alignment_map(image: Tensor, labels: Tensor) -> Tensor:
             f"labels must have the size and device of the image, {tuple(image.shape)} on {image.device}; got "
             f"{tuple(labels.shape)} on {labels.device}"
         )
-    batch = image if image.ndim == 4 else image[None]
-    maps = labels if labels.ndim == 3 else labels[None]
-    edges = _edges(batch if batch.dtype == torch.float64 else batch.float())
+    maps = labels.reshape(-1, *labels.shape[-2:])
+    edges = _edges(image.reshape(-1, *image.shape[-3:]).to(torch.promote_types(image.dtype, torch.float32)))
     ranks = [_ranks(edge, edge_band(each, 1), edge_band(each, _GAP)) for edge, each in zip(edges, maps, strict=True)]
     return torch.stack(ranks).reshape(labels.shape)
 

@@ -31,8 +31,7 @@ def cholesky_to_covariance(cholesky: Tensor) -> Tensor:
         Covariances in square pixels, :math:`(..., 2, 2)`.
 
     Raises:
-        TypeError: not a floating tensor.
-        ValueError: wrong last dimension, not finite, or l11, l22 not positive.
+        TypeError, ValueError: not a floating tensor; wrong last dimension, not finite, or l11, l22 not positive.
 
     Example:
         >>> cholesky_to_covariance(torch.tensor([2.0, 1.0, 3.0]))
@@ -56,8 +55,7 @@ def covariance_to_cholesky(covariance: Tensor) -> Tensor:
         Factors in pixels, :math:`(..., 3)`.
 
     Raises:
-        TypeError: not a floating tensor.
-        ValueError: wrong shape, not finite, or not positive definite.
+        TypeError, ValueError: not a floating tensor; wrong shape, not finite, or not positive definite.
 
     Example:
         >>> covariance_to_cholesky(torch.tensor([[4.0, 2.0], [2.0, 10.0]]))
@@ -78,13 +76,10 @@ def cholesky_to_conic(cholesky: Tensor) -> Tensor:
     r"""Invert the covariance: the conic :math:`\Sigma^{-1} = L^{-T} L^{-1}`, formed from L without subtraction.
 
     Args:
-        cholesky: factors in pixels, :math:`(..., 3)`.
+        cholesky: factors in pixels, :math:`(..., 3)`, as :func:`cholesky_to_covariance` takes them.
 
     Returns:
         Conics (A, B, C) with :math:`q = A\,dx^2 + 2 B\,dx\,dy + C\,dy^2`, :math:`(..., 3)`.
-
-    Raises:
-        TypeError, ValueError: as :func:`cholesky_to_covariance`.
 
     Example:
         >>> cholesky_to_conic(torch.tensor([2.0, 0.0, 4.0]))
@@ -106,8 +101,7 @@ def scale_rotation_to_cholesky(scales: Tensor, angle: Tensor) -> Tensor:
         Factors in pixels, :math:`(..., 3)`.
 
     Raises:
-        TypeError: not floating tensors.
-        ValueError: wrong shape, not finite, or a scale that is not positive.
+        TypeError, ValueError: not floating tensors; wrong shape, not finite, or a scale that is not positive.
 
     Example:
         >>> scale_rotation_to_cholesky(torch.tensor([3.0, 1.0]), torch.tensor(0.0))
@@ -130,14 +124,11 @@ def cholesky_to_scale_rotation(cholesky: Tensor) -> tuple[Tensor, Tensor]:
     r"""Find the axes of the ellipse.
 
     Args:
-        cholesky: factors in pixels, :math:`(..., 3)`.
+        cholesky: factors in pixels, :math:`(..., 3)`, as :func:`cholesky_to_covariance` takes them.
 
     Returns:
         Standard deviations (largest first) in pixels :math:`(..., 2)`, and the angle of the first axis from x
         towards y in radians, in (-pi/2, pi/2], :math:`(...)`.
-
-    Raises:
-        TypeError, ValueError: as :func:`cholesky_to_covariance`.
 
     Example:
         >>> scales, angle = cholesky_to_scale_rotation(torch.tensor([1.0, 0.0, 3.0]))
@@ -157,14 +148,11 @@ def support_extent(cholesky: Tensor, cutoff: float = 1e-4) -> Tensor:
     r"""Half the width and height of the box outside which a Gaussian's weight is below `cutoff`.
 
     Args:
-        cholesky: factors in pixels, :math:`(..., 3)`.
+        cholesky: factors in pixels, :math:`(..., 3)`, as :func:`cholesky_to_covariance` takes them.
         cutoff: weight in [0, 1); 0: where the weight is zero in the dtype.
 
     Returns:
         Extents along x and y in pixels, :math:`(..., 2)`.
-
-    Raises:
-        TypeError, ValueError: as :func:`cholesky_to_covariance`; a cutoff out of range.
 
     Example:
         >>> support_extent(torch.tensor([1.0, 3.0, 4.0]), cutoff=0.01).round(decimals=3)

@@ -24,8 +24,7 @@ def lookup_regions(means: Tensor, labels: Tensor) -> Tensor:
         Ids, int64, :math:`(N,)` or :math:`(B, N)`.
 
     Raises:
-        TypeError: wrong dtype.
-        ValueError: wrong shapes, values that are not finite, negative ids.
+        TypeError, ValueError: wrong dtype; wrong shapes, values that are not finite, negative ids.
 
     Example:
         >>> lookup_regions(torch.tensor([[0.2, 0.9], [5.0, -3.0]]), torch.tensor([[1, 2], [3, 4]]))
@@ -62,8 +61,7 @@ def edge_band(labels: Tensor, width: float = 5) -> Tensor:
         Boolean, shape of `labels`; all False where there is one region.
 
     Raises:
-        TypeError: labels are not integer.
-        ValueError: wrong shape, negative ids, width below 1 or not finite.
+        TypeError, ValueError: labels are not integer; wrong shape, negative ids, width below 1 or not finite.
 
     Example:
         >>> edge_band(torch.tensor([[0, 0, 0, 0, 9, 9]]), width=2).int()
@@ -148,13 +146,7 @@ def largest_share(index: Tensor, factor: int) -> Tensor:
     blocks = split.transpose(2, 3).flatten(-2)  # [B, H, W, factor**2]
     best = blocks.amin(-1)
     mixed = best != blocks.amax(-1)
-    ordered = blocks[mixed].sort(-1).values  # [P, factor**2], equal labels in runs
-    places = torch.arange(factor * factor, device=index.device)
-    starts = ordered != torch.nn.functional.pad(ordered[:, :-1], (1, 0), value=-1)
-    run = places - torch.where(starts, places, 0).cummax(-1).values  # place within its run
-    # the longest run, then the first
-    last = (run * (factor * factor) - places).argmax(-1, keepdim=True)
-    best[mixed] = ordered.gather(-1, last)[:, 0]
+    best[mixed] = blocks[mixed].cpu().mode(-1).values.to(best.device)  # on the CPU, the smallest on a tie
     return best
 
 

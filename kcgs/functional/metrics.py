@@ -41,8 +41,9 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
         >>> psnr(torch.full((3, 8, 8), 0.6), torch.full((3, 8, 8), 0.5))
         tensor(20.0000)
     """
-    image, target, batched = _check_pair(image, target)
-    return _per_image(-10.0 * torch.log10((image - target).square().flatten(1).mean(1)), batched)
+    image, target, lead = _check_pair(image, target)
+    mse = (image - target).square().flatten(1).mean(1)
+    return -10.0 * torch.log10(mse.reshape(lead))
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -63,10 +64,10 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     Source: Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to structural
     similarity", 2004.
     """
-    image, target, batched = _check_pair(image, target)
+    image, target, lead = _check_pair(image, target)
     if min(image.shape[-2:]) < _WINDOW:
-        return _too_small("ssim", image, batched, _WINDOW)
-    return _per_image(_valid_mean(_ssim_map(image, target)), batched)
+        return _too_small("ssim", image, lead, _WINDOW)
+    return _valid_mean(_ssim_map(image, target)).reshape(lead)
 
 
 def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -88,9 +89,9 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
 
     Source: Wang, Simoncelli, Bovik, "Multi-scale structural similarity for image quality assessment", 2003.
     """
-    image, target, batched = _check_pair(image, target)
+    image, target, lead = _check_pair(image, target)
     if min(image.shape[-2:]) < _MS_SSIM_SIDE:
-        return _too_small("ms_ssim", image, batched, _MS_SSIM_SIDE)
+        return _too_small("ms_ssim", image, lead, _MS_SSIM_SIDE)
     batch, channels = image.shape[:2]
     # torchmetrics averages channels before the powers are taken: hand it one channel at a time
     image, target = image.flatten(0, 1)[:, None], target.flatten(0, 1)[:, None]
@@ -99,7 +100,7 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
         product = product * _ssim_map(image, target, contrast=True).relu() ** weight
         image, target = _halve(image), _halve(target)
     product = product * _valid_mean(_ssim_map(image, target)).relu() ** _SCALE_WEIGHTS[-1]
-    return _per_image(product.reshape(batch, channels).mean(1), batched)
+    return product.reshape(batch, channels).mean(1).reshape(lead)
 
 
 def ef_psnr(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> Tensor:
@@ -129,9 +130,9 @@ def ef_psnr(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> 
 
     Source: the paper's edge-focused evaluation.
     """
-    image, target, batched = _check_pair(image, target)
+    image, target, lead = _check_pair(image, target)
     band = _check_band("ef_psnr", image, labels, width)
-    return _per_image(-10.0 * torch.log10(_band_mean((image - target).square(), band)), batched)
+    return -10.0 * torch.log10(_band_mean((image - target).square(), band).reshape(lead))
 
 
 def ef_ssim(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> Tensor:
@@ -153,15 +154,15 @@ def ef_ssim(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> 
 
     Source: the paper's edge-focused evaluation.
     """
-    image, target, batched = _check_pair(image, target)
+    image, target, lead = _check_pair(image, target)
     band = _check_band("ef_ssim", image, labels, width)
     if min(image.shape[-2:]) < _WINDOW:
-        return _too_small("ef_ssim", image, batched, _WINDOW)
-    return _per_image(_band_mean(_ssim_map(image, target), band), batched)
+        return _too_small("ef_ssim", image, lead, _WINDOW)
+    return _band_mean(_ssim_map(image, target), band).reshape(lead)
 
 
-def _check_pair(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, bool]:
-    """Validate, clip and batch; tell whether the pair came batched."""
+def _check_pair(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, torch.Size]:
+    """Validate, clip and batch; return the shape of the result too, () or (B,)."""
     check_image("image", image)
     check_image("target", target)
     if target.shape != image.shape:
@@ -169,9 +170,9 @@ def _check_pair(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, bool]:
     if target.device != image.device:
         raise ValueError(f"target must be on {image.device} with image; got {target.device}")
     dtype = torch.promote_types(torch.promote_types(image.dtype, target.dtype), torch.float32)
-    batched = image.ndim == 4
-    image, target = (t.to(dtype).clamp(0.0, 1.0) for t in (image, target))
-    return (image, target, True) if batched else (image[None], target[None], False)
+    lead = image.shape[:-3]
+    image, target = (t.to(dtype).clamp(0.0, 1.0).reshape(-1, *t.shape[-3:]) for t in (image, target))
+    return image, target, lead
 
 
 def _check_band(name: str, image: Tensor, labels: Tensor, width: float) -> Tensor:
@@ -192,18 +193,14 @@ def _check_band(name: str, image: Tensor, labels: Tensor, width: float) -> Tenso
     return band
 
 
-def _too_small(name: str, image: Tensor, batched: bool, side: int) -> Tensor:
+def _too_small(name: str, image: Tensor, lead: torch.Size, side: int) -> Tensor:
     height, width = image.shape[-2:]
     warnings.warn(
         f"{name} is NaN: the image has {height} x {width} pixels, its window needs {side} x {side}",
         RuntimeWarning,
         stacklevel=3,
     )
-    return _per_image(image.new_full((image.shape[0],), math.nan), batched)
-
-
-def _per_image(values: Tensor, batched: bool) -> Tensor:
-    return values if batched else values[0]
+    return image.new_full(lead, math.nan)
 
 
 def _band_mean(values: Tensor, band: Tensor) -> Tensor:

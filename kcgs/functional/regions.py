@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
@@ -93,8 +93,7 @@ class RegionMap:
         """Take a RegionMap, a label map Tensor (hard contours) or None for what it is.
 
         Raises:
-            TypeError: anything else; the message calls it `name`.
-            ValueError: a Tensor that is no label map.
+            TypeError, ValueError: anything else; the message calls it `name`; a Tensor that is no label map.
 
         Example:
             >>> RegionMap.coerce(torch.tensor([[3, 7]])).ids
@@ -243,17 +242,10 @@ class RegionMap:
         device = torch.device(device)
         if device == self.labels.device:
             return self
-        labels = self.labels.to(device)
-        return RegionMap(
-            labels,
-            self.ids.to(device),
-            self.softness,
-            self.supersample,
-            fine_labels=labels if self.supersample == 1 else self.fine_labels.to(device),
-            membership=self.membership.to(device),
-            _table=None if self._table is None else self._table.to(device),
-            _origin=None if self._origin is None else self._origin.to(device),
-        )
+        moved = {name: part.to(device) for name, part in vars(self).items() if hasattr(part, "to")}
+        if self.supersample == 1:
+            moved["fine_labels"] = moved["labels"]
+        return replace(self, **moved)
 
     def state(self) -> dict[str, Any]:
         """Return what :meth:`from_state` makes the same map of: tensors, numbers, tuples and None only."""

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs._check import check_floating, check_labels
+from kcgs._check import check_floating, check_labels, check_number
 from kcgs.kernels.membership import RADIUS_SIGMAS
 
 from .labels import contour_edges, unique_pairs
@@ -179,9 +179,7 @@ def _measure(image: Tensor, labels: Tensor, candidates: Sequence[float]) -> tupl
 def check_problem(image: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     """Return an image (C, H, W) and a label map of its size."""
     image = check_floating("image", image, dims=(3,))
-    labels = check_labels("labels", labels)
-    if labels.ndim != 2:
-        raise ValueError(f"labels must have 2 dimensions; got shape {tuple(labels.shape)}")
+    labels = check_labels("labels", labels, dims=(2,))
     if image.shape[0] == 0 or image.shape[1:] != labels.shape:
         raise ValueError(
             f"image must have shape (C, {labels.shape[0]}, {labels.shape[1]}) with labels; got {tuple(image.shape)}"
@@ -192,11 +190,9 @@ def check_problem(image: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
 def _check_candidates(candidates: Sequence[float]) -> list[float]:
     if isinstance(candidates, str) or not isinstance(candidates, Sequence):
         raise TypeError(f"candidates must be a sequence of widths; got {candidates!r}")
-    if any(isinstance(c, bool) or not isinstance(c, int | float) for c in candidates):
-        raise TypeError(f"candidates must be numbers of pixels; got {candidates!r}")
-    if not candidates or not all(0.0 <= c <= MAX_SOFTNESS for c in candidates):
-        raise ValueError(f"candidates must be one or more widths in [0, {MAX_SOFTNESS:g}] pixels; got {candidates!r}")
-    return sorted({float(c) for c in candidates})
+    if not candidates:
+        raise ValueError("candidates must be one or more widths; got none")
+    return sorted({check_number("each of candidates", c, 0.0, MAX_SOFTNESS, unit="pixels") for c in candidates})
 
 
 def _place_windows(labels: Tensor) -> _Windows:

@@ -66,28 +66,24 @@ class GaussianField(nn.Module):
         lead = means.shape[:-1]
         check_cholesky("cholesky", cholesky)
         check_floating("colors", colors, dims=(2, 3))
-        self._hold("means", means, lead)
-        self._hold("cholesky", cholesky, lead)
-        self._hold("colors", colors, lead)
-        if opacities is None:
-            self.register_parameter("opacities", None)
-        else:
-            check_floating("opacities", opacities, dims=(1, 2))
-            if opacities.shape != lead:
-                raise ValueError(f"opacities must have shape {tuple(lead)}; got {tuple(opacities.shape)}")
-            self._hold("opacities", opacities, opacities.shape)
+        for name, value in (("cholesky", cholesky), ("colors", colors)):
+            if value.shape[:-1] != lead or value.shape[-1] == 0:
+                raise ValueError(f"{name} must have shape {(*lead, '...')}; got {tuple(value.shape)}")
+        if opacities is not None and check_floating("opacities", opacities).shape != lead:
+            raise ValueError(f"opacities must have shape {tuple(lead)}; got {tuple(opacities.shape)}")
+        tensors = {"means": means, "cholesky": cholesky, "colors": colors, "opacities": opacities}
+        for name, tensor in tensors.items():
+            self._hold(name, tensor)
         self.register_buffer("region_ids", None)
         if region_ids is not None:
             self.region_ids = self._checked_ids(region_ids)
 
-    def _hold(self, name: str, value: Tensor, lead: torch.Size) -> None:
-        if value.shape[: len(lead)] != lead:
-            raise ValueError(f"{name} must have shape {(*lead, '...')}; got {tuple(value.shape)}")
-        if value.dtype in _HALF:
+    def _hold(self, name: str, value: Tensor | None) -> None:
+        if value is not None and value.dtype in _HALF:
             value = value.float()
-        if value.grad_fn is not None:
+        if value is not None and value.grad_fn is not None:
             self.register_buffer(name, value)
-        elif isinstance(value, nn.Parameter):
+        elif value is None or isinstance(value, nn.Parameter):
             self.register_parameter(name, value)
         else:
             self.register_parameter(name, nn.Parameter(value.detach().clone()))

@@ -152,7 +152,7 @@ class TestContract:
             (torch.zeros(3, 4, 4), torch.zeros(4, 4).long(), (), ValueError, "candidates .* one or more"),
             (torch.zeros(3, 4, 4), torch.zeros(4, 4).long(), (-1.0,), ValueError, "candidates .* in"),
             (torch.zeros(3, 4, 4), torch.zeros(4, 4).long(), (float("nan"),), ValueError, "candidates .* in"),
-            (torch.zeros(3, 4, 4), torch.zeros(4, 4).long(), ("1",), TypeError, "candidates must be numbers"),
+            (torch.zeros(3, 4, 4), torch.zeros(4, 4).long(), ("1",), TypeError, "candidates must be a number"),
             (torch.zeros(3, 4, 4), torch.zeros(4, 4).long(), 1.0, TypeError, "candidates must be a sequence"),
         ],
     )
