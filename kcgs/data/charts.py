@@ -73,14 +73,11 @@ def chart_pie(scale: int = 1) -> ChartSample:
     red, orange, yellow, green, cyan, blue, purple and magenta. A pixel is the mean of 8 x 8 samples.
 
     Args:
-        scale: how many times the size of 300 by 300, at least 1. The shapes are the same: labels at a higher
+        scale: how many times the size of 300 by 300, as in `chart_2x3`. The shapes are the same: labels at a higher
             scale are exact contours, not enlarged ones.
 
     Returns:
         The chart, (300 scale, 300 scale); label 0 is the background, 1 to 8 the sectors.
-
-    Raises:
-        TypeError, ValueError: as `chart_2x3`.
 
     Example:
         >>> image, labels = chart_pie()

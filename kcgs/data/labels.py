@@ -139,28 +139,22 @@ def label_colors(n: int) -> Tensor:
         (8, 3)
     """
     check_count("n", n, least=0)
-    index = torch.arange(n, dtype=torch.float64)
-    hue = (index * _GOLDEN).frac()
-    cycle = torch.arange(n) % len(_VALUE)
-    saturation = torch.tensor(_SATURATION, dtype=torch.float64)[cycle]
-    value = torch.tensor(_VALUE, dtype=torch.float64)[cycle]
-    # Each channel of HSV is a trapezoid over the hue, a third of the circle apart.
-    phase = (hue[:, None] * 6 + torch.tensor([5.0, 3.0, 1.0], dtype=torch.float64)) % 6
-    dip = torch.minimum(phase, 4 - phase).clamp(0, 1)
-    return (value[:, None] * (1 - saturation[:, None] * dip)).float()
+    from skimage.color import hsv2rgb
+
+    index = np.arange(n)
+    cycle = index % len(_VALUE)
+    colors = np.stack([index * _GOLDEN % 1, np.take(_SATURATION, cycle), np.take(_VALUE, cycle)], axis=-1)
+    return torch.from_numpy(hsv2rgb(colors)).float()
 
 
 def colorize_labels(labels: Tensor) -> Tensor:
     """Paint a label map: the k-th smallest id gets the k-th colour of `label_colors`.
 
     Args:
-        labels: :math:`(H, W)` integer, any non-negative ids.
+        labels: as `save_labels` takes them, and any ids.
 
     Returns:
         :math:`(3, H, W)` float32 RGB in [0, 1], on the device of ``labels``.
-
-    Raises:
-        TypeError, ValueError: as `save_labels`.
 
     Example:
         >>> image = colorize_labels(torch.tensor([[0, 255, 0]]))

@@ -33,11 +33,7 @@ def check_scene(scene: Scene, region_ids: object, target: tuple[int, int] | None
     if regions.labels.ndim != 2 or regions.size not in (size, target):
         allowed = f"{size}" if target == size else f"{size} or {target}"
         raise ValueError(f"scene must have one map of the size {allowed}; got {tuple(regions.labels.shape)}")
-    wanted = check_ids(region_ids)
-    known = set(regions.ids.tolist())
-    for region in wanted:
-        if region not in known:
-            raise ValueError(f"region_ids must be among the map's {len(known)} ids, {_some(known)}; got {region}")
+    wanted = check_ids(region_ids, regions.ids, "map")
     return regions, torch.tensor(wanted, device=regions.ids.device)
 
 
@@ -51,12 +47,17 @@ def check_editable(scene: Scene, region_ids: object) -> tuple[RegionMap, Tensor]
     return regions, chosen
 
 
-def check_ids(region_ids: object) -> list[int]:
-    """Return the ids, each once, sorted."""
+def check_ids(region_ids: object, known: Tensor, owner: str) -> list[int]:
+    """Return the ids, each once, sorted, if all are known."""
     several = region_ids if isinstance(region_ids, Iterable) else [region_ids]
     wanted = sorted({check_count("region_ids", region, 0) for region in several})
     if not wanted:
         raise ValueError("region_ids must hold an id; got none")
+    ids = sorted(set(known.tolist()))
+    for region in wanted:
+        if region not in ids:
+            shown = ", ".join(map(str, ids[:20])) + (" ..." if len(ids) > 20 else "")
+            raise ValueError(f"region_ids must be among the {len(ids)} ids of the {owner}, {shown}; got {region}")
     return wanted
 
 
@@ -84,8 +85,3 @@ def ids_of(field: GaussianField) -> Tensor:
     """Return the region ids that `check_field` has seen."""
     assert field.region_ids is not None
     return field.region_ids
-
-
-def _some(ids: set[int]) -> str:
-    shown = [str(region) for region in sorted(ids)[:20]]
-    return ", ".join(shown) + (" ..." if len(ids) > 20 else "")

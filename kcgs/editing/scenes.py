@@ -91,11 +91,7 @@ def recolor_region(
         True
     """
     field = check_field(scene)
-    wanted = check_ids(region_ids)
-    known = set(ids_of(field).tolist())
-    for region in wanted:
-        if region not in known:
-            raise ValueError(f"region_ids must be ids of the scene's Gaussians, {sorted(known)}; got {region}")
+    wanted = check_ids(region_ids, ids_of(field), "Gaussians")
     chosen = torch.isin(ids_of(field), torch.tensor(wanted, device=field.means.device))
     channels = field.colors.shape[-1]
     matrix = color_tensor("gain", gain, field.colors, [(), (channels,), (channels, channels)])

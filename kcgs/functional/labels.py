@@ -113,13 +113,7 @@ def contour_edges(labels: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def touching_pairs(labels: Tensor) -> set[tuple[int, int]]:
-    r"""Find the regions that share a pixel side.
-
-    Args:
-        labels: integer label map, :math:`(H, W)`.
-
-    Returns:
-        Pairs of ids, the lower first.
+    r"""Find the pairs of regions, the lower id first, that share a pixel side in a map as of :func:`contour_edges`.
 
     Example:
         >>> touching_pairs(torch.tensor([[0, 3, 3], [0, 0, 7]])) == {(0, 3), (0, 7), (3, 7)}

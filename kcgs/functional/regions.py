@@ -90,15 +90,7 @@ class RegionMap:
 
     @classmethod
     def coerce(cls, value: object, name: str = "regions") -> RegionMap | None:
-        """Take a RegionMap, a label map Tensor (hard contours) or None for what it is.
-
-        Raises:
-            TypeError, ValueError: anything else; the message calls it `name`; a Tensor that is no label map.
-
-        Example:
-            >>> RegionMap.coerce(torch.tensor([[3, 7]])).ids
-            tensor([3, 7])
-        """
+        """Return a RegionMap, the map of a Tensor with hard contours, or None; TypeError calls anything else `name`."""
         if value is None or isinstance(value, RegionMap):
             return value
         if isinstance(value, Tensor):

@@ -206,19 +206,12 @@ class GaussianField(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianField:
-        warned = False
+        if fn(self.means.detach().new_zeros(1)).dtype in _HALF:
+            warnings.warn("GaussianField stays in float32: half precision cannot hold pixel positions", stacklevel=3)
 
         def keep_precision(tensor: Tensor) -> Tensor:
-            nonlocal warned
             moved = fn(tensor)
-            if moved.dtype not in _HALF:
-                return moved
-            if not warned:
-                warnings.warn(
-                    "GaussianField stays in float32: half precision cannot hold pixel positions", stacklevel=4
-                )
-                warned = True
-            return tensor.to(moved.device, torch.float32)
+            return tensor.to(moved.device, torch.float32) if moved.dtype in _HALF else moved
 
         super()._apply(keep_precision, recurse)  # type: ignore[no-untyped-call]
         return self

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Protocol, runtime_checkable
 
-import torch
 from torch import Tensor, nn
 
 from kcgs._check import check_cutoff, check_size
@@ -110,10 +109,3 @@ class RegionSplatRenderer(nn.Module):
     def extra_repr(self) -> str:
         """Show the settings."""
         return f"cutoff={self.cutoff:g}, clamp={self.clamp}, backend={self.backend!r}, keepdim={self.keepdim}"
-
-
-def render_image(field: GaussianField, regions: RegionMap | None = None, size: tuple[int, int] | None = None) -> Tensor:
-    """Render without a graph, clipped to [0, 1]: what a viewer shows, (C, H, W)."""
-    with torch.no_grad():
-        image: Tensor = RegionSplatRenderer(clamp=True)(field, regions, size)
-    return image

@@ -41,14 +41,7 @@ def connected_regions(labels: Tensor) -> Tensor:
 def order_by_area(labels: Tensor) -> Tensor:
     """Renumber regions by decreasing area; of equal ones, the one with the earlier first pixel comes first.
 
-    Args:
-        labels: :math:`(H, W)` integer, any non-negative ids.
-
-    Returns:
-        :math:`(H, W)` int64 with ids 0 to R - 1.
-
-    Raises:
-        TypeError, ValueError: ``labels`` is no integer map (H, W) of non-negative ids, or is empty.
+    Takes, returns and raises what :func:`connected_regions` does.
 
     Example:
         >>> order_by_area(torch.tensor([[9, 4, 4], [9, 4, 7]])).tolist()

@@ -25,7 +25,6 @@ from torch import Tensor
 import kcgs
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene, save
 from kcgs.data import save_image
-from kcgs.nn.renderer import render_image
 from kcgs.onnx import generic_decoder, scene_decoder, write_model
 from kcgs.onnx.graph import Graph
 
@@ -143,7 +142,7 @@ def read(path: Path) -> np.ndarray:
 
 def library_levels(folder: Path, field: GaussianField, regions: RegionMap | None, size: tuple[int, int]) -> np.ndarray:
     path = folder / "library.png"
-    save_image(path, render_image(field, regions, size))
+    save_image(path, Scene(field, regions).render(size))
     return read(path)
 
 

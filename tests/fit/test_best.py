@@ -14,7 +14,6 @@ from kcgs import FitConfig, RegionMap, fit
 from kcgs.data import chart_2x3, chart_pie
 from kcgs.fit import FitResult
 from kcgs.functional import edge_band, psnr
-from kcgs.nn.renderer import render_image
 
 
 def scene(size: tuple[int, int] = (48, 64), seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -61,7 +60,7 @@ class TestBest:
         assert with_.ef_psnr > without.ef_psnr + 0.5
 
     def test_psnr_is_that_of_the_scene_as_drawn_by_default(self, fitted: FitResult) -> None:
-        drawn = render_image(fitted.scene.field, fitted.scene.regions)
+        drawn = fitted.scene.render()
         assert fitted.history[-1].psnr == pytest.approx(float(psnr(drawn, scene()[0])), abs=0.01)
 
     def test_grows_to_n(self) -> None:

@@ -25,7 +25,6 @@ from kcgs.fit.colors import solve_colors
 from kcgs.fit.contour_moves import refine_contours
 from kcgs.fit.levenberg_marquardt import levenberg_marquardt
 from kcgs.fit.pursuit import propose
-from kcgs.nn.renderer import render_image
 from kcgs.onnx import generic_decoder, scene_decoder
 from kcgs.pruning import prune
 from kcgs.rate import compress, fit_bytes
@@ -157,7 +156,7 @@ def splat(p: Parts, **settings: Any) -> Tensor:
 
 def render(p: Parts, size: tuple[int, int] | None = None) -> Tensor:
     """Render a scene as a viewer shows it."""
-    return render_image(_field(p), _regions(p), size)
+    return _scene(p).render(size)
 
 
 def resized_map(p: Parts, size: tuple[int, int]) -> dict[str, Any]:

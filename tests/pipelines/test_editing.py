@@ -287,7 +287,7 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("edit", "error", "words"),
         [
-            (lambda s: move_region(s, 2, (1, 0)), ValueError, "among the map's 3 ids, 1, 4, 9; got 2"),
+            (lambda s: move_region(s, 2, (1, 0)), ValueError, "among the 3 ids of the map, 1, 4, 9; got 2"),
             (lambda s: move_region(s, BOX, (0.5, 0)), ValueError, "whole multiples of 1 pixel"),
             (lambda s: move_region(s, BOX, (float("nan"), 0)), ValueError, "whole multiples of 1 pixel"),
             (lambda s: move_region(s, BOX, (1,)), ValueError, r"offset must be \(dx, dy\)"),

@@ -40,9 +40,7 @@ def file(image: Tensor, *, path: str | os.PathLike[str]) -> Tensor:
 def davis(
     image: Tensor, *, root: str | os.PathLike[str], sequence: str, frame: int = 0, resolution: str = "480p"
 ) -> Tensor:
-    """Take the regions of a frame of DAVIS from its annotation.
-
-    Unless asked, nothing is cleaned: no piece is too small, and an object in several pieces is one region.
+    """Take the regions of a frame of DAVIS from its annotation, cleaned no more than by `file`.
 
     Args:
         image: as `segment` takes it, the frame; the result is that of `segment` too.

@@ -107,24 +107,10 @@ def lseg(
 ) -> Prediction:
     """Segment by language as LSeg does (Li et al., ICLR 2022): pixel features against text embeddings.
 
-    Args:
-        image: as `segment` takes it, any size.
-        model: LSeg's image encoder in ONNX, (1, 3, h, w) to features (1, D, h', w'), or a session.
-        embeddings: an .npy file with a CLIP text embedding for each class, (K, D), or that array.
-        output: as in `onnx`.
-        size: as in `onnx`.
-        mean: as in `onnx`.
-        std: as in `onnx`.
-        max_value: as in `onnx`.
-        temperature: above 0; the score is the softmax of cosine similarities over it.
-        names: of the classes, one for each embedding, or a text file with one on each line.
-
-    Returns:
-        As `onnx`, the classes being those of largest cosine similarity.
-
-    Raises:
-        FileNotFoundError: a file does not exist.
-        TypeError, ValueError: as `segment`; a file cannot be read, or features and embeddings differ in length.
+    Arguments, result and errors are those of `onnx`, but for these. ``model`` is LSeg's image encoder, (1, 3, h, w) to
+    features (1, D, h', w'). ``embeddings`` is an .npy file with a CLIP text embedding for each class, (K, D), or that
+    array; ``names`` has as many. The largest cosine similarity wins; its score is the softmax of the similarities over
+    ``temperature``, above 0.
 
     Example:
         ``segment(image, "lseg", model="lseg.onnx", embeddings="dog-grass-other.npy")``
