@@ -393,7 +393,7 @@ class TestLoadRefuses:
             (_entry("means", dtype="F16", shape=[13, 4]), "means must have a dtype"),
             (_entry("labels", dtype="I8"), "labels must have a dtype"),
             (_entry("region_ids", dtype="BOOL"), "region_ids must have a dtype"),
-            (_entry("means", shape=[26]), "must have shape"),
+            (_entry("means", shape=[26]), "means must have 2 or 3 dimensions"),
             (_entry("means", shape=[2, 13]), "must have shape"),
             (_entry("cholesky", shape=[13, 3, 1]), "cholesky must have shape"),
             (_entry("colors", shape=[39, 1]), "colors must have shape"),
