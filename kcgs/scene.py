@@ -79,17 +79,7 @@ class Scene(nn.Module):
         return image
 
     def render(self, size: tuple[int, int] | None = None) -> Tensor:
-        """Render what one shows or saves: clipped to [0, 1], without a graph.
-
-        Args:
-            size: (height, width); None: the scene's own.
-
-        Returns:
-            Image, :math:`(C, H, W)`, or :math:`(B, C, H, W)` for a batch.
-
-        Raises:
-            TypeError, ValueError: as :meth:`forward`.
-        """
+        """Render what one shows or saves: as :meth:`forward`, but clipped to [0, 1] and without a graph."""
         with torch.no_grad():
             image: Tensor = self(size)
             return image.clamp(0.0, 1.0)
@@ -155,17 +145,7 @@ def save(path: str | os.PathLike[str], scene: Scene) -> int:
 
 
 def scene_bytes(scene: Scene, suffix: str = ".safetensors") -> int:
-    """Size in bytes of the file that :func:`save` would write.
-
-    Args:
-        scene: as there.
-        suffix: .safetensors or .kcgs.
-
-    Returns:
-        Bytes.
-
-    Raises:
-        TypeError, ValueError: as :func:`save`.
+    """Return the size in bytes of the file that :func:`save` would write to a path with this suffix.
 
     Example:
         >>> scene_bytes(Scene(GaussianField.random(1000, (32, 48), seed=0))) > 1000 * 8 * 4
