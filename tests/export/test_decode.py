@@ -111,7 +111,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     write_model(generic_decoder(), made.generic)
     write_model(ramp_decoder(interactive=False), made.plain)
     write_model(ramp_decoder(interactive=True), made.interactive)
-    save(made.scene, make_field(), make_labels())
+    save(made.scene, Scene(make_field(), make_labels()))
     return made
 
 
@@ -173,7 +173,7 @@ class TestGenericImages:
         self, files: Files, decode: Any, tmp_path: Path, channels: int, options: list[object], size: tuple[int, int]
     ) -> None:
         field, scene, output = make_field(channels), tmp_path / "scene.safetensors", tmp_path / "out.png"
-        save(scene, field, make_labels())
+        save(scene, Scene(field, make_labels()))
         assert decode(files.generic, scene, "-o", output, *options) == Result(0, "", "")
         want = library_levels(tmp_path, field, RegionMap.from_labels(make_labels()), size)
         assert read(output).shape == want.shape
@@ -190,7 +190,7 @@ class TestGenericImages:
         if case == "no labels":
             field.region_ids = None
         scene, output = tmp_path / "scene.safetensors", tmp_path / "out.npy"
-        save(scene, field, labels)
+        save(scene, Scene(field, labels))
         assert decode(files.generic, scene, "-o", output, "--scale", 2).code == 0
         with torch.no_grad():
             regions = None if labels is None else RegionMap.from_labels(labels)
@@ -203,14 +203,14 @@ class TestGenericImages:
         labels = torch.where(make_labels() == IDS[0], 1, highest)
         field = make_field().assign_regions(labels)
         scene, output = tmp_path / "scene.safetensors", tmp_path / "out.png"
-        save(scene, field, labels)
+        save(scene, Scene(field, labels))
         assert decode(files.generic, scene, "-o", output).code == 0
         want = library_levels(tmp_path, field, RegionMap.from_labels(labels), SIZE)
         assert np.abs(read(output) - want).max() <= 1
 
     def test_other_channels_as_npy(self, files: Files, decode: Any, tmp_path: Path) -> None:
         field, scene = make_field(channels=5), tmp_path / "scene.safetensors"
-        save(scene, field, make_labels())
+        save(scene, Scene(field, make_labels()))
         assert decode(files.generic, scene, "-o", tmp_path / "out.npy").code == 0
         image = np.load(tmp_path / "out.npy")
         assert image.shape == (5, *SIZE)
@@ -472,7 +472,7 @@ class TestRefusals:
             (RegionMap.from_labels(labels, {(5, 300): 0.5}), r"softness \[\[5,300,0.5\]\]"),
             (RegionMap.from_labels(fine, supersample=2), "supersample 2"),
         ):
-            save(path, make_field(), regions)
+            save(path, Scene(make_field(), regions))
             refuses(
                 rf"{path} has soft or finer contours \({what}\); a generic decoder renders hard", files.generic, path
             )
@@ -534,7 +534,7 @@ class TestRefusals:
         field = make_field(dtype=torch.float64)
         with torch.no_grad():
             field.colors[:] = 1e300
-        save(path, field, make_labels())
+        save(path, Scene(field, make_labels()))
         refuses("the decoder gave NaN or infinite values", files.generic, path)
 
     def test_negative_ids(self, files: Files, refuses: Any, tmp_path: Path) -> None:
