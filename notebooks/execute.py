@@ -1,4 +1,4 @@
-"""Run the tutorials from top to bottom and keep what they print and draw.
+"""Run the tutorials from top to bottom and keep what they print and show.
 
 All of them in full, in place; with ``--quick -o FOLDER``, the short form that the tests run, written elsewhere.
 """
@@ -19,7 +19,7 @@ from nbformat import NotebookNode
 from PIL import Image
 
 FOLDER = Path(__file__).resolve().parent
-# one thread: the pictures are then the same, bit for bit, on every run
+# one thread: the images are then the same, bit for bit, on every run
 _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
 
 
@@ -33,7 +33,7 @@ def execute(path: Path, *, quick: bool, timeout: float = 600.0) -> NotebookNode:
 
     Args:
         path: the notebook; the file is not changed.
-        quick: smaller pictures and shorter fits, as the tests run it.
+        quick: smaller images and shorter fits, as the tests run it.
         timeout: seconds that a cell may take.
 
     Raises:
@@ -83,7 +83,7 @@ def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("paths", type=Path, nargs="*", help="notebooks; default: all")
-    parser.add_argument("--quick", action="store_true", help="smaller pictures and shorter fits, as the tests run them")
+    parser.add_argument("--quick", action="store_true", help="smaller images and shorter fits, as the tests run them")
     parser.add_argument("-o", "--output", type=Path, help="folder to write to; default: in place")
     args = parser.parse_args()
     if args.quick and args.output is None:

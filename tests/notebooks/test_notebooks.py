@@ -34,8 +34,13 @@ PRINTED = {
 }
 SECONDS = 180
 _COMPILE = (
-    "from kcgs import GaussianField, RegionSplatRenderer\n"
-    "RegionSplatRenderer()(GaussianField.random(1, (16, 16), seed=0)).sum().backward()\n"
+    "import torch\n"
+    "from kcgs import GaussianField, Scene\n"
+    "from kcgs.codec import encode\n"
+    "labels = (torch.arange(16) > 7).long().expand(16, 16)\n"
+    "scene = Scene(GaussianField.random(2, (16, 16), regions=labels, seed=0), labels)\n"
+    "scene().sum().backward()\n"
+    "encode(scene)\n"
 )
 BYTES = 2_000_000
 
@@ -62,7 +67,7 @@ def run_quick(name: str, folder: Path) -> Run:
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Future[Run]]]:
     """Run all, two at a time unless tests do: a kernel takes one thread, and seconds to import what it needs."""
-    # Compiled and kept here, so that no kernel has to, and says so. In a new process, as they are: this one may have
+    # Compiled and kept here, so that no tutorial has to, and says so. In a new process, as they are: this one may have
     # the code in memory when it is on disk no more, since two that keep theirs at once may drop the other's.
     subprocess.run([sys.executable, "-c", _COMPILE], check=True, timeout=SECONDS)
     folder = tmp_path_factory.mktemp("quick")
@@ -76,7 +81,7 @@ def outputs_of(notebook: Any) -> list[Any]:
 
 
 def assert_clean(notebook: Any) -> None:
-    """Text on standard output and pictures: no error, no warning, nothing that names a place on a machine."""
+    """Text on standard output and images: no error, no warning, nothing that names a place on a machine."""
     for output in outputs_of(notebook):
         if output.output_type == "stream":
             assert output.name == "stdout", output.text
