@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcgs._check import check_number
 from kcgs.nn import GaussianField, RegionSplatRenderer
-from kcgs.scene import Scene
+from kcgs.scene import Scene, check_scene
 
 
 class PruneResult(NamedTuple):
@@ -47,10 +47,7 @@ def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backen
         >>> result.removed, result.change
         (20, 0.0)
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
-    if scene.field.means.ndim != 2:
-        raise ValueError(f"scene must not be batched; got means of shape {tuple(scene.field.means.shape)}")
+    check_scene(scene)
     tolerance = check_number("tolerance", tolerance, 0.0)
     render = RegionSplatRenderer(cutoff=cutoff, backend=backend)
     if len(scene) == 0:

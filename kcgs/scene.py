@@ -201,6 +201,20 @@ def _serialized(scene: Scene, format: Any) -> bytes:
     return content
 
 
+def check_scene(scene: object) -> Scene:
+    """Return `scene` if it is a Scene of one image, with one map of its size and region ids, or without a map."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
+    field, regions = scene.field, scene.regions
+    if field.means.ndim != 2:
+        raise ValueError(f"scene must not be batched; got means of shape {tuple(field.means.shape)}")
+    if regions is not None and (regions.labels.ndim != 2 or regions.size != field.size):
+        raise ValueError(f"scene must have one map of its size {field.size}; got {tuple(regions.labels.shape)}")
+    if regions is not None and field.region_ids is None:
+        raise ValueError("scene must have region ids for its map; call scene.field.assign_regions(scene.regions)")
+    return scene
+
+
 def _check_metadata(metadata: object) -> dict[str, str]:
     if metadata is not None and not isinstance(metadata, Mapping):
         raise TypeError(f"metadata must map str to str; got {type(metadata).__name__}")

@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 
 from kcgs._check import check_cutoff
-from kcgs.scene import Scene
+from kcgs.scene import Scene, check_scene
 
 from .axis import Axis
 from .blocks import Blocks
@@ -115,22 +115,9 @@ class _Plan(NamedTuple):
 
 
 def _check(scene: object) -> None:
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
-    field, regions = scene.field, scene.regions
-    if field.means.ndim != 2:
-        raise ValueError(f"scene must not be a batch; got means of shape {tuple(field.means.shape)}")
-    if regions is None:
-        return
-    if regions.labels.ndim != 2 or regions.size != field.size:
-        raise ValueError(
-            f"regions must be one map of the field's size {field.size}; got labels of shape "
-            f"{tuple(regions.labels.shape)}"
-        )
-    if regions.resized:
-        raise ValueError("regions must be the map itself; got a soft one that was resized")
-    if field.region_ids is None:
-        raise ValueError("field must have region_ids where regions are given; call field.assign_regions(regions)")
+    regions = check_scene(scene).regions
+    if regions is not None and regions.resized:
+        raise ValueError("scene must have the map itself; got a soft one that was resized")
 
 
 def _check_change(exact: onnx.ModelProto, half: onnx.ModelProto, plan: _Plan) -> None:

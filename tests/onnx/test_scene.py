@@ -308,8 +308,8 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("shape", "words"),
         [
-            ((3, 4), "regions must be one map of the field's size"),
-            ((2, 20, 30), "regions must be one map"),
+            ((3, 4), "scene must have one map of its size"),
+            ((2, 20, 30), "scene must have one map"),
             ((20, 30), "field must have region_ids"),
         ],
     )
@@ -325,7 +325,7 @@ class TestBadInput:
 
     def test_batch(self) -> None:
         batch = GaussianField(torch.rand(2, 3, 2), torch.ones(2, 3, 3), torch.rand(2, 3, 3), size=(8, 8))
-        with pytest.raises(ValueError, match="scene must not be a batch"):
+        with pytest.raises(ValueError, match="scene must not be batched"):
             scene_decoder(Scene(batch))
 
 
