@@ -310,7 +310,7 @@ class TestBadInput:
         [
             ((3, 4), "scene must have one map of its size"),
             ((2, 20, 30), "scene must have one map"),
-            ((20, 30), "field must have region_ids"),
+            ((20, 30), "scene must have region ids"),
         ],
     )
     def test_map_that_does_not_fit(self, shape: tuple[int, ...], words: str) -> None:
