@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import statistics
-import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -29,17 +28,13 @@ from .core.store import Store
 
 SCENE, GENERIC, CPU, TILED = "onnxruntime, scene", "onnxruntime, generic", "torch, cpu", "torch, tiled"
 DECODERS = (SCENE, GENERIC, CPU, TILED)
-YARDSTICK = CPU
-OPENING = ("load", "first image")
 # the truth: what it leaves out of a sum is far below float32's rounding
 TRUTH_CUTOFF = 1e-12
 CONTOURS = ("none", "hard", "soft")
 SOFTNESS = 0.7
 SEQUENCE = "blackswan"
 QUICK_SIZE, QUICK_COUNT, QUICK_STRIDE = (96, 128), 60, 4
-# height, width, N
 WORKLOADS = {name: STANDARD[name] for name in ("W1", "W2")}
-
 
 Render = Callable[[], Tensor]
 
@@ -68,6 +63,14 @@ class Subject(NamedTuple):
             return "none"
         return "hard" if regions.softness == 0.0 else "soft"
 
+    @property
+    def about(self) -> str:
+        """What a reader must know of it."""
+        (height, width), regions = self.scene.size, self.scene.regions
+        count = 1 if regions is None else regions.num_regions
+        numbers = f"{height} x {width}, N = {len(self.scene):,}, regions: {count}, contours: {self.contours}"
+        return f"{self.source}; {numbers}"
+
 
 class Files(NamedTuple):
     """What decoders read, and the cutoff that they have."""
@@ -76,8 +79,6 @@ class Files(NamedTuple):
     decoder: Path
     generic: Path
     cutoff: float
-    seconds: float
-    """That making and writing them took."""
 
 
 def standard_subjects(quick: bool) -> list[Subject]:
@@ -120,21 +121,14 @@ def why_not_fitted(options: Options) -> str | None:
     return None if (options.data / "DAVIS").is_dir() else "there is no folder DAVIS in the data"
 
 
-def small_scene() -> Scene:
-    """Make a scene to warm up with, 48 x 64."""
-    labels = (torch.arange(64) > 30).long().expand(48, 64)
-    return Scene(GaussianField.random(40, (48, 64), regions=labels, seed=0), labels)
-
-
 def write_files(folder: Path, scene: Scene, cutoff: float) -> Files:
     """Write a scene and its decoders into a folder, which is made."""
-    start = time.perf_counter()
     folder.mkdir(parents=True)
     paths = folder / "scene.safetensors", folder / "scene.onnx", folder / "generic.onnx"
     scene.save(paths[0])
     write_model(scene_decoder(scene, cutoff=cutoff), paths[1])
     write_model(generic_decoder(cutoff=cutoff), paths[2])
-    return Files(*paths, cutoff, time.perf_counter() - start)
+    return Files(*paths, cutoff)
 
 
 def decoders_of(scene: Scene) -> list[str]:
@@ -145,14 +139,7 @@ def decoders_of(scene: Scene) -> list[str]:
 
 
 def open_decoder(name: str, files: Files, size: tuple[int, int], threads: int) -> Render:
-    """Read the files and return what renders (C, H, W) at that size.
-
-    Args:
-        name: among `DECODERS`.
-        files: of the scene.
-        size: (height, width).
-        threads: of onnxruntime; torch renders on as many as it is told to use.
-    """
+    """Read the files and return what renders (C, H, W) at that size; torch has its own setting of threads."""
     if name == SCENE:
         return _session(files.decoder, {"size": np.array(size, np.int64)}, threads)
     placed = _resized(load(files.scene), size)
@@ -181,25 +168,16 @@ def race(renders: Mapping[Entrant, Render], rounds: int) -> dict[Entrant, list[f
     return in_turns({entrant: partial(second, entrant) for entrant in renders}, rounds)
 
 
-def opening(name: str, files: Files, size: tuple[int, int], rounds: int) -> dict[str, float]:
-    """Time a decoder from its files, on one thread: until ready to render, and until the first image is there.
-
-    Returns:
-        Medians in seconds after one run to warm up.
-    """
-    runs = []
+def load_seconds(name: str, files: Files, size: tuple[int, int], rounds: int) -> float:
+    """Time a decoder from its files until it is ready to render, on one thread, after one run to warm up."""
     with threads(1):
-        for _ in range(rounds + 1):
-            opened: list[Render] = []
-            load = clock(lambda: opened.append(open_decoder(name, files, size, 1)))  # noqa: B023
-            runs.append((load, load + clock(opened[0])))
-    return dict(zip(OPENING, map(statistics.median, zip(*runs[1:], strict=True)), strict=True))
+        seconds = [clock(partial(open_decoder, name, files, size, 1)) for _ in range(rounds + 1)]
+    return statistics.median(seconds[1:])
 
 
-def truth(scene: Scene, size: tuple[int, int], *, dense: bool = False) -> Tensor:
-    """Render in float64: tile by tile at a cutoff next to nothing, or the whole dense sum of the reference."""
-    exact = _resized(copy.deepcopy(scene).double(), size)
-    return _splat(exact, "reference", 0.0) if dense else _splat(exact, "tiled", TRUTH_CUTOFF)
+def truth(scene: Scene, size: tuple[int, int]) -> Tensor:
+    """Render in float64, tile by tile at a cutoff next to nothing."""
+    return _splat(_resized(copy.deepcopy(scene).double(), size), "tiled", TRUTH_CUTOFF)
 
 
 def _resized(scene: Scene, size: tuple[int, int]) -> Scene:

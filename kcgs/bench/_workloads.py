@@ -24,14 +24,7 @@ STANDARD = {
 
 
 def workload(height: int, width: int, count: int, *, spread: float | None = None) -> Scene:
-    """Scatter `count` Gaussians of random shape over six regions with hard contours: five blocks and a disc.
-
-    Args:
-        height: pixels.
-        width: pixels.
-        count: N.
-        spread: standard deviation in pixels; None: such that the mean coverage is 12.
-    """
+    """Scatter Gaussians, `spread` pixels wide (None: for a mean coverage of 12), over five blocks and a disc."""
     generator = torch.Generator().manual_seed(0)
 
     def uniform(*shape: int) -> Tensor:

@@ -92,13 +92,7 @@ def _fit(image: Tensor, labels: Tensor, count: int, config: FitConfig, name: str
 
 
 def compose(panels: Sequence[Panel], *, side: int = 512, gap: int = 12) -> Image:
-    """Lay out columns of a title, two lines, the image, and the same two close-ups of each, no pixel smoothed.
-
-    Args:
-        panels: square images of the same size.
-        side: of an image, in pixels of the result.
-        gap: between columns.
-    """
+    """Lay out columns of a title, two lines, a square image and two close-ups of it, no pixel smoothed."""
     from PIL import Image, ImageDraw, ImageFont
 
     top, close = 136, (side - gap) // 2

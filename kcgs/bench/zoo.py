@@ -85,10 +85,14 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
     folder.mkdir(parents=True, exist_ok=True)
     size = scene.save(folder / "scene.safetensors")
     _write(folder / "recipe.json", config.model_dump_json(indent=1) + "\n")
-    decoder = _write_decoder(folder / "decoder.onnx", scene)
-    if decoder is not None:
+    model, decoder = scene_decoder(scene, interactive=True), folder / "decoder.onnx"  # with views and regions
+    has_decoder = model.ByteSize() <= _LARGEST_DECODER
+    if has_decoder:
+        write_model(model, decoder)
         # to compare with in the viewer
         save_image(folder / ("original.webp" if recipe == "best" else "original.jpg"), image)
+    else:
+        decoder.unlink(missing_ok=True)
     height, width = scene.size
     shrink = _PREVIEW / max(height, width)
     save_image(folder / "preview.jpg", scene.render((max(1, round(height * shrink)), max(1, round(width * shrink)))))
@@ -107,21 +111,11 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
         ef_psnr=round(edge, 3) if edge == edge else None,
         licence=plan.licence,
         command=f"kcgs bench zoo -o models --only {name}",
-        decoder=None if decoder is None else f"{name}/decoder.onnx",
-        decoder_sha256=None if decoder is None else _hash(decoder),
+        decoder=f"{name}/decoder.onnx" if has_decoder else None,
+        decoder_sha256=_hash(decoder) if has_decoder else None,
     )
     _write(folder / "card.md", _card(entry, scene.size, figures["ms_ssim"]))
     return entry
-
-
-def _write_decoder(path: Path, scene: Scene) -> Path | None:
-    """Write the decoder, with its inputs for views and regions, where it is small."""
-    model = scene_decoder(scene, interactive=True)
-    if model.ByteSize() > _LARGEST_DECODER:
-        path.unlink(missing_ok=True)
-        return None
-    write_model(model, path)
-    return path
 
 
 def _write(path: Path, text: str) -> None:

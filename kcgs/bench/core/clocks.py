@@ -15,6 +15,7 @@ import torch
 
 Key = TypeVar("Key")
 Result = TypeVar("Result")
+Prepare = Callable[..., Callable[[], object]]
 _CLEAR = Path("/proc/self/clear_refs")
 
 
@@ -50,9 +51,7 @@ def median_ratio(values: Sequence[float], others: Sequence[float]) -> float:
     return statistics.median(one / other for one, other in zip(values, others, strict=True))
 
 
-def peak_bytes(
-    prepare: Callable[..., Callable[[], object]], arguments: tuple[object, ...], warm_up: tuple[object, ...]
-) -> float:
+def peak_bytes(prepare: Prepare, arguments: tuple[object, ...], warm_up: tuple[object, ...]) -> float:
     """Measure, in a process of its own and on one thread, how much memory an action adds at its peak.
 
     Args:
@@ -69,9 +68,7 @@ def peak_bytes(
         return pool.apply(_peak, (prepare, arguments, warm_up))
 
 
-def _peak(
-    prepare: Callable[..., Callable[[], object]], arguments: tuple[object, ...], warm_up: tuple[object, ...]
-) -> float:
+def _peak(prepare: Prepare, arguments: tuple[object, ...], warm_up: tuple[object, ...]) -> float:
     torch.set_num_threads(1)
     prepare(*warm_up)()
     action = prepare(*arguments)

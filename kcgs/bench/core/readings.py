@@ -63,22 +63,13 @@ class Readings(list[Any]):
         body = [[*map(str, line), *(cells.get((line, column), "") for column in titles)] for line in ordered]
         return markdown([*index, *titles.values()], body)
 
-    def plot(self, axis: Any, along: str, x: str, y: str, *, annotate: bool = False, **style: Any) -> None:
-        """Plot a line through the quantities `x` and `y` of each name that the field `along` has, on log axes.
-
-        Args:
-            axis: of matplotlib.
-            along: field.
-            x: quantity.
-            y: quantity.
-            annotate: whether each point says its name.
-            style: of the line.
-        """
+    def plot(self, axis: Any, along: str, x: str, y: str, **style: Any) -> None:
+        """Plot a line through the quantities `x` and `y` of each name that the field `along` has, on log axes."""
         names = self.names(along)
         points = [[self.value(**{along: name, "quantity": quantity}) for quantity in (x, y)] for name in names]
         axis.plot(*zip(*points, strict=True), **style)
         axis.set(xscale="log", yscale="log")
-        for name, point in zip(names, points, strict=True) if annotate else ():
+        for name, point in zip(names, points, strict=True):
             axis.annotate(name, point, textcoords="offset points", xytext=(4, 4), fontsize=7)
 
 
