@@ -23,13 +23,7 @@ _KEPT = ("cutoff", "region_ids", "anchor", "iteration", "first", "wanted", "dens
 
 
 class Checkpoint:
-    """A file that holds a fit's state, written whole or not at all, and only by the problem that it belongs to.
-
-    Args:
-        path: of the file; its folder must exist.
-        state: the start of the fit.
-        given: the map that the fit was given.
-    """
+    """A file that holds a fit's state, written whole or not at all, and only by the problem that it belongs to."""
 
     def __init__(self, path: str | os.PathLike[str], state: FitState, given: RegionMap | None) -> None:
         self.path = Path(path)
@@ -51,11 +45,7 @@ class Checkpoint:
         self._next = end + _PATIENCE * (end - start)
 
     def read_into(self, state: FitState) -> bool:
-        """Take up the state of the file, and say whether there is one.
-
-        Raises:
-            ValueError: the file is not a checkpoint, or that of another problem.
-        """
+        """Take up the state of the file, and say whether there is one; refuse what is damaged or another problem's."""
         if not self.path.exists():
             return False
         try:

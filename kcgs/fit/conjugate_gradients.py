@@ -18,21 +18,11 @@ def conjugate_gradients(
     gradient: Callable[[Tensor], Tensor] | None = None,
     least_squares: bool = False,
 ) -> Tensor:
-    """Take steps from x towards the solution of A x = b.
+    """Take steps from x towards the solution of A x = b, where r = b - A x and `apply` is p to A p.
 
-    Args:
-        x: start.
-        r: b - A x.
-        apply: p to A p.
-        steps: how many; each applies A once.
-        dot: inner product; a tensor where columns are problems of their own.
-        gradient: r to the direction of descent: a preconditioner; with `least_squares` the product with the transpose.
-        least_squares: A is rectangular, and x is to minimise abs(b - A x)^2.
-
-    Returns:
-        The last x.
-
-    Source: Hestenes and Stiefel, "Methods of conjugate gradients for solving linear systems", 1952.
+    `gradient` takes r to the direction of descent: a preconditioner; with `least_squares`, where A is rectangular and
+    abs(b - A x)^2 is to be least, the product with the transpose. `dot` gives a tensor where columns are problems of
+    their own. Source: Hestenes and Stiefel, "Methods of conjugate gradients for solving linear systems", 1952.
     """
     z = r if gradient is None else gradient(r)
     p, power = z, dot(z, z if least_squares else r)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import torch
@@ -53,20 +52,11 @@ class RegionCosts:
     Pixels are flat indices into the image with a rim of `pad`.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        image: Tensor,
-        boxes: Ints,
-        pad: int,
-        blur: float,
-        **rendering: Any,
-    ) -> None:
+    def __init__(self, scene: Scene, image: Tensor, boxes: Ints, pad: int, blur: float, backend: str) -> None:
         field, regions = scene.field, scene.regions
         assert regions is not None and field.region_ids is not None
-        owners = regions.to(field.means.device).index_of(field.region_ids)
+        owners = regions.index_of(field.region_ids)
         colors = field.merged_colors()
-        image = image.to(colors.device, colors.dtype)
         margin = math.ceil(4 * blur)
         parts = []
         for region, (top, bottom, left, right) in enumerate(boxes.tolist()):
@@ -76,7 +66,7 @@ class RegionCosts:
                 members = (owners == region).nonzero().flatten()
                 means = field.means[members] - field.means.new_tensor([x, y])
                 size = (target.shape[1], target.shape[2])
-                rendered = region_splat(means, field.cholesky[members], colors[members], size=size, **rendering)
+                rendered = region_splat(means, field.cholesky[members], colors[members], size=size, backend=backend)
                 error = _blur(_blur((rendered - target).square_().mean(0), blur).T, blur).T
                 parts.append(error[top - y : bottom - y, left - x : right - x].cpu().numpy().ravel())
         self._values = np.concatenate(parts)

@@ -7,19 +7,7 @@ from torch import Tensor
 
 
 def local_gradient(cholesky: Tensor, means_gradient: Tensor, cholesky_gradient: Tensor) -> Tensor:
-    r"""Express a gradient in each Gaussian's frame.
-
-    Convention: a step (d1, d2, k11, k21, k22) moves the centre by :math:`L d` and the factor to :math:`L \exp K`, K
-    lower triangular; see :func:`move`.
-
-    Args:
-        cholesky: factors, :math:`(N, 3)`.
-        means_gradient: of the centres, :math:`(N, 2)`.
-        cholesky_gradient: of the factors, :math:`(N, 3)`.
-
-    Returns:
-        :math:`(N, 5)`.
-    """
+    """Express a gradient in each Gaussian's frame, (N, 5): by the step of :func:`move`, at none."""
     l11, l21, l22 = cholesky.unbind(-1)
     gx, gy = means_gradient.unbind(-1)
     g11, g21, g22 = cholesky_gradient.unbind(-1)
@@ -27,20 +15,9 @@ def local_gradient(cholesky: Tensor, means_gradient: Tensor, cholesky_gradient: 
 
 
 def move(means: Tensor, cholesky: Tensor, step: Tensor, *, exact: bool = True) -> tuple[Tensor, Tensor]:
-    r"""Move Gaussians in their own frames.
+    """Move Gaussians by (d1, d2, k11, k21, k22) in their own frames: centres by L d, factors to L exp K.
 
-    Args:
-        means: centres, :math:`(N, 2)`.
-        cholesky: factors, :math:`(N, 3)`.
-        step: (d1, d2, k11, k21, k22) of each, :math:`(N, 5)`, as in :func:`local_gradient`.
-        exact: take :math:`\exp K` as it is; False: to first order in k21, for steps that a solver chose so.
-
-    Returns:
-        Centres and factors.
-
-    Example:
-        >>> move(torch.zeros(1, 2), torch.tensor([[2.0, 0.0, 1.0]]), torch.tensor([[0.5, 0.0, 0.0, 0.0, 0.0]]))
-        (tensor([[1., 0.]]), tensor([[2., 0., 1.]]))
+    K is lower triangular. `exact` takes exp K as it is; False: to first order in k21, for steps that a solver chose so.
     """
     d1, d2, k11, k21, k22 = step.unbind(-1)
     l11, l21, l22 = cholesky.unbind(-1)

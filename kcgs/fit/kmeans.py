@@ -40,20 +40,6 @@ def kmeans_field(
     The density of a pixel is 0.7 x (gradient inside its region / mean gradient)^1.3 + 0.3: detail attracts cells, the
     contour itself does not. A region gets Gaussians in proportion to its mass and at least one; with fewer Gaussians
     than regions the regions of largest mass get one each, and the others stay black.
-
-    Args:
-        image: (C, H, W); gives size, channels, dtype and device.
-        num_gaussians: N, at least 1.
-        regions: the map; None: one region, and no ids.
-        seed: of the first centres and of the pixels that the cells are computed from.
-        backend: kernel that colours are solved with.
-
-    Example:
-        >>> labels = torch.zeros(16, 24, dtype=torch.long)
-        >>> labels[4:8, 4:8] = 7
-        >>> field = kmeans_field(torch.rand(3, 16, 24), 20, RegionMap.from_labels(labels), seed=0)
-        >>> sorted(set(field.region_ids.tolist())), len(field)
-        ([0, 7], 20)
     """
     rng = np.random.default_rng(seed)
     planes = image.detach().cpu().double().numpy()
@@ -83,21 +69,7 @@ def kmeans_field(
 
 
 def gaussian_shares(image: Tensor, regions: RegionMap) -> Tensor:
-    """Share of the Gaussians that `kmeans_field` gives every region, the rounding to whole ones left aside.
-
-    Args:
-        image: (C, H, W) floating.
-        regions: the map, R regions.
-
-    Returns:
-        (R,) float64 on the CPU in the order of the map's ids; they sum to 1.
-
-    Example:
-        >>> labels = torch.zeros(16, 24, dtype=torch.long)
-        >>> labels[:, 18:] = 7
-        >>> gaussian_shares(torch.zeros(3, 16, 24), RegionMap.from_labels(labels))
-        tensor([0.7500, 0.2500], dtype=torch.float64)
-    """
+    """Share of the Gaussians that `kmeans_field` gives every region of the map, (R,), the rounding left aside."""
     planes = image.detach().cpu().double().numpy()
     index, count = _region_index(planes.shape[1:], regions)
     mass = np.bincount(index.ravel(), _density(planes, index).ravel(), minlength=count)
@@ -124,13 +96,11 @@ def _slope(planes: Array, index: Indices) -> Array:
     """Root mean square difference to the neighbours of the same region, over channels, (H, W)."""
     total, count = np.zeros(index.shape), np.zeros(index.shape)
     for axis in (0, 1):
-        first = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
-        second = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
-        same = index[first] == index[second]
+        same = np.diff(index, axis=axis) == 0
         difference = np.square(np.diff(planes, axis=axis + 1)).sum(0) * same
-        for side in (first, second):
-            total[side] += difference
-            count[side] += same
+        for sums, values in ((total, difference), (count, same)):
+            sums.swapaxes(0, axis)[:-1] += values.swapaxes(0, axis)
+            sums.swapaxes(0, axis)[1:] += values.swapaxes(0, axis)
     return np.sqrt(total / np.maximum(count, 1))
 
 
@@ -159,13 +129,7 @@ def _cells(
 ) -> tuple[Array, Array, Array]:
     """Centres (K, 2), factors (K, 3) and mean colours (K, C) of `count` cells of one region.
 
-    Args:
-        pixels: of the region, flat positions in the image, (P,).
-        density: of each, (P,).
-        values: of all pixels of the image, (H * W, C).
-        width: of the image.
-        count: K.
-        rng: of the samples.
+    `pixels` are the region's, flat; `density` is theirs; `values`, (H * W, C), are those of all pixels of the image.
     """
     from scipy.spatial import cKDTree
 

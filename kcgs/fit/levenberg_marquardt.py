@@ -13,7 +13,7 @@ from kcgs.functional import RegionMap, edge_band, region_splat
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
-from .colors import check_scene, is_better
+from .colors import is_better
 from .frame import move
 
 # a Gaussian as wide as 100 diagonals is constant over the image to 2.6e-6 (root mean square, 111 dB)
@@ -35,7 +35,6 @@ _FEW_GAUSSIANS = 64
 _FLAT_SAMPLES = 1 << 16
 
 
-@torch.inference_mode(False)
 @torch.no_grad()
 def levenberg_marquardt(
     scene: Scene,
@@ -46,45 +45,21 @@ def levenberg_marquardt(
     cutoff: float = 0.0,
     backend: str = "auto",
 ) -> Scene:
-    r"""Fit all parameters of a small scene to the last digit, by Levenberg-Marquardt in float64.
+    """Fit all parameters of a small scene to the last digit, by Levenberg-Marquardt in float64.
 
-    Convention: a step moves a Gaussian in its own frame, :math:`\mu + L d` and :math:`L \exp K`, K lower triangular;
-    colours are eliminated, with 1e-9 per pixel charged for their squares, so that near-duplicates take none that
-    float32 cannot hold. Gaussians that share no pixel are fitted apart; where it helps, the largest of each region
-    starts as a constant. l11 and l22 stay within 0.05 pixels and 100 image diagonals, where flat
-    regions end, and centres within 3 diagonals of the image. The same scene each time, unless the clock stops it.
-
-    Args:
-        scene: Gaussians of one image, hard or soft contours; opacities are merged into the colours.
-        image: :math:`(C, H, W)`, of the scene's size, channels and device.
-        max_steps: for each group of Gaussians that share pixels, at least 1.
-        max_seconds: of wall time in all, checked between steps.
-        cutoff: weights below it are skipped; render with the same.
-        backend: kernel that the result is compared with the start with.
-
-    Returns:
-        A new scene; `scene` itself where the squared error, rendered in its dtype, did not fall, or rose once clipped.
-
-    Raises:
-        TypeError, ValueError: as :func:`kcgs.fit.colors.check_scene`.
-
-    Example:
-        >>> labels = torch.arange(30).expand(20, 30) // 15
-        >>> scene = Scene(GaussianField.random(6, (20, 30), regions=labels, seed=1), labels)
-        >>> levenberg_marquardt(scene, labels.expand(3, 20, 30) * 0.5 + 0.2).render()[0, 9, 13:17]
-        tensor([0.2000, 0.2000, 0.7000, 0.7000])
+    A step moves a Gaussian in its own frame; colours are eliminated, with 1e-9 per pixel charged for their squares, so
+    that near-duplicates take none that float32 cannot hold. Gaussians that share no pixel are fitted apart; where it
+    helps, the largest of each region starts as a constant. Returns the scene itself if the error did not fall.
 
     Source: Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares problems whose
     variables separate", 1973; Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", 1963.
     """
     start = time.perf_counter()
-    image = check_scene(scene, image)
     field, regions = scene.field, scene.regions
-    bounds = _Bounds.of(field.size, field.means.device)
     whole = [t.detach().clone() for t in (field.means, field.cholesky, field.merged_colors())]
     before = _render(scene, whole, cutoff, backend)
-    kept = bounds.clamp(whole[0].double(), whole[1].double())
-    flat = _sheets(*kept, field, regions, bounds.sigma[1])
+    kept = _bounded(whole[0].double(), whole[1].double(), field.size)
+    flat = _sheets(*kept, field, regions)
     groups = _groups(_patches(field, image, regions), len(field))
     for done, (members, patches) in enumerate(groups):
         deadline = time.perf_counter() + (start + max_seconds - time.perf_counter()) / (len(groups) - done)
@@ -92,7 +67,7 @@ def levenberg_marquardt(
         states = [
             _measure(patches, means[members], cholesky[members], colors, cutoff) for means, cholesky in (kept, flat)
         ]
-        state = _descend(patches, min(states, key=lambda s: s.cost), bounds, cutoff, max_steps, deadline)
+        state = _descend(patches, min(states, key=lambda s: s.cost), field.size, cutoff, max_steps, deadline)
         # the colours that suit the geometry as it is kept
         means, cholesky = state.means.to(image.dtype).double(), state.cholesky.to(image.dtype).double()
         state = _measure(patches, means, cholesky, state.colors, cutoff)
@@ -111,33 +86,22 @@ def _render(scene: Scene, gaussians: list[Tensor], cutoff: float, backend: str) 
     return region_splat(means, cholesky, colors, ids, scene.regions, **settings)  # type: ignore[arg-type]
 
 
-class _Bounds(NamedTuple):
-    """What a Gaussian may be, in pixels."""
-
-    sigma: tuple[float, float]
-    centre: tuple[Tensor, Tensor]  # [2] each
-
-    @classmethod
-    def of(cls, size: tuple[int, int], device: torch.device) -> _Bounds:
-        diagonal = math.hypot(*size)
-        sigma = (_SIGMA_LIMITS[0], _SIGMA_LIMITS[1] * diagonal)
-        extent = torch.tensor(size[::-1], dtype=torch.float64, device=device)
-        margin = torch.full_like(extent, _CENTRE_DIAGONALS * diagonal)
-        return cls(sigma, (-margin, extent + margin))
-
-    def clamp(self, means: Tensor, cholesky: Tensor) -> tuple[Tensor, Tensor]:
-        l11, l21, l22 = cholesky.unbind(-1)
-        # both numbers of the first column alike, so that the slope stays
-        shrink = (self.sigma[1] / torch.maximum(l11, l21.abs())).clamp_max(1.0)
-        factors = [(l11 * shrink).clamp(*self.sigma), l21 * shrink, l22.clamp(*self.sigma)]
-        return means.clamp(*self.centre), torch.stack(factors, -1)
+def _bounded(means: Tensor, cholesky: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Keep centres within 3 diagonals of the image, and scales within `_SIGMA_LIMITS`."""
+    diagonal = math.hypot(*size)
+    least, most = _SIGMA_LIMITS[0], _SIGMA_LIMITS[1] * diagonal
+    l11, l21, l22 = cholesky.unbind(-1)
+    # both numbers of the first column alike, so that the slope stays
+    shrink = (most / torch.maximum(l11, l21.abs())).clamp_max(1.0)
+    factors = [(l11 * shrink).clamp(least, most), l21 * shrink, l22.clamp(least, most)]
+    extent, margin = means.new_tensor(size[::-1]), _CENTRE_DIAGONALS * diagonal
+    return means.clamp(torch.full_like(extent, -margin), extent + margin), torch.stack(factors, -1)
 
 
-def _sheets(
-    means: Tensor, cholesky: Tensor, field: GaussianField, regions: RegionMap | None, sigma: float
-) -> tuple[Tensor, Tensor]:
+def _sheets(means: Tensor, cholesky: Tensor, field: GaussianField, regions: RegionMap | None) -> tuple[Tensor, Tensor]:
     """Make the largest Gaussian of each region constant: where flat regions end, if slow steps do not get stuck."""
     means, cholesky = means.clone(), cholesky.clone()
+    sigma = _SIGMA_LIMITS[1] * math.hypot(*field.size)
     index, index_map = torch.zeros_like(means[:, 0]), means.new_zeros(field.size)
     if regions is not None and field.region_ids is not None:
         index, index_map = regions.index_of(field.region_ids), regions.index[0]
@@ -276,7 +240,7 @@ def _step(state: _State, damping: float) -> tuple[Tensor, Tensor]:
 
 
 def _descend(
-    patches: list[_Patch], state: _State, bounds: _Bounds, cutoff: float, max_steps: int, deadline: float
+    patches: list[_Patch], state: _State, size: tuple[int, int], cutoff: float, max_steps: int, deadline: float
 ) -> _State:
     """Take steps that lower the cost, a more careful one after each that would not."""
     damping, small = 1e-2, 0
@@ -285,7 +249,7 @@ def _descend(
             break
         step, colors = _step(state, damping)
         moved = move(state.means, state.cholesky, step.T, exact=False)
-        trial = _measure(patches, *bounds.clamp(*moved), state.colors + colors, cutoff)
+        trial = _measure(patches, *_bounded(*moved, size), state.colors + colors, cutoff)
         if trial.cost < state.cost:
             small = small + 1 if trial.cost > (1 - _LEAST_GAIN) * state.cost else 0
             state, damping = trial, max(damping / 5, _LEAST_DAMPING)
@@ -295,21 +259,11 @@ def _descend(
 
 
 def is_flat(image: Tensor, regions: RegionMap | None, num_gaussians: int) -> bool:
-    r"""Say whether :func:`levenberg_marquardt` pays on a scene: few Gaussians, and an image smooth inside its regions.
+    """Say whether :func:`levenberg_marquardt` pays on a scene: few Gaussians, and an image smooth inside its regions.
 
-    Convention: at most 64 Gaussians, no fewer than regions, and 80 % of the pixels (of about 65,536 on a grid) farther
-    than 2 pixels from a contour within 1.5 / 255 of the best quadratic in x and y of their region. Charts have 100 %,
-    65 photographs at most 29 % (BSDS with human labels 29, DAVIS 0.9, Kodak without a map 0.4).
-
-    Args:
-        image: :math:`(C, H, W)`.
-        regions: of the image's size; None: the image is one region.
-        num_gaussians: N.
-
-    Example:
-        >>> image = torch.eye(2).repeat_interleave(20, 0).repeat_interleave(20, 1)[None]
-        >>> is_flat(image, RegionMap.from_labels(image[0].long()), 20), is_flat(image, None, 20)
-        (True, False)
+    At most 64 Gaussians, no fewer than regions, and 80 % of the pixels (of about 65,536 on a grid) farther than 2
+    pixels from a contour within 1.5 / 255 of the best quadratic in x and y of their region. Charts have 100 %, 65
+    photographs at most 29 % (BSDS with human labels 29, DAVIS 0.9, Kodak without a map 0.4).
     """
     size = (image.shape[1], image.shape[2])
     if not (1 if regions is None else regions.num_regions) <= num_gaussians <= _FEW_GAUSSIANS:

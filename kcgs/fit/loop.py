@@ -83,11 +83,11 @@ def fit(
     state = start(image, regions, num_gaussians, config, seed, started)
     keeper = None if checkpoint is None else Checkpoint(checkpoint, state, regions)
     if not (keeper is not None and resume and keeper.read_into(state)) and config.merge_regions:
-        MergeRegions().before(state)
+        MergeRegions(state).before(state)
     if state.regions is not None and state.regions.num_regions > num_gaussians:
         _warn_of_empty_regions(state.regions.num_regions, num_gaussians)
 
-    strategies = make_strategies(config)
+    strategies = make_strategies(state)
     reason: StopReason | None = None
     while reason is None and state.iteration < config.iterations:
         if not state.optimizer.is_finite():
@@ -96,7 +96,7 @@ def fit(
             break
         progress = state.progress()
         for strategy in strategies:
-            if strategy.due(progress, state):
+            if strategy.due(progress):
                 strategy.apply(state)
         rendered = render(state)
         if log_is_due(state, progress):

@@ -62,40 +62,22 @@ class _Candidates(NamedTuple):
 def propose(
     residual: Tensor, regions: RegionMap | None, count: int, *, sigmas: Sequence[float], backend: str = "auto"
 ) -> Proposal:
-    r"""Find round Gaussians that lower the squared error most when they are added to the render.
+    r"""Find at most `count` round Gaussians that lower the squared error most when they are added to the render.
 
     A Gaussian g of region r and colour :math:`\langle g, e \rangle_r / \langle g, g \rangle_r` lowers the squared
-    error of the residual e by :math:`\sum_c \langle g, e_c \rangle_r^2 / \langle g, g \rangle_r`, the products taken
-    over the pixels of r. The largest of these is taken, its share of the error is taken off its neighbours', and so
-    on; the colours of all are then solved for together, so that the squared error never grows.
-
-    Convention: centres are centres of pixels of their region. The search takes contours as hard and averages the
-    residual over blocks for the large scales (gains within 15 %); the colours are for the map as it is. No
-    randomness; of equal gains the first in raster order wins.
-
-    Args:
-        residual: image minus render, floating, :math:`(C, H, W)`.
-        regions: one map of that size; None: one region.
-        count: most Gaussians to propose, at least 0; fewer come only where none lowers the error.
-        sigmas: standard deviations to try, in pixels, positive.
-        backend: kernel that the colours are solved with, as in :func:`kcgs.functional.region_splat`.
-
-    Returns:
-        Means :math:`(K, 2)`, factors :math:`(K, 3)`, colours :math:`(K, C)`, region ids :math:`(K,)` or None.
-
-    Example:
-        >>> residual = torch.zeros(3, 32, 48)
-        >>> residual[:, 10:14, 20:24] = 0.5
-        >>> proposal = propose(residual, None, 1, sigmas=(0.7, 1.5, 3.0))
-        >>> proposal.means.round(), proposal.cholesky[0, 0]
-        (tensor([[22., 12.]]), tensor(1.5000))
+    error of the residual e by :math:`\sum_c \langle g, e_c \rangle_r^2 / \langle g, g \rangle_r`. The largest of these
+    is taken, its share of the error is taken off its neighbours', and so on; the colours of all are then solved for
+    together, so that the squared error never grows. The search takes contours as hard, averages the residual over
+    blocks for the large scales (gains within 15 %) and puts centres at pixels of their region. It samples nothing.
     """
-    error = residual.detach().to(torch.float64 if residual.dtype == torch.float64 else torch.float32)
+    error = residual.detach()
     index = torch.zeros_like(error[0], dtype=torch.int32) if regions is None else regions.index[0]
     labels = index.cpu().numpy()
     # below this the gain is rounding error: one pixel's, at the precision of the largest
     floor = (128 * torch.finfo(error.dtype).eps * float(error.abs().max())) ** 2
-    parts: list[Proposal] = []
+    nothing = error.new_zeros
+    ids = None if regions is None else regions.ids[:0]
+    parts = [Proposal(nothing(0, 2), nothing(0, 3), nothing(0, len(error)), ids)]
     while (wanted := count - sum(len(part.means) for part in parts)) > 0:
         chosen = _pursue(_search(error, labels, sigmas, wanted), wanted, floor)
         if not len(chosen.x):
@@ -105,7 +87,8 @@ def propose(
             break
         parts.append(part)
         error = error - rendered
-    return _join(parts, residual, regions)
+    columns = zip(*parts, strict=True)
+    return Proposal(*(None if column[0] is None else torch.cat(column) for column in columns))  # type: ignore[arg-type]
 
 
 def _search(residual: Tensor, labels: NDArray[np.int32], sigmas: Sequence[float], count: int) -> _Candidates:
@@ -155,14 +138,8 @@ def _best_of_squares(
 ) -> _Candidates:
     """Gains at every block of one region, at one scale; the best of each square of blocks, the `limit` best of those.
 
-    Args:
-        padded: residual inside the region, zero outside, and the mask, averaged over blocks, (C + 1, h, w).
-        margin: width in blocks of the zeros around them.
-        region: position of the region in the map.
-        sigma: in pixels.
-        block: side of a block in pixels.
-        corner: (x, y) of the first pixel inside the margin.
-        limit: most candidates to return.
+    `padded`, (C + 1, h, w), is the residual inside the region, zero outside, and the mask, averaged over blocks, with
+    `margin` blocks of zeros around them; `corner` is the first pixel (x, y) inside the margin.
     """
     # <g, e> and <g, g> of the blocks; g^2 is a Gaussian too, narrower by sqrt 2
     inner = _blur(padded[:-1], sigma / block, margin).mul_(block**2)
@@ -315,15 +292,3 @@ def _joint_colors(chosen: _Candidates, centres: NDArray[np.float64], inner: NDAr
         dot=lambda a, b: torch.from_numpy((a.numpy() * b.numpy()).sum(0)),
     )
     return torch.from_numpy(solved.numpy() / root)
-
-
-def _join(parts: list[Proposal], residual: Tensor, regions: RegionMap | None) -> Proposal:
-    if not parts:
-        empty = residual.new_zeros
-        ids = None if regions is None else regions.ids[:0]
-        return Proposal(empty(0, 2), empty(0, 3), empty(0, len(residual)), ids)
-    means = torch.cat([part.means for part in parts]).to(residual.dtype)
-    cholesky = torch.cat([part.cholesky for part in parts]).to(residual.dtype)
-    colors = torch.cat([part.colors for part in parts]).to(residual.dtype)
-    ids = torch.cat([part.region_ids for part in parts if part.region_ids is not None]) if regions is not None else None
-    return Proposal(means, cholesky, colors, ids)

@@ -36,13 +36,14 @@ def start(
 ) -> FitState:
     """Return the state of a fit at its start; see :func:`kcgs.fit.fit`."""
     band = None if regions is None else edge_band(regions.labels).flatten().nonzero().flatten()
+    saturated = float(((image == 0.0) | (image == 1.0)).float().mean())
     state = FitState(
         image,
         config,
         num_gaussians,
         seed,
         started,
-        clamp=_is_saturated(image) if config.clamp == "auto" else config.clamp,
+        clamp=saturated >= _SATURATED if config.clamp == "auto" else config.clamp,
         band=None if band is None or not len(band) else band,
         # a map that comes with widths keeps them
         chooses_widths=config.softness == "auto" and regions is not None and regions.softness == 0.0,
@@ -69,10 +70,6 @@ def _make_optimizer(config: FitConfig, field: GaussianField, sigma: float) -> Ga
     if config.optimizer == "adan":
         return GaussianImageAdan(field, sigma, config.iterations, config.learning_rate_factor)
     return (FrameAdam if config.optimizer == "frame" else ImageGSAdam)(field, config.learning_rate_factor)
-
-
-def _is_saturated(image: Tensor) -> bool:
-    return bool(((image == 0.0) | (image == 1.0)).float().mean() >= _SATURATED)
 
 
 def _regions_to_render(
@@ -123,15 +120,7 @@ def _first_field(state: FitState, regions: RegionMap | None) -> tuple[GaussianFi
 def random_field(
     image: Tensor, num_gaussians: int, sigma: float, regions: RegionMap | None, seed: int
 ) -> GaussianField:
-    """Scatter round Gaussians uniformly over the image; no region starts empty while another has two.
-
-    Args:
-        image: (C, H, W); gives size, channels, dtype and device.
-        num_gaussians: N.
-        sigma: standard deviation in pixels.
-        regions: the map whose ids they get; None: none.
-        seed: of the places.
-    """
+    """Scatter round Gaussians uniformly over the image; no region starts empty while another has two."""
     size = (image.shape[1], image.shape[2])
     field = GaussianField.random(
         num_gaussians, size, channels=image.shape[0], sigma=sigma, seed=seed, dtype=image.dtype
@@ -169,21 +158,8 @@ def _fill_empty_regions(field: GaussianField, regions: RegionMap, seed: int) -> 
 def gradient_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:
     """Sample centres where the image changes, as Image-GS does: 0.7 Sobel gradient magnitude + 0.3 uniform.
 
-    Round Gaussians of half the expected spacing, coloured like the pixel under them, so scaled that their sum is
-    about the image. Pixels are sampled without replacement while there are as many as Gaussians.
-
-    Args:
-        image: (C, H, W); gives size, channels, dtype and device.
-        num_gaussians: N, at least 1.
-        regions: the map whose ids they get; None: none.
-        seed: of the places.
-
-    Example:
-        >>> image = torch.zeros(1, 20, 40)
-        >>> image[:, :, 20:] = 1.0
-        >>> field = gradient_field(image, 50, None, seed=0)
-        >>> bool(((field.means[:, 0] - 20).abs() < 2).float().mean() > 0.4)
-        True
+    Round Gaussians of half the expected spacing, coloured like the pixel under them, so scaled that their sum is about
+    the image.
     """
     from scipy.ndimage import sobel
 

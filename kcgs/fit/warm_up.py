@@ -12,11 +12,7 @@ from .loop import fit
 
 @lru_cache(maxsize=64)
 def warm_up(config: FitConfig) -> None:
-    """Compile and load what fits of these settings need, so that no fit's clock counts it.
-
-    Example:
-        >>> warm_up(FitConfig(iterations=5))
-    """
+    """Compile and load what fits of these settings need, so that no fit's clock counts it."""
     ramp = torch.linspace(0.0, 1.0, 96)
     image = torch.stack([ramp.expand(64, 96), 1 - ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96)])
     labels = (ramp > 0.6).long().expand(64, 96).contiguous()

@@ -25,17 +25,17 @@ def state_of(num_gaussians: int, started: float = 0.0, **settings: Any) -> FitSt
 
 class TestDensify:
     def test_additions_are_even_and_end_at_n(self) -> None:
-        densify, state = Densify(), state_of(1000)
-        counts = [densify.wanted(p / 1000, state) for p in range(1001)]
+        densify = Densify(state_of(1000))
+        counts = [densify.wanted(p / 1000) for p in range(1001)]
         assert counts[0] == counts[49] == 50
-        assert counts[-1] == densify.wanted(0.5, state) == 1000
+        assert counts[-1] == densify.wanted(0.5) == 1000
         assert len(set(counts)) == densify.steps + 1
         assert all(b >= a for a, b in pairwise(counts))
 
     def test_is_due_where_more_are_wanted(self) -> None:
-        densify, state = Densify(), state_of(100)
-        assert not densify.due(0.04, state)
-        assert densify.due(0.05, state)
+        densify = Densify(state_of(100))
+        assert not densify.due(0.04)
+        assert densify.due(0.05)
 
 
 class TestLearningRates:
@@ -72,17 +72,17 @@ class TestProgress:
 class TestStrategies:
     def test_are_those_that_the_settings_ask_for(self) -> None:
         def names(**settings: Any) -> list[str]:
-            return [type(strategy).__name__ for strategy in make_strategies(FitConfig(**settings))]
+            return [type(strategy).__name__ for strategy in make_strategies(state_of(10, **settings))]
 
         assert names() == ["EndDrafts", "Densify", "MoveContours", "MergeRegions"]
         off = {"move_contours": False, "merge_regions": False}
         assert names(warmup=True, **off) == ["EndDrafts", "RefreshIds", "Densify"]
 
     def test_late_moves_are_even(self) -> None:
-        strategy: Strategy = MoveContours(rise=1.5, after=0.5)
         state, due = state_of(10), []
+        strategy: Strategy = MoveContours(state, rise=1.5, after=0.5)
         for p in range(101):
-            if strategy.due(p / 100, state):
+            if strategy.due(p / 100):
                 state.late_moves += 1
                 due.append(p / 100)
         assert due == [0.6, 0.7, 0.8, 0.9]

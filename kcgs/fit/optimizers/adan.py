@@ -9,24 +9,10 @@ from torch.optim.optimizer import Optimizer, ParamsT
 
 
 class Adan(Optimizer):
-    r"""Adaptive Nesterov momentum: averages of the gradient, of its change, and of the squared look-ahead.
+    """Adaptive Nesterov momentum: averages of the gradient, of its change, and of the squared look-ahead.
 
-    Convention: as in the authors' release the betas weigh the past (the paper writes one minus them), the
-    averages start at zero and are corrected for it, and the gradient before the first is the first. State:
-    `step`; `momentum`, `change`, `square`, `previous`.
-
-    Args:
-        params: parameters, or dicts of parameter groups.
-        lr: step size, at least 0.
-        betas: decay of the averages of gradient, change and square, each in [0, 1).
-        eps: added to the root of the square, at least 0.
-
-    Example:
-        >>> point = torch.nn.Parameter(torch.tensor([1.0, -2.0]))
-        >>> point.square().sum().backward()
-        >>> Adan([point], lr=0.1).step()
-        >>> point.data
-        tensor([ 0.9000, -1.9000])
+    As in the authors' release the betas weigh the past (the paper writes one minus them), the averages start at zero
+    and are corrected for it, and the gradient before the first is the first.
 
     Source: Xie et al., "Adan: Adaptive Nesterov Momentum Algorithm", 2022, Algorithm 1 without its restarts.
     """

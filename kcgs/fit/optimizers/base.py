@@ -21,9 +21,6 @@ class GaussianOptimizer(ABC):
     """Gaussians that can be rendered, differentiated, and moved downhill.
 
     What moves is `raw`, tensors of which the last holds the colours as they are.
-
-    Args:
-        field: the start.
     """
 
     widest = 1.0
@@ -86,15 +83,13 @@ class PublishedOptimizer(GaussianOptimizer):
 
     rates: list[float]
     """Learning rate of each raw tensor."""
+    make: type[Any]
+    """The torch optimizer."""
 
     def set_raw(self, raw: list[Tensor]) -> None:
         """Take these for the raw tensors; the averages of all start anew."""
         super().set_raw(raw)
         self.optimizer = self.make([{"params": [t], "lr": rate} for t, rate in zip(self.raw, self.rates, strict=True)])
-
-    @abstractmethod
-    def make(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
-        """Make the torch optimizer."""
 
     def step(self, factor: float) -> None:
         """Move and forget the gradients."""

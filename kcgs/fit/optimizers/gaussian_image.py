@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,15 +18,9 @@ _EDGE = 1.0 - 1e-6
 class GaussianImageAdan(PublishedOptimizer):
     """Adan on centres through tanh, and on Cholesky factors and colours as they are.
 
-    Convention: the learning rate, 1e-3, is that of 50,000 iterations; a shorter fit takes larger steps, by the root of
-    the ratio, up to twentyfold. It halves each 40 % of the fit. Steps of the factors scale with the size of the
+    The learning rate, 1e-3, is that of 50,000 iterations; a shorter fit takes larger steps, by the root of the ratio,
+    up to twentyfold. It halves each 40 % of the fit. Steps of the factors scale with `sigma`, the size of the
     Gaussians at the start. A factor's columns may change sign in the descent, which leaves the covariance as it is.
-
-    Args:
-        field: the start.
-        sigma: standard deviation in pixels of its Gaussians, about.
-        iterations: of the fit.
-        rate_factor: factor on the learning rates.
 
     Source: Zhang et al., "GaussianImage: 1000 FPS Image Representation and Compression by 2D Gaussian Splatting", 2024.
     """
@@ -37,16 +30,13 @@ class GaussianImageAdan(PublishedOptimizer):
     largest_factor = 20.0
     halved_every = 0.4
     widest = 10.0
+    make = Adan
 
     def __init__(self, field: GaussianField, sigma: float, iterations: int, rate_factor: float) -> None:
         longer = min(self.largest_factor, math.sqrt(max(1.0, self.full_iterations / iterations)))
         rate = self.learning_rate * longer * rate_factor
         self.rates = [rate, rate * sigma, rate]
         super().__init__(field)
-
-    def make(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
-        """Make Adan."""
-        return Adan(groups)
 
     def decay(self, progress: float) -> float:
         """Halve the learning rates from time to time."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -15,25 +13,18 @@ from .base import LEAST_SIGMA, PublishedOptimizer
 class ImageGSAdam(PublishedOptimizer):
     """Adam on centres in units of the image, inverse scales in 1 / pixel, rotation angles, and colours.
 
-    Convention: learning rates are constant over the fit. They are ours, for the publication blends the ten nearest
-    Gaussians with normalised weights, and here they are summed.
-
-    Args:
-        field: the start.
-        rate_factor: factor on the learning rates.
+    Learning rates are constant over the fit. They are ours, for the publication blends the ten nearest Gaussians with
+    normalised weights, and here they are summed.
 
     Source: Zhang et al., "Image-GS: Content-Adaptive Image Representation via 2D Gaussians", 2025.
     """
 
     learning_rates = (5e-4, 2e-3, 2e-3, 5e-3)
+    make = torch.optim.Adam
 
     def __init__(self, field: GaussianField, rate_factor: float) -> None:
         self.rates = [rate * rate_factor for rate in self.learning_rates]
         super().__init__(field)
-
-    def make(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
-        """Make Adam."""
-        return torch.optim.Adam(groups)
 
     def decay(self, progress: float) -> float:
         """Keep the learning rates."""

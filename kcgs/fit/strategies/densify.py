@@ -21,6 +21,7 @@ from .move_contours import MoveContours
 class Densify:
     """Add Gaussians where they lower the squared error most, by matching pursuit, region by region."""
 
+    state: FitState
     contours: MoveContours | None = None
     """What moves the contours before an addition."""
     steps: int = 10
@@ -34,8 +35,9 @@ class Densify:
     sigmas: tuple[float, ...] = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
     """Standard deviations in pixels that are tried."""
 
-    def wanted(self, progress: float, state: FitState) -> int:
+    def wanted(self, progress: float) -> int:
         """Return how many Gaussians there should be."""
+        state = self.state
         if state.search is not None:
             return state.search.wanted
         if progress < self.begin:
@@ -44,9 +46,10 @@ class Densify:
         step = min(self.steps, 1 + int(share * (self.steps - 1)))
         return state.first + round((state.num_gaussians - state.first) * step / self.steps)
 
-    def due(self, progress: float, state: FitState) -> bool:
+    def due(self, progress: float) -> bool:
         """Say whether Gaussians are wanted, and the clock has time for them."""
-        if self.wanted(progress, state) <= state.wanted:
+        state = self.state
+        if self.wanted(progress) <= state.wanted:
             return False
         # against the clock, additions must leave time for the descent
         hurried = state.config.max_seconds is not None and progress < 0.9 * self.end
@@ -56,7 +59,7 @@ class Densify:
     def apply(self, state: FitState) -> None:
         """Add Gaussians, after moving the contours, if that is due."""
         start = state.seconds()
-        state.wanted = self.wanted(state.progress(), state)
+        state.wanted = self.wanted(state.progress())
         state.densifications += 1
         if self.contours is not None:
             self.contours.before_addition(state)

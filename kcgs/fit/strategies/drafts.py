@@ -14,11 +14,12 @@ class EndDrafts:
     after: float = 0.85
     """Share of the fit that renders with the draft cutoff."""
 
-    def due(self, progress: float, state: FitState) -> bool:
+    def due(self, progress: float) -> bool:
         """Say whether drafts have served their time."""
-        return state.cutoff != state.config.cutoff and progress >= self.after
+        return progress >= self.after
 
     def apply(self, state: FitState) -> None:
         """Sharpen; the next state that is measured is the best, for what was measured on drafts does not compare."""
-        state.cutoff = state.config.cutoff
-        state.best_psnr = float("-inf")
+        if state.cutoff != state.config.cutoff:
+            state.cutoff = state.config.cutoff
+            state.best_psnr = float("-inf")

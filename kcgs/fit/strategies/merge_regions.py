@@ -30,6 +30,7 @@ class MergeRegions:
     confined Gaussians have learnt by then is little use to unconfined ones.
     """
 
+    state: FitState
     after: float = Densify.end
     """Share of the fit when the trial is made: the end of densification."""
     trial: float = 0.05
@@ -63,9 +64,9 @@ class MergeRegions:
         pairs = self.harmful_pairs(regions.labels, *errors)
         begin(state, regions.merge(pairs)[0] if pairs else regions)
 
-    def due(self, progress: float, state: FitState) -> bool:
+    def due(self, progress: float) -> bool:
         """Say whether the one trial is to be made."""
-        return not state.merged and progress >= self.after
+        return not self.state.merged and progress >= self.after
 
     def apply(self, state: FitState) -> None:
         """Merge, once, the regions that a trial renders better without a contour between them."""

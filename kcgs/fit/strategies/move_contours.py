@@ -21,6 +21,7 @@ class MoveContours:
     :class:`Densify`. Later it must lower it: that is when this strategy is due.
     """
 
+    state: FitState
     rise: float
     """Factor by which a move may raise the squared error about it while Gaussians are added."""
     after: float
@@ -34,11 +35,10 @@ class MoveContours:
     time_share: float = 0.1
     """Share of the seconds that a fit may spend on moves."""
 
-    def due(self, progress: float, state: FitState) -> bool:
+    def due(self, progress: float) -> bool:
         """Say whether it is time for a move that must lower the error."""
-        if state.late_moves >= self.times:
-            return False
-        return progress >= self.after + (1 - self.after) * (state.late_moves + 1) / (self.times + 1)
+        moves = self.state.late_moves
+        return moves < self.times and progress >= self.after + (1 - self.after) * (moves + 1) / (self.times + 1)
 
     def apply(self, state: FitState) -> None:
         """Move the contours where that lowers the error at once."""

@@ -15,17 +15,18 @@ from kcgs.functional import RegionMap, lookup_regions
 class RefreshIds:
     """Read the region ids again under the moving centres."""
 
+    state: FitState
     every: float = 0.02
     """Share of the iterations between refreshes."""
     until: float = 0.5
     """Share of the iterations after which the ids are frozen."""
 
-    def due(self, progress: float, state: FitState) -> bool:
+    def due(self, progress: float) -> bool:
         """Say whether it is time; by iterations, as the paper has it."""
-        iterations = state.config.iterations
-        if state.regions is None or state.iteration % max(1, round(self.every * iterations)):
+        iteration, iterations = self.state.iteration, self.state.config.iterations
+        if self.state.regions is None or iteration % max(1, round(self.every * iterations)):
             return False
-        return 0 < state.iteration <= self.until * iterations
+        return 0 < iteration <= self.until * iterations
 
     def apply(self, state: FitState) -> None:
         """Read the ids."""
@@ -37,11 +38,6 @@ def refresh_ids(means: Tensor, region_ids: Tensor | None, regions: RegionMap) ->
     """Read the ids again under the centres, but leave no region without its last Gaussian.
 
     A region that lost every Gaussian would stay black for good, since nothing outside it feels its error.
-
-    Args:
-        means: centres in pixels, (N, 2).
-        region_ids: the present ids, (N,); None: there are none.
-        regions: the map.
     """
     found = lookup_regions(means, regions.labels)
     if region_ids is None:
