@@ -69,15 +69,11 @@ class ColorOperator:
         self._settings = {"size": field.size, "cutoff": cutoff, "backend": backend}
         with torch.enable_grad():
             self._leaf = colors.detach().requires_grad_()
-            self.rendered = self._splat(self._leaf)
-
-    def _splat(self, colors: Tensor) -> Tensor:
-        return region_splat(*self._geometry, colors, *self._confined, **self._settings)  # type: ignore[arg-type]
+            self.rendered = self.render(self._leaf)
 
     def render(self, colors: Tensor) -> Tensor:
         """Return A c, (C, H, W)."""
-        with torch.no_grad():
-            return self._splat(colors)
+        return region_splat(*self._geometry, colors, *self._confined, **self._settings)  # type: ignore[arg-type]
 
     def adjoint(self, image: Tensor) -> Tensor:
         """Return the product of the transpose with an image, (N, C)."""

@@ -28,14 +28,11 @@ def bounding_boxes(index: Labels, count: int, margin: int) -> Ints:
     """Return (R, 4) top, bottom, left, right of each region's pixels, grown by the margin; empty where it has none."""
     from scipy.ndimage import find_objects
 
-    height, width = index.shape
     boxes = np.zeros((count, 4), np.int64)
-    for region, found in enumerate(find_objects(index + 1, max_label=count)):
-        if found is not None:
-            rows, columns = found
-            boxes[region, ::2] = max(0, rows.start - margin), max(0, columns.start - margin)
-            boxes[region, 1::2] = min(height, rows.stop + margin), min(width, columns.stop + margin)
-    return boxes
+    for region, sides in enumerate(find_objects(index + 1, max_label=count)):
+        if sides is not None:
+            boxes[region] = [end for side in sides for end in (side.start - margin, side.stop + margin)]
+    return boxes.clip(0, np.repeat(index.shape, 2))
 
 
 def unequal(padded: Labels) -> int:

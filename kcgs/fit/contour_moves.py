@@ -1,8 +1,4 @@
-"""Contours that move: each pixel near a contour goes to the region whose own Gaussians explain it best.
-
-With the descent on the Gaussians this is alternating minimisation of a Mumford-Shah energy whose smooth part is a sum
-of Gaussians for each region.
-"""
+"""Contours that move: each pixel near a contour goes to the region whose own Gaussians explain it best."""
 
 from __future__ import annotations
 
@@ -32,16 +28,10 @@ def refine_contours(
     smallest: int = 12,
     backend: str = "auto",
 ) -> RegionMap:
-    r"""Move contours to where the image is explained better, at most `max_distance` pixels from the given map.
+    """Move contours to where the image is explained better, at most `max_distance` from the given map.
 
-    Lowers, by exact coordinate descent, the energy
-
-    .. math:: E = \sum_p (G * |I - F_{l(p)}|^2)(p) + \beta \sum_p \tfrac18 |\{q \in N_8(p): l(q) \ne l(p)\}|
-
-    F_r is the sum of region r's Gaussians without the constraint, the square is the mean over channels, G the blur. All
-    pixels of one colour of a 2 x 2 colouring move at once, which no two 8-neighbours share, so that no sweep raises the
-    energy. No region is lost; pieces under `smallest` pixels that came up are given to the adjacent label that costs
-    least. Returns the scene's map itself where nothing lowers the energy.
+    Exact coordinate descent on the energy in docs/fitting.md; no region is lost. Pieces under `smallest` pixels that
+    came up are given to the adjacent label that costs least. The scene's map itself where nothing lowers the energy.
 
     Source: Mumford and Shah's functional of 1989; Besag's iterated conditional modes of 1986.
     """
@@ -72,11 +62,10 @@ def refine_contours(
 
 
 def accept_moves(before: RegionMap, after: RegionMap, gain: Tensor) -> RegionMap:
-    """Keep, of the moves between two maps, those whose surroundings are rendered better.
+    """Keep, of the moves between two maps, those whose surroundings are rendered better; lose no region.
 
-    Moves are judged by the region's Gaussians alone; the render blends them over soft contours. Pixels that changed
-    their label are grouped with all within two pixels, and a group stays changed where its gain, the fall of the
-    squared error (H, W), is positive in its sum. Returns `before` where nothing is kept, or a region would be lost.
+    Moves are judged by the region's Gaussians alone; the render blends them over soft contours. Pixels that changed are
+    grouped with all within two pixels, and a group stays changed where its gain, (H, W), is positive in its sum.
     """
     from scipy import ndimage
 

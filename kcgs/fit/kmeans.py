@@ -37,30 +37,25 @@ def kmeans_field(
 ) -> GaussianField:
     """Cut every region into cells of equal density mass by k-means; one Gaussian per cell, of its shape and colour.
 
-    The density of a pixel is 0.7 x (gradient inside its region / mean gradient)^1.3 + 0.3: detail attracts cells, the
-    contour itself does not. A region gets Gaussians in proportion to its mass and at least one; with fewer Gaussians
-    than regions the regions of largest mass get one each, and the others stay black.
+    A region gets Gaussians in proportion to its mass and at least one; with fewer Gaussians than regions the regions of
+    largest mass get one each, and the others stay black.
     """
     rng = np.random.default_rng(seed)
     planes = image.detach().cpu().double().numpy()
-    size = planes.shape[1:]
-    index, count = _region_index(size, regions)
-    density = _density(planes, index)
-    mass = np.bincount(index.ravel(), density.ravel(), minlength=count).astype(np.float64)
-    budget = np.zeros(count, np.int64)
+    index, density, mass = _density(planes, regions)
+    budget = np.zeros(len(mass), np.int64)
     # a region may have no pixel of its own, with a map finer than the image
     budget[mass > 0] = _budget(mass[mass > 0], num_gaussians)
     # pixels sorted by region, raster order within
     order = np.argsort(index, axis=None, kind="stable")
-    ends = np.bincount(index.ravel(), minlength=count).cumsum()
+    members = np.split(order, np.bincount(index.ravel(), minlength=len(mass)).cumsum()[:-1])
     values = planes.reshape(len(planes), -1).T
     parts = []
     for region in np.flatnonzero(budget):
-        pixels = order[ends[region - 1] if region else 0 : ends[region]]
-        parts.append(_cells(pixels, density.ravel()[pixels], values, size[1], int(budget[region]), rng))
-    centres, cholesky, colors = (np.concatenate(values) for values in zip(*parts, strict=True))
-    means, factors, shades = (torch.from_numpy(values).to(image) for values in (centres, cholesky, colors))
-    field = GaussianField(means, factors, shades, size=(image.shape[1], image.shape[2]))
+        pixels = members[region]
+        parts.append(_cells(pixels, density.ravel()[pixels], values, index.shape[1], int(budget[region]), rng))
+    tensors = (torch.from_numpy(np.concatenate(columns)).to(image) for columns in zip(*parts, strict=True))
+    field = GaussianField(*tensors, size=(image.shape[1], image.shape[2]))
     if regions is not None:
         field.region_ids = regions.ids[torch.from_numpy(np.repeat(np.arange(len(budget)), budget)).to(image.device)]
     with torch.no_grad():
@@ -70,26 +65,21 @@ def kmeans_field(
 
 def gaussian_shares(image: Tensor, regions: RegionMap) -> Tensor:
     """Share of the Gaussians that `kmeans_field` gives every region of the map, (R,), the rounding left aside."""
-    planes = image.detach().cpu().double().numpy()
-    index, count = _region_index(planes.shape[1:], regions)
-    mass = np.bincount(index.ravel(), _density(planes, index).ravel(), minlength=count)
+    mass = _density(image.detach().cpu().double().numpy(), regions)[2]
     return torch.from_numpy(mass / mass.sum())
 
 
-def _region_index(size: tuple[int, ...], regions: RegionMap | None) -> tuple[Indices, int]:
-    """Place of every pixel's region in the map's ids, (H, W), and the number of regions."""
-    if regions is None:
-        return np.zeros(size, np.int64), 1
-    return regions.index[0].cpu().numpy().astype(np.int64), regions.num_regions
-
-
-def _density(planes: Array, index: Indices) -> Array:
-    """Density of the cells' centres, (H, W)."""
+def _density(planes: Array, regions: RegionMap | None) -> tuple[Indices, Array, Array]:
+    """Place of every pixel's region in the map's ids, density of the cells' centres, and its sum over each region."""
+    index: Indices = np.zeros(planes.shape[1:], np.int64)
+    if regions is not None:
+        index = regions.index[0].cpu().numpy().astype(np.int64)
     slope = _slope(planes, index)
-    density = np.full(index.shape, 1.0 - _GRADIENT_SHARE)
+    density: Array = np.full(index.shape, 1.0 - _GRADIENT_SHARE)
     if slope.any():
         density += _GRADIENT_SHARE * (slope / slope.mean()) ** _GRADIENT_POWER
-    return density
+    mass = np.bincount(index.ravel(), density.ravel(), minlength=1 if regions is None else regions.num_regions)
+    return index, density, mass.astype(np.float64)
 
 
 def _slope(planes: Array, index: Indices) -> Array:

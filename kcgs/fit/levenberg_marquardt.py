@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -45,11 +46,9 @@ def levenberg_marquardt(
     cutoff: float = 0.0,
     backend: str = "auto",
 ) -> Scene:
-    """Fit all parameters of a small scene to the last digit, by Levenberg-Marquardt in float64.
+    """Fit all parameters of a small scene to the last digit, by Levenberg-Marquardt in float64; see docs/fitting.md.
 
-    A step moves a Gaussian in its own frame; colours are eliminated, with 1e-9 per pixel charged for their squares, so
-    that near-duplicates take none that float32 cannot hold. Gaussians that share no pixel are fitted apart; where it
-    helps, the largest of each region starts as a constant. Returns the scene itself if the error did not fall.
+    Returns the scene itself where the squared error, rendered in its dtype, did not fall, or rose once clipped.
 
     Source: Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares problems whose
     variables separate", 1973; Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", 1963.
@@ -57,7 +56,10 @@ def levenberg_marquardt(
     start = time.perf_counter()
     field, regions = scene.field, scene.regions
     whole = [t.detach().clone() for t in (field.means, field.cholesky, field.merged_colors())]
-    before = _render(scene, whole, cutoff, backend)
+    ids = None if regions is None else field.region_ids
+    settings = {"size": field.size, "cutoff": cutoff, "backend": backend}
+    render = partial(region_splat, region_ids=ids, regions=regions, **settings)  # type: ignore[arg-type]
+    before = render(*whole)
     kept = _bounded(whole[0].double(), whole[1].double(), field.size)
     flat = _sheets(*kept, field, regions)
     groups = _groups(_patches(field, image, regions), len(field))
@@ -73,17 +75,10 @@ def levenberg_marquardt(
         state = _measure(patches, means, cholesky, state.colors, cutoff)
         for tensor, value in zip(whole, state[:3], strict=True):
             tensor[members] = value.to(image.dtype)
-    if not is_better(_render(scene, whole, cutoff, backend), before, image):
+    if not is_better(render(*whole), before, image):
         return scene
     means, cholesky, colors = whole
     return Scene(GaussianField(means, cholesky, colors, field.region_ids, size=field.size), regions, scene.metadata)
-
-
-def _render(scene: Scene, gaussians: list[Tensor], cutoff: float, backend: str) -> Tensor:
-    ids = None if scene.regions is None else scene.field.region_ids
-    settings = {"size": scene.size, "cutoff": cutoff, "backend": backend}
-    means, cholesky, colors = gaussians
-    return region_splat(means, cholesky, colors, ids, scene.regions, **settings)  # type: ignore[arg-type]
 
 
 def _bounded(means: Tensor, cholesky: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:

@@ -85,7 +85,11 @@ def fit(
     if not (keeper is not None and resume and keeper.read_into(state)) and config.merge_regions:
         MergeRegions(state).before(state)
     if state.regions is not None and state.regions.num_regions > num_gaussians:
-        _warn_of_empty_regions(state.regions.num_regions, num_gaussians)
+        warnings.warn(
+            f"{state.regions.num_regions - num_gaussians} of {state.regions.num_regions} regions get no Gaussian and "
+            f"stay black: num_gaussians is {num_gaussians}; merge regions or take more",
+            stacklevel=4,  # past the decorators
+        )
 
     strategies = make_strategies(state)
     reason: StopReason | None = None
@@ -129,11 +133,3 @@ def check_problem(image: Any, regions: RegionMap | Tensor | None) -> tuple[Tenso
     dtype = torch.float64 if image.dtype == torch.float64 else torch.float32
     # a copy: an inference tensor cannot take part in a graph
     return image.detach().to(dtype, copy=True), regions
-
-
-def _warn_of_empty_regions(regions: int, num_gaussians: int) -> None:
-    warnings.warn(
-        f"{regions - num_gaussians} of {regions} regions get no Gaussian and stay black: num_gaussians is "
-        f"{num_gaussians}; merge regions or take more",
-        stacklevel=5,  # past the decorators of `fit`
-    )

@@ -64,11 +64,8 @@ def propose(
 ) -> Proposal:
     r"""Find at most `count` round Gaussians that lower the squared error most when they are added to the render.
 
-    A Gaussian g of region r and colour :math:`\langle g, e \rangle_r / \langle g, g \rangle_r` lowers the squared
-    error of the residual e by :math:`\sum_c \langle g, e_c \rangle_r^2 / \langle g, g \rangle_r`. The largest of these
-    is taken, its share of the error is taken off its neighbours', and so on; the colours of all are then solved for
-    together, so that the squared error never grows. The search takes contours as hard, averages the residual over
-    blocks for the large scales (gains within 15 %) and puts centres at pixels of their region. It samples nothing.
+    A Gaussian g lowers it by :math:`\sum_c \langle g, e_c \rangle^2 / \langle g, g \rangle`, with products over pixels
+    of its region. Contours are hard in the search, and centres are those of pixels; nothing is sampled at random.
     """
     error = residual.detach()
     index = torch.zeros_like(error[0], dtype=torch.int32) if regions is None else regions.index[0]

@@ -156,11 +156,7 @@ def _fill_empty_regions(field: GaussianField, regions: RegionMap, seed: int) -> 
 
 
 def gradient_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:
-    """Sample centres where the image changes, as Image-GS does: 0.7 Sobel gradient magnitude + 0.3 uniform.
-
-    Round Gaussians of half the expected spacing, coloured like the pixel under them, so scaled that their sum is about
-    the image.
-    """
+    """Sample centres where the image changes, as Image-GS does: 0.7 Sobel gradient magnitude + 0.3 uniform."""
     from scipy.ndimage import sobel
 
     rng = np.random.default_rng(seed)

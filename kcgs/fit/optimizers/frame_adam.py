@@ -16,13 +16,10 @@ from .base import LEAST_SIGMA, GaussianOptimizer
 
 
 class FrameAdam(GaussianOptimizer):
-    """Adam in each Gaussian's own frame.
+    """Adam in each Gaussian's own frame, so that one learning rate suits all sizes and every image.
 
-    A step moves the centre by d mu = L d and the factor by L <- L exp(K), K lower triangular: steps are fractions of
-    the Gaussian's own size and shape, so that one learning rate suits all sizes and every image. Centres stay within
-    the image plus two of their standard deviations, and scales between 0.1 pixels and the image diagonal: without
-    bounds a few Gaussians run away to 1e5 pixels, harmless to the render and ruinous to its numbers. The learning rates
-    fall to a tenth along a cosine.
+    A step moves the centre by d mu = L d and the factor by L <- L exp(K), K lower triangular. Centres and scales are
+    bounded: else a few Gaussians run away to 1e5 pixels, harmless to the render and ruinous to its numbers.
     """
 
     learning_rate = 0.1

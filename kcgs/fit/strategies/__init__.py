@@ -10,8 +10,7 @@ from typing import Protocol
 from kcgs.fit.state import FitState
 
 from .densify import Densify, DensifyAtLargestError
-from .drafts import EndDrafts
-from .finish import Finish
+from .finish import EndDrafts, Finish
 from .merge_regions import MergeRegions
 from .move_contours import MoveContours
 from .warmup import RefreshIds

@@ -1,4 +1,4 @@
-"""The end of a fit: the best state, refined and pruned."""
+"""The end of a fit: no more drafts, then the best state, refined and pruned."""
 
 from __future__ import annotations
 
@@ -13,7 +13,23 @@ from kcgs.fit.state import FitResult, FitState, Gaussians, StopReason
 from kcgs.pruning import prune
 from kcgs.scene import Scene
 
-from .drafts import EndDrafts
+
+@dataclass(frozen=True)
+class EndDrafts:
+    """Render with the cutoff of the result from here on."""
+
+    after: float = 0.85
+    """Share of the fit that renders with the draft cutoff."""
+
+    def due(self, progress: float) -> bool:
+        """Say whether drafts have served their time."""
+        return progress >= self.after
+
+    def apply(self, state: FitState) -> None:
+        """Sharpen; the next state that is measured is the best, for what was measured on drafts does not compare."""
+        if state.cutoff != state.config.cutoff:
+            state.cutoff = state.config.cutoff
+            state.best_psnr = float("-inf")
 
 
 @dataclass(frozen=True)
@@ -26,10 +42,8 @@ class Finish:
     def apply(self, state: FitState, reason: StopReason) -> FitResult:
         """Return the result of a fit that ended for this reason."""
         config = state.config
-        drafted = None
-        if state.cutoff != config.cutoff:
-            drafted = state.best
-            EndDrafts().apply(state)
+        drafted = None if state.cutoff == config.cutoff else state.best
+        EndDrafts().apply(state)
         with torch.no_grad():
             if drafted is not None:
                 log(state, render(state, drafted), drafted)

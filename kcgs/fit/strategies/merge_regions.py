@@ -6,6 +6,7 @@ import copy
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,13 +22,9 @@ from .densify import Densify
 class MergeRegions:
     """Merge the touching regions that are rendered better without the contour between them.
 
-    The squared errors of two trials, one with all contours and one with none, are summed over the pixels nearest to
-    each pair's contour; where none is better by a quarter the pair is merged.
-
-    Before the fit, :meth:`before` compares two short fits with the few Gaussians that densification starts from. When
-    the last Gaussians are there, `apply` goes on for some steps twice from the same state, both after a solution of the
-    colours, since Gaussians that were confined overlap once they are not. Neither can stand for the other: what
-    confined Gaussians have learnt by then is little use to unconfined ones.
+    Two trials, one with all contours and one with none, are compared over the pixels nearest to each pair's contour:
+    :meth:`before` the fit from its first Gaussians, and once the last are there from the state of the moment, after a
+    solution of the colours. What confined Gaussians learnt by then is little use to unconfined ones: it takes both.
     """
 
     state: FitState
@@ -128,15 +125,10 @@ def nearest_contour(labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """For every pixel: its label, the label on the other side of the nearest contour, and the distance in pixels."""
     from scipy import ndimage
 
-    labels = labels.cpu()
-    other = labels.clone()
-    for dim in (0, 1):
-        for shift in (1, -1):
-            moved = labels.roll(shift, dim)
-            edge = 0 if shift == 1 else labels.shape[dim] - 1
-            moved.select(dim, edge).copy_(labels.select(dim, edge))
-            other = torch.where(other == labels, moved, other)
-    distance, (row, column) = ndimage.distance_transform_edt((other == labels).numpy(), return_indices=True)
-    nearest = torch.from_numpy(row).long(), torch.from_numpy(column).long()
-    across = torch.where(labels[nearest] == labels, other[nearest], labels[nearest])
-    return labels, across, torch.from_numpy(distance)
+    values = labels.cpu().numpy()
+    other, padded = values, np.pad(values, 1, "edge")
+    for neighbor in (padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]):
+        other = np.where(other == values, neighbor, other)
+    distance, (row, column) = ndimage.distance_transform_edt(other == values, return_indices=True)
+    across = np.where(values[row, column] == values, other[row, column], values[row, column])
+    return labels.cpu(), torch.from_numpy(across), torch.from_numpy(distance)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from kcgs.fit.state import FitState
-from kcgs.functional import RegionMap, lookup_regions
+from kcgs.functional import lookup_regions
 
 
 @dataclass(frozen=True)
@@ -29,19 +28,10 @@ class RefreshIds:
         return 0 < iteration <= self.until * iterations
 
     def apply(self, state: FitState) -> None:
-        """Read the ids."""
-        assert state.regions is not None
-        state.region_ids = refresh_ids(state.optimizer.gaussians()[0], state.region_ids, state.regions)
-
-
-def refresh_ids(means: Tensor, region_ids: Tensor | None, regions: RegionMap) -> Tensor:
-    """Read the ids again under the centres, but leave no region without its last Gaussian.
-
-    A region that lost every Gaussian would stay black for good, since nothing outside it feels its error.
-    """
-    found = lookup_regions(means, regions.labels)
-    if region_ids is None:
-        return found
-    left = torch.zeros(regions.num_regions, dtype=torch.bool, device=found.device)
-    left[regions.index_of(found)] = True
-    return torch.where(left[regions.index_of(region_ids)], found, region_ids)
+        """Read the ids, but leave no region without its last Gaussian: nothing outside it would feel its error."""
+        regions, ids = state.regions, state.region_ids
+        assert regions is not None and ids is not None
+        found = lookup_regions(state.optimizer.gaussians()[0], regions.labels)
+        left = torch.zeros(regions.num_regions, dtype=torch.bool, device=found.device)
+        left[regions.index_of(found)] = True
+        state.region_ids = torch.where(left[regions.index_of(ids)], found, ids)
