@@ -7,10 +7,10 @@ import sys
 import typer
 
 # each puts its commands into `app`, in the order of `kcgs --help`
-from . import fit, many, scenes, segmentation, decoders, bench  # isort: skip
+from . import fit, many, scenes, segmentation, decoders  # isort: skip
 from .common import app
 
-__all__ = ["app", "bench", "decoders", "fit", "main", "many", "scenes", "segmentation"]
+__all__ = ["app", "decoders", "fit", "main", "many", "scenes", "segmentation"]
 
 
 def main() -> None:

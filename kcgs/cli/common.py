@@ -10,6 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
+from kcgs._atomic import atomic_path
+
 app = typer.Typer(
     help="Contour-aware 2D Gaussian splatting of images.",
     no_args_is_help=True,
@@ -63,8 +65,6 @@ def check_output(path: Path, *suffixes: str, option: str = "--output") -> None:
 
 def write_file(path: Path, data: bytes) -> int:
     """Write a file whole or not at all; return its bytes."""
-    from kcgs._atomic import atomic_path
-
     with atomic_path(path) as temporary:
         return temporary.write_bytes(data)
 

@@ -24,21 +24,15 @@ _ALIGNED = 0.58
 
 
 @app.command("fit")
+@options.with_fit_options
 def fit_command(
     image: ImageFile,
+    *,
     regions: Annotated[
         str,
         typer.Option(metavar="MASK|auto|none", help="Label-map file, or auto (segment the image), or none."),
     ] = "auto",
-    num_gaussians: options.Gaussians = None,
-    recipe: options.Recipe = "best",
-    iterations: options.Iterations = None,
-    max_seconds: options.MaxSeconds = None,
-    target_psnr: options.TargetPsnr = None,
-    target_bytes: options.TargetBytes = None,
-    keep_contours: options.KeepContours = False,
-    seed: options.Seed = 0,
-    backend: options.KernelName = "auto",
+    request: options.FitRequest,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", help="Scene (.safetensors) or file (.kcgs); default: IMAGE's name, here."),
@@ -51,19 +45,15 @@ def fit_command(
     """Fit Gaussians to an image and save the scene."""
     from kcgs.data import load_image
 
-    suffixes = (".safetensors", ".kcgs") if target_bytes is None else (".kcgs",)
+    suffixes = (".safetensors", ".kcgs") if request.target_bytes is None else (".kcgs",)
     output = Path(f"{image.stem}{suffixes[0]}") if output is None else output
     check_output(output, *suffixes)
     if plot is not None:
         check_output(plot, ".png", option="--plot")
     if resume and checkpoint is None:
         raise typer.BadParameter("--resume needs --checkpoint")
-    if target_bytes is not None:
+    if request.target_bytes is not None:
         options.exclude("--target-bytes", checkpoint=checkpoint)
-    request = options.fit_request(
-        num_gaussians=num_gaussians, target_bytes=target_bytes, recipe=recipe, seed=seed, backend=backend,
-        keep_contours=keep_contours, iterations=iterations, max_seconds=max_seconds, target_psnr=target_psnr,
-    )  # fmt: skip
     target = load_image(image)
     labels = read_regions(regions, target, partial(typer.echo, err=True))
     with Progress(request.config.iterations) as progress:
@@ -72,7 +62,7 @@ def fit_command(
     if plot is not None:
         from kcgs.plots import plot_history
 
-        plot_history(plot, {recipe: result.history})
+        plot_history(plot, {request.recipe: result.history})
     if progress.interrupted:
         typer.echo(f"interrupted: saved the best so far to {output}", err=True)
     title = f"{output}: {len(fitted.scene)} Gaussians, stopped by {result.stop_reason}"
@@ -123,13 +113,7 @@ def fit_into(
 
 
 def read_regions(regions: str, image: Tensor, warn: Callable[[str], None]) -> Tensor | None:
-    """Return the label map that the option --regions names.
-
-    Args:
-        regions: a file; auto: found in the image; none: there is none.
-        image: (C, H, W).
-        warn: called with a sentence where a file's contours do not seem to be the image's.
-    """
+    """Return the label map that the option --regions names; `warn` hears where its contours are not the image's."""
     if regions == "none":
         return None
     if regions == "auto":
@@ -137,52 +121,40 @@ def read_regions(regions: str, image: Tensor, warn: Callable[[str], None]) -> Te
 
         return segment(image)
     from kcgs.data import load_labels
-
-    labels = load_labels(Path(regions))
-    doubt = _misalignment(image, labels, regions)
-    if doubt is not None:
-        warn(doubt)
-    return labels
-
-
-def _misalignment(image: Tensor, labels: Tensor, name: str) -> str | None:
-    """Return a warning where a map's contours lie beside the image's edges; None: they do not."""
     from kcgs.functional import edge_alignment
 
-    if labels.shape != image.shape[1:]:
-        return None  # the fit refuses it
-    alignment = float(edge_alignment(image, labels))
-    if alignment >= _ALIGNED:
-        return None
-    return (
-        f"warning: the contours of {name} hardly follow the image's edges: alignment {alignment:.2f}, where chance "
-        "gives 0.50 and good masks 0.63 or more; does the mask belong to this image?"
-    )
+    labels = load_labels(Path(regions))
+    # the fit refuses one of another size
+    alignment = float(edge_alignment(image, labels)) if labels.shape == image.shape[1:] else 1.0
+    if alignment < _ALIGNED:
+        warn(
+            f"warning: the contours of {regions} hardly follow the image's edges: alignment {alignment:.2f}, where "
+            "chance gives 0.50 and good masks 0.63 or more; does the mask belong to this image?"
+        )
+    return labels
 
 
 def measure_scene(
     scene: Scene, image: Tensor, labels: Tensor | None, num_bytes: int, seconds: float | None = None
 ) -> dict[str, Any]:
-    """Compare a scene with its image: what `fit` and `eval` print.
+    """Compare a scene, as its file has it, with its image: what `fit` and `eval` print.
 
-    Args:
-        scene: as it is in the file.
-        image: (C, H, W).
-        labels: whose contours the edge-focused metrics look at.
-        num_bytes: of the file.
-        seconds: of the fit; None: those of the rendering.
+    Edge-focused metrics look at the contours of `labels`; `seconds` are those of the fit, or else of the rendering.
     """
     from kcgs.evaluate import measure
 
     start = time.perf_counter()
     render = scene.render()
     seconds = time.perf_counter() - start if seconds is None else seconds
-    height, width = scene.size
     return {
         **measure(render, image, labels),
         "num_gaussians": len(scene),
         "regions": 1 if scene.regions is None else scene.regions.num_regions,
         "seconds": seconds,
-        "bytes": num_bytes,
-        "bits_per_pixel": 8 * num_bytes / (height * width),
+        **describe_size(num_bytes, scene.size),
     }
+
+
+def describe_size(num_bytes: int, size: tuple[int, int]) -> dict[str, float]:
+    """Return the size of a file, and that by the pixels of its image."""
+    return {"bytes": num_bytes, "bits_per_pixel": 8 * num_bytes / (size[0] * size[1])}

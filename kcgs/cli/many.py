@@ -26,28 +26,22 @@ _COLUMNS = ("image", *_METRICS, "error", "core_seconds", "fit")
 
 
 @app.command("fit-many")
+@options.with_fit_options
 def fit_many_command(
     patterns: Annotated[
         list[str], typer.Argument(metavar="PATTERN...", help="Images, folders of images, or quoted patterns.")
     ],
+    *,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the scenes or files, and results.csv.")],
     regions: Annotated[
         str,
         typer.Option(metavar="DIR|auto|none", help="Folder of masks with the images' stems, or auto, or none."),
     ] = "auto",
-    num_gaussians: options.Gaussians = None,
-    recipe: options.Recipe = "best",
-    iterations: options.Iterations = None,
-    max_seconds: options.MaxSeconds = None,
-    target_psnr: options.TargetPsnr = None,
-    target_bytes: options.TargetBytes = None,
+    request: options.FitRequest,
     suffix: Annotated[
         Literal[".safetensors", ".kcgs"] | None,
         typer.Option(help="What is written; default: .safetensors, with --target-bytes .kcgs."),
     ] = None,
-    keep_contours: options.KeepContours = False,
-    seed: options.Seed = 0,
-    backend: options.KernelName = "auto",
     engine: options.EngineName = "local",
     workers: Annotated[int | None, typer.Option(min=1, help="Images at a time; default: cores / --threads.")] = None,
     threads: Annotated[int, typer.Option(min=1, help="Threads of each fit.")] = 1,
@@ -61,18 +55,14 @@ def fit_many_command(
     The same command again goes on where an earlier one was stopped: what is there from the same image, mask
     and settings is kept. One image's failure stops no other; with any, the exit status is 1.
     """
-    if target_bytes is not None and suffix == ".safetensors":
+    if request.target_bytes is not None and suffix == ".safetensors":
         options.exclude("--target-bytes", suffix=suffix)
-    request = options.fit_request(
-        num_gaussians=num_gaussians, target_bytes=target_bytes, recipe=recipe, seed=seed, backend=backend,
-        keep_contours=keep_contours, iterations=iterations, max_seconds=max_seconds, target_psnr=target_psnr,
-    )  # fmt: skip
     images = _expand(patterns)
     masks = {} if regions in ("auto", "none") else _masks(Path(regions))
     # absolute: a worker on a cluster has a working folder of its own
     output.mkdir(parents=True, exist_ok=True)
     folder, table = output.absolute(), Table(output / "results.csv")
-    ending = suffix or (".safetensors" if target_bytes is None else ".kcgs")
+    ending = suffix or (".safetensors" if request.target_bytes is None else ".kcgs")
 
     def order(image: Path) -> Order:
         target = folder / f"{image.stem}{ending}"

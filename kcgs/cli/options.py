@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+import inspect
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
@@ -11,25 +13,8 @@ if TYPE_CHECKING:
 
 DEFAULT_GAUSSIANS = 1000
 
-
 Backend = Literal["auto", "reference", "tiled", "cpu", "cuda"]
 Engine = Literal["local", "ray"]
-Gaussians = Annotated[
-    int | None,
-    typer.Option("-n", "--num-gaussians", min=1, help=f"Number of Gaussians; default: {DEFAULT_GAUSSIANS}."),
-]
-Recipe = Annotated[str, typer.Option(help="Recipe by name.")]
-Iterations = Annotated[int | None, typer.Option(min=1, help="Default: the recipe's.")]
-MaxSeconds = Annotated[float | None, typer.Option(help="The best fit in this wall time.")]
-TargetPsnr = Annotated[
-    float | None, typer.Option(help="As few Gaussians as reach this PSNR in dB, at most --num-gaussians.")
-]
-TargetBytes = Annotated[
-    int | None, typer.Option(min=1, help="The best .kcgs file that is not larger; chooses the number of Gaussians.")
-]
-KeepContours = Annotated[bool, typer.Option("--keep-contours", help="Take the label map as exact.")]
-Seed = Annotated[int, typer.Option(help="Seed of the random start.")]
-KernelName = Annotated[Backend, typer.Option(help="Kernel.")]
 EngineName = Annotated[
     Engine, typer.Option(help="local: processes of this machine; ray: the cluster at RAY_ADDRESS, or one started here.")
 ]
@@ -49,16 +34,22 @@ class FitRequest(NamedTuple):
 
 
 def fit_request(
-    *,
-    num_gaussians: int | None,
-    target_bytes: int | None,
-    recipe: str,
-    seed: int,
-    backend: Backend,
-    keep_contours: bool,
-    iterations: int | None,
-    max_seconds: float | None,
-    target_psnr: float | None,
+    num_gaussians: Annotated[
+        int | None,
+        typer.Option("-n", "--num-gaussians", min=1, help=f"Number of Gaussians; default: {DEFAULT_GAUSSIANS}."),
+    ] = None,
+    recipe: Annotated[str, typer.Option(help="Recipe by name.")] = "best",
+    iterations: Annotated[int | None, typer.Option(min=1, help="Default: the recipe's.")] = None,
+    max_seconds: Annotated[float | None, typer.Option(help="The best fit in this wall time.")] = None,
+    target_psnr: Annotated[
+        float | None, typer.Option(help="As few Gaussians as reach this PSNR in dB, at most --num-gaussians.")
+    ] = None,
+    target_bytes: Annotated[
+        int | None, typer.Option(min=1, help="The best .kcgs file that is not larger; chooses the number of Gaussians.")
+    ] = None,
+    keep_contours: Annotated[bool, typer.Option("--keep-contours", help="Take the label map as exact.")] = False,
+    seed: Annotated[int, typer.Option(help="Seed of the random start.")] = 0,
+    backend: Annotated[Backend, typer.Option(help="Kernel.")] = "auto",
 ) -> FitRequest:
     """Return what the options ask for; None where one was not given."""
     from kcgs.fit import FitConfig
@@ -71,6 +62,22 @@ def fit_request(
         given |= {"move_contours": False, "merge_regions": False}
     config = FitConfig.from_recipe(recipe, backend=backend, **given)
     return FitRequest(num_gaussians or DEFAULT_GAUSSIANS, target_bytes, recipe, config, seed)
+
+
+def with_fit_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of `fit_request` in place of its argument `request`."""
+    shared = inspect.signature(fit_request, eval_str=True).parameters
+    parameters: list[inspect.Parameter] = []
+    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
+        parameters.extend(shared.values() if name == "request" else [parameter])
+
+    def run(**arguments: Any) -> None:
+        command(request=fit_request(**{name: arguments.pop(name) for name in shared}), **arguments)
+
+    run.__doc__, run.__annotations__ = command.__doc__, {}
+    keywords = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
+    run.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
+    return run
 
 
 def exclude(option: str, **others: object) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from .common import IMAGES, ImageFile, Json, SceneFile, app, check_output, print_report, write_file
-from .fit import measure_scene
+from .fit import describe_size, measure_scene
 from .options import Scale, Size, exclude, target_size
 
 OutputImage = Annotated[Path, typer.Option("-o", "--output", help="Image file to write.")]
@@ -77,7 +77,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
         "width": loaded.size[1],
         "regions": 1 if loaded.regions is None else loaded.regions.num_regions,
         "softness": softness,
-        **_size_of(scene.stat().st_size, loaded.size),
+        **describe_size(scene.stat().st_size, loaded.size),
         **{f"metadata.{key}": value for key, value in loaded.metadata.items()},
     }
     print_report(report, as_json, str(scene))
@@ -122,7 +122,7 @@ def encode(
         "num_gaussians": len(rounded),
         "regions": 1 if rounded.regions is None else rounded.regions.num_regions,
         "layers": decoded.num_layers,
-        **_size_of(len(data), loaded.size),
+        **describe_size(len(data), loaded.size),
         "bits_per_gaussian": 8 * len(data) / len(rounded),
     }
     print_report(report, as_json, str(output))
@@ -150,7 +150,3 @@ def decode(
         part = f"{decoded.layers} of {decoded.num_layers} layers, {len(scene)} Gaussians"
         typer.echo(f"{file}: a coarser image, {part}", err=True)
     save_image(output, scene.render(target_size(scene.size, scale, size)))
-
-
-def _size_of(num_bytes: int, size: tuple[int, int]) -> dict[str, float]:
-    return {"bytes": num_bytes, "bits_per_pixel": 8 * num_bytes / (size[0] * size[1])}

@@ -15,12 +15,9 @@ T = TypeVar("T")
 
 
 def compile_kept(name: str, compiler: Callable[[str, bool], T], sources: Iterable[Path]) -> T:
-    """Return what a compiler makes, kept on disk by what is in the sources, or in memory where no folder takes it.
+    """Return the loops that `compiler` makes of a fingerprint of the sources and of whether to keep them on disk.
 
-    Args:
-        name: of what the loops do.
-        compiler: makes them of a fingerprint, and of whether to keep them on disk.
-        sources: files that they are in.
+    Where no folder takes them they are kept in memory, and a warning says so.
     """
     digest = hashlib.sha256()
     for source in sources:

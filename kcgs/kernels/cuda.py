@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from .autograd import Gradients, SplatInputs, Steps, apply_kernel
-from .membership import Membership
 from .tiles import TILE, Pairs, bin_gaussians, coefficients, expand_runs, grid_of, split_into_tiles, sum_runs
 from .whitened import sums_to_gradients
 
@@ -67,14 +66,10 @@ def _make_plan(inputs: SplatInputs) -> _Plan:
     counts = _starts(pairs.gaussian, inputs.means.shape[0] * inputs.means.shape[1]).diff()
     mask, masks = None, None
     if pairs.mask is not None and inputs.membership is not None:
-        mask, masks = pairs.mask[order], inputs.membership.derived("cuda", _masks)
+        mask, masks = pairs.mask[order], inputs.membership.derived("cuda", lambda m: m.tiles(TILE).masks.float())
     pairs = Pairs(pairs.gaussian[order], pairs.tile[order], mask, pairs.origin[order])
     start = _starts(pairs.tile, grid_of(inputs).total)
     return _Plan(start, coefficients(pairs, inputs), pairs.gaussian, pairs.mask, masks, order, counts)
-
-
-def _masks(membership: Membership) -> Tensor:
-    return membership.tiles(TILE).masks.to(torch.float32)
 
 
 def _starts(values: Tensor, total: int) -> Tensor:

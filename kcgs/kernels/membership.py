@@ -55,13 +55,10 @@ class Membership:
         *,
         fine: Tensor | None = None,
     ) -> None:
-        """Take the labels of pixels as integers 0 ... num_regions - 1.
+        """Take the labels of pixels, (B, H, W), as integers 0 ... num_regions - 1.
 
-        Args:
-            index: (B, H, W).
-            num_regions: number of labels.
-            softness: contour width in pixels, or that of each pair (a, b) of labels with a < b, 0 where absent.
-            fine: (B, k * H, k * W), the labels of the k * k sub-pixels of each pixel; None: k is 1.
+        `softness` is the contour width in pixels, or that of each pair (a, b) of labels with a < b, 0 where absent;
+        `fine`, (B, k * H, k * W), are the labels of the k * k sub-pixels of each pixel; None: k is 1.
         """
         self.index = index
         self.num_regions = num_regions
@@ -132,58 +129,48 @@ class Membership:
         return value
 
     def _build_tiles(self, tile: int) -> TileMembership:
-        side = tile * self.supersample
-        widths, level = self.levels
-        holds = _levels_held(self.grid, level, len(widths), side)  # [T, levels]
-        # a tile is mixed if a contour is within the reach of one of its own pixels
-        mixed = torch.zeros_like(holds[:, 0])
-        label = torch.zeros(len(holds), dtype=torch.int64, device=holds.device)
-        for position, width in enumerate(widths):
-            low, high = _extremes(self.grid, side, self._reach(width), self.num_regions)
-            mixed |= holds[:, position] & (low != high)
-            label = torch.where(holds[:, position], high, label)
-        single = (~mixed).nonzero().flatten()
-        parts = [
-            part
-            for position, width in enumerate(widths)
-            for part in self._keys((mixed & holds[:, position]).nonzero().flatten(), side, self._reach(width))
-        ]
-        several = torch.cat([single[:0], *parts])
-        several = several if level is None else several.unique()
-        masks = self._masks(several, tile)
-        return TileMembership.assemble(single * self.num_regions + label[single], several, masks)
+        k, (widths, level) = self.supersample, self.levels
+        maps, height, width = self.index.shape
+        counts = (maps, -(-height // tile), -(-width // tile))
+        place = torch.cartesian_prod(*[torch.arange(n, device=self.index.device) for n in counts])
+        place[:, 1:] *= tile
+        # what a tile sees is what its widest contour reaches
+        widest = torch.zeros(len(place), device=place.device)
+        if level is not None:
+            widest = torch.nn.functional.max_pool2d(level.float(), k * tile, ceil_mode=True).flatten()
+        found = []
+        for position, contour in enumerate(widths):
+            tiles = (widest == position).nonzero().flatten()
+            batch, row, col = place[tiles].unbind(1)
+            found.append(self.list_keys(tiles, (batch, k * row, k * col), (k * tile, k * tile), self._reach(contour)))
+        single, keys = (torch.cat(parts) for parts in zip(*found, strict=True))
+        keys = keys.sort().values
+        batch, row, col = place[keys // self.num_regions].unbind(1)
+        masks = self.window_weights(batch, keys % self.num_regions, row, col, (tile, tile)).flatten(1)
+        hard = k == 1 and widths == (0.0,)
+        return TileMembership.assemble(single, keys, masks.bool() if hard else masks)
 
-    def _keys(self, tiles: Tensor, side: int, reach: int) -> list[Tensor]:
-        """List tile * num_regions + region of all that the pixels of some tiles can see, in sorted pieces."""
-        view = _windows(self.grid, side, reach, -1)
-        keys = []
-        for chunk in tiles.split(max(1, _PATCH_ELEMENTS // (side + 2 * reach) ** 2)):
-            seen = view[_place(chunk, view)].flatten(1)
-            keys.append(torch.unique((chunk[:, None] * self.num_regions + seen)[seen >= 0]))
-        return keys
+    def list_keys(
+        self, tiles: Tensor, place: tuple[Tensor, ...], sides: Sequence[int], reach: int
+    ) -> tuple[Tensor, Tensor]:
+        """List tile * num_regions + region of tiles that see one region, and, sorted, of those that see several.
 
-    def _masks(self, keys: Tensor, tile: int) -> Tensor:
-        """Weights of each key's region over its tile."""
-        cols = -(-self.index.shape[2] // tile)
-        per_map = cols * -(-self.index.shape[1] // tile)
-        tiles, region = keys // self.num_regions, keys % self.num_regions
-        batch, row, col = tiles // per_map, tiles // cols % (per_map // cols) * tile, tiles % cols * tile
-        masks = self.window_weights(batch, region, row, col, (tile, tile)).flatten(1)
-        hard = self.supersample == 1 and self.levels.widths == (0.0,)
-        return masks.bool() if hard else masks
+        Tiles are numbers (T,), `place` their image and first row and column on the grid, `reach` how far they see.
+        """
+        single, several = [], []
+        chunks = torch.arange(len(tiles), device=tiles.device)
+        for chunk in chunks.split(max(1, _PATCH_ELEMENTS // ((sides[0] + 2 * reach) * (sides[1] + 2 * reach)))):
+            seen = self._read(self.grid, tuple(part[chunk] for part in place), sides, reach)[0].flatten(1)
+            keys = tiles[chunk, None] * self.num_regions + seen
+            low, high = keys.aminmax(dim=1)
+            single.append(low[low == high])
+            several.append(keys[low < high].unique())
+        return torch.cat(single), torch.cat(several)
 
     def window_weights(self, batch: Tensor, region: Tensor, rows: Tensor, cols: Tensor, span: Sequence[int]) -> Tensor:
-        """Evaluate s_r over windows of pixels.
+        """Evaluate s_r over windows of pixels: image, region, first row and column (P,) each give float64 (P, *span).
 
-        Args:
-            batch: (P,), image of each window.
-            region: (P,).
-            rows: (P,), first row; windows may reach beyond the image, where the weights mean nothing.
-            cols: (P,), first column.
-            span: height and width of the windows.
-
-        Returns:
-            float64, (P, *span).
+        Windows may reach beyond the image, where the weights mean nothing.
         """
         k, (widths, level) = self.supersample, self.levels
         sides = (k * span[0], k * span[1])
@@ -205,7 +192,7 @@ class Membership:
         return weights
 
     def _read(
-        self, grid: Tensor, place: tuple[Tensor, ...], sides: tuple[int, int], reach: int
+        self, grid: Tensor, place: tuple[Tensor, ...], sides: Sequence[int], reach: int
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return windows of a grid with a halo, held at its border, and which of their rows and columns are inside."""
         lines, inside = [], []
@@ -280,42 +267,3 @@ def _pool(weights: Tensor, factor: int) -> Tensor:
         return weights
     height, width = weights.shape[-2:]
     return weights.reshape(*weights.shape[:-2], height // factor, factor, width // factor, factor).mean((-3, -1))
-
-
-def _pad(grid: Tensor, side: int, reach: int, outside: int) -> Tensor:
-    height, width = grid.shape[1:]
-    return torch.nn.functional.pad(grid, (reach, -width % side + reach, reach, -height % side + reach), value=outside)
-
-
-def _windows(grid: Tensor, side: int, reach: int, outside: int) -> Tensor:
-    """Every tile with a halo that wide, (B, tiles_y, tiles_x, span, span), a view."""
-    span = side + 2 * reach
-    return _pad(grid, side, reach, outside).unfold(1, span, side).unfold(2, span, side)
-
-
-def _place(tiles: Tensor, windows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Image, row and column of tiles by number."""
-    rows, cols = windows.shape[1:3]
-    return tiles // (rows * cols), tiles // cols % rows, tiles % cols
-
-
-def _extremes(grid: Tensor, side: int, reach: int, num_regions: int) -> tuple[Tensor, Tensor]:
-    """Lowest and highest label of every window, [T] each."""
-    span = side + 2 * reach
-    low, high = _pad(grid, side, reach, num_regions), _pad(grid, side, reach, -1)
-    for axis in (1, 2):
-        low, high = low.unfold(axis, span, side).amin(-1), high.unfold(axis, span, side).amax(-1)
-    return low.flatten(), high.flatten()
-
-
-def _levels_held(grid: Tensor, level: Tensor | None, count: int, side: int) -> Tensor:
-    """Say which levels the pixels of each tile have, [T, count] bool."""
-    maps, height, width = grid.shape
-    rows, cols = -(-height // side), -(-width // side)
-    if level is None:
-        return torch.ones(maps * rows * cols, 1, dtype=torch.bool, device=grid.device)
-    image, y, x = (torch.arange(n, device=grid.device) for n in grid.shape)
-    tile = (image[:, None, None] * rows + y[:, None] // side) * cols + x // side
-    holds = torch.zeros(maps * rows * cols * count, dtype=torch.bool, device=grid.device)
-    holds[(tile * count + level).flatten()] = True
-    return holds.view(-1, count)

@@ -17,10 +17,6 @@ BACKENDS = ("auto", "reference", "tiled", "cpu", "cuda")
 Kernel = Callable[[SplatInputs], Tensor]
 
 
-def _runs(device: str) -> bool:
-    return device == "cpu" or (device == "cuda" and _has_triton())
-
-
 @functools.cache
 def _has_triton() -> bool:
     if util.find_spec("triton") is not None:
@@ -41,18 +37,17 @@ def resolve(backend: str, device: torch.device, dtype: torch.dtype) -> Kernel:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
     name = backend
     if backend == "auto":
-        name = device.type if dtype == torch.float32 and _runs(device.type) else "tiled"
-    if torch.compiler.is_compiling():
-        return functools.partial(_untraced, name)
-    return _kernel(name)
+        runs = device.type == "cpu" or (device.type == "cuda" and _has_triton())
+        name = device.type if runs and dtype == torch.float32 else "tiled"
+    return functools.partial(_untraced if torch.compiler.is_compiling() else _splat, name)
 
 
-def _kernel(name: str) -> Kernel:
-    kernel: Kernel = import_module(f"{__package__}.{name}").splat
-    return kernel
+def _splat(name: str, inputs: SplatInputs) -> Tensor:
+    image: Tensor = import_module(f"{__package__}.{name}").splat(inputs)
+    return image
 
 
 @torch._disable_dynamo  # type: ignore[attr-defined]  # the public name imports the compiler
 def _untraced(name: str, inputs: SplatInputs) -> Tensor:
     """Render outside of the compiled graph: the compiler would trace into numba and Triton."""
-    return _kernel(name)(inputs)
+    return _splat(name, inputs)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -29,12 +28,7 @@ class Resampled(Membership):
     """
 
     def __init__(self, index: Tensor, source: Membership) -> None:
-        """Take the map.
-
-        Args:
-            index: (B, H, W), labels at the new size.
-            source: the map at its own size.
-        """
+        """Take labels at the new size, (B, H, W), and the map at its own."""
         super().__init__(index, source.num_regions, source.softness)
         self.source = source
 
@@ -67,7 +61,11 @@ class Resampled(Membership):
         )  # [tiles of the axis, tile, span] each
         place = torch.cartesian_prod(*[torch.arange(n, device=firsts[0].device) for n in (maps, *map(len, firsts))])
         batch, row, col = place.unbind(1)
-        keys, label = self._keys_seen(batch, firsts[0][row], firsts[1][col], spans)
+        source, corners = self.source, (firsts[0][row], firsts[1][col])
+        k = source.supersample
+        corner, sides = (batch, k * corners[0], k * corners[1]), [k * span for span in spans]
+        numbers = torch.arange(len(batch), device=batch.device)
+        single, keys = source.list_keys(numbers, corner, sides, source.radius * k)
         tiles, region = keys // self.num_regions, keys % self.num_regions
         masks = torch.zeros(len(keys), tile * tile, dtype=torch.float64, device=keys.device)
         step = max(1, _CHUNK_ELEMENTS // (spans[0] * spans[1] + tile * tile))
@@ -76,27 +74,7 @@ class Resampled(Membership):
             window = self.source.window_weights(batch[t], region[chunk], firsts[0][y], firsts[1][x], spans)
             masks[chunk] = (down[y] @ window @ across[x].mT).flatten(1)
         seen = (masks > 0).any(1)
-        single = (label >= 0).nonzero().flatten()
-        return TileMembership.assemble(single * self.num_regions + label[single], keys[seen], masks[seen])
-
-    def _keys_seen(self, batch: Tensor, rows: Tensor, cols: Tensor, span: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Return the sorted keys of tiles that may be mixed, and the label of each other tile, -1 for those."""
-        source = self.source
-        k, grid = source.supersample, source.grid
-        reach = source.radius * k
-        y, x = (torch.arange(-reach, k * n + reach, device=grid.device) for n in span)
-        keys, label = [], torch.full_like(batch, -1)
-        tiles = torch.arange(len(batch), device=grid.device)
-        for chunk in tiles.split(max(1, _CHUNK_ELEMENTS // (len(y) * len(x)))):
-            at_y = (k * rows[chunk, None] + y).clamp(0, grid.shape[1] - 1)
-            at_x = (k * cols[chunk, None] + x).clamp(0, grid.shape[2] - 1)
-            seen = grid[batch[chunk, None, None], at_y[:, :, None], at_x[:, None, :]].flatten(1)
-            low, high = seen.aminmax(dim=1)
-            single = low == high
-            label[chunk[single]] = high[single].long()
-            mixed = chunk[~single]
-            keys.append(torch.unique(mixed[:, None] * self.num_regions + seen[~single]))
-        return torch.cat(keys), label
+        return TileMembership.assemble(single, keys[seen], masks[seen])
 
 
 def _axis(new: int, old: int, tile: int, device: torch.device) -> _Axis:

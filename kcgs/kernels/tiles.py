@@ -66,18 +66,10 @@ def bin_gaussians(inputs: SplatInputs) -> Pairs:
 def bounding_tiles(
     means: Tensor, cholesky: Tensor, radius: float, size: tuple[int, int], *, between: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """List the tiles that the bounding box of each Gaussian's support touches.
+    """List the tiles that the bounding box of each float64 Gaussian's support, of so many deviations, touches.
 
-    Args:
-        means: float64, (N, 2).
-        cholesky: float64, (N, 3).
-        radius: of the support, in standard deviations.
-        size: (height, width) of the image.
-        between: whether to touch is to hold any point of a tile; else the centre of one of its pixels in the image.
-
-    Returns:
-        For each pair, ordered by Gaussian: the Gaussian (P,), the tile's column and row (P, 2), and the tile's centre
-        minus the Gaussian's mean (P, 2).
+    With `between`, to touch is to hold any point of a tile; else the centre of one of its pixels in the image. Returns,
+    ordered by Gaussian: it (P,), the tile's column and row (P, 2), and the tile's centre minus the mean (P, 2).
     """
     l11, l21, l22 = cholesky.unbind(-1)
     extent = torch.stack([l11, torch.hypot(l21, l22)], -1) * radius * (1 + 1e-5) + 1e-3

@@ -31,16 +31,10 @@ def support_radius(cutoff: float, dtype: torch.dtype) -> float:
 
 
 def sums_to_gradients(sums: Tensor, channels: int, cholesky: Tensor) -> Gradients:
-    """Turn sums over the pixels into gradients, with g = dLoss/dI and v = w g^T c.
+    """Turn sums over the pixels into gradients of means, factors (None each where not asked for) and colours.
 
-    Args:
-        sums: of w g, (..., C); then, if geometry is asked for, of v (z1, z2, z1 z1, z1 z2, z2 z2), (..., C + 5).
-        channels: C.
-        cholesky: (..., 3).
-
-    Returns:
-        Gradients of the means (..., 2) and of the Cholesky factors (..., 3), in the dtype of `cholesky`, or None; of
-        the colours (..., C).
+    With g = dLoss/dI and v = w g^T c the sums are of w g, (..., C), and, where geometry is asked for, of
+    v (z1, z2, z1 z1, z1 z2, z2 z2), (..., C + 5).
     """
     colors = sums[..., :channels]
     if sums.shape[-1] == channels:

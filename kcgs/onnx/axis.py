@@ -20,13 +20,8 @@ class Axis:
     Pixels whose centres lie in the same tile of the scene make a run; runs are cut into blocks of one length, at most
     `TILE` pixels, with some pixels to spare at the ends of runs. Places are integers over a common denominator: pixel i
     is at (2 n start + (2 i + 1) (end - start)) / 2 n, so that a contour's pixels fall on the same side everywhere, and
-    not all runtimes have float64.
-
-    Args:
-        graph: the graph.
-        size: int64 (1,), pixels of the output.
-        length: pixels of the scene.
-        ends: float32 (1,) each, the part of the scene that fills the output; None: all of it.
+    not all runtimes have float64. `size`, int64 (1,), counts the pixels of the output, `length` those of the scene;
+    `ends`, float32 (1,) each, bound the part of the scene that fills the output.
     """
 
     def __init__(self, graph: Graph, size: Value, length: int, ends: tuple[Value, Value] | None = None) -> None:
@@ -79,10 +74,8 @@ class Axis:
     def weights(self, factor: int, halo: int, soft: bool) -> Value:
         """Weights of a window's labels or pixels at the pixels of each block, (blocks, side * factor, window).
 
-        Args:
-            factor: labels along a side of a pixel.
-            halo: labels around a tile.
-            soft: whether to interpolate; else offsets are such that no two labels weigh the same.
+        A window has `factor` labels along a side of a pixel, `halo` around its tile. Where it is hard, offsets are such
+        that no two labels weigh the same.
         """
         g = self.g
         # a view may go beyond the scene, where the border's are held

@@ -58,12 +58,9 @@ class Blocks:
         return self._assemble(g("Gather", g("Concat", *rendered, axis=0), index))
 
     def _sort(self, group: Value) -> tuple[Value, Value, Value, Value]:
-        """Sort blocks by their group, (NB,); those that nothing touches have the number of groups.
+        """Sort blocks by group, (NB,); return them, one to spare, groups' begins, their ends, where each is rendered.
 
         A group without a block renders one that nobody looks at: tensors without elements are not for every runtime.
-
-        Returns:
-            The sorted blocks, with one to spare; where each group's begin and end; where each block is rendered.
         """
         g, count = self.g, len(self.layout.groups)
         total = g("Shape", group)
@@ -80,14 +77,7 @@ class Blocks:
         return g("Concat", order, g.constant([0]), axis=0), starts, g("Add", starts, rendered), index
 
     def _render_group(self, number: int, blocks: Value, slots: Value, windows: Windows | None) -> Value:
-        """Render blocks of a group, (B, C, P).
-
-        Args:
-            number: of the group.
-            blocks: (B,), by number: row times columns plus column.
-            slots: (B,), the tile of each, by place in the group.
-            windows: region weights.
-        """
+        """Render blocks (B,) of a group, (B, C, P); `slots`, (B,), are their tiles by place in the group."""
         g, group = self.g, self.layout.groups[number]
         whitened, colors = self.stored.whitened(number), self.stored.colors(number)
         row, col = g("Div", blocks, self.across.blocks), g("Mod", blocks, self.across.blocks)

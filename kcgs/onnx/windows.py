@@ -9,8 +9,7 @@ from kcgs.kernels.tiles import TILE
 
 from .axis import Axis
 from .graph import FLOAT, Graph, Value
-from .layout import Group, Integers
-from .tiles import Tiles, margin
+from .layout import Group, Integers, Tiles, margin
 
 _STEPS = 65535
 
@@ -28,13 +27,9 @@ class Windows:
         self.sides = across.side, down.side
 
     def weights(self, group: Group, slots: Value, row: Value, col: Value) -> Value:
-        """Sample the region weights of blocks, (B, K, 1, P), column by column.
+        """Sample the K region weights of blocks, (B, K, 1, P), column by column.
 
-        Args:
-            group: with K regions, at least those of every tile.
-            slots: the tile of each block, by place in the group, (B,).
-            row: row of each block, (B,).
-            col: its column, (B,).
+        `slots`, (B,), are the tiles of the blocks by place in the group, `row` and `col`, (B,), where the blocks are.
         """
         g, sample = self.g, self._soft if self.soft else self._hard
         windows = sample(group.tiles, group.regions)  # [T, K, S, S]

@@ -111,40 +111,6 @@ def _element(builder: Any, pointer: Any, index: int) -> Any:
     return builder.load(builder.gep(pointer, [ir.Constant(_LONG, index)]))
 
 
-def _rows(builder: Any, first: Any, last: Any, carried: list[Any]) -> Any:
-    """Open a loop over rows; returns (row, phis, close), where close(values) ends it."""
-    before = builder.block
-    body = builder.append_basic_block("rows")
-    after = builder.append_basic_block("rows.end")
-    builder.cbranch(builder.icmp_signed("<", first, last), body, after)
-    builder.position_at_end(body)
-    row = builder.phi(first.type)
-    row.add_incoming(first, before)
-    phis = []
-    for value in carried:
-        phi = builder.phi(value.type)
-        phi.add_incoming(value, before)
-        phis.append(phi)
-
-    def close(values: list[Any]) -> list[Any]:
-        following = builder.add(row, ir.Constant(row.type, 1))
-        row.add_incoming(following, builder.block)
-        for phi, value in zip(phis, values, strict=True):
-            phi.add_incoming(value, builder.block)
-        end = builder.block
-        builder.cbranch(builder.icmp_signed("<", following, last), body, after)
-        builder.position_at_end(after)
-        out = []
-        for start, value in zip(carried, values, strict=True):
-            phi = builder.phi(value.type)
-            phi.add_incoming(start, before)
-            phi.add_incoming(value, end)
-            out.append(phi)
-        return out
-
-    return row, phis, close
-
-
 def _middle(builder: Any, row: Any) -> Any:
     return builder.fadd(builder.sitofp(row, _FLOAT), ir.Constant(_FLOAT, -(SIDE - 1) / 2))
 
@@ -157,6 +123,7 @@ class _Call:
         self.builder = builder
         self.channels = types_of[-1].count
         self.first, self.last = arguments[2:4]
+        self.step = ir.Constant(_LONG, 1)
         self.pixels = _pointer(context, builder, types_of[0], arguments[0], arguments[1])
         coefficients = _pointer(context, builder, types_of[4], arguments[4], start)
         colors = _pointer(context, builder, types_of[6], arguments[6], arguments[7])
@@ -191,11 +158,10 @@ def add_rows(  # type: ignore[no-untyped-def]
         call = _Call(context, builder, signature.args, arguments)
 
         def emit(masked: bool) -> None:
-            row, _, close = _rows(builder, call.first, call.last, [])
-            _, weight, pixels = call.at_row(row, masked)
-            for c, color in enumerate(call.colors):
-                _store(builder, _call(builder, "fma", weight, color, _load(builder, pixels, c)), pixels, c)
-            close([])
+            with cgutils.for_range_slice(builder, call.first, call.last, call.step) as (row, _):
+                _, weight, pixels = call.at_row(row, masked)
+                for c, color in enumerate(call.colors):
+                    _store(builder, _call(builder, "fma", weight, color, _load(builder, pixels, c)), pixels, c)
 
         call.each_kind(emit)
         return context.get_dummy_value()
@@ -231,20 +197,25 @@ def gather_rows(  # type: ignore[no-untyped-def]
         def emit(masked: bool, moments: bool) -> None:
             start = [_load(builder, sums_at, c) for c in range(call.channels)]
             start += [_constant(0.0)] * 3 if moments else []
-            row, sums, close = _rows(builder, call.first, call.last, start)
-            second, weight, pixels = call.at_row(row, masked)
-            grads = [_load(builder, pixels, c) for c in range(call.channels)]
-            following = [_call(builder, "fma", weight, g, total) for g, total in zip(grads, sums, strict=False)]
-            if moments:
-                value = builder.fmul(grads[0], call.colors[0])
-                for g, color in zip(grads[1:], call.colors[1:], strict=True):
-                    value = _call(builder, "fma", g, color, value)
-                value = builder.fmul(value, weight)
-                moment = builder.fmul(value, second)
-                total, along, square = sums[call.channels :]
-                following += [builder.fadd(total, value), builder.fadd(along, moment)]
-                following.append(_call(builder, "fma", moment, second, square))
-            final = close(following)
+            # variables, which LLVM keeps in registers
+            totals = [cgutils.alloca_once_value(builder, value) for value in start]
+            with cgutils.for_range_slice(builder, call.first, call.last, call.step) as (row, _):
+                second, weight, pixels = call.at_row(row, masked)
+                grads = [_load(builder, pixels, c) for c in range(call.channels)]
+                sums = [builder.load(total) for total in totals]
+                following = [_call(builder, "fma", weight, g, total) for g, total in zip(grads, sums, strict=False)]
+                if moments:
+                    value = builder.fmul(grads[0], call.colors[0])
+                    for g, color in zip(grads[1:], call.colors[1:], strict=True):
+                        value = _call(builder, "fma", g, color, value)
+                    value = builder.fmul(value, weight)
+                    moment = builder.fmul(value, second)
+                    total, along, square = sums[call.channels :]
+                    following += [builder.fadd(total, value), builder.fadd(along, moment)]
+                    following.append(_call(builder, "fma", moment, second, square))
+                for total, value in zip(totals, following, strict=True):
+                    builder.store(value, total)
+            final = [builder.load(total) for total in totals]
             for c in range(call.channels):
                 _store(builder, final[c], sums_at, c)
             if moments:
