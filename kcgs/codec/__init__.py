@@ -2,6 +2,6 @@
 
 from .decode import Decoded, decode, deserialize
 from .encode import DEFAULT_QUALITY, QUALITIES, encode, serialize
-from .errors import CodecError
+from .rangecoder import CodecError
 
 __all__ = ["DEFAULT_QUALITY", "QUALITIES", "CodecError", "Decoded", "decode", "deserialize", "encode", "serialize"]

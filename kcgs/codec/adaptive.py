@@ -8,12 +8,9 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .exact import Floats
+from .exact import Floats, Integers
 from .rangecoder import ONE, Coder
-
-Integers = NDArray[np.int64]
 
 _LEAST = 64  # chance of an adaptive bit, in 1 / ONE
 # magnitudes below 16 have a bucket each; above, an octave has eight
@@ -47,11 +44,7 @@ class AdaptiveBit:
 
 
 class AdaptiveSymbol:
-    """One of a few symbols.
-
-    Args:
-        weights: of the symbols at first.
-    """
+    """One of a few symbols, with the weights that they have at first."""
 
     def __init__(self, weights: Floats) -> None:
         self._weights = weights.copy()
@@ -64,11 +57,7 @@ class AdaptiveSymbol:
 
 
 class AdaptiveNumber:
-    """A number whose count of bits is learned.
-
-    Args:
-        weights: of 0 bits, 1, 2 and so on, at first.
-    """
+    """A number whose count of bits is learned, with the weights of 0 bits, 1, 2 and so on, at first."""
 
     def __init__(self, weights: Floats) -> None:
         self._length = AdaptiveSymbol(weights)
@@ -84,9 +73,7 @@ class AdaptiveNumber:
 class AdaptiveMagnitude:
     """Magnitudes 0, 1, 2 ... whose scale is known: a shape over magnitude / scale, learned for all scales.
 
-    Args:
-        shape: weights of the `_BINS` bins of magnitude / scale at first.
-        contexts: how many kinds there are, each of which learns by itself.
+    `shape` has the weights of the `_BINS` bins at first; each of the contexts learns by itself.
     """
 
     def __init__(self, shape: Floats, contexts: int = 1) -> None:

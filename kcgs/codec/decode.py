@@ -11,22 +11,18 @@ from kcgs._check import check_count
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
-from .errors import CodecError
 from .file import SPARE, most_gaussians, unpack
 from .gaussians.layers import LayerCoder
 from .gaussians.quantize import Quantizer
-from .rangecoder import Reader
+from .rangecoder import CodecError, Reader
 
 
 class Decoded(NamedTuple):
-    """What a file holds."""
+    """The scene of a file (without regions where there is one), the layers that were there, and those of all of it."""
 
     scene: Scene
-    """Without regions where there is one."""
     layers: int
-    """How many layers were there."""
     num_layers: int
-    """How many there are in the whole file."""
 
 
 def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kcgs._check import check_count, check_floating, check_number
 from kcgs.functional import RegionMap
@@ -14,6 +13,7 @@ from kcgs.functional.covariance import check_cholesky
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
+from .exact import Integers
 from .file import MOST_CHANNELS, MOST_SIDE, SPARE, Header, most_gaussians, pack
 from .gaussians.layers import LayerCoder
 from .gaussians.quantize import QPS, Classes, Codes, Parameters, Quantizer
@@ -67,14 +67,7 @@ def serialize(scene: Scene) -> bytes:
 
 
 class SceneWriter:
-    """A scene that files are written of, at any quantization parameter; its map is coded once.
-
-    Args:
-        scene: N Gaussians of one image.
-
-    Raises:
-        TypeError, ValueError: as :func:`encode`.
-    """
+    """A scene that files are written of, at any quantization parameter; its map is coded once."""
 
     def __init__(self, scene: Scene) -> None:
         if not isinstance(scene, Scene):
@@ -133,7 +126,7 @@ class SceneWriter:
         codes = quantizer.quantize(gaussians, Classes(*(numbers[kept] for numbers in classes)))
         return self.write(quantizer, codes, self.ids[kept])
 
-    def write(self, quantizer: Quantizer, codes: Codes, ids: NDArray[np.int64]) -> bytes:
+    def write(self, quantizer: Quantizer, codes: Codes, ids: Integers) -> bytes:
         """Write the file of Gaussians that are whole numbers already, with the positions of their regions' ids."""
         order = codes.order()
         codes, ids = codes.pick(order), ids[order]
@@ -165,7 +158,7 @@ def _check_field(field: GaussianField) -> None:
     check_count("number of Gaussians", len(field), 1, most_gaussians(channels))
 
 
-def _positions(field: GaussianField, regions: RegionMap) -> NDArray[np.int64]:
+def _positions(field: GaussianField, regions: RegionMap) -> Integers:
     """Return the position of each Gaussian's region among the map's ids."""
     if regions.labels.ndim != 2 or regions.size != field.size:
         raise ValueError(f"regions must be one map of size {field.size}; got {tuple(regions.labels.shape)}")

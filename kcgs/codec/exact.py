@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 _LN2 = 0.6931471805599453
 _EXP = [1.0 / math.factorial(i) for i in range(15)]

@@ -7,8 +7,8 @@ import zlib
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from .errors import CodecError
 from .gaussians.quantize import ENERGIES, QPS
+from .rangecoder import CodecError
 
 MAGIC, VERSION = b"kcgs", 1
 # a decoder's memory: pixels of a map; Gaussians in all, and numbers of their colours

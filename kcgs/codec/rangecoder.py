@@ -9,17 +9,17 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .errors import CodecError
-from .exact import Floats
-
-Integers = NDArray[np.int64]
+from .exact import Floats, Integers
 
 ONE = 1 << 16  # chances are whole multiples of 1 / ONE
 _WINDOW = 64  # bits of the coder's state
 _ALPHABET = 1 << 16  # largest alphabet of equally likely numbers
 _FEW = 16  # symbols among which the library finds one faster by trying all than by a table
+
+
+class CodecError(ValueError):
+    """A stream that is damaged, or no stream of this format."""
 
 
 class Coder(ABC):

@@ -29,14 +29,10 @@ _LOSSLESS_FORMATS = ("PNG", "GIF", "BMP")
 class Samples(NamedTuple):
     """The samples of one image."""
 
-    values: Array
-    """(H, W, C): grey, grey and alpha, RGB or RGBA for C = 1 to 4, alpha not multiplied in."""
-    white: float | None
-    """The sample value of full intensity; None where the file format does not say."""
-    format: str
-    """The format's name, as Pillow spells it."""
-    lossless: bool
-    """Whether the format is known to give back the very samples that were stored."""
+    values: Array  # (H, W, C): grey, grey and alpha, RGB or RGBA for C = 1 to 4, alpha not multiplied in
+    white: float | None  # the sample value of full intensity; None where the file format does not say
+    format: str  # as Pillow spells it
+    lossless: bool  # whether the format is known to give back the very samples that were stored
 
 
 def read_file(path: str | os.PathLike[str]) -> bytes:

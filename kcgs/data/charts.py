@@ -32,12 +32,10 @@ _SUBSAMPLES = 8
 
 
 class ChartSample(NamedTuple):
-    """A chart and its regions."""
+    """A chart, :math:`(3, H, W)` float32 RGB in [0, 1], and the regions of pixel centres, :math:`(H, W)` int64."""
 
     image: Tensor
-    """:math:`(3, H, W)` float32 RGB in [0, 1]."""
     labels: Tensor
-    """:math:`(H, W)` int64, the region of every pixel's centre."""
 
 
 def chart_2x3(scale: int = 1) -> ChartSample:

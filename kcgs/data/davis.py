@@ -13,13 +13,14 @@ from kcgs.data.labels import load_labels
 
 
 class DavisFrame(NamedTuple):
-    """One frame of a sequence."""
+    """One frame of a sequence, :math:`(3, H, W)` float32 RGB in [0, 1], and its labels, :math:`(H, W)` int64.
+
+    They are as annotated: 0 and 255 in DAVIS 2016, object numbers in 2017.
+    """
 
     sequence: str
     image: Tensor
-    """:math:`(3, H, W)` float32 RGB in [0, 1]."""
     labels: Tensor
-    """:math:`(H, W)` int64 as annotated: 0 and 255 in DAVIS 2016, object numbers in 2017."""
 
 
 class Davis:
@@ -60,7 +61,6 @@ class Davis:
         sequences: Iterable[str] | None = None,
         frame: int = 0,
     ) -> None:
-        """List the sequences; the class says what the arguments mean."""
         check_count("frame", frame, least=0)
         self._images = Path(root) / "JPEGImages" / resolution
         self._annotations = Path(root) / "Annotations" / resolution

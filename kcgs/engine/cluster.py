@@ -6,14 +6,13 @@ import logging
 import os
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from types import ModuleType
 from typing import Any
 
-from .jobs import Done, Failure, environment, perform
+from .jobs import Done, Failure, environment, perform, take_turns
 
 
 def load() -> ModuleType:
@@ -58,23 +57,18 @@ def run(function: Callable[[Any], Any], jobs: Sequence[Any], workers: int | None
         # tried again here, not by Ray, which would do so for ever where memory runs out
         remote = ray.remote(perform).options(num_cpus=threads, max_retries=0)
         room = _room(ray, threads) if workers is None else workers
-        waiting = deque(range(len(jobs)))
-        again: set[int] = set()
         running: dict[Any, tuple[int, float]] = {}
+
+        def start(index: int) -> None:
+            answer = remote.remote(index, partial(function, jobs[index]), threads)
+            running[answer] = index, time.perf_counter()
+
+        def ended() -> Iterator[tuple[Done[Any], bool]]:
+            for answer in ray.wait(list(running), num_returns=1)[0]:
+                yield _take(ray, answer, *running.pop(answer))
+
         try:
-            while waiting or running:
-                while waiting and len(running) < room:
-                    index = waiting.popleft()
-                    answer = remote.remote(index, partial(function, jobs[index]), threads)
-                    running[answer] = index, time.perf_counter()
-                for answer in ray.wait(list(running), num_returns=1)[0]:
-                    index, since = running.pop(answer)
-                    done, died = _take(ray, answer, index, since)
-                    if died and index not in again:
-                        again.add(index)
-                        waiting.appendleft(index)
-                        continue
-                    yield done
+            yield from take_turns(len(jobs), room, start, ended)
         finally:
             for answer in running:
                 ray.cancel(answer, force=True)

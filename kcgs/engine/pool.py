@@ -9,14 +9,13 @@ import multiprocessing
 import pickle
 import signal
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from .jobs import Done, Failure, describe, environment, perform
+from .jobs import Done, Failure, describe, environment, perform, take_turns
 
 # seconds that a worker has to go by itself
 _PATIENCE = 5.0
@@ -66,39 +65,30 @@ class _Worker:
 
 def run(function: Callable[[Any], Any], jobs: Sequence[Any], workers: int, threads: int) -> Iterator[Done[Any]]:
     """Do the jobs in so many processes; yield each as it ends."""
-    waiting = deque(range(len(jobs)))
-    again: set[int] = set()
     team: list[_Worker] = []
-    try:
-        while waiting or any(worker.index is not None for worker in team):
-            for worker in [w for w in team if w.index is None][: len(waiting)]:
-                following = waiting.popleft()
-                worker.give(following, pickle.dumps((function, jobs[following])))
-            if waiting and len(team) < workers:
-                team.append(_Worker(threads))
-                continue
-            for worker in _ready(team):
-                index = worker.index
-                assert index is not None
+
+    def start(index: int) -> None:
+        idle = next((worker for worker in team if worker.index is None), None)
+        if idle is None:
+            idle = _Worker(threads)
+            team.append(idle)
+        idle.give(index, pickle.dumps((function, jobs[index])))
+
+    def ended() -> Iterator[tuple[Done[Any], bool]]:
+        busy = {worker: worker.index for worker in team if worker.index is not None}
+        found = wait([*(worker.pipe for worker in busy), *(worker.process.sentinel for worker in busy)])
+        for worker, index in busy.items():
+            if worker.pipe in found or worker.process.sentinel in found:
                 done = worker.take()
                 if done is None:
                     team.remove(worker)
-                    done = _obituary(worker, index)
-                    if index not in again:
-                        again.add(index)
-                        waiting.appendleft(index)
-                        continue
-                yield done
+                yield done or _obituary(worker, index), done is None
+
+    try:
+        yield from take_turns(len(jobs), workers, start, ended)
     finally:
         for worker in team:
             worker.stop()
-
-
-def _ready(team: list[_Worker]) -> list[_Worker]:
-    """Wait for those that have answered, or are gone."""
-    busy = [worker for worker in team if worker.index is not None]
-    found = wait([*(w.pipe for w in busy), *(w.process.sentinel for w in busy)])
-    return [w for w in busy if w.pipe in found or w.process.sentinel in found]
 
 
 def _obituary(worker: _Worker, index: int) -> Done[Any]:

@@ -28,13 +28,11 @@ _TRIAL_ITERATIONS, _TRIAL_TO_END = 80, 0.65
 
 
 class FitBytesResult(NamedTuple):
-    """A file, what it holds, and the fit that it was made from."""
+    """A file, the scene that it decodes to, and the fit that it was made from, before rounding."""
 
     data: bytes
     scene: Scene
-    """As decoded."""
     result: FitResult
-    """The fit, before rounding."""
 
 
 def fit_bytes(

@@ -28,11 +28,10 @@ _SLACK = 0.997
 
 
 class Compressed(NamedTuple):
-    """A file, and what it holds."""
+    """A file, and the scene that it decodes to."""
 
     data: bytes
     scene: Scene
-    """As decoded."""
 
 
 @torch.inference_mode(False)

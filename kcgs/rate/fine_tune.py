@@ -29,16 +29,7 @@ _DRAFT_CUTOFF = 1e-3
 
 
 class FineTuning:
-    """Gaussians on their way to whole numbers.
-
-    Args:
-        gaussians: in float64.
-        region_ids: their regions.
-        image: (C, H, W) that they are to show.
-        regions: the map to render with.
-        quantizer: says what they may be rounded to.
-        seed: of the order in which they are rounded.
-    """
+    """Gaussians (float64) that are rounded a few at a time, in an order of the seed, to show an image (C, H, W)."""
 
     def __init__(
         self,

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from kcgs.codec.labels.contexts import FEATURE, INPUT, INPUTS, network
-from kcgs.codec.labels.prior import LAYOUT, TEMPLATE, load_prior
+from kcgs.codec.labels.contexts import FEATURE, INPUT, INPUTS, LAYOUT, TEMPLATE, load_prior, network
 from kcgs.codec.labels.wavefront import new_work
 
 from . import train_prior

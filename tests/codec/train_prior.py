@@ -31,8 +31,21 @@ import torch
 from torch import Tensor
 
 import kcgs
-from kcgs.codec.labels.contexts import CODED, FEATURE, FIRST, LABEL, LEFT, RIGHT, SECOND, TOP, new_tables
-from kcgs.codec.labels.prior import HIDDEN, LATENT, LAYOUT, TEMPLATE
+from kcgs.codec.labels.contexts import (
+    CODED,
+    FEATURE,
+    FIRST,
+    HIDDEN,
+    LABEL,
+    LATENT,
+    LAYOUT,
+    LEFT,
+    RIGHT,
+    SECOND,
+    TEMPLATE,
+    TOP,
+    new_tables,
+)
 from kcgs.codec.labels.wavefront import DECIDED, REGIONS, STATE, loops, new_work
 from kcgs.data import load_labels
 
@@ -76,10 +89,9 @@ def examples(labels: Any) -> tuple[Any, Any]:
     work, state = new_work(height), np.zeros(STATE, np.int64)
     state[REGIONS] = len(ids)
     padded = np.zeros((height + TOP + 1, width + LEFT + RIGHT), np.int32)
-    memory = (state, padded, seeds, *new_tables(), *work)
     bits, features, kinds = np.zeros(2 * height, np.int32), [], []
+    memory = (truth, bits, state, padded, seeds, *new_tables(), *work)
     while count := run.advance(bits, *memory):
-        run.answer(state, truth, work[0], bits)
         rows = work[0][:count][work[0][:count, CODED] == 1]
         features.append(rows[:, FEATURE : FEATURE + len(TEMPLATE)].astype(np.int8))
         kinds.append(np.where(rows[:, LABEL] == rows[:, FIRST], 0, np.where(rows[:, LABEL] == rows[:, SECOND], 1, 2)))

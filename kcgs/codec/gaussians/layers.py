@@ -13,15 +13,13 @@ import torch
 from numpy.typing import NDArray
 
 from kcgs.codec.adaptive import AdaptiveMagnitude, AdaptiveNumber, AdaptiveSymbol
-from kcgs.codec.errors import CodecError
-from kcgs.codec.rangecoder import Coder
+from kcgs.codec.exact import Integers
+from kcgs.codec.rangecoder import CodecError, Coder
 from kcgs.functional import RegionMap
 from kcgs.functional.labels import lookup_regions
 
 from .occupancy import Occupancy
 from .quantize import SIZES, Classes, Codes, Parameters, Quantizer
-
-Integers = NDArray[np.int64]
 
 _CLASSES = 64  # that a stream may name, of size
 _MOST_BITS = 21
@@ -39,13 +37,7 @@ _WEIGHT = 0.05
 
 
 class LayerCoder:
-    """Codes layers one after another; what was learned in one helps the next.
-
-    Args:
-        quantizer: of the file.
-        channels: of the colours.
-        regions: the map, on the CPU; None: one region.
-    """
+    """Codes layers one after another; what was learned in one helps the next. The map is on the CPU."""
 
     def __init__(self, quantizer: Quantizer, channels: int, regions: RegionMap | None) -> None:
         self.quantizer, self.channels, self.regions = quantizer, channels, regions
@@ -60,17 +52,9 @@ class LayerCoder:
     def code(
         self, coder: Coder, energy: int, codes: Codes | None, ids: Integers | None, most: int
     ) -> tuple[Parameters, Integers]:
-        """Code the layer of one energy; return its Gaussians and their regions.
+        """Code the layer of one energy, at most so many Gaussians; return them and the positions of their regions' ids.
 
-        Args:
-            coder: writes or reads.
-            energy: of the layer.
-            codes: the layer's Gaussians, in `Codes.order`; None: to read.
-            ids: their regions, as positions among the map's ids.
-            most: more Gaussians than this are refused.
-
-        Raises:
-            CodecError: a stream that names more.
+        `codes` is in `Codes.order`; None: to read.
         """
         counts = self._code_counts(coder, codes)
         if counts.sum() > most:

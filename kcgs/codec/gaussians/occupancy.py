@@ -6,13 +6,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kcgs.codec.adaptive import AdaptiveNumber
-from kcgs.codec.errors import CodecError
-from kcgs.codec.rangecoder import Coder
-
-Integers = NDArray[np.int64]
+from kcgs.codec.exact import Integers
+from kcgs.codec.rangecoder import CodecError, Coder
 
 # cells beyond the image on each side; centres farther out are brought to the border of that
 _MOST_MARGIN = 255
@@ -79,11 +76,7 @@ class Grid(NamedTuple):
 
 
 class Occupancy:
-    """Codes the cells of one class after another; what was learned in one helps the next.
-
-    Args:
-        size: (height, width) of the image.
-    """
+    """Codes the cells of one class after another; what was learned in one helps the next."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         self._size = size
@@ -91,11 +84,7 @@ class Occupancy:
         self._outside = 0.5, 20.0
 
     def code(self, coder: Coder, count: int, cell: Integers | None) -> Integers:
-        """Code the cells (N, 2) of `count` Gaussians, sorted row by row; None: to read.
-
-        Raises:
-            CodecError: a stream whose cells do not hold so many.
-        """
+        """Code the cells (N, 2) of `count` Gaussians, sorted row by row; None: to read."""
         grid = Grid.over(self._size, count)
         grid = grid._replace(margin=self._code_margin(coder, grid, cell))
         places = (None, None) if cell is None else grid.split(cell)

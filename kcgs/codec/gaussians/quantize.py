@@ -8,11 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kcgs.codec.exact import Floats, exp2, turn
+from kcgs.codec.exact import Floats, Integers, exp2, turn
 
 from .occupancy import Grid
-
-Integers = NDArray[np.int64]
 
 ENERGIES = (-24, 40)
 SIZES = (-8, 28)
@@ -122,12 +120,7 @@ class Steps(NamedTuple):
 
 
 class Quantizer:
-    """Whole numbers from Gaussians, and back, at one quantization parameter.
-
-    Args:
-        qp: the quantization parameter: each number adds a squared error of D = 2^(-qp / 32) to the image.
-        size: (height, width) of the image.
-    """
+    """Whole numbers from Gaussians, and back: each adds a squared error of D = 2^(-qp / 32) to the image."""
 
     def __init__(self, qp: int, size: tuple[int, int]) -> None:
         self.qp, self.size = qp, size

@@ -7,32 +7,23 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from kcgs.codec.adaptive import AdaptiveBit
-from kcgs.codec.errors import CodecError
-from kcgs.codec.rangecoder import Coder, Reader, Writer
+from kcgs.codec.exact import Integers
+from kcgs.codec.rangecoder import CodecError, Coder, Reader, Writer
 from kcgs.functional.labels import compact
 
 from .contexts import CODED, LABEL, LEFT, RIGHT, TOP, new_tables
-from .ids import code_ids
-from .seeds import code_seeds
+from .preamble import code_ids, code_seeds
 from .wavefront import DECIDED, RANKS, REGIONS, STATE, Loops, loops, new_work
 
 # what a reader may be asked to work through: seconds
 _MOST_ASKED, _MOST_ESCAPES = 1 << 23, 1 << 18
-Labels = NDArray[np.int64]
 _NOISY = np.array([2.0**-10])  # chance of a map that the model makes larger
 
 
-def encode_labels(labels: Labels) -> bytes:
-    """Write a label map.
-
-    Args:
-        labels: (H, W), ids of 0 to 2**63 - 1.
-
-    Returns:
-        The map without its height and width; the same map gives the same bytes everywhere.
+def encode_labels(labels: Integers) -> bytes:
+    """Write a label map (H, W), ids of 0 to 2**63 - 1, without its height and width; the bytes are the same everywhere.
 
     Example:
         >>> halves = np.repeat([[5], [9]], 32, axis=0) + np.zeros((1, 64), np.int64)
@@ -66,20 +57,8 @@ def encode_labels(labels: Labels) -> bytes:
     return writer.finish()
 
 
-def decode_labels(data: bytes, height: int, width: int, *, max_regions: int) -> Labels:
-    """Read a label map.
-
-    Args:
-        data: what `encode_labels` returned.
-        height: of the map.
-        width: of the map.
-        max_regions: more are refused.
-
-    Returns:
-        (H, W) int64.
-
-    Raises:
-        CodecError: the bytes are no such map.
+def decode_labels(data: bytes, height: int, width: int, *, max_regions: int) -> Integers:
+    """Read a label map (H, W) that `encode_labels` wrote; what is none, or has more regions, is a CodecError.
 
     Example:
         >>> labels = np.array([[7, 7, 3], [7, 3, 3]])
@@ -94,12 +73,12 @@ def decode_labels(data: bytes, height: int, width: int, *, max_regions: int) -> 
         index = reader.numbers(None, len(ids), height * width).reshape(height, width)
     else:
         index = _code_pixels(reader, np.zeros((0, 0), np.int32), np.zeros((height, width), np.uint8), len(ids))
-    labels: Labels = ids[index]
+    labels: Integers = ids[index]
     return labels
 
 
 def _code_pixels(coder: Coder, truth: Any, seeds: Any, regions: int) -> Any:
-    """Code a map of numbered regions; a reader ignores `truth` and fills in `seeds`."""
+    """Code a map of numbered regions; a reader has an empty `truth` and fills in `seeds`."""
     run = loops()
     code_seeds(coder, seeds)
     height, width = seeds.shape
@@ -107,9 +86,9 @@ def _code_pixels(coder: Coder, truth: Any, seeds: Any, regions: int) -> Any:
     labels = np.zeros((height + TOP + 1, width + LEFT + RIGHT), np.int32)
     state = np.zeros(STATE, np.int64)
     state[REGIONS] = regions
-    memory = (state, labels, seeds, *new_tables(), rows, chances, lines)
     escapes = _Escapes(coder, run, labels, regions)
     answers = np.zeros(2 * height, np.int32)
+    memory = (truth, answers, state, labels, seeds, *new_tables(), rows, chances, lines)
     bits, asked = answers[:0], 0
     while count := run.advance(bits, *memory):
         decided = int(state[DECIDED])
@@ -117,8 +96,6 @@ def _code_pixels(coder: Coder, truth: Any, seeds: Any, regions: int) -> Any:
         asked += decided
         if asked > _MOST_ASKED:
             raise _Laborious(f"data must ask for at most {_MOST_ASKED} pixels near contours; got more")
-        if not coder.reads:
-            run.answer(state, truth, rows, answers)
         if used:
             bits = coder.bits(chances[:used], answers[:used])
         if regions > 2 and (count > decided or np.count_nonzero(bits[:decided])):

@@ -1,16 +1,32 @@
 """The model of label maps: what a pixel may be, given the pixels before it (docs/format.md, "Chances of a pixel").
 
-Loops in integers, compiled by numba: ``>>`` and ``//`` round down.
+A small network, trained once by `tests/codec/train_prior.py`, says what is known before a map is seen. Loops in
+integers, compiled by numba: ``>>`` and ``//`` round down.
 """
 
 from __future__ import annotations
 
+from importlib import resources
 from typing import Any, cast
 
 import numpy as np
 from numba import njit
 
-from .prior import HIDDEN, LATENT, TEMPLATE, load_prior
+# columns of each row above the pixel that the network sees, nearest row first
+_REACH = ((-8, -1), (-8, 7), (-7, 8), (-6, 7), (-5, 6), (-3, 4), (-2, 3))
+_OFFSETS = [(dx, -dy) for dy, (low, high) in enumerate(_REACH) for dx in range(low, high + 1)]
+TEMPLATE = sorted(_OFFSETS, key=lambda place: (place[0] ** 2 + place[1] ** 2, -place[1], place[0]))
+HIDDEN, LATENT = 48, 16
+# weights are in 1/64, biases of the second and third layer in 1/4096, first estimates of the mixer in 1/65536
+LAYOUT = (
+    ("<i1", (len(TEMPLATE), 2, HIDDEN)),  # layer1
+    ("<i2", (HIDDEN,)),  # bias1
+    ("<i1", (HIDDEN, LATENT)),  # layer2
+    ("<i4", (LATENT,)),  # bias2
+    ("<i1", (LATENT, 2)),  # layer3
+    ("<i4", (2,)),  # bias3
+    ("<i4", (4,)),  # mixer
+)
 
 LEFT, RIGHT, TOP = 8, 9, 6  # margins around the map
 CLIP = 3071  # largest logit, in 1/256
@@ -34,6 +50,13 @@ _MEMORY = 40  # decisions that a counter remembers
 _SURE = 16  # least chance, in 1/65536
 
 
+def load_prior() -> list[Any]:
+    """Read the tables that come with the package, as int32, in the order of `LAYOUT`."""
+    data = resources.files(__package__).joinpath("prior.bin").read_bytes()
+    tables = np.frombuffer(data, [("", kind, shape) for kind, shape in LAYOUT])[0]
+    return [table.astype(np.int32) for table in tables]
+
+
 # constants of the loops: the template, the network, 65536 / (1 + e**(-x / 256)) for logits from -CLIP, its inverse.
 # No value of the third but 32768 is within 1e-6 of a half before it is rounded: any machine's exp gives the same table.
 _DX, _DY = (np.array(axis, np.int32) for axis in zip(*TEMPLATE, strict=True))
@@ -43,9 +66,9 @@ _STRETCH = (np.searchsorted(SQUASH, np.arange(4096) * 16 + 8) - CLIP).astype(np.
 
 
 def new_tables() -> tuple[Any, Any]:
-    """Return what adapts, as every stream starts with it: counters, and weights of the mixer.
+    """Return what adapts, as every stream starts with it.
 
-    Counters are [slots, 2] uint16, a chance in 1/65536 and how often it was seen; weights [HEADS, 4, INPUTS] int32.
+    Counters [slots, 2] uint16, a chance in 1/65536 and how often it was seen; the mixer's weights [HEADS, 4, INPUTS].
     """
     return np.zeros((_SLOTS, 2), np.uint16), np.tile(_MIXER, (HEADS, 4, 1))
 

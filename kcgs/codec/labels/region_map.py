@@ -6,13 +6,12 @@ import math
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from kcgs._check import check_count
 from kcgs.codec.adaptive import AdaptiveSymbol
-from kcgs.codec.errors import CodecError
+from kcgs.codec.exact import Integers
 from kcgs.codec.file import MOST_LABELS, MOST_REGIONS, ByteReader, varint
-from kcgs.codec.rangecoder import Coder, Reader, Writer
+from kcgs.codec.rangecoder import CodecError, Coder, Reader, Writer
 from kcgs.functional import MAX_SOFTNESS, PairWidths, RegionMap
 from kcgs.functional.labels import touching_pairs
 
@@ -74,7 +73,7 @@ def _round(width: float) -> int:
     return math.floor(width * _FORTIETHS + 0.5)
 
 
-def _code_places(coder: Coder, pairs: int, count: int, places: NDArray[np.int64] | None) -> NDArray[np.int64]:
+def _code_places(coder: Coder, pairs: int, count: int, places: Integers | None) -> Integers:
     """Code the width of each pair, as its place in the list of different widths."""
     model, found = AdaptiveSymbol(np.ones(count)), np.zeros(pairs, np.int64)
     for start in range(0, pairs, _TOGETHER):

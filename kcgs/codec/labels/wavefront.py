@@ -145,18 +145,22 @@ def _look(state, labels, seeds, rows, lines):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _weigh(state, counters, weights, rows, chances):  # type: ignore[no-untyped-def]
-    """Fill in the chances: first of being neither candidate, then of being the second."""
+def _weigh(truth, answers, state, counters, weights, rows, chances):  # type: ignore[no-untyped-def]
+    """Fill in the chances, and answers where the truth is known: first of being neither candidate, then the second."""
     escapes = state[DECIDED] if state[REGIONS] > 2 else 0
     asked = 0
     for n in range(state[ROWS]):
         row = rows[n]
+        if len(truth) > 0:
+            row[LABEL] = truth[row[Y] - TOP, row[X] - LEFT]
         if row[CODED]:
             network(row)
             contexts(row)
             if escapes > 0:
                 chances[asked] = mix(counters, weights, row, 1)
+                answers[asked] = row[LABEL] != row[FIRST] and row[LABEL] != row[SECOND]
             chances[escapes + asked] = mix(counters, weights, row, 0)
+            answers[escapes + asked] = row[LABEL] != row[FIRST]
             asked += 1
 
 
@@ -211,26 +215,10 @@ def _survey(index, regions):  # type: ignore[no-untyped-def]
     return truth, seeds, order
 
 
-@inner
-def _answer(state, truth, rows, bits):  # type: ignore[no-untyped-def]
-    """Look the answers up in a map that is known."""
-    escapes = state[DECIDED] if state[REGIONS] > 2 else 0
-    asked = 0
-    for n in range(state[ROWS]):
-        row = rows[n]
-        row[LABEL] = truth[row[Y] - TOP, row[X] - LEFT]
-        if row[CODED]:
-            if escapes > 0:
-                bits[asked] = row[LABEL] != row[FIRST] and row[LABEL] != row[SECOND]
-            bits[escapes + asked] = row[LABEL] != row[FIRST]
-            asked += 1
-
-
 class Loops(NamedTuple):
     """The compiled entry points."""
 
     advance: Callable[..., int]
-    answer: Callable[..., None]
     nearest: Callable[..., int]
     survey: Callable[..., Any]
 
@@ -240,8 +228,8 @@ def _compile(fingerprint: str, cache: bool) -> Loops:
     entry = cast(Any, njit)(cache=cache, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
 
     @entry
-    def advance(bits, state, labels, seeds, counters, weights, rows, chances, lines):  # type: ignore[no-untyped-def]
-        """Take the answers for a wavefront in, go on to the next that has questions and return their number."""
+    def advance(bits, truth, answers, state, labels, seeds, counters, weights, rows, chances, lines):  # type: ignore[no-untyped-def]
+        """Take the bits of a wavefront in, go on to the next that has questions and return their number."""
         fingerprint  # noqa: B018
         height, width = seeds.shape
         _settle(state, labels, bits, counters, weights, rows, lines)
@@ -250,13 +238,8 @@ def _compile(fingerprint: str, cache: bool) -> Loops:
         while state[ROWS] == 0 and state[FRONT] < width - 1 + SLANT * (height - 1):
             state[FRONT] += 1
             _look(state, labels, seeds, rows, lines)
-        _weigh(state, counters, weights, rows, chances)
+        _weigh(truth, answers, state, counters, weights, rows, chances)
         return state[ROWS]
-
-    @entry
-    def answer(state, truth, rows, bits):  # type: ignore[no-untyped-def]
-        fingerprint  # noqa: B018
-        _answer(state, truth, rows, bits)
 
     @entry
     def nearest(labels, row, found):  # type: ignore[no-untyped-def]
@@ -268,14 +251,14 @@ def _compile(fingerprint: str, cache: bool) -> Loops:
         fingerprint  # noqa: B018
         return _survey(index, regions)
 
-    return Loops(advance, answer, nearest, survey)
+    return Loops(advance, nearest, survey)
 
 
 @functools.cache
 def loops() -> Loops:
     """Compile the loops, or load them from disk; say how long it took."""
     folder = Path(__file__).parent
-    kept = [folder / source for source in ("contexts.py", "prior.py", "prior.bin", "wavefront.py")]
+    kept = [folder / source for source in ("contexts.py", "prior.bin", "wavefront.py")]
     made = compile_kept("codec", _compile, kept)
     with announced("the codec of label maps", made):
         _rehearse(made)
@@ -287,6 +270,5 @@ def _rehearse(run: Loops) -> None:
     truth, seeds, _ = run.survey(np.eye(2, dtype=np.int32), 2)
     work, bits, state = new_work(2), np.zeros(4, np.int32), np.zeros(STATE, np.int64)
     labels = np.zeros((2 + TOP + 1, 2 + LEFT + RIGHT), np.int32)
-    run.advance(bits, state, labels, seeds, *new_tables(), *work)
-    run.answer(state, truth, work[0], bits)
+    run.advance(bits, truth, bits, state, labels, seeds, *new_tables(), *work)
     run.nearest(labels, work[0][0], np.zeros(RANKS, np.int32))
