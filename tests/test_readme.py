@@ -38,7 +38,7 @@ def test_a_changed_figure_shows(tmp_path: Path) -> None:
     write_rows(tmp_path / "charts/results.csv", Row, rows)
     assert read_rows(tmp_path / "charts/results.csv", Row) == rows
     text = results(tmp_path)
-    assert "| 20 | 20 | `best` | 700 | 1 | 38.60 | 31.20 | 0.050 | 38.60 | 2 |" in text
+    assert "| 20 | `best` | 700 | 1 | 20 | 38.60 | 31.20 | 0.050 | 38.60 | 2 |" in text
     assert put(f"a\n{BEGIN}\nold\n{END}\nb", text) == f"a\n{BEGIN}\n{text}\n{END}\nb"
     with pytest.raises(ValueError, match="page must have"):
         put("nothing", text)

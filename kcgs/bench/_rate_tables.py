@@ -1,16 +1,16 @@
-"""What kcgs has over other codecs: pairs of files, curves, bounds, and the tables of bench rate."""
+"""What kcgs has over other codecs: pairs of files, curves, and the tables of bench rate."""
 
 from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-from ._codecs import AVIF, AVIF_PSNR, CODECS, JPEG, WEBP
+from ._codecs import CODECS
 from ._rate_files import FLOAT, KCGS, LABELS, LOSSLESS_WEBP, MAPS, NO_REGIONS, Point
-from .core.statistics import Bound, Delta, Summary, delta, summarize
-from .core.tables import count, db, markdown, seconds, signed
+from .core.statistics import Delta, Summary, delta, summarize
+from .core.tables import count, db, markdown, seconds, signed, table
 
 MATCHED, DAVIS_CURVE, KODAK_CURVE = "davis8k", "davis-curve", "kodak-curve"
 PRECISION, SPEED = "precision", "speed"
@@ -26,9 +26,7 @@ QUALITIES = {
 RIVALS = (*CODECS, NO_REGIONS)
 # a smaller difference is neither a win nor a loss
 TIE = {"dB": 0.005, "1": 0.0005, "%": 0.05}
-MOST_BYTES, MOST_BITS, MOST_SHARE = 7_950, 48.0, 45.0
-MOST_SECONDS = {TUNED: 5.0, PLAIN: 0.5, DECODE: 0.1}
-_LEAST = {JPEG: (2.5, 3.0), WEBP: (0.0, 0.0), AVIF: (-0.5, 0.5), AVIF_PSNR: (-0.5, 0.5)}
+MOST_BYTES = 7_950
 
 
 class Pair(NamedTuple):
@@ -101,32 +99,6 @@ def shares(points: Sequence[Point]) -> dict[str, float]:
     return {i: 100 * size / sizes[i, LOSSLESS_WEBP] for i, size in ours if (i, LOSSLESS_WEBP) in sizes}
 
 
-def bounds(points: Sequence[Point]) -> list[Bound]:
-    """Hold what was measured to the bounds."""
-    found = []
-    for rival, bound in _LEAST.items():
-        for quality, least in zip((PSNR, EF_PSNR), bound, strict=True):
-            gain = gains([pair for pair in pairs(points, rival) if pair.is_low], quality)
-            if gain is not None:
-                over = f"mean {QUALITIES[quality][0]} over {rival}, {len(gain.values)} frames"
-                what, measured = f"at {MOST_BYTES:,} bytes, {over}", f"{gain.mean:+.2f} dB"
-                found.append(Bound(what, f">= {least:+.2f} dB", measured, gain.mean >= least))
-    files = bits_per_gaussian(points)
-    for n in sorted({scene.asked for scene, _, _ in files}):
-        most = max(bits for scene, _, bits in files if scene.asked == n)
-        loss = max(scene.psnr - file.psnr for scene, file, _ in files if scene.asked == n)
-        what = f"bits per Gaussian at N = {n:,}, the worst frame; most that one loses is {loss:.2f} dB"
-        found.append(Bound(what, f"<= {MOST_BITS:.0f}", f"{most:.1f}", most <= MOST_BITS and loss <= 0.15 + 1e-6))
-    share = summarize(shares(points), TIE["%"])
-    if share is not None:
-        what = f"bytes of label maps to those as lossless WebP, mean of {len(share.values)}"
-        found.append(Bound(what, f"<= {MOST_SHARE:.0f} %", f"{share.mean:.1f} %", share.mean <= MOST_SHARE))
-    for p in (p for p in points if p.group == SPEED):
-        limit, what = MOST_SECONDS[p.codec], f"seconds, {p.codec}, {p.num_gaussians:,} Gaussians"
-        found.append(Bound(what, f"<= {limit:g} s", f"{_took(p):.3g} s", _took(p) <= limit))
-    return found
-
-
 def losses(points: Sequence[Point]) -> str:
     """Name what kcgs loses, worst first in each line."""
     lines = []
@@ -148,25 +120,10 @@ def losses(points: Sequence[Point]) -> str:
     return "\n".join(lines) or "Nowhere."
 
 
-def no_overlap(points: Sequence[Point]) -> str:
-    """Name the images on which two curves have no quality in common."""
-    lines = []
-    for group in curve_groups(points):
-        for rival in RIVALS:
-            apart = []
-            for quality, (name, _) in QUALITIES.items():
-                images = [i for i, d in deltas(points, group, rival, quality).items() if math.isnan(d.rate)]
-                apart += [f"{name} on {', '.join(images)}"] if images else []
-            if apart:
-                lines.append(f"- {group}, no quality in common with {rival}, so no BD-rate: {'; '.join(apart)}")
-    return "\n".join(lines) or "All curves overlap."
-
-
 def matched_means(points: Sequence[Point]) -> str:
     """Means of what kcgs gains at no more bytes."""
     header = ["against", "frames", "its bytes", "kcgs' bytes"]
     header += [cell for name, _ in QUALITIES.values() for cell in (f"{name} gained", "95 %", "won-lost")]
-    header += ["s, encode", "s, decode"]
     lines = []
     for rival in RIVALS:
         found = pairs(points, rival)
@@ -174,29 +131,7 @@ def matched_means(points: Sequence[Point]) -> str:
         for name, group in ((rival, found), (f"{rival}, as low", low if len(low) < len(found) else [])):
             if group:
                 lines.append([name, *_pair_cells(group)])
-    ours = [p.ours for p in pairs(points, AVIF_PSNR) or pairs(points, AVIF)]
-    if ours:
-        blank = [""] * (3 * len(QUALITIES))
-        lines.append([KCGS, str(len(ours)), "", _mean_bytes(ours), *blank, *_times(ours)])
-    return markdown(header, lines)
-
-
-def each_frame(points: Sequence[Point], rival: str) -> str:
-    """Every frame against one codec, the losses first."""
-    header = ["frame", "its bytes", "kcgs' bytes", "PSNR", "EF-PSNR", "kcgs' PSNR", "kcgs' EF-PSNR"]
-    header += ["PSNR gained", "EF-PSNR gained", "MS-SSIM gained", "EF-SSIM gained", "regions", "Gaussians"]
-    header += ["s, encode", "kcgs, s", "s, decode", "kcgs, s"]
-    lines = []
-    for pair in sorted(pairs(points, rival), key=lambda p: p.gain(PSNR)):
-        ours, other = pair
-        line = [other.image, count(other.bytes), count(ours.bytes)]
-        line += [db(p) for p in (other.psnr, other.ef_psnr, ours.psnr, ours.ef_psnr)]
-        line += [_signed(pair.gain(quality), unit) for quality, (_, unit) in QUALITIES.items()]
-        line += [str(ours.regions), count(ours.num_gaussians)]
-        for field in ("encode_seconds", "decode_seconds"):
-            line += [seconds(getattr(point, field)) for point in (other, ours)]
-        lines.append(line)
-    return markdown(header, lines)
+    return markdown([*header, "s, encode", "s, decode", "kcgs, s, encode", "kcgs, s, decode"], lines)
 
 
 def bd_means(points: Sequence[Point], group: str) -> str:
@@ -216,32 +151,21 @@ def bd_means(points: Sequence[Point], group: str) -> str:
     return markdown(header, lines)
 
 
-def bd_each(points: Sequence[Point], group: str) -> str:
-    """Bjontegaard's differences of every image, the most lost first."""
-    header = ["image", "against", "BD-rate of PSNR, %", "overlap, dB", "BD-PSNR, dB"]
-    header += ["BD-rate of EF-PSNR, %", "overlap, dB", "BD-EF-PSNR, dB"]
-    lines = []
-    for rival in RIVALS:
-        found = [deltas(points, group, rival, quality) for quality in (PSNR, EF_PSNR)]
-        for image, first in found[0].items():
-            line = [image, rival]
-            for d in (by_image.get(image) for by_image in found):
-                line += ["", "", ""] if d is None else [_signed(d.rate, "%"), f"{d.overlap:.1f}", signed(d.quality)]
-            lines.append((math.inf if math.isnan(first.rate) else first.rate, line))
-    return markdown(header, [line for _, line in sorted(lines, key=lambda line: -line[0])])
-
-
 def precision_table(points: Sequence[Point]) -> str:
     """What a Gaussian takes in a file that shows nearly what the fit does, most first."""
-    header = ["frame", "N", "PSNR", "file's PSNR", "lost, dB", "EF-PSNR", "file's EF-PSNR", "in the file", "bytes"]
-    header += ["bits per Gaussian", "to those of the fit", "setting", "s, compress"]
-    lines = []
-    for scene, file, bits in sorted(bits_per_gaussian(points), key=lambda line: -line[2]):
-        line = [scene.image, count(scene.num_gaussians), db(scene.psnr), db(file.psnr), db(scene.psnr - file.psnr)]
-        line += [db(scene.ef_psnr), db(file.ef_psnr), count(file.num_gaussians), count(file.bytes), f"{bits:.1f}"]
-        line += [f"{8 * file.bytes / scene.num_gaussians:.1f}", file.setting, seconds(file.encode_seconds)]
-        lines.append(line)
-    return markdown(header, lines)
+    columns: dict[str, Callable[[tuple[Point, Point, float]], str]] = {
+        "frame": lambda line: line[0].image,
+        "N": lambda line: count(line[0].num_gaussians),
+        "in the file": lambda line: count(line[1].num_gaussians),
+        "bytes": lambda line: count(line[1].bytes),
+        "bits per Gaussian": lambda line: f"{line[2]:.1f}",
+        "PSNR": lambda line: db(line[0].psnr),
+        "lost, dB": lambda line: db(line[0].psnr - line[1].psnr),
+        "EF-PSNR": lambda line: db(line[0].ef_psnr),
+        "lost there, dB": lambda line: db(line[0].ef_psnr - line[1].ef_psnr),
+        "s, compress": lambda line: seconds(line[1].encode_seconds),
+    }
+    return table(columns, sorted(bits_per_gaussian(points), key=lambda line: -line[2]))
 
 
 def maps_table(points: Sequence[Point]) -> str:
@@ -261,18 +185,14 @@ def maps_table(points: Sequence[Point]) -> str:
 
 def speed_table(points: Sequence[Point]) -> str:
     """Seconds of each step."""
-    lines = [
-        [p.image, count(p.num_gaussians), p.codec, count(p.bytes), f"{1e3 * _took(p):.0f}"]
-        for p in points
-        if p.group == SPEED
-    ]
-    return markdown(["frame", "Gaussians", "what", "bytes", "ms, median"], lines)
-
-
-def dropped(points: Sequence[Point]) -> str:
-    """Name the files of kcgs that hold no map though one was given."""
-    found = [f"{p.image} at {p.bytes:,} bytes ({p.group})" for p in points if p.codec == KCGS and p.regions == 1]
-    return f"{KCGS.capitalize()} left the map out of: {', '.join(found) or 'no file'}."
+    columns: dict[str, Callable[[Point], str]] = {
+        "frame": lambda p: p.image,
+        "Gaussians": lambda p: count(p.num_gaussians),
+        "what": lambda p: p.codec,
+        "bytes": lambda p: count(p.bytes),
+        "ms, median": lambda p: f"{1e3 * (p.decode_seconds if p.codec == DECODE else p.encode_seconds):.0f}",
+    }
+    return table(columns, (p for p in points if p.group == SPEED))
 
 
 def curve_groups(points: Sequence[Point]) -> list[str]:
@@ -289,7 +209,7 @@ def _pair_cells(found: Sequence[Pair]) -> list[str]:
             cells += ["", "", ""]
         else:
             cells += [_signed(gain.mean, unit), _spread(gain, unit), f"{gain.wins}-{gain.losses}"]
-    return cells + _times(others)
+    return [*cells, *_times(others), *_times([pair.ours for pair in found])]
 
 
 def _mean_bytes(points: Sequence[Point]) -> str:
@@ -298,10 +218,6 @@ def _mean_bytes(points: Sequence[Point]) -> str:
 
 def _times(points: Sequence[Point]) -> list[str]:
     return [seconds(statistics.median(getattr(p, f"{what}_seconds") for p in points)) for what in ("encode", "decode")]
-
-
-def _took(point: Point) -> float:
-    return point.decode_seconds if point.codec == DECODE else point.encode_seconds
 
 
 def _mean_cells(values: Mapping[str, float], unit: str) -> list[str]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .core import figures, summaries
+from .core import summaries
 from .core.cases import BASELINE, BEST, CLAMPED, PAPER, PUBLISHED_ITERATIONS, UNCLAMPED, Case, method, plan
-from .core.compare import Contest, equal_bits, equal_n, mean_over, select, shared
+from .core.compare import Contest, mean_over, select, shared
 from .core.images import sequences
 from .core.options import Options
 from .core.registry import experiment
@@ -14,7 +14,6 @@ from .core.report import Made
 from .core.rows import read_rows
 from .core.stages import run_stages
 from .core.store import Row
-from .core.summaries import means
 from .core.tables import count, db, markdown, signed
 
 COUNTS = (1_250, 7_500)
@@ -35,13 +34,6 @@ OUR_ROWS = (
     BASELINE,
 )
 METHODS = (*PAPER_ROWS, *OUR_ROWS)
-SHOWN = {
-    **{m.name: m.name for m in METHODS},
-    CLAMPED.name: "baseline clamp (gaussian-image-clamp)",
-    UNCLAMPED.name: "baseline no clamp (gaussian-image)",
-    PAPER.name: "all three (paper)",
-    BASELINE.name: "best without regions (best-baseline)",
-}
 CONTESTS = (
     *(Contest(m.name, CLAMPED.name) for m in PAPER_ROWS[1:]),
     *(Contest(BEST.name, m.name) for m in OUR_ROWS[1:]),
@@ -55,28 +47,23 @@ PRINTED = {
     WARMED.name: {1_250: (27.06, 23.09), 7_500: (33.28, 29.44)},
     PAPER.name: {1_250: (27.31, 23.41), 7_500: (33.44, 29.18)},
 }
-_QUANTITIES, _FILE = ("psnr", "ef_psnr"), ("bits_per_pixel", "decoded_psnr")
 _PAPER_TEXT = """Columns marked *theirs* are what the paper prints, means over all of DAVIS at 50,000 iterations;
 nobody measured them here. Changes are to the first row."""
-_OUR_TEXT = """Parts of `best` taken away one at a time. Changes are to `best`, paired by image, below zero where the
-part helps; at equal bits the file is held against `best` files of as many bytes, where there are two sizes to
-interpolate between."""
+_OUR_TEXT = (
+    "Parts of the paper's method against its clamped baseline, then `best` against `best` with a part taken away."
+)
 
 
 def report(output: Path, made: Made) -> list[str]:
     """Write the report's parts."""
     rows = read_rows(output / "results.csv", Row)
-    parts = ["# Ablation", "## What was run", summaries.what_was_run(rows, METHODS), summaries.METRICS_TEXT]
+    parts = ["# Ablation", summaries.what_was_run(rows)]
     if not rows:
         return parts
     parts += ["## Where a part does harm", summaries.losses(rows, CONTESTS)]
-    parts += _figure(output / "changes.png", rows)
     parts += ["## The paper's rows", _PAPER_TEXT, paper_table(rows)]
-    parts += ["## Ours", _OUR_TEXT, our_table(rows)]
-    parts += ["## Differences", summaries.EQUAL_BITS_TEXT, summaries.differences(rows, CONTESTS)]
-    parts += ["## All figures", summaries.BITS_TEXT, summaries.rounding(rows)]
-    parts += [summaries.quality(rows, tuple(SHOWN), SHOWN)]
-    return [*parts, "## Each image", summaries.each(rows, tuple(SHOWN))]
+    parts += ["## Differences", _OUR_TEXT, summaries.differences(rows, CONTESTS)]
+    return [*parts, "## Means", summaries.means(rows, [m.name for m in METHODS])]
 
 
 @experiment("engine", "workers", "sequences", "budget_seconds", "seeds", "iterations", "runs", report=report)
@@ -96,64 +83,19 @@ def cases(names: list[str], options: Options) -> list[Case]:
 
 def paper_table(rows: list[Row]) -> str:
     """Our means beside the printed ones."""
-    header = ["N", "row", "images", "PSNR", "change", "EF-PSNR", "change", "bits per pixel", "decoded PSNR"]
+    header = ["N", "row", "images", "PSNR", "change", "EF-PSNR", "change"]
     header += ["theirs: PSNR", "theirs: change", "theirs: EF-PSNR", "theirs: change"]
     lines = []
     for n, present, images in shared(rows, [m.name for m in PAPER_ROWS]):
         first = select(rows, CLAMPED.name, n, images)
         for name in present:
             found = select(rows, name, n, images)
-            line = [count(n), SHOWN[name], str(len(images))]
-            for quantity in _QUANTITIES:
+            line = [count(n), f"`{name}`", str(len(images))]
+            for quantity in ("psnr", "ef_psnr"):
                 value = mean_over(found, quantity)
                 line += [db(value), signed(value - mean_over(first, quantity))]
-            lines.append([*line, *means(found, _FILE), *_printed(name, n)])
+            lines.append([*line, *_printed(name, n)])
     return markdown(header, lines)
-
-
-def our_table(rows: list[Row]) -> str:
-    """What each part of ours brings."""
-    header = ["N", "row", "images", "PSNR", "EF-PSNR", "bits per pixel", "decoded PSNR", "PSNR, change", "95 %"]
-    header += ["EF-PSNR, change", "95 %", "at equal bits: PSNR, change", "EF-PSNR, change"]
-    lines = []
-    for n, present, images in shared(rows, [m.name for m in OUR_ROWS]):
-        same = [row for row in rows if row.image in images]
-        for name in present:
-            found = select(same, name, n)
-            line = [count(n), SHOWN[name], str(len(images)), *means(found, (*_QUANTITIES, *_FILE))]
-            lines.append(line + ([""] * 6 if name == BEST.name else _changes(same, name, n)))
-    return markdown(header, lines)
-
-
-def _figure(path: Path, rows: list[Row]) -> list[str]:
-    """Plot the paper's rows against its first, and ours against best."""
-    panels: dict[str, dict[str, tuple[float, float]]] = {}
-    for first, group, where in ((CLAMPED, PAPER_ROWS, "clamped baseline"), (BEST, OUR_ROWS, "best")):
-        for n, present, images in shared(rows, [m.name for m in group]):
-            base = [mean_over(select(rows, first.name, n, images), q) for q in _QUANTITIES]
-            changes = {}
-            for name in present if first.name in present and images else []:
-                psnr, ef_psnr = (mean_over(select(rows, name, n, images), q) for q in _QUANTITIES)
-                changes[SHOWN[name]] = psnr - base[0], ef_psnr - base[1]
-            changes.pop(SHOWN[first.name], None)
-            if changes:
-                panels[f"against {where}, N = {n:,}, images: {len(images)}"] = changes
-    if not panels:
-        return []
-    figures.plot_changes(path, panels)
-    return ["## Changes", "Means over the images that all rows of a panel have.", "![](changes.png)"]
-
-
-def _changes(rows: list[Row], name: str, n: int) -> list[str]:
-    cells = []
-    for quantity in _QUANTITIES:
-        found = equal_n(rows, name, BEST.name, n, quantity)
-        spread = "" if found is None or found.low != found.low else f"{signed(found.low)} to {signed(found.high)}"
-        cells += ["" if found is None else signed(found.mean), spread]
-    for quantity in _QUANTITIES:
-        found = equal_bits(rows, name, BEST.name, n, quantity)
-        cells.append("" if found is None or not found.is_complete else signed(found.mean))
-    return cells
 
 
 def _printed(name: str, n: int) -> list[str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from .core import figures, images, summaries
 from .core.cases import BASELINE, BEST, CLAMPED, COVERAGE, PAPER, PAPER_CLAMPED, UNCLAMPED, Case, plan
-from .core.compare import Contest, select
+from .core.compare import Contest
 from .core.images import CHARTS
 from .core.options import Options
 from .core.registry import experiment
@@ -21,15 +21,7 @@ ITERATIONS = 5_000
 QUICK_STRIDE = 2
 # the paper's four conditions, and ours
 METHODS = (CLAMPED, UNCLAMPED, PAPER_CLAMPED, PAPER, BASELINE, BEST)
-SHOWN = {
-    CLAMPED.name: "gaussian-image-clamp: baseline, clamp",
-    UNCLAMPED.name: "gaussian-image: baseline, no clamp",
-    PAPER_CLAMPED.name: "paper, clamp: contour, clamp",
-    PAPER.name: "paper: contour, no clamp",
-    BASELINE.name: "best-baseline: improved baseline",
-    BEST.name: "best: ours",
-    COVERAGE.name: COVERAGE.name,
-}
+NAMES = tuple(m.name for m in (*METHODS, COVERAGE))
 CONTESTS = (
     *(Contest(PAPER.name, other.name) for other in (UNCLAMPED, CLAMPED, PAPER_CLAMPED)),
     Contest(PAPER_CLAMPED.name, CLAMPED.name),
@@ -50,24 +42,15 @@ def report(output: Path, made: Made) -> list[str]:
     """Write the report's parts."""
     rows = read_rows(output / "results.csv", Row)
     asked = [row for row in rows if row.n == NUM_GAUSSIANS]
-    parts = ["# Colour charts at 20 Gaussians", _TEXT, "## What was run"]
-    parts += [summaries.what_was_run(asked, (*METHODS, COVERAGE)), summaries.METRICS_TEXT]
+    parts = ["# Colour charts at 20 Gaussians", _TEXT, summaries.what_was_run(asked)]
     if not rows:
         return parts
     parts += ["## Where a method loses", summaries.losses(rows, CONTESTS, [NUM_GAUSSIANS])]
-    parts += ["## Results", summaries.BITS_TEXT, summaries.rounding(asked)]
     for name in dict.fromkeys(row.image for row in asked):
-        of_chart = [row for row in asked if row.image == name]
-        parts += [f"### {name}", summaries.quality(of_chart, [m for m in SHOWN if select(of_chart, m)], SHOWN)]
+        parts += [f"## Chart {name}", summaries.means([row for row in rows if row.image == name], NAMES)]
         figure = f"renders-{name}.jpg"
         parts.append(f"![]({figure})" if (output / figure).is_file() else "")
-    parts += ["## Differences", summaries.EQUAL_BITS_TEXT, _BITS_TEXT]
-    parts.append(summaries.differences(rows, CONTESTS, [NUM_GAUSSIANS]))
-    extra = [row for row in rows if row.n != NUM_GAUSSIANS]
-    if not extra:
-        return [*parts, "No fits of the baselines at our bytes are there."]
-    title = "### The baselines with the Gaussians that our bytes buy"
-    return [*parts, title, summaries.each(extra, [m.name for m in METHODS])]
+    return [*parts, "## Differences", _BITS_TEXT, summaries.differences(rows, CONTESTS, [NUM_GAUSSIANS])]
 
 
 @experiment("engine", "workers", "budget_seconds", "seeds", "iterations", "runs", report=report)

@@ -22,9 +22,8 @@ from .core.images import sequences
 from .core.options import Options
 from .core.registry import experiment
 from .core.report import Made
-from .core.rivals import near
 from .core.rows import read_rows, write_rows
-from .core.stages import run_stages
+from .core.stages import near, run_stages
 from .core.store import Row, Store
 from .core.tables import count, db, markdown, seconds, signed, similarity
 
@@ -35,20 +34,6 @@ CONTESTS = (Contest(BEST.name, BASELINE.name), Contest(REFINED.name, BASELINE.na
 SIREN = "SIREN"
 # the share of the budget, or the seconds, that the network gets
 _NETWORK_SHARE, _NETWORK_SECONDS, _QUICK_NETWORK_SECONDS = 0.2, 60.0, 0.5
-_LEVELS = (20.0, 22.0, 24.0, 25.0, 26.0, 27.0, 28.0)
-_SPEED_TEXT = """All fits ran on the same kernel, on one thread. Seconds are those of a processor: the wall
-time at which a fit had a quality, times the share of a processor that the whole fit had, so that what else the machine
-did is not in them; the start of a fit is, compilation is not. *Never*: the fit ends below. `paper` dips where it reads
-the regions' ids anew."""
-_PEER_TEXT = """JPEG, WebP and AVIF, also tuned for PSNR (Pillow, best effort): the largest file that is not above
-the bytes of the `.kcgs` file of `best`, s that of this one file; SIREN: three hidden layers with sines, weights at
-half precision and nothing else counted, the widest that these bytes hold, Adam on random pixels for the seconds
-shown. The Gaussian rows are decoded files, that of `best-baseline` with as many Gaussians as make as many bytes, or
-up to 6 % more. The peers were given no contours; figures in the band are taken at the same contours."""
-_TOOLS_TEXT = """No other tool that fits 2D Gaussians to images is in the table. The registry's list has
-`gsplat`, which renders on CUDA only; GaussianImage and Image-GS are not on it, and their code needs CUDA. `splatthis`
-0.3.2, which writes splats as SVG, does run on a processor: told to make 1,250 of a DAVIS frame in its profile `fast`,
-it was stopped after 285 core seconds, having done between 50 and 100 of its 500 iterations."""
 
 
 class Step(NamedTuple):
@@ -64,20 +49,15 @@ def report(output: Path, made: Made) -> list[str]:
     """Write the report's parts."""
     rows, steps = read_rows(output / "results.csv", Row), read_rows(output / "steps.csv", Step)
     asked = [row for row in rows if row.n == (QUICK_GAUSSIANS if made.quick else NUM_GAUSSIANS)]
-    parts = ["# Error against run time, and other codecs at the same bytes", "## What was run"]
-    parts += [summaries.what_was_run(asked, METHODS), summaries.METRICS_TEXT]
+    parts = ["# Error against run time, and other codecs at the same bytes", summaries.what_was_run(asked)]
     if not asked:
         return parts
     gaussians, peers = ([row for row in rows if bool(row.n) == is_ours] for is_ours in (True, False))
     lost = [summaries.losses(gaussians, CONTESTS, [asked[0].n]), beaten(asked, peers)]
     parts += ["## Where ours loses", "\n".join(filter(None, lost))]
-    parts += ["## Error against time", _SPEED_TEXT, "![](convergence.png)"]
-    parts += ["### Against the paper's recipe", against_paper(asked, steps)]
-    parts += ["### Seconds to a PSNR", reached(asked, steps, "psnr")]
-    parts += ["### Seconds to an EF-PSNR", reached(asked, steps, "ef_psnr")]
-    parts += ["## At the same bytes", _PEER_TEXT, peer_table(gaussians, peers), _TOOLS_TEXT]
-    parts += ["## All figures", summaries.BITS_TEXT, summaries.rounding(asked)]
-    return [*parts, summaries.quality(asked, [m.name for m in METHODS])]
+    parts += ["## Error against time", against_paper(asked, steps), "![](convergence.png)"]
+    parts += ["## At the same bytes", peer_table(gaussians, peers)]
+    return [*parts, "## Means", summaries.means(asked, [m.name for m in METHODS])]
 
 
 @experiment("sequences", "budget_seconds", "iterations", "runs", report=report)
@@ -160,19 +140,6 @@ def seconds_to(steps: Sequence[Step], method: str, quantity: str, value: float) 
     """Seconds after which a fit first has this quality; NaN: never."""
     found = (step.seconds for step in steps if step.method == method and getattr(step, quantity) >= value)
     return next(found, math.nan)
-
-
-def reached(rows: Sequence[Row], steps: Sequence[Step], quantity: str) -> str:
-    """Seconds of every recipe to fixed qualities."""
-    values = [getattr(step, quantity) for step in steps if step.method != SIREN]
-    top = max((value for value in values if math.isfinite(value)), default=0.0)
-    levels = [level for level in _LEVELS if level <= top] or [math.floor(top)]
-    lines = []
-    for row in rows:
-        values = [seconds_to(steps, row.method, quantity, level) for level in levels]
-        cells = ["never" if math.isnan(value) else seconds(value) for value in values]
-        lines.append([row.method, count(row.iterations), *cells, seconds(row.core_seconds), db(getattr(row, quantity))])
-    return markdown(["recipe", "iterations", *(f"{level:g} dB" for level in levels), "in all", "in the end, dB"], lines)
 
 
 def against_paper(rows: Sequence[Row], steps: Sequence[Step]) -> str:

@@ -20,9 +20,9 @@ from .core.options import Options
 from .core.registry import experiment
 from .core.report import Made, conclude
 from .core.rows import read_rows, write_rows
-from .core.statistics import Bound, Summary, bounds_table, summarize
+from .core.statistics import Summary, summarize
 from .core.store import Store
-from .core.tables import count, db, markdown, seconds, signed
+from .core.tables import count, markdown, number, seconds, signed
 
 AUTO = "auto"
 OTHERS = ("felzenszwalb", "slic", "watershed", "kmeans")
@@ -30,27 +30,18 @@ COUNTS = (400, 1_000)
 # the other sources are compared at the first of the counts, on every so many of the images
 OTHERS_STRIDE = 4
 QUICK_COUNT, QUICK_STRIDE, QUICK_IMAGES = 60, 4, 2
-# mean gains in PSNR and EF-PSNR that an automatic map must bring, by N
-LEAST = {400: (0.4, 0.8), 1_000: (0.1, 0.3)}
-# the loss in PSNR that no image may pass, and the difference in dB that is neither a win nor a loss
+# the loss in PSNR that no image should pass, and the difference in dB that is neither a win nor a loss
 MOST_LOSS, TIE = 0.1, 0.005
-_GAINS = {
-    "gain": "PSNR",
-    "ef_gain": "EF-PSNR",
-    "equal_gain": "PSNR at equal bytes",
-    "equal_ef_gain": "EF-PSNR at equal bytes",
+# what is gained, and the fields that it is the difference of
+GAINS = {
+    "PSNR": ("psnr", "baseline_psnr"),
+    "EF-PSNR": ("ef_psnr", "baseline_ef_psnr"),
+    "PSNR at equal bytes": ("decoded_psnr", "equal_psnr"),
+    "EF-PSNR at equal bytes": ("decoded_ef_psnr", "equal_ef_psnr"),
 }
-_INTRODUCTION = """No map is given: each comes from the image itself, by `kcgs.segment.segment(image, source)` with
-its default options, and the fit is that of `kcgs fit --regions auto --recipe best-refined`: contours may move freely.
-The baseline is `best-baseline` with as many Gaussians. PSNR is over the whole image;
-EF-PSNR within 5 pixels of the contours of the final map, the one that the scene stores: both renders are measured in
-that same band. Gained is what the fit with the map has over the baseline, in dB. An image whose final map has no
-contour has no band. Intervals are the bootstrap's, 95 %, of the mean over images sampled in pairs. Bytes are those of
-the scene's `.kcgs` file, and the map's share of them. Seconds are wall time, compilation excluded, in summaries
-medians; what else the machine did meanwhile slows them."""
-_BYTES_TEXT = """Gains above are at equal numbers of Gaussians, and a map's bytes come on top. Here the baseline has
-the Gaussians that the bytes of the scene's file buy, the map's included, and what both files decode to is compared.
-Files are written by `kcgs.codec.encode(scene, quality=psnr + 14.5)`, without a look at the image."""
+_INTRODUCTION = """No map is given: each comes from the image itself, see docs/results.md. Gained is what the fit with
+the map has over the baseline, in dB. An image whose final map has no contour has no band. Seconds are medians. Each
+image by itself: results.csv."""
 
 
 class Result(NamedTuple):
@@ -77,26 +68,6 @@ class Result(NamedTuple):
     equal_psnr: float = math.nan  # decoded
     equal_ef_psnr: float = math.nan
 
-    @property
-    def gain(self) -> float:
-        """Difference in PSNR, above zero where the map helps."""
-        return self.psnr - self.baseline_psnr
-
-    @property
-    def ef_gain(self) -> float:
-        """Difference in EF-PSNR."""
-        return self.ef_psnr - self.baseline_ef_psnr
-
-    @property
-    def equal_gain(self) -> float:
-        """Difference in PSNR to the baseline of as many bytes, both decoded."""
-        return self.decoded_psnr - self.equal_psnr
-
-    @property
-    def equal_ef_gain(self) -> float:
-        """Difference in EF-PSNR to the baseline of as many bytes, both decoded."""
-        return self.decoded_ef_psnr - self.equal_ef_psnr
-
 
 def report(output: Path, made: Made) -> list[str]:
     """Write the report's parts."""
@@ -106,22 +77,14 @@ def report(output: Path, made: Made) -> list[str]:
     if not results:
         return parts
     parts += ["## Where a map does not help", failures(results)]
-    if not made.quick:
-        bounded = "What automatic maps (`auto`) are held to, over all images."
-        parts += ["## Bounds", bounded, bounds_table(bounds(automatic))]
     _plot_gains(results, output / "gains.png")
-    parts += ["## Automatic maps", summary(automatic), "![](gains.png)"]
-    parts += ["### At equal bytes", _BYTES_TEXT, at_equal_bytes(automatic)]
+    parts += ["## Automatic maps", gains_table(automatic), sizes_table(automatic), "![](gains.png)"]
     others = [r for r in results if r.source != AUTO]
     if others:
         images = list(dict.fromkeys(r.image for r in others))
         beside = [r for r in automatic if r.image in images and r.n == others[0].n]
         which = f"On {len(images)} of the images: {', '.join(images)}."
-        parts += ["## Other sources", which, summary([*beside, *others])]
-    for n in sorted({r.n for r in automatic}):
-        parts += [f"## Each image: auto, N = {n:,}", each_image([r for r in automatic if r.n == n])]
-    if others:
-        parts += [f"## Each image: other sources, N = {others[0].n:,}", each_image(others)]
+        parts += ["## Other sources", which, gains_table([*beside, *others]), sizes_table([*beside, *others])]
     return parts
 
 
@@ -140,7 +103,7 @@ def run(output: Path, options: Options) -> None:
         failed += store.obtain([rival for rival in rivals if rival is not None], options.place)
     finally:
         results = [found for case in wanted if (found := compare(store, case)) is not None]
-        write_rows(output / "results.csv", Result, results, list(_GAINS))
+        write_rows(output / "results.csv", Result, results)
         lacking = f"Stopped before its end: {len(results)} of {len(wanted)} fits with a map are there."
         conclude(report, output, options.made("maps", [lacking] if len(results) < len(wanted) else []))
     check_made(failed)
@@ -228,94 +191,55 @@ def compare(store: Store, case: Case) -> Result | None:
 
 def gain_of(results: Iterable[Result], quantity: str) -> Summary | None:
     """Sum up a gain of results, by name; images where it is not defined are left out. None: it is nowhere."""
-    return summarize({r.image: float(getattr(r, quantity)) for r in results}, TIE)
-
-
-def bounds(results: Sequence[Result]) -> list[Bound]:
-    """Hold the automatic maps to the bounds of every N that was run."""
-    found = []
-    for n, least in LEAST.items():
-        for quantity, bound in zip(("gain", "ef_gain"), least, strict=True):
-            gain = gain_of([r for r in results if r.n == n], quantity)
-            if gain is not None:
-                measured = {f"mean {_GAINS[quantity]} gained": (bound, gain.mean)}
-                if quantity == "gain":
-                    what = f"PSNR gained on the worst image ({gain.worst[0]})"
-                    measured[what] = -MOST_LOSS, gain.values[gain.worst[0]]
-                for what, (limit, value) in measured.items():
-                    shown = f">= {signed(limit)} dB", f"{signed(value)} dB"
-                    found.append(Bound(f"N = {n:,}: {what}", *shown, value >= limit))
-    return found
+    ours, other = GAINS[quantity]
+    return summarize({r.image: float(getattr(r, ours) - getattr(r, other)) for r in results}, TIE)
 
 
 def failures(results: Sequence[Result]) -> str:
     """Name the images on which a source loses, worst first, and those whose map has no contour left."""
     lines = []
-    for n, source in dict.fromkeys((r.n, r.source) for r in results):
-        found = [r for r in results if (r.n, r.source) == (n, source)]
-        for quantity, shown in _GAINS.items():
+    for (n, source), found in _groups(results).items():
+        for quantity in GAINS:
             gain = gain_of(found, quantity)
             if gain is not None and gain.losses:
                 which = ", ".join(f"{image} {signed(gain.values[image])}" for image in gain.worst[: gain.losses])
-                lines.append(f"- {source}, N = {n:,}, {shown}: {gain.losses} of {len(found)} images lose: {which}")
+                lines.append(f"- {source}, N = {n:,}, {quantity}: {gain.losses} of {len(found)} images lose: {which}")
         bare = [r.image for r in found if r.regions == 1]
         if bare:
             lines.append(f"- {source}, N = {n:,}: no contour is left on {', '.join(bare)}")
     return "\n".join(lines) or "Nowhere."
 
 
-def summary(results: Sequence[Result]) -> str:
-    """Means of every source at every N, gains with their intervals."""
-    header = ["N", "source", "images", "regions", "map bytes", "PSNR gained", "95 %", "won-lost", "worst"]
-    header += ["EF-PSNR gained", "95 %", "won-lost", "worst", "s, map", "s, fit", "s, baseline"]
+def gains_table(results: Sequence[Result]) -> str:
+    """Write mean gains with their intervals, a line for each N, source and quantity."""
     lines = []
-    for n, source in dict.fromkeys((r.n, r.source) for r in results):
-        found = [r for r in results if (r.n, r.source) == (n, source)]
-        line = [count(n), source, str(len(found)), f"{statistics.fmean(r.regions for r in found):.1f}"]
-        line.append(count(statistics.fmean(r.map_bytes for r in found)))
-        line += [*_gain_cells(gain_of(found, "gain")), *_gain_cells(gain_of(found, "ef_gain"))]
-        for field in ("segment_seconds", "seconds", "baseline_seconds"):
-            line.append(seconds(statistics.median(getattr(r, field) for r in found)))
-        lines.append(line)
-    return markdown(header, lines)
+    for (n, source), found in _groups(results).items():
+        for quantity in GAINS:
+            gain = gain_of(found, quantity)
+            if gain is not None:
+                spread, worst = f"{signed(gain.low)} to {signed(gain.high)}", gain.worst[0]
+                line = [count(n), source, quantity, str(len(gain.values)), signed(gain.mean), spread]
+                lines.append([*line, f"{gain.wins}-{gain.losses}", f"{worst} {signed(gain.values[worst])}"])
+    return markdown(["N", "source", "gained in", "images", "mean", "95 %", "won-lost", "worst"], lines)
 
 
-def at_equal_bytes(automatic: Sequence[Result]) -> str:
-    """Gains over the baseline of as many bytes."""
-    header = ["N", "source", "images", "bytes", "of these map", "baseline's N", "its bytes"]
-    header += ["PSNR gained", "95 %", "won-lost", "worst", "EF-PSNR gained", "95 %", "won-lost", "worst"]
+def sizes_table(results: Sequence[Result]) -> str:
+    """Write mean sizes and median seconds of every source at every N."""
+    sizes = {"regions": "regions", "bytes": "bytes", "of these map": "map_bytes", "N at equal bytes": "equal_n"}
+    times = {"s, map": "segment_seconds", "s, fit": "seconds", "s, baseline": "baseline_seconds"}
     lines = []
-    for n in sorted({r.n for r in automatic if r.equal_n}):
-        found = [r for r in automatic if r.n == n and r.equal_n]
-        line = [count(n), AUTO, str(len(found))]
-        fields = ("bytes", "map_bytes", "equal_n", "equal_bytes")
-        line += [count(statistics.fmean(getattr(r, field) for r in found)) for field in fields]
-        lines.append([*line, *(c for q in ("equal_gain", "equal_ef_gain") for c in _gain_cells(gain_of(found, q)))])
-    return markdown(header, lines)
+    for (n, source), found in _groups(results).items():
+        line = [count(n), source]
+        line += [number(statistics.fmean(getattr(r, field) for r in found) or math.nan) for field in sizes.values()]
+        lines.append(line + [seconds(statistics.median(getattr(r, field) for r in found)) for field in times.values()])
+    return markdown(["N", "source", *sizes, *times], lines)
 
 
-def each_image(results: Sequence[Result]) -> str:
-    """One line per fit; where a map loses comes first."""
-    header = ["image", "source", "regions found", "regions kept", "bytes", "map bytes", "PSNR", "baseline", "gained"]
-    header += ["EF-PSNR", "baseline", "gained", "s, map", "s, fit", "s, baseline"]
-    has_rivals = any(r.equal_n for r in results)
-    header += ["baseline's N at equal bytes", "PSNR gained", "EF-PSNR gained"] if has_rivals else []
-    lines = []
-    for r in sorted(results, key=lambda r: (r.gain >= -TIE, r.gain if r.gain < -TIE else 0.0)):
-        line = [r.image, r.source, count(r.given_regions), count(r.regions), count(r.bytes), count(r.map_bytes)]
-        line += [db(r.psnr), db(r.baseline_psnr), signed(r.gain)]
-        line += [db(r.ef_psnr), db(r.baseline_ef_psnr), signed(r.ef_gain)]
-        line += map(seconds, (r.segment_seconds, r.seconds, r.baseline_seconds))
-        line += [count(r.equal_n), signed(r.equal_gain), signed(r.equal_ef_gain)] if has_rivals else []
-        lines.append(line)
-    return markdown(header, lines)
-
-
-def _gain_cells(gain: Summary | None) -> list[str]:
-    if gain is None:
-        return [""] * 4
-    spread, worst = f"{signed(gain.low)} to {signed(gain.high)}", gain.worst[0]
-    return [signed(gain.mean), spread, f"{gain.wins}-{gain.losses}", f"{worst} {signed(gain.values[worst])}"]
+def _groups(results: Sequence[Result]) -> dict[tuple[int, str], list[Result]]:
+    found: dict[tuple[int, str], list[Result]] = {}
+    for result in results:
+        found.setdefault((result.n, result.source), []).append(result)
+    return found
 
 
 def _plot_gains(results: Sequence[Result], path: Path) -> None:
@@ -326,7 +250,7 @@ def _plot_gains(results: Sequence[Result], path: Path) -> None:
         axis.axhline(0.0, color="black", linewidth=0.8)
         axis.axhline(-MOST_LOSS, color="black", linewidth=0.8, linestyle=":", label="most that an image may lose")
         for index, source in enumerate((AUTO, *OTHERS)):
-            points = [(r.map_bytes, r.gain) for r in results if (r.n, r.source) == (n, source)]
+            points = [(r.map_bytes, r.psnr - r.baseline_psnr) for r in _groups(results).get((n, source), [])]
             if points:
                 size = 6 if source == AUTO else 5
                 style = {"color": COLORS[index], "markersize": size, "markeredgecolor": "white"}

@@ -38,7 +38,6 @@ from .core.options import Options
 from .core.registry import experiment
 from .core.report import Made, conclude
 from .core.rows import read_rows, write_rows
-from .core.statistics import bounds_table
 
 # the folders of the data that a group reads
 GROUPS = {
@@ -76,30 +75,16 @@ _STYLES = {
     AVIF_PSNR: (COLORS[0], "-", "P"),
 }
 _INTRODUCTION = f"""Bytes are those of real files, everything in them included. `{KCGS}` is `kcgs.rate.fit_bytes` with
-the map that is given on DAVIS (the annotation of the first frame), and with the one that `kcgs.segment.segment` finds
-on Kodak; `{NO_REGIONS}` is the same without a map. The others are Pillow's: JPEG with optimize and progressive, 4:2:0
-or 4:4:4, whichever has the higher PSNR; WebP with method 6; AVIF with speed 0, as it comes and, as `{AVIF_PSNR}`, told
-to mind PSNR, in 4:2:0 or 4:4:4, whichever is better. PSNR is over the whole image, EF-PSNR and EF-SSIM within 5 pixels
-of the contours of that map. Gained is what kcgs has over the other, in dB. Intervals are the bootstrap's, 95 %, of the
-mean over images sampled in pairs. Seconds to encode are those of the final setting, the search for it excluded; of
-kcgs those of the whole fit and of finding the map, to decode until the image is there; medians, compilation excluded.
-What else the machine did meanwhile slows them."""
+the map that is given on DAVIS, and with the one that `kcgs.segment.segment` finds on Kodak; `{NO_REGIONS}` is the same
+without a map. Gained is what kcgs has over the other. The other codecs, and how curves are compared: docs/results.md.
+Seconds are medians, of kcgs those of the whole fit. Each file by itself: results.csv."""
 _MATCHED_TEXT = f"""Every codec made its largest file of at most {MOST_BYTES:,} bytes, or its smallest if it cannot go
-as low. Kcgs was fitted to the bytes of the larger AVIF file; the fit was written again with the bytes of each other
-file, unless nearly as many were there already. Each file of another codec meets the largest of kcgs' that has no more
-bytes; of the codecs that cannot go as low, one of far fewer. Without regions kcgs was asked for the bytes that it was
-fitted to with them."""
-_CURVE_TEXT = """Files of about 2,000, 4,000, 8,000, 16,000 and 32,000 bytes; a codec that cannot go as low has its
-smallest file there. BD-rate is how many more bits kcgs takes for the same quality, in %, below zero where it saves
-bits; BD-PSNR how much better it is at the same bits. Both are means over where two curves overlap, log-rate over
-quality and quality over log-rate interpolated by monotone cubics (PCHIP); similarities count as -10 log10(1 - x)."""
+as low. Each meets the largest file of kcgs that has no more bytes. Without regions kcgs was asked for the bytes that it
+was fitted to with them."""
 _SECTIONS = {
     PRECISION: ("Bits per Gaussian", tables.precision_table, f"""A fit of N Gaussians with the annotation's contours,
-and the smallest of a few files by `kcgs.rate.compress` that loses at most {MOST_LOSS} dB of its PSNR. Header, map and
-checksums count. Gaussians that do not pay for their bits are left out of the file; bits are for each that is in it,
-and beside that for each of those fitted."""),
-    MAPS: ("Label maps", tables.maps_table, """Bytes of a label map alone, its size not included, beside Pillow's
-lossless WebP with quality 100 and method 6."""),
+and the smallest of a few files by `kcgs.rate.compress` that loses at most {MOST_LOSS} dB of its PSNR."""),
+    MAPS: ("Label maps", tables.maps_table, """Bytes of a label map alone, beside Pillow's lossless WebP."""),
     SPEED: ("Speed", tables.speed_table, f"""Medians on {SPEED_THREADS} threads: `kcgs.rate.compress`,
 `kcgs.codec.encode`, and a file decoded and rendered, in a process that has done so before."""),
 }  # fmt: skip
@@ -115,25 +100,17 @@ def report(output: Path, made: Made) -> list[str]:
     if not points:
         return parts
     parts += ["## Where kcgs loses", tables.losses(points)]
-    parts += [] if made.quick else ["## Bounds", bounds_table(tables.bounds(points))]
     rivals = [rival for rival in tables.RIVALS if tables.pairs(points, rival)]
     if rivals:
-        _plot_matched(points, rivals, output / "matched.png")
-        parts += [f"## At {MOST_BYTES:,} bytes: {MATCHED}", _MATCHED_TEXT]
-        parts += [tables.matched_means(points), "![](matched.png)"]
-    curves = [group for group in (DAVIS_CURVE, KODAK_CURVE) if group in tables.curve_groups(points)]
-    parts += ["## Curves", _CURVE_TEXT, tables.no_overlap(points)] if curves else []
-    for group in curves:
+        parts += [f"## At {MOST_BYTES:,} bytes: {MATCHED}", _MATCHED_TEXT, tables.matched_means(points)]
+    for group in tables.curve_groups(points):
         of_group = [p for p in points if p.group == group]
         _plot_curves(of_group, output / f"{group}.png")
-        parts += [f"### {group}", f"Images: {', '.join(dict.fromkeys(p.image for p in of_group))}."]
-        parts += [tables.bd_means(points, group), f"![]({group}.png)", tables.bd_each(points, group)]
-    parts += [tables.dropped(points)] if curves or rivals else []
+        parts += [f"## Curves: {group}", f"Images: {', '.join(dict.fromkeys(p.image for p in of_group))}."]
+        parts += [tables.bd_means(points, group), f"![]({group}.png)"]
     for group, (title, table, text) in _SECTIONS.items():
         if any(p.group == group for p in points):
             parts += [f"## {title}", text, table(points)]
-    for rival in rivals:
-        parts += [f"## Each frame at {MOST_BYTES:,} bytes: against {rival}", tables.each_frame(points, rival)]
     return parts
 
 
@@ -323,22 +300,4 @@ def _plot_curves(points: Sequence[Point], path: Path) -> None:
             axis.xaxis.set_major_formatter("{x:g}")
             axis.set(xlabel="bits per pixel", ylabel=f"{QUALITIES[quality][0]} (dB)", title=image)
     add_legend(plot, rows[0][0], columns=len(_STYLES), where="upper")
-    save_figure(plot, path)
-
-
-def _plot_matched(points: Sequence[Point], rivals: Sequence[str], path: Path) -> None:
-    """Plot what each frame gains over each codec at no more bytes, frames by what they gain over AVIF."""
-    plot, axes = figure(1, 2, width=11.0, height=4.2)
-    order = tables.gains(tables.pairs(points, AVIF_PSNR if AVIF_PSNR in rivals else rivals[0]), PSNR)
-    frames = [] if order is None else order.worst
-    for axis, quality in zip(axes, (PSNR, EF_PSNR), strict=True):
-        axis.axhline(0.0, color="black", linewidth=0.8)
-        for codec in rivals:
-            color, _, marker = _STYLES[codec]
-            gain = tables.gains(tables.pairs(points, codec), quality)
-            found = [(frames.index(i), v) for i, v in (gain.values if gain else {}).items() if i in frames]
-            axis.plot([x for x, _ in found], [y for _, y in found], marker, color=color, label=codec)
-        axis.set_xticks(range(len(frames)), frames, rotation=60, ha="right", fontsize=8)
-        axis.set(ylabel=f"{QUALITIES[quality][0]} gained by kcgs (dB)")
-    add_legend(plot, axes[0], columns=len(rivals), where="upper")
     save_figure(plot, path)

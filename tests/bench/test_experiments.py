@@ -36,7 +36,6 @@ class TestConvergence:
         text = convergence.against_paper([paper, ours], steps)
         assert "took 25 s and ends at 24.00 dB" in text
         assert "| best | 40 | 1 | 40 | 1 | 40 | +1.00 | +7.00 |" in text
-        assert "| best | 700 | 10 | 20 | 40 | 50 | 40 | 25.00 |" in convergence.reached([paper, ours], steps, "psnr")
 
     def test_network_fits(self) -> None:
         width = width_for(2_000)
@@ -63,8 +62,6 @@ class TestAblation:
         lines = ablation.paper_table(rows).splitlines()
         assert len(lines) == 2 + 6 and "| 20.00 | +0.00 | 19.00 | +0.00 |" in lines[2] and "27.10" in lines[2]
         assert "| 25.00 | +5.00 | 24.00 | +5.00 |" in lines[-1] and "27.31 | +0.21" in lines[-1]
-        rows = [row(p, method=m.name, psnr=30.0 - i) for p in "ab" for i, m in enumerate(ablation.OUR_ROWS)]
-        assert "-1.00" in ablation.our_table(rows).splitlines()[3]
 
     def test_conditions(self) -> None:
         conditions = {

@@ -1,4 +1,4 @@
-"""Means over images with bootstrap intervals, bounds that they are held to, and differences between curves."""
+"""Means over images with bootstrap intervals, and differences between curves."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.interpolate import PchipInterpolator
-
-from .tables import markdown
 
 # (rate, quality) of each file
 Curve = Sequence[tuple[float, float]]
@@ -41,15 +39,6 @@ class Summary(NamedTuple):
     def worst(self) -> list[str]:
         """Images, the lowest first."""
         return sorted(self.values, key=lambda image: self.values[image])
-
-
-class Bound(NamedTuple):
-    """A bound, what was measured, and whether it is met."""
-
-    what: str
-    bound: str
-    measured: str
-    met: bool
 
 
 class Delta(NamedTuple):
@@ -102,12 +91,6 @@ def summarize(values: Mapping[str, float], tie: float, *, least: int = 1) -> Sum
     low, high = interval(list(finite.values())) if len(finite) >= least else (math.nan, math.nan)
     wins, losses = (sum(sign * value > tie for value in finite.values()) for sign in (1, -1))
     return Summary(statistics.fmean(finite.values()), low, high, wins, losses, finite, len(values))
-
-
-def bounds_table(bounds: Iterable[Bound]) -> str:
-    """Say of every bound what was measured and whether it is met, those that are not first."""
-    lines = [[b.what, b.bound, b.measured, "yes" if b.met else "NO"] for b in sorted(bounds, key=lambda b: b.met)]
-    return markdown(["", "bound", "measured", "met"], lines)
 
 
 def interpolate(curve: Curve, rate: float) -> float:

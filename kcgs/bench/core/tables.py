@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TypeVar
+
+Item = TypeVar("Item")
 
 
 def markdown(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     """Lay out a table."""
     return "\n".join("| " + " | ".join(row) + " |" for row in [header, ["---"] * len(header), *lines])
+
+
+def table(columns: Mapping[str, Callable[[Item], str]], items: Iterable[Item]) -> str:
+    """Lay out a table with a line for each item, from what writes each column."""
+    return markdown(list(columns), ([write(item) for write in columns.values()] for item in items))
 
 
 def db(value: float) -> str:

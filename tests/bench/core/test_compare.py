@@ -60,18 +60,6 @@ class TestCompare:
         assert found is not None and list(found.values) == ["a"] and found.asked == 2 and not found.is_complete
         lines = summaries.differences(rows, [CONTEST], [100]).splitlines()
         assert "equal N | 2 | +1.00" in lines[2] and "equal bits | 1 of 2 |  |" in lines[3]
-        assert summaries.unpaid(rows, *CONTEST) == "Nothing to compare."
-
-    def test_unpaid(self) -> None:
-        rows = [row(p, psnr=31.0) for p in "abcde"]
-        for low, word in ((29.0, "pays for itself in PSNR"), (31.5, "does not pay for itself in PSNR")):
-            others = [
-                row(p, method="best-baseline", psnr=low + 0.01 * i + (b > 1_000), bytes=b, n=n)
-                for i, p in enumerate("abcde")
-                for b, n in ((1_000, 100), (2_000, 200))
-            ]
-            text = summaries.unpaid([*rows, *others], *CONTEST)
-            assert word in text and "10.0 % of the bytes" in text
 
     def test_images_that_figures_show(self) -> None:
         rows = [row(p, n=n, method=m) for p in "abc" for n in (10, 20) for m in CONTEST if (p, n) != ("c", 20)]
@@ -83,7 +71,6 @@ class TestCompare:
         lines = summaries.losses(rows, [CONTEST]).splitlines()
         assert lines[0] == "- best - best-baseline, equal N, N = 100, PSNR: 1 of 2: b -0.50"
         assert summaries.losses([row(), row(method="best-baseline", psnr=20.0)], [CONTEST]) == "Nowhere."
-        assert "0.30 dB here (b, N = 100, best)" in summaries.rounding([rows[0], row("b", decoded_psnr=29.7)])
         assert "| 100 | best - best-baseline | equal N | 2 | +0.00 |" in summaries.differences(rows, [CONTEST])
 
 

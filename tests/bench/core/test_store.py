@@ -13,7 +13,7 @@ from kcgs.bench.core.cases import BASELINE, BEST, CLAMPED, PAPER, UNCLAMPED, Cas
 from kcgs.bench.core.images import load, sequences
 from kcgs.bench.core.jobs import Place, check_made, make_all
 from kcgs.bench.core.options import Options
-from kcgs.bench.core.rivals import near, rivals
+from kcgs.bench.core.stages import near, rivals
 from kcgs.bench.core.store import Row, Store
 
 HERE = Place()
