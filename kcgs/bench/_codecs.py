@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from functools import lru_cache
@@ -19,8 +18,6 @@ from kcgs.functional import psnr
 JPEG, WEBP, AVIF, AVIF_PSNR = "JPEG", "WebP", "AVIF", "AVIF, tune=psnr"
 # one quality for each of AVIF's 64 quantizers: the others give the same files
 _AVIF_QUALITIES = tuple(sorted({((100 - q) * 63 + 50) // 100: q for q in range(101)}.values()))
-# what twice the bytes bring at low rates, where files of unequal sizes are compared
-_DB_PER_OCTAVE = 3.0
 _SUBSAMPLING = ({"subsampling": "4:2:0"}, {"subsampling": "4:4:4"})
 
 
@@ -32,11 +29,9 @@ class Codec(NamedTuple):
     qualities: tuple[int, ...]  # rising
     settings: dict[str, Any]
     variants: tuple[dict[str, Any], ...] = ({},)
-    draft: dict[str, Any] | None = None
-    """Settings that tell about which quality it will be, where the real ones are slow."""
 
 
-_AVIF = Codec("AVIF", "avif", _AVIF_QUALITIES, {"speed": 0, "max_threads": 1}, draft={"speed": 6})
+_AVIF = Codec("AVIF", "avif", _AVIF_QUALITIES, {"speed": 0, "max_threads": 1})
 CODECS = {
     JPEG: Codec("JPEG", "jpg", tuple(range(96)), {"optimize": True, "progressive": True}, _SUBSAMPLING),
     WEBP: Codec("WEBP", "webp", tuple(range(101)), {"method": 6}),
@@ -72,26 +67,13 @@ def open_file(data: bytes) -> Tensor:
     return torch.from_numpy(pixels.copy()).permute(2, 0, 1).float() / 255
 
 
-def largest(codec: str, image: Tensor, most: int, *, exact: bool = True, quick: bool = False) -> Coded:
-    """Make the largest file of at most `most` bytes, of the variants' the one with the higher PSNR.
-
-    Args:
-        codec: by name.
-        image: (3, H, W) in [0, 1].
-        most: bytes. Where the codec cannot go as low, the file is its smallest.
-        exact: False: about `most` will do, for a curve.
-        quick: AVIF at its draft's speed.
-    """
-    found = [_largest(CODECS[codec], variant, image, most, exact, quick) for variant in CODECS[codec].variants]
+def largest(codec: str, image: Tensor, most: int, *, quick: bool = False) -> Coded:
+    """Make the largest file of at most `most` bytes, or the smallest; of the variants' the one with the higher PSNR."""
+    found = [_largest(CODECS[codec], variant, image, most, quick) for variant in CODECS[codec].variants]
     small = [coded for coded in found if len(coded.data) <= most]
-    if not small and exact:
+    if not small:
         return min(found, key=lambda coded: len(coded.data))
-
-    def merit(coded: Coded) -> float:
-        price = 0.0 if exact else _DB_PER_OCTAVE * math.log2(len(coded.data))
-        return float(psnr(open_file(coded.data), image)) - price
-
-    return max(small if exact else found, key=merit)
+    return max(small, key=lambda coded: float(psnr(open_file(coded.data), image)))
 
 
 def lossless_bytes(labels: Tensor) -> int:
@@ -113,19 +95,17 @@ def lossless_bytes(labels: Tensor) -> int:
     return file.getbuffer().nbytes
 
 
-def _largest(codec: Codec, variant: dict[str, Any], image: Tensor, most: int, exact: bool, quick: bool) -> Coded:
+def _largest(codec: Codec, variant: dict[str, Any], image: Tensor, most: int, quick: bool) -> Coded:
     pixels = (image * 255).round().byte().permute(1, 2, 0).contiguous().numpy()
-    draft = {**codec.settings, **variant, **(codec.draft or {})}
-    settings = draft if quick else {**codec.settings, **variant}
+    settings = {**codec.settings, **variant}
+    if quick and "speed" in settings:
+        settings["speed"] = 6
+    hashable = tuple((k, tuple(v.items()) if isinstance(v, dict) else v) for k, v in settings.items())
 
-    def encode(place: int, options: dict[str, Any]) -> Coded:
-        hashable = tuple((k, tuple(v.items()) if isinstance(v, dict) else v) for k, v in options.items())
+    def encode(place: int) -> Coded:
         return _encode(codec.format, pixels.tobytes(), pixels.shape[:2], codec.qualities[place], hashable)
 
-    place = _last(len(codec.qualities), lambda place: len(encode(place, draft).data) <= most)
-    if exact and draft != settings:
-        place = _walk(len(codec.qualities), place, lambda place: len(encode(place, settings).data) <= most)
-    return encode(place, settings)
+    return encode(_last(len(codec.qualities), lambda place: len(encode(place).data) <= most))
 
 
 def _last(count: int, fits: Callable[[int], bool]) -> int:
@@ -135,15 +115,6 @@ def _last(count: int, fits: Callable[[int], bool]) -> int:
         middle = (low + high + 1) // 2
         low, high = (middle, high) if fits(middle) else (low, middle - 1)
     return low
-
-
-def _walk(count: int, place: int, fits: Callable[[int], bool]) -> int:
-    """Return the same, from a place that must be near."""
-    while place > 0 and not fits(place):
-        place -= 1
-    while place + 1 < count and fits(place + 1):
-        place += 1
-    return place
 
 
 # a slow codec's files at several targets are often the same

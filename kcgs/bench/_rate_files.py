@@ -87,18 +87,18 @@ class Files:
         self.config = BEST.config(QUICK_ITERATIONS if quick else None)
         self.tuning = QUICK_TUNING if quick else ITERATIONS
 
-    def other(self, group: str, image: str, codec: str, most: int, *, exact: bool = True) -> list[Point]:
-        """Return the largest file of another codec of at most `most` bytes; not `exact`: of about as many."""
+    def other(self, group: str, image: str, codec: str, most: int) -> list[Point]:
+        """Return the largest file of another codec of at most `most` bytes."""
         ask = Ask(group, image, codec, most)
 
         def make() -> tuple[Point, bytes]:
-            coded = largest(codec, self.sample(image)[0].image, most, exact=exact, quick=self.quick)
+            coded = largest(codec, self.sample(image)[0].image, most, quick=self.quick)
             shown, seconds = timed(lambda: open_file(coded.data))
             point = self._measured(ask, shown, len(coded.data))
             point = point._replace(setting=coded.setting, encode_seconds=coded.seconds, decode_seconds=seconds)
             return point, coded.data
 
-        return self.keep(ask, [*CODECS[codec], exact], make)
+        return self.keep(ask, [*CODECS[codec]], make)
 
     def fitted(self, group: str, image: str, most: int, *, regions: bool = True) -> list[Point]:
         """Return kcgs' file of a fit to so many bytes."""

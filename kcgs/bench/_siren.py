@@ -55,14 +55,7 @@ def width_for(size: int) -> int:
 
 
 def train(image: Tensor, size: int, *, seconds: float, seed: int = 0) -> Trained:
-    """Train a network of at most `size` bytes on random pixels for some seconds; renders on the way are kept.
-
-    Args:
-        image: (3, H, W) in [0, 1].
-        size: bytes of the weights.
-        seconds: of a processor, renders on the way not counted.
-        seed: of start and pixels.
-    """
+    """Train a network of at most `size` bytes on random pixels for so many processor seconds, renders not counted."""
     generator = torch.Generator().manual_seed(seed)
     width = width_for(size)
     with torch.random.fork_rng(devices=[]):

@@ -28,7 +28,6 @@ CONTESTS = (
     *(Contest(BEST.name, other.name) for other in (BASELINE, CLAMPED, PAPER)),
     Contest(BASELINE.name, CLAMPED.name),
 )
-_WINDOW = 60
 _OTHERS = (BASELINE, CLAMPED)
 _BITS_TEXT = """Of both baselines files are made until one has as many bytes as that of `best`, or up to 6 % more. The
 other methods have one size."""
@@ -69,17 +68,12 @@ def cases(options: Options) -> list[Case]:
 
 
 def _finish(output: Path, store: Store, wanted: Sequence[Case]) -> list[Row]:
-    """Show what each method renders, and a part of it with contours."""
+    """Show what each method renders."""
     for name in CHARTS:
-        image, labels = images.load(name, None, wanted[0].stride)
-        assert labels is not None
-        whole = {"original": image}
+        shown = {"original": images.load(name, None, wanted[0].stride).image}
         for case in wanted:
             row = store.row(case)
             if row is not None and case.image == name and case.method in METHODS and case.seed == 0:
-                title = f"{row.method}\nPSNR {row.psnr:.1f}, EF {row.ef_psnr:.1f}"
-                whole[title] = store.scene(case).render()
-        part = figures.window(labels, _WINDOW, _WINDOW)
-        details = {" " * index: image[:, *part] for index, image in enumerate(whole.values())}
-        figures.plot_images(output / f"renders-{name}.jpg", [whole, details], side_names=("chart", "part"))
+                shown[f"{row.method}\nPSNR {row.psnr:.1f}, EF {row.ef_psnr:.1f}"] = store.scene(case).render()
+        figures.plot_images(output / f"renders-{name}.jpg", shown)
     return []

@@ -23,9 +23,9 @@ from .core.options import Options
 from .core.registry import experiment
 from .core.report import Made
 from .core.rows import read_rows, write_rows
-from .core.stages import near, run_stages
+from .core.stages import run_stages
 from .core.store import Row, Store
-from .core.tables import count, db, markdown, seconds, signed, similarity
+from .core.tables import count, markdown, seconds, signed
 
 NUM_GAUSSIANS, QUICK_GAUSSIANS = 1_250, 40
 QUICK_STRIDE = 4
@@ -56,8 +56,7 @@ def report(output: Path, made: Made) -> list[str]:
     lost = [summaries.losses(gaussians, CONTESTS, [asked[0].n]), beaten(asked, peers)]
     parts += ["## Where ours loses", "\n".join(filter(None, lost))]
     parts += ["## Error against time", against_paper(asked, steps), "![](convergence.png)"]
-    parts += ["## At the same bytes", peer_table(gaussians, peers)]
-    return [*parts, "## Means", summaries.means(asked, [m.name for m in METHODS])]
+    return [*parts, "## At the same bytes", summaries.means(rows, list(dict.fromkeys(row.method for row in rows)))]
 
 
 @experiment("sequences", "budget_seconds", "iterations", "runs", report=report)
@@ -164,19 +163,6 @@ def against_paper(rows: Sequence[Row], steps: Sequence[Step]) -> str:
         "Times faster: these seconds through those to the same quality."
     )
     return f"{text}\n\n{markdown(header, lines)}"
-
-
-def peer_table(rows: Sequence[Row], peers: Sequence[Row]) -> str:
-    """Everything at the bytes of our file."""
-    header = ["what", "bytes", "bits per pixel", "PSNR", "MS-SSIM", "EF-PSNR", "edge SSIM", "s", "note"]
-    ours = select(rows, BEST.name)[:1]
-    lines = []
-    for row in [*ours, *filter(None, (near(rows, one, BASELINE.name) for one in ours)), *peers]:
-        line = [row.method, count(row.bytes), f"{row.bits_per_pixel:.3f}", db(row.decoded_psnr)]
-        line += [similarity(row.decoded_ms_ssim), db(row.decoded_ef_psnr), similarity(row.decoded_ef_ssim)]
-        line += [seconds(row.core_seconds), f"N = {row.n:,}, decoded"] if row.n else [seconds(row.seconds), row.note]
-        lines.append(line)
-    return markdown(header, lines)
 
 
 def beaten(rows: Sequence[Row], peers: Sequence[Row]) -> str:

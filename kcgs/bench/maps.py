@@ -10,11 +10,9 @@ from typing import Any, NamedTuple
 
 from kcgs.codec import decode, encode
 from kcgs.functional import ef_psnr
-from kcgs.plots import COLORS, figure, save_figure
 from kcgs.rate import quality_for
 
 from .core.cases import BASELINE, QUICK_ITERATIONS, REFINED, Case
-from .core.figures import MARKERS
 from .core.jobs import check_made
 from .core.options import Options
 from .core.registry import experiment
@@ -30,8 +28,8 @@ COUNTS = (400, 1_000)
 # the other sources are compared at the first of the counts, on every so many of the images
 OTHERS_STRIDE = 4
 QUICK_COUNT, QUICK_STRIDE, QUICK_IMAGES = 60, 4, 2
-# the loss in PSNR that no image should pass, and the difference in dB that is neither a win nor a loss
-MOST_LOSS, TIE = 0.1, 0.005
+# the difference in dB that is neither a win nor a loss
+TIE = 0.005
 # what is gained, and the fields that it is the difference of
 GAINS = {
     "PSNR": ("psnr", "baseline_psnr"),
@@ -77,8 +75,7 @@ def report(output: Path, made: Made) -> list[str]:
     if not results:
         return parts
     parts += ["## Where a map does not help", failures(results)]
-    _plot_gains(results, output / "gains.png")
-    parts += ["## Automatic maps", gains_table(automatic), sizes_table(automatic), "![](gains.png)"]
+    parts += ["## Automatic maps", gains_table(automatic), sizes_table(automatic)]
     others = [r for r in results if r.source != AUTO]
     if others:
         images = list(dict.fromkeys(r.image for r in others))
@@ -240,22 +237,3 @@ def _groups(results: Sequence[Result]) -> dict[tuple[int, str], list[Result]]:
     for result in results:
         found.setdefault((result.n, result.source), []).append(result)
     return found
-
-
-def _plot_gains(results: Sequence[Result], path: Path) -> None:
-    """Plot the gain in PSNR against the bytes of the map, a dot per image, a panel for each N."""
-    counts = sorted({r.n for r in results})
-    plot, axes = figure(1, len(counts), width=1.0 + 4.6 * len(counts), height=4.4)
-    for axis, n in zip(axes if len(counts) > 1 else [axes], counts, strict=True):
-        axis.axhline(0.0, color="black", linewidth=0.8)
-        axis.axhline(-MOST_LOSS, color="black", linewidth=0.8, linestyle=":", label="most that an image may lose")
-        for index, source in enumerate((AUTO, *OTHERS)):
-            points = [(r.map_bytes, r.psnr - r.baseline_psnr) for r in _groups(results).get((n, source), [])]
-            if points:
-                size = 6 if source == AUTO else 5
-                style = {"color": COLORS[index], "markersize": size, "markeredgecolor": "white"}
-                axis.plot(*zip(*points, strict=True), MARKERS[index], markeredgewidth=0.5, label=source, **style)
-        axis.set(xlabel="bytes of the final map", ylabel="PSNR gained (dB)", title=f"N = {n:,}")
-        axis.set_xlim(left=0)
-        axis.legend(fontsize=7)
-    save_figure(plot, path)

@@ -39,15 +39,7 @@ from .core.registry import experiment
 from .core.report import Made, conclude
 from .core.rows import read_rows, write_rows
 
-# the folders of the data that a group reads
-GROUPS = {
-    MATCHED: ("DAVIS",),
-    PRECISION: ("DAVIS",),
-    MAPS: ("DAVIS", "bsds"),
-    DAVIS_CURVE: ("DAVIS",),
-    KODAK_CURVE: ("kodak",),
-    SPEED: ("DAVIS",),
-}
+GROUPS = (MATCHED, PRECISION, MAPS, DAVIS_CURVE, KODAK_CURVE, SPEED)
 FRAMES = (
     *("blackswan", "dog", "train", "breakdance", "car-turn", "dance-jump", "mallard-water", "rollerblade"),
     *("bmx-trees", "cows", "kite-surf", "paragliding-launch"),
@@ -139,40 +131,28 @@ def choose(options: Options) -> list[str]:
     """List the groups that are asked for.
 
     Raises:
-        ValueError: `only` names no group, or one whose images are missing; there is nothing to run.
+        ValueError: `only` names no group, or one without images in the data; there is nothing to run.
     """
-    able = [group for group in GROUPS if options.quick or missing(group, options.data) is None]
+    able = [group for group in GROUPS if names(group, options.data, options.quick)]
+    if not able:
+        raise ValueError("data must be a folder with DAVIS, bsds or kodak in it; without one there is only quick")
     if options.only is None:
-        if not able:
-            raise ValueError("data must be a folder with DAVIS, bsds or kodak in it; without one there is only quick")
         return [group for group in able if options.quick or group != SPEED]
     wanted = options.only.replace(" ", "").split(",")
-    for name in wanted:
-        if name not in GROUPS:
-            raise ValueError(f"only must name groups of {', '.join(GROUPS)}, with commas; got {options.only!r}")
-        if name not in able:
-            raise ValueError(f"only asks for {name!r}, but {missing(name, options.data)}")
+    if not set(wanted) <= set(able):
+        raise ValueError(f"only must name groups with images, {', '.join(able)}, with commas; got {options.only!r}")
     return [group for group in GROUPS if group in wanted]
 
 
-def missing(group: str, data: Path | None) -> str | None:
-    """Say why a group cannot be run, None if it can."""
-    if data is None:
-        return "it needs a data folder"
-    for folder in GROUPS[group]:
-        if not (data / folder).is_dir():
-            return f"the data folder has no {folder}"
-    return None if names(group, data, False) else "the data folder has none of its images"
-
-
 def names(group: str, data: Path | None, quick: bool) -> list[str]:
-    """List a group's images."""
+    """List a group's images that are there."""
     if quick:
         return [] if group == KODAK_CURVE else [QUICK_IMAGE]  # one curve will do
-    assert data is not None
+    if data is None:
+        return []
     if group == KODAK_CURVE:
         return [name for name in _NAMES[group] if (data / "kodak" / f"{name}.png").is_file()]
-    frames = images.davis(data).sequences
+    frames = images.davis(data).sequences if (data / "DAVIS").is_dir() else []
     if group != MAPS:
         return [name for name in _NAMES[group] if name in frames]
     masks = sorted((data / "bsds").glob("*/mask*.png"), key=lambda path: (len(path.parent.name), path))
@@ -203,19 +183,16 @@ def _collect(kept: Files, chosen: Sequence[str]) -> tuple[list[Point], list[str]
     """Return all points that are there, also of unfinished steps, and what is missing."""
     points, notes = list[Point](), list[str]()
     for group in GROUPS:
-        why = None if kept.quick else missing(group, kept.data)
-        if why is not None:
-            notes.append(f"{group}: {why}.")
-            continue
-        todo, whole = list(steps(group, kept)), 0
-        for _, step in todo:
-            before = kept.missed
-            found = step()
+        todo, whole = [step for _, step in steps(group, kept)], 0
+        for step in todo:
+            before, found = kept.missed, step()
             points += found
             whole += bool(found) and kept.missed == before
         if whole < len(todo):
             why = "stopped before its end" if group in chosen else "not chosen"
             notes.append(f"{group}: {why}, {whole} of {len(todo)} steps are finished.")
+        elif not todo and not kept.quick:
+            notes.append(f"{group}: the data folder has none of its images.")
     absent = [name for name in (JPEG, WEBP, AVIF) if name not in present()]
     return points, [*notes, *(f"This Pillow has no {name}." for name in absent)]
 
@@ -247,7 +224,7 @@ def _matched_without(files: Files, image: str) -> list[Point]:
 
 
 def _on_curve(files: Files, group: str, image: str, most: int) -> list[Point]:
-    points = [p for codec in present() for p in files.other(group, image, codec, most, exact=False)]
+    points = [p for codec in present() for p in files.other(group, image, codec, most)]
     which = (True,) if files.quick else (True, False)
     return points + [p for regions in which for p in files.fitted(group, image, most, regions=regions)]
 

@@ -205,7 +205,7 @@ class TestReport:
 class TestFiles:
     def test_quick_without_data_resumes(self, tmp_path: Path, stub: Stub) -> None:
         kcgs.bench.run("maps", tmp_path, quick=True)
-        assert {p.name for p in tmp_path.iterdir()} == {"results.csv", "made.json", "report.md", "gains.png", "runs"}
+        assert {p.name for p in tmp_path.iterdir()} == {"results.csv", "made.json", "report.md", "runs"}
         # a baseline, a map of each source, a baseline at equal bytes
         count = len(stub.asked)
         assert count == len(list((tmp_path / "runs").glob("*.safetensors"))) == 1 + 5 + 1

@@ -104,16 +104,7 @@ def plan(
     iterations: int,
     stride: int,
 ) -> list[Case]:
-    """List cases, image by image, N by N.
-
-    Args:
-        names: of the images.
-        counts: numbers of Gaussians.
-        methods: recipes.
-        options: seeds, and iterations of the published recipes.
-        iterations: of the published recipes where the options do not say.
-        stride: of the quick form.
-    """
+    """List cases, image by image, N by N; published recipes have these iterations, the quick form this stride."""
     published, stride = options.iterations or iterations, stride if options.quick else 1
     return [
         Case(name, n, m, seed, QUICK_ITERATIONS if options.quick else published if m.is_published else None, stride)

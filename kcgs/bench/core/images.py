@@ -40,12 +40,7 @@ def davis(data: Path | None) -> Davis:
 
 
 def sequences(data: Path | None, wanted: str | None, *, quick: bool) -> list[str]:
-    """List what is to be fitted: the sequences named, with commas between them, or all in alphabetical order.
-
-    Args:
-        data: as in `davis`; None is enough for the quick form, which has two images of its own then.
-        wanted: names; None: all, of the quick form two.
-        quick: whether it is the quick form.
+    """List the sequences named, with commas between them, or all; the quick form has two, or two images of its own.
 
     Raises:
         ValueError: no data, or no sequence of that name.
@@ -65,13 +60,7 @@ def sequences(data: Path | None, wanted: str | None, *, quick: bool) -> list[str
 
 @lru_cache(maxsize=4)
 def load(name: str, data: Path | None, stride: int = 1) -> Sample:
-    """Read a chart, a stand-in, a photo of BSDS (a number) or Kodak (kodimN), or the first frame of a sequence.
-
-    Args:
-        name: of the image.
-        data: folder with DAVIS, bsds and kodak in it.
-        stride: one of so many pixels is taken.
-    """
+    """Read a chart, a stand-in, a photo of BSDS (a number) or Kodak (kodimN), or the first frame of a sequence."""
     image, labels = _read(name, data)
     if stride > 1:
         image = image[:, ::stride, ::stride].contiguous()

@@ -31,41 +31,22 @@ class Place(NamedTuple):
         return f"{count} at a time on one thread each, engine {self.engine}"
 
 
-def make_all(
-    function: Callable[[Job], object], jobs: Sequence[Job], place: Place, *, name: Callable[[Job], str] = str
-) -> list[str]:
-    """Do jobs that keep what they make on disk themselves.
-
-    Args:
-        function: called with one job; importable by name, or a method of what can be pickled, in other processes.
-        jobs: what it is called with.
-        place: where.
-        name: what a job is called on the terminal, and where it fails.
-
-    Returns:
-        What failed, one line each; see `check_made`.
-    """
+def make_all(function: Callable[[Job], object], jobs: Sequence[Job], place: Place) -> list[str]:
+    """Do jobs that keep what they make on disk themselves; return what failed, one line each."""
     failed: list[str] = []
     with _progress() as progress:
-        task = progress.add_task(name(jobs[0]) if jobs else "", total=len(jobs))
+        task = progress.add_task(str(jobs[0]) if jobs else "", total=len(jobs))
         for number, ended in enumerate(run_jobs(function, jobs, engine=place.engine, workers=place.workers), 1):
             if ended.error is not None:
-                failed.append(f"{name(jobs[ended.index])}: {ended.error}")
+                failed.append(f"{jobs[ended.index]}: {ended.error}")
             # in this process the next job is the one that runs
             shown = min(number, len(jobs) - 1) if place.is_local else ended.index
-            progress.update(task, advance=1, description=name(jobs[shown]))
+            progress.update(task, advance=1, description=str(jobs[shown]))
     return failed
 
 
 def check_made(failed: Sequence[str]) -> None:
-    """Raise once all that could be done is done.
-
-    Args:
-        failed: what `make_all` returned.
-
-    Raises:
-        RuntimeError: a job failed; the message names all of them.
-    """
+    """Raise a RuntimeError that names all jobs that failed, once all that could be done is done."""
     if failed:
         raise RuntimeError(f"fits failed, {len(failed)} of them: {'; '.join(failed)}")
 

@@ -21,13 +21,7 @@ _ALWAYS = ("data", "quick")
 
 @dataclass(frozen=True)
 class Experiment:
-    """An experiment.
-
-    Args:
-        function: measures; called with the folder of the report, which is there, and the options.
-        takes: names of the options that it takes besides data and quick.
-        report: writes the report from the files in the folder; None: there is none.
-    """
+    """An experiment: what measures, the options that it takes besides data and quick, and what writes its report."""
 
     function: Callable[[Path, Options], None]
     takes: tuple[str, ...] = ()

@@ -34,13 +34,7 @@ Report = Callable[[Path, Made], Sequence[str]]
 
 
 def conclude(report: Report, output: Path, made: Made) -> None:
-    """Write down how results were made on this machine, and their report.
-
-    Args:
-        report: of the experiment.
-        output: folder with the results.
-        made: its machine is described here; lines that it has already follow.
-    """
+    """Write down how results were made, on this machine, and their report."""
     made = made._replace(machine=(*describe(), *made.machine))
     with atomic_path(output / "made.json") as temporary:
         temporary.write_text(json.dumps(made._asdict(), indent=1) + "\n", encoding="utf-8")
@@ -48,15 +42,7 @@ def conclude(report: Report, output: Path, made: Made) -> None:
 
 
 def redraw(report: Report, output: Path) -> None:
-    """Write report.md and its figures from the files of an earlier run.
-
-    Args:
-        report: of the experiment.
-        output: folder with made.json and the results.
-
-    Raises:
-        FileNotFoundError: the folder has no made.json.
-    """
+    """Write report.md and its figures from the files of an earlier run; a FileNotFoundError where there was none."""
     fields = json.loads((output / "made.json").read_text(encoding="utf-8"))
     made = Made(**{**fields, "machine": tuple(fields["machine"]), "notes": tuple(fields["notes"])})
     title, *parts = report(output, made)

@@ -13,14 +13,7 @@ Record = TypeVar("Record", bound=NamedTuple)
 
 
 def write_rows(path: Path, kind: type[NamedTuple], rows: Iterable[NamedTuple], derived: Sequence[str] = ()) -> None:
-    """Write rows, floats with six digits; the file appears whole or not at all.
-
-    Args:
-        path: file.
-        kind: class of the rows.
-        rows: what is written.
-        derived: names of properties that get a column of their own; they are not read back.
-    """
+    """Write rows, floats with six digits; properties named by `derived` get a column that is not read back."""
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         names = [*kind._fields, *derived]

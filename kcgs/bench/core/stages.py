@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from itertools import product
 from pathlib import Path
 
 from .cases import BEST, Case, Method
-from .jobs import Place, check_made
+from .jobs import check_made
 from .options import Options
 from .report import Report, conclude
 from .rows import write_rows
@@ -43,10 +44,6 @@ def run_stages(
         matched: methods of which also files of about as many bytes as those of `best` are made.
         finish: is called when all is made that will be.
         share: of the budget that fits get.
-
-    Raises:
-        ValueError: numbers out of range.
-        RuntimeError: fits failed; the others are kept, and in the report.
     """
     options.check()
     store, wanted = Store.open(output, options), [case for stage in stages for case in stage]
@@ -55,8 +52,8 @@ def run_stages(
     try:
         for stage in stages:
             failed += store.obtain(stage, options.place, deadline)
-            for other in matched:
-                failed += approach(store, stage, BEST, other, options.place, deadline)
+            for other, _ in product(matched, range(_TRIES)):
+                failed += [] if failed else store.obtain(rivals(store, stage, BEST, other), options.place, deadline)
     finally:
         rows = store.rows(wanted)
         extra = [*store.rows(case for other in matched for case in rivals(store, wanted, BEST, other))]
@@ -68,38 +65,14 @@ def run_stages(
 
 def _notes(rows: Sequence[Row], wanted: Sequence[Case], options: Options) -> list[str]:
     """Say what of the planned cases is not there, and that fits may be another bench's."""
-    shared = "Fits are shared with the other benches, which may have made them."
-    notes = [] if options.runs is None else [shared]
+    notes = [] if options.runs is None else ["Fits are shared with the other benches, which may have made them."]
     present = {(row.image, row.n, row.method, row.seed) for row in rows}
     lacking = [case for case in wanted if (case.image, case.n, case.method.name, case.seed) not in present]
-    if not lacking:
-        return notes
-    parts = []
-    for n in sorted({case.n for case in lacking}):
-        names = [case.image for case in lacking if case.n == n]
-        images = list(dict.fromkeys(names))
-        more = f" and {len(images) - 4} more images" if len(images) > 4 else ""
-        parts.append(f"N = {n:,}: {len(names)} of {', '.join(images[:4])}{more}")
-    budget = options.budget_seconds
-    over = "" if budget is None else f" the budget of {budget:,.0f} s was over, or"
-    why = f"Missing, for{over} the run was stopped: {len(lacking)} of {len(wanted)} fits"
-    return [*notes, f"{why}: {'; '.join(parts)}."]
-
-
-def approach(
-    store: Store, cases: Iterable[Case], ours: Method, other: Method, place: Place, deadline: float | None = None
-) -> list[str]:
-    """Make files of another method of about as many bytes as ours.
-
-    Returns:
-        What failed; what could not be made is not tried again.
-    """
-    cases = list(cases)
-    for _ in range(_TRIES):
-        failed = store.obtain(rivals(store, cases, ours, other), place, deadline)
-        if failed:
-            return failed
-    return []
+    if lacking:
+        counts = ", ".join(f"{n:,}" for n in sorted({case.n for case in lacking}))
+        which = f"{len(lacking)} of {len(wanted)} fits, at N = {counts}"
+        notes.append(f"Missing, for the budget was over or the run was stopped: {which}.")
+    return notes
 
 
 def rivals(store: Store, cases: Iterable[Case], ours: Method, other: Method) -> list[Case]:
@@ -117,12 +90,6 @@ def rivals(store: Store, cases: Iterable[Case], ours: Method, other: Method) -> 
             if row is not None and first is not None:
                 found += _approach(store, beside, first, row.bytes)
     return found
-
-
-def near(rows: Iterable[Row], row: Row, method: str) -> Row | None:
-    """Return the file of another method with as many bytes as a row's, or little more, the nearest one."""
-    found = [r for r in rows if (r.image, r.seed, r.method) == (row.image, row.seed, method)]
-    return min((r for r in found if row.bytes <= r.bytes <= _NEAR * row.bytes), key=lambda r: r.bytes, default=None)
 
 
 def _approach(store: Store, first: Case, row: Row, size: int) -> list[Case]:

@@ -78,13 +78,7 @@ def interval(values: Sequence[float]) -> tuple[float, float]:
 
 
 def summarize(values: Mapping[str, float], tie: float, *, least: int = 1) -> Summary | None:
-    """Sum up differences; undefined ones are left out. None: there are none.
-
-    Args:
-        values: by image.
-        tie: a smaller difference is neither won nor lost.
-        least: images that an interval takes; NaN for fewer.
-    """
+    """Sum up differences by image; None: none is defined. Fewer images than `least` have no interval."""
     finite = {image: value for image, value in values.items() if math.isfinite(value)}
     if not finite:
         return None
