@@ -1,7 +1,6 @@
 """The compressed file `.kcgs`; docs/format.md specifies it."""
 
-from .decode import Decoded, decode, deserialize
-from .encode import DEFAULT_QUALITY, QUALITIES, encode, serialize
 from .rangecoder import CodecError
+from .scenes import DEFAULT_QUALITY, QUALITIES, Decoded, decode, deserialize, encode, serialize
 
 __all__ = ["DEFAULT_QUALITY", "QUALITIES", "CodecError", "Decoded", "decode", "deserialize", "encode", "serialize"]

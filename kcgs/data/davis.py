@@ -65,7 +65,17 @@ class Davis:
         self._images = Path(root) / "JPEGImages" / resolution
         self._annotations = Path(root) / "Annotations" / resolution
         self._frame = frame
-        present = self._list()
+        trees = (self._images, self._annotations)
+        for tree in trees:
+            if not tree.is_dir():
+                raise FileNotFoundError(
+                    f"no folder {tree}: root must hold JPEGImages/RESOLUTION/SEQUENCE/00000.jpg and "
+                    "Annotations/RESOLUTION/SEQUENCE/00000.png, as DAVIS is distributed"
+                )
+        first, second = ({entry.name for entry in tree.iterdir() if entry.is_dir()} for tree in trees)
+        present = sorted(first & second)
+        if not present:
+            raise FileNotFoundError(f"no sequence has a folder in both {trees[0]} and {trees[1]}")
         self._sequences = present if sequences is None else self._select(sequences, present)
 
     @property
@@ -100,19 +110,6 @@ class Davis:
                 f"got {tuple(image.shape[-2:])} in {image_path} and {tuple(labels.shape)} in {labels_path}"
             )
         return DavisFrame(name, image, labels)
-
-    def _list(self) -> list[str]:
-        trees = (self._images, self._annotations)
-        for tree in trees:
-            if not tree.is_dir():
-                raise FileNotFoundError(
-                    f"no folder {tree}: root must hold JPEGImages/RESOLUTION/SEQUENCE/00000.jpg and "
-                    "Annotations/RESOLUTION/SEQUENCE/00000.png, as DAVIS is distributed"
-                )
-        first, second = ({entry.name for entry in tree.iterdir() if entry.is_dir()} for tree in trees)
-        if not first & second:
-            raise FileNotFoundError(f"no sequence has a folder in both {trees[0]} and {trees[1]}")
-        return sorted(first & second)
 
     @staticmethod
     def _select(names: Iterable[str], present: list[str]) -> list[str]:

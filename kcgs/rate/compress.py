@@ -1,4 +1,9 @@
-"""A scene and its image in, a file out: Gaussians that do not pay for their bits go, the others are fine tuned."""
+"""A scene and its image in, a file out: Gaussians that do not pay for their bits go, the others are fine tuned.
+
+Gaussians overlap, so what rounding one of them does to the image its neighbours can partly undo, as long as they may
+still move. So they are rounded a few at a time, shapes first and colours last, and those that are still free descend
+meanwhile. A step is a gradient divided by the known curvature of the squared error (docs/format.md), with momentum.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +13,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from kcgs._check import as_image, check_count
 from kcgs.codec import QUALITIES, decode
-from kcgs.codec.encode import SceneWriter
-from kcgs.codec.gaussians.quantize import QPS, Parameters, Quantizer
+from kcgs.codec.gaussians.quantize import QPS, Codes, Parameters, Quantizer
+from kcgs.codec.scenes import SceneWriter
+from kcgs.fit.frame import local_gradient, move
+from kcgs.functional import RegionMap, region_splat
 from kcgs.scene import Scene
-
-from .fine_tune import FineTuning
 
 # a Gaussian whose whole energy is below this many times the distortion costs more bits than it saves: at the best rate
 # a bit saves 2 ln 2 D for each number, and a Gaussian has about 30
@@ -25,6 +31,16 @@ _PAYING = 20.0
 _MARGIN = 14.5
 # coded lengths vary by so much as Gaussians are tuned
 _SLACK = 0.997
+# share of the iterations in which shapes are rounded; colours are in the rest
+_SHAPES = 0.65
+_STEP, _MOMENTUM = 0.09, 0.9
+# the largest step, in standard deviations and in log scale; and the largest share of Newton's
+_LARGEST, _NEWTON = 0.2, 0.3
+# energies below it have next to no curvature: steps are as if they had this
+_FAINT = 1e-2
+# half the second derivatives of the squared error by a step in a Gaussian's frame, in units of its energy
+_CURVATURE = (0.5, 0.5, 0.75, 0.25, 0.75)
+_DRAFT_CUTOFF = 1e-3
 
 
 class Compressed(NamedTuple):
@@ -85,7 +101,7 @@ def compress(
         kept = _pays(writer.gaussians, quantizer)
         gaussians = Parameters(*(numbers[kept] for numbers in writer.gaussians))
         region_ids = None if writer.regions is None else writer.regions.ids[torch.from_numpy(writer.ids[kept])]
-        tuning = FineTuning(gaussians, region_ids, target, writer.regions, quantizer, seed)
+        tuning = _FineTuning(gaussians, region_ids, target, writer.regions, quantizer, seed)
         return writer.write(quantizer, tuning.run(steps), writer.ids[kept])
 
     if target_bytes is None:
@@ -118,3 +134,63 @@ def _pays(gaussians: Parameters, quantizer: Quantizer) -> NDArray[np.bool_]:
     kept = energy >= _PAYING * quantizer.distortion
     kept[energy.argmax()] = True
     return kept.numpy()
+
+
+class _FineTuning:
+    """Gaussians (float64) that are rounded a few at a time, in an order of the seed, to show an image (C, H, W)."""
+
+    def __init__(
+        self,
+        gaussians: Parameters,
+        region_ids: Tensor | None,
+        image: Tensor,
+        regions: RegionMap | None,
+        quantizer: Quantizer,
+        seed: int,
+    ) -> None:
+        self.region_ids, self.image, self.regions, self.quantizer = region_ids, image, regions, quantizer
+        self.classes = quantizer.classify(gaussians)
+        self.free = [torch.from_numpy(numbers).to(image) for numbers in gaussians]
+        count, channels = gaussians.colors.shape
+        generator = torch.Generator().manual_seed(seed)
+        self.turn = torch.rand(2, count, generator=generator).to(image)
+        self.speed = torch.zeros(count, 5 + channels).to(image)
+
+    def run(self, iterations: int) -> Codes:
+        """Round everything in so many iterations, and return the whole numbers."""
+        for iteration in range(iterations):
+            share = iteration / iterations
+            shaped = self.turn[0] < share / _SHAPES
+            colored = self.turn[1] < (share - _SHAPES) / (1 - _SHAPES)
+            self._step(shaped[:, None], colored[:, None])
+        return self._codes()
+
+    def _codes(self) -> Codes:
+        """Return what the Gaussians round to now."""
+        gaussians = Parameters(*(numbers.double().numpy() for numbers in self.free))
+        return self.quantizer.quantize(gaussians, self.classes)
+
+    def _step(self, shaped: Tensor, colored: Tensor) -> None:
+        """Move what is free, against the render of what is rounded and what is not."""
+        rounded = [torch.from_numpy(t).to(self.image) for t in self.quantizer.restore(self._codes())]
+        fixed = (shaped, shaped, colored)
+        current = [torch.where(fix, r, f) for fix, r, f in zip(fixed, rounded, self.free, strict=True)]
+        downhill = self._downhill(*current)
+        stopped = torch.cat([shaped.expand(-1, 5), colored.expand(-1, downhill.shape[1] - 5)], -1)
+        self.speed = torch.where(stopped, 0.0, _MOMENTUM * self.speed + downhill)
+        step = _STEP * self.speed
+        means, cholesky = move(current[0], current[1], step[:, :5].clamp(-_LARGEST, _LARGEST), exact=False)
+        moved = means, cholesky, current[2] + step[:, 5:]
+        self.free = [torch.where(fix, f, m) for fix, f, m in zip(fixed, self.free, moved, strict=True)]
+
+    def _downhill(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
+        """Return Newton's steps of each number alone: of centre and factor in the Gaussian's frame, of colours."""
+        size = self.quantizer.size
+        x, factors, c = (t.detach().requires_grad_() for t in (means, cholesky, colors))
+        render = region_splat(x, factors, c, self.region_ids, self.regions, size=size, cutoff=_DRAFT_CUTOFF)
+        gradients = torch.autograd.grad(render, (x, factors, c), render.detach() - self.image)
+        area = (math.pi * cholesky[:, 0] * cholesky[:, 2]).clamp_max(size[0] * size[1])
+        energy = (colors.square().sum(-1) * area).clamp_min(_FAINT)
+        curvature = torch.tensor(_CURVATURE).to(energy) * energy[:, None]
+        shape = (local_gradient(cholesky, *gradients[:2]) / curvature).clamp(-_NEWTON, _NEWTON)
+        return -torch.cat([shape, gradients[2] / area[:, None]], -1)

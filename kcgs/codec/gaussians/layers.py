@@ -54,7 +54,7 @@ class LayerCoder:
     ) -> tuple[Parameters, Integers]:
         """Code the layer of one energy, at most so many Gaussians; return them and the positions of their regions' ids.
 
-        `codes` is in `Codes.order`; None: to read.
+        `codes` is in the order of a file; None: to read.
         """
         counts = self._code_counts(coder, codes)
         if counts.sum() > most:

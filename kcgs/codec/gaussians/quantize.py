@@ -63,10 +63,6 @@ class Codes(NamedTuple):
         """Return some of the Gaussians."""
         return Codes(*(numbers[index] for numbers in self))
 
-    def order(self) -> Integers:
-        """Return the order of a file: by energy, then size, falling; then by cell, row by row."""
-        return np.lexsort((self.cell[:, 0], self.cell[:, 1], -self.size, -self.energy))
-
 
 class Steps(NamedTuple):
     """How fine each number of each Gaussian is."""

@@ -1,11 +1,13 @@
-"""Scenes as `.kcgs` bytes."""
+"""Scenes as `.kcgs` bytes, and back."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from kcgs._check import check_count, check_floating, check_number
 from kcgs.functional import RegionMap
@@ -14,10 +16,10 @@ from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
 from .exact import Integers
-from .file import MOST_CHANNELS, MOST_SIDE, SPARE, Header, most_gaussians, pack
+from .file import MOST_CHANNELS, MOST_SIDE, SPARE, Header, most_gaussians, pack, unpack
 from .gaussians.layers import LayerCoder
 from .gaussians.quantize import QPS, Classes, Codes, Parameters, Quantizer
-from .rangecoder import Writer
+from .rangecoder import CodecError, Reader, Writer
 
 # of the decoded image against the scene's own, in dB
 QUALITIES = (10.0, 90.0)
@@ -128,7 +130,8 @@ class SceneWriter:
 
     def write(self, quantizer: Quantizer, codes: Codes, ids: Integers) -> bytes:
         """Write the file of Gaussians that are whole numbers already, with the positions of their regions' ids."""
-        order = codes.order()
+        # by energy, then size, falling; then by cell, row by row
+        order = np.lexsort((codes.cell[:, 0], codes.cell[:, 1], -codes.size, -codes.energy))
         codes, ids = codes.pick(order), ids[order]
         model, layers, listed = LayerCoder(quantizer, self.channels, self.regions), [], []
         energies, starts, counts = np.unique(-codes.energy, return_index=True, return_counts=True)
@@ -169,3 +172,69 @@ def _positions(field: GaussianField, regions: RegionMap) -> Integers:
     if (index < 0).any():
         raise ValueError(f"region_ids must be ids of the map; got {int(region_ids[index < 0][0])}")
     return index.numpy()
+
+
+class Decoded(NamedTuple):
+    """The scene of a file (without regions where there is one), the layers that were there, and those of all of it."""
+
+    scene: Scene
+    layers: int
+    num_layers: int
+
+
+def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
+    """Read a `.kcgs` file, or the coarser scene that its first bytes hold.
+
+    Args:
+        data: the file; one that ends early gives a coarser scene, as long as its first layer is whole.
+        max_bytes: read no more than these.
+
+    Returns:
+        The scene (float32, on the CPU, bit for bit the same on every machine), and how much of the file that is.
+
+    Raises:
+        TypeError: an argument of the wrong type.
+        CodecError: a ValueError; the file is damaged, or none, or too short to hold an image.
+
+    Example:
+        >>> from kcgs.codec import encode
+        >>> data = encode(Scene(GaussianField.random(200, (32, 48), seed=0)))
+        >>> whole, part = decode(data), decode(data, max_bytes=len(data) // 2)
+        >>> whole.layers == whole.num_layers, part.layers < part.num_layers, len(part.scene) < len(whole.scene)
+        (True, True, True)
+    """
+    if not isinstance(data, bytes | bytearray | memoryview):
+        raise TypeError(f"data must be bytes; got {type(data).__name__}")
+    if max_bytes is not None:
+        max_bytes = check_count("max_bytes", max_bytes)
+    header, region_map, layers = unpack(bytes(data[:max_bytes]))
+    regions = None
+    if header.regions > 1:
+        from .labels import decode_map  # loads numba
+
+        regions = decode_map(region_map, header.size, header.regions)
+    model = LayerCoder(Quantizer(header.qp, header.size), header.channels, regions)
+    parts, ids, left = [], [], most_gaussians(header.channels)
+    for (energy, _), layer in zip(header.layers, layers, strict=False):
+        # each Gaussian takes more than a bit, and all must fit into memory
+        gaussians, positions = model.code(Reader(layer), energy, None, None, min(8 * len(layer) + SPARE, left))
+        parts.append(gaussians)
+        ids.append(positions)
+        left -= len(positions)
+    means, cholesky, colors = (torch.from_numpy(np.concatenate(numbers)) for numbers in zip(*parts, strict=True))
+    region_ids = None if regions is None else regions.ids[torch.from_numpy(np.concatenate(ids))]
+    try:
+        field = GaussianField(means, cholesky, colors, region_ids, size=header.size)
+    except ValueError as error:
+        raise CodecError(f"the file holds no Gaussians that can be rendered: {error}") from error
+    return Decoded(Scene(field, regions), len(layers), len(header.layers))
+
+
+def deserialize(data: bytes) -> Scene:
+    """Read a whole file, for :func:`kcgs.load`."""
+    decoded = decode(data)
+    if decoded.layers < decoded.num_layers:
+        raise CodecError(
+            f"it ends early, with {decoded.layers} of {decoded.num_layers} layers; kcgs decode renders what is there"
+        )
+    return decoded.scene
