@@ -19,7 +19,7 @@ from kcgs.functional import RegionMap
 from kcgs.functional.labels import lookup_regions
 
 from .occupancy import Occupancy
-from .quantize import SIZES, Classes, Codes, Parameters, Quantizer
+from .quantize import MOST_RATIO, SIZES, Classes, Codes, Parameters, Quantizer
 
 _CLASSES = 64  # that a stream may name, of size
 _MOST_BITS = 21
@@ -90,8 +90,8 @@ class LayerCoder:
         steps, zero = self.quantizer.steps(classes), np.zeros(len(cell), np.int64)
         scale = coder.uniform(steps.scales, None if codes is None else codes.scale)
         ratio = self._ratio.code(coder, _RATIO_SCALE / steps.ratio[0], zero, None if codes is None else codes.ratio)
-        if (ratio > steps.most_ratio).any():
-            raise CodecError(f"a ratio must be at most {steps.most_ratio[0]} steps; got {ratio.max()}")
+        if (ratio > (most := math.floor(MOST_RATIO / steps.ratio[0] + 0.5))).any():
+            raise CodecError(f"a ratio must be at most {most} steps; got {ratio.max()}")
         turns = steps.turns(ratio)
         angle = coder.uniform(turns, None if codes is None else codes.angle)
         # how many steps the amplitude of a Gaussian of this energy has

@@ -19,7 +19,7 @@ OCTAVES = 0.75
 # quantization parameters: the distortion is D = 2^(-qp / 32)
 QPS = (-512, 1023)
 # half the log2 of the ratio of standard deviations
-_MOST_RATIO = 12.0
+MOST_RATIO = 12.0
 _MOST_LEVELS = 1 << 20
 # steps that a colour may have
 _MOST_COLOR = 1 << 24
@@ -74,11 +74,6 @@ class Steps(NamedTuple):
     angle: Floats  # [N] radians, times sinh of the log ratio
     color: Floats  # [N]
     side: Integers  # [N] of the cells, in pixels, a power of two
-
-    @property
-    def most_ratio(self) -> Integers:
-        """The largest code of a ratio [N]."""
-        return np.floor(_MOST_RATIO / self.ratio + 0.5).astype(np.int64)
 
     def turns(self, ratio: Integers) -> Integers:
         """Return how many angles there are at each ratio: one for circles."""
@@ -147,7 +142,7 @@ class Quantizer:
             classes.size,
             place=relative * math.sqrt(2.0),
             scales=np.clip(np.floor(OCTAVES / scale + 0.5), 1, _MOST_LEVELS).astype(np.int64),
-            ratio=np.maximum(relative * (1.0 / _LN2), _MOST_RATIO / _MOST_LEVELS),
+            ratio=np.maximum(relative * (1.0 / _LN2), MOST_RATIO / _MOST_LEVELS),
             angle=relative,
             color=self._color[classes.size - SIZES[0]],
             side=np.array(sides, np.int64)[group],
@@ -160,7 +155,7 @@ class Quantizer:
         log_scale, log_ratio, radians = _decompose(cholesky)
         scale = np.floor((log_scale / OCTAVES - classes.size) * steps.scales).astype(np.int64)
         scale = np.clip(scale, 0, steps.scales - 1)
-        ratio = np.floor(np.clip(log_ratio, 0, _MOST_RATIO) / steps.ratio + 0.5).astype(np.int64)
+        ratio = np.floor(np.clip(log_ratio, 0, MOST_RATIO) / steps.ratio + 0.5).astype(np.int64)
         turns = steps.turns(ratio)
         angle = np.floor(radians / math.pi * turns + 0.5).astype(np.int64) % turns
         opposed = steps.round_colors(colors)

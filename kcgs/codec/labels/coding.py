@@ -17,12 +17,13 @@ from kcgs.functional import MAX_SOFTNESS, PairWidths, RegionMap
 from kcgs.functional.labels import compact, touching_pairs
 
 from .contexts import CODED, LABEL, LEFT, RIGHT, TOP, new_tables
-from .preamble import code_ids, code_seeds
 from .wavefront import DECIDED, RANKS, REGIONS, STATE, Loops, loops, new_work
 
 # what a reader may be asked to work through: seconds
 _MOST_ASKED, _MOST_ESCAPES = 1 << 23, 1 << 18
 _NOISY = np.array([2.0**-10])  # chance of a map that the model makes larger
+_MOST_BITS = 24  # of the number of regions
+_SIZES = 8  # contexts of seeds, by how many are in the block
 _FORTIETHS = 40  # of a pixel
 _MOST_WIDTH = int(MAX_SOFTNESS) * _FORTIETHS
 _MOST_SUPERSAMPLE = 64
@@ -40,14 +41,14 @@ def encode_labels(labels: Integers) -> bytes:
     ids, index = (found.numpy() for found in compact(torch.from_numpy(labels))[:2])
     if len(ids) == 1:
         writer = Writer()
-        code_ids(writer, ids.tolist(), 1)
+        _code_ids(writer, ids.tolist(), 1)
         return writer.finish()
     truth, seeds, order = loops().survey(index, len(ids))
     numbered = ids[order].tolist()
 
     def begin(noisy: int) -> Writer:
         writer = Writer()
-        code_ids(writer, numbered, len(ids))
+        _code_ids(writer, numbered, len(ids))
         writer.bits(_NOISY, np.array([noisy], np.int32))
         return writer
 
@@ -73,7 +74,7 @@ def decode_labels(data: bytes, height: int, width: int, *, max_regions: int) -> 
         np.True_
     """
     reader = Reader(data)
-    ids = np.array(code_ids(reader, [], min(max_regions, height * width)), np.int64)
+    ids = np.array(_code_ids(reader, [], min(max_regions, height * width)), np.int64)
     if len(ids) == 1:
         return np.full((height, width), ids[0], np.int64)
     if reader.bits(_NOISY, np.zeros(1, np.int32))[0]:
@@ -87,7 +88,7 @@ def decode_labels(data: bytes, height: int, width: int, *, max_regions: int) -> 
 def _code_pixels(coder: Coder, truth: Any, seeds: Any, regions: int) -> Any:
     """Code a map of numbered regions; a reader has an empty `truth` and fills in `seeds`."""
     run = loops()
-    code_seeds(coder, seeds)
+    _code_seeds(coder, seeds)
     height, width = seeds.shape
     rows, chances, lines = new_work(height)
     labels = np.zeros((height + TOP + 1, width + LEFT + RIGHT), np.int32)
@@ -204,3 +205,105 @@ def _code_places(coder: Coder, pairs: int, count: int, places: Integers | None) 
         part = slice(start, start + _TOGETHER)
         found[part] = model.code(coder, len(found[part]), None if places is None else places[part])
     return found
+
+
+def _code_ids(coder: Coder, ids: list[int], limit: int) -> list[int]:
+    """Code the ids in the order in which the wavefront meets their regions; a reader gives none."""
+    extra = 0
+    while coder.fair(len(ids) >= 2 << extra):
+        extra += 1
+        if extra == _MOST_BITS:
+            raise CodecError(f"data must hold at most {limit} regions; got {1 << extra} or more")
+    count = 1 << extra | coder.plain(len(ids), extra)
+    if count > limit:
+        raise CodecError(f"data must hold at most {limit} regions; got {count}")
+    if not coder.fair(ids != list(range(len(ids)))):
+        return list(range(count))
+    given, ordered, last = sorted(ids), [], -1
+    for i in range(count):
+        last += 1 + coder.unbounded(0 if coder.reads else given[i] - last - 1)
+        ordered.append(last)
+    if last >= 1 << 63:
+        raise CodecError(f"data must hold ids below 2**63; got {last}")
+    left, places, found = Remaining(count), {region: i for i, region in enumerate(given)}, []
+    for i in range(count):
+        rank = coder.number(0 if coder.reads else left.rank(places[ids[i]]), count - i)
+        if rank >= count - i:
+            raise CodecError(f"data must name one of {count - i} ids that are left; got number {rank}")
+        found.append(ordered[left.take(rank)])
+    return found
+
+
+class Remaining:
+    """Which of so many things in order are left: a tree of counts, so that millions take seconds."""
+
+    def __init__(self, count: int) -> None:
+        self._tree = [i & -i for i in range(count + 1)]
+
+    def rank(self, place: int) -> int:
+        """Return how many are left before the one at `place`."""
+        total = 0
+        while place:
+            total += self._tree[place]
+            place &= place - 1
+        return total
+
+    def take(self, rank: int) -> int:
+        """Remove the one that so many are left before; return its place."""
+        place, step = 0, 1 << len(self._tree).bit_length()
+        while step := step >> 1:
+            if place + step >= len(self._tree):
+                continue
+            if self._tree[place + step] <= rank:
+                place += step
+                rank -= self._tree[place]
+            else:
+                self._tree[place + step] -= 1
+        return place
+
+
+def _code_seeds(coder: Coder, seeds: Any) -> None:
+    """Code which entries of `seeds`, (H, W) uint8, are 1, by how many lie in each half of ever smaller blocks.
+
+    A reader sets them.
+    """
+    count = coder.unbounded(int(np.count_nonzero(seeds)))
+    if count > seeds.size:
+        raise CodecError(f"data must mark at most {seeds.size} pixels; got {count}")
+    extreme = [AdaptiveBit() for _ in range(_SIZES)]
+    waiting = [(seeds, count)]
+    while waiting:
+        block, count = waiting.pop()
+        if count == 1:
+            place = coder.number(0 if coder.reads else int(block.argmax()), block.size)
+            if place >= block.size:
+                raise CodecError("data must mark pixels of the map")
+            block[place // block.shape[1], place % block.shape[1]] = 1
+        elif count == block.size:
+            block[:] = 1
+        elif count:
+            first, second = _halves(block)
+            inside = _code_count(coder, first, count, second.size, extreme[min(count.bit_length() - 2, _SIZES - 1)])
+            waiting += [(first, inside), (second, count - inside)]
+
+
+def _halves(block: Any) -> tuple[Any, Any]:
+    """Cut across the longer side; the first half is the smaller."""
+    height, width = block.shape
+    if height >= width:
+        return block[: height // 2], block[height // 2 :]
+    return block[:, : width // 2], block[:, width // 2 :]
+
+
+def _code_count(coder: Coder, half: Any, seeds: int, rest: int, extreme: AdaptiveBit) -> int:
+    """Code how many of a block's seeds are in its first half: all, none, or some number between."""
+    low, high = max(0, seeds - rest), min(seeds, half.size)
+    if low == high:
+        return low
+    count = 0 if coder.reads else int(np.count_nonzero(half))
+    if high - low < 2 or extreme.code(coder, count in (low, high)):
+        return high if coder.fair(count == high) else low
+    count = low + 1 + coder.number(count - low - 1, high - low - 1)
+    if count >= high:
+        raise CodecError("data must mark pixels of the map")
+    return count
