@@ -1,4 +1,4 @@
-"""The shape of the code: layers and private names."""
+"""The shape of the code: layers, no circles, short files, private names, and words that are gone."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 import kcgs
 
@@ -25,6 +27,16 @@ LAYERS = [
     {"kernels"},
     {"_check", "_atomic", "_shipped", "engine"},
 ]
+GONE = {
+    "image, render": r"\bpictures?\b|\bdraw(s|n|ing|ings)?\b",
+    "merge cost": r"\bworth(less)?\b",
+    "tile, mask, region weight, wavefront": r"\b(strips?|lanes?|waves?)\b",
+    "Levenberg-Marquardt refinement": r"\bpolish\w*\b",
+    "quantization parameter": r"\bnoise codes?\b",
+    "per": r"\b(bits?|labels?|floats?|bytes|Gaussians?|integer) an? (pixel|Gaussian|image|file|core|thread)\b",
+}
+# names of libraries, an input inside decoders whose bytes stay, and English
+ALLOWED = re.compile(r"skimage\.draw|ImageDraw(\.Draw)?|input\(\"picture\"|Gaussians a file may|\.strip\(")
 
 
 def modules() -> dict[str, Path]:
@@ -69,8 +81,36 @@ def test_imports_go_one_way() -> None:
             assert target == room or level[target] > level[room], f"{name} imports {other}"
 
 
+def test_no_circle_of_imports() -> None:
+    left = graph()
+    while free := [name for name, others in left.items() if not others & left.keys()]:
+        for name in free:
+            del left[name]
+    assert not left, f"circles among {sorted(left)}"
+
+
+def test_files_are_short() -> None:
+    lengths = {path: len(path.read_text().splitlines()) for path in modules().values()}
+    assert not {str(path): count for path, count in lengths.items() if count > 350}
+    bench = sum(count for path, count in lengths.items() if "bench" in path.parts)
+    assert sum(lengths.values()) <= 21_000 and bench <= 4_500
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 160
+
+
 def test_private_names_of_maps_stay_below() -> None:
     """What a RegionMap keeps to itself is read in functional and kernels only."""
     for name, path in modules().items():
         if not name.startswith(("kcgs.functional", "kcgs.kernels")):
             assert not re.search(r"regions?\._[a-z]|membership\._[a-z]", path.read_text()), name
+
+
+@pytest.mark.parametrize("word", GONE)
+def test_words_that_are_gone(word: str) -> None:
+    """One thing has one name; the key says which."""
+    texts = [*PACKAGE.rglob("*.py"), ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("export/*.py")]
+    found = []
+    for path in texts:
+        for number, line in enumerate(path.read_text().splitlines(), 1):
+            if re.search(GONE[word], ALLOWED.sub("", line), re.IGNORECASE):
+                found.append(f"{path.relative_to(ROOT)}:{number}: {line.strip()}")
+    assert not found, f"say {word}:\n" + "\n".join(found)
