@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcgs._check import as_image
 from kcgs.functional import RegionMap, ef_psnr, ef_ssim, ms_ssim, psnr, ssim
-from kcgs.scene import Scene
+from kcgs.scene import Scene, check_scene
 
 
 def evaluate(scene: Scene, image: Any, labels: RegionMap | Tensor | None = None) -> dict[str, float]:
@@ -38,10 +38,7 @@ def evaluate(scene: Scene, image: Any, labels: RegionMap | Tensor | None = None)
         >>> figures["psnr"], round(figures["ssim"], 4)
         (inf, 1.0)
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
-    target = as_image("image", image)
-    render = scene.render()
+    target, render = as_image("image", image), check_scene(scene).render()
     if tuple(target.shape) != tuple(render.shape):
         raise ValueError(f"image must have the scene's shape {tuple(render.shape)}; got {tuple(target.shape)}")
     regions = scene.regions if labels is None else RegionMap.coerce(labels, "labels")
@@ -49,7 +46,7 @@ def evaluate(scene: Scene, image: Any, labels: RegionMap | Tensor | None = None)
 
 
 def measure(render: Tensor, image: Tensor, labels: Tensor | None = None) -> dict[str, float]:
-    """Compare a render with an image, (C, H, W), in all the figures of :func:`evaluate`; labels None: no contours."""
+    """Compare a render with an image, (C, H, W) both, as :func:`evaluate` does; no labels: no contours."""
     with warnings.catch_warnings():
         # a missing figure is shown as missing
         warnings.simplefilter("ignore", RuntimeWarning)

@@ -24,8 +24,8 @@ LAYERS = [
     {"scene"},
     {"nn"},
     {"functional"},
-    {"kernels"},
-    {"_check", "_atomic", "_shipped", "engine"},
+    {"kernels", "engine"},
+    {"_check", "_atomic", "_shipped"},
 ]
 GONE = {
     "image, render": r"\bpictures?\b|\bdraw(s|n|ing|ings)?\b",

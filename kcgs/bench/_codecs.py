@@ -77,10 +77,7 @@ def largest(codec: str, image: Tensor, most: int, *, quick: bool = False) -> Cod
 
 
 def lossless_bytes(labels: Tensor) -> int:
-    """Size of a label map as lossless WebP, with quality 100 and method 6.
-
-    Args:
-        labels: (H, W) integer; the ids themselves cost nothing.
+    """Size of a label map (H, W) as lossless WebP, with quality 100 and method 6; the ids themselves cost nothing.
 
     Example:
         >>> halves = (torch.arange(64) > 30).long().expand(64, 64)

@@ -73,11 +73,7 @@ class Ask(NamedTuple):
 class Files:
     """Makes files and keeps them, each beside its point, under a hash of all that it depends on.
 
-    Args:
-        folder: where they are kept.
-        data: folder of the images.
-        quick: the short form.
-        makes: False: only what is kept is there, so that a report is of what was finished.
+    Where it makes none, only what is kept is there: a report of what was finished.
     """
 
     def __init__(self, folder: Path, data: Path | None, quick: bool, makes: bool = True) -> None:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_count, check_floating, check_size
+from kcgs.kernels.tiles import expand_runs
 
 _MOST_LABELS = 16384  # along a side, times the supersample
 
@@ -116,7 +117,7 @@ def _coverage(outline: Tensor, height: int, width: int) -> Tensor:
     drop = drop * _orientation(outline)
     left = torch.minimum(near, far).detach().floor().clamp(0, width).long()
     right = torch.maximum(near, far).detach().floor().clamp(-1, width - 2).long() + 1
-    of, step = _expand(right - left + 1)
+    of, step = expand_runs((right - left + 1).clamp_min(0))
     column = left[of] + step
     inside = _right_of(near[of], far[of], column)
     before = torch.where(step > 0, _right_of(near[of], far[of], column - 1), 0.0)
@@ -134,7 +135,7 @@ def _rows(outline: Tensor, height: int) -> tuple[Tensor, Tensor, Tensor, Tensor]
     last = (lower[:, 1].detach().ceil() - 1).clamp(-1, height - 1)
     # an edge on the grid line below a row is in no row by this, and has a gradient all the same
     last = torch.where(lower[:, 1].detach() < 0, last, last.maximum(first))
-    of, step = _expand((last - first + 1).clamp_min(0).long() * (first < height))
+    of, step = expand_runs((last - first + 1).clamp_min(0).long() * (first < height))
     row = first[of] + step
     (x0, y0), (x1, y1) = upper[of].unbind(1), lower[of].unbind(1)
     tall = y1 - y0
@@ -145,14 +146,6 @@ def _rows(outline: Tensor, height: int) -> tuple[Tensor, Tensor, Tensor, Tensor]
     far = torch.where(ends, x1, x0 + (row + 1 - y0) * slope)
     drop = torch.where(ends, y1, row + 1) - torch.where(begins, y0, row)
     return row.long(), near, far, torch.where(turned[of, 0], -drop, drop)
-
-
-def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Return for counts (2, 3) which each item belongs to, 0 0 1 1 1, and its place there, 0 1 0 1 2."""
-    counts = counts.clamp_min(0)
-    of = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
-    before = counts.cumsum(0) - counts
-    return of, torch.arange(len(of), device=counts.device) - before[of]
 
 
 def _right_of(near: Tensor, far: Tensor, column: Tensor) -> Tensor:

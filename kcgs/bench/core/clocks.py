@@ -52,15 +52,10 @@ def median_ratio(values: Sequence[float], others: Sequence[float]) -> float:
 
 
 def peak_bytes(prepare: Prepare, arguments: tuple[object, ...], warm_up: tuple[object, ...]) -> float:
-    """Measure, in a process of its own and on one thread, how much memory an action adds at its peak.
+    """Measure, in a process of its own and on one thread, how many bytes an action adds at its peak; NaN: not told.
 
-    Args:
-        prepare: returns the action; importable by name. What it allocates itself does not count.
-        arguments: of `prepare`, for the action that is measured.
-        warm_up: of `prepare`, for an action before it, so that libraries and compiled code do not count.
-
-    Returns:
-        Bytes; NaN where the system does not tell (it is asked through /proc).
+    `prepare`, importable by name, returns the action; what it allocates itself does not count. It is called with
+    `warm_up` first, so that libraries and compiled code do not count either, then with `arguments`.
     """
     if not _CLEAR.exists():
         return math.nan

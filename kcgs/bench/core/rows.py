@@ -26,10 +26,6 @@ def write_rows(path: Path, kind: type[NamedTuple], rows: Iterable[NamedTuple], d
 def read_rows(path: Path, kind: type[Record]) -> list[Record]:
     """Read what `write_rows` wrote; a column that is missing has its field's default, and no file means no rows.
 
-    Args:
-        path: file.
-        kind: class of the rows, whose fields are of the types str, int and float.
-
     Example:
         >>> import tempfile
         >>> class Point(NamedTuple):

@@ -33,17 +33,8 @@ def run_stages(
 ) -> None:
     """Make what is missing, stage after stage, then results.csv and the report of what is there.
 
-    Every finished fit is kept, so that the same call goes on where an earlier one was interrupted.
-
-    Args:
-        name: of the experiment.
-        report: of the experiment.
-        output: folder.
-        options: of the experiment.
-        stages: cases; the budget sees the first stage first.
-        matched: methods of which also files of about as many bytes as those of `best` are made.
-        finish: is called when all is made that will be.
-        share: of the budget that fits get.
+    Every finished fit is kept, so that the same call goes on where an earlier one was interrupted. Of the `matched`
+    methods also files of about as many bytes as those of `best` are made; fits get a `share` of the budget.
     """
     options.check()
     store, wanted = Store.open(output, options), [case for stage in stages for case in stage]

@@ -61,9 +61,6 @@ def interval(values: Sequence[float]) -> tuple[float, float]:
     Percentiles of few images lie too near to the mean, by as much as the normal distribution's do beside Student's,
     and by sqrt((n - 1) / n); they are moved away from it by these factors.
 
-    Args:
-        values: differences, one per image, at least one.
-
     Example:
         >>> interval([0.5, 0.5])
         (0.5, 0.5)
@@ -101,13 +98,6 @@ def delta(ours: Curve, other: Curve) -> Delta:
 
     Log-rate is interpolated over quality, quality over log-rate, by monotone piecewise cubics (PCHIP, as in later forms
     of the measure: the first one's single cubic swings between few points), and averaged where both curves are.
-
-    Args:
-        ours: (rate, quality) of each file.
-        other: of the other codec.
-
-    Returns:
-        Mean differences of ours to the other.
 
     Example:
         >>> curve = [(1000.0, 25.0), (2000.0, 28.0), (4000.0, 31.0)]

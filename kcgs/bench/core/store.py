@@ -73,11 +73,7 @@ class Kept(NamedTuple):
 class Store:
     """Fits in a folder, under a hash of all that they depend on; benches that share it share their fits.
 
-    Remove the folder to measure changed code anew.
-
-    Args:
-        folder: made where it is missing; on a cluster all nodes must see it.
-        data: folder of the images.
+    Remove the folder to measure changed code anew; on a cluster all nodes must see it.
     """
 
     def __init__(self, folder: Path, data: Path | None) -> None:
