@@ -11,6 +11,7 @@ import subprocess
 import sys
 import urllib.request
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -132,7 +133,9 @@ def test_every_command(environment: Path, folder: Path) -> None:
 def test_view(environment: Path, folder: Path) -> None:
     command = [str(environment / "bin" / "kcgs"), "view", "zoo:chart-2x3", "--no-browser"]
     clean = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    process = subprocess.Popen(command, cwd=folder, env=clean, stdout=subprocess.PIPE, text=True)
+    # where the tests run in the background, Ctrl-C is ignored unless it is asked for
+    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(command, cwd=folder, env=clean, stdout=subprocess.PIPE, text=True, preexec_fn=listen)
     try:
         assert process.stdout is not None
         url = process.stdout.readline().split(" ")[0]

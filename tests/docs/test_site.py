@@ -83,7 +83,7 @@ def test_readme_is_a_front_page() -> None:
 
 def test_readme_has_the_figures_of_the_results() -> None:
     """Its table is a part of that of DAVIS: PSNR and EF-PSNR of four methods, and nothing else."""
-    row = re.compile(r"\| ([\d,]+) \| [\d,]+ \| `([\w-]+)` \| [\d,]+ \| \d+ \| ([\d.]+) \| ([\d.]+) \|")
+    row = re.compile(r"\| ([\d,]+) \| `([\w-]+)` \| [\d,]+ \| \d+ \| [\d,]+ \| ([\d.]+) \| ([\d.]+) \|")
     known: dict[tuple[str, str], str] = {}
     for n, method, psnr, ef_psnr in row.findall((DOCS / "results.md").read_text(encoding="utf-8")):
         known.setdefault((method, n), f"{psnr} / {ef_psnr}")
