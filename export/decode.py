@@ -359,7 +359,7 @@ def _whole(path: Path) -> Iterator[Path]:
 
 
 def write_image(path: Path, image: Array) -> None:
-    """Write (C, H, W) as an 8-bit PNG or, unclipped, as .npy; the file appears whole or not at all."""
+    """Write (C, H, W) as an 8-bit PNG, or as it is, as .npy; the file appears whole or not at all."""
     if not np.isfinite(image).all():
         raise DecodeError(f"the decoder gave NaN or infinite values, {(~np.isfinite(image)).sum()} of {image.size}")
     if path.suffix == ".png" and image.shape[0] not in _COLOR_TYPES:

@@ -145,7 +145,8 @@ def make(folder: Path) -> None:
     """Write NAME.npz and NAME.onnx of every case into a folder."""
     for name, case in CASES.items():
         np.savez_compressed(folder / f"{name}.npz", **make_arrays(case))
-        write_model(scene_decoder(make_scene(case), cutoff=case.cutoff, interactive=True), folder / f"{name}.onnx")
+        model = scene_decoder(make_scene(case), cutoff=case.cutoff, clamp=False, interactive=True)
+        write_model(model, folder / f"{name}.onnx")
 
 
 if __name__ == "__main__":

@@ -126,8 +126,8 @@ def write_files(folder: Path, scene: Scene, cutoff: float) -> Files:
     folder.mkdir(parents=True)
     paths = folder / "scene.safetensors", folder / "scene.onnx", folder / "generic.onnx"
     scene.save(paths[0])
-    write_model(scene_decoder(scene, cutoff=cutoff), paths[1])
-    write_model(generic_decoder(cutoff=cutoff), paths[2])
+    write_model(scene_decoder(scene, cutoff=cutoff, clamp=False), paths[1])
+    write_model(generic_decoder(cutoff=cutoff, clamp=False), paths[2])
     return Files(*paths, cutoff)
 
 

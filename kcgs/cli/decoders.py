@@ -24,7 +24,7 @@ def export(
         typer.Option(help="fp16 stores factors and colours in 16 bits, where no value of the render changes by 1/255."),
     ] = "fp32",
     cutoff: Annotated[float, typer.Option(help="Weights below it are skipped.")] = 1e-4,
-    clamp: Annotated[bool, typer.Option("--clamp", help="Clip the render to [0, 1].")] = False,
+    clamp: Annotated[bool, typer.Option("--clamp/--no-clamp", help="Clip the image to [0, 1].")] = True,
     interactive: Annotated[
         bool, typer.Option("--interactive", help="With inputs for the part that is rendered and for regions to hide.")
     ] = False,

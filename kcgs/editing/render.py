@@ -14,17 +14,20 @@ from kcgs.scene import Scene
 from .checks import check_field, check_scene, ids_of
 
 
-def render_region(scene: Scene, region_ids: int | Iterable[int], size: tuple[int, int] | None = None) -> Tensor:
+def render_region(
+    scene: Scene, region_ids: int | Iterable[int], size: tuple[int, int] | None = None, *, clamp: bool = True
+) -> Tensor:
     r"""Render regions alone, with their share of each pixel as alpha.
 
-    Convention: colours are straight, not multiplied by alpha, and not clipped: what the regions paint where they have
-    the pixel to themselves, also under a soft contour. They are 0 where alpha is. Shares of all regions add up to one,
-    so that the sum of alpha times colour over all of them is the image. Differentiable, as the renderer is.
+    Convention: colours are straight, not multiplied by alpha: what the regions paint where they have the pixel to
+    themselves, also under a soft contour. They are 0 where alpha is. Shares of all regions add up to one; without
+    `clamp` the sum of alpha times colour over all of them is the image. Differentiable, as the renderer is.
 
     Args:
         scene: unbatched, with a map of its own size or of `size`.
         region_ids: an id in the map, or several.
         size: (height, width) of the result; None: the scene's.
+        clamp: clip colours to [0, 1], as image files hold them.
 
     Returns:
         RGBA, :math:`(4, H, W)`; :math:`(C + 1, H, W)` for C channels.
@@ -50,7 +53,7 @@ def render_region(scene: Scene, region_ids: int | Iterable[int], size: tuple[int
         alone = RegionSplatRenderer()(_part(scene.field, ids_of(scene.field) == region), None, target)
         share = (weight / torch.where(total > 0, total, 1.0)).to(alone.dtype)
         colors = colors + torch.where(alpha > 0, alone * share, 0.0)
-    return torch.cat([colors, alpha[None]])
+    return torch.cat([colors.clamp(0.0, 1.0) if clamp else colors, alpha[None]])
 
 
 def render_over(scene: Scene, region_ids: int | Iterable[int], image: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from .axis import Axis
 from .blocks import Blocks
 from .graph import Graph, Value
 from .layout import Layout, lay_out
-from .metadata import describe
+from .metadata import describe, image_doc
 from .stored import Stored
 from .windows import Windows
 
@@ -25,7 +25,7 @@ _LARGEST_CHANGE = 1 / 255
 
 
 def scene_decoder(
-    scene: Scene, *, cutoff: float = 1e-4, clamp: bool = False, precision: str = "fp32", interactive: bool = False
+    scene: Scene, *, cutoff: float = 1e-4, clamp: bool = True, precision: str = "fp32", interactive: bool = False
 ) -> onnx.ModelProto:
     r"""Build the ONNX graph that renders one scene at any size.
 
@@ -36,7 +36,7 @@ def scene_decoder(
     Args:
         scene: one scene, no batch.
         cutoff: weights below it are skipped, as in :func:`kcgs.functional.region_splat`.
-        clamp: clip the image to [0, 1].
+        clamp: clip the image to [0, 1]; False: as the renderer gives it, which may be below 0 and above 1.
         precision: "fp32"; or "fp16": Cholesky factors and colours are stored in 16 bits, and computed with in 32.
         interactive: two more inputs. ``view``, float32 (4,): left, top, right and bottom of the part of the scene that
             fills the image, in pixels of the scene. ``visible``, float32 (R,): a factor on the Gaussians of each
@@ -100,17 +100,21 @@ class _Plan(NamedTuple):
         if self.clamp:
             image = g("Clip", image, np.float32(0), np.float32(1))
         shape = [1, stored.channels, "height", "width"]
-        return g.finish("image", image, np.float32, shape, {**facts, "precision": precision})
+        docs = f"Renders one image at any size: {len(self.scene)} Gaussians of a kcgs scene."
+        output = image_doc(stored.channels, self.clamp)
+        return g.finish("image", image, np.float32, shape, {**facts, "precision": precision}, (docs, output))
 
     def _inputs(self, g: Graph) -> tuple[Axis, Axis, Value | None]:
-        size = g.input("size", np.int64, [2])
+        size = g.input("size", np.int64, [2], "height and width of the image in pixels, 1 or more each")
         rows, cols = g.apply("Split", [size], 2, axis=0, num_outputs=2)
         height, width = self.scene.size
         if not self.interactive:
             return Axis(g, rows, height), Axis(g, cols, width), None
-        view = g.input("view", np.float32, [4])
+        bounds = f"left, top, right, bottom of the part to render; the whole is 0, 0, {width}, {height}, in pixels"
+        view = g.input("view", np.float32, [4], bounds)
         left, top, right, bottom = g.apply("Split", [view], 4, axis=0, num_outputs=4)
-        visible = g.input("visible", np.float32, [self.num_regions])
+        factors = "factor on each region, 0 hidden to 1 shown; in the order of the metadata's region_ids"
+        visible = g.input("visible", np.float32, [self.num_regions], factors)
         return Axis(g, rows, height, (top, bottom)), Axis(g, cols, width, (left, right)), visible
 
 

@@ -18,7 +18,7 @@ from kcgs._check import check_count, check_cutoff
 from kcgs.kernels.whitened import least_exponent, support_radius
 
 from .graph import FLOAT, Array, Graph, Value
-from .metadata import header
+from .metadata import header, image_doc
 
 _SIDE = 32  # of a tile, in pixels
 _CHUNK = 64  # Gaussians evaluated at once
@@ -67,7 +67,7 @@ class _Tile(NamedTuple):
     tags: Value  # [2, K]
 
 
-def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = False, channels: int | None = None) -> onnx.ModelProto:
+def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = True, channels: int | None = None) -> onnx.ModelProto:
     r"""Build the decoder of any scene that has hard contours, or none.
 
     Convention: inputs ``means`` float32 :math:`(N, 2)` and ``cholesky`` float32 :math:`(N, 3)` in pixels of the
@@ -80,7 +80,7 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = False, channels: int 
 
     Args:
         cutoff: weights below it are zero, in [0, 1); 0 leaves out what is zero in float32.
-        clamp: clip the image to [0, 1].
+        clamp: clip the image to [0, 1]; False: it may be below 0 and above 1.
         channels: C, where it is to be fixed; None: it varies too.
 
     Returns:
@@ -109,7 +109,8 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = False, channels: int 
     left_out = ["soft weights: contours are hard", "opacities: the caller multiplies them into the colours"]
     left_out = left_out if clamp else ["the clip to [0, 1]", *left_out]
     facts = {**header("generic", cutoff, clamp), "precision": "fp32", "left_out": json.dumps(left_out)}
-    return graph.finish("image", image, np.float32, [1, depth, "H", "W"], facts)
+    docs = "Renders any kcgs scene of hard contours: its Gaussians and its label map, at the size of the map."
+    return graph.finish("image", image, np.float32, [1, depth, "H", "W"], facts, (docs, image_doc(channels, clamp)))
 
 
 def _floats(values: object) -> Array:
@@ -117,11 +118,12 @@ def _floats(values: object) -> Array:
 
 
 def _declare(graph: Graph, depth: int | str, cutoff: float) -> _Scene:
-    means = graph.input("means", np.float32, ["N", 2])
-    cholesky = graph.input("cholesky", np.float32, ["N", 3])
-    colors = graph.input("colors", np.float32, ["N", depth])
-    ids = graph.input("region_ids", np.int64, ["N"])
-    labels = graph.input("labels", np.int64, ["H", "W"])
+    means = graph.input("means", np.float32, ["N", 2], "centres x, y in pixels of the image, from its top left corner")
+    factors = "l11, l21, l22 of the Cholesky factors of the covariances, in pixels; l11, l22 > 0"
+    cholesky = graph.input("cholesky", np.float32, ["N", 3], factors)
+    colors = graph.input("colors", np.float32, ["N", depth], "colours, 0 black to 1 white, times opacity; any sign")
+    ids = graph.input("region_ids", np.int64, ["N"], "region of each Gaussian, 0 or more; all 0 without regions")
+    labels = graph.input("labels", np.int64, ["H", "W"], "region of each pixel; its size is that of the image")
 
     x, y = graph.apply("Split", [graph("Transpose", means, perm=[1, 0])], 2, axis=0, num_outputs=2)
     l11, l21, l22 = graph.apply("Split", [graph("Transpose", cholesky, perm=[1, 0])], 3, axis=0, num_outputs=3)

@@ -45,9 +45,10 @@ class Graph:
         self._outer = outer
         self._names: list[int] = [0] if outer is None else outer._names
 
-    def input(self, name: str, dtype: type[np.generic], shape: Sequence[int | str]) -> Value:
-        """Declare an input; names stand for sizes that vary."""
+    def input(self, name: str, dtype: type[np.generic], shape: Sequence[int | str], doc: str | None = None) -> Value:
+        """Declare an input; names stand for sizes that vary, `doc` says order, range and units."""
         value = ir.val(name, dtype=ir.DataType.from_numpy(np.dtype(dtype)), shape=ir.Shape(list(shape)))
+        value.doc_string = doc
         self._inputs.append(value)
         return value
 
@@ -102,10 +103,13 @@ class Graph:
         dtype: type[np.generic],
         shape: Sequence[int | str],
         metadata: Mapping[str, str],
+        docs: tuple[str, str] | None = None,
     ) -> onnx.ModelProto:
-        """Close the graph, with its output, and check it."""
+        """Close the graph, with its output, and check it; `docs` are those of the graph and of the output."""
         value.name, value.dtype, value.shape = name, ir.DataType.from_numpy(np.dtype(dtype)), ir.Shape(list(shape))
-        model = ir.Model(self._close([value], "decoder"), ir_version=_IR_VERSION, producer_name="kcgs")
+        graph = self._close([value], "decoder")
+        graph.doc_string, value.doc_string = docs or (None, None)
+        model = ir.Model(graph, ir_version=_IR_VERSION, producer_name="kcgs")
         model.metadata_props.update(metadata)
         proto = ir.to_proto(model)
         onnx.checker.check_model(proto, full_check=True)

@@ -14,6 +14,14 @@ from .layout import Layout
 FORMAT = "kcgs.decoder"
 FORMAT_VERSION = "1"
 _LISTS = ("region_ids", "left_out")
+_CHANNELS = {1: "grey", 3: "red, green, blue"}
+
+
+def image_doc(channels: int | None, clamp: bool) -> str:
+    """Say what an image is: order of its axes, channels, range."""
+    names = _CHANNELS.get(channels or 0, "in the order of the scene's colours")
+    limits = "clipped to [0, 1]" if clamp else "not clipped: it may go below 0 and above 1"
+    return f"float32 (1, channels, height, width); channels: {names}; 0 is black, 1 white; {limits}"
 
 
 def header(kind: str, cutoff: float, clamp: bool) -> dict[str, str]:

@@ -117,12 +117,12 @@ def saved(p: Parts, metadata: dict[str, str] | None = None) -> tuple[bytes, dict
 def decoder_of(p: Parts, **settings: Any) -> onnx.ModelProto:
     """Build the ONNX decoder of one scene."""
     metadata = {"recipe": settings.pop("recipe")} if "recipe" in settings else None
-    return scene_decoder(Scene(_field(p), _regions(p), metadata), **settings)
+    return scene_decoder(Scene(_field(p), _regions(p), metadata), **{"clamp": False, **settings})
 
 
 def decoder_of_any(**settings: Any) -> onnx.ModelProto:
     """Build the generic ONNX decoder."""
-    return generic_decoder(**settings)
+    return generic_decoder(**{"clamp": False, **settings})
 
 
 def run_onnx(model: onnx.ModelProto, feeds: dict[str, Any]) -> Tensor:
@@ -213,8 +213,8 @@ def edits(p: Parts, region: int, background: Tensor) -> dict[str, Any]:
         "move": _of(editing.move_region(scene, region, (3, -2))),
         "delete": _of(editing.delete_region(scene, region)),
         "recolor": _of(editing.recolor_region(scene, region, torch.tensor([0.5, 1.0, 1.5]), 0.1)),
-        "extract": editing.render_region(scene, region),
-        "extract-larger": editing.render_region(scene, region, larger),
+        "extract": editing.render_region(scene, region, clamp=False),
+        "extract-larger": editing.render_region(scene, region, larger, clamp=False),
         "background": editing.render_over(scene, [region], background),
     }
 

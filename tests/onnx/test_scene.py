@@ -51,13 +51,17 @@ def decode(session: onnxruntime.InferenceSession, size: tuple[int, int], **feeds
 
 
 def assert_same(
-    field: GaussianField, regions: RegionMap | None, sizes: list[tuple[int, int]], cutoff: float = 1e-4, **options: bool
+    field: GaussianField,
+    regions: RegionMap | None,
+    sizes: list[tuple[int, int]],
+    cutoff: float = 1e-4,
+    clamp: bool = False,
 ) -> None:
-    session = session_of(scene_decoder(Scene(field, regions), cutoff=cutoff, **options))  # type: ignore[arg-type]
+    session = session_of(scene_decoder(Scene(field, regions), cutoff=cutoff, clamp=clamp))
     bound = 1e-3 if cutoff >= 1e-4 else 1e-4
     for size in sizes:
         with torch.no_grad():
-            want = RegionSplatRenderer(cutoff=cutoff, **options)(field, regions, size)
+            want = RegionSplatRenderer(cutoff=cutoff, clamp=clamp)(field, regions, size)
         got = decode(session, size)
         assert got.shape == want.shape
         assert (got - want).abs().max() < bound, size
@@ -138,6 +142,15 @@ class TestImage:
         )
         assert decode(session_of(scene_decoder(Scene(field))), (40, 50)).abs().max() == 0
 
+    def test_clipped_unless_asked_otherwise(self) -> None:
+        field = scattered(40, (40, 60))
+        field.colors.data = 8 * field.colors.data - 2
+        plain, clipped = (
+            decode(session_of(scene_decoder(Scene(field), **o)), (40, 60)) for o in ({"clamp": False}, {})
+        )
+        assert plain.min() < -0.1 and plain.max() > 1.1
+        assert torch.equal(clipped, plain.clamp(0, 1))
+
     def test_opacities_and_clamp(self) -> None:
         field = GaussianField(
             torch.rand(20, 2) * 30, torch.tensor([[4.0, 0.0, 4.0]]).repeat(20, 1), 2 * torch.rand(20, 3) - 0.5,
@@ -152,7 +165,7 @@ class TestImage:
         field = scattered(30, size, regions)
         field.region_ids[::2] = 999
         assert_same(field, regions, [size, (33, 71)])
-        session = session_of(scene_decoder(Scene(field, regions), interactive=True))
+        session = session_of(scene_decoder(Scene(field, regions), clamp=False, interactive=True))
         view, every = np.array([0, 0, 50, 40], np.float32), np.ones(count, np.float32)
         with torch.no_grad():
             assert (
@@ -165,7 +178,7 @@ class TestInteractive:
         size = (48, 80)
         regions = RegionMap.from_labels(blobs(size, 5), 0.6)
         field = scattered(150, size, regions)
-        session = session_of(scene_decoder(Scene(field, regions), interactive=True))
+        session = session_of(scene_decoder(Scene(field, regions), clamp=False, interactive=True))
         whole = np.array([0, 0, 80, 48], np.float32)
         every = np.ones(5, np.float32)
         with torch.no_grad():
@@ -192,7 +205,7 @@ class TestInteractive:
         labels = blobs(size, 5)
         regions = RegionMap.from_labels(labels, softness)
         field = scattered(60, size, regions)
-        session = session_of(scene_decoder(Scene(field, regions), interactive=True))
+        session = session_of(scene_decoder(Scene(field, regions), clamp=False, interactive=True))
         held = torch.nn.functional.pad(labels[None, None].double(), (pad,) * 4, mode="replicate")[0, 0].long()
         shares = [regions.membership.weights(0, r, torch.float64) for r in range(5)]
         shares = [torch.nn.functional.pad(s[None, None], (pad,) * 4, mode="replicate")[0, 0] for s in shares]
@@ -212,7 +225,9 @@ class TestInteractive:
     def test_far_in(self) -> None:
         size = (48, 80)
         regions = RegionMap.from_labels(blobs(size, 5))
-        session = session_of(scene_decoder(Scene(scattered(150, size, regions), regions), interactive=True))
+        session = session_of(
+            scene_decoder(Scene(scattered(150, size, regions), regions), clamp=False, interactive=True)
+        )
         view = np.array([40, 24, 40.5, 24.4], np.float32)
         assert torch.isfinite(decode(session, (400, 500), view=view, visible=np.ones(5, np.float32))).all()
 
@@ -249,10 +264,17 @@ class TestFile:
         field = scattered(30, size, hard)
         none, some = operators(field, None), operators(field, hard)
         assert "ReduceMax" in some and not any(name.startswith("Scatter") for name in some | operators(field, soft))
-        assert "Clip" in operators(field, None, clamp=True)
+        assert "Clip" in operators(field, None)
         counts = [len(scene_decoder(Scene(field, m)).graph.node) for m in (None, hard)]
         assert counts[0] < counts[1]
         assert not {"Loop", "If", "NonZero"} & (none | some)
+
+    def test_says_order_range_and_units(self) -> None:
+        graph = scene_decoder(Scene(scattered(3, (20, 30))), interactive=True).graph
+        docs = {value.name: value.doc_string for value in (*graph.input, *graph.output)}
+        words = {"size": "height and width", "view": "left, top, right, bottom", "visible": "region_ids"}
+        assert all(words[name] in docs[name] for name in words) and graph.doc_string
+        assert "red, green, blue" in docs["image"] and "clipped to [0, 1]" in docs["image"]
 
     def test_recipe_of_any_name(self) -> None:
         assert (
@@ -289,7 +311,7 @@ class TestFile:
         field.means.data, field.cholesky.data = torch.full((4, 2), 20.3), torch.tensor([[9.01, 0.3, 8.7]]).repeat(4, 1)
         field.cholesky.data += 0.003 * torch.arange(4)[:, None]
         with pytest.raises(ValueError, match=r"precision must be fp32 .* changes a value of the image by 0\.\d+"):
-            scene_decoder(Scene(field), precision="fp16")
+            scene_decoder(Scene(field), clamp=False, precision="fp16")
 
 
 class TestBadInput:
@@ -343,7 +365,7 @@ def test_chains_with_kornia(tmp_path: object) -> None:
         dynamo=True, opset_version=18, dynamic_shapes=({**shape},), external_data=False, verbose=False,
     )  # fmt: skip
     field = scattered(20, (32, 48))
-    chain = ONNXSequential(scene_decoder(Scene(field)), onnx.load(path), io_maps=[[("image", "color")]])
+    chain = ONNXSequential(scene_decoder(Scene(field), clamp=False), onnx.load(path), io_maps=[[("image", "color")]])
     (got,) = chain(np.array([40, 50]))
     with torch.no_grad():
         want = RgbToGrayscale()(RegionSplatRenderer()(field, size=(40, 50))[None])

@@ -65,7 +65,7 @@ def ids_of(scene: Scene) -> Tensor:
 
 
 def cut(scene: Scene, region: int, size: tuple[int, int] | None = None) -> Tensor:
-    return render_region(scene, region, size).detach()
+    return render_region(scene, region, size, clamp=False).detach()
 
 
 class TestRenderRegion:
@@ -108,9 +108,17 @@ class TestRenderRegion:
         moved = scene.field.means.grad.abs().sum(-1) > 0
         assert moved.any() and not moved[ids_of(scene) != DISC].any()
 
+    def test_colours_are_clipped_unless_asked_otherwise(self) -> None:
+        scene = scene_of(MAPS["soft"]())
+        with torch.no_grad():
+            scene.field.colors.mul_(9.0).sub_(2.0)
+        plain = cut(scene, BOX)
+        assert plain.max() > 1.0 and plain.min() < 0.0
+        assert torch.equal(render_region(scene, BOX).detach(), plain.clamp(0.0, 1.0))
+
     def test_several_regions_are_their_blend(self, regions: RegionMap) -> None:
         scene = scene_of(regions)
-        rgba, disc, box = render_region(scene, [BOX, DISC]).detach(), cut(scene, DISC), cut(scene, BOX)
+        rgba, disc, box = render_region(scene, [BOX, DISC], clamp=False).detach(), cut(scene, DISC), cut(scene, BOX)
         torch.testing.assert_close(rgba[3], disc[3] + box[3], rtol=0, atol=1e-6)
         want = disc[:3] * disc[3] + box[:3] * box[3]
         torch.testing.assert_close(rgba[:3] * rgba[3], want, rtol=0, atol=1e-5)

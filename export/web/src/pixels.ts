@@ -1,7 +1,7 @@
 /** Between the decoder's planes of floats and pictures of 8 bits a channel. */
 
 export interface Picture {
-  /** (1, C, H, W), not clipped. */
+  /** (1, C, H, W); may go beyond [0, 1]. */
   data: Float32Array;
   dims: readonly number[];
 }
