@@ -15,9 +15,13 @@ from .labels import edge_band
 
 _WINDOW = 11  # pixels; torchmetrics makes it int(3.5 sigma + 0.5) * 2 + 1 whatever kernel size it is given
 _SIGMA = 1.5
+_K1, _K2 = 0.01, 0.03
 _MARGIN = _WINDOW // 2
 _SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 _MS_SSIM_SIDE = (_WINDOW - 1) * 2 ** (len(_SCALE_WEIGHTS) - 1) + 1
+# torchmetrics holds some fifteen maps of the whole image, 700 bytes per pixel; images of more pixels than the first go
+# by blocks of rows, of about so many pixels as the second, which stay in a processor's cache
+_LARGE, _BLOCK = 1 << 20, 1 << 17
 
 
 def psnr(image: Tensor, target: Tensor) -> Tensor:
@@ -67,7 +71,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     image, target, lead = _check_pair(image, target)
     if min(image.shape[-2:]) < _WINDOW:
         return _too_small("ssim", image, lead, _WINDOW)
-    return _valid_mean(_ssim_map(image, target)).reshape(lead)
+    return _mean_ssim(image, target).reshape(lead)
 
 
 def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -97,9 +101,9 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
     image, target = image.flatten(0, 1)[:, None], target.flatten(0, 1)[:, None]
     product = image.new_ones(batch * channels)
     for weight in _SCALE_WEIGHTS[:-1]:
-        product = product * _ssim_map(image, target, contrast=True).relu() ** weight
+        product = product * _mean_ssim(image, target, contrast=True).relu() ** weight
         image, target = _halve(image), _halve(target)
-    product = product * _valid_mean(_ssim_map(image, target)).relu() ** _SCALE_WEIGHTS[-1]
+    product = product * _mean_ssim(image, target).relu() ** _SCALE_WEIGHTS[-1]
     return product.reshape(batch, channels).mean(1).reshape(lead)
 
 
@@ -158,7 +162,7 @@ def ef_ssim(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> 
     band = _check_band("ef_ssim", image, labels, width)
     if min(image.shape[-2:]) < _WINDOW:
         return _too_small("ef_ssim", image, lead, _WINDOW)
-    return _band_mean(_ssim_map(image, target), band).reshape(lead)
+    return _mean_ssim(image, target, band=band).reshape(lead)
 
 
 def _check_pair(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, torch.Size]:
@@ -209,33 +213,83 @@ def _band_mean(values: Tensor, band: Tensor) -> Tensor:
     return (values * band).sum((1, 2, 3)) / count
 
 
-def _valid_mean(similarity: Tensor) -> Tensor:
-    """Average where the window lies inside the image; torchmetrics' own mean takes the padded rim too."""
-    return similarity[..., _MARGIN:-_MARGIN, _MARGIN:-_MARGIN].flatten(1).mean(1)
-
-
 def _halve(image: Tensor) -> Tensor:
     height, width = image.shape[-2:]
     return avg_pool2d(pad(image, (0, width % 2, 0, height % 2), mode="replicate"), 2)
 
 
-def _ssim_map(image: Tensor, target: Tensor, *, contrast: bool = False) -> Tensor:
-    """SSIM at every pixel, (B, C, H, W); or of contrast and structure alone the mean over the valid area, (B)."""
-    from torchmetrics.functional.image import structural_similarity_index_measure
-
+def _mean_ssim(image: Tensor, target: Tensor, *, contrast: bool = False, band: Tensor | None = None) -> Tensor:
+    """Mean SSIM, or contrast and structure alone, where the window lies inside the image, or over a band; (B)."""
     # variances are differences of near-equal convolutions and need every digit: neither TF32 nor autocast
     working = torch.float64 if image.is_cuda else image.dtype
     with torch.autocast(image.device.type, enabled=False):
-        result = structural_similarity_index_measure(
-            image.to(working),
-            target.to(working),
-            sigma=_SIGMA,
-            kernel_size=_WINDOW,
-            reduction="none",
-            data_range=1.0,
-            k1=0.01,
-            k2=0.03,
-            return_full_image=not contrast,
-            return_contrast_sensitivity=contrast,
-        )
-    return result[1].to(image.dtype)
+        if image[0, 0].numel() > _LARGE and not torch.compiler.is_compiling():
+            return _mean_by_rows(image.to(working), target.to(working), contrast, band).to(image.dtype)
+        result = _ssim_map(image.to(working), target.to(working), contrast).to(image.dtype)
+    if contrast:
+        return result
+    if band is not None:
+        return _band_mean(result, band)
+    # torchmetrics' own mean takes the padded rim too
+    return result[..., _MARGIN:-_MARGIN, _MARGIN:-_MARGIN].flatten(1).mean(1)
+
+
+def _ssim_map(image: Tensor, target: Tensor, contrast: bool) -> Tensor:
+    """SSIM at every pixel, (B, C, H, W); or of contrast and structure alone the mean over the valid area, (B)."""
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    result = structural_similarity_index_measure(
+        image,
+        target,
+        sigma=_SIGMA,
+        kernel_size=_WINDOW,
+        reduction="none",
+        data_range=1.0,
+        k1=_K1,
+        k2=_K2,
+        return_full_image=not contrast,
+        return_contrast_sensitivity=contrast,
+    )
+    return torch.as_tensor(result[1])
+
+
+def _mean_by_rows(image: Tensor, target: Tensor, contrast: bool, band: Tensor | None) -> Tensor:
+    """Mean as `_mean_ssim` gives it, (B), in the memory of a few rows."""
+    if band is not None:
+        image, target = (pad(t, [_MARGIN] * 4, mode="reflect") for t in (image, target))
+    overlap = _WINDOW - 1
+    rows = max(4 * overlap, _BLOCK // image.shape[-1])
+    total: Tensor | float = 0.0
+    count, above = 0, image.new_empty((2, *image.shape[:-2], 0, image.shape[-1]))
+    for block in zip(image.split(rows, -2), target.split(rows, -2), strict=True):
+        # `split` and `cat`, since the gradient of overlapping slices would be as large as the image for each
+        window = torch.cat([above, torch.stack(block)], -2)
+        values = _similarity(window[0], window[1], contrast)
+        above, height = window[..., -overlap:, :], values.shape[-2]
+        values = values if band is None else values * band[..., count : count + height, :]
+        total, count = total + values.sum((1, 2, 3), dtype=torch.float64), count + height
+    pixels = count * (image.shape[-1] - overlap) if band is None else band.sum((1, 2, 3))
+    return torch.as_tensor(total / (pixels * image.shape[1]))
+
+
+def _similarity(image: Tensor, target: Tensor, contrast: bool) -> Tensor:
+    """SSIM, or its contrast and structure alone, where the window lies inside; as torchmetrics has it."""
+    moments = _blur(torch.stack([image, target, image * image, target * target, image * target]))
+    squares, product = (moments[:2] * moments[:2]), moments[0] * moments[1]
+    variances = (moments[2:4] - squares).clamp_min(0.0).sum(0)
+    c1, c2 = _K1**2, _K2**2
+    structure = (2 * (moments[4] - product) + c2) / (variances + c2)
+    return structure if contrast else structure * (2 * product + c1) / (squares.sum(0) + c1)
+
+
+def _blur(maps: Tensor) -> Tensor:
+    """Filter by the Gaussian window along both sides, one after the other, without padding."""
+    weights = [math.exp(-0.5 * (offset / _SIGMA) ** 2) for offset in range(-_MARGIN, _MARGIN + 1)]
+    for dim in (-2, -1):
+        length = maps.shape[dim] - 2 * _MARGIN
+        blurred = maps.narrow(dim, _MARGIN, length) * (1 / sum(weights))
+        for k in range(_MARGIN):
+            pair = maps.narrow(dim, k, length) + maps.narrow(dim, 2 * _MARGIN - k, length)
+            blurred = blurred.add_(pair, alpha=weights[k] / sum(weights))
+        maps = blurred
+    return maps

@@ -391,3 +391,39 @@ def _on_another_device(image: Tensor) -> Tensor:
             return torch.device("meta")
 
     return image.as_subclass(Elsewhere)
+
+
+class TestLargeImages:
+    """Blocks of rows give what the whole image gives, in less memory."""
+
+    @pytest.fixture
+    def metrics(self) -> list[Metric]:
+        labels = (torch.arange(192) > 90).long().expand(176, 192)
+        return [ssim, ms_ssim, lambda image, target: ef_ssim(image, target, labels)]
+
+    def test_blocks_agree_with_the_whole(self, metrics: list[Metric], monkeypatch: pytest.MonkeyPatch) -> None:
+        image, target = photo_pair("coffee")
+        images, targets = torch.stack([image, target.flip(-1)]).requires_grad_(), torch.stack([target, target])
+        whole = [metric(images, targets) for metric in metrics]
+        slopes = [torch.autograd.grad(value.sum(), images)[0] for value in whole]
+        monkeypatch.setattr(f"{psnr.__module__}._LARGE", 100)
+        monkeypatch.setattr(f"{psnr.__module__}._BLOCK", 1)  # as few rows as may be
+        monkeypatch.setattr(f"{psnr.__module__}._ssim_map", None)  # not even asked
+        for metric, value, slope in zip(metrics, whole, slopes, strict=True):
+            blocks = metric(images, targets)
+            assert torch.allclose(blocks, value, rtol=0, atol=1e-11)
+            assert torch.allclose(torch.autograd.grad(blocks.sum(), images)[0], slope, rtol=1e-8, atol=1e-12)
+            single = metric(images.float(), targets.float())
+            assert torch.allclose(single, value.float(), rtol=0, atol=5e-6)  # what float32 has of variances
+
+    def test_memory_of_a_large_image(self) -> None:
+        """Two megapixels took 1.5 GB for SSIM, ten times the two images and their clipped copies."""
+        images = torch.rand(2, 3, 1200, 1700)
+        with torch.profiler.profile(profile_memory=True) as profile:
+            ssim(*images)
+        taken, most = 0, 0
+        for event in profile.profiler.kineto_results.events():  # type: ignore[union-attr]
+            if event.name() == "[memory]":
+                taken += event.nbytes()
+                most = max(most, taken)
+        assert 0 < most < 4 * images.nbytes
