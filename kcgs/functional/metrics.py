@@ -99,11 +99,11 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
     batch, channels = image.shape[:2]
     # torchmetrics averages channels before the powers are taken: hand it one channel at a time
     image, target = image.flatten(0, 1)[:, None], target.flatten(0, 1)[:, None]
-    product = image.new_ones(batch * channels)
+    product, large = image.new_ones(batch * channels), _is_large(image)
     for weight in _SCALE_WEIGHTS[:-1]:
-        product = product * _mean_ssim(image, target, contrast=True).relu() ** weight
+        product = product * _mean_ssim(image, target, contrast=True, by_rows=large).relu() ** weight
         image, target = _halve(image), _halve(target)
-    product = product * _mean_ssim(image, target).relu() ** _SCALE_WEIGHTS[-1]
+    product = product * _mean_ssim(image, target, by_rows=large).relu() ** _SCALE_WEIGHTS[-1]
     return product.reshape(batch, channels).mean(1).reshape(lead)
 
 
@@ -218,12 +218,24 @@ def _halve(image: Tensor) -> Tensor:
     return avg_pool2d(pad(image, (0, width % 2, 0, height % 2), mode="replicate"), 2)
 
 
-def _mean_ssim(image: Tensor, target: Tensor, *, contrast: bool = False, band: Tensor | None = None) -> Tensor:
+def _is_large(image: Tensor) -> bool:
+    # compiled, a loop over blocks would be a graph of thousands of nodes
+    return image.shape[-2] * image.shape[-1] > _LARGE and not torch.compiler.is_compiling()
+
+
+def _mean_ssim(
+    image: Tensor,
+    target: Tensor,
+    *,
+    contrast: bool = False,
+    band: Tensor | None = None,
+    by_rows: bool | None = None,
+) -> Tensor:
     """Mean SSIM, or contrast and structure alone, where the window lies inside the image, or over a band; (B)."""
     # variances are differences of near-equal convolutions and need every digit: neither TF32 nor autocast
     working = torch.float64 if image.is_cuda else image.dtype
     with torch.autocast(image.device.type, enabled=False):
-        if image[0, 0].numel() > _LARGE and not torch.compiler.is_compiling():
+        if _is_large(image) if by_rows is None else by_rows:
             return _mean_by_rows(image.to(working), target.to(working), contrast, band).to(image.dtype)
         result = _ssim_map(image.to(working), target.to(working), contrast).to(image.dtype)
     if contrast:
