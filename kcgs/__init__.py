@@ -1,5 +1,6 @@
 """kcgs: contour-aware 2D Gaussian splatting of images, as differentiable torch modules."""
 
+from . import _interrupts as _interrupts  # first: the others take seconds to load
 from .evaluate import evaluate
 from .fit import FitConfig, FitResult, fit
 from .functional import RegionMap

@@ -1,10 +1,30 @@
 """Files that appear whole or not at all."""
 
 import os
+import tempfile
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+
+def check_writable(name: str, path: str | os.PathLike[str]) -> None:
+    """Refuse a path at which no file can be written, before the work whose result it is; nothing appears there.
+
+    Raises:
+        OSError: its folder is not there, or takes no files; a folder is in its place. The message begins with `name`.
+    """
+    target = Path(path)
+    if target.is_dir():
+        raise IsADirectoryError(f"{name} must be a file; {str(target)!r} is a folder")
+    folder = target.resolve().parent
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{name} needs an existing folder; {str(folder)!r} is not there")
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise type(error)(f"{name} cannot be written into {str(folder)!r}: {error.strerror}") from error
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 import tempfile
 import webbrowser
 from collections.abc import Callable
@@ -60,6 +61,13 @@ class _Handler(SimpleHTTPRequestHandler):
         """Say nothing of requests."""
 
 
+class _Server(ThreadingHTTPServer):
+    def handle_error(self, request: Any, address: Any) -> None:
+        # a browser may leave at any moment
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, address)
+
+
 def serve(
     scene: Scene,
     *,
@@ -92,12 +100,9 @@ def serve(
             shutil.copyfile(original, Path(folder) / f"original{original.suffix.lower()}")
             query["original"] = f"scene/original{original.suffix.lower()}"
         handler = partial(_Handler, directory=str(page), extra=Path(folder))
-        with ThreadingHTTPServer(("127.0.0.1", port), handler) as server:
+        with _Server(("127.0.0.1", port), handler) as server:
             url = f"http://127.0.0.1:{server.server_address[1]}/?{urlencode(query, quote_via=quote, safe='/')}"
             say(f"{url} (Ctrl-C ends)")
             if browser:
                 webbrowser.open(url)
-            try:
-                server.serve_forever()
-            except KeyboardInterrupt:
-                return
+            server.serve_forever()

@@ -25,7 +25,7 @@ LAYERS = [
     {"nn"},
     {"functional"},
     {"kernels", "engine"},
-    {"_check", "_atomic", "_shipped"},
+    {"_check", "_atomic", "_shipped", "_interrupts", "_progress"},
 ]
 GONE = {
     "image, render": r"\bpictures?\b|\bdraw(s|n|ing|ings)?\b",

@@ -143,4 +143,4 @@ def test_view(environment: Path, folder: Path) -> None:
     finally:
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60)
-    assert process.returncode == 0
+    assert process.returncode == 130

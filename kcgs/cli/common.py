@@ -4,15 +4,47 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import signal
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from kcgs._atomic import atomic_path
+from kcgs import _interrupts
+from kcgs._atomic import atomic_path, check_writable
+
+# who read the standard output has left, as the shell would say of other programs
+_CLOSED = 128 + 13
+
+
+class _Commands(typer.core.TyperGroup):
+    """The commands, ended in one way by Ctrl-C and by a reader of standard output who leaves."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command."""
+        with _interrupts.raised() as came:
+            try:
+                return super().invoke(ctx)
+            except BrokenPipeError as error:
+                # what is left in the buffer has nowhere to go
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                raise typer.Exit(_CLOSED) from error
+            except BaseException as error:
+                if not came and not isinstance(error, KeyboardInterrupt):
+                    raise
+                raise interrupted(str(error) if isinstance(error, KeyboardInterrupt) else "") from None
+
+
+def interrupted(detail: str = "") -> typer.Exit:
+    """Say in one line that Ctrl-C came, and return what ends the command."""
+    typer.echo(f"kcgs: interrupted{detail and ': ' + detail}", err=True)
+    return typer.Exit(_interrupts.STATUS)
+
 
 app = typer.Typer(
+    cls=_Commands,
     help="Contour-aware 2D Gaussian splatting of images.",
     no_args_is_help=True,
     add_completion=False,
@@ -50,6 +82,7 @@ SceneFile = Annotated[
     Path, typer.Argument(help="Scene file (.safetensors or .kcgs), or zoo:NAME.", metavar="SCENE", parser=_scene_path)
 ]
 ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE")]
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Show no progress.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
 
@@ -59,8 +92,7 @@ def check_output(path: Path, *suffixes: str, option: str = "--output") -> None:
     suffix = path.suffix.lower() if path.suffix.lower() in IMAGES else path.suffix
     if suffix not in suffixes:
         raise ValueError(f"{option} must end in {' or '.join(suffixes)}; got {str(path)!r}")
-    if not path.resolve().parent.is_dir():
-        raise FileNotFoundError(f"{option} needs an existing folder; {str(path.resolve().parent)!r} is not there")
+    check_writable(option, path)
 
 
 def write_file(path: Path, data: bytes) -> int:
@@ -75,49 +107,46 @@ def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
         clean = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in report.items()}
         typer.echo(json.dumps(clean))
         return
-    from rich.console import Console
     from rich.table import Table
 
     table = Table("", title, show_header=True)
     for key, value in report.items():
         table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
-    Console().print(table)
+    print_table(table)
 
 
-class Progress:
-    """Bar on standard error, only on a terminal, and Ctrl-C as a wish to stop; a second Ctrl-C ends the program."""
+def print_table(table: Any) -> None:
+    """Print a table of rich's, which by itself would end the program where the reader has left."""
+    from rich.console import Console
 
-    def __init__(self, iterations: int) -> None:
-        from rich.progress import TextColumn, TimeElapsedColumn
+    console = Console()
+    with console.capture() as text:
+        console.print(table)
+    typer.echo(text.get(), nl=False)
 
-        self.interrupted = False
-        self._bar = progress_bar(TimeElapsedColumn(), TextColumn("{task.fields[quality]}"))
-        self._task = self._bar.add_task("fit", total=iterations, quality="")
 
-    def __enter__(self) -> Progress:
+class Stop:
+    """Ctrl-C as a wish that a fit stop and be saved; before it has begun, or a second time, it ends the command."""
+
+    def __init__(self) -> None:
+        self.wanted = self._began = False
+
+    def __enter__(self) -> Stop:
         self._before = signal.signal(signal.SIGINT, self._interrupt)
-        self._bar.start()
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._bar.stop()
         signal.signal(signal.SIGINT, self._before)
 
-    def _interrupt(self, number: int, frame: object) -> None:
-        self.interrupted = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    def _interrupt(self, number: int, frame: Any) -> None:
+        if self._began and not self.wanted:
+            self.wanted = True
+        elif callable(self._before):
+            self._before(number, frame)
+        else:
+            raise KeyboardInterrupt
 
     def step(self, iteration: int, entry: Any) -> bool:
-        """Show the iteration; say whether to stop."""
-        self._bar.update(self._task, completed=iteration, quality=f"{entry.psnr:.2f} dB")
-        return self.interrupted
-
-
-def progress_bar(*columns: Any) -> Any:
-    """Make a bar on standard error, shown only on a terminal, with columns beside its own and the remaining time."""
-    from rich.console import Console
-    from rich.progress import Progress, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    first = Progress.get_default_columns()[:2]
-    return Progress(*first, *columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal)
+        """Say whether the fit is to stop; `on_step` of :func:`kcgs.fit.fit`."""
+        self._began = True
+        return self.wanted

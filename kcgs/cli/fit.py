@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from kcgs._atomic import check_writable
+from kcgs._progress import Progress
+
 from . import options
-from .common import ImageFile, Json, Progress, app, check_output, print_report, write_file
+from .common import ImageFile, Json, Quiet, Stop, app, check_output, interrupted, print_report, write_file
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -40,6 +43,7 @@ def fit_command(
     plot: Annotated[Path | None, typer.Option(help="Plot error against run time into this PNG.")] = None,
     checkpoint: Annotated[Path | None, typer.Option(help="Keep the fit's state in this file as it goes.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from --checkpoint, where it exists.")] = False,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Fit Gaussians to an image and save the scene."""
@@ -52,24 +56,29 @@ def fit_command(
         check_output(plot, ".png", option="--plot")
     if resume and checkpoint is None:
         raise typer.BadParameter("--resume needs --checkpoint")
+    if checkpoint is not None:
+        check_writable("--checkpoint", checkpoint)
     if request.target_bytes is not None:
         options.exclude("--target-bytes", checkpoint=checkpoint)
     target = load_image(image)
-    labels = read_regions(regions, target, partial(typer.echo, err=True))
-    with Progress(request.config.iterations) as progress:
-        fitted = fit_into(output, target, labels, request, on_step=progress.step, checkpoint=checkpoint, resume=resume)
+    labels = read_regions(regions, target, partial(typer.echo, err=True), progress=not quiet)
+    with Stop() as stop:
+        fitted = fit_into(
+            output, target, labels, request,
+            on_step=stop.step, progress=not quiet, checkpoint=checkpoint, resume=resume,
+        )  # fmt: skip
     result = fitted.result
     if plot is not None:
         from kcgs.plots import plot_history
 
         plot_history(plot, {request.recipe: result.history})
-    if progress.interrupted:
-        typer.echo(f"interrupted: saved the best so far to {output}", err=True)
     title = f"{output}: {len(fitted.scene)} Gaussians, stopped by {result.stop_reason}"
     if result.removed:
         title += f"; {result.removed} useless ones removed, which changed no value by more than {result.change:.1g}"
     report = measure_scene(fitted.scene, target, labels, fitted.num_bytes, result.history[-1].seconds)
     print_report(report, as_json, title)
+    if stop.wanted:
+        raise interrupted(f"saved the best so far to {output}")
 
 
 class Fitted(NamedTuple):
@@ -88,6 +97,7 @@ def fit_into(
     request: options.FitRequest,
     *,
     on_step: Any = None,
+    progress: bool = False,
     checkpoint: Path | None = None,
     resume: bool = False,
     notes: Mapping[str, str] | None = None,
@@ -97,29 +107,31 @@ def fit_into(
     from kcgs.rate import compress, fit_bytes, quality_for
     from kcgs.scene import Scene
 
+    check_writable("--output", output)
+    settings: Any = {"recipe": request.config, "seed": request.seed, "on_step": on_step, "progress": progress}
     if request.target_bytes is not None:
-        done = fit_bytes(image, labels, request.target_bytes, recipe=request.config, seed=request.seed, on_step=on_step)
+        done = fit_bytes(image, labels, request.target_bytes, **settings)
         return Fitted(done.result, done.scene, write_file(output, done.data))
-    result = fit(
-        image, labels, request.num_gaussians,
-        recipe=request.config, seed=request.seed, on_step=on_step, checkpoint=checkpoint, resume=resume,
-    )  # fmt: skip
+    count = request.num_gaussians or min(options.DEFAULT_GAUSSIANS, image.shape[1] * image.shape[2])
+    result = fit(image, labels, count, checkpoint=checkpoint, resume=resume, **settings)
     if output.suffix != ".kcgs":
         scene = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe, **(notes or {})})
         return Fitted(result, scene, scene.save(output))
     quality = quality_for(max(entry.psnr for entry in result.history))
-    file = compress(result.scene, image, quality=quality, seed=request.seed)
+    with Progress("writing the file", known=False, shown=progress):
+        file = compress(result.scene, image, quality=quality, seed=request.seed)
     return Fitted(result, file.scene, write_file(output, file.data))
 
 
-def read_regions(regions: str, image: Tensor, warn: Callable[[str], None]) -> Tensor | None:
+def read_regions(regions: str, image: Tensor, warn: Callable[[str], None], *, progress: bool = False) -> Tensor | None:
     """Return the label map that the option --regions names; `warn` hears where its contours are not the image's."""
     if regions == "none":
         return None
     if regions == "auto":
         from kcgs.segment import segment
 
-        return segment(image)
+        with Progress("finding regions", known=False, shown=progress):
+            return segment(image)
     from kcgs.data import load_labels
     from kcgs.functional import edge_alignment
 

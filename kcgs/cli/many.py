@@ -14,10 +14,11 @@ from typing import Annotated, Any, Literal
 import typer
 
 from kcgs._atomic import atomic_path
+from kcgs._progress import Progress
 from kcgs.engine import Done, run_jobs
 
 from . import options
-from .common import IMAGES, Json, app, print_report, progress_bar
+from .common import IMAGES, Json, Quiet, app, print_report
 from .many_jobs import Order, Outcome, fit_one
 
 _MILLION = 1_000_000
@@ -48,6 +49,7 @@ def fit_many_command(
     price: Annotated[
         float | None, typer.Option("--price-per-core-hour", min=0.0, help="In dollars: what a million images cost.")
     ] = None,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Fit many images, each into a scene or a compressed file of its own.
@@ -75,7 +77,7 @@ def fit_many_command(
     workers = None if workers is None else min(workers, len(orders))
     done = run_jobs(fit_one, orders, engine=engine, workers=workers, threads=threads)
     try:
-        kept, failed = _write_down(done, images, table)
+        kept, failed = _write_down(done, images, table, quiet)
     finally:
         table.write()
     report = _summary(table, images, kept, failed, price)
@@ -164,26 +166,29 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _write_down(done: Iterable[Done[Outcome]], images: list[Path], table: Table) -> tuple[int, dict[Path, str]]:
+def _write_down(
+    done: Iterable[Done[Outcome]], images: list[Path], table: Table, quiet: bool
+) -> tuple[int, dict[Path, str]]:
     """Put what ends into the table; return how many were kept, and what to say of those that failed."""
-    from rich.progress import MofNCompleteColumn
-
-    kept, failed = 0, dict[Path, str]()
-    with progress_bar(MofNCompleteColumn()) as progress:
-        task = progress.add_task("fit", total=len(images))
-        for ended in done:
-            image, outcome = images[ended.index], ended.result
-            if outcome is None:
-                failed[image] = f"{image.name}: {ended.error}"
-                table.put(image, error=str(ended.error))
-            elif outcome.metrics is None:
-                kept += 1
-            else:
-                kept += math.isnan(outcome.core_seconds)
-                table.put(image, **outcome.metrics, core_seconds=outcome.core_seconds, fit=outcome.fit)
-            for warning in () if outcome is None else outcome.warnings:
-                progress.console.print(f"{image.name}: {warning}", markup=False, highlight=False, soft_wrap=True)
-            progress.update(task, advance=1, description=f"fit, {len(failed)} failed" if failed else "fit")
+    kept, count, failed = 0, 0, dict[Path, str]()
+    with Progress("fit-many", shown=not quiet) as progress:
+        try:
+            for count, ended in enumerate(done, 1):
+                image, outcome = images[ended.index], ended.result
+                if outcome is None:
+                    failed[image] = f"{image.name}: {ended.error}"
+                    table.put(image, error=str(ended.error))
+                elif outcome.metrics is None:
+                    kept += 1
+                else:
+                    kept += math.isnan(outcome.core_seconds)
+                    table.put(image, **outcome.metrics, core_seconds=outcome.core_seconds, fit=outcome.fit)
+                for warning in () if outcome is None else outcome.warnings:
+                    progress.print(f"{image.name}: {warning}")
+                told = f"{count} of {len(images)}" + (f", {len(failed)} failed" if failed else "")
+                progress.update(count / len(images), told)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"{count} of {len(images)} images are done; the same command goes on") from None
     return kept, failed
 
 

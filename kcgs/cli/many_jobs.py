@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from .fit import fit_into, measure_scene, read_regions
-from .options import FitRequest
+from .options import DEFAULT_GAUSSIANS, FitRequest
 
 if TYPE_CHECKING:
     from kcgs.fit import FitConfig
@@ -88,7 +88,13 @@ def _source(order: Order) -> str:
 
 def _fingerprint(order: Order) -> str:
     request, source = order.request, _source(order)
-    settings = request.config.model_dump_json(), *request[:2], order.output.suffix, request.seed
+    settings = (
+        request.config.model_dump_json(),
+        request.num_gaussians or DEFAULT_GAUSSIANS,
+        request.target_bytes,
+        order.output.suffix,
+        request.seed,
+    )
     digest = hashlib.sha256(repr(settings).encode())
     digest.update(order.image.read_bytes())
     digest.update(Path(source).read_bytes() if order.masks else source.encode())

@@ -25,7 +25,8 @@ Size = Annotated[str | None, typer.Option(metavar="WxH", help="Width and height 
 class FitRequest(NamedTuple):
     """What is asked of a fit besides the image and its regions."""
 
-    num_gaussians: int
+    num_gaussians: int | None
+    """None: the default number, or one for each pixel of a smaller image."""
     target_bytes: int | None
     """Of a `.kcgs` file, which then chooses the number of Gaussians; None: as many as said."""
     recipe: str
@@ -61,7 +62,7 @@ def fit_request(
     if keep_contours:
         given |= {"move_contours": False, "merge_regions": False}
     config = FitConfig.from_recipe(recipe, backend=backend, **given)
-    return FitRequest(num_gaussians or DEFAULT_GAUSSIANS, target_bytes, recipe, config, seed)
+    return FitRequest(num_gaussians, target_bytes, recipe, config, seed)
 
 
 def with_fit_options(command: Callable[..., None]) -> Callable[..., None]:

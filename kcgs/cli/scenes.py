@@ -7,7 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from .common import IMAGES, ImageFile, Json, SceneFile, app, check_output, print_report, write_file
+from kcgs._progress import Progress
+
+from .common import IMAGES, ImageFile, Json, Quiet, SceneFile, app, check_output, print_report, write_file
 from .fit import describe_size, measure_scene
 from .options import Scale, Size, exclude, target_size
 
@@ -96,6 +98,7 @@ def encode(
         Path | None,
         typer.Option(help="The image that the scene shows: Gaussians then make up for each other's rounding."),
     ] = None,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Compress a scene."""
@@ -107,13 +110,14 @@ def encode(
         exclude("--target-bytes", quality=quality)
     loaded = load(scene)
     goal: dict[str, Any] = {"quality": quality, "target_bytes": target_bytes}
-    if image is None:
-        data = codec.encode(loaded, **goal)
-    else:
-        from kcgs.data import load_image
-        from kcgs.rate import compress
+    with Progress("writing the file", known=False, shown=not quiet):
+        if image is None:
+            data = codec.encode(loaded, **goal)
+        else:
+            from kcgs.data import load_image
+            from kcgs.rate import compress
 
-        data = compress(loaded, load_image(image), **goal).data
+            data = compress(loaded, load_image(image), **goal).data
     write_file(output, data)
     decoded = codec.decode(data)
     rounded = decoded.scene

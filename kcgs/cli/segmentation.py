@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .common import IMAGES, ImageFile, Json, app, check_output, print_report
+from kcgs._progress import Progress
+
+from .common import IMAGES, ImageFile, Json, Quiet, app, check_output, print_report, print_table
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -42,6 +44,7 @@ def segment(
     overlay: Annotated[
         Path | None, typer.Option(help="Write the image with the regions over it into this file.")
     ] = None,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Make a label map of an image, and list its regions.
@@ -59,7 +62,8 @@ def segment(
     if max_regions is not None:
         options["max_regions"] = max_regions
     target = load_image(image)
-    found = segment_with_scores(target, method, **options)
+    with Progress("finding regions", known=False, shown=not quiet):
+        found = segment_with_scores(target, method, **options)
     save_labels(output, found.labels)
     if overlay is not None:
         save_image(overlay, overlay_labels(target, found.labels))
@@ -112,7 +116,6 @@ def _rows(image: Tensor, found: Segmentation) -> tuple[list[dict[str, Any]], flo
 
 
 def _print_rows(rows: list[dict[str, Any]]) -> None:
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
@@ -123,4 +126,4 @@ def _print_rows(rows: list[dict[str, Any]]) -> None:
         table.add_column(_COLUMNS[key][0], justify="left" if key == "name" else "right")
     for row in rows:
         table.add_row(*("" if row[key] is None else escape(_COLUMNS[key][1].format(row[key])) for key in shown))
-    Console().print(table)
+    print_table(table)

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from kcgs._atomic import atomic_path
+from kcgs._atomic import atomic_path, check_writable
 from kcgs.functional import RegionMap
 
 from .state import FitState, Gaussians, HistoryEntry
@@ -27,8 +27,7 @@ class Checkpoint:
 
     def __init__(self, path: str | os.PathLike[str], state: FitState, given: RegionMap | None) -> None:
         self.path = Path(path)
-        if not self.path.resolve().parent.is_dir():
-            raise FileNotFoundError(f"checkpoint needs an existing folder; {str(self.path.parent)!r} is not there")
+        check_writable("checkpoint", path)
         self.problem = _fingerprint(state, given)
         self._next = 0.0
 

@@ -6,13 +6,15 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from kcgs._check import as_image, check_count
+from kcgs._progress import Progress
 from kcgs.functional import RegionMap
 
 from .checkpoint import Checkpoint
@@ -21,6 +23,8 @@ from .descent import descend, log, log_is_due, render
 from .start import start
 from .state import FitResult, HistoryEntry, StopReason
 from .strategies import Finish, MergeRegions, make_strategies
+
+OnStep = Callable[[int, HistoryEntry], bool | None]
 
 
 @torch.inference_mode(False)
@@ -32,7 +36,8 @@ def fit(
     *,
     recipe: str | FitConfig = "best",
     seed: int = 0,
-    on_step: Callable[[int, HistoryEntry], bool | None] | None = None,
+    on_step: OnStep | None = None,
+    progress: bool = False,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
     **settings: Any,
@@ -47,12 +52,13 @@ def fit(
         image: Tensor :math:`(C, H, W)` or :math:`(1, C, H, W)`, floating, values in [0, 1]; a numpy array
             :math:`(H, W, C)`, uint8 or floating; or a PIL image.
         regions: label map of the image's size, or a RegionMap; also says where EF-PSNR is measured. None: one region.
-        num_gaussians: N, at least 1, the most there may be. Where it is below the number of regions, the smaller ones
-            stay empty and black, and a UserWarning says how many.
+        num_gaussians: N, the most there may be, from 1 to the number of pixels. Where it is below the number of
+            regions, the smaller ones stay empty and black, and a UserWarning says how many.
         recipe: a name from :func:`available_recipes`, or settings.
         seed: of the random start.
         on_step: called after every iteration with its number (from 1) and the last history entry; returning True
             stops the fit.
+        progress: show a bar, in a terminal or a notebook; elsewhere a line on standard error every ten seconds.
         checkpoint: a file to write the state to from time to time, whole or not at all.
         resume: go on from `checkpoint` where it exists; the result is that of an uninterrupted fit.
         settings: fields of :class:`FitConfig`, in place of the recipe's.
@@ -63,8 +69,9 @@ def fit(
 
     Raises:
         TypeError: wrong types.
-        ValueError: an image that is not finite or not in [0, 1], regions of another size, N below 1, unknown recipe or
-            setting, a checkpoint that is damaged or of another fit.
+        ValueError: an image that is not finite or not in [0, 1], regions of another size, N below 1 or
+            above the number of pixels, unknown recipe or setting, a checkpoint that is damaged or of another fit.
+        OSError: a checkpoint that cannot be written; found before the fit.
 
     Example:
         >>> image = torch.zeros(3, 16, 24)
@@ -75,8 +82,14 @@ def fit(
     """
     started = time.perf_counter()
     config = FitConfig.from_recipe(recipe, **settings)
+    if progress:
+        with _shown(config, on_step) as on_step:
+            return fit(
+                image, regions, num_gaussians, recipe=config, seed=seed, on_step=on_step, checkpoint=checkpoint,
+                resume=resume,
+            )  # fmt: skip
     image, regions = check_problem(image, regions)
-    num_gaussians = check_count("num_gaussians", num_gaussians)
+    num_gaussians = check_num_gaussians(num_gaussians, image)
     seed = check_count("seed", seed, 0, 2**63 - 1)
     if resume and checkpoint is None:
         raise ValueError("resume needs checkpoint, a file to go on from; got None")
@@ -98,17 +111,17 @@ def fit(
             warnings.warn(f"the fit diverged at iteration {state.iteration}: the best so far is kept", stacklevel=4)
             reason = "diverged"
             break
-        progress = state.progress()
+        share = state.progress()
         for strategy in strategies:
-            if strategy.due(progress):
+            if strategy.due(share):
                 strategy.apply(state)
         rendered = render(state)
-        if log_is_due(state, progress):
+        if log_is_due(state, share):
             log(state, rendered)
             if config.target_psnr is not None and state.best_psnr >= config.target_psnr:
                 reason = "target_psnr"
                 break
-        descend(state, rendered, progress)
+        descend(state, rendered, share)
 
         if keeper is not None and (keeper.due() or state.iteration == config.iterations):
             keeper.write(state)
@@ -117,6 +130,31 @@ def fit(
         elif state.seconds() >= (config.max_seconds or math.inf):
             reason = "seconds"
     return Finish().apply(state, reason or "iterations")
+
+
+@contextmanager
+def _shown(config: FitConfig, on_step: OnStep | None) -> Iterator[OnStep]:
+    """Yield a callback that shows how far a fit is, and calls `on_step`; a search for a target has no known length."""
+    start = time.perf_counter()
+    with Progress("fit", known=config.target_psnr is None) as shown:
+
+        def step(iteration: int, entry: HistoryEntry) -> bool | None:
+            share = iteration / config.iterations
+            if config.max_seconds is not None:
+                share = max(share, (time.perf_counter() - start) / config.max_seconds)
+            shown.update(share, f"iteration {iteration}, {entry.num_gaussians} Gaussians, {entry.psnr:.2f} dB")
+            return None if on_step is None else on_step(iteration, entry)
+
+        yield step
+
+
+def check_num_gaussians(value: object, image: Tensor) -> int:
+    """Return N if it is a number of Gaussians that an image (C, H, W) can use."""
+    count, pixels = check_count("num_gaussians", value), image.shape[1] * image.shape[2]
+    if count > pixels:
+        size = f"{image.shape[2]} x {image.shape[1]}"
+        raise ValueError(f"num_gaussians must be at most {pixels}, the pixels of the {size} image; got {count}")
+    return count
 
 
 def check_problem(image: Any, regions: RegionMap | Tensor | None) -> tuple[Tensor, RegionMap | None]:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from kcgs._check import check_count
+from kcgs._progress import Progress
 from kcgs.fit import FitConfig, FitResult, HistoryEntry, fit
 from kcgs.fit.loop import check_problem
 from kcgs.functional import RegionMap, merge_regions
@@ -43,6 +44,7 @@ def fit_bytes(
     recipe: str | FitConfig = "best",
     seed: int = 0,
     on_step: Callable[[int, HistoryEntry], bool | None] | None = None,
+    progress: bool = False,
     **settings: Any,
 ) -> FitBytesResult:
     """Fit an image to a budget of bytes, everything included.
@@ -59,6 +61,7 @@ def fit_bytes(
         recipe: as there.
         seed: as there.
         on_step: as there, for the fit itself, not the trials.
+        progress: as there.
         settings: as there; `contour_cost` is replaced by the coder's, and `max_seconds` is for the fit alone, without
             the trials and the rounding.
 
@@ -78,20 +81,22 @@ def fit_bytes(
     config = FitConfig.from_recipe(recipe, **settings)
     image, regions = check_problem(image, regions)
     check_count("num_bytes", num_bytes)
-    regions, cost = _choose(image, regions, num_bytes, config, seed)
-    count = count_for(num_bytes - _map_bytes(regions))
-    result = fit(image, regions, count, recipe=config, seed=seed, on_step=on_step, contour_cost=cost)
-    data, scene = compress(result.scene, image, target_bytes=num_bytes, seed=seed)
+    with Progress("trial fits", known=False, shown=progress):
+        regions, cost = _choose(image, regions, num_bytes, config, seed)
+    count = count_for(num_bytes - _map_bytes(regions), image.shape[1] * image.shape[2])
+    result = fit(image, regions, count, recipe=config, seed=seed, on_step=on_step, progress=progress, contour_cost=cost)
+    with Progress("writing the file", known=False, shown=progress):
+        data, scene = compress(result.scene, image, target_bytes=num_bytes, seed=seed)
     return FitBytesResult(data, scene, result)
 
 
-def count_for(num_bytes: float) -> int:
-    """Return how many Gaussians make the best of so many bytes."""
+def count_for(num_bytes: float, pixels: int) -> int:
+    """Return how many Gaussians make the best of so many bytes, at most one for each pixel."""
     bits = 8 * max(num_bytes - _HEADER_BYTES, 1)
     count = bits / _BITS
     for _ in range(4):
         count = bits / max(_BITS + _BITS_PER_OCTAVE * math.log2(max(count, 1.0) / _COUNT), 8.0)
-    return max(1, round(count))
+    return min(max(1, round(count)), pixels)
 
 
 def _choose(
@@ -100,25 +105,26 @@ def _choose(
     """Return the map, or None where its bytes do more as Gaussians, and what a pixel of contour must save."""
     if regions is None or regions.num_regions == 1:
         return None, config.contour_cost
+    pixels = image.shape[1] * image.shape[2]
     # by iterations, so that the same arguments give the same file
     iterations = min(_TRIAL_ITERATIONS, config.iterations)
     shorter = {"iterations": iterations, "max_seconds": None, "merge_regions": False, "refine_flat": False}
     trial = FitConfig.from_recipe(config, **shorter)
 
     def error(regions: RegionMap | None, left: int) -> float:
-        result = fit(image, regions, count_for(left), recipe=trial, seed=seed)
+        result = fit(image, regions, count_for(left, pixels), recipe=trial, seed=seed)
         return float(10 ** (-max(entry.psnr for entry in result.history) / 10))
 
     without = error(None, num_bytes)
     # what a bit saves, where it is spent on Gaussians
-    saved = _POWER * _TRIAL_TO_END * without * image.shape[-2] * image.shape[-1] / (8 * num_bytes)
+    saved = _POWER * _TRIAL_TO_END * without * pixels / (8 * num_bytes)
     # a pixel of contour must save what its bits would
     bits = 8 * _map_bytes(regions) / max(len(contour_edges(regions.fine_labels)[0]), 1)
     cost = saved * bits
     if config.merge_regions and regions.softness == 0.0 and regions.supersample == 1:
         regions = RegionMap.from_labels(merge_regions(image, regions.labels, cost))
     left = num_bytes - _map_bytes(regions)
-    if regions.num_regions == 1 or count_for(left) < regions.num_regions:
+    if regions.num_regions == 1 or count_for(left, pixels) < regions.num_regions:
         return None, cost
     return (regions if error(regions, left) < _FAVOUR * without else None), cost
 

@@ -8,6 +8,7 @@ import threading
 import urllib.error
 import urllib.parse
 import urllib.request
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ import torch
 
 from kcgs import GaussianField, RegionMap, Scene, load, save
 from kcgs.cli import main
-from kcgs.view import serve
+from kcgs.view import _Handler, _Server, serve
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -143,6 +144,16 @@ class TestView:
             connection.close()
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(urllib.request.Request(root, headers={"Host": "elsewhere.example"}))
+
+    def test_a_browser_that_leaves_is_no_error(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        with _Server(("127.0.0.1", 0), partial(_Handler, directory=str(tmp_path), extra=tmp_path)) as server:
+            for error in (BrokenPipeError(), ConnectionResetError(), ValueError("ours")):
+                try:
+                    raise error
+                except Exception:
+                    server.handle_error(None, ("127.0.0.1", 1))
+        err = capsys.readouterr().err
+        assert "ours" in err and "Pipe" not in err and "Reset" not in err
 
     def test_page_that_is_not_built(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError, match="make page"):

@@ -44,9 +44,9 @@ class TestFitBytes:
         assert done.scene.regions is not None and psnr(done.scene, image) > 35
 
     def test_count_grows_with_bytes(self) -> None:
-        counts = [count_for(size) for size in (100, 1000, 8000, 50_000)]
+        counts = [count_for(size, 10_000) for size in (100, 1000, 8000, 50_000)]
         assert counts == sorted(counts) and 1900 < counts[2] < 2300
-        assert count_for(1) == 1
+        assert count_for(1, 10_000) == 1
 
     def test_refusals(self) -> None:
         image = torch.zeros(3, 16, 16)

@@ -1,0 +1,150 @@
+"""Ctrl-C, progress, outputs that cannot be written, renders that do not fit: what a command does at a terminal."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+import torch
+
+import kcgs.cli
+from kcgs import GaussianField, Scene
+from kcgs.data import save_image
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photos").mkdir()
+    for name in ("photo.png", "photos/a.png", "photos/b.png"):
+        save_image(name, torch.linspace(0.0, 1.0, 48).expand(3, 32, 48))
+    Scene(GaussianField.random(5, (32, 48), seed=0)).save("scene.safetensors")
+    return tmp_path
+
+
+@pytest.fixture
+def run(files: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    def call(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["kcgs", *arguments])
+        with pytest.raises(SystemExit) as stop:
+            kcgs.cli.main()
+        captured = capsys.readouterr()
+        return int(stop.value.code or 0), captured.out, captured.err
+
+    return call
+
+
+def start(*command: str, **settings: Any) -> subprocess.Popen[bytes]:
+    # where the tests run in the background, Ctrl-C is ignored unless it is asked for
+    listen = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731
+    return subprocess.Popen(command, stderr=subprocess.PIPE, preexec_fn=listen, **settings)
+
+
+def press(*_: object, **__: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+class TestCtrlC:
+    @pytest.mark.parametrize("seconds", [0.1, 0.5])
+    def test_while_libraries_are_loaded(self, seconds: float) -> None:
+        process = start(sys.executable, "-m", "kcgs.cli", "models")
+        time.sleep(seconds)
+        process.send_signal(signal.SIGINT)
+        assert process.communicate(timeout=60)[1] == b"kcgs: interrupted\n"
+        assert process.returncode == 130
+
+    @pytest.mark.parametrize(
+        ("name", "arguments"),
+        [
+            ("kcgs.segment.segment", ("fit", "photo.png", "-n", "5")),
+            ("kcgs.segment.segment_with_scores", ("segment", "photo.png", "-o", "map.png")),
+            ("kcgs.fit.fit", ("fit", "photo.png", "-n", "5", "--regions", "none")),
+            ("kcgs.codec.encode", ("encode", "scene.safetensors", "-o", "scene.kcgs")),
+            ("kcgs.view.serve", ("view", "scene.safetensors")),
+        ],
+    )
+    def test_one_line(
+        self, files: Path, run: Any, monkeypatch: pytest.MonkeyPatch, name: str, arguments: tuple[str, ...]
+    ) -> None:
+        before = set(files.iterdir())
+        module, _, function = name.rpartition(".")
+        monkeypatch.setattr(import_module(module), function, press)
+        assert run(*arguments) == (130, "", "kcgs: interrupted\n")
+        assert set(files.iterdir()) == before
+
+    def test_while_many_are_fitted(self, files: Path, run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(kcgs.cli.many_jobs, "_warm_up", lambda *_: None)
+        monkeypatch.setattr(kcgs.cli.many_jobs, "fit_into", press)
+        code, out, err = run("fit-many", "photos", "-o", "out", "-n", "5", "--workers", "1")
+        assert (code, out) == (130, "")
+        assert err == "kcgs: interrupted: 0 of 2 images are done; the same command goes on\n"
+
+    def test_workers_that_load_libraries_are_silent(self, files: Path) -> None:
+        command = [sys.executable, "-m", "kcgs.cli", "fit-many", "photos", "-o", "out", "--workers", "2"]
+        process = start(*command, start_new_session=True)
+        while not (files / "out" / "results.csv").exists():
+            assert process.poll() is None
+            time.sleep(0.02)
+        time.sleep(0.5)
+        os.killpg(process.pid, signal.SIGINT)
+        err = process.communicate(timeout=60)[1]
+        assert process.returncode == 130
+        assert err == b"kcgs: interrupted: 0 of 2 images are done; the same command goes on\n"
+
+
+def test_a_reader_who_leaves(files: Path) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    process = start(sys.executable, "-m", "kcgs.cli", "info", "scene.safetensors", stdout=writer)
+    os.close(writer)
+    assert process.communicate(timeout=60)[1] == b""
+    assert process.returncode == 141
+
+
+class TestOutputs:
+    @pytest.mark.parametrize(
+        "arguments",
+        [
+            ("fit", "photo.png", "-o"),
+            ("fit", "photo.png", "--plot"),
+            ("fit", "photo.png", "--checkpoint"),
+            ("render", "scene.safetensors", "-o"),
+            ("segment", "photo.png", "-o"),
+            ("segment", "photo.png", "-o", "map.png", "--overlay"),
+            ("encode", "scene.safetensors", "-o"),
+            ("export", "scene.safetensors", "-o"),
+        ],
+    )
+    @pytest.mark.parametrize("place", ["folder", "nowhere/x", "sealed/x"])
+    def test_are_tried_before_the_work(
+        self, files: Path, run: Any, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], place: str
+    ) -> None:
+        suffix = {"export": ".onnx", "encode": ".kcgs", "fit": ".safetensors"}.get(arguments[0], ".png")
+        place += ".png" if arguments[-1] == "--plot" else suffix
+        (files / f"folder{Path(place).suffix}").mkdir()
+        if place.startswith("sealed"):
+            (files / "sealed").mkdir()
+            make = tempfile.TemporaryFile
+
+            # the tests may run as root, to whom a mode forbids nothing
+            def refuse(*, dir: Path) -> Any:
+                if dir.name == "sealed":
+                    raise PermissionError(13, "Permission denied")
+                return make(dir=dir)
+
+            monkeypatch.setattr("kcgs._atomic.tempfile.TemporaryFile", refuse)
+        monkeypatch.setattr("kcgs.data.load_image", press)
+        monkeypatch.setattr("kcgs.load", press)
+        before = sorted(files.rglob("*"))
+        code, out, err = run(*arguments, place)
+        option = "--output" if arguments[-1] == "-o" else arguments[-1]
+        assert (code, out) == (1, "") and err.startswith(f"kcgs: {option} ") and err.count("\n") == 1, err
+        assert sorted(files.rglob("*")) == before
