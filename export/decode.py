@@ -38,7 +38,7 @@ except ImportError as missing:
 MAX_SIDE = 1 << 20
 _FORMAT, _VERSION = "kcgs.decoder", "1"
 _PARTS = 1 << 20
-_SCENE_FORMAT, _SCENE_VERSIONS = "kcgs.scene", ("1", "2")
+_SCENE_FORMAT, _SCENE_VERSIONS = "kcgs.scene", ("1", "2", "3")
 _FLOAT, _INTEGER = "tensor(float)", "tensor(int64)"
 _OPTIONAL = {"view": _FLOAT, "visible": _FLOAT}
 _INPUTS = {
@@ -50,6 +50,9 @@ _FLOATS = {"F32": "<f4", "F64": "<f8"}
 _INTEGERS = {"U8": "u1", "U16": "<u2", "I32": "<i4", "I64": "<i8"}
 _REQUIRED = ("means", "cholesky", "colors")
 _TENSORS = dict.fromkeys((*_REQUIRED, "opacities"), _FLOATS) | dict.fromkeys(("region_ids", "labels"), _INTEGERS)
+_DEFLATED = "labels_deflate"
+_TENSORS[_DEFLATED] = {"U8": "u1"}
+_TYPES = {"uint8": "u1", "uint16": "<u2", "int32": "<i4", "int64": "<i8"}
 _LARGEST, _SMALLEST = 1e8, 1e-6  # pixels: what kcgs itself renders
 _COLOR_TYPES = {1: 0, 3: 2, 4: 6}  # of PNG, by number of channels
 
@@ -238,7 +241,7 @@ def read_scene(path: Path) -> Scene:
     tensors, notes = _read_safetensors(path)
     if notes.get("format") != _SCENE_FORMAT or notes.get("format_version") not in _SCENE_VERSIONS:
         found = notes.get("format"), notes.get("format_version")
-        raise DecodeError(f"{path} is not a scene: its format must be {_SCENE_FORMAT}, version 1 or 2; got {found}")
+        raise DecodeError(f"{path} is not a scene: its format must be {_SCENE_FORMAT}, version 1 to 3; got {found}")
     _check_contours(path, notes)
     _check_shapes(path, tensors)
     size = _note_side(path, notes, "height"), _note_side(path, notes, "width")
@@ -298,8 +301,11 @@ def _read_safetensors(path: Path) -> tuple[dict[str, Array], dict[str, str]]:
         notes = header.pop("__metadata__", {})
         if not all(isinstance(value, str) for value in notes.values()):
             raise ValueError("metadata must be strings")
-        return {name: _read_tensor(content, 8 + length, name, header[name]) for name in header}, notes
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+        tensors = {name: _read_tensor(content, 8 + length, name, header[name]) for name in header}
+        if _DEFLATED in tensors:
+            tensors["labels"] = _inflate(tensors.pop(_DEFLATED), notes)
+        return tensors, notes
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, zlib.error) as error:
         raise DecodeError(f"{path} is not a .safetensors file, or is truncated: {_short(error, 300)}") from error
 
 
@@ -315,6 +321,18 @@ def _read_tensor(content: bytes, base: int, name: str, entry: Mapping[str, Any])
     if not start <= stop <= len(content) - base or stop - start != math.prod(shape) * dtype.itemsize:
         raise ValueError(f"{name} lies at {start}:{stop} of {len(content) - base} bytes; its shape is {_short(shape)}")
     return np.frombuffer(content, dtype, math.prod(shape), base + start).reshape(shape)
+
+
+def _inflate(data: Array, notes: Mapping[str, str]) -> Array:
+    """Unpack a label map: each row is what it differs by from the row above it."""
+    shape, dtype = json.loads(notes["labels_shape"]), np.dtype(_TYPES[notes["labels_type"]])
+    if len(shape) not in (2, 3) or not all(type(n) is int and 0 < n <= MAX_SIDE for n in shape):
+        raise ValueError(f"labels_shape must hold 1 to {MAX_SIDE} a side; got {_short(shape)}")
+    size = math.prod(shape) * dtype.itemsize
+    raw = zlib.decompressobj().decompress(data.tobytes(), size + 1)
+    if len(raw) != size:
+        raise ValueError(f"{_DEFLATED} must unpack to {size} bytes; got {len(raw)}")
+    return np.add.accumulate(np.frombuffer(raw, dtype).reshape(shape), axis=-2, dtype=dtype)
 
 
 def _note_side(path: Path, notes: Mapping[str, str], name: str) -> int:

@@ -1,16 +1,17 @@
-"""Scenes as .safetensors files, bit for bit.
+"""Scenes as .safetensors files, bit for bit; docs/files.md has the format.
 
-The tensors are ``means``, ``cholesky``, ``colors`` and, where there are some, ``opacities``, ``region_ids`` and
-``labels``. Of the metadata, ``user.`` marks the scene's own. Version 2 is written only for what version 1 cannot say:
-widths of pairs and finer maps.
+A version is written only for what those before it cannot say: 2 has widths of pairs and finer maps, 3 deflated maps.
 """
 
 from __future__ import annotations
 
 import json
+import math
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import safetensors
 import safetensors.torch
 import torch
@@ -21,13 +22,15 @@ from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
 FORMAT = "kcgs.scene"
-FORMAT_VERSIONS = ("1", "2")
+FORMAT_VERSIONS = ("1", "2", "3")
 MAX_SIDE = 1 << 20  # pixels; past it float32 centres cannot tell tenths of a pixel apart
 _USER = "user."
 _REQUIRED = ("means", "cholesky", "colors")
 _INTEGER = ("region_ids", "labels")
 _FLOATS = (torch.float32, torch.float64)
 _PACKED = (torch.uint8, torch.uint16, torch.int32, torch.int64)
+_DEFLATED = "labels_deflate"
+_LEAST = 1024  # bytes that a deflated map must save
 
 
 def serialize(scene: Scene) -> bytes:
@@ -43,6 +46,14 @@ def serialize(scene: Scene) -> bytes:
             # a copy, since safetensors refuses tensors that are views of one storage
             packed[name] = (_pack(tensor) if name in _INTEGER else tensor).clone(memory_format=torch.contiguous_format)
     _assemble(packed, notes)  # what could not be loaded is not written
+    if "labels" in packed:
+        labels = packed["labels"]
+        deflated = _deflate(labels)
+        if len(deflated) + _LEAST < labels.numel() * labels.element_size():
+            del packed["labels"]
+            packed[_DEFLATED] = torch.frombuffer(bytearray(deflated), dtype=torch.uint8)
+            notes |= {"labels_shape": json.dumps(list(labels.shape)), "labels_type": labels.numpy().dtype.name}
+            notes["format_version"] = FORMAT_VERSIONS[2]
     return _sort_header(safetensors.torch.save(packed, notes))
 
 
@@ -52,6 +63,8 @@ def deserialize(data: bytes) -> Scene:
         tensors = safetensors.torch.load(data)
         notes = _header(data).get("__metadata__", {})
         _check_format(notes)
+        if notes["format_version"] == FORMAT_VERSIONS[2]:
+            tensors["labels"] = _inflate(tensors.pop(_DEFLATED, None), notes)
         return _assemble(tensors, notes)
     except (safetensors.SafetensorError, TypeError, ValueError) as error:
         raise ValueError(str(error)) from error
@@ -88,6 +101,35 @@ def _describe_regions(regions: RegionMap) -> dict[str, str]:
 def _pack(integers: Tensor) -> Tensor:
     highest = int(integers.max()) if integers.numel() else 0
     return integers.to(next(dtype for dtype in _PACKED if highest <= torch.iinfo(dtype).max))
+
+
+def _deflate(labels: Tensor) -> bytes:
+    """Compress what each row differs by from the row above it, in the labels' own type, which wraps."""
+    rows = labels.numpy()
+    steps = np.diff(rows, axis=-2, prepend=np.zeros_like(rows[..., :1, :]))
+    return zlib.compress(steps.astype(_little(rows.dtype)).tobytes(), 9)
+
+
+def _inflate(data: Tensor | None, notes: Mapping[str, str]) -> Tensor:
+    try:
+        shape, dtype = json.loads(notes.get("labels_shape", "")), notes.get("labels_type", "")
+        if data is None or dtype not in [str(packed).removeprefix("torch.") for packed in _PACKED]:
+            raise ValueError(f"no tensor {_DEFLATED}, or one of the type {dtype!r}")
+        if len(shape) not in (2, 3) or not all(type(side) is int and 0 < side <= MAX_SIDE for side in shape):
+            raise ValueError(f"of shape {shape}")
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        unpacker = zlib.decompressobj()
+        raw = unpacker.decompress(data.numpy().tobytes(), size + 1)
+        if len(raw) != size or not unpacker.eof:
+            raise ValueError(f"{size} bytes do not come out of it")
+    except (TypeError, ValueError, OverflowError, RecursionError, zlib.error) as error:
+        raise ValueError(f"{_DEFLATED} must be a deflated label map; {error}") from None
+    steps = np.frombuffer(raw, _little(np.dtype(dtype))).astype(dtype).reshape(shape)
+    return torch.from_numpy(np.add.accumulate(steps, axis=-2, dtype=steps.dtype))
+
+
+def _little(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    return dtype.newbyteorder("<")
 
 
 def _sort_header(content: bytes) -> bytes:

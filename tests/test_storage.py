@@ -18,7 +18,7 @@ from torch import Tensor
 import kcgs
 from kcgs import GaussianField, RegionMap, Scene, load, save
 from kcgs.scene import scene_bytes
-from kcgs.storage import FORMAT, MAX_SIDE
+from kcgs.storage import FORMAT, MAX_SIDE, deserialize
 
 SIZE = (9, 11)
 Softness = float | dict[tuple[int, int], float]
@@ -237,6 +237,54 @@ class TestFormat:
         assert (notes["format_version"], notes["softness"], notes["supersample"]) == ("2", "0.5", "2")
         assert header["labels"]["shape"] == [18, 22]
 
+    @pytest.mark.parametrize("highest", [7, 300, 70_000, 1 << 40])
+    @pytest.mark.parametrize("kind", ["plain", "pairs", "fine", "batch"])
+    def test_large_maps_are_deflated(self, path: Path, highest: int, kind: str) -> None:
+        labels = labels_with(highest, (90, 110) if kind == "fine" else (45, 55))
+        softness: Softness = {(0, 1): 0.25} if kind == "pairs" else 0.0
+        labels = torch.stack([labels, labels.flip(1)]) if kind == "batch" else labels
+        regions = RegionMap.from_labels(labels, softness, supersample=2 if kind == "fine" else 1)
+        field = GaussianField.random(5, (45, 55), seed=0)
+        if kind == "batch":
+            parts = (field.means, field.cholesky, field.colors)
+            field = GaussianField(*(t.detach().expand(2, -1, -1) for t in parts), size=(45, 55))
+        scene = Scene(field, regions)
+        assert save(path, scene) < 5 * 32 + 1_200 + (200 if kind == "fine" else 0) + (160 if kind == "batch" else 0)
+        notes = read_header(path)[0]["__metadata__"]
+        assert notes["format_version"] == "3" and json.loads(notes["labels_shape"]) == list(labels.shape)
+        assert_same_scene(load(path), scene.field, regions)
+
+    def test_old_files_load_as_before(self, path: Path) -> None:
+        """Raw maps of any size: what versions 1 and 2 wrote."""
+        field, labels = GaussianField.random(5, (45, 55), seed=0), labels_with(300, (45, 55))
+        tensors = {name: getattr(field, name).detach() for name in ("means", "cholesky", "colors")}
+        tensors |= {"labels": labels.to(torch.uint16)}
+        notes = {"format": FORMAT, "height": "45", "width": "55"}
+        for version, softness, width in (("1", "0.5", 0.5), ("2", "[[0,1,0.25]]", {(0, 1): 0.25})):
+            data = safetensors.torch.save(tensors, notes | {"format_version": version, "softness": softness})
+            assert_same_scene(deserialize(data), field, RegionMap.from_labels(labels, width))
+
+    @pytest.mark.parametrize(
+        ("edit", "message"),
+        [
+            (lambda h: h["__metadata__"].pop("labels_shape"), "labels_deflate must be a deflated label map"),
+            (lambda h: h["__metadata__"].update(labels_shape="[45, 56]"), "2520 bytes do not come out"),
+            (lambda h: h["__metadata__"].update(labels_shape="[45, 54]"), "2430 bytes do not come out"),
+            (lambda h: h["__metadata__"].update(labels_shape="[-1]"), "shape"),
+            (lambda h: h["__metadata__"].update(labels_type="float32"), "of the type 'float32'"),
+            (lambda h: h["__metadata__"].update(format_version="2"), "unknown: ."),
+            (lambda h: h["labels_deflate"].update(data_offsets=h["colors"]["data_offsets"]), "deserializing"),
+        ],
+    )
+    def test_damaged_maps_are_refused(self, path: Path, edit: Callable[[dict[str, Any]], None], message: str) -> None:
+        save(path, Scene(GaussianField.random(5, (45, 55), seed=0), labels_with(7, (45, 55))))
+        header, body = read_header(path)
+        edit(header)
+        write_header(path, header, body)
+        with pytest.raises(ValueError, match=message) as caught:
+            load(path)
+        assert "\n" not in str(caught.value)
+
     def test_absent_things_take_no_room(self, path: Path) -> None:
         save(path, Scene(make_field(opacities=False)))
         header, body = read_header(path)
@@ -367,8 +415,8 @@ class TestLoadRefuses:
         ("edit", "message"),
         [
             (_note("format", "pt"), r"its format must be 'kcgs\.scene'; got 'pt'"),
-            (_note("format_version", "3"), r"its format version must be one of \('1', '2'\); got '3'"),
-            (_drop("format_version"), r"its format version must be one of \('1', '2'\); got None"),
+            (_note("format_version", "4"), r"its format version must be one of \('1', '2', '3'\); got '4'"),
+            (_drop("format_version"), r"its format version must be one of \('1', '2', '3'\); got None"),
             (_note("softness", "[[0,1,0.7]]"), r"softness must be a number; got '\[\[0,1,0.7\]\]'"),
             (_drop("height"), "height must be a whole number"),
             (_note("height", "0"), "height must be a whole number of 1 to 1048576 pixels; got '0'"),

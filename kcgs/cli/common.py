@@ -111,7 +111,8 @@ def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
 
     table = Table("", title, show_header=True)
     for key, value in report.items():
-        table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
+        if value is not None:
+            table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
     print_table(table)
 
 

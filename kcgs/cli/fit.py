@@ -75,7 +75,7 @@ def fit_command(
     title = f"{output}: {len(fitted.scene)} Gaussians, stopped by {result.stop_reason}"
     if result.removed:
         title += f"; {result.removed} useless ones removed, which changed no value by more than {result.change:.1g}"
-    report = measure_scene(fitted.scene, target, labels, fitted.num_bytes, result.history[-1].seconds)
+    report = measure_scene(fitted.scene, target, labels, output, fitted.num_bytes, result.history[-1].seconds)
     print_report(report, as_json, title)
     if stop.wanted:
         raise interrupted(f"saved the best so far to {output}")
@@ -147,9 +147,9 @@ def read_regions(regions: str, image: Tensor, warn: Callable[[str], None], *, pr
 
 
 def measure_scene(
-    scene: Scene, image: Tensor, labels: Tensor | None, num_bytes: int, seconds: float | None = None
+    scene: Scene, image: Tensor, labels: Tensor | None, path: Path, num_bytes: int, seconds: float | None = None
 ) -> dict[str, Any]:
-    """Compare a scene, as its file has it, with its image: what `fit` and `eval` print.
+    """Compare a scene, as its file at `path` has it, with its image: what `fit` and `eval` print.
 
     Edge-focused metrics look at the contours of `labels`; `seconds` are those of the fit, or else of the rendering.
     """
@@ -163,10 +163,11 @@ def measure_scene(
         "num_gaussians": len(scene),
         "regions": 1 if scene.regions is None else scene.regions.num_regions,
         "seconds": seconds,
-        **describe_size(num_bytes, scene.size),
+        **describe_size(path, num_bytes, scene.size),
     }
 
 
-def describe_size(num_bytes: int, size: tuple[int, int]) -> dict[str, float]:
-    """Return the size of a file, and that by the pixels of its image."""
-    return {"bytes": num_bytes, "bits_per_pixel": 8 * num_bytes / (size[0] * size[1])}
+def describe_size(path: Path, num_bytes: int, size: tuple[int, int]) -> dict[str, float | None]:
+    """Return the size of a file and, of a compressed one, that by the pixels of its image."""
+    rate = 8 * num_bytes / (size[0] * size[1]) if path.suffix == ".kcgs" else None
+    return {"bytes": num_bytes, "bits_per_pixel": rate}

@@ -127,7 +127,7 @@ class Table:
 def _text(value: Any) -> str:
     if isinstance(value, float):
         return "" if math.isnan(value) else f"{value:.6g}"
-    return str(value)
+    return "" if value is None else str(value)
 
 
 def _expand(patterns: list[str]) -> list[Path]:

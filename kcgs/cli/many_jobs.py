@@ -8,7 +8,7 @@ import time
 import warnings
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .fit import fit_into, measure_scene, read_regions
 from .options import DEFAULT_GAUSSIANS, FitRequest
@@ -64,7 +64,7 @@ def fit_one(order: Order) -> Outcome:
     return Outcome(_mark(order, fit), metrics, core_seconds, messages)
 
 
-def _measure(order: Order, fit: str | None) -> dict[str, float]:
+def _measure(order: Order, fit: str | None) -> dict[str, Any]:
     """Fit and measure; where `fit` is None, only measure: the metrics were lost with the process that had them."""
     from kcgs import load
     from kcgs.data import load_image
@@ -72,9 +72,10 @@ def _measure(order: Order, fit: str | None) -> dict[str, float]:
     image = load_image(order.image)
     labels = read_regions(_source(order), image, warnings.warn)
     if fit is None:
-        return measure_scene(load(order.output), image, labels, order.output.stat().st_size, math.nan)
+        return measure_scene(load(order.output), image, labels, order.output, order.output.stat().st_size, math.nan)
     fitted = fit_into(order.output, image, labels, order.request, notes={_NOTE: fit})
-    return measure_scene(fitted.scene, image, labels, fitted.num_bytes, fitted.result.history[-1].seconds)
+    seconds = fitted.result.history[-1].seconds
+    return measure_scene(fitted.scene, image, labels, order.output, fitted.num_bytes, seconds)
 
 
 def _source(order: Order) -> str:
@@ -132,4 +133,4 @@ def _warm_up(config: FitConfig, segments: bool) -> None:
     ramp = torch.linspace(0.0, 1.0, 192).expand(3, 192, 192)
     image = torch.where(ramp > 0.4, 0.2 * ramp, 0.5 + 0.5 * ramp)
     labels = read_regions("auto" if segments else "none", image, warnings.warn)
-    measure_scene(Scene(GaussianField.random(8, (192, 192), seed=0)), image, labels, 0)
+    measure_scene(Scene(GaussianField.random(8, (192, 192), seed=0)), image, labels, Path(), 0)

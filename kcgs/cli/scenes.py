@@ -60,7 +60,7 @@ def eval_command(
     labels = loaded.regions.labels if loaded.regions is not None else None
     if regions is not None:
         labels = load_labels(Path(regions))
-    print_report(measure_scene(loaded, target, labels, scene.stat().st_size), as_json, str(scene))
+    print_report(measure_scene(loaded, target, labels, scene, scene.stat().st_size), as_json, str(scene))
 
 
 @app.command()
@@ -79,7 +79,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
         "width": loaded.size[1],
         "regions": 1 if loaded.regions is None else loaded.regions.num_regions,
         "softness": softness,
-        **describe_size(scene.stat().st_size, loaded.size),
+        **describe_size(scene, scene.stat().st_size, loaded.size),
         **{f"metadata.{key}": value for key, value in loaded.metadata.items()},
     }
     print_report(report, as_json, str(scene))
@@ -126,7 +126,7 @@ def encode(
         "num_gaussians": len(rounded),
         "regions": 1 if rounded.regions is None else rounded.regions.num_regions,
         "layers": decoded.num_layers,
-        **describe_size(len(data), loaded.size),
+        **describe_size(output, len(data), loaded.size),
         "bits_per_gaussian": 8 * len(data) / len(rounded),
     }
     print_report(report, as_json, str(output))

@@ -46,6 +46,8 @@ class TestEncode:
         finer = json.loads(run("encode", scene, "-o", out, "--quality", 60, "--json"))
         assert finer["bytes"] > report["bytes"]
         assert report["bits_per_pixel"] == pytest.approx(8 * report["bytes"] / (48 * 64))
+        exact = json.loads(run("info", scene, "--json"))
+        assert exact["bits_per_pixel"] is None and "bits_per_pixel" not in run("info", scene)
 
     def test_with_the_image(self, scene: Path, photo: Path, tmp_path: Path) -> None:
         run("encode", scene, "-o", tmp_path / "a.kcgs", "--target-bytes", 700, "--image", photo)

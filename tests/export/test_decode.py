@@ -481,7 +481,7 @@ class TestRefusals:
         ("edit", "pattern"),
         [
             (lambda h: h["__metadata__"].update(format="pt"), "is not a scene: its format must be kcgs.scene"),
-            (lambda h: h["__metadata__"].update(format_version="3"), "is not a scene: its format must be kcgs.scene"),
+            (lambda h: h["__metadata__"].update(format_version="4"), "is not a scene: its format must be kcgs.scene"),
             (lambda h: h["__metadata__"].update(height="0"), "its height must be a whole number of 1 to 1048576"),
             (lambda h: h["__metadata__"].update(width="9" * 5000), "its width must be a whole number .*got '999"),
             (lambda h: h["__metadata__"].update(height="36"), r"labels must have the size \(36, 53\) of the scene"),
@@ -490,12 +490,15 @@ class TestRefusals:
             (lambda h: h.pop("region_ids"), "it must hold region_ids where it holds labels"),
             (lambda h: h.update(blobs=h["means"]), "a scene holds means, .*; got 'blobs'"),
             (lambda h: h["means"].update(dtype="F16"), "means must have a dtype among F32, F64; got F16"),
-            (lambda h: h["labels"].update(dtype=["I8"]), "unhashable|must have a dtype"),
+            (lambda h: h["region_ids"].update(dtype=["I8"]), "unhashable|must have a dtype"),
             (lambda h: h["means"].update(shape=[120]), r"means must have shape \(N, 2\)"),
             (lambda h: h["means"].update(shape=[1, 60, 2]), r"means must have shape \(N, 2\), of one scene"),
             (lambda h: h["means"].update(shape=[40, 3]), r"means must have shape \(N, 2\), of one scene"),
             (lambda h: h["colors"].update(shape=[30, 6]), r"colors must have shape \(N, 6\)"),
-            (lambda h: h["labels"].update(shape=[1, 37, 53]), r"labels must have shape \(H, W\)"),
+            (lambda h: h["__metadata__"].update(labels_shape="[1, 37, 53]"), r"labels must have shape \(H, W\)"),
+            (lambda h: h["__metadata__"].update(labels_shape="[37, 54]"), "labels_deflate must unpack to 7992 bytes"),
+            (lambda h: h["__metadata__"].update(labels_shape="[-37, 53]"), "labels_shape must hold 1 to 1048576"),
+            (lambda h: h["__metadata__"].update(labels_type="int8"), "int8"),
             (lambda h: h["means"].update(shape=[60, 3]), "means lies at"),
             (lambda h: h["means"].update(shape=[-60, -2]), "means must have a shape and offsets of whole numbers"),
             (lambda h: h["means"].update(data_offsets=[0, 10**12]), "means lies at"),
@@ -540,10 +543,10 @@ class TestRefusals:
     def test_negative_ids(self, files: Files, refuses: Any, tmp_path: Path) -> None:
         path = tmp_path / "scene.safetensors"
         header, body = read_header(files.scene)
-        assert header["labels"]["dtype"] == "I32"
-        at = header["labels"]["data_offsets"][0]
+        assert header["region_ids"]["dtype"] == "I32"
+        at = header["region_ids"]["data_offsets"][0]
         write_header(path, header, body[:at] + struct.pack("<i", -1) + body[at + 4 :])
-        refuses(f"{path}: labels must be non-negative; got -1", files.generic, path)
+        refuses(f"{path}: region_ids must be non-negative; got -1", files.generic, path)
 
     def test_damage_is_rendered_or_refused(self, files: Files, decode: Any, tmp_path: Path) -> None:
         content = files.scene.read_bytes()
