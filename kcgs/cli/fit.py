@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -76,7 +77,12 @@ def fit_command(
     if result.removed:
         title += f"; {result.removed} useless ones removed, which changed no value by more than {result.change:.1g}"
     report = measure_scene(fitted.scene, target, labels, output, fitted.num_bytes, result.history[-1].seconds)
+    became = result.regions
+    if as_json:
+        report["region_report"] = None if became is None else asdict(became)
     print_report(report, as_json, title)
+    if became is not None and not as_json:
+        typer.echo(f"regions: {became}")
     if stop.wanted:
         raise interrupted(f"saved the best so far to {output}")
 

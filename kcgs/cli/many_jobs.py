@@ -74,6 +74,9 @@ def _measure(order: Order, fit: str | None) -> dict[str, Any]:
     if fit is None:
         return measure_scene(load(order.output), image, labels, order.output, order.output.stat().st_size, math.nan)
     fitted = fit_into(order.output, image, labels, order.request, notes={_NOTE: fit})
+    became = fitted.result.regions
+    if order.masks and became is not None and became.kept == 1 < became.given and became.dropped != "recipe":
+        warnings.warn(f"regions: {became}", stacklevel=2)
     seconds = fitted.result.history[-1].seconds
     return measure_scene(fitted.scene, image, labels, order.output, fitted.num_bytes, seconds)
 

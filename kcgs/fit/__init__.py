@@ -2,7 +2,8 @@
 
 from .config import FitConfig, available_recipes
 from .loop import fit
+from .region_report import RegionReport
 from .state import FitResult, HistoryEntry
 from .warm_up import warm_up
 
-__all__ = ["FitConfig", "FitResult", "HistoryEntry", "available_recipes", "fit", "warm_up"]
+__all__ = ["FitConfig", "FitResult", "HistoryEntry", "RegionReport", "available_recipes", "fit", "warm_up"]

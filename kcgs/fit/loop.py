@@ -21,7 +21,7 @@ from .checkpoint import Checkpoint
 from .config import FitConfig
 from .descent import descend, log, log_is_due, render
 from .start import start
-from .state import FitResult, HistoryEntry, StopReason
+from .state import FitResult, FitState, HistoryEntry, StopReason
 from .strategies import Finish, MergeRegions, make_strategies
 
 OnStep = Callable[[int, HistoryEntry], bool | None]
@@ -53,7 +53,8 @@ def fit(
             :math:`(H, W, C)`, uint8 or floating; or a PIL image.
         regions: label map of the image's size, or a RegionMap; also says where EF-PSNR is measured. None: one region.
         num_gaussians: N, the most there may be, from 1 to the number of pixels. Where it is below the number of
-            regions, the smaller ones stay empty and black, and a UserWarning says how many.
+            regions, those most alike are merged until each has a Gaussian, or with ``merge_regions=False`` the smaller
+            ones stay empty and black; a UserWarning says how many.
         recipe: a name from :func:`available_recipes`, or settings.
         seed: of the random start.
         on_step: called after every iteration with its number (from 1) and the last history entry; returning True
@@ -65,7 +66,7 @@ def fit(
 
     Returns:
         The scene (its contours moved, its regions merged, where the recipe does so), history, why it stopped, settings,
-        and how many Gaussians were left out as useless.
+        how many Gaussians were left out as useless, and what became of the regions.
 
     Raises:
         TypeError: wrong types.
@@ -97,12 +98,7 @@ def fit(
     keeper = None if checkpoint is None else Checkpoint(checkpoint, state, regions)
     if not (keeper is not None and resume and keeper.read_into(state)) and config.merge_regions:
         MergeRegions(state).before(state)
-    if state.regions is not None and state.regions.num_regions > num_gaussians:
-        warnings.warn(
-            f"{state.regions.num_regions - num_gaussians} of {state.regions.num_regions} regions get no Gaussian and "
-            f"stay black: num_gaussians is {num_gaussians}; merge regions or take more",
-            stacklevel=4,  # past the decorators
-        )
+    _warn_of_regions(state)
 
     strategies = make_strategies(state)
     reason: StopReason | None = None
@@ -155,6 +151,23 @@ def check_num_gaussians(value: object, image: Tensor) -> int:
         size = f"{image.shape[2]} x {image.shape[1]}"
         raise ValueError(f"num_gaussians must be at most {pixels}, the pixels of the {size} image; got {count}")
     return count
+
+
+def _warn_of_regions(state: FitState) -> None:
+    """Say where there are more regions than Gaussians."""
+    num_gaussians, message = state.num_gaussians, ""
+    if state.regions is not None and (count := state.regions.num_regions) > num_gaussians:
+        message = (
+            f"{count - num_gaussians} of {count} regions get no Gaussian and stay black: num_gaussians is "
+            f"{num_gaussians}; merge regions or take more"
+        )
+    elif state.merged_for_count:
+        message = (
+            f"{state.merged_for_count} of {state.merged_for_count + num_gaussians} regions were merged with others: "
+            f"there are more than num_gaussians, {num_gaussians}"
+        )
+    if message:
+        warnings.warn(message, stacklevel=5)  # past the decorators
 
 
 def check_problem(image: Any, regions: RegionMap | Tensor | None) -> tuple[Tensor, RegionMap | None]:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap, choose_widths, edge_band, smooth_contours
+from kcgs.functional.merging import pairs_to_merge
 from kcgs.nn import GaussianField
 
 from .config import FitConfig
@@ -36,6 +37,7 @@ def start(
 ) -> FitState:
     """Return the state of a fit at its start; see :func:`kcgs.fit.fit`."""
     band = None if regions is None else edge_band(regions.labels).flatten().nonzero().flatten()
+    fitting = _as_many_as_gaussians(image, regions, num_gaussians, config)
     saturated = float(((image == 0.0) | (image == 1.0)).float().mean())
     state = FitState(
         image,
@@ -47,9 +49,11 @@ def start(
         band=None if band is None or not len(band) else band,
         # a map that comes with widths keeps them
         chooses_widths=config.softness == "auto" and regions is not None and regions.softness == 0.0,
+        given=regions,
+        merged_for_count=_count(regions) - _count(fitting),
         cutoff=max(config.cutoff, config.draft_cutoff if config.target_psnr is None else 0.0),
     )
-    begin(state, _regions_to_render(image, regions, num_gaussians, config))
+    begin(state, _regions_to_render(image, fitting, num_gaussians, config))
     return state
 
 
@@ -64,6 +68,19 @@ def begin(state: FitState, regions: RegionMap | None) -> None:
     state.iteration = 0
     searches = config.target_psnr is not None and config.densify_from < 1.0
     state.search = TargetSearch(config.target_psnr, state.num_gaussians, len(field)) if searches else None  # type: ignore[arg-type]
+
+
+def _count(regions: RegionMap | None) -> int:
+    return 1 if regions is None else regions.num_regions
+
+
+def _as_many_as_gaussians(
+    image: Tensor, regions: RegionMap | None, num_gaussians: int, config: FitConfig
+) -> RegionMap | None:
+    """Merge regions, where the config lets them merge, until each can have a Gaussian: others would be black."""
+    if regions is None or not config.merge_regions or regions.num_regions <= num_gaussians:
+        return regions
+    return regions.merge(pairs_to_merge(image, regions.labels, num_gaussians))[0]
 
 
 def _make_optimizer(config: FitConfig, field: GaussianField, sigma: float) -> GaussianOptimizer:

@@ -15,6 +15,7 @@ from kcgs.scene import Scene
 
 from .config import FitConfig
 from .optimizers import GaussianOptimizer
+from .region_report import RegionReport
 from .search import TargetSearch
 
 StopReason = Literal["iterations", "seconds", "target_psnr", "callback", "diverged"]
@@ -43,6 +44,8 @@ class FitResult(NamedTuple):
     """Gaussians that were left out at the end."""
     change: float = 0.0
     """No value of the render changed by more when they were."""
+    regions: RegionReport | None = None
+    """What became of the label map; None: none was given."""
 
 
 class Gaussians(NamedTuple):
@@ -78,6 +81,8 @@ class FitState:
     clamp: bool  # clip the render to [0, 1] in training
     band: Tensor | None  # pixels near a contour of the given map, where EF-PSNR is measured
     chooses_widths: bool  # the map came without widths, and the config asks for some
+    given: RegionMap | None  # the map as it came
+    merged_for_count: int  # regions that were merged before the fit, for they were more than Gaussians
 
     # What is rendered
     cutoff: float

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
 
@@ -12,8 +12,10 @@ from kcgs._check import check_count
 from kcgs._progress import Progress
 from kcgs.fit import FitConfig, FitResult, HistoryEntry, fit
 from kcgs.fit.loop import check_problem
+from kcgs.fit.region_report import RegionReport, report_regions
 from kcgs.functional import RegionMap, merge_regions
 from kcgs.functional.labels import contour_edges
+from kcgs.functional.merging import pairs_to_merge
 from kcgs.scene import Scene
 
 from .compress import compress
@@ -52,7 +54,7 @@ def fit_bytes(
     One trade decides: what the last bit saves. The number of Gaussians is that at which another one, or more digits
     for all, would save as much. A pixel of contour must save what the bits that the coder needs for it would save as
     Gaussians, else it moves or its regions are merged. The map as a whole stays only where two short fits, with it and
-    with Gaussians for its bytes, say so, within 0.1 dB.
+    with Gaussians for its bytes, say so, within 0.1 dB. ``result.regions`` says what became of it.
 
     Args:
         image: as in :func:`kcgs.fit.fit`.
@@ -82,12 +84,15 @@ def fit_bytes(
     image, regions = check_problem(image, regions)
     check_count("num_bytes", num_bytes)
     with Progress("trial fits", known=False, shown=progress):
-        regions, cost = _choose(image, regions, num_bytes, config, seed)
-    count = count_for(num_bytes - _map_bytes(regions), image.shape[1] * image.shape[2])
-    result = fit(image, regions, count, recipe=config, seed=seed, on_step=on_step, progress=progress, contour_cost=cost)
+        chosen = _choose(image, regions, num_bytes, config, seed)
+    count = count_for(num_bytes - _map_bytes(chosen.regions), image.shape[1] * image.shape[2])
+    result = fit(
+        image, chosen.regions, count,
+        recipe=config, seed=seed, on_step=on_step, progress=progress, contour_cost=chosen.cost,
+    )  # fmt: skip
     with Progress("writing the file", known=False, shown=progress):
         data, scene = compress(result.scene, image, target_bytes=num_bytes, seed=seed)
-    return FitBytesResult(data, scene, result)
+    return FitBytesResult(data, scene, result._replace(regions=_report(regions, chosen, result)))
 
 
 def count_for(num_bytes: float, pixels: int) -> int:
@@ -99,13 +104,19 @@ def count_for(num_bytes: float, pixels: int) -> int:
     return min(max(1, round(count)), pixels)
 
 
-def _choose(
-    image: Tensor, regions: RegionMap | None, num_bytes: int, config: FitConfig, seed: int
-) -> tuple[RegionMap | None, float]:
-    """Return the map, or None where its bytes do more as Gaussians, and what a pixel of contour must save."""
+class _Choice(NamedTuple):
+    regions: RegionMap | None  # None: its bytes do more as Gaussians
+    cost: float  # what a pixel of contour must save
+    dropped: bool = False  # as a whole
+    merged_for_bytes: int = 0
+    merged_for_count: int = 0
+
+
+def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: FitConfig, seed: int) -> _Choice:
+    """Choose the regions that pay for their bytes."""
     if regions is None or regions.num_regions == 1:
-        return None, config.contour_cost
-    pixels = image.shape[1] * image.shape[2]
+        return _Choice(None, config.contour_cost)
+    given, pixels = regions.num_regions, image.shape[1] * image.shape[2]
     # by iterations, so that the same arguments give the same file
     iterations = min(_TRIAL_ITERATIONS, config.iterations)
     shorter = {"iterations": iterations, "max_seconds": None, "merge_regions": False, "refine_flat": False}
@@ -123,10 +134,28 @@ def _choose(
     cost = saved * bits
     if config.merge_regions and regions.softness == 0.0 and regions.supersample == 1:
         regions = RegionMap.from_labels(merge_regions(image, regions.labels, cost))
+    paying, count = regions.num_regions, count_for(num_bytes - _map_bytes(regions), pixels)
+    if config.merge_regions and paying > count:
+        regions = regions.merge(pairs_to_merge(image, regions.labels, count))[0]
+    merged = given - paying, paying - (1 if regions is None else regions.num_regions)
+    if regions is None or regions.num_regions == 1:
+        return _Choice(None, cost, False, *merged)
     left = num_bytes - _map_bytes(regions)
-    if regions.num_regions == 1 or count_for(left, pixels) < regions.num_regions:
-        return None, cost
-    return (regions if error(regions, left) < _FAVOUR * without else None), cost
+    if count_for(left, pixels) < regions.num_regions or error(regions, left) >= _FAVOUR * without:
+        return _Choice(None, cost, dropped=True)
+    return _Choice(regions, cost, False, *merged)
+
+
+def _report(given: RegionMap | None, chosen: _Choice, result: FitResult) -> RegionReport | None:
+    dropped: Literal["recipe", "bytes"] | None = "bytes" if chosen.dropped else None
+    of_fit = 0 if result.regions is None else result.regions.merged_for_count
+    return report_regions(
+        given,
+        result.scene,
+        merged_for_count=chosen.merged_for_count + of_fit,
+        merged_for_bytes=chosen.merged_for_bytes,
+        dropped=dropped if result.config.guidance else "recipe",
+    )
 
 
 def _map_bytes(regions: RegionMap | None) -> int:

@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import as_image, check_count, check_labels
-from kcgs.functional import contour_edges
-from kcgs.functional.labels import compact, unique_pairs
+from kcgs.functional.labels import compact
+from kcgs.functional.merging import Labels, RegionGraph, merge_nearest
 
 # By how much values may pass [0, 1], as resizing and colour conversion leave them.
 _TOLERANCE = 1e-3
 
-Labels = NDArray[np.int64]
 Colors = NDArray[np.float64]
 
 
@@ -122,7 +121,7 @@ def merge_similar(image: Any, labels: Tensor, max_regions: int | None) -> Tensor
     check_count("max_regions", max_regions)
     lab, ids, regions = lab_and_regions(image, labels)
     graph = RegionGraph(regions)
-    _merge_nearest(graph, lab_sums(lab, regions), max_regions)
+    merge_nearest(graph, lab_sums(lab, regions), max_regions)
     return torch.from_numpy(ids[graph.roots()][regions]).to(labels.device)
 
 
@@ -130,65 +129,6 @@ def clean(labels: Tensor, min_size: int) -> Tensor:
     """Return 4-connected regions of at least ``min_size`` pixels, by decreasing area."""
     # Pieces of one region become one piece where what lay between them joins it: connect after merging.
     return order_by_area(connected_regions(merge_small(labels, min_size)))
-
-
-class RegionGraph:
-    """Which of the regions 0 to R - 1 touch and along how many pixel sides, kept up to date while regions merge."""
-
-    def __init__(self, labels: Labels) -> None:
-        """Count areas and shared sides."""
-        self.areas: Labels = np.bincount(labels.ravel())
-        self.borders: list[dict[int, int]] = [{} for _ in self.areas]
-        self._parents = np.arange(len(self.areas))
-        pairs, _, lengths = unique_pairs(contour_edges(torch.from_numpy(labels))[0])
-        for (a, b), length in zip(pairs.tolist(), lengths.tolist(), strict=True):
-            self.borders[a][b] = self.borders[b][a] = length
-
-    def merge(self, source: int, target: int) -> None:
-        """Let ``target`` take in its neighbour ``source``."""
-        self._parents[source] = target
-        self.areas[target] += self.areas[source]
-        for other, length in self.borders[source].items():
-            del self.borders[other][source]
-            if other != target:
-                self.borders[target][other] = self.borders[target].get(other, 0) + length
-                self.borders[other][target] = self.borders[target][other]
-        self.borders[source] = {}
-
-    def roots(self) -> Labels:
-        """Return for every region the one it is part of now."""
-        roots = self._parents
-        while (roots != roots[roots]).any():
-            roots = roots[roots]
-        return roots
-
-
-def _merge_nearest(graph: RegionGraph, sums: Colors, max_regions: int) -> None:
-    """Merge the nearest pair while there are too many regions; ``sums`` holds colours times areas."""
-
-    def distance(a: int, b: int) -> float:
-        return float(np.linalg.norm(sums[a] / graph.areas[a] - sums[b] / graph.areas[b]))
-
-    # Distances change with every merge; entries of before one are told by the regions' borders and areas.
-    queue = [
-        (distance(a, b), a, b, graph.areas[a], graph.areas[b])
-        for a, others in enumerate(graph.borders)
-        for b in others
-        if a < b
-    ]
-    heapq.heapify(queue)
-    count = len(graph.areas)
-    while count > max_regions:
-        _, a, b, area_a, area_b = heapq.heappop(queue)
-        if b not in graph.borders[a] or (area_a, area_b) != (graph.areas[a], graph.areas[b]):
-            continue
-        source, target = (a, b) if area_a < area_b else (b, a)
-        graph.merge(source, target)
-        sums[target] += sums[source]
-        count -= 1
-        for other in graph.borders[target]:
-            low, high = min(target, other), max(target, other)
-            heapq.heappush(queue, (distance(low, high), low, high, graph.areas[low], graph.areas[high]))
 
 
 def to_pixels(image: Tensor) -> NDArray[np.float32]:

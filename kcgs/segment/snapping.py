@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_count
-from kcgs.segment.cleanup import Labels, RegionGraph, lab_and_regions, lab_sums
+from kcgs.functional.merging import Labels, RegionGraph
+from kcgs.segment.cleanup import lab_and_regions, lab_sums
 
 # A region with a smaller share of its pixels further than `reach` inside is a ribbon.
 _CORE_SHARE = 0.1

@@ -60,10 +60,11 @@ FIT = ("fit", "photo.png", "-n", "12", "--iterations", "40", "-o", "scene.safete
 
 class TestFit:
     def test_plot_and_kept_contours(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        code, _, err = kcgs(*FIT, "--regions", "mask.png", "--keep-contours", "--plot", "plot.png", capsys=capsys)
+        code, out, err = kcgs(*FIT, "--regions", "mask.png", "--keep-contours", "--plot", "plot.png", capsys=capsys)
         assert code == 0, err
         with Image.open("plot.png") as plot:
             assert plot.width > 500
+        assert "\nregions: 2 of 2 regions kept\n" in out
         regions = load("scene.safetensors").regions
         assert regions is not None
         assert torch.equal(regions.labels, load_labels(Path("mask.png")))
@@ -92,7 +93,8 @@ class TestFit:
         code, out, err = kcgs(*FIT, "--regions", regions, "--json", capsys=capsys)
         assert code == 0, err
         report = json.loads(out)
-        assert set(report) == KEYS
+        assert set(report) == {*KEYS, "region_report"}
+        assert (report["region_report"] is None) == (regions == "none")
         assert 1 <= report["num_gaussians"] <= 12
         assert report["bytes"] == (files / "scene.safetensors").stat().st_size
         assert (report["ef_psnr"] is None) == (regions == "none")

@@ -187,6 +187,13 @@ class TestFailures:
         code, _, err = kcgs("photos/a.png", *SETTINGS, "--regions", "masks", "-n", "1", "--keep-contours")
         assert code == 0 and "a.png: " in err and "region" in err
 
+    def test_a_mask_that_is_lost_is_said(self, files: Path, kcgs: Any) -> None:
+        y, x = torch.meshgrid(torch.arange(40), torch.arange(60), indexing="ij")
+        save_image("photos/a.png", torch.stack([0.5 + 0.3 * torch.sin(0.11 * x + 0.07 * k * y) for k in range(3)]))
+        save_labels("masks/a.png", (x // 6 + y // 6) % 2)
+        code, _, err = kcgs("photos/a.png", *SETTINGS, "--regions", "masks", "--iterations", "60", "-n", "24")
+        assert code == 0 and "a.png: regions: 2 regions became one; 1 merged: their contours do not help" in err
+
     def test_refused_before_the_work(self, files: Path, kcgs: Any) -> None:
         save_image("masks/d.jpg", torch.zeros(3, 20, 20))
         for arguments, message in (

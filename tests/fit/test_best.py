@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcgs import FitConfig, RegionMap, fit
 from kcgs.data import chart_2x3, chart_pie
-from kcgs.fit import FitResult
+from kcgs.fit import FitResult, RegionReport
 from kcgs.functional import edge_band, psnr
 
 
@@ -123,6 +123,8 @@ class TestContours:
         result = fit(smooth, board, 24, recipe=quick(move_contours=False))
         assert result.scene.regions is None
         assert result.scene.field.region_ids is None
+        assert result.regions == RegionReport(2, 1, merged_by_trial=1)
+        assert str(result.regions) == "2 regions became one; 1 merged: their contours do not help"
         assert fit(smooth, board, 24, recipe=quick(move_contours=False, merge_regions=False)).scene.regions is not None
         assert fit(image, labels, 24, recipe=quick()).scene.regions is not None
 
@@ -246,6 +248,36 @@ class TestHardCases:
         with pytest.warns(UserWarning, match="11 of 16 regions get no Gaussian and stay black"):
             result = fit(image, labels, 5, recipe=quick(iterations=10, move_contours=False, merge_regions=False))
         assert len(result.scene.field) <= 5
+        assert result.regions == RegionReport(16, 16, empty=11)
+        assert str(result.regions) == "16 of 16 regions kept; 11 without a Gaussian, black"
+
+
+class TestRegionReport:
+    @pytest.mark.parametrize("given", [15, 192])
+    def test_more_regions_than_gaussians_merge(self, given: int) -> None:
+        """Cells of the scene's own map: what is left follows the disc, and no region is black."""
+        image, labels = scene()
+        side = 16 if given == 15 else 4
+        cells = (torch.arange(48)[:, None] // side) * 64 + torch.arange(64) // side
+        cells = 10_000 * labels + cells
+        with pytest.warns(UserWarning, match=r"of \d+ regions were merged with others: there are more than"):
+            result = fit(image, cells, 12, recipe=quick(iterations=60))
+        report = result.regions
+        assert report is not None and report.given == len(cells.unique()) > 12 >= report.kept > 1
+        assert report.merged_for_count == report.given - 12
+        assert report.given == report.kept + report.merged_for_count + report.merged_by_trial
+        assert result.history[-1].psnr > fit(image, None, 12, recipe=quick(iterations=60)).history[-1].psnr + 1
+
+    def test_moved_pixels_are_counted(self) -> None:
+        image, labels = scene()
+        shifted = labels.roll(1, 1)
+        result = fit(image, shifted, 40, recipe=quick(merge_regions=False))
+        assert result.scene.regions is not None and result.regions is not None
+        assert result.regions.moved_pixels == int((result.scene.regions.labels != shifted).sum()) > 20
+        assert fit(image, labels, 12, recipe=quick("best-baseline", iterations=2)).regions == RegionReport(
+            2, 1, dropped="recipe"
+        )
+        assert fit(image, None, 12, recipe=quick(iterations=2)).regions is None
 
 
 class TestReviewed:

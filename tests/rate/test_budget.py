@@ -33,7 +33,10 @@ class TestFitBytes:
         image, _ = photo
         noise = torch.randint(0, 2, (30, 40), generator=torch.Generator().manual_seed(0))
         speckled = noise.repeat_interleave(4, 0).repeat_interleave(4, 1)
-        assert fit_bytes(image, speckled, 900, iterations=150).scene.regions is None
+        done = fit_bytes(image, speckled, 900, iterations=150)
+        report = done.result.regions
+        assert done.scene.regions is None and report is not None
+        assert (report.given, report.kept) == (2, 1) and (report.dropped == "bytes" or report.merged_for_bytes == 1)
 
     def test_a_map_that_pays_stays(self) -> None:
         image = torch.full((3, 96, 128), 0.1)
@@ -42,6 +45,7 @@ class TestFitBytes:
         image[:, disc] = 0.9
         done = fit_bytes(image, disc.long(), 250, iterations=150)
         assert done.scene.regions is not None and psnr(done.scene, image) > 35
+        assert done.result.regions is not None and done.result.regions.kept == done.result.regions.given == 2
 
     def test_count_grows_with_bytes(self) -> None:
         counts = [count_for(size, 10_000) for size in (100, 1000, 8000, 50_000)]

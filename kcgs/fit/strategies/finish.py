@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 
 from kcgs.fit.descent import log, render
 from kcgs.fit.levenberg_marquardt import is_flat, levenberg_marquardt
+from kcgs.fit.region_report import report_regions
 from kcgs.fit.state import FitResult, FitState, Gaussians, StopReason
 from kcgs.pruning import prune
 from kcgs.scene import Scene
@@ -54,9 +56,16 @@ class Finish:
         if config.refine_flat and reason == "iterations" and is_flat(state.image, scene.regions, len(scene)):
             scene = self._refined(state, scene)
         if config.prune == 0:
-            return FitResult(scene, state.history, reason, config)
+            return self._result(state, scene, reason)
         left = prune(scene, config.prune, cutoff=config.cutoff, backend=config.backend)
-        return FitResult(left.scene, state.history, reason, config, left.removed, left.change)
+        return self._result(state, left.scene, reason, left.removed, left.change)
+
+    def _result(
+        self, state: FitState, scene: Scene, reason: StopReason, removed: int = 0, change: float = 0.0
+    ) -> FitResult:
+        dropped: Literal["recipe"] | None = None if state.config.guidance else "recipe"
+        regions = report_regions(state.given, scene, merged_for_count=state.merged_for_count, dropped=dropped)
+        return FitResult(scene, state.history, reason, state.config, removed, change, regions)
 
     def _refined(self, state: FitState, scene: Scene) -> Scene:
         """Refine a flat scene to its last digits, and write them down."""

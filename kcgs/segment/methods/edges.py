@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_count, check_number
-from kcgs.segment.cleanup import Labels, clean, merge_similar, rgb_to_lab
+from kcgs.functional.merging import Labels
+from kcgs.segment.cleanup import clean, merge_similar, rgb_to_lab
 from kcgs.segment.registry import Cleanup, register
 
 # Basins below this share of the smallest region go to their longest border first: hundreds of specks would use up the

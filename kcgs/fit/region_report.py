@@ -1,0 +1,98 @@
+"""What became of a label map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+
+from kcgs.functional import RegionMap
+from kcgs.scene import Scene
+
+
+@dataclass(frozen=True)
+class RegionReport:
+    """What became of the regions of a label map; as text, one line.
+
+    `given` is the sum of `kept` and of what was merged, unless the map was dropped as a whole.
+
+    Example:
+        >>> print(RegionReport(given=40, kept=28, merged_for_count=10, merged_by_trial=2))
+        28 of 40 regions kept; 10 merged: more than Gaussians; 2 merged: their contours do not help
+    """
+
+    given: int
+    """Regions of the map that was given."""
+    kept: int
+    """Regions of the scene; 1: it has no map."""
+    merged_for_count: int = 0
+    """Regions that went into others since there were more than Gaussians."""
+    merged_for_bytes: int = 0
+    """Those whose contours save less error than Gaussians for their bytes."""
+    merged_by_trial: int = 0
+    """Those whose contours do not help."""
+    dropped: Literal["recipe", "bytes"] | None = None
+    """Why the map is not used: the recipe confines nothing, or the map's bytes do more as Gaussians."""
+    moved_pixels: int = 0
+    """Pixels of the image that moved to another region."""
+    empty: int = 0
+    """Regions of the scene without a Gaussian: they are black."""
+
+    def __str__(self) -> str:
+        if self.dropped is not None:
+            why = "the recipe uses none" if self.dropped == "recipe" else "its bytes do more as Gaussians"
+            return f"the map of {_count(self.given)} was dropped: {why}"
+        parts = [f"{self.kept} of {_count(self.given)} kept"]
+        if self.kept == 1 < self.given:
+            parts = [f"{self.given} regions became one"]
+        merged = {
+            "more than Gaussians": self.merged_for_count,
+            "their contours save less than their bytes": self.merged_for_bytes,
+            "their contours do not help": self.merged_by_trial,
+        }
+        parts += [f"{number} merged: {why}" for why, number in merged.items() if number]
+        if self.moved_pixels:
+            parts.append(f"{self.moved_pixels} pixel{'s' * (self.moved_pixels > 1)} moved to others")
+        if self.empty:
+            parts.append(f"{self.empty} without a Gaussian, black")
+        return "; ".join(parts)
+
+
+def _count(number: int) -> str:
+    return f"{number} region{'s' * (number > 1)}"
+
+
+def report_regions(
+    given: RegionMap | None,
+    scene: Scene,
+    *,
+    merged_for_count: int = 0,
+    merged_for_bytes: int = 0,
+    dropped: Literal["recipe", "bytes"] | None = None,
+) -> RegionReport | None:
+    """Compare the map that was given with the scene's; what was merged and not counted here a trial has merged."""
+    if given is None:
+        return None
+    if dropped is not None:
+        return RegionReport(given.num_regions, 1, dropped=dropped)
+    regions, ids = scene.regions, scene.field.region_ids
+    kept = 1 if regions is None else regions.num_regions
+    return RegionReport(
+        given.num_regions,
+        kept,
+        merged_for_count,
+        merged_for_bytes,
+        given.num_regions - kept - merged_for_count - merged_for_bytes,
+        moved_pixels=0 if regions is None else _moved_pixels(given, regions),
+        empty=0 if regions is None or ids is None else int((~torch.isin(regions.ids, ids)).sum()),
+    )
+
+
+def _moved_pixels(given: RegionMap, regions: RegionMap) -> int:
+    """Count the pixels that are not where their region went: under its own id, or where most of its pixels are."""
+    before, after = given.index_of(given.labels).flatten(), regions.index_of(regions.labels).flatten()
+    shared = torch.bincount(before * regions.num_regions + after, minlength=given.num_regions * regions.num_regions)
+    into, same = shared.view(given.num_regions, -1).argmax(1), regions.index_of(given.ids)
+    into = torch.where(same >= 0, same, into)
+    return int((into[before] != after).sum())
