@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,11 +34,11 @@ class Segmentation(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """What a method says of every pixel, before clean-up."""
+    """What a method says of every pixel, before clean-up; tensors or numpy arrays."""
 
-    labels: Tensor
-    """:math:`(H, W)` integer, non-negative."""
-    scores: Tensor | None = None
+    labels: Any
+    """:math:`(H, W)`, whole numbers of any dtype, also bool, non-negative."""
+    scores: Any = None
     """:math:`(H, W)` in [0, 1], NaN where the method says nothing; None: no scores."""
     names: Sequence[str] | None = None
     """What the labels are called, from 0 on; None: the method knows no names."""
@@ -143,13 +144,43 @@ class _Method:
                 raise
             line = f"pip install {_PACKAGES.get(module, module)}"
             raise ImportError(f"segmentation method {self.name!r} needs {module}: {line} ({error})") from error
-        found = Prediction(found) if isinstance(found, Tensor) else found
-        if found.labels.shape != pixels.shape[1:]:
+        return cleanup.apply(pixels, self._checked(found, tuple(pixels.shape[1:])))
+
+    def _checked(self, found: Any, size: tuple[int, ...]) -> Prediction:
+        """Return what the function gave with int64 labels; refuse what says no region for every pixel."""
+        found = found if isinstance(found, Prediction) else Prediction(found)
+        values = self._of_pixels("labels", found.labels, size)
+        labels = values if values.is_complex() else values.long()
+        if values.is_complex() or not torch.equal(labels.to(values.dtype), values):
+            raise ValueError(f"labels from segmentation method {self.name!r} must be whole numbers; got {values.dtype}")
+        if labels.min() < 0:
             raise ValueError(
-                f"labels from segmentation method {self.name!r} must have the image's size "
-                f"{tuple(pixels.shape[1:])}; got {tuple(found.labels.shape)}"
+                f"labels from segmentation method {self.name!r} must be non-negative; got {int(labels.min())}: give "
+                "the pixels of no region an id of their own"
             )
-        return cleanup.apply(pixels, found)
+        if found.names is not None and labels.max() >= len(found.names):
+            raise ValueError(
+                f"names from segmentation method {self.name!r} must say what label {int(labels.max())} is; got "
+                f"{len(found.names)} names"
+            )
+        scores = None if found.scores is None else self._of_pixels("scores", found.scores, size)
+        return Prediction(labels, scores, found.names)
+
+    def _of_pixels(self, what: str, values: Any, size: tuple[int, ...]) -> Tensor:
+        if isinstance(values, np.ndarray) and values.dtype.kind in "biuf":
+            values = torch.from_numpy(np.ascontiguousarray(values))
+        if not isinstance(values, Tensor):
+            kind = f"an array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
+            raise TypeError(
+                f"{what} from segmentation method {self.name!r} must be a Tensor or a numpy array of numbers; "
+                f"got {kind}"
+            )
+        if tuple(values.shape) != size:
+            raise ValueError(
+                f"{what} from segmentation method {self.name!r} must have the image's size {size}; got "
+                f"{tuple(values.shape)}"
+            )
+        return values.detach()
 
 
 _methods: dict[str, _Method] = {}
@@ -159,7 +190,8 @@ def register(name: str, cleanup: Cleanup | None = None) -> Callable[[Callable[..
     """Make a function a segmentation method.
 
     The function gets the image as a checked tensor :math:`(3, H, W)` float32 in [0, 1] and its own keyword options. It
-    returns labels :math:`(H, W)`, or a `Prediction` with scores and names. Where it has a parameter with the name of a
+    returns labels :math:`(H, W)`, or a `Prediction` with scores and names: whole numbers from 0 on, of any dtype, bool
+    and numpy arrays too; what else it returns is refused when it is called. Where it has a parameter with the name of a
     clean-up option, it gets the value that the clean-up will use, ``min_size`` in pixels. It imports optional libraries
     when it runs.
 

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import PIL.Image
 import pytest
 import torch
@@ -85,6 +86,44 @@ class TestRegistry:
         monkeypatch.setattr("kcgs.segment.registry._methods", dict(_methods))
         register("test")(lambda image: torch.zeros(2, 2, dtype=torch.int64))
         with pytest.raises(ValueError, match=r"method 'test' must have the image's size \(20, 30\); got \(2, 2\)"):
+            segment(two_colors(), "test")
+
+    @pytest.mark.parametrize(
+        "labels",
+        [
+            lambda columns: columns >= 10,
+            lambda columns: (columns >= 10).half(),
+            lambda columns: (columns >= 10).double().numpy(),
+            lambda columns: (columns >= 10).numpy().astype("uint16")[:, ::-1],
+            lambda columns: ((columns >= 10) * 2**40 + 7).expand(20, 30).T.contiguous().T,
+        ],
+    )
+    def test_labels_of_other_kinds(self, monkeypatch: pytest.MonkeyPatch, labels: Any) -> None:
+        monkeypatch.setattr("kcgs.segment.registry._methods", dict(_methods))
+        register("test")(lambda image: labels(torch.arange(30).expand(20, 30)))
+        found = segment(two_colors(), "test")
+        assert found.dtype == torch.int64 and found.shape == (20, 30)
+        assert found.flatten().bincount().tolist() == [400, 200]  # by area
+
+    @pytest.mark.parametrize(
+        ("labels", "error", "message"),
+        [
+            (torch.full((20, 30), -1), ValueError, "must be non-negative; got -1: give the pixels of no region an id"),
+            (torch.full((20, 30), 0.5), ValueError, "labels from segmentation method 'test' must be whole numbers"),
+            (torch.full((20, 30), torch.nan), ValueError, "must be whole numbers; got torch.float32"),
+            (torch.zeros(20, 30, 1), ValueError, r"must have the image's size \(20, 30\); got \(20, 30, 1\)"),
+            (np.full((20, 30), "sky"), TypeError, "must be a Tensor or a numpy array of numbers; got an array of <U3"),
+            ([[0]], TypeError, "must be a Tensor or a numpy array of numbers; got list"),
+            (Prediction(np.ones((20, 30)), names=["sky"]), ValueError, "must say what label 1 is; got 1 names"),
+            (Prediction(np.ones((20, 30)), np.ones(3)), ValueError, "scores from .* must have the image's size"),
+        ],
+    )
+    def test_labels_that_are_none(
+        self, monkeypatch: pytest.MonkeyPatch, labels: Any, error: type[Exception], message: str
+    ) -> None:
+        monkeypatch.setattr("kcgs.segment.registry._methods", dict(_methods))
+        register("test")(lambda image: labels)
+        with pytest.raises(error, match=message):
             segment(two_colors(), "test")
 
     def test_images_of_other_kinds(self) -> None:
