@@ -157,7 +157,7 @@ def as_image(name: str, value: object, tolerance: float = 0.0) -> Tensor:
     elif hasattr(value, "getbands") and hasattr(value, "convert"):  # PIL, which need not be imported for this
         image = _from_array(name, _pil_array(value))
     elif isinstance(value, Tensor):
-        image = check_image(name, value)
+        image = check_floating(name, value, dims=(3, 4), finite=False)  # looked for below, once
     else:
         raise TypeError(f"{name} must be a Tensor, a numpy array or a PIL image; got {type(value).__name__}")
     if image.ndim == 4:

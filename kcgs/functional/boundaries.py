@@ -20,6 +20,7 @@ _SIGMA = 1.0
 _SLACK = 1
 _GAP = 3
 _REACH = 8
+_BLOCK = 1 << 20  # pixels whose gradient is taken at a time
 
 
 class BoundaryScore(NamedTuple):
@@ -212,9 +213,17 @@ def _edges(image: Tensor) -> Tensor:
     from kornia.filters import gaussian_blur2d, spatial_gradient
 
     side = 2 * round(3 * _SIGMA) + 1
-    blurred = gaussian_blur2d(image, (side, side), (_SIGMA, _SIGMA), border_type="replicate")
-    strength = spatial_gradient(blurred).square().sum((1, 2)).sqrt()
-    return max_pool2d(strength, 2 * _SLACK + 1, stride=1, padding=_SLACK)
+    margin, height, width = side // 2 + 1 + _SLACK, *image.shape[-2:]
+    edges, rows = image.new_empty(len(image), height, width), max(1, _BLOCK // width)
+    for top in range(0, height, rows):
+        first = max(0, top - margin)
+        blurred = gaussian_blur2d(
+            image[..., first : top + rows + margin, :], (side, side), (_SIGMA, _SIGMA), border_type="replicate"
+        )
+        strength = spatial_gradient(blurred).square().sum((1, 2)).sqrt()
+        strongest = max_pool2d(strength, 2 * _SLACK + 1, stride=1, padding=_SLACK)
+        edges[:, top : top + rows] = strongest[:, top - first :][:, :rows]
+    return edges
 
 
 def _ranks(edges: Tensor, contour: Tensor, near: Tensor) -> Tensor:

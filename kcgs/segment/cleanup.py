@@ -14,6 +14,7 @@ from kcgs.functional.merging import Labels, RegionGraph, merge_nearest
 
 # By how much values may pass [0, 1], as resizing and colour conversion leave them.
 _TOLERANCE = 1e-3
+_BLOCK = 1 << 16  # pixels that change their colour space at a time
 
 Colors = NDArray[np.float64]
 
@@ -140,7 +141,12 @@ def rgb_to_lab(image: Tensor) -> NDArray[np.float32]:
     """Return a checked image (3, H, W) as CIE Lab (D65), (H, W, 3) with L in [0, 100]."""
     from skimage.color import rgb2lab
 
-    return np.asarray(rgb2lab(to_pixels(image)), dtype=np.float32)
+    pixels = to_pixels(image)
+    lab = np.empty(pixels.shape, dtype=np.float32)
+    rows = max(1, _BLOCK // pixels.shape[1])  # its intermediates are six images
+    for top in range(0, len(pixels), rows):
+        lab[top : top + rows] = rgb2lab(pixels[top : top + rows])
+    return lab
 
 
 def lab_sums(lab: NDArray[np.float32], regions: Labels) -> Colors:

@@ -92,7 +92,8 @@ class Cleanup:
         labels = merge_small(labels, self.smallest(labels.numel()))
         # Pieces of one region become one piece where what lay between them joins it: connect after merging.
         labels = order_by_area(connected_regions(labels) if self.connected else labels)
-        labels = order_by_area(merge_similar(image, labels, self.max_regions))
+        if self.max_regions is not None and int(labels.max()) >= self.max_regions:
+            labels = order_by_area(merge_similar(image, labels, self.max_regions))
         scores = None if found.scores is None else _region_means(labels, found.scores)
         return Segmentation(labels, scores, None if found.names is None else _names(labels, classes, found.names))
 

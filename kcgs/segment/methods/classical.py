@@ -31,10 +31,12 @@ _FLAT = 3.0
 _PART_SHARE = 0.9
 # Larger images are segmented at this many pixels; only their contours are set at full size.
 _MAX_PIXELS = 500_000
+# Of images larger than this, regions are also compared and merged at so many pixels: a full-size band says no more.
+_LARGE = 2 * 1920 * 1080
 
 
 @register("auto", Cleanup(max_regions=30))
-def auto(image: Tensor, *, min_size: int) -> Tensor:
+def auto(image: Tensor, *, min_size: int, max_regions: int | None) -> Tensor:
     """Segment a photo into up to 30 clean connected regions, fewer where contours would save too little.
 
     The method of Felzenszwalb and Huttenlocher, with its scale halved up to twice while fewer than 4 regions
@@ -57,6 +59,14 @@ def auto(image: Tensor, *, min_size: int) -> Tensor:
         ([0, 1], 1)
     """
     image = image.cpu()
+    if image[0].numel() <= _LARGE:
+        return _auto_regions(image, min_size)
+    small = _reduced(image)
+    smallest = max(1, round(min_size * small[0].numel() / image[0].numel()))
+    return _enlarged(image, merge_similar(small, _auto_regions(small, smallest), max_regions))
+
+
+def _auto_regions(image: Tensor, min_size: int) -> Tensor:
     best = torch.zeros(image.shape[1:], dtype=torch.int64)
     if (image != image[:, :1, :1]).any():
         for scale in _SCALES:
@@ -123,17 +133,29 @@ def slic(image: Tensor, *, num_segments: int = 400, compactness: float = 10.0, m
 
 def _photo_regions(image: Tensor, scale: float, min_size: int) -> Tensor:
     """Return 4-connected regions of (3, H, W), none a speck, contours on edges."""
-    shrink = max(1.0, math.sqrt(image[0].numel() / _MAX_PIXELS))
-    small = image
-    if shrink > 1:
-        size = [max(1, round(side / shrink)) for side in image.shape[1:]]
-        small = F.interpolate(image[None], size, mode="area")[0]
+    small = _reduced(image)
     smallest = max(1, round(min_size * small[0].numel() / image[0].numel()))
-    labels = _graph_regions(check_segment_image(small), scale, _SIGMA, smallest)
-    if shrink > 1:
+    return clean(_enlarged(image, _graph_regions(small, scale, _SIGMA, smallest)), min_size)
+
+
+def _shrink(image: Tensor) -> float:
+    return max(1.0, math.sqrt(image[0].numel() / _MAX_PIXELS))
+
+
+def _reduced(image: Tensor) -> Tensor:
+    """Return (3, H, W) at no more pixels than regions are looked for at."""
+    shrink = _shrink(image)
+    if shrink == 1:
+        return image
+    size = [max(1, round(side / shrink)) for side in image.shape[1:]]
+    return check_segment_image(F.interpolate(image[None], size, mode="area")[0])
+
+
+def _enlarged(image: Tensor, labels: Tensor) -> Tensor:
+    """Return labels at the size of (3, H, W), contours on its edges."""
+    if labels.shape != image.shape[1:]:
         labels = F.interpolate(labels[None, None].double(), image.shape[1:], mode="nearest")[0, 0].long()
-    labels = snap_contours(image, labels, reach=math.ceil(2 * shrink))
-    return clean(labels, min_size)
+    return snap_contours(image, labels, reach=math.ceil(2 * _shrink(image)))
 
 
 def _cut_out(coarse: Tensor, fine: Tensor, min_size: int) -> Tensor:
