@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from kcgs.data import chart_2x3, chart_pie, load_image, load_labels
+from kcgs.functional import edge_alignment, merge_regions
 from kcgs.segment import (
     Segmenter,
     auto,
@@ -258,6 +259,28 @@ class TestAuto:
         labels = auto(pie.image)  # 1200 x 1200, segmented at a smaller size
         assert_clean(labels, (1200, 1200))
         assert covering(labels, pie.labels) > 0.99
+
+    def test_only_contours_of_photos_of_many_megapixels_are_set_at_full_size(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """12 megapixels took 24 s, of which most went into comparing regions at full size."""
+        classical = f"{auto.__module__}.{{}}".format
+        sizes = []
+
+        def merging(image: Tensor, labels: Tensor) -> Tensor:
+            sizes.append(labels.numel())
+            return merge_regions(image, labels)
+
+        monkeypatch.setattr(classical("_LARGE"), 1000)
+        monkeypatch.setattr(classical("_MAX_PIXELS"), 20_000)
+        monkeypatch.setattr(classical("merge_regions"), merging)
+        chart, image = chart_pie(), photo("coffee")
+        assert covering(auto(chart.image), chart.labels) > 0.98
+        labels = auto(image)
+        assert max(sizes) <= 20_500
+        assert_clean(labels, (400, 600))
+        assert edge_alignment(image, labels) > 0.85  # sharp at full size
+        assert (auto(torch.full((3, 120, 80), 0.5)) == 0).all()
 
     def test_takes_seconds_at_most(self) -> None:
         image = torch.nn.functional.interpolate(photo("coffee")[None], (480, 854), mode="area")[0]

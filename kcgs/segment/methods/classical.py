@@ -31,7 +31,7 @@ _FLAT = 3.0
 _PART_SHARE = 0.9
 # Larger images are segmented at this many pixels; only their contours are set at full size.
 _MAX_PIXELS = 500_000
-# Of images larger than this, regions are also compared and merged at so many pixels: a full-size band says no more.
+# Of images larger than this, regions are also compared and merged at so many pixels: the full size says no more.
 _LARGE = 2 * 1920 * 1080
 
 
@@ -50,6 +50,7 @@ def auto(image: Tensor, *, min_size: int, max_regions: int | None) -> Tensor:
     Args:
         image: as `segment` takes it, any size; result and errors are those of `segment` too.
         min_size: of `Cleanup`, as are ``max_regions``, ``snap`` and ``connected``.
+        max_regions: of `Cleanup`.
 
     Example:
         >>> image = torch.zeros(3, 40, 60)
