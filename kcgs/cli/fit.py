@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 # contours that people traced reach 0.63 and more on their image, at most 0.54 on its mirror image
 _ALIGNED = 0.58
+# dB that a fit must have to spare where it is then rounded to a file
+_ROUNDING = 0.15
 
 
 @app.command("fit")
@@ -61,6 +63,8 @@ def fit_command(
         check_writable("--checkpoint", checkpoint)
     if request.target_bytes is not None:
         options.exclude("--target-bytes", checkpoint=checkpoint)
+    if request.config.target_psnr is not None:
+        options.exclude("--target-psnr", checkpoint=checkpoint)
     target = load_image(image)
     labels = read_regions(regions, target, partial(typer.echo, err=True), progress=not quiet)
     with Stop() as stop:
@@ -76,7 +80,7 @@ def fit_command(
     title = f"{output}: {len(fitted.scene)} Gaussians, stopped by {result.stop_reason}"
     if result.removed:
         title += f"; {result.removed} useless ones removed, which changed no value by more than {result.change:.1g}"
-    report = measure_scene(fitted.scene, target, labels, output, fitted.num_bytes, result.history[-1].seconds)
+    report = report_fit(fitted, target, labels, output, request)
     became = result.regions
     if as_json:
         report["region_report"] = None if became is None else asdict(became)
@@ -85,6 +89,9 @@ def fit_command(
         typer.echo(f"regions: {became}")
     if stop.wanted:
         raise interrupted(f"saved the best so far to {output}")
+    if missed := describe_miss(report, request):
+        typer.echo(f"kcgs: {missed}", err=True)
+        raise typer.Exit(1)
 
 
 class Fitted(NamedTuple):
@@ -118,14 +125,17 @@ def fit_into(
     if request.target_bytes is not None:
         done = fit_bytes(image, labels, request.target_bytes, **settings)
         return Fitted(done.result, done.scene, write_file(output, done.data))
+    target, compressed = request.config.target_psnr, output.suffix == ".kcgs"
+    if target is not None and compressed:  # rounding costs some
+        settings["recipe"] = request.config.model_copy(update={"target_psnr": target + _ROUNDING})
     count = request.num_gaussians or min(options.DEFAULT_GAUSSIANS, image.shape[1] * image.shape[2])
     result = fit(image, labels, count, checkpoint=checkpoint, resume=resume, **settings)
-    if output.suffix != ".kcgs":
+    if not compressed:
         scene = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe, **(notes or {})})
         return Fitted(result, scene, scene.save(output))
-    quality = quality_for(max(entry.psnr for entry in result.history))
+    quality = quality_for(max(entry.psnr for entry in result.history)) if target is None else None
     with Progress("writing the file", known=False, shown=progress):
-        file = compress(result.scene, image, quality=quality, seed=request.seed)
+        file = compress(result.scene, image, quality=quality, target_psnr=target, seed=request.seed)
     return Fitted(result, file.scene, write_file(output, file.data))
 
 
@@ -177,3 +187,27 @@ def describe_size(path: Path, num_bytes: int, size: tuple[int, int]) -> dict[str
     """Return the size of a file and, of a compressed one, that by the pixels of its image."""
     rate = 8 * num_bytes / (size[0] * size[1]) if path.suffix == ".kcgs" else None
     return {"bytes": num_bytes, "bits_per_pixel": rate}
+
+
+def report_fit(
+    fitted: Fitted, image: Tensor, labels: Tensor | None, output: Path, request: options.FitRequest
+) -> dict[str, Any]:
+    """Measure what was written of a fit, and say how the fit ended."""
+    report = measure_scene(fitted.scene, image, labels, output, fitted.num_bytes, fitted.result.seconds)
+    target = request.config.target_psnr
+    # the file counts, not what it was rounded from
+    reached = None if target is None else report["psnr"] >= target
+    return {**report, "stop_reason": fitted.result.stop_reason, "target_reached": reached}
+
+
+def describe_miss(report: Mapping[str, Any], request: options.FitRequest) -> str | None:
+    """Return the line that says which target was missed."""
+    if report["target_reached"] is not False:
+        return None
+    most = request.num_gaussians or options.DEFAULT_GAUSSIANS
+    why = {
+        "seconds": "the time was over",
+        "callback": "it was interrupted",
+        "diverged": "the fit diverged",
+    }.get(report["stop_reason"], f"{most} Gaussians do not reach it, -n allows more")
+    return f"--target-psnr {request.config.target_psnr:g} was not reached: {report['psnr']:.2f} dB is the best; {why}"

@@ -23,7 +23,7 @@ from .many_jobs import Order, Outcome, fit_one
 
 _MILLION = 1_000_000
 _METRICS = ("psnr", "ssim", "ms_ssim", "ef_psnr", "ef_ssim", "num_gaussians", "seconds", "bytes", "bits_per_pixel")
-_COLUMNS = ("image", *_METRICS, "error", "core_seconds", "fit")
+_COLUMNS = ("image", *_METRICS, "stop_reason", "target_reached", "error", "core_seconds", "fit")
 
 
 @app.command("fit-many")
@@ -80,11 +80,15 @@ def fit_many_command(
         kept, failed = _write_down(done, images, table, quiet)
     finally:
         table.write()
-    report = _summary(table, images, kept, failed, price)
+    missed = [image for image in images if table.get(image).get("target_reached") == "False"]
+    report = _summary(table, images, kept, failed, price) | {"missed": len(missed)}
     print_report(report if as_json else {k: v for k, v in report.items() if v is not None}, as_json, str(output))
     for line in failed.values():
         typer.echo(f"kcgs: {line}", err=True)
-    if failed:
+    if missed:
+        names = ", ".join(image.name for image in missed)
+        typer.echo(f"kcgs: --target-psnr {request.config.target_psnr:g} was not reached by {names}", err=True)
+    if failed or missed:
         raise typer.Exit(1)
 
 

@@ -10,7 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .fit import fit_into, measure_scene, read_regions
+from .fit import fit_into, measure_scene, read_regions, report_fit
 from .options import DEFAULT_GAUSSIANS, FitRequest
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Outcome(NamedTuple):
 
     fit: str
     """Hash of the image, the mask and all settings; of a compressed file its own too."""
-    metrics: dict[str, float] | None
+    metrics: dict[str, Any] | None
     """None: the file was there, and its metrics are in the table."""
     core_seconds: float
     """Processor time of all that was done for the image, in all threads; NaN: nothing was fitted."""
@@ -72,13 +72,14 @@ def _measure(order: Order, fit: str | None) -> dict[str, Any]:
     image = load_image(order.image)
     labels = read_regions(_source(order), image, warnings.warn)
     if fit is None:
-        return measure_scene(load(order.output), image, labels, order.output, order.output.stat().st_size, math.nan)
+        report = measure_scene(load(order.output), image, labels, order.output, order.output.stat().st_size, math.nan)
+        target = order.request.config.target_psnr
+        return {**report, "stop_reason": "", "target_reached": None if target is None else report["psnr"] >= target}
     fitted = fit_into(order.output, image, labels, order.request, notes={_NOTE: fit})
     became = fitted.result.regions
     if order.masks and became is not None and became.kept == 1 < became.given and became.dropped != "recipe":
         warnings.warn(f"regions: {became}", stacklevel=2)
-    seconds = fitted.result.history[-1].seconds
-    return measure_scene(fitted.scene, image, labels, order.output, fitted.num_bytes, seconds)
+    return report_fit(fitted, image, labels, order.output, order.request)
 
 
 def _source(order: Order) -> str:

@@ -18,7 +18,7 @@ from .state import FitState, Gaussians, HistoryEntry
 
 # a checkpoint is written when the fit has run this many times as long as the last one took to write
 _PATIENCE = 100.0
-_VERSION = 2
+_VERSION = 3
 _KEPT = ("cutoff", "region_ids", "anchor", "iteration", "first", "wanted", "densifications", "late_moves", "merged")
 
 
@@ -73,12 +73,10 @@ def _fingerprint(state: FitState, given: RegionMap | None) -> str:
 
 def _plain(state: FitState) -> dict[str, Any]:
     """Use nothing but tensors, numbers, strings, lists and dicts, which load without running code."""
-    search = state.search
     return {
         **{name: getattr(state, name) for name in _KEPT},
         "optimizer": state.optimizer.state_dict(),
         "regions": None if state.regions is None else state.regions.state(),
-        "search": None if search is None else (search.wanted, search.phase, search.since),
         "seconds": state.seconds(),
         "history": [tuple(entry) for entry in state.history],
         "best_psnr": state.best_psnr,
@@ -94,8 +92,6 @@ def _take_up(state: FitState, kept: dict[str, Any]) -> None:
     state.regions, best_regions = (
         None if kept[name] is None else RegionMap.from_state(kept[name]) for name in ("regions", "best_regions")
     )
-    if state.search is not None:
-        state.search.wanted, state.search.phase, state.search.since = kept["search"]
     state.started = time.perf_counter() - kept["seconds"]
     state.history = [HistoryEntry(*entry) for entry in kept["history"]]
     if kept["best"] is not None:

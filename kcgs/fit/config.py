@@ -43,7 +43,7 @@ class FitConfig(BaseModel):
         1e-3,
         ge=0.0,
         lt=1.0,
-        description="cutoff of the first 85 % of a fit without `target_psnr`, where it is above `cutoff`; 0: none",
+        description="cutoff of the first 85 % of a fit, where it is above `cutoff`; 0: none",
     )
     backend: str = Field("auto", description="kernel, as in region_splat")
 
@@ -90,7 +90,7 @@ class FitConfig(BaseModel):
     iterations: int = Field(700, ge=1)
     max_seconds: float | None = Field(None, gt=0.0, description="stop after this wall time; the schedule adapts to it")
     target_psnr: float | None = Field(
-        None, gt=0.0, description="stop at this PSNR (dB), and add no more Gaussians than it takes"
+        None, gt=0.0, description="the fewest Gaussians that reach this PSNR (dB), by a search over several fits"
     )
 
     def model_post_init(self, context: Any) -> None:

@@ -33,8 +33,7 @@ def squared_error(state: FitState, gaussians: Gaussians | None = None) -> Tensor
 def descend(state: FitState, rendered: Tensor, progress: float) -> None:
     """Move the Gaussians downhill from a render of them."""
     _backward(state, rendered)
-    decay = state.optimizer.decay
-    state.optimizer.step(decay(progress) if state.search is None else state.search.rate(progress, decay))
+    state.optimizer.step(state.optimizer.decay(progress))
     state.iteration += 1
 
 
@@ -55,9 +54,8 @@ def _backward(state: FitState, rendered: Tensor) -> None:
 def log_is_due(state: FitState, progress: float) -> bool:
     """Say whether the history wants an entry: about a hundred over the fit, by iterations or by the clock."""
     config = state.config
-    by_iterations = state.iteration % max(1, config.iterations // _HISTORY_POINTS) == 0
-    if config.max_seconds is None or (config.target_psnr is not None and by_iterations):
-        return by_iterations  # the search for a target goes by what is measured
+    if config.max_seconds is None:
+        return state.iteration % max(1, config.iterations // _HISTORY_POINTS) == 0
     return progress * _HISTORY_POINTS >= len(state.history)
 
 
@@ -73,8 +71,6 @@ def log(state: FitState, rendered: Tensor, gaussians: Gaussians | None = None) -
     state.history.append(entry)
     if psnr > state.best_psnr:
         state.best_psnr, state.best = psnr, gaussians.detached()
-    if state.search is not None:
-        state.search.observe(state.progress(), psnr)
 
 
 def _decibel(mean_square: float) -> float:

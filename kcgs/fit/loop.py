@@ -6,7 +6,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -20,11 +20,10 @@ from kcgs.functional import RegionMap
 from .checkpoint import Checkpoint
 from .config import FitConfig
 from .descent import descend, log, log_is_due, render
+from .search import OnStep, fewest
 from .start import start
 from .state import FitResult, FitState, HistoryEntry, StopReason
 from .strategies import Finish, MergeRegions, make_strategies
-
-OnStep = Callable[[int, HistoryEntry], bool | None]
 
 
 @torch.inference_mode(False)
@@ -46,7 +45,8 @@ def fit(
 
     Convention: the same arguments, device and number of threads give the same scene, bit for bit (unless it is stopped
     by the clock). The best state that was logged is returned, not the last; with a draft cutoff, the best of those that
-    were rendered without. The scene holds fewer than N Gaussians where the recipe prunes, or reaches its target sooner.
+    were rendered without. The scene holds fewer than N Gaussians where the recipe prunes, or its target takes fewer.
+    With `target_psnr` several fits search for the fewest Gaussians that reach it, and the one found is returned.
 
     Args:
         image: Tensor :math:`(C, H, W)` or :math:`(1, C, H, W)`, floating, values in [0, 1]; a numpy array
@@ -94,19 +94,25 @@ def fit(
     seed = check_count("seed", seed, 0, 2**63 - 1)
     if resume and checkpoint is None:
         raise ValueError("resume needs checkpoint, a file to go on from; got None")
+    if config.target_psnr is not None:
+        if checkpoint is not None:
+            raise ValueError(f"checkpoint must be None with target_psnr, which takes several fits; got {checkpoint!r}")
+        return fewest(image, regions, num_gaussians, config, seed, _run, on_step)
     state = start(image, regions, num_gaussians, config, seed, started)
     keeper = None if checkpoint is None else Checkpoint(checkpoint, state, regions)
     if not (keeper is not None and resume and keeper.read_into(state)) and config.merge_regions:
         MergeRegions(state).before(state)
     _warn_of_regions(state)
+    return Finish().apply(state, _run(state, on_step, keeper))
 
-    strategies = make_strategies(state)
-    reason: StopReason | None = None
-    while reason is None and state.iteration < config.iterations:
+
+def _run(state: FitState, on_step: OnStep | None = None, keeper: Checkpoint | None = None) -> StopReason:
+    """Descend, with what the strategies do meanwhile, until something says stop; return what did."""
+    config, strategies = state.config, make_strategies(state)
+    while state.iteration < config.iterations:
         if not state.optimizer.is_finite():
-            warnings.warn(f"the fit diverged at iteration {state.iteration}: the best so far is kept", stacklevel=4)
-            reason = "diverged"
-            break
+            warnings.warn(f"the fit diverged at iteration {state.iteration}: the best so far is kept", stacklevel=5)
+            return "diverged"
         share = state.progress()
         for strategy in strategies:
             if strategy.due(share):
@@ -114,18 +120,15 @@ def fit(
         rendered = render(state)
         if log_is_due(state, share):
             log(state, rendered)
-            if config.target_psnr is not None and state.best_psnr >= config.target_psnr:
-                reason = "target_psnr"
-                break
         descend(state, rendered, share)
 
         if keeper is not None and (keeper.due() or state.iteration == config.iterations):
             keeper.write(state)
         if on_step is not None and on_step(state.iteration, state.history[-1]):
-            reason = "callback"
-        elif state.seconds() >= (config.max_seconds or math.inf):
-            reason = "seconds"
-    return Finish().apply(state, reason or "iterations")
+            return "callback"
+        if state.seconds() >= (config.max_seconds or math.inf):
+            return "seconds"
+    return "iterations"
 
 
 @contextmanager

@@ -17,13 +17,10 @@ from .kmeans import kmeans_field
 from .levenberg_marquardt import is_flat
 from .optimizers import FrameAdam, GaussianImageAdan, GaussianOptimizer, ImageGSAdam
 from .sampling import sample_pixels, spread_repeats
-from .search import TargetSearch
 from .state import FitState
 
 # share of its pixels that a region must keep when contours are smoothed, and the supersampling of smooth contours
 _LEAST_AREA, _SUPERSAMPLE = 0.7, 4
-# a fit to a target starts with a Gaussian for each square of so many pixels
-_TARGET_SPACING = 64
 # share of an image's values that are 0 or 1, from which on Gaussians that overshoot them are of use
 _SATURATED = 0.25
 # share of the gradient in the density of Image-GS's centres; the rest is uniform
@@ -51,7 +48,7 @@ def start(
         chooses_widths=config.softness == "auto" and regions is not None and regions.softness == 0.0,
         given=regions,
         merged_for_count=_count(regions) - _count(fitting),
-        cutoff=max(config.cutoff, config.draft_cutoff if config.target_psnr is None else 0.0),
+        cutoff=max(config.cutoff, config.draft_cutoff),
     )
     begin(state, _regions_to_render(image, fitting, num_gaussians, config))
     return state
@@ -63,11 +60,9 @@ def begin(state: FitState, regions: RegionMap | None) -> None:
     field, sigma = _first_field(state, regions)
     state.regions, state.region_ids = regions, field.region_ids
     state.anchor = None if regions is None else regions.labels
-    state.optimizer = _make_optimizer(config, field, sigma)
+    state.optimizer = make_optimizer(config, field, sigma)
     state.first = state.wanted = len(field)
     state.iteration = 0
-    searches = config.target_psnr is not None and config.densify_from < 1.0
-    state.search = TargetSearch(config.target_psnr, state.num_gaussians, len(field)) if searches else None  # type: ignore[arg-type]
 
 
 def _count(regions: RegionMap | None) -> int:
@@ -83,7 +78,8 @@ def _as_many_as_gaussians(
     return regions.merge(pairs_to_merge(image, regions.labels, num_gaussians))[0]
 
 
-def _make_optimizer(config: FitConfig, field: GaussianField, sigma: float) -> GaussianOptimizer:
+def make_optimizer(config: FitConfig, field: GaussianField, sigma: float) -> GaussianOptimizer:
+    """Return what moves Gaussians that are about `sigma` pixels wide."""
     if config.optimizer == "adan":
         return GaussianImageAdan(field, sigma, config.iterations, config.learning_rate_factor)
     return (FrameAdam if config.optimizer == "frame" else ImageGSAdam)(field, config.learning_rate_factor)
@@ -122,9 +118,6 @@ def _first_field(state: FitState, regions: RegionMap | None) -> tuple[GaussianFi
     image, config, seed = state.image, state.config, state.seed
     pixels = image.shape[1] * image.shape[2]
     first = math.ceil(config.densify_from * state.num_gaussians)
-    if config.target_psnr is not None and config.densify_from < 1.0:
-        # num_gaussians is the most there may be, and says nothing of how many are needed
-        first = min(first, math.ceil(pixels / _TARGET_SPACING**2))
     count = min(state.num_gaussians, max(1 if regions is None else regions.num_regions, first))
     sigma = max(1.0, 0.5 * math.sqrt(pixels / count))
     if config.initializer == "random":

@@ -16,7 +16,6 @@ from kcgs.scene import Scene
 from .config import FitConfig
 from .optimizers import GaussianOptimizer
 from .region_report import RegionReport
-from .search import TargetSearch
 
 StopReason = Literal["iterations", "seconds", "target_psnr", "callback", "diverged"]
 
@@ -46,6 +45,10 @@ class FitResult(NamedTuple):
     """No value of the render changed by more when they were."""
     regions: RegionReport | None = None
     """What became of the label map; None: none was given."""
+    seconds: float = 0.0
+    """Wall time of all that was done, which the history of a search does not tell."""
+    target_reached: bool | None = None
+    """None: there was no `target_psnr`."""
 
 
 class Gaussians(NamedTuple):
@@ -95,7 +98,6 @@ class FitState:
     iteration: int = 0
     first: int = 0  # Gaussians at the start
     wanted: int = 0  # Gaussians that were asked for so far
-    search: TargetSearch | None = None  # where the fewest Gaussians are to be found
     densifications: int = 0
     late_moves: int = 0  # of contours, after densification
     merged: bool = False  # the trial that merges regions is over

@@ -83,6 +83,8 @@ def fit_bytes(
     config = FitConfig.from_recipe(recipe, **settings)
     image, regions = check_problem(image, regions)
     check_count("num_bytes", num_bytes)
+    if config.target_psnr is not None:
+        raise ValueError(f"target_psnr must be None where bytes are the target; got {config.target_psnr}")
     with Progress("trial fits", known=False, shown=progress):
         chosen = _choose(image, regions, num_bytes, config, seed)
     count = count_for(num_bytes - _map_bytes(chosen.regions), image.shape[1] * image.shape[2])

@@ -15,12 +15,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import as_image, check_count
+from kcgs._check import as_image, check_count, check_number
 from kcgs.codec import QUALITIES, decode
 from kcgs.codec.gaussians.quantize import QPS, Codes, Parameters, Quantizer
 from kcgs.codec.scenes import SceneWriter
 from kcgs.fit.frame import local_gradient, move
-from kcgs.functional import RegionMap, region_splat
+from kcgs.functional import RegionMap, psnr, region_splat
 from kcgs.scene import Scene
 
 # a Gaussian whose whole energy is below this many times the distortion costs more bits than it saves: at the best rate
@@ -29,6 +29,8 @@ _PAYING = 20.0
 # dB of a file's image against the scene's own above the scene's PSNR: the error grows by about a 28th, 0.15 dB,
 # and by more where so few Gaussians are rounded that errors do not average out
 _MARGIN = 14.5
+# dB by which files are finer that are tried until one is good enough
+_FINER = (0.0, 2.0, 5.0, 9.0, 14.0, 20.0, 30.0, 50.0)
 # coded lengths vary by so much as Gaussians are tuned
 _SLACK = 0.997
 # share of the iterations in which shapes are rounded; colours are in the rest
@@ -58,6 +60,7 @@ def compress(
     *,
     quality: float | None = None,
     target_bytes: int | None = None,
+    target_psnr: float | None = None,
     iterations: int = 100,
     seed: int = 0,
 ) -> Compressed:
@@ -71,6 +74,8 @@ def compress(
         image: what :func:`kcgs.fit.fit` takes, of the scene's size and channels.
         quality: as in :func:`kcgs.codec.encode`, before the others make up for it.
         target_bytes: the finest file that is not larger, in place of `quality`.
+        target_psnr: dB against the image, in place of both: the first of ever finer files that shows it, or where the
+            scene itself does not, one that is nearly as good.
         iterations: renders that the descent may take, at least 1.
         seed: of the order in which Gaussians are rounded.
 
@@ -93,6 +98,8 @@ def compress(
         raise ValueError(f"image must have shape {(writer.channels, *writer.size)}; got {tuple(target.shape)}")
     # a copy: an inference tensor cannot take part in a graph
     target = target.detach().to("cpu", torch.float32, copy=True)
+    if target_psnr is not None and (quality is not None or target_bytes is not None):
+        raise ValueError(f"target_psnr excludes quality and target_bytes; got {quality!r} and {target_bytes!r}")
     qp = writer.qp_for(quality, target_bytes)
     check_count("iterations", iterations)
 
@@ -104,7 +111,14 @@ def compress(
         tuning = _FineTuning(gaussians, region_ids, target, writer.regions, quantizer, seed)
         return writer.write(quantizer, tuning.run(steps), writer.ids[kept])
 
-    if target_bytes is None:
+    if target_psnr is not None:
+        wanted = check_number("target_psnr", target_psnr, 0.0, unit="dB")
+        reached = float(psnr(scene.render().to(target), target))
+        for finer in _FINER if reached >= wanted else _FINER[:1]:
+            data = write(writer.qp_for(quality_for(reached + finer)), iterations)
+            if float(psnr(decode(data).scene.render(), target)) >= wanted:
+                break
+    elif target_bytes is None:
         data = write(qp, iterations)
     else:
         highest, data = writer.finest(lambda qp: write(qp, 0), target_bytes, share=_SLACK)
@@ -113,17 +127,17 @@ def compress(
     return Compressed(data, decode(data).scene)
 
 
-def quality_for(psnr: float) -> float:
+def quality_for(decibels: float) -> float:
     """Return the `quality` of a file that is nearly as good as its scene.
 
     Args:
-        psnr: of the scene's render against the image, in dB.
+        decibels: PSNR of the scene's render against the image.
 
     Example:
         >>> quality_for(30.0), quality_for(100.0)
         (44.5, 90.0)
     """
-    return min(max(psnr + _MARGIN, QUALITIES[0]), QUALITIES[1])
+    return min(max(decibels + _MARGIN, QUALITIES[0]), QUALITIES[1])
 
 
 def _pays(gaussians: Parameters, quantizer: Quantizer) -> NDArray[np.bool_]:

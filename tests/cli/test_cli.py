@@ -17,6 +17,7 @@ from PIL import Image
 from kcgs import fit, load
 from kcgs.cli import main
 from kcgs.data import load_image, load_labels, save_image, save_labels
+from kcgs.functional import psnr
 from kcgs.segment import segment
 
 KEYS = {
@@ -85,16 +86,32 @@ class TestFit:
         code, out, err = kcgs(*FIT, *arguments, capsys=capsys)
         assert code == 0, err
         report = json.loads(out)
-        assert report["psnr"] >= 24.99
+        assert report["psnr"] >= 25 and report["target_reached"] is True and report["stop_reason"] == "target_psnr"
         assert report["num_gaussians"] < 100
+
+    @pytest.mark.parametrize("suffix", ["safetensors", "kcgs"])
+    def test_target_psnr_out_of_reach(self, files: Path, capsys: pytest.CaptureFixture[str], suffix: str) -> None:
+        code, out, err = kcgs(
+            *FIT[:-1], f"s.{suffix}", "--regions", "none", "--target-psnr", "90", "--json", capsys=capsys
+        )
+        report = json.loads(out)
+        assert code == 1 and report["target_reached"] is False and report["stop_reason"] == "iterations"
+        assert f"--target-psnr 90 was not reached: {report['psnr']:.2f} dB is the best; 12 Gaussians do not" in err
+        assert float(psnr(load(f"s.{suffix}").render(), load_image("photo.png"))) == pytest.approx(report["psnr"])
+
+    def test_target_psnr_of_a_file(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        code, _, err = kcgs(*FIT[:-1], "photo.kcgs", "-n", "60", "--target-psnr", "24", capsys=capsys)
+        assert code == 0, err
+        assert float(psnr(load("photo.kcgs").render(), load_image("photo.png"))) >= 24
 
     @pytest.mark.parametrize("regions", ["mask.png", "auto", "none"])
     def test_fit_render_eval_info(self, files: Path, capsys: pytest.CaptureFixture[str], regions: str) -> None:
         code, out, err = kcgs(*FIT, "--regions", regions, "--json", capsys=capsys)
         assert code == 0, err
         report = json.loads(out)
-        assert set(report) == {*KEYS, "region_report"}
+        assert set(report) == KEYS | {"region_report", "stop_reason", "target_reached"}
         assert (report["region_report"] is None) == (regions == "none")
+        assert report["stop_reason"] == "iterations" and report["target_reached"] is None
         assert 1 <= report["num_gaussians"] <= 12
         assert report["bytes"] == (files / "scene.safetensors").stat().st_size
         assert (report["ef_psnr"] is None) == (regions == "none")

@@ -75,6 +75,13 @@ class TestTable:
         assert report["core_hours_per_million"] == pytest.approx(mean * 1e6 / 3600)
         assert report["dollars_per_million"] == pytest.approx(mean * 1e6 / 3600 * 0.5)
 
+    def test_missed_targets_are_said(self, files: Path, kcgs: Any) -> None:
+        for _ in range(2):  # a kept one too
+            code, out, err = kcgs("photos", *SETTINGS, "--workers", "1", "--json", "--target-psnr", "80")
+            assert code == 1 and json.loads(out)["missed"] == 3
+            assert "--target-psnr 80 was not reached by a.png, b.png, c.png" in err
+        assert {row["target_reached"] for row in rows().values()} == {"False"}
+
     @pytest.mark.parametrize(
         "wanted", [("--suffix", ".kcgs", "-n", "12"), ("--target-bytes", "200")], ids=["suffix", "bytes"]
     )

@@ -150,23 +150,6 @@ class TestContours:
         assert 1.0 < regions.softness < 2.2
 
 
-class TestTarget:
-    def test_few_gaussians_for_it(self) -> None:
-        image, labels = scene((96, 128))
-        config = quick(iterations=600, target_psnr=30.0)
-        result = fit(image, labels, 2000, recipe=config)
-        assert result.stop_reason == "target_psnr"
-        assert float(psnr(result.scene.render(), image)) >= 29.99
-        fewer = fit(image, labels, max(2, round(0.6 * len(result.scene.field))), recipe=quick(iterations=600))
-        assert max(h.psnr for h in fewer.history) < 30.0
-
-    def test_out_of_reach(self) -> None:
-        image, labels = scene()
-        result = fit(image, labels, 10, recipe=quick(iterations=150, target_psnr=60.0))
-        assert result.stop_reason == "iterations"
-        assert len(result.scene.field) <= 10
-
-
 class TestClock:
     def test_the_schedule_ends_with_the_time(self, monkeypatch: pytest.MonkeyPatch) -> None:
         # a clock that only being read moves on: a busy machine would have done too little when the time is up

@@ -192,12 +192,6 @@ class TestSwitches:
 
 
 class TestStopping:
-    def test_target_psnr(self) -> None:
-        image, labels = disc()
-        result = fit(image, labels, 12, recipe=quick(iterations=2000, target_psnr=22.0))
-        assert result.stop_reason == "target_psnr"
-        assert result.history[-1].psnr >= 22 and result.history[-1].iteration < 2000
-
     def test_seconds(self) -> None:
         image, labels = disc()
         result = fit(image, labels, 12, recipe=quick(iterations=10**7, max_seconds=0.5))

@@ -11,7 +11,6 @@ import torch
 from kcgs import FitConfig, RegionMap
 from kcgs.fit.contour_moves import accept_moves
 from kcgs.fit.optimizers import FrameAdam, GaussianImageAdan
-from kcgs.fit.search import TargetSearch
 from kcgs.fit.start import start
 from kcgs.fit.state import FitState
 from kcgs.fit.strategies import Densify, MoveContours, Strategy, make_strategies
@@ -86,35 +85,6 @@ class TestStrategies:
                 state.late_moves += 1
                 due.append(p / 100)
         assert due == [0.6, 0.7, 0.8, 0.9]
-
-
-class TestTarget:
-    def test_only_recipes_that_densify_search(self) -> None:
-        assert state_of(100, target_psnr=30.0).search is not None
-        assert state_of(100, target_psnr=30.0, densify_from=1.0).search is None
-
-    def test_densifies_anneals_and_adds_what_is_missing(self) -> None:
-        search = TargetSearch(30.0, 1000, 100)
-
-        def rate(progress: float) -> float:
-            return search.rate(progress, lambda p: 1 - 0.9 * p)
-
-        search.observe(0.05, 20.0)
-        assert search.wanted > 100
-        many = search.wanted
-        search.observe(0.1, 29.5)
-        assert rate(0.1) == 1
-        search.observe(0.3, 29.7)
-        assert search.wanted == many
-        assert rate(0.3) < 1
-        search.observe(0.51, 29.9)
-        assert many < search.wanted < 1.1 * many
-
-    def test_never_beyond_the_most(self) -> None:
-        search = TargetSearch(60.0, 120, 100)
-        for k in range(1, 60):
-            search.observe(k / 20, 20.0)
-        assert search.wanted == 120
 
 
 class TestMaps:

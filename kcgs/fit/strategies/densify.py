@@ -38,8 +38,6 @@ class Densify:
     def wanted(self, progress: float) -> int:
         """Return how many Gaussians there should be."""
         state = self.state
-        if state.search is not None:
-            return state.search.wanted
         if progress < self.begin:
             return state.first
         share = (progress - self.begin) / (self.end - self.begin)
@@ -63,11 +61,17 @@ class Densify:
         state.densifications += 1
         if self.contours is not None:
             self.contours.before_addition(state)
-        added = self.place(state, state.wanted - len(state.optimizer.gaussians()[0]))
+        self.add(state, state.wanted - len(state.optimizer.gaussians()[0]))
+        state.densify_after = state.seconds() + self.patience * (state.seconds() - start)
+
+    def add(self, state: FitState, count: int) -> None:
+        """Add so many Gaussians, if any."""
+        if count < 1:
+            return
+        added = self.place(state, count)
         state.optimizer.append(added.means, added.cholesky, added.colors)
         if state.region_ids is not None and added.region_ids is not None:
             state.region_ids = torch.cat([state.region_ids, added.region_ids])
-        state.densify_after = state.seconds() + self.patience * (state.seconds() - start)
 
     def place(self, state: FitState, count: int) -> Proposal:
         """Return the Gaussians to add."""

@@ -55,17 +55,12 @@ class Finish:
         scene = state.best.scene(state.size)
         if config.refine_flat and reason == "iterations" and is_flat(state.image, scene.regions, len(scene)):
             scene = self._refined(state, scene)
-        if config.prune == 0:
-            return self._result(state, scene, reason)
-        left = prune(scene, config.prune, cutoff=config.cutoff, backend=config.backend)
-        return self._result(state, left.scene, reason, left.removed, left.change)
-
-    def _result(
-        self, state: FitState, scene: Scene, reason: StopReason, removed: int = 0, change: float = 0.0
-    ) -> FitResult:
-        dropped: Literal["recipe"] | None = None if state.config.guidance else "recipe"
+        removed, change = 0, 0.0
+        if config.prune > 0:
+            scene, removed, change = prune(scene, config.prune, cutoff=config.cutoff, backend=config.backend)
+        dropped: Literal["recipe"] | None = None if config.guidance else "recipe"
         regions = report_regions(state.given, scene, merged_for_count=state.merged_for_count, dropped=dropped)
-        return FitResult(scene, state.history, reason, state.config, removed, change, regions)
+        return FitResult(scene, state.history, reason, config, removed, change, regions, state.seconds())
 
     def _refined(self, state: FitState, scene: Scene) -> Scene:
         """Refine a flat scene to its last digits, and write them down."""
