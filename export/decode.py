@@ -36,6 +36,7 @@ except ImportError as missing:
     raise SystemExit(f"decode.py: {missing}; install what it needs: pip install numpy onnxruntime") from None
 
 MAX_SIDE = 1 << 20
+_PIXEL_BYTES = 36  # three numbers, three times: as rendered, clipped, and in levels
 _FORMAT, _VERSION = "kcgs.decoder", "1"
 _PARTS = 1 << 20
 _SCENE_FORMAT, _SCENE_VERSIONS = "kcgs.scene", ("1", "2", "3")
@@ -203,6 +204,10 @@ def target_size(args: argparse.Namespace, own: tuple[int, int]) -> tuple[int, in
         sides = [max(1, round(side)) for side in sides]
     if not all(1 <= side <= MAX_SIDE for side in sides):
         raise DecodeError(f"the image must have 1 to {MAX_SIDE} pixels a side; got {sides[1]}x{sides[0]}")
+    needed = _PIXEL_BYTES * sides[0] * sides[1]
+    if hasattr(os, "sysconf") and needed > (memory := os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")):
+        gigabytes = f"{needed / 1e9:,.1f} GB of memory; this machine has {memory / 1e9:,.1f} GB"
+        raise DecodeError(f"an image of {sides[1]}x{sides[0]} pixels needs about {gigabytes}")
     return sides[0], sides[1]
 
 

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import math
 import operator
+import os
+import re
 from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +18,8 @@ from torch import Tensor
 
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32)
+# bytes that every machine has
+_LITTLE = 1 << 26
 
 
 def check_tensor(name: str, value: object, dims: Sequence[int] = ()) -> Tensor:
@@ -135,6 +141,35 @@ def check_size(name: str, value: object) -> tuple[int, int]:
     if height < 1 or width < 1:
         raise ValueError(f"{name} must be at least 1 x 1; got {value!r}")
     return height, width
+
+
+def check_memory(name: str, size: tuple[int, int], per_pixel: float) -> None:
+    """Refuse an image of so many pixels where it needs more memory than is free, at so many bytes per pixel."""
+    needed = float(size[0]) * size[1] * per_pixel
+    if needed > _LITTLE and needed > (free := _free_memory()):
+        raise ValueError(
+            f"{name} asks for {size[1]} x {size[0]} pixels, which need about {_gigabytes(needed)} of memory; "
+            f"{_gigabytes(free)} are free"
+        )
+
+
+def _free_memory() -> float:
+    """Bytes that this process may still take, swap included; infinite where the system does not say."""
+    found = [math.inf]
+    with suppress(OSError):
+        facts = dict(re.findall(r"(\w+): +(\d+) kB", Path("/proc/meminfo").read_text()))
+        found.append(1024.0 * sum(int(facts.get(name, 0)) for name in ("MemAvailable", "SwapFree")))
+    for limit in ("memory.max", "memory/memory.limit_in_bytes"):
+        with suppress(OSError, ValueError):
+            found.append(float(Path("/sys/fs/cgroup", limit).read_text()))
+    if found == [math.inf]:
+        with suppress(AttributeError, OSError, ValueError):
+            found.append(float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")))
+    return min(found)
+
+
+def _gigabytes(count: float) -> str:
+    return f"{count / 1e9:,.1f} GB"
 
 
 def check_image(name: str, value: object) -> Tensor:

@@ -12,11 +12,15 @@ import torch
 from torch import Tensor, nn
 
 from kcgs._atomic import atomic_path
+from kcgs._check import check_memory, check_size
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField, RegionSplatRenderer
 
 FORMATS = {".safetensors": "kcgs.storage", ".kcgs": "kcgs.codec"}
 """File formats by suffix: a module, imported on use, with ``serialize(scene)`` and ``deserialize(data)``."""
+
+# as measured: of each number of a render that is saved, of each pixel of a label map, or of what it is made of
+_IMAGE_BYTES, _MAP_BYTES = 12, 42
 
 
 class Scene(nn.Module):
@@ -79,10 +83,22 @@ class Scene(nn.Module):
         return image
 
     def render(self, size: tuple[int, int] | None = None) -> Tensor:
-        """Render what one shows or saves: as :meth:`forward`, but clipped to [0, 1] and without a graph."""
+        """Render what one shows or saves: as :meth:`forward`, but clipped to [0, 1] and without a graph.
+
+        On the CPU, ValueError says how much memory a size needs that is more than is free.
+        """
+        self.check_size("size", size)
         with torch.no_grad():
             image: Tensor = self(size)
             return image.clamp(0.0, 1.0)
+
+    def check_size(self, name: str, size: tuple[int, int] | None) -> None:
+        """Refuse a size (height, width) whose render does not fit into memory; the message begins with `name`."""
+        if self.field.means.device.type == "cpu":
+            numbers = self.field.colors.shape[-1] * max(1, self.field.means[..., 0, 0].numel())
+            finer = 0 if self.regions is None else self.regions.supersample**2
+            per_pixel = max(_IMAGE_BYTES * numbers, 4 * numbers + _MAP_BYTES * finer)
+            check_memory(name, self.size if size is None else check_size(name, size), per_pixel)
 
     def save(self, path: str | os.PathLike[str]) -> int:
         """Write the scene, as :func:`kcgs.save` does; return the bytes of the file."""

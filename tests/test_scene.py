@@ -69,6 +69,12 @@ class TestModule:
         image = scene.render()
         assert not image.requires_grad and 0.0 <= float(image.min()) and float(image.max()) == 1.0
 
+    @pytest.mark.parametrize(("name", "needed"), [("none", "1.2"), ("soft", "1.8"), ("fine", "6.0")])
+    def test_renders_that_do_not_fit(self, monkeypatch: pytest.MonkeyPatch, name: str, needed: str) -> None:
+        monkeypatch.setattr("kcgs._check._free_memory", lambda: 1e9)
+        with pytest.raises(ValueError, match=f"size asks for 8192 x 4096 pixels, which need about {needed} GB of mem"):
+            make_scene(name).render(size=(4096, 8192))
+
     def test_to_moves_the_map(self) -> None:
         scene = make_scene().to("meta")
         assert scene.regions is not None and scene.regions.labels.device.type == "meta"

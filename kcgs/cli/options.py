@@ -10,8 +10,11 @@ import typer
 
 if TYPE_CHECKING:
     from kcgs.fit import FitConfig
+    from kcgs.scene import Scene
 
 DEFAULT_GAUSSIANS = 1000
+# pixels per side, which no memory holds
+_FAR = 1e12
 
 Backend = Literal["auto", "reference", "tiled", "cpu", "cuda"]
 Engine = Literal["local", "ray"]
@@ -88,16 +91,20 @@ def exclude(option: str, **others: object) -> None:
             raise typer.BadParameter(f"{option} excludes --{name.replace('_', '-')}")
 
 
-def target_size(size: tuple[int, int], scale: float | None, wanted: str | None) -> tuple[int, int]:
-    """Return the (height, width) that the options --scale and --size ask for."""
+def target_size(scene: Scene, scale: float | None, wanted: str | None) -> tuple[int, int]:
+    """Return the (height, width) that the options --scale and --size ask for, if memory has room for it."""
     if scale is not None and wanted is not None:
         raise typer.BadParameter("give --scale or --size, not both")
     if wanted is not None:
         width, _, height = wanted.lower().partition("x")
         if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
             raise typer.BadParameter(f"--size must be WxH, such as 640x480; got {wanted!r}")
-        return int(height), int(width)
-    factor = 1.0 if scale is None else scale
-    if not 0 < factor < float("inf"):
-        raise typer.BadParameter(f"--scale must be positive; got {scale!r}")
-    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
+        sides = float(height), float(width)
+    else:
+        factor = 1.0 if scale is None else scale
+        if not 0 < factor < float("inf"):
+            raise typer.BadParameter(f"--scale must be positive; got {scale!r}")
+        sides = scene.size[0] * factor, scene.size[1] * factor
+    size = max(1, round(min(sides[0], _FAR))), max(1, round(min(sides[1], _FAR)))
+    scene.check_size("--size" if wanted else "SCENE" if scale is None else f"--scale {scale:g}", size)
+    return size

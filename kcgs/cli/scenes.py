@@ -31,7 +31,7 @@ def render(
 
     check_output(output, *IMAGES)
     loaded = load(scene)
-    target = target_size(loaded.size, scale, size)
+    target = target_size(loaded, scale, size)
     if region is not None:
         known = [] if loaded.regions is None else loaded.regions.ids.tolist()
         if loaded.field.region_ids is None or region not in known:
@@ -153,4 +153,4 @@ def decode(
     if decoded.layers < decoded.num_layers:
         part = f"{decoded.layers} of {decoded.num_layers} layers, {len(scene)} Gaussians"
         typer.echo(f"{file}: a coarser image, {part}", err=True)
-    save_image(output, scene.render(target_size(scene.size, scale, size)))
+    save_image(output, scene.render(target_size(scene, scale, size)))

@@ -148,3 +148,21 @@ class TestOutputs:
         option = "--output" if arguments[-1] == "-o" else arguments[-1]
         assert (code, out) == (1, "") and err.startswith(f"kcgs: {option} ") and err.count("\n") == 1, err
         assert sorted(files.rglob("*")) == before
+
+
+class TestMemory:
+    @pytest.mark.parametrize("asked", [("--scale", "400"), ("--size", "19200x12800"), ("--scale", "1e300")])
+    @pytest.mark.parametrize("command", ["render", "decode"])
+    def test_renders_that_do_not_fit(
+        self, files: Path, run: Any, monkeypatch: pytest.MonkeyPatch, command: str, asked: tuple[str, str]
+    ) -> None:
+        monkeypatch.setattr("kcgs._check._free_memory", lambda: 1e9)
+        kcgs.load("scene.safetensors").save("scene.kcgs")
+        code, out, err = run(command, "scene.kcgs", "-o", "large.png", *asked)
+        assert (code, out) == (1, "") and err.startswith(f"kcgs: {asked[0]}") and err.count("\n") == 1
+        if asked[1] != "1e300":
+            assert "asks for 19200 x 12800 pixels, which need about 8.8 GB of memory; 1.0 GB are free" in err
+        assert not (files / "large.png").exists()
+
+    def test_free_memory(self) -> None:
+        assert 1e7 < kcgs._check._free_memory() < 1e15
