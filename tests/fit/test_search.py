@@ -74,7 +74,7 @@ class TestStopping:
         assert result.target_reached is None and result.seconds >= result.history[-1].seconds
 
     def test_clock(self, photo: tuple[Tensor, Tensor]) -> None:
-        result = fit(*photo, 1200, recipe=FitConfig(iterations=10**6, max_seconds=1.0, target_psnr=70.0))
+        result = fit(*photo, 500, recipe=FitConfig(iterations=10**6, max_seconds=1.0, target_psnr=150.0))
         assert result.stop_reason == "seconds" and result.target_reached is False
 
     def test_callback_counts_all_iterations(self, photo: tuple[Tensor, Tensor]) -> None:
