@@ -185,7 +185,8 @@ def as_image(name: str, value: object, tolerance: float = 0.0) -> Tensor:
 
     Taken are a Tensor (C, H, W) or (1, C, H, W), a numpy array (H, W, C) or (H, W) of uint8, uint16 or floats in [0,
     1], and a PIL image, whose palette is resolved and whose transparent pixels are composed on white.
-    Values may pass [0, 1] by `tolerance`.
+    Values may pass [0, 1] by `tolerance`. A Tensor that can only be meant as (H, W, C) is refused: more than 4 channels
+    and rows, and 1, 3 or 4 columns.
     """
     if isinstance(value, np.ndarray):
         image = _from_array(name, value)
@@ -200,6 +201,11 @@ def as_image(name: str, value: object, tolerance: float = 0.0) -> Tensor:
             raise ValueError(f"{name} must be one image, (C, H, W) or (1, C, H, W); got {tuple(image.shape)}")
         image = image[0]
     check_image(name, image)
+    if image.shape[-1] in (1, 3, 4) and min(image.shape[:2]) > 4:
+        raise ValueError(
+            f"{name} must be (C, H, W); got {tuple(image.shape)}, which looks like (H, W, C): pass "
+            f"{name}.permute(2, 0, 1), or a numpy array (H, W, C)"
+        )
     low, high = float(image.detach().min()), float(image.detach().max())
     if low < -tolerance or high > 1 + tolerance:
         raise ValueError(f"{name} must be in [0, 1]; got [{low:g}, {high:g}]")

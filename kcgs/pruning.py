@@ -50,8 +50,13 @@ def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backen
     check_scene(scene)
     tolerance = check_number("tolerance", tolerance, 0.0)
     render = RegionSplatRenderer(cutoff=cutoff, backend=backend)
+    strangers = 0
+    if scene.regions is not None and scene.field.region_ids is not None:
+        held = scene.regions.index_of(scene.field.region_ids) >= 0
+        strangers = int((~held).sum())
+        scene = _part(scene, held) if strangers else scene
     if len(scene) == 0:
-        return PruneResult(_part(scene, torch.zeros(0, dtype=torch.bool)), 0, 0.0)
+        return PruneResult(_part(scene, torch.zeros(0, dtype=torch.bool)), strangers, 0.0)
 
     with torch.inference_mode(False), torch.enable_grad():
         order = _painted(scene, render).argsort(stable=True)
@@ -64,7 +69,7 @@ def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backen
             low, high = (middle, high) if fits else (low, middle - 1)
         kept = _part(scene, order[low:].sort().values)
         change = float((render(scene) - render(kept)).abs().max())
-    return PruneResult(kept, low, change)
+    return PruneResult(kept, strangers + low, change)
 
 
 def _part(scene: Scene, mask: Tensor) -> Scene:

@@ -78,5 +78,10 @@ class TestAsImage:
             as_image("image", np.zeros((3, 4, 5), np.float32))
         with pytest.raises(ValueError, match="must be one image"):
             as_image("image", torch.zeros(2, 3, 4, 4))
+        for shape in ((80, 120, 3), (1, 80, 120, 3), (80, 120, 1)):
+            with pytest.raises(ValueError, match=r"looks like \(H, W, C\): pass image.permute\(2, 0, 1\)"):
+                as_image("image", torch.zeros(shape))
+        for shape in ((3, 120, 3), (80, 3, 3), (80, 120, 2), (80, 1, 1)):  # thin images, and many channels
+            assert as_image("image", torch.zeros(shape)).shape == shape
         with pytest.raises(TypeError, match="a Tensor, a numpy array or a PIL image; got str"):
             as_image("image", "photo.jpg")

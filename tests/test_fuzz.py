@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 
+import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -101,6 +102,7 @@ def test_regions(labels: Tensor, means: Tensor, width: float, size: tuple[int, i
     works_or_refuses(lambda: cholesky_to_scale_rotation(means))
 
 
+@pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing")
 @fuzz
 @given(
     means=tensors((4, 2)), cholesky=tensors((4, 3)), colors=tensors((4, 1)), ids=label_maps((4,)),

@@ -36,7 +36,7 @@ def make_field(
 ) -> GaussianField:
     generator = torch.Generator().manual_seed(0)
     field = GaussianField.random(13, SIZE, channels=channels, seed=1, dtype=dtype)
-    ids = torch.randint(0, 5, (13,), generator=generator)
+    ids = torch.randint(0, 4, (13,), generator=generator)
     ids[3] = highest
     return GaussianField(
         field.means.detach(),

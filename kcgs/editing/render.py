@@ -50,7 +50,9 @@ def render_region(
     colors = scene.field.colors.new_zeros(scene.field.colors.shape[-1], *target)
     for region, weight in weights.items():
         # rendered alone and not confined, which is the colour itself: nothing is divided by a small alpha
-        alone = RegionSplatRenderer()(_part(scene.field, ids_of(scene.field) == region), None, target)
+        members = _part(scene.field, ids_of(scene.field) == region)
+        members.region_ids = None
+        alone = RegionSplatRenderer()(members, None, target)
         share = (weight / torch.where(total > 0, total, 1.0)).to(alone.dtype)
         colors = colors + torch.where(alpha > 0, alone * share, 0.0)
     return torch.cat([colors.clamp(0.0, 1.0) if clamp else colors, alpha[None]])

@@ -22,7 +22,7 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
 
     Convention: pixels that they leave take the label of the nearest pixel of another region (Euclidean; of equal
     distances, the smallest id), and show what the Gaussians of that region paint there; pixels that leave the image
-    are lost. A region that is covered whole is no region any more, and its Gaussians paint nothing. Where pairs of
+    are lost. A region that is covered whole is no region any more, and its Gaussians are lost too. Where pairs of
     regions have widths, the contour with a region that a moved one did not touch before takes the mean width of those
     it had.
 
@@ -56,7 +56,7 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
     source[rows[1], cols[1]] = before[rows[0], cols[0]]
     labels[landed] = source[landed]
 
-    moved = scene.field.subset(torch.ones_like(ids_of(scene.field), dtype=torch.bool))
+    moved = scene.field.subset(torch.isin(ids_of(scene.field), labels))
     with torch.no_grad():
         shift = moved.means.new_tensor(steps) / regions.supersample
         moved.means += torch.where(torch.isin(ids_of(moved), chosen)[:, None], shift, 0.0)

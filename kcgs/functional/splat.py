@@ -43,7 +43,7 @@ def region_splat(
         cholesky: factors (l11, l21, l22) of the covariances in pixels, l11 and l22 in [1e-6, 1e8],
             :math:`(B, N, 3)`.
         colors: any range, opacity merged, :math:`(B, N, C)`, C at least 1.
-        region_ids: integer region of each Gaussian, :math:`(B, N)`; needed where `regions` is given.
+        region_ids: integer region of each Gaussian, :math:`(B, N)`; needed where `regions` is given, and None without.
         regions: label map (a Tensor means hard contours) for all images or :math:`(B, H, W)`; None: one region.
         size: (height, width); needed without `regions`, else it must equal theirs.
         cutoff: weights below it are skipped, in [0, 1); 0 evaluates all. The image is off by at most cutoff times the
@@ -121,6 +121,11 @@ def _resolve_regions(
         region_ids = check_ids("region_ids", region_ids, means)
     regions = RegionMap.coerce(regions)
     if regions is None:
+        if region_ids is not None:
+            raise ValueError(
+                "regions must be given with region_ids; got None: pass the label map, or leave region_ids out, too, to "
+                "render Gaussians that are not confined"
+            )
         if size is None:
             raise ValueError("size must be given as (height, width) where regions is None; got None")
         return None, None, size

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor, nn
@@ -59,14 +60,18 @@ class RegionSplatRenderer(nn.Module):
         Args:
             field: the Gaussians; or a :class:`kcgs.Scene`, which brings its map along, so that the renderer can be the
                 first link of an `nn.Sequential`.
-            regions: label map of the field's size or of `size`; None: the scene's, or the field's ids are not used.
+            regions: label map of the field's size or of `size`; None: the scene's, or none, where the field has no ids.
             size: (height, width) of the image; None: the field's.
 
         Returns:
             Image, :math:`(C, H, W)`, or :math:`(B, C, H, W)` for a batched field or with ``keepdim=False``.
 
         Raises:
-            TypeError, ValueError: as :func:`kcgs.functional.region_splat`; regions without region ids.
+            TypeError, ValueError: as :func:`kcgs.functional.region_splat`; regions without region ids, or ids without
+                regions.
+
+        Warns:
+            UserWarning: Gaussians whose region ids the map does not hold; they paint nothing.
         """
         if not isinstance(field, GaussianField):
             if not isinstance(field, SceneLike):
@@ -82,11 +87,16 @@ class RegionSplatRenderer(nn.Module):
             cholesky = cholesky * cholesky.new_tensor([across, down, down])
         if regions is not None:
             regions = self._fit_regions(field, regions, target)
+        elif field.region_ids is not None:
+            raise ValueError(
+                "regions must be given for a field that is confined to regions; got None: pass its label map or its "
+                "Scene, or set field.region_ids to None to render it without contours"
+            )
         image = region_splat(
             means,
             cholesky,
             field.merged_colors(),
-            None if regions is None else field.region_ids,
+            field.region_ids,
             regions,
             size=target,
             cutoff=self.cutoff,
@@ -104,6 +114,15 @@ class RegionSplatRenderer(nn.Module):
         assert coerced is not None
         if coerced.size not in (target, field.size):
             raise ValueError(f"regions must have the size {field.size} of the field or {target}; got {coerced.size}")
+        # before the map is resized, for a small map may lose small regions
+        strangers = coerced.index_of(field.region_ids) < 0
+        if bool(strangers.any()):
+            warnings.warn(
+                f"{int(strangers.sum())} of {strangers.numel()} Gaussians paint nothing: regions does not hold their "
+                f"region ids, such as {int(field.region_ids[strangers][0])}; pass the map that they belong to, or call "
+                "field.assign_regions(regions)",
+                stacklevel=5,  # past nn.Module's own call
+            )
         return coerced.resize(target)
 
     def extra_repr(self) -> str:

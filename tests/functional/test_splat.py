@@ -59,7 +59,8 @@ def rounding(backend: str) -> float:
 def gradients(scene: Scene, regions: RegionMap | None, **options: object) -> tuple[Tensor, list[Tensor]]:
     inputs = [t.detach().clone().requires_grad_() for t in scene[:3]]
     size = None if regions is not None else tuple(scene.labels.shape)
-    image = region_splat(*inputs, scene.region_ids, regions, size=size, **options)
+    region_ids = None if regions is None else scene.region_ids
+    image = region_splat(*inputs, region_ids, regions, size=size, **options)
     probe = torch.linspace(-1, 2, image.numel(), dtype=image.dtype).view_as(image)
     return image.detach(), list(torch.autograd.grad((image * probe).sum(), inputs))
 
@@ -375,7 +376,8 @@ class TestErrors:
             ({"regions": torch.zeros(0, 3).long()}, ValueError, "labels must have at least one pixel"),
             ({"regions": torch.zeros(2, 3, 3).long()}, ValueError, "regions must hold 1 map"),
             ({"regions": "map.png"}, TypeError, "regions must be a RegionMap, a label map Tensor or None"),
-            ({"regions": None}, ValueError, "size must be given"),
+            ({"regions": None}, ValueError, "regions must be given with region_ids; got None"),
+            ({"regions": None, "region_ids": None}, ValueError, "size must be given"),
             ({"regions": None, "size": (0, 4)}, ValueError, "size must be at least 1 x 1"),
             ({"regions": None, "size": (2.0, 4)}, TypeError, "size must hold two integers"),
             ({"size": (2, 2)}, ValueError, r"size must equal the size of regions, \(1, 2\); got \(2, 2\)"),

@@ -151,7 +151,8 @@ def run_decode_script(files: list[bytes], options: list[str]) -> Tensor:
 
 def splat(p: Parts, **settings: Any) -> Tensor:
     """Evaluate the splat of tensors that may hold gradients; `size` is that of the map."""
-    return F.region_splat(p.means, p.cholesky, p.colors, p.ids, _regions(p), **settings)
+    regions = _regions(p)
+    return F.region_splat(p.means, p.cholesky, p.colors, None if regions is None else p.ids, regions, **settings)
 
 
 def render(p: Parts, size: tuple[int, int] | None = None) -> Tensor:

@@ -131,10 +131,10 @@ class TestRenderer:
         twin = region_splat(field.means, field.cholesky, field.colors, field.region_ids, labels, cutoff=1e-3)
         assert torch.equal(image, twin)
 
-    def test_clamp(self, field: GaussianField) -> None:
+    def test_clamp(self, field: GaussianField, labels: Tensor) -> None:
         with torch.no_grad():
             field.colors.mul_(20).sub_(3)
-        free, clamped = RegionSplatRenderer()(field), RegionSplatRenderer(clamp=True)(field)
+        free, clamped = RegionSplatRenderer()(field, labels), RegionSplatRenderer(clamp=True)(field, labels)
         assert free.min() < 0 and free.max() > 1
         assert torch.equal(clamped, free.clamp(0, 1))
 
@@ -145,6 +145,7 @@ class TestRenderer:
         torch.testing.assert_close(large[:, 1::3, 1::3], small, rtol=1e-4, atol=1e-5)
 
     def test_another_aspect(self, field: GaussianField) -> None:
+        field.region_ids = None
         wide = RegionSplatRenderer(cutoff=0)(field, None, (24, 108))
         torch.testing.assert_close(wide[:, :, 1::3], RegionSplatRenderer(cutoff=0)(field), rtol=1e-4, atol=1e-5)
 
@@ -158,10 +159,26 @@ class TestRenderer:
             render(field, labels[:5])
         with pytest.raises(ValueError, match="field must have region_ids"):
             render(GaussianField.random(3, SIZE), labels)
+        for confined in (field, Scene(field)):
+            with pytest.raises(ValueError, match="regions must be given for a field that is confined to regions"):
+                render(confined)
         with pytest.raises(TypeError, match="field must be a GaussianField or a Scene; got Tensor"):
             render(labels)
         with pytest.raises(ValueError, match="cutoff must be in"):
             RegionSplatRenderer(cutoff=2.0)
+
+    def test_a_map_that_lacks_ids(self, field: GaussianField, labels: Tensor) -> None:
+        other = torch.where(labels == 4, 99, labels)
+        count = int((field.region_ids == 4).sum())
+        with pytest.warns(UserWarning, match=f"^{count} of {len(field)} Gaussians paint nothing: .* such as 4;"):
+            image = Scene(field, other).render()
+        assert (image[:, labels == 4] == 0).all() and (image[:, labels != 4] > 0).any()
+        # a small map may lose regions: that is no mistake
+        dot = torch.zeros(SIZE, dtype=torch.long)
+        dot[5, 5] = 1
+        field.region_ids = torch.ones(len(field), dtype=torch.long)
+        assert RegionSplatRenderer()(field, dot, (2, 3)).eq(0).all()
+        assert RegionSplatRenderer()(GaussianField.random(0, SIZE, regions=dot), dot).eq(0).all()
 
 
 class TestComposition:
