@@ -158,6 +158,7 @@ class TestImage:
         )  # fmt: skip
         assert_same(field, None, [(30, 30), (60, 40)], clamp=True)
 
+    @pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing")
     @pytest.mark.parametrize("count", [1, 2])
     def test_ids_that_the_map_has_not(self, count: int) -> None:
         size = (40, 50)
