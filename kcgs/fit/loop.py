@@ -158,19 +158,14 @@ def check_num_gaussians(value: object, image: Tensor) -> int:
 
 def _warn_of_regions(state: FitState) -> None:
     """Say where there are more regions than Gaussians."""
-    num_gaussians, message = state.num_gaussians, ""
-    if state.regions is not None and (count := state.regions.num_regions) > num_gaussians:
-        message = (
-            f"{count - num_gaussians} of {count} regions get no Gaussian and stay black: num_gaussians is "
-            f"{num_gaussians}; merge regions or take more"
-        )
-    elif state.merged_for_count:
-        message = (
-            f"{state.merged_for_count} of {state.merged_for_count + num_gaussians} regions were merged with others: "
-            f"there are more than num_gaussians, {num_gaussians}"
-        )
-    if message:
-        warnings.warn(message, stacklevel=5)  # past the decorators
+    most, merged = state.num_gaussians, state.merged_for_count
+    if state.regions is not None and (count := state.regions.num_regions) > most:
+        lost = f"{count - most} of {count} regions get no Gaussian and stay black"
+    elif merged:
+        lost = f"{merged} of {merged + most} regions were merged with others"
+    else:
+        return
+    warnings.warn(f"{lost}: there are more than num_gaussians, {most}", stacklevel=5)  # past the decorators
 
 
 def check_problem(image: Any, regions: RegionMap | Tensor | None) -> tuple[Tensor, RegionMap | None]:

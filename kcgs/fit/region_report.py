@@ -42,10 +42,9 @@ class RegionReport:
     def __str__(self) -> str:
         if self.dropped is not None:
             why = "the recipe uses none" if self.dropped == "recipe" else "its bytes do more as Gaussians"
-            return f"the map of {_count(self.given)} was dropped: {why}"
-        parts = [f"{self.kept} of {_count(self.given)} kept"]
-        if self.kept == 1 < self.given:
-            parts = [f"{self.given} regions became one"]
+            return f"the map of {self.given} regions was dropped: {why}"
+        one = self.kept == 1 < self.given
+        parts = [f"{self.given} regions became one" if one else f"{self.kept} of {self.given} regions kept"]
         merged = {
             "more than Gaussians": self.merged_for_count,
             "their contours save less than their bytes": self.merged_for_bytes,
@@ -53,14 +52,10 @@ class RegionReport:
         }
         parts += [f"{number} merged: {why}" for why, number in merged.items() if number]
         if self.moved_pixels:
-            parts.append(f"{self.moved_pixels} pixel{'s' * (self.moved_pixels > 1)} moved to others")
+            parts.append(f"{self.moved_pixels} pixels moved to others")
         if self.empty:
             parts.append(f"{self.empty} without a Gaussian, black")
         return "; ".join(parts)
-
-
-def _count(number: int) -> str:
-    return f"{number} region{'s' * (number > 1)}"
 
 
 def report_regions(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -12,7 +12,7 @@ from kcgs._check import check_count
 from kcgs._progress import Progress
 from kcgs.fit import FitConfig, FitResult, HistoryEntry, fit
 from kcgs.fit.loop import check_problem
-from kcgs.fit.region_report import RegionReport, report_regions
+from kcgs.fit.region_report import report_regions
 from kcgs.functional import RegionMap, merge_regions
 from kcgs.functional.labels import contour_edges
 from kcgs.functional.merging import pairs_to_merge
@@ -28,6 +28,7 @@ _POWER = 0.93
 # contours show: an image with them may have this much more squared error, 0.1 dB
 _FAVOUR = 1.023
 _TRIAL_ITERATIONS, _TRIAL_TO_END = 80, 0.65
+_Choice = tuple[RegionMap | None, float, dict[str, Any]]
 
 
 class FitBytesResult(NamedTuple):
@@ -86,15 +87,14 @@ def fit_bytes(
     if config.target_psnr is not None:
         raise ValueError(f"target_psnr must be None where bytes are the target; got {config.target_psnr}")
     with Progress("trial fits", known=False, shown=progress):
-        chosen = _choose(image, regions, num_bytes, config, seed)
-    count = count_for(num_bytes - _map_bytes(chosen.regions), image.shape[1] * image.shape[2])
-    result = fit(
-        image, chosen.regions, count,
-        recipe=config, seed=seed, on_step=on_step, progress=progress, contour_cost=chosen.cost,
-    )  # fmt: skip
+        chosen, cost, changes = _choose(image, regions, num_bytes, config, seed)
+    count = count_for(num_bytes - _map_bytes(chosen), image.shape[1] * image.shape[2])
+    result = fit(image, chosen, count, recipe=config, seed=seed, on_step=on_step, progress=progress, contour_cost=cost)
+    changes = changes if config.guidance else {"dropped": "recipe"}
+    result = result._replace(regions=report_regions(regions, result.scene, **changes))
     with Progress("writing the file", known=False, shown=progress):
         data, scene = compress(result.scene, image, target_bytes=num_bytes, seed=seed)
-    return FitBytesResult(data, scene, result._replace(regions=_report(regions, chosen, result)))
+    return FitBytesResult(data, scene, result)
 
 
 def count_for(num_bytes: float, pixels: int) -> int:
@@ -106,18 +106,10 @@ def count_for(num_bytes: float, pixels: int) -> int:
     return min(max(1, round(count)), pixels)
 
 
-class _Choice(NamedTuple):
-    regions: RegionMap | None  # None: its bytes do more as Gaussians
-    cost: float  # what a pixel of contour must save
-    dropped: bool = False  # as a whole
-    merged_for_bytes: int = 0
-    merged_for_count: int = 0
-
-
 def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: FitConfig, seed: int) -> _Choice:
-    """Choose the regions that pay for their bytes."""
+    """Choose the regions that pay for their bytes; return what a pixel of contour must save, and what went, too."""
     if regions is None or regions.num_regions == 1:
-        return _Choice(None, config.contour_cost)
+        return None, config.contour_cost, {}
     given, pixels = regions.num_regions, image.shape[1] * image.shape[2]
     # by iterations, so that the same arguments give the same file
     iterations = min(_TRIAL_ITERATIONS, config.iterations)
@@ -139,25 +131,14 @@ def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: Fi
     paying, count = regions.num_regions, count_for(num_bytes - _map_bytes(regions), pixels)
     if config.merge_regions and paying > count:
         regions = regions.merge(pairs_to_merge(image, regions.labels, count))[0]
-    merged = given - paying, paying - (1 if regions is None else regions.num_regions)
-    if regions is None or regions.num_regions == 1:
-        return _Choice(None, cost, False, *merged)
+    kept = 1 if regions is None else regions.num_regions
+    merged = {"merged_for_bytes": given - paying, "merged_for_count": paying - kept}
+    if regions is None or kept == 1:
+        return None, cost, merged
     left = num_bytes - _map_bytes(regions)
-    if count_for(left, pixels) < regions.num_regions or error(regions, left) >= _FAVOUR * without:
-        return _Choice(None, cost, dropped=True)
-    return _Choice(regions, cost, False, *merged)
-
-
-def _report(given: RegionMap | None, chosen: _Choice, result: FitResult) -> RegionReport | None:
-    dropped: Literal["recipe", "bytes"] | None = "bytes" if chosen.dropped else None
-    of_fit = 0 if result.regions is None else result.regions.merged_for_count
-    return report_regions(
-        given,
-        result.scene,
-        merged_for_count=chosen.merged_for_count + of_fit,
-        merged_for_bytes=chosen.merged_for_bytes,
-        dropped=dropped if result.config.guidance else "recipe",
-    )
+    if count_for(left, pixels) < kept or error(regions, left) >= _FAVOUR * without:
+        return None, cost, {"dropped": "bytes"}
+    return regions, cost, merged
 
 
 def _map_bytes(regions: RegionMap | None) -> int:

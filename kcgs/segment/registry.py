@@ -150,38 +150,29 @@ class _Method:
     def _checked(self, found: Any, size: tuple[int, ...]) -> Prediction:
         """Return what the function gave with int64 labels; refuse what says no region for every pixel."""
         found = found if isinstance(found, Prediction) else Prediction(found)
-        values = self._of_pixels("labels", found.labels, size)
+        source = f"from segmentation method {self.name!r} must"
+        values = _of_pixels(f"labels {source}", found.labels, size)
         labels = values if values.is_complex() else values.long()
         if values.is_complex() or not torch.equal(labels.to(values.dtype), values):
-            raise ValueError(f"labels from segmentation method {self.name!r} must be whole numbers; got {values.dtype}")
-        if labels.min() < 0:
-            raise ValueError(
-                f"labels from segmentation method {self.name!r} must be non-negative; got {int(labels.min())}: give "
-                "the pixels of no region an id of their own"
-            )
-        if found.names is not None and labels.max() >= len(found.names):
-            raise ValueError(
-                f"names from segmentation method {self.name!r} must say what label {int(labels.max())} is; got "
-                f"{len(found.names)} names"
-            )
-        scores = None if found.scores is None else self._of_pixels("scores", found.scores, size)
+            raise ValueError(f"labels {source} be whole numbers; got {values.dtype}")
+        low, high = int(labels.min()), int(labels.max())
+        if low < 0:
+            raise ValueError(f"labels {source} be non-negative; got {low}: give pixels of no region an id of their own")
+        if found.names is not None and high >= len(found.names):
+            raise ValueError(f"names {source} say what label {high} is; got {len(found.names)} names")
+        scores = None if found.scores is None else _of_pixels(f"scores {source}", found.scores, size)
         return Prediction(labels, scores, found.names)
 
-    def _of_pixels(self, what: str, values: Any, size: tuple[int, ...]) -> Tensor:
-        if isinstance(values, np.ndarray) and values.dtype.kind in "biuf":
-            values = torch.from_numpy(np.ascontiguousarray(values))
-        if not isinstance(values, Tensor):
-            kind = f"an array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
-            raise TypeError(
-                f"{what} from segmentation method {self.name!r} must be a Tensor or a numpy array of numbers; "
-                f"got {kind}"
-            )
-        if tuple(values.shape) != size:
-            raise ValueError(
-                f"{what} from segmentation method {self.name!r} must have the image's size {size}; got "
-                f"{tuple(values.shape)}"
-            )
-        return values.detach()
+
+def _of_pixels(what: str, values: Any, size: tuple[int, ...]) -> Tensor:
+    if isinstance(values, np.ndarray) and values.dtype.kind in "biuf":
+        values = torch.from_numpy(np.ascontiguousarray(values))
+    if not isinstance(values, Tensor):
+        kind = f"an array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
+        raise TypeError(f"{what} be a Tensor or a numpy array of numbers; got {kind}")
+    if tuple(values.shape) != size:
+        raise ValueError(f"{what} have the image's size {size}; got {tuple(values.shape)}")
+    return values.detach()
 
 
 _methods: dict[str, _Method] = {}

@@ -108,7 +108,7 @@ class TestRegistry:
     @pytest.mark.parametrize(
         ("labels", "error", "message"),
         [
-            (torch.full((20, 30), -1), ValueError, "must be non-negative; got -1: give the pixels of no region an id"),
+            (torch.full((20, 30), -1), ValueError, "must be non-negative; got -1: give pixels of no region an id"),
             (torch.full((20, 30), 0.5), ValueError, "labels from segmentation method 'test' must be whole numbers"),
             (torch.full((20, 30), torch.nan), ValueError, "must be whole numbers; got torch.float32"),
             (torch.zeros(20, 30, 1), ValueError, r"must have the image's size \(20, 30\); got \(20, 30, 1\)"),
