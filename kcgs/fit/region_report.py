@@ -86,8 +86,11 @@ def report_regions(
 
 def _moved_pixels(given: RegionMap, regions: RegionMap) -> int:
     """Count the pixels that are not where their region went: under its own id, or where most of its pixels are."""
-    before, after = given.index_of(given.labels).flatten(), regions.index_of(regions.labels).flatten()
-    shared = torch.bincount(before * regions.num_regions + after, minlength=given.num_regions * regions.num_regions)
-    into, same = shared.view(given.num_regions, -1).argmax(1), regions.index_of(given.ids)
-    into = torch.where(same >= 0, same, into)
+    before, after = given.index_of(given.labels), regions.index_of(regions.labels)
+    into = regions.index_of(given.ids)
+    lost = into[before] < 0  # pixels of ids that are no more
+    pairs, counts = (before[lost] * regions.num_regions + after[lost]).unique(return_counts=True)
+    most = torch.zeros_like(into).scatter_reduce_(0, pairs // regions.num_regions, counts, "amax")
+    largest = pairs[counts == most[pairs // regions.num_regions]]
+    into[largest // regions.num_regions] = largest % regions.num_regions
     return int((into[before] != after).sum())
