@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from kcgs._atomic import atomic_path
-
-if TYPE_CHECKING:
-    from kcgs.fit import HistoryEntry
 
 # of Okabe and Ito
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
@@ -22,8 +20,16 @@ def figure(rows: int, cols: int, *, width: float, height: float) -> tuple[Any, A
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    class Plot(Figure):
+        """A figure that a notebook shows, which knows of none but pyplot's."""
+
+        def _repr_png_(self) -> bytes:
+            file = io.BytesIO()
+            self.savefig(file, dpi=100)
+            return file.getvalue()
+
     with rc_context({"axes.prop_cycle": cycler(color=COLORS), "axes.grid": True, "grid.alpha": 0.3, "font.size": 9}):
-        plot = Figure(figsize=(width, height), layout="constrained")
+        plot = Plot(figsize=(width, height), layout="constrained")
         FigureCanvasAgg(plot)
         axes = plot.subplots(rows, cols, squeeze=rows == 1)
     return plot, axes
@@ -35,8 +41,11 @@ def save_figure(plot: Any, path: Path) -> None:
         plot.savefig(temporary, dpi=130)
 
 
-def plot_history(path: Path, histories: Mapping[str, Sequence[HistoryEntry]]) -> None:
-    """Plot PSNR and EF-PSNR of fits, by name, against seconds and against iterations, as a PNG."""
+def history_figure(histories: Mapping[str, Sequence[Any]]) -> Any:
+    """Plot PSNR and EF-PSNR of fits, by name, against seconds and against iterations.
+
+    A history is a list of :class:`kcgs.fit.HistoryEntry`.
+    """
     plot, axes = figure(1, 2, width=9.5, height=3.8)
     for axis, field, unit in ((axes[0], "seconds", "seconds"), (axes[1], "iteration", "iterations")):
         for index, (name, history) in enumerate(histories.items()):
@@ -49,4 +58,4 @@ def plot_history(path: Path, histories: Mapping[str, Sequence[HistoryEntry]]) ->
         axis.legend(loc="lower right")
     axes[0].set_title("error against run time")
     axes[1].set_title("error against iterations")
-    save_figure(plot, path)
+    return plot

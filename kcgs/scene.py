@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from kcgs._atomic import atomic_path
 from kcgs._check import check_memory, check_size
+from kcgs._repr import png, shorten
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField, RegionSplatRenderer
 
@@ -21,6 +22,8 @@ FORMATS = {".safetensors": "kcgs.storage", ".kcgs": "kcgs.codec"}
 
 # as measured: of each number of a render that is saved, of each pixel of a label map, or of what it is made of
 _IMAGE_BYTES, _MAP_BYTES = 12, 42
+# pixels of the longer side in a notebook
+_SHOWN_SIDE = 1024
 
 
 class Scene(nn.Module):
@@ -104,10 +107,16 @@ class Scene(nn.Module):
         """Write the scene, as :func:`kcgs.save` does; return the bytes of the file."""
         return save(path, self)
 
-    def extra_repr(self) -> str:
-        """Show the map and the notes; the field shows itself."""
+    def __repr__(self) -> str:
         regions = "no regions" if self.regions is None else f"{self.regions.num_regions} regions"
-        return f"size={self.size}, {regions}" + (f", metadata={self.metadata}" if self.metadata else "")
+        notes = f", metadata={self.metadata}" if self.metadata else ""
+        return shorten(f"Scene({self.field.extra_repr()}, {regions}{notes})")
+
+    def _repr_png_(self) -> bytes | None:
+        if self.field.means.ndim != 2:
+            return None
+        factor = min(1.0, _SHOWN_SIDE / max(self.size))
+        return png(self.render((max(1, round(self.size[0] * factor)), max(1, round(self.size[1] * factor)))))
 
     def get_extra_state(self) -> dict[str, Any]:
         """Map and notes, for `state_dict`."""

@@ -7,12 +7,14 @@ import json
 from pathlib import Path
 from typing import NamedTuple
 
+from kcgs._repr import brief
 from kcgs._shipped import shipped_folder
 
 _FOLDER = shipped_folder("models", checkout="models")
 PREFIX = "zoo:"
 
 
+@brief
 class Entry(NamedTuple):
     """A scene of the zoo, as its manifest has it."""
 

@@ -17,15 +17,15 @@ ROOT = PACKAGE.parent
 LAYERS = [
     {"cli"},
     {"bench"},
-    {"view", "zoo", "plots"},
+    {"view", "zoo"},
     {"rate"},
     {"fit", "codec", "onnx", "segment"},
     {"data", "editing", "evaluate", "pruning", "storage"},
     {"scene"},
     {"nn"},
     {"functional"},
-    {"kernels", "engine"},
-    {"_check", "_atomic", "_shipped", "_interrupts", "_progress"},
+    {"kernels", "engine", "plots"},
+    {"_check", "_atomic", "_shipped", "_interrupts", "_progress", "_repr"},
 ]
 GONE = {
     "image, render": r"\bpictures?\b|\bdraw(s|n|ing|ings)?\b",

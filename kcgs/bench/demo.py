@@ -10,8 +10,8 @@ import torch
 
 from kcgs.data import colorize_labels, save_image, save_labels
 from kcgs.evaluate import measure
-from kcgs.fit import FitConfig, FitResult, HistoryEntry, fit, warm_up
-from kcgs.plots import COLORS, plot_history
+from kcgs.fit import FitConfig, FitResult, fit, warm_up
+from kcgs.plots import COLORS, history_figure, save_figure
 from kcgs.scene import load
 from kcgs.segment import segment
 
@@ -21,7 +21,6 @@ from .core.registry import experiment
 
 if TYPE_CHECKING:
     from PIL.Image import Image
-    from rich.progress import Progress
     from torch import Tensor
 
 NUM_GAUSSIANS = 400
@@ -44,7 +43,6 @@ class Panel(NamedTuple):
 def run(output: Path, options: Options) -> None:
     """Fit scikit-image's astronaut twice; write images, scenes, comparison.png and error-against-time.png."""
     from rich.console import Console
-    from rich.progress import Progress
     from rich.table import Table
 
     image, count = astronaut(), NUM_GAUSSIANS
@@ -55,40 +53,30 @@ def run(output: Path, options: Options) -> None:
     save_image(output / "regions.png", colorize_labels(labels))
     save_labels(output / "labels.png", labels)
     settings = {"iterations": QUICK_ITERATIONS} if options.quick else {}
-    console = Console(stderr=True)
     results: dict[str, FitResult] = {}
     panels = [Panel("original", (f"{image.shape[2]} x {image.shape[1]} pixels", ""), image)]
     table = Table("", "PSNR (dB)", "EF-PSNR (dB)", "seconds", "bytes", title=f"{count} Gaussians")
-    with Progress(console=console, disable=not console.is_terminal) as progress:
-        for name, recipe in RECIPES.items():
-            config = FitConfig.from_recipe(recipe, **settings)
-            if not options.quick:
-                warm_up(config)  # the clock counts no compilation
-            results[name] = result = _fit(image, labels, count, config, name, progress)
-            scene = result.scene
-            scene.save(output / f"{name}.safetensors")
-            size = scene.save(output / f"{name}.kcgs")
-            rendered = load(output / f"{name}.kcgs").render()  # what so many bytes give
-            save_image(output / f"{name}.png", rendered)
-            figures = measure(rendered, image, labels)
-            psnr, ef_psnr = f"{figures['psnr']:.2f}", f"{figures['ef_psnr']:.2f}"
-            table.add_row(name, psnr, ef_psnr, f"{result.history[-1].seconds:.1f}", f"{size:,}")
-            parts = f"{len(scene)} Gaussians" + ("" if scene.regions is None else " and contours")
-            lines = f"{parts}, {size / 1e3:.1f} kB", f"PSNR {psnr} dB, EF-PSNR {ef_psnr} dB"
-            panels.append(Panel(TITLES[name], lines, rendered))
-    plot_history(output / "error-against-time.png", {name: result.history for name, result in results.items()})
+    for name, recipe in RECIPES.items():
+        config = FitConfig.from_recipe(recipe, **settings)
+        if not options.quick:
+            warm_up(config)  # the clock counts no compilation
+        results[name] = result = fit(image, labels, count, recipe=config, progress=True)
+        scene = result.scene
+        scene.save(output / f"{name}.safetensors")
+        size = scene.save(output / f"{name}.kcgs")
+        rendered = load(output / f"{name}.kcgs").render()  # what so many bytes give
+        save_image(output / f"{name}.png", rendered)
+        figures = measure(rendered, image, labels)
+        psnr, ef_psnr = f"{figures['psnr']:.2f}", f"{figures['ef_psnr']:.2f}"
+        table.add_row(name, psnr, ef_psnr, f"{result.history[-1].seconds:.1f}", f"{size:,}")
+        parts = f"{len(scene)} Gaussians" + ("" if scene.regions is None else " and contours")
+        lines = f"{parts}, {size / 1e3:.1f} kB", f"PSNR {psnr} dB, EF-PSNR {ef_psnr} dB"
+        panels.append(Panel(TITLES[name], lines, rendered))
+    histories = {name: result.history for name, result in results.items()}
+    save_figure(history_figure(histories), output / "error-against-time.png")
     compose(panels).save(output / "comparison.png")
     Console().print(table)
     Console().print(f"images and scenes in {output}/")
-
-
-def _fit(image: Tensor, labels: Tensor, count: int, config: FitConfig, name: str, progress: Progress) -> FitResult:
-    task = progress.add_task(name, total=config.iterations)
-
-    def step(iteration: int, _: HistoryEntry) -> None:
-        progress.update(task, completed=iteration)
-
-    return fit(image, labels, count, recipe=config, on_step=step)
 
 
 def compose(panels: Sequence[Panel], *, side: int = 512, gap: int = 12) -> Image:

@@ -74,9 +74,9 @@ def fit_command(
         )  # fmt: skip
     result = fitted.result
     if plot is not None:
-        from kcgs.plots import plot_history
+        from kcgs.plots import history_figure, save_figure
 
-        plot_history(plot, {request.recipe: result.history})
+        save_figure(history_figure({request.recipe: result.history}), plot)
     title = f"{output}: {len(fitted.scene)} Gaussians, stopped by {result.stop_reason}"
     if result.removed:
         title += f"; {result.removed} useless ones removed, which changed no value by more than {result.change:.1g}"

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from kcgs._check import check_count, check_floating, check_number
+from kcgs._repr import brief
 from kcgs.functional import RegionMap
 from kcgs.functional.covariance import check_cholesky
 from kcgs.nn import GaussianField
@@ -174,6 +175,7 @@ def _positions(field: GaussianField, regions: RegionMap) -> Integers:
     return index.numpy()
 
 
+@brief
 class Decoded(NamedTuple):
     """The scene of a file (without regions where there is one), the layers that were there, and those of all of it."""
 

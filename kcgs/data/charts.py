@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from kcgs._check import check_count
+from kcgs._repr import brief
 
 _BLOCKS = (
     ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
@@ -31,6 +32,7 @@ _PIE_START = torch.pi / 8
 _SUBSAMPLES = 8
 
 
+@brief
 class ChartSample(NamedTuple):
     """A chart, :math:`(3, H, W)` float32 RGB in [0, 1], and the regions of pixel centres, :math:`(H, W)` int64."""
 

@@ -8,10 +8,12 @@ from typing import NamedTuple
 from torch import Tensor
 
 from kcgs._check import check_count
+from kcgs._repr import brief
 from kcgs.data.images import load_image
 from kcgs.data.labels import load_labels
 
 
+@brief
 class DavisFrame(NamedTuple):
     """One frame of a sequence, :math:`(3, H, W)` float32 RGB in [0, 1], and its labels, :math:`(H, W)` int64.
 

@@ -13,12 +13,15 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 
+from kcgs._repr import brief
+
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 ENGINES = ("local", "ray")
 
 
+@brief
 class Failure(NamedTuple):
     """Why there is no result: WorkerDied, without a traceback, where the process itself ended."""
 
@@ -30,6 +33,7 @@ class Failure(NamedTuple):
         return f"{self.type}: {' '.join(self.message.split())}" if self.message else self.type
 
 
+@brief
 @dataclass(frozen=True)
 class Done(Generic[Result]):
     """A job that has ended: its index, its result or error, and its wall time, measured where it ran."""

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from kcgs._repr import shorten
 from kcgs.functional import MAX_SOFTNESS
 from kcgs.kernels import BACKENDS
 
@@ -101,6 +102,10 @@ class FitConfig(BaseModel):
             raise ValueError(f"softness must be 'auto' or in [0, {MAX_SOFTNESS:g}] pixels; got {self.softness!r}")
         if self.max_move != "any" and self.max_move < 1.0:
             raise ValueError(f"max_move must be 'any' or at least 1 pixel; got {self.max_move!r}")
+
+    def __repr__(self) -> str:
+        changed = self.model_dump(exclude_defaults=True)
+        return shorten(f"FitConfig({', '.join(f'{name}={value!r}' for name, value in changed.items())})")
 
     @classmethod
     def from_recipe(cls, recipe: str | FitConfig, **settings: Any) -> FitConfig:

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from torch import Tensor
 
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
+from kcgs.plots import history_figure
 from kcgs.scene import Scene
 
 from .config import FitConfig
 from .optimizers import GaussianOptimizer
 from .region_report import RegionReport
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 StopReason = Literal["iterations", "seconds", "target_psnr", "callback", "diverged"]
 
@@ -49,6 +54,18 @@ class FitResult(NamedTuple):
     """Wall time of all that was done, which the history of a search does not tell."""
     target_reached: bool | None = None
     """None: there was no `target_psnr`."""
+
+    def __repr__(self) -> str:
+        psnr = max((entry.psnr for entry in self.history), default=math.nan)
+        return f"FitResult({psnr:.2f} dB, stopped by {self.stop_reason}, {self.seconds:.1f} s, {self.scene!r})"
+
+    def _repr_png_(self) -> bytes | None:
+        return self.scene._repr_png_()
+
+    def plot(self) -> Figure:
+        """Plot PSNR and EF-PSNR against run time and iterations; save it with its `savefig`."""
+        figure: Figure = history_figure({"fit": self.history})
+        return figure
 
 
 class Gaussians(NamedTuple):
@@ -108,6 +125,9 @@ class FitState:
     history: list[HistoryEntry] = dataclasses.field(default_factory=list)
     best: Gaussians | None = None
     best_psnr: float = float("-inf")
+
+    def __repr__(self) -> str:
+        return f"FitState(iteration {self.iteration} of {self.config.iterations}, {self.best_psnr:.2f} dB)"
 
     @property
     def size(self) -> tuple[int, int]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from kcgs._check import check_count, check_image, check_labels, check_number
+from kcgs._repr import brief
 
 from .labels import edge_band
 
@@ -23,6 +24,7 @@ _REACH = 8
 _BLOCK = 1 << 20  # pixels whose gradient is taken at a time
 
 
+@brief
 class BoundaryScore(NamedTuple):
     """How well two maps' boundaries agree, each 0-dim or (B,), in [0, 1]."""
 

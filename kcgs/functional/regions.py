@@ -44,6 +44,10 @@ class RegionMap:
     _table: Tensor | None = field(repr=False, kw_only=True)
     _origin: RegionMap | None = field(default=None, repr=False, kw_only=True)  # what this was resized from
 
+    def __repr__(self) -> str:
+        finer = "" if self.supersample == 1 else f", supersample={self.supersample}"
+        return f"RegionMap({self.num_regions} regions, size={self.size}, softness={self.softness}{finer})"
+
     @classmethod
     def from_labels(
         cls, labels: Tensor, softness: float | Mapping[tuple[int, int], float] = 0.0, *, supersample: int = 1

@@ -10,6 +10,7 @@ from torch import Tensor
 from kcgs._check import check_number
 
 MAX_SOFTNESS = 64.0  # pixels
+_FEW = 4
 
 
 class PairWidths(Mapping[tuple[int, int], float]):
@@ -39,7 +40,9 @@ class PairWidths(Mapping[tuple[int, int], float]):
         return hash(tuple(self._widths.items()))
 
     def __repr__(self) -> str:
-        return f"PairWidths({self._widths})"
+        if len(self) <= _FEW:
+            return f"PairWidths({self._widths})"
+        return f"PairWidths({len(self)} pairs, {min(self.values()):.3g} to {max(self.values()):.3g} pixels)"
 
 
 def check_softness(softness: object, ids: Tensor) -> float | PairWidths:

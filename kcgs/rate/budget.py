@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcgs._check import check_count
 from kcgs._progress import Progress
+from kcgs._repr import brief
 from kcgs.fit import FitConfig, FitResult, HistoryEntry, fit
 from kcgs.fit.loop import check_problem
 from kcgs.fit.region_report import report_regions
@@ -31,6 +32,7 @@ _TRIAL_ITERATIONS, _TRIAL_TO_END = 80, 0.65
 _Choice = tuple[RegionMap | None, float, dict[str, Any]]
 
 
+@brief
 class FitBytesResult(NamedTuple):
     """A file, the scene that it decodes to, and the fit that it was made from, before rounding."""
 

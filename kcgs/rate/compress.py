@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import as_image, check_count, check_number
+from kcgs._repr import brief
 from kcgs.codec import QUALITIES, decode
 from kcgs.codec.gaussians.quantize import QPS, Codes, Parameters, Quantizer
 from kcgs.codec.scenes import SceneWriter
@@ -45,6 +46,7 @@ _CURVATURE = (0.5, 0.5, 0.75, 0.25, 0.75)
 _DRAFT_CUTOFF = 1e-3
 
 
+@brief
 class Compressed(NamedTuple):
     """A file, and the scene that it decodes to."""
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_count
+from kcgs._repr import brief
 from kcgs.segment.cleanup import check_segment_image, connected_regions, merge_similar, merge_small, order_by_area
 from kcgs.segment.snapping import snap_contours
 
@@ -22,6 +23,7 @@ _MIN_SHARE = 0.004
 _PACKAGES = {"skimage": "scikit-image", "PIL": "pillow", "transformers": "'kcgs[segment]'"}
 
 
+@brief
 class Segmentation(NamedTuple):
     """A label map, how sure its method is of every region, and what each is called."""
 
@@ -33,6 +35,7 @@ class Segmentation(NamedTuple):
     """By id; several regions may have one name. None: the method knows no names."""
 
 
+@brief
 class Prediction(NamedTuple):
     """What a method says of every pixel, before clean-up; tensors or numpy arrays."""
 

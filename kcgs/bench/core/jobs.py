@@ -1,13 +1,11 @@
-"""Work that takes long: many jobs here or on other processors, with a progress bar on a terminal."""
+"""Work that takes long: many jobs here or on other processors, with a sign of how far they are."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, TypeVar
 
-from rich.console import Console
-from rich.progress import Progress
-
+from kcgs._progress import Progress
 from kcgs.engine import run_jobs
 
 Job = TypeVar("Job")
@@ -34,14 +32,13 @@ class Place(NamedTuple):
 def make_all(function: Callable[[Job], object], jobs: Sequence[Job], place: Place) -> list[str]:
     """Do jobs that keep what they make on disk themselves; return what failed, one line each."""
     failed: list[str] = []
-    with _progress() as progress:
-        task = progress.add_task(str(jobs[0]) if jobs else "", total=len(jobs))
+    with Progress("bench") as progress:
         for number, ended in enumerate(run_jobs(function, jobs, engine=place.engine, workers=place.workers), 1):
             if ended.error is not None:
                 failed.append(f"{jobs[ended.index]}: {ended.error}")
             # in this process the next job is the one that runs
             shown = min(number, len(jobs) - 1) if place.is_local else ended.index
-            progress.update(task, advance=1, description=str(jobs[shown]))
+            progress.update(number / len(jobs), str(jobs[shown]))
     return failed
 
 
@@ -53,14 +50,7 @@ def check_made(failed: Sequence[str]) -> None:
 
 def with_progress(steps: Sequence[tuple[str, Job]]) -> Iterator[Job]:
     """Yield the second of each pair, with the first beside a bar."""
-    with _progress() as progress:
-        task = progress.add_task("", total=len(steps))
-        for name, step in steps:
-            progress.update(task, description=name)
+    with Progress("bench") as progress:
+        for number, (name, step) in enumerate(steps):
+            progress.update(number / len(steps), name)
             yield step
-            progress.advance(task)
-
-
-def _progress() -> Progress:
-    console = Console(stderr=True)
-    return Progress(console=console, disable=not console.is_terminal)

@@ -1,0 +1,60 @@
+"""How public objects show themselves: a line at a prompt, an image in a notebook."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+T = TypeVar("T")
+
+_FIELD, _LINE = 60, 200
+
+
+def brief(kind: type[T]) -> type[T]:
+    """Have a NamedTuple or a dataclass show itself in a line; of tensors, bytes and long lists only their size.
+
+    Example:
+        >>> from kcgs.segment import Segmentation
+        >>> Segmentation(torch.zeros(32, 48, dtype=torch.int64))
+        Segmentation(labels=int64 (32, 48), scores=None, names=None)
+    """
+    kind.__repr__ = _describe  # type: ignore[method-assign]
+    return kind
+
+
+def _describe(value: Any) -> str:
+    names = getattr(value, "_fields", None) or [field.name for field in dataclasses.fields(value)]
+    fields = ", ".join(f"{name}={_short(getattr(value, name))}" for name in names)
+    return shorten(f"{type(value).__name__}({fields})")
+
+
+def _short(value: Any) -> str:
+    if hasattr(value, "dtype") and hasattr(value, "shape"):
+        return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
+    if isinstance(value, bytes):
+        return f"{len(value):,} bytes"
+    if type(value) in (list, tuple, dict) and len(value) > 4:
+        return f"{len(value)} entries"
+    return shorten(repr(value), _FIELD)
+
+
+def shorten(text: str, length: int = _LINE) -> str:
+    """Put a text into a line of at most so many characters."""
+    text = " ".join(text[: 2 * length].split())
+    return text if len(text) <= length else f"{text[: length - 4]}...{text[-1] if text[-1] in ')]}' else ''}"
+
+
+def png(image: Tensor) -> bytes | None:
+    """Return the PNG of an image (C, H, W) in [0, 1]; None: it has channels that nobody can see."""
+    from PIL import Image
+
+    if image.ndim != 3 or image.shape[0] not in (1, 3, 4):
+        return None
+    levels = (image.float() * 255).round().to(torch.uint8).permute(1, 2, 0).squeeze(-1).cpu().numpy()
+    file = io.BytesIO()
+    Image.fromarray(levels).save(file, "PNG")
+    return file.getvalue()

@@ -1,0 +1,123 @@
+"""What public objects say of themselves: a line or two, and an image in a notebook."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import io
+import pkgutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import kcgs
+from kcgs import FitConfig, GaussianField, RegionMap, RegionSplatRenderer, Scene, codec, fit
+from kcgs.data import ChartSample, Davis, DavisFrame
+from kcgs.engine import run_jobs
+from kcgs.fit import FitResult, available_recipes
+from kcgs.fit.optimizers import Adan, FrameAdam, GaussianImageAdan, ImageGSAdam
+from kcgs.fit.start import start
+from kcgs.fit.strategies import Densify, Finish, MergeRegions, MoveContours
+from kcgs.functional import BandGain, BoundaryScore, PairWidths
+from kcgs.pruning import prune
+from kcgs.rate import Compressed, FitBytesResult
+from kcgs.segment import Cleanup, Prediction, Segmentation
+from kcgs.zoo import entries
+
+SIZE = (64, 96)
+PRIVATE = {"kcgs.cli", "kcgs.bench", "kcgs.kernels"}
+LABELS = torch.arange(64 * 96).reshape(SIZE) // 300
+WIDTHS = {(region, region + 1): 0.3 + 0.1 * region for region in range(20)}
+
+
+@pytest.fixture(scope="module")
+def result() -> FitResult:
+    image = torch.linspace(0.0, 1.0, 96).expand(3, *SIZE)
+    labels = (image[0] > 0.5).long()
+    return fit(image, labels, 40, iterations=110, merge_regions=False)
+
+
+def objects(result: FitResult, folder: Path) -> Iterator[Any]:
+    """Yield an object of every public class, or of one below it, with as much in it as people's have."""
+    field = GaussianField.random(4000, SIZE, regions=LABELS, seed=0)
+    regions = RegionMap.from_labels(LABELS, WIDTHS)
+    scene = Scene(field, regions, {"title": "a long note " * 40})
+    image, data = torch.rand(3, *SIZE), codec.encode(result.scene)
+    yield from (result, result.history[0], result.regions, field, regions, regions.resize((128, 192)), scene)
+    yield from (PairWidths(WIDTHS), RegionSplatRenderer())
+    yield from (FitConfig.from_recipe(recipe) for recipe in available_recipes())
+    yield from (codec.decode(data), Compressed(data, scene), FitBytesResult(data, scene, result), prune(result.scene))
+    yield from (Segmentation(LABELS, torch.rand(21), {i: f"name {i}" for i in range(21)}), Cleanup())
+    yield from (Prediction(LABELS.numpy(), torch.rand(SIZE), [f"name {i}" for i in range(21)]), *entries())
+    yield from (ChartSample(image, LABELS), DavisFrame("bear", image, LABELS), BandGain(0.1, 0.2))
+    yield BoundaryScore(*torch.rand(3, 2))
+    for kind in ("JPEGImages", "Annotations"):
+        (folder / kind / "480p" / "bear").mkdir(parents=True)
+    yield Davis(folder)
+    for done in run_jobs(fail, [image, image]):
+        yield from (done, done.error)
+    state = start(image, regions, 100, FitConfig(), 0, 0.0)
+    yield from (state, Densify(state), MergeRegions(state), MoveContours(state, 1.5, 0.5), Finish())
+    yield from (
+        Adan([field.means]),
+        FrameAdam(field, 1.0),
+        GaussianImageAdan(field, 1.0, 9, 1.0),
+        ImageGSAdam(field, 1.0),
+    )
+
+
+def fail(image: torch.Tensor) -> None:
+    raise ValueError(f"a message as long as {image}")
+
+
+def public_classes() -> set[type]:
+    names = [f"kcgs.{module.name}" for module in pkgutil.iter_modules(kcgs.__path__) if module.name[0] != "_"]
+    names += ["kcgs.fit.optimizers", "kcgs.fit.strategies"]
+    modules = [kcgs, *(importlib.import_module(name) for name in names if name not in PRIVATE)]
+    found = {getattr(module, name) for module in modules for name in getattr(module, "__all__", ())}
+    return {one for one in found if inspect.isclass(one) and not issubclass(one, Exception)}
+
+
+def test_a_line_or_two(result: FitResult, tmp_path: Path) -> None:
+    shown = list(objects(result, tmp_path))
+    for one in shown:
+        text = repr(one)
+        assert text.count("\n") < 2 and max(map(len, text.split("\n"))) <= 200, text
+    protocols = {one for one in public_classes() if getattr(one, "_is_protocol", False)}
+    assert not {one for one in public_classes() - protocols if not any(isinstance(o, one) for o in shown)}
+
+
+def test_what_they_say(result: FitResult) -> None:
+    count = len(result.scene)
+    assert repr(result.scene) == f"Scene({count} Gaussians, 3 channels, size=(64, 96), confined, 2 regions)"
+    words = f"FitResult({max(e.psnr for e in result.history):.2f} dB, stopped by iterations, "
+    assert repr(result).startswith(words) and repr(result).endswith(f" s, {result.scene!r})")
+    assert repr(result.scene.regions).startswith("RegionMap(2 regions, size=(64, 96), softness=")
+    assert repr(FitConfig(iterations=9)) == "FitConfig(iterations=9)"
+
+
+def test_images_in_a_notebook(result: FitResult) -> None:
+    shown = np.asarray(Image.open(io.BytesIO(result._repr_png_())))
+    want = (result.scene.render().permute(1, 2, 0) * 255).round().numpy()
+    assert np.array_equal(shown, want) and result.scene._repr_png_() == result._repr_png_()
+    for channels, mode in ((1, "L"), (4, "RGBA")):
+        scene = Scene(GaussianField.random(5, (20, 3000), channels=channels, seed=0))
+        with Image.open(io.BytesIO(scene._repr_png_())) as image:
+            assert (image.mode, image.size) == (mode, (1024, 7))
+    assert Scene(GaussianField.random(5, SIZE, channels=7, seed=0))._repr_png_() is None
+    means, cholesky, colors = (torch.stack([t, t]) for t in list(result.scene.field.parameters()))
+    assert Scene(GaussianField(means, cholesky, colors, size=SIZE))._repr_png_() is None
+
+
+def test_plot(result: FitResult, tmp_path: Path) -> None:
+    figure = result.plot()
+    figure.savefig(tmp_path / "plot.png")
+    assert figure._repr_png_()[:4] == b"\x89PNG"
+    lines = figure.axes[0].get_lines()
+    assert list(lines[0].get_xdata()) == [entry.seconds for entry in result.history]
+    assert figure.axes[0].get_title() == "error against run time" and len(lines) == 2
