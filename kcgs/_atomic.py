@@ -9,11 +9,7 @@ from pathlib import Path
 
 
 def check_writable(name: str, path: str | os.PathLike[str]) -> None:
-    """Refuse a path at which no file can be written, before the work whose result it is; nothing appears there.
-
-    Raises:
-        OSError: its folder is not there, or takes no files; a folder is in its place. The message begins with `name`.
-    """
+    """Refuse, by an OSError that begins with `name`, a path at which no file can be written; nothing appears there."""
     target = Path(path)
     if target.is_dir():
         raise IsADirectoryError(f"{name} must be a file; {str(target)!r} is a folder")
@@ -32,14 +28,6 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a path beside `path`, of the same suffix, at which the block writes a file that takes its place at the end.
 
     On any exception, Ctrl-C included, it is removed and whatever stood at `path` stays.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with atomic_path(f"{folder}/note.txt") as temporary:
-        ...         _ = temporary.write_text("whole")
-        ...     (Path(folder) / "note.txt").read_text()
-        'whole'
     """
     target = Path(path)
     if not target.parent.is_dir():

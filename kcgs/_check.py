@@ -147,10 +147,8 @@ def check_memory(name: str, size: tuple[int, int], per_pixel: float) -> None:
     """Refuse an image of so many pixels where it needs more memory than is free, at so many bytes per pixel."""
     needed = float(size[0]) * size[1] * per_pixel
     if needed > _LITTLE and needed > (free := _free_memory()):
-        raise ValueError(
-            f"{name} asks for {size[1]} x {size[0]} pixels, which need about {_gigabytes(needed)} of memory; "
-            f"{_gigabytes(free)} are free"
-        )
+        memory = f"about {needed / 1e9:,.1f} GB of memory; {free / 1e9:,.1f} GB are free"
+        raise ValueError(f"{name} asks for {size[1]} x {size[0]} pixels, which need {memory}")
 
 
 def _free_memory() -> float:
@@ -166,10 +164,6 @@ def _free_memory() -> float:
         with suppress(AttributeError, OSError, ValueError):
             found.append(float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")))
     return min(found)
-
-
-def _gigabytes(count: float) -> str:
-    return f"{count / 1e9:,.1f} GB"
 
 
 def check_image(name: str, value: object) -> Tensor:

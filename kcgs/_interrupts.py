@@ -31,13 +31,13 @@ def raised() -> Iterator[list[int]]:
         came.append(number)
         raise KeyboardInterrupt
 
-    ours = signal.getsignal(signal.SIGINT) is leave
-    if ours:
+    before = signal.getsignal(signal.SIGINT)
+    if before is leave:
         signal.signal(signal.SIGINT, interrupt)
     try:
         yield came
     finally:
-        if ours:
+        if before is leave:
             signal.signal(signal.SIGINT, leave)
 
 

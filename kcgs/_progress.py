@@ -20,12 +20,6 @@ class Progress:
         name: of the work.
         known: its length is known: `update` says what share is done. Otherwise only that it goes on is shown.
         shown: False: show nothing.
-
-    Example:
-        >>> with Progress("fit", shown=False) as progress:
-        ...     progress.update(0.5, "29.31 dB")
-        ...     progress.text()
-        'fit, 50 %, 29.31 dB, 0 s'
     """
 
     # of the next line: pieces of work that are short one by one are long together
@@ -80,13 +74,6 @@ class Progress:
         elif self._handle is not None and time.perf_counter() - self._updated >= _NOTEBOOK_SECONDS:
             self._updated = time.perf_counter()
             self._handle.update(self._html(), raw=True)
-
-    def print(self, line: str) -> None:
-        """Print a line that stays, above the bar where there is one."""
-        if self._bar is None:
-            print(line, file=sys.stderr, flush=True)
-        else:
-            self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def text(self) -> str:
         """Describe the work in a line."""

@@ -15,13 +15,7 @@ _FIELD, _LINE = 60, 200
 
 
 def brief(kind: type[T]) -> type[T]:
-    """Have a NamedTuple or a dataclass show itself in a line; of tensors, bytes and long lists only their size.
-
-    Example:
-        >>> from kcgs.segment import Segmentation
-        >>> Segmentation(torch.zeros(32, 48, dtype=torch.int64))
-        Segmentation(labels=int64 (32, 48), scores=None, names=None)
-    """
+    """Have a NamedTuple or a dataclass show itself in a line; of tensors, bytes and long lists only their size."""
     kind.__repr__ = _describe  # type: ignore[method-assign]
     return kind
 
@@ -55,6 +49,5 @@ def png(image: Tensor) -> bytes | None:
     if image.ndim != 3 or image.shape[0] not in (1, 3, 4):
         return None
     levels = (image.float() * 255).round().to(torch.uint8).permute(1, 2, 0).squeeze(-1).cpu().numpy()
-    file = io.BytesIO()
-    Image.fromarray(levels).save(file, "PNG")
+    Image.fromarray(levels).save(file := io.BytesIO(), "PNG")
     return file.getvalue()

@@ -24,8 +24,7 @@ def figure(rows: int, cols: int, *, width: float, height: float) -> tuple[Any, A
         """A figure that a notebook shows, which knows of none but pyplot's."""
 
         def _repr_png_(self) -> bytes:
-            file = io.BytesIO()
-            self.savefig(file, dpi=100)
+            self.savefig(file := io.BytesIO(), dpi=100)
             return file.getvalue()
 
     with rc_context({"axes.prop_cycle": cycler(color=COLORS), "axes.grid": True, "grid.alpha": 0.3, "font.size": 9}):
@@ -42,10 +41,7 @@ def save_figure(plot: Any, path: Path) -> None:
 
 
 def history_figure(histories: Mapping[str, Sequence[Any]]) -> Any:
-    """Plot PSNR and EF-PSNR of fits, by name, against seconds and against iterations.
-
-    A history is a list of :class:`kcgs.fit.HistoryEntry`.
-    """
+    """Plot PSNR and EF-PSNR of fits, by name, against seconds and against iterations."""
     plot, axes = figure(1, 2, width=9.5, height=3.8)
     for axis, field, unit in ((axes[0], "seconds", "seconds"), (axes[1], "iteration", "iterations")):
         for index, (name, history) in enumerate(histories.items()):

@@ -140,12 +140,9 @@ class Stop:
         signal.signal(signal.SIGINT, self._before)
 
     def _interrupt(self, number: int, frame: Any) -> None:
-        if self._began and not self.wanted:
-            self.wanted = True
-        elif callable(self._before):
-            self._before(number, frame)
-        else:
+        if self.wanted or not self._began:
             raise KeyboardInterrupt
+        self.wanted = True
 
     def step(self, iteration: int, entry: Any) -> bool:
         """Say whether the fit is to stop; `on_step` of :func:`kcgs.fit.fit`."""

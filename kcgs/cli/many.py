@@ -188,7 +188,7 @@ def _write_down(
                     kept += math.isnan(outcome.core_seconds)
                     table.put(image, **outcome.metrics, core_seconds=outcome.core_seconds, fit=outcome.fit)
                 for warning in () if outcome is None else outcome.warnings:
-                    progress.print(f"{image.name}: {warning}")
+                    typer.echo(f"{image.name}: {warning}", err=True)
                 told = f"{count} of {len(images)}" + (f", {len(failed)} failed" if failed else "")
                 progress.update(count / len(images), told)
         except KeyboardInterrupt:

@@ -126,9 +126,6 @@ class FitState:
     best: Gaussians | None = None
     best_psnr: float = float("-inf")
 
-    def __repr__(self) -> str:
-        return f"FitState(iteration {self.iteration} of {self.config.iterations}, {self.best_psnr:.2f} dB)"
-
     @property
     def size(self) -> tuple[int, int]:
         """(height, width) of the image."""

@@ -11,24 +11,7 @@ from .tables import markdown, number
 
 
 class Readings(list[Any]):
-    """Rows with a field `value`, a number, and fields that say what was measured: a `quantity`, its `unit` and others.
-
-    Example:
-        >>> from typing import NamedTuple
-        >>> class Row(NamedTuple):
-        ...     case: str
-        ...     quantity: str
-        ...     value: float
-        ...     unit: str
-        >>> rows = Readings([Row("a", "time", 1.0, "ms"), Row("b", "time", 2.0, "ms"), Row("b", "memory", 3.5, "MB")])
-        >>> rows.value(case="b", quantity="time"), rows.value(case="c"), rows.names("case")
-        (2.0, nan, ['a', 'b'])
-        >>> print(rows.table("case"))
-        | case | time, ms | memory, MB |
-        | --- | --- | --- |
-        | a | 1 |  |
-        | b | 2 | 3.5 |
-    """
+    """Rows with a field `value`, a number, and fields that say of what: a `quantity`, its `unit` and others."""
 
     def __init__(self, rows: Iterable[Any]) -> None:
         super().__init__(rows)

@@ -39,10 +39,7 @@ def experiment(
 
     The function writes results.csv and calls :func:`kcgs.bench.core.report.conclude`. It raises a ValueError where what
     is asked cannot be done, and a RuntimeError at its end where fits failed; the others are kept, and in the report.
-
-    Args:
-        takes: options besides data and quick, by name.
-        report: function (folder, how it was made) -> parts of report.md, the title first; it reads results.csv.
+    `takes` names options besides data and quick; `report` makes the parts of report.md from results.csv, title first.
     """
     return lambda function: Experiment(function, takes, report)
 
@@ -54,17 +51,10 @@ def available_experiments() -> tuple[str, ...]:
 
 
 def run(name: str, output: Path, *, redraw: bool = False, **settings: Any) -> None:
-    """Run an experiment and write its report into a folder.
+    """Run an experiment and write its report into a folder, or only the report, from the results that are there.
 
-    Args:
-        name: of the experiment.
-        output: folder, which is made if it is not there.
-        redraw: measure nothing: write the report of an earlier run again from the results in the folder.
-        settings: fields of :class:`kcgs.bench.core.options.Options`; None: not given.
-
-    Raises:
-        ValueError: unknown name, an option that the experiment does not take, `redraw` for one without a report.
-        OSError: the folder cannot be made, or holds no results to redraw.
+    `settings` are fields of :class:`kcgs.bench.core.options.Options`, None where not given; a ValueError says what is
+    not an experiment, or not taken by it.
     """
     if name not in available_experiments():
         raise ValueError(f"name must be one of {', '.join(available_experiments())}; got {name!r}")

@@ -24,18 +24,7 @@ def write_rows(path: Path, kind: type[NamedTuple], rows: Iterable[NamedTuple], d
 
 
 def read_rows(path: Path, kind: type[Record]) -> list[Record]:
-    """Read what `write_rows` wrote; a column that is missing has its field's default, and no file means no rows.
-
-    Example:
-        >>> import tempfile
-        >>> class Point(NamedTuple):
-        ...     name: str
-        ...     size: int
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_rows(Path(folder) / "results.csv", Point, [Point("a", 2)])
-        ...     read_rows(Path(folder) / "results.csv", Point)
-        [Point(name='a', size=2)]
-    """
+    """Read what `write_rows` wrote; a column that is missing has its field's default, and no file means no rows."""
     if not path.is_file():
         return []
     types, make = get_type_hints(kind), cast("Callable[..., Record]", kind)

@@ -60,10 +60,6 @@ def interval(values: Sequence[float]) -> tuple[float, float]:
 
     Percentiles of few images lie too near to the mean, by as much as the normal distribution's do beside Student's,
     and by sqrt((n - 1) / n); they are moved away from it by these factors.
-
-    Example:
-        >>> interval([0.5, 0.5])
-        (0.5, 0.5)
     """
     count, centre = len(values), statistics.fmean(values)
     samples = np.random.default_rng(0).choice(np.asarray(values), (_SAMPLES, count))
@@ -98,12 +94,6 @@ def delta(ours: Curve, other: Curve) -> Delta:
 
     Log-rate is interpolated over quality, quality over log-rate, by monotone piecewise cubics (PCHIP, as in later forms
     of the measure: the first one's single cubic swings between few points), and averaged where both curves are.
-
-    Example:
-        >>> curve = [(1000.0, 25.0), (2000.0, 28.0), (4000.0, 31.0)]
-        >>> found = delta([(0.5 * rate, quality) for rate, quality in curve], curve)
-        >>> round(found.rate, 6), round(found.quality, 6), found.overlap
-        (-50.0, 3.0, 6.0)
     """
     (log_a, quality_a), (log_b, quality_b) = _rising(ours), _rising(other)
     if min(len(log_a), len(log_b)) < 2:

@@ -26,9 +26,6 @@ class Adan(Optimizer):
     ) -> None:
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
 
-    def __repr__(self) -> str:
-        return f"Adan({len(self.param_groups)} groups, lr={self.param_groups[0]['lr']:g})"
-
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """Move every parameter that has a gradient."""

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
 
+from kcgs.bench._codecs import lossless_bytes
 from kcgs.bench.core.cases import BASELINE, BEST, CLAMPED, PAPER, UNCLAMPED, Case, plan
 from kcgs.bench.core.images import load, sequences
 from kcgs.bench.core.jobs import Place, check_made, make_all
 from kcgs.bench.core.options import Options
+from kcgs.bench.core.readings import Readings
+from kcgs.bench.core.rows import read_rows, write_rows
 from kcgs.bench.core.stages import rivals
 from kcgs.bench.core.store import Row, Store
 
@@ -110,3 +114,30 @@ class TestJobs:
         assert make_all(int, ["1", "x"], HERE)[0].startswith("x: ValueError")
         assert make_all(int, [], HERE) == []
         check_made([])
+
+
+class TestReadings:
+    class Reading(NamedTuple):
+        case: str
+        quantity: str
+        value: float
+        unit: str
+
+    rows = (Reading("a", "time", 1.0, "ms"), Reading("b", "time", 2.0, "ms"), Reading("b", "memory", 3.5, "MB"))
+
+    def test_table(self) -> None:
+        readings = Readings(self.rows)
+        assert readings.value(case="b", quantity="time") == 2.0 and math.isnan(readings.value(case="c"))
+        assert readings.names("case") == ["a", "b"]
+        lines = ["| case | time, ms | memory, MB |", "| --- | --- | --- |", "| a | 1 |  |", "| b | 2 | 3.5 |"]
+        assert readings.table("case").splitlines() == lines
+
+    def test_file(self, tmp_path: Path) -> None:
+        write_rows(tmp_path / "results.csv", self.Reading, self.rows)
+        assert read_rows(tmp_path / "results.csv", self.Reading) == list(self.rows)
+        assert read_rows(tmp_path / "nothing.csv", self.Reading) == []
+
+
+def test_a_lossless_map_costs_no_ids() -> None:
+    halves = (torch.arange(64) > 30).long().expand(64, 64)
+    assert 20 < lossless_bytes(halves) == lossless_bytes(7 * halves) < 100
