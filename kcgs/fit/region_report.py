@@ -86,11 +86,15 @@ def report_regions(
 
 def _moved_pixels(given: RegionMap, regions: RegionMap) -> int:
     """Count the pixels that are not where their region went: under its own id, or where most of its pixels are."""
-    before, after = given.index_of(given.labels), regions.index_of(regions.labels)
-    into = regions.index_of(given.ids)
-    lost = into[before] < 0  # pixels of ids that are no more
-    pairs, counts = (before[lost] * regions.num_regions + after[lost]).unique(return_counts=True)
-    most = torch.zeros_like(into).scatter_reduce_(0, pairs // regions.num_regions, counts, "amax")
-    largest = pairs[counts == most[pairs // regions.num_regions]]
-    into[largest // regions.num_regions] = largest % regions.num_regions
-    return int((into[before] != after).sum())
+    before, after, count = given.index.flatten().long(), regions.index.flatten().long(), regions.num_regions
+    codes, into = before * count + after, regions.index_of(given.ids)
+    if given.num_regions * count < 1 << 24:  # without sorting every pixel
+        shared = codes.bincount()
+        pairs = shared.nonzero().flatten()
+        shared = shared[pairs]
+    else:
+        pairs, shared = codes.unique(return_counts=True)
+    most = torch.zeros_like(into).scatter_reduce_(0, pairs // count, shared, "amax")
+    largest = pairs[(shared == most[pairs // count]) & (into[pairs // count] < 0)]
+    into[largest // count] = largest % count
+    return int((into.index_select(0, before) != after).sum())
