@@ -47,7 +47,7 @@ def start(
         # a map that comes with widths keeps them
         chooses_widths=config.softness == "auto" and regions is not None and regions.softness == 0.0,
         given=regions,
-        merged_for_count=_count(regions) - _count(fitting),
+        merged_for_count=0 if regions is None else regions.num_regions - (fitting.num_regions if fitting else 1),
         cutoff=max(config.cutoff, config.draft_cutoff),
     )
     begin(state, _regions_to_render(image, fitting, num_gaussians, config))
@@ -63,10 +63,6 @@ def begin(state: FitState, regions: RegionMap | None) -> None:
     state.optimizer = make_optimizer(config, field, sigma)
     state.first = state.wanted = len(field)
     state.iteration = 0
-
-
-def _count(regions: RegionMap | None) -> int:
-    return 1 if regions is None else regions.num_regions
 
 
 def _as_many_as_gaussians(

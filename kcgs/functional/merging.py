@@ -75,11 +75,6 @@ def pairs_to_merge(image: Tensor, labels: Tensor, max_regions: int) -> list[tupl
 
     The two neighbours merge, again and again, that raise the squared error of flat colours least (Ward's method).
 
-    Args:
-        image: :math:`(C, H, W)` floating.
-        labels: :math:`(H, W)` integer, non-negative.
-        max_regions: at least 1.
-
     Example:
         >>> labels = torch.tensor([[4, 5, 6, 6]])
         >>> pairs_to_merge(torch.tensor([[[0.0, 0.1, 0.9, 0.9]]]), labels, 2)
