@@ -98,7 +98,7 @@ class Scene(nn.Module):
     def check_size(self, name: str, size: tuple[int, int] | None) -> None:
         """Refuse a size (height, width) whose render does not fit into memory; the message begins with `name`."""
         if self.field.means.device.type == "cpu":
-            numbers = self.field.colors.shape[-1] * max(1, self.field.means[..., 0, 0].numel())
+            numbers = self.field.colors.shape[-1] * self.field.means.shape[:-2].numel()
             finer = 0 if self.regions is None else self.regions.supersample**2
             per_pixel = max(_IMAGE_BYTES * numbers, 4 * numbers + _MAP_BYTES * finer)
             check_memory(name, self.size if size is None else check_size(name, size), per_pixel)
