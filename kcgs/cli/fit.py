@@ -72,6 +72,7 @@ def fit_command(
             output, target, labels, request,
             on_step=stop.step, progress=not quiet, checkpoint=checkpoint, resume=resume,
         )  # fmt: skip
+        report = report_fit(fitted, target, labels, output, request)
     result = fitted.result
     if plot is not None:
         from kcgs.plots import history_figure, save_figure
@@ -80,7 +81,6 @@ def fit_command(
     title = f"{output}: {len(fitted.scene)} Gaussians, stopped by {result.stop_reason}"
     if result.removed:
         title += f"; {result.removed} useless ones removed, which changed no value by more than {result.change:.1g}"
-    report = report_fit(fitted, target, labels, output, request)
     became = result.regions
     if as_json:
         report["region_report"] = None if became is None else asdict(became)
