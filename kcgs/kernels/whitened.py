@@ -6,22 +6,24 @@ All kernels share this arithmetic; docs/performance.md has the formulas.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor
+if TYPE_CHECKING:  # processes that compile the CPU kernel do without torch
+    import torch
+    from torch import Tensor
 
-from .autograd import Gradients
+    from .autograd import Gradients
 
 # |z| is cut here, where every weight is zero: its square is still finite in float32
 Z_LIMIT = 1e15
 
 # exp() of less is left out: it is zero in the dtype, or nothing beside the smallest colour step
-_LOWEST_EXPONENT = {torch.float32: -80.0, torch.float64: -700.0}
+_LOWEST_EXPONENT = {4: -80.0, 8: -700.0}  # by the bytes of the dtype
 
 
 def least_exponent(cutoff: float, dtype: torch.dtype) -> float:
     """Exponent below which a weight is not evaluated; at cutoff 0 where exp() turns slow, and zero in the dtype."""
-    lowest = _LOWEST_EXPONENT[dtype]
+    lowest = _LOWEST_EXPONENT[dtype.itemsize]
     return max(math.log(cutoff), lowest) if cutoff > 0.0 else lowest
 
 
@@ -36,6 +38,8 @@ def sums_to_gradients(sums: Tensor, channels: int, cholesky: Tensor) -> Gradient
     With g = dLoss/dI and v = w g^T c the sums are of w g, (..., C), and, where geometry is asked for, of
     v (z1, z2, z1 z1, z1 z2, z2 z2), (..., C + 5).
     """
+    import torch
+
     colors = sums[..., :channels]
     if sums.shape[-1] == channels:
         return None, None, colors

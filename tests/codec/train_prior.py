@@ -46,7 +46,7 @@ from kcgs.codec.labels.contexts import (
     TOP,
     new_tables,
 )
-from kcgs.codec.labels.wavefront import DECIDED, REGIONS, STATE, loops, new_work
+from kcgs.codec.labels.wavefront import DECIDED, REGIONS, STATE, advance, new_work, program
 from kcgs.data import load_labels
 
 MIXER = (46000, 7000, 7000, 8000)
@@ -83,7 +83,7 @@ def examples(labels: Any) -> tuple[Any, Any]:
     That is 0 or 1 for the first or the second candidate, 2 for neither.
     """
     ids, index = np.unique(labels, return_inverse=True)
-    run = loops()
+    program.ready()
     truth, seeds, _ = run.survey(index.reshape(labels.shape).astype(np.int32), len(ids))
     height, width = truth.shape
     work, state = new_work(height), np.zeros(STATE, np.int64)
@@ -91,7 +91,7 @@ def examples(labels: Any) -> tuple[Any, Any]:
     padded = np.zeros((height + TOP + 1, width + LEFT + RIGHT), np.int32)
     bits, features, kinds = np.zeros(2 * height, np.int32), [], []
     memory = (truth, bits, state, padded, seeds, *new_tables(), *work)
-    while count := run.advance(bits, *memory):
+    while count := advance(bits, *memory):
         rows = work[0][:count][work[0][:count, CODED] == 1]
         features.append(rows[:, FEATURE : FEATURE + len(TEMPLATE)].astype(np.int8))
         kinds.append(np.where(rows[:, LABEL] == rows[:, FIRST], 0, np.where(rows[:, LABEL] == rows[:, SECOND], 1, 2)))

@@ -17,7 +17,7 @@ from kcgs.functional import MAX_SOFTNESS, PairWidths, RegionMap
 from kcgs.functional.labels import compact, touching_pairs
 
 from .contexts import CODED, LABEL, LEFT, RIGHT, TOP, new_tables
-from .wavefront import DECIDED, RANKS, REGIONS, STATE, Loops, loops, new_work
+from .wavefront import DECIDED, RANKS, REGIONS, STATE, advance, nearest, new_work, program, survey
 
 # what a reader may be asked to work through: seconds
 _MOST_ASKED, _MOST_ESCAPES = 1 << 23, 1 << 18
@@ -43,7 +43,8 @@ def encode_labels(labels: Integers) -> bytes:
         writer = Writer()
         _code_ids(writer, ids.tolist(), 1)
         return writer.finish()
-    truth, seeds, order = loops().survey(index, len(ids))
+    program.ready()
+    truth, seeds, order = survey(index, len(ids))
     numbered = ids[order].tolist()
 
     def begin(noisy: int) -> Writer:
@@ -87,18 +88,18 @@ def decode_labels(data: bytes, height: int, width: int, *, max_regions: int) -> 
 
 def _code_pixels(coder: Coder, truth: Any, seeds: Any, regions: int) -> Any:
     """Code a map of numbered regions; a reader has an empty `truth` and fills in `seeds`."""
-    run = loops()
+    program.ready()
     _code_seeds(coder, seeds)
     height, width = seeds.shape
     rows, chances, lines = new_work(height)
     labels = np.zeros((height + TOP + 1, width + LEFT + RIGHT), np.int32)
     state = np.zeros(STATE, np.int64)
     state[REGIONS] = regions
-    escapes = _Escapes(coder, run, labels, regions)
+    escapes = _Escapes(coder, labels, regions)
     answers = np.zeros(2 * height, np.int32)
     memory = (truth, answers, state, labels, seeds, *new_tables(), rows, chances, lines)
     bits, asked = answers[:0], 0
-    while count := run.advance(bits, *memory):
+    while count := advance(bits, *memory):
         decided = int(state[DECIDED])
         used = decided if regions == 2 else 2 * decided
         asked += decided
@@ -118,8 +119,8 @@ class _Laborious(CodecError):
 class _Escapes:
     """Labels of pixels that are neither candidate."""
 
-    def __init__(self, coder: Coder, run: Loops, labels: Any, regions: int) -> None:
-        self._coder, self._run, self._labels, self._regions = coder, run, labels, regions
+    def __init__(self, coder: Coder, labels: Any, regions: int) -> None:
+        self._coder, self._labels, self._regions = coder, labels, regions
         self._met, self._count = 1, 0
         # of seeds, and of others
         self._new = [AdaptiveBit(), AdaptiveBit()]
@@ -141,7 +142,7 @@ class _Escapes:
         if self._met < self._regions and self._new[coded].code(self._coder, label == self._met):
             self._met += 1
             return self._met - 1
-        for rank in range(self._run.nearest(self._labels, row, self._found)):
+        for rank in range(nearest(self._labels, row, self._found)):
             guess = int(self._found[rank])
             if self._rank[coded][rank].code(self._coder, label == guess):
                 return guess

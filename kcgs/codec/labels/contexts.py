@@ -7,10 +7,11 @@ integers, compiled by numba: ``>>`` and ``//`` round down.
 from __future__ import annotations
 
 from importlib import resources
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-from numba import njit
+
+from kcgs.kernels.compiled import inner
 
 # columns of each row above the pixel that the network sees, nearest row first
 _REACH = ((-8, -1), (-8, 7), (-7, 8), (-6, 7), (-5, 6), (-3, 4), (-2, 3))
@@ -71,9 +72,6 @@ def new_tables() -> tuple[Any, Any]:
     Counters [slots, 2] uint16, a chance in 1/65536 and how often it was seen; the mixer's weights [HEADS, 4, INPUTS].
     """
     return np.zeros((_SLOTS, 2), np.uint16), np.tile(_MIXER, (HEADS, 4, 1))
-
-
-inner = cast(Any, njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 
 
 @inner

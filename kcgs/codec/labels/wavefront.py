@@ -6,15 +6,12 @@ with their last label until a decision changes it, so that only pixels near cont
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any
 
 import numpy as np
-from numba import njit
 
-from kcgs.kernels.compiled import announced, compile_kept
+from kcgs.kernels.compiled import Program, inner
 
 from .contexts import (
     CODED,
@@ -29,7 +26,6 @@ from .contexts import (
     Y,
     contexts,
     describe,
-    inner,
     learn,
     mix,
     network,
@@ -164,8 +160,28 @@ def _weigh(truth, answers, state, counters, weights, rows, chances):  # type: ig
             asked += 1
 
 
-@inner
-def _nearest(labels, row, found):  # type: ignore[no-untyped-def]
+_FOLDER = Path(__file__).parent
+program = Program(
+    "label coder", __name__, [_FOLDER / source for source in ("contexts.py", "prior.bin", "wavefront.py")]
+)
+
+
+@program.entry
+def advance(bits, truth, answers, state, labels, seeds, counters, weights, rows, chances, lines):  # type: ignore[no-untyped-def]
+    """Take the bits of a wavefront in, go on to the next that has questions and return their number."""
+    height, width = seeds.shape
+    _settle(state, labels, bits, counters, weights, rows, lines)
+    state[ROWS] = 0
+    state[DECIDED] = 0
+    while state[ROWS] == 0 and state[FRONT] < width - 1 + SLANT * (height - 1):
+        state[FRONT] += 1
+        _look(state, labels, seeds, rows, lines)
+    _weigh(truth, answers, state, counters, weights, rows, chances)
+    return state[ROWS]
+
+
+@program.entry
+def nearest(labels, row, found):  # type: ignore[no-untyped-def]
     """List up to RANKS labels other than the candidates, by distance from a pixel; return how many."""
     count = 0
     for radius in range(1, _FAR + 1):
@@ -187,8 +203,8 @@ def _nearest(labels, row, found):  # type: ignore[no-untyped-def]
     return count
 
 
-@inner
-def _survey(index, regions):  # type: ignore[no-untyped-def]
+@program.entry
+def survey(index, regions):  # type: ignore[no-untyped-def]
     """Number the labels in the order in which wavefronts meet them; mark pixels unlike their uniform surroundings."""
     height, width = index.shape
     number = np.full(regions, -1, np.int32)
@@ -215,60 +231,16 @@ def _survey(index, regions):  # type: ignore[no-untyped-def]
     return truth, seeds, order
 
 
-class Loops(NamedTuple):
-    """The compiled entry points."""
-
-    advance: Callable[..., int]
-    nearest: Callable[..., int]
-    survey: Callable[..., Any]
-
-
-def _compile(fingerprint: str, cache: bool) -> Loops:
-    """Make the entry points; they compile when called and are kept on disk (`cache`) by `fingerprint`."""
-    entry = cast(Any, njit)(cache=cache, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
-
-    @entry
-    def advance(bits, truth, answers, state, labels, seeds, counters, weights, rows, chances, lines):  # type: ignore[no-untyped-def]
-        """Take the bits of a wavefront in, go on to the next that has questions and return their number."""
-        fingerprint  # noqa: B018
-        height, width = seeds.shape
-        _settle(state, labels, bits, counters, weights, rows, lines)
-        state[ROWS] = 0
-        state[DECIDED] = 0
-        while state[ROWS] == 0 and state[FRONT] < width - 1 + SLANT * (height - 1):
-            state[FRONT] += 1
-            _look(state, labels, seeds, rows, lines)
-        _weigh(truth, answers, state, counters, weights, rows, chances)
-        return state[ROWS]
-
-    @entry
-    def nearest(labels, row, found):  # type: ignore[no-untyped-def]
-        fingerprint  # noqa: B018
-        return _nearest(labels, row, found)
-
-    @entry
-    def survey(index, regions):  # type: ignore[no-untyped-def]
-        fingerprint  # noqa: B018
-        return _survey(index, regions)
-
-    return Loops(advance, nearest, survey)
-
-
-@functools.cache
-def loops() -> Loops:
-    """Compile the loops, or load them from disk; say how long it took."""
-    folder = Path(__file__).parent
-    kept = [folder / source for source in ("contexts.py", "prior.bin", "wavefront.py")]
-    made = compile_kept("codec", _compile, kept)
-    with announced("the codec of label maps", made):
-        _rehearse(made)
-    return made
-
-
-def _rehearse(run: Loops) -> None:
-    """Call each entry point once, for it is then that they compile."""
-    truth, seeds, _ = run.survey(np.eye(2, dtype=np.int32), 2)
+@program.part
+def fronts() -> None:
+    """Compile what goes from wavefront to wavefront."""
     work, bits, state = new_work(2), np.zeros(4, np.int32), np.zeros(STATE, np.int64)
-    labels = np.zeros((2 + TOP + 1, 2 + LEFT + RIGHT), np.int32)
-    run.advance(bits, truth, bits, state, labels, seeds, *new_tables(), *work)
-    run.nearest(labels, work[0][0], np.zeros(RANKS, np.int32))
+    labels, index = np.zeros((2 + TOP + 1, 2 + LEFT + RIGHT), np.int32), np.zeros((2, 2), np.int32)
+    advance(bits, index, bits, state, labels, index.astype(np.uint8), *new_tables(), *work)
+
+
+@program.part
+def places() -> None:
+    """Compile what looks for labels."""
+    survey(np.eye(2, dtype=np.int32), 2)
+    nearest(np.zeros((TOP + 1, LEFT + RIGHT), np.int32), np.zeros(COLUMNS, np.int32), np.zeros(RANKS, np.int32))

@@ -1,6 +1,6 @@
 """The CPU kernel as torch sees it: what the loops read, how threads share them, what they return.
 
-The first call compiles (seconds, once for each machine and number of channels) or loads the compiled code.
+The first call compiles, once for each machine and user, or loads the compiled code.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,15 +17,14 @@ import torch
 from torch import Tensor
 
 from ..autograd import Gradients, SplatInputs, Steps, apply_kernel
-from ..compiled import announced, compile_kept
 from ..membership import Membership
 from ..whitened import least_exponent, support_radius
-from .loops import Lists, Loops, compile_loops
+from . import loops
+from .loops import Lists
 from .simd import SIDE
 
 # fewer entries of the lists than this are left to the calling thread: waking another costs as much
 _SERIAL_ENTRIES = 200
-_SOURCES = ("../whitened.py", "simd.py", "scalar.py", "loops.py")
 
 
 class _Plan(NamedTuple):
@@ -40,27 +38,8 @@ def splat(inputs: SplatInputs) -> Tensor:
         raise ValueError(f"backend 'cpu' computes in float32; got {inputs.means.dtype}: use 'tiled' or 'reference'")
     if inputs.means.device.type != "cpu":
         raise ValueError(f"backend 'cpu' needs tensors on the CPU; got {inputs.means.device}")
-    _prepare(_tag(inputs.colors.shape[-1]))
+    loops.program.ready()
     return apply_kernel(Steps(plan, render, differentiate), inputs)
-
-
-@functools.cache
-def _loops() -> Loops:
-    return compile_kept("CPU kernel", compile_loops, [Path(__file__).parent / name for name in _SOURCES])
-
-
-@functools.cache
-def _prepare(tag: tuple[float, ...]) -> None:
-    """Compile the loops for this number of channels, or load them from disk, and say how long it took."""
-    means, cholesky, colors = (torch.full((1, 1, n), 8.0) for n in (2, 3, len(tag)))
-    inputs = SplatInputs(means, cholesky, colors, None, None, (16, 16), 1e-4)
-    with announced(f"the CPU kernel for {len(tag)} channels", _loops()):
-        planned = plan(inputs)
-        differentiate(planned, inputs, render(planned, inputs), geometry=True)
-
-
-def _tag(channels: int) -> tuple[float, ...]:
-    return (0.0 if os.environ.get("KCGS_SIMD") == "0" else 0,) * channels
 
 
 def plan(inputs: SplatInputs) -> _Plan:
@@ -78,9 +57,7 @@ def plan(inputs: SplatInputs) -> _Plan:
         regions = inputs.region_index.flatten().numpy()[order]
     radius = support_radius(inputs.cutoff, torch.float32)
     lowest = np.float32(least_exponent(inputs.cutoff, torch.float32) / math.log(2))
-    gaussians, start, entries = _loops().list_tiles(
-        means, factors, order, regions, images, batch, height, width, radius
-    )
+    gaussians, start, entries = loops.list_tiles(means, factors, order, regions, images, batch, height, width, radius)
     return _Plan(Lists(gaussians, colors[order].ravel(), regions, start, entries, *table, radius, lowest), order)
 
 
@@ -116,9 +93,7 @@ def render(planned: _Plan, inputs: SplatInputs) -> Tensor:
     batch, _, channels = inputs.colors.shape
     # numpy asks for huge pages where an array is large: first use costs a quarter of what torch.empty's does
     image = torch.from_numpy(np.empty((batch, channels, *inputs.size), np.float32))
-    tag = _tag(channels)
-    loop = _loops().render
-    _run_threads(lambda offset, step: loop(planned.lists, offset, step, image.numpy(), tag), planned.lists)
+    _run_threads(lambda offset, step: loops.render(planned.lists, offset, step, image.numpy()), planned.lists)
     return image
 
 
@@ -126,13 +101,11 @@ def differentiate(planned: _Plan, inputs: SplatInputs, grad: Tensor, geometry: b
     """Give the gradients of means, cholesky (unless only colours are asked for) and colors."""
     channels = inputs.colors.shape[-1]
     terms = np.empty((len(planned.lists.entries), channels + (5 if geometry else 0)), np.float32)
-    tag = _tag(channels)
     values = grad.resolve_neg().contiguous().numpy()
-    loop = _loops().gather
-    _run_threads(lambda offset, step: loop(planned.lists, offset, step, values, terms, geometry, tag), planned.lists)
+    _run_threads(lambda offset, step: loops.gather(planned.lists, offset, step, values, terms, geometry), planned.lists)
     means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs[:3])
     flat = [t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors)]
-    _loops().finish(planned.lists, planned.order, terms, *flat)
+    loops.finish(planned.lists, planned.order, terms, *flat)
     return (means, cholesky, colors) if geometry else (None, None, colors)
 
 

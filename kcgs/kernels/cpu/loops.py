@@ -7,15 +7,16 @@ rows of pixels that the ellipse crosses are visited.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ..compiled import Program, inner
 from ..whitened import Z_LIMIT
-from .scalar import add_rows, gather_rows
-from .simd import SIDE, sum_columns
+from . import scalar, simd
+from .simd import SIDE, copy, sum_columns
 
 # z * SCALE, squared, is an exponent of 2
 SCALE = math.sqrt(0.5 / math.log(2.0))
@@ -28,8 +29,17 @@ MX, MY, L11, L21, L22, HEIGHT, INVERSE, PEAK, RISE1, RISE2, RISE3 = range(11)
 COLUMNS = 11
 
 
-# called from compiled code alone: without entry points for Python to call they compile in less time
-_inner = cast(Any, njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
+_FOLDER = Path(__file__).parent
+# the environment decides between vector code and its scalar twins
+_SCALAR = os.environ.get("KCGS_SIMD") == "0"
+add_rows: Any
+gather_rows: Any
+add_rows, gather_rows = (scalar.add_rows, scalar.gather_rows) if _SCALAR else (simd.add_rows, simd.gather_rows)
+program = Program(
+    "CPU kernel in scalar loops" if _SCALAR else "CPU kernel",
+    __name__,
+    [_FOLDER.parent / "whitened.py", *(_FOLDER / name for name in ("loops.py", "scalar.py", "simd.py"))],
+)
 
 
 class Lists(NamedTuple):
@@ -50,35 +60,19 @@ class Lists(NamedTuple):
     lowest: Any  # float32, least exponent of 2
 
 
-@_inner
+@inner
 def _bounded(value):  # type: ignore[no-untyped-def]
     return min(max(value, -Z_LIMIT), Z_LIMIT)
 
 
-@_inner
-def _tabulate(means, factors, order, radius):  # type: ignore[no-untyped-def]
-    table = np.empty((len(order), COLUMNS))
-    for i in range(len(order)):
-        g, given = table[i], order[i]
-        g[MX], g[MY] = means[given, 0], means[given, 1]
-        g[L11], g[L21], g[L22] = factors[given, 0], factors[given, 1], factors[given, 2]
-        g[HEIGHT] = math.hypot(g[L21], g[L22])
-        g[INVERSE] = 1.0 / g[L11]
-        g[PEAK] = radius * g[L21] / g[HEIGHT]
-        g[RISE1] = _bounded(SCALE / g[L11])
-        g[RISE2] = _bounded(-SCALE * (g[L21] / g[L11]) / g[L22])
-        g[RISE3] = _bounded(SCALE / g[L22])
-    return table
-
-
-@_inner
+@inner
 def _highest(along, across, peak, low, high, radius):  # type: ignore[no-untyped-def]
     """Return the largest along * u + across * sqrt(radius^2 - u^2), which peaks at u = peak, over [low, high]."""
     u = min(max(peak, low), high)
     return along * u + across * math.sqrt(max(radius * radius - u * u, 0.0))
 
 
-@_inner
+@inner
 def _row_range(g, height, width, radius):  # type: ignore[no-untyped-def]
     reach, spread = g[HEIGHT] * radius + MARGIN, g[L11] * radius + MARGIN
     first = math.ceil(max(g[MY] - reach - 0.5, 0.0))
@@ -88,7 +82,7 @@ def _row_range(g, height, width, radius):  # type: ignore[no-untyped-def]
     return first // SIDE, last // SIDE + 1
 
 
-@_inner
+@inner
 def _tile_range(g, row, height, width, radius):  # type: ignore[no-untyped-def]
     # the ellipse's columns within the row of tiles, by the factor of (y, x)
     h = g[HEIGHT]
@@ -102,31 +96,7 @@ def _tile_range(g, row, height, width, radius):  # type: ignore[no-untyped-def]
     return (first // SIDE, last // SIDE + 1) if first <= last else (0, 0)
 
 
-@_inner
-def _list_tiles(gaussians, regions, images, rows, batch, height, width, radius):  # type: ignore[no-untyped-def]
-    """Start of each row of tiles in the list, and the list: Gaussian, first tile, last tile + 1."""
-    count = gaussians.shape[0]
-    start = np.zeros(batch * rows + 1, np.int64)
-    span = np.zeros((count, 2), np.int64)
-    for i in range(count):
-        if regions[i] >= 0:
-            span[i, 0], span[i, 1] = _row_range(gaussians[i], height, width, radius)
-        for row in range(span[i, 0], span[i, 1]):
-            start[images[i] * rows + row + 1] += 1
-    for r in range(batch * rows):
-        start[r + 1] += start[r]
-    end = start[:-1].copy()
-    entries = np.empty((start[-1], 3), np.int32)
-    for i in range(count):
-        for row in range(span[i, 0], span[i, 1]):
-            e = end[images[i] * rows + row]
-            first, last = _tile_range(gaussians[i], row, height, width, radius)
-            entries[e, 0], entries[e, 1], entries[e, 2] = i, first, last
-            end[images[i] * rows + row] += 1
-    return start, entries
-
-
-@_inner
+@inner
 def _find_mask(lists, tile, region):  # type: ignore[no-untyped-def]
     """Offset of the region's mask, negative where it is alone in the tile; and whether it is in the tile."""
     key = tile * lists.num_regions + region
@@ -143,7 +113,7 @@ def _find_mask(lists, tile, region):  # type: ignore[no-untyped-def]
     return lists.mask[low] * SIDE * SIDE, True
 
 
-@_inner
+@inner
 def _enter_tile(g, row, col, height, width, radius, coefficients):  # type: ignore[no-untyped-def]
     """Set the coefficients of z * SCALE about the tile's middle; return the rows, first and last + 1, to visit."""
     left = max((col * SIDE + 0.5 - MARGIN - g[MX]) * g[INVERSE], -radius)
@@ -164,88 +134,130 @@ def _enter_tile(g, row, col, height, width, radius, coefficients):  # type: igno
     return first - base, last + 1 - base
 
 
-@_inner
-def _write_row(pixels, image, b, row, cols):  # type: ignore[no-untyped-def]
+@program.entry
+def list_tiles(means, factors, order, regions, images, batch, height, width, radius):  # type: ignore[no-untyped-def]
+    """Make the table of Gaussians, the start of each row of tiles in the list, and the list."""
+    count, rows = len(order), -(-height // SIDE)
+    table = np.empty((count, COLUMNS))
+    start = np.zeros(batch * rows + 1, np.int64)
+    span = np.zeros((count, 2), np.int64)
+    for i in range(count):
+        g, given = table[i], order[i]
+        g[MX], g[MY] = means[given, 0], means[given, 1]
+        g[L11], g[L21], g[L22] = factors[given, 0], factors[given, 1], factors[given, 2]
+        g[HEIGHT] = math.hypot(g[L21], g[L22])
+        g[INVERSE] = 1.0 / g[L11]
+        g[PEAK] = radius * g[L21] / g[HEIGHT]
+        g[RISE1] = _bounded(SCALE / g[L11])
+        g[RISE2] = _bounded(-SCALE * (g[L21] / g[L11]) / g[L22])
+        g[RISE3] = _bounded(SCALE / g[L22])
+        if regions[i] >= 0:
+            span[i, 0], span[i, 1] = _row_range(g, height, width, radius)
+        for row in range(span[i, 0], span[i, 1]):
+            start[images[i] * rows + row + 1] += 1
+    for r in range(batch * rows):
+        start[r + 1] += start[r]
+    end = start[:-1].copy()
+    entries = np.empty((start[-1], 3), np.int32)
+    for i in range(count):
+        for row in range(span[i, 0], span[i, 1]):
+            e = end[images[i] * rows + row]
+            entries[e, 0] = i
+            entries[e, 1], entries[e, 2] = _tile_range(table[i], row, height, width, radius)
+            end[images[i] * rows + row] += 1
+    return table, start, entries
+
+
+@inner
+def _exchange(pixels, image, row, outward):  # type: ignore[no-untyped-def]
+    """Copy a row of tiles to its place in an image, or from there."""
     channels, height, width = image.shape[1:]
-    for r in range(min(SIDE, height - row * SIDE)):
+    rows, cols, last = -(-height // SIDE), width // SIDE, width % SIDE
+    b, top = row // rows, row % rows * SIDE
+    for r in range(min(SIDE, height - top)):
         for c in range(channels):
-            line = image[b, c, row * SIDE + r]
-            for col in range(width // SIDE):
-                start = ((col * SIDE + r) * channels + c) * SIDE
-                for k in range(SIDE):
-                    line[col * SIDE + k] = pixels[start + k]
-            start = (((cols - 1) * SIDE + r) * channels + c) * SIDE
-            for k in range(width - width // SIDE * SIDE):
-                line[width // SIDE * SIDE + k] = pixels[start + k]
+            outside, inside = ((b * channels + c) * height + top + r) * width, (r * channels + c) * SIDE
+            for _ in range(cols):
+                if outward:
+                    copy(image, outside, pixels, inside, SIDE)  # type: ignore[call-arg]
+                else:
+                    copy(pixels, inside, image, outside, SIDE)  # type: ignore[call-arg]
+                outside += SIDE
+                inside += SIDE * SIDE * channels
+            if outward:
+                copy(image, outside, pixels, inside, last)  # type: ignore[call-arg]
+            else:
+                copy(pixels, inside, image, outside, last)  # type: ignore[call-arg]
 
 
-@_inner
-def _read_row(pixels, image, b, row, cols):  # type: ignore[no-untyped-def]
-    channels, height, width = image.shape[1:]
-    for r in range(min(SIDE, height - row * SIDE)):
-        for c in range(channels):
-            line = image[b, c, row * SIDE + r]
-            for col in range(width // SIDE):
-                start = ((col * SIDE + r) * channels + c) * SIDE
-                for k in range(SIDE):
-                    pixels[start + k] = line[col * SIDE + k]
-            start = (((cols - 1) * SIDE + r) * channels + c) * SIDE
-            for k in range(width - width // SIDE * SIDE):
-                pixels[start + k] = line[width // SIDE * SIDE + k]
-
-
-@_inner
-def _render_row(lists, row, image, pixels, coefficients, tag):  # type: ignore[no-untyped-def]
-    channels, height, width = image.shape[1:]
+@program.entry
+def render(lists, offset, step, image):  # type: ignore[no-untyped-def]
+    """Render every `step`-th row of tiles from `offset`: image[b, c, y, x]."""
+    batch, channels, height, width = image.shape
     rows, cols = -(-height // SIDE), -(-width // SIDE)
     per_tile = SIDE * SIDE * channels
-    for k in range(len(pixels)):
-        pixels[k] = 0.0
-    mask_at, present = -1, True
-    for e in range(lists.start[row], lists.start[row + 1]):
-        i = lists.entries[e, 0]
-        for col in range(lists.entries[e, 1], lists.entries[e, 2]):
-            if lists.num_regions > 0:
-                mask_at, present = _find_mask(lists, row % (lists.maps * rows) * cols + col, lists.regions[i])
-            if not present:
-                continue
-            first, last = _enter_tile(lists.gaussians[i], row % rows, col, height, width, lists.radius, coefficients)
-            if first < last:
-                add_rows(
-                    pixels, col * per_tile, first, last, coefficients, lists.lowest, lists.colors, i * channels,
-                    lists.masks, mask_at, tag,
-                )  # fmt: skip
-    _write_row(pixels, image, row // rows, row % rows, cols)
+    pixels = np.empty(cols * per_tile, np.float32)
+    coefficients = np.empty(5, np.float32)
+    for row in range(offset, batch * rows, step):
+        for k in range(len(pixels)):
+            pixels[k] = 0.0
+        mask_at, present = -1, True
+        for e in range(lists.start[row], lists.start[row + 1]):
+            i = lists.entries[e, 0]
+            for col in range(lists.entries[e, 1], lists.entries[e, 2]):
+                if lists.num_regions > 0:
+                    mask_at, present = _find_mask(lists, row % (lists.maps * rows) * cols + col, lists.regions[i])
+                if not present:
+                    continue
+                first, last = _enter_tile(
+                    lists.gaussians[i], row % rows, col, height, width, lists.radius, coefficients
+                )
+                if first < last:
+                    add_rows(
+                        pixels, col * per_tile, first, last, coefficients, lists.lowest, lists.colors, i * channels,
+                        lists.masks, mask_at, channels,
+                    )  # fmt: skip
+        _exchange(pixels, image, row, True)
 
 
-@_inner
-def _gather_row(lists, row, grad, pixels, coefficients, sums, out, moments, tag):  # type: ignore[no-untyped-def]
-    channels, height, width = grad.shape[1:]
+@program.entry
+def gather(lists, offset, step, grad, out, moments):  # type: ignore[no-untyped-def]
+    """Fill out[e] for the entries of every `step`-th row of tiles: C colour gradients, 5 moments of z * SCALE."""
+    batch, channels, height, width = grad.shape
     rows, cols = -(-height // SIDE), -(-width // SIDE)
     per_tile = SIDE * SIDE * channels
-    _read_row(pixels, grad, row // rows, row % rows, cols)
-    mask_at, present = -1, True
-    for e in range(lists.start[row], lists.start[row + 1]):
-        i = lists.entries[e, 0]
-        for k in range(len(sums)):
-            sums[k] = 0.0
-        for col in range(lists.entries[e, 1], lists.entries[e, 2]):
-            if lists.num_regions > 0:
-                mask_at, present = _find_mask(lists, row % (lists.maps * rows) * cols + col, lists.regions[i])
-            if not present:
-                continue
-            first, last = _enter_tile(lists.gaussians[i], row % rows, col, height, width, lists.radius, coefficients)
-            if first < last:
-                gather_rows(
-                    pixels, col * per_tile, first, last, coefficients, lists.lowest, lists.colors, i * channels,
-                    lists.masks, mask_at, sums, moments, tag,
-                )  # fmt: skip
-        for k in range(out.shape[1]):
-            out[e, k] = sum_columns(sums, k)  # type: ignore[call-arg]
+    pixels = np.zeros(cols * per_tile, np.float32)
+    coefficients = np.empty(5, np.float32)
+    sums = np.empty((channels + 5) * SIDE, np.float32)
+    for row in range(offset, batch * rows, step):
+        if lists.start[row] == lists.start[row + 1]:
+            continue
+        _exchange(pixels, grad, row, False)
+        mask_at, present = -1, True
+        for e in range(lists.start[row], lists.start[row + 1]):
+            i = lists.entries[e, 0]
+            for k in range(len(sums)):
+                sums[k] = 0.0
+            for col in range(lists.entries[e, 1], lists.entries[e, 2]):
+                if lists.num_regions > 0:
+                    mask_at, present = _find_mask(lists, row % (lists.maps * rows) * cols + col, lists.regions[i])
+                if not present:
+                    continue
+                first, last = _enter_tile(
+                    lists.gaussians[i], row % rows, col, height, width, lists.radius, coefficients
+                )
+                if first < last:
+                    gather_rows(
+                        pixels, col * per_tile, first, last, coefficients, lists.lowest, lists.colors, i * channels,
+                        lists.masks, mask_at, sums, moments, channels,
+                    )  # fmt: skip
+            for k in range(out.shape[1]):
+                out[e, k] = sum_columns(sums, k)  # type: ignore[call-arg]
 
 
-@_inner
-def _finish(lists, order, out, means, cholesky, colors):  # type: ignore[no-untyped-def]
+@program.entry
+def finish(lists, order, out, means, cholesky, colors):  # type: ignore[no-untyped-def]
+    """Add up each Gaussian's entries in float64 and turn moments into gradients, in the caller's order."""
     count, channels = colors.shape
     total = np.zeros((count, out.shape[1]))
     for e in range(out.shape[0]):
@@ -265,57 +277,27 @@ def _finish(lists, order, out, means, cholesky, colors):  # type: ignore[no-unty
             cholesky[to, 2] = s22 / g[L22]
 
 
-class Loops(NamedTuple):
-    """The compiled entry points."""
+def _example() -> tuple[Lists, Any]:
+    empty, places, numbers = np.zeros((1, 3), np.int32), np.zeros(2, np.int64), np.zeros(1, np.float32)
+    lists = Lists(
+        np.ones((1, COLUMNS)), numbers, places, places, empty, 0, 1, places, places, places, numbers, 4.0, numbers[0]
+    )
+    return lists, np.zeros((1, 6), np.float32)
 
-    list_tiles: Callable[..., Any]
-    render: Callable[..., None]
-    gather: Callable[..., None]
-    finish: Callable[..., None]
+
+@program.part
+def lists() -> None:
+    """Compile what lists tiles, and what ends the gradient."""
+    example, terms = _example()
+    one, pair, triple = (np.ones((1, n), np.float32) for n in (1, 2, 3))
+    list_tiles(pair, triple, example.start[:1], example.start, example.start, 1, 1, 1, 4.0)
+    finish(example, example.start, terms, pair, triple, one)
 
 
-def compile_loops(fingerprint: str, cache: bool) -> Loops:
-    """Make the entry points; they compile when called and are kept on disk (`cache`) by `fingerprint` of the sources.
-
-    numba looks at one file only to tell whether its disk cache is stale, and these loops span three; what a function
-    closes over is part of the key.
-    """
-    entry = cast(Any, njit)(cache=cache, nogil=True, no_cfunc_wrapper=True, error_model="numpy")
-
-    @entry
-    def list_tiles(means, factors, order, regions, images, batch, height, width, radius):  # type: ignore[no-untyped-def]
-        """Make the table of Gaussians, the start of each row of tiles in the list, and the list."""
-        fingerprint  # noqa: B018
-        table = _tabulate(means, factors, order, radius)
-        start, entries = _list_tiles(table, regions, images, -(-height // SIDE), batch, height, width, radius)
-        return table, start, entries
-
-    @entry
-    def render(lists, offset, step, image, tag):  # type: ignore[no-untyped-def]
-        """Render every `step`-th row of tiles from `offset`: image[b, c, y, x]."""
-        fingerprint  # noqa: B018
-        batch, channels, height, width = image.shape
-        pixels = np.empty(-(-width // SIDE) * SIDE * SIDE * channels, np.float32)
-        coefficients = np.empty(5, np.float32)
-        for row in range(offset, batch * -(-height // SIDE), step):
-            _render_row(lists, row, image, pixels, coefficients, tag)
-
-    @entry
-    def gather(lists, offset, step, grad, out, moments, tag):  # type: ignore[no-untyped-def]
-        """Fill out[e] for the entries of every `step`-th row of tiles: C colour gradients, 5 moments of z * SCALE."""
-        fingerprint  # noqa: B018
-        batch, channels, height, width = grad.shape
-        pixels = np.zeros(-(-width // SIDE) * SIDE * SIDE * channels, np.float32)
-        coefficients = np.empty(5, np.float32)
-        sums = np.empty((channels + 5) * SIDE, np.float32)
-        for row in range(offset, batch * -(-height // SIDE), step):
-            if lists.start[row] < lists.start[row + 1]:
-                _gather_row(lists, row, grad, pixels, coefficients, sums, out, moments, tag)
-
-    @entry
-    def finish(lists, order, out, means, cholesky, colors):  # type: ignore[no-untyped-def]
-        """Add up each Gaussian's entries in float64 and turn moments into gradients, in the caller's order."""
-        fingerprint  # noqa: B018
-        _finish(lists, order, out, means, cholesky, colors)
-
-    return Loops(list_tiles, render, gather, finish)
+@program.part
+def pixels() -> None:
+    """Compile what visits pixels."""
+    example, terms = _example()
+    image = np.zeros((1, 1, 1, 1), np.float32)
+    render(example, 0, 1, image)
+    gather(example, 0, 1, image, terms, True)

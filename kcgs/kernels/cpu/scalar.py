@@ -1,24 +1,16 @@
-"""The scalar twins of the vector loops, and the choice between them.
-
-The choice is made when a kernel is compiled, by the type of its `tag`: a tuple as long as the image has channels, of
-integers for the vector loops and of floats for the scalar ones.
-"""
+"""The scalar twins of the vector loops."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numba import njit, types
-from numba.extending import overload
 
-from . import simd
+from ..compiled import inner
 from .simd import SIDE
 
 _MIDDLE = (SIDE - 1) / 2
 
 
-@njit
+@inner
 def _weight(coefficients, row, column, lowest):  # type: ignore[no-untyped-def]
     x, y = np.float32(column - _MIDDLE), np.float32(row - _MIDDLE)
     first = coefficients[0] + coefficients[1] * x
@@ -28,11 +20,11 @@ def _weight(coefficients, row, column, lowest):  # type: ignore[no-untyped-def]
     return first, second, weight
 
 
-@njit
-def _scalar_add_rows(  # type: ignore[no-untyped-def]
-    pixels, offset, first, last, coefficients, lowest, colors, color_at, masks, mask_at, tag
+@inner
+def add_rows(  # type: ignore[no-untyped-def]
+    pixels, offset, first, last, coefficients, lowest, colors, color_at, masks, mask_at, channels
 ):
-    channels = len(tag)
+    """Add a Gaussian to rows of a tile."""
     for row in range(first, last):
         for column in range(SIDE):
             _, _, weight = _weight(coefficients, row, column, lowest)
@@ -42,11 +34,11 @@ def _scalar_add_rows(  # type: ignore[no-untyped-def]
                 pixels[offset + (row * channels + c) * SIDE + column] += weight * colors[color_at + c]
 
 
-@njit
-def _scalar_gather_rows(  # type: ignore[no-untyped-def]
-    pixels, offset, first, last, coefficients, lowest, colors, color_at, masks, mask_at, sums, moments, tag
+@inner
+def gather_rows(  # type: ignore[no-untyped-def]
+    pixels, offset, first, last, coefficients, lowest, colors, color_at, masks, mask_at, sums, moments, channels
 ):
-    channels = len(tag)
+    """Add a Gaussian's gradient terms over rows of a tile."""
     for row in range(first, last):
         for column in range(SIDE):
             z1, z2, weight = _weight(coefficients, row, column, lowest)
@@ -66,29 +58,3 @@ def _scalar_gather_rows(  # type: ignore[no-untyped-def]
             sums[k + 2 * SIDE] += value * z1 * z1
             sums[k + 3 * SIDE] += value * z1 * z2
             sums[k + 4 * SIDE] += value * z2 * z2
-
-
-def add_rows(*arguments: Any) -> None:
-    """Add a Gaussian to rows of a tile; only inside compiled code."""
-    raise NotImplementedError
-
-
-def gather_rows(*arguments: Any) -> None:
-    """Add a Gaussian's gradient terms over rows of a tile; only inside compiled code."""
-    raise NotImplementedError
-
-
-def _choose(vector: Any, scalar: Any) -> Any:
-    def choose(*arguments):  # type: ignore[no-untyped-def]
-        chosen = vector if isinstance(arguments[-1].dtype, types.Integer) else scalar
-
-        def call(*arguments):  # type: ignore[no-untyped-def]
-            return chosen(*arguments)
-
-        return call
-
-    return choose
-
-
-overload(add_rows)(_choose(simd.add_rows, _scalar_add_rows))
-overload(gather_rows)(_choose(simd.gather_rows, _scalar_gather_rows))

@@ -6,6 +6,8 @@ has a scalar twin in `scalar.py` with the same arguments. The pixels of a tile l
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ _INT = ir.IntType(32)
 _LONG = ir.IntType(64)
 _VECTOR = ir.VectorType(_FLOAT, SIDE)
 _VECTOR_INT = ir.VectorType(_INT, SIDE)
+_START = ir.Constant(_LONG, 0)
 
 
 def exp2_coefficients(degree: int = 5) -> list[float]:
@@ -71,14 +74,18 @@ def _pointer(context: Any, builder: Any, array_type: Any, array: Any, offset: An
     return builder.gep(data, [offset])
 
 
-def _load(builder: Any, pointer: Any, step: int = 0) -> Any:
-    start = builder.gep(pointer, [ir.Constant(_LONG, step * SIDE)])
-    return builder.load(builder.bitcast(start, _VECTOR.as_pointer()), align=4)
+def _row(builder: Any, pointer: Any, index: Any) -> Any:
+    """Return the pointer to a vector `index` vectors further on."""
+    start = builder.gep(pointer, [builder.mul(index, ir.Constant(_LONG, SIDE))])
+    return builder.bitcast(start, _VECTOR.as_pointer())
 
 
-def _store(builder: Any, value: Any, pointer: Any, step: int = 0) -> None:
-    start = builder.gep(pointer, [ir.Constant(_LONG, step * SIDE)])
-    builder.store(value, builder.bitcast(start, _VECTOR.as_pointer()), align=4)
+def _load(builder: Any, pointer: Any, index: Any = _START) -> Any:
+    return builder.load(_row(builder, pointer, index), align=4)
+
+
+def _store(builder: Any, value: Any, pointer: Any, index: Any = _START) -> None:
+    builder.store(value, _row(builder, pointer, index), align=4)
 
 
 class _Columns:
@@ -86,7 +93,7 @@ class _Columns:
 
     def __init__(self, builder: Any, coefficients: Any, lowest: Any) -> None:
         self.builder = builder
-        k = [_element(builder, coefficients, i) for i in range(5)]
+        k = [builder.load(builder.gep(coefficients, [ir.Constant(_LONG, i)])) for i in range(5)]
         column = _ramp()
         first = _call(builder, "fma", _broadcast(builder, k[1]), column, _broadcast(builder, k[0]))
         self.first = first
@@ -107,50 +114,51 @@ class _Columns:
         return second, weight
 
 
-def _element(builder: Any, pointer: Any, index: int) -> Any:
-    return builder.load(builder.gep(pointer, [ir.Constant(_LONG, index)]))
-
-
-def _middle(builder: Any, row: Any) -> Any:
-    return builder.fadd(builder.sitofp(row, _FLOAT), ir.Constant(_FLOAT, -(SIDE - 1) / 2))
-
-
 class _Call:
     """The arguments that both loops share, as LLVM values."""
 
     def __init__(self, context: Any, builder: Any, types_of: Any, arguments: Any) -> None:
-        start = ir.Constant(_LONG, 0)
         self.builder = builder
-        self.channels = types_of[-1].count
+        self.channels = arguments[-1]
         self.first, self.last = arguments[2:4]
-        self.step = ir.Constant(_LONG, 1)
         self.pixels = _pointer(context, builder, types_of[0], arguments[0], arguments[1])
-        coefficients = _pointer(context, builder, types_of[4], arguments[4], start)
-        colors = _pointer(context, builder, types_of[6], arguments[6], arguments[7])
+        coefficients = _pointer(context, builder, types_of[4], arguments[4], _START)
+        self.colors = _pointer(context, builder, types_of[6], arguments[6], arguments[7])
         self.masks = _pointer(context, builder, types_of[8], arguments[8], arguments[9])
-        self.plain = builder.icmp_signed("<", arguments[9], start)
-        self.colors = [_broadcast(builder, _element(builder, colors, c)) for c in range(self.channels)]
+        self.plain = builder.icmp_signed("<", arguments[9], _START)
         self.geometry = _Columns(builder, coefficients, arguments[5])
 
-    def at_row(self, row: Any, masked: bool) -> tuple[Any, Any, Any]:
-        """Second coordinate, weight, and pointer to the pixels of a row."""
-        builder = self.builder
-        mask = builder.gep(self.masks, [builder.mul(row, ir.Constant(row.type, SIDE))]) if masked else None
-        second, weight = self.geometry.weight(_middle(builder, row), mask)
-        return second, weight, builder.gep(self.pixels, [builder.mul(row, ir.Constant(row.type, SIDE * self.channels))])
+    def each_kind(self, emit: Callable[[bool], None]) -> None:
+        """Emit code for rows without a mask, and with one."""
+        _both(self.builder, self.plain, lambda plain: emit(not plain))
 
-    def each_kind(self, emit: Any) -> None:
-        """Emit a loop for rows without a mask, and one for rows with one."""
-        with self.builder.if_else(self.plain) as (then, otherwise):
-            with then:
-                emit(False)
-            with otherwise:
-                emit(True)
+    @contextmanager
+    def each_row(self, masked: bool) -> Iterator[tuple[Any, Any, Any]]:
+        """Emit a loop over the rows; yield second coordinate, weight, and pointer to the pixels."""
+        builder = self.builder
+        with cgutils.for_range_slice(builder, self.first, self.last, ir.Constant(_LONG, 1)) as (row, _):
+            start = builder.mul(row, ir.Constant(_LONG, SIDE))
+            mask = builder.gep(self.masks, [start]) if masked else None
+            middle = builder.fadd(builder.sitofp(row, _FLOAT), ir.Constant(_FLOAT, -(SIDE - 1) / 2))
+            second, weight = self.geometry.weight(middle, mask)
+            yield second, weight, builder.gep(self.pixels, [builder.mul(start, self.channels)])
+
+    def color(self, channel: Any) -> Any:
+        """Return a color in all elements of a vector."""
+        return _broadcast(self.builder, self.builder.load(self.builder.gep(self.colors, [channel])))
+
+
+def _both(builder: Any, condition: Any, emit: Callable[[bool], None]) -> None:
+    with builder.if_else(condition) as (then, otherwise):
+        with then:
+            emit(True)
+        with otherwise:
+            emit(False)
 
 
 @intrinsic
 def add_rows(  # type: ignore[no-untyped-def]
-    typing_context, pixels, offset, first, last, coefficients, lowest, colors, color_at, masks, mask_at, tag
+    typing_context, pixels, offset, first, last, coefficients, lowest, colors, color_at, masks, mask_at, channels
 ):
     """pixels[row, c, :] += weight[row, :] * colors[c] for rows first ... last - 1; mask_at < 0: no mask."""
 
@@ -158,91 +166,80 @@ def add_rows(  # type: ignore[no-untyped-def]
         call = _Call(context, builder, signature.args, arguments)
 
         def emit(masked: bool) -> None:
-            with cgutils.for_range_slice(builder, call.first, call.last, call.step) as (row, _):
-                _, weight, pixels = call.at_row(row, masked)
-                for c, color in enumerate(call.colors):
-                    _store(builder, _call(builder, "fma", weight, color, _load(builder, pixels, c)), pixels, c)
+            with call.each_row(masked) as (_, weight, pixels), cgutils.for_range(builder, call.channels) as loop:
+                value = _call(builder, "fma", weight, call.color(loop.index), _load(builder, pixels, loop.index))
+                _store(builder, value, pixels, loop.index)
 
         call.each_kind(emit)
         return context.get_dummy_value()
 
     long = types.int64
-    return types.void(pixels, long, long, long, coefficients, types.float32, colors, long, masks, long, tag), generate
+    return types.void(pixels, long, long, long, coefficients, types.float32, colors, long, masks, long, long), generate
 
 
 @intrinsic
 def gather_rows(  # type: ignore[no-untyped-def]
-    typing_context,
-    pixels,
-    offset,
-    first,
-    last,
-    coefficients,
-    lowest,
-    colors,
-    color_at,
-    masks,
-    mask_at,
-    sums,
-    moments,
-    tag,
-):
+    typing_context, pixels, offset, first, last, coefficients, lowest, colors, color_at, masks, mask_at, sums, moments,
+    channels,
+):  # fmt: skip
     """Add to sums[k, column] over rows: w g_c for every channel c, then, with v = w sum_c g_c colors_c and where
     `moments` is true, v z1, v z2, v z1 z1, v z1 z2, v z2 z2."""  # noqa: D205, D209
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         call = _Call(context, builder, signature.args, arguments)
-        sums_at = _pointer(context, builder, signature.args[10], arguments[10], ir.Constant(_LONG, 0))
+        sums_at = _pointer(context, builder, signature.args[10], arguments[10], _START)
 
         def emit(masked: bool, moments: bool) -> None:
-            start = [_load(builder, sums_at, c) for c in range(call.channels)]
-            start += [_constant(0.0)] * 3 if moments else []
             # variables, which LLVM keeps in registers
-            totals = [cgutils.alloca_once_value(builder, value) for value in start]
-            with cgutils.for_range_slice(builder, call.first, call.last, call.step) as (row, _):
-                second, weight, pixels = call.at_row(row, masked)
-                grads = [_load(builder, pixels, c) for c in range(call.channels)]
-                sums = [builder.load(total) for total in totals]
-                following = [_call(builder, "fma", weight, g, total) for g, total in zip(grads, sums, strict=False)]
+            totals = [cgutils.alloca_once_value(builder, _constant(0.0)) for _ in range(3 if moments else 0)]
+            with call.each_row(masked) as (second, weight, pixels):
+                # -0.0 added changes nothing, not even the sign of a zero
+                value = cgutils.alloca_once_value(builder, _constant(-0.0))
+                with cgutils.for_range(builder, call.channels) as loop:
+                    c = loop.index
+                    grad = _load(builder, pixels, c)
+                    _store(builder, _call(builder, "fma", weight, grad, _load(builder, sums_at, c)), sums_at, c)
+                    if moments:
+                        builder.store(_call(builder, "fma", grad, call.color(c), builder.load(value)), value)
                 if moments:
-                    value = builder.fmul(grads[0], call.colors[0])
-                    for g, color in zip(grads[1:], call.colors[1:], strict=True):
-                        value = _call(builder, "fma", g, color, value)
-                    value = builder.fmul(value, weight)
-                    moment = builder.fmul(value, second)
-                    total, along, square = sums[call.channels :]
-                    following += [builder.fadd(total, value), builder.fadd(along, moment)]
-                    following.append(_call(builder, "fma", moment, second, square))
-                for total, value in zip(totals, following, strict=True):
-                    builder.store(value, total)
-            final = [builder.load(total) for total in totals]
-            for c in range(call.channels):
-                _store(builder, final[c], sums_at, c)
+                    moment = builder.fmul(builder.load(value), weight)
+                    along = builder.fmul(moment, second)
+                    total, first, square = (builder.load(total) for total in totals)
+                    builder.store(builder.fadd(total, moment), totals[0])
+                    builder.store(builder.fadd(first, along), totals[1])
+                    builder.store(_call(builder, "fma", along, second, square), totals[2])
             if moments:
-                _add_moments(builder, call.geometry.first, final[call.channels :], sums_at, call.channels)
+                _add_moments(call, [builder.load(total) for total in totals], sums_at)
 
-        def both(masked: bool) -> None:
-            with builder.if_else(arguments[11]) as (then, otherwise):
-                with then:
-                    emit(masked, True)
-                with otherwise:
-                    emit(masked, False)
-
-        call.each_kind(both)
+        call.each_kind(lambda masked: _both(builder, arguments[11], lambda moments: emit(masked, moments)))
         return context.get_dummy_value()
 
     long = types.int64
     return types.void(
-        pixels, long, long, long, coefficients, types.float32, colors, long, masks, long, sums, types.boolean, tag
+        pixels, long, long, long, coefficients, types.float32, colors, long, masks, long, sums, types.boolean, long
     ), generate
 
 
-def _add_moments(builder: Any, first: Any, sums: list[Any], sums_at: Any, channels: int) -> None:
+def _add_moments(call: _Call, sums: list[Any], sums_at: Any) -> None:
     # z1 is the same in every row of the tile: it multiplies the sums, not the terms
+    builder, first = call.builder, call.geometry.first
     total, along, square = sums
     once = builder.fmul(total, first)
     for k, term in enumerate([once, along, builder.fmul(once, first), builder.fmul(along, first), square]):
-        _store(builder, builder.fadd(_load(builder, sums_at, channels + k), term), sums_at, channels + k)
+        at = builder.add(call.channels, ir.Constant(_LONG, k))
+        _store(builder, builder.fadd(_load(builder, sums_at, at), term), sums_at, at)
+
+
+@intrinsic
+def copy(typing_context, target, target_at, source, source_at, count):  # type: ignore[no-untyped-def]
+    """Copy elements; a constant number becomes vector code."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        to, start = (_pointer(context, builder, signature.args[i], *arguments[i : i + 2]) for i in (0, 2))
+        cgutils.raw_memcpy(builder, to, start, arguments[4], 4)
+        return context.get_dummy_value()
+
+    return types.void(target, types.int64, source, types.int64, types.int64), generate
 
 
 @intrinsic
