@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 import signal
@@ -82,8 +83,17 @@ SceneFile = Annotated[
     Path, typer.Argument(help="Scene file (.safetensors or .kcgs), or zoo:NAME.", metavar="SCENE", parser=_scene_path)
 ]
 ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE")]
-Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Show no progress.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
+
+
+def _hush(wanted: bool) -> bool:
+    """Let the log speak of warnings only."""
+    if wanted:
+        logging.getLogger("kcgs").setLevel(logging.WARNING)
+    return wanted
+
+
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", callback=_hush, help="Show no progress.")]
+Json = Annotated[bool, typer.Option("--json", callback=_hush, help="Print one JSON object on standard output.")]
 
 
 def check_output(path: Path, *suffixes: str, option: str = "--output") -> None:

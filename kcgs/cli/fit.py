@@ -20,7 +20,8 @@ from .common import ImageFile, Json, Quiet, Stop, app, check_output, interrupted
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from kcgs.fit import FitResult
+    from kcgs.fit import FitConfig, FitResult
+    from kcgs.kernels.compiled import Program
     from kcgs.scene import Scene
 
 # contours that people traced reach 0.63 and more on their image, at most 0.54 on its mirror image
@@ -65,6 +66,7 @@ def fit_command(
         options.exclude("--target-bytes", checkpoint=checkpoint)
     if request.config.target_psnr is not None:
         options.exclude("--target-psnr", checkpoint=checkpoint)
+    compile_ahead(request.config, output.suffix == ".kcgs" and regions != "none")
     target = load_image(image)
     labels = read_regions(regions, target, partial(typer.echo, err=True), progress=not quiet)
     with Stop() as stop:
@@ -92,6 +94,19 @@ def fit_command(
     if missed := describe_miss(report, request):
         typer.echo(f"kcgs: {missed}", err=True)
         raise typer.Exit(1)
+
+
+def compile_ahead(config: FitConfig, writes_map: bool) -> list[Program]:
+    """Begin to compile, in other processes, what a fit and its file need: seconds, once on a machine."""
+    from kcgs.kernels import compile_ahead
+
+    programs = [program for program in [compile_ahead(config.backend)] if program is not None]
+    if writes_map:
+        from kcgs.codec.labels.wavefront import program as coder
+
+        coder.start()
+        programs.append(coder)
+    return programs
 
 
 class Fitted(NamedTuple):
@@ -170,7 +185,10 @@ def measure_scene(
     Edge-focused metrics look at the contours of `labels`; `seconds` are those of the fit, or else of the rendering.
     """
     from kcgs.evaluate import measure
+    from kcgs.kernels import prepare
 
+    colors = scene.field.colors
+    prepare("auto", colors.device, colors.dtype, colors.shape[-1])
     start = time.perf_counter()
     render = scene.render()
     seconds = time.perf_counter() - start if seconds is None else seconds

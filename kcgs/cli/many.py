@@ -19,6 +19,7 @@ from kcgs.engine import Done, run_jobs
 
 from . import options
 from .common import IMAGES, Json, Quiet, app, print_report
+from .fit import compile_ahead
 from .many_jobs import Order, Outcome, fit_one
 
 _MILLION = 1_000_000
@@ -75,6 +76,10 @@ def fit_many_command(
         workers = max(1, _cores() // threads)
     # one image needs no process of its own
     workers = None if workers is None else min(workers, len(orders))
+    if engine == "local" and len(orders) > 1:
+        # before there are workers, each of which would compile for itself
+        for program in compile_ahead(request.config, ending == ".kcgs" and regions != "none"):
+            program.wait()
     done = run_jobs(fit_one, orders, engine=engine, workers=workers, threads=threads)
     try:
         kept, failed = _write_down(done, images, table, quiet)

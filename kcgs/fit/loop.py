@@ -16,6 +16,7 @@ from torch import Tensor
 from kcgs._check import as_image, check_count
 from kcgs._progress import Progress
 from kcgs.functional import RegionMap
+from kcgs.kernels import prepare
 
 from .checkpoint import Checkpoint
 from .config import FitConfig
@@ -81,7 +82,6 @@ def fit(
         >>> result.history[-1].psnr > 20, result.scene.regions.num_regions
         (True, 2)
     """
-    started = time.perf_counter()
     config = FitConfig.from_recipe(recipe, **settings)
     if progress:
         with _shown(config, on_step) as on_step:
@@ -94,11 +94,12 @@ def fit(
     seed = check_count("seed", seed, 0, 2**63 - 1)
     if resume and checkpoint is None:
         raise ValueError("resume needs checkpoint, a file to go on from; got None")
+    if config.target_psnr is not None and checkpoint is not None:
+        raise ValueError(f"checkpoint must be None with target_psnr, which takes several fits; got {checkpoint!r}")
+    prepare(config.backend, image.device, image.dtype, len(image))  # no fit's clock counts what compiles or loads once
     if config.target_psnr is not None:
-        if checkpoint is not None:
-            raise ValueError(f"checkpoint must be None with target_psnr, which takes several fits; got {checkpoint!r}")
         return fewest(image, regions, num_gaussians, config, seed, _run, on_step)
-    state = start(image, regions, num_gaussians, config, seed, started)
+    state = start(image, regions, num_gaussians, config, seed, time.perf_counter())
     keeper = None if checkpoint is None else Checkpoint(checkpoint, state, regions)
     if not (keeper is not None and resume and keeper.read_into(state)) and config.merge_regions:
         MergeRegions(state).before(state)

@@ -2,7 +2,7 @@
 
 from .autograd import SplatInputs
 from .membership import Membership
-from .registry import BACKENDS, resolve
+from .registry import BACKENDS, compile_ahead, prepare, resolve
 from .resampled import Resampled
 
-__all__ = ["BACKENDS", "Membership", "Resampled", "SplatInputs", "resolve"]
+__all__ = ["BACKENDS", "Membership", "Resampled", "SplatInputs", "compile_ahead", "prepare", "resolve"]

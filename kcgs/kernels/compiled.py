@@ -91,6 +91,12 @@ class Program:
         for worker in self._workers:
             worker.start()
 
+    def wait(self) -> None:
+        """Wait for what was started."""
+        for worker in self._workers or ():
+            worker.join(_PATIENCE)
+            worker.stop()
+
     def ready(self) -> None:
         """Compile or load all loops, unless that has been done; one line says how long a compilation took."""
         if self._is_ready:
@@ -103,9 +109,7 @@ class Program:
     def _make_ready(self) -> None:
         start = time.perf_counter()
         self.start()
-        for worker in self._workers or ():
-            worker.join(_PATIENCE)
-            worker.stop()
+        self.wait()
         for rehearsal in self._parts.values():
             rehearsal()
         kept = ", kept on disk for next time"

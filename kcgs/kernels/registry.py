@@ -6,11 +6,15 @@ import functools
 import warnings
 from collections.abc import Callable
 from importlib import import_module, util
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from .autograd import SplatInputs
+
+if TYPE_CHECKING:  # loads numba
+    from .compiled import Program
 
 BACKENDS = ("auto", "reference", "tiled", "cpu", "cuda")
 
@@ -33,13 +37,36 @@ def resolve(backend: str, device: torch.device, dtype: torch.dtype) -> Kernel:
     Raises:
         ValueError: unknown name.
     """
+    name = _choose(backend, device, dtype)
+    return functools.partial(_untraced if torch.compiler.is_compiling() else _splat, name)
+
+
+def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
-    name = backend
-    if backend == "auto":
-        runs = device.type == "cpu" or (device.type == "cuda" and _has_triton())
-        name = device.type if runs and dtype == torch.float32 else "tiled"
-    return functools.partial(_untraced if torch.compiler.is_compiling() else _splat, name)
+    if backend != "auto":
+        return backend
+    runs = device.type == "cpu" or (device.type == "cuda" and _has_triton())
+    return device.type if runs and dtype == torch.float32 else "tiled"
+
+
+def compile_ahead(backend: str) -> Program | None:
+    """Begin to compile, in other processes, what float32 images on the CPU need of a backend; None: nothing."""
+    if _choose(backend, torch.device("cpu"), torch.float32) != "cpu":
+        return None
+    program: Program = import_module(f"{__package__}.cpu.loops").program
+    program.start()
+    return program
+
+
+@functools.cache
+def prepare(backend: str, device: torch.device, dtype: torch.dtype, channels: int) -> None:
+    """Render and differentiate once, so that no clock counts what compiles or loads at first use."""
+    means, cholesky, colors = (
+        torch.full((1, 1, n), 8.0, device=device, dtype=dtype, requires_grad=True) for n in (2, 3, channels)
+    )
+    image = resolve(backend, device, dtype)(SplatInputs(means, cholesky, colors, None, None, (16, 16), 1e-4))
+    torch.autograd.grad(image, means, torch.ones_like(image))  # torch too loads much at the first gradient
 
 
 def _splat(name: str, inputs: SplatInputs) -> Tensor:

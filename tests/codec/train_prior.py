@@ -46,7 +46,7 @@ from kcgs.codec.labels.contexts import (
     TOP,
     new_tables,
 )
-from kcgs.codec.labels.wavefront import DECIDED, REGIONS, STATE, advance, new_work, program
+from kcgs.codec.labels.wavefront import DECIDED, REGIONS, STATE, advance, new_work, program, survey
 from kcgs.data import load_labels
 
 MIXER = (46000, 7000, 7000, 8000)
@@ -84,7 +84,7 @@ def examples(labels: Any) -> tuple[Any, Any]:
     """
     ids, index = np.unique(labels, return_inverse=True)
     program.ready()
-    truth, seeds, _ = run.survey(index.reshape(labels.shape).astype(np.int32), len(ids))
+    truth, seeds, _ = survey(index.reshape(labels.shape).astype(np.int32), len(ids))
     height, width = truth.shape
     work, state = new_work(height), np.zeros(STATE, np.int64)
     state[REGIONS] = len(ids)
