@@ -182,6 +182,8 @@ def _find_folder(what: str, sources: Sequence[Path]) -> Path | None:
 
 def _make_cache(function: Callable[..., Any], folder: Path) -> Any:
     class Locator(caching._CacheLocator):
+        _py_file = function.__code__.co_filename
+
         def get_cache_path(self) -> str:
             return str(folder)
 
