@@ -100,12 +100,11 @@ def compile_ahead(config: FitConfig, writes_map: bool) -> list[Program]:
     """Begin to compile, in other processes, what a fit and its file need: seconds, once on a machine."""
     from kcgs.kernels import compile_ahead
 
-    programs = [program for program in [compile_ahead(config.backend)] if program is not None]
+    programs = compile_ahead(config.backend)
     if writes_map:
-        from kcgs.codec.labels.wavefront import program as coder
+        from kcgs.codec.labels.wavefront import program
 
-        coder.start()
-        programs.append(coder)
+        programs.append(program.start())
     return programs
 
 

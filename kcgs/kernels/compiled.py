@@ -39,7 +39,7 @@ for package in packages:
     init = os.path.join(folder, "__init__.py")
     spec = importlib.util.spec_from_file_location(package, init, submodule_search_locations=[folder])
     sys.modules[package] = importlib.util.module_from_spec(spec)
-importlib.import_module(module).program.rehearse(part)
+importlib.import_module(module).program.parts[part]()
 """
 
 # of functions that compiled code alone calls: without entry points for Python they compile in less time
@@ -47,18 +47,18 @@ inner = cast(Any, numba.njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, er
 
 
 class Program:
-    """The loops of a module, compiled together and kept on disk by the text of `sources`.
+    """The loops of a module, compiled together and kept on disk by the text of `sources`, beside `file`.
 
     The module must not need torch and have its Program under the name `program`. A function under `@program.entry` is
     called from Python. One under `@program.part` calls entries once, with arguments of the types that they are called
     with, for it is then that numba compiles: parts may do so at the same time, each in a process of its own.
     """
 
-    def __init__(self, what: str, module: str, sources: Sequence[Path]) -> None:
+    def __init__(self, what: str, module: str, file: str, *sources: str) -> None:
         self._what, self._module = what, module
-        self._folder = _find_folder(what, sources)
+        self._folder = _find_folder([Path(file).parent / source for source in sources])
         self._entries: list[Any] = []
-        self._parts: dict[str, Callable[[], None]] = {}
+        self.parts: dict[str, Callable[[], None]] = {}
         self._workers: list[_Worker] | None = None
         self._is_ready = False
         self._lock = threading.Lock()
@@ -71,25 +71,24 @@ class Program:
         self._entries.append(made)
         return cast(Callable[..., Any], made)
 
-    def part(self, rehearsal: Callable[[], None]) -> Callable[[], None]:
+    def part(self, rehearsal: Callable[[], None]) -> None:
         """Decorate a function that calls entries once."""
-        self._parts[rehearsal.__name__] = rehearsal
-        return rehearsal
+        self.parts[rehearsal.__name__] = rehearsal
 
-    def rehearse(self, part: str) -> None:
-        """Compile a part, or load it from disk."""
-        self._parts[part]()
-
-    def start(self) -> None:
+    def start(self) -> Program:
         """Begin to compile in other processes what is not on disk yet; return at once."""
         if self._workers is not None:
-            return
+            return self
         self._workers = []
-        if self._folder is None or self._is_kept() or _CORES == 1 or not _is_python(sys.executable):
-            return
-        self._workers = [_Worker(self._module, part) for part in self._parts]
+        # not an application with an interpreter inside: who knows what that would do
+        is_python = Path(sys.executable or "").stem.startswith("python") and not hasattr(sys, "frozen")
+        if self._folder is None or _CORES == 1 or not is_python:
+            return self
+        if not all(any(self._folder.glob(f"*.{entry.__name__}-*.nbc")) for entry in self._entries):
+            self._workers = [_Worker(self._module, part) for part in self.parts]
         for worker in self._workers:
             worker.start()
+        return self
 
     def wait(self) -> None:
         """Wait for what was started."""
@@ -99,29 +98,22 @@ class Program:
 
     def ready(self) -> None:
         """Compile or load all loops, unless that has been done; one line says how long a compilation took."""
-        if self._is_ready:
+        if self._is_ready:  # without the lock, which a fork may copy while another thread holds it
             return
         with self._lock:
-            if not self._is_ready:
-                self._make_ready()
-                self._is_ready = True
-
-    def _make_ready(self) -> None:
-        start = time.perf_counter()
-        self.start()
-        self.wait()
-        for rehearsal in self._parts.values():
-            rehearsal()
-        kept = ", kept on disk for next time"
-        if self._folder is None:
-            log.warning("kcgs: no folder to keep the compiled %s in; set NUMBA_CACHE_DIR to one", self._what)
-            kept = ""
-        if self._workers or not all(entry.stats.cache_hits for entry in self._entries):
-            log.info("kcgs: compiled the %s in %.1f s%s", self._what, time.perf_counter() - start, kept)
-
-    def _is_kept(self) -> bool:
-        folder = cast(Path, self._folder)
-        return all(any(folder.glob(f"*.{entry.__name__}-*.nbc")) for entry in self._entries)
+            if self._is_ready:
+                return
+            start = time.perf_counter()
+            self.start().wait()
+            for rehearsal in self.parts.values():
+                rehearsal()
+            kept = ", kept on disk for next time"
+            if self._folder is None:
+                log.warning("kcgs: no folder to keep the compiled %s in; set NUMBA_CACHE_DIR to one", self._what)
+                kept = ""
+            if self._workers or not all(entry.stats.cache_hits for entry in self._entries):
+                log.info("kcgs: compiled the %s in %.1f s%s", self._what, time.perf_counter() - start, kept)
+            self._is_ready = True
 
 
 class _Worker(threading.Thread):
@@ -129,7 +121,8 @@ class _Worker(threading.Thread):
 
     def __init__(self, module: str, part: str) -> None:
         super().__init__(daemon=True, name="kcgs-compile")
-        packages = {name for wanted in (module, __name__) for name in _parents(wanted)}
+        names = module.split(".")[:-1]
+        packages = {__package__, *(".".join(names[: count + 1]) for count in range(len(names)))}
         self._command = [sys.executable, "-c", _CHILD, str(_ROOT), module, part, *sorted(packages)]
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -150,23 +143,13 @@ class _Worker(threading.Thread):
             self._process.kill()
 
 
-def _parents(module: str) -> list[str]:
-    names = module.split(".")
-    return [".".join(names[:count]) for count in range(1, len(names))]
-
-
-def _is_python(executable: str | None) -> bool:
-    """Tell whether the program that runs is an interpreter, not an application with one inside."""
-    return bool(executable) and Path(cast(str, executable)).stem.startswith("python") and not hasattr(sys, "frozen")
-
-
-def _find_folder(what: str, sources: Sequence[Path]) -> Path | None:
+def _find_folder(sources: Sequence[Path]) -> Path | None:
     """Return the folder for what these sources compile to with this Python, numba and processor; None: there is none.
 
     numba's own choice goes by the path of the sources, and looks at one file to tell whether they have changed.
     """
     processor = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
-    known = what, sys.implementation.cache_tag, numba.__version__, llvmlite.__version__, *processor
+    known = sys.implementation.cache_tag, numba.__version__, llvmlite.__version__, *processor
     digest = hashlib.sha256(repr(known).encode())
     for source in (Path(__file__), *sources):
         digest.update(source.read_bytes())
@@ -181,26 +164,14 @@ def _find_folder(what: str, sources: Sequence[Path]) -> Path | None:
 
 
 def _make_cache(function: Callable[..., Any], folder: Path) -> Any:
-    class Locator(caching._CacheLocator):
-        _py_file = function.__code__.co_filename
-
-        def get_cache_path(self) -> str:
-            return str(folder)
-
-        def get_source_stamp(self) -> str:
-            return folder.name
-
-        def get_disambiguator(self) -> str:
-            return "0"
-
-        @classmethod
-        def from_function(cls, *_: Any) -> Any:
-            return cls()
-
-    class Implementation(caching.CompileResultCacheImpl):
-        _locator_classes = [Locator]  # type: ignore[list-item]  # noqa: RUF012
-
-    class Cache(caching.FunctionCache):
-        _impl_class = Implementation
-
-    return Cache(function)  # type: ignore[no-untyped-call]
+    """Return numba's cache of a function, in a folder that says all that numba would ask of the sources."""
+    answers = {
+        "get_cache_path": lambda self: str(folder),
+        "get_source_stamp": lambda self: folder.name,
+        "get_disambiguator": lambda self: "0",
+        "from_function": classmethod(lambda cls, *_: cls()),
+        "_py_file": function.__code__.co_filename,
+    }
+    locator = type("Locator", (caching._CacheLocator,), answers)
+    implementation = type("Implementation", (caching.CompileResultCacheImpl,), {"_locator_classes": [locator]})
+    return type("Cache", (caching.FunctionCache,), {"_impl_class": implementation})(function)

@@ -50,13 +50,10 @@ def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
     return device.type if runs and dtype == torch.float32 else "tiled"
 
 
-def compile_ahead(backend: str) -> Program | None:
-    """Begin to compile, in other processes, what float32 images on the CPU need of a backend; None: nothing."""
-    if _choose(backend, torch.device("cpu"), torch.float32) != "cpu":
-        return None
-    program: Program = import_module(f"{__package__}.cpu.loops").program
-    program.start()
-    return program
+def compile_ahead(backend: str) -> list[Program]:
+    """Begin to compile, in other processes, what float32 images on the CPU need of a backend."""
+    name = _choose(backend, torch.device("cpu"), torch.float32)
+    return [import_module(f"{__package__}.cpu.loops").program.start()] if name == "cpu" else []
 
 
 @functools.cache

@@ -18,7 +18,7 @@ from kcgs.kernels.compiled import Program
 
 def make(folder: Path | None, module: str = "kcgs.nowhere") -> Program:
     """Make a program of one loop; processes that compile it do not find its module."""
-    program = Program("test", module, [])
+    program = Program("test", module, __file__)
     program._folder = folder
 
     @program.entry
@@ -79,13 +79,13 @@ def test_folder_goes_by_the_text_not_by_the_place(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(compiled._config, "CACHE_DIR", str(tmp_path / "cache"))
     source = Path(compiled.__file__).parent / "cpu" / "simd.py"
     copy = Path(shutil.copy(source, tmp_path / "other.py"))
-    folder = compiled._find_folder("loops", [source])
+    folder = compiled._find_folder([source])
     assert folder is not None and folder.parent == tmp_path / "cache"
-    assert folder == compiled._find_folder("loops", [copy])
+    assert folder == compiled._find_folder([copy])
     copy.write_text(copy.read_text() + "\n")
-    assert folder != compiled._find_folder("loops", [copy])
+    assert folder != compiled._find_folder([copy])
     monkeypatch.setattr(compiled.binding, "get_host_cpu_name", lambda: "other")
-    assert folder != compiled._find_folder("loops", [source])
+    assert folder != compiled._find_folder([source])
 
 
 @pytest.mark.parametrize("user", [{"XDG_CACHE_HOME": "cache"}, {"HOME": ".", "XDG_CACHE_HOME": ""}])
@@ -97,7 +97,7 @@ def test_folder_is_the_user_s(user: dict[str, str], tmp_path: Path, monkeypatch:
         monkeypatch.setenv(name, str(tmp_path / place) if place else "")
         if not place:
             monkeypatch.delenv(name)
-    folder = compiled._find_folder("loops", [])
+    folder = compiled._find_folder([])
     assert folder is not None and folder.is_relative_to(tmp_path)
 
 

@@ -6,7 +6,6 @@ with their last label until a decision changes it, so that only pixels near cont
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -160,10 +159,7 @@ def _weigh(truth, answers, state, counters, weights, rows, chances):  # type: ig
             asked += 1
 
 
-_FOLDER = Path(__file__).parent
-program = Program(
-    "label coder", __name__, [_FOLDER / source for source in ("contexts.py", "prior.bin", "wavefront.py")]
-)
+program = Program("label coder", __name__, __file__, "contexts.py", "prior.bin", "wavefront.py")
 
 
 @program.entry

@@ -7,16 +7,13 @@ rows of pixels that the ellipse crosses are visited.
 from __future__ import annotations
 
 import math
-import os
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..compiled import Program, inner
 from ..whitened import Z_LIMIT
-from . import scalar, simd
-from .simd import SIDE, copy, sum_columns
+from .simd import SIDE, add_rows, copy, gather_rows, sum_columns
 
 # z * SCALE, squared, is an exponent of 2
 SCALE = math.sqrt(0.5 / math.log(2.0))
@@ -29,17 +26,7 @@ MX, MY, L11, L21, L22, HEIGHT, INVERSE, PEAK, RISE1, RISE2, RISE3 = range(11)
 COLUMNS = 11
 
 
-_FOLDER = Path(__file__).parent
-# the environment decides between vector code and its scalar twins
-_SCALAR = os.environ.get("KCGS_SIMD") == "0"
-add_rows: Any
-gather_rows: Any
-add_rows, gather_rows = (scalar.add_rows, scalar.gather_rows) if _SCALAR else (simd.add_rows, simd.gather_rows)
-program = Program(
-    "CPU kernel in scalar loops" if _SCALAR else "CPU kernel",
-    __name__,
-    [_FOLDER.parent / "whitened.py", *(_FOLDER / name for name in ("loops.py", "scalar.py", "simd.py"))],
-)
+program = Program("CPU kernel", __name__, __file__, "../whitened.py", "loops.py", "simd.py")
 
 
 class Lists(NamedTuple):
@@ -213,7 +200,7 @@ def render(lists, offset, step, image):  # type: ignore[no-untyped-def]
                     lists.gaussians[i], row % rows, col, height, width, lists.radius, coefficients
                 )
                 if first < last:
-                    add_rows(
+                    add_rows(  # type: ignore[call-arg]
                         pixels, col * per_tile, first, last, coefficients, lists.lowest, lists.colors, i * channels,
                         lists.masks, mask_at, channels,
                     )  # fmt: skip
@@ -247,7 +234,7 @@ def gather(lists, offset, step, grad, out, moments):  # type: ignore[no-untyped-
                     lists.gaussians[i], row % rows, col, height, width, lists.radius, coefficients
                 )
                 if first < last:
-                    gather_rows(
+                    gather_rows(  # type: ignore[call-arg]
                         pixels, col * per_tile, first, last, coefficients, lists.lowest, lists.colors, i * channels,
                         lists.masks, mask_at, sums, moments, channels,
                     )  # fmt: skip

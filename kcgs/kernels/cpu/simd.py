@@ -1,7 +1,7 @@
 """The inner loops of the CPU kernel as explicit vector code: a row of a tile, 16 pixels, at a time.
 
-LLVM does not vectorise these loops by itself, but splits vectors of 16 float32 into what the processor has. Each loop
-has a scalar twin in `scalar.py` with the same arguments. The pixels of a tile lie in memory as [row][channel][column].
+LLVM does not vectorise these loops by itself, but splits vectors of 16 float32 into what the processor has. The
+pixels of a tile lie in memory as [row][channel][column].
 """
 
 from __future__ import annotations
@@ -125,12 +125,8 @@ class _Call:
         coefficients = _pointer(context, builder, types_of[4], arguments[4], _START)
         self.colors = _pointer(context, builder, types_of[6], arguments[6], arguments[7])
         self.masks = _pointer(context, builder, types_of[8], arguments[8], arguments[9])
-        self.plain = builder.icmp_signed("<", arguments[9], _START)
+        self.masked = builder.icmp_signed(">=", arguments[9], _START)
         self.geometry = _Columns(builder, coefficients, arguments[5])
-
-    def each_kind(self, emit: Callable[[bool], None]) -> None:
-        """Emit code for rows without a mask, and with one."""
-        _both(self.builder, self.plain, lambda plain: emit(not plain))
 
     @contextmanager
     def each_row(self, masked: bool) -> Iterator[tuple[Any, Any, Any]]:
@@ -170,7 +166,7 @@ def add_rows(  # type: ignore[no-untyped-def]
                 value = _call(builder, "fma", weight, call.color(loop.index), _load(builder, pixels, loop.index))
                 _store(builder, value, pixels, loop.index)
 
-        call.each_kind(emit)
+        _both(builder, call.masked, emit)
         return context.get_dummy_value()
 
     long = types.int64
@@ -211,7 +207,7 @@ def gather_rows(  # type: ignore[no-untyped-def]
             if moments:
                 _add_moments(call, [builder.load(total) for total in totals], sums_at)
 
-        call.each_kind(lambda masked: _both(builder, arguments[11], lambda moments: emit(masked, moments)))
+        _both(builder, call.masked, lambda masked: _both(builder, arguments[11], lambda moments: emit(masked, moments)))
         return context.get_dummy_value()
 
     long = types.int64
