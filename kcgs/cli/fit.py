@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 # contours that people traced reach 0.63 and more on their image, at most 0.54 on its mirror image
 _ALIGNED = 0.58
+# of the seconds that a fit and a compressed file of it may take
+_FIT_SHARE = 0.75
 # dB that a fit must have to spare where it is then rounded to a file
 _ROUNDING = 0.15
 
@@ -57,6 +59,8 @@ def fit_command(
     output = Path(f"{image.stem}{suffixes[0]}") if output is None else output
     check_output(output, *suffixes)
     if plot is not None:
+        from kcgs.plots import history_figure, save_figure
+
         check_output(plot, ".png", option="--plot")
     if resume and checkpoint is None:
         raise typer.BadParameter("--resume needs --checkpoint")
@@ -77,8 +81,6 @@ def fit_command(
         report = report_fit(fitted, target, labels, output, request)
     result = fitted.result
     if plot is not None:
-        from kcgs.plots import history_figure, save_figure
-
         save_figure(history_figure({request.recipe: result.history}), plot)
     title = f"{output}: {len(fitted.scene)} Gaussians, stopped by {result.stop_reason}"
     if result.removed:
@@ -135,13 +137,17 @@ def fit_into(
     from kcgs.scene import Scene
 
     check_writable("--output", output)
-    settings: Any = {"recipe": request.config, "seed": request.seed, "on_step": on_step, "progress": progress}
+    config, target, compressed = request.config, request.config.target_psnr, output.suffix == ".kcgs"
+    left = request.clock.left(image)
+    if left is not None:
+        share = _FIT_SHARE if compressed and request.target_bytes is None else 1.0
+        config = config.model_copy(update={"max_seconds": share * left})
+    if target is not None and compressed:  # rounding costs some
+        config = config.model_copy(update={"target_psnr": target + _ROUNDING})
+    settings: Any = {"recipe": config, "seed": request.seed, "on_step": on_step, "progress": progress}
     if request.target_bytes is not None:
         done = fit_bytes(image, labels, request.target_bytes, **settings)
         return Fitted(done.result, done.scene, write_file(output, done.data))
-    target, compressed = request.config.target_psnr, output.suffix == ".kcgs"
-    if target is not None and compressed:  # rounding costs some
-        settings["recipe"] = request.config.model_copy(update={"target_psnr": target + _ROUNDING})
     count = request.num_gaussians or min(options.DEFAULT_GAUSSIANS, image.shape[1] * image.shape[2])
     result = fit(image, labels, count, checkpoint=checkpoint, resume=resume, **settings)
     if not compressed:
@@ -149,7 +155,8 @@ def fit_into(
         return Fitted(result, scene, scene.save(output))
     quality = quality_for(max(entry.psnr for entry in result.history)) if target is None else None
     with Progress("writing the file", known=False, shown=progress):
-        file = compress(result.scene, image, quality=quality, target_psnr=target, seed=request.seed)
+        goal: Any = {"quality": quality, "target_psnr": target, "max_seconds": request.clock.left(image)}
+        file = compress(result.scene, image, seed=request.seed, **goal)
     return Fitted(result, file.scene, write_file(output, file.data))
 
 
@@ -211,20 +218,39 @@ def report_fit(
 ) -> dict[str, Any]:
     """Measure what was written of a fit, and say how the fit ended."""
     report = measure_scene(fitted.scene, image, labels, output, fitted.num_bytes, fitted.result.seconds)
-    target = request.config.target_psnr
+    report |= {"total_seconds": request.clock.took(), "stop_reason": fitted.result.stop_reason}
+    reached = not _missed(report, request) if describe_goals(request) else None
+    return {**report, "target_reached": reached}
+
+
+def describe_goals(request: options.FitRequest) -> str:
+    """Return the options that a fit may miss, as they were given."""
+    goals = {
+        "--target-psnr": request.config.target_psnr,
+        "--target-bytes": request.target_bytes,
+        "--max-seconds": request.config.max_seconds,
+    }
+    return " or ".join(f"{option} {value:g}" for option, value in goals.items() if value is not None)
+
+
+def _missed(report: Mapping[str, Any], request: options.FitRequest) -> list[str]:
+    """Say of each target that was missed what is there instead; of bytes, the fit itself does."""
+    target, seconds, missed = request.config.target_psnr, request.clock.seconds, []
     # the file counts, not what it was rounded from
-    reached = None if target is None else report["psnr"] >= target
-    return {**report, "stop_reason": fitted.result.stop_reason, "target_reached": reached}
+    if target is not None and report["psnr"] < target:
+        most = request.num_gaussians or options.DEFAULT_GAUSSIANS
+        why = {
+            "seconds": "the time was over",
+            "callback": "it was interrupted",
+            "diverged": "the fit diverged",
+        }.get(report["stop_reason"], f"{most} Gaussians do not reach it, -n allows more")
+        missed.append(f"--target-psnr {target:g} was not reached: {report['psnr']:.2f} dB is the best; {why}")
+    if seconds is not None and report["total_seconds"] > seconds:
+        took = f"with the image's regions, metrics and file it took {report['total_seconds']:.1f} s"
+        missed.append(f"--max-seconds {seconds:g} was not kept: {took}")
+    return missed
 
 
-def describe_miss(report: Mapping[str, Any], request: options.FitRequest) -> str | None:
-    """Return the line that says which target was missed."""
-    if report["target_reached"] is not False:
-        return None
-    most = request.num_gaussians or options.DEFAULT_GAUSSIANS
-    why = {
-        "seconds": "the time was over",
-        "callback": "it was interrupted",
-        "diverged": "the fit diverged",
-    }.get(report["stop_reason"], f"{most} Gaussians do not reach it, -n allows more")
-    return f"--target-psnr {request.config.target_psnr:g} was not reached: {report['psnr']:.2f} dB is the best; {why}"
+def describe_miss(report: Mapping[str, Any], request: options.FitRequest) -> str:
+    """Return the line that says which targets were missed, if any."""
+    return "; ".join(_missed(report, request))

@@ -92,7 +92,7 @@ def fit_many_command(
         typer.echo(f"kcgs: {line}", err=True)
     if missed:
         names = ", ".join(image.name for image in missed)
-        typer.echo(f"kcgs: --target-psnr {request.config.target_psnr:g} was not reached by {names}", err=True)
+        typer.echo(f"kcgs: {describe_goals(request)} was not kept by {names}", err=True)
     if failed or missed:
         raise typer.Exit(1)
 

@@ -10,6 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from .clock import Clock
 from .fit import fit_into, measure_scene, read_regions, report_fit
 from .options import DEFAULT_GAUSSIANS, FitRequest
 
@@ -69,17 +70,18 @@ def _measure(order: Order, fit: str | None) -> dict[str, Any]:
     from kcgs import load
     from kcgs.data import load_image
 
+    request = order.request._replace(clock=Clock(order.request.config.max_seconds, time.perf_counter()))
     image = load_image(order.image)
     labels = read_regions(_source(order), image, warnings.warn)
     if fit is None:
         report = measure_scene(load(order.output), image, labels, order.output, order.output.stat().st_size, math.nan)
         target = order.request.config.target_psnr
         return {**report, "stop_reason": "", "target_reached": None if target is None else report["psnr"] >= target}
-    fitted = fit_into(order.output, image, labels, order.request, notes={_NOTE: fit})
+    fitted = fit_into(order.output, image, labels, request, notes={_NOTE: fit})
     became = fitted.result.regions
     if order.masks and became is not None and became.kept == 1 < became.given and became.dropped != "recipe":
         warnings.warn(f"regions: {became}", stacklevel=2)
-    return report_fit(fitted, image, labels, order.output, order.request)
+    return report_fit(fitted, image, labels, order.output, request)
 
 
 def _source(order: Order) -> str:

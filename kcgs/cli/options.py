@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
+from .clock import Clock, process_began
+
 if TYPE_CHECKING:
     from kcgs.fit import FitConfig
     from kcgs.scene import Scene
@@ -35,6 +37,7 @@ class FitRequest(NamedTuple):
     recipe: str
     config: FitConfig
     seed: int
+    clock: Clock = Clock()
 
 
 def fit_request(
@@ -44,7 +47,9 @@ def fit_request(
     ] = None,
     recipe: Annotated[str, typer.Option(help="Recipe by name.")] = "best",
     iterations: Annotated[int | None, typer.Option(min=1, help="Default: the recipe's.")] = None,
-    max_seconds: Annotated[float | None, typer.Option(help="The best fit in this wall time.")] = None,
+    max_seconds: Annotated[
+        float | None, typer.Option(help="Wall time of the whole command; of fit-many, for each image.")
+    ] = None,
     target_psnr: Annotated[
         float | None, typer.Option(help="As few Gaussians as reach this PSNR in dB, at most --num-gaussians.")
     ] = None,
@@ -65,7 +70,7 @@ def fit_request(
     if keep_contours:
         given |= {"move_contours": False, "merge_regions": False}
     config = FitConfig.from_recipe(recipe, backend=backend, **given)
-    return FitRequest(num_gaussians, target_bytes, recipe, config, seed)
+    return FitRequest(num_gaussians, target_bytes, recipe, config, seed, Clock(max_seconds, process_began()))
 
 
 def with_fit_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -63,7 +63,9 @@ class Checkpoint:
 
 def _fingerprint(state: FitState, given: RegionMap | None) -> str:
     size = tuple(state.image.shape)
-    digest = hashlib.sha256(f"{state.config.model_dump_json()} {state.num_gaussians} {state.seed} {size}".encode())
+    # a fit that goes on may be granted more time
+    settings = state.config.model_dump_json(exclude={"max_seconds"})
+    digest = hashlib.sha256(f"{settings} {state.num_gaussians} {state.seed} {size}".encode())
     digest.update(state.image.cpu().numpy().tobytes())
     if given is not None:
         digest.update(repr((given.softness, given.supersample)).encode())

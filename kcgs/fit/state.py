@@ -120,6 +120,7 @@ class FitState:
     merged: bool = False  # the trial that merges regions is over
     moving_seconds: float = 0.0  # spent on moving contours
     densify_after: float = 0.0  # seconds
+    addition_seconds: float = 0.0  # of the last addition of Gaussians
 
     # What was measured
     history: list[HistoryEntry] = dataclasses.field(default_factory=list)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -29,6 +30,8 @@ _POWER = 0.93
 # contours show: an image with them may have this much more squared error, 0.1 dB
 _FAVOUR = 1.023
 _TRIAL_ITERATIONS, _TRIAL_TO_END = 80, 0.65
+# shares of the clock: each of two trials, and the fit of what is left then
+_TRIAL_SHARE, _FIT_SHARE = 0.08, 0.75
 _Choice = tuple[RegionMap | None, float, dict[str, Any]]
 
 
@@ -67,8 +70,8 @@ def fit_bytes(
         seed: as there.
         on_step: as there, for the fit itself, not the trials.
         progress: as there.
-        settings: as there; `contour_cost` is replaced by the coder's, and `max_seconds` is for the fit alone, without
-            the trials and the rounding.
+        settings: as there; `contour_cost` is replaced by the coder's, and `max_seconds` counts the trials, the fit and
+            the rounding.
 
     Returns:
         The file, what it decodes to, and the fit.
@@ -88,14 +91,21 @@ def fit_bytes(
     check_count("num_bytes", num_bytes)
     if config.target_psnr is not None:
         raise ValueError(f"target_psnr must be None where bytes are the target; got {config.target_psnr}")
+    end = math.inf if config.max_seconds is None else time.perf_counter() + config.max_seconds
     with Progress("trial fits", known=False, shown=progress):
         chosen, cost, changes = _choose(image, regions, num_bytes, config, seed)
     count = count_for(num_bytes - _map_bytes(chosen), image.shape[1] * image.shape[2])
-    result = fit(image, chosen, count, recipe=config, seed=seed, on_step=on_step, progress=progress, contour_cost=cost)
+
+    def left(share: float = 1.0) -> float | None:
+        return None if math.isinf(end) else max(share * (end - time.perf_counter()), 1e-3)
+
+    settings = {"contour_cost": cost, "max_seconds": left(_FIT_SHARE)}
+    config = config.model_copy(update=settings)
+    result = fit(image, chosen, count, recipe=config, seed=seed, on_step=on_step, progress=progress)
     changes = changes if config.guidance else {"dropped": "recipe"}
     result = result._replace(regions=report_regions(regions, result.scene, **changes))
     with Progress("writing the file", known=False, shown=progress):
-        data, scene = compress(result.scene, image, target_bytes=num_bytes, seed=seed)
+        data, scene = compress(result.scene, image, target_bytes=num_bytes, max_seconds=left(), seed=seed)
     return FitBytesResult(data, scene, result)
 
 
@@ -113,9 +123,10 @@ def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: Fi
     if regions is None or regions.num_regions == 1:
         return None, config.contour_cost, {}
     given, pixels = regions.num_regions, image.shape[1] * image.shape[2]
-    # by iterations, so that the same arguments give the same file
+    # by iterations, so that without a clock the same arguments give the same file
     iterations = min(_TRIAL_ITERATIONS, config.iterations)
-    shorter = {"iterations": iterations, "max_seconds": None, "merge_regions": False, "refine_flat": False}
+    clock = None if config.max_seconds is None else _TRIAL_SHARE * config.max_seconds
+    shorter = {"iterations": iterations, "max_seconds": clock, "merge_regions": False, "refine_flat": False}
     trial = FitConfig.from_recipe(config, **shorter)
 
     def error(regions: RegionMap | None, left: int) -> float:

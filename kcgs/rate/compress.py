@@ -8,6 +8,7 @@ meanwhile. A step is a gradient divided by the known curvature of the squared er
 from __future__ import annotations
 
 import math
+import time
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,6 +37,8 @@ _FINER = (0.0, 2.0, 5.0, 9.0, 14.0, 20.0, 30.0, 50.0)
 _SLACK = 0.997
 # share of the iterations in which shapes are rounded; colours are in the rest
 _SHAPES = 0.65
+# of the seconds that are left, for the first of several files
+_SHARE = 0.5
 _STEP, _MOMENTUM = 0.09, 0.9
 # the largest step, in standard deviations and in log scale; and the largest share of Newton's
 _LARGEST, _NEWTON = 0.2, 0.3
@@ -64,6 +67,7 @@ def compress(
     target_bytes: int | None = None,
     target_psnr: float | None = None,
     iterations: int = 100,
+    max_seconds: float | None = None,
     seed: int = 0,
 ) -> Compressed:
     """Write a scene as a `.kcgs` file, rounded with an eye on the image that it shows.
@@ -79,6 +83,7 @@ def compress(
         target_psnr: dB against the image, in place of both: the first of ever finer files that shows it, or where the
             scene itself does not, one that is nearly as good.
         iterations: renders that the descent may take, at least 1.
+        max_seconds: wall time, above 0; what it has no time for is rounded at once. None: as long as it takes.
         seed: of the order in which Gaussians are rounded.
 
     Returns:
@@ -104,27 +109,30 @@ def compress(
         raise ValueError(f"target_psnr excludes quality and target_bytes; got {quality!r} and {target_bytes!r}")
     qp = writer.qp_for(quality, target_bytes)
     check_count("iterations", iterations)
+    end = math.inf
+    if max_seconds is not None:
+        end = time.perf_counter() + check_number("max_seconds", max_seconds, 0.0, unit="seconds", above=True)
 
-    def write(qp: int, steps: int) -> bytes:
+    def write(qp: int, steps: int, share: float = 1.0) -> bytes:
         quantizer = Quantizer(qp, writer.size)
         kept = _pays(writer.gaussians, quantizer)
         gaussians = Parameters(*(numbers[kept] for numbers in writer.gaussians))
         region_ids = None if writer.regions is None else writer.regions.ids[torch.from_numpy(writer.ids[kept])]
         tuning = _FineTuning(gaussians, region_ids, target, writer.regions, quantizer, seed)
-        return writer.write(quantizer, tuning.run(steps), writer.ids[kept])
+        return writer.write(quantizer, tuning.run(steps, share * (end - time.perf_counter())), writer.ids[kept])
 
     if target_psnr is not None:
         wanted = check_number("target_psnr", target_psnr, 0.0, unit="dB")
         reached = float(psnr(scene.render().to(target), target))
         for finer in _FINER if reached >= wanted else _FINER[:1]:
-            data = write(writer.qp_for(quality_for(reached + finer)), iterations)
+            data = write(writer.qp_for(quality_for(reached + finer)), iterations, _SHARE)
             if float(psnr(decode(data).scene.render(), target)) >= wanted:
                 break
     elif target_bytes is None:
         data = write(qp, iterations)
     else:
         highest, data = writer.finest(lambda qp: write(qp, 0), target_bytes, share=_SLACK)
-        tuned = (write(qp, iterations) for qp in range(highest, QPS[0] - 1, -1))
+        tuned = (write(qp, iterations, _SHARE) for qp in range(highest, QPS[0] - 1, -1))
         data = next((tried for tried in tuned if len(tried) <= target_bytes), data)
     return Compressed(data, decode(data).scene)
 
@@ -172,10 +180,15 @@ class _FineTuning:
         self.turn = torch.rand(2, count, generator=generator).to(image)
         self.speed = torch.zeros(count, 5 + channels).to(image)
 
-    def run(self, iterations: int) -> Codes:
-        """Round everything in so many iterations, and return the whole numbers."""
+    def run(self, iterations: int, seconds: float = math.inf) -> Codes:
+        """Round everything in so many iterations and seconds, and return the whole numbers."""
+        start, share = time.perf_counter(), 0.0
         for iteration in range(iterations):
-            share = iteration / iterations
+            share = max(share, iteration / iterations)
+            if seconds < math.inf:
+                share = max(share, (time.perf_counter() - start) / max(seconds, 1e-9))
+            if share >= 1:
+                break
             shaped = self.turn[0] < share / _SHAPES
             colored = self.turn[1] < (share - _SHAPES) / (1 - _SHAPES)
             self._step(shaped[:, None], colored[:, None])

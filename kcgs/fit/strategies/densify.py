@@ -32,6 +32,8 @@ class Densify:
     """Share of the fit at the last addition."""
     patience: float = 2.0
     """Where the clock ends the fit, descent gets this many times the seconds of the addition before it."""
+    first_seconds: float = 8e-7
+    """About what the first addition takes, for each pixel."""
     sigmas: tuple[float, ...] = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
     """Standard deviations in pixels that are tried."""
 
@@ -49,9 +51,12 @@ class Densify:
         state = self.state
         if self.wanted(progress) <= state.wanted:
             return False
-        # against the clock, additions must leave time for the descent
-        hurried = state.config.max_seconds is not None and progress < 0.9 * self.end
-        return not (hurried and state.seconds() < state.densify_after)
+        if state.config.max_seconds is None:
+            return True
+        # against the clock, additions must end before the fit does, and leave time for the descent
+        now, pixels = state.seconds(), state.image[0].numel()
+        takes = state.addition_seconds or self.first_seconds * pixels
+        return now + takes < state.config.max_seconds and (progress >= 0.9 * self.end or now >= state.densify_after)
 
     @torch.no_grad()
     def apply(self, state: FitState) -> None:
@@ -62,7 +67,8 @@ class Densify:
         if self.contours is not None:
             self.contours.before_addition(state)
         self.add(state, state.wanted - len(state.optimizer.gaussians()[0]))
-        state.densify_after = state.seconds() + self.patience * (state.seconds() - start)
+        state.addition_seconds = state.seconds() - start
+        state.densify_after = state.seconds() + self.patience * state.addition_seconds
 
     def add(self, state: FitState, count: int) -> None:
         """Add so many Gaussians, if any."""
