@@ -104,12 +104,36 @@ class TestFit:
         assert code == 0, err
         assert float(psnr(load("photo.kcgs").render(), load_image("photo.png"))) >= 24
 
+    @pytest.mark.parametrize("name", ["s.safetensors", "s.kcgs"])
+    def test_max_seconds_holds_for_all_that_is_done(
+        self, files: Path, capsys: pytest.CaptureFixture[str], name: str
+    ) -> None:
+        save_image("photo.png", load_image("photo.png").repeat(1, 12, 12))  # takes a while to measure
+        warm = ("fit", "photo.png", "-n", "50", "-o", name, "--json", "--regions", "none", "--iterations")
+        kcgs(*warm, "2", capsys=capsys)
+        start = time.perf_counter()
+        code, out, err = kcgs(*warm, "1000000", "--max-seconds", "4", capsys=capsys)
+        took, report = time.perf_counter() - start, json.loads(out)
+        assert (code, report["target_reached"]) == (0, True), err
+        assert report["stop_reason"] == "seconds" and 0.5 < report["seconds"] < report["total_seconds"] < 4
+        assert report["total_seconds"] == pytest.approx(took, abs=0.3)
+
+    def test_max_seconds_counts_from_the_start_of_the_process(self, files: Path) -> None:
+        command = (sys.executable, "-m", "kcgs.cli", *FIT, "--regions", "none", "--max-seconds", "0.5", "--json")
+        start = time.perf_counter()
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        took, report = time.perf_counter() - start, json.loads(done.stdout)
+        assert done.returncode == 1 and report["target_reached"] is False
+        assert 0.5 * took < report["total_seconds"] < took
+        assert "kcgs: --max-seconds 0.5 was not kept: with the image's regions" in done.stderr
+        assert len(load("scene.safetensors")) >= 1
+
     @pytest.mark.parametrize("regions", ["mask.png", "auto", "none"])
     def test_fit_render_eval_info(self, files: Path, capsys: pytest.CaptureFixture[str], regions: str) -> None:
         code, out, err = kcgs(*FIT, "--regions", regions, "--json", capsys=capsys)
         assert code == 0, err
         report = json.loads(out)
-        assert set(report) == KEYS | {"region_report", "stop_reason", "target_reached"}
+        assert set(report) == KEYS | {"region_report", "stop_reason", "target_reached", "total_seconds"}
         assert (report["region_report"] is None) == (regions == "none")
         assert report["stop_reason"] == "iterations" and report["target_reached"] is None
         assert 1 <= report["num_gaussians"] <= 12

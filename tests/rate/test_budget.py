@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 import torch
 
@@ -20,6 +22,12 @@ class TestFitBytes:
         assert 0.93 * target < len(done.data) <= target
         assert torch.equal(decode(done.data).scene.field.means, done.scene.field.means)
         assert psnr(done.scene, image) > 18
+
+    def test_the_clock_counts_trials_and_rounding(self, photo: Photo) -> None:
+        start = time.perf_counter()
+        done = fit_bytes(*photo, 1500, max_seconds=2.5, iterations=10**7)
+        assert 1.0 < time.perf_counter() - start < 4.0  # rounding alone took as long as it liked
+        assert done.result.stop_reason == "seconds" and 0.9 * 1500 < len(done.data) <= 1500
 
     def test_more_bytes_are_better(self, photo: Photo) -> None:
         image, labels = photo
