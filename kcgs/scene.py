@@ -49,10 +49,7 @@ class Scene(nn.Module):
     """
 
     def __init__(
-        self,
-        field: GaussianField,
-        regions: RegionMap | Tensor | None = None,
-        metadata: Mapping[str, str] | None = None,
+        self, field: GaussianField, regions: RegionMap | Tensor | None = None, metadata: Mapping[str, str] | None = None
     ) -> None:
         super().__init__()
         if not isinstance(field, GaussianField):

@@ -17,12 +17,7 @@ PRECISION, SPEED = "precision", "speed"
 TUNED, PLAIN, DECODE = "encode, fine-tuned", "encode", "decode"
 PSNR, EF_PSNR = "psnr", "ef_psnr"
 # as tables call them, and their unit
-QUALITIES = {
-    PSNR: ("PSNR", "dB"),
-    EF_PSNR: ("EF-PSNR", "dB"),
-    "ms_ssim": ("MS-SSIM", "1"),
-    "ef_ssim": ("EF-SSIM", "1"),
-}
+QUALITIES = {PSNR: ("PSNR", "dB"), EF_PSNR: ("EF-PSNR", "dB"), "ms_ssim": ("MS-SSIM", "1"), "ef_ssim": ("EF-SSIM", "1")}
 RIVALS = (*CODECS, NO_REGIONS)
 # a smaller difference is neither a win nor a loss
 TIE = {"dB": 0.005, "1": 0.0005, "%": 0.05}

@@ -15,12 +15,7 @@ from kcgs.scene import Scene
 COVERAGE = 12.0
 NEEDLES_SIZE = (96, 128)
 # height, width, N
-STANDARD = {
-    "W3": (200, 300, 20),
-    "W1": (480, 854, 1_250),
-    "W2": (480, 854, 7_500),
-    "W4": (2160, 3840, 50_000),
-}
+STANDARD = {"W3": (200, 300, 20), "W1": (480, 854, 1_250), "W2": (480, 854, 7_500), "W4": (2160, 3840, 50_000)}
 
 
 def workload(height: int, width: int, count: int, *, spread: float | None = None) -> Scene:

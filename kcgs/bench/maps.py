@@ -161,23 +161,12 @@ def compare(store: Store, case: Case) -> Result | None:
         return float(ef_psnr(scene.render(), image, labels))
 
     result = Result(
-        image=case.image,
-        n=case.n,
-        source=case.source,
-        given_regions=kept.given_regions,
-        regions=1 if regions is None else regions.num_regions,
-        bytes=row.bytes,
-        map_bytes=row.map_bytes,
-        psnr=row.psnr,
-        ef_psnr=edges(case),
-        baseline_psnr=alone.psnr,
-        baseline_ef_psnr=edges(baseline(case)),
-        segment_seconds=kept.segment_seconds,
-        seconds=row.seconds,
-        baseline_seconds=alone.seconds,
-        decoded_psnr=row.decoded_psnr,
-        decoded_ef_psnr=edges(case, decoded=True),
-    )
+        image=case.image, n=case.n, source=case.source, given_regions=kept.given_regions,
+        regions=1 if regions is None else regions.num_regions, bytes=row.bytes, map_bytes=row.map_bytes, psnr=row.psnr,
+        ef_psnr=edges(case), baseline_psnr=alone.psnr, baseline_ef_psnr=edges(baseline(case)),
+        segment_seconds=kept.segment_seconds, seconds=row.seconds, baseline_seconds=alone.seconds,
+        decoded_psnr=row.decoded_psnr, decoded_ef_psnr=edges(case, decoded=True),
+    )  # fmt: skip
     rival = equal_bytes(store, case)
     equal = None if rival is None else store.row(rival)
     if rival is None or equal is None:

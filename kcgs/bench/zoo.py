@@ -99,21 +99,13 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
     figures = evaluate(scene, image, labels)
     edge = figures["ef_psnr"]
     entry = Entry(
-        name=name,
-        title=plan.title,
-        scene=f"{name}/scene.safetensors",
-        sha256=_hash(folder / "scene.safetensors"),
-        bytes=size,
-        recipe=recipe,
-        num_gaussians=len(scene),
-        num_regions=1 if scene.regions is None else scene.regions.num_regions,
-        psnr=round(figures["psnr"], 3),
-        ef_psnr=round(edge, 3) if edge == edge else None,
-        licence=plan.licence,
-        command=f"kcgs bench zoo -o models --only {name}",
-        decoder=f"{name}/decoder.onnx" if has_decoder else None,
+        name=name, title=plan.title, scene=f"{name}/scene.safetensors", sha256=_hash(folder / "scene.safetensors"),
+        bytes=size, recipe=recipe, num_gaussians=len(scene),
+        num_regions=1 if scene.regions is None else scene.regions.num_regions, psnr=round(figures["psnr"], 3),
+        ef_psnr=round(edge, 3) if edge == edge else None, licence=plan.licence,
+        command=f"kcgs bench zoo -o models --only {name}", decoder=f"{name}/decoder.onnx" if has_decoder else None,
         decoder_sha256=_hash(decoder) if has_decoder else None,
-    )
+    )  # fmt: skip
     _write(folder / "card.md", _card(entry, scene.size, figures["ms_ssim"]))
     return entry
 

@@ -38,8 +38,7 @@ def fit_command(
     image: ImageFile,
     *,
     regions: Annotated[
-        str,
-        typer.Option(metavar="MASK|auto|none", help="Label-map file, or auto (segment the image), or none."),
+        str, typer.Option(metavar="MASK|auto|none", help="Label-map file, or auto (segment the image), or none.")
     ] = "auto",
     request: options.FitRequest,
     output: Annotated[
@@ -218,23 +217,13 @@ def report_fit(
 ) -> dict[str, Any]:
     """Measure what was written of a fit, and say how the fit ended."""
     report = measure_scene(fitted.scene, image, labels, output, fitted.num_bytes, fitted.result.seconds)
-    report |= {"total_seconds": request.clock.took(), "stop_reason": fitted.result.stop_reason}
-    reached = not _missed(report, request) if describe_goals(request) else None
-    return {**report, "target_reached": reached}
+    report |= {"total_seconds": time.perf_counter() - request.clock.began, "stop_reason": fitted.result.stop_reason}
+    goals = request.config.target_psnr, request.target_bytes, request.clock.seconds
+    return report | {"target_reached": None if goals == (None, None, None) else not describe_miss(report, request)}
 
 
-def describe_goals(request: options.FitRequest) -> str:
-    """Return the options that a fit may miss, as they were given."""
-    goals = {
-        "--target-psnr": request.config.target_psnr,
-        "--target-bytes": request.target_bytes,
-        "--max-seconds": request.config.max_seconds,
-    }
-    return " or ".join(f"{option} {value:g}" for option, value in goals.items() if value is not None)
-
-
-def _missed(report: Mapping[str, Any], request: options.FitRequest) -> list[str]:
-    """Say of each target that was missed what is there instead; of bytes, the fit itself does."""
+def describe_miss(report: Mapping[str, Any], request: options.FitRequest) -> str:
+    """Return the line that says which targets were missed, if any; a size in bytes is kept, or refused by the fit."""
     target, seconds, missed = request.config.target_psnr, request.clock.seconds, []
     # the file counts, not what it was rounded from
     if target is not None and report["psnr"] < target:
@@ -248,9 +237,4 @@ def _missed(report: Mapping[str, Any], request: options.FitRequest) -> list[str]
     if seconds is not None and report["total_seconds"] > seconds:
         took = f"with the image's regions, metrics and file it took {report['total_seconds']:.1f} s"
         missed.append(f"--max-seconds {seconds:g} was not kept: {took}")
-    return missed
-
-
-def describe_miss(report: Mapping[str, Any], request: options.FitRequest) -> str:
-    """Return the line that says which targets were missed, if any."""
-    return "; ".join(_missed(report, request))
+    return "; ".join(missed)

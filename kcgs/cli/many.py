@@ -36,8 +36,7 @@ def fit_many_command(
     *,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the scenes or files, and results.csv.")],
     regions: Annotated[
-        str,
-        typer.Option(metavar="DIR|auto|none", help="Folder of masks with the images' stems, or auto, or none."),
+        str, typer.Option(metavar="DIR|auto|none", help="Folder of masks with the images' stems, or auto, or none.")
     ] = "auto",
     request: options.FitRequest,
     suffix: Annotated[
@@ -92,7 +91,7 @@ def fit_many_command(
         typer.echo(f"kcgs: {line}", err=True)
     if missed:
         names = ", ".join(image.name for image in missed)
-        typer.echo(f"kcgs: {describe_goals(request)} was not kept by {names}", err=True)
+        typer.echo(f"kcgs: the target was missed by {names}", err=True)
     if failed or missed:
         raise typer.Exit(1)
 

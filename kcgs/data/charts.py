@@ -9,10 +9,7 @@ from torch import Tensor
 from kcgs._check import check_count
 from kcgs._repr import brief
 
-_BLOCKS = (
-    ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-    ((0.0, 0.5, 0.0), (1.0, 0.5, 0.0), (0.5, 0.0, 0.5)),
-)
+_BLOCKS = (((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), ((0.0, 0.5, 0.0), (1.0, 0.5, 0.0), (0.5, 0.0, 0.5)))
 _BLOCK = 100
 
 _SECTORS = (

@@ -16,13 +16,7 @@ from .conjugate_gradients import conjugate_gradients
 
 
 def solve_colors(
-    scene: Scene,
-    image: Tensor,
-    *,
-    steps: int = 20,
-    cutoff: float = 1e-4,
-    backend: str = "auto",
-    damping: float = 1e-4,
+    scene: Scene, image: Tensor, *, steps: int = 20, cutoff: float = 1e-4, backend: str = "auto", damping: float = 1e-4
 ) -> Scene:
     r"""Give the Gaussians the colours with the least squared error; return the scene itself where it did not fall.
 

@@ -41,10 +41,7 @@ class FitConfig(BaseModel):
     )
     cutoff: float = Field(1e-4, ge=0.0, lt=1.0, description="weights below it are skipped")
     draft_cutoff: float = Field(
-        1e-3,
-        ge=0.0,
-        lt=1.0,
-        description="cutoff of the first 85 % of a fit, where it is above `cutoff`; 0: none",
+        1e-3, ge=0.0, lt=1.0, description="cutoff of the first 85 % of a fit, where it is above `cutoff`; 0: none"
     )
     backend: str = Field("auto", description="kernel, as in region_splat")
 

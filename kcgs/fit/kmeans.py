@@ -171,11 +171,6 @@ def _solved_colors(field: GaussianField, image: Tensor, regions: RegionMap | Non
     start = 0.4 * field.colors.detach()
     operator = ColorOperator(field, regions, start, _CUTOFF, backend)
     return conjugate_gradients(
-        start,
-        image - operator.rendered.detach(),
-        operator.render,
-        _COLOR_STEPS,
-        gradient=operator.adjoint,
-        dot=lambda a, b: (a * b).sum(),
-        least_squares=True,
-    )
+        start, image - operator.rendered.detach(), operator.render, _COLOR_STEPS, gradient=operator.adjoint,
+        dot=lambda a, b: (a * b).sum(), least_squares=True,
+    )  # fmt: skip

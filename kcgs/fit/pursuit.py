@@ -151,15 +151,10 @@ def _best_of_squares(
     chosen = where[torch.from_numpy(kept).to(where.device)]
     places = chosen.cpu().numpy()
     return _Candidates(
-        np.full(len(places), region),
-        corner[0] + (places % gain.shape[1] + 0.5) * block,
-        corner[1] + (places // gain.shape[1] + 0.5) * block,
-        np.full(len(places), sigma),
-        np.full(len(places), block),
-        inner.flatten(1)[:, chosen].T.cpu().numpy(),
-        norm.flatten()[chosen].cpu().numpy(),
-        values[kept],
-    )
+        np.full(len(places), region), corner[0] + (places % gain.shape[1] + 0.5) * block,
+        corner[1] + (places // gain.shape[1] + 0.5) * block, np.full(len(places), sigma), np.full(len(places), block),
+        inner.flatten(1)[:, chosen].T.cpu().numpy(), norm.flatten()[chosen].cpu().numpy(), values[kept],
+    )  # fmt: skip
 
 
 def _blur(padded: Tensor, sigma: float, margin: int) -> Tensor:
@@ -282,10 +277,7 @@ def _joint_colors(chosen: _Candidates, centres: NDArray[np.float64], inner: NDAr
     overlap *= chosen.region[:, None] == chosen.region
     products = torch.from_numpy((inner / root).astype(np.float32))
     solved = conjugate_gradients(
-        torch.zeros_like(products),
-        products,
-        lambda p: torch.from_numpy(overlap @ p.numpy()),
-        _COLOR_STEPS,
+        torch.zeros_like(products), products, lambda p: torch.from_numpy(overlap @ p.numpy()), _COLOR_STEPS,
         dot=lambda a, b: torch.from_numpy((a.numpy() * b.numpy()).sum(0)),
-    )
+    )  # fmt: skip
     return torch.from_numpy(solved.numpy() / root)

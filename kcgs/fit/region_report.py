@@ -74,14 +74,11 @@ def report_regions(
     regions, ids = scene.regions, scene.field.region_ids
     kept = 1 if regions is None else regions.num_regions
     return RegionReport(
-        given.num_regions,
-        kept,
-        merged_for_count,
-        merged_for_bytes,
+        given.num_regions, kept, merged_for_count, merged_for_bytes,
         given.num_regions - kept - merged_for_count - merged_for_bytes,
         moved_pixels=0 if regions is None else _moved_pixels(given, regions),
         empty=0 if regions is None or ids is None else int((~torch.isin(regions.ids, ids)).sum()),
-    )
+    )  # fmt: skip
 
 
 def _moved_pixels(given: RegionMap, regions: RegionMap) -> int:

@@ -219,9 +219,8 @@ def _edges(image: Tensor) -> Tensor:
     edges, rows = image.new_empty(len(image), height, width), max(1, _BLOCK // width)
     for top in range(0, height, rows):
         first = max(0, top - margin)
-        blurred = gaussian_blur2d(
-            image[..., first : top + rows + margin, :], (side, side), (_SIGMA, _SIGMA), border_type="replicate"
-        )
+        block = image[..., first : top + rows + margin, :]
+        blurred = gaussian_blur2d(block, (side, side), (_SIGMA, _SIGMA), border_type="replicate")
         strength = spatial_gradient(blurred).square().sum((1, 2)).sqrt()
         strongest = max_pool2d(strength, 2 * _SLACK + 1, stride=1, padding=_SLACK)
         edges[:, top : top + rows] = strongest[:, top - first :][:, :rows]

@@ -224,12 +224,7 @@ def _is_large(image: Tensor) -> bool:
 
 
 def _mean_ssim(
-    image: Tensor,
-    target: Tensor,
-    *,
-    contrast: bool = False,
-    band: Tensor | None = None,
-    by_rows: bool | None = None,
+    image: Tensor, target: Tensor, *, contrast: bool = False, band: Tensor | None = None, by_rows: bool | None = None
 ) -> Tensor:
     """Mean SSIM, or contrast and structure alone, where the window lies inside the image, or over a band; (B)."""
     # variances are differences of near-equal convolutions and need every digit: neither TF32 nor autocast
@@ -251,17 +246,9 @@ def _ssim_map(image: Tensor, target: Tensor, contrast: bool) -> Tensor:
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     result = structural_similarity_index_measure(
-        image,
-        target,
-        sigma=_SIGMA,
-        kernel_size=_WINDOW,
-        reduction="none",
-        data_range=1.0,
-        k1=_K1,
-        k2=_K2,
-        return_full_image=not contrast,
-        return_contrast_sensitivity=contrast,
-    )
+        image, target, sigma=_SIGMA, kernel_size=_WINDOW, reduction="none", data_range=1.0, k1=_K1, k2=_K2,
+        return_full_image=not contrast, return_contrast_sensitivity=contrast,
+    )  # fmt: skip
     return torch.as_tensor(result[1])
 
 

@@ -292,11 +292,7 @@ class RegionMap:
         labels = sample_labels(self.labels, height, width, 1)
         index = self.index_of(labels).to(torch.int32)
         return RegionMap(
-            labels,
-            self.ids,
-            scaled_widths(self.softness, math.sqrt(height * width / (self.size[0] * self.size[1]))),
-            fine_labels=labels,
-            membership=Resampled(index if index.ndim == 3 else index[None], self.membership),
-            _table=self._table,
-            _origin=self,
-        )
+            labels, self.ids, scaled_widths(self.softness, math.sqrt(height * width / (self.size[0] * self.size[1]))),
+            fine_labels=labels, membership=Resampled(index if index.ndim == 3 else index[None], self.membership),
+            _table=self._table, _origin=self,
+        )  # fmt: skip

@@ -93,15 +93,9 @@ class RegionSplatRenderer(nn.Module):
                 "Scene, or set field.region_ids to None to render it without contours"
             )
         image = region_splat(
-            means,
-            cholesky,
-            field.merged_colors(),
-            field.region_ids,
-            regions,
-            size=target,
-            cutoff=self.cutoff,
+            means, cholesky, field.merged_colors(), field.region_ids, regions, size=target, cutoff=self.cutoff,
             backend=self.backend,
-        )
+        )  # fmt: skip
         if not self.keepdim and image.ndim == 3:
             image = image[None]
         return image.clamp(0.0, 1.0) if self.clamp else image

@@ -178,19 +178,11 @@ def _measure(case: Case, result: FitResult, image: Tensor, labels: Tensor | None
     fields: dict[str, Any] = {name: figures[name] for name in _FIGURES}
     fields |= {f"decoded_{name}": decoded[name] for name in _FIGURES}
     return Row(
-        image=case.image,
-        n=case.n,
-        method=case.method.name,
-        seed=case.seed,
-        iterations=result.config.iterations,
-        **fields,
-        seconds=math.nan,
-        core_seconds=math.nan,
-        num_gaussians=len(scene),
-        pixels=image[0].numel(),
+        image=case.image, n=case.n, method=case.method.name, seed=case.seed, iterations=result.config.iterations,
+        **fields, seconds=math.nan, core_seconds=math.nan, num_gaussians=len(scene), pixels=image[0].numel(),
         bytes=len(data),
         map_bytes=len(encode_map(scene.regions)) if scene.regions is not None and scene.regions.num_regions > 1 else 0,
-    )
+    )  # fmt: skip
 
 
 def find_labels(source: str, image: Tensor, given: Tensor | None) -> tuple[Tensor | None, float]:

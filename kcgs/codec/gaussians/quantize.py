@@ -139,14 +139,11 @@ class Quantizer:
         _, group, counts = np.unique(np.stack(classes), axis=1, return_inverse=True, return_counts=True)
         sides = [Grid.over(self.size, count).side for count in counts.tolist()]
         return Steps(
-            classes.size,
-            place=relative * math.sqrt(2.0),
+            classes.size, place=relative * math.sqrt(2.0),
             scales=np.clip(np.floor(OCTAVES / scale + 0.5), 1, _MOST_LEVELS).astype(np.int64),
-            ratio=np.maximum(relative * (1.0 / _LN2), MOST_RATIO / _MOST_LEVELS),
-            angle=relative,
-            color=self._color[classes.size - SIZES[0]],
-            side=np.array(sides, np.int64)[group],
-        )
+            ratio=np.maximum(relative * (1.0 / _LN2), MOST_RATIO / _MOST_LEVELS), angle=relative,
+            color=self._color[classes.size - SIZES[0]], side=np.array(sides, np.int64)[group],
+        )  # fmt: skip
 
     def quantize(self, gaussians: Parameters, classes: Classes) -> Codes:
         """Round Gaussians; what leaves its class of size is brought back to its border."""

@@ -60,13 +60,10 @@ class MoveContours:
         if state.moving_seconds > self.time_share * (config.max_seconds or math.inf):
             return
         moved = refine_contours(
-            state.gaussians().scene(state.size),
-            state.image,
-            given=state.anchor,
-            max_distance=None if config.max_move == "any" else config.max_move,
-            length_weight=config.contour_cost,
+            state.gaussians().scene(state.size), state.image, given=state.anchor,
+            max_distance=None if config.max_move == "any" else config.max_move, length_weight=config.contour_cost,
             backend=config.backend,
-        )
+        )  # fmt: skip
         if moved is not before:
             gain = rise * squared_error(state) - squared_error(state, state.gaussians()._replace(regions=moved))
             moved = accept_moves(before, moved, gain)
