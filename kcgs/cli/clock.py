@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from torch import Tensor
 
-# what follows a fit, by the seconds per pixel of a small image's metrics: those of images above a megapixel, and the end
-# of the fit with its file; how much longer it may take; and what takes as long for any image
+# what follows a fit, by the seconds per pixel of a small image's metrics: those of images above a megapixel, and its
+# end with its file; how much longer that may take; and what takes as long for any image
 _BY_ROWS, _ENDING, _MARGIN, _EXIT = 0.2, 0.1, 1.4, 0.3
 
 

@@ -228,11 +228,8 @@ def describe_miss(report: Mapping[str, Any], request: options.FitRequest) -> str
     # the file counts, not what it was rounded from
     if target is not None and report["psnr"] < target:
         most = request.num_gaussians or options.DEFAULT_GAUSSIANS
-        why = {
-            "seconds": "the time was over",
-            "callback": "it was interrupted",
-            "diverged": "the fit diverged",
-        }.get(report["stop_reason"], f"{most} Gaussians do not reach it, -n allows more")
+        ends = {"seconds": "the time was over", "callback": "it was interrupted", "diverged": "the fit diverged"}
+        why = ends.get(report["stop_reason"], f"{most} Gaussians do not reach it, -n allows more")
         missed.append(f"--target-psnr {target:g} was not reached: {report['psnr']:.2f} dB is the best; {why}")
     if seconds is not None and report["total_seconds"] > seconds:
         took = f"with the image's regions, metrics and file it took {report['total_seconds']:.1f} s"
