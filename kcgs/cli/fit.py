@@ -77,10 +77,10 @@ def fit_command(
             output, target, labels, request,
             on_step=stop.step, progress=not quiet, checkpoint=checkpoint, resume=resume,
         )  # fmt: skip
+        result = fitted.result
+        if plot is not None:
+            save_figure(history_figure({request.recipe: result.history}), plot)
         report = report_fit(fitted, target, labels, output, request)
-    result = fitted.result
-    if plot is not None:
-        save_figure(history_figure({request.recipe: result.history}), plot)
     title = f"{output}: {len(fitted.scene)} Gaussians, stopped by {result.stop_reason}"
     if result.removed:
         title += f"; {result.removed} useless ones removed, which changed no value by more than {result.change:.1g}"
@@ -132,11 +132,13 @@ def fit_into(
 ) -> Fitted:
     """Fit, and write the scene, with notes in it, or the compressed file, as the suffix says."""
     from kcgs.fit import fit
+    from kcgs.kernels import prepare
     from kcgs.rate import compress, fit_bytes, quality_for
     from kcgs.scene import Scene
 
     check_writable("--output", output)
     config, target, compressed = request.config, request.config.target_psnr, output.suffix == ".kcgs"
+    prepare(config.backend, image.device, image.dtype, len(image))
     left = request.clock.left(image)
     if left is not None:
         share = _FIT_SHARE if compressed and request.target_bytes is None else 1.0
