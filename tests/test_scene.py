@@ -46,6 +46,16 @@ class TestKeepsItsMap:
         assert torch.equal(other(), scene()) and other.metadata == {"title": name}
         assert (other.regions is None) == (name == "none")
 
+    def test_state_dict_within_a_module(self, name: str) -> None:
+        """As a part of another module, through a copy of every tensor, over a scene with a map of its own."""
+        whole, other = (
+            torch.nn.ModuleDict({"scene": make_scene(n)}) for n in (name, "none" if name == "none" else "hard")
+        )
+        state = {k: v.clone() if isinstance(v, torch.Tensor) else v for k, v in whole.state_dict().items()}
+        other.load_state_dict(state)
+        assert torch.equal(other["scene"](), whole["scene"]())
+        assert (other["scene"].regions is None) == (name == "none")
+
     def test_safetensors(self, name: str, tmp_path: Path) -> None:
         if name == "resized":
             pytest.skip("a file keeps the labels of the new size, which are another map")

@@ -84,7 +84,11 @@ class TestExport:
         self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: Path
     ) -> None:
         assert run(monkeypatch, "export", str(scene), "-o", str(scene.with_name("g.onnx")), "--kind", "generic") == 1
-        assert "soft or finer" in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert "soft or finer" in said and "Scene(scene.field, scene.regions.labels)" in said
+        soft = load(scene)
+        Scene(soft.field, soft.regions.labels).save(scene)
+        assert run(monkeypatch, "export", str(scene), "-o", str(scene.with_name("g.onnx")), "--kind", "generic") == 0
 
     def test_truncated_scene(
         self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: Path
