@@ -136,6 +136,10 @@ class FitState:
         """Wall time since the fit began."""
         return time.perf_counter() - self.started
 
+    def has_time(self, seconds: float) -> bool:
+        """Say whether the clock allows so many seconds more."""
+        return self.config.max_seconds is None or self.seconds() + seconds < self.config.max_seconds
+
     def progress(self) -> float:
         """Share of the fit that is done: of its iterations or of its seconds, whichever is more.
 

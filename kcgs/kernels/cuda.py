@@ -136,23 +136,9 @@ def _weigh(k0, k1, k2, k3, k4, x, y, cutoff):  # type: ignore[no-untyped-def]
 
 @_jit
 def _render_tile(  # type: ignore[no-untyped-def]
-    image,
-    colors,
-    rows,
-    cols,
-    height,
-    width,
-    start,
-    coefficients,
-    gaussian,
-    mask_of,
-    masks,
-    cutoff,
-    SIDE: tl.constexpr,
-    CHANNELS: tl.constexpr,
-    BLOCK: tl.constexpr,
-    MAPPED: tl.constexpr,
-):
+    image, colors, rows, cols, height, width, start, coefficients, gaussian, mask_of, masks, cutoff,
+    SIDE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr, MAPPED: tl.constexpr,
+):  # fmt: skip
     tile = tl.program_id(0).to(tl.int64)
     pixel = tl.arange(0, SIDE * SIDE)
     column, row = pixel % SIDE, pixel // SIDE
@@ -179,26 +165,10 @@ def _render_tile(  # type: ignore[no-untyped-def]
 
 @_jit
 def _gather_piece(  # type: ignore[no-untyped-def]
-    terms,
-    order,
-    tiles,
-    firsts,
-    grad,
-    colors,
-    count,
-    start,
-    coefficients,
-    gaussian,
-    mask_of,
-    masks,
-    cutoff,
-    SIDE: tl.constexpr,
-    CHANNELS: tl.constexpr,
-    BLOCK: tl.constexpr,
-    MAPPED: tl.constexpr,
-    GEOMETRY: tl.constexpr,
+    terms, order, tiles, firsts, grad, colors, count, start, coefficients, gaussian, mask_of, masks, cutoff,
+    SIDE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr, MAPPED: tl.constexpr, GEOMETRY: tl.constexpr,
     PIECE: tl.constexpr,
-):
+):  # fmt: skip
     tile = tl.load(tiles + tl.program_id(0))
     entry = tl.load(firsts + tl.program_id(0)) + tl.arange(0, PIECE)
     valid = entry < tl.load(start + tile + 1)

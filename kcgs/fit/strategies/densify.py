@@ -51,12 +51,10 @@ class Densify:
         state = self.state
         if self.wanted(progress) <= state.wanted:
             return False
-        if state.config.max_seconds is None:
-            return True
         # against the clock, additions must end before the fit does, and leave time for the descent
-        now, pixels = state.seconds(), state.image[0].numel()
-        takes = state.addition_seconds or self.first_seconds * pixels
-        return now + takes < state.config.max_seconds and (progress >= 0.9 * self.end or now >= state.densify_after)
+        hurried = state.config.max_seconds is not None and progress < 0.9 * self.end
+        in_time = state.has_time(state.addition_seconds or self.first_seconds * state.image[0].numel())
+        return in_time and not (hurried and state.seconds() < state.densify_after)
 
     @torch.no_grad()
     def apply(self, state: FitState) -> None:

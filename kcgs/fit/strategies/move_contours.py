@@ -34,6 +34,8 @@ class MoveContours:
     """Before every fourth addition their widths are chosen anew."""
     time_share: float = 0.1
     """Share of the seconds that a fit may spend on moves."""
+    pixel_seconds: float = 5e-7
+    """About what a move takes, for each pixel."""
 
     def due(self, progress: float) -> bool:
         """Say whether it is time for a move that must lower the error."""
@@ -55,7 +57,7 @@ class MoveContours:
     def move(self, state: FitState, rise: float, choose_anew: bool = False) -> None:
         """Move the contours where that raises the squared error about them by no more than this factor."""
         config, before, start = state.config, state.regions, state.seconds()
-        if before is None or before.supersample > 1:
+        if before is None or before.supersample > 1 or not state.has_time(self.pixel_seconds * state.image[0].numel()):
             return
         if state.moving_seconds > self.time_share * (config.max_seconds or math.inf):
             return
