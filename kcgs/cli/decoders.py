@@ -42,9 +42,7 @@ def export(
         regions = loaded.regions
         if regions is not None and regions.num_regions > 1 and (regions.softness != 0.0 or regions.supersample > 1):
             hint = "leave --kind out, or make them hard in Python with Scene(scene.field, scene.regions.labels)"
-            raise ValueError(
-                f"--kind generic takes hard contours of whole pixels; this scene's are soft or finer: {hint}"
-            )
+            raise ValueError(f"--kind generic renders hard contours; this scene's are soft or finer: {hint}")
         model = generic_decoder(cutoff=cutoff, clamp=clamp)
     else:
         model = scene_decoder(loaded, cutoff=cutoff, clamp=clamp, precision=precision, interactive=interactive)
