@@ -103,8 +103,6 @@ class Files:
         def make() -> tuple[Point, bytes]:
             sample, segment_seconds = self.sample(image)
             labels = sample.labels if regions else None
-            if not self.quick:
-                _warm_up(self.config)
             start = time.perf_counter()
             made = fit_bytes(sample.image, labels, most, recipe=self.config)
             seconds = time.perf_counter() - start + (segment_seconds if regions else 0.0)
@@ -191,6 +189,8 @@ class Files:
         """Return a point that is kept, or is made and kept with its file; none where it is not there."""
         path = self.path(ask, settings, "json")
         if not path.is_file() and self.makes:
+            if not self.quick:
+                _warm_up(self.config)
             point, data = make()
             path.with_suffix(".file").write_bytes(data)
             with atomic_path(path) as temporary:

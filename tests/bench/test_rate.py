@@ -155,7 +155,7 @@ class TestCodecs:
 
 
 class TestFilesOnDisk:
-    def test_keeps(self, tmp_path: Path) -> None:
+    def test_keeps(self, tmp_path: Path, stub: Stub) -> None:
         files, ask = Files(tmp_path / "files", None, False), Ask(MATCHED, "DAVIS/dog", KCGS, 100)
         dry = Files(files.folder, None, False, makes=False)
         assert dry.keep(ask, 1, lambda: (point(), b"data")) == [] and dry.missed == 1
@@ -166,6 +166,19 @@ class TestFilesOnDisk:
         quick = Files(files.folder, None, True, makes=False)
         assert not any(dry.keep(*other, lambda: (point(), b"")) for other in others)
         assert quick.keep(ask, 1, lambda: (point(), b"")) == []
+
+    def test_no_clock_counts_what_compiles_once(
+        self, tmp_path: Path, stub: Stub, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        files, warmed = Files(tmp_path, None, False), list[FitConfig]()
+        monkeypatch.setattr(_rate_files, "_warm_up", warmed.append)
+        point = Point(MATCHED, QUICK_IMAGE, KCGS, 100, 0, 0.0, "")
+
+        def make() -> tuple[Point, bytes]:
+            assert warmed == [files.config]
+            return point, b""
+
+        assert len(files.keep(Ask(*point[:4]), "any way", make)) == 1
 
     def test_a_changed_codec_is_noticed(self, tmp_path: Path, stub: Stub, monkeypatch: pytest.MonkeyPatch) -> None:
         files = Files(tmp_path, None, True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -18,6 +19,7 @@ from kcgs import fit, load
 from kcgs.cli import main
 from kcgs.data import load_image, load_labels, save_image, save_labels
 from kcgs.functional import psnr
+from kcgs.kernels.compiled import Program
 from kcgs.segment import segment
 
 KEYS = {
@@ -171,8 +173,28 @@ class TestFit:
         assert "psnr" in out
 
     def test_no_bar_off_a_terminal(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        lines = kcgs(*FIT, "--json", capsys=capsys)[2].splitlines()
-        assert all(line.startswith("kcgs: ") for line in lines)  # at most that the kernel was compiled or loaded
+        assert kcgs(*FIT, "--json", capsys=capsys)[2] == ""
+
+    @pytest.mark.parametrize("options", [["--json"], ["--quiet"], []])
+    def test_hushed_about_what_it_compiles(
+        self, options: list[str], files: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        kcgs("fit", "photo.png", "-n", "3", "--iterations", "2", *options, capsys=capsys)
+        assert logging.getLogger("kcgs").isEnabledFor(logging.INFO) is not bool(options)
+
+    def test_compiles_ahead(
+        self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        events: list[str] = []
+
+        def start(program: Program) -> Program:
+            events.append(program._what)
+            return program
+
+        monkeypatch.setattr(Program, "start", start)
+        monkeypatch.setattr("kcgs.data.load_image", lambda path: [load_image(path), events.append("image")][0])
+        assert kcgs(*FIT[:-1], "scene.kcgs", capsys=capsys)[0] == 0
+        assert events[:3] == ["CPU kernel", "label coder", "image"]
 
     def test_recipe_is_recorded(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
         kcgs(*FIT, "--recipe", "gaussian-image", capsys=capsys)
