@@ -130,7 +130,7 @@ def _card(entry: Entry, size: tuple[int, int], ms_ssim: float) -> str:
         "PSNR": f"{entry.psnr:.2f} dB",
         "EF-PSNR": "not defined: one region" if entry.ef_psnr is None else f"{entry.ef_psnr:.2f} dB",
         "MS-SSIM": f"{ms_ssim:.4f}",
-        "bytes": f"{entry.bytes} (label map as plain numbers)",
+        "bytes": f"{entry.bytes} (label map deflated)",
         "decoder": "`decoder.onnx`, with `view` and `visible`" if entry.decoder else "left out: large",
     }
     table = "\n".join(f"| {key} | {value} |" for key, value in rows.items())
