@@ -79,10 +79,10 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
     image, labels = read(plan.image)
     recipe = "best" if plan.image in _CHARTS else "best-refined"  # contours that were found may move freely
     config = FitConfig.from_recipe(recipe, **({"iterations": 20} if quick else {}))
-    fitted = fit(image, labels, plan.n, recipe=config).scene
-    scene = Scene(fitted.field, fitted.regions, {"recipe": recipe, "title": plan.title})
     folder = output / name
     folder.mkdir(parents=True, exist_ok=True)
+    fitted = fit(image, labels, plan.n, recipe=config).scene
+    scene = Scene(fitted.field, fitted.regions, {"recipe": recipe, "title": plan.title})
     size = scene.save(folder / "scene.safetensors")
     _write(folder / "recipe.json", config.model_dump_json(indent=1) + "\n")
     model, decoder = scene_decoder(scene, interactive=True), folder / "decoder.onnx"  # with views and regions

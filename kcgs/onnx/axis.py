@@ -26,7 +26,7 @@ class Axis:
 
     def __init__(self, graph: Graph, size: Value, length: int, ends: tuple[Value, Value] | None = None) -> None:
         g = self.g = graph
-        self.size, self.tiles = size, -(-length // TILE)
+        self.size, self.length, self.tiles = size, length, -(-length // TILE)
         if ends is None:
             start, extent = g.constant([0]), g.constant([length * _PARTS])
         else:
@@ -82,7 +82,10 @@ class Axis:
         last = factor * TILE + 2 * halo - 1
         if soft:
             position = g("Div", g("Cast", self.local, to=FLOAT), g("Cast", self.parts, to=FLOAT))
-            position = g("Clip", g("Add", position, np.float32(halo - 0.5)), np.float32(0), np.float32(last))
+            position = g("Add", position, np.float32(halo - 0.5))
+            first = g("Unsqueeze", g("Sub", np.int64(halo), g("Mul", self.tile, TILE)), g.constant([1]))
+            ends = (g("Cast", g("Add", first, np.int64(n)), to=FLOAT) for n in (0, self.length - 1))
+            position = g("Min", g("Max", position, next(ends)), next(ends))
             position = g("Unsqueeze", position, g.constant([2]))
         else:
             # sub-pixels spread over a pixel of the output, or one of the scene where that is smaller

@@ -10,10 +10,16 @@ import numpy as np
 
 from .axis import Axis
 from .graph import INT64, Graph, Value
+from .layout import Group, Integers
 from .stored import Stored
 from .windows import Windows
 
 F32 = np.float32
+# of the monomials 1, x, y, xx, xy, yy at (x + a, y + b): which of a, b, aa, ab, bb, which of them, times which, factor
+_SHIFT = (
+    *((0, 1, 0, 1), (1, 2, 0, 1), (2, 3, 0, 1), (3, 4, 0, 1), (4, 5, 0, 1)),
+    *((0, 3, 1, 2), (1, 4, 1, 1), (0, 4, 2, 1), (1, 5, 2, 2)),
+)
 
 
 class Blocks:
@@ -32,24 +38,37 @@ class Blocks:
         one = g("Add", g("Mul", x, F32(0)), F32(1))
         rows = (one, x, y, g("Mul", x, x), g("Mul", x, y), g("Mul", y, y))
         self.monomials = g("Concat", *[g("Unsqueeze", r, g.constant([0])) for r in rows], axis=0)  # [6, P]
+        self.shifts = self._shifts()
+
+    def _shifts(self) -> Value:
+        """Make what turns coefficients around a tile's centre into those around each block's middle, (NB, 6, 6)."""
+        g = self.g
+        sides = g("Concat", self.down.blocks, self.across.blocks, g.constant([1]), axis=0)
+        x, y = (
+            g("Expand", g("Reshape", axis.origins, g.constant(shape)), sides)
+            for axis, shape in ((self.across, [1, -1, 1]), (self.down, [-1, 1, 1]))
+        )
+        columns = (x, y, g("Mul", x, x), g("Mul", x, y), g("Mul", y, y))
+        powers = g("Reshape", g("Concat", *columns, axis=2), g.constant([-1, 5]))
+        basis = np.zeros((5, 6, 6), F32)
+        for power, row, column, factor in _SHIFT:
+            basis[power, row, column] = factor
+        moved = g("Reshape", g("MatMul", powers, basis.reshape(5, 36)), g.constant([-1, 6, 6]))
+        return g("Add", moved, np.eye(6, dtype=F32))
 
     def render(self, windows: Windows | None) -> Value:
         """Render the image, (1, C, H, W); windows are needed where any tile has several regions."""
         g, tiles, groups = self.g, self.layout.tiles, self.layout.groups
-        group_of = np.full(len(tiles.regions), len(groups))
-        slot_of = np.zeros(len(tiles.regions), np.int64)
-        for number, group in enumerate(groups):
-            group_of[group.tiles], slot_of[group.tiles] = number, np.arange(len(group.tiles))
         one = g.constant([1])
         tile = g("Add", g("Unsqueeze", g("Mul", self.down.tile, tiles.cols), one), self.across.tile)
         tile = g("Reshape", tile, g.constant([-1]))
-        group_of_block = g("Cast", g("Gather", g.whole(group_of), tile), to=INT64)
-        slots = g("Cast", g("Gather", g.whole(slot_of), tile), to=INT64)
-        order, starts, stops, index = self._sort(group_of_block)
+        group_of_block = g("Cast", g("Gather", self.stored.group_of, tile), to=INT64)
+        slots = g("Cast", g("Gather", self.stored.slot_of, tile), to=INT64)
+        order, *bounds, index = self._sort(group_of_block)
+        starts, stops = (g.split(ends, [1] * (len(groups) + 1)) for ends in bounds)
         rendered = []
         for number, group in enumerate(groups):
-            start, stop = (g("Gather", ends, g.constant([number])) for ends in (starts, stops))
-            chosen = g("Slice", order, start, stop, g.constant([0]))
+            chosen = g("Slice", order, starts[number], stops[number], g.constant([0]))
             slot = g("Min", g("Gather", slots, chosen), len(group.tiles) - 1)
             rendered.append(self._render_group(number, chosen, slot, windows))
         # one black block for all that nothing touches
@@ -79,45 +98,41 @@ class Blocks:
     def _render_group(self, number: int, blocks: Value, slots: Value, windows: Windows | None) -> Value:
         """Render blocks (B,) of a group, (B, C, P); `slots`, (B,), are their tiles by place in the group."""
         g, group = self.g, self.layout.groups[number]
-        whitened, colors = self.stored.whitened(number), self.stored.colors(number)
-        row, col = g("Div", blocks, self.across.blocks), g("Mod", blocks, self.across.blocks)
-        oy, ox = (
-            g("Reshape", g("Gather", axis.origins, block), g.constant([-1, 1, 1]))
-            for axis, block in ((self.down, row), (self.across, col))
-        )
-        whitened = g("Gather", whitened, slots)  # [B, L, 8]
-        e1, k1, e2, k3, k4, squares = g.apply("Split", [whitened, g.constant([1, 1, 1, 1, 1, 3])], 6, axis=2)
-        z1 = g("Add", e1, g("Mul", k1, ox))
-        z2 = g("Add", g("Add", e2, g("Mul", k3, ox)), g("Mul", k4, oy))
-        exponent = self._squares(z1, k1, z2, k3, k4) if group.narrow else self._polynomial(z1, k1, z2, k3, k4, squares)
+        regions = None if group.regions == 1 else g.whole(self._regions(group))
+        colors = self.stored.colors(number, regions)
+        coefficients = g("Gather", self.stored.coefficients(number), slots)  # [B, L, 6]
+        exponent = (self._squares if group.narrow else self._polynomial)(coefficients, blocks)
         weight = g("Exp", exponent)
         if self.cutoff > 0:
             # keeps what is greater; the least weight that counts is the cutoff itself
             weight = g("ThresholdedRelu", weight, alpha=float(np.nextafter(F32(self.cutoff), F32(0))))
         values = g("MatMul", g("Gather", colors, slots), weight)  # [B, K * C, P]
-        if windows is None or group.regions == 1:
+        if windows is None or regions is None:
             return values
         values = g("Reshape", values, g.constant([0, group.regions, self.channels, -1]))
+        row, col = g("Div", blocks, self.across.blocks), g("Mod", blocks, self.across.blocks)
         weights = windows.weights(group, slots, row, col)  # [B, K, 1, P]
         return g("ReduceSum", g("Mul", values, weights), g.constant([1]), keepdims=0)
 
-    def _polynomial(self, z1: Value, k1: Value, z2: Value, k3: Value, k4: Value, squares: Value) -> Value:
-        """Log w as coefficients times monomials."""
-        g, twice = self.g, F32(-2)
-        constant = g("Neg", g("Add", g("Mul", z1, z1), g("Mul", z2, z2)))
-        along = g("Mul", twice, g("Add", g("Mul", z1, k1), g("Mul", z2, k3)))
-        down = g("Mul", twice, g("Mul", z2, k4))
-        return g("MatMul", g("Concat", constant, along, down, squares, axis=2), self.monomials)
+    def _regions(self, group: Group) -> Integers:
+        """Regions of a group's tiles, (T, K), filled up with one that nothing has."""
+        found = [self.layout.tiles.regions[tile] for tile in group.tiles.tolist()]
+        beyond = 1 + max(max(regions) for regions in self.layout.tiles.regions)
+        return np.array([regions + [beyond] * (group.regions - len(regions)) for regions in found])
 
-    def _squares(self, z1: Value, k1: Value, z2: Value, k3: Value, k4: Value) -> Value:
-        """Log w as a sum of squares, which no rounding of large coefficients harms."""
+    def _polynomial(self, coefficients: Value, blocks: Value) -> Value:
+        """Log w as coefficients times monomials."""
         g = self.g
-        one, x, y = (
-            g("Slice", self.monomials, g.constant([i]), g.constant([i + 1]), g.constant([0])) for i in range(3)
-        )
-        first = g("Add", z1, g("Mul", k1, x))  # [B, L, P]
-        second = g("MatMul", g("Concat", z2, k3, k4, axis=2), g("Concat", one, x, y, axis=0))
-        return g("Neg", g("Add", g("Mul", first, first), g("Mul", second, second)))
+        return g("MatMul", g("MatMul", coefficients, g("Gather", self.shifts, blocks)), self.monomials)
+
+    def _squares(self, coefficients: Value, blocks: Value) -> Value:
+        """Log w as a sum of squares, which no rounding of large coefficients harms."""
+        g, three = self.g, self.g.constant([3])
+        shift = g("Slice", g("Gather", self.shifts, blocks), g.constant([0, 0]), g.constant([3, 3]), g.constant([1, 2]))
+        monomials = g("Slice", self.monomials, g.constant([0]), three, g.constant([0]))
+        parts = g.apply("Split", [coefficients, g.constant([3, 3])], 2, axis=2)
+        z1, z2 = (g("MatMul", g("MatMul", part, shift), monomials) for part in parts)
+        return g("Neg", g("Add", g("Mul", z1, z1), g("Mul", z2, z2)))
 
     def _assemble(self, blocks: Value) -> Value:
         """Put the blocks together and leave out the pixels to spare: columns, then rows, each a stretch of memory."""

@@ -95,7 +95,7 @@ class _Plan(NamedTuple):
         blocks = Blocks(g, stored, down, across, self.cutoff)
         regions, windows = self.scene.regions, None
         if regions is not None and any(group.regions > 1 for group in self.layout.groups):
-            windows = Windows(g, self.layout.tiles, down, across, regions)
+            windows = Windows(g, self.layout.tiles, self.layout.groups, down, across, regions)
         image = blocks.render(windows)
         if self.clamp:
             image = g("Clip", image, np.float32(0), np.float32(1))

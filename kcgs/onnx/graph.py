@@ -18,6 +18,7 @@ OPSET = 18  # what torch exports by default, so that graphs of both chain
 INT32, INT64, FLOAT = 6, 7, 1  # ONNX's numbers of its types
 _IR_VERSION = 10
 _SUFFIX = ".onnx"
+_NODES = 500  # bytes that the operators of packed numbers take
 
 Value = ir.Value
 Array = NDArray[np.generic]
@@ -75,6 +76,29 @@ class Graph:
         high = self("Cast", self.constant((numbers // 256).astype(np.uint8)), to=INT32)
         return self("Add", low, self("Mul", high, np.int32(256)))
 
+    def sparse(self, numbers: NDArray[np.int64]) -> Value:
+        """Store whole numbers (n,) of which most are 0: flags of the others, and those; int32."""
+        used = numbers > 0
+        size = 1 if numbers.max(initial=0) < 256 else 2
+        if size * used.sum() + len(numbers) // 8 + _NODES > size * len(numbers):
+            return self.whole(numbers)
+        flags = self.flags(used)
+        values = self("Concat", np.zeros(1, np.int32), self.whole(numbers[used]), axis=0)
+        return self("Gather", values, self("Mul", flags, self("CumSum", flags, np.int64(0))))
+
+    def flags(self, flags: NDArray[np.bool_]) -> Value:
+        """Store flags (n,), as bits and where few are set sparser; int32."""
+        octets = self.sparse(np.packbits(flags, bitorder="little").astype(np.int64))
+        bits = self("Div", self("Unsqueeze", octets, self.constant([1])), (1 << np.arange(8)).astype(np.int32))
+        bits = self("Reshape", self("Mod", bits, np.int32(2)), self.constant([-1]))
+        return self("Slice", bits, self.constant([0]), self.constant([len(flags)]), self.constant([0]))
+
+    def piecewise(self, numbers: NDArray[np.int64]) -> Value:
+        """Store whole numbers (n,) that are often the same as the one before: where they change, and to what; int32."""
+        changes = np.diff(numbers, prepend=-1) != 0
+        place = self("Sub", self("CumSum", self.flags(changes), np.int64(0)), np.int32(1))
+        return self("Gather", self.whole(numbers[changes]), place)
+
     def __call__(self, op: str, *operands: Operand, **attributes: object) -> Value:
         """Apply an operator that has one result."""
         return self.apply(op, operands, 1, **attributes)[0]
@@ -89,6 +113,10 @@ class Graph:
         assert node is not None
         node.name = ""  # names of nodes are optional, and weigh as much as the nodes
         return made
+
+    def split(self, values: Operand, lengths: Sequence[int]) -> Sequence[Value]:
+        """Cut a value along its first axis."""
+        return self.apply("Split", [values, self.constant(lengths)], len(lengths), axis=0)
 
     def body(self, build: Callable[[Graph], Sequence[Value]], name: str) -> ir.Graph:
         """Make the graph inside a Loop or an If; it may use values from outside."""

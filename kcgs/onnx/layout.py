@@ -66,6 +66,7 @@ class Layout(NamedTuple):
     tiles: Tiles
     gaussians: Gaussians
     groups: list[Group]
+    pairs: Integers  # [2, P] Gaussian and tile of every entry, in this order
 
 
 def lay_out(field: GaussianField, regions: RegionMap | None, cutoff: float) -> Layout:
@@ -82,7 +83,8 @@ def lay_out(field: GaussianField, regions: RegionMap | None, cutoff: float) -> L
     order = torch.argsort(tile * len(field) + entry)
     gaussians = _read(field, regions, used)
     narrow = _is_narrow(gaussians.cholesky, _NARROW if cutoff >= _FAINT else _NARROW_OF_FAINT)
-    return Layout(tiles, gaussians, _group_tiles(tile[order], entry[order], tiles, narrow))
+    pairs = torch.stack([entry, tile])[:, torch.argsort(entry * len(tiles.regions) + tile)].numpy()
+    return Layout(tiles, gaussians, _group_tiles(tile[order], entry[order], tiles, narrow), pairs)
 
 
 def _read(field: GaussianField, regions: RegionMap | None, used: Tensor) -> Gaussians:

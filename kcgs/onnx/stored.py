@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from kcgs.kernels.tiles import TILE
 from kcgs.kernels.whitened import Z_LIMIT
 
-from .graph import FLOAT, Graph, Value
+from .graph import FLOAT, INT64, Graph, Value
 from .layout import Layout
 
 F32 = np.float32
@@ -17,88 +18,103 @@ _ROOT = math.sqrt(0.5)
 
 
 class Stored:
-    """The entries of all groups, one after the other: whitened coordinates at the centre of the tile, and colours.
+    """The entries of all groups, one after the other: coefficients of log w around the centre of the tile, and colours.
 
-    Coordinates are scaled by sqrt(1/2): log w is minus their sum of squares. All that does not depend on the size of
-    the image is computed for all groups at once, since the time to load grows with the number of operators.
+    Whitened coordinates z are scaled by sqrt(1/2): log w is minus their sum of squares. All that does not depend on the
+    size of the image is computed for all groups at once, since the time to load grows with the number of operators.
     `visible` is a factor on each region's Gaussians, (R,); `half` stores Cholesky factors and colours in 16 bits.
     """
 
     def __init__(self, graph: Graph, layout: Layout, visible: Value | None, half: bool) -> None:
-        self.g, self.layout = graph, layout
-        self.gaussians, groups = layout.gaussians, layout.groups
+        g = self.g = graph
+        self.layout, self.gaussians, groups = layout, layout.gaussians, layout.groups
         self.channels = self.gaussians.colors.shape[1]
+        # of each tile: its group, one beyond them where nothing touches it, and its slot there
+        group_of = np.full(len(layout.tiles.regions), len(groups))
+        slot_of = np.zeros(len(layout.tiles.regions), np.int64)
+        for number, group in enumerate(groups):
+            group_of[group.tiles], slot_of[group.tiles] = number, np.arange(len(group.tiles))
+        self.group_of, self.slot_of = g.whole(group_of), g.whole(slot_of)
         if not groups:
             return
-        g = graph
-        self._starts = np.cumsum([0, *(group.entries.size for group in groups)])
-        steps = zip(self._starts, self._starts[1:], [group.entries.shape[1] for group in groups], strict=False)
-        self._begins = np.concatenate([np.arange(*step) for step in steps])  # of each tile's entries
+        self._sizes = [group.entries.size for group in groups]
         tile = self._tile_of_entries()
-        entries = self._entries(tile)
+        entries, real = self._entries(tile)
         with np.errstate(over="ignore"):  # what is too large for 16 bits shows in the image
             stored = [a.astype(np.float16 if half else F32) for a in (self.gaussians.cholesky, self.gaussians.colors)]
         cholesky, colors = (g("Cast", a, to=FLOAT) if half else a for a in [g.constant(a) for a in stored])
         if visible is not None:
             shown = g("Gather", visible, g.whole(self.gaussians.region))
             colors = g("Mul", colors, g("Unsqueeze", shown, g.constant([1])))
-        self._whitened = self._whiten(entries, tile, cholesky)
-        self._colors = g("Mul", g("Gather", colors, entries), self._real(tile))
+        squares, polynomials = self._whiten(entries, tile, cholesky)
+        self._squares, self._polynomials = (g.split(part, self._sizes) for part in (squares, polynomials))
+        self._colors = g.split(g("Mul", g("Gather", colors, entries), real), self._sizes)
+        if any(group.regions > 1 for group in groups):
+            self._regions = g.split(g("Gather", g.whole(self.gaussians.region), entries), self._sizes)
 
-    def whitened(self, number: int) -> Value:
-        """Coordinates of a group, (T, L, 8): z1 = k0 + k1 x, z2 = k2 + k3 x + k4 y, coefficients of xx, xy, yy."""
-        return self._group(self._whitened, number, 8)
+    def coefficients(self, number: int) -> Value:
+        """Coefficients of a group, (T, L, 6): of 1, x, y, xx, xy, yy in log w; or, narrow, of 1, x, y in z1 and z2."""
+        narrow = self.layout.groups[number].narrow
+        return self._shaped(self._squares if narrow else self._polynomials, number, 6)
 
-    def colors(self, number: int) -> Value:
-        """Colours of a group, (T, K * C, L), zero where a Gaussian is of another region."""
+    def colors(self, number: int, regions: Value | None) -> Value:
+        """Colours of a group, (T, K * C, L), zero where a Gaussian is of another of the tiles' regions, (T, K)."""
         g, group = self.g, self.layout.groups[number]
-        colors = g("Transpose", self._group(self._colors, number, self.channels), perm=[0, 2, 1])  # [T, C, L]
-        if group.regions == 1:
+        colors = g("Transpose", self._shaped(self._colors, number, self.channels), perm=[0, 2, 1])  # [T, C, L]
+        if regions is None:
             return colors
-        local = [
-            np.searchsorted(self.layout.tiles.regions[tile], self.gaussians.region[entries])
-            for tile, entries in zip(group.tiles.tolist(), group.entries, strict=True)
-        ]
-        same = np.stack(local)[:, None] == np.arange(group.regions)[:, None]  # [T, K, L]
-        colors = g("Mul", g("Unsqueeze", colors, g.constant([1])), g("Cast", g.constant(same[:, :, None]), to=FLOAT))
+        region = self._shaped(self._regions, number, place=(1, 1))
+        same = g("Cast", g("Equal", region, g("Unsqueeze", regions, g.constant([2, 3]))), to=FLOAT)  # [T, K, 1, L]
+        colors = g("Mul", g("Unsqueeze", colors, g.constant([1])), same)
         return g("Reshape", colors, g.constant([0, group.regions * self.channels, -1]))
 
-    def _group(self, values: Value, number: int, width: int) -> Value:
-        g = self.g
-        start, end = (g.constant([int(bound)]) for bound in self._starts[number : number + 2])
-        part = g("Slice", values, start, end, g.constant([0]))
-        return g("Reshape", part, g.constant([*self.layout.groups[number].entries.shape, width]))
+    def _shaped(self, values: Sequence[Value], number: int, *width: int, place: tuple[int, ...] = ()) -> Value:
+        count, length = self.layout.groups[number].entries.shape
+        return self.g("Reshape", values[number], self.g.constant([count, *place, length, *width]))
 
     def _tile_of_entries(self) -> Value:
         """Place of each entry's tile among the tiles of all groups, (P,)."""
-        g = self.g
-        parts, first = [], 0
-        for group in self.layout.groups:
-            count, length = group.entries.shape
-            places = g("Range", np.int32(first), np.int32(first + count), np.int32(1))
-            places = g("Expand", g("Unsqueeze", places, g.constant([1])), g.constant([count, length]))
-            parts.append(g("Reshape", places, g.constant([-1])))
-            first += count
-        return g("Concat", *parts, axis=0)
+        begins = [np.arange(group.entries.size) % group.entries.shape[1] == 0 for group in self.layout.groups]
+        return self.g("Sub", self.g("CumSum", self.g.flags(np.concatenate(begins)), np.int64(0)), np.int32(1))
 
-    def _entries(self, tile: Value) -> Value:
-        """Which Gaussian each entry is, (P,), stored by how much it is more than the one before: mostly in a byte."""
-        g = self.g
-        steps = [np.diff(group.entries, axis=1, prepend=group.entries[:, :1]) for group in self.layout.groups]
-        flat = np.concatenate([part.ravel() for part in steps])
-        base = np.concatenate([group.entries[:, 0] for group in self.layout.groups]) - np.cumsum(flat)[self._begins]
-        total = g("CumSum", g.whole(flat), np.int64(0))
-        return g("Add", total, g("Gather", g.constant(base.astype(np.int32)), tile))
+    def _entries(self, tile: Value) -> tuple[Value, Value]:
+        """Which Gaussian each entry is, (P,), and 1 for entries, 0 for what lists are filled up with, (P, 1)."""
+        g, groups = self.g, self.layout.groups
+        counts = g.whole(np.concatenate([group.lengths for group in groups]))
+        sides = g.whole(np.concatenate([np.full(len(group.tiles), group.entries.shape[1]) for group in groups]))
+        firsts, begins = (g("CumSum", n, np.int64(0), exclusive=1) for n in (counts, sides))
+        rank = g("Sub", g("Range", np.int32(0), np.int32(sum(self._sizes)), np.int32(1)), g("Gather", begins, tile))
+        count = g("Gather", counts, tile)
+        real = g("Unsqueeze", g("Cast", g("Less", rank, count), to=FLOAT), g.constant([1]))
+        place = g("Add", g("Gather", firsts, tile), g("Min", rank, g("Sub", count, np.int32(1))))
+        return g("Gather", self._sorted_pairs(), place), real
 
-    def _real(self, tile: Value) -> Value:
-        """1 for entries, 0 for what lists are filled up with, (P, 1)."""
-        g = self.g
-        ends = self._begins + np.concatenate([group.lengths for group in self.layout.groups])
-        places = g("Range", np.int32(0), np.int32(self._starts[-1]), np.int32(1))
-        real = g("Cast", g("Less", places, g("Gather", g.constant(ends.astype(np.int32)), tile)), to=FLOAT)
-        return g("Unsqueeze", real, g.constant([1]))
+    def _sorted_pairs(self) -> Value:
+        """Which Gaussian each pair of Gaussian and tile is of, sorted by the tile's place, then by Gaussian.
 
-    def _whiten(self, entries: Value, tile: Value, cholesky: Value) -> Value:
+        They are stored the other way, Gaussian by Gaussian: its first tile, and how many tiles lie between one and the
+        next, which is mostly none.
+        """
+        g, groups, (gaussian, tile) = self.g, self.layout.groups, self.layout.pairs
+        fresh = np.diff(gaussian, prepend=-1) > 0
+        gaps = np.diff(tile, prepend=0) - 1
+        gaps[fresh] = 0
+        is_first = g.flags(fresh)
+        owner = g("Sub", g("CumSum", is_first, np.int64(0)), np.int32(1))
+        steps = g("Mul", g("Add", g.sparse(gaps), np.int32(1)), g("Sub", np.int32(1), is_first))
+        path = g("CumSum", steps, np.int64(0))
+        # not Compress: onnxruntime leaves it for every run
+        flags, count = g("Cast", is_first, to=INT64), g.constant([int(fresh.sum())])
+        begin = g("Gather", path, g.apply("TopK", [flags, count], 2, axis=0)[1])
+        base = g("Sub", g.whole(tile[fresh]), begin)
+        number = g("Add", path, g("Gather", base, owner))
+        starts = np.cumsum([0, *(len(group.tiles) for group in groups)]).astype(np.int32)
+        place = g("Add", g("Gather", g.constant(starts), self.group_of), self.slot_of)
+        # of equal tiles, the first pair comes first
+        keys, count = g("Cast", g("Gather", place, number), to=INT64), g.constant([len(tile)])
+        return g("Gather", owner, g.apply("TopK", [keys, count], 2, largest=0, axis=0)[1])
+
+    def _whiten(self, entries: Value, tile: Value, cholesky: Value) -> tuple[Value, Value]:
         g, cols = self.g, self.layout.tiles.cols
         numbers = np.concatenate([group.tiles for group in self.layout.groups])
         place = g("Cast", g.whole(np.stack([numbers % cols, numbers // cols], -1)), to=FLOAT)
@@ -112,7 +128,9 @@ class Stored:
         k3 = g("Neg", g("Div", slope, l22))
         z = g("Mul", g("Concat", e1, k1, e2, k3, k4, axis=1), F32(_ROOT))
         z = g("Clip", z, F32(-Z_LIMIT), F32(Z_LIMIT))
-        _, k1, _, k3, k4 = g.apply("Split", [z], 5, axis=1, num_outputs=5)
-        xx = g("Neg", g("Add", g("Mul", k1, k1), g("Mul", k3, k3)))
-        xy, yy = g("Mul", F32(-2), g("Mul", k3, k4)), g("Neg", g("Mul", k4, k4))
-        return g("Concat", z, xx, xy, yy, axis=1)
+        e1, k1, e2, k3, k4 = g.apply("Split", [z], 5, axis=1, num_outputs=5)
+        squares = g("Concat", e1, k1, g("Mul", k1, F32(0)), e2, k3, k4, axis=1)
+        sums = [g("Add", g("Mul", e1, a), g("Mul", e2, b)) for a, b in ((e1, e2), (k1, k3))]
+        xx = g("Add", g("Mul", k1, k1), g("Mul", k3, k3))
+        terms = g("Concat", *sums, g("Mul", e2, k4), xx, g("Mul", k3, k4), g("Mul", k4, k4), axis=1)
+        return squares, g("Mul", terms, np.array([-1, -2, -2, -1, -2, -1], F32))

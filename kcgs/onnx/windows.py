@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from kcgs.functional import RegionMap
 from kcgs.kernels.tiles import TILE
@@ -11,28 +15,47 @@ from .axis import Axis
 from .graph import FLOAT, Graph, Value
 from .layout import Group, Integers, Tiles, margin
 
+F32 = np.float32
 _STEPS = 65535
+_FARTHEST = 16  # pixels that a contour reaches where its blur is computed in the graph
+_SOFT = TILE + 2  # side of a window of weights
 
 
 class Windows:
-    """Samples region weights at the pixels of blocks, whose rows and columns are `down` and `across`."""
+    """Samples region weights at the pixels of blocks, whose rows and columns are `down` and `across`.
 
-    def __init__(self, graph: Graph, tiles: Tiles, down: Axis, across: Axis, regions: RegionMap) -> None:
-        soft = self.soft = regions.softness != 0.0
+    Windows are made when the decoder is loaded: of hard contours they are stored as labels; soft ones are the blur of
+    labels, or stored as weights where contours are very wide or finer than pixels.
+    """
+
+    def __init__(
+        self, graph: Graph, tiles: Tiles, groups: Sequence[Group], down: Axis, across: Axis, regions: RegionMap
+    ) -> None:
+        g, soft = graph, regions.softness != 0.0
         factor = self.factor = 1 if soft else regions.supersample  # labels along a side of a pixel
-        self.g, self.tiles = graph, tiles
-        self.side = factor * TILE + 2 * margin(factor)
+        self.g, self.soft, self.tiles, self.map = graph, soft, tiles, regions
         self.across = across.weights(factor, margin(factor), soft)
-        self.down = graph("Transpose", down.weights(factor, margin(factor), soft), perm=[0, 2, 1])
+        self.down = g("Transpose", down.weights(factor, margin(factor), soft), perm=[0, 2, 1])
         self.sides = across.side, down.side
+        mixed = [group for group in groups if group.regions > 1]
+        self._numbers = {id(group): number for number, group in enumerate(mixed)}
+        chosen = np.concatenate([group.tiles for group in mixed])
+        self._reach = regions.membership.radius
+        blurs = regions.supersample == 1 and self._reach <= _FARTHEST
+        self._sample = (self._blurred if blurs else self._soft) if soft else self._hard
+        if self._sample == self._blurred:
+            self._blurs = self._blur(chosen)
+        elif not soft:
+            labels = self._piecewise(np.stack([tiles.windows[tile].numpy() for tile in chosen.tolist()]))
+            self._labels = g.split(labels, [len(group.tiles) for group in mixed])
 
     def weights(self, group: Group, slots: Value, row: Value, col: Value) -> Value:
         """Sample the K region weights of blocks, (B, K, 1, P), column by column.
 
         `slots`, (B,), are the tiles of the blocks by place in the group, `row` and `col`, (B,), where the blocks are.
         """
-        g, sample = self.g, self._soft if self.soft else self._hard
-        windows = sample(group.tiles, group.regions)  # [T, K, S, S]
+        g = self.g
+        windows = self._sample(group)
         one = g.constant([1])
         across, down = (
             g("Unsqueeze", g("Gather", w, block), one) for w, block in ((self.across, col), (self.down, row))
@@ -47,34 +70,110 @@ class Windows:
             weights = g("ReduceMean", g("Reshape", weights, split), g.constant([3, 5]), keepdims=0)
         return g("Reshape", weights, g.constant([0, 0, 1, -1]))
 
-    def _soft(self, chosen: Integers, regions: int) -> Value:
+    def _piecewise(self, windows: Integers) -> Value:
+        """Store windows (T, S, S), column by column."""
+        flat = windows.swapaxes(1, 2).ravel()
+        return self.g("Reshape", self.g.piecewise(flat), self.g.constant(windows.shape))
+
+    def _hard(self, group: Group) -> Value:
+        g = self.g
+        labels = g("Unsqueeze", self._labels[self._numbers[id(group)]], g.constant([1]))
+        return g("Cast", g("Equal", labels, np.arange(group.regions, dtype=np.int32)[:, None, None]), to=FLOAT)
+
+    def _soft(self, group: Group) -> Value:
         """All but the last region's are stored, in 65,535 steps; they sum to one."""
         g = self.g
-        windows = [self.tiles.windows[tile].numpy() for tile in chosen.tolist()]
+        windows = [self.tiles.windows[tile].numpy() for tile in group.tiles.tolist()]
         stored = np.concatenate([window[:-1] for window in windows]).swapaxes(1, 2)
         counts = np.array([len(window) for window in windows])[:, None]
-        place = np.arange(regions)
+        place = np.arange(group.regions)
         # which of the stored a region has; the one beyond them is zero
         which = np.where(place < counts - 1, np.cumsum(counts - 1)[:, None] - counts + 1 + place, len(stored))
         masks = g("Cast", g.whole(np.round(stored * _STEPS).astype(np.int64)), to=FLOAT)
-        masks = g("Pad", g("Mul", masks, np.float32(1 / _STEPS)), np.array([0, 0, 0, 1, 0, 0]))
+        masks = g("Pad", g("Mul", masks, F32(1 / _STEPS)), np.array([0, 0, 0, 1, 0, 0]))
         weights = g("Gather", masks, g.whole(which))
-        rest = g("Sub", np.float32(1), g("ReduceSum", weights, g.constant([1]), keepdims=1))
+        rest = g("Sub", F32(1), g("ReduceSum", weights, g.constant([1]), keepdims=1))
         last = g("Cast", g.constant((place == counts - 1)[:, :, None, None]), to=FLOAT)
         return g("Add", weights, g("Mul", rest, last))
 
-    def _hard(self, chosen: Integers, regions: int) -> Value:
-        """Labels are stored in as few bits as tell a tile's regions apart."""
+    def _blurred(self, group: Group) -> Value:
+        """Pick the blurred windows of a group, (T, K, S, S): the sum over the widths of a window, normalised."""
+        g, one = self.g, self.g.constant([1])
+        most = max(self._widths[tile] for tile in group.tiles.tolist())
+        places = np.zeros((len(group.tiles), group.regions, most), np.int64)
+        for place, tile in zip(places, group.tiles.tolist(), strict=True):
+            count, widths = len(self.tiles.regions[tile]), self._widths[tile]
+            place[:count, :widths] = self._firsts[tile] + np.arange(count * widths).reshape(count, widths)
+        windows = g("Gather", self._blurs, g.whole(places if most > 1 else places[:, :, 0]))
+        windows = g("ReduceSum", windows, g.constant([2]), keepdims=0) if most > 1 else windows
+        # beyond the map there is no label, and nothing weighs
+        return g("Div", windows, g("Max", g("ReduceSum", windows, one, keepdims=1), F32(1e-30)))
+
+    def _blur(self, chosen: Integers) -> Value:
+        """Blur labels: a window of zeros, then one for every tile, region and width, 0 where pixels have another."""
+        g, (widths, level) = self.g, self.map.membership.levels
+        found = np.zeros((len(chosen), _SOFT, _SOFT), np.int64)
+        if level is not None:
+            sides = [
+                (1, TILE * count - length + 1)
+                for count, length in zip((self.tiles.rows, self.tiles.cols), level.shape[1:], strict=True)
+            ]
+            padded = np.pad(level[0].cpu().numpy().astype(np.int64), sides, mode="edge")
+            found = sliding_window_view(padded, (_SOFT, _SOFT))[::TILE, ::TILE].reshape(-1, _SOFT, _SOFT)[chosen]
+        triples: list[tuple[int, int, int]] = []
+        self._firsts, self._widths = dict[int, int](), dict[int, int]()
+        for number, tile in enumerate(chosen.tolist()):
+            used = np.unique(found[number]).tolist()
+            self._firsts[tile], self._widths[tile] = 1 + len(triples), len(used)
+            triples += [(number, region, width) for region in self.tiles.regions[tile] for width in used]
+        axes = g.constant([1, 2])
+        window, region, width = (g.piecewise(np.array(column)) for column in zip(*triples, strict=True))
+        inside = g("Equal", g("Gather", self._label_windows(chosen), window), g("Unsqueeze", region, axes))
+        kernels = g("Gather", self._kernels(np.array(widths)), width)  # [Q, S, side]
+        blurred = g("MatMul", kernels, g("Cast", inside, to=FLOAT))
+        blurred = g("MatMul", blurred, g("Transpose", kernels, perm=[0, 2, 1]))
+        if level is not None:
+            has = g("Equal", g("Gather", self._piecewise(found), window), g("Unsqueeze", width, axes))
+            blurred = g("Mul", blurred, g("Cast", has, to=FLOAT))
+        return g("Concat", np.zeros((1, _SOFT, _SOFT), F32), blurred, axis=0)
+
+    def _kernels(self, widths: NDArray[np.float64]) -> Value:
+        """Make the blurs of all widths, (V, S, side)."""
         g = self.g
-        labels = np.stack([self.tiles.windows[tile].numpy() for tile in chosen.tolist()]).swapaxes(1, 2)
-        bits = next(b for b in (1, 2, 4, 8, 16) if regions <= 1 << b)
-        count = max(1, 8 // bits)
-        places = (1 << bits) ** np.arange(count)
-        width = -(-self.side // count) * count
-        padded = np.pad(labels, ((0, 0), (0, 0), (0, width - self.side))).reshape(*labels.shape[:2], -1, count)
-        packed = g.whole((padded * places).sum(-1))
-        unpacked = g("Div", g("Unsqueeze", packed, g.constant([3])), places.astype(np.int32))
-        unpacked = g("Mod", unpacked, np.int32(1 << bits))
-        unpacked = g("Reshape", unpacked, g.constant([len(chosen), 1, self.side, width]))
-        unpacked = g("Slice", unpacked, g.constant([0]), g.constant([self.side]), g.constant([3]))
-        return g("Cast", g("Equal", unpacked, np.arange(regions, dtype=np.int32)[:, None, None]), to=FLOAT)
+        distance = np.abs(np.arange(_SOFT)[:, None] - np.arange(_SOFT + 2 * self._reach) + self._reach).astype(F32)
+        ends, sigma = np.ceil(4 * widths), np.maximum(widths, 1e-3)
+        falloff = g("Div", distance, sigma.astype(F32)[:, None, None])
+        kernels = g("Exp", g("Mul", g("Mul", falloff, falloff), F32(-0.5)))
+        near = g("LessOrEqual", distance, ends.astype(F32)[:, None, None])
+        return g("Mul", kernels, g("Cast", near, to=FLOAT))
+
+    def _label_windows(self, chosen: Integers) -> Value:
+        """Cut windows out of the label map, (T, side, side), column by column.
+
+        The map is stored in tiles, one beyond it around: those of one label by that label, the others by their pixels.
+        """
+        g, rows, cols = self.g, self.tiles.rows, self.tiles.cols
+        index = self.map.membership.grid[0].cpu().numpy()
+        beyond = self.map.num_regions + 1  # nor is it what lists of regions are filled up with
+        wide = -(-(self._reach + 1) // TILE)
+        frame = [(wide * TILE, (wide + n) * TILE - length) for n, length in zip((rows, cols), index.shape, strict=True)]
+        grid = np.pad(index, frame, constant_values=beyond).astype(np.int64)
+        down, across = rows + 2 * wide, cols + 2 * wide
+        blocks = grid.reshape(down, TILE, across, TILE).transpose(0, 2, 3, 1).reshape(down * across, TILE * TILE)
+        mixed = blocks.min(1) != blocks.max(1)
+        slots = np.where(mixed, beyond + np.cumsum(mixed), blocks[:, 0])
+        flat = g(
+            "Expand", g.constant(np.arange(beyond + 1, dtype=np.int32)[:, None]), g.constant([beyond + 1, TILE**2])
+        )
+        labels = g("Concat", g("Reshape", flat, g.constant([-1])), g.piecewise(blocks[mixed].ravel()), axis=0)
+        # rows of a window: how many tiles from the window's, and where in their own; whole tiles along them
+        first, side = -1 - self._reach, _SOFT + 2 * self._reach
+        tile, pixel = np.divmod(np.arange(first, first + side, dtype=np.int32), TILE)
+        corner = g.whole((chosen // cols + wide) * across + chosen % cols + wide)
+        steps = np.arange(tile[0], tile[-1] + 1, dtype=np.int32) * np.int32(across)
+        number = g("Add", g("Unsqueeze", corner, g.constant([1, 2])), g("Add", tile[:, None], steps))
+        place = g("Add", g("Mul", g("Gather", g.whole(slots), number), np.int32(TILE)), pixel[:, None])
+        windows = g("Gather", g("Reshape", labels, g.constant([-1, TILE])), place)  # [T, side, tiles, TILE]
+        windows = g("Reshape", windows, g.constant([0, side, -1]))
+        begin = first % TILE
+        return g("Slice", windows, g.constant([begin]), g.constant([begin + side]), g.constant([2]))
