@@ -16,6 +16,8 @@ import typer
 from kcgs import _interrupts
 from kcgs._atomic import atomic_path, check_writable
 
+# typer may have click or a copy of it
+_UsageError: Any = typer.BadParameter.__mro__[1]
 # who read the standard output has left, as the shell would say of other programs
 _CLOSED = 128 + 13
 
@@ -32,6 +34,10 @@ class _Commands(typer.core.TyperGroup):
                 # what is left in the buffer has nowhere to go
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 raise typer.Exit(_CLOSED) from error
+            except _UsageError as error:
+                if "unexpected extra argument" in error.message and error.ctx and error.ctx.info_name == "fit":
+                    raise _UsageError(f"{error.message}: kcgs fit-many fits several images", error.ctx) from None
+                raise
             except BaseException as error:
                 if not came and not isinstance(error, KeyboardInterrupt):
                     raise
@@ -48,7 +54,6 @@ app = typer.Typer(
     cls=_Commands,
     help="Contour-aware 2D Gaussian splatting of images.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
@@ -122,7 +127,8 @@ def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
     table = Table("", title, show_header=True)
     for key, value in report.items():
         if value is not None:
-            table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
+            text = f"{value:.4g}" if isinstance(value, float) else str(value)
+            table.add_row(key, "not defined" if text == "nan" else text)
     print_table(table)
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Mapping
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -71,7 +71,7 @@ def fit_command(
         options.exclude("--target-psnr", checkpoint=checkpoint)
     compile_ahead(request.config, output.suffix == ".kcgs" and regions != "none")
     target = load_image(image)
-    labels = read_regions(regions, target, partial(typer.echo, err=True), progress=not quiet)
+    labels = read_regions(regions, target, progress=not quiet)
     with Stop() as stop:
         fitted = fit_into(
             output, target, labels, request,
@@ -119,17 +119,10 @@ class Fitted(NamedTuple):
 
 
 def fit_into(
-    output: Path,
-    image: Tensor,
-    labels: Tensor | None,
-    request: options.FitRequest,
-    *,
-    on_step: Any = None,
-    progress: bool = False,
-    checkpoint: Path | None = None,
-    resume: bool = False,
+    output: Path, image: Tensor, labels: Tensor | None, request: options.FitRequest, *, on_step: Any = None,
+    progress: bool = False, checkpoint: Path | None = None, resume: bool = False,
     notes: Mapping[str, str] | None = None,
-) -> Fitted:
+) -> Fitted:  # fmt: skip
     """Fit, and write the scene, with notes in it, or the compressed file, as the suffix says."""
     from kcgs.fit import fit
     from kcgs.kernels import prepare
@@ -161,8 +154,8 @@ def fit_into(
     return Fitted(result, file.scene, write_file(output, file.data))
 
 
-def read_regions(regions: str, image: Tensor, warn: Callable[[str], None], *, progress: bool = False) -> Tensor | None:
-    """Return the label map that the option --regions names; `warn` hears where its contours are not the image's."""
+def read_regions(regions: str, image: Tensor, *, progress: bool = False) -> Tensor | None:
+    """Return the label map that the option --regions names; warn where its contours are not the image's."""
     if regions == "none":
         return None
     if regions == "auto":
@@ -177,9 +170,10 @@ def read_regions(regions: str, image: Tensor, warn: Callable[[str], None], *, pr
     # the fit refuses one of another size
     alignment = float(edge_alignment(image, labels)) if labels.shape == image.shape[1:] else 1.0
     if alignment < _ALIGNED:
-        warn(
-            f"warning: the contours of {regions} hardly follow the image's edges: alignment {alignment:.2f}, where "
-            "chance gives 0.50 and good masks 0.63 or more; does the mask belong to this image?"
+        warnings.warn(
+            f"the contours of {regions} hardly follow the image's edges: alignment {alignment:.2f}, where chance gives "
+            "0.50 and good masks 0.63 or more; does the mask belong to this image?",
+            stacklevel=2,
         )
     return labels
 

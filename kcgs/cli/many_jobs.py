@@ -72,7 +72,7 @@ def _measure(order: Order, fit: str | None) -> dict[str, Any]:
 
     request = order.request._replace(clock=Clock(order.request.config.max_seconds, time.perf_counter()))
     image = load_image(order.image)
-    labels = read_regions(_source(order), image, warnings.warn)
+    labels = read_regions(_source(order), image)
     if fit is None:
         report = measure_scene(load(order.output), image, labels, order.output, order.output.stat().st_size, math.nan)
         target = order.request.config.target_psnr
@@ -138,5 +138,5 @@ def _warm_up(config: FitConfig, segments: bool) -> None:
     # as large as MS-SSIM needs
     ramp = torch.linspace(0.0, 1.0, 192).expand(3, 192, 192)
     image = torch.where(ramp > 0.4, 0.2 * ramp, 0.5 + 0.5 * ramp)
-    labels = read_regions("auto" if segments else "none", image, warnings.warn)
+    labels = read_regions("auto" if segments else "none", image)
     measure_scene(Scene(GaussianField.random(8, (192, 192), seed=0)), image, labels, Path(), 0)

@@ -29,13 +29,20 @@ _COLUMNS = {
 }
 
 
+def _list_methods(wanted: bool) -> None:
+    if wanted:
+        from kcgs.segment.registry import available_methods, describe_options
+
+        for method in available_methods():
+            typer.echo(f"{method}: {describe_options(method)}")
+        raise typer.Exit
+
+
 @app.command()
 def segment(
     image: ImageFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Label map to write: .png or .npy.")],
-    method: Annotated[
-        str, typer.Option(help="Where the regions come from; a wrong name lists the right ones.")
-    ] = "auto",
+    method: Annotated[str, typer.Option(help="Where the regions come from; see --methods.")] = "auto",
     option: Annotated[
         list[str] | None,
         typer.Option(metavar="KEY=VALUE", help="Option of the method, as often as needed; the value is JSON or text."),
@@ -45,6 +52,9 @@ def segment(
         Path | None, typer.Option(help="Write the image with the regions over it into this file.")
     ] = None,
     quiet: Quiet = False,
+    methods: Annotated[
+        bool, typer.Option("--methods", is_eager=True, callback=_list_methods, help="List methods and their options.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Make a label map of an image, and list its regions.

@@ -33,6 +33,7 @@ class Samples(NamedTuple):
     white: float | None  # the sample value of full intensity; None where the file format does not say
     format: str  # as Pillow spells it
     lossless: bool  # whether the format is known to give back the very samples that were stored
+    frames: int = 1  # of an animation, or pages
 
 
 def read_file(path: str | os.PathLike[str]) -> bytes:
@@ -82,7 +83,9 @@ def _pillow(data: bytes, image: Image.Image, indices: bool) -> Samples:
         values = np.concatenate([values, np.where(opaque, 65535, 0).astype(np.uint16)], axis=-1)
     if image.format != "TIFF":  # Pillow turns those on loading.
         values = _upright(values, image.getexif().get(_ORIENTATION, 1))
-    return Samples(values, white, image.format or "unknown", _is_lossless(data, image))
+    # photos of telephones hold a second image that is part of the first
+    frames = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)
+    return Samples(values, white, image.format or "unknown", _is_lossless(data, image), frames)
 
 
 def _shown(image: Image.Image) -> tuple[Array, float]:

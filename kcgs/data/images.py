@@ -2,6 +2,7 @@
 
 import math
 import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -32,7 +33,7 @@ def load_image(
     path: str | os.PathLike[str],
     *,
     channels: Literal["RGB", "L", "RGBA"] = "RGB",
-    background: Sequence[float] = (1.0, 1.0, 1.0),
+    background: Sequence[float] | None = None,
 ) -> Tensor:
     """Read an image as a tensor.
 
@@ -44,7 +45,8 @@ def load_image(
         path: the file.
         channels: what to return. "RGB" repeats grey three times; "L" is Rec. 601 luma, 0.299 R + 0.587 G + 0.114 B;
             "RGBA" adds an alpha of 1 to opaque images.
-        background: the colour (R, G, B) in [0, 1] under transparent pixels, for "RGB" and "L".
+        background: the colour (R, G, B) in [0, 1] under transparent pixels, for "RGB" and "L"; None: white, and a
+            UserWarning says so, as one does of an animation.
 
     Returns:
         :math:`(C, H, W)` float32 in [0, 1], C = 3, 1 or 4.
@@ -65,7 +67,7 @@ def load_image(
     """
     if channels not in _MODES.values():
         raise ValueError(f'channels must be "RGB", "L" or "RGBA"; got {channels!r}')
-    under = np.asarray(check_numbers("background", background, 3, 0, 1), dtype=np.float32)
+    under = np.asarray(check_numbers("background", background or (1.0, 1.0, 1.0), 3, 0, 1), dtype=np.float32)
     samples = decode(read_file(path), path)
     if samples.white is None:
         raise ValueError(f"cannot read {path}: {samples.values.dtype} samples have no stated white")
@@ -73,7 +75,11 @@ def load_image(
     has_alpha = pixels.shape[-1] in (2, 4)
     alpha = pixels[..., -1:] if has_alpha else np.ones_like(pixels[..., :1])
     color = pixels[..., :-1] if has_alpha else pixels
+    if samples.frames > 1:
+        warnings.warn(f"{path} holds {samples.frames} images: the first is read", stacklevel=2)
     if has_alpha and channels != "RGBA":
+        if background is None and (alpha < 1).any():
+            warnings.warn(f"{path} has transparent pixels: they are composed on white", stacklevel=2)
         color = color * alpha + under * (1 - alpha)
     if channels == "L":
         color = color @ _LUMA[:, None] if color.shape[-1] == 3 else color

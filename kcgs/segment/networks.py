@@ -1,8 +1,11 @@
 """What the methods that run a network share: loading, preprocessing, reading out its maps."""
 
+import socket
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import getproxies
 
 import torch
 import torch.nn.functional as F
@@ -27,7 +30,8 @@ def load_pretrained(class_name: str, model: Any, device: torch.device) -> Any:
     log.set_verbosity_error()
     log.disable_progress_bar()
     try:
-        loaded, info = getattr(transformers, class_name).from_pretrained(model, output_loading_info=True)
+        source = getattr(transformers, class_name)
+        loaded, info = source.from_pretrained(model, output_loading_info=True, local_files_only=is_offline())
     except Exception as error:  # Whatever a damaged file, a wrong config or a missing network raises.
         raise ValueError(f"cannot load {model!r} as {class_name}: {first_line(error)}") from error
     finally:
@@ -39,6 +43,20 @@ def load_pretrained(class_name: str, model: Any, device: torch.device) -> Any:
     if missing:
         raise ValueError(f"cannot load {model!r} as {class_name}: it lacks {len(missing)} weights, as {missing[0]}")
     return loaded.eval().to(device)
+
+
+def is_offline() -> bool:
+    """Say that the hub cannot be reached, in a second or three: the hub's library tries for half a minute."""
+    from huggingface_hub.constants import ENDPOINT
+
+    if getproxies():
+        return False
+    address = urlsplit(ENDPOINT)
+    try:
+        socket.create_connection((address.hostname or "", address.port or 443), timeout=3).close()
+    except OSError:
+        return True
+    return False
 
 
 def first_line(error: BaseException) -> str:

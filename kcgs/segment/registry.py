@@ -135,7 +135,7 @@ class _Method:
         """Check the image, run the function, and clean what it returns."""
         for option in options:
             if option not in self.signature.parameters:
-                known = ", ".join(list(self.signature.parameters)[1:])
+                known = describe_options(self.name)
                 raise TypeError(f"segmentation method {self.name!r} has no option {option!r}; it takes {known}")
         cleanup = replace(self.cleanup, **{key: options.pop(key) for key in _CLEANUP if key in options})
         pixels = check_segment_image(image)
@@ -230,6 +230,12 @@ def register(name: str, cleanup: Cleanup | None = None) -> Callable[[Callable[..
 def available_methods() -> list[str]:
     """Return the names that `segment` knows, sorted."""
     return sorted(_methods)
+
+
+def describe_options(method: str) -> str:
+    """Name the options of a method with their defaults, those of clean-up last."""
+    _, *options = _methods[method].signature.parameters.values()
+    return ", ".join(o.name if o.default is o.empty else f"{o.name}={o.default!r}" for o in options)
 
 
 def segment(image: Any, method: str = "auto", **options: Any) -> Tensor:

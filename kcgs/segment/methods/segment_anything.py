@@ -58,9 +58,9 @@ def sam(
 
     Args:
         image: as `segment` takes it, any size.
-        model: "vit_b", "vit_l", "vit_h" or "mobile_sam" for Segment Anything by kornia, or a
-            ``kornia.models.sam.SamConfig``; else SAM 2 by transformers: a hub id such as "facebook/sam2.1-hiera-tiny",
-            a local folder, or a loaded ``Sam2Model``.
+        model: "vit_b", "vit_l", "vit_h" or "mobile_sam" for Segment Anything by kornia, a ``SamConfig`` or a loaded
+            ``Sam`` of ``kornia.models.sam``; else SAM 2 by transformers: a hub id such as
+            "facebook/sam2.1-hiera-tiny", a local folder, or a loaded ``Sam2Model``.
         checkpoint: the weights of a kornia model, a file or URL; None: the released ones, downloaded once.
         boxes: :math:`(K, 4)` left, top, right, bottom in pixels; these three may be lists too.
         points: :math:`(K, 2)`, or :math:`(K, P, 2)` for K objects of P points each, (x, y) in pixels.
@@ -177,10 +177,14 @@ def _predictor(image: Tensor, model: Any, checkpoint: str | os.PathLike[str] | N
 
 def _kornia_predictor(image: Tensor, model: Any, checkpoint: str | os.PathLike[str] | None) -> _Predict:
     from kornia.contrib.visual_prompter import VisualPrompter
-    from kornia.models.sam.model import SamConfig
+    from kornia.models.sam.model import Sam, SamConfig
 
     config = SamConfig(model) if isinstance(model, str) else model
-    if checkpoint is None and config.checkpoint is None and config.model_type is None:
+    if isinstance(model, Sam):
+        if checkpoint is not None:
+            raise ValueError(f"checkpoint must be None with a loaded Sam; got {checkpoint!r}")
+        config = SamConfig(encoder_embed_dim=8, encoder_depth=1, encoder_num_heads=1, encoder_global_attn_indexes=())
+    elif checkpoint is None and config.checkpoint is None and config.model_type is None:
         raise ValueError("checkpoint must be given for a SamConfig of one's own; got None")
     source = os.fspath(checkpoint if checkpoint is not None else config.checkpoint or "")
     if source and "://" not in source and not Path(source).expanduser().is_file():
@@ -193,6 +197,8 @@ def _kornia_predictor(image: Tensor, model: Any, checkpoint: str | os.PathLike[s
         # torch's own words advise to run whatever code is in the file
         why = "it is no file of weights" if isinstance(error, UnpicklingError) else first_line(error)
         raise ValueError(f"cannot load {name} as Segment Anything {model!r}: {why}") from error
+    if isinstance(model, Sam):
+        prompter.model = model.to(image.device)
     prompter.model.eval()
     prompter.set_image(image)
 

@@ -8,7 +8,15 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_count, check_number
-from kcgs.segment.networks import IMAGENET_MEAN, IMAGENET_STD, first_line, largest_map, load_pretrained, preprocess
+from kcgs.segment.networks import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    first_line,
+    is_offline,
+    largest_map,
+    load_pretrained,
+    preprocess,
+)
 from kcgs.segment.registry import Prediction, register
 
 BACKGROUND = "background"  # What is no prompt's is called so.
@@ -88,7 +96,7 @@ def _tokens(network: Any, model: Any, tokenizer: Any, words: list[str], device: 
         from transformers import AutoTokenizer
 
         try:
-            tokenizer = AutoTokenizer.from_pretrained(str(model))
+            tokenizer = AutoTokenizer.from_pretrained(str(model), local_files_only=is_offline())
         except Exception as error:  # Whatever a damaged file or a missing network raises.
             raise ValueError(f"cannot load the tokenizer of {str(model)!r}: {first_line(error)}") from error
     longest = network.config.text_config.max_position_embeddings
