@@ -120,6 +120,17 @@ class TestFit:
         assert report["stop_reason"] == "seconds" and 0.5 < report["seconds"] < report["total_seconds"] < 4
         assert report["total_seconds"] == pytest.approx(took, abs=0.3)
 
+    @pytest.mark.filterwarnings("default")
+    def test_warnings_are_lines_and_what_is_not_defined_is_no_number(
+        self, files: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        Image.new("RGBA", (40, 30), (255, 0, 0, 9)).save("clear.png")
+        code, out, err = kcgs(
+            "fit", "clear.png", "-n", "5", "--iterations", "2", "-q", "--regions", "none", capsys=capsys
+        )
+        assert (code, err) == (0, "warning: clear.png has transparent pixels: they are composed on white\n")
+        assert "nan" not in out and out.count("not defined") == 3
+
     def test_max_seconds_counts_from_the_start_of_the_process(self, files: Path) -> None:
         command = (sys.executable, "-m", "kcgs.cli", *FIT, "--regions", "none", "--max-seconds", "0.5", "--json")
         start = time.perf_counter()
@@ -241,7 +252,7 @@ class TestRender:
     @pytest.mark.parametrize(
         ("arguments", "code", "words"),
         [
-            (("--region", "9"), 1, "--region must be one of the scene's regions [0, 1]; got 9"),
+            (("--region", "9"), 1, "--region must be among the 2 ids of the map, 0, 1; got 9"),
             (("--size", "90"), 2, "--size must be WxH"),
             (("--size", "0x5"), 2, "--size must be WxH"),
             (("--scale", "-1"), 2, "--scale must be positive"),
@@ -272,6 +283,7 @@ class TestFailures:
         [
             ((), 2, "Usage"),
             (("fit",), 2, "Missing argument"),
+            (("fit", "photo.png", "b.png"), 2, "extra argument(s) (b.png): kcgs fit-many fits several images"),
             (("fit", "photo.png", "-n", "0"), 2, "greater than or equal to 1"),
             (("fit", "photo.png", "--backend", "gpu"), 2, "'gpu' is not one of"),
             (("fit", "nothing.png"), 1, "nothing.png"),

@@ -14,7 +14,7 @@ from kcgs.cli import main
 from kcgs.data import load_image, load_labels, overlay_labels, save_image, save_labels
 from kcgs.fit.kmeans import kmeans_field
 from kcgs.functional import RegionMap
-from kcgs.segment import Prediction, register
+from kcgs.segment import Prediction, available_methods, register
 from kcgs.segment.registry import _methods
 
 
@@ -154,7 +154,16 @@ class TestSegment:
         assert not Path("out.png").exists()
 
 
+def test_methods_and_their_options_are_listed(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, out, _ = kcgs("segment", "--methods", capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0 and "\nfelzenszwalb: scale=300.0, sigma=1.0, snap=0, min_size=None, connected=True" in out
+    assert [line.partition(":")[0] for line in out.splitlines()] == available_methods()
+
+
 class TestWarning:
+    @pytest.mark.filterwarnings("default")
     @pytest.mark.parametrize(("mask", "warned"), [("mask.png", 0), ("mirrored.png", 1)])
     def test_fit_warns_of_a_mask_beside_the_edges(
         self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, mask: str, warned: int

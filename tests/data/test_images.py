@@ -114,7 +114,7 @@ class TestChannels:
         with pytest.raises(ValueError, match="background must be"):
             load_image(tmp_path / "a.png", background=background)
 
-    @pytest.mark.parametrize("background", ["white", None, 1.0, ("0", "0", "0")])
+    @pytest.mark.parametrize("background", ["white", 1.0, ("0", "0", "0")])
     def test_background_of_another_type(self, tmp_path: Path, background: Any) -> None:
         with pytest.raises(TypeError, match="background must be"):
             load_image(tmp_path / "a.png", background=background)
@@ -200,7 +200,16 @@ class TestModes:
         for suffix in ("gif", "tif", "webp", "png"):
             path = tmp_path / f"a.{suffix}"
             frames[0].save(path, save_all=True, append_images=frames[1:])
-            torch.testing.assert_close(load_image(path)[:, 0, 0], torch.tensor([1.0, 0.0, 0.0]), atol=0.02, rtol=0)
+            with pytest.warns(UserWarning, match=f"a.{suffix} holds 3 images: the first is read"):
+                first = load_image(path)[:, 0, 0]
+            torch.testing.assert_close(first, torch.tensor([1.0, 0.0, 0.0]), atol=0.02, rtol=0)
+
+    def test_transparent_pixels_are_told_of_unless_a_background_is_given(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.png"
+        Image.new("RGBA", (4, 3), (255, 0, 0, 0)).save(path)
+        with pytest.warns(UserWarning, match="a.png has transparent pixels: they are composed on white"):
+            assert (load_image(path) == 1).all()
+        assert (load_image(path, background=(0, 0, 0)) == 0).all() and load_image(path, channels="RGBA")[3].max() == 0
 
 
 class TestSixteenBits:

@@ -181,6 +181,17 @@ class TestPrompts:
             segment(two_colors(), "sam", **prompt, **options)
 
 
+class TestLoadedSam:
+    def test_gives_what_its_checkpoint_gives(self, kornia_checkpoint: Path) -> None:
+        model = Sam.from_config(TINY)
+        model.load_state_dict(torch.load(kornia_checkpoint))
+        boxes = torch.tensor([[10.0, 10.0, 40.0, 30.0]])
+        labels = segment(two_colors(), "sam", model=model, boxes=boxes)
+        assert torch.equal(labels, segment(two_colors(), "sam", model=TINY, checkpoint=kornia_checkpoint, boxes=boxes))
+        with pytest.raises(ValueError, match="checkpoint must be None with a loaded Sam"):
+            segment(two_colors(), "sam", model=model, checkpoint=kornia_checkpoint)
+
+
 class TestKorniaCheckpoint:
     def test_missing(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError, match=r"no checkpoint at .*gone.pth"):
