@@ -31,7 +31,7 @@ def load_pretrained(class_name: str, model: Any, device: torch.device) -> Any:
     log.disable_progress_bar()
     try:
         source = getattr(transformers, class_name)
-        loaded, info = source.from_pretrained(model, output_loading_info=True, local_files_only=is_offline())
+        loaded, info = source.from_pretrained(model, output_loading_info=True, local_files_only=is_offline(model))
     except Exception as error:  # Whatever a damaged file, a wrong config or a missing network raises.
         raise ValueError(f"cannot load {model!r} as {class_name}: {first_line(error)}") from error
     finally:
@@ -45,11 +45,11 @@ def load_pretrained(class_name: str, model: Any, device: torch.device) -> Any:
     return loaded.eval().to(device)
 
 
-def is_offline() -> bool:
-    """Say that the hub cannot be reached, in a second or three: the hub's library tries for half a minute."""
+def is_offline(model: str) -> bool:
+    """Say whether to look on this disk only: the hub's library asks a hub that is out of reach for half a minute."""
     from huggingface_hub.constants import ENDPOINT
 
-    if getproxies():
+    if getproxies() or Path(model).is_dir():
         return False
     address = urlsplit(ENDPOINT)
     try:

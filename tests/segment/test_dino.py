@@ -1,5 +1,6 @@
 """Patch features of DINO, DINOv2 and DINOv3: small random models, saved and loaded as released ones are."""
 
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -142,3 +143,26 @@ class TestErrors:
         )
         with pytest.raises(ValueError, match="must be a vision transformer with patches; got CLIPTextModel"):
             segment(two_colors(), "dino", model=model)
+
+
+@pytest.mark.parametrize("is_reached", [True, False])
+def test_a_hub_that_cannot_be_reached_is_not_tried_for_long(monkeypatch: pytest.MonkeyPatch, is_reached: bool) -> None:
+    asked = []
+
+    def connect(address: tuple[str, int], timeout: float) -> Any:
+        assert address == ("huggingface.co", 443) and timeout <= 5
+        if not is_reached:
+            raise OSError("no network")
+        return StringIO()
+
+    def load(model: str, **settings: Any) -> None:
+        asked.append((model, settings["local_files_only"]))
+        raise OSError("nowhere")
+
+    for name in ("HTTPS_PROXY", "https_proxy", "HTTP_PROXY", "http_proxy", "ALL_PROXY", "all_proxy"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("socket.create_connection", connect)
+    monkeypatch.setattr("transformers.AutoModel.from_pretrained", load)
+    with pytest.raises(ValueError, match="cannot load 'a/model' as AutoModel: nowhere"):
+        segment(torch.rand(3, 20, 30), "dino", model="a/model")
+    assert asked == [("a/model", not is_reached)]

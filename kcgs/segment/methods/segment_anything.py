@@ -189,7 +189,7 @@ def _kornia_predictor(image: Tensor, model: Any, checkpoint: str | os.PathLike[s
     source = os.fspath(checkpoint if checkpoint is not None else config.checkpoint or "")
     if source and "://" not in source and not Path(source).expanduser().is_file():
         raise FileNotFoundError(f"no checkpoint at {source}")
-    fields = {**vars(config), "checkpoint": source or None, "pretrained": not source}
+    fields = {**vars(config), "checkpoint": source or None, "pretrained": not (source or isinstance(model, Sam))}
     try:
         prompter = VisualPrompter(SamConfig(**fields), device=image.device)
     except Exception as error:  # Whatever a damaged file, other weights or a missing network raises.

@@ -96,7 +96,7 @@ def _tokens(network: Any, model: Any, tokenizer: Any, words: list[str], device: 
         from transformers import AutoTokenizer
 
         try:
-            tokenizer = AutoTokenizer.from_pretrained(str(model), local_files_only=is_offline())
+            tokenizer = AutoTokenizer.from_pretrained(str(model), local_files_only=is_offline(str(model)))
         except Exception as error:  # Whatever a damaged file or a missing network raises.
             raise ValueError(f"cannot load the tokenizer of {str(model)!r}: {first_line(error)}") from error
     longest = network.config.text_config.max_position_embeddings
