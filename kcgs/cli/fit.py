@@ -119,10 +119,17 @@ class Fitted(NamedTuple):
 
 
 def fit_into(
-    output: Path, image: Tensor, labels: Tensor | None, request: options.FitRequest, *, on_step: Any = None,
-    progress: bool = False, checkpoint: Path | None = None, resume: bool = False,
+    output: Path,
+    image: Tensor,
+    labels: Tensor | None,
+    request: options.FitRequest,
+    *,
+    on_step: Any = None,
+    progress: bool = False,
+    checkpoint: Path | None = None,
+    resume: bool = False,
     notes: Mapping[str, str] | None = None,
-) -> Fitted:  # fmt: skip
+) -> Fitted:
     """Fit, and write the scene, with notes in it, or the compressed file, as the suffix says."""
     from kcgs.fit import fit
     from kcgs.kernels import prepare

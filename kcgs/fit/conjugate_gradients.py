@@ -9,9 +9,15 @@ from torch import Tensor
 
 
 def conjugate_gradients(
-    x: Tensor, r: Tensor, apply: Callable[[Tensor], Tensor], steps: int, *, dot: Callable[[Tensor, Tensor], Tensor],
-    gradient: Callable[[Tensor], Tensor] | None = None, least_squares: bool = False,
-) -> Tensor:  # fmt: skip
+    x: Tensor,
+    r: Tensor,
+    apply: Callable[[Tensor], Tensor],
+    steps: int,
+    *,
+    dot: Callable[[Tensor, Tensor], Tensor],
+    gradient: Callable[[Tensor], Tensor] | None = None,
+    least_squares: bool = False,
+) -> Tensor:
     """Take steps from x towards the solution of A x = b, where r = b - A x and `apply` is p to A p.
 
     `gradient` takes r to the direction of descent: a preconditioner; with `least_squares`, where A is rectangular and

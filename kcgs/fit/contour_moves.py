@@ -16,10 +16,18 @@ from .contour_energy import MovingLabels, RegionCosts, bounding_boxes, index_map
 
 @torch.no_grad()
 def refine_contours(
-    scene: Scene, image: Tensor, *, given: Tensor | None = None, max_distance: float | None = 3.0,
-    length_weight: float = 0.003, reach: int = 2, sweeps: int = 3, blur: float = 0.7, smallest: int = 12,
+    scene: Scene,
+    image: Tensor,
+    *,
+    given: Tensor | None = None,
+    max_distance: float | None = 3.0,
+    length_weight: float = 0.003,
+    reach: int = 2,
+    sweeps: int = 3,
+    blur: float = 0.7,
+    smallest: int = 12,
     backend: str = "auto",
-) -> RegionMap:  # fmt: skip
+) -> RegionMap:
     """Move contours to where the image is explained better, at most `max_distance` from the given map.
 
     Exact coordinate descent on the energy in docs/fitting.md; no region is lost. Pieces under `smallest` pixels that

@@ -38,9 +38,14 @@ _FLAT_SAMPLES = 1 << 16
 
 @torch.no_grad()
 def levenberg_marquardt(
-    scene: Scene, image: Tensor, *, max_steps: int = 100, max_seconds: float = 10.0, cutoff: float = 0.0,
+    scene: Scene,
+    image: Tensor,
+    *,
+    max_steps: int = 100,
+    max_seconds: float = 10.0,
+    cutoff: float = 0.0,
     backend: str = "auto",
-) -> Scene:  # fmt: skip
+) -> Scene:
     """Fit all parameters of a small scene to the last digit, by Levenberg-Marquardt in float64; see docs/fitting.md.
 
     Returns the scene itself where the squared error, rendered in its dtype, did not fall, or rose once clipped.

@@ -191,9 +191,14 @@ class _Search:
 
 
 def fewest(
-    image: Tensor, regions: RegionMap | None, most: int, config: FitConfig, seed: int,
-    run: Callable[[FitState, OnStep | None], StopReason], on_step: OnStep | None,
-) -> FitResult:  # fmt: skip
+    image: Tensor,
+    regions: RegionMap | None,
+    most: int,
+    config: FitConfig,
+    seed: int,
+    run: Callable[[FitState, OnStep | None], StopReason],
+    on_step: OnStep | None,
+) -> FitResult:
     """Find the fewest Gaussians, at most `most`, with which a finished fit reaches `target_psnr`.
 
     `run` takes a fit from its state to its end. Where the most do not reach it, the result is theirs; where the clock

@@ -164,9 +164,14 @@ class _FineTuning:
     """Gaussians (float64) that are rounded a few at a time, in an order of the seed, to show an image (C, H, W)."""
 
     def __init__(
-        self, gaussians: Parameters, region_ids: Tensor | None, image: Tensor, regions: RegionMap | None,
-        quantizer: Quantizer, seed: int,
-    ) -> None:  # fmt: skip
+        self,
+        gaussians: Parameters,
+        region_ids: Tensor | None,
+        image: Tensor,
+        regions: RegionMap | None,
+        quantizer: Quantizer,
+        seed: int,
+    ) -> None:
         self.region_ids, self.image, self.regions, self.quantizer = region_ids, image, regions, quantizer
         self.classes = quantizer.classify(gaussians)
         self.free = [torch.from_numpy(numbers).to(image) for numbers in gaussians]

@@ -97,9 +97,13 @@ class Case(NamedTuple):
 
 
 def plan(
-    names: Iterable[str], counts: Sequence[int], methods: Sequence[Method], options: Options, iterations: int,
+    names: Iterable[str],
+    counts: Sequence[int],
+    methods: Sequence[Method],
+    options: Options,
+    iterations: int,
     stride: int,
-) -> list[Case]:  # fmt: skip
+) -> list[Case]:
     """List cases, image by image, N by N; published recipes have these iterations, the quick form this stride."""
     published, stride = options.iterations or iterations, stride if options.quick else 1
     return [

@@ -21,9 +21,16 @@ _ABOVE, _NEAR, _TRIES = 1.03, 1.06, 4
 
 
 def run_stages(
-    name: str, report: Report, output: Path, options: Options, stages: Sequence[Sequence[Case]], *,
-    matched: Sequence[Method] = (), finish: Finish | None = None, share: float = 1.0,
-) -> None:  # fmt: skip
+    name: str,
+    report: Report,
+    output: Path,
+    options: Options,
+    stages: Sequence[Sequence[Case]],
+    *,
+    matched: Sequence[Method] = (),
+    finish: Finish | None = None,
+    share: float = 1.0,
+) -> None:
     """Make what is missing, stage after stage, then results.csv and the report of what is there.
 
     Every finished fit is kept, so that the same call goes on where an earlier one was interrupted. Of the `matched`

@@ -157,9 +157,14 @@ def _check_names(names: Sequence[str], classes: int) -> None:
 
 
 def _run(
-    image: Tensor, model: str | os.PathLike[str] | Any, output: int | str, size: tuple[int, int] | None,
-    mean: Sequence[float], std: Sequence[float], max_value: float,
-) -> Tensor:  # fmt: skip
+    image: Tensor,
+    model: str | os.PathLike[str] | Any,
+    output: int | str,
+    size: tuple[int, int] | None,
+    mean: Sequence[float],
+    std: Sequence[float],
+    max_value: float,
+) -> Tensor:
     """Run a network on (3, H, W) and return one of its outputs."""
     check_numbers("mean", mean, 3)
     check_numbers("std", std, 3, 0, above=True)
