@@ -32,8 +32,8 @@ class Densify:
     """Share of the fit at the last addition."""
     patience: float = 2.0
     """Where the clock ends the fit, descent gets this many times the seconds of the addition before it."""
-    first_seconds: float = 8e-7
-    """About what the first addition takes, for each pixel."""
+    first_share: float = 0.8
+    """About what the first addition takes, as a share of the seconds before it, most of which made the start."""
     sigmas: tuple[float, ...] = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
     """Standard deviations in pixels that are tried."""
 
@@ -53,7 +53,7 @@ class Densify:
             return False
         # against the clock, additions must end before the fit does, and leave time for the descent
         hurried = state.config.max_seconds is not None and progress < 0.9 * self.end
-        in_time = state.has_time(state.addition_seconds or self.first_seconds * state.image[0].numel())
+        in_time = state.has_time(state.addition_seconds or self.first_share * state.seconds())
         return in_time and not (hurried and state.seconds() < state.densify_after)
 
     @torch.no_grad()

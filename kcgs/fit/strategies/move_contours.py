@@ -57,7 +57,8 @@ class MoveContours:
     def move(self, state: FitState, rise: float, choose_anew: bool = False) -> None:
         """Move the contours where that raises the squared error about them by no more than this factor."""
         config, before, start = state.config, state.regions, state.seconds()
-        if before is None or before.supersample > 1 or not state.has_time(self.pixel_seconds * state.image[0].numel()):
+        takes = state.moving_seconds or self.pixel_seconds * state.image[0].numel()
+        if before is None or before.supersample > 1 or not state.has_time(takes):
             return
         if state.moving_seconds > self.time_share * (config.max_seconds or math.inf):
             return
