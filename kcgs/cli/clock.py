@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # what follows a fit, by the seconds per pixel of a small image's metrics: those of images above a megapixel, and its
 # end with its file; how much longer that may take; and what takes as long for any image
-_BY_ROWS, _ENDING, _MARGIN, _EXIT = 0.2, 0.1, 1.7, 0.5
+_BY_ROWS, _ENDING, _MARGIN, _EXIT = 0.35, 0.15, 1.6, 0.5
 
 
 class Clock(NamedTuple):
