@@ -20,6 +20,40 @@ if "OMP_NUM_THREADS" not in os.environ:
 ROOT = Path(__file__).resolve().parent.parent
 
 
+# Files that take longest, 12 seconds of a processor and more: workers begin with them, so that none is left with one at
+# the end. (By itself pytest-xdist begins with the files of most tests, and these have few.)
+LONGEST = (
+    "notebooks/test_notebooks.py",
+    "golden/test_golden.py",
+    "export/test_web.py",
+    "cli/test_cli.py",
+    "engine/test_ray.py",
+    "cli/test_many.py",
+    "engine/test_local.py",
+    "kernels/test_cuda.py",
+    "kernels/test_cpu.py",
+    "fit/test_best.py",
+    "bench/test_decode.py",
+    "test_wheel.py",
+    "segment/test_classical.py",
+    "bench/test_experiments.py",
+    "export/test_decode.py",
+    "fit/test_loop.py",
+    "docs/test_site.py",
+    "docs/test_pages.py",
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False  # files go to workers in the order below
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    ranks = {ROOT / "tests" / name: rank for rank, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--device", default="cpu", help="device of the kernel tests: cpu or cuda")
 

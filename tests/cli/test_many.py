@@ -105,8 +105,8 @@ class TestTable:
         (files / "out/c.kcgs").unlink()
         code, out, err = kcgs("photos/*.png", *settings)
         assert code == 0 and [json.loads(out)[key] for key in ("fitted", "kept")] == [2, 1], err
-        code, out, err = kcgs("photos/*.png", *settings, "--seed", "1")
-        assert code == 0 and json.loads(out)["fitted"] == 3, err
+        code, out, err = kcgs("photos/a.png", *settings, "--seed", "1")
+        assert code == 0 and json.loads(out)["fitted"] == 1, err
 
     @pytest.mark.parametrize("given", [("-n", "5"), ("--target-psnr", "20"), ("--suffix", ".safetensors")])
     def test_bytes_exclude(self, files: Path, kcgs: Any, given: tuple[str, ...]) -> None:

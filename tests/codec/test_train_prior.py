@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from kcgs.codec.labels.contexts import FEATURE, INPUT, INPUTS, LAYOUT, TEMPLATE, load_prior, network
@@ -11,7 +12,8 @@ from kcgs.codec.labels.wavefront import new_work
 from . import train_prior
 
 
-def test_tables_have_the_format() -> None:
+def test_tables_have_the_format(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train_prior, "SHAPES", 3)  # maps beside those given
     labels = train_prior.shapes(np.random.default_rng(1))
     data = train_prior.pack(train_prior.train([labels], steps=3, seed=0))
     assert len(data) == sum(np.dtype(kind).itemsize * int(np.prod(shape)) for kind, shape in LAYOUT)

@@ -16,10 +16,12 @@ class Task(NamedTuple):
     folder: Path
 
 
-def fail_at_one(task: Task) -> int:
+def fail_at_one(task: Task) -> tuple[int, int, int]:
+    """Return a result, the process and its threads."""
+    time.sleep(0.05)  # for each of several workers to get some
     if task.number == 1:
         raise ValueError(f"no {task.number}\nplease")
-    return 2 * task.number
+    return 2 * task.number, os.getpid(), torch.get_num_threads()
 
 
 def misbehave(task: Task) -> object:

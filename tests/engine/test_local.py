@@ -32,23 +32,19 @@ def by_index(found: list[Done[Any]]) -> list[Done[Any]]:
 
 @pytest.mark.parametrize("workers", [None, 1, 2])
 class TestBoth:
-    def test_results_and_a_job_that_raises(self, tmp_path: Path, workers: int | None) -> None:
-        found = list(run_jobs(function("fail_at_one"), tasks(4, tmp_path), workers=workers))
+    def test_results_threads_and_a_job_that_raises(self, tmp_path: Path, workers: int | None) -> None:
+        before = torch.get_num_threads()
+        found = list(run_jobs(function("fail_at_one"), tasks(6, tmp_path), workers=workers, threads=3))
+        assert torch.get_num_threads() == before
         assert all(0 <= done.seconds < 5 for done in found)
         found = by_index(found)
-        assert [done.result for done in found] == [0, None, 4, 6]
-        assert [done.error is None for done in found] == [True, False, True, True]
+        results, processes, threads = zip(*(done.result for done in found if done.result), strict=True)
+        assert results == (0, 4, 6, 8, 10) and set(threads) == {3}
+        assert len(set(processes)) == (workers or 1) and (os.getpid() in processes) == (workers != 2)
+        assert [done.error is None for done in found] == [True, False, True, True, True, True]
         error = found[1].error
         assert error is not None and (error.type, error.message) == ("ValueError", "no 1\nplease")
         assert "fail_at_one" in error.traceback and str(error) == "ValueError: no 1 please"
-
-    def test_threads(self, tmp_path: Path, workers: int | None) -> None:
-        before = torch.get_num_threads()
-        jobs = tasks(4, tmp_path)
-        found = list(run_jobs(function("process_and_threads"), jobs, workers=workers, threads=3))
-        assert {done.result[1] for done in found if done.result} == {3} and torch.get_num_threads() == before
-        processes = {done.result[0] for done in found if done.result}
-        assert len(processes) == (workers or 1) and (os.getpid() in processes) == (workers != 2)
 
     def test_no_jobs(self, workers: int | None) -> None:
         assert list(run_jobs(function("process_and_threads"), [], workers=workers)) == []

@@ -44,7 +44,7 @@ def run(name: str, count: int, folder: Path, **options: Any) -> list[Done[Any]]:
 class TestCluster:
     def test_results_and_a_job_that_raises(self, tmp_path: Path) -> None:
         found = run("fail_at_one", 4, tmp_path)
-        assert [done.result for done in found] == [0, None, 4, 6]
+        assert [done.result and done.result[0] for done in found] == [0, None, 4, 6]
         error = found[1].error
         assert error is not None and (error.type, error.message) == ("ValueError", "no 1\nplease")
         assert "fail_at_one" in error.traceback

@@ -589,12 +589,12 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 def bare_python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Interpreter of a new environment that holds numpy and onnxruntime, as CI pins them, and nothing of ours."""
     folder = tmp_path_factory.mktemp("bare")
-    subprocess.run([sys.executable, "-m", "venv", folder], check=True, capture_output=True)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True, capture_output=True)
     python = folder / ("Scripts" if os.name == "nt" else "bin") / "python"
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = [line for line in lines if line.startswith(("numpy==", "onnxruntime=="))]
     assert len(pins) == 2
-    command = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *pins]
+    command = [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-compile", *pins]
     installed = subprocess.run(command, capture_output=True, text=True)
     if installed.returncode:
         pytest.skip(f"pip cannot install {pins}: {installed.stderr.strip().splitlines()[-1]}")

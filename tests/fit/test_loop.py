@@ -237,7 +237,7 @@ class TestCharts:
         image, labels = chart()  # type: ignore[operator]
         best = {}
         for recipe in ("paper", "gaussian-image", "gaussian-image-clamp"):
-            history = fit(image, labels, 20, recipe=recipe, iterations=500).history
+            history = fit(image, labels, 20, recipe=recipe, iterations=300).history
             best[recipe] = max(history, key=lambda h: h.psnr)
         for baseline in ("gaussian-image", "gaussian-image-clamp"):
             assert best["paper"].psnr > best[baseline].psnr + lead
