@@ -33,7 +33,7 @@ TRUTH_CUTOFF = 1e-12
 CONTOURS = ("none", "hard", "soft")
 SOFTNESS = 0.7
 SEQUENCE = "blackswan"
-QUICK_SIZE, QUICK_COUNT, QUICK_STRIDE = (96, 128), 60, 4
+QUICK_SIZE, QUICK_COUNT, QUICK_STRIDE = (48, 64), 60, 8
 WORKLOADS = {name: STANDARD[name] for name in ("W1", "W2")}
 
 Render = Callable[[], Tensor]
