@@ -120,8 +120,15 @@ class _Search:
         iterations = max(1, round(_SHORT_SHARE * self.config.iterations))
         known: dict[int, float] = {}
         while True:
-            changes = {"iterations": iterations, "refine_flat": False, "prune": 0.0}
-            probe = self.fit(count, self.settings(_SHORT_SECONDS * self.left(), **changes))
+            # what takes as long in a short fit: contours stay where they are, and merge only where there are too many
+            crowded = self.regions is not None and count < self.regions.num_regions and self.config.merge_regions
+            probe = self.fit(
+                count,
+                self.settings(
+                    _SHORT_SECONDS * self.left(), iterations=iterations, merge_regions=crowded, move_contours=False,
+                    refine_flat=False, prune=0.0,
+                ),
+            )  # fmt: skip
             known[count] = probe.psnr
             if len(known) > 1:
                 slope = _slope(*sorted(known.items(), key=lambda item: abs(item[1] - self.target + _REST))[:2])
