@@ -1,4 +1,8 @@
-"""Ctrl-C in the command `kcgs`: one line and exit status 130, from the first import on; other processes keep theirs."""
+"""What the command `kcgs` sets before anything else is imported; other processes keep theirs.
+
+Ctrl-C: one line and exit status 130. And torch's threads sleep while they wait: spinning, they take many times as long
+where other programs run.
+"""
 
 from __future__ import annotations
 
@@ -56,6 +60,8 @@ def _unraisable(report: Any) -> None:
     sys.__unraisablehook__(report)
 
 
+if _is_command():
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 if _is_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, leave)
     sys.unraisablehook = _unraisable

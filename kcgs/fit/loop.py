@@ -16,7 +16,7 @@ from torch import Tensor
 from kcgs._check import as_image, check_count
 from kcgs._progress import Progress
 from kcgs.functional import RegionMap
-from kcgs.kernels import prepare
+from kcgs.kernels import prepare, threads_for_kernels
 
 from .checkpoint import Checkpoint
 from .config import FitConfig
@@ -97,14 +97,15 @@ def fit(
     if config.target_psnr is not None and checkpoint is not None:
         raise ValueError(f"checkpoint must be None with target_psnr, which takes several fits; got {checkpoint!r}")
     prepare(config.backend, image.device, image.dtype, len(image))  # no fit's clock counts what compiles or loads once
-    if config.target_psnr is not None:
-        return fewest(image, regions, num_gaussians, config, seed, _run, on_step)
-    state = start(image, regions, num_gaussians, config, seed, time.perf_counter())
-    keeper = None if checkpoint is None else Checkpoint(checkpoint, state, regions)
-    if not (keeper is not None and resume and keeper.read_into(state)) and config.merge_regions:
-        MergeRegions(state).before(state)
-    _warn_of_regions(state)
-    return Finish().apply(state, _run(state, on_step, keeper))
+    with threads_for_kernels(image[0].numel()):
+        if config.target_psnr is not None:
+            return fewest(image, regions, num_gaussians, config, seed, _run, on_step)
+        state = start(image, regions, num_gaussians, config, seed, time.perf_counter())
+        keeper = None if checkpoint is None else Checkpoint(checkpoint, state, regions)
+        if not (keeper is not None and resume and keeper.read_into(state)) and config.merge_regions:
+            MergeRegions(state).before(state)
+        _warn_of_regions(state)
+        return Finish().apply(state, _run(state, on_step, keeper))
 
 
 def _run(state: FitState, on_step: OnStep | None = None, keeper: Checkpoint | None = None) -> StopReason:

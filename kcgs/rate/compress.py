@@ -23,6 +23,7 @@ from kcgs.codec.gaussians.quantize import QPS, Codes, Parameters, Quantizer
 from kcgs.codec.scenes import SceneWriter
 from kcgs.fit.frame import local_gradient, move
 from kcgs.functional import RegionMap, psnr, region_splat
+from kcgs.kernels import threads_for_kernels
 from kcgs.scene import Scene
 
 # a Gaussian whose whole energy is below this many times the distortion costs more bits than it saves: at the best rate
@@ -119,7 +120,9 @@ def compress(
         gaussians = Parameters(*(numbers[kept] for numbers in writer.gaussians))
         region_ids = None if writer.regions is None else writer.regions.ids[torch.from_numpy(writer.ids[kept])]
         tuning = _FineTuning(gaussians, region_ids, target, writer.regions, quantizer, seed)
-        return writer.write(quantizer, tuning.run(steps, share * (end - time.perf_counter())), writer.ids[kept])
+        with threads_for_kernels(target[0].numel()):
+            tuned = tuning.run(steps, share * (end - time.perf_counter()))
+        return writer.write(quantizer, tuned, writer.ids[kept])
 
     if target_psnr is not None:
         wanted = check_number("target_psnr", target_psnr, 0.0, unit="dB")

@@ -282,3 +282,17 @@ class TestErrors:
     def test_bad_settings(self, settings: dict[str, object], words: str) -> None:
         with pytest.raises(ValueError, match=words):
             FitConfig.from_recipe("paper", **settings)
+
+
+class TestThreads:
+    def test_same_bits_with_any_number_of_them(self) -> None:
+        image, labels = disc()
+        before, renders = torch.get_num_threads(), []
+        try:
+            for threads in (1, 2, 3):
+                torch.set_num_threads(threads)
+                renders.append(fit(image, labels, 12, recipe=quick()).scene.render())
+                assert torch.get_num_threads() == threads
+        finally:
+            torch.set_num_threads(before)
+        assert torch.equal(renders[0], renders[1]) and torch.equal(renders[0], renders[2])

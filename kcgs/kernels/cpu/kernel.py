@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ..autograd import Gradients, SplatInputs, Steps, apply_kernel
 from ..membership import Membership
+from ..threads import num_threads
 from ..whitened import least_exponent, support_radius
 from . import loops
 from .loops import Lists
@@ -117,11 +118,11 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
 
 def _run_threads(work: Callable[[int, int], None], lists: Lists) -> None:
     """Run work(offset, step) over all rows of tiles with torch's number of threads, the caller's among them."""
-    threads = min(torch.get_num_threads(), len(lists.start) - 1)
+    threads = min(num_threads(), len(lists.start) - 1)
     if threads < 2 or len(lists.entries) < _SERIAL_ENTRIES:
         work(0, 1)
         return
-    others = [_pool(os.getpid(), torch.get_num_threads() - 1).submit(work, t, threads) for t in range(1, threads)]
+    others = [_pool(os.getpid(), num_threads() - 1).submit(work, t, threads) for t in range(1, threads)]
     work(0, threads)
     for other in others:
         other.result()
