@@ -90,8 +90,8 @@ def attack(count: int, seed: int) -> None:
 
 
 class TestDamage:
-    def test_three_hundred(self) -> None:
-        attack(300, seed=0)
+    def test_a_hundred_and_fifty(self) -> None:
+        attack(150, seed=0)
 
     @pytest.mark.slow
     def test_ten_thousand(self) -> None:
