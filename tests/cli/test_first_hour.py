@@ -1,4 +1,4 @@
-"""What strangers typed in their first hour, in order, in one folder: exit statuses, and a word of what they are told."""
+"""What strangers typed in their first hour, in order, in one folder: exit statuses, and a word of what is said."""
 
 from __future__ import annotations
 
