@@ -159,10 +159,10 @@ class TestSize:
         return float(np.mean([len(encode_labels(labels)) / webp_bytes(labels) for labels in maps]))
 
     def test_davis(self, data_root: Path, every: int) -> None:
-        assert self.ratio(sorted(data_root.glob("DAVIS/Annotations/480p/*/00000.png"))[::every]) < 0.32
+        assert self.ratio(sorted(data_root.glob("DAVIS/Annotations/480p/*/00000.png"))[::every]) < 0.285
 
     def test_bsds(self, data_root: Path, every: int) -> None:
-        assert self.ratio(sorted(data_root.glob("bsds/*/mask.png"))[::every]) < 0.36
+        assert self.ratio(sorted(data_root.glob("bsds/*/mask.png"))[::every]) < 0.32
 
 
 class TestWork:
