@@ -41,6 +41,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         if not temporary.is_file():
             raise FileNotFoundError(f"nothing was written for {target}")
         os.replace(temporary, target)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and str(error.filename) == str(temporary):
+            error.filename = str(target)
         raise

@@ -55,6 +55,15 @@ def check_integer(name: str, value: object, dims: Sequence[int] = ()) -> Tensor:
     return tensor
 
 
+def check_rows(name: str, value: Tensor, like: Tensor, last: int | str) -> None:
+    """Refuse what has not one row for each of `like`; `last` is the length of a row, or its letter."""
+    if value.shape[:-1] != like.shape[:-1]:
+        wanted = ", ".join(map(str, (*like.shape[:-1], last)))
+        raise ValueError(f"{name} must have shape ({wanted}); got {tuple(value.shape)}")
+    if value.shape[-1] == 0:
+        raise ValueError(f"{name} must have at least one channel; got shape {tuple(value.shape)}")
+
+
 def check_ids(name: str, value: object, like: Tensor) -> Tensor:
     """Return region ids as int64: integer, one for each centre of `like` (..., 2), on its device, none negative."""
     tensor = check_integer(name, value)
@@ -121,7 +130,14 @@ def check_cutoff(value: object) -> float:
 
 
 def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3)) -> Tensor:
-    """Return a label map as int64: integer, (H, W) or (B, H, W), at least one pixel, no negative id."""
+    """Return a label map as int64: integer or bool, (H, W) or (B, H, W), at least one pixel, no negative id.
+
+    A numpy array is one too; False is 0 and True is 1.
+    """
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biu":
+        value = torch.from_numpy(np.array(value, np.int64, order="C"))
+    elif isinstance(value, Tensor) and value.dtype == torch.bool:
+        value = value.long()
     tensor = check_integer(name, value, dims=dims)
     if tensor.numel() == 0:
         raise ValueError(f"{name} must have at least one pixel; got shape {tuple(tensor.shape)}")
@@ -189,7 +205,8 @@ def as_image(name: str, value: object, tolerance: float = 0.0) -> Tensor:
     elif isinstance(value, Tensor):
         image = check_floating(name, value, dims=(3, 4), finite=False)  # looked for below, once
     else:
-        raise TypeError(f"{name} must be a Tensor, a numpy array or a PIL image; got {type(value).__name__}")
+        hint = ": read it with kcgs.data.load_image" if isinstance(value, str | os.PathLike) else ""
+        raise TypeError(f"{name} must be a Tensor, a numpy array or a PIL image; got {type(value).__name__}{hint}")
     if image.ndim == 4:
         if image.shape[0] != 1:
             raise ValueError(f"{name} must be one image, (C, H, W) or (1, C, H, W); got {tuple(image.shape)}")

@@ -6,6 +6,7 @@ import math
 import warnings
 from typing import Any
 
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import as_image
@@ -13,7 +14,7 @@ from kcgs.functional import RegionMap, ef_psnr, ef_ssim, ms_ssim, psnr, ssim
 from kcgs.scene import Scene, check_scene
 
 
-def evaluate(scene: Scene, image: Any, labels: RegionMap | Tensor | None = None) -> dict[str, float]:
+def evaluate(scene: Scene, image: Any, labels: RegionMap | Tensor | NDArray[Any] | None = None) -> dict[str, float]:
     r"""Render a scene, clipped to [0, 1], and compare it with an image.
 
     Args:
@@ -38,7 +39,7 @@ def evaluate(scene: Scene, image: Any, labels: RegionMap | Tensor | None = None)
         >>> figures["psnr"], round(figures["ssim"], 4)
         (inf, 1.0)
     """
-    target, render = as_image("image", image), check_scene(scene).render()
+    render, target = check_scene(scene).render(), as_image("image", image)
     if tuple(target.shape) != tuple(render.shape):
         raise ValueError(f"image must have the scene's shape {tuple(render.shape)}; got {tuple(target.shape)}")
     regions = scene.regions if labels is None else RegionMap.coerce(labels, "labels")

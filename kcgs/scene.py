@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from kcgs._atomic import atomic_path
@@ -34,8 +35,8 @@ class Scene(nn.Module):
 
     Args:
         field: N Gaussians, or a batch of them.
-        regions: a RegionMap, or an integer label map, :math:`(H, W)` or :math:`(B, H, W)`, with hard contours; None:
-            nothing is confined.
+        regions: a RegionMap, or a label map, integer or bool, Tensor or numpy array, :math:`(H, W)` or
+            :math:`(B, H, W)`, with hard contours; None: nothing is confined.
         metadata: notes, str to str, which files keep.
 
     Raises:
@@ -49,7 +50,10 @@ class Scene(nn.Module):
     """
 
     def __init__(
-        self, field: GaussianField, regions: RegionMap | Tensor | None = None, metadata: Mapping[str, str] | None = None
+        self,
+        field: GaussianField,
+        regions: RegionMap | Tensor | NDArray[Any] | None = None,
+        metadata: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__()
         if not isinstance(field, GaussianField):
@@ -99,6 +103,22 @@ class Scene(nn.Module):
             finer = 0 if self.regions is None else self.regions.supersample**2
             per_pixel = max(_IMAGE_BYTES * numbers, 4 * numbers + _MAP_BYTES * finer)
             check_memory(name, self.size if size is None else check_size(name, size), per_pixel)
+
+    def unbind(self) -> tuple[Scene, ...]:
+        """Take a batch apart: a scene for each image, without the graph; a scene of one image gives itself.
+
+        Example:
+            >>> means, cholesky, colors = torch.rand(4, 9, 2), torch.ones(4, 9, 3), torch.rand(4, 9, 3)
+            >>> batch = Scene(GaussianField(means, cholesky, colors, size=(8, 8)))
+            >>> len(batch.unbind()), batch.unbind()[2]().shape
+            (4, torch.Size([3, 8, 8]))
+        """
+        if self.field.means.ndim == 2:
+            return (self,)
+        fields = self.field.unbind()
+        maps: tuple[RegionMap | None, ...] = (None,) if self.regions is None else self.regions.unbind()
+        maps = maps * len(fields) if len(maps) == 1 else maps
+        return tuple(Scene(field, one, self.metadata) for field, one in zip(fields, maps, strict=True))
 
     def save(self, path: str | os.PathLike[str]) -> int:
         """Write the scene, as :func:`kcgs.save` does; return the bytes of the file."""
@@ -202,6 +222,8 @@ def load(path: str | os.PathLike[str]) -> Scene:
         ((32, 48), 1, {})
     """
     path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"no such file: {path}")
     deserialize: Callable[[bytes], Scene] = _format(path).deserialize
     data = path.read_bytes()
     try:
@@ -223,13 +245,20 @@ def _serialized(scene: Scene, format: Any) -> bytes:
     return content
 
 
-def check_scene(scene: object) -> Scene:
-    """Return `scene` if it is a Scene of one image, with one map of its size and region ids, or without a map."""
+def check_unbatched(scene: object) -> Scene:
+    """Return `scene` if it is a Scene of one image."""
     if not isinstance(scene, Scene):
         raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
+    if scene.field.means.ndim != 2:
+        count = len(scene.field.means)
+        raise ValueError(f"scene must be of one image; got a batch of {count}, which scene.unbind() takes apart")
+    return scene
+
+
+def check_scene(scene: object) -> Scene:
+    """Return `scene` if it is a Scene of one image, with one map of its size and region ids, or without a map."""
+    scene = check_unbatched(scene)
     field, regions = scene.field, scene.regions
-    if field.means.ndim != 2:
-        raise ValueError(f"scene must not be batched; got means of shape {tuple(field.means.shape)}")
     if regions is not None and (regions.labels.ndim != 2 or regions.size != field.size):
         raise ValueError(f"scene must have one map of its size {field.size}; got {tuple(regions.labels.shape)}")
     if regions is not None and field.region_ids is None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from kcgs._check import as_image, check_count, check_number, check_numbers
+from kcgs._check import as_image, check_count, check_labels, check_number, check_numbers
 
 
 class TestCheckCount:
@@ -47,6 +47,17 @@ class TestCheckNumbers:
             check_numbers("mean", [1, 0, 1], 3, 0, above=True)
 
 
+class TestCheckLabels:
+    def test_masks_and_arrays_are_maps(self) -> None:
+        want = torch.tensor([[0, 1, 1], [0, 0, 1]])
+        array = np.ascontiguousarray(want.numpy()[:, ::-1])[:, ::-1]  # of negative strides
+        for given in (want.bool(), array, array.astype(bool), array.astype(np.uint16), array.astype(">i2")):
+            labels = check_labels("labels", given)
+            assert torch.equal(labels, want) and labels.dtype == torch.int64
+        with pytest.raises(TypeError, match="labels must be a Tensor; got ndarray"):
+            check_labels("labels", array.astype(np.float32))
+
+
 class TestAsImage:
     def test_all_kinds_are_one_image(self) -> None:
         levels = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
@@ -83,5 +94,5 @@ class TestAsImage:
                 as_image("image", torch.zeros(shape))
         for shape in ((3, 120, 3), (80, 3, 3), (80, 120, 2), (80, 1, 1)):  # thin images, and many channels
             assert as_image("image", torch.zeros(shape)).shape == shape
-        with pytest.raises(TypeError, match="a Tensor, a numpy array or a PIL image; got str"):
+        with pytest.raises(TypeError, match="or a PIL image; got str: read it with kcgs.data.load_image"):
             as_image("image", "photo.jpg")

@@ -40,7 +40,8 @@ def test_labels_say_where_contours_are() -> None:
     image = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0))
     assert math.isnan(evaluate(make_scene(None), image)["ef_psnr"])
     given = evaluate(make_scene(None), image, RegionMap.from_labels(LABELS, 0.7))
-    assert given["ef_psnr"] == evaluate(make_scene(None), image, LABELS)["ef_psnr"] > 0
+    for same in (LABELS, LABELS.bool(), LABELS.numpy(), LABELS[None]):
+        assert given["ef_psnr"] == evaluate(make_scene(None), image, same)["ef_psnr"] > 0
 
 
 def test_bad_input() -> None:

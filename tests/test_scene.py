@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene, load, save
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene, evaluate, load, save
 
 SIZE = (20, 30)
 MAPS = {
@@ -21,6 +21,14 @@ MAPS = {
     "fine": RegionMap.from_labels((torch.arange(60) // 23).expand(40, 60), supersample=2),
     "resized": RegionMap.from_labels((torch.arange(60) // 23).expand(40, 60), 1.0).resize(SIZE),
 }
+
+
+def batch_of(one: RegionMap) -> RegionMap:
+    """Make a batch of three maps, the last of one region."""
+    if one._origin is not None:
+        return batch_of(one._origin).resize(one.size)
+    labels = torch.stack([one.fine_labels, one.fine_labels.flip(-1), torch.ones_like(one.fine_labels)])
+    return RegionMap.from_labels(labels, one.softness, supersample=one.supersample)
 
 
 def make_scene(name: str = "soft") -> Scene:
@@ -95,6 +103,28 @@ class TestModule:
         regions = Scene(make_scene("hard").field, labels).regions
         assert regions is not None and regions.softness == 0.0
 
+    def test_masks_and_arrays_mean_them_too(self) -> None:
+        mask = (torch.arange(30) >= 11).expand(SIZE)
+        want = Scene(GaussianField.random(40, SIZE, regions=mask, seed=0), mask)()
+        for labels in (mask.long(), mask.numpy(), mask.numpy().astype("uint8")):
+            assert torch.equal(Scene(GaussianField.random(40, SIZE, regions=labels, seed=0), labels)(), want)
+
+    @pytest.mark.parametrize("name", MAPS)
+    def test_a_batch_says_so_and_comes_apart(self, name: str) -> None:
+        """Each image has its own map, with regions that others lack, but for "none" and one map for all."""
+        one = MAPS[name]
+        maps = one if one is None or name == "hard" else batch_of(one)
+        parts = [GaussianField.random(40, SIZE, regions=one, seed=seed) for seed in range(3)]
+        tensors = (torch.stack([getattr(f, t).detach() for f in parts]) for t in ("means", "cholesky", "colors"))
+        field = GaussianField(*tensors, size=SIZE)
+        batch = Scene(field if maps is None else field.assign_regions(maps), maps, {"title": name})
+        assert repr(batch).startswith("Scene(3 x 40 Gaussians, 3 channels, ")
+        scenes = batch.unbind()
+        assert torch.equal(torch.stack([scene() for scene in scenes]), batch())
+        assert scenes[0].unbind() == (scenes[0],) and scenes[2].metadata == {"title": name}
+        with pytest.raises(ValueError, match=r"must be of one image; got a batch of 3, which scene.unbind\(\) takes"):
+            evaluate(batch, torch.rand(3, 3, *SIZE))
+
     def test_repr_is_a_few_lines(self) -> None:
         assert "3 regions" in repr(make_scene()) and len(repr(make_scene()).splitlines()) <= 4
         assert len(make_scene()) == 40 and make_scene().size == SIZE
@@ -103,7 +133,7 @@ class TestModule:
         field = GaussianField.random(3, SIZE, seed=0)
         with pytest.raises(TypeError, match="field must be a GaussianField; got Scene"):
             Scene(Scene(field))  # type: ignore[arg-type]
-        with pytest.raises(TypeError, match="regions must be a RegionMap, a label map Tensor or None; got str"):
+        with pytest.raises(TypeError, match="regions must be a RegionMap, a label map or None; got str"):
             Scene(field, "map.png")  # type: ignore[arg-type]
         with pytest.raises(TypeError, match="metadata must map str to str; got 'n': 3"):
             Scene(field, metadata={"n": 3})  # type: ignore[dict-item]
@@ -115,6 +145,13 @@ class TestFiles:
         size = save(path, make_scene("hard"))
         assert size == path.stat().st_size < make_scene("hard").save(tmp_path / "scene.safetensors")
         assert len(load(path)) <= 40 and load(path).regions is not None
+
+    def test_errors_name_the_path_given(self) -> None:
+        for name in ("nofile", "nofile.kcgs"):
+            with pytest.raises(FileNotFoundError, match=f"^no such file: {name}$"):
+                load(name)
+        with pytest.raises(OSError, match="/proc/foo.safetensors"):
+            save("/proc/foo.safetensors", make_scene())
 
     def test_cut_file_is_refused_with_its_name(self, tmp_path: Path) -> None:
         path = tmp_path / "photo.kcgs"

@@ -338,7 +338,7 @@ class TestSaveRefuses:
         field = make_field()
         with pytest.raises(TypeError, match="field must be a GaussianField; got dict"):
             save(path, Scene({"means": field.means}))  # type: ignore[arg-type]
-        with pytest.raises(TypeError, match="regions must be a RegionMap, a label map Tensor or None; got list"):
+        with pytest.raises(TypeError, match="regions must be a RegionMap, a label map or None; got list"):
             save(path, Scene(field, [[0, 1]]))  # type: ignore[arg-type]
         with pytest.raises(TypeError, match="metadata must map str to str; got 'n': 3"):
             save(path, Scene(field, metadata={"n": 3}))  # type: ignore[dict-item]

@@ -28,9 +28,10 @@ def render(
     from kcgs import load
     from kcgs.data import save_image
     from kcgs.editing import extract_region
+    from kcgs.scene import check_unbatched
 
     check_output(output, *IMAGES)
-    loaded = load(scene)
+    loaded = check_unbatched(load(scene))
     target = target_size(loaded, scale, size)
     if region is not None:
         if loaded.regions is None or loaded.field.region_ids is None:
@@ -52,8 +53,9 @@ def eval_command(
     """Compare a scene with an image."""
     from kcgs import load
     from kcgs.data import load_image, load_labels
+    from kcgs.scene import check_unbatched
 
-    loaded, target = load(scene), load_image(image)
+    loaded, target = check_unbatched(load(scene)), load_image(image)
     if target.shape[1:] != loaded.size:
         raise ValueError(f"IMAGE must have the size {loaded.size} of SCENE; got {tuple(target.shape[1:])}")
     labels = loaded.regions.labels if loaded.regions is not None else None
@@ -72,6 +74,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
     if not isinstance(softness, float):
         softness = sum(softness.values()) / max(1, len(softness))
     report = {
+        "images": loaded.field.means.shape[:-2].numel(),
         "num_gaussians": len(loaded),
         "channels": loaded.field.colors.shape[-1],
         "height": loaded.size[0],

@@ -161,7 +161,8 @@ def colorize_labels(labels: Tensor) -> Tensor:
         >>> tuple(image.shape), bool((image[:, 0, 0] == image[:, 0, 2]).all())
         ((3, 1, 3), True)
     """
-    ids, rank = torch.unique(check_labels("labels", labels, dims=(2,)), return_inverse=True)
+    labels = check_labels("labels", labels, dims=(2,))
+    ids, rank = torch.unique(labels, return_inverse=True)
     return label_colors(len(ids)).to(labels.device)[rank].permute(2, 0, 1).contiguous()
 
 

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_count, check_floating, check_number
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
-from kcgs.scene import Scene
+from kcgs.scene import Scene, check_unbatched
+
+Numbers = Tensor | NDArray[Any] | Sequence[Any] | float
 
 
 def check_field(scene: Scene) -> GaussianField:
     """Return the field of an unbatched scene whose Gaussians have region ids."""
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
-    if scene.field.means.ndim != 2:
-        raise ValueError(f"scene must not be batched; got means of shape {tuple(scene.field.means.shape)}")
-    if scene.field.region_ids is None:
+    if check_unbatched(scene).field.region_ids is None:
         raise ValueError("scene must have region ids; call scene.field.assign_regions(regions)")
     return scene.field
 
@@ -63,17 +64,25 @@ def check_ids(region_ids: object, known: Tensor, owner: str) -> list[int]:
 
 def check_offset(offset: Sequence[float], supersample: int) -> tuple[int, int]:
     """Return the offset in labels."""
-    if len(offset) != 2:
+    pair = offset.tolist() if isinstance(offset, Tensor | np.ndarray) else offset
+    if not isinstance(pair, Sequence) or isinstance(pair, str):
+        raise TypeError(f"offset must be (dx, dy) in pixels; got {offset!r}")
+    if len(pair) != 2:
         raise ValueError(f"offset must be (dx, dy); got {offset!r}")
-    steps = [float(d) * supersample for d in offset]
-    if any(step != step or abs(step) > 1e8 or abs(step - round(step)) > 1e-6 for step in steps):
+    steps = [check_number("offset", d) * supersample for d in pair]
+    if any(abs(step) > 1e8 or abs(step - round(step)) > 1e-6 for step in steps):
         unit = "1 pixel" if supersample == 1 else f"1/{supersample} pixel, the spacing of the labels"
         raise ValueError(f"offset must be whole multiples of {unit}; got {offset!r}")
     return round(steps[0]), round(steps[1])
 
 
-def color_tensor(name: str, value: Tensor | float, colors: Tensor, shapes: list[tuple[int, ...]]) -> Tensor:
-    """Return a number or a tensor of one of these shapes in the dtype and on the device of the colours."""
+def color_tensor(name: str, value: Numbers, colors: Tensor, shapes: list[tuple[int, ...]]) -> Tensor:
+    """Return numbers of one of these shapes in the dtype and on the device of the colours."""
+    if isinstance(value, Sequence | np.ndarray) and not isinstance(value, str):
+        try:
+            value = torch.as_tensor(value, dtype=colors.dtype)
+        except (TypeError, ValueError) as error:
+            raise TypeError(f"{name} must hold numbers; got {value!r}") from error
     number = value if isinstance(value, Tensor) else colors.new_tensor(check_number(name, value))
     tensor = check_floating(name, number).detach().to(colors)
     if tuple(tensor.shape) not in shapes:

@@ -11,7 +11,7 @@ from kcgs.functional import PairWidths, RegionMap, touching_pairs
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
-from .checks import check_editable, check_field, check_ids, check_offset, check_scene, color_tensor, ids_of
+from .checks import Numbers, check_editable, check_field, check_ids, check_offset, check_scene, color_tensor, ids_of
 
 # standard deviation of a Gaussian that is flat over the image, in its longer sides: 1 to 3 in 10^7
 _FLAT = 1e3
@@ -63,9 +63,7 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
     return Scene(moved, regions.relabel(labels, _new_widths(regions, chosen.tolist())), scene.metadata)
 
 
-def recolor_region(
-    scene: Scene, region_ids: int | Iterable[int], gain: Tensor | float, bias: Tensor | float | None = None
-) -> Scene:
+def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers, bias: Numbers | None = None) -> Scene:
     r"""Change the colours of regions, c' = gain c + bias, exactly so in the image.
 
     Convention: a gain acts on the colours of the Gaussians. A bias does not (pixels are sums of Gaussians, not means):
@@ -74,7 +72,7 @@ def recolor_region(
     Args:
         scene: unbatched, with region ids.
         region_ids: an id that some of its Gaussians have, or several.
-        gain: a number, one for each channel :math:`(C)`, or a matrix :math:`(C, C)`.
+        gain: a number, one for each channel :math:`(C)`, or a matrix :math:`(C, C)`: tensors, arrays or lists.
         bias: a number, or one for each channel :math:`(C)`; None: none, and no Gaussian more.
 
     Returns:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from difflib import get_close_matches
 from importlib.resources import files
 from typing import Any, Literal
 
@@ -141,5 +142,15 @@ def available_recipes() -> list[str]:
 
 
 def _one_line(error: ValidationError) -> str:
-    parts = [f"{'.'.join(map(str, e['loc'])) or 'config'}: {e['msg']}; got {e['input']!r}" for e in error.errors()]
+    parts = []
+    for found in error.errors():
+        name = ".".join(map(str, found["loc"]))
+        if found["type"] == "extra_forbidden":
+            near = get_close_matches(name, FitConfig.model_fields, 1)
+            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(FitConfig.model_fields)}"
+            parts.append(f"unknown setting {name!r}: {hint}")
+        elif found["type"] == "value_error":  # one of our own, which says it all
+            parts.append(str(found["ctx"]["error"]))
+        else:
+            parts.append(f"{name}: {found['msg']}; got {found['input']!r}")
     return "; ".join(parts)

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import as_image, check_count
@@ -31,7 +32,7 @@ from .strategies import Finish, MergeRegions, make_strategies
 @torch.enable_grad()
 def fit(
     image: Any,
-    regions: RegionMap | Tensor | None = None,
+    regions: RegionMap | Tensor | NDArray[Any] | None = None,
     num_gaussians: int = 1000,
     *,
     recipe: str | FitConfig = "best",
@@ -52,7 +53,8 @@ def fit(
     Args:
         image: Tensor :math:`(C, H, W)` or :math:`(1, C, H, W)`, floating, values in [0, 1]; a numpy array
             :math:`(H, W, C)`, uint8 or floating; or a PIL image.
-        regions: label map of the image's size, or a RegionMap; also says where EF-PSNR is measured. None: one region.
+        regions: label map of the image's size, integer or bool, a Tensor or a numpy array; or a RegionMap. Also says
+            where EF-PSNR is measured. None: one region.
         num_gaussians: N, the most there may be, from 1 to the number of pixels. Where it is below the number of
             regions, those most alike are merged until each has a Gaussian, or with ``merge_regions=False`` the smaller
             ones stay empty and black; a UserWarning says how many.
@@ -170,11 +172,13 @@ def _warn_of_regions(state: FitState) -> None:
     warnings.warn(f"{lost}: there are more than num_gaussians, {most}", stacklevel=5)  # past the decorators
 
 
-def check_problem(image: Any, regions: RegionMap | Tensor | None) -> tuple[Tensor, RegionMap | None]:
+def check_problem(image: Any, regions: object) -> tuple[Tensor, RegionMap | None]:
     """Return the image, (C, H, W), and its regions, as copies that a fit may use; refuse what cannot be fitted."""
     image = as_image("image", image)
     regions = RegionMap.coerce(regions)
     if regions is not None:
+        if regions.labels.shape[:-2] == (1,):
+            (regions,) = regions.unbind()
         if regions.size != tuple(image.shape[1:]) or regions.labels.ndim != 2:
             raise ValueError(
                 f"regions must be one map of the image's size {tuple(image.shape[1:])}; got "

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import check_number
+from kcgs._check import check_labels, check_number
 
 from .labels import compact, contour_edges, unique_pairs
 from .widths import band_gain, check_problem
@@ -50,6 +50,7 @@ def merge_regions(image: Tensor, labels: Tensor, merge_cost: float = MERGE_COST)
         [0, 1, 1]
     """
     check_number("merge_cost", merge_cost, 0.0)
+    labels = check_labels("labels", labels)
     check_problem(image, labels)
     ids, labels = torch.unique(labels, return_inverse=True)
     for _ in range(_ROUNDS):

@@ -7,7 +7,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_count, check_labels, check_size
@@ -50,19 +52,23 @@ class RegionMap:
 
     @classmethod
     def from_labels(
-        cls, labels: Tensor, softness: float | Mapping[tuple[int, int], float] = 0.0, *, supersample: int = 1
+        cls,
+        labels: Tensor | NDArray[Any],
+        softness: float | Mapping[tuple[int, int], float] = 0.0,
+        *,
+        supersample: int = 1,
     ) -> RegionMap:
         r"""Build from a label map.
 
         Args:
-            labels: integer, :math:`(H, W)` or :math:`(B, H, W)`, non-negative; ids need not be consecutive. With
-                ``supersample`` k it has k times the image's height and width.
+            labels: integer or bool, a Tensor or a numpy array, :math:`(H, W)` or :math:`(B, H, W)`, non-negative; ids
+                need not be consecutive. With ``supersample`` k it has k times the image's height and width.
             softness: contour width (standard deviation) in pixels, 0 to 64; or one for each pair of ids in any
                 order, 0 for pairs that are not mentioned.
             supersample: labels along a side of a pixel, k.
 
         Raises:
-            TypeError: labels are not an integer tensor; softness or supersample of another type.
+            TypeError: labels are no integers; softness or supersample of another type.
             ValueError: wrong shape, no pixels, negative ids, softness out of range or of ids that are not in the map,
                 a size that supersample does not divide.
 
@@ -94,12 +100,12 @@ class RegionMap:
 
     @classmethod
     def coerce(cls, value: object, name: str = "regions") -> RegionMap | None:
-        """Return a RegionMap, the map of a Tensor with hard contours, or None; TypeError calls anything else `name`."""
+        """Return a RegionMap, a label map's with hard contours, or None; TypeError calls anything else `name`."""
         if value is None or isinstance(value, RegionMap):
             return value
-        if isinstance(value, Tensor):
+        if isinstance(value, Tensor | np.ndarray):
             return cls.from_labels(value)
-        raise TypeError(f"{name} must be a RegionMap, a label map Tensor or None; got {type(value).__name__}")
+        raise TypeError(f"{name} must be a RegionMap, a label map or None; got {type(value).__name__}")
 
     @property
     def num_regions(self) -> int:
@@ -180,10 +186,8 @@ class RegionMap:
             raise ValueError(f"labels must have shape {tuple(self.fine_labels.shape)}; got {tuple(labels.shape)}")
         softness: float | Mapping[tuple[int, int], float] = self.softness
         if isinstance(softness, PairWidths):
-            widths = {**self._new_widths(labels, new_width), **softness}
-            left = set(labels.unique().tolist())
-            softness = {pair: width for pair, width in widths.items() if left.issuperset(pair)}
-        return RegionMap.from_labels(labels, softness, supersample=self.supersample)
+            softness = {**self._new_widths(labels, new_width), **softness}
+        return self._with_labels(labels, softness)
 
     def _new_widths(
         self, labels: Tensor, width: float | Literal["mean"] | Mapping[tuple[int, int], float]
@@ -242,6 +246,26 @@ class RegionMap:
         if self.supersample == 1:
             moved["fine_labels"] = moved["labels"]
         return replace(self, **moved)
+
+    def unbind(self) -> tuple[RegionMap, ...]:
+        """Take a batch apart: a map for each image, with the regions that it has; one map gives itself.
+
+        Example:
+            >>> [one.labels.tolist() for one in RegionMap.from_labels(torch.tensor([[[1, 4]], [[1, 1]]])).unbind()]
+            [[[1, 4]], [[1, 1]]]
+        """
+        if self.labels.ndim == 2:
+            return (self,)
+        if self._origin is not None:
+            return tuple(one.resize(self.size) for one in self._origin.unbind())
+        return tuple(self._with_labels(labels, self.softness) for labels in self.fine_labels)
+
+    def _with_labels(self, labels: Tensor, widths: float | Mapping[tuple[int, int], float]) -> RegionMap:
+        """Make the map of these labels, without the widths of pairs that they do not have."""
+        if isinstance(widths, Mapping):
+            left = set(labels.unique().tolist())
+            widths = {pair: width for pair, width in widths.items() if left.issuperset(pair)}
+        return RegionMap.from_labels(labels, widths, supersample=self.supersample)
 
     def state(self) -> dict[str, Any]:
         """Return what :meth:`from_state` makes the same map of: tensors, numbers, tuples and None only."""

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcgs._check import check_cutoff, check_floating, check_ids, check_size, check_tensor
+from kcgs._check import check_cutoff, check_floating, check_ids, check_rows, check_size, check_tensor
 from kcgs.kernels import Membership, SplatInputs, resolve
 
 from .covariance import check_cholesky
@@ -80,13 +80,10 @@ def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
     check_floating("means", means, last=2, dims=(2, 3), finite=False)
     check_floating("cholesky", cholesky, last=3, finite=False)
     check_floating("colors", colors, dims=(2, 3), finite=False)
-    for name, tensor in (("cholesky", cholesky), ("colors", colors)):
-        if tensor.shape[:-1] != means.shape[:-1]:
-            raise ValueError(f"{name} must have shape {(*means.shape[:-1], '...')}; got {tuple(tensor.shape)}")
+    for name, tensor, last in (("cholesky", cholesky, 3), ("colors", colors, "C")):
+        check_rows(name, tensor, means, last)
         if tensor.device != means.device:
             raise ValueError(f"{name} must be on {means.device} with means; got {tensor.device}")
-    if colors.shape[-1] < 1:
-        raise ValueError(f"colors must have at least one channel; got shape {tuple(colors.shape)}")
     if means.shape[0] == 0 and means.ndim == 3:
         raise ValueError(f"means must hold at least one image; got shape {tuple(means.shape)}")
     if means.numel():

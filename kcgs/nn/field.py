@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from kcgs._check import check_floating, check_ids, check_integer, check_size, check_tensor
+from kcgs._check import check_floating, check_ids, check_integer, check_labels, check_rows, check_size, check_tensor
 from kcgs.functional import RegionMap, lookup_regions
 from kcgs.functional.covariance import check_cholesky
 
@@ -66,9 +66,8 @@ class GaussianField(nn.Module):
         lead = means.shape[:-1]
         check_cholesky("cholesky", cholesky)
         check_floating("colors", colors, dims=(2, 3))
-        for name, value in (("cholesky", cholesky), ("colors", colors)):
-            if value.shape[:-1] != lead or value.shape[-1] == 0:
-                raise ValueError(f"{name} must have shape {(*lead, '...')}; got {tuple(value.shape)}")
+        check_rows("cholesky", cholesky, means, 3)
+        check_rows("colors", colors, means, "C")
         if opacities is not None and check_floating("opacities", opacities).shape != lead:
             raise ValueError(f"opacities must have shape {tuple(lead)}; got {tuple(opacities.shape)}")
         tensors = {"means": means, "cholesky": cholesky, "colors": colors, "opacities": opacities}
@@ -145,7 +144,7 @@ class GaussianField(nn.Module):
         Args:
             regions: label map of the field's size, or a RegionMap of one.
         """
-        labels = regions.labels if isinstance(regions, RegionMap) else regions
+        labels = regions.labels if isinstance(regions, RegionMap) else check_labels("regions", regions)
         ids = lookup_regions(self.means, labels)
         if tuple(labels.shape[-2:]) != self.size:
             raise ValueError(f"regions must have the field's size {self.size}; got {tuple(labels.shape[-2:])}")
@@ -186,6 +185,20 @@ class GaussianField(nn.Module):
         ids, opacities = pick(self.region_ids), pick(self.opacities)
         return GaussianField(means, cholesky, colors, ids, opacities, size=self.size)
 
+    def unbind(self) -> tuple[GaussianField, ...]:
+        """Take a batch apart: a field of parameters for each image, without the graph; an unbatched one gives itself.
+
+        Example:
+            >>> means, cholesky, colors = torch.rand(4, 9, 2), torch.ones(4, 9, 3), torch.rand(4, 9, 3)
+            >>> len(GaussianField(means, cholesky, colors, size=(8, 8)).unbind())
+            4
+        """
+        if self.means.ndim == 2:
+            return (self,)
+        parts = (self.means, self.cholesky, self.colors, self.region_ids, self.opacities)
+        rows = ([None if part is None else part.detach()[k] for part in parts] for k in range(len(self.means)))
+        return tuple(GaussianField(*row, size=self.size) for row in rows)  # type: ignore[arg-type]
+
     def merged_colors(self) -> Tensor:
         """Colours with the opacities multiplied in, (N, C) or (B, N, C)."""
         return self.colors if self.opacities is None else self.colors * self.opacities[..., None]
@@ -219,4 +232,5 @@ class GaussianField(nn.Module):
     def extra_repr(self) -> str:
         """Show the numbers that matter."""
         confined = "confined" if self.region_ids is not None else "not confined"
-        return f"{len(self)} Gaussians, {self.colors.shape[-1]} channels, size={self.size}, {confined}"
+        images = f"{len(self.means)} x " if self.means.ndim == 3 else ""
+        return f"{images}{len(self)} Gaussians, {self.colors.shape[-1]} channels, size={self.size}, {confined}"

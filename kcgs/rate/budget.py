@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_count
@@ -46,7 +47,7 @@ class FitBytesResult(NamedTuple):
 
 def fit_bytes(
     image: Any,
-    regions: RegionMap | Tensor | None = None,
+    regions: RegionMap | Tensor | NDArray[Any] | None = None,
     num_bytes: int = 8000,
     *,
     recipe: str | FitConfig = "best",

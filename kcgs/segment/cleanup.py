@@ -35,6 +35,7 @@ def connected_regions(labels: Tensor) -> Tensor:
         >>> connected_regions(torch.tensor([[5, 2, 5], [5, 2, 2]])).tolist()
         [[0, 1, 2], [0, 1, 1]]
     """
+    labels = check_labels("labels", labels, dims=(2,))
     return torch.from_numpy(_components(to_regions(labels)[1])).to(labels.device)
 
 
@@ -47,6 +48,7 @@ def order_by_area(labels: Tensor) -> Tensor:
         >>> order_by_area(torch.tensor([[9, 4, 4], [9, 4, 7]])).tolist()
         [[1, 0, 0], [1, 0, 2]]
     """
+    labels = check_labels("labels", labels, dims=(2,))
     _, regions = to_regions(labels)
     areas = np.bincount(regions.ravel())
     first = np.empty_like(areas)
@@ -76,6 +78,7 @@ def merge_small(labels: Tensor, min_size: int) -> Tensor:
         >>> merge_small(torch.tensor([[3, 3, 3, 8], [3, 1, 3, 8]]), min_size=2).tolist()
         [[3, 3, 3, 8], [3, 3, 3, 8]]
     """
+    labels = check_labels("labels", labels, dims=(2,))
     ids, regions = to_regions(labels)
     check_count("min_size", min_size)
     pieces = _components(regions)
@@ -117,6 +120,7 @@ def merge_similar(image: Any, labels: Tensor, max_regions: int | None) -> Tensor
         >>> merge_similar(image, torch.tensor([[4, 5, 6]]), max_regions=2).tolist()
         [[4, 4, 6]]
     """
+    labels = check_labels("labels", labels, dims=(2,))
     if max_regions is None:
         return labels
     check_count("max_regions", max_regions)

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import check_count
+from kcgs._check import check_count, check_labels
 from kcgs.functional.merging import Labels, RegionGraph
 from kcgs.segment.cleanup import lab_and_regions, lab_sums
 
@@ -49,6 +49,7 @@ def snap_contours(image: Any, labels: Tensor, *, reach: int = 2) -> Tensor:
     from skimage.segmentation import watershed
 
     check_count("reach", reach)
+    labels = check_labels("labels", labels, dims=(2,))
     lab, ids, regions = lab_and_regions(image, labels)
     fixed = _fixed(lab, regions, reach)
     # The watershed runs in the band that is open and on its rim: the inside of regions has no say in it.

@@ -15,7 +15,7 @@ import pytest
 import torch
 from PIL import Image
 
-from kcgs import fit, load
+from kcgs import GaussianField, Scene, fit, load
 from kcgs.cli import main
 from kcgs.data import load_image, load_labels, save_image, save_labels
 from kcgs.functional import psnr
@@ -248,6 +248,15 @@ class TestRender:
         render = load_image("a.png")
         outside = load_labels("mask.png") == 0
         assert render[:, outside].max() == 0 and render.max() > 0
+
+    def test_a_batch_is_refused_by_its_name(self, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        one = load(scene).field
+        means, cholesky, colors = (torch.stack([t.detach(), t.detach()]) for t in one.parameters())
+        Scene(GaussianField(means, cholesky, colors, size=one.size)).save("batch.safetensors")
+        assert json.loads(kcgs("info", "batch.safetensors", "--json", capsys=capsys)[1])["images"] == 2
+        for arguments in (("render", "batch.safetensors", "-o", "a.png"), ("eval", "batch.safetensors", "photo.png")):
+            code, _, err = kcgs(*arguments, capsys=capsys)
+            assert code == 1 and err.startswith("kcgs: SCENE must be of one image; got a batch of 2")
 
     @pytest.mark.parametrize(
         ("arguments", "code", "words"),

@@ -103,7 +103,7 @@ class TestSettings:
         whole = fit(image, labels, 5, recipe=FitConfig.from_recipe("paper", softness=0.7), iterations=7)
         assert named.config == whole.config == FitConfig.from_recipe("paper", iterations=7, softness=0.7)
         assert torch.equal(named.scene.field.means, whole.scene.field.means)
-        with pytest.raises(ValueError, match="iteration: Extra inputs are not permitted"):
+        with pytest.raises(ValueError, match="^unknown setting 'iteration': did you mean iterations\\?$"):
             fit(image, labels, 5, iteration=7)
         with pytest.raises(TypeError, match="recipe must be a name or a FitConfig; got dict"):
             fit(image, labels, 5, recipe={})  # type: ignore[arg-type]
@@ -117,6 +117,21 @@ class TestSettings:
         for given in (pixels.numpy(), pixels.numpy().astype("float32") / 255, Image.fromarray(pixels.numpy())):
             got = fit(given, labels, 5, recipe=quick(iterations=5)).scene.field
             assert torch.equal(got.means, want.means) and torch.equal(got.colors, want.colors)
+
+    @pytest.mark.parametrize("kind", ["bool", "array", "one of a batch", "RegionMap of one"])
+    def test_kinds_of_label_maps(self, kind: str) -> None:
+        image, labels = disc()
+        given = {
+            "bool": labels.bool(),
+            "array": labels.bool().numpy(),
+            "one of a batch": labels[None],
+            "RegionMap of one": RegionMap.from_labels(labels[None], {(0, 1): 0.5}),
+        }[kind]
+        softness = 0.5 if kind.startswith("Region") else 0.0
+        recipe = quick(softness=softness, iterations=5)
+        want, got = (fit(image[None], regions, 5, recipe=recipe).scene for regions in (labels, given))
+        assert torch.equal(got.field.means, want.field.means)
+        assert torch.equal(got.regions.labels, labels)  # type: ignore[union-attr]
 
 
 class TestImageGS:
@@ -272,11 +287,11 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("settings", "words"),
         [
-            ({"iteration": 5}, "iteration: Extra inputs are not permitted; got 5"),
+            ({"speed": 5}, "^unknown setting 'speed': there are guidance, .*, target_psnr$"),
             ({"iterations": 0}, "iterations: .* greater than or equal to 1; got 0"),
             ({"loss": "l3"}, "loss: .*'l1', 'l2' or .*; got 'l3'"),
             ({"max_seconds": math.inf}, "max_seconds: .*finite"),
-            ({"backend": "gpu"}, "backend must be one of"),
+            ({"backend": "gpu"}, "^backend must be one of auto, [^;]*; got 'gpu'$"),
         ],
     )
     def test_bad_settings(self, settings: dict[str, object], words: str) -> None:

@@ -102,7 +102,7 @@ class TestField:
     @pytest.mark.parametrize(
         ("change", "error", "words"),
         [
-            ({"means": torch.zeros(3, 2)}, ValueError, "cholesky must have shape"),
+            ({"means": torch.zeros(3, 2)}, ValueError, r"cholesky must have shape \(3, 3\); got \(2, 3\)"),
             ({"cholesky": torch.zeros(2, 3)}, ValueError, "l11 > 0"),
             ({"colors": torch.zeros(2)}, ValueError, "colors must have 2 or 3 dimensions"),
             ({"region_ids": torch.tensor([0, -3])}, ValueError, "non-negative; got -3"),

@@ -356,7 +356,7 @@ class TestBadInput:
 
     def test_batch(self) -> None:
         batch = GaussianField(torch.rand(2, 3, 2), torch.ones(2, 3, 3), torch.rand(2, 3, 3), size=(8, 8))
-        with pytest.raises(ValueError, match="scene must not be batched"):
+        with pytest.raises(ValueError, match="scene must be of one image; got a batch of"):
             scene_decoder(Scene(batch))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -206,6 +207,13 @@ class TestRecolor:
         values = RegionSplatRenderer(backend=backend)(scene)[:, regions.labels == BOX]
         torch.testing.assert_close(values, torch.full_like(values, 0.7), rtol=0, atol=2e-6)
 
+    def test_lists_and_arrays_are_tensors(self) -> None:
+        scene, gain = scene_of(MAPS["hard"]()), [1.4, 1.0, 0.6]
+        want = recolor_region(scene, BOX, torch.tensor(gain), torch.tensor(gain))().detach()
+        for given in (gain, tuple(gain), np.array(gain), torch.diag(torch.tensor(gain)).tolist()):
+            got = recolor_region(scene, BOX, given, gain)().detach()
+            torch.testing.assert_close(got, want)
+
     def test_without_bias_no_gaussian_is_added(self) -> None:
         scene = scene_of(MAPS["hard"]())
         again = recolor_region(scene, BOX, 1.0)
@@ -297,7 +305,8 @@ class TestErrors:
         [
             (lambda s: move_region(s, 2, (1, 0)), ValueError, "among the 3 ids of the map, 1, 4, 9; got 2"),
             (lambda s: move_region(s, BOX, (0.5, 0)), ValueError, "whole multiples of 1 pixel"),
-            (lambda s: move_region(s, BOX, (float("nan"), 0)), ValueError, "whole multiples of 1 pixel"),
+            (lambda s: move_region(s, BOX, (float("nan"), 0)), ValueError, "offset must be finite; got nan"),
+            (lambda s: move_region(s, BOX, 5), TypeError, r"offset must be \(dx, dy\) in pixels; got 5"),
             (lambda s: move_region(s, BOX, (1,)), ValueError, r"offset must be \(dx, dy\)"),
             (lambda s: delete_region(resized(s), BOX), ValueError, r"one map of the size \(48, 64\)"),
             (lambda s: delete_region(s, [BOX, DISC, GROUND]), ValueError, "leave a region .*got all 3"),
@@ -308,6 +317,7 @@ class TestErrors:
             (lambda s: recolor_region(s, 77, 0.5), ValueError, r"ids of the Gaussians, 1, 4, 9; got 77"),
             (lambda s: recolor_region(s, BOX, torch.ones(2)), ValueError, r"gain must have shape .*got \(2,\)"),
             (lambda s: recolor_region(s, BOX, "red"), TypeError, "gain must be a number"),
+            (lambda s: recolor_region(s, BOX, [1.0, "a", 0.0]), TypeError, "gain must hold numbers; got"),
             (lambda s: recolor_region(s, BOX, 1.0, torch.eye(3)), ValueError, "bias must have shape"),
             (lambda s: render_region(s, BOX, (0, 4)), ValueError, "size must be at least 1 x 1"),
             (lambda s: render_region(Scene(GaussianField.random(3, SIZE), s.regions), BOX), ValueError, "region ids"),
@@ -325,7 +335,7 @@ class TestErrors:
     def test_batched(self) -> None:
         two = [torch.ones(2, 5, n) for n in (2, 3, 3)]
         field = GaussianField(*two, torch.zeros(2, 5, dtype=torch.long), size=SIZE)
-        with pytest.raises(ValueError, match="scene must not be batched"):
+        with pytest.raises(ValueError, match="scene must be of one image; got a batch of"):
             recolor_region(Scene(field), 0, 0.5)
 
     def test_resized_soft_map(self) -> None:

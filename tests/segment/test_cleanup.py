@@ -41,7 +41,7 @@ def pieces_by_flooding(labels: Tensor) -> list[list[int]]:
 
 BAD_LABELS: list[tuple[Any, type[Exception]]] = [
     (torch.zeros(3, 3), TypeError),
-    (np.zeros((3, 3), int), TypeError),
+    (np.zeros((3, 3)), TypeError),
     (torch.zeros(1, 3, 3, dtype=torch.int64), ValueError),
     (torch.zeros(0, 3, dtype=torch.int64), ValueError),
     (torch.tensor([[0, -1]]), ValueError),
@@ -55,6 +55,18 @@ class TestConnectedRegions:
         result = connected_regions(labels)
         assert result.dtype == torch.int64
         assert result.tolist() == pieces_by_flooding(labels)
+
+    def test_masks_and_arrays_are_maps(self) -> None:
+        labels, image = (torch.arange(40) >= 30).expand(20, 40), torch.rand(3, 20, 40)
+        for step in (
+            connected_regions,
+            order_by_area,
+            lambda m: merge_small(m, 3),
+            lambda m: merge_similar(image, m, 1),
+            lambda m: merge_similar(image, m, None),
+            lambda m: snap_contours(image, m, reach=2),
+        ):
+            assert torch.equal(step(labels.numpy()), step(labels.long()))
 
     def test_diagonal_pixels_are_apart(self) -> None:
         assert connected_regions(torch.tensor([[0, 1], [1, 0]])).tolist() == [[0, 1], [2, 3]]
