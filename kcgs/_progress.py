@@ -22,8 +22,8 @@ class Progress:
         shown: False: show nothing.
     """
 
-    # of the next line: pieces of work that are short one by one are long together
-    _due = math.inf
+    # of the next line: pieces of work that are short one by one, and follow each other, are long together
+    _due = -math.inf
 
     def __init__(self, name: str, *, known: bool = True, shown: bool = True) -> None:
         self.name, self._known, self._shown = name, known, shown
@@ -53,11 +53,16 @@ class Progress:
             self._bar.add_task(self.name, total=1.0 if self._known else None, note="")
             self._bar.start()
         else:
-            if Progress._due == math.inf:
+            if self._start > Progress._due + _LINE_SECONDS:
                 Progress._due = self._start + _LINE_SECONDS
             # a thread: much of the work, such as compiling, calls nobody back
             threading.Thread(target=self._say_so_often, args=(sys.stderr,), daemon=True).start()
         return self
+
+    @staticmethod
+    def forget() -> None:
+        """Have the next piece of work be the first: its first line is due ten seconds after it began."""
+        Progress._due = -math.inf
 
     def __exit__(self, *error: object) -> None:
         self._over.set()

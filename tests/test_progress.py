@@ -20,7 +20,7 @@ IMAGE = torch.linspace(0.0, 1.0, 48).expand(3, 32, 48)
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have a line every twentieth of a second."""
     monkeypatch.setattr(_progress, "_LINE_SECONDS", 0.05)
-    monkeypatch.setattr(Progress, "_due", float("inf"))
+    Progress.forget()
 
 
 def test_lines_elsewhere(often: None, capsys: pytest.CaptureFixture[str]) -> None:
@@ -36,6 +36,19 @@ def test_many_short_pieces_are_long_together(often: None, capsys: pytest.Capture
             time.sleep(0.02)
     lines = capsys.readouterr().err.splitlines()
     assert 2 <= len(lines) <= 5 and all(line.startswith("kcgs: piece ") and "%" not in line for line in lines)
+
+
+def test_what_was_long_ago_is_not_the_same_work(
+    often: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Progress("long"):
+        time.sleep(0.12)
+    monkeypatch.setattr(_progress, "_LINE_SECONDS", 0.2)
+    for wait in (time.sleep, lambda _: Progress.forget()):
+        wait(0.45)
+        with Progress("quick"):
+            time.sleep(0.05)
+    assert "long" in (err := capsys.readouterr().err) and "quick" not in err
 
 
 def test_not_shown(often: None, capsys: pytest.CaptureFixture[str]) -> None:

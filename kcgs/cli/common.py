@@ -15,6 +15,7 @@ import typer
 
 from kcgs import _interrupts
 from kcgs._atomic import atomic_path, check_writable
+from kcgs._progress import Progress
 
 # typer may have click or a copy of it
 _UsageError: Any = typer.BadParameter.__mro__[1]
@@ -28,6 +29,7 @@ class _Commands(typer.core.TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """Run a command."""
         with _interrupts.raised() as came:
+            Progress.forget()
             try:
                 return super().invoke(ctx)
             except BrokenPipeError as error:
@@ -75,19 +77,28 @@ def _options(
     """Take options that come before a command."""
 
 
-IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+OUTPUT_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+# the files of a folder that are images; a file that is named is tried whatever it is called
+IMAGES = (*OUTPUT_IMAGES, ".gif")
 
 
 def _scene_path(text: str) -> Path:
+    from kcgs.scene import FORMATS
     from kcgs.zoo import PREFIX, find
 
-    return find(text) if text.startswith(PREFIX) else Path(text)
+    try:
+        path = find(text) if text.startswith(PREFIX) else Path(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    if path.suffix not in FORMATS:
+        raise typer.BadParameter(f"it must end in {' or '.join(FORMATS)}, or be {PREFIX}NAME; got {text!r}")
+    return path
 
 
 SceneFile = Annotated[
     Path, typer.Argument(help="Scene file (.safetensors or .kcgs), or zoo:NAME.", metavar="SCENE", parser=_scene_path)
 ]
-ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE")]
+ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE", dir_okay=False)]
 
 
 def _hush(wanted: bool) -> bool:
@@ -104,7 +115,7 @@ Json = Annotated[bool, typer.Option("--json", callback=_hush, help="Print one JS
 def check_output(path: Path, *suffixes: str, option: str = "--output") -> None:
     """Refuse an output that cannot be written, before the work, not after it."""
     # scenes are written by their exact suffix, images in any case
-    suffix = path.suffix.lower() if path.suffix.lower() in IMAGES else path.suffix
+    suffix = path.suffix.lower() if path.suffix.lower() in OUTPUT_IMAGES else path.suffix
     if suffix not in suffixes:
         raise ValueError(f"{option} must end in {' or '.join(suffixes)}; got {str(path)!r}")
     check_writable(option, path)

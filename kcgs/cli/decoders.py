@@ -28,21 +28,26 @@ def export(
     interactive: Annotated[
         bool, typer.Option("--interactive", help="With inputs for the part that is rendered and for regions to hide.")
     ] = False,
+    hard_contours: Annotated[
+        bool, typer.Option("--hard-contours", help="Give each pixel to its label alone, whatever the contours' widths.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Write a scene's decoder as ONNX: it needs no torch and no kcgs."""
-    from kcgs import load
+    from kcgs import Scene, load
     from kcgs.onnx import describe_decoder, generic_decoder, scene_decoder, write_model
 
     check_output(output, ".onnx")
     loaded = load(scene)
+    if hard_contours and loaded.regions is not None:
+        loaded = Scene(loaded.field, loaded.regions.labels, loaded.metadata)
     if kind == "generic":
         if interactive or precision == "fp16":
             raise typer.BadParameter("--interactive and --precision are for --kind scene")
         regions = loaded.regions
         if regions is not None and regions.num_regions > 1 and (regions.softness != 0.0 or regions.supersample > 1):
-            hint = "leave --kind out, or make them hard in Python with Scene(scene.field, scene.regions.labels)"
-            raise ValueError(f"--kind generic renders hard contours; this scene's are soft or finer: {hint}")
+            why = "a generic decoder renders hard contours, and this scene's are soft or finer"
+            raise ValueError(f"--kind must be scene, or come with --hard-contours: {why}")
         model = generic_decoder(cutoff=cutoff, clamp=clamp)
     else:
         model = scene_decoder(loaded, cutoff=cutoff, clamp=clamp, precision=precision, interactive=interactive)

@@ -81,7 +81,9 @@ def fit_command(
         if plot is not None:
             save_figure(history_figure({request.recipe: result.history}), plot)
         report = report_fit(fitted, target, labels, output, request)
-    title = f"{output}: {len(fitted.scene)} Gaussians, stopped by {result.stop_reason}"
+    reason = report["stop_reason"]
+    ended = reason if reason == "interrupted" else f"stopped by {reason}"
+    title = f"{output}: {len(fitted.scene)} Gaussians, {ended}"
     if result.removed:
         title += f"; {result.removed} useless ones removed, which changed no value by more than {result.change:.1g}"
     became = result.regions
@@ -173,6 +175,8 @@ def read_regions(regions: str, image: Tensor, *, progress: bool = False) -> Tens
     from kcgs.data import load_labels
     from kcgs.functional import edge_alignment
 
+    if not Path(regions).is_file():
+        raise FileNotFoundError(f"--regions must be auto, none or the file of a label map; no such file: {regions}")
     labels = load_labels(Path(regions))
     # the fit refuses one of another size
     alignment = float(edge_alignment(image, labels)) if labels.shape == image.shape[1:] else 1.0
@@ -220,7 +224,9 @@ def report_fit(
 ) -> dict[str, Any]:
     """Measure what was written of a fit, and say how the fit ended."""
     report = measure_scene(fitted.scene, image, labels, output, fitted.num_bytes, fitted.result.seconds)
-    report |= {"total_seconds": time.perf_counter() - request.clock.began, "stop_reason": fitted.result.stop_reason}
+    # the only callback of a command is Ctrl-C's
+    reason = "interrupted" if fitted.result.stop_reason == "callback" else fitted.result.stop_reason
+    report |= {"total_seconds": time.perf_counter() - request.clock.began, "stop_reason": reason}
     goals = request.config.target_psnr, request.target_bytes, request.clock.seconds
     return report | {"target_reached": None if goals == (None, None, None) else not describe_miss(report, request)}
 
@@ -231,7 +237,7 @@ def describe_miss(report: Mapping[str, Any], request: options.FitRequest) -> str
     # the file counts, not what it was rounded from
     if target is not None and report["psnr"] < target:
         most = request.num_gaussians or options.DEFAULT_GAUSSIANS
-        ends = {"seconds": "the time was over", "callback": "it was interrupted", "diverged": "the fit diverged"}
+        ends = {"seconds": "the time was over", "interrupted": "it was interrupted", "diverged": "the fit diverged"}
         why = ends.get(report["stop_reason"], f"{most} Gaussians do not reach it, -n allows more")
         missed.append(f"--target-psnr {target:g} was not reached: {report['psnr']:.2f} dB is the best; {why}")
     if seconds is not None and report["total_seconds"] > seconds:

@@ -139,23 +139,30 @@ def _text(value: Any) -> str:
 
 
 def _expand(patterns: list[str]) -> list[Path]:
-    """Return the images that patterns mean, as absolute paths, each once; two with one stem are refused."""
+    """Return the images that patterns mean, as absolute paths, each once; those that share a stem are refused."""
     images: dict[Path, None] = {}
+    others = 0
     for pattern in patterns:
         path = Path(pattern)
         if path.is_file():
             found = [path]
         else:
             names = path.iterdir() if path.is_dir() else map(Path, glob.glob(pattern, recursive=True))
-            found = sorted(name for name in names if name.suffix.lower() in IMAGES and name.is_file())
+            files = [name for name in names if name.is_file()]
+            found = sorted(name for name in files if name.suffix.lower() in IMAGES)
+            others += len(files) - len(found)
         if not found:
-            raise ValueError(f"PATTERN must name images; nothing found for {pattern!r}")
+            raise FileNotFoundError(f"PATTERN must name images; nothing found for {pattern!r}")
         images |= dict.fromkeys(name.absolute() for name in found)
-    by_stem: dict[str, Path] = {}
+    by_stem: dict[str, list[str]] = {}
     for image in images:
-        other = by_stem.setdefault(image.stem, image)
-        if other != image:
-            raise ValueError(f"images must have different stems, after which scenes are named; got {other} and {image}")
+        by_stem.setdefault(image.stem, []).append(str(image))
+    if clashes := [" and ".join(paths) for paths in by_stem.values() if len(paths) > 1]:
+        raise ValueError(
+            f"PATTERN must name images of different stems, after which scenes are named; got {'; '.join(clashes)}"
+        )
+    if others:
+        typer.echo(f"kcgs: {others} {'files' if others > 1 else 'file'} of other kinds skipped", err=True)
     return list(images)
 
 
@@ -164,7 +171,7 @@ def _masks(folder: Path) -> dict[str, tuple[Path, ...]]:
         raise ValueError(f"--regions must be auto, none or a folder of masks; got {str(folder)!r}")
     found: dict[str, tuple[Path, ...]] = {}
     for path in sorted(folder.absolute().iterdir()):
-        if path.suffix.lower() in (*IMAGES, ".npy", ".gif"):
+        if path.suffix.lower() in (*IMAGES, ".npy"):
             found[path.stem] = (*found.get(path.stem, ()), path)
     return found
 
@@ -196,7 +203,9 @@ def _write_down(
                 told = f"{count} of {len(images)}" + (f", {len(failed)} failed" if failed else "")
                 progress.update(count / len(images), told)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"{count} of {len(images)} images are done; the same command goes on") from None
+            failures = f", {len(failed)} failed" if failed else ""
+            told = f"{count - len(failed)} of {len(images)} images are done{failures}"
+            raise KeyboardInterrupt(f"{told}; the same command goes on") from None
     return kept, failed
 
 

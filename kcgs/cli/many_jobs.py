@@ -77,6 +77,10 @@ def _measure(order: Order, fit: str | None) -> dict[str, Any]:
         report = measure_scene(load(order.output), image, labels, order.output, order.output.stat().st_size, math.nan)
         target = order.request.config.target_psnr
         return {**report, "stop_reason": "", "target_reached": None if target is None else report["psnr"] >= target}
+    pixels = image[0].numel()
+    if (request.num_gaussians or 0) > pixels:
+        warnings.warn(f"{pixels} Gaussians in place of {request.num_gaussians}: it has no more pixels", stacklevel=2)
+        request = request._replace(num_gaussians=pixels)
     fitted = fit_into(order.output, image, labels, request, notes={_NOTE: fit})
     became = fitted.result.regions
     if order.masks and became is not None and became.kept == 1 < became.given and became.dropped != "recipe":

@@ -9,7 +9,7 @@ import typer
 
 from kcgs._progress import Progress
 
-from .common import IMAGES, ImageFile, Json, Quiet, SceneFile, app, check_output, print_report, write_file
+from .common import OUTPUT_IMAGES, ImageFile, Json, Quiet, SceneFile, app, check_output, print_report, write_file
 from .fit import describe_size, measure_scene
 from .options import Scale, Size, exclude, target_size
 
@@ -30,7 +30,7 @@ def render(
     from kcgs.editing import extract_region
     from kcgs.scene import check_unbatched
 
-    check_output(output, *IMAGES)
+    check_output(output, *OUTPUT_IMAGES)
     loaded = check_unbatched(load(scene))
     target = target_size(loaded, scale, size)
     if region is not None:
@@ -45,8 +45,10 @@ def eval_command(
     scene: SceneFile,
     image: ImageFile,
     regions: Annotated[
-        str | None,
-        typer.Option(metavar="MASK", help="Label map whose contours EF-PSNR looks at; default: the scene's."),
+        Path | None,
+        typer.Option(
+            metavar="MASK", help="Label map whose contours EF-PSNR looks at; default: the scene's.", dir_okay=False
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -60,7 +62,7 @@ def eval_command(
         raise ValueError(f"IMAGE must have the size {loaded.size} of SCENE; got {tuple(target.shape[1:])}")
     labels = loaded.regions.labels if loaded.regions is not None else None
     if regions is not None:
-        labels = load_labels(Path(regions))
+        labels = load_labels(regions)
     print_report(measure_scene(loaded, target, labels, scene, scene.stat().st_size), as_json, str(scene))
 
 
@@ -98,7 +100,9 @@ def encode(
     ] = None,
     image: Annotated[
         Path | None,
-        typer.Option(help="The image that the scene shows: Gaussians then make up for each other's rounding."),
+        typer.Option(
+            help="The image that the scene shows: Gaussians then make up for each other's rounding.", dir_okay=False
+        ),
     ] = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -136,7 +140,7 @@ def encode(
 
 @app.command()
 def decode(
-    file: Annotated[Path, typer.Argument(help="Compressed file (.kcgs).", metavar="FILE")],
+    file: Annotated[Path, typer.Argument(help="Compressed file (.kcgs).", metavar="FILE", dir_okay=False)],
     output: OutputImage,
     num_bytes: Annotated[int | None, typer.Option("--bytes", min=1, help="Read only the first bytes.")] = None,
     scale: Scale = None,
@@ -146,7 +150,7 @@ def decode(
     from kcgs import codec
     from kcgs.data import save_image
 
-    check_output(output, *IMAGES)
+    check_output(output, *OUTPUT_IMAGES)
     try:
         decoded = codec.decode(file.read_bytes(), max_bytes=num_bytes)
     except codec.CodecError as error:

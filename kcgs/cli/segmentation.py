@@ -10,7 +10,7 @@ import typer
 
 from kcgs._progress import Progress
 
-from .common import IMAGES, ImageFile, Json, Quiet, app, check_output, print_report, print_table
+from .common import OUTPUT_IMAGES, ImageFile, Json, Quiet, app, check_output, print_report, print_table
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -67,7 +67,7 @@ def segment(
 
     check_output(output, ".png", ".npy")
     if overlay is not None:
-        check_output(overlay, *IMAGES, option="--overlay")
+        check_output(overlay, *OUTPUT_IMAGES, option="--overlay")
     options = _parse_options(option or [])
     if max_regions is not None:
         options["max_regions"] = max_regions

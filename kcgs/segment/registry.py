@@ -136,7 +136,7 @@ class _Method:
         for option in options:
             if option not in self.signature.parameters:
                 known = describe_options(self.name)
-                raise TypeError(f"segmentation method {self.name!r} has no option {option!r}; it takes {known}")
+                raise TypeError(f"option must be one of the method {self.name!r}, {known}; got {option!r}")
         cleanup = replace(self.cleanup, **{key: options.pop(key) for key in _CLEANUP if key in options})
         pixels = check_segment_image(image)
         cleanup = replace(cleanup, min_size=cleanup.smallest(pixels[0].numel()))

@@ -228,7 +228,8 @@ class TestFit:
         out, err = process.communicate(timeout=60)
         assert process.returncode == 130, err
         assert b"kcgs: interrupted: saved the best so far to scene.safetensors" in err
-        assert 1 <= json.loads(out)["num_gaussians"] <= 12
+        report = json.loads(out)
+        assert 1 <= report["num_gaussians"] <= 12 and report["stop_reason"] == "interrupted"
         assert 1 <= len(load(files / "scene.safetensors").field) <= 12
 
 
@@ -256,12 +257,12 @@ class TestRender:
         assert json.loads(kcgs("info", "batch.safetensors", "--json", capsys=capsys)[1])["images"] == 2
         for arguments in (("render", "batch.safetensors", "-o", "a.png"), ("eval", "batch.safetensors", "photo.png")):
             code, _, err = kcgs(*arguments, capsys=capsys)
-            assert code == 1 and err.startswith("kcgs: SCENE must be of one image; got a batch of 2")
+            assert code == 2 and err.startswith("kcgs: SCENE must be of one image; got a batch of 2")
 
     @pytest.mark.parametrize(
         ("arguments", "code", "words"),
         [
-            (("--region", "9"), 1, "--region must be among the 2 ids of the map, 0, 1; got 9"),
+            (("--region", "9"), 2, "--region must be among the 2 ids of the map, 0, 1; got 9"),
             (("--size", "90"), 2, "--size must be WxH"),
             (("--size", "0x5"), 2, "--size must be WxH"),
             (("--scale", "-1"), 2, "--scale must be positive"),
@@ -297,31 +298,37 @@ class TestFailures:
             (("fit", "photo.png", "--backend", "gpu"), 2, "'gpu' is not one of"),
             (("fit", "nothing.png"), 1, "nothing.png"),
             (("fit", "text.png"), 1, "text.png"),
-            (("fit", "photo.png", "--recipe", "none-such"), 1, "--recipe must be one of"),
+            (("fit", "photo.png", "--recipe", "none-such"), 2, "--recipe must be one of"),
             (("fit", "photo.png", "--resume"), 2, "--resume needs --checkpoint"),
-            (("fit", "photo.png", "--plot", "plot.txt"), 1, "--plot must end in .png"),
-            (("bench", "render", "-o", "out", "--only", "speed"), 1, "does not take only"),
-            (("fit", "photo.png", "--regions", "nothing.png"), 1, "nothing.png"),
-            (("fit", "photo.png", "--regions", "small.png"), 1, "--regions must be one map of the image's size"),
-            (("fit", "photo.png", "-o", "scene.pt"), 1, "must end in .safetensors"),
-            (("fit", "photo.png", "-o", "scene.KCGS"), 1, "must end in .safetensors"),
+            (("fit", "photo.png", "--plot", "plot.txt"), 2, "--plot must end in .png"),
+            (("bench", "render", "-o", "out", "--only", "speed"), 2, "--only must not be given to render"),
+            (("fit", "photo.png", "--regions", "nothing.png"), 1, "--regions must be auto, none or the file of a"),
+            (("fit", "photo.png", "--regions", "small.png"), 2, "--regions must be one map of the image's size"),
+            (("fit", "photo.png", "-o", "scene.pt"), 2, "must end in .safetensors"),
+            (("fit", "photo.png", "-o", "scene.KCGS"), 2, "must end in .safetensors"),
             (("fit", "photo.png", "-o", "nowhere/scene.safetensors"), 1, "needs an existing folder"),
-            (("fit", "photo.png", "--max-seconds", "-1"), 1, "--max-seconds"),
-            (("info", "text.png"), 1, "text.png"),
-            (("bench", "none-such", "-o", "out"), 1, "NAME must be one of "),
-            (("segment", "photo.png", "-o", "a.png", "--method", "magic"), 1, "--method must be one of"),
+            (("fit", "photo.png", "--max-seconds", "-1"), 2, "--max-seconds: Input should be greater than 0"),
+            (("fit", "photo.png", "--target-psnr", "-3"), 2, "--target-psnr: Input should be greater than 0"),
+            (("fit", "folder"), 2, "'IMAGE': file 'folder' is a directory"),
+            (("info", "text.png"), 2, "'SCENE': it must end in .safetensors or .kcgs, or be zoo:NAME; got 'text.png'"),
+            (("info", "nothing.kcgs"), 1, "kcgs: no such file: nothing.kcgs"),
+            (("decode", "nothing.kcgs", "-o", "a.png"), 1, "kcgs: no such file: nothing.kcgs"),
+            (("encode", "zoo:chart-pie", "-o", "a.kcgs", "--quality", "500"), 2, "--quality must be in [10, 90]"),
+            (("bench", "none-such", "-o", "out"), 2, "NAME must be one of "),
+            (("segment", "photo.png", "-o", "a.png", "--method", "magic"), 2, "--method must be one of"),
         ],
     )
     def test_one_line_and_an_exit_code(
         self, files: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], code: int, words: str
     ) -> None:
         Path("text.png").write_text("this is no image")
+        Path("folder").mkdir()
         save_labels("small.png", torch.zeros(4, 4, dtype=torch.long))
         before = sorted(p.name for p in files.iterdir())
         got, out, err = kcgs(*arguments, capsys=capsys)
         assert got == code
         assert words in " ".join((out + err).replace("│", " ").split())
-        if code == 1:
+        if code == 1 or err.startswith("kcgs: "):
             assert err.startswith("kcgs: ") and err.count("\n") == 1
         assert sorted(p.name for p in files.iterdir()) == before
 

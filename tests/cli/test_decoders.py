@@ -64,7 +64,7 @@ class TestExport:
         ("arguments", "words"),
         [
             (["-o", "decoder.txt"], "--output must end in .onnx"),
-            (["-o", "decoder.onnx", "--cutoff", "3"], "cutoff must"),
+            (["-o", "decoder.onnx", "--cutoff", "3"], "--cutoff must"),
         ],
     )
     def test_errors(
@@ -76,19 +76,22 @@ class TestExport:
         words: str,
     ) -> None:
         monkeypatch.chdir(scene.parent)
-        assert run(monkeypatch, "export", str(scene), *arguments) == 1
+        assert run(monkeypatch, "export", str(scene), *arguments) == 2
         assert words in capsys.readouterr().err
         assert not list(scene.parent.glob("decoder*"))
 
     def test_generic_for_a_soft_scene(
         self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: Path
     ) -> None:
-        assert run(monkeypatch, "export", str(scene), "-o", str(scene.with_name("g.onnx")), "--kind", "generic") == 1
+        out = scene.with_name("g.onnx")
+        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic") == 2
         said = capsys.readouterr().err
-        assert "soft or finer" in said and "Scene(scene.field, scene.regions.labels)" in said
+        assert "soft or finer" in said and "--hard-contours" in said and not out.exists()
+        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic", "--hard-contours") == 0
+        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--hard-contours") == 0
+        (image,) = onnxruntime.InferenceSession(str(out)).run(None, {"size": np.array([32, 48])})
         soft = load(scene)
-        Scene(soft.field, soft.regions.labels).save(scene)
-        assert run(monkeypatch, "export", str(scene), "-o", str(scene.with_name("g.onnx")), "--kind", "generic") == 0
+        assert np.abs(image[0] - Scene(soft.field, soft.regions.labels).render().numpy()).max() < 1e-4
 
     def test_truncated_scene(
         self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: Path

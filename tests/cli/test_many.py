@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 import torch
+from PIL import Image
 
 from kcgs import load
 from kcgs.cli import main, many_jobs
@@ -210,16 +211,28 @@ class TestFailures:
 
     def test_refused_before_the_work(self, files: Path, kcgs: Any) -> None:
         save_image("masks/d.jpg", torch.zeros(3, 20, 20))
-        for arguments, message in (
-            (("photos/nothing*",), "PATTERN must name images; nothing found for 'photos/nothing*'"),
-            (("photos/a.png", "masks/a.png"), "images must have different stems"),
-            (("photos", "--regions", "mask"), "--regions must be auto, none or a folder of masks; got 'mask'"),
-            (("photos", "--recipe", "worst"), "recipe must be one of"),
+        clashes = "; ".join(f"{files}/photos/{name}.png and {files}/masks/{name}.png" for name in "ab") + "\n"
+        for arguments, wanted, message in (
+            (("photos/nothing*",), 1, "PATTERN must name images; nothing found for 'photos/nothing*'"),
+            (("photos", "masks"), 2, clashes),
+            (("photos", "--regions", "mask"), 2, "--regions must be auto, none or a folder of masks; got 'mask'"),
+            (("photos", "--recipe", "worst"), 2, "recipe must be one of"),
         ):
             code, _, err = kcgs(*SETTINGS, *arguments)
-            assert code == 1 and message in err
+            assert code == wanted and message in err
         assert not (files / "out").exists()
         assert kcgs("photos", *SETTINGS, "--engine", "slurm")[0] == 2
+
+    def test_which_files_of_a_folder_are_images(self, files: Path, kcgs: Any) -> None:
+        frames = [Image.new("RGB", (20, 20), color) for color in ("red", "blue")]
+        frames[0].save("masks/anim.gif", save_all=True, append_images=frames[1:])
+        save_image("masks/dot.png", torch.rand(3, 1, 1))
+        for name in ("notes.txt", "map.npy"):
+            Path("masks", name).touch()
+        code, out, err = kcgs("masks", *SETTINGS, "--workers", "1", "--json")
+        assert code == 0 and json.loads(out)["fitted"] == 4 and rows()["dot"]["num_gaussians"] == "1", err
+        assert err.startswith("kcgs: 2 files of other kinds skipped\nanim.gif: ")
+        assert "dot.png: 1 Gaussians in place of 12: it has no more pixels\n" in err
 
     def test_the_same_image_twice_is_one(self, files: Path, kcgs: Any) -> None:
         code, out, _ = kcgs("photos/a.png", "photos/[ab].png", *SETTINGS, "--workers", "1", "--json")

@@ -128,13 +128,13 @@ class TestSegment:
     @pytest.mark.parametrize(
         ("arguments", "code", "words"),
         [
-            (("--method", "magic"), 1, "--method must be one of"),
-            (("--option", "colour=3"), 1, "colour"),
-            (("--option", "max_regions=many"), 1, "--max-regions must be an integer; got 'many'"),
+            (("--method", "magic"), 2, "--method must be one of"),
+            (("--option", "colour=3"), 2, "--option must be one of the method 'auto'"),
+            (("--option", "max_regions=many"), 2, "--max-regions must be an integer; got 'many'"),
             (("--option", "nonsense"), 2, "--option must be KEY=VALUE; got 'nonsense'"),
             (("--option", "a=1", "--option", "a=2"), 2, "--option a is given twice"),
             (("--max-regions", "0"), 2, "greater than or equal to 1"),
-            (("--overlay", "over.txt"), 1, "--overlay must end in .png"),
+            (("--overlay", "over.txt"), 2, "--overlay must end in .png"),
         ],
     )
     def test_errors(

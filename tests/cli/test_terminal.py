@@ -102,6 +102,13 @@ class TestCtrlC:
         assert (code, out) == (130, "")
         assert err == "kcgs: interrupted: 0 of 2 images are done; the same command goes on\n"
 
+    def test_after_one_of_many_has_failed(self, files: Path, run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(kcgs.cli.many_jobs, "_warm_up", lambda *_: None)
+        monkeypatch.setattr(kcgs.cli.many_jobs, "fit_into", press)
+        (files / "photos/a.png").write_bytes(b"no image")
+        code, out, err = run("fit-many", "photos", "-o", "out", "-n", "5", "--workers", "1")
+        assert err == "kcgs: interrupted: 0 of 2 images are done, 1 failed; the same command goes on\n"
+
     def test_workers_that_load_libraries_are_silent(self, files: Path) -> None:
         command = [sys.executable, "-m", "kcgs.cli", "fit-many", "photos", "-o", "out", "--workers", "2"]
         process = start(*command, start_new_session=True)

@@ -328,6 +328,6 @@ class TestOneCleanup:
                 segment(photo, method, snap=wrong)
 
     def test_unknown_option(self, tmp_path: Path) -> None:
-        message = "'onnx' has no option 'nams'; it takes model, kind='auto', .*, connected=True, max_regions=None$"
+        message = "the method 'onnx', model, kind='auto', .*, connected=True, max_regions=None; got 'nams'$"
         with pytest.raises(TypeError, match=message):
             segment(two_colors(), "onnx", model=tmp_path / "net.onnx", nams=["sky"])

@@ -64,7 +64,7 @@ def run(name: str, output: Path, *, redraw: bool = False, **settings: Any) -> No
     refused = [key for key in changed if key not in (*_ALWAYS, *found.takes)]
     if refused:
         takes = ", ".join((*_ALWAYS, *found.takes))
-        raise ValueError(f"{name} does not take {', '.join(refused)}; its options are {takes}")
+        raise ValueError(f"{refused[0]} must not be given to {name}, whose options are {takes}")
     if redraw:
         if found.report is None:
             raise ValueError(f"redraw is for experiments with a report; {name} has none")

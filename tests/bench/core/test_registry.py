@@ -22,12 +22,12 @@ def test_names() -> None:
 
 
 def test_wrong_questions(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="maps does not take seeds; its options are data, quick, engine"):
+    with pytest.raises(ValueError, match="seeds must not be given to maps, whose options are data, quick, engine"):
         kcgs.bench.run("maps", tmp_path / "out", seeds=2)
-    with pytest.raises(ValueError, match="rate does not take workers"):
+    with pytest.raises(ValueError, match="workers must not be given to rate"):
         kcgs.bench.run("rate", tmp_path / "out", workers=2)
     assert not (tmp_path / "out").exists()
-    with pytest.raises(ValueError, match="charts does not take sequences"):
+    with pytest.raises(ValueError, match="sequences must not be given to charts"):
         kcgs.bench.run("charts", tmp_path, quick=True, sequences="dog")
     with pytest.raises(ValueError, match="budget_seconds must be above 0; got -1"):
         kcgs.bench.run("davis", tmp_path, quick=True, budget_seconds=-1)
