@@ -21,7 +21,8 @@ def evaluate(scene: Scene, image: Any, labels: RegionMap | Tensor | NDArray[Any]
         scene: unbatched.
         image: of the scene's size and channels in [0, 1]: :math:`(C, H, W)`, a numpy array (H, W, C) of uint8 or
             floats, or a PIL image.
-        labels: the map whose contours the edge-focused figures look at; None: the scene's own.
+        labels: the map whose contours the edge-focused figures look at; None: the scene's own, which a fit may have
+            moved. The history of a fit and `kcgs fit` look at the map that was given: pass it for the same figures.
 
     Returns:
         By name: psnr (dB), ssim, ms_ssim, and within 5 pixels of the contours ef_psnr (dB) and ef_ssim. What is not

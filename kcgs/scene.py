@@ -126,6 +126,8 @@ class Scene(nn.Module):
 
     def __repr__(self) -> str:
         regions = "no regions" if self.regions is None else f"{self.regions.num_regions} regions"
+        if count := len(empty_regions(self)):
+            regions += f", {count} of them without a Gaussian"
         notes = f", metadata={self.metadata}" if self.metadata else ""
         return shorten(f"Scene({self.field.extra_repr()}, {regions}{notes})")
 
@@ -243,6 +245,14 @@ def _serialized(scene: Scene, format: Any) -> bytes:
         raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
     content: bytes = format.serialize(scene)
     return content
+
+
+def empty_regions(scene: Scene) -> Tensor:
+    """Return the ids of the map that no Gaussian has: these regions are black."""
+    regions, ids = scene.regions, scene.field.region_ids
+    if regions is None or ids is None or ids.is_meta:
+        return torch.empty(0, dtype=torch.int64)
+    return regions.ids[~torch.isin(regions.ids, ids)]
 
 
 def check_unbatched(scene: object) -> Scene:

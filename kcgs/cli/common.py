@@ -127,8 +127,8 @@ def write_file(path: Path, data: bytes) -> int:
         return temporary.write_bytes(data)
 
 
-def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
-    """Print a table, or one JSON object."""
+def print_report(report: dict[str, Any], as_json: bool, title: str, contours: str = "") -> None:
+    """Print a table, or one JSON object; the table says along which contours edge-focused figures were taken."""
     if as_json:
         clean = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in report.items()}
         typer.echo(json.dumps(clean))
@@ -140,6 +140,8 @@ def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
         if value is not None:
             text = f"{value:.4g}" if isinstance(value, float) else str(value)
             table.add_row(key, "not defined" if text == "nan" else text)
+        if key == "ef_ssim" and contours:
+            table.add_row("ef_psnr, ef_ssim", f"along the contours of {contours}")
     print_table(table)
 
 

@@ -89,7 +89,8 @@ def fit_command(
     became = result.regions
     if as_json:
         report["region_report"] = None if became is None else asdict(became)
-    print_report(report, as_json, title)
+    contours = {"none": "", "auto": "the regions found in the image, as found"}.get(regions, f"{regions}, as given")
+    print_report(report, as_json, title, contours)
     if became is not None and not as_json:
         typer.echo(f"regions: {became}")
     if stop.wanted:

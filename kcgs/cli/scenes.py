@@ -63,7 +63,8 @@ def eval_command(
     labels = loaded.regions.labels if loaded.regions is not None else None
     if regions is not None:
         labels = load_labels(regions)
-    print_report(measure_scene(loaded, target, labels, scene, scene.stat().st_size), as_json, str(scene))
+    contours = "" if labels is None else str(regions or "the scene")
+    print_report(measure_scene(loaded, target, labels, scene, scene.stat().st_size), as_json, str(scene), contours)
 
 
 @app.command()

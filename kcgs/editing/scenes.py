@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 
 import torch
@@ -22,9 +23,9 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
 
     Convention: pixels that they leave take the label of the nearest pixel of another region (Euclidean; of equal
     distances, the smallest id), and show what the Gaussians of that region paint there; pixels that leave the image
-    are lost. A region that is covered whole is no region any more, and its Gaussians are lost too. Where pairs of
-    regions have widths, the contour with a region that a moved one did not touch before takes the mean width of those
-    it had.
+    are lost. A region that is covered whole, or leaves the image, is no region any more: its Gaussians are lost too.
+    Where pairs of regions have widths, the contour with a region that a moved one did not touch before takes the mean
+    width of those it had.
 
     Args:
         scene: unbatched, with a map of its own size, not a resized one.
@@ -37,6 +38,9 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
     Raises:
         TypeError: wrong types.
         ValueError: a batch, no map or one of another size, an unknown id, all regions, an offset between labels.
+
+    Warns:
+        UserWarning: the ids of regions that are lost.
 
     Example:
         >>> labels = torch.tensor([[0, 7, 7, 0, 0, 0]])
@@ -55,6 +59,10 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
     source = torch.zeros_like(before)
     source[rows[1], cols[1]] = before[rows[0], cols[0]]
     labels[landed] = source[landed]
+
+    lost = regions.ids[~torch.isin(regions.ids, labels)].tolist()
+    if lost:
+        warnings.warn(f"regions {', '.join(map(str, lost))} are lost: covered, or out of the image", stacklevel=2)
 
     moved = scene.field.subset(torch.isin(ids_of(scene.field), labels))
     with torch.no_grad():
@@ -126,8 +134,9 @@ def delete_region(scene: Scene, region_ids: int | Iterable[int]) -> Scene:
 def extract_region(scene: Scene, region_ids: int | Iterable[int]) -> Scene:
     """Keep the Gaussians of some regions: the scene shows them where they were, and black elsewhere.
 
-    Arguments are those of :func:`move_region`; the map may be resized. :func:`render_region` gives regions with their
-    share of each pixel as alpha.
+    The map stays whole, so that contours stay as they were: `num_regions` counts the others too, and the scene's repr
+    says how many have no Gaussian. Arguments are those of :func:`move_region`; the map may be resized.
+    :func:`render_region` gives regions with their share of each pixel as alpha.
 
     Example:
         >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])

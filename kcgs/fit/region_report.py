@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 
 from kcgs.functional import RegionMap
-from kcgs.scene import Scene
+from kcgs.scene import Scene, empty_regions
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,8 @@ class RegionReport:
     """Pixels of the image that moved to another region."""
     empty: int = 0
     """Regions of the scene without a Gaussian: they are black."""
+    empty_pixels: int = 0
+    """Pixels of the image that are most of all theirs."""
 
     def __str__(self) -> str:
         if self.dropped is not None:
@@ -54,7 +56,7 @@ class RegionReport:
         if self.moved_pixels:
             parts.append(f"{self.moved_pixels} pixels moved to others")
         if self.empty:
-            parts.append(f"{self.empty} without a Gaussian, black")
+            parts.append(f"{self.empty} without a Gaussian, black: {self.empty_pixels} pixels")
         return "; ".join(parts)
 
 
@@ -71,13 +73,14 @@ def report_regions(
         return None
     if dropped is not None:
         return RegionReport(given.num_regions, 1, dropped=dropped)
-    regions, ids = scene.regions, scene.field.region_ids
+    regions, empty = scene.regions, empty_regions(scene)
     kept = 1 if regions is None else regions.num_regions
     return RegionReport(
         given.num_regions, kept, merged_for_count, merged_for_bytes,
         given.num_regions - kept - merged_for_count - merged_for_bytes,
         moved_pixels=0 if regions is None else _moved_pixels(given, regions),
-        empty=0 if regions is None or ids is None else int((~torch.isin(regions.ids, ids)).sum()),
+        empty=len(empty),
+        empty_pixels=int(torch.isin(regions.labels, empty).sum()) if regions is not None and len(empty) else 0,
     )  # fmt: skip
 
 

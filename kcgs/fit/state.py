@@ -26,7 +26,11 @@ StopReason = Literal["iterations", "seconds", "target_psnr", "callback", "diverg
 
 
 class HistoryEntry(NamedTuple):
-    """One point of the curve of error against run time."""
+    """One point of the curve of error against run time.
+
+    EF-PSNR is taken along the contours of the map that was given, wherever the fit moves them: those of the scene's map
+    are what :func:`kcgs.evaluate` looks at by default. NaN without contours.
+    """
 
     iteration: int
     seconds: float
@@ -42,6 +46,7 @@ class FitResult(NamedTuple):
     scene: Scene
     """Without regions where nothing is confined."""
     history: list[HistoryEntry]
+    """Its EF-PSNR is along the contours of the map that was given, not of the scene's; see :class:`HistoryEntry`."""
     stop_reason: StopReason
     config: FitConfig
     removed: int = 0

@@ -68,6 +68,10 @@ class TestFit:
         with Image.open("plot.png") as plot:
             assert plot.width > 500
         assert "\nregions: 2 of 2 regions kept\n" in out
+        assert "│ ef_psnr, ef_ssim │ along the contours of mask.png, as given" in out
+        for option, which in (((), "the scene"), (("--regions", "mask.png"), "mask.png")):
+            out = kcgs("eval", "scene.safetensors", "photo.png", *option, capsys=capsys)[1]
+            assert f"│ ef_psnr, ef_ssim │ along the contours of {which} " in out
         regions = load("scene.safetensors").regions
         assert regions is not None
         assert torch.equal(regions.labels, load_labels(Path("mask.png")))

@@ -231,8 +231,9 @@ class TestHardCases:
         with pytest.warns(UserWarning, match="11 of 16 regions get no Gaussian and stay black"):
             result = fit(image, labels, 5, recipe=quick(iterations=10, move_contours=False, merge_regions=False))
         assert len(result.scene.field) <= 5
-        assert result.regions == RegionReport(16, 16, empty=11)
-        assert str(result.regions) == "16 of 16 regions kept; 11 without a Gaussian, black"
+        assert result.regions == RegionReport(16, 16, empty=11, empty_pixels=11 * 12 * 16)
+        assert str(result.regions) == "16 of 16 regions kept; 11 without a Gaussian, black: 2112 pixels"
+        assert repr(result.scene).endswith("confined, 16 regions, 11 of them without a Gaussian)")
 
 
 class TestRegionReport:

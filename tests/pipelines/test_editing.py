@@ -132,6 +132,7 @@ class TestExtract:
         alone = extract_region(scene, DISC)
         torch.testing.assert_close(alone().detach(), rgba[:3] * rgba[3], rtol=0, atol=1e-5)
         assert alone.metadata == scene.metadata and set(ids_of(alone).tolist()) == {DISC}
+        assert map_of(alone).num_regions == 3 and "3 regions, 2 of them without a Gaussian" in repr(alone)
         both = extract_region(scene, [DISC, BOX])
         assert set(ids_of(both).tolist()) == {BOX, DISC}
 
@@ -176,8 +177,11 @@ class TestMove:
 
     def test_out_of_the_image(self) -> None:
         regions = MAPS["hard"]()
-        gone = move_region(scene_of(regions), BOX, (1000, 0))
+        with pytest.warns(UserWarning, match=f"regions {BOX} are lost: covered, or out of the image"):
+            gone = move_region(scene_of(regions), BOX, (1000, 0))
         assert map_of(gone).ids.tolist() == [GROUND, DISC]
+        with pytest.warns(UserWarning, match=f"regions {BOX}, {DISC} are lost"):
+            move_region(scene_of(regions), [BOX, DISC], (0, -1000))
         part = map_of(move_region(scene_of(regions), BOX, (-22, 0))).labels
         assert int((part == BOX).sum()) == 12 * 6
 
