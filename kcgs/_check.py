@@ -134,7 +134,9 @@ def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3)) -> Tens
 
     A numpy array is one too; False is 0 and True is 1.
     """
-    if isinstance(value, np.ndarray) and value.dtype.kind in "biu":
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind not in "biu":
+            raise TypeError(f"{name} must have an integer dtype; got {value.dtype}")
         value = torch.from_numpy(np.array(value, np.int64, order="C"))
     elif isinstance(value, Tensor) and value.dtype == torch.bool:
         value = value.long()

@@ -54,7 +54,7 @@ class TestCheckLabels:
         for given in (want.bool(), array, array.astype(bool), array.astype(np.uint16), array.astype(">i2")):
             labels = check_labels("labels", given)
             assert torch.equal(labels, want) and labels.dtype == torch.int64
-        with pytest.raises(TypeError, match="labels must be a Tensor; got ndarray"):
+        with pytest.raises(TypeError, match="labels must have an integer dtype; got float32"):
             check_labels("labels", array.astype(np.float32))
 
 
