@@ -40,7 +40,8 @@ class TestBoth:
         found = by_index(found)
         results, processes, threads = zip(*(done.result for done in found if done.result), strict=True)
         assert results == (0, 4, 6, 8, 10) and set(threads) == {3}
-        assert len(set(processes)) == (workers or 1) and (os.getpid() in processes) == (workers != 2)
+        # while one process starts, the other may do all
+        assert len(set(processes)) <= (workers or 1) and (os.getpid() in processes) == (workers != 2)
         assert [done.error is None for done in found] == [True, False, True, True, True, True]
         error = found[1].error
         assert error is not None and (error.type, error.message) == ("ValueError", "no 1\nplease")
