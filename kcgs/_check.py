@@ -64,15 +64,15 @@ def check_rows(name: str, value: Tensor, like: Tensor, last: int | str) -> None:
         raise ValueError(f"{name} must have at least one channel; got shape {tuple(value.shape)}")
 
 
-def check_ids(name: str, value: object, like: Tensor) -> Tensor:
-    """Return region ids as int64: integer, one for each centre of `like` (..., 2), on its device, none negative."""
+def check_ids(name: str, value: object, like: Tensor, values: bool = True) -> Tensor:
+    """Return region ids as int64: integer, one for each centre of `like` (..., 2), with `values` none negative."""
     tensor = check_integer(name, value)
     if tensor.shape != like.shape[:-1]:
         raise ValueError(f"{name} must have shape {tuple(like.shape[:-1])}; got {tuple(tensor.shape)}")
     if tensor.device != like.device:
         raise ValueError(f"{name} must be on {like.device} with means; got {tensor.device}")
     tensor = tensor.long()
-    if tensor.numel() and int(tensor.min()) < 0:
+    if values and tensor.numel() and int(tensor.min()) < 0:
         raise ValueError(f"{name} must be non-negative; got {int(tensor.min())}")
     return tensor
 
@@ -129,8 +129,8 @@ def check_cutoff(value: object) -> float:
     return float(value)
 
 
-def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3)) -> Tensor:
-    """Return a label map as int64: integer or bool, (H, W) or (B, H, W), at least one pixel, no negative id.
+def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values: bool = True) -> Tensor:
+    """Return a label map as int64: integer or bool, (H, W) or (B, H, W), at least one pixel; `values`: no negative id.
 
     A numpy array is one too; False is 0 and True is 1.
     """
@@ -144,7 +144,7 @@ def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3)) -> Tens
     if tensor.numel() == 0:
         raise ValueError(f"{name} must have at least one pixel; got shape {tuple(tensor.shape)}")
     tensor = tensor.long()
-    if int(tensor.min()) < 0:
+    if values and int(tensor.min()) < 0:
         raise ValueError(f"{name} must hold non-negative ids; got {int(tensor.min())}")
     return tensor
 

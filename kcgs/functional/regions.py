@@ -16,7 +16,8 @@ from kcgs._check import check_count, check_labels, check_size
 from kcgs.kernels import Membership, Resampled
 
 from .labels import compact, largest_share, sample_labels, touching_pairs
-from .softness import PairWidths, check_softness, merged_widths, scaled_widths
+from .map_tables import MapTables, keep_tables
+from .softness import PairWidths, check_softness, merged_widths, scaled_widths, widths_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +43,14 @@ class RegionMap:
     softness: float | PairWidths = 0.0
     supersample: int = 1  # k
     fine_labels: Tensor = field(repr=False, kw_only=True)  # (k * H, k * W) or (B, k * H, k * W) int64
-    membership: Membership = field(repr=False, kw_only=True)  # what the kernels evaluate
-    _table: Tensor | None = field(repr=False, kw_only=True)
+    tables: MapTables = field(repr=False, kw_only=True)
+    widths: Tensor | None = field(repr=False, kw_only=True)  # softness, as the operator takes it
     _origin: RegionMap | None = field(default=None, repr=False, kw_only=True)  # what this was resized from
+
+    def __post_init__(self) -> None:
+        """Keep the tables where the operator finds them."""
+        given = self.given
+        keep_tables(given.fine_labels, given.widths, given.supersample, self.size, self.tables)
 
     def __repr__(self) -> str:
         finer = "" if self.supersample == 1 else f", supersample={self.supersample}"
@@ -96,7 +102,9 @@ class RegionMap:
         coarse = index if supersample == 1 else largest_share(index, supersample)
         membership = Membership(coarse, len(ids), by_index, fine=None if supersample == 1 else index)
         shown = labels if supersample == 1 else ids[coarse if labels.ndim == 3 else coarse[0]]
-        return cls(shown, ids, width, supersample, fine_labels=labels, membership=membership, _table=table)
+        tables = MapTables(ids, table, membership)
+        widths = widths_of(width, labels.device)
+        return cls(shown, ids, width, supersample, fine_labels=labels, tables=tables, widths=widths)
 
     @classmethod
     def coerce(cls, value: object, name: str = "regions") -> RegionMap | None:
@@ -118,6 +126,16 @@ class RegionMap:
         return self.labels.shape[-2], self.labels.shape[-1]
 
     @property
+    def given(self) -> RegionMap:
+        """The map that this one was interpolated from; itself where it was not."""
+        return self if self._origin is None else self._origin
+
+    @property
+    def membership(self) -> Membership:
+        """What the kernels evaluate."""
+        return self.tables.membership
+
+    @property
     def index(self) -> Tensor:
         """Position of each pixel's label among `ids`, (B, H, W) int32, also for one map."""
         return self.membership.index
@@ -129,12 +147,7 @@ class RegionMap:
 
     def index_of(self, region_ids: Tensor) -> Tensor:
         """Return the position of each id among `ids`, -1 where the map does not hold it."""
-        if self._table is not None:
-            # not self._table[...]: that wakes torch's threads, which then spin beside the kernel's
-            places = region_ids.clamp(-1, len(self._table) - 1).flatten() % len(self._table)
-            return self._table.index_select(0, places).view(region_ids.shape)
-        places = torch.searchsorted(self.ids, region_ids.contiguous()).clamp_max(self.num_regions - 1)
-        return torch.where(self.ids[places] == region_ids, places, -1)
+        return self.tables.index_of(region_ids)
 
     def weights(self, region_ids: int | Iterable[int], dtype: torch.dtype = torch.float64) -> Tensor:
         r"""Evaluate the membership of a region at every pixel, or the sum over several.
@@ -312,11 +325,13 @@ class RegionMap:
             return self._origin.resize((height, width))
         k = self.supersample
         if self.softness == 0.0:
-            return RegionMap.from_labels(sample_labels(self.fine_labels, height, width, k), supersample=k)
+            sampled = RegionMap.from_labels(sample_labels(self.fine_labels, height, width, k), supersample=k)
+            return replace(sampled, tables=sampled.tables._replace(whole=False))
         labels = sample_labels(self.labels, height, width, 1)
         index = self.index_of(labels).to(torch.int32)
+        membership = Resampled(index if index.ndim == 3 else index[None], self.membership)
         return RegionMap(
             labels, self.ids, scaled_widths(self.softness, math.sqrt(height * width / (self.size[0] * self.size[1]))),
-            fine_labels=labels, membership=Resampled(index if index.ndim == 3 else index[None], self.membership),
-            _table=self._table, _origin=self,
+            fine_labels=labels, widths=self.widths, _origin=self,
+            tables=self.tables._replace(membership=membership),
         )  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterator, Mapping
 
+import torch
 from torch import Tensor
 
 from kcgs._check import check_number
@@ -82,3 +83,19 @@ def merged_widths(softness: float | PairWidths, find: Callable[[int], int]) -> f
         if low != high:
             widths.setdefault((low, high), []).append(width)
     return {pair: sum(found) / len(found) for pair, found in widths.items()}
+
+
+def widths_of(softness: float | PairWidths, device: torch.device) -> Tensor | None:
+    """Return widths as the operator takes them, (P, 3) float64: two ids, -1 for all, and the width; None: hard."""
+    if softness == 0.0:
+        return None
+    rows = [(-1, -1, softness)] if isinstance(softness, float) else [(*pair, width) for pair, width in softness.items()]
+    return torch.tensor(rows, dtype=torch.float64, device=device)
+
+
+def softness_of(widths: Tensor | None) -> float | dict[tuple[int, int], float]:
+    """Return what :func:`widths_of` was given."""
+    rows = [] if widths is None else widths.tolist()
+    if len(rows) == 1 and rows[0][0] < 0:
+        return float(rows[0][2])
+    return {(int(a), int(b)): width for a, b, width in rows} if rows else 0.0

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import math
-
+import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs._check import check_cutoff, check_floating, check_ids, check_rows, check_size, check_tensor
-from kcgs.kernels import Membership, SplatInputs, resolve
+from kcgs._check import check_cutoff, check_floating, check_ids, check_labels, check_rows, check_size, check_tensor
+from kcgs.kernels import check_backend
 
-from .covariance import check_cholesky
+from .operator import splat_operator
 from .regions import RegionMap
 
-# float32 arithmetic stays finite inside these bounds, which are far beyond any image
-MEAN_LIMIT = 1e8
-SCALE_LIMITS = (1e-6, 1e8)
+_UNMAPPED = (
+    "regions must be given with region_ids; got None: pass the label map, or leave region_ids out, too, to render "
+    "Gaussians that are not confined"
+)
 
 
 def region_splat(
@@ -35,8 +35,9 @@ def region_splat(
 
     Convention: points are (x, y) in pixels and pixel (j, i) is sampled at (j + 0.5, i + 0.5); a Gaussian whose id the
     map does not hold paints nothing; N = 0 gives a black image. Half precision is computed in float32. The result is
-    not clamped. Once differentiable in means, cholesky and colors, by `backward` and `torch.autograd.grad`;
-    `torch.func.grad`, `vjp` and `jvp` work with backend "reference" only, and `vmap` is refused: give the batch as B.
+    not clamped. Once differentiable in means, cholesky and colors; with backend "reference" twice, and
+    forward. It is the operator ``torch.ops.kcgs.region_splat``: one node of a graph of `torch.compile` and
+    `torch.export`, and `torch.func` transforms it, `vmap` by a larger batch.
 
     Args:
         means: centres in pixels, within 1e8, :math:`(B, N, 2)`, or all without B.
@@ -57,6 +58,9 @@ def region_splat(
         TypeError: an argument of the wrong type or dtype.
         ValueError: shapes that do not fit, devices that differ, values that are not finite or out of range.
 
+    Warns:
+        UserWarning: Gaussians whose region ids the map does not hold, on the CPU.
+
     Example:
         >>> means, cholesky = torch.tensor([[2.5, 0.5]]), torch.tensor([[1.0, 0.0, 1.0]])
         >>> labels = torch.tensor([[0, 0, 0, 1, 1]])
@@ -65,15 +69,56 @@ def region_splat(
 
     Source: the paper's region-constrained sum (its third equation), with memberships s in place of [M = r].
     """
+    if size is not None:
+        size = check_size("size", size)
+    if regions is not None:
+        regions = as_map(regions)
+        found = map_size(regions)
+        if size not in (None, found):
+            raise ValueError(f"size must equal the size of regions, {found}; got {size}")
+        size = found
+    if regions is None and region_ids is not None:
+        raise ValueError(_UNMAPPED)
+    if size is None:
+        raise ValueError("size must be given as (height, width) where regions is None; got None")
+    return splat_at(size, means, cholesky, colors, region_ids, regions, cutoff=cutoff, backend=backend)
+
+
+def splat_at(
+    size: tuple[int, int],
+    means: Tensor,
+    cholesky: Tensor,
+    colors: Tensor,
+    region_ids: Tensor | None,
+    regions: RegionMap | Tensor | None,
+    *,
+    cutoff: float,
+    backend: str,
+) -> Tensor:
+    """Render at a size, at which a map of another one is sampled, as by :meth:`RegionMap.resize`."""
     _check_gaussians(means, cholesky, colors)
     batched = means.ndim == 3
     dtype = torch.float64 if torch.float64 in (means.dtype, cholesky.dtype, colors.dtype) else torch.float32
     arrays = [t.to(dtype) if batched else t.to(dtype)[None] for t in (means, cholesky, colors)]
-    cutoff = check_cutoff(cutoff)
-    index, membership, size = _resolve_regions(means, region_ids, regions, size)
-    kernel = resolve(backend, means.device, dtype)
-    image = kernel(SplatInputs(arrays[0], arrays[1], arrays[2], index, membership, size, cutoff))
+    ids, labels, widths, supersample = _resolve_regions(means, region_ids, regions)
+    image: Tensor = splat_operator(
+        *arrays, ids, labels, widths, supersample, *size, check_cutoff(cutoff), check_backend(backend)
+    )
     return (image if batched else image.squeeze(0)).to(colors.dtype)
+
+
+def as_map(regions: object) -> RegionMap | Tensor:
+    """Return a RegionMap, or labels, int64, whose values the operator checks; refuse anything else."""
+    if isinstance(regions, RegionMap):
+        return regions
+    if isinstance(regions, Tensor | np.ndarray):
+        return check_labels("regions", regions, values=False)
+    raise TypeError(f"regions must be a RegionMap, a label map or None; got {type(regions).__name__}")
+
+
+def map_size(regions: RegionMap | Tensor) -> tuple[int, int]:
+    """(height, width) in pixels."""
+    return regions.size if isinstance(regions, RegionMap) else (regions.shape[-2], regions.shape[-1])
 
 
 def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
@@ -86,64 +131,29 @@ def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
             raise ValueError(f"{name} must be on {means.device} with means; got {tensor.device}")
     if means.shape[0] == 0 and means.ndim == 3:
         raise ValueError(f"means must hold at least one image; got shape {tuple(means.shape)}")
-    if means.numel():
-        _check_values(means.detach(), cholesky.detach(), colors.detach())
-
-
-def _check_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
-    # extremes carry NaN along, so that one pass checks finiteness and range; written so that NaN fails
-    low, high = (float(t) for t in torch.aminmax(means))
-    if not (low >= -MEAN_LIMIT and high <= MEAN_LIMIT):
-        check_floating("means", means)
-        raise ValueError(f"means must be within {MEAN_LIMIT:g} pixels; got {max(-low, high):g}")
-    least, most = (float(t) for t in torch.aminmax(cholesky[..., ::2]))
-    low, high = (float(t) for t in torch.aminmax(cholesky[..., 1]))
-    if not (least >= SCALE_LIMITS[0] * (1 - 1e-6) and max(most, -low, high) <= SCALE_LIMITS[1]):
-        check_cholesky("cholesky", cholesky)
-        raise ValueError(
-            f"cholesky must have l11, l22 in [{SCALE_LIMITS[0]:g}, {SCALE_LIMITS[1]:g}] pixels and |l21| at most "
-            f"{SCALE_LIMITS[1]:g}; got a least diagonal of {least:g} and a largest value of {max(most, -low, high):g}"
-        )
-    low, high = (float(t) for t in torch.aminmax(colors))
-    if not (low > -math.inf and high < math.inf):
-        check_floating("colors", colors)
 
 
 def _resolve_regions(
-    means: Tensor, region_ids: Tensor | None, regions: RegionMap | Tensor | None, size: tuple[int, int] | None
-) -> tuple[Tensor | None, Membership | None, tuple[int, int]]:
-    if size is not None:
-        size = check_size("size", size)
+    means: Tensor, region_ids: Tensor | None, regions: RegionMap | Tensor | None
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, int]:
+    """Return ids (B, N), labels, widths and supersampling as the operator takes them."""
     if region_ids is not None:
-        region_ids = check_ids("region_ids", region_ids, means)
-    regions = RegionMap.coerce(regions)
+        region_ids = check_ids("region_ids", region_ids, means, values=False)
     if regions is None:
         if region_ids is not None:
-            raise ValueError(
-                "regions must be given with region_ids; got None: pass the label map, or leave region_ids out, too, to "
-                "render Gaussians that are not confined"
-            )
-        if size is None:
-            raise ValueError("size must be given as (height, width) where regions is None; got None")
-        return None, None, size
+            raise ValueError(_UNMAPPED)
+        return None, None, None, 1
     check_tensor("region_ids", region_ids)
     assert region_ids is not None
-    _check_fit(means, regions, size)
-    index = regions.index_of(region_ids)
-    if index.ndim == 1:
-        index = index[None]
-    if regions.num_regions == 1:
-        # one region covers everything: no map, but Gaussians of other ids still paint nothing
-        return (None, None, regions.size) if bool((index >= 0).all()) else (index, regions.membership, regions.size)
-    return index, regions.membership, regions.size
-
-
-def _check_fit(means: Tensor, regions: RegionMap, size: tuple[int, int] | None) -> None:
-    if size is not None and size != regions.size:
-        raise ValueError(f"size must equal the size of regions, {regions.size}; got {size}")
-    if regions.labels.device != means.device:
-        raise ValueError(f"regions must be on {means.device} with means; got {regions.labels.device}")
-    maps = regions.labels.shape[0] if regions.labels.ndim == 3 else 1
+    if isinstance(regions, RegionMap):
+        given = regions.given
+        labels, widths, supersample = given.fine_labels, given.widths, given.supersample
+    else:
+        labels, widths, supersample = regions, None, 1
+    if labels.device != means.device:
+        raise ValueError(f"regions must be on {means.device} with means; got {labels.device}")
+    maps = labels.shape[0] if labels.ndim == 3 else 1
     images = means.shape[0] if means.ndim == 3 else 1
     if maps not in (1, images):
         raise ValueError(f"regions must hold 1 map or one for each of {images} images; got {maps} maps")
+    return region_ids if region_ids.ndim == 2 else region_ids[None], labels, widths, supersample

@@ -1,11 +1,12 @@
 """Ways to evaluate the splat and its gradient; private: call `kcgs.functional.region_splat`."""
 
-from .autograd import SplatInputs
+from .autograd import SplatInputs, Steps, with_autograd
 from .membership import Membership
-from .registry import BACKENDS, compile_ahead, prepare, resolve
+from .registry import BACKENDS, check_backend, compile_ahead, prepare, resolve
 from .resampled import Resampled
 from .threads import threads_for_kernels
 
 __all__ = [
-    "BACKENDS", "Membership", "Resampled", "SplatInputs", "compile_ahead", "prepare", "resolve", "threads_for_kernels",
+    "BACKENDS", "Membership", "Resampled", "SplatInputs", "Steps", "check_backend", "compile_ahead", "prepare",
+    "resolve", "threads_for_kernels", "with_autograd",
 ]  # fmt: skip

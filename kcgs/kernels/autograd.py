@@ -1,13 +1,13 @@
-"""What a kernel is: the inputs that every kernel takes, and the autograd function of those with their own backward."""
+"""What a kernel is: the inputs that every kernel takes, and the steps that it consists of."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from .membership import Membership
 
@@ -30,38 +30,25 @@ class SplatInputs(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """A kernel in three steps.
+    """A kernel in three steps, without a graph.
 
     `plan(inputs)` finds what touches what, `render(plan, inputs)` gives the image (B, C, H, W), and
     `differentiate(plan, inputs, grad, geometry)` the gradients of means, cholesky (None unless `geometry`) and colors.
+    `image(inputs)` renders with a graph of all orders; None: the kernel is differentiable once.
     """
 
     plan: Callable[[SplatInputs], Any]
     render: Callable[[Any, SplatInputs], Tensor]
     differentiate: Callable[[Any, SplatInputs, Tensor, bool], Gradients]
+    image: Callable[[SplatInputs], Tensor] | None = None
 
 
-def apply_kernel(steps: Steps, inputs: SplatInputs) -> Tensor:
-    """Render with gradients where they are asked for, and without a trace where they are not."""
-    if not torch.is_grad_enabled() or not any(t.requires_grad for t in inputs[:3]):
-        return steps.render(steps.plan(inputs), inputs)
-    image: Tensor = _Splat.apply(inputs.means, inputs.cholesky, inputs.colors, inputs, steps)  # type: ignore[no-untyped-call]
-    return image
-
-
-class _Splat(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, means: Tensor, cholesky: Tensor, colors: Tensor, inputs: SplatInputs, steps: Steps) -> Tensor:
-        plan = steps.plan(inputs)
-        ctx.save_for_backward(means, cholesky, colors)
-        ctx.plan, ctx.steps, ctx.settings = plan, steps, inputs[3:]
-        return steps.render(plan, inputs)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        inputs = SplatInputs(*ctx.saved_tensors, *ctx.settings)
-        geometry = ctx.needs_input_grad[0] or ctx.needs_input_grad[1]
-        gradients = ctx.steps.differentiate(ctx.plan, inputs, grad, geometry)
-        wanted = zip(gradients, ctx.needs_input_grad, strict=False)
-        return (*(g if need else None for g, need in wanted), None, None)
+@contextmanager
+def with_autograd() -> Iterator[None]:
+    """Record a graph inside of an operator, which is evaluated below autograd."""
+    keys = torch._C.DispatchKey.AutogradFunctionality, torch._C.DispatchKey.ADInplaceOrView
+    with ExitStack() as stack:
+        for key in keys:
+            stack.enter_context(torch._C._SetExcludeDispatchKeyGuard(key, False))
+        stack.enter_context(torch.enable_grad())
+        yield

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .autograd import Gradients, SplatInputs, Steps, apply_kernel
+from .autograd import Gradients, SplatInputs, Steps
 from .tiles import TILE, Pairs, bin_gaussians, coefficients, expand_runs, grid_of, split_into_tiles, sum_runs
 from .whitened import sums_to_gradients
 
@@ -43,8 +43,8 @@ class _Plan(NamedTuple):
     counts: Tensor  # [B * N] int64, pairs of each Gaussian
 
 
-def splat(inputs: SplatInputs) -> Tensor:
-    """Render (B, C, H, W)."""
+def steps(inputs: SplatInputs) -> Steps:
+    """Return the kernel, if it takes these inputs."""
     dtype, device = inputs.means.dtype, inputs.means.device
     if dtype != torch.float32:
         raise ValueError(f"backend 'cuda' computes in float32; got {dtype}: use 'tiled' or 'reference'")
@@ -52,7 +52,7 @@ def splat(inputs: SplatInputs) -> Tensor:
         raise ValueError(f"backend 'cuda' needs tensors on a CUDA device; got {device}")
     if triton is None:
         raise ImportError("backend 'cuda' needs Triton: pip install triton")
-    return apply_kernel(Steps(_make_plan, _render, _differentiate), inputs)
+    return Steps(_make_plan, _render, _differentiate)
 
 
 def _interpreted() -> bool:

@@ -11,14 +11,34 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .autograd import SplatInputs
+from .autograd import Gradients, SplatInputs, Steps, with_autograd
 from .whitened import Z_LIMIT
 
 _CHUNK_ELEMENTS = 1 << 22
 
 
+def steps(inputs: SplatInputs) -> Steps:
+    """Return the kernel."""
+    return Steps(lambda inputs: None, _render, _differentiate, splat)
+
+
+def _render(plan: None, inputs: SplatInputs) -> Tensor:
+    with torch.no_grad():
+        return splat(inputs)
+
+
+def _differentiate(plan: None, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
+    wanted = slice(0 if geometry else 2, 3)
+    with with_autograd():
+        gaussians = [t.detach() for t in inputs[:3]]
+        leaves = [t.requires_grad_() for t in gaussians[wanted]]
+        image = splat(inputs._replace(means=gaussians[0], cholesky=gaussians[1], colors=gaussians[2]))
+        found = torch.autograd.grad(image, leaves, grad)
+    return (found[0], found[1], found[2]) if geometry else (None, None, found[0])
+
+
 def splat(inputs: SplatInputs) -> Tensor:
-    """Render (B, C, H, W)."""
+    """Render (B, C, H, W), with a graph."""
     height, width = inputs.size
     batch, _, channels = inputs.colors.shape
     image = inputs.colors.new_zeros(batch, height * width, channels)

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Callable
 from importlib import import_module, util
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
-from .autograd import SplatInputs
+from .autograd import SplatInputs, Steps
 
 if TYPE_CHECKING:  # loads numba
     from .compiled import Program
 
 BACKENDS = ("auto", "reference", "tiled", "cpu", "cuda")
-
-Kernel = Callable[[SplatInputs], Tensor]
 
 
 @functools.cache
@@ -31,20 +27,19 @@ def _has_triton() -> bool:
     return False
 
 
-def resolve(backend: str, device: torch.device, dtype: torch.dtype) -> Kernel:
-    """Return the kernel that `backend` names for tensors of this device and dtype.
+def resolve(backend: str, inputs: SplatInputs) -> Steps:
+    """Return the kernel that `backend` names for these inputs.
 
     Raises:
-        ValueError: unknown name.
+        ValueError: inputs that the backend does not take.
     """
-    name = _choose(backend, device, dtype)
-    return functools.partial(_untraced if torch.compiler.is_compiling() else _splat, name)
+    name = _choose(backend, inputs.means.device, inputs.means.dtype)
+    kernel: Steps = import_module(f"{__package__}.{name}").steps(inputs)
+    return kernel
 
 
 def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
-    if backend not in BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
-    if backend != "auto":
+    if check_backend(backend) != "auto":
         return backend
     runs = device.type == "cpu" or (device.type == "cuda" and _has_triton())
     return device.type if runs and dtype == torch.float32 else "tiled"
@@ -59,19 +54,18 @@ def compile_ahead(backend: str) -> list[Program]:
 @functools.cache
 def prepare(backend: str, device: torch.device, dtype: torch.dtype, channels: int) -> None:
     """Render and differentiate once, so that no clock counts what compiles or loads at first use."""
-    means, cholesky, colors = (
-        torch.full((1, 1, n), 8.0, device=device, dtype=dtype, requires_grad=True) for n in (2, 3, channels)
-    )
-    image = resolve(backend, device, dtype)(SplatInputs(means, cholesky, colors, None, None, (16, 16), 1e-4))
-    torch.autograd.grad(image, means, torch.ones_like(image))  # torch too loads much at the first gradient
+    means, cholesky, colors = (torch.full((1, 1, n), 8.0, device=device, dtype=dtype) for n in (2, 3, channels))
+    inputs = SplatInputs(means, cholesky, colors, None, None, (16, 16), 1e-4)
+    steps = resolve(backend, inputs)
+    plan = steps.plan(inputs)
+    image = steps.render(plan, inputs)
+    steps.differentiate(plan, inputs, torch.ones_like(image), True)
+    leaf = image.detach().requires_grad_()
+    torch.autograd.grad(leaf.sum(), leaf)  # torch too loads much at the first gradient
 
 
-def _splat(name: str, inputs: SplatInputs) -> Tensor:
-    image: Tensor = import_module(f"{__package__}.{name}").splat(inputs)
-    return image
-
-
-@torch._disable_dynamo  # type: ignore[attr-defined]  # the public name imports the compiler
-def _untraced(name: str, inputs: SplatInputs) -> Tensor:
-    """Render outside of the compiled graph: the compiler would trace into numba and Triton."""
-    return _splat(name, inputs)
+def check_backend(backend: str) -> str:
+    """Return `backend` if it is a name of one."""
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
+    return backend

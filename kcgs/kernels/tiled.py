@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .autograd import Gradients, SplatInputs, Steps, apply_kernel
+from .autograd import Gradients, SplatInputs, Steps
 from .tiles import TILE, Pairs, bin_gaussians, coefficients, expand_runs, grid_of, split_into_tiles, sum_runs
 from .whitened import least_exponent, sums_to_gradients
 
@@ -37,9 +37,9 @@ class _Plan(NamedTuple):
     masks: Tensor | None  # [K, 256], in the dtype of the inputs
 
 
-def splat(inputs: SplatInputs) -> Tensor:
-    """Render (B, C, H, W)."""
-    return apply_kernel(Steps(_make_plan, _render, _differentiate), inputs)
+def steps(inputs: SplatInputs) -> Steps:
+    """Return the kernel."""
+    return Steps(_make_plan, _render, _differentiate)
 
 
 def _make_plan(inputs: SplatInputs) -> _Plan:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor, nn
 
 from kcgs._check import check_cutoff, check_size
-from kcgs.functional import RegionMap, region_splat
+from kcgs.functional import RegionMap
+from kcgs.functional.splat import as_map, map_size, splat_at
 
 from .field import GaussianField
 
@@ -86,14 +86,14 @@ class RegionSplatRenderer(nn.Module):
             means = means * means.new_tensor([across, down])
             cholesky = cholesky * cholesky.new_tensor([across, down, down])
         if regions is not None:
-            regions = self._fit_regions(field, regions, target)
+            regions = self._check_regions(field, regions, target)
         elif field.region_ids is not None:
             raise ValueError(
                 "regions must be given for a field that is confined to regions; got None: pass its label map or its "
                 "Scene, or set field.region_ids to None to render it without contours"
             )
-        image = region_splat(
-            means, cholesky, field.merged_colors(), field.region_ids, regions, size=target, cutoff=self.cutoff,
+        image = splat_at(
+            target, means, cholesky, field.merged_colors(), field.region_ids, regions, cutoff=self.cutoff,
             backend=self.backend,
         )  # fmt: skip
         if not self.keepdim and image.ndim == 3:
@@ -101,23 +101,16 @@ class RegionSplatRenderer(nn.Module):
         return image.clamp(0.0, 1.0) if self.clamp else image
 
     @staticmethod
-    def _fit_regions(field: GaussianField, regions: RegionMap | Tensor, target: tuple[int, int]) -> RegionMap:
+    def _check_regions(
+        field: GaussianField, regions: RegionMap | Tensor, target: tuple[int, int]
+    ) -> RegionMap | Tensor:
         if field.region_ids is None:
             raise ValueError("field must have region_ids where regions are given; call field.assign_regions(regions)")
-        coerced = RegionMap.coerce(regions)
-        assert coerced is not None
-        if coerced.size not in (target, field.size):
-            raise ValueError(f"regions must have the size {field.size} of the field or {target}; got {coerced.size}")
-        # before the map is resized, for a small map may lose small regions
-        strangers = coerced.index_of(field.region_ids) < 0
-        if bool(strangers.any()):
-            warnings.warn(
-                f"{int(strangers.sum())} of {strangers.numel()} Gaussians paint nothing: regions does not hold their "
-                f"region ids, such as {int(field.region_ids[strangers][0])}; pass the map that they belong to, or call "
-                "field.assign_regions(regions)",
-                stacklevel=5,  # past nn.Module's own call
-            )
-        return coerced.resize(target)
+        regions = as_map(regions)
+        found = map_size(regions)
+        if found not in (target, field.size):
+            raise ValueError(f"regions must have the size {field.size} of the field or {target}; got {found}")
+        return regions
 
     def extra_repr(self) -> str:
         """Show the settings."""

@@ -101,6 +101,7 @@ class TestSolveColors:
         field = a_field(None)
         assert solved_colors(field, rendered(field, None, 1e-4), None) is field
 
+    @pytest.mark.filterwarnings("ignore:1 of 8 Gaussians paint nothing:UserWarning")
     def test_unseen_gaussians_and_opacities(self) -> None:
         regions = a_map()
         start = a_field(regions)

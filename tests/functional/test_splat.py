@@ -13,6 +13,9 @@ from torch import Tensor
 from kcgs import RegionMap
 from kcgs.functional import region_splat
 
+# scenes here are drawn at random, with ids that their maps may lack
+pytestmark = pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing:UserWarning")
+
 
 class Scene(NamedTuple):
     means: Tensor
@@ -371,9 +374,9 @@ class TestErrors:
             ({"region_ids": torch.tensor([0.0, 1.0])}, TypeError, "region_ids must have an integer dtype"),
             ({"region_ids": torch.tensor([0, -1])}, ValueError, "region_ids must be non-negative; got -1"),
             ({"region_ids": torch.tensor([0])}, ValueError, r"region_ids must have shape \(2,\); got \(1,\)"),
-            ({"regions": torch.tensor([[0.0, 1.0]])}, TypeError, "labels must have an integer dtype"),
+            ({"regions": torch.tensor([[0.0, 1.0]])}, TypeError, "regions must have an integer dtype"),
             ({"regions": torch.tensor([[0, -1]])}, ValueError, "labels must hold non-negative ids; got -1"),
-            ({"regions": torch.zeros(0, 3).long()}, ValueError, "labels must have at least one pixel"),
+            ({"regions": torch.zeros(0, 3).long()}, ValueError, "regions must have at least one pixel"),
             ({"regions": torch.zeros(2, 3, 3).long()}, ValueError, "regions must hold 1 map"),
             ({"regions": "map.png"}, TypeError, "regions must be a RegionMap, a label map or None"),
             ({"regions": None}, ValueError, "regions must be given with region_ids; got None"),

@@ -84,6 +84,7 @@ def test_centres_far_away(backend: str, distance: float) -> None:
     assert gradient < 1e-4
 
 
+@pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing:UserWarning")
 @pytest.mark.parametrize("size", [(1, 1), (1, 2000), (2000, 1), (3, 17)])
 @pytest.mark.parametrize("count", [0, 1, 40])
 def test_shapes(size: tuple[int, int], count: int) -> None:

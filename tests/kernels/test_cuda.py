@@ -79,16 +79,16 @@ def inputs(dtype: torch.dtype = torch.float32) -> SplatInputs:
 
 def test_float64_is_refused() -> None:
     with pytest.raises(ValueError, match="backend 'cuda' computes in float32; got torch.float64: use 'tiled'"):
-        cuda.splat(inputs(torch.float64))
+        cuda.steps(inputs(torch.float64))
 
 
 def test_cpu_is_refused() -> None:
     with pytest.raises(ValueError, match="backend 'cuda' needs tensors on a CUDA device; got cpu"):
-        cuda.splat(inputs())
+        cuda.steps(inputs())
 
 
 def test_missing_triton_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda, "triton", None)
     on_a_gpu = inputs()._replace(means=SimpleNamespace(dtype=torch.float32, device=torch.device("cuda")))
     with pytest.raises(ImportError, match="backend 'cuda' needs Triton: pip install triton"):
-        cuda.splat(on_a_gpu)
+        cuda.steps(on_a_gpu)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import ModuleType
 
 import pytest
 import torch
@@ -50,17 +51,19 @@ def make_inputs(
     return SplatInputs(*arrays, index, membership, size, cutoff)
 
 
-def render(kernel: object, inputs: SplatInputs, wanted: tuple[bool, ...] = (True, True, True)) -> list[Tensor]:
+def render(kernel: ModuleType, inputs: SplatInputs, wanted: tuple[bool, ...] = (True, True, True)) -> list[Tensor]:
     """Return the image and the wanted gradients."""
-    arrays = [t.detach().clone().requires_grad_(w) for t, w in zip(inputs[:3], wanted, strict=True)]
-    image = kernel(SplatInputs(*arrays, *inputs[3:]))
+    steps = kernel.steps(inputs)
+    plan = steps.plan(inputs)
+    image = steps.render(plan, inputs)
     probe = torch.linspace(-1, 2, image.numel(), dtype=image.dtype, device=DEVICE).view_as(image)
-    return [image.detach(), *torch.autograd.grad((image * probe).sum(), [t for t in arrays if t.requires_grad])]
+    gradients = steps.differentiate(plan, inputs, probe, wanted[0] or wanted[1])
+    return [image, *(g for g, w in zip(gradients, wanted, strict=True) if w)]
 
 
 def assert_matches_reference(inputs: SplatInputs, tolerance: float = 5e-6) -> None:
-    got = render(cuda.splat, inputs)
-    want = render(reference.splat, SplatInputs(*(t.double() for t in inputs[:3]), *inputs[3:]))
+    got = render(cuda, inputs)
+    want = render(reference, SplatInputs(*(t.double() for t in inputs[:3]), *inputs[3:]))
     for a, b in zip(got, want, strict=True):
         assert a.dtype == torch.float32 and a.shape == b.shape
         assert b.abs().max() > 1e-3
@@ -113,26 +116,29 @@ def test_slanted_needles() -> None:
     l11 = torch.hypot(1e4 * cos, sin)
     cholesky = torch.stack([l11, (1e8 - 1) * sin * cos / l11, 1e4 / l11], -1).float()[None].to(DEVICE)
     inputs = make_inputs(size=(16, 20) if GPU else (16, 16))._replace(cholesky=cholesky)
-    want = reference.splat(SplatInputs(*(t.double() for t in inputs[:3]), *inputs[3:]))
-    got = render(cuda.splat, inputs)
+    want = reference.splat(SplatInputs(*(t.double() for t in inputs[:3]), *inputs[3:])).detach()
+    got = render(cuda, inputs)
     assert (got[0] - want).abs().max() < 1e-5 * 20
     assert all(torch.isfinite(t).all() for t in got)
 
 
 def test_only_what_is_asked() -> None:
     inputs = make_inputs(size=(9, 16), regions=2)
-    _, means, cholesky, colors = render(cuda.splat, inputs)
-    assert torch.equal(render(cuda.splat, inputs, (False, False, True))[1], colors)
-    assert torch.equal(render(cuda.splat, inputs, (True, False, False))[1], means)
-    assert torch.equal(render(cuda.splat, inputs, (False, True, False))[1], cholesky)
+    _, means, cholesky, colors = render(cuda, inputs)
+    assert torch.equal(render(cuda, inputs, (False, False, True))[1], colors)
+    assert torch.equal(render(cuda, inputs, (True, False, False))[1], means)
+    assert torch.equal(render(cuda, inputs, (False, True, False))[1], cholesky)
 
 
 def test_gradient_that_is_not_contiguous() -> None:
     inputs = make_inputs(size=(16, 20) if GPU else (9, 16))
-    means = inputs.means.clone().requires_grad_()
-    image = cuda.splat(inputs._replace(means=means))
-    (ones,) = torch.autograd.grad(image.sum(), means, retain_graph=True)  # an expanded scalar
-    (same,) = torch.autograd.grad((image.permute(0, 2, 3, 1) * torch.ones(1, device=DEVICE)).sum(), means)
+    steps = cuda.steps(inputs)
+    plan = steps.plan(inputs)
+    image = steps.render(plan, inputs)
+    scalar = torch.ones((), device=DEVICE).expand(image.shape)  # as a sum's
+    ones = steps.differentiate(plan, inputs, scalar, True)[0]
+    channels_last = torch.ones_like(image).permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)
+    same = steps.differentiate(plan, inputs, channels_last, True)[0]
     assert torch.equal(ones, same) and ones.abs().max() > 0
 
 
@@ -141,7 +147,7 @@ def test_gradient_that_is_not_contiguous() -> None:
 def test_nothing_to_render(count: int, regions: int) -> None:
     inputs = make_inputs(count, regions=regions)
     inputs = inputs._replace(means=torch.full_like(inputs.means, 1e6))
-    image, *gradients = render(cuda.splat, inputs)
+    image, *gradients = render(cuda, inputs)
     assert torch.equal(image, torch.zeros(1, 3, 16, 20, device=DEVICE))
     for gradient, array in zip(gradients, inputs[:3], strict=True):
         assert torch.equal(gradient, torch.zeros_like(array))
@@ -149,5 +155,5 @@ def test_nothing_to_render(count: int, regions: int) -> None:
 
 def test_same_bits_every_time() -> None:
     inputs = make_inputs(400 if GPU else 20, size=(9, 16), regions=3, softness=0.7)
-    first, second = render(cuda.splat, inputs), render(cuda.splat, inputs)
+    first, second = render(cuda, inputs), render(cuda, inputs)
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))

@@ -10,14 +10,13 @@ from pathlib import Path
 
 import pytest
 import torch
+import torch._dynamo.testing
 from torch import Tensor, nn
 
-from kcgs import GaussianField, RegionMap, RegionSplatRenderer
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.functional import region_splat
 
 SIZE = (24, 32)
-# the CPU kernel and the tiled one have a backward of their own, which torch.func cannot transform
-TRANSFORMS_REFUSED = "autograd.Function with functorch transforms"
 
 
 def compiler_warnings(test: Callable[..., None]) -> Callable[..., None]:
@@ -71,7 +70,6 @@ class TestCompile:
     @compiler_warnings
     @pytest.mark.parametrize("name", ["eager", "aot_eager"])
     def test_equals_eager(self, field: GaussianField, regions: RegionMap, backend: str, name: str) -> None:
-        """The checks of values break the graph; picture and gradients stay."""
         torch.manual_seed(0)
         module = Picture(field, regions, backend)
         compiled = torch.compile(module, backend=name)
@@ -95,11 +93,78 @@ class TestCompile:
             optimizer.step()
 
     @compiler_warnings
-    def test_one_whole_graph_is_refused(self, field: GaussianField, regions: RegionMap) -> None:
-        compiled = torch.compile(RegionSplatRenderer(), backend="eager", fullgraph=True)
-        # which of the two depends on what was compiled before
-        with pytest.raises((torch._dynamo.exc.Unsupported, torch._dynamo.exc.UserError), match="data-dependent|item"):
-            compiled(field, regions)
+    @pytest.mark.parametrize("name", ["eager", "aot_eager"])
+    def test_one_whole_graph_for_all_numbers_and_maps(self, regions: RegionMap, name: str) -> None:
+        counter = torch._dynamo.testing.CompileCounterWithBackend(name)
+        compiled = torch.compile(region_splat, backend=counter, fullgraph=True, dynamic=True)
+        maps = [regions, RegionMap.from_labels(3 - regions.labels, 0.5)]
+        first = 0
+        for count in (20, 12, 31):
+            for of in maps:
+                field = GaussianField.random(count, SIZE, regions=of, seed=count)
+                tensors = field.means.detach(), field.cholesky.detach(), field.colors.detach(), field.region_ids
+                assert torch.equal(compiled(*tensors, of), region_splat(*tensors, of))
+                first = first or counter.frame_count
+        assert counter.frame_count == first
+
+    @compiler_warnings
+    def test_a_training_step_with_kornia_in_one_graph(self, field: GaussianField, regions: RegionMap) -> None:
+        import kornia
+
+        chain = nn.Sequential(RegionSplatRenderer(keepdim=False), kornia.filters.GaussianBlur2d((3, 3), (1.0, 1.0)))
+        scene = Scene(field, regions)
+
+        def loss() -> Tensor:
+            return kornia.losses.charbonnier_loss(chain(scene), torch.zeros(1, 3, *SIZE), reduction="mean")
+
+        want = torch.autograd.grad(loss(), list(scene.parameters()))
+        got = torch.autograd.grad(torch.compile(loss, fullgraph=True, backend="aot_eager")(), list(scene.parameters()))
+        for a, b in zip(got, want, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
+
+    @compiler_warnings
+    def test_export(self, field: GaussianField, regions: RegionMap, tmp_path: Path) -> None:
+        """Saved and loaded, a program renders the scene with the map that it holds."""
+        scene = Scene(field, regions)
+        torch.export.save(torch.export.export(scene, ()), tmp_path / "scene.pt2")
+        assert torch.equal(torch.export.load(tmp_path / "scene.pt2").module()(), scene())
+
+
+class TestOperator:
+    @compiler_warnings
+    @pytest.mark.parametrize("kernel", ["cpu", "tiled", "reference"])
+    def test_opcheck(self, field: GaussianField, regions: RegionMap, kernel: str) -> None:
+        gaussians = [t.detach()[None].clone().requires_grad_() for t in (field.means, field.cholesky, field.colors)]
+        settings = (field.region_ids[None], regions.fine_labels, regions.widths, 1, *SIZE, 1e-4, kernel)
+        torch.library.opcheck(torch.ops.kcgs.region_splat.default, (*gaussians, *settings))
+        grad = torch.rand(1, 3, *SIZE, requires_grad=kernel == "reference")
+        gaussians = gaussians if kernel == "reference" else [t.detach() for t in gaussians]
+        torch.library.opcheck(torch.ops.kcgs.region_splat_backward.default, (grad, *gaussians, *settings, True))
+
+    def test_meta(self, field: GaussianField, regions: RegionMap) -> None:
+        tensors = field.means, field.cholesky, field.colors, field.region_ids, regions.labels
+        image = region_splat(*(t.to("meta") for t in tensors))
+        assert image.device.type == "meta" and image.shape == (3, *SIZE)
+
+    @pytest.mark.parametrize("kernel", ["cpu", "tiled"])
+    def test_second_derivatives_are_the_references(self, field: GaussianField, regions: RegionMap, kernel: str) -> None:
+        def slope(backend: str) -> Tensor:
+            image = RegionSplatRenderer(backend=backend)(field, regions)
+            (first,) = torch.autograd.grad(image.square().sum(), field.colors, create_graph=True)
+            return torch.autograd.grad(first.square().sum(), field.colors)[0]
+
+        assert slope("reference").abs().max() > 0
+        with pytest.raises(RuntimeError, match=f"backend '{kernel}' has first derivatives by backward only"):
+            slope(kernel)
+
+    def test_labels_that_change_in_place(self, field: GaussianField) -> None:
+        labels = torch.zeros(SIZE, dtype=torch.long)
+        labels[:, 16:] = 3
+        gaussians = field.means, field.cholesky, field.colors, field.region_ids
+        before = region_splat(*gaussians, labels)
+        labels[:] = labels.flip(1)
+        assert torch.equal(region_splat(*gaussians, labels), region_splat(*gaussians, labels.clone()))
+        assert not torch.equal(region_splat(*gaussians, labels), before)
 
 
 class TestFunctional:
@@ -115,8 +180,9 @@ class TestFunctional:
         assert swapped["field.colors"].grad is not None and swapped["field.colors"].grad.any()
         assert field.colors.grad is None and torch.equal(field.colors, before)
 
-    def test_grad_and_vjp_through_reference(self, field: GaussianField, regions: RegionMap) -> None:
-        module = Picture(field, regions, "reference")
+    @pytest.mark.parametrize("kernel", ["cpu", "tiled", "reference"])
+    def test_grad_and_vjp(self, field: GaussianField, regions: RegionMap, kernel: str) -> None:
+        module = Picture(field, regions, kernel)
         parameters = {name: p.detach() for name, p in module.named_parameters()}
 
         def loss(values: dict[str, Tensor]) -> Tensor:
@@ -129,38 +195,40 @@ class TestFunctional:
         torch.testing.assert_close(pull(torch.tensor(2.0))[0]["field.means"], 2 * want["field.means"])
 
     @pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")  # torch's own first use
-    def test_jvp_through_reference(self, field: GaussianField, regions: RegionMap) -> None:
+    def test_jvp(self, field: GaussianField, regions: RegionMap) -> None:
         """The picture is linear in the colours: its derivative along a colour is the picture of that colour."""
         along = torch.rand(field.colors.shape, generator=torch.Generator().manual_seed(1))
 
-        def draw(colors: Tensor) -> Tensor:
-            return region_splat(field.means, field.cholesky, colors, field.region_ids, regions, backend="reference")
+        def draw(colors: Tensor, backend: str = "reference") -> Tensor:
+            return region_splat(field.means, field.cholesky, colors, field.region_ids, regions, backend=backend)
 
         _, derivative = torch.func.jvp(draw, (field.colors.detach(),), (along,))
         torch.testing.assert_close(derivative, draw(along), rtol=1e-5, atol=1e-6)
+        with pytest.raises(RuntimeError, match="backend 'cpu' has first derivatives by backward only"):
+            torch.func.jvp(lambda colors: draw(colors, "cpu"), (field.colors.detach(),), (along,))
 
-    @pytest.mark.parametrize("kernel", ["tiled", "cpu"])
-    def test_grad_is_refused_elsewhere(self, field: GaussianField, regions: RegionMap, kernel: str) -> None:
-        def loss(colors: Tensor) -> Tensor:
-            return region_splat(
-                field.means.detach(), field.cholesky.detach(), colors, field.region_ids, regions, backend=kernel
-            ).sum()
-
-        with pytest.raises(RuntimeError, match=TRANSFORMS_REFUSED):
-            torch.func.grad(loss)(field.colors.detach())
-
-    def test_vmap_is_refused_and_a_batch_does_it(self, field: GaussianField, regions: RegionMap, backend: str) -> None:
-        """Values are checked before anything is drawn, which vmap cannot do; (B, N, ...) draws all at once."""
+    def test_vmap_over_colors_gaussians_and_maps(self, field: GaussianField, regions: RegionMap, backend: str) -> None:
         means, cholesky, ids = field.means.detach(), field.cholesky.detach(), field.region_ids
-        assert ids is not None
-        colors = torch.rand(4, *field.colors.shape, generator=torch.Generator().manual_seed(1))
-        with pytest.raises(RuntimeError, match="vmap"):
-            torch.func.vmap(lambda c: region_splat(means, cholesky, c, ids, regions, backend=backend))(colors)
-        batched = [t.expand(4, *t.shape) for t in (means, cholesky, ids)]
-        got = region_splat(batched[0], batched[1], colors, batched[2], regions, backend=backend)
-        for picture, c in zip(got, colors, strict=True):
-            want = region_splat(means, cholesky, c, ids, regions, backend=backend)
-            torch.testing.assert_close(picture, want, rtol=1e-5, atol=1e-5)
+        generator = torch.Generator().manual_seed(1)
+        colors = torch.rand(4, *field.colors.shape, generator=generator)
+        shifted = means + torch.rand(4, 1, 2, generator=generator)
+        labels = torch.stack([regions.labels.roll(k, 1) for k in range(4)])
+
+        def draw(c: Tensor, m: Tensor = means, of: RegionMap | Tensor = regions) -> Tensor:
+            return region_splat(m, cholesky, c, ids, of, backend=backend)
+
+        for mapped, singles in (
+            (torch.func.vmap(draw)(colors), [draw(c) for c in colors]),
+            (torch.func.vmap(draw)(colors, shifted), [draw(c, m) for c, m in zip(colors, shifted, strict=True)]),
+            (
+                torch.func.vmap(lambda of: draw(colors[0], means, of))(labels),
+                [draw(colors[0], means, of) for of in labels],
+            ),
+        ):
+            torch.testing.assert_close(mapped, torch.stack(singles), rtol=1e-5, atol=1e-5)
+        rows = torch.func.vmap(torch.func.grad(lambda c: draw(c).square().sum()))(colors)
+        one = torch.func.grad(lambda c: draw(c).square().sum())(colors[2])
+        torch.testing.assert_close(rows[2], one, rtol=1e-4, atol=1e-4)
 
 
 class TestState:

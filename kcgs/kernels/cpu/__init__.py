@@ -1,5 +1,5 @@
 """The splat on the CPU, in float32: numba, 16 pixels at a time, rows of tiles shared among threads."""
 
-from .kernel import splat
+from .kernel import steps
 
-__all__ = ["splat"]
+__all__ = ["steps"]

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..autograd import Gradients, SplatInputs, Steps, apply_kernel
+from ..autograd import Gradients, SplatInputs, Steps
 from ..membership import Membership
 from ..threads import num_threads
 from ..whitened import least_exponent, support_radius
@@ -33,14 +33,14 @@ class _Plan(NamedTuple):
     order: Any  # [N] int64, sorted to given
 
 
-def splat(inputs: SplatInputs) -> Tensor:
-    """Render (B, C, H, W)."""
+def steps(inputs: SplatInputs) -> Steps:
+    """Return the kernel, if it takes these inputs."""
     if inputs.means.dtype != torch.float32:
         raise ValueError(f"backend 'cpu' computes in float32; got {inputs.means.dtype}: use 'tiled' or 'reference'")
     if inputs.means.device.type != "cpu":
         raise ValueError(f"backend 'cpu' needs tensors on the CPU; got {inputs.means.device}")
     loops.program.ready()
-    return apply_kernel(Steps(plan, render, differentiate), inputs)
+    return Steps(plan, render, differentiate)
 
 
 def plan(inputs: SplatInputs) -> _Plan:

@@ -1,0 +1,69 @@
+"""What rendering derives from a label map, kept beside the tensor of its labels for as long as that lives."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
+
+from kcgs.kernels import Membership
+
+
+class MapTables(NamedTuple):
+    """The ids of a map, where each is among them, and what the kernels evaluate."""
+
+    ids: Tensor  # [R] int64, sorted
+    table: Tensor | None  # from small ids to positions, -1 at the end
+    membership: Membership
+    whole: bool = True  # False: a map sampled at another size, where small regions may be lost
+
+    def to(self, device: torch.device) -> MapTables:
+        """Return the same tables on `device`."""
+        table = None if self.table is None else self.table.to(device)
+        return self._replace(ids=self.ids.to(device), table=table, membership=self.membership.to(device))
+
+    def index_of(self, region_ids: Tensor) -> Tensor:
+        """Return the position of each id among `ids`, -1 where the map does not hold it."""
+        if self.table is not None:
+            # not self.table[...]: that wakes torch's threads, which then spin beside the kernel's
+            places = region_ids.clamp(-1, len(self.table) - 1).flatten() % len(self.table)
+            return self.table.index_select(0, places).view(region_ids.shape)
+        places = torch.searchsorted(self.ids, region_ids.contiguous()).clamp_max(len(self.ids) - 1)
+        return torch.where(self.ids[places] == region_ids, places, -1)
+
+
+class _Kept(NamedTuple):
+    version: int
+    widths: Tensor | None
+    tables: MapTables
+
+
+# a viewer renders at ever new sizes
+_MOST_SIZES = 4
+_kept: WeakIdKeyDictionary = WeakIdKeyDictionary()
+
+
+def keep_tables(
+    labels: Tensor, widths: Tensor | None, supersample: int, size: tuple[int, int], tables: MapTables
+) -> None:
+    """Keep the tables of a map at a size, and of few others; `widths` as the operator has them."""
+    sizes = _kept.setdefault(labels, {})
+    sizes[supersample, *size] = _Kept(_version(labels), widths, tables)
+    if len(sizes) > _MOST_SIZES:
+        del sizes[list(sizes)[1]]  # the first is the map's own
+
+
+def find_tables(labels: Tensor, widths: Tensor | None, supersample: int, size: tuple[int, int]) -> MapTables | None:
+    """Return the tables of a map at a size, unless there are none, or the labels were written to since."""
+    kept: _Kept | None = _kept.get(labels, {}).get((supersample, *size))
+    if kept is None or kept.version != _version(labels):
+        return None
+    if kept.widths is not widths and (widths is None or kept.widths is None or not torch.equal(kept.widths, widths)):
+        return None
+    return kept.tables
+
+
+def _version(labels: Tensor) -> int:
+    return -1 if labels.is_inference() else labels._version
