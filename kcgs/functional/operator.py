@@ -174,7 +174,7 @@ def _second_shapes(*arguments: Any) -> tuple[Tensor, ...]:
 
 
 class _KeptPlan(NamedTuple):
-    others: tuple[Any, ...]  # weak references to factors, colours, ids and labels
+    others: tuple[Any, ...]  # weak references to factors, colours, ids, labels and widths
     versions: tuple[int, ...]
     settings: tuple[Any, ...]
     plan: Any
@@ -185,7 +185,7 @@ _plans: WeakIdKeyDictionary = WeakIdKeyDictionary()
 
 def _keep_plan(given: Arguments, plan: Any) -> None:
     if plan is not None and any(t.requires_grad for t in given[:3]):
-        others = tuple(None if t is None else weakref.ref(t) for t in given[1:5])
+        others = tuple(None if t is None else weakref.ref(t) for t in given[1:6])
         _plans[given.means] = _KeptPlan(others, _versions(given), given[6:], plan)
 
 
@@ -193,12 +193,12 @@ def _take_plan(given: Arguments) -> Any:
     kept = _plans.pop(given.means, None)
     if kept is None or kept.settings != given[6:] or kept.versions != _versions(given):
         return None
-    same = all((None if ref is None else ref()) is t for ref, t in zip(kept.others, given[1:5], strict=True))
+    same = all((None if ref is None else ref()) is t for ref, t in zip(kept.others, given[1:6], strict=True))
     return kept.plan if same else None
 
 
 def _versions(given: Arguments) -> tuple[int, ...]:
-    return tuple(-1 if t is None or t.is_inference() else t._version for t in given[:5])
+    return tuple(-1 if t is None or t.is_inference() else t._version for t in given[:6])
 
 
 # Derivatives

@@ -157,6 +157,24 @@ class TestOperator:
         with pytest.raises(RuntimeError, match=f"backend '{kernel}' has first derivatives by backward only"):
             slope(kernel)
 
+    @pytest.mark.parametrize("kernel", ["cpu", "tiled"])
+    def test_maps_that_share_labels_keep_their_gradients(self, field: GaussianField, kernel: str) -> None:
+        """Two renders of the same tensors before the first backward: each has the gradient of its own contours."""
+        labels = torch.zeros(SIZE, dtype=torch.long)
+        labels[:, 16:] = 3
+        maps = [RegionMap.from_labels(labels, softness) for softness in (0.4, 4.0)]
+        tensors = [t.detach()[None].clone() for t in (field.means, field.cholesky, field.colors)]
+        tensors[2].requires_grad_()
+        ids = field.region_ids[None]
+
+        def draw(of: RegionMap) -> Tensor:
+            return region_splat(*tensors, ids, of, backend=kernel).square().sum()
+
+        want = [torch.autograd.grad(draw(of), tensors[2])[0] for of in maps]
+        for image, gradient in zip([draw(of) for of in maps], want, strict=True):
+            assert torch.equal(torch.autograd.grad(image, tensors[2])[0], gradient)
+        assert not torch.equal(*want)
+
     def test_labels_that_change_in_place(self, field: GaussianField) -> None:
         labels = torch.zeros(SIZE, dtype=torch.long)
         labels[:, 16:] = 3
