@@ -1,6 +1,6 @@
 """Ways to evaluate the splat and its gradient; private: call `kcgs.functional.region_splat`."""
 
-from .autograd import SplatInputs, Steps, with_autograd
+from .inputs import SplatInputs, Steps, with_autograd
 from .membership import Membership
 from .registry import BACKENDS, check_backend, compile_ahead, prepare, resolve
 from .resampled import Resampled

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .autograd import Gradients, SplatInputs, Steps, with_autograd
+from .inputs import Gradients, SplatInputs, Steps, with_autograd
 from .whitened import Z_LIMIT
 
 _CHUNK_ELEMENTS = 1 << 22

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from .autograd import SplatInputs, Steps
+from .inputs import SplatInputs, Steps
 
 if TYPE_CHECKING:  # loads numba
     from .compiled import Program

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .autograd import Gradients, SplatInputs, Steps
+from .inputs import Gradients, SplatInputs, Steps
 from .tiles import TILE, Pairs, bin_gaussians, coefficients, expand_runs, grid_of, split_into_tiles, sum_runs
 from .whitened import least_exponent, sums_to_gradients
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .autograd import SplatInputs
+from .inputs import SplatInputs
 from .whitened import Z_LIMIT, support_radius
 
 TILE = 16

@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # processes that compile the CPU kernel do without torch
     import torch
     from torch import Tensor
 
-    from .autograd import Gradients
+    from .inputs import Gradients
 
 # |z| is cut here, where every weight is zero: its square is still finite in float32
 Z_LIMIT = 1e15

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..autograd import Gradients, SplatInputs, Steps
+from ..inputs import Gradients, SplatInputs, Steps
 from ..membership import Membership
 from ..threads import num_threads
 from ..whitened import least_exponent, support_radius
