@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensor
 
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32)
@@ -42,9 +43,17 @@ def check_floating(
         raise TypeError(f"{name} must have a real floating dtype; got {tensor.dtype}")
     if last is not None and (tensor.ndim == 0 or tensor.shape[-1] != last):
         raise ValueError(f"{name} must have shape (..., {last}); got {tuple(tensor.shape)}")
-    if finite and not torch.isfinite(tensor).all():
+    if finite and not holds(torch.isfinite(tensor).all(), f"{name} must be finite"):
         raise ValueError(f"{name} must be finite; got {int((~torch.isfinite(tensor)).sum())} NaN or infinite values")
     return tensor
+
+
+def holds(condition: Tensor, words: str) -> bool:
+    """Read a condition on values; a graph that is being made asserts it instead, and fake tensors have no values."""
+    if torch.compiler.is_compiling():
+        torch._assert_async(condition, words)
+        return True
+    return condition.is_meta or isinstance(condition, FakeTensor) or bool(condition)
 
 
 def check_integer(name: str, value: object, dims: Sequence[int] = ()) -> Tensor:
@@ -72,7 +81,7 @@ def check_ids(name: str, value: object, like: Tensor, values: bool = True) -> Te
     if tensor.device != like.device:
         raise ValueError(f"{name} must be on {like.device} with means; got {tensor.device}")
     tensor = tensor.long()
-    if values and tensor.numel() and int(tensor.min()) < 0:
+    if values and not holds((tensor >= 0).all(), f"{name} must be non-negative"):
         raise ValueError(f"{name} must be non-negative; got {int(tensor.min())}")
     return tensor
 
@@ -144,7 +153,7 @@ def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values:
     if tensor.numel() == 0:
         raise ValueError(f"{name} must have at least one pixel; got shape {tuple(tensor.shape)}")
     tensor = tensor.long()
-    if values and int(tensor.min()) < 0:
+    if values and not holds(tensor.min() >= 0, f"{name} must hold non-negative ids"):
         raise ValueError(f"{name} must hold non-negative ids; got {int(tensor.min())}")
     return tensor
 
@@ -153,9 +162,11 @@ def check_size(name: str, value: object) -> tuple[int, int]:
     """Return (height, width) if both are whole numbers of at least 1."""
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
         raise TypeError(f"{name} must be a pair (height, width); got {value!r}")
-    if any(isinstance(side, bool) or not hasattr(side, "__index__") for side in value):
+    # operator.index would make a constant of the size that a graph leaves open
+    whole = [isinstance(side, int | torch.SymInt) and not isinstance(side, bool) for side in value]
+    if not all(known or hasattr(side, "__index__") for known, side in zip(whole, value, strict=True)):
         raise TypeError(f"{name} must hold two integers (height, width); got {value!r}")
-    height, width = map(operator.index, value)
+    height, width = (side if known else operator.index(side) for known, side in zip(whole, value, strict=True))
     if height < 1 or width < 1:
         raise ValueError(f"{name} must be at least 1 x 1; got {value!r}")
     return height, width

@@ -190,8 +190,8 @@ def _check_band(name: str, image: Tensor, labels: Tensor, width: float) -> Tenso
         wanted = f"({height}, {breadth}) or ({batch}, {height}, {breadth})"
         raise ValueError(f"labels must have shape {wanted} to fit image; got {tuple(labels.shape)}")
     band = edge_band(labels, width).reshape(maps, 1, height, breadth)
-    empty = int((~band.flatten(1).any(1)).sum())
-    if empty:
+    empty = (~band.flatten(1).any(1)).sum()
+    if not torch.compiler.is_compiling() and empty:
         which = "the label map has" if maps == 1 else f"{empty} of {maps} label maps have"
         warnings.warn(f"{name} is NaN: {which} one region and so no edge band", RuntimeWarning, stacklevel=3)
     return band

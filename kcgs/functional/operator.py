@@ -153,7 +153,7 @@ _LIBRARY.impl("region_splat_forward", _differentiate_forward, "CompositeExplicit
 
 def _render_shape(*arguments: Any) -> Tensor:
     given = Arguments(*arguments)
-    return given.colors.new_empty(len(given.colors), given.colors.shape[-1], given.height, given.width)
+    return given.colors.new_empty(given.colors.shape[0], given.colors.shape[-1], given.height, given.width)
 
 
 def _gradient_shapes(grad: Tensor, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:

@@ -80,7 +80,7 @@ class GaussianField(nn.Module):
     def _hold(self, name: str, value: Tensor | None) -> None:
         if value is not None and value.dtype in _HALF:
             value = value.float()
-        if value is not None and value.grad_fn is not None:
+        if value is not None and not value.is_leaf:
             self.register_buffer(name, value)
         elif value is None or isinstance(value, nn.Parameter):
             self.register_parameter(name, value)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import io
 import pickle
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -12,9 +14,11 @@ import pytest
 import torch
 import torch._dynamo.testing
 from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils.checkpoint import checkpoint
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
-from kcgs.functional import region_splat
+from kcgs.functional import ef_psnr, ef_ssim, lookup_regions, region_splat
 
 SIZE = (24, 32)
 
@@ -123,11 +127,146 @@ class TestCompile:
             torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
 
     @compiler_warnings
-    def test_export(self, field: GaussianField, regions: RegionMap, tmp_path: Path) -> None:
-        """Saved and loaded, a program renders the scene with the map that it holds."""
+    @pytest.mark.parametrize("name", ["aot_eager", "inductor"])
+    def test_one_graph_for_all_sizes(self, name: str) -> None:
+        """Forward and backward, without a map and with one."""
+        counter = torch._dynamo.testing.CompileCounterWithBackend(name)
+        compiled = torch.compile(region_splat, backend=counter, fullgraph=True, dynamic=True)
+        counts = []
+        for count, size in ((20, SIZE), (12, (31, 20)), (31, (16, 50))):
+            labels = (torch.arange(size[1]) > 9).long().expand(size).contiguous()
+            field = GaussianField.random(count, size, regions=labels, seed=count)
+            leaves = [t.detach().requires_grad_() for t in (field.means, field.cholesky, field.colors)]
+            for rest, options in (((), {"size": size}), ((field.region_ids, labels), {})):
+                image, want = (splat(*leaves, *rest, **options) for splat in (compiled, region_splat))  # type: ignore[arg-type]
+                assert torch.equal(image, want) and want.abs().max() > 0.1
+                gradients = (torch.autograd.grad(t.square().sum(), leaves) for t in (image, want))
+                assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
+            counts.append(counter.frame_count)
+        assert counts[0] == counts[2]
+
+    @compiler_warnings
+    @pytest.mark.parametrize("whole", [False, True])
+    def test_modules_at_any_size(self, field: GaussianField, regions: RegionMap, whole: bool) -> None:
+        scene, counts = Scene(field, regions), []
+        counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
+        module = scene if whole else RegionSplatRenderer()
+        compiled, given = torch.compile(module, backend=counter, fullgraph=True), () if whole else (scene,)
+        for size in (None, (48, 72), (30, 20), (31, 50)):
+            image, want = (m(*given, size=size) for m in (compiled, module))
+            torch.testing.assert_close(image, want, rtol=1e-5, atol=1e-6)
+            gradients = (torch.autograd.grad(t.sum(), list(scene.parameters())) for t in (image, want))
+            for got, expected in zip(*gradients, strict=True):
+                torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-5)
+            counts.append(counter.frame_count)
+        assert counts[3] == counts[2] <= 3  # its own, a first other one, and any
+
+    @compiler_warnings
+    def test_scenes_of_any_number_of_gaussians(self) -> None:
+        """torch takes shapes of parameters for constants unless told otherwise: then one graph serves all scenes."""
+        counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
+        compiled, counts = torch.compile(RegionSplatRenderer(), backend=counter, fullgraph=True, dynamic=True), []
+        with torch._dynamo.config.patch(force_parameter_static_shapes=False):
+            for count in (20, 12, 31):
+                labels = (torch.arange(SIZE[1]) > count).long().expand(SIZE)
+                scene = Scene(GaussianField.random(count, SIZE, regions=labels, seed=0), labels)
+                assert torch.equal(compiled(scene), scene())
+                counts.append(counter.frame_count)
+        assert counts[0] == counts[2]
+
+    @compiler_warnings
+    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    def test_edge_metrics_in_one_graph(
+        self, field: GaussianField, regions: RegionMap, metric: Callable[..., Tensor]
+    ) -> None:
         scene = Scene(field, regions)
-        torch.export.save(torch.export.export(scene, ()), tmp_path / "scene.pt2")
-        assert torch.equal(torch.export.load(tmp_path / "scene.pt2").module()(), scene())
+
+        def loss() -> Tensor:
+            return -metric(scene(), torch.full((3, *SIZE), 0.5), regions.labels, 1)
+
+        compiled = torch.compile(loss, fullgraph=True, backend="eager")
+        for got, want in zip(
+            *(torch.autograd.grad(f(), list(scene.parameters())) for f in (compiled, loss)), strict=True
+        ):
+            torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-5)
+
+
+class Encoder(nn.Module):
+    """The least network from a batch of images, each with its label map, to what they look like as Gaussians."""
+
+    def __init__(self, fielded: bool) -> None:
+        super().__init__()
+        self.fielded = fielded
+        self.layers = nn.Sequential(
+            nn.Conv2d(3, 8, 3, stride=2), nn.AdaptiveAvgPool2d(3), nn.Flatten(), nn.Linear(72, 80)
+        )
+
+    def forward(self, images: Tensor, labels: Tensor) -> Tensor:
+        raw = self.layers(images).unflatten(1, (10, 8))
+        means, cholesky = raw[..., :2].sigmoid() * 24, nn.functional.softplus(raw[..., 2:5]) + 0.5
+        if not self.fielded:
+            return region_splat(means, cholesky, raw[..., 5:], lookup_regions(means, labels), labels)
+        field = GaussianField(means, cholesky, raw[..., 5:], size=SIZE).assign_regions(labels)
+        return RegionSplatRenderer()(field, labels)
+
+
+def batch(count: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(count)
+    return torch.rand(count, 3, *SIZE, generator=generator), torch.randint(3, (count, *SIZE), generator=generator)
+
+
+class TestExport:
+    @compiler_warnings
+    def test_runs_in_a_new_process(self, field: GaussianField, regions: RegionMap, tmp_path: Path) -> None:
+        """A scene, a splat of any number of Gaussians, encoders of any batch: traced with one, run with another."""
+        torch.manual_seed(0)
+        scene, splat, encoders = Scene(field, regions), Splat(), [Encoder(False), Encoder(True)]
+        parts = [field.means, field.cholesky, field.colors, field.region_ids, regions.labels]
+        traced = [t.detach() for t in parts if t is not None]
+        other = [t[:7] for t in traced[:4]] + traced[4:]
+        count, images = torch.export.Dim("N", min=0), torch.export.Dim("B", min=1)
+        cases = [(scene, (), (), None), (splat, tuple(traced), tuple(other), [{0: count}] * 4 + [None])]
+        cases += [(encoder, batch(2), batch(3), [{0: images}] * 2) for encoder in encoders]  # type: ignore[arg-type]
+        wanted = []
+        for number, (module, example, given, shapes) in enumerate(cases):
+            shapes = (tuple(shapes),) if module is splat else tuple(shapes or ())
+            program = torch.export.export(module, example, dynamic_shapes=shapes or None)
+            torch.export.save(program, tmp_path / f"{number}.pt2")
+            wanted.append((given, module(*given).detach()))
+        torch.save(wanted, tmp_path / "wanted.pt")
+        code = (
+            "import sys, torch, kcgs\n"
+            "for number, (given, image) in enumerate(torch.load(f'{sys.argv[1]}/wanted.pt')):\n"
+            "    found = torch.export.load(f'{sys.argv[1]}/{number}.pt2').module()(*given)\n"
+            "    torch.testing.assert_close(found, image, rtol=1e-5, atol=1e-6)\n"
+            "    assert image.abs().max() > 0.1 and not torch.equal(image[0], image[-1])\n"
+        )
+        subprocess.run([sys.executable, "-W", "ignore", "-c", code, str(tmp_path)], check=True, timeout=120)
+
+    @compiler_warnings
+    def test_encoder_of_any_size_of_image(self) -> None:
+        height, width = torch.export.Dim("H", min=8), torch.export.Dim("W", min=8)
+        encoder, shapes = Encoder(False), ({2: height, 3: width}, {1: height, 2: width})
+        program = torch.export.export(encoder, batch(2), dynamic_shapes=shapes)
+        other = [nn.functional.interpolate(batch(2)[0], (30, 41)), batch(2)[1].repeat(1, 2, 2)[:, :30, :41]]
+        torch.testing.assert_close(program.module()(*other), encoder(*other), rtol=1e-5, atol=1e-6)
+
+    @compiler_warnings
+    def test_encoder_in_one_graph_for_any_batch(self) -> None:
+        torch._dynamo.reset()
+        counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
+        encoder = Encoder(False)
+        compiled, counts = torch.compile(encoder, backend=counter, fullgraph=True), []
+        for count in (2, 3, 5):
+            assert torch.equal(compiled(*batch(count)), encoder(*batch(count)))
+            compiled(*batch(count)).sum().backward()
+            counts.append(counter.frame_count)
+        assert counts == [1, 2, 2]
+
+
+class Splat(nn.Module):
+    def forward(self, *tensors: Tensor) -> Tensor:
+        return region_splat(*tensors)
 
 
 class TestOperator:
@@ -145,6 +284,27 @@ class TestOperator:
         tensors = field.means, field.cholesky, field.colors, field.region_ids, regions.labels
         image = region_splat(*(t.to("meta") for t in tensors))
         assert image.device.type == "meta" and image.shape == (3, *SIZE)
+
+    @pytest.mark.parametrize("mapped", [False, True])
+    def test_fake_tensors(self, mapped: bool) -> None:
+        """Shapes, forward and backward, of tensors that have no values."""
+        with FakeTensorMode():
+            tensors = [torch.rand(2, 20, n, requires_grad=True) for n in (2, 3, 4)]
+            zeros = torch.zeros(2, 20, dtype=torch.long), torch.zeros(SIZE, dtype=torch.long)
+            image = region_splat(*tensors, *zeros) if mapped else region_splat(*tensors, size=SIZE)
+            assert image.shape == (2, 4, *SIZE)
+            for gradient, tensor in zip(torch.autograd.grad(image.sum(), tensors), tensors, strict=True):
+                assert gradient.shape == tensor.shape
+
+    @pytest.mark.parametrize("size", [None, (40, 50)])
+    def test_fake_scene(self, field: GaussianField, regions: RegionMap, size: tuple[int, int] | None) -> None:
+        with FakeTensorMode() as mode:
+            made = Scene(GaussianField.random(20, SIZE))
+            made(size).sum().backward()
+            assert made.field.means.grad is not None and made.field.means.grad.shape == (20, 2)
+        mode.allow_non_fake_inputs = True
+        with mode:
+            assert Scene(field, regions)(size).shape == (3, *(size or SIZE))
 
     @pytest.mark.parametrize("kernel", ["cpu", "tiled"])
     def test_second_derivatives_are_the_references(self, field: GaussianField, regions: RegionMap, kernel: str) -> None:
@@ -197,6 +357,22 @@ class TestFunctional:
         got.sum().backward()
         assert swapped["field.colors"].grad is not None and swapped["field.colors"].grad.any()
         assert field.colors.grad is None and torch.equal(field.colors, before)
+
+    @pytest.mark.parametrize("reentrant", [False, True])
+    def test_checkpoint(self, field: GaussianField, regions: RegionMap, backend: str, reentrant: bool) -> None:
+        """Evaluated again in the backward, the same gradients, bit for bit."""
+        results = []
+        for wrap in (lambda f, *given: f(*given), lambda f, *given: checkpoint(f, *given, use_reentrant=reentrant)):
+            leaves = [t.detach().clone().requires_grad_() for t in (field.means, field.cholesky, field.colors)]
+
+            def draw(*tensors: Tensor) -> Tensor:
+                return region_splat(*tensors, field.region_ids, regions, backend=backend)
+
+            image = wrap(draw, *leaves)
+            (image * image.detach().cos()).sum().backward()
+            results.append([image.detach(), *(t.grad for t in leaves)])
+        for got, want in zip(*results, strict=True):
+            assert want is not None and want.any() and torch.equal(got, want)
 
     @pytest.mark.parametrize("kernel", ["cpu", "tiled", "reference"])
     def test_grad_and_vjp(self, field: GaussianField, regions: RegionMap, kernel: str) -> None:
