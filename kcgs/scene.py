@@ -144,8 +144,10 @@ class Scene(nn.Module):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Map and notes, from `load_state_dict`."""
         regions = state["regions"]
-        device = self.field.means.device
-        self.regions = None if regions is None else RegionMap.from_state(regions).to(device)
+        self.regions = None if regions is None else RegionMap.from_state(regions)
+        # a field on the device meta has yet to get its tensors, and with assign=True the device of theirs
+        if self.regions is not None and not self.field.means.is_meta:
+            self.regions = self.regions.to(self.field.means.device)
         self.metadata = _check_metadata(state["metadata"])
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Scene:

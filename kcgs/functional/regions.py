@@ -52,6 +52,11 @@ class RegionMap:
         given = self.given
         keep_tables(given.fine_labels, given.widths, given.supersample, self.size, self.tables)
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Keep the tables of a copy where the operator finds them, too."""
+        vars(self).update(state)
+        self.__post_init__()
+
     def __repr__(self) -> str:
         finer = "" if self.supersample == 1 else f", supersample={self.supersample}"
         return f"RegionMap({self.num_regions} regions, size={self.size}, softness={self.softness}{finer})"

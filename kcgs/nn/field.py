@@ -73,9 +73,7 @@ class GaussianField(nn.Module):
         tensors = {"means": means, "cholesky": cholesky, "colors": colors, "opacities": opacities}
         for name, tensor in tensors.items():
             self._hold(name, tensor)
-        self.register_buffer("region_ids", None)
-        if region_ids is not None:
-            self.region_ids = self._checked_ids(region_ids)
+        self.register_buffer("region_ids", None if region_ids is None else self._checked_ids(region_ids))
 
     def _hold(self, name: str, value: Tensor | None) -> None:
         if value is not None and value.dtype in _HALF:
@@ -148,7 +146,7 @@ class GaussianField(nn.Module):
         ids = lookup_regions(self.means, labels)
         if tuple(labels.shape[-2:]) != self.size:
             raise ValueError(f"regions must have the field's size {self.size}; got {tuple(labels.shape[-2:])}")
-        self.region_ids = ids.to(self.means.device)
+        self.register_buffer("region_ids", ids.to(self.means.device))
         return self
 
     def subset(self, mask: Tensor) -> GaussianField:
@@ -212,9 +210,11 @@ class GaussianField(nn.Module):
         self.size = check_size("size", tuple(state["size"]))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        # torch treats a buffer that is None as absent: take the ids that the state carries
+        # torch treats a buffer that is None as absent: take the ids that the state carries, or their absence
         ids = state_dict.get(f"{prefix}region_ids")
-        if self.region_ids is None and ids is not None:
+        if ids is None and f"{prefix}means" in state_dict:
+            self.region_ids = None
+        elif self.region_ids is None and ids is not None and ids.shape == self.means.shape[:-1]:
             self.region_ids = self._checked_ids(ids)
         super()._load_from_state_dict(state_dict, prefix, *args)
 
