@@ -5,10 +5,12 @@ from __future__ import annotations
 import copy
 import io
 import pickle
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene, evaluate, load, save
 
@@ -39,10 +41,19 @@ def make_scene(name: str = "soft") -> Scene:
 
 @pytest.mark.parametrize("name", MAPS)
 class TestKeepsItsMap:
-    def test_deepcopy_and_pickle(self, name: str) -> None:
+    @pytest.mark.parametrize("rendered", [False, True])
+    def test_deepcopy_and_pickle(self, name: str, rendered: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The copies render alike, with gradients of their own, and make nothing of the map anew."""
         scene = make_scene(name)
-        for other in (copy.deepcopy(scene), pickle.loads(pickle.dumps(scene))):
-            assert torch.equal(other(), scene()) and other.metadata == {"title": name}
+        if rendered:
+            scene().sum().backward()
+        others = copy.deepcopy(scene), pickle.loads(pickle.dumps(scene))
+        image = scene()
+        monkeypatch.setattr(RegionMap, "from_labels", None)
+        for other in others:
+            assert torch.equal(other(), image) and other.metadata == {"title": name}
+            other().square().sum().backward()
+            assert other.field.colors.grad.any() and (scene.field.colors.grad is None) == (not rendered)
 
     def test_state_dict(self, name: str) -> None:
         scene = make_scene(name)
@@ -64,12 +75,97 @@ class TestKeepsItsMap:
         assert torch.equal(other["scene"](), whole["scene"]())
         assert (other["scene"].regions is None) == (name == "none")
 
+    @pytest.mark.parametrize("other", ["none", "hard"])
+    def test_state_dict_of_a_scene_of_another_size_and_map(self, name: str, other: str) -> None:
+        """Ids, map, size and notes are the state's, or none, where it has none; strictly, and by weights only."""
+        scene, file = make_scene(name), io.BytesIO()
+        torch.save(scene.state_dict(), file)
+        file.seek(0)
+        small = torch.eye(9).long()
+        field = GaussianField.random(40, (9, 9), regions=None if other == "none" else small, seed=1)
+        loaded = Scene(field, None if other == "none" else small, {"title": "small", "by": "test"})
+        assert loaded().shape == (3, 9, 9)
+        loaded.load_state_dict(torch.load(file, weights_only=True))
+        assert torch.equal(loaded(), scene()) and loaded.size == SIZE and loaded.metadata == {"title": name}
+        assert (loaded.regions is None) == (loaded.field.region_ids is None) == (name == "none")
+
+    def test_state_dict_assigned_to_a_scene_without_memory(self, name: str) -> None:
+        scene = make_scene(name)
+        with torch.device("meta"):
+            empty = Scene(GaussianField.random(40, SIZE))
+        empty.load_state_dict(scene.state_dict(), assign=True)
+        assert torch.equal(empty(), scene())
+
     def test_safetensors(self, name: str, tmp_path: Path) -> None:
         if name == "resized":
             pytest.skip("a file keeps the labels of the new size, which are another map")
         scene = make_scene(name)
         assert scene.save(tmp_path / "scene.safetensors") == (tmp_path / "scene.safetensors").stat().st_size
         assert torch.equal(load(tmp_path / "scene.safetensors")(), scene())
+
+
+def as_they_are(scenes: list[Scene]) -> list[Scene]:
+    return scenes
+
+
+class TestProcesses:
+    """What torch sends between processes."""
+
+    @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+    @pytest.mark.parametrize("start", ["fork", "spawn"])
+    def test_items_of_a_data_loader(self, start: str) -> None:
+        """Scenes with their maps, from two workers; they are rendered before, and render alike on both sides."""
+        scenes = [make_scene(name) for name in MAPS]
+        images = [scene().detach() for scene in scenes]
+        loader = DataLoader(scenes, 2, num_workers=2, collate_fn=as_they_are, multiprocessing_context=start)  # type: ignore[arg-type]
+        got = [scene for batch in loader for scene in batch]
+        for scene, sent, image in zip(got, scenes, images, strict=True):
+            assert torch.equal(scene(), image) and torch.equal(sent(), image) and scene.metadata == sent.metadata
+            scene().sum().backward()
+            assert scene.field.means.grad is not None and scene.field.means.grad.any()
+
+    @pytest.mark.skipif(not torch.distributed.is_available(), reason="torch is built without distributed")
+    @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+    def test_data_parallel(self, tmp_path: Path) -> None:
+        """Two processes, each with a target of its own, train as one does on the mean of both losses."""
+        context = get_context("fork")
+        processes = [
+            context.Process(target=train_in_parallel, args=(rank, str(tmp_path)), daemon=True) for rank in range(2)
+        ]
+        for process in processes:
+            process.start()
+        for process in processes:
+            process.join(30)
+            assert process.exitcode == 0
+        scene, optimizer = trained_scene()
+        for _ in range(3):
+            optimizer.zero_grad()
+            sum((scene() - target).square().mean() / 2 for target in (0.2, 0.8)).backward()  # type: ignore[union-attr]
+            optimizer.step()
+        first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2))
+        assert torch.equal(first["field.colors"], second["field.colors"])
+        loaded = Scene(GaussianField.random(40, SIZE, seed=1))
+        loaded.load_state_dict(first)
+        torch.testing.assert_close(loaded(), scene(), rtol=1e-4, atol=1e-5)
+        assert not torch.allclose(scene(), make_scene()())
+
+
+def trained_scene() -> tuple[Scene, torch.optim.Optimizer]:
+    scene = make_scene()
+    return scene, torch.optim.SGD(scene.parameters(), lr=1.0)
+
+
+def train_in_parallel(rank: int, folder: str) -> None:
+    """Train a scene as one of two processes, and save its state."""
+    torch.distributed.init_process_group("gloo", init_method=f"file://{folder}/group", rank=rank, world_size=2)
+    scene, optimizer = trained_scene()
+    wrapped = torch.nn.parallel.DistributedDataParallel(scene)
+    for _ in range(3):
+        optimizer.zero_grad()
+        (wrapped() - (0.2, 0.8)[rank]).square().mean().backward()
+        optimizer.step()
+    torch.save(scene.state_dict(), f"{folder}/{rank}.pt")
+    torch.distributed.destroy_process_group()
 
 
 class TestModule:

@@ -66,6 +66,11 @@ class Membership:
         self.fine = fine
         self._derived: dict[object, Any] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Tables stay behind: torch moves tensors that it sends to another process, from under the arrays that share
+        # their memory.
+        return {**vars(self), "_derived": {}}
+
     @property
     def grid(self) -> Tensor:
         """The map at its own resolution, (B, k * H, k * W)."""

@@ -231,3 +231,85 @@ class TestComposition:
             optimizer.step()
             losses.append(float(loss.detach()))
         assert losses[-1] < 0.3 * losses[0]
+
+
+class TestBatch:
+    """Images whose maps have other regions, and other numbers of them."""
+
+    IDS = ((0, 4), (7,), (2, 9, 5))
+
+    @pytest.fixture
+    def maps(self) -> Tensor:
+        maps = torch.zeros(3, *SIZE, dtype=torch.long)
+        for labels, ids in zip(maps, self.IDS, strict=True):
+            labels[:] = torch.tensor(ids)[torch.arange(SIZE[1]) * len(ids) // SIZE[1]]
+        return maps
+
+    @pytest.mark.parametrize("form", ["tensor", "hard", "soft", "pairs", "resized"])
+    def test_is_its_images(self, maps: Tensor, backend: str, form: str) -> None:
+        softness = {"soft": 0.8, "resized": 0.8, "pairs": {(0, 4): 1.0, (9, 5): 0.5}}.get(form, 0.0)
+        regions = maps if form == "tensor" else RegionMap.from_labels(maps, softness)  # type: ignore[arg-type]
+        size = (40, 50) if form == "resized" else None
+        parts = [GaussianField.random(30, SIZE, regions=labels, seed=k) for k, labels in enumerate(maps)]
+        leaves = [torch.stack([getattr(f, name).detach() for f in parts]) for name in ("means", "cholesky", "colors")]
+        batch = GaussianField(*leaves, size=SIZE).assign_regions(regions)
+        assert batch.region_ids is not None
+        assert [tuple(row.unique().tolist()) for row in batch.region_ids] == [tuple(sorted(ids)) for ids in self.IDS]
+        render = RegionSplatRenderer(backend=backend)
+        images = render(batch, regions, size)
+        images.square().sum().backward()
+        singles = regions if isinstance(regions, Tensor) else regions.unbind()
+        for k, (part, one) in enumerate(zip(parts, singles, strict=True)):
+            image = render(part, one, size)
+            image.square().sum().backward()
+            torch.testing.assert_close(images[k], image, rtol=1e-5, atol=1e-6)
+            for name, parameter in part.named_parameters():
+                torch.testing.assert_close(batch.get_parameter(name).grad[k], parameter.grad, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+class TestHalf:
+    """Half precision in: computed in float32, in the dtype of the colours out."""
+
+    def test_function(self, field: GaussianField, labels: Tensor, backend: str, dtype: torch.dtype) -> None:
+        from kcgs.functional import region_splat
+
+        def render(*tensors: Tensor) -> Tensor:
+            return region_splat(*tensors, field.region_ids, labels, backend=backend)
+
+        halves = [p.detach().to(dtype).requires_grad_() for p in (field.means, field.cholesky, field.colors)]
+        floats = [t.detach().float().requires_grad_() for t in halves]
+        image, want = render(*halves), render(*floats)
+        assert image.dtype == dtype and torch.equal(image, want.to(dtype))
+        got = torch.autograd.grad(image.float().sum(), halves)
+        for gradient, exact, leaf in zip(got, torch.autograd.grad(want.sum(), floats), halves, strict=True):
+            assert gradient.dtype == leaf.dtype == dtype and torch.equal(gradient, exact.to(dtype))
+        # one of the three is enough, and the colours decide
+        assert render(halves[0], floats[1], floats[2]).dtype == torch.float32
+        assert render(floats[0], floats[1], halves[2]).dtype == dtype
+
+    def test_field_keeps_pixel_positions(self, field: GaussianField, labels: Tensor, dtype: torch.dtype) -> None:
+        """A field of half tensors is of float32, with and without a graph; so is what it renders."""
+        for graph in (False, True):
+            halves = [p.detach().to(dtype).requires_grad_(graph) for p in (field.means, field.cholesky, field.colors)]
+            other = GaussianField(*(t * 1 for t in halves), field.region_ids, size=SIZE)
+            image = RegionSplatRenderer()(other, labels)
+            assert image.dtype == other.means.dtype == torch.float32
+            image.sum().backward()
+            assert not graph or all(t.grad is not None and t.grad.dtype == dtype for t in halves)
+
+    def test_autocast(self, field: GaussianField, labels: Tensor, dtype: torch.dtype) -> None:
+        """The splat of a network in half precision is evaluated in float32; filters after it are not its matter."""
+        torch.manual_seed(0)
+        network, chain = nn.Linear(4, 20 * 8), nn.Sequential(RegionSplatRenderer(keepdim=False), nn.Conv2d(3, 3, 3))
+        with torch.autocast("cpu", dtype):
+            raw = network(torch.randn(2, 4)).view(2, 20, 8)
+            assert raw.dtype == dtype
+            means, cholesky = 24 * raw[..., :2].sigmoid(), 1 + raw[..., 2:5].sigmoid()
+            batch = GaussianField(means, cholesky, raw[..., 5:], size=SIZE).assign_regions(labels)
+            image = RegionSplatRenderer()(batch, labels)
+            assert batch.means.dtype == image.dtype == torch.float32 and chain(Scene(field, labels)).dtype == dtype
+        assert torch.equal(image, RegionSplatRenderer()(batch, labels))
+        image.square().sum().backward()
+        assert network.weight.grad is not None and network.weight.grad.dtype == torch.float32
+        assert network.weight.grad.isfinite().all() and network.weight.grad.any()

@@ -1,4 +1,4 @@
-"""Augment with Kornia, segment, fit, draw, measure with Kornia: one pipeline of torch tensors."""
+"""Kornia before and after kcgs: a fit of what was augmented, and the renderer as the first link of a chain."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from kcgs import fit
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene, fit
 from kcgs.functional import psnr
 from kcgs.segment import segment
 
@@ -61,3 +61,78 @@ def test_labels_follow_a_geometric_augmentation(photo: Tensor) -> None:
         render = scene.render()[None]
         quality.append(float(kornia.metrics.psnr(render, image, 1.0)))
     assert quality[0] > quality[1] + 1
+
+
+LINKS = {
+    "gaussian-blur": kornia.filters.GaussianBlur2d((3, 3), (1.0, 1.0)),
+    "sobel": kornia.filters.Sobel(),
+    "flip": K.RandomHorizontalFlip(p=1.0),
+    "jiggle": K.ColorJiggle(0.1, 0.1, 0.1, 0.1, p=1.0),
+    "affine": K.RandomAffine(10.0, p=1.0),
+    "crop": K.RandomCrop((16, 16), p=1.0),
+    "augmentations": K.AugmentationSequential(
+        K.RandomHorizontalFlip(p=1.0), K.RandomErasing(p=1.0), data_keys=["input"]
+    ),
+    "grey": kornia.color.RgbToGrayscale(),
+    "resize": kornia.geometry.Resize((12, 18), antialias=True),
+}
+
+
+class TestFirstLink:
+    """`nn.Sequential(RegionSplatRenderer(keepdim=False), ...)` of a scene, as Kornia chains its own modules."""
+
+    SIZE = (24, 36)
+
+    @pytest.fixture
+    def scene(self) -> Scene:
+        labels = torch.zeros(self.SIZE, dtype=torch.long)
+        labels[6:18, 10:30] = 4
+        regions = RegionMap.from_labels(labels, 0.7)
+        return Scene(GaussianField.random(60, self.SIZE, regions=regions, seed=0), regions)
+
+    @pytest.mark.parametrize("link", LINKS)
+    def test_takes_any_link(self, scene: Scene, link: str) -> None:
+        torch.manual_seed(0)
+        image = nn.Sequential(RegionSplatRenderer(clamp=True, keepdim=False), LINKS[link])(scene)
+        assert image.ndim == 4 and len(image) == 1
+        image.square().sum().backward()
+        for parameter in scene.parameters():
+            assert parameter.grad is not None and parameter.grad.isfinite().all() and parameter.grad.any()
+
+    def test_a_long_chain_and_a_batch(self, scene: Scene) -> None:
+        """One scene gives a batch of one; a batch of scenes stays a batch, with or without `keepdim`."""
+        links = [LINKS["gaussian-blur"], LINKS["flip"], LINKS["resize"]]
+        assert nn.Sequential(RegionSplatRenderer(keepdim=False), *links)(scene).shape == (1, 3, 12, 18)
+        field = scene.field
+        tensors = (t.detach().expand(2, -1, -1) for t in (field.means, field.cholesky, field.colors))
+        assert field.region_ids is not None
+        both = Scene(GaussianField(*tensors, field.region_ids.expand(2, -1), size=self.SIZE), scene.regions)
+        for keepdim in (False, True):
+            assert nn.Sequential(RegionSplatRenderer(keepdim=keepdim), *links)(both).shape == (2, 3, 12, 18)
+
+    def test_keepdim(self, scene: Scene) -> None:
+        """As Kornia's augmentations have it, but with (C, H, W) kept by default: a scene is one image."""
+        image = RegionSplatRenderer()(scene)
+        assert image.shape == (3, *self.SIZE) and torch.equal(RegionSplatRenderer(keepdim=False)(scene)[0], image)
+        assert K.RandomHorizontalFlip(p=1.0, keepdim=True)(image).shape == (3, *self.SIZE)
+
+    @pytest.mark.parametrize(
+        "loss",
+        [
+            kornia.losses.SSIMLoss(5), kornia.losses.MS_SSIMLoss(), kornia.losses.PSNRLoss(1.0),
+            kornia.losses.CharbonnierLoss(reduction="mean"), kornia.losses.WelschLoss(reduction="mean"),
+        ],
+        ids=lambda loss: type(loss).__name__,
+    )  # fmt: skip
+    def test_losses_and_metrics(self, scene: Scene, loss: nn.Module) -> None:
+        """They take the render as it is, and are best where it is its target."""
+        target = RegionSplatRenderer(keepdim=False, clamp=True)(scene).detach()
+        with torch.no_grad():
+            scene.field.colors.mul_(0.5)
+        image = RegionSplatRenderer(keepdim=False)(scene)
+        value = loss(image, target)
+        value.backward()
+        assert scene.field.colors.grad is not None and scene.field.colors.grad.any()
+        assert value > loss(target, target)
+        torch.testing.assert_close(psnr(image, target).squeeze(), kornia.metrics.psnr(image, target, 1.0))
+        assert 0 < kornia.metrics.ssim(image, target, 5).mean() < 1
