@@ -48,7 +48,7 @@ def check_floating(
 
 
 def holds(condition: Tensor, words: str) -> bool:
-    """Whether a condition on values holds; in a graph and on CUDA it is an assertion instead, for which nobody waits."""
+    """Read a condition on values; in a graph and on CUDA it is an assertion instead, for which nobody waits."""
     try:
         torch._assert_async(condition, words)
     except RuntimeError:
