@@ -54,19 +54,48 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
 
 
+DEVICES = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
+DTYPES = ("float16", "bfloat16", "float32", "float64")
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--device", default="cpu", help="device of the kernel tests: cpu or cuda")
+    parser.addoption("--device", default="cpu", help=f"of tests of operations: all, or some of {', '.join(DEVICES)}")
+    parser.addoption("--dtype", default="float32", help=f"the same: all, or some of {', '.join(DTYPES)}")
 
 
-@pytest.fixture
-def device(request: pytest.FixtureRequest) -> torch.device:
-    return torch.device(request.config.getoption("--device"))
+def _chosen(config: pytest.Config, option: str, known: tuple[str, ...]) -> tuple[str, ...]:
+    value = config.getoption(option)
+    chosen = known if value == "all" else tuple(value.split(","))
+    if unknown := set(chosen) - set(known):
+        raise pytest.UsageError(f"{option} must be all, or some of {', '.join(known)}; got {', '.join(unknown)}")
+    return chosen
 
 
-@pytest.fixture(params=[b for b in BACKENDS if b not in ("auto", "cuda")])
-def backend(request: pytest.FixtureRequest) -> str:
-    """Name a kernel that runs on the CPU; the one that does not has cases of its own in tests/kernels."""
-    return request.param
+def _backends(device: str) -> list[str]:
+    """Name the kernels that take tensors of a device."""
+    others = {"cpu", "cuda", "auto"} - {device}
+    return [name for name in BACKENDS if name not in others]
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run tests that ask for `device`, `dtype` or `backend` with each that the command line chooses.
+
+    A test without `device` runs on the CPU; kernels of one dtype are left out where `dtype` is another.
+    """
+    given = [mark.args[0] for mark in metafunc.definition.iter_markers("parametrize")]
+    own = {name for each in given for name in (each.split(",") if isinstance(each, str) else each)}
+    names = [n for n in ("backend", "device", "dtype") if n in metafunc.fixturenames and n not in own]
+    if not names:
+        return
+    rows = []
+    for device in _chosen(metafunc.config, "--device", DEVICES) if "device" in names else ("cpu",):
+        for dtype in _chosen(metafunc.config, "--dtype", DTYPES) if "dtype" in names else ("",):
+            for backend in _backends(device) if "backend" in names else ("",):
+                if dtype != "float64" or backend not in ("cpu", "cuda"):
+                    row = {"backend": backend, "device": torch.device(device), "dtype": getattr(torch, dtype, None)}
+                    parts = {"backend": backend, "device": device, "dtype": dtype}
+                    rows.append(pytest.param(*(row[n] for n in names), id="-".join(parts[n] for n in names)))
+    metafunc.parametrize(names, rows)
 
 
 @pytest.fixture(scope="session")

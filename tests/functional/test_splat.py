@@ -10,8 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs import RegionMap
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer
 from kcgs.functional import region_splat
+from tests.tester import BaseTester
 
 # scenes here are drawn at random, with ids that their maps may lack
 pytestmark = pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing:UserWarning")
@@ -43,6 +44,10 @@ def random_scene(n: int, size: tuple[int, int], regions: int, *, channels: int =
         labels = torch.where(disc, regions - 1, labels)
     ids = torch.randint(0, regions, (n,), generator=generator)
     return Scene(means, cholesky, uniform(n, channels) - 0.3, 10 * ids, 10 * labels)
+
+
+def on(device: torch.device, dtype: torch.dtype, scene: Scene) -> Scene:
+    return Scene(*(t.to(device, dtype) for t in scene[:3]), *(t.to(device) for t in scene[3:]))
 
 
 def as_float32(scene: Scene) -> Scene:
@@ -77,12 +82,69 @@ def assert_gradients_close(actual: list[Tensor], expected: list[Tensor], toleran
         assert cosine >= 1 - tolerance
 
 
-class TestTable:
-    """Three Gaussians, two regions, written out."""
+class TestRegionSplat(BaseTester):
+    def test_smoke(self, backend: str, device: torch.device, dtype: torch.dtype) -> None:
+        image = region_splat(*on(device, dtype, random_scene(40, (20, 30), 3)), backend=backend)
+        assert image.dtype == dtype and image.device.type == device.type
+        assert image.isfinite().all() and image.any()
 
-    def test_hand_worked(self, backend: str) -> None:
+    @pytest.mark.parametrize("lead", [(), (1,), (3,)])
+    @pytest.mark.parametrize(("count", "channels"), [(0, 3), (1, 1), (7, 5)])
+    def test_cardinality(
+        self, backend: str, device: torch.device, dtype: torch.dtype, lead: tuple[int, ...], count: int, channels: int
+    ) -> None:
+        scene = on(device, dtype, random_scene(count, (9, 17), 3, channels=channels))
+        tensors = [t.expand(*lead, *t.shape) for t in scene[:4]]
+        for maps in (scene.labels, scene.labels.expand(*lead, 9, 17)):
+            image = region_splat(*tensors, maps, backend=backend)
+            assert image.shape == (*lead, channels, 9, 17) and bool(image.any()) == (count > 0)
+
+    @pytest.mark.parametrize(
+        ("change", "error", "words"),
+        [
+            ({"means": [[0.0, 0.0]]}, TypeError, "means must be a Tensor; got list"),
+            ({"means": torch.zeros(2, 2).long()}, TypeError, "means must have a real floating dtype; got torch.int64"),
+            ({"means": torch.zeros(2, 3)}, ValueError, r"means must have shape \(..., 2\); got \(2, 3\)"),
+            ({"means": torch.full((2, 2), math.nan)}, ValueError, "means must be finite; got 4 NaN"),
+            ({"means": torch.full((2, 2), 1e9)}, ValueError, "means must be within"),
+            ({"cholesky": torch.zeros(2, 3)}, ValueError, "l11 > 0 and l22 > 0"),
+            ({"cholesky": torch.tensor([[1.0, 0.0, -1.0]] * 2)}, ValueError, "got a least of -1"),
+            ({"cholesky": torch.tensor([[1e-7, 0.0, 1.0]] * 2)}, ValueError, "least diagonal of 1e-07"),
+            ({"cholesky": torch.ones(3, 3)}, ValueError, r"cholesky must have shape \(2, 3\); got \(3, 3\)"),
+            ({"colors": torch.zeros(2, 0)}, ValueError, "at least one channel"),
+            ({"colors": torch.full((2, 3), math.inf)}, ValueError, "colors must be finite"),
+            ({"region_ids": None}, TypeError, "region_ids must be a Tensor"),
+            ({"region_ids": torch.tensor([0.0, 1.0])}, TypeError, "region_ids must have an integer dtype"),
+            ({"region_ids": torch.tensor([0, -1])}, ValueError, "region_ids must be non-negative; got -1"),
+            ({"region_ids": torch.tensor([0])}, ValueError, r"region_ids must have shape \(2,\); got \(1,\)"),
+            ({"regions": torch.tensor([[0.0, 1.0]])}, TypeError, "regions must have an integer dtype"),
+            ({"regions": torch.tensor([[0, -1]])}, ValueError, "labels must hold non-negative ids; got -1"),
+            ({"regions": torch.zeros(0, 3).long()}, ValueError, "regions must have at least one pixel"),
+            ({"regions": torch.zeros(2, 3, 3).long()}, ValueError, "regions must hold 1 map"),
+            ({"regions": "map.png"}, TypeError, "regions must be a RegionMap, a label map or None"),
+            ({"regions": None}, ValueError, "regions must be given with region_ids; got None"),
+            ({"regions": None, "region_ids": None}, ValueError, "size must be given"),
+            ({"regions": None, "size": (0, 4)}, ValueError, "size must be at least 1 x 1"),
+            ({"regions": None, "size": (2.0, 4)}, TypeError, "size must hold two integers"),
+            ({"size": (2, 2)}, ValueError, r"size must equal the size of regions, \(1, 2\); got \(2, 2\)"),
+            ({"cutoff": 1.0}, ValueError, r"cutoff must be in \[0, 1\); got 1.0"),
+            ({"cutoff": math.nan}, ValueError, "cutoff must be in"),
+            ({"backend": "gpu"}, ValueError, "backend must be one of auto, reference, tiled, cpu, cuda"),
+        ],
+    )  # fmt: skip
+    def test_exception(self, change: dict[str, object], error: type[Exception], words: str) -> None:
+        good = {
+            "means": torch.zeros(2, 2), "cholesky": torch.tensor([[1.0, 0.0, 1.0]] * 2), "colors": torch.zeros(2, 3),
+            "region_ids": torch.tensor([0, 1]), "regions": torch.tensor([[0, 1]]),
+        }  # fmt: skip
+        assert region_splat(**good).shape == (3, 1, 2)  # type: ignore[arg-type]
+        with pytest.raises(error, match=words):
+            region_splat(**{**good, **change})
+
+    def test_feature(self, backend: str, device: torch.device, dtype: torch.dtype) -> None:
+        """Three Gaussians, two regions, written out."""
         means = [(1.0, 1.0), (3.5, 0.5), (2.0, 1.5)]
-        factors = [(1.0, 0.0, 1.0), (2.0, 1.0, 0.5), (0.7, -0.4, 1.5)]
+        factors = [(1.0, 0.0, 1.0), (2.0, 1.0, 0.5), (0.75, -0.375, 1.5)]
         colors = [(1.0, 0.0), (0.25, -0.5), (0.0, 2.0)]
         ids = [5, 9, 5]
         labels = [[5, 5, 9, 9], [5, 9, 9, 5]]
@@ -94,13 +156,14 @@ class TestTable:
             q = (s_yy * dx * dx - 2 * s_xy * dx * dy + s_xx * dy * dy) / (s_xx * s_yy - s_xy * s_xy)
             for c in range(2):
                 expected[c, i, j] += (ids[k] == labels[i][j]) * math.exp(-0.5 * q) * colors[k][c]
-        dtype = torch.float32 if backend == "cpu" else torch.float64
-        arrays = [torch.tensor(v, dtype=dtype) for v in (means, factors, colors)]
-        image = region_splat(*arrays, torch.tensor(ids), torch.tensor(labels), cutoff=0, backend=backend)
-        torch.testing.assert_close(image.double(), expected, rtol=rounding(backend), atol=rounding(backend))
-        assert image.abs().max() > 0.5
+        for kind in (dtype, torch.float32 if backend in ("cpu", "cuda") else torch.float64):
+            scene = [torch.tensor(v, dtype=kind, device=device) for v in (means, factors, colors)]
+            scene += [torch.tensor(v, device=device) for v in (ids, labels)]
+            image = region_splat(*scene, cutoff=0, backend=backend)
+            self.assert_close(image, expected.to(dtype=kind, device=device))
+            assert image.abs().max() > 0.5
 
-    def test_soft_membership_by_hand(self, backend: str) -> None:
+    def test_feature_soft_membership(self, backend: str) -> None:
         labels = torch.tensor([[0, 0, 0, 1, 1, 1]])
         flat = torch.tensor([[1e6, 0.0, 1e6]])
         regions = RegionMap.from_labels(labels, softness=0.5)
@@ -115,6 +178,48 @@ class TestTable:
         ]
         torch.testing.assert_close(image[0, 0], torch.tensor(share), rtol=0, atol=1e-6)
         assert share[0] == 1.0 and share[5] == 0.0 and 0.5 < share[2] < 1.0
+
+    @pytest.mark.parametrize("softness", [0.0, 0.8])
+    @pytest.mark.parametrize("regions", [1, 3])
+    @pytest.mark.parametrize("backend", ["reference", "tiled"])
+    def test_gradcheck(self, backend: str, regions: int, softness: float) -> None:
+        scene = random_scene(5, (9, 19), regions, channels=2)
+        region_map = RegionMap.from_labels(scene.labels, softness)
+
+        def draw(means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
+            return region_splat(means, cholesky, colors, scene.region_ids, region_map, cutoff=0, backend=backend)
+
+        self.gradcheck(draw, scene[:3], fast_mode=(regions, softness) != (3, 0.8))
+
+    def test_only_what_is_asked(self, backend: str) -> None:
+        scene = suited(random_scene(20, (20, 30), 2), backend)
+        full = gradients(scene, RegionMap.from_labels(scene.labels), backend=backend)[1]
+        for chosen in range(3):
+            inputs = [t.detach().requires_grad_(i == chosen) for i, t in enumerate(scene[:3])]
+            image = region_splat(*inputs, *scene[3:], backend=backend)
+            probe = torch.linspace(-1, 2, image.numel(), dtype=image.dtype).view_as(image)
+            (image * probe).sum().backward()
+            torch.testing.assert_close(inputs[chosen].grad, full[chosen], rtol=1e-5, atol=1e-5)
+            assert all(t.grad is None for i, t in enumerate(inputs) if i != chosen)
+
+    def test_module(self, backend: str, device: torch.device, dtype: torch.dtype) -> None:
+        """RegionSplatRenderer is the twin; a field holds no half precision, and renders in float32."""
+        scene = on(device, dtype, random_scene(40, (20, 30), 3))
+        field = GaussianField(*scene[:4], size=(20, 30))
+        image = RegionSplatRenderer(cutoff=1e-3, backend=backend)(field, scene.labels)
+        want = region_splat(*(t.to(image.dtype) for t in scene[:3]), *scene[3:], cutoff=1e-3, backend=backend)
+        assert want.any() and torch.equal(image, want)
+
+    @pytest.mark.parametrize("softness", [0.0, 0.8])
+    def test_dynamo(self, backend: str, device: torch.device, dtype: torch.dtype, softness: float) -> None:
+        scene = on(device, dtype, random_scene(12, (9, 17), 3))
+        regions = RegionMap.from_labels(scene.labels, softness)
+        leaves = [t.requires_grad_() for t in scene[:3]]
+
+        def draw(*tensors: Tensor) -> Tensor:
+            return region_splat(*tensors, scene.region_ids, regions, backend=backend)
+
+        self.assert_compiles(draw, *leaves, leaves=leaves, backend="aot_eager")
 
 
 SIZES = [(1, 1), (1, 37), (33, 16), (47, 61)]
@@ -169,32 +274,6 @@ class TestAgainstReference:
         tolerance = 10 * rounding(backend)
         torch.testing.assert_close(got.double(), want, rtol=tolerance, atol=tolerance)
         assert_gradients_close(got_gradients, want_gradients, tolerance)
-
-
-class TestGradcheck:
-    @pytest.mark.parametrize("softness", [0.0, 0.8])
-    @pytest.mark.parametrize("regions", [1, 3])
-    @pytest.mark.parametrize("backend", ["reference", "tiled"])
-    def test_gradcheck(self, backend: str, regions: int, softness: float) -> None:
-        scene = random_scene(5, (9, 19), regions, channels=2)
-        region_map = RegionMap.from_labels(scene.labels, softness)
-
-        def draw(means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
-            return region_splat(means, cholesky, colors, scene.region_ids, region_map, cutoff=0, backend=backend)
-
-        inputs = tuple(t.requires_grad_() for t in scene[:3])
-        assert torch.autograd.gradcheck(draw, inputs)
-
-    def test_only_what_is_asked(self, backend: str) -> None:
-        scene = suited(random_scene(20, (20, 30), 2), backend)
-        full = gradients(scene, RegionMap.from_labels(scene.labels), backend=backend)[1]
-        for chosen in range(3):
-            inputs = [t.detach().requires_grad_(i == chosen) for i, t in enumerate(scene[:3])]
-            image = region_splat(*inputs, *scene[3:], backend=backend)
-            probe = torch.linspace(-1, 2, image.numel(), dtype=image.dtype).view_as(image)
-            (image * probe).sum().backward()
-            torch.testing.assert_close(inputs[chosen].grad, full[chosen], rtol=1e-5, atol=1e-5)
-            assert all(t.grad is None for i, t in enumerate(inputs) if i != chosen)
 
 
 class TestConstraint:
@@ -344,51 +423,3 @@ class TestExtremes:
             image = region_splat(*scene[:3], ids, regions, cutoff=0, backend=backend)
             want = region_splat(*(t.double() for t in scene[:3]), ids, regions, cutoff=0, backend="reference")
             assert (image - want).abs().max() < 1e-5
-
-
-class TestErrors:
-    def good(self) -> dict[str, object]:
-        return {
-            "means": torch.zeros(2, 2), "cholesky": torch.tensor([[1.0, 0.0, 1.0]] * 2), "colors": torch.zeros(2, 3),
-            "region_ids": torch.tensor([0, 1]), "regions": torch.tensor([[0, 1]]),
-        }  # fmt: skip
-
-    def test_good_is_good(self) -> None:
-        assert region_splat(**self.good()).shape == (3, 1, 2)
-
-    @pytest.mark.parametrize(
-        ("change", "error", "words"),
-        [
-            ({"means": [[0.0, 0.0]]}, TypeError, "means must be a Tensor; got list"),
-            ({"means": torch.zeros(2, 2).long()}, TypeError, "means must have a real floating dtype; got torch.int64"),
-            ({"means": torch.zeros(2, 3)}, ValueError, r"means must have shape \(..., 2\); got \(2, 3\)"),
-            ({"means": torch.full((2, 2), math.nan)}, ValueError, "means must be finite; got 4 NaN"),
-            ({"means": torch.full((2, 2), 1e9)}, ValueError, "means must be within"),
-            ({"cholesky": torch.zeros(2, 3)}, ValueError, "l11 > 0 and l22 > 0"),
-            ({"cholesky": torch.tensor([[1.0, 0.0, -1.0]] * 2)}, ValueError, "got a least of -1"),
-            ({"cholesky": torch.tensor([[1e-7, 0.0, 1.0]] * 2)}, ValueError, "least diagonal of 1e-07"),
-            ({"cholesky": torch.ones(3, 3)}, ValueError, r"cholesky must have shape \(2, 3\); got \(3, 3\)"),
-            ({"colors": torch.zeros(2, 0)}, ValueError, "at least one channel"),
-            ({"colors": torch.full((2, 3), math.inf)}, ValueError, "colors must be finite"),
-            ({"region_ids": None}, TypeError, "region_ids must be a Tensor"),
-            ({"region_ids": torch.tensor([0.0, 1.0])}, TypeError, "region_ids must have an integer dtype"),
-            ({"region_ids": torch.tensor([0, -1])}, ValueError, "region_ids must be non-negative; got -1"),
-            ({"region_ids": torch.tensor([0])}, ValueError, r"region_ids must have shape \(2,\); got \(1,\)"),
-            ({"regions": torch.tensor([[0.0, 1.0]])}, TypeError, "regions must have an integer dtype"),
-            ({"regions": torch.tensor([[0, -1]])}, ValueError, "labels must hold non-negative ids; got -1"),
-            ({"regions": torch.zeros(0, 3).long()}, ValueError, "regions must have at least one pixel"),
-            ({"regions": torch.zeros(2, 3, 3).long()}, ValueError, "regions must hold 1 map"),
-            ({"regions": "map.png"}, TypeError, "regions must be a RegionMap, a label map or None"),
-            ({"regions": None}, ValueError, "regions must be given with region_ids; got None"),
-            ({"regions": None, "region_ids": None}, ValueError, "size must be given"),
-            ({"regions": None, "size": (0, 4)}, ValueError, "size must be at least 1 x 1"),
-            ({"regions": None, "size": (2.0, 4)}, TypeError, "size must hold two integers"),
-            ({"size": (2, 2)}, ValueError, r"size must equal the size of regions, \(1, 2\); got \(2, 2\)"),
-            ({"cutoff": 1.0}, ValueError, r"cutoff must be in \[0, 1\); got 1.0"),
-            ({"cutoff": math.nan}, ValueError, "cutoff must be in"),
-            ({"backend": "gpu"}, ValueError, "backend must be one of auto, reference, tiled, cpu, cuda"),
-        ],
-    )  # fmt: skip
-    def test_bad_input(self, change: dict[str, object], error: type[Exception], words: str) -> None:
-        with pytest.raises(error, match=words):
-            region_splat(**{**self.good(), **change})
