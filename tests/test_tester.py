@@ -9,7 +9,7 @@ from tests.tester import CASES, BaseTester
 
 
 def make(without: dict[str, str], *cases: str) -> type:
-    return type("TestNew", (BaseTester,), {"without": without, **dict.fromkeys(cases, lambda self: None)})
+    return type("TestNew", (BaseTester,), dict.fromkeys(cases, lambda self: None), without=without)
 
 
 @pytest.mark.parametrize("case", CASES)

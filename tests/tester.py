@@ -1,13 +1,14 @@
 """The form of the tests of an operation: what each of them has to show, and how results are compared.
 
-A class derives from :class:`BaseTester` and has every case of ``CASES``, or says in ``without`` why it has one not.
+A class derives from :class:`BaseTester` and has every case of ``CASES``, or says why it has one not:
+``class TestBand(BaseTester, without={"test_gradcheck": "labels are integers"})``.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -42,15 +43,13 @@ class BaseTester:
     Tests take the fixtures `device`, `dtype` and `backend`, which the command line chooses.
     """
 
-    without: ClassVar[Mapping[str, str]] = {}
-    """Cases that the operation cannot have, each with the reason."""
-
-    def __init_subclass__(cls, **options: Any) -> None:
+    def __init_subclass__(cls, *, without: Mapping[str, str] | None = None, **options: Any) -> None:
         super().__init_subclass__(**options)
-        if unknown := set(cls.without) - set(CASES):
-            raise TypeError(f"{cls.__name__}.without must name cases; got {', '.join(sorted(unknown))}")
+        reasons = without or {}
+        if unknown := set(reasons) - set(CASES):
+            raise TypeError(f"{cls.__name__}: without must name cases; got {', '.join(sorted(unknown))}")
         for case, shows in CASES.items():
-            found, excused = callable(getattr(cls, case, None)), bool(cls.without.get(case))
+            found, excused = callable(getattr(cls, case, None)), bool(reasons.get(case))
             if not found and not excused:
                 raise TypeError(f"{cls.__name__} must have {case} ({shows}), or say in `without` why it has none")
             if found and excused:

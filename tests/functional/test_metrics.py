@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import correlate1d, distance_transform_edt
 from skimage import data
 from torch import Tensor
-from torch.autograd import gradcheck
 
 from kcgs.functional import edge_band, ef_psnr, ef_ssim, ms_ssim, psnr, ssim
+from tests.tester import BaseTester
 
 Array = NDArray[np.float64]
 Metric = Callable[..., Tensor]
@@ -87,6 +87,12 @@ def disc_labels(rows: int, columns: int) -> Tensor:
     y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
     disc = (y - rows // 2) ** 2 + (x - columns // 3) ** 2 < (rows // 4) ** 2
     return torch.where(disc, 7, torch.where(x > columns * 4 // 5, 300, 0))
+
+
+def small_pair() -> tuple[Tensor, Tensor]:
+    """Return two images inside [0, 1], which clipping leaves as they are."""
+    image, target = 0.1 + 0.8 * torch.rand(2, 1, 11, 12, generator=torch.Generator().manual_seed(1))
+    return image, target
 
 
 def reference_band(labels: Tensor, width: float) -> NDArray[np.bool_]:
@@ -200,22 +206,69 @@ class TestMsSsim:
         assert apart.mean() > 0.4
 
 
-class TestEdgeFocused:
-    @pytest.mark.parametrize("width", [1, 5])
-    def test_psnr_reads_the_band_only(self, width: int) -> None:
+class TestEdgeFocused(BaseTester, without={"test_module": "metrics are functions"}):
+    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    def test_smoke(self, metric: Metric, device: torch.device, dtype: torch.dtype) -> None:
+        image, target = (t.to(device, dtype) for t in photo_pair("coffee", 20, 24))
+        value = metric(image, target, disc_labels(20, 24).to(device))
+        assert value.isfinite() and value.device.type == device.type
+        assert value.dtype == torch.promote_types(dtype, torch.float32)
+
+    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    @pytest.mark.parametrize(("lead", "channels"), [((), 1), ((1,), 3), ((2,), 4)])
+    def test_cardinality(
+        self, metric: Metric, device: torch.device, dtype: torch.dtype, lead: tuple[int, ...], channels: int
+    ) -> None:
+        image, target = (
+            t.to(device, dtype)[torch.arange(channels) % 3].expand(*lead, channels, 20, 24)
+            for t in photo_pair("coffee", 20, 24)
+        )
+        labels = disc_labels(20, 24).to(device)
+        value = metric(image, target, labels)
+        assert value.shape == lead
+        self.assert_close(metric(image, target, labels.expand(*lead, 20, 24)), value)
+
+    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    def test_exception(self, metric: Metric) -> None:
+        image, labels = torch.rand(2, 3, 16, 20), disc_labels(16, 20)
+        with pytest.raises(TypeError, match="labels must have an integer dtype"):
+            metric(image, image, labels.float())
+        with pytest.raises(TypeError, match="labels must be a Tensor"):
+            metric(image, image, labels.tolist())
+        with pytest.raises(ValueError, match=r"labels must have shape \(16, 20\) or \(2, 16, 20\)"):
+            metric(image, image, labels.T)
+        with pytest.raises(ValueError, match="labels must have shape"):
+            metric(image, image, labels.expand(3, 16, 20))
+        with pytest.raises(ValueError, match="labels must have shape"):
+            metric(image[0], image[0], labels.expand(2, 16, 20))
+        with pytest.raises(ValueError, match="non-negative"):
+            metric(image, image, labels - 1)
+        with pytest.raises(ValueError, match="width"):
+            metric(image, image, labels, 0)
+
+    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    def test_gradcheck(self, metric: Metric) -> None:
+        image, target = small_pair()
+        self.gradcheck(metric, (image, target, disc_labels(11, 12), 2))
+
+    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    def test_dynamo(self, metric: Metric, device: torch.device, dtype: torch.dtype) -> None:
+        image, target = (t.to(device, dtype) for t in small_pair())
+        image.requires_grad_()
+        labels = disc_labels(11, 12).to(device)
+        self.assert_compiles(lambda i, t: metric(i, t, labels, 1), image, target, leaves=[image])
+
+    def test_feature(self) -> None:
+        """PSNR and SSIM over the band, by its definition."""
         image, target = photo_pair("astronaut", 64, 80)
         labels = disc_labels(64, 80)
-        band = reference_band(labels, width)
-        assert 0 < band.mean() < 0.5
-        expected = -10 * np.log10(np.mean((clipped(image) - clipped(target))[:, band] ** 2))
-        assert abs(float(ef_psnr(image, target, labels, width)) - expected) < 1e-12
-
-    @pytest.mark.parametrize("width", [1, 5])
-    def test_ssim_averages_the_band_of_the_map(self, width: int) -> None:
-        image, target = photo_pair("coffee", 64, 80)
-        labels = disc_labels(64, 80)
-        expected = reference_ssim_map(image, target)[:, reference_band(labels, width)].mean()
-        assert abs(float(ef_ssim(image, target, labels, width)) - expected) < 1e-12
+        for width in (1, 5):
+            band = reference_band(labels, width)
+            assert 0 < band.mean() < 0.5
+            expected = -10 * np.log10(np.mean((clipped(image) - clipped(target))[:, band] ** 2))
+            assert abs(float(ef_psnr(image, target, labels, width)) - expected) < 1e-12
+            expected = reference_ssim_map(image, target)[:, band].mean()
+            assert abs(float(ef_ssim(image, target, labels, width)) - expected) < 1e-12
 
     def test_default_width_is_five(self) -> None:
         image, target = photo_pair("coffee", 64, 80)
@@ -320,21 +373,9 @@ class TestCardinality:
 
 
 class TestGradient:
-    @pytest.mark.parametrize("name", ["psnr", "ssim", "ef_psnr", "ef_ssim"])
-    def test_gradcheck(self, name: str) -> None:
-        generator = torch.Generator().manual_seed(1)
-        image, target = (0.1 + 0.8 * torch.rand(2, 1, 11, 12, generator=generator).double() for _ in range(2))
-        image.requires_grad_()
-        labels = disc_labels(11, 12)
-        metrics: dict[str, Metric] = {
-            "psnr": psnr,
-            "ssim": ssim,
-            "ef_psnr": lambda a, b: ef_psnr(a, b, labels, 2),
-            "ef_ssim": lambda a, b: ef_ssim(a, b, labels, 2),
-        }
-        assert gradcheck(metrics[name], (image, target), fast_mode=True)
-        (gradient,) = torch.autograd.grad(metrics[name](image, target).sum(), image)
-        assert gradient.abs().max() > 1e-4
+    @pytest.mark.parametrize("metric", [psnr, ssim])
+    def test_gradcheck(self, metric: Metric) -> None:
+        BaseTester.gradcheck(metric, small_pair())
 
     def test_ascent_on_ms_ssim(self) -> None:
         image, target = (t.float() for t in photo_pair("coffee", 161, 161))
@@ -362,24 +403,6 @@ class TestExceptions:
             metric(image, image.index_fill(0, torch.tensor(1), torch.nan))
         with pytest.raises(ValueError, match="target must be on cpu"):
             metric(image, _on_another_device(image))
-
-    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
-    def test_labels(self, metric: Metric) -> None:
-        image, labels = torch.rand(2, 3, 16, 20), disc_labels(16, 20)
-        with pytest.raises(TypeError, match="labels must have an integer dtype"):
-            metric(image, image, labels.float())
-        with pytest.raises(TypeError, match="labels must be a Tensor"):
-            metric(image, image, labels.tolist())
-        with pytest.raises(ValueError, match=r"labels must have shape \(16, 20\) or \(2, 16, 20\)"):
-            metric(image, image, labels.T)
-        with pytest.raises(ValueError, match="labels must have shape"):
-            metric(image, image, labels.expand(3, 16, 20))
-        with pytest.raises(ValueError, match="labels must have shape"):
-            metric(image[0], image[0], labels.expand(2, 16, 20))
-        with pytest.raises(ValueError, match="non-negative"):
-            metric(image, image, labels - 1)
-        with pytest.raises(ValueError, match="width"):
-            metric(image, image, labels, 0)
 
 
 def _on_another_device(image: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from torch import Tensor
 from kcgs import RegionMap
 from kcgs.functional import PairWidths, edge_band, lookup_regions
 from kcgs.kernels.tiles import TILE
+from tests.tester import BaseTester
 
 
 def blobs(size: tuple[int, int] = (45, 70), regions: int = 4, seed: int = 0) -> Tensor:
@@ -22,12 +23,51 @@ def blobs(size: tuple[int, int] = (45, 70), regions: int = 4, seed: int = 0) -> 
     return torch.nn.functional.avg_pool2d(noise, 9, stride=1, padding=4).argmax(1)[0]
 
 
-class TestRegionMap:
-    def test_ids_need_not_be_consecutive(self) -> None:
-        regions = RegionMap.from_labels(torch.tensor([[255, 0], [7, 100_000]]))
+class TestRegionMap(
+    BaseTester,
+    without={
+        "test_gradcheck": "labels are integers, and memberships take no gradient",
+        "test_module": "it is data, which a Scene keeps in its state",
+    },
+):
+    @pytest.mark.parametrize("softness", [0.0, 0.7, {(0, 1): 0.5}])
+    def test_smoke(
+        self, device: torch.device, dtype: torch.dtype, softness: float | dict[tuple[int, int], float]
+    ) -> None:
+        regions = RegionMap.from_labels(blobs().to(device), softness)
+        assert regions.labels.device.type == device.type and "4 regions, size=(45, 70)" in repr(regions)
+        weights = regions.weights(0, dtype)
+        assert weights.dtype == dtype and weights.isfinite().all() and weights.any()
+
+    @pytest.mark.parametrize("factor", [1, 3])
+    @pytest.mark.parametrize("lead", [(), (1,), (2,)])
+    def test_cardinality(self, device: torch.device, lead: tuple[int, ...], factor: int) -> None:
+        labels = blobs((45, 69)).to(device).expand(*lead, 45, 69)
+        regions = RegionMap.from_labels(labels, supersample=factor)
+        height, width = 45 // factor, 69 // factor
+        assert regions.size == (height, width) and regions.labels.shape == (*lead, height, width)
+        assert regions.fine_labels.shape == labels.shape and regions.ids.shape == (4,)
+        assert regions.index.shape == (*(lead or (1,)), height, width)
+        assert len(regions.unbind()) == (lead or (1,))[0]
+        assert regions.resize((7, 9)).labels.shape == (*lead, 7, 9)
+
+    @pytest.mark.parametrize("softness", [0.0, 0.7])
+    def test_dynamo(self, device: torch.device, dtype: torch.dtype, softness: float) -> None:
+        """A map is made outside of a graph, for the number of its regions is found in values; read inside."""
+        regions, other = (RegionMap.from_labels(blobs(seed=k).to(device), softness) for k in (0, 1))
+
+        def shares(of: RegionMap) -> Tensor:
+            return of.labels.to(dtype) / of.num_regions + of.size[0] + of.index_of(of.ids).sum()
+
+        self.assert_compiles(shares, regions, backend="aot_eager")
+        self.assert_compiles(shares, other, backend="aot_eager")
+
+    def test_feature(self, device: torch.device) -> None:
+        """Ids need not be consecutive."""
+        regions = RegionMap.from_labels(torch.tensor([[255, 0], [7, 100_000]], device=device))
         assert regions.ids.tolist() == [0, 7, 255, 100_000]
         assert regions.num_regions == 4
-        assert regions.index_of(torch.tensor([7, 8, 100_000, 0])).tolist() == [1, -1, 3, 0]
+        assert regions.index_of(torch.tensor([7, 8, 100_000, 0], device=device)).tolist() == [1, -1, 3, 0]
 
     @pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.int64])
     def test_integer_dtypes(self, dtype: torch.dtype) -> None:
@@ -93,7 +133,7 @@ class TestRegionMap:
             ([[0]], 0.0, TypeError, "labels must be a Tensor; got list"),
         ],
     )
-    def test_bad_input(self, labels: Tensor, softness: float, error: type[Exception], words: str) -> None:
+    def test_exception(self, labels: Tensor, softness: float, error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):
             RegionMap.from_labels(labels, softness)
 
@@ -320,8 +360,23 @@ class TestLookup:
             lookup_regions(torch.zeros(3, 2), torch.zeros(2, 4, 4).long())
 
 
-class TestEdgeBand:
-    def test_distance_to_another_label(self) -> None:
+class TestEdgeBand(BaseTester, without={"test_gradcheck": "labels are integers", "test_module": "a function only"}):
+    def test_smoke(self, device: torch.device) -> None:
+        band = edge_band(blobs().to(device))
+        assert band.device.type == device.type and band.dtype == torch.bool and band.any()
+
+    @pytest.mark.parametrize("lead", [(), (1,), (3,)])
+    def test_cardinality(self, device: torch.device, lead: tuple[int, ...]) -> None:
+        maps = torch.stack([blobs(seed=k) for k in range(3)])[: lead[0]] if lead else blobs()
+        band = edge_band(maps.to(device))
+        assert band.shape == maps.shape
+        assert not lead or torch.equal(band[-1], edge_band(maps[-1].to(device)))
+
+    def test_dynamo(self, device: torch.device, dtype: torch.dtype) -> None:
+        self.assert_compiles(lambda labels: edge_band(labels, 2).to(dtype), blobs().to(device))
+
+    def test_feature(self) -> None:
+        """The band is found by distances to another label."""
         labels = blobs()
         distance = torch.full(labels.shape, math.inf, dtype=torch.float64)
         for r in labels.unique().tolist():
@@ -346,6 +401,6 @@ class TestEdgeBand:
         assert edge_band(torch.tensor([[0], [1], [1]])).all()
 
     @pytest.mark.parametrize("width", [0, 0.5, -1, math.inf, math.nan])
-    def test_bad_width(self, width: float) -> None:
+    def test_exception(self, width: float) -> None:
         with pytest.raises(ValueError, match="width must be"):
             edge_band(blobs(), width)
