@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap, region_splat
-from kcgs.functional.values import SCALE_LIMITS
+from kcgs.kernels.whitened import SCALE_LIMITS
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 

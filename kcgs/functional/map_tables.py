@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import weakref
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -63,6 +64,31 @@ def find_tables(labels: Tensor, widths: Tensor | None, supersample: int, size: t
     if kept.widths is not widths and (widths is None or kept.widths is None or not torch.equal(kept.widths, widths)):
         return None
     return kept.tables
+
+
+class _Index(NamedTuple):
+    of: Any  # weak reference to the ids of the map
+    version: int
+    places: Tensor
+    least: int
+
+
+_indices: WeakIdKeyDictionary = WeakIdKeyDictionary()
+
+
+def find_index(tables: MapTables, region_ids: Tensor) -> tuple[Tensor, int]:
+    """Return the position of each id in a map, (B, N), and the least of them; on CUDA, which is not waited for, -1.
+
+    Kept beside the tensor of the ids, until it is written to or goes with another map.
+    """
+    kept: _Index | None = _indices.get(region_ids)
+    if kept is not None and kept.of() is tables.ids and kept.version == _version(region_ids):
+        return kept.places, kept.least
+    index = tables.index_of(region_ids if region_ids.ndim == 2 else region_ids.unsqueeze(0))
+    least = (int(index.min()) if index.numel() else 0) if index.device.type == "cpu" else -1
+    if not region_ids.is_inference():
+        _indices[region_ids] = _Index(weakref.ref(tables.ids), _version(region_ids), index, least)
+    return index, least
 
 
 def _version(labels: Tensor) -> int:

@@ -6,22 +6,20 @@ beside the tensors that it belongs to, and never traced. Values are checked here
 
 from __future__ import annotations
 
-import warnings
-import weakref
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch._functorch.utils import enable_single_level_autograd_function
 from torch.autograd import forward_ad
-from torch.utils.weak import WeakIdKeyDictionary
 
-from kcgs.kernels import SplatInputs, Steps, resolve, with_autograd
+from kcgs.kernels import OutOfRangeError, SplatInputs, Steps, resolve, with_autograd
 
-from .map_tables import MapTables, find_tables, keep_tables
+from .arguments import Arguments, KeptPlan, plans
+from .map_tables import MapTables, find_index, find_tables, keep_tables
 from .regions import RegionMap
 from .softness import softness_of
-from .values import check_values
+from .values import check_id_values, check_values
 
 _ARGUMENTS = (
     "Tensor means, Tensor cholesky, Tensor colors, Tensor? region_ids, Tensor? labels, Tensor? widths, "
@@ -46,42 +44,35 @@ _second: Any = torch.ops.kcgs.region_splat_second.default
 _forward: Any = torch.ops.kcgs.region_splat_forward.default
 
 
-class Arguments(NamedTuple):
-    """Arguments of the operator; floating tensors share one dtype, float32 or float64."""
-
-    means: Tensor  # [B, N, 2]
-    cholesky: Tensor  # [B, N, 3]
-    colors: Tensor  # [B, N, C]
-    region_ids: Tensor | None  # [B, N] int64
-    labels: Tensor | None  # [k * H, k * W] or [B, ...] int64; of the map at its own size, if that is another
-    widths: Tensor | None  # [P, 3] float64: a pair of ids and its contour width; None: all are hard
-    supersample: int  # k
-    height: int
-    width: int
-    cutoff: float
-    backend: str
-
-
 # The operator
 
 
 def _render(*arguments: Any) -> Tensor:
     given = Arguments(*arguments)
     inputs, steps = _prepare(given)
-    plan = steps.plan(inputs)
-    _keep_plan(given, plan)
-    return steps.render(plan, inputs).contiguous()
+    try:
+        plan = steps.plan(inputs)
+    except OutOfRangeError:
+        check_values(*given[:3])
+        raise
+    if plans.wanted:
+        plans.kept = KeptPlan.of(given, inputs, steps, plan)
+    image = steps.render(plan, inputs).contiguous()
+    return image if given.means.ndim == 3 else image.squeeze(0)
 
 
 def _differentiate(grad: Tensor, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
     given, geometry = Arguments(*arguments[:-1]), arguments[-1]
-    inputs, steps = _prepare(given, checked=True)
-    plan = _take_plan(given)
-    if plan is None:
+    kept, plans.kept = plans.kept, None
+    if kept is not None and kept.is_of(given):
+        inputs, steps, plan = given.inputs(*kept.others), kept.steps, kept.plan
+    else:
+        inputs, steps = _prepare(given, checked=True)
         plan = steps.plan(inputs)
-    means, cholesky, colors = steps.differentiate(plan, inputs, grad, geometry)
-    found = (colors.new_empty(0) if t is None else t.contiguous() for t in (means, cholesky, colors))
-    return tuple(found)  # type: ignore[return-value]
+    found = steps.differentiate(plan, inputs, grad if grad.ndim == 4 else grad.unsqueeze(0), geometry)
+    none = found[2].new_empty(0)
+    pairs = zip(found, given[:3], strict=True)
+    return tuple(none if t is None else t.contiguous().view(like.shape) for t, like in pairs)  # type: ignore[return-value]
 
 
 def _differentiate_again(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -111,29 +102,21 @@ def _differentiate_forward(*arguments: Any) -> Tensor:
 
 def _prepare(given: Arguments, checked: bool = False) -> tuple[SplatInputs, Steps]:
     """Return what a kernel takes, and the kernel."""
-    if not checked:
-        check_values(*given[:4])
     size, membership, index = (given.height, given.width), None, None
     if given.labels is not None and given.region_ids is not None:
         tables = _tables(given.labels, given.widths, given.supersample, size)
-        index, membership = tables.index_of(given.region_ids), tables.membership
-        if not checked and tables.whole and index.device.type == "cpu":
-            _warn_of_strangers(index, given.region_ids)
+        index, least = find_index(tables, given.region_ids)
+        membership = tables.membership
+        if not checked:
+            check_id_values(given.region_ids, index, least, tables.whole)
         # one region covers everything: no map, but Gaussians of other ids still paint nothing
-        if membership.num_regions == 1 and index.device.type == "cpu" and bool((index >= 0).all()):
+        if membership.num_regions == 1 and least >= 0:
             index, membership = None, None
-    inputs = SplatInputs(*given[:3], index, membership, size, given.cutoff)
-    return inputs, resolve(given.backend, inputs)
-
-
-def _warn_of_strangers(index: Tensor, region_ids: Tensor) -> None:
-    if index.numel() and int(index.min()) < 0:
-        strangers = region_ids[index < 0]
-        warnings.warn(
-            f"{len(strangers)} of {index.numel()} Gaussians paint nothing: regions does not hold their region ids, "
-            f"such as {int(strangers[0])}; pass the map that they belong to, or call field.assign_regions(regions)",
-            stacklevel=2,
-        )
+    inputs = given.inputs(index, membership, size, given.cutoff)
+    steps = resolve(given.backend, inputs)
+    if not (checked or steps.checks):
+        check_values(*given[:3])
+    return inputs, steps
 
 
 def _tables(labels: Tensor, widths: Tensor | None, supersample: int, size: tuple[int, int]) -> MapTables:
@@ -153,7 +136,7 @@ _LIBRARY.impl("region_splat_forward", _differentiate_forward, "CompositeExplicit
 
 def _render_shape(*arguments: Any) -> Tensor:
     given = Arguments(*arguments)
-    return given.colors.new_empty(given.colors.shape[0], given.colors.shape[-1], given.height, given.width)
+    return given.colors.new_empty(*given.colors.shape[:-2], given.colors.shape[-1], given.height, given.width)
 
 
 def _gradient_shapes(grad: Tensor, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
@@ -170,44 +153,17 @@ def _second_shapes(*arguments: Any) -> tuple[Tensor, ...]:
     return tuple(torch.empty_like(t, memory_format=torch.contiguous_format) for t in arguments[3:7])
 
 
-# Plans: a forward leaves what it found for its backward
-
-
-class _KeptPlan(NamedTuple):
-    others: tuple[Any, ...]  # weak references to factors, colours, ids, labels and widths
-    versions: tuple[int, ...]
-    settings: tuple[Any, ...]
-    plan: Any
-
-
-_plans: WeakIdKeyDictionary = WeakIdKeyDictionary()
-
-
-def _keep_plan(given: Arguments, plan: Any) -> None:
-    if plan is not None and any(t.requires_grad for t in given[:3]):
-        others = tuple(None if t is None else weakref.ref(t) for t in given[1:6])
-        _plans[given.means] = _KeptPlan(others, _versions(given), given[6:], plan)
-
-
-def _take_plan(given: Arguments) -> Any:
-    kept = _plans.pop(given.means, None)
-    if kept is None or kept.settings != given[6:] or kept.versions != _versions(given):
-        return None
-    same = all((None if ref is None else ref()) is t for ref, t in zip(kept.others, given[1:6], strict=True))
-    return kept.plan if same else None
-
-
-def _versions(given: Arguments) -> tuple[int, ...]:
-    return tuple(-1 if t is None or t.is_inference() else t._version for t in given[:6])
-
-
 # Derivatives
 
 
 class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(*arguments: Any) -> Tensor:
-        return _below_autograd(splat_operator, *arguments)  # type: ignore[no-any-return]
+        plans.wanted, plans.kept = True, None
+        try:
+            return _below_autograd(splat_operator, *arguments)  # type: ignore[no-any-return]
+        finally:
+            plans.wanted = False
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -217,6 +173,7 @@ class _Splat(torch.autograd.Function):
         ctx.save_for_backward(*saved)
         ctx.save_for_forward(*saved)
         ctx.settings = inputs[6:]
+        ctx.kept, plans.kept = plans.kept, None
 
     @staticmethod
     def tensors(ctx: Any) -> list[Tensor | None]:
@@ -232,7 +189,13 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         needed = ctx.needs_input_grad[:3]
-        gradients = _backward(grad, *_Splat.tensors(ctx), *ctx.settings, needed[0] or needed[1])
+        # once: what is kept for another backward through the same graph is little
+        plans.kept, ctx.kept = ctx.kept, None
+        try:
+            operator = _backward if torch._C._are_functorch_transforms_active() else _differentiate_with_gradient
+            gradients = operator(grad, *_Splat.tensors(ctx), *ctx.settings, needed[0] or needed[1])
+        finally:
+            plans.kept = None
         return (*(g if need else None for g, need in zip(gradients, needed, strict=True)), *[None] * 8)
 
 
@@ -262,7 +225,8 @@ def _image_with_graph(given: Arguments) -> tuple[Tensor, list[Tensor]]:
         )
     with with_autograd():
         leaves = [t.detach().requires_grad_() for t in given[:3]]
-        return steps.image(inputs._replace(means=leaves[0], cholesky=leaves[1], colors=leaves[2])), leaves
+        image = steps.image(given._replace(means=leaves[0], cholesky=leaves[1], colors=leaves[2]).inputs(*inputs[3:]))
+        return image if given.means.ndim == 3 else image.squeeze(0), leaves
 
 
 def _differentiable(function: Any, *arguments: Any) -> Any:
@@ -303,8 +267,11 @@ torch.library.register_autocast("kcgs::region_splat", "cuda", torch.float32, lib
 # vmap: more images in the batch
 
 
-def _fold(info: Any, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...], first: int) -> list[Any]:
-    """Put the mapped dimension of every tensor into its batch; `first` is where the Gaussians begin."""
+def _fold(info: Any, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...], first: int) -> tuple[bool, list[Any]]:
+    """Put the mapped dimension of every tensor into its batch; `first` is where the Gaussians begin.
+
+    Returns, first, whether there was a batch.
+    """
     means, labels, widths = first, first + 4, first + 5
     if in_dims[widths] is not None:
         raise ValueError("widths of contours cannot be mapped over: give the images as a batch")
@@ -315,28 +282,31 @@ def _fold(info: Any, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...]
         return moved
 
     folded = list(arguments)
+    batched = over(means).ndim == 4
     for k in range(labels):
         if arguments[k] is not None:
-            folded[k] = over(k).flatten(0, 1)
+            folded[k] = over(k).flatten(0, 1) if batched else over(k)
     given = arguments[labels]
     # a map that all images share stays as it is
     if given is not None and (in_dims[labels] is not None or (given.ndim == 3 and given.shape[0] > 1)):
         maps = over(labels)
         maps = maps[:, None] if maps.ndim == 3 else maps
-        folded[labels] = maps.expand(-1, over(means).shape[1], -1, -1).flatten(0, 1)
-    return folded
+        folded[labels] = maps.expand(-1, over(means).shape[1] if batched else 1, -1, -1).flatten(0, 1)
+    return batched, folded
 
 
 def _render_mapped(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> tuple[Tensor, int]:
-    image = splat_operator(*_fold(info, in_dims, arguments, 0))
-    return image.unflatten(0, (info.batch_size, -1)), 0
+    batched, folded = _fold(info, in_dims, arguments, 0)
+    image = splat_operator(*folded)
+    return image.unflatten(0, (info.batch_size, -1)) if batched else image, 0
 
 
 def _differentiate_mapped(
     info: Any, in_dims: tuple[int | None, ...], *arguments: Any
 ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-    gradients = _backward(*_fold(info, in_dims, arguments, 1))
-    return tuple(g.unflatten(0, (info.batch_size, -1)) for g in gradients), (0, 0, 0)
+    batched, folded = _fold(info, in_dims, arguments, 1)
+    gradients = _backward(*folded)
+    return tuple(g.unflatten(0, (info.batch_size, -1)) if batched else g for g in gradients), (0, 0, 0)
 
 
 for _name, _shape in (

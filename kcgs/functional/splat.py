@@ -97,14 +97,13 @@ def splat_at(
 ) -> Tensor:
     """Render at a size, at which a map of another one is sampled, as by :meth:`RegionMap.resize`."""
     _check_gaussians(means, cholesky, colors)
-    batched = means.ndim == 3
     dtype = torch.float64 if torch.float64 in (means.dtype, cholesky.dtype, colors.dtype) else torch.float32
-    arrays = [t.to(dtype) if batched else t.to(dtype)[None] for t in (means, cholesky, colors)]
+    arrays = [t if t.dtype == dtype else t.to(dtype) for t in (means, cholesky, colors)]
     ids, labels, widths, supersample = _resolve_regions(means, region_ids, regions)
     image: Tensor = splat_operator(
         *arrays, ids, labels, widths, supersample, *size, check_cutoff(cutoff), check_backend(backend)
     )
-    return (image if batched else image.squeeze(0)).to(colors.dtype)
+    return image if colors.dtype == dtype else image.to(colors.dtype)
 
 
 def as_map(regions: object) -> RegionMap | Tensor:
@@ -136,7 +135,7 @@ def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
 def _resolve_regions(
     means: Tensor, region_ids: Tensor | None, regions: RegionMap | Tensor | None
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, int]:
-    """Return ids (B, N), labels, widths and supersampling as the operator takes them."""
+    """Return ids, labels, widths and supersampling as the operator takes them."""
     if region_ids is not None:
         region_ids = check_ids("region_ids", region_ids, means, values=False)
     if regions is None:
@@ -156,4 +155,4 @@ def _resolve_regions(
     images = means.shape[0] if means.ndim == 3 else 1
     if maps not in (1, images):
         raise ValueError(f"regions must hold 1 map or one for each of {images} images; got {maps} maps")
-    return region_ids if region_ids.ndim == 2 else region_ids[None], labels, widths, supersample
+    return region_ids, labels, widths, supersample

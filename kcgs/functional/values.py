@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import torch
 from torch import Tensor
 
 from kcgs._check import check_floating
+from kcgs.kernels.whitened import MEAN_LIMIT, SCALE_LIMITS
 
 from .covariance import check_cholesky
 
-# float32 arithmetic stays finite inside these bounds, which are far beyond any image
-MEAN_LIMIT = 1e8
-SCALE_LIMITS = (1e-6, 1e8)
 
-
-def check_values(means: Tensor, cholesky: Tensor, colors: Tensor, region_ids: Tensor | None) -> None:
-    """Refuse what is not finite or out of range, and negative ids; on CUDA without waiting for the answer."""
+def check_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
+    """Refuse what is not finite or out of range; on CUDA without waiting for the answer."""
     if means.numel() == 0:
         return
     if means.device.type != "cpu":
-        _assert_values(means, cholesky, colors, region_ids)
+        _assert_values(means, cholesky, colors)
         return
     # extremes carry NaN along, so that one pass checks finiteness and range; written so that NaN fails
     low, high = (float(t) for t in torch.aminmax(means))
@@ -39,11 +37,29 @@ def check_values(means: Tensor, cholesky: Tensor, colors: Tensor, region_ids: Te
     low, high = (float(t) for t in torch.aminmax(colors))
     if not (low > -math.inf and high < math.inf):
         check_floating("colors", colors)
-    if region_ids is not None and int(region_ids.min()) < 0:
-        raise ValueError(f"region_ids must be non-negative; got {int(region_ids.min())}")
 
 
-def _assert_values(means: Tensor, cholesky: Tensor, colors: Tensor, region_ids: Tensor | None) -> None:
+def check_id_values(region_ids: Tensor, index: Tensor, least: int, whole: bool) -> None:
+    """Refuse negative ids, and warn of Gaussians whose id is not in the map: their `index`, (B, N), is negative.
+
+    `least` is the least index. A map that is not `whole` may have lost regions. On CUDA nothing waits, nothing warns.
+    """
+    if index.device.type != "cpu":
+        torch._assert_async((region_ids >= 0).all(), "region_ids must be non-negative")
+    elif least < 0:
+        if int(region_ids.min()) < 0:
+            raise ValueError(f"region_ids must be non-negative; got {int(region_ids.min())}")
+        if whole:
+            strangers = region_ids.view_as(index)[index < 0]
+            warnings.warn(
+                f"{len(strangers)} of {index.numel()} Gaussians paint nothing: regions does not hold their region ids, "
+                f"such as {int(strangers[0])}; pass the map that they belong to, or call "
+                "field.assign_regions(regions)",
+                stacklevel=2,
+            )
+
+
+def _assert_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
     # written so that NaN fails
     ends = cholesky[..., ::2]
     least, most = SCALE_LIMITS[0] * (1 - 1e-6), SCALE_LIMITS[1]
@@ -53,5 +69,3 @@ def _assert_values(means: Tensor, cholesky: Tensor, colors: Tensor, region_ids: 
         f"cholesky must have l11, l22 in [{SCALE_LIMITS[0]:g}, {most:g}] pixels and |l21| at most {most:g}",
     )
     torch._assert_async(torch.isfinite(colors).all(), "colors must be finite")
-    if region_ids is not None:
-        torch._assert_async((region_ids >= 0).all(), "region_ids must be non-negative")

@@ -1,12 +1,12 @@
 """Ways to evaluate the splat and its gradient; private: call `kcgs.functional.region_splat`."""
 
-from .inputs import SplatInputs, Steps, with_autograd
+from .inputs import OutOfRangeError, SplatInputs, Steps, with_autograd
 from .membership import Membership
 from .registry import BACKENDS, check_backend, compile_ahead, prepare, resolve
 from .resampled import Resampled
 from .threads import threads_for_kernels
 
 __all__ = [
-    "BACKENDS", "Membership", "Resampled", "SplatInputs", "Steps", "check_backend", "compile_ahead", "prepare",
-    "resolve", "threads_for_kernels", "with_autograd",
+    "BACKENDS", "Membership", "OutOfRangeError", "Resampled", "SplatInputs", "Steps", "check_backend", "compile_ahead",
+    "prepare", "resolve", "threads_for_kernels", "with_autograd",
 ]  # fmt: skip

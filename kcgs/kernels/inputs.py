@@ -29,18 +29,24 @@ class SplatInputs(NamedTuple):
     cutoff: float
 
 
+class OutOfRangeError(ValueError):
+    """A value is not finite or beyond the limits in whitened.py; the public function says which."""
+
+
 class Steps(NamedTuple):
     """A kernel in three steps, without a graph.
 
     `plan(inputs)` finds what touches what, `render(plan, inputs)` gives the image (B, C, H, W), and
     `differentiate(plan, inputs, grad, geometry)` the gradients of means, cholesky (None unless `geometry`) and colors.
     `image(inputs)` renders with a graph of all orders; None: the kernel is differentiable once.
+    `checks`: the plan raises OutOfRangeError where values are out of range; else that is checked before.
     """
 
     plan: Callable[[SplatInputs], Any]
     render: Callable[[Any, SplatInputs], Tensor]
     differentiate: Callable[[Any, SplatInputs, Tensor, bool], Gradients]
     image: Callable[[SplatInputs], Tensor] | None = None
+    checks: bool = False
 
 
 @contextmanager

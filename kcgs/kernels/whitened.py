@@ -17,6 +17,10 @@ if TYPE_CHECKING:  # processes that compile the CPU kernel do without torch
 # |z| is cut here, where every weight is zero: its square is still finite in float32
 Z_LIMIT = 1e15
 
+# arithmetic in float32 stays finite inside these bounds of means and factors, which are far beyond any image
+MEAN_LIMIT = 1e8
+SCALE_LIMITS = (1e-6, 1e8)
+
 # exp() of less is left out: it is zero in the dtype, or nothing beside the smallest colour step
 _LOWEST_EXPONENT = {4: -80.0, 8: -700.0}  # by the bytes of the dtype
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..inputs import Gradients, SplatInputs, Steps
+from ..inputs import Gradients, OutOfRangeError, SplatInputs, Steps
 from ..membership import Membership
 from ..threads import num_threads
 from ..whitened import least_exponent, support_radius
@@ -40,7 +40,7 @@ def steps(inputs: SplatInputs) -> Steps:
     if inputs.means.device.type != "cpu":
         raise ValueError(f"backend 'cpu' needs tensors on the CPU; got {inputs.means.device}")
     loops.program.ready()
-    return Steps(plan, render, differentiate)
+    return _STEPS
 
 
 def plan(inputs: SplatInputs) -> _Plan:
@@ -58,6 +58,8 @@ def plan(inputs: SplatInputs) -> _Plan:
         regions = inputs.region_index.flatten().numpy()[order]
     radius = support_radius(inputs.cutoff, torch.float32)
     lowest = np.float32(least_exponent(inputs.cutoff, torch.float32) / math.log(2))
+    if not loops.in_range(means, factors, colors):
+        raise OutOfRangeError
     gaussians, start, entries = loops.list_tiles(means, factors, order, regions, images, batch, height, width, radius)
     return _Plan(Lists(gaussians, colors[order].ravel(), regions, start, entries, *table, radius, lowest), order)
 
@@ -108,6 +110,9 @@ def differentiate(planned: _Plan, inputs: SplatInputs, grad: Tensor, geometry: b
     flat = [t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors)]
     loops.finish(planned.lists, planned.order, terms, *flat)
     return (means, cholesky, colors) if geometry else (None, None, colors)
+
+
+_STEPS = Steps(plan, render, differentiate, checks=True)
 
 
 @functools.cache

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..compiled import Program, inner
-from ..whitened import Z_LIMIT
+from ..whitened import MEAN_LIMIT, SCALE_LIMITS, Z_LIMIT
 from .simd import SIDE, add_rows, copy, gather_rows, sum_columns
 
 # z * SCALE, squared, is an exponent of 2
@@ -119,6 +119,19 @@ def _enter_tile(g, row, col, height, width, radius, coefficients):  # type: igno
     coefficients[3] = g[RISE2]
     coefficients[4] = g[RISE3]
     return first - base, last + 1 - base
+
+
+@program.entry
+def in_range(means, factors, colors):  # type: ignore[no-untyped-def]
+    """Whether all is finite, and where arithmetic stays so."""
+    least, most = SCALE_LIMITS[0] * (1 - 1e-6), SCALE_LIMITS[1]
+    fine = True
+    for i in range(len(means)):  # written so that NaN fails
+        fine &= abs(means[i, 0]) <= MEAN_LIMIT and abs(means[i, 1]) <= MEAN_LIMIT
+        fine &= least <= factors[i, 0] <= most and abs(factors[i, 1]) <= most and least <= factors[i, 2] <= most
+        for c in range(colors.shape[1]):
+            fine &= abs(colors[i, c]) < math.inf
+    return fine
 
 
 @program.entry
@@ -277,6 +290,7 @@ def lists() -> None:
     """Compile what lists tiles, and what ends the gradient."""
     example, terms = _example()
     one, pair, triple = (np.ones((1, n), np.float32) for n in (1, 2, 3))
+    in_range(pair, triple, one)
     list_tiles(pair, triple, example.start[:1], example.start, example.start, 1, 1, 1, 4.0)
     finish(example, example.start, terms, pair, triple, one)
 
