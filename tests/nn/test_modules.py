@@ -13,6 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
+from kcgs.functional import region_splat
+from tests.tester import BaseTester
 
 SIZE = (24, 36)
 
@@ -29,8 +31,58 @@ def field(labels: Tensor) -> GaussianField:
     return GaussianField.random(60, SIZE, regions=labels, seed=0)
 
 
-class TestField:
-    def test_parameters_and_buffer(self, field: GaussianField) -> None:
+def whole(dtype: torch.dtype) -> torch.dtype:
+    """Give the dtype of a field, which holds no half precision."""
+    return torch.promote_types(dtype, torch.float32)
+
+
+class TestGaussianField(BaseTester):
+    def test_smoke(self, device: torch.device, dtype: torch.dtype) -> None:
+        field = GaussianField.random(60, SIZE, seed=0, dtype=whole(dtype)).to(device)
+        assert field.means.device.type == device.type and field.colors.dtype == whole(dtype)
+        assert all(p.isfinite().all() and p.any() for p in field.parameters())
+
+    @pytest.mark.parametrize("lead", [(), (1,), (3,)])
+    @pytest.mark.parametrize(("count", "channels"), [(0, 3), (1, 1), (7, 5)])
+    def test_cardinality(
+        self, device: torch.device, dtype: torch.dtype, lead: tuple[int, ...], count: int, channels: int
+    ) -> None:
+        tensors = [torch.ones(*lead, count, n, device=device, dtype=dtype) for n in (2, 3, channels)]
+        field = GaussianField(*tensors, opacities=tensors[0][..., 0], size=SIZE)
+        assert len(field) == count and field.merged_colors().shape == (*lead, count, channels)
+        assert field.means.dtype == whole(dtype) and field.size == SIZE
+        labels = torch.zeros(*lead, *SIZE, device=device, dtype=torch.long)
+        assert field.assign_regions(labels).region_ids.shape == (*lead, count)  # type: ignore[union-attr]
+        assert len(field.unbind()) == (lead or (1,))[0]
+        assert all(
+            one.means.shape == (count, 2) and len(one.subset(torch.arange(count))) == count for one in field.unbind()
+        )
+
+    def test_gradcheck(self, device: torch.device, labels: Tensor) -> None:
+        """Tensors of a graph stay in it: gradients pass a field, its opacities too."""
+        field = GaussianField.random(4, SIZE, regions=labels, seed=0).to(device)
+        render = RegionSplatRenderer(0.0, backend="reference")
+
+        def draw(*tensors: Tensor) -> Tensor:
+            means, cholesky, colors, opacities = (1 * t for t in tensors)
+            return render(
+                GaussianField(means, cholesky, colors, field.region_ids, opacities, size=SIZE), labels.to(device)
+            )
+
+        self.gradcheck(draw, (field.means, field.cholesky, field.colors, torch.linspace(0.2, 1, 4, device=device)))
+
+    def test_dynamo(self, device: torch.device, dtype: torch.dtype, labels: Tensor) -> None:
+        """Made, assigned and rendered in one graph, as after a network."""
+        labels = labels.to(device)
+        raw = torch.rand(2, 9, 8, generator=torch.Generator().manual_seed(0)).to(device, dtype).requires_grad_()
+
+        def draw(raw: Tensor) -> Tensor:
+            field = GaussianField(24 * raw[..., :2], 1 + raw[..., 2:5], raw[..., 5:], size=SIZE).assign_regions(labels)
+            return RegionSplatRenderer()(field, labels)
+
+        self.assert_compiles(draw, raw, leaves=[raw], backend="aot_eager")
+
+    def test_module(self, field: GaussianField) -> None:
         assert {n for n, _ in field.named_parameters()} == {"means", "cholesky", "colors"}
         assert dict(field.named_buffers())["region_ids"].dtype == torch.int64
         assert len(field) == 60
@@ -87,7 +139,8 @@ class TestField:
         total = RegionSplatRenderer()(part, labels) + RegionSplatRenderer()(rest, labels)
         torch.testing.assert_close(total, RegionSplatRenderer()(field, labels))
 
-    def test_opacities_are_merged(self, field: GaussianField, labels: Tensor) -> None:
+    def test_feature(self, field: GaussianField, labels: Tensor) -> None:
+        """Opacities are merged into colours."""
         alpha = torch.rand(60)
         with_alpha = GaussianField(field.means, field.cholesky, field.colors, field.region_ids, alpha, size=SIZE)
         merged = GaussianField(
@@ -112,24 +165,65 @@ class TestField:
             ({"means": torch.full((2, 2), math.inf)}, ValueError, "means must be finite"),
         ],
     )
-    def test_bad_input(self, change: dict[str, object], error: type[Exception], words: str) -> None:
+    def test_exception(self, change: dict[str, object], error: type[Exception], words: str) -> None:
         good = {"means": torch.zeros(2, 2), "cholesky": torch.ones(2, 3), "colors": torch.zeros(2, 3), "size": SIZE}
         with pytest.raises(error, match=words):
             GaussianField(**{**good, **change})
 
     @pytest.mark.parametrize("mask", [torch.ones(5, dtype=torch.bool), torch.tensor([60]), torch.tensor([-1])])
-    def test_bad_subset(self, field: GaussianField, mask: Tensor) -> None:
+    def test_exception_subset(self, field: GaussianField, mask: Tensor) -> None:
         with pytest.raises(ValueError, match="mask must"):
             field.subset(mask)
 
 
-class TestRenderer:
-    def test_functional_twin(self, field: GaussianField, labels: Tensor) -> None:
-        from kcgs.functional import region_splat
+class TestRegionSplatRenderer(BaseTester):
+    def scene(self, device: torch.device, dtype: torch.dtype, labels: Tensor, count: int = 60) -> Scene:
+        field = GaussianField.random(count, SIZE, regions=labels, seed=0, dtype=whole(dtype))
+        return Scene(field, labels).to(device)
 
-        image = RegionSplatRenderer(cutoff=1e-3)(field, labels)
-        twin = region_splat(field.means, field.cholesky, field.colors, field.region_ids, labels, cutoff=1e-3)
-        assert torch.equal(image, twin)
+    def test_smoke(self, backend: str, device: torch.device, dtype: torch.dtype, labels: Tensor) -> None:
+        image = RegionSplatRenderer(backend=backend)(self.scene(device, dtype, labels))
+        assert image.dtype == whole(dtype) and image.device.type == device.type
+        assert image.isfinite().all() and image.any()
+
+    @pytest.mark.parametrize("size", [None, (10, 50)])
+    @pytest.mark.parametrize("keepdim", [True, False])
+    @pytest.mark.parametrize("lead", [(), (1,), (2,)])
+    def test_cardinality(
+        self, backend: str, device: torch.device, lead: tuple[int, ...], keepdim: bool, size: tuple[int, int] | None
+    ) -> None:
+        tensors = [torch.ones(*lead, 5, n, device=device) for n in (2, 3, 4)]
+        image = RegionSplatRenderer(backend=backend, keepdim=keepdim)(GaussianField(*tensors, size=SIZE), size=size)
+        assert image.shape == ((*lead, 4) if keepdim or lead else (1, 4)) + (size or SIZE) and image.any()
+
+    def test_gradcheck(self, device: torch.device, labels: Tensor) -> None:
+        """At another size, through a soft map."""
+        scene = self.scene(device, torch.float32, labels, 4)
+        regions = RegionMap.from_labels(labels.to(device), 0.8)
+
+        def draw(*tensors: Tensor) -> Tensor:
+            field = GaussianField(*(1 * t for t in tensors), scene.field.region_ids, size=SIZE)
+            return RegionSplatRenderer(0.0, backend="tiled")(field, regions, (12, 30))
+
+        self.gradcheck(draw, (scene.field.means, scene.field.cholesky, scene.field.colors))
+
+    def test_feature(self, backend: str, device: torch.device, dtype: torch.dtype, labels: Tensor) -> None:
+        """Each block of 3 x 3 pixels has the centre of its middle where a pixel of the small image has it."""
+        scene, render = self.scene(device, dtype, labels), RegionSplatRenderer(0.0, backend=backend)
+        self.assert_close(render(scene, size=(72, 108))[:, 1::3, 1::3], render(scene), rtol=1e-4, atol=1e-5)
+
+    def test_module(self, backend: str, device: torch.device, dtype: torch.dtype, labels: Tensor) -> None:
+        """The twin of region_splat."""
+        scene = self.scene(device, dtype, labels)
+        field = scene.field
+        image = RegionSplatRenderer(cutoff=1e-3, backend=backend)(scene)
+        tensors = field.means, field.cholesky, field.colors, field.region_ids
+        twin = region_splat(*tensors, labels.to(device), cutoff=1e-3, backend=backend)
+        assert twin.any() and torch.equal(image, twin)
+
+    def test_dynamo(self, backend: str, device: torch.device, dtype: torch.dtype, labels: Tensor) -> None:
+        scene, render = self.scene(device, dtype, labels), RegionSplatRenderer(clamp=True, backend=backend)
+        self.assert_compiles(lambda: render(scene), leaves=list(scene.parameters()), rtol=1e-4, atol=1e-5)
 
     def test_clamp(self, field: GaussianField, labels: Tensor) -> None:
         with torch.no_grad():
@@ -137,12 +231,6 @@ class TestRenderer:
         free, clamped = RegionSplatRenderer()(field, labels), RegionSplatRenderer(clamp=True)(field, labels)
         assert free.min() < 0 and free.max() > 1
         assert torch.equal(clamped, free.clamp(0, 1))
-
-    def test_another_size(self, field: GaussianField, labels: Tensor) -> None:
-        large = RegionSplatRenderer(cutoff=0)(field, labels, (72, 108))
-        small = RegionSplatRenderer(cutoff=0)(field, labels)
-        # the middle pixel of every 3 x 3 block has its centre where the small pixel has it
-        torch.testing.assert_close(large[:, 1::3, 1::3], small, rtol=1e-4, atol=1e-5)
 
     def test_another_aspect(self, field: GaussianField) -> None:
         field.region_ids = None
@@ -153,7 +241,7 @@ class TestRenderer:
         fine = labels.repeat_interleave(2, 0).repeat_interleave(2, 1)
         assert RegionSplatRenderer()(field, fine, (48, 72)).shape == (3, 48, 72)
 
-    def test_errors(self, field: GaussianField, labels: Tensor) -> None:
+    def test_exception(self, field: GaussianField, labels: Tensor) -> None:
         render = RegionSplatRenderer()
         with pytest.raises(ValueError, match=r"regions must have the size \(24, 36\)"):
             render(field, labels[:5])
@@ -272,8 +360,6 @@ class TestHalf:
     """Half precision in: computed in float32, in the dtype of the colours out."""
 
     def test_function(self, field: GaussianField, labels: Tensor, backend: str, dtype: torch.dtype) -> None:
-        from kcgs.functional import region_splat
-
         def render(*tensors: Tensor) -> Tensor:
             return region_splat(*tensors, field.region_ids, labels, backend=backend)
 
