@@ -9,6 +9,7 @@ import torch
 
 from kcgs import GaussianField, Scene
 from kcgs.pruning import prune
+from tests.tester import BaseTester
 
 
 @pytest.fixture
@@ -19,52 +20,72 @@ def scene() -> Scene:
     return Scene(field)
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 1e-4, 1e-2, 0.1])
-def test_change_is_within_the_tolerance(scene: Scene, tolerance: float) -> None:
-    result = prune(scene, tolerance=tolerance)
-    with torch.no_grad():
-        change = (scene() - result.scene()).abs().max()
-    assert float(change) == result.change <= tolerance + 1e-6
-    assert len(result.scene) == 300 - result.removed
+class TestPrune(
+    BaseTester,
+    without={
+        "test_gradcheck": "what is left has no graph",
+        "test_module": "a function; what it returns is a Scene",
+    },
+):
+    def test_smoke(self, backend: str, device: torch.device, dtype: torch.dtype, scene: Scene) -> None:
+        scene = scene.to(device, torch.promote_types(dtype, torch.float32))
+        result = prune(scene, tolerance=1e-2, backend=backend)
+        image = result.scene()
+        assert 0 < result.removed < 300 and 0 < result.change <= 1e-2
+        assert image.device.type == device.type and image.dtype == scene.field.colors.dtype and image.any()
 
+    @pytest.mark.parametrize("channels", [1, 4])
+    @pytest.mark.parametrize("count", [0, 1, 20])
+    def test_cardinality(self, device: torch.device, count: int, channels: int) -> None:
+        scene = Scene(GaussianField.random(count, (9, 17), channels=channels, seed=0), metadata={"title": "few"})
+        result = prune(scene.to(device), tolerance=0.1)
+        assert len(result.scene) == count - result.removed and result.scene.size == (9, 17)
+        assert result.scene().shape == (channels, 9, 17) and result.scene.metadata == {"title": "few"}
 
-def test_a_larger_tolerance_removes_more(scene: Scene) -> None:
-    removed = [prune(scene, tolerance=t).removed for t in (0.0, 1e-3, 1e-1, 1e3)]
-    assert removed == sorted(removed)
-    assert removed[0] == 0 < removed[1] < removed[2] < removed[3] == 300
+    def test_dynamo(self, device: torch.device, scene: Scene) -> None:
+        """What is left is found in values, outside of a graph; it compiles as any scene."""
+        self.assert_compiles(prune(scene.to(device), tolerance=1e-2).scene, rtol=1e-4, atol=1e-5)
 
+    @pytest.mark.parametrize("tolerance", [0.0, 1e-4, 1e-2, 0.1])
+    def test_feature(self, scene: Scene, tolerance: float) -> None:
+        result = prune(scene, tolerance=tolerance)
+        with torch.no_grad():
+            change = (scene() - result.scene()).abs().max()
+        assert float(change) == result.change <= tolerance + 1e-6
+        assert len(result.scene) == 300 - result.removed
 
-def test_what_paints_nothing_goes(scene: Scene) -> None:
-    labels = torch.zeros(40, 60, dtype=torch.long)
-    ids = torch.zeros(300, dtype=torch.long)
-    ids[50:80] = 9
-    field = scene.field
-    confined = GaussianField(field.means, field.cholesky, field.colors, ids, size=(40, 60))
-    result = prune(Scene(confined, labels), tolerance=0.0)
-    assert (result.removed, result.change) == (30, 0.0)
+    def test_a_larger_tolerance_removes_more(self, scene: Scene) -> None:
+        removed = [prune(scene, tolerance=t).removed for t in (0.0, 1e-3, 1e-1, 1e3)]
+        assert removed == sorted(removed)
+        assert removed[0] == 0 < removed[1] < removed[2] < removed[3] == 300
 
+    def test_what_paints_nothing_goes(self, scene: Scene) -> None:
+        labels = torch.zeros(40, 60, dtype=torch.long)
+        ids = torch.zeros(300, dtype=torch.long)
+        ids[50:80] = 9
+        field = scene.field
+        confined = GaussianField(field.means, field.cholesky, field.colors, ids, size=(40, 60))
+        result = prune(Scene(confined, labels), tolerance=0.0)
+        assert (result.removed, result.change) == (30, 0.0)
 
-def test_opacities_count(scene: Scene) -> None:
-    opacities = torch.ones(300)
-    opacities[:40] = 0
-    field = scene.field
-    faint = GaussianField(field.means, field.cholesky, field.colors, opacities=opacities, size=(40, 60))
-    assert prune(Scene(faint), tolerance=0.0).removed == 40
+    def test_opacities_count(self, scene: Scene) -> None:
+        opacities = torch.ones(300)
+        opacities[:40] = 0
+        field = scene.field
+        faint = GaussianField(field.means, field.cholesky, field.colors, opacities=opacities, size=(40, 60))
+        assert prune(Scene(faint), tolerance=0.0).removed == 40
 
+    @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+    def test_without_a_graph(self, scene: Scene, mode: type) -> None:
+        want = prune(scene, tolerance=1e-2)
+        with mode():
+            got = prune(scene, tolerance=1e-2)
+        assert got[1:] == want[1:]
 
-@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
-def test_without_a_graph(scene: Scene, mode: type) -> None:
-    want = prune(scene, tolerance=1e-2)
-    with mode():
-        got = prune(scene, tolerance=1e-2)
-    assert got[1:] == want[1:]
+    def test_nothing_to_prune(self) -> None:
+        assert prune(Scene(GaussianField.random(0, (4, 4)))).removed == 0
 
-
-def test_nothing_to_prune() -> None:
-    assert prune(Scene(GaussianField.random(0, (4, 4)))).removed == 0
-
-
-@pytest.mark.parametrize("tolerance", [-1e-3, math.nan, math.inf])
-def test_bad_tolerance(scene: Scene, tolerance: float) -> None:
-    with pytest.raises(ValueError, match="tolerance must be"):
-        prune(scene, tolerance=tolerance)
+    @pytest.mark.parametrize("tolerance", [-1e-3, math.nan, math.inf])
+    def test_exception(self, scene: Scene, tolerance: float) -> None:
+        with pytest.raises(ValueError, match="tolerance must be"):
+            prune(scene, tolerance=tolerance)

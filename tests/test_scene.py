@@ -13,6 +13,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene, evaluate, load, save
+from tests.tester import BaseTester
 
 SIZE = (20, 30)
 MAPS = {
@@ -168,8 +169,55 @@ def train_in_parallel(rank: int, folder: str) -> None:
     torch.distributed.destroy_process_group()
 
 
-class TestModule:
-    def test_forward_is_the_renderer(self) -> None:
+def scene_on(device: torch.device, dtype: torch.dtype, name: str = "soft") -> Scene:
+    """Make a scene of a dtype that a field may have."""
+    return make_scene(name).to(device, torch.promote_types(dtype, torch.float32))
+
+
+class TestScene(BaseTester):
+    @pytest.mark.parametrize("name", MAPS)
+    def test_smoke(self, device: torch.device, dtype: torch.dtype, name: str) -> None:
+        scene = scene_on(device, dtype, name)
+        image = scene()
+        assert image.dtype == scene.field.colors.dtype and image.device.type == device.type
+        assert image.isfinite().all() and image.any()
+
+    @pytest.mark.parametrize("size", [None, (10, 50)])
+    @pytest.mark.parametrize("lead", [(), (1,), (2,)])
+    def test_cardinality(self, device: torch.device, lead: tuple[int, ...], size: tuple[int, int] | None) -> None:
+        tensors = [torch.ones(*lead, 5, n, device=device) for n in (2, 3, 4)]
+        scene = Scene(GaussianField(*tensors, size=SIZE), metadata={"title": "ones"})
+        assert scene(size).shape == scene.render(size).shape == (*lead, 4, *(size or SIZE)) and scene(size).any()
+        assert len(scene) == 5 and scene.size == SIZE and len(scene.unbind()) == (lead or (1,))[0]
+
+    def test_feature(self, device: torch.device, dtype: torch.dtype) -> None:
+        """Within a hard contour is what the Gaussians of the region render without a map."""
+        scene = scene_on(device, dtype, "hard")
+        regions, ids = scene.regions, scene.field.region_ids
+        assert regions is not None and ids is not None
+        for region in regions.ids:
+            part = scene.field.subset(ids == region)
+            part.region_ids = None
+            inside = regions.labels == region
+            self.assert_close(scene()[:, inside], Scene(part)()[:, inside])
+
+    def test_gradcheck(self, device: torch.device) -> None:
+        scene = scene_on(device, torch.float64)
+        scene = Scene(scene.field.subset(torch.arange(4, device=device)), scene.regions)
+        names = [name for name, _ in scene.named_parameters()]
+
+        def draw(*tensors: torch.Tensor) -> torch.Tensor:
+            image: torch.Tensor = torch.func.functional_call(scene, dict(zip(names, tensors, strict=True)), ())
+            return image
+
+        self.gradcheck(draw, list(scene.parameters()))
+
+    @pytest.mark.parametrize("name", ["none", "hard", "fine", "resized"])
+    def test_dynamo(self, device: torch.device, dtype: torch.dtype, name: str) -> None:
+        self.assert_compiles(scene_on(device, dtype, name), rtol=1e-4, atol=1e-5)
+
+    def test_module(self) -> None:
+        """It renders as the renderer does, and its parameters take gradients."""
         scene = make_scene()
         assert torch.equal(scene(), RegionSplatRenderer()(scene.field, scene.regions))
         assert torch.equal(scene((40, 60)), RegionSplatRenderer()(scene, size=(40, 60)))
@@ -225,7 +273,7 @@ class TestModule:
         assert "3 regions" in repr(make_scene()) and len(repr(make_scene()).splitlines()) <= 4
         assert len(make_scene()) == 40 and make_scene().size == SIZE
 
-    def test_bad_input(self) -> None:
+    def test_exception(self) -> None:
         field = GaussianField.random(3, SIZE, seed=0)
         with pytest.raises(TypeError, match="field must be a GaussianField; got Scene"):
             Scene(Scene(field))  # type: ignore[arg-type]
