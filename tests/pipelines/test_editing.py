@@ -19,6 +19,7 @@ from kcgs.editing import (
     render_region,
     replace_background,
 )
+from tests.tester import BaseTester
 
 SIZE = (48, 64)
 BOX, DISC, GROUND = 4, 9, 1
@@ -67,6 +68,121 @@ def ids_of(scene: Scene) -> Tensor:
 
 def cut(scene: Scene, region: int, size: tuple[int, int] | None = None) -> Tensor:
     return render_region(scene, region, size, clamp=False).detach()
+
+
+EDITS = {
+    "move": lambda s: move_region(s, BOX, (-4, 2)),
+    "recolor": lambda s: recolor_region(s, DISC, 0.5, 0.1),
+    "delete": lambda s: delete_region(s, [BOX]),
+    "extract": lambda s: extract_region(s, [BOX, DISC]),
+    "background": lambda s: replace_background(s, GROUND, recolor_region(s, GROUND, 0.0, 0.9)),
+}
+Edit = Callable[[Scene], Scene]
+
+
+@pytest.fixture(params=EDITS)
+def edit(request: pytest.FixtureRequest) -> Edit:
+    return EDITS[request.param]
+
+
+class TestEditing(BaseTester):
+    def test_smoke(self, edit: Edit, regions: RegionMap, device: torch.device, dtype: torch.dtype) -> None:
+        scene = scene_of(regions).to(device, torch.promote_types(dtype, torch.float32))
+        edited = edit(scene)
+        image = edited()
+        assert image.dtype == scene.field.colors.dtype and image.device.type == device.type
+        assert image.isfinite().all() and not torch.equal(image, scene())
+
+    @pytest.mark.parametrize("opacities", [False, True])
+    def test_cardinality(self, edit: Edit, regions: RegionMap, device: torch.device, opacities: bool) -> None:
+        scene = scene_of(regions, opacities).to(device)
+        edited = edit(scene)
+        assert edited.size == SIZE and edited().shape == (3, *SIZE) and edited.metadata == {"title": "shapes"}
+        assert map_of(edited).size == SIZE and map_of(edited).supersample == regions.supersample
+        assert set(ids_of(edited).tolist()) <= set(map_of(edited).ids.tolist())
+        for region in map_of(edited).ids.tolist():
+            assert render_region(edited, region).shape == (4, *SIZE)
+
+    @pytest.mark.parametrize(
+        ("edit", "error", "words"),
+        [
+            (lambda s: move_region(s, 2, (1, 0)), ValueError, "among the 3 ids of the map, 1, 4, 9; got 2"),
+            (lambda s: move_region(s, BOX, (0.5, 0)), ValueError, "whole multiples of 1 pixel"),
+            (lambda s: move_region(s, BOX, (float("nan"), 0)), ValueError, "offset must be finite; got nan"),
+            (lambda s: move_region(s, BOX, 5), TypeError, r"offset must be \(dx, dy\) in pixels; got 5"),
+            (lambda s: move_region(s, BOX, (1,)), ValueError, r"offset must be \(dx, dy\)"),
+            (lambda s: delete_region(resized(s), BOX), ValueError, r"one map of the size \(48, 64\)"),
+            (lambda s: delete_region(s, [BOX, DISC, GROUND]), ValueError, "leave a region .*got all 3"),
+            (lambda s: delete_region(s, []), ValueError, "region_ids must hold an id"),
+            (lambda s: delete_region(s, "box"), TypeError, "region_ids must be an integer; got 'b'"),
+            (lambda s: delete_region((s.field, s.regions), BOX), TypeError, "scene must be a Scene; got tuple"),
+            (lambda s: delete_region(Scene(s.field), BOX), ValueError, "scene must have a label map"),
+            (lambda s: recolor_region(s, 77, 0.5), ValueError, r"ids of the Gaussians, 1, 4, 9; got 77"),
+            (lambda s: recolor_region(s, BOX, torch.ones(2)), ValueError, r"gain must have shape .*got \(2,\)"),
+            (lambda s: recolor_region(s, BOX, "red"), TypeError, "gain must be a number"),
+            (lambda s: recolor_region(s, BOX, [1.0, "a", 0.0]), TypeError, "gain must hold numbers; got"),
+            (lambda s: recolor_region(s, BOX, 1.0, torch.eye(3)), ValueError, "bias must have shape"),
+            (lambda s: render_region(s, BOX, (0, 4)), ValueError, "size must be at least 1 x 1"),
+            (lambda s: render_region(Scene(GaussianField.random(3, SIZE), s.regions), BOX), ValueError, "region ids"),
+            (lambda s: render_region(Scene(s.field, shapes().expand(2, -1, -1)), BOX), ValueError, "one map of the"),
+            (lambda s: render_over(s, BOX, torch.zeros(1, 4, 4)), ValueError, r"shape \(3, H, W\)"),
+            (lambda s: render_over(s, [3], torch.zeros(3, 4, 4)), ValueError, "ids of the map, 1, 4, 9; got 3"),
+            (lambda s: replace_background(s, BOX, torch.zeros(3, 4, 4)), TypeError, "background must be a Scene"),
+            (lambda s: replace_background(s, BOX, grey()), ValueError, "have 3 channels; got colors of shape"),
+        ],
+    )
+    def test_exception(self, edit: Callable[[Scene], object], error: type[Exception], words: str) -> None:
+        with pytest.raises(error, match=words):
+            edit(scene_of(MAPS["hard"]()))
+
+    def test_exception_batched(self) -> None:
+        two = [torch.ones(2, 5, n) for n in (2, 3, 3)]
+        field = GaussianField(*two, torch.zeros(2, 5, dtype=torch.long), size=SIZE)
+        with pytest.raises(ValueError, match="scene must be of one image; got a batch of"):
+            recolor_region(Scene(field), 0, 0.5)
+
+    def test_exception_resized_soft_map(self) -> None:
+        with pytest.raises(ValueError, match="must not have a resized map"):
+            move_region(scene_of(RegionMap.from_labels(shapes(), 0.8).resize((96, 128))), BOX, (2, 0))
+
+    def test_feature(self, edit: Edit, regions: RegionMap) -> None:
+        """An edit makes a new scene: nothing of the one given changes, nor is shared with it."""
+        scene = scene_of(regions)
+        before = scene().detach(), [t.detach().clone() for t in scene.field.parameters()], regions.fine_labels.clone()
+        edited = edit(scene)
+        with torch.no_grad():
+            for tensor in edited.field.parameters():
+                tensor.fill_(1.0)
+        assert all(torch.equal(a, b) for a, b in zip(scene.field.parameters(), before[1], strict=True))
+        assert torch.equal(scene(), before[0]) and torch.equal(regions.fine_labels, before[2])
+
+    @pytest.mark.parametrize("name", MAPS)
+    def test_gradcheck(self, name: str) -> None:
+        """Of what renders regions, by the Gaussians and by the background."""
+        scene = scene_of(MAPS[name]())
+        few = scene.field.subset(torch.cat([(ids_of(scene) == r).nonzero().flatten()[:2] for r in (BOX, DISC, GROUND)]))
+        background = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(1))
+
+        def draw(background: Tensor, *tensors: Tensor) -> Tensor:
+            field = GaussianField(*(1 * t for t in tensors), few.region_ids, size=SIZE)
+            made = Scene(field, scene.regions)
+            return torch.cat([render_region(made, [BOX, DISC], clamp=False)[:3], render_over(made, GROUND, background)])
+
+        self.gradcheck(draw, (background, few.means, few.cholesky, few.colors))
+
+    def test_module(self, edit: Edit, regions: RegionMap) -> None:
+        """An edited scene is a module as any: its state holds all of it, and its Gaussians can be trained."""
+        edited = edit(scene_of(regions))
+        other = Scene(GaussianField.random(len(edited), SIZE, seed=1))
+        other.load_state_dict(edited.state_dict())
+        assert torch.equal(other(), edited())
+        other().square().sum().backward()
+        assert all(p.is_leaf and p.grad is not None and p.grad.any() for p in other.parameters())
+
+    def test_dynamo(self, edit: Edit, device: torch.device, dtype: torch.dtype) -> None:
+        """Maps are edited outside of graphs, for their values decide what becomes of them; the result compiles."""
+        scene = scene_of(MAPS["hard"]()).to(device, torch.promote_types(dtype, torch.float32))
+        self.assert_compiles(edit(scene), rtol=1e-4, atol=1e-5)
 
 
 class TestRenderRegion:
@@ -301,50 +417,6 @@ class TestReplaceBackground:
         hard = replace_background(Scene(scene.field, map_of(scene).labels), [GROUND, BOX], other)
         outside = map_of(scene).labels != DISC
         torch.testing.assert_close(hard().detach()[:, outside], other().detach()[:, outside], rtol=0, atol=1e-5)
-
-
-class TestErrors:
-    @pytest.mark.parametrize(
-        ("edit", "error", "words"),
-        [
-            (lambda s: move_region(s, 2, (1, 0)), ValueError, "among the 3 ids of the map, 1, 4, 9; got 2"),
-            (lambda s: move_region(s, BOX, (0.5, 0)), ValueError, "whole multiples of 1 pixel"),
-            (lambda s: move_region(s, BOX, (float("nan"), 0)), ValueError, "offset must be finite; got nan"),
-            (lambda s: move_region(s, BOX, 5), TypeError, r"offset must be \(dx, dy\) in pixels; got 5"),
-            (lambda s: move_region(s, BOX, (1,)), ValueError, r"offset must be \(dx, dy\)"),
-            (lambda s: delete_region(resized(s), BOX), ValueError, r"one map of the size \(48, 64\)"),
-            (lambda s: delete_region(s, [BOX, DISC, GROUND]), ValueError, "leave a region .*got all 3"),
-            (lambda s: delete_region(s, []), ValueError, "region_ids must hold an id"),
-            (lambda s: delete_region(s, "box"), TypeError, "region_ids must be an integer; got 'b'"),
-            (lambda s: delete_region((s.field, s.regions), BOX), TypeError, "scene must be a Scene; got tuple"),
-            (lambda s: delete_region(Scene(s.field), BOX), ValueError, "scene must have a label map"),
-            (lambda s: recolor_region(s, 77, 0.5), ValueError, r"ids of the Gaussians, 1, 4, 9; got 77"),
-            (lambda s: recolor_region(s, BOX, torch.ones(2)), ValueError, r"gain must have shape .*got \(2,\)"),
-            (lambda s: recolor_region(s, BOX, "red"), TypeError, "gain must be a number"),
-            (lambda s: recolor_region(s, BOX, [1.0, "a", 0.0]), TypeError, "gain must hold numbers; got"),
-            (lambda s: recolor_region(s, BOX, 1.0, torch.eye(3)), ValueError, "bias must have shape"),
-            (lambda s: render_region(s, BOX, (0, 4)), ValueError, "size must be at least 1 x 1"),
-            (lambda s: render_region(Scene(GaussianField.random(3, SIZE), s.regions), BOX), ValueError, "region ids"),
-            (lambda s: render_region(Scene(s.field, shapes().expand(2, -1, -1)), BOX), ValueError, "one map of the"),
-            (lambda s: render_over(s, BOX, torch.zeros(1, 4, 4)), ValueError, r"shape \(3, H, W\)"),
-            (lambda s: render_over(s, [3], torch.zeros(3, 4, 4)), ValueError, "ids of the map, 1, 4, 9; got 3"),
-            (lambda s: replace_background(s, BOX, torch.zeros(3, 4, 4)), TypeError, "background must be a Scene"),
-            (lambda s: replace_background(s, BOX, grey()), ValueError, "have 3 channels; got colors of shape"),
-        ],
-    )
-    def test_bad_input(self, edit: Callable[[Scene], object], error: type[Exception], words: str) -> None:
-        with pytest.raises(error, match=words):
-            edit(scene_of(MAPS["hard"]()))
-
-    def test_batched(self) -> None:
-        two = [torch.ones(2, 5, n) for n in (2, 3, 3)]
-        field = GaussianField(*two, torch.zeros(2, 5, dtype=torch.long), size=SIZE)
-        with pytest.raises(ValueError, match="scene must be of one image; got a batch of"):
-            recolor_region(Scene(field), 0, 0.5)
-
-    def test_resized_soft_map(self) -> None:
-        with pytest.raises(ValueError, match="must not have a resized map"):
-            move_region(scene_of(RegionMap.from_labels(shapes(), 0.8).resize((96, 128))), BOX, (2, 0))
 
 
 def resized(scene: Scene) -> Scene:
