@@ -157,3 +157,19 @@ def test_same_bits_every_time() -> None:
     inputs = make_inputs(400 if GPU else 20, size=(9, 16), regions=3, softness=0.7)
     first, second = render(cuda, inputs), render(cuda, inputs)
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_operator() -> None:
+    """Schema, fake shapes, gradient and tracing of the operator and of its gradient operator."""
+    inputs = make_inputs(4, size=(8, 16))
+    labels = (torch.arange(16, device=DEVICE) // 9).expand(8, 16).contiguous()
+    ids = torch.tensor([[0, 1, 0, 1]], device=DEVICE)
+    settings = ids, labels, None, 1, 8, 16, 0.0
+    leaves = [t.clone().requires_grad_() for t in inputs[:3]]
+    operators = torch.ops.kcgs.region_splat.default, torch.ops.kcgs.region_splat_backward.default
+    torch.library.opcheck(operators[0], (*leaves, *settings, "cuda"))
+    grad = torch.rand(1, 3, 8, 16, device=DEVICE)
+    torch.library.opcheck(operators[1], (grad, *inputs[:3], *settings, "cuda", True))
+    got, want = (operators[1](grad, *inputs[:3], *settings, name, True) for name in ("cuda", "reference"))
+    for a, b in zip(got, want, strict=True):
+        assert b.any() and (a - b).abs().max() <= 1e-5 * b.abs().max()
