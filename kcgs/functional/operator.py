@@ -161,7 +161,7 @@ class _Splat(torch.autograd.Function):
     def forward(*arguments: Any) -> Tensor:
         plans.wanted, plans.kept = True, None
         try:
-            return _below_autograd(splat_operator, *arguments)  # type: ignore[no-any-return]
+            return _inside(splat_operator, *arguments)  # type: ignore[no-any-return]
         finally:
             plans.wanted = False
 
@@ -202,7 +202,7 @@ class _Splat(torch.autograd.Function):
 class _SplatBackward(torch.autograd.Function):
     @staticmethod
     def forward(*arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
-        return _below_autograd(_backward, *arguments)  # type: ignore[no-any-return]
+        return _inside(_backward, *arguments)  # type: ignore[no-any-return]
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -235,6 +235,12 @@ def _differentiable(function: Any, *arguments: Any) -> Any:
         with enable_single_level_autograd_function():
             return super(torch.autograd.Function, function).apply(*arguments)
     return super(torch.autograd.Function, function).apply(*arguments)
+
+
+def _inside(operator: Any, *arguments: Any) -> Any:
+    """Evaluate the forward of a function, which records nothing; levels of torch.func around it go on recording."""
+    with torch.set_grad_enabled(torch._C._are_functorch_transforms_active()):
+        return _below_autograd(operator, *arguments)
 
 
 def _below_autograd(operator: Any, *arguments: Any) -> Any:

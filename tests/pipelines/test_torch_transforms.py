@@ -408,6 +408,83 @@ class TestFunctional:
         one = torch.func.grad(lambda c: draw(c).square().sum())(colors[2])
         torch.testing.assert_close(rows[2], one, rtol=1e-4, atol=1e-4)
 
+    def test_vmap_of_batches(self, backend: str) -> None:
+        """Dimensions in any place, a map for each image of each batch, ids alone, levels in levels, none."""
+        generator = torch.Generator().manual_seed(1)
+        means = 12 * torch.rand(2, 3, 6, 2, generator=generator)
+        rest = torch.ones(2, 6, 3), torch.rand(2, 6, 3, generator=generator)
+        ids, labels = (
+            torch.randint(2, (3, 6), generator=generator),
+            torch.randint(2, (2, 3, 9, 14), generator=generator),
+        )
+
+        def draw(m: Tensor, of: Tensor, i: Tensor) -> Tensor:
+            return region_splat(m, *rest, i.expand(2, 6), of, backend=backend)
+
+        def slope(m: Tensor, of: Tensor, i: Tensor) -> Tensor:
+            return torch.func.grad(lambda m: draw(m, of, i).square().sum())(m)
+
+        for function in (draw, slope):
+            mapped = torch.func.vmap(function, in_dims=(1, 1, 0), out_dims=1)(means, labels, ids)
+            singles = [function(means[:, k], labels[:, k], ids[k]) for k in range(3)]
+            torch.testing.assert_close(mapped, torch.stack(singles, 1), rtol=1e-4, atol=1e-5)
+        one = rest[0][0], rest[1][0], ids[0], labels[0, 0]
+        levels = torch.func.vmap(torch.func.vmap(lambda m: region_splat(m, *one, backend=backend)))(means)
+        torch.testing.assert_close(levels[1, 2], region_splat(means[1, 2], *one, backend=backend), rtol=1e-4, atol=1e-5)
+        none = torch.func.vmap(
+            lambda m: region_splat(m, m.new_ones(0, 3), m.new_ones(0, 1), size=(4, 5), backend=backend)
+        )
+        assert torch.equal(none(torch.ones(3, 0, 2)), torch.zeros(3, 1, 4, 5))
+
+    def test_jacobian(self, backend: str) -> None:
+        """By rows and by whole batches of gradients, and through a graph that is kept."""
+        colors = torch.rand(3, 2, generator=torch.Generator().manual_seed(1), requires_grad=True)
+        means, cholesky = torch.tensor([[1.0, 2.0], [4.0, 1.0], [3.0, 3.0]], requires_grad=True), torch.ones(3, 3)
+
+        def draw(m: Tensor, c: Tensor) -> Tensor:
+            return region_splat(m, cholesky, c, size=(4, 5), backend=backend)
+
+        image = draw(means, colors)
+        rows = torch.eye(image.numel()).view(-1, *image.shape)
+        singles = [torch.autograd.grad(image, (means, colors), row, retain_graph=True) for row in rows]
+        batched = torch.autograd.grad(image, (means, colors), rows, is_grads_batched=True)
+        jacobians = torch.func.jacrev(draw, (0, 1))(means.detach(), colors.detach())
+        for k, (at_once, mapped) in enumerate(zip(batched, jacobians, strict=True)):
+            want = torch.stack([pair[k] for pair in singles])
+            assert want.any()
+            torch.testing.assert_close(at_once, want, rtol=1e-5, atol=1e-6)
+            torch.testing.assert_close(mapped.flatten(0, 2), want, rtol=1e-5, atol=1e-6)
+
+    @pytest.mark.filterwarnings(
+        "ignore:There is a performance drop:UserWarning"
+    )  # of vmap, second derivatives one by one
+    @pytest.mark.parametrize("kernel", ["cpu", "tiled", "reference"])
+    def test_levels_of_gradients(self, field: GaussianField, regions: RegionMap, kernel: str) -> None:
+        """A gradient of a gradient is not zero: it is right, or refused by name."""
+        means = field.means.detach()[:4]
+        rest = field.cholesky.detach()[:4], field.colors.detach()[:4].requires_grad_(), field.region_ids[:4]
+
+        def loss(m: Tensor) -> Tensor:
+            return region_splat(m, *rest, regions, backend=kernel).square().sum()
+
+        inner = torch.func.grad(loss)
+        slopes = [lambda m: torch.func.grad(lambda m: inner(m).square().sum())(m), torch.func.jacrev(inner)]
+        # the inner loop of a training: its gradient, differentiated by what the loop does not know of
+        slopes.append(lambda m: torch.autograd.grad(inner(m).square().sum(), rest[1])[0])
+        if kernel != "reference":
+            for slope in slopes:
+                with pytest.raises(RuntimeError, match=f"backend '{kernel}' has first derivatives by backward only"):
+                    slope(means)
+            return
+        leaf = means.clone().requires_grad_()
+        (first,) = torch.autograd.grad(loss(leaf), leaf, create_graph=True)
+        want = [torch.autograd.grad(first.square().sum(), t, retain_graph=True)[0] for t in (leaf, rest[1])]
+        rows = [torch.autograd.grad(value, leaf, retain_graph=True)[0] for value in first.flatten()]
+        want.insert(1, torch.stack(rows).view(4, 2, 4, 2))
+        for slope, expected in zip(slopes, want, strict=True):
+            assert expected.any()
+            torch.testing.assert_close(slope(means), expected, rtol=1e-4, atol=1e-4)
+
 
 class TestState:
     def test_renderer_has_none(self, field: GaussianField, regions: RegionMap) -> None:
