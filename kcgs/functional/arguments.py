@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import weakref
 from typing import Any, NamedTuple
 
 from torch import Tensor
@@ -31,26 +30,22 @@ class Arguments(NamedTuple):
 
     def inputs(self, *others: Any) -> SplatInputs:
         """Return what a kernel takes: the Gaussians with B, and `others`."""
-        gaussians: Any = self[:3] if self.means.ndim == 3 else (t.unsqueeze(0) for t in self[:3])
-        return SplatInputs(*gaussians, *others)
+        if self.means.ndim == 3:
+            return SplatInputs(*self[:3], *others)
+        return SplatInputs(self.means.unsqueeze(0), self.cholesky.unsqueeze(0), self.colors.unsqueeze(0), *others)
 
 
 class KeptPlan(NamedTuple):
-    """A plan, and what it was made of: under a transform the backward may be of other tensors."""
+    """A plan, and what it was made of."""
 
-    tensors: tuple[Any, ...]  # weak references
-    others: tuple[Any, ...]  # inputs of the kernel but the Gaussians
+    given: Arguments
+    inputs: SplatInputs
     steps: Steps
     plan: Any
 
-    @classmethod
-    def of(cls, given: Arguments, inputs: SplatInputs, steps: Steps, plan: Any) -> KeptPlan:
-        """Keep a plan of these arguments, and what else the kernel got, for as long as the graph lives."""
-        return cls(tuple(None if t is None else weakref.ref(t) for t in given[:6]), inputs[3:], steps, plan)
-
     def is_of(self, given: Arguments) -> bool:
-        """Whether these are the tensors that the plan was made of."""
-        return all((None if r is None else r()) is t for r, t in zip(self.tensors, given, strict=False))
+        """Whether these are the same Gaussians: under a transform a backward may be of others."""
+        return all([a is b for a, b in zip(self.given[:3], given[:3], strict=True)])
 
 
 class _Plans(threading.local):

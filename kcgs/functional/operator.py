@@ -56,7 +56,7 @@ def _render(*arguments: Any) -> Tensor:
         check_values(*given[:3])
         raise
     if plans.wanted:
-        plans.kept = KeptPlan.of(given, inputs, steps, plan)
+        plans.kept = KeptPlan(given, inputs, steps, plan)
     image = steps.render(plan, inputs).contiguous()
     return image if given.means.ndim == 3 else image.squeeze(0)
 
@@ -65,14 +65,17 @@ def _differentiate(grad: Tensor, *arguments: Any) -> tuple[Tensor, Tensor, Tenso
     given, geometry = Arguments(*arguments[:-1]), arguments[-1]
     kept, plans.kept = plans.kept, None
     if kept is not None and kept.is_of(given):
-        inputs, steps, plan = given.inputs(*kept.others), kept.steps, kept.plan
+        _, inputs, steps, plan = kept
     else:
         inputs, steps = _prepare(given, checked=True)
         plan = steps.plan(inputs)
     found = steps.differentiate(plan, inputs, grad if grad.ndim == 4 else grad.unsqueeze(0), geometry)
-    none = found[2].new_empty(0)
-    pairs = zip(found, given[:3], strict=True)
-    return tuple(none if t is None else t.contiguous().view(like.shape) for t, like in pairs)  # type: ignore[return-value]
+    means, cholesky, colors = [found[2].new_empty(0) if t is None else t.contiguous() for t in found]
+    if given.means.ndim == 3:
+        return means, cholesky, colors
+    if geometry:
+        means, cholesky = means.squeeze(0), cholesky.squeeze(0)
+    return means, cholesky, colors.squeeze(0)
 
 
 def _differentiate_again(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -167,36 +170,28 @@ class _Splat(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        # a graph does not save what was made in inference mode: ids and labels may be
-        ctx.aside = [t if t is not None and t.is_inference() else None for t in inputs[:6]]
-        saved = [t if aside is None else None for t, aside in zip(inputs, ctx.aside, strict=False)]
-        ctx.save_for_backward(*saved)
-        ctx.save_for_forward(*saved)
-        ctx.settings = inputs[6:]
-        ctx.kept, plans.kept = plans.kept, None
-
-    @staticmethod
-    def tensors(ctx: Any) -> list[Tensor | None]:
-        return [t if aside is None else aside for t, aside in zip(ctx.saved_tensors, ctx.aside, strict=True)]
+        ctx.save_for_backward(*inputs[:3])
+        ctx.save_for_forward(*inputs[:3])
+        # a graph would not save what was made in inference mode, which ids and labels may be
+        ctx.others, ctx.kept, plans.kept = inputs[3:], plans.kept, None
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:
-        tensors = _Splat.tensors(ctx)
-        along = [torch.zeros_like(t) if v is None else v for v, t in zip(tangents[:3], tensors[:3], strict=True)]  # type: ignore[arg-type]
-        image: Tensor = _forward(*along, *tensors, *ctx.settings)
+        saved = ctx.saved_tensors
+        along = [torch.zeros_like(t) if v is None else v for v, t in zip(tangents[:3], saved, strict=True)]
+        image: Tensor = _forward(*along, *saved, *ctx.others)
         return image
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        needed = ctx.needs_input_grad[:3]
-        # once: what is kept for another backward through the same graph is little
-        plans.kept, ctx.kept = ctx.kept, None
+        means, cholesky, colors = ctx.needs_input_grad[:3]
+        plans.kept, ctx.kept = ctx.kept, None  # once: another backward through the same graph plans anew
         try:
             operator = _backward if torch._C._are_functorch_transforms_active() else _differentiate_with_gradient
-            gradients = operator(grad, *_Splat.tensors(ctx), *ctx.settings, needed[0] or needed[1])
+            found = operator(grad, *ctx.saved_tensors, *ctx.others, means or cholesky)
         finally:
             plans.kept = None
-        return (*(g if need else None for g, need in zip(gradients, needed, strict=True)), *[None] * 8)
+        return found[0] if means else None, found[1] if cholesky else None, found[2] if colors else None, *[None] * 8
 
 
 class _SplatBackward(torch.autograd.Function):
@@ -249,7 +244,7 @@ def _below_autograd(operator: Any, *arguments: Any) -> Any:
 
 
 def _is_differentiated(tensors: tuple[Tensor, ...]) -> bool:
-    return forward_ad._current_level >= 0 or (torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
+    return (torch.is_grad_enabled() and any([t.requires_grad for t in tensors])) or forward_ad._current_level >= 0
 
 
 def _render_with_gradient(*arguments: Any) -> Any:

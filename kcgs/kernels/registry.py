@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import warnings
 from importlib import import_module, util
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -33,9 +33,13 @@ def resolve(backend: str, inputs: SplatInputs) -> Steps:
     Raises:
         ValueError: inputs that the backend does not take.
     """
-    name = _choose(backend, inputs.means.device, inputs.means.dtype)
-    kernel: Steps = import_module(f"{__package__}.{name}").steps(inputs)
+    kernel: Steps = _load(backend, inputs.means.device, inputs.means.dtype).steps(inputs)
     return kernel
+
+
+@functools.cache
+def _load(backend: str, device: torch.device, dtype: torch.dtype) -> Any:
+    return import_module(f"{__package__}.{_choose(backend, device, dtype)}")
 
 
 def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
