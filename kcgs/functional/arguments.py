@@ -28,12 +28,6 @@ class Arguments(NamedTuple):
     cutoff: float
     backend: str
 
-    def inputs(self, *others: Any) -> SplatInputs:
-        """Return what a kernel takes: the Gaussians with B, and `others`."""
-        if self.means.ndim == 3:
-            return SplatInputs(*self[:3], *others)
-        return SplatInputs(self.means.unsqueeze(0), self.cholesky.unsqueeze(0), self.colors.unsqueeze(0), *others)
-
 
 class KeptPlan(NamedTuple):
     """A plan, and what it was made of."""

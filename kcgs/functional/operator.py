@@ -6,6 +6,7 @@ beside the tensors that it belongs to, and never traced. Values are checked here
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -58,7 +59,7 @@ def _render(*arguments: Any) -> Tensor:
     if plans.wanted:
         plans.kept = KeptPlan(given, inputs, steps, plan)
     image = steps.render(plan, inputs).contiguous()
-    return image if given.means.ndim == 3 else image.squeeze(0)
+    return image if image.ndim == given.means.ndim + 1 else image.squeeze(0)
 
 
 def _differentiate(grad: Tensor, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
@@ -69,9 +70,11 @@ def _differentiate(grad: Tensor, *arguments: Any) -> tuple[Tensor, Tensor, Tenso
     else:
         inputs, steps = _prepare(given, checked=True)
         plan = steps.plan(inputs)
-    found = steps.differentiate(plan, inputs, grad if grad.ndim == 4 else grad.unsqueeze(0), geometry)
+    if grad.ndim < inputs.means.ndim + 1:
+        grad = grad.unsqueeze(0)
+    found = steps.differentiate(plan, inputs, grad, geometry)
     means, cholesky, colors = [found[2].new_empty(0) if t is None else t.contiguous() for t in found]
-    if given.means.ndim == 3:
+    if colors.ndim == given.colors.ndim:
         return means, cholesky, colors
     if geometry:
         means, cholesky = means.squeeze(0), cholesky.squeeze(0)
@@ -115,11 +118,11 @@ def _prepare(given: Arguments, checked: bool = False) -> tuple[SplatInputs, Step
         # one region covers everything: no map, but Gaussians of other ids still paint nothing
         if membership.num_regions == 1 and least >= 0:
             index, membership = None, None
-    inputs = given.inputs(index, membership, size, given.cutoff)
+    inputs = SplatInputs(given.means, given.cholesky, given.colors, index, membership, size, given.cutoff)
     steps = resolve(given.backend, inputs)
-    if not (checked or steps.checks):
+    if not (checked or steps.as_given):
         check_values(*given[:3])
-    return inputs, steps
+    return inputs if steps.as_given else inputs.with_batch(), steps
 
 
 def _tables(labels: Tensor, widths: Tensor | None, supersample: int, size: tuple[int, int]) -> MapTables:
@@ -161,19 +164,17 @@ def _second_shapes(*arguments: Any) -> tuple[Tensor, ...]:
 
 class _Splat(torch.autograd.Function):
     @staticmethod
-    def forward(*arguments: Any) -> Tensor:
+    def forward(ctx: Any, *arguments: Any) -> Tensor:
         plans.wanted, plans.kept = True, None
         try:
-            return _inside(splat_operator, *arguments)  # type: ignore[no-any-return]
+            image: Tensor = _inside(splat_operator, *arguments)
         finally:
             plans.wanted = False
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs[:3])
-        ctx.save_for_forward(*inputs[:3])
+        ctx.save_for_backward(*arguments[:3])
+        ctx.save_for_forward(*arguments[:3])
         # a graph would not save what was made in inference mode, which ids and labels may be
-        ctx.others, ctx.kept, plans.kept = inputs[3:], plans.kept, None
+        ctx.others, ctx.kept, plans.kept = arguments[3:], plans.kept, None
+        return image
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:
@@ -196,13 +197,10 @@ class _Splat(torch.autograd.Function):
 
 class _SplatBackward(torch.autograd.Function):
     @staticmethod
-    def forward(*arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
+        ctx.save_for_backward(*arguments[:7])
+        ctx.settings = arguments[7:]
         return _inside(_backward, *arguments)  # type: ignore[no-any-return]
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        ctx.save_for_backward(*inputs[:7])
-        ctx.settings = inputs[7:]
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
@@ -220,7 +218,7 @@ def _image_with_graph(given: Arguments) -> tuple[Tensor, list[Tensor]]:
         )
     with with_autograd():
         leaves = [t.detach().requires_grad_() for t in given[:3]]
-        image = steps.image(given._replace(means=leaves[0], cholesky=leaves[1], colors=leaves[2]).inputs(*inputs[3:]))
+        image = steps.image(SplatInputs(leaves[0], leaves[1], leaves[2], *inputs[3:]).with_batch())
         return image if given.means.ndim == 3 else image.squeeze(0), leaves
 
 
@@ -234,7 +232,7 @@ def _differentiable(function: Any, *arguments: Any) -> Any:
 
 def _inside(operator: Any, *arguments: Any) -> Any:
     """Evaluate the forward of a function, which records nothing; levels of torch.func around it go on recording."""
-    with torch.set_grad_enabled(torch._C._are_functorch_transforms_active()):
+    with torch.enable_grad() if torch._C._are_functorch_transforms_active() else nullcontext():
         return _below_autograd(operator, *arguments)
 
 

@@ -28,6 +28,12 @@ class SplatInputs(NamedTuple):
     size: tuple[int, int]  # (height, width)
     cutoff: float
 
+    def with_batch(self) -> SplatInputs:
+        """Return the same, with B where Gaussians of one image have none."""
+        if self.means.ndim == 3:
+            return self
+        return SplatInputs(self.means[None], self.cholesky[None], self.colors[None], *self[3:])
+
 
 class OutOfRangeError(ValueError):
     """A value is not finite or beyond the limits in whitened.py; the public function says which."""
@@ -39,14 +45,15 @@ class Steps(NamedTuple):
     `plan(inputs)` finds what touches what, `render(plan, inputs)` gives the image (B, C, H, W), and
     `differentiate(plan, inputs, grad, geometry)` the gradients of means, cholesky (None unless `geometry`) and colors.
     `image(inputs)` renders with a graph of all orders; None: the kernel is differentiable once.
-    `checks`: the plan raises OutOfRangeError where values are out of range; else that is checked before.
+    `as_given`: Gaussians of one image may come without B, which results have not either then, and the plan raises
+    OutOfRangeError where values are out of range; else B is there, and values have been checked.
     """
 
     plan: Callable[[SplatInputs], Any]
     render: Callable[[Any, SplatInputs], Tensor]
     differentiate: Callable[[Any, SplatInputs, Tensor, bool], Gradients]
     image: Callable[[SplatInputs], Tensor] | None = None
-    checks: bool = False
+    as_given: bool = False
 
 
 @contextmanager

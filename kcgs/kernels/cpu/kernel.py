@@ -45,7 +45,7 @@ def steps(inputs: SplatInputs) -> Steps:
 
 def plan(inputs: SplatInputs) -> _Plan:
     """List which Gaussians touch which tiles, for the loops."""
-    batch, count, _ = inputs.colors.shape
+    batch, count = inputs.colors.shape[:-2].numel(), inputs.colors.shape[-2]
     height, width = inputs.size
     means, factors, colors = (_array(t) for t in inputs[:3])
     images = np.repeat(np.arange(batch), count)
@@ -93,18 +93,19 @@ def _table(membership: Membership) -> tuple[Any, ...]:
 
 def render(planned: _Plan, inputs: SplatInputs) -> Tensor:
     """Render (B, C, H, W)."""
-    batch, _, channels = inputs.colors.shape
+    *batch, _, channels = inputs.colors.shape
     # numpy asks for huge pages where an array is large: first use costs a quarter of what torch.empty's does
-    image = torch.from_numpy(np.empty((batch, channels, *inputs.size), np.float32))
-    _run_threads(lambda offset, step: loops.render(planned.lists, offset, step, image.numpy()), planned.lists)
-    return image
+    image = np.empty((*batch, channels, *inputs.size), np.float32)
+    images = image.reshape(-1, *image.shape[-3:])
+    _run_threads(lambda offset, step: loops.render(planned.lists, offset, step, images), planned.lists)
+    return torch.from_numpy(image)
 
 
 def differentiate(planned: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
     """Give the gradients of means, cholesky (unless only colours are asked for) and colors."""
     channels = inputs.colors.shape[-1]
     terms = np.empty((len(planned.lists.entries), channels + (5 if geometry else 0)), np.float32)
-    values = grad.resolve_neg().contiguous().numpy()
+    values = grad.resolve_neg().contiguous().numpy().reshape(-1, *grad.shape[-3:])
     _run_threads(lambda offset, step: loops.gather(planned.lists, offset, step, values, terms, geometry), planned.lists)
     means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs[:3])
     flat = [t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors)]
@@ -112,7 +113,7 @@ def differentiate(planned: _Plan, inputs: SplatInputs, grad: Tensor, geometry: b
     return (means, cholesky, colors) if geometry else (None, None, colors)
 
 
-_STEPS = Steps(plan, render, differentiate, checks=True)
+_STEPS = Steps(plan, render, differentiate, as_given=True)
 
 
 @functools.cache
