@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import io
 import pickle
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -112,7 +113,12 @@ class TestCompile:
         assert counter.frame_count == first
 
     @compiler_warnings
-    def test_a_training_step_with_kornia_in_one_graph(self, field: GaussianField, regions: RegionMap) -> None:
+    @pytest.mark.parametrize("name", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
+    def test_a_training_step_with_kornia_in_one_graph(
+        self, field: GaussianField, regions: RegionMap, name: str
+    ) -> None:
+        if name == "inductor" and not any(map(shutil.which, ("c++", "g++", "clang++"))):
+            pytest.skip("inductor needs a C++ compiler")
         import kornia
 
         chain = nn.Sequential(RegionSplatRenderer(keepdim=False), kornia.filters.GaussianBlur2d((3, 3), (1.0, 1.0)))
@@ -122,7 +128,7 @@ class TestCompile:
             return kornia.losses.charbonnier_loss(chain(scene), torch.zeros(1, 3, *SIZE), reduction="mean")
 
         want = torch.autograd.grad(loss(), list(scene.parameters()))
-        got = torch.autograd.grad(torch.compile(loss, fullgraph=True, backend="aot_eager")(), list(scene.parameters()))
+        got = torch.autograd.grad(torch.compile(loss, fullgraph=True, backend=name)(), list(scene.parameters()))
         for a, b in zip(got, want, strict=True):
             torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
 
