@@ -168,17 +168,24 @@ class TestCompile:
         assert counts[3] == counts[2] <= 3  # its own, a first other one, and any
 
     @compiler_warnings
-    def test_scenes_of_any_number_of_gaussians(self) -> None:
-        """torch takes shapes of parameters for constants unless told otherwise: then one graph serves all scenes."""
+    @pytest.mark.parametrize("predicted", [False, True])
+    def test_scenes_of_any_number_of_gaussians(self, predicted: bool) -> None:
+        """torch takes shapes of a module's tensors for constants unless told otherwise: then one graph serves all."""
         counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
         compiled, counts = torch.compile(RegionSplatRenderer(), backend=counter, fullgraph=True, dynamic=True), []
-        with torch._dynamo.config.patch(force_parameter_static_shapes=False):
-            for count in (20, 12, 31):
-                labels = (torch.arange(SIZE[1]) > count).long().expand(SIZE)
-                scene = Scene(GaussianField.random(count, SIZE, regions=labels, seed=0), labels)
-                assert torch.equal(compiled(scene), scene())
+        options = {"force_parameter_static_shapes": False, "force_nn_module_property_static_shapes": False}
+        for count in (20, 12, 31):
+            for softness in (0.5, 0.9):
+                regions = RegionMap.from_labels((torch.arange(SIZE[1]) > count).long().expand(SIZE), softness)
+                field = GaussianField.random(count, SIZE, regions=regions, seed=0)
+                if predicted:  # buffers, part of a graph
+                    tensors = (1 * p for p in field.parameters())
+                    field = GaussianField(*tensors, field.region_ids, size=SIZE)
+                scene = Scene(field, regions)
+                with torch._dynamo.config.patch(options):
+                    assert torch.equal(compiled(scene), scene())
                 counts.append(counter.frame_count)
-        assert counts[0] == counts[2]
+        assert counts[0] == counts[5]
 
 
 class Encoder(nn.Module):
