@@ -203,6 +203,12 @@ class _SplatBackward(torch.autograd.Function):
         return _inside(_backward, *arguments)  # type: ignore[no-any-return]
 
     @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:
+        raise RuntimeError(
+            "a gradient of region_splat has no forward derivative: take jacrev twice in place of hessian"
+        )
+
+    @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         needed = ctx.needs_input_grad[:4]
         second = _second(*grads, *ctx.saved_tensors, *ctx.settings)

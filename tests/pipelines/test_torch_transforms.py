@@ -489,6 +489,8 @@ class TestFunctional:
                 with pytest.raises(RuntimeError, match=f"backend '{kernel}' has first derivatives by backward only"):
                     slope(means)
             return
+        with pytest.raises(RuntimeError, match="take jacrev twice in place of hessian"):
+            torch.func.hessian(loss)(means)
         leaf = means.clone().requires_grad_()
         (first,) = torch.autograd.grad(loss(leaf), leaf, create_graph=True)
         want = [torch.autograd.grad(first.square().sum(), t, retain_graph=True)[0] for t in (leaf, rest[1])]
