@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import region_splat
+from kcgs.kernels import SplatInputs, resolve
+from kcgs.nn import RegionSplatRenderer
 from kcgs.scene import Scene
 
 from ._workloads import standard
@@ -77,6 +79,27 @@ def once(render: Render, scene: Scene, cutoff: float) -> tuple[Timing, Tensor, l
 def timed(name: str, scene: Scene, cutoff: float, rounds: int) -> list[Timing]:
     """Time a backend or the peer after one run to warm up."""
     return [once(renderer(name), scene, cutoff)[0] for _ in range(rounds + 1)][1:]
+
+
+def in_turns(scene: Scene, cutoff: float, rounds: int) -> tuple[list[Timing], list[Timing]]:
+    """Time the CPU kernel alone, and the module with autograd around it, in turns after one run each to warm up."""
+    field, regions, module = scene.field, scene.regions, RegionSplatRenderer(cutoff, backend="cpu")
+    assert regions is not None and field.region_ids is not None
+    means, cholesky, colors = (t.detach() for t in (field.means, field.cholesky, field.colors))
+    index = regions.index_of(field.region_ids)
+    inputs = SplatInputs(means, cholesky, colors, index, regions.membership, scene.size, cutoff)
+    steps, probe = resolve("cpu", inputs), probe_of(scene.size, colors.shape[-1], colors.dtype)
+
+    def alone() -> Timing:
+        start = time.perf_counter()
+        plan = steps.plan(inputs)
+        _image = steps.render(plan, inputs)
+        middle = time.perf_counter()
+        steps.differentiate(plan, inputs, probe, True)
+        return Timing(middle - start, time.perf_counter() - middle)
+
+    found = [(alone(), once(lambda *_: module(field, regions), scene, cutoff)[0]) for _ in range(rounds + 1)][1:]
+    return [kernel for kernel, _ in found], [around for _, around in found]
 
 
 def prepare(name: str, case: str, cutoff: float) -> Callable[[], object]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import statistics
 from collections.abc import Callable
 from functools import partial
@@ -38,6 +39,8 @@ _SPEED_TEXT = """Milliseconds, medians; through `region_splat` and autograd. Cov
 sigma), with 6 regions. W3 is 200x300 with 20 Gaussians, W1 480x854 with 1,250, W2 480x854 with 7,500, W4 2160x3840
 with 50,000. `to cpu` is the ratio of sums on one thread. `pair-list autograd` is plain torch, on one thread; where it
 is missing it needs too much memory."""
+_OVERHEAD_TEXT = """What the module, the operator and autograd add to the time of the `cpu` kernel alone: runs in turns
+on one thread, of each the lower quartile, since other programs only add."""
 _MEMORY_TEXT = "MiB added by rendering one image and its gradients, in a process of its own."
 _ERROR_TEXT = """One thread. Largest errors against the float64 reference at cutoff 0: of the image, and of the
 gradients of means, cholesky and colors, relative to the largest gradient."""
@@ -71,6 +74,8 @@ def report(folder: Path, made: Made) -> list[str]:
     _plot_error(errors, folder / "error-against-time.png")
     parts = ["# Rendering: speed, error, stability", "## Speed", _SPEED_TEXT]
     parts += [speed.table("case", "backend", across=["quantity", "threads"])]
+    if overhead := rows.select(section="overhead"):
+        parts += ["## Overhead of the module", _OVERHEAD_TEXT, overhead.table("case")]
     parts += ["## Peak memory", _MEMORY_TEXT, memory.table("backend", across=["case"])]
     parts += ["## Error against run time", _ERROR_TEXT, "![](error-against-time.png)", errors.table("backend", "case")]
     parts += ["## Growth", _GROWTH_TEXT, growth.table("case", across=["backend", "quantity"])]
@@ -79,12 +84,13 @@ def report(folder: Path, made: Made) -> list[str]:
 
 @experiment(report=report)
 def run(output: Path, options: Options) -> None:
-    """Measure speed, memory, error against run time, growth and stiffness."""
+    """Measure speed, overhead, memory, error against run time, growth and stiffness."""
     quick = options.quick
     rounds = 1 if quick else 5
     names = ("W3",) if quick else ("W3", "W1", "W2", "W4")
     steps: list[tuple[str, Callable[[], list[Row]]]] = [
         *((f"speed {name}", partial(_speed, name, rounds)) for name in names),
+        *((f"overhead {name}", partial(_overhead, name)) for name in names),
         # last, since it leaves a gigabyte of memory in pieces behind it
         *((f"{runs.PEER} {name}", partial(_peer_speed, name, rounds)) for name in names),
         *((f"memory {name}", partial(_memory, name)) for name in (names if quick else ("W1", "W2", "W4"))),
@@ -113,6 +119,19 @@ def _speed(name: str, rounds: int) -> list[Row]:
     backends = [*runs.backends(), *(["reference"] if name in DENSE else [])]
     cases = product(SPEED_CUTOFFS, backends, (1, 2))
     return [row for cutoff, backend, count in cases for row in _timed(name, cutoff, backend, count, rounds)]
+
+
+def _overhead(name: str) -> list[Row]:
+    scene = standard(name)
+    with threads(1):
+        kernel, module = runs.in_turns(scene, DEFAULT_CUTOFF, max(5, 20_000_000 // math.prod(scene.size)))
+    row = partial(Row, "overhead", _case(name, DEFAULT_CUTOFF), "cpu", 1)
+
+    def added(quantity: str) -> float:
+        around, alone = (float(np.quantile([getattr(t, quantity) for t in times], 0.25)) for times in (module, kernel))
+        return 100 * (around / alone - 1)
+
+    return [row(quantity, added(quantity), "%") for quantity in ("forward", "sum")]
 
 
 def _peer_speed(name: str, rounds: int) -> list[Row]:

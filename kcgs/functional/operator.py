@@ -6,7 +6,6 @@ beside the tensors that it belongs to, and never traced. Values are checked here
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -186,7 +185,7 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         means, cholesky, colors = ctx.needs_input_grad[:3]
-        plans.kept, ctx.kept = ctx.kept, None  # once: another backward through the same graph plans anew
+        plans.kept = ctx.kept
         try:
             operator = _backward if torch._C._are_functorch_transforms_active() else _differentiate_with_gradient
             found = operator(grad, *ctx.saved_tensors, *ctx.others, means or cholesky)
@@ -238,7 +237,9 @@ def _differentiable(function: Any, *arguments: Any) -> Any:
 
 def _inside(operator: Any, *arguments: Any) -> Any:
     """Evaluate the forward of a function, which records nothing; levels of torch.func around it go on recording."""
-    with torch.enable_grad() if torch._C._are_functorch_transforms_active() else nullcontext():
+    if not torch._C._are_functorch_transforms_active():
+        return _below_autograd(operator, *arguments)
+    with torch.enable_grad():
         return _below_autograd(operator, *arguments)
 
 

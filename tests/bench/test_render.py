@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from kcgs.bench import run
-from kcgs.bench._render_runs import PEER, once, peer_fits, prepare, renderer
+from kcgs.bench._render_runs import PEER, in_turns, once, peer_fits, prepare, renderer
 from kcgs.bench._workloads import standard, workload
 from kcgs.bench.core.clocks import peak_bytes
 
@@ -28,6 +28,15 @@ def test_peer_is_left_out_where_memory_ends() -> None:
     assert peer_fits(standard("W2"), 1e-4) and not peer_fits(standard("W4"), 1 / 255)
 
 
+def test_module_and_kernel_take_turns() -> None:
+    """The module does what the kernel does, and more; by how much, a busy machine does not say."""
+    kernel, module = in_turns(standard("W3"), 1e-4, 30)
+    assert len(kernel) == len(module) == 30
+    for quantity in ("forward", "sum"):
+        least, whole = (min(getattr(timing, quantity) for timing in times) for times in (kernel, module))
+        assert 0 < least < whole < 3 * least
+
+
 def test_peak_memory_is_the_childs_own() -> None:
     ballast = torch.ones(60_000_000)  # a parent larger than the child must not hide the child's peak
     arguments = (PEER, "W3", 1e-4)
@@ -41,4 +50,4 @@ def test_quick_report(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == FILES
     with (tmp_path / "results.csv").open() as file:
         sections = {row["section"] for row in csv.DictReader(file)}
-    assert sections == {"speed", "memory", "error", "growth", "stiffness"}
+    assert sections == {"speed", "overhead", "memory", "error", "growth", "stiffness"}

@@ -341,6 +341,31 @@ class TestOperator:
         assert torch.equal(region_splat(*gaussians, labels), region_splat(*gaussians, labels.clone()))
         assert not torch.equal(region_splat(*gaussians, labels), before)
 
+    def test_ids_that_change_in_place(self, field: GaussianField, regions: RegionMap) -> None:
+        gaussians, ids = (field.means, field.cholesky, field.colors), field.region_ids.clone()
+        before = region_splat(*gaussians, ids, regions)
+        ids.copy_(3 - ids)
+        assert torch.equal(region_splat(*gaussians, ids, regions), region_splat(*gaussians, ids.clone(), regions))
+        assert not torch.equal(region_splat(*gaussians, ids, regions), before)
+        with pytest.raises(ValueError, match="region_ids must be non-negative; got -5"):
+            region_splat(*gaussians, ids.sub_(5), regions)
+
+    @pytest.mark.parametrize("kernel", ["cpu", "tiled", "reference"])
+    def test_a_backward_is_of_its_forward(
+        self, field: GaussianField, regions: RegionMap, kernel: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """What a graph renders once it plans once, and a map that is written to later does not change its gradients."""
+        tensors = [t.detach().clone().requires_grad_() for t in (field.means, field.cholesky, field.colors)]
+        labels, ids = regions.labels.clone(), field.region_ids.clone()
+        image = region_splat(*tensors, ids, labels, backend=kernel)
+        want = torch.autograd.grad(image.square().sum(), tensors, retain_graph=True)
+        labels.fill_(0)
+        ids.fill_(3)
+        monkeypatch.setattr("kcgs.functional.operator._prepare", None)
+        for _ in range(2):
+            got = torch.autograd.grad(image.square().sum(), tensors, retain_graph=True)
+            assert all(torch.equal(a, b) for a, b in zip(got, want, strict=True))
+
 
 class TestFunctional:
     def test_functional_call(self, field: GaussianField, regions: RegionMap, backend: str) -> None:
