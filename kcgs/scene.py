@@ -26,6 +26,8 @@ _IMAGE_BYTES, _MAP_BYTES = 12, 42
 # pixels of the longer side in a notebook
 _SHOWN_SIDE = 1024
 
+_render = RegionSplatRenderer()  # without a state: one for all
+
 
 class Scene(nn.Module):
     r"""Gaussians, the label map that confines them, and notes.
@@ -83,7 +85,7 @@ class Scene(nn.Module):
         Raises:
             TypeError, ValueError: as :func:`kcgs.functional.region_splat`; a map without region ids.
         """
-        image: Tensor = RegionSplatRenderer()(self.field, self.regions, size)
+        image: Tensor = _render(self.field, self.regions, size)
         return image
 
     def render(self, size: tuple[int, int] | None = None) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 from torch import Tensor, nn
 
@@ -13,7 +13,6 @@ from kcgs.functional.splat import as_map, map_size, splat_at
 from .field import GaussianField
 
 
-@runtime_checkable
 class SceneLike(Protocol):
     """Gaussians with the map to render them with, such as :class:`kcgs.Scene`."""
 
@@ -74,43 +73,37 @@ class RegionSplatRenderer(nn.Module):
             UserWarning: Gaussians whose region ids the map does not hold; they paint nothing.
         """
         if not isinstance(field, GaussianField):
-            if not isinstance(field, SceneLike):
+            # not by isinstance of the protocol, which takes as long as the rest of this module
+            scene, inner = field, getattr(field, "field", None)
+            if not isinstance(inner, GaussianField):
                 raise TypeError(f"field must be a GaussianField or a Scene; got {type(field).__name__}")
-            scene = field
-            field = scene.field
-            regions = scene.regions if regions is None else regions
+            field, regions = inner, scene.regions if regions is None else regions
         target = field.size if size is None else check_size("size", size)
-        means, cholesky = field.means, field.cholesky
+        means, cholesky, ids = field.means, field.cholesky, field.region_ids
         if target != field.size:
             down, across = target[0] / field.size[0], target[1] / field.size[1]
             means = means * means.new_tensor([across, down])
             cholesky = cholesky * cholesky.new_tensor([across, down, down])
         if regions is not None:
-            regions = self._check_regions(field, regions, target)
-        elif field.region_ids is not None:
+            if ids is None:
+                raise ValueError(
+                    "field must have region_ids where regions are given; call field.assign_regions(regions)"
+                )
+            regions = as_map(regions)
+            found = map_size(regions)
+            if found not in (target, field.size):
+                raise ValueError(f"regions must have the size {field.size} of the field or {target}; got {found}")
+        elif ids is not None:
             raise ValueError(
                 "regions must be given for a field that is confined to regions; got None: pass its label map or its "
                 "Scene, or set field.region_ids to None to render it without contours"
             )
         image = splat_at(
-            target, means, cholesky, field.merged_colors(), field.region_ids, regions, cutoff=self.cutoff,
-            backend=self.backend,
-        )  # fmt: skip
+            target, means, cholesky, field.merged_colors(), ids, regions, cutoff=self.cutoff, backend=self.backend
+        )
         if not self.keepdim and image.ndim == 3:
             image = image[None]
         return image.clamp(0.0, 1.0) if self.clamp else image
-
-    @staticmethod
-    def _check_regions(
-        field: GaussianField, regions: RegionMap | Tensor, target: tuple[int, int]
-    ) -> RegionMap | Tensor:
-        if field.region_ids is None:
-            raise ValueError("field must have region_ids where regions are given; call field.assign_regions(regions)")
-        regions = as_map(regions)
-        found = map_size(regions)
-        if found not in (target, field.size):
-            raise ValueError(f"regions must have the size {field.size} of the field or {target}; got {found}")
-        return regions
 
     def extra_repr(self) -> str:
         """Show the settings."""
