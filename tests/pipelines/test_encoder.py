@@ -1,107 +1,137 @@
-"""An amortised encoder: a network that predicts the Gaussians of a batch of images, trained through the renderer."""
+"""An encoder: a network that predicts the Gaussians of a batch of images, trained, compiled and exported."""
 
 from __future__ import annotations
 
+import inspect
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import kornia
 import pytest
 import torch
+import torch._dynamo.testing
 from torch import Tensor, nn
+from torch.nn import functional
 
-from kcgs import GaussianField, RegionMap, RegionSplatRenderer
-from kcgs.functional import region_splat
+import kcgs
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
+from kcgs.functional import edge_band, lookup_regions, region_splat
 
+ROOT = Path(kcgs.__file__).resolve().parent.parent
 SIZE = (24, 32)
-COUNT = 16  # Gaussians of an image
 BATCH = 6
 
 
 def draw_shapes(seed: int, batch: int = BATCH) -> tuple[Tensor, Tensor]:
-    """Draw a coloured disc on a shaded ground of another colour, (B, 3, H, W), and the label maps, (B, H, W)."""
+    """Draw a coloured disc on a shaded ground of another colour, (B, 3, H, W), and the label maps, (B, H, W).
+
+    Every second image has a third region, of another id for each, in a corner.
+    """
     generator = torch.Generator().manual_seed(seed)
     draw = torch.rand(batch, 10, generator=generator)
     y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in SIZE), indexing="ij")
     center_x, center_y = (8 + 16 * draw[:, 0])[:, None, None], (8 + 8 * draw[:, 1])[:, None, None]
     inside = (x - center_x) ** 2 + (y - center_y) ** 2 < (4 + 3 * draw[:, 2])[:, None, None] ** 2
     ground = draw[:, 3:6, None, None] * (0.5 + 0.5 * x / SIZE[1])
-    return torch.where(inside[:, None], draw[:, 6:9, None, None], ground), inside.long()
+    images, labels = torch.where(inside[:, None], draw[:, 6:9, None, None], ground), inside.long()
+    images[::2, :, :8, :8] = draw[::2, 9, None, None, None]
+    labels[::2, :8, :8] = 2 + torch.arange(0, batch, 2)[:, None, None]
+    return images, labels
 
 
 class Encoder(nn.Module):
-    """Image and label map to Gaussians on a loose grid."""
+    """Images (B, 3, H, W) and label maps (B, H, W) to images of Gaussians, one for each cell."""
+
+    cell = 4
 
     def __init__(self) -> None:
         super().__init__()
-        self.features = nn.Sequential(
-            nn.Conv2d(4, 16, 3, stride=2, padding=1), nn.GELU(), nn.Conv2d(16, 32, 3, stride=2, padding=1), nn.GELU(),
-            nn.AdaptiveAvgPool2d((3, 4)), nn.Flatten(),
+        self.net = nn.Sequential(
+            nn.Conv2d(4, 32, 3, stride=2, padding=1), nn.GELU(),
+            nn.Conv2d(32, 64, 3, stride=2, padding=1), nn.GELU(),
+            nn.Conv2d(64, 64, 3, padding=1), nn.GELU(),
+            nn.Conv2d(64, 8, 1),
         )  # fmt: skip
-        self.head = nn.Sequential(nn.Linear(32 * 12, 64), nn.GELU(), nn.Linear(64, COUNT * 8))
-        rows, cols = torch.meshgrid(torch.arange(4.0), torch.arange(4.0), indexing="ij")
-        grid = torch.stack([(cols + 0.5) * SIZE[1] / 4, (rows + 0.5) * SIZE[0] / 4], -1)
-        self.register_buffer("grid", grid.view(COUNT, 2), persistent=False)
 
-    def forward(self, images: Tensor, labels: Tensor) -> GaussianField:
-        raw = self.head(self.features(torch.cat([images, labels[:, None].to(images)], 1))).unflatten(1, (COUNT, 8))
-        means = self.grid + 4 * raw[..., :2].tanh()
-        scales = 1 + 4 * nn.functional.softplus(raw[..., 2:4])
-        cholesky = torch.stack([scales[..., 0], raw[..., 4], scales[..., 1]], -1)
-        return GaussianField(means, cholesky, raw[..., 5:], size=SIZE).assign_regions(labels)
+    def predict(self, images: Tensor, labels: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return means, factors, colours and region ids of a batch."""
+        contours = edge_band(labels, width=1)[:, None].to(images)
+        raw = self.net(torch.cat([images, contours], 1)).flatten(2).mT  # [B, N, 8]
+        rows, columns = (torch.arange(n // self.cell) for n in images.shape[-2:])
+        grid = (torch.cartesian_prod(rows, columns).flip(-1) + 0.5) * self.cell
+        means = grid + self.cell * raw[..., :2].tanh()
+        widths = 1 + self.cell * (raw[..., 2:4] - 1).sigmoid()
+        cholesky = torch.stack([widths[..., 0], raw[..., 4], widths[..., 1]], -1)
+        colors = raw[..., 5:] + 0.6 * functional.avg_pool2d(images, self.cell).flatten(2).mT
+        return means, cholesky, colors, lookup_regions(means, labels)
+
+    def forward(self, images: Tensor, labels: Tensor) -> Tensor:
+        """Predict and render."""
+        return region_splat(*self.predict(images, labels), labels)
+
+
+@pytest.mark.parametrize("page", ["notebooks/06_differentiable_layer.ipynb", "docs/kornia.md"])
+def test_is_the_one_that_people_start_from(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    if page.endswith("ipynb"):
+        text = "\n".join("".join(cell["source"]) for cell in json.loads(text)["cells"])
+    assert inspect.getsource(Encoder) in text
 
 
 @pytest.mark.parametrize("softness", [0.0, 0.7])
 def test_trains_through_the_renderer(softness: float) -> None:
-    """The loss over a batch falls to a twentieth in 200 steps."""
+    """The loss over a batch falls to a fifth in 60 steps."""
     torch.manual_seed(0)
-    encoder, render = Encoder(), RegionSplatRenderer()
+    encoder = Encoder()
     images, labels = draw_shapes(0)
     regions = RegionMap.from_labels(labels, softness)
-    optimizer = torch.optim.Adam(encoder.parameters(), lr=3e-3)
+    optimizer = torch.optim.Adam(encoder.parameters(), lr=5e-3)
     losses = []
-    for step in range(200):
-        field = encoder(images, labels)
-        assert not list(field.parameters())  # part of the encoder's graph, nothing to train of its own
-        loss = (render(field, regions) - images).square().mean()
+    for step in range(60):
+        loss = (region_splat(*encoder.predict(images, labels), regions) - images).square().mean()
         optimizer.zero_grad()
         loss.backward()
-        if step in (0, 199):
+        if step in (0, 59):
             for name, parameter in encoder.named_parameters():
                 assert parameter.grad is not None and parameter.grad.isfinite().all(), name
                 assert parameter.grad.any(), name
         optimizer.step()
         losses.append(float(loss.detach()))
-    assert losses[-1] < 0.05 * losses[0]
+    assert losses[-1] < 0.2 * losses[0]
 
 
 def test_generalises_to_images_not_seen() -> None:
-    """Trained on fresh images at every step, it draws others better than a field of their mean colours."""
+    """Trained on fresh images at every step, it renders others better than a field of their mean colours."""
     torch.manual_seed(0)
-    encoder, render = Encoder(), RegionSplatRenderer()
-    optimizer = torch.optim.Adam(encoder.parameters(), lr=3e-3)
-    for step in range(400):
+    encoder = Encoder()
+    optimizer = torch.optim.Adam(encoder.parameters(), lr=5e-3)
+    for step in range(100):
         images, labels = draw_shapes(step + 1)
-        loss = (render(encoder(images, labels), labels) - images).square().mean()
+        loss = (encoder(images, labels) - images).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
     images, labels = draw_shapes(100_000, batch=32)
     with torch.no_grad():
-        error = (render(encoder(images, labels), labels) - images).square().mean()
+        error = (encoder(images, labels) - images).square().mean()
     flat = images - images.mean((-2, -1), keepdim=True)
-    assert error < 0.5 * flat.square().mean()
+    assert error < 0.2 * flat.square().mean()
 
 
 def test_a_batch_is_its_images(backend: str) -> None:
-    """Ids and label maps of a batch: each image has its own, and drawn alone it is the same."""
+    """Ids and label maps of a batch: each image has its own, and rendered alone, as a scene, it is the same."""
     torch.manual_seed(0)
     images, labels = draw_shapes(3)
-    field = Encoder()(images, labels)
-    assert field.region_ids is not None and field.region_ids.shape == (BATCH, COUNT)
-    together = RegionSplatRenderer(backend=backend)(field, labels)
+    *gaussians, ids = Encoder().predict(images, labels)
+    field = GaussianField(*gaussians, ids, size=SIZE)
+    assert not list(field.parameters())  # part of the encoder's graph, nothing to train of its own
+    render = RegionSplatRenderer(backend=backend)
+    together = render(field, labels)
     assert together.shape == images.shape
-    for b in range(BATCH):
-        alone = region_splat(
-            field.means[b], field.cholesky[b], field.colors[b], field.region_ids[b], labels[b], backend=backend
-        )
-        torch.testing.assert_close(together[b], alone, rtol=1e-5, atol=1e-5)
+    for b, scene in enumerate(Scene(field, labels).unbind()):
+        assert scene.regions is not None and scene.regions.num_regions == (3, 2)[b % 2]
+        torch.testing.assert_close(together[b], render(scene), rtol=1e-5, atol=1e-5)
 
 
 def test_gradients_agree_between_backends() -> None:
@@ -110,8 +140,46 @@ def test_gradients_agree_between_backends() -> None:
     images, labels = draw_shapes(3)
     gradients = {}
     for name in ("reference", "tiled", "cpu"):
-        picture = RegionSplatRenderer(backend=name)(encoder(images, labels), labels)
-        gradients[name] = torch.autograd.grad((picture - images).square().sum(), list(encoder.parameters()))
+        image = region_splat(*encoder.predict(images, labels), labels, backend=name)
+        gradients[name] = torch.autograd.grad((image - images).square().sum(), list(encoder.parameters()))
     for name in ("tiled", "cpu"):
         for got, want in zip(gradients[name], gradients["reference"], strict=True):
             torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-3 * float(want.abs().max()))
+
+
+class TestOneGraph:
+    """Network, renderer and Kornia's loss in one graph, and the network as a program."""
+
+    @pytest.fixture(autouse=True)
+    def fresh(self) -> Iterator[None]:
+        torch._dynamo.reset()
+        yield
+        torch._dynamo.reset()
+
+    @pytest.mark.filterwarnings("ignore:.*torch.autograd.function.Function.* should not be:DeprecationWarning")
+    @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf:UserWarning")
+    def test_trains_compiled(self) -> None:
+        """Images and maps with other numbers of regions at every step: compiled once, the losses of eager mode."""
+
+        def train(name: str | None) -> tuple[list[float], int]:
+            torch.manual_seed(0)
+            encoder = Encoder()
+            optimizer = torch.optim.SGD(encoder.parameters(), lr=0.1)
+
+            def batch_loss(images: Tensor, labels: Tensor) -> Tensor:
+                return kornia.losses.ssim_loss(encoder(images, labels), images, window_size=5)
+
+            counter = torch._dynamo.testing.CompileCounterWithBackend(name or "eager")
+            step_loss = torch.compile(batch_loss, fullgraph=True, backend=counter) if name else batch_loss
+            losses = []
+            for step in range(8):
+                loss = step_loss(*draw_shapes(step % 2))
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+                losses.append(float(loss.detach()))
+            return losses, counter.frame_count
+
+        losses, compiled = train("aot_eager")
+        assert compiled == 1 and losses == pytest.approx(train(None)[0], rel=1e-4)
+        assert losses[-2] < losses[0]
