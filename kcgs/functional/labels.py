@@ -73,17 +73,17 @@ def edge_band(labels: Tensor, width: float = 5) -> Tensor:
     if not (1 <= width < math.inf):
         raise ValueError(f"width must be a finite number of at least 1 pixel; got {width!r}")
     height, breadth = labels.shape[-2:]
-    band = torch.zeros_like(labels, dtype=torch.bool)
+    band = torch.zeros_like(labels, dtype=torch.uint8)  # not bool: inductor's C++ for parts of such tensors is refused
     width = min(width, math.hypot(height, breadth))
     for dy in range(min(int(width), height - 1) + 1):
         reach = min(int(math.sqrt(width * width - dy * dy)), breadth - 1)
         for dx in range(-reach if dy else 1, reach + 1):
             first = (..., slice(0, height - dy), slice(max(0, -dx), breadth - max(0, dx)))
             second = (..., slice(dy, height), slice(max(0, dx), breadth - max(0, -dx)))
-            differs = labels[first] != labels[second]
+            differs = (labels[first] != labels[second]).byte()
             band[first] |= differs
             band[second] |= differs
-    return band
+    return band.bool()
 
 
 def contour_edges(labels: Tensor) -> tuple[Tensor, Tensor]:
