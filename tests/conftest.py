@@ -72,8 +72,9 @@ def _chosen(config: pytest.Config, option: str, known: tuple[str, ...]) -> tuple
 
 
 def _backends(device: str) -> list[str]:
-    """Name the kernels that take tensors of a device."""
-    others = {"cpu", "cuda", "auto"} - {device}
+    """Name the kernels that take tensors of a device; Triton's interpreter runs that of CUDA in numpy, slowly."""
+    interpreted = {"cuda"} if os.environ.get("TRITON_INTERPRET") == "1" else set()
+    others = {"cpu", "cuda", "auto"} - {device} - interpreted
     return [name for name in BACKENDS if name not in others]
 
 

@@ -56,12 +56,12 @@ def as_float32(scene: Scene) -> Scene:
 
 def suited(scene: Scene, backend: str) -> Scene:
     """Give a float64 scene in the widest dtype that the backend computes in."""
-    return as_float32(scene) if backend == "cpu" else scene
+    return as_float32(scene) if backend in ("cpu", "cuda") else scene
 
 
 def rounding(backend: str) -> float:
     """Allow for the arithmetic of :func:`suited` scenes."""
-    return 2e-6 if backend == "cpu" else 1e-11
+    return 2e-6 if backend in ("cpu", "cuda") else 1e-11
 
 
 def gradients(scene: Scene, regions: RegionMap | None, **options: object) -> tuple[Tensor, list[Tensor]]:

@@ -236,6 +236,7 @@ class TestExport:
             "for number, (given, image) in enumerate(torch.load(f'{sys.argv[1]}/wanted.pt')):\n"
             "    found = torch.export.load(f'{sys.argv[1]}/{number}.pt2').module()(*given)\n"
             "    torch.testing.assert_close(found, image, rtol=1e-5, atol=1e-6)\n"
+            "    assert number > 1 or torch.equal(found, image)\n"  # without convolutions every bit is the same
             "    assert image.abs().max() > 0.1 and not torch.equal(image[0], image[-1])\n"
         )
         subprocess.run([sys.executable, "-W", "ignore", "-c", code, str(tmp_path)], check=True, timeout=120)
