@@ -21,7 +21,7 @@ class Arguments(NamedTuple):
     colors: Tensor  # [B, N, C]
     region_ids: Tensor | None  # [B, N] int64
     labels: Tensor | None  # [k * H, k * W] or [B, ...] int64; of the map at its own size, if that is another
-    widths: Tensor | None  # [P, 3] float64: a pair of ids and its contour width; None: all are hard
+    widths: Tensor | None  # float64, as of `widths_of`; None: all contours are hard
     supersample: int  # k
     height: int
     width: int

@@ -160,32 +160,38 @@ def compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     return ids, index.to(torch.int32), None
 
 
+def sample_places(new: int, old: int, factor: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Place `new` pixels of `factor` sub-pixels on a line of labels: both neighbours, (2, n), and their shares."""
+    # in integers, so that any program that renders the map puts a pixel on the same side
+    pixels = old // factor
+    i = torch.arange(new, device=device)[:, None]
+    j = torch.arange(factor, device=device)
+    # sub-pixels spread over a new pixel, or over an old one where that is smaller
+    points = factor * (2 * i + 1) * pixels + (2 * j + 1 - factor) * torch.sym_min(pixels, new) - new
+    points = points.flatten() + 2 * new  # from one label before the first: never negative
+    low = torch.div(points, 2 * new, rounding_mode="floor")
+    offset = (torch.div((points - 2 * new * low) * _OFFSETS, 2 * new, rounding_mode="floor") + 0.5) / _OFFSETS
+    ends = torch.stack([low - 1, low]).clamp(0, old - 1)
+    return ends, torch.stack([1 - offset, offset]).double()
+
+
 def sample_labels(labels: Tensor, height: int, width: int, factor: int) -> Tensor:
     """Sample a label map at another size: the label with the largest share among four neighbours; see `resize`."""
-
-    # in integers, so that any program that renders the map puts a pixel on the same side
-    def neighbours(new: int, old: int) -> tuple[Tensor, Tensor]:
-        pixels = old // factor
-        i = torch.arange(new, device=labels.device)[:, None]
-        j = torch.arange(factor, device=labels.device)
-        if pixels <= new:  # sub-pixels spread over a new pixel
-            points = pixels * (2 * (i * factor + j) + 1) - new
-        else:  # over an old one
-            points = factor * (2 * i + 1) * pixels + (2 * j - factor) * new
-        points = points.flatten()
-        low = torch.div(points, 2 * new, rounding_mode="floor")
-        offset = (torch.div((points - 2 * new * low) * _OFFSETS, 2 * new, rounding_mode="floor") + 0.5) / _OFFSETS
-        ends = torch.stack([low, low + 1]).clamp(0, old - 1)
-        return ends, torch.stack([1 - offset, offset]).double()
-
-    (rows, down), (cols, across) = neighbours(height, labels.shape[-2]), neighbours(width, labels.shape[-1])
+    (rows, down), (cols, across) = (
+        sample_places(new, old, factor, labels.device)
+        for new, old in zip((height, width), labels.shape[-2:], strict=True)
+    )
     corners = [labels.index_select(-2, r).index_select(-1, c) for r in rows for c in cols]
     sampled = corners[0].clone()
     # nearly everywhere the four are one label
     mixed = (corners[1] != sampled).logical_or_(corners[2] != sampled).logical_or_(corners[3] != sampled)
     places = mixed.nonzero(as_tuple=True)
-    candidates = torch.stack([corner[places] for corner in corners])
     weights = torch.stack([d[places[-2]] * a[places[-1]] for d in down for a in across])
-    scores = torch.stack([torch.where(candidates == corner, weights, 0.0).sum(0) for corner in candidates])
-    sampled[places] = candidates.gather(0, scores.argmax(0, keepdim=True))[0]
+    sampled[places] = most_shared(torch.stack([corner[places] for corner in corners]), weights)
     return sampled
+
+
+def most_shared(labels: Tensor, shares: Tensor) -> Tensor:
+    """Return the label with the largest sum of shares along the first dimension; of several the first."""
+    sums = torch.stack([torch.where(labels == label, shares, 0.0).sum(0) for label in labels])
+    return labels.gather(0, sums.argmax(0, keepdim=True))[0]

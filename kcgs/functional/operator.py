@@ -322,5 +322,7 @@ for _name, _shape in (
     ("region_splat_forward", lambda *arguments: _render_shape(*arguments[3:])),
 ):
     torch.library.register_fake(f"kcgs::{_name}", _shape, lib=_LIBRARY)
+# fake tensors of open sizes prefer a decomposition where this table has nothing, and torch.onnx.export is given one
+torch._decomp.register_decomposition(splat_operator, type="meta")(_render_shape)
 torch.library.register_vmap("kcgs::region_splat", _render_mapped, lib=_LIBRARY)
 torch.library.register_vmap("kcgs::region_splat_backward", _differentiate_mapped, lib=_LIBRARY)

@@ -108,7 +108,7 @@ class RegionMap:
         membership = Membership(coarse, len(ids), by_index, fine=None if supersample == 1 else index)
         shown = labels if supersample == 1 else ids[coarse if labels.ndim == 3 else coarse[0]]
         tables = MapTables(ids, table, membership)
-        widths = widths_of(width, labels.device)
+        widths = widths_of(width, supersample, labels.device)
         return cls(shown, ids, width, supersample, fine_labels=labels, tables=tables, widths=widths)
 
     @classmethod

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_number
+from kcgs.kernels.membership import RADIUS_SIGMAS
 
 MAX_SOFTNESS = 64.0  # pixels
 _FEW = 4
@@ -85,17 +86,28 @@ def merged_widths(softness: float | PairWidths, find: Callable[[int], int]) -> f
     return {pair: sum(found) / len(found) for pair, found in widths.items()}
 
 
-def widths_of(softness: float | PairWidths, device: torch.device) -> Tensor | None:
-    """Return widths as the operator takes them, (P, 3) float64: two ids, -1 for all, and the width; None: hard."""
+def widths_of(softness: float | PairWidths, supersample: int, device: torch.device) -> Tensor | None:
+    """Return widths as the operator takes them, float64; None: all contours are hard.
+
+    One width, then half of its blur, from the middle, at the sub-pixels of the map: (1 + taps,). Or, sorted, a row for
+    each pair of ids before width and blur: (P, 3 + taps). So shapes say how far contours reach.
+    """
     if softness == 0.0:
         return None
-    rows = [(-1, -1, softness)] if isinstance(softness, float) else [(*pair, width) for pair, width in softness.items()]
-    return torch.tensor(rows, dtype=torch.float64, device=device)
+    widths = torch.tensor([softness] if isinstance(softness, float) else list(softness.values()), dtype=torch.float64)
+    reach = (RADIUS_SIGMAS * widths * supersample).ceil()[:, None]
+    distance = torch.arange(int(reach.max()) + 1, dtype=torch.float64)
+    blurs = torch.exp(-0.5 * (distance / (widths[:, None] * supersample).clamp_min(1e-9)) ** 2)
+    rows = torch.cat([widths[:, None], torch.where(distance <= reach, blurs, 0.0)], 1)
+    if isinstance(softness, float):
+        return rows[0].to(device)
+    return torch.cat([torch.tensor(list(softness), dtype=torch.float64), rows], 1).to(device)
 
 
 def softness_of(widths: Tensor | None) -> float | dict[tuple[int, int], float]:
     """Return what :func:`widths_of` was given."""
-    rows = [] if widths is None else widths.tolist()
-    if len(rows) == 1 and rows[0][0] < 0:
-        return float(rows[0][2])
-    return {(int(a), int(b)): width for a, b, width in rows} if rows else 0.0
+    if widths is None:
+        return 0.0
+    if widths.ndim == 1:
+        return float(widths[0])
+    return {(int(a), int(b)): width for a, b, width in widths[:, :3].tolist()}

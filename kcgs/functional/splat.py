@@ -9,8 +9,12 @@ from torch import Tensor
 from kcgs._check import check_cutoff, check_floating, check_ids, check_labels, check_rows, check_size, check_tensor
 from kcgs.kernels import check_backend
 
+from .decomposition import decompose
 from .operator import splat_operator
 from .regions import RegionMap
+
+# what torch.onnx.export puts in place of the operator; compilers and torch.export do not
+torch._decomp.register_decomposition(splat_operator)(decompose)
 
 _UNMAPPED = (
     "regions must be given with region_ids; got None: pass the label map, or leave region_ids out, too, to render "

@@ -1,0 +1,131 @@
+"""`kcgs::region_splat` in standard operators: what `torch.onnx.export` puts in its place; docs/onnx.md has the whole.
+
+Three loops bound the memory, and no shape depends on values: over tiles, over the regions that a tile sees, and over
+chunks of the Gaussians of a region that reach the tile. Bodies of loops are handed all tensors that they read.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcgs.kernels.whitened import least_exponent, support_radius
+
+from .arguments import Arguments
+from .map_windows import MapWindows
+
+_SIDE = 32  # of a tile, in pixels
+_CHUNK = 64  # Gaussians evaluated at once
+_HALF = (_SIDE - 1) / 2
+_FRAME = 5  # numbers of a Gaussian before its colour: mean x, mean y, 1 / l11, l21 / l11, 1 / l22
+# of the support, so that rounding drops no Gaussian that has a weight
+_SLACK = 1.001
+
+
+def decompose(*arguments: Any) -> Tensor:
+    """Render as `kcgs::region_splat` does, whose arguments these are; to be traced, and slow in eager mode."""
+    given = Arguments(*arguments)
+    if given.means.ndim == 2:
+        return decompose(*(None if t is None else t[None] for t in given[:4]), *given[4:]).squeeze(0)
+    # a graph that renders only: loops cannot all be differentiated
+    means, cholesky, colors = (t.detach() for t in given[:3])
+    device, (batch, count, channels), (height, width) = means.device, colors.shape, given[7:9]
+    l11, l21, l22 = cholesky.unbind(-1)
+    frame = torch.stack([*means.unbind(-1), 1 / l11, l21 / l11, 1 / l22], -1)
+    # one Gaussian more, of no colour and no region
+    rows = torch.nn.functional.pad(torch.cat([frame, colors], -1), (0, 0, 0, 1))
+    ids = torch.zeros_like(means[..., 0], dtype=torch.int64) if given.region_ids is None else given.region_ids
+    ids = torch.nn.functional.pad(ids, (0, 1), value=-1)
+
+    # not -(-height // _SIDE): division of integers rounds to zero in ONNX
+    down, across = (height + _SIDE - 1) // _SIDE, (width + _SIDE - 1) // _SIDE
+    counts = torch.stack([torch.full((), n, dtype=torch.int64, device=device) for n in (down, across, count)])
+    maps = None if given.labels is None else MapWindows(given, _SIDE)
+
+    def render_tile(carry: Tensor, number: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+        (down, across, count), columns, rows, ids = tensors[0].unbind(), *tensors[1:4]
+        column, row, image = number % across, number // across % down, number // (across * down)
+        middle = torch.stack([column, row]).to(rows.dtype) * _SIDE + _SIDE / 2
+        near = _find_near(columns.index_select(0, image.reshape(1)).squeeze(0), middle, given.cutoff)
+        black = rows.new_zeros(rows.shape[1] - _FRAME, _SIDE * _SIDE)
+        gaussians = image * (count + 1), count, middle, rows
+        if maps is None:
+            total = _sum_list(near, gaussians, black, given.cutoff)
+        else:
+            ids = ids.index_select(0, image.reshape(1)).squeeze(0)
+            seen = maps.look(tensors[4:], image, row, column)
+            total = _sum_regions(maps, seen, (near, ids, *gaussians), black, given.cutoff)
+        return carry + 1, total.reshape(-1, _SIDE, _SIDE)
+
+    tiles = torch.arange(batch * down * across, device=device)
+    tensors = (counts, rows[..., :_FRAME].transpose(1, 2).contiguous(), rows.flatten(0, 1), ids)
+    tensors = tensors if maps is None else (*tensors, *maps.tables)
+    _, found = torch.ops.higher_order.scan(render_tile, [torch.zeros_like(counts[0])], [tiles], tensors)
+    image = found.reshape(batch, down, across, channels, _SIDE, _SIDE).permute(0, 3, 1, 4, 2, 5)
+    image = image.reshape(batch, channels, down * _SIDE, across * _SIDE)
+    # by less than nothing, since shapes then stay plain: a slice would be of min(height, rows)
+    return torch.nn.functional.pad(image, (0, width - across * _SIDE, 0, height - down * _SIDE)).contiguous()
+
+
+def _find_near(columns: Tensor, middle: Tensor, cutoff: float) -> Tensor:
+    """Mark the Gaussians whose support reaches a tile, [N + 1]; not the last, which is no Gaussian."""
+    x, y, inverse1, slope, inverse2 = columns.unbind()
+    radius = support_radius(cutoff, x.dtype) * _SLACK
+    # z at the middle of the tile, against how far it goes from there to the farthest pixel
+    z1, z2 = (middle[0] - x) * inverse1, (middle[1] - y - slope * (middle[0] - x)) * inverse2
+    near = (z1.abs() <= inverse1 * _HALF + radius) & (z2.abs() <= (slope.abs() + 1) * inverse2 * _HALF + radius)
+    return near & (inverse1 > 0)
+
+
+def _sum_regions(
+    maps: MapWindows, seen: tuple[Tensor, ...], gaussians: tuple[Tensor, ...], black: Tensor, cutoff: float
+) -> Tensor:
+    """Add up the regions of a tile, in the order of their ids; `seen` begins with these, sorted."""
+
+    def more(place: Tensor, total: Tensor, *rest: Tensor) -> Tensor:
+        return place < rest[6].shape[0]
+
+    def add(place: Tensor, total: Tensor, near: Tensor, ids: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
+        region = rest[4].index_select(0, place.reshape(1))
+        part = _sum_list(near & (ids == region), rest[:4], torch.zeros_like(total), cutoff)
+        return (rest[4] <= region).sum(), total + part * maps.weigh(rest[5:], region).reshape(1, -1)
+
+    start = torch.zeros_like(gaussians[2])
+    total: Tensor = torch.ops.higher_order.while_loop(more, add, (start, black), (*gaussians, *seen))[1]
+    return total
+
+
+def _sum_list(near: Tensor, gaussians: tuple[Tensor, ...], black: Tensor, cutoff: float) -> Tensor:
+    """Add up colour times weight over the Gaussians that are marked, [C, pixels]."""
+
+    def more(start: Tensor, total: Tensor, stop: Tensor, *rest: Tensor) -> Tensor:
+        return start < stop
+
+    def add(start: Tensor, total: Tensor, stop: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
+        order, first, count, middle, rows = rest
+        places = start + torch.arange(_CHUNK, device=rows.device)
+        chosen = torch.where(places < stop, order.index_select(0, torch.minimum(places, count)), count)
+        chunk = rows.index_select(0, first + chosen)
+        return start + _CHUNK, total + chunk[:, _FRAME:].T @ _weights(chunk[:, :_FRAME], middle, cutoff)
+
+    order = torch.sort(near.to(torch.int32), descending=True)[1]
+    start = torch.zeros_like(order[0])
+    given = (near.sum(), order, *gaussians)
+    total: Tensor = torch.ops.higher_order.while_loop(more, add, (start, black), given)[1]
+    return total
+
+
+def _weights(frame: Tensor, middle: Tensor, cutoff: float) -> Tensor:
+    """Evaluate the weights of K Gaussians at the pixels of a tile, [K, pixels]."""
+    offsets = torch.arange(_SIDE, device=frame.device, dtype=frame.dtype) - _HALF
+    mean_x, mean_y, inverse1, slope, inverse2 = (v[:, None, None] for v in frame.unbind(1))
+    # pixel minus mean before anything is multiplied: nothing cancels where a Gaussian is far below a pixel wide
+    x = (middle[0] - mean_x) + offsets  # [K, 1, side]
+    y = (middle[1] - mean_y) + offsets[:, None]  # [K, side, 1]
+    z1, z2 = x * inverse1, (y - slope * x) * inverse2
+    weight = ((z1 * z1 + z2 * z2) * -0.5).clamp_min(least_exponent(0.0, frame.dtype)).exp()
+    if cutoff > 0.0:
+        weight = torch.where(weight >= cutoff, weight, 0.0)
+    return weight.flatten(1)

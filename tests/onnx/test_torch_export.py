@@ -1,0 +1,216 @@
+"""`torch.onnx.export` of modules that hold the renderer, and `to_onnx` as Kornia's modules have it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import onnxruntime
+import pytest
+import torch
+from torch import Tensor, nn
+from torch._higher_order_ops.scan import generic_scan
+from torch._higher_order_ops.while_loop import while_loop_dense
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from kcgs import GaussianField, RegionMap, Scene
+from kcgs.functional import region_splat
+from kcgs.functional.decomposition import decompose
+
+SIZE = (40, 56)
+PAIRS = {(0, 3): 1.1, (0, 7): 0.0, (3, 7): 2.0}
+exporter_warnings = pytest.mark.filterwarnings(
+    "ignore:.*:DeprecationWarning", "ignore:.*:FutureWarning", "ignore:.*:UserWarning"
+)
+
+
+def labels_of(size: tuple[int, int], factor: int = 1) -> Tensor:
+    """A disc, a slanted part, and what is left."""
+    y, x = torch.meshgrid(*(torch.arange(n) for n in size), indexing="ij")
+    y, x = (v.repeat_interleave(factor, 0).repeat_interleave(factor, 1) for v in (y, x))
+    labels = torch.where(x > size[1] * 0.6 + y // 3, 7, 0)
+    return torch.where((y - 16) ** 2 + (x - 20) ** 2 < 100, 3, labels)
+
+
+def gaussians(batch: int, count: int, size: tuple[int, int]) -> list[Tensor]:
+    """Slanted ones, of the three regions and one that no map has."""
+    fields = [GaussianField.random(count, size, seed=k) for k in range(batch)]
+    means, cholesky, colors = (
+        torch.stack([getattr(f, n).detach() for f in fields]) for n in ("means", "cholesky", "colors")
+    )
+    cholesky[..., 1] += 1.5
+    ids = torch.tensor([0, 3, 7, 99])[torch.arange(batch * count) % 4]
+    return [means, cholesky, colors, ids.reshape(batch, count)]
+
+
+def run(program: Any, *inputs: Tensor) -> Tensor:
+    session = onnxruntime.InferenceSession(program.SerializeToString())
+    feeds = {node.name: t.numpy() for node, t in zip(session.get_inputs(), inputs, strict=True)}
+    return torch.from_numpy(session.run(None, feeds)[0])
+
+
+def assert_close(got: Tensor, want: Tensor) -> None:
+    assert want.abs().max() > 0.1
+    torch.testing.assert_close(got, want.detach(), rtol=0, atol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing:UserWarning")
+class TestDecomposition:
+    @pytest.mark.parametrize("size", [SIZE, (77, 101), (33, 41)])
+    @pytest.mark.parametrize(
+        ("softness", "supersample"),
+        [(0.0, 1), (0.0, 2), (0.7, 1), (0.7, 2), (PAIRS, 1), (PAIRS, 2), ({(0, 3): 1.0}, 1)],
+    )
+    def test_maps(self, softness: Any, supersample: int, size: tuple[int, int]) -> None:
+        regions = RegionMap.from_labels(labels_of(SIZE, supersample), softness, supersample=supersample)
+        args = (*gaussians(2, 30, size), regions.fine_labels, regions.widths, supersample, *size, 1e-4, "reference")
+        assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
+
+    @pytest.mark.parametrize("cutoff", [0.0, 1e-2])
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_without_a_map(self, cutoff: float, dtype: torch.dtype) -> None:
+        given = [t.to(dtype) for t in gaussians(2, 30, SIZE)[:3]]
+        args = (*given, None, None, None, 1, *SIZE, cutoff, "reference")
+        assert decompose(*args).dtype == dtype
+        assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
+
+    def test_a_map_for_each_image_of_large_ids(self) -> None:
+        labels = torch.stack([labels_of(SIZE), labels_of(SIZE).flip(1)]) << 40
+        given = gaussians(2, 30, SIZE)
+        given[3] <<= 40
+        args = (*given, labels, None, 1, *SIZE, 1e-4, "reference")
+        assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
+
+    def test_no_gaussians(self) -> None:
+        args = (*gaussians(1, 0, SIZE), labels_of(SIZE), None, 1, *SIZE, 1e-4, "reference")
+        assert torch.equal(decompose(*args), torch.zeros(1, 3, *SIZE))
+
+    def test_many_pairs(self) -> None:
+        """Nearest contours, equal distances among them, are those of scipy's distance transform."""
+        labels = torch.arange(24)[:, None] // 5 * 8 + torch.arange(36) // 5
+        pairs = {(a, b): 0.3 + (7 * a + 3 * b) % 5 / 4 for a in range(40) for b in range(a + 1, 40) if (a + b) % 3}
+        regions = RegionMap.from_labels(
+            labels, {p: w for p, w in pairs.items() if set(p) <= set(labels.unique().tolist())}
+        )
+        means, cholesky, colors, _ = gaussians(1, 40, (24, 36))
+        args = (
+            means,
+            3 * cholesky,
+            colors,
+            torch.arange(40)[None],
+            labels,
+            regions.widths,
+            1,
+            24,
+            36,
+            1e-4,
+            "reference",
+        )
+        assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
+
+    def test_memory_is_that_of_a_chunk_and_the_image(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        loops = torch.ops.higher_order
+        monkeypatch.setattr(loops, "scan", lambda body, *given: generic_scan(body, *given[:2], 0, given[2]))
+        monkeypatch.setattr(loops, "while_loop", while_loop_dense)
+
+        class Largest(TorchDispatchMode):
+            numel = 0
+
+            def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+                found = func(*args, **(kwargs or {}))
+                self.numel = max(self.numel, found.numel() if isinstance(found, Tensor) else 0)
+                return found
+
+        size, largest = (96, 128), Largest()
+        given = gaussians(1, 400, size)
+        with largest:
+            decompose(*given, labels_of(size), None, 1, *size, 1e-4, "tiled")
+        assert largest.numel == 64 * 32 * 32 > 3 * 96 * 128
+
+    def test_compilers_and_torch_export_keep_the_operator(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        operator = torch.ops.kcgs.region_splat.default
+        monkeypatch.setitem(torch._decomp.decomposition_table, operator, None)  # not to be called
+        given = [t[0] for t in gaussians(1, 12, SIZE)]
+        torch._dynamo.reset()
+        compiled = torch.compile(region_splat, backend="aot_eager", fullgraph=True, dynamic=True)
+        assert_close(compiled(*given, labels_of(SIZE)), region_splat(*given, labels_of(SIZE)))
+
+
+class Predictor(nn.Module):
+    """A network that predicts Gaussians, the renderer, and a filter of Kornia."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        from kornia.filters import GaussianBlur2d
+
+        self.shift = nn.Linear(2, 2)
+        self.blur = GaussianBlur2d((3, 3), (1.0, 1.0))
+
+    def forward(self, means: Tensor, cholesky: Tensor, colors: Tensor, ids: Tensor, labels: Tensor) -> Tensor:
+        return self.blur(region_splat(means + self.shift(means).tanh(), cholesky, colors, ids, labels))
+
+
+class Resized(nn.Module):
+    """A scene behind an image of any size."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        self.scene = scene
+
+    def forward(self, image: Tensor) -> Tensor:
+        return image + self.scene(size=tuple(image.shape[-2:]))
+
+
+@exporter_warnings
+class TestTorchExport:
+    def test_a_network_with_kornia_behind_the_renderer(self) -> None:
+        """Sizes, numbers and batches that were not traced, a map for each image."""
+        names = {0: "B", 1: "N"}
+        maps = torch.stack([labels_of(SIZE), labels_of(SIZE).flip(0)])
+        module = Predictor().eval()
+        program = torch.onnx.export(
+            module, (*gaussians(2, 20, SIZE), maps), dynamo=True, verbose=False,
+            dynamic_shapes=(*[names] * 4, {0: "B", 1: "H", 2: "W"}),
+        )  # fmt: skip
+        assert program is not None
+        session = program.model_proto
+        for batch, count, size in ((3, 70, (61, 35)), (1, 5, (24, 100))):
+            inputs = (*gaussians(batch, count, size), torch.stack([labels_of(size).roll(k, 1) for k in range(batch)]))
+            assert_close(run(session, *inputs), module(*inputs))
+
+    def test_a_scene_of_soft_contours_at_sizes_that_were_not_traced(self) -> None:
+        regions = RegionMap.from_labels(labels_of(SIZE), PAIRS)
+        module = Resized(Scene(GaussianField.random(40, SIZE, seed=0, regions=regions), regions)).eval()
+        program = torch.onnx.export(
+            module, (torch.rand(3, 48, 60),), dynamo=True, verbose=False, dynamic_shapes=({1: "H", 2: "W"},)
+        )
+        assert program is not None
+        for size in (SIZE, (90, 33)):
+            image = torch.rand(3, *size)
+            assert_close(run(program.model_proto, image), module(image))
+
+
+@exporter_warnings
+class TestMixin:
+    def test_a_scene_chains_with_a_filter(self) -> None:
+        from kornia.core import ImageSequential
+        from kornia.filters import GaussianBlur2d
+        from kornia.onnx import ONNXSequential
+
+        regions = RegionMap.from_labels(labels_of(SIZE), 0.7)
+        scene = Scene(GaussianField.random(40, SIZE, seed=0, regions=regions), regions)
+        blur = ImageSequential(GaussianBlur2d((3, 3), (1.0, 1.0)))
+        chain = ONNXSequential(scene.to_onnx(save=False), blur.to_onnx(save=False, verbose=False))
+        assert_close(torch.from_numpy(chain()[0]), blur(scene()[None]))
+
+    def test_the_renderer(self, tmp_path: Any) -> None:
+        import onnx
+
+        from kcgs import RegionSplatRenderer
+
+        path = str(tmp_path / "renderer.onnx")
+        RegionSplatRenderer(cutoff=1e-3, clamp=True).to_onnx(path, pseudo_shape=[2, 1, 20, 30])
+        given = gaussians(3, 50, (61, 35))
+        given[2] = given[2][..., :1]
+        labels = torch.stack([labels_of((61, 35)).roll(k, 1) for k in range(3)])
+        want = region_splat(*given, labels, cutoff=1e-3).clamp(0, 1)
+        assert_close(run(onnx.load(path), *given, labels), want)
