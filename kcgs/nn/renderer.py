@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 from torch import Tensor, nn
 
@@ -104,6 +104,16 @@ class RegionSplatRenderer(nn.Module):
         if not self.keepdim and image.ndim == 3:
             image = image[None]
         return image.clamp(0.0, 1.0) if self.clamp else image
+
+    def to_onnx(self, onnx_name: str = "Kornia-RegionSplatRenderer.onnx", **settings: Any) -> Any:
+        """Export for any Gaussians and label maps, by Kornia's `ONNXExportMixin`.
+
+        Takes what Kornia's ``to_onnx`` takes; ``input_shape`` and ``pseudo_shape`` are those of the image. Returns the
+        `onnx.ModelProto`: batches of means, cholesky, colors, region_ids and labels in, the image out.
+        """
+        from .onnx_export import RendererExport
+
+        return RendererExport(self).to_onnx(onnx_name, **settings)
 
     def extra_repr(self) -> str:
         """Show the settings."""
