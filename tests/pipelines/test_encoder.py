@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import inspect
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import kornia
+import numpy as np
 import pytest
 import torch
 import torch._dynamo.testing
@@ -18,6 +21,16 @@ import kcgs
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.functional import edge_band, lookup_regions, region_splat
 
+# run by a process of its own
+RUN = """
+import sys
+import numpy as np
+import onnxruntime
+
+session = onnxruntime.InferenceSession("encoder.onnx")
+np.save("renders.npy", session.run(None, dict(np.load("inputs.npz")))[0])
+assert not {"torch", "kcgs"} & set(sys.modules)
+"""
 ROOT = Path(kcgs.__file__).resolve().parent.parent
 SIZE = (24, 32)
 BATCH = 6
@@ -183,3 +196,20 @@ class TestOneGraph:
         losses, compiled = train("aot_eager")
         assert compiled == 1 and losses == pytest.approx(train(None)[0], rel=1e-4)
         assert losses[-2] < losses[0]
+
+    @pytest.mark.filterwarnings(
+        "ignore:.*:DeprecationWarning", "ignore:.*:FutureWarning", "ignore:.*:UserWarning:torch"
+    )
+    def test_runs_without_torch(self, tmp_path: Path) -> None:
+        """As one ONNX file, over another number of images than was traced."""
+        torch.manual_seed(0)
+        encoder = Encoder().eval()
+        shapes = {0: "B"}, {0: "B"}
+        program = torch.onnx.export(encoder, draw_shapes(0, batch=2), dynamo=True, dynamic_shapes=shapes, verbose=False)
+        assert program is not None
+        program.save(tmp_path / "encoder.onnx")
+        images, labels = draw_shapes(1, batch=5)
+        np.savez(tmp_path / "inputs.npz", images=images.numpy(), labels=labels.numpy())
+        subprocess.run([sys.executable, "-c", RUN], cwd=tmp_path, check=True)
+        renders = torch.from_numpy(np.load(tmp_path / "renders.npy"))
+        torch.testing.assert_close(renders, encoder(images, labels).detach(), rtol=0, atol=1e-5)
