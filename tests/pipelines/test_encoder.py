@@ -197,6 +197,23 @@ class TestOneGraph:
         assert compiled == 1 and losses == pytest.approx(train(None)[0], rel=1e-4)
         assert losses[-2] < losses[0]
 
+    @pytest.mark.filterwarnings("ignore:.*torch.autograd.function.Function.* should not be:DeprecationWarning")
+    def test_a_field_and_its_checks_are_in_the_graph(self) -> None:
+        """A field may be made there, too, of tensors with a graph; what is not finite is refused as it runs."""
+        encoder = Encoder()
+
+        def render(images: Tensor, labels: Tensor) -> Tensor:
+            field = GaussianField(*encoder.predict(images, labels)[:3], size=SIZE).assign_regions(labels)
+            image: Tensor = RegionSplatRenderer()(field, labels)
+            return image
+
+        compiled, (images, labels) = torch.compile(render, fullgraph=True, backend="eager"), draw_shapes(0)
+        assert torch.equal(compiled(images, labels), encoder(images, labels))
+        with pytest.raises(RuntimeError, match="means must be finite"):
+            compiled(images * torch.nan, labels)
+        with pytest.raises(RuntimeError, match="labels must hold non-negative ids"):
+            compiled(images, labels - 1)
+
     @pytest.mark.filterwarnings(
         "ignore:.*:DeprecationWarning", "ignore:.*:FutureWarning", "ignore:.*:UserWarning:torch"
     )
