@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -18,10 +18,12 @@ from torch import Tensor
 
 from ..inputs import Gradients, OutOfRangeError, SplatInputs, Steps
 from ..membership import Membership
+from ..octaves import blocks_of, most_spacing
 from ..threads import num_threads
 from ..whitened import least_exponent, support_radius
 from . import loops
-from .loops import Lists
+from .lists import Lists, Table, in_range, list_tiles
+from .loops import EVERYTHING, NODES, PIXELS, REFINEMENT
 from .simd import SIDE
 
 # fewer entries of the lists than this are left to the calling thread: waking another costs as much
@@ -31,6 +33,7 @@ _SERIAL_ENTRIES = 200
 class _Plan(NamedTuple):
     lists: Lists
     order: Any  # [N] int64, sorted to given
+    has_nodes: bool
 
 
 def steps(inputs: SplatInputs) -> Steps:
@@ -50,26 +53,30 @@ def plan(inputs: SplatInputs) -> _Plan:
     means, factors, colors = (_array(t) for t in inputs[:3])
     images = np.repeat(np.arange(batch), count)
     order = _sort(means, images, height, width)
-    images = images[order]
-    table = _NO_TABLE
-    regions = np.zeros(batch * count, np.int64)
+    images, colors = images[order], colors[order]
     if inputs.membership is not None and inputs.region_index is not None:
-        table = inputs.membership.derived("cpu", _table)
+        table = inputs.membership.derived("cpu", lambda m: _table(m, inputs.size))
         regions = inputs.region_index.flatten().numpy()[order]
+    else:
+        table, regions = _table_without_map(inputs.size), np.zeros(batch * count, np.int64)
     radius = support_radius(inputs.cutoff, torch.float32)
     lowest = np.float32(least_exponent(inputs.cutoff, torch.float32) / math.log(2))
-    if not loops.in_range(means, factors, colors):
+    if not in_range(means, factors, colors):
         raise OutOfRangeError
-    gaussians, start, entries = loops.list_tiles(means, factors, order, regions, images, batch, height, width, radius)
-    return _Plan(Lists(gaussians, colors[order].ravel(), regions, start, entries, *table, radius, lowest), order)
+    gaussians, start, entries, live = list_tiles(
+        means, factors, colors, order, regions, images, batch, table, radius, most_spacing(inputs.cutoff)
+    )
+    lists = Lists(gaussians, colors.ravel(), regions, start, entries, table, live, batch, radius, lowest)
+    return _Plan(lists, order, live.any())
 
 
 def _sort(means: Any, images: Any, height: int, width: int) -> Any:
-    """Order by image, row of tiles and x: neighbours in the image become neighbours in memory."""
-    rows = -(-height // SIDE)
-    row = images * (rows + 2) + np.clip(np.floor(means[:, 1] / SIDE), -1, rows)
-    # stable: what other Gaussians do must not change the order of these
-    return np.argsort(row * (width + 2.0) + np.clip(means[:, 0], -1, width), kind="stable")
+    """Order by image, row and column of tiles: neighbours in the image become neighbours in memory."""
+    rows, cols = -(-height // SIDE) + 2, -(-width // SIDE) + 2
+    row, col = (np.clip(means[:, k] * (1 / SIDE) + 1, 0, n - 1).astype(np.int64) for k, n in ((1, rows), (0, cols)))
+    tile = (images * rows + row) * cols + col
+    # numbers of 16 bits are sorted in linear time; stable: what other Gaussians do must not change the order of these
+    return np.argsort(tile.astype(np.uint16) if tile.size and tile.max() < 1 << 16 else tile, kind="stable")
 
 
 def _array(tensor: Tensor) -> Any:
@@ -77,18 +84,28 @@ def _array(tensor: Tensor) -> Any:
     return tensor.detach().resolve_neg().reshape(-1, tensor.shape[-1]).contiguous().numpy()
 
 
-_NOTHING = np.zeros(1, np.int64)
-_NO_TABLE = (0, 1, _NOTHING, _NOTHING, _NOTHING, np.zeros(1, np.float32))
+@functools.lru_cache(maxsize=4)
+def _table_without_map(size: tuple[int, int]) -> Table:
+    return _table(None, size)
 
 
-def _table(membership: Membership) -> tuple[Any, ...]:
-    tiles = membership.tiles(SIDE)
-    maps, height, width = membership.index.shape
-    keys = tiles.keys.numpy()
-    count = maps * -(-height // SIDE) * -(-width // SIDE)
-    start = np.searchsorted(keys, np.arange(count + 1) * membership.num_regions)
-    masks = tiles.masks.to(torch.float32).flatten().numpy()
-    return membership.num_regions, maps, keys, start, tiles.mask.numpy(), masks
+def _table(membership: Membership | None, size: tuple[int, int]) -> Table:
+    blocks = blocks_of(membership, size, torch.device("cpu"))
+    keys, (regions, maps) = blocks.keys.numpy(), (1, 1)
+    mask, masks = np.full(blocks.first, -1), np.zeros(1, np.float32)
+    if membership is not None:
+        regions, maps = membership.num_regions, len(membership.index)
+        tiles = membership.tiles(SIDE)
+        mask, masks = tiles.mask.numpy(), tiles.masks.to(torch.float32).flatten().numpy()
+    last = blocks.grids[-1]
+    start = np.searchsorted(keys, np.arange(last.first_tile + maps * last.rows * last.cols + 1) * regions)
+    rows = np.cumsum([0, *(grid.rows for grid in blocks.grids[:-1])])
+    grids = np.column_stack([np.array(blocks.grids), rows])
+    of_block, parents, odd = keys % regions, blocks.parents.numpy(), blocks.odd.numpy()
+    whole = np.flatnonzero(mask < 0)
+    owner = np.full(maps * blocks.grids[0].rows * blocks.grids[0].cols, -1)
+    owner[keys[whole] // regions] = of_block[whole]
+    return Table(regions, maps, grids, of_block, start, parents, odd, owner, mask, masks)
 
 
 def render(planned: _Plan, inputs: SplatInputs) -> Tensor:
@@ -97,23 +114,34 @@ def render(planned: _Plan, inputs: SplatInputs) -> Tensor:
     # numpy asks for huge pages where an array is large: first use costs a quarter of what torch.empty's does
     image = np.empty((*batch, channels, *inputs.size), np.float32)
     images = image.reshape(-1, *image.shape[-3:])
-    _run_threads(lambda offset, step: loops.render(planned.lists, offset, step, images), planned.lists)
+    nodes = _make_nodes(planned, channels)
+    parts = (NODES, REFINEMENT, PIXELS) if planned.has_nodes else (PIXELS,)
+    _run_threads(lambda *which: loops.render(planned.lists, *which, images, nodes), planned.lists, parts)
     return torch.from_numpy(image)
 
 
 def differentiate(planned: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
     """Give the gradients of means, cholesky (unless only colours are asked for) and colors."""
     channels = inputs.colors.shape[-1]
-    terms = np.empty((len(planned.lists.entries), channels + (5 if geometry else 0)), np.float32)
+    # the loops sum eight terms at a time
+    terms = np.empty((len(planned.lists.entries), -(-(channels + 5 * geometry) // 8) * 8), np.float32)
     values = grad.resolve_neg().contiguous().numpy().reshape(-1, *grad.shape[-3:])
-    _run_threads(lambda offset, step: loops.gather(planned.lists, offset, step, values, terms, geometry), planned.lists)
+    nodes = _make_nodes(planned, channels)
+    parts = (PIXELS, PIXELS + 1, PIXELS + 2, *((REFINEMENT, NODES) if planned.has_nodes else ()))
+    _run_threads(
+        lambda *which: loops.gather(planned.lists, *which, values, terms, geometry, nodes), planned.lists, parts
+    )
     means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs[:3])
     flat = [t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors)]
-    loops.finish(planned.lists, planned.order, terms, *flat)
+    loops.finish(planned.lists, planned.order, _array(inputs.cholesky), terms, geometry, *flat)
     return (means, cholesky, colors) if geometry else (None, None, colors)
 
 
 _STEPS = Steps(plan, render, differentiate, as_given=True)
+
+
+def _make_nodes(planned: _Plan, channels: int) -> Any:
+    return np.zeros(len(planned.lists.live) * SIDE * SIDE * channels if planned.has_nodes else 0, np.float32)
 
 
 @functools.cache
@@ -122,13 +150,19 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="kcgs")
 
 
-def _run_threads(work: Callable[[int, int], None], lists: Lists) -> None:
-    """Run work(offset, step) over all rows of tiles with torch's number of threads, the caller's among them."""
+def _run_threads(work: Callable[[int, int, int], None], lists: Lists, parts: Sequence[int]) -> None:
+    """Run work(part, offset, step) over all rows of tiles with torch's number of threads, the caller's among them."""
     threads = min(num_threads(), len(lists.start) - 1)
     if threads < 2 or len(lists.entries) < _SERIAL_ENTRIES:
-        work(0, 1)
+        work(EVERYTHING, 0, 1)
         return
-    others = [_pool(os.getpid(), num_threads() - 1).submit(work, t, threads) for t in range(1, threads)]
-    work(0, threads)
-    for other in others:
-        other.result()
+    for part in parts:
+        if part == REFINEMENT:
+            work(part, 0, 1)
+            continue
+        others = [
+            _pool(os.getpid(), num_threads() - 1).submit(work, part, t, threads) for t in range(1, threads)
+        ]
+        work(part, 0, threads)
+        for other in others:
+            other.result()

@@ -1,288 +1,322 @@
 """The loops of the CPU kernel: over rows of tiles, the Gaussians of each, and the tiles that each touches.
 
 A row of tiles belongs to one thread, so the result does not depend on the number of threads. Within a tile only the
-rows of pixels that the ellipse crosses are visited.
+rows of pixels that the ellipse crosses are visited. Wide Gaussians are evaluated in blocks of nodes of coarser grids,
+which are refined from level to level and brought to the pixels.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ..compiled import Program, inner
-from ..whitened import MEAN_LIMIT, SCALE_LIMITS, Z_LIMIT
-from .simd import SIDE, add_rows, copy, gather_rows, sum_columns
+from ..compiled import inner
+from .lists import (
+    COLS,
+    COLS_OF_NODES,
+    COLUMNS,
+    FACTOR,
+    FIRST_ROW,
+    L11,
+    L21,
+    L22,
+    LEVEL,
+    PADDING,
+    ROWS,
+    ROWS_OF_NODES,
+    SCALE,
+    Lists,
+    Table,
+    copy_of,
+    enter_rows,
+    enter_tile,
+    find_block,
+    first_tile,
+    in_range,
+    list_tiles,
+    program,
+)
+from .simd import SIDE, add_rows, add_sheared, clear_rows, copy, gather_rows, gather_sheared, sum_columns
+from .spline import add_refined, add_sampled, gather_refined, gather_sampled, set_sampled
 
-# z * SCALE, squared, is an exponent of 2
-SCALE = math.sqrt(0.5 / math.log(2.0))
-# pixels by which geometry in float64 is kept on the safe side of the weights in float32
-MARGIN = 1e-3
-
-# columns of the table of Gaussians: mean, factor, standard deviation along y, 1 / l11, where the ellipse is highest
-# (in standard deviations along x), and the slopes of z1 along x and of z2 along x and y, times SCALE
-MX, MY, L11, L21, L22, HEIGHT, INVERSE, PEAK, RISE1, RISE2, RISE3 = range(11)
-COLUMNS = 11
-
-
-program = Program("CPU kernel", __name__, __file__, "../whitened.py", "loops.py", "simd.py")
-
-
-class Lists(NamedTuple):
-    """Everything the loops read, as arrays."""
-
-    gaussians: Any  # [N, COLUMNS] float64, sorted
-    colors: Any  # [N * C] float32
-    regions: Any  # [N] int64
-    start: Any  # [rows of tiles + 1] int64 into entries
-    entries: Any  # [E, 3] int32: Gaussian, first tile, last tile + 1
-    num_regions: int  # 0: no map
-    maps: int  # label maps, 1 or as many as images
-    keys: Any  # [K] int64, tile * num_regions + region
-    tile_start: Any  # [tiles + 1] int64 into keys
-    mask: Any  # [K] int64 row of masks, -1: alone in its tile
-    masks: Any  # [P * 256] float32
-    radius: float  # largest |z|
-    lowest: Any  # float32, least exponent of 2
-
-
-@inner
-def _bounded(value):  # type: ignore[no-untyped-def]
-    return min(max(value, -Z_LIMIT), Z_LIMIT)
+# what a call does, so that threads may wait for one another between: all that is before NODES needs no grid of nodes
+EVERYTHING, NODES, REFINEMENT, PIXELS = 0, 1, 2, 3
+# rows of tiles by their number modulo 4, as they are taken one after the other: no two of a turn share blocks of nodes
+TURNS = ((0, 2), (1, 1), (3, 3))
 
 
 @inner
-def _highest(along, across, peak, low, high, radius):  # type: ignore[no-untyped-def]
-    """Return the largest along * u + across * sqrt(radius^2 - u^2), which peaks at u = peak, over [low, high]."""
-    u = min(max(peak, low), high)
-    return along * u + across * math.sqrt(max(radius * radius - u * u, 0.0))
-
-
-@inner
-def _row_range(g, height, width, radius):  # type: ignore[no-untyped-def]
-    reach, spread = g[HEIGHT] * radius + MARGIN, g[L11] * radius + MARGIN
-    first = math.ceil(max(g[MY] - reach - 0.5, 0.0))
-    last = math.floor(min(g[MY] + reach - 0.5, height - 1.0))
-    if g[MX] + spread < 0.5 or g[MX] - spread > width - 0.5 or first > last:
-        return 0, 0
-    return first // SIDE, last // SIDE + 1
-
-
-@inner
-def _tile_range(g, row, height, width, radius):  # type: ignore[no-untyped-def]
-    # the ellipse's columns within the row of tiles, by the factor of (y, x)
-    h = g[HEIGHT]
-    top = max((row * SIDE + 0.5 - MARGIN - g[MY]) / h, -radius)
-    bottom = min((min(row * SIDE + SIDE, height) - 0.5 + MARGIN - g[MY]) / h, radius)
-    along, across = g[L11] * g[L21] / h, g[L11] * g[L22] / h
-    right = g[MX] + _highest(along, across, g[PEAK], top, bottom, radius) + MARGIN
-    left = g[MX] - _highest(along, across, g[PEAK], -bottom, -top, radius) - MARGIN
-    first = math.ceil(max(left - 0.5, 0.0))
-    last = math.floor(min(right - 0.5, width - 1.0))
-    return (first // SIDE, last // SIDE + 1) if first <= last else (0, 0)
-
-
-@inner
-def _find_mask(lists, tile, region):  # type: ignore[no-untyped-def]
-    """Offset of the region's mask, negative where it is alone in the tile; and whether it is in the tile."""
-    key = tile * lists.num_regions + region
-    low, high = lists.tile_start[tile], lists.tile_start[tile + 1]
-    end = high
-    while low < high:
-        middle = (low + high) // 2
-        if lists.keys[middle] < key:
-            low = middle + 1
-        else:
-            high = middle
-    if low == end or lists.keys[low] != key:
-        return -1, False
-    return lists.mask[low] * SIDE * SIDE, True
-
-
-@inner
-def _enter_tile(g, row, col, height, width, radius, coefficients):  # type: ignore[no-untyped-def]
-    """Set the coefficients of z * SCALE about the tile's middle; return the rows, first and last + 1, to visit."""
-    left = max((col * SIDE + 0.5 - MARGIN - g[MX]) * g[INVERSE], -radius)
-    right = min((min(col * SIDE + SIDE, width) - 0.5 + MARGIN - g[MX]) * g[INVERSE], radius)
-    if left > right:
-        return 0, 0
-    base = row * SIDE
-    bottom = g[MY] + _highest(g[L21], g[L22], g[PEAK], left, right, radius) + MARGIN
-    top = g[MY] - _highest(g[L21], g[L22], g[PEAK], -right, -left, radius) - MARGIN
-    first = math.ceil(max(top - 0.5, float(base)))
-    last = math.floor(min(bottom - 0.5, min(base + SIDE, height) - 1.0))
-    x, y = col * SIDE + SIDE / 2 - g[MX], base + SIDE / 2 - g[MY]
-    coefficients[0] = _bounded(g[RISE1] * x)
-    coefficients[1] = g[RISE1]
-    coefficients[2] = _bounded(g[RISE3] * y + g[RISE2] * x)
-    coefficients[3] = g[RISE2]
-    coefficients[4] = g[RISE3]
-    return first - base, last + 1 - base
-
-
-@program.entry
-def in_range(means, factors, colors):  # type: ignore[no-untyped-def]
-    """Whether all is finite, and where arithmetic stays so."""
-    least, most = SCALE_LIMITS[0] * (1 - 1e-6), SCALE_LIMITS[1]
-    fine = True
-    for i in range(len(means)):  # written so that NaN fails
-        fine &= abs(means[i, 0]) <= MEAN_LIMIT and abs(means[i, 1]) <= MEAN_LIMIT
-        fine &= least <= factors[i, 0] <= most and abs(factors[i, 1]) <= most and least <= factors[i, 2] <= most
-        for c in range(colors.shape[1]):
-            fine &= abs(colors[i, c]) < math.inf
-    return fine
-
-
-@program.entry
-def list_tiles(means, factors, order, regions, images, batch, height, width, radius):  # type: ignore[no-untyped-def]
-    """Make the table of Gaussians, the start of each row of tiles in the list, and the list."""
-    count, rows = len(order), -(-height // SIDE)
-    table = np.empty((count, COLUMNS))
-    start = np.zeros(batch * rows + 1, np.int64)
-    span = np.zeros((count, 2), np.int64)
-    for i in range(count):
-        g, given = table[i], order[i]
-        g[MX], g[MY] = means[given, 0], means[given, 1]
-        g[L11], g[L21], g[L22] = factors[given, 0], factors[given, 1], factors[given, 2]
-        g[HEIGHT] = math.hypot(g[L21], g[L22])
-        g[INVERSE] = 1.0 / g[L11]
-        g[PEAK] = radius * g[L21] / g[HEIGHT]
-        g[RISE1] = _bounded(SCALE / g[L11])
-        g[RISE2] = _bounded(-SCALE * (g[L21] / g[L11]) / g[L22])
-        g[RISE3] = _bounded(SCALE / g[L22])
-        if regions[i] >= 0:
-            span[i, 0], span[i, 1] = _row_range(g, height, width, radius)
-        for row in range(span[i, 0], span[i, 1]):
-            start[images[i] * rows + row + 1] += 1
-    for r in range(batch * rows):
-        start[r + 1] += start[r]
-    end = start[:-1].copy()
-    entries = np.empty((start[-1], 3), np.int32)
-    for i in range(count):
-        for row in range(span[i, 0], span[i, 1]):
-            e = end[images[i] * rows + row]
-            entries[e, 0] = i
-            entries[e, 1], entries[e, 2] = _tile_range(table[i], row, height, width, radius)
-            end[images[i] * rows + row] += 1
-    return table, start, entries
-
-
-@inner
-def _exchange(pixels, image, row, outward):  # type: ignore[no-untyped-def]
+def _exchange(pixels, stride, image, row, outward):  # type: ignore[no-untyped-def]
     """Copy a row of tiles to its place in an image, or from there."""
     channels, height, width = image.shape[1:]
-    rows, cols, last = -(-height // SIDE), width // SIDE, width % SIDE
+    rows = -(-height // SIDE)
     b, top = row // rows, row % rows * SIDE
     for r in range(min(SIDE, height - top)):
         for c in range(channels):
-            outside, inside = ((b * channels + c) * height + top + r) * width, (r * channels + c) * SIDE
-            for _ in range(cols):
-                if outward:
-                    copy(image, outside, pixels, inside, SIDE)  # type: ignore[call-arg]
-                else:
-                    copy(pixels, inside, image, outside, SIDE)  # type: ignore[call-arg]
-                outside += SIDE
-                inside += SIDE * SIDE * channels
+            outside, inside = ((b * channels + c) * height + top + r) * width, (r * channels + c) * stride + PADDING
             if outward:
-                copy(image, outside, pixels, inside, last)  # type: ignore[call-arg]
+                copy(image, outside, pixels, inside, width)  # type: ignore[call-arg]
             else:
-                copy(pixels, inside, image, outside, last)  # type: ignore[call-arg]
-
-
-@program.entry
-def render(lists, offset, step, image):  # type: ignore[no-untyped-def]
-    """Render every `step`-th row of tiles from `offset`: image[b, c, y, x]."""
-    batch, channels, height, width = image.shape
-    rows, cols = -(-height // SIDE), -(-width // SIDE)
-    per_tile = SIDE * SIDE * channels
-    pixels = np.empty(cols * per_tile, np.float32)
-    coefficients = np.empty(5, np.float32)
-    for row in range(offset, batch * rows, step):
-        for k in range(len(pixels)):
+                copy(pixels, inside, image, outside, width)  # type: ignore[call-arg]
+    if not outward:
+        for k in range((height - top) * channels * stride, len(pixels)):
             pixels[k] = 0.0
-        mask_at, present = -1, True
-        for e in range(lists.start[row], lists.start[row + 1]):
-            i = lists.entries[e, 0]
-            for col in range(lists.entries[e, 1], lists.entries[e, 2]):
-                if lists.num_regions > 0:
-                    mask_at, present = _find_mask(lists, row % (lists.maps * rows) * cols + col, lists.regions[i])
-                if not present:
-                    continue
-                first, last = _enter_tile(
-                    lists.gaussians[i], row % rows, col, height, width, lists.radius, coefficients
-                )
-                if first < last:
-                    add_rows(  # type: ignore[call-arg]
-                        pixels, col * per_tile, first, last, coefficients, lists.lowest, lists.colors, i * channels,
-                        lists.masks, mask_at, channels,
-                    )  # fmt: skip
-        _exchange(pixels, image, row, True)
 
 
-@program.entry
-def gather(lists, offset, step, grad, out, moments):  # type: ignore[no-untyped-def]
-    """Fill out[e] for the entries of every `step`-th row of tiles: C colour gradients, 5 moments of z * SCALE."""
-    batch, channels, height, width = grad.shape
-    rows, cols = -(-height // SIDE), -(-width // SIDE)
+@inner
+def _find_parents(live, parents, block, base, per_tile, offsets):  # type: ignore[no-untyped-def]
+    """Set the offsets of the blocks that one is refined from; say whether any is not all zero."""
+    found = False
+    for k in range(4):
+        parent = base + parents[block, k]
+        if live[parent]:
+            found = True
+        else:
+            parent = base + len(parents)  # the block of zeros
+        offsets[k] = parent * per_tile
+    return found
+
+
+@inner
+def _refine(lists, nodes, channels, transposed):  # type: ignore[no-untyped-def]
+    """Add to every block of nodes what the coarser ones say of it; or, from the finest on, to them what it says."""
+    table, live, stride = lists.table, lists.live, SIDE * channels
+    parents, odd, offsets, one = table.parents, table.odd, np.empty(4, np.int64), np.ones(SIDE, np.float32)
+    first, count = len(table.mask), len(parents) - len(table.mask)
+    for base in range(-first, len(live) - first, count + 1):
+        for n in range(count):
+            block = first + (n if transposed else count - 1 - n)
+            if not _find_parents(live, parents, block, base, SIDE * stride, offsets):
+                continue
+            at, down, right = (base + block) * SIDE * stride, odd[block] >= 2, odd[block] % 2 == 1
+            if transposed:
+                gather_refined(nodes, offsets, down, right, nodes, at, stride, SIDE, channels, one, 0, 0)  # type: ignore[call-arg]
+            else:
+                add_refined(nodes, offsets, down, right, nodes, at, stride, SIDE, channels, one, 0, 0)  # type: ignore[call-arg]
+
+
+@inner
+def _sample_row(lists, image, row, pixels, stride, nodes, channels, transposed):  # type: ignore[no-untyped-def]
+    """Set a row of tiles to the nodes' splines times the region weights; or add its gradients to the nodes."""
+    table, live, rows = lists.table, lists.live, channels * stride
+    tile_start, parents, mask, masks = table.tile_start, table.parents, table.mask, table.masks
+    offsets, one, down = np.empty(4, np.int64), np.ones(SIDE, np.float32), row % 2 == 1
+    base, tile = copy_of(table, image) - len(mask), first_tile(table, 0, image, row)
+    for col in range(table.grids[0, COLS]):
+        at, right, empty = PADDING + col * SIDE, col % 2 == 1, True
+        for block in range(tile_start[tile + col], tile_start[tile + col + 1]):
+            if not _find_parents(live, parents, block, base, SIDE * SIDE * channels, offsets):
+                continue
+            weights, mask_at, step = one, 0, 0
+            if mask[block] >= 0:
+                weights, mask_at, step = masks, mask[block] * SIDE * SIDE, SIDE
+            if transposed:
+                gather_sampled(nodes, offsets, down, right, pixels, at, rows, stride, channels, weights, mask_at, step)  # type: ignore[call-arg]
+            elif empty:
+                set_sampled(nodes, offsets, down, right, pixels, at, rows, stride, channels, weights, mask_at, step)  # type: ignore[call-arg]
+            else:
+                add_sampled(nodes, offsets, down, right, pixels, at, rows, stride, channels, weights, mask_at, step)  # type: ignore[call-arg]
+            empty = False
+        if empty and not transposed:
+            clear_rows(pixels, at, stride, SIDE * channels)  # type: ignore[call-arg]
+
+
+@inner
+def _add_row(lists, r, level, image, row, pixels, stride, channels, shape):  # type: ignore[no-untyped-def]
+    """Add the Gaussians of a row of tiles; pixels are those of the row, or the blocks of all nodes."""
     per_tile = SIDE * SIDE * channels
-    pixels = np.zeros(cols * per_tile, np.float32)
-    coefficients = np.empty(5, np.float32)
-    sums = np.empty((channels + 5) * SIDE, np.float32)
-    for row in range(offset, batch * rows, step):
-        if lists.start[row] == lists.start[row + 1]:
+    table, gaussians, entries, colors = lists.table, lists.gaussians, lists.entries, lists.colors
+    num_regions, tile_start, regions, mask, masks = table[0], table.tile_start, table.regions, table.mask, table.masks
+    height, width = table.grids[level, ROWS_OF_NODES], table.grids[level, COLS_OF_NODES]
+    tile, first_block = first_tile(table, level, image, row), copy_of(table, image) - len(mask)
+    radius, lowest = lists.radius, lists.lowest
+    for e in range(lists.start[r], lists.start[r + 1]):
+        i = entries[e, 0]
+        if entries[e, 1] < 0:
+            first, last = enter_rows(gaussians[i], row, height, width, radius, entries[e, 2], shape)
+            add_sheared(  # type: ignore[call-arg]
+                pixels, PADDING, channels * stride, stride, channels, first, last, shape, colors, i * channels, lowest,
+                entries[e, 2],
+            )  # fmt: skip
             continue
-        _exchange(pixels, grad, row, False)
-        mask_at, present = -1, True
-        for e in range(lists.start[row], lists.start[row + 1]):
-            i = lists.entries[e, 0]
-            for k in range(len(sums)):
-                sums[k] = 0.0
-            for col in range(lists.entries[e, 1], lists.entries[e, 2]):
-                if lists.num_regions > 0:
-                    mask_at, present = _find_mask(lists, row % (lists.maps * rows) * cols + col, lists.regions[i])
-                if not present:
-                    continue
-                first, last = _enter_tile(
-                    lists.gaussians[i], row % rows, col, height, width, lists.radius, coefficients
-                )
-                if first < last:
-                    gather_rows(  # type: ignore[call-arg]
-                        pixels, col * per_tile, first, last, coefficients, lists.lowest, lists.colors, i * channels,
-                        lists.masks, mask_at, sums, moments, channels,
-                    )  # fmt: skip
-            for k in range(out.shape[1]):
-                out[e, k] = sum_columns(sums, k)  # type: ignore[call-arg]
+        region = lists.regions[i]
+        for col in range(entries[e, 1], entries[e, 2]):
+            block = find_block(num_regions, tile_start, regions, tile + col, region)
+            if block < 0:
+                continue
+            first, last = enter_tile(gaussians[i], row, col, height, width, radius, shape)
+            if first < last:
+                at, mask_at = (first_block + block) * per_tile, -1
+                if level == 0:
+                    at, mask_at = PADDING + col * SIDE, mask[block] * SIDE * SIDE
+                add_rows(  # type: ignore[call-arg]
+                    pixels, at, channels * stride, stride, channels, first, last, shape, colors, i * channels, lowest,
+                    masks, mask_at,
+                )  # fmt: skip
+
+
+@inner
+def _gather_row(lists, r, level, image, row, pixels, stride, channels, shape, sums, out, moments):  # type: ignore[no-untyped-def]
+    """Fill out[e] for the Gaussians of a row of tiles: C colour gradients, 5 moments of z * SCALE, and room."""
+    per_tile = SIDE * SIDE * channels
+    table, gaussians, entries, colors = lists.table, lists.gaussians, lists.entries, lists.colors
+    num_regions, tile_start, regions, mask, masks = table[0], table.tile_start, table.regions, table.mask, table.masks
+    height, width = table.grids[level, ROWS_OF_NODES], table.grids[level, COLS_OF_NODES]
+    tile, first_block = first_tile(table, level, image, row), copy_of(table, image) - len(mask)
+    radius, lowest = lists.radius, lists.lowest
+    for e in range(lists.start[r], lists.start[r + 1]):
+        i = entries[e, 0]
+        region = lists.regions[i]
+        for k in range(len(sums)):
+            sums[k] = 0.0
+        if entries[e, 1] < 0:
+            first, last = enter_rows(gaussians[i], row, height, width, radius, entries[e, 2], shape)
+            gather_sheared(  # type: ignore[call-arg]
+                pixels, PADDING, channels * stride, stride, channels, first, last, shape, colors, i * channels, lowest,
+                entries[e, 2], sums, moments,
+            )  # fmt: skip
+        for col in range(entries[e, 1], entries[e, 2] if entries[e, 1] >= 0 else -1):
+            block = find_block(num_regions, tile_start, regions, tile + col, region)
+            if block < 0:
+                continue
+            first, last = enter_tile(gaussians[i], row, col, height, width, radius, shape)
+            if first < last:
+                at, mask_at = (first_block + block) * per_tile, -1
+                if level == 0:
+                    at, mask_at = PADDING + col * SIDE, mask[block] * SIDE * SIDE
+                gather_rows(  # type: ignore[call-arg]
+                    pixels, at, channels * stride, stride, channels, first, last, shape, colors, i * channels, lowest,
+                    masks, mask_at, sums, moments,
+                )  # fmt: skip
+        sum_columns(sums, out.shape[1], out, e * out.shape[1])  # type: ignore[call-arg]
 
 
 @program.entry
-def finish(lists, order, out, means, cholesky, colors):  # type: ignore[no-untyped-def]
+def render(lists, part, offset, step, image, nodes):  # type: ignore[no-untyped-def]
+    """Render every `step`-th row of tiles from `offset`, of the nodes or of image[b, c, y, x]."""
+    batch, channels, height, width = image.shape
+    grids = lists.table.grids
+    shape = np.empty(9)
+    if part in (EVERYTHING, NODES):
+        turn = 0
+        for level in range(1, len(grids)):
+            for r in range(batch * grids[level, ROWS]):
+                turn += 1
+                if turn % step == offset:
+                    b, row = r // grids[level, ROWS], r % grids[level, ROWS]
+                    _add_row(
+                        lists, batch * grids[level, FIRST_ROW] + r, level, b, row, nodes, SIDE, channels, shape
+                    )
+    if part in (EVERYTHING, REFINEMENT):
+        _refine(lists, nodes, channels, False)
+    if part in (EVERYTHING, PIXELS):
+        rows = grids[0, ROWS]
+        stride = grids[0, COLS] * SIDE + 2 * PADDING
+        pixels = np.empty(SIDE * channels * stride, np.float32)
+        for r in range(offset, batch * rows, step):
+            if len(nodes) == 0:
+                for k in range(len(pixels)):
+                    pixels[k] = 0.0
+            else:
+                _sample_row(lists, r // rows, r % rows, pixels, stride, nodes, channels, False)
+            _add_row(lists, r, 0, r // rows, r % rows, pixels, stride, channels, shape)
+            _exchange(pixels, stride, image, r, True)
+
+
+@program.entry
+def gather(lists, part, offset, step, grad, out, moments, nodes):  # type: ignore[no-untyped-def]
+    """Fill out[e] for the entries of every `step`-th row of tiles; `nodes` become the gradients of the nodes."""
+    batch, channels, height, width = grad.shape
+    grids = lists.table.grids
+    shape = np.empty(9)
+    sums = np.zeros(out.shape[1] * SIDE, np.float32)
+    if part == EVERYTHING or part >= PIXELS:
+        rows = grids[0, ROWS]
+        stride = grids[0, COLS] * SIDE + 2 * PADDING
+        pixels = np.zeros(SIDE * channels * stride, np.float32)
+        for turn in range(3):
+            if part not in (EVERYTHING, PIXELS + turn):
+                continue
+            number = 0
+            for r in range(batch * rows):
+                if r % rows % 4 != TURNS[turn][0] and r % rows % 4 != TURNS[turn][1]:
+                    continue
+                number += 1
+                if number % step != offset or (lists.start[r] == lists.start[r + 1] and not len(nodes)):
+                    continue
+                _exchange(pixels, stride, grad, r, False)
+                if len(nodes):
+                    _sample_row(lists, r // rows, r % rows, pixels, stride, nodes, channels, True)
+                _gather_row(lists, r, 0, r // rows, r % rows, pixels, stride, channels, shape, sums, out, moments)
+    if part in (EVERYTHING, REFINEMENT):
+        _refine(lists, nodes, channels, True)
+    if part in (EVERYTHING, NODES):
+        turn = 0
+        for level in range(1, len(grids)):
+            for r in range(batch * grids[level, ROWS]):
+                turn += 1
+                if turn % step == offset:
+                    b, row = r // grids[level, ROWS], r % grids[level, ROWS]
+                    _gather_row(
+                        lists, batch * grids[level, FIRST_ROW] + r, level, b, row, nodes, SIDE, channels, shape, sums,
+                        out, moments,
+                    )  # fmt: skip
+
+
+@inner
+def _uncoarsen(g, factors, means, cholesky, along):  # type: ignore[no-untyped-def]
+    """Turn gradients of a Gaussian as its level has it into those of what was given; `along` is that of FACTOR."""
+    h = float(1 << int(g[LEVEL]))
+    l11, l21, l22, p11, p22 = factors[0], factors[1], factors[2], g[L11] * h, g[L22] * h
+    g11, g21, g22 = cholesky[0] / h, cholesky[1] / h, cholesky[2] / h
+    scaled = along * g[FACTOR]
+    lost = h * h / 3 * l21 / (p11 * p11)
+    last = (g22 - scaled / p22) / p22
+    first = (g11 - scaled / p11) * l11 - g21 * lost + last * lost * l21 * l11 / p11
+    means[0], means[1] = means[0] / h, means[1] / h
+    cholesky[0] = scaled / l11 + first / p11
+    cholesky[1] = g21 * l11 / p11 - last * lost
+    cholesky[2] = scaled / l22 + last * l22
+
+
+@program.entry
+def finish(lists, order, factors, out, moments, means, cholesky, colors):  # type: ignore[no-untyped-def]
     """Add up each Gaussian's entries in float64 and turn moments into gradients, in the caller's order."""
     count, channels = colors.shape
     total = np.zeros((count, out.shape[1]))
+    at, bend = np.empty(2), np.empty(3)
     for e in range(out.shape[0]):
         for k in range(out.shape[1]):
             total[lists.entries[e, 0], k] += out[e, k]
     for i in range(count):
         t, g, to = total[i], lists.gaussians[i], order[i]
+        along = 0.0
         for c in range(channels):
-            colors[to, c] = t[c]
-        if out.shape[1] > channels:
+            along += t[c] * (lists.colors[i * channels + c] / g[FACTOR])
+            colors[to, c] = t[c] * g[FACTOR]
+        if moments:
             s1, s2 = t[channels] / SCALE, t[channels + 1] / SCALE
             s11, s12 = t[channels + 2] / (SCALE * SCALE), t[channels + 3] / (SCALE * SCALE)
             s22 = t[channels + 4] / (SCALE * SCALE)
             slope = g[L21] / g[L22]
-            means[to, 0], means[to, 1] = (s1 - slope * s2) / g[L11], s2 / g[L22]
-            cholesky[to, 0], cholesky[to, 1] = (s11 - slope * s12) / g[L11], s12 / g[L22]
-            cholesky[to, 2] = s22 / g[L22]
+            at[0], at[1] = (s1 - slope * s2) / g[L11], s2 / g[L22]
+            bend[0], bend[1], bend[2] = (s11 - slope * s12) / g[L11], s12 / g[L22], s22 / g[L22]
+            if g[LEVEL] > 0:
+                _uncoarsen(g, factors[to], at, bend, along)
+            means[to, 0], means[to, 1] = at[0], at[1]
+            cholesky[to, 0], cholesky[to, 1], cholesky[to, 2] = bend[0], bend[1], bend[2]
 
 
 def _example() -> tuple[Lists, Any]:
-    empty, places, numbers = np.zeros((1, 3), np.int32), np.zeros(2, np.int64), np.zeros(1, np.float32)
+    places, numbers = np.zeros(2, np.int64), np.zeros(1, np.float32)
+    grids = np.array([[1, 1, 1, 1, 0, 0]])
+    table = Table(1, 1, grids, places[:1], places, np.ones((1, 4), np.int64), np.zeros(1, np.uint8), places[:1], -np.ones(1, np.int64), numbers)
+    nothing = np.zeros(1, np.bool_)
     lists = Lists(
-        np.ones((1, COLUMNS)), numbers, places, places, empty, 0, 1, places, places, places, numbers, 4.0, numbers[0]
+        np.ones((1, COLUMNS)), numbers, places, places, np.zeros((1, 3), np.int32), table, nothing, 1, 4.0, numbers[0]
     )
-    return lists, np.zeros((1, 6), np.float32)
+    return lists, np.zeros((1, 8), np.float32)
 
 
 @program.part
@@ -291,8 +325,8 @@ def lists() -> None:
     example, terms = _example()
     one, pair, triple = (np.ones((1, n), np.float32) for n in (1, 2, 3))
     in_range(pair, triple, one)
-    list_tiles(pair, triple, example.start[:1], example.start, example.start, 1, 1, 1, 4.0)
-    finish(example, example.start, terms, pair, triple, one)
+    list_tiles(pair, triple, one, example.start[:1], example.start, example.start, 1, example.table, 4.0, 0.5)
+    finish(example, example.start, triple, terms, True, pair, triple, one)
 
 
 @program.part
@@ -300,5 +334,5 @@ def pixels() -> None:
     """Compile what visits pixels."""
     example, terms = _example()
     image = np.zeros((1, 1, 1, 1), np.float32)
-    render(example, 0, 1, image)
-    gather(example, 0, 1, image, terms, True)
+    render(example, 0, 0, 1, image, example.colors[:0])
+    gather(example, 0, 0, 1, image, terms, True, example.colors[:0])

@@ -1,0 +1,109 @@
+"""Coarse grids for wide Gaussians: a Gaussian is evaluated at nodes, and cubic B-splines carry it to the pixels.
+
+Level l has nodes 2^l pixels apart, in blocks of 16 x 16 for each region, only where the region has tiles; level 0 are
+the pixels. docs/performance.md has the formulas and the measured errors.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .membership import Membership
+
+SIDE = 16  # of a block and of a tile
+# a grid of no more nodes than this is not coarsened again
+_SMALLEST = 2 * SIDE
+# the interpolation is off by 0.0042 (spacing / deviation)^4, which this keeps at 2.6 times the cutoff
+_SPACING = 5.0
+_MOST = 0.7
+
+
+class Grid(NamedTuple):
+    """Nodes of a level, and the tiles that hold them, 16 x 16 each; node k of an axis lies at (k - 1) 2^l pixels."""
+
+    height: int
+    width: int
+    rows: int
+    cols: int
+    first_tile: int  # tiles are numbered through all levels: (level, map, row, column)
+
+
+class Blocks(NamedTuple):
+    """Tile and region of every block, all levels, and the blocks of the next level that each is refined from."""
+
+    grids: tuple[Grid, ...]
+    keys: Tensor  # [K] int64, sorted: tile * num_regions + region
+    parents: Tensor  # [K, 4] int64 into keys: above left, above right, below left, below right; K: none
+    odd: Tensor  # [K] uint8: 1 in an odd column of tiles, 2 in an odd row, 3 both
+    first: int  # block of level 1 or above; those before are tiles of pixels
+
+
+def most_spacing(cutoff: float) -> float:
+    """Spacing of nodes over the smaller standard deviation of a Gaussian that may be evaluated there; 0: none may."""
+    return min(_SPACING * cutoff**0.25, _MOST)
+
+
+def blocks_of(membership: Membership | None, size: tuple[int, int], device: torch.device) -> Blocks:
+    """Return the blocks of a map, or of one region everywhere, made once and kept."""
+    if membership is None:
+        return _blocks_without_map(size, device)
+    return membership.derived("blocks", lambda m: _make_blocks(m.tiles(SIDE).keys, m.num_regions, m.index.shape))
+
+
+@functools.lru_cache(maxsize=4)
+def _blocks_without_map(size: tuple[int, int], device: torch.device) -> Blocks:
+    tiles = -(-size[0] // SIDE) * -(-size[1] // SIDE)
+    return _make_blocks(torch.arange(tiles, device=device), 1, (1, *size))
+
+
+def _make_blocks(keys: Tensor, num_regions: int, shape: tuple[int, ...]) -> Blocks:
+    maps, height, width = shape
+    grid = Grid(height, width, -(-height // SIDE), -(-width // SIDE), 0)
+    grids, levels, parents, odd = [], [], [], []
+    while True:
+        grids.append(grid)
+        levels.append(keys)
+        row, col = _places(keys, num_regions, grid)[1:3]
+        odd.append(2 * (row % 2) + col % 2)
+        if max(grid.height, grid.width) <= _SMALLEST:
+            break
+        coarse = _coarser(grid, maps)
+        wanted = _parent_keys(keys, num_regions, grid, coarse)
+        keys = wanted[wanted >= 0].unique()
+        place = torch.searchsorted(keys, wanted)
+        parents.append(torch.where(wanted < 0, -1, place + sum(map(len, levels))))
+        grid = coarse
+    total = sum(map(len, levels))
+    parents.append(keys.new_full((len(keys), 4), -1))
+    table = torch.cat(parents)
+    table[table < 0] = total
+    return Blocks(tuple(grids), torch.cat(levels), table, torch.cat(odd).to(torch.uint8), len(levels[0]))
+
+
+def _coarser(grid: Grid, maps: int) -> Grid:
+    # the last pixel, at n - 1/2, needs two nodes after it; node n - 2 the one at its place, and one more
+    pixels = grid.first_tile == 0
+    height, width = ((n - 1) // 2 + 4 if pixels else (n - 2) // 2 + 3 for n in (grid.height, grid.width))
+    return Grid(height, width, -(-height // SIDE), -(-width // SIDE), grid.first_tile + maps * grid.rows * grid.cols)
+
+
+def _places(keys: Tensor, num_regions: int, grid: Grid) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return map, row, column and region of blocks."""
+    tile = keys // num_regions - grid.first_tile
+    return tile // (grid.cols * grid.rows), tile // grid.cols % grid.rows, tile % grid.cols, keys % num_regions
+
+
+def _parent_keys(keys: Tensor, num_regions: int, fine: Grid, coarse: Grid) -> Tensor:
+    """Return the keys of the four blocks that each block reads of the coarser grid, -1 where it does not, (K, 4)."""
+    one, row, col, region = _places(keys, num_regions, fine)
+    found = []
+    for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        y, x = (row + down) // 2, (col + right) // 2
+        needed = (y < coarse.rows) & (x < coarse.cols) & (row % 2 >= down) & (col % 2 >= right)
+        parent = coarse.first_tile + (one * coarse.rows + y) * coarse.cols + x
+        found.append(torch.where(needed, parent * num_regions + region, -1))
+    return torch.stack(found, -1)
