@@ -130,7 +130,7 @@ def test_65535_regions_of_a_few_pixels(backend: str) -> None:
     painted = torch.zeros(65_535).index_put((ids,), colors[:, 0])
     at = labels[0, ::2]
     want = painted[at] * math.exp(-0.5 * (0.5 / 4) ** 2)
-    torch.testing.assert_close(image[0, 0, ::2], want, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(image[0, 0, ::2], want, rtol=1e-3, atol=1e-6)
     assert (image[0] > 0).float().mean() == pytest.approx(1 / 7, abs=0.01)
 
 

@@ -153,7 +153,7 @@ def test_compiled_and_said_once_for_all_channels(tmp_path: Path) -> None:
     assert first.startswith("kcgs: compiled the CPU kernel in ")
     assert first.endswith(", kept on disk for next time")
     made = sorted(path.name.split("-")[0] for path in tmp_path.glob("*/*.nbc"))
-    assert made == ["loops.finish", "loops.gather", "loops.in_range", "loops.list_tiles", "loops.render"]
+    assert made == ["lists.in_range", "lists.list_tiles", "loops.finish", "loops.gather", "loops.render"]
     assert first_calls(environment) == []
 
 

@@ -51,6 +51,8 @@ def plan(inputs: SplatInputs) -> _Plan:
     batch, count = inputs.colors.shape[:-2].numel(), inputs.colors.shape[-2]
     height, width = inputs.size
     means, factors, colors = (_array(t) for t in inputs[:3])
+    if not in_range(means, factors, colors):
+        raise OutOfRangeError
     images = np.repeat(np.arange(batch), count)
     order = _sort(means, images, height, width)
     images, colors = images[order], colors[order]
@@ -61,8 +63,6 @@ def plan(inputs: SplatInputs) -> _Plan:
         table, regions = _table_without_map(inputs.size), np.zeros(batch * count, np.int64)
     radius = support_radius(inputs.cutoff, torch.float32)
     lowest = np.float32(least_exponent(inputs.cutoff, torch.float32) / math.log(2))
-    if not in_range(means, factors, colors):
-        raise OutOfRangeError
     gaussians, start, entries, live = list_tiles(
         means, factors, colors, order, regions, images, batch, table, radius, most_spacing(inputs.cutoff)
     )
