@@ -44,7 +44,7 @@ class Blocks(NamedTuple):
 
 def most_spacing(cutoff: float) -> float:
     """Spacing of nodes over the smaller standard deviation of a Gaussian that may be evaluated there; 0: none may."""
-    return min(_SPACING * cutoff**0.25, _MOST)
+    return min(_SPACING * float(cutoff**0.25), _MOST)
 
 
 def blocks_of(membership: Membership | None, size: tuple[int, int], device: torch.device) -> Blocks:

@@ -6,9 +6,10 @@ The first call compiles, once for each machine and user, or loads the compiled c
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -22,8 +23,7 @@ from ..octaves import blocks_of, most_spacing
 from ..threads import num_threads
 from ..whitened import least_exponent, support_radius
 from . import loops
-from .lists import Lists, Table, in_range, list_tiles
-from .loops import EVERYTHING, NODES, PIXELS, REFINEMENT
+from .lists import ROWS, Lists, Table, in_range, list_tiles, order_rows, program
 from .simd import SIDE
 
 # fewer entries of the lists than this are left to the calling thread: waking another costs as much
@@ -34,6 +34,8 @@ class _Plan(NamedTuple):
     lists: Lists
     order: Any  # [N] int64, sorted to given
     has_nodes: bool
+    rows: Any  # see order_rows
+    starts: list[int]
 
 
 def steps(inputs: SplatInputs) -> Steps:
@@ -42,7 +44,7 @@ def steps(inputs: SplatInputs) -> Steps:
         raise ValueError(f"backend 'cpu' computes in float32; got {inputs.means.dtype}: use 'tiled' or 'reference'")
     if inputs.means.device.type != "cpu":
         raise ValueError(f"backend 'cpu' needs tensors on the CPU; got {inputs.means.device}")
-    loops.program.ready()
+    program.ready()
     return _STEPS
 
 
@@ -67,7 +69,7 @@ def plan(inputs: SplatInputs) -> _Plan:
         means, factors, colors, order, regions, images, batch, table, radius, most_spacing(inputs.cutoff)
     )
     lists = Lists(gaussians, colors.ravel(), regions, start, entries, table, live, batch, radius, lowest)
-    return _Plan(lists, order, live.any())
+    return _Plan(lists, order, live.any(), *order_rows(tuple(table.grids[:, ROWS].tolist()), batch))
 
 
 def _sort(means: Any, images: Any, height: int, width: int) -> Any:
@@ -113,10 +115,8 @@ def render(planned: _Plan, inputs: SplatInputs) -> Tensor:
     *batch, _, channels = inputs.colors.shape
     # numpy asks for huge pages where an array is large: first use costs a quarter of what torch.empty's does
     image = np.empty((*batch, channels, *inputs.size), np.float32)
-    images = image.reshape(-1, *image.shape[-3:])
-    nodes = _make_nodes(planned, channels)
-    parts = (NODES, REFINEMENT, PIXELS) if planned.has_nodes else (PIXELS,)
-    _run_threads(lambda *which: loops.render(planned.lists, *which, images, nodes), planned.lists, parts)
+    images, nodes = image.reshape(-1, *image.shape[-3:]), _make_nodes(planned, channels)
+    _run_threads(lambda rows: loops.render(planned.lists, rows, images, nodes), planned, reverse=True)
     return torch.from_numpy(image)
 
 
@@ -127,10 +127,7 @@ def differentiate(planned: _Plan, inputs: SplatInputs, grad: Tensor, geometry: b
     terms = np.empty((len(planned.lists.entries), -(-(channels + 5 * geometry) // 8) * 8), np.float32)
     values = grad.resolve_neg().contiguous().numpy().reshape(-1, *grad.shape[-3:])
     nodes = _make_nodes(planned, channels)
-    parts = (PIXELS, PIXELS + 1, PIXELS + 2, *((REFINEMENT, NODES) if planned.has_nodes else ()))
-    _run_threads(
-        lambda *which: loops.gather(planned.lists, *which, values, terms, geometry, nodes), planned.lists, parts
-    )
+    _run_threads(lambda rows: loops.gather(planned.lists, rows, values, terms, geometry, nodes), planned)
     means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs[:3])
     flat = [t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors)]
     loops.finish(planned.lists, planned.order, _array(inputs.cholesky), terms, geometry, *flat)
@@ -150,19 +147,19 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="kcgs")
 
 
-def _run_threads(work: Callable[[int, int, int], None], lists: Lists, parts: Sequence[int]) -> None:
-    """Run work(part, offset, step) over all rows of tiles with torch's number of threads, the caller's among them."""
-    threads = min(num_threads(), len(lists.start) - 1)
-    if threads < 2 or len(lists.entries) < _SERIAL_ENTRIES:
-        work(EVERYTHING, 0, 1)
+def _run_threads(work: Callable[[Any], None], planned: _Plan, reverse: bool = False) -> None:
+    """Run work(rows of tiles) with torch's number of threads, the caller's among them, section by section."""
+    starts = planned.starts if planned.has_nodes else planned.starts[:4]
+    rows = planned.rows[: starts[-1]]
+    threads = min(num_threads(), len(rows))
+    if threads < 2 or len(planned.lists.entries) < _SERIAL_ENTRIES:
+        work(rows[::-1].copy() if reverse else rows)
         return
-    for part in parts:
-        if part == REFINEMENT:
-            work(part, 0, 1)
-            continue
-        others = [
-            _pool(os.getpid(), num_threads() - 1).submit(work, part, t, threads) for t in range(1, threads)
-        ]
-        work(part, 0, threads)
+    sections = [rows[first:last] for first, last in itertools.pairwise(starts)] if planned.has_nodes else [rows]
+    for section in reversed(sections) if reverse else sections:
+        parts = [section[t::threads].copy() for t in range(min(threads, len(section)))]
+        others = [_pool(os.getpid(), num_threads() - 1).submit(work, part) for part in parts[1:]]
+        for part in parts[:1]:
+            work(part)
         for other in others:
             other.result()

@@ -5,6 +5,7 @@ Gaussians wider than the nodes of a coarser grid move there: see ..octaves.
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -29,9 +30,8 @@ PADDING = 4 * SIDE
 # columns of the grids
 ROWS_OF_NODES, COLS_OF_NODES, ROWS, COLS, FIRST_TILE, FIRST_ROW = range(6)
 
-program = Program(
-    "CPU kernel", f"{__package__}.loops", __file__, "../whitened.py", "lists.py", "loops.py", "simd.py", "spline.py"
-)
+_SOURCES = ("../whitened.py", "lists.py", "loops.py", "rows.py", "simd.py", "spline.py")
+program = Program("CPU kernel", f"{__package__}.loops", __file__, *_SOURCES)
 
 
 class Table(NamedTuple):
@@ -193,6 +193,33 @@ def _coarsen(g, spacing, levels):  # type: ignore[no-untyped-def]
     g[MX], g[MY] = g[MX] / h + 1.5, g[MY] / h + 1.5
 
 
+# in place of a level: the blocks of nodes are refined
+REFINEMENT = -1
+
+
+@functools.lru_cache(maxsize=8)
+def order_rows(counts: tuple[int, ...], batch: int) -> tuple[Any, list[int]]:
+    """Rows of tiles in the order of the backward, the forward's is the reverse: number, level, image, row in its grid.
+
+    First the rows of pixels by their number modulo 4, first 0 and 2, then 1, then 3: those of a section share no blocks
+    of nodes. Then the refinement, then the rows of nodes. Also returns where the five sections start, and the end.
+
+    Args:
+        counts: rows of tiles of each level.
+        batch: images.
+    """
+    by_level = [
+        np.column_stack([np.arange(batch * count) + batch * sum(counts[:level]), np.full(batch * count, level),
+                         np.repeat(np.arange(batch), count), np.tile(np.arange(count), batch)])
+        for level, count in enumerate(counts)
+    ]  # fmt: skip
+    turn = by_level[0][:, 3] % 4
+    sections = [by_level[0][chosen] for chosen in (turn % 2 == 0, turn == 1, turn == 3)]
+    nodes = np.concatenate([np.empty((0, 4), np.int64), *by_level[1:]])
+    sections += [np.array([[0, REFINEMENT, 0, 0]]), nodes]
+    return np.concatenate(sections), np.cumsum([0, *map(len, sections)]).tolist()
+
+
 @program.entry
 def in_range(means, factors, colors):  # type: ignore[no-untyped-def]
     """Whether all is finite, and where arithmetic stays so."""
@@ -208,7 +235,7 @@ def in_range(means, factors, colors):  # type: ignore[no-untyped-def]
 
 @program.entry
 def list_tiles(means, factors, colors, order, regions, images, batch, table, radius, spacing):  # type: ignore[no-untyped-def]
-    """Make the table of Gaussians, scale their colours, list them by rows of tiles, and tell which blocks they touch."""
+    """Make the table of Gaussians, scale their colours, list them by rows of tiles, and tell which blocks are alive."""
     count, grids, channels = len(order), table.grids, colors.shape[1]
     levels = len(grids)
     gaussians = np.empty((count, COLUMNS))
@@ -285,9 +312,16 @@ def _list_entries(table, gaussians, regions, images, span, start, batch, radius)
                     block = find_block(num_regions, tile_start, block_regions, k, region)
                     if block >= 0:
                         live[base + block] = True
-    for base in range(-len(mask), len(live) - len(mask), nodes + 1):
-        for block in range(len(block_regions) - 1, len(mask) - 1, -1):
+    _spread(live, parents, len(mask))
+    return entries, live
+
+
+@inner
+def _spread(live, parents, first):  # type: ignore[no-untyped-def]
+    """A block is alive, too, where one that it is refined from is: those come after it."""
+    blocks = len(parents)
+    for base in range(-first, len(live) - first, blocks - first + 1):
+        for block in range(blocks - 1, first - 1, -1):
             for k in range(4):
                 if live[base + parents[block, k]]:
                     live[base + block] = True
-    return entries, live

@@ -17,13 +17,12 @@ from .lists import (
     COLS_OF_NODES,
     COLUMNS,
     FACTOR,
-    FIRST_ROW,
     L11,
     L21,
     L22,
     LEVEL,
     PADDING,
-    ROWS,
+    REFINEMENT,
     ROWS_OF_NODES,
     SCALE,
     Lists,
@@ -37,21 +36,16 @@ from .lists import (
     list_tiles,
     program,
 )
-from .simd import SIDE, add_rows, add_sheared, clear_rows, copy, gather_rows, gather_sheared, sum_columns
+from .rows import add_rows, add_sheared, gather_rows, gather_sheared
+from .simd import SIDE, clear_rows, copy, sum_columns
 from .spline import add_refined, add_sampled, gather_refined, gather_sampled, set_sampled
-
-# what a call does, so that threads may wait for one another between: all that is before NODES needs no grid of nodes
-EVERYTHING, NODES, REFINEMENT, PIXELS = 0, 1, 2, 3
-# rows of tiles by their number modulo 4, as they are taken one after the other: no two of a turn share blocks of nodes
-TURNS = ((0, 2), (1, 1), (3, 3))
 
 
 @inner
-def _exchange(pixels, stride, image, row, outward):  # type: ignore[no-untyped-def]
+def _exchange(pixels, stride, image, b, row, outward):  # type: ignore[no-untyped-def]
     """Copy a row of tiles to its place in an image, or from there."""
     channels, height, width = image.shape[1:]
-    rows = -(-height // SIDE)
-    b, top = row // rows, row % rows * SIDE
+    top = row * SIDE
     for r in range(min(SIDE, height - top)):
         for c in range(channels):
             outside, inside = ((b * channels + c) * height + top + r) * width, (r * channels + c) * stride + PADDING
@@ -91,9 +85,9 @@ def _refine(lists, nodes, channels, transposed):  # type: ignore[no-untyped-def]
                 continue
             at, down, right = (base + block) * SIDE * stride, odd[block] >= 2, odd[block] % 2 == 1
             if transposed:
-                gather_refined(nodes, offsets, down, right, nodes, at, stride, SIDE, channels, one, 0, 0)  # type: ignore[call-arg]
+                gather_refined(nodes, offsets, down, right, nodes, at, stride, SIDE, channels, one, 0, 0)
             else:
-                add_refined(nodes, offsets, down, right, nodes, at, stride, SIDE, channels, one, 0, 0)  # type: ignore[call-arg]
+                add_refined(nodes, offsets, down, right, nodes, at, stride, SIDE, channels, one, 0, 0)
 
 
 @inner
@@ -112,11 +106,11 @@ def _sample_row(lists, image, row, pixels, stride, nodes, channels, transposed):
             if mask[block] >= 0:
                 weights, mask_at, step = masks, mask[block] * SIDE * SIDE, SIDE
             if transposed:
-                gather_sampled(nodes, offsets, down, right, pixels, at, rows, stride, channels, weights, mask_at, step)  # type: ignore[call-arg]
+                gather_sampled(nodes, offsets, down, right, pixels, at, rows, stride, channels, weights, mask_at, step)
             elif empty:
-                set_sampled(nodes, offsets, down, right, pixels, at, rows, stride, channels, weights, mask_at, step)  # type: ignore[call-arg]
+                set_sampled(nodes, offsets, down, right, pixels, at, rows, stride, channels, weights, mask_at, step)
             else:
-                add_sampled(nodes, offsets, down, right, pixels, at, rows, stride, channels, weights, mask_at, step)  # type: ignore[call-arg]
+                add_sampled(nodes, offsets, down, right, pixels, at, rows, stride, channels, weights, mask_at, step)
             empty = False
         if empty and not transposed:
             clear_rows(pixels, at, stride, SIDE * channels)  # type: ignore[call-arg]
@@ -193,75 +187,47 @@ def _gather_row(lists, r, level, image, row, pixels, stride, channels, shape, su
 
 
 @program.entry
-def render(lists, part, offset, step, image, nodes):  # type: ignore[no-untyped-def]
-    """Render every `step`-th row of tiles from `offset`, of the nodes or of image[b, c, y, x]."""
-    batch, channels, height, width = image.shape
-    grids = lists.table.grids
-    shape = np.empty(9)
-    if part in (EVERYTHING, NODES):
-        turn = 0
-        for level in range(1, len(grids)):
-            for r in range(batch * grids[level, ROWS]):
-                turn += 1
-                if turn % step == offset:
-                    b, row = r // grids[level, ROWS], r % grids[level, ROWS]
-                    _add_row(
-                        lists, batch * grids[level, FIRST_ROW] + r, level, b, row, nodes, SIDE, channels, shape
-                    )
-    if part in (EVERYTHING, REFINEMENT):
-        _refine(lists, nodes, channels, False)
-    if part in (EVERYTHING, PIXELS):
-        rows = grids[0, ROWS]
-        stride = grids[0, COLS] * SIDE + 2 * PADDING
-        pixels = np.empty(SIDE * channels * stride, np.float32)
-        for r in range(offset, batch * rows, step):
-            if len(nodes) == 0:
-                for k in range(len(pixels)):
-                    pixels[k] = 0.0
-            else:
-                _sample_row(lists, r // rows, r % rows, pixels, stride, nodes, channels, False)
-            _add_row(lists, r, 0, r // rows, r % rows, pixels, stride, channels, shape)
-            _exchange(pixels, stride, image, r, True)
+def render(lists, rows, image, nodes):  # type: ignore[no-untyped-def]
+    """Render these rows of tiles, of nodes or of image[b, c, y, x], one after the other; see `order_rows`."""
+    channels, width = image.shape[1], image.shape[3]
+    stride = -(-width // SIDE) * SIDE + 2 * PADDING
+    pixels, shape = np.empty(SIDE * channels * stride, np.float32), np.empty(9)
+    for k in range(len(rows)):
+        r, level, b, row = rows[k]
+        if level == REFINEMENT:
+            _refine(lists, nodes, channels, False)
+            continue
+        values, step = (nodes, SIDE) if level > 0 else (pixels, stride)
+        if level == 0 and len(nodes) > 0:
+            _sample_row(lists, b, row, pixels, stride, nodes, channels, False)
+        elif level == 0:
+            for at in range(len(pixels)):
+                pixels[at] = 0.0
+        _add_row(lists, r, level, b, row, values, step, channels, shape)
+        if level == 0:
+            _exchange(pixels, stride, image, b, row, True)
 
 
 @program.entry
-def gather(lists, part, offset, step, grad, out, moments, nodes):  # type: ignore[no-untyped-def]
-    """Fill out[e] for the entries of every `step`-th row of tiles; `nodes` become the gradients of the nodes."""
-    batch, channels, height, width = grad.shape
-    grids = lists.table.grids
-    shape = np.empty(9)
+def gather(lists, rows, grad, out, moments, nodes):  # type: ignore[no-untyped-def]
+    """Fill out[e] for the entries of these rows of tiles; `nodes` become the gradients of the nodes."""
+    channels, width = grad.shape[1], grad.shape[3]
+    stride = -(-width // SIDE) * SIDE + 2 * PADDING
+    pixels, shape = np.zeros(SIDE * channels * stride, np.float32), np.empty(9)
     sums = np.zeros(out.shape[1] * SIDE, np.float32)
-    if part == EVERYTHING or part >= PIXELS:
-        rows = grids[0, ROWS]
-        stride = grids[0, COLS] * SIDE + 2 * PADDING
-        pixels = np.zeros(SIDE * channels * stride, np.float32)
-        for turn in range(3):
-            if part not in (EVERYTHING, PIXELS + turn):
-                continue
-            number = 0
-            for r in range(batch * rows):
-                if r % rows % 4 != TURNS[turn][0] and r % rows % 4 != TURNS[turn][1]:
-                    continue
-                number += 1
-                if number % step != offset or (lists.start[r] == lists.start[r + 1] and not len(nodes)):
-                    continue
-                _exchange(pixels, stride, grad, r, False)
-                if len(nodes):
-                    _sample_row(lists, r // rows, r % rows, pixels, stride, nodes, channels, True)
-                _gather_row(lists, r, 0, r // rows, r % rows, pixels, stride, channels, shape, sums, out, moments)
-    if part in (EVERYTHING, REFINEMENT):
-        _refine(lists, nodes, channels, True)
-    if part in (EVERYTHING, NODES):
-        turn = 0
-        for level in range(1, len(grids)):
-            for r in range(batch * grids[level, ROWS]):
-                turn += 1
-                if turn % step == offset:
-                    b, row = r // grids[level, ROWS], r % grids[level, ROWS]
-                    _gather_row(
-                        lists, batch * grids[level, FIRST_ROW] + r, level, b, row, nodes, SIDE, channels, shape, sums,
-                        out, moments,
-                    )  # fmt: skip
+    for k in range(len(rows)):
+        r, level, b, row = rows[k]
+        if level == REFINEMENT:
+            _refine(lists, nodes, channels, True)
+            continue
+        values, step = (nodes, SIDE) if level > 0 else (pixels, stride)
+        if level == 0 and len(nodes) == 0 and lists.start[r] == lists.start[r + 1]:
+            continue
+        if level == 0:
+            _exchange(pixels, stride, grad, b, row, False)
+        if level == 0 and len(nodes) > 0:
+            _sample_row(lists, b, row, pixels, stride, nodes, channels, True)
+        _gather_row(lists, r, level, b, row, values, step, channels, shape, sums, out, moments)
 
 
 @inner
@@ -311,7 +277,8 @@ def finish(lists, order, factors, out, moments, means, cholesky, colors):  # typ
 def _example() -> tuple[Lists, Any]:
     places, numbers = np.zeros(2, np.int64), np.zeros(1, np.float32)
     grids = np.array([[1, 1, 1, 1, 0, 0]])
-    table = Table(1, 1, grids, places[:1], places, np.ones((1, 4), np.int64), np.zeros(1, np.uint8), places[:1], -np.ones(1, np.int64), numbers)
+    parents, odd, mask = np.ones((1, 4), np.int64), np.zeros(1, np.uint8), -np.ones(1, np.int64)
+    table = Table(1, 1, grids, places[:1], places, parents, odd, places[:1], mask, numbers)
     nothing = np.zeros(1, np.bool_)
     lists = Lists(
         np.ones((1, COLUMNS)), numbers, places, places, np.zeros((1, 3), np.int32), table, nothing, 1, 4.0, numbers[0]
@@ -334,5 +301,6 @@ def pixels() -> None:
     """Compile what visits pixels."""
     example, terms = _example()
     image = np.zeros((1, 1, 1, 1), np.float32)
-    render(example, 0, 0, 1, image, example.colors[:0])
-    gather(example, 0, 0, 1, image, terms, True, example.colors[:0])
+    rows, nodes = np.zeros((1, 4), np.int64), example.colors[:0]
+    render(example, rows, image, nodes)
+    gather(example, rows, image, terms, True, nodes)

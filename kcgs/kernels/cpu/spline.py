@@ -1,7 +1,7 @@
 """From a grid to one of half its spacing, and back: blocks of 16 x 16 as vector code.
 
-Along an axis, values 2 i and 2 i + 1 of the finer grid are each a sum of four neighbours, i ... i + 3, of a window of the
-coarser one, which begins at a block's first node or in its middle. Blocks lie in memory as [row][channel][column].
+Along an axis, values 2 i and 2 i + 1 of the finer grid are each a sum of four neighbours, i ... i + 3, of a window of
+the coarser one, which begins at a block's first node or in its middle. Blocks lie in memory as [row][channel][column].
 """
 
 from __future__ import annotations
@@ -19,15 +19,14 @@ from .simd import _FLOAT, _INT, _LONG, _START, _VECTOR, SIDE, _call, _constant, 
 # weights of the four neighbours: refinement of cubic B-splines, exact; and the spline at pixel centres, a quarter and
 # three quarters of the way from one node to the next
 REFINE = ((0.5, 0.5, 0.0, 0.0), (0.125, 0.75, 0.125, 0.0))
-SAMPLE = tuple(
-    ((1 - t) ** 3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6, (4 - 6 * (1 - t) ** 2 + 3 * (1 - t) ** 3) / 6, t**3 / 6)
-    for t in (0.25, 0.75)
+SAMPLE = (
+    (27 / 384, 235 / 384, 121 / 384, 1 / 384),
+    (1 / 384, 121 / 384, 235 / 384, 27 / 384),
 )
 
 _HALF = SIDE // 2
 _WINDOW = _HALF + 3
 _NOTHING = ir.Constant(_VECTOR, ir.Undefined)
-Weights = tuple[tuple[float, ...], ...]
 
 
 def _long(value: int) -> ir.Constant:
@@ -42,7 +41,11 @@ def _shuffle(builder: Any, first: Any, second: Any, places: Any) -> Any:
 def _multiply_add(builder: Any, factor: float, value: Any, total: Any) -> Any:
     if factor == 0.0:
         return total
-    return builder.fmul(_constant(factor), value) if total is None else _call(builder, "fma", _constant(factor), value, total)
+    return (
+        builder.fmul(_constant(factor), value)
+        if total is None
+        else _call(builder, "fma", _constant(factor), value, total)
+    )
 
 
 def _alternating(even: float, odd: float) -> ir.Constant:
@@ -84,7 +87,7 @@ class _Blocks:
         return builder.gep(left, [at]), builder.gep(right, [at])
 
     def each(self, emit: Callable[[Any, bool], None]) -> None:
-        """Emit a loop over channels, for windows that begin in the middle of the left block and for those that do not."""
+        """Emit a loop over channels, for windows that begin in the middle of the left block and for others."""
         builder = self.builder
         with builder.if_else(self.right) as (then, otherwise):
             for branch, right in ((then, True), (otherwise, False)):
@@ -94,9 +97,7 @@ class _Blocks:
 
 def _signature(coarse: Any, offsets: Any, fine: Any, masks: Any) -> Any:
     long = types.int64
-    return types.void(
-        coarse, offsets, types.boolean, types.boolean, fine, long, long, long, long, masks, long, long
-    )
+    return types.void(coarse, offsets, types.boolean, types.boolean, fine, long, long, long, long, masks, long, long)
 
 
 def _make_add(even: tuple[float, ...], odd: tuple[float, ...], replaces: bool = False) -> Any:
