@@ -11,20 +11,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from .simd import (
-    _FLOAT,
-    _LONG,
-    _START,
-    SIDE,
-    _broadcast,
-    _call,
-    _constant,
-    _exp2,
-    _load,
-    _pointer,
-    _ramp,
-    _store,
-)  # fmt: skip
+from .simd import _FLOAT, _LONG, _START, SIDE, _broadcast, _call, _constant, _exp2, _load, _pointer, _ramp, _store
 
 
 class _Columns:
@@ -235,14 +222,15 @@ def gather_rows(  # type: ignore[no-untyped-def]
                 totals = [once, totals[1], builder.fmul(once, first), builder.fmul(totals[1], first), totals[2]]
             sums.finish(totals)
 
-        masked, moments = call.masked, arguments[14]
-        special = builder.and_(_is_three(builder, call.channels), builder.not_(masked))
-        _special_or(
-            builder,
-            special,
-            lambda: _both(builder, moments, lambda m: emit(False, m, True)),
-            lambda: _both(builder, moments, lambda m: _both(builder, masked, lambda k: emit(k, m))),
-        )
+        special = builder.and_(_is_three(builder, call.channels), builder.not_(call.masked))
+
+        def general() -> None:
+            _both(builder, arguments[14], lambda moments: _both(builder, call.masked, lambda m: emit(m, moments)))
+
+        def of_three() -> None:
+            _both(builder, arguments[14], lambda moments: emit(False, moments, True))
+
+        _special_or(builder, special, of_three, general)
         return context.get_dummy_value()
 
     return types.void(
