@@ -51,8 +51,9 @@ def region_splat(
         region_ids: integer region of each Gaussian, :math:`(B, N)`; needed where `regions` is given, and None without.
         regions: label map (a Tensor means hard contours) for all images or :math:`(B, H, W)`; None: one region.
         size: (height, width); needed without `regions`, else it must equal theirs.
-        cutoff: weights below it are skipped, in [0, 1); 0 evaluates all. The image is off by at most cutoff times the
-            sum of the absolute colours that overlap there.
+        cutoff: weights below it are skipped, in [0, 1), and wide Gaussians are interpolated between coarse nodes as
+            closely; 0 evaluates all at all pixels. Skipping a Gaussian is off by cutoff times its absolute colour at
+            most, interpolating by 2.6 times that: see docs/performance.md.
         backend: auto, reference, tiled, cpu or cuda.
 
     Returns:
