@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from bisect import bisect_right
 from functools import lru_cache
 from io import BytesIO
 from typing import Any, NamedTuple
@@ -96,16 +96,8 @@ def _largest(codec: Codec, variant: dict[str, Any], image: Tensor, most: int, qu
     def encode(place: int) -> Coded:
         return _encode(codec.format, pixels.tobytes(), pixels.shape[:2], codec.qualities[place], hashable)
 
-    return encode(_last(len(codec.qualities), lambda place: len(encode(place).data) <= most))
-
-
-def _last(count: int, fits: Callable[[int], bool]) -> int:
-    """Return the last place that fits, if those that fit come first; 0 where none does."""
-    low, high = 0, count - 1
-    while low < high:
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if fits(middle) else (low, middle - 1)
-    return low
+    # the last that fits, the first where none does
+    return encode(bisect_right(range(1, len(codec.qualities)), most, key=lambda place: len(encode(place).data)))
 
 
 # a slow codec's files at several targets are often the same

@@ -138,11 +138,6 @@ class TestCodecs:
         ]
         assert sizes[0] == len(found.data) and sizes[1] > 1_500
 
-    def test_search(self) -> None:
-        for last in range(9):
-            assert _codecs._last(10, lambda place, last=last: place <= last) == last
-        assert _codecs._last(10, lambda place: False) == 0
-
     def test_qualities_of_avif(self) -> None:
         qualities = CODECS[AVIF].qualities
         assert len(qualities) == 64 and qualities[0] == 0 and qualities[-1] == 100

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -82,11 +81,8 @@ def summarize(values: Mapping[str, float], tie: float, *, least: int = 1) -> Sum
 
 def interpolate(curve: Curve, rate: float) -> float:
     """Quality at a rate, linear over the logarithm of the rate; NaN outside the sorted points."""
-    for (low, first), (high, last) in pairwise(curve):
-        if low <= rate <= high:
-            share = 0.0 if high == low else math.log(rate / low) / math.log(high / low)
-            return first + share * (last - first)
-    return math.nan
+    rates, qualities = np.array(curve, np.float64).reshape(-1, 2).T
+    return float(np.interp(math.log(rate), np.log(rates), qualities, math.nan, math.nan)) if len(rates) else math.nan
 
 
 def delta(ours: Curve, other: Curve) -> Delta:
