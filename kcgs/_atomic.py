@@ -46,3 +46,9 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         if isinstance(error, OSError) and str(error.filename) == str(temporary):
             error.filename = str(target)
         raise
+
+
+def write_file(path: str | os.PathLike[str], content: bytes | str) -> int:
+    """Write bytes, or a text in UTF-8, whole or not at all; return how many bytes."""
+    with atomic_path(path) as temporary:
+        return temporary.write_bytes(content.encode() if isinstance(content, str) else content)

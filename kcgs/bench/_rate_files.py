@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from kcgs._atomic import atomic_path
+from kcgs._atomic import write_file
 from kcgs.codec import decode
 from kcgs.data import load_labels
 from kcgs.evaluate import measure
@@ -193,8 +193,7 @@ class Files:
                 _warm_up(self.config)
             point, data = make()
             path.with_suffix(".file").write_bytes(data)
-            with atomic_path(path) as temporary:
-                temporary.write_text(json.dumps(point), encoding="utf-8")
+            write_file(path, json.dumps(point))
         if not path.is_file():
             self.missed += 1
             return []

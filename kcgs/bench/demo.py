@@ -15,7 +15,7 @@ from kcgs.plots import COLORS, history_figure, save_figure
 from kcgs.scene import load
 from kcgs.segment import segment
 
-from .core.images import astronaut
+from .core.images import photo
 from .core.options import Options
 from .core.registry import experiment
 
@@ -45,7 +45,7 @@ def run(output: Path, options: Options) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    image, count = astronaut(), NUM_GAUSSIANS
+    image, count = photo("astronaut"), NUM_GAUSSIANS
     if options.quick:
         image, count = torch.nn.functional.avg_pool2d(image, QUICK_STRIDE), QUICK_GAUSSIANS
     labels = segment(image)

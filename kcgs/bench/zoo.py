@@ -7,24 +7,20 @@ import json
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
-from torch import Tensor
-
-from kcgs._atomic import atomic_path
-from kcgs.data import chart_2x3, chart_pie, save_image
+from kcgs._atomic import write_file
+from kcgs.data import save_image
 from kcgs.evaluate import evaluate
 from kcgs.fit import FitConfig, fit
 from kcgs.onnx import scene_decoder, write_model
 from kcgs.scene import Scene
-from kcgs.segment import segment
 from kcgs.zoo import Entry, entries
 
+from .core import images
 from .core.options import Options
 from .core.registry import experiment
 
 _PREVIEW = 384  # pixels of its longer side
 _LARGEST_DECODER = 600_000
-_CHARTS = {"2x3": chart_2x3, "pie": chart_pie}
 _CHART = "Apache-2.0, made by kcgs"
 _NASA = "public domain (NASA), from scikit-image"
 _CC0 = "CC0, from scikit-image"
@@ -61,30 +57,19 @@ def run(output: Path, options: Options) -> None:
     for name in names:
         known[name] = _make(name, PLANS[name], output, options.quick)
         listed = [known[name]._asdict() for name in PLANS if name in known]
-        _write(output / "manifest.json", json.dumps({"format": "kcgs.zoo", "entries": listed}, indent=1) + "\n")
-
-
-def read(name: str) -> tuple[Tensor, Tensor]:
-    """Return an image of the zoo and the label map that its scene was fitted with."""
-    if name in _CHARTS:
-        chart = _CHARTS[name]()
-        return chart.image, chart.labels
-    from skimage import data
-
-    image = torch.as_tensor(getattr(data, name)()).permute(2, 0, 1).float() / 255
-    return image, segment(image)
+        write_file(output / "manifest.json", json.dumps({"format": "kcgs.zoo", "entries": listed}, indent=1) + "\n")
 
 
 def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
-    image, labels = read(plan.image)
-    recipe = "best" if plan.image in _CHARTS else "best-refined"  # contours that were found may move freely
+    image, labels = images.load(plan.image, None)
+    recipe = "best" if plan.image in images.CHARTS else "best-refined"  # contours that were found may move freely
     config = FitConfig.from_recipe(recipe, **({"iterations": 20} if quick else {}))
     folder = output / name
     folder.mkdir(parents=True, exist_ok=True)
     fitted = fit(image, labels, plan.n, recipe=config).scene
     scene = Scene(fitted.field, fitted.regions, {"recipe": recipe, "title": plan.title})
     size = scene.save(folder / "scene.safetensors")
-    _write(folder / "recipe.json", config.model_dump_json(indent=1) + "\n")
+    write_file(folder / "recipe.json", config.model_dump_json(indent=1) + "\n")
     model, decoder = scene_decoder(scene, interactive=True), folder / "decoder.onnx"  # with views and regions
     has_decoder = model.ByteSize() <= _LARGEST_DECODER
     if has_decoder:
@@ -106,13 +91,8 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
         command=f"kcgs bench zoo -o models --only {name}", decoder=f"{name}/decoder.onnx" if has_decoder else None,
         decoder_sha256=_hash(decoder) if has_decoder else None,
     )  # fmt: skip
-    _write(folder / "card.md", _card(entry, scene.size, figures["ms_ssim"]))
+    write_file(folder / "card.md", _card(entry, scene.size, figures["ms_ssim"]))
     return entry
-
-
-def _write(path: Path, text: str) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def _hash(path: Path) -> str:

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from kcgs import _interrupts
-from kcgs._atomic import atomic_path, check_writable
+from kcgs._atomic import check_writable
 from kcgs._progress import Progress
 
 # typer may have click or a copy of it
@@ -119,12 +119,6 @@ def check_output(path: Path, *suffixes: str, option: str = "--output") -> None:
     if suffix not in suffixes:
         raise ValueError(f"{option} must end in {' or '.join(suffixes)}; got {str(path)!r}")
     check_writable(option, path)
-
-
-def write_file(path: Path, data: bytes) -> int:
-    """Write a file whole or not at all; return its bytes."""
-    with atomic_path(path) as temporary:
-        return temporary.write_bytes(data)
 
 
 def print_report(report: dict[str, Any], as_json: bool, title: str, contours: str = "") -> None:

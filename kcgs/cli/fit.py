@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from kcgs._atomic import check_writable
+from kcgs._atomic import check_writable, write_file
 from kcgs._progress import Progress
 
 from . import options
-from .common import ImageFile, Json, Quiet, Stop, app, check_output, interrupted, print_report, write_file
+from .common import ImageFile, Json, Quiet, Stop, app, check_output, interrupted, print_report
 
 if TYPE_CHECKING:
     from torch import Tensor

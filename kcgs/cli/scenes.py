@@ -7,9 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
+from kcgs._atomic import write_file
 from kcgs._progress import Progress
 
-from .common import OUTPUT_IMAGES, ImageFile, Json, Quiet, SceneFile, app, check_output, print_report, write_file
+from .common import OUTPUT_IMAGES, ImageFile, Json, Quiet, SceneFile, app, check_output, print_report
 from .fit import describe_size, measure_scene
 from .options import Scale, Size, exclude, target_size
 

@@ -13,7 +13,8 @@ import torch
 
 import kcgs
 from kcgs.bench import run
-from kcgs.bench.zoo import PLANS, read
+from kcgs.bench.core import images
+from kcgs.bench.zoo import PLANS
 from kcgs.fit import FitConfig
 from kcgs.functional import psnr
 from kcgs.scene import load
@@ -38,7 +39,7 @@ def test_entry(entry: Entry) -> None:
     assert path.stat().st_size == entry.bytes
     scene = load(path)
     assert len(scene) == entry.num_gaussians
-    image, _ = read(PLANS[entry.name].image)
+    image = images.load(PLANS[entry.name].image, None).image
     assert float(psnr(scene.render(), image)) == pytest.approx(entry.psnr, abs=0.02)
     folder = path.parent
     FitConfig(**json.loads((folder / "recipe.json").read_text()))

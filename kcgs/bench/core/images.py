@@ -16,6 +16,7 @@ from kcgs.segment import segment
 CHARTS = ("2x3", "pie")
 # stand in where there is no data
 QUICK = ("astronaut", "disc")
+PHOTOS = ("astronaut", "chelsea", "coffee", "rocket")
 # a pixel of the pie is the mean of 8 x 8 samples: with so many labels per pixel its contours are exact
 COVERAGE_LABELS = 8
 
@@ -60,7 +61,7 @@ def sequences(data: Path | None, wanted: str | None, *, quick: bool) -> list[str
 
 @lru_cache(maxsize=4)
 def load(name: str, data: Path | None, stride: int = 1) -> Sample:
-    """Read a chart, a stand-in, a photo of BSDS (a number) or Kodak (kodimN), or the first frame of a sequence."""
+    """Read a chart, a photo of scikit-image, BSDS (a number) or Kodak (kodimN), a disc, or a sequence's first frame."""
     image, labels = _read(name, data)
     if stride > 1:
         image = image[:, ::stride, ::stride].contiguous()
@@ -73,11 +74,11 @@ def coverage_map() -> RegionMap:
     return RegionMap.from_labels(chart_pie(COVERAGE_LABELS).labels, supersample=COVERAGE_LABELS)
 
 
-def astronaut() -> Tensor:
-    """Return scikit-image's photo."""
-    from skimage import data as photos
+def photo(name: str) -> Tensor:
+    """Return a photo of scikit-image."""
+    from skimage import data
 
-    return torch.from_numpy(photos.astronaut()).permute(2, 0, 1).float() / 255
+    return torch.from_numpy(getattr(data, name)()).permute(2, 0, 1).float() / 255
 
 
 def _read(name: str, data: Path | None) -> tuple[Tensor, Tensor | None]:
@@ -86,8 +87,8 @@ def _read(name: str, data: Path | None) -> tuple[Tensor, Tensor | None]:
         return chart.image, chart.labels
     if name == "disc":
         return _disc()
-    if name == "astronaut":
-        return astronaut(), segment(astronaut())
+    if name in PHOTOS:
+        return photo(name), segment(photo(name))
     if data is not None and name.isdigit():
         return load_image(data / "bsds" / name / "image.jpg"), None
     if data is not None and name.startswith("kodim"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from kcgs._atomic import atomic_path
+from kcgs._atomic import write_file
 
 from . import summaries
 from .cases import BASELINE, BEST, CLAMPED, PAPER, UNCLAMPED
@@ -72,9 +72,7 @@ def _compared(rows: Sequence[Row]) -> list[int]:
 def main() -> None:
     """Put the tables into docs/results.md of the current folder."""
     path = Path("docs/results.md")
-    text = put(path.read_text(encoding="utf-8"), results(Path("notebooks/reports")))
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_file(path, put(path.read_text(encoding="utf-8"), results(Path("notebooks/reports"))))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NamedTuple
 
-from kcgs._atomic import atomic_path
+from kcgs._atomic import write_file
 
 _PACKAGES = ("kcgs", "torch", "numba", "numpy", "kornia", "triton")
 QUICK_TEXT = "The short form, small images and few iterations: the numbers only show that all of it runs."
@@ -36,8 +36,7 @@ Report = Callable[[Path, Made], Sequence[str]]
 def conclude(report: Report, output: Path, made: Made) -> None:
     """Write down how results were made, on this machine, and their report."""
     made = made._replace(machine=(*describe(), *made.machine))
-    with atomic_path(output / "made.json") as temporary:
-        temporary.write_text(json.dumps(made._asdict(), indent=1) + "\n", encoding="utf-8")
+    write_file(output / "made.json", json.dumps(made._asdict(), indent=1) + "\n")
     redraw(report, output)
 
 
@@ -47,9 +46,7 @@ def redraw(report: Report, output: Path) -> None:
     made = Made(**{**fields, "machine": tuple(fields["machine"]), "notes": tuple(fields["notes"])})
     title, *parts = report(output, made)
     head = [title, f"Made by `{made.command}`.", _listed(made.machine), QUICK_TEXT if made.quick else ""]
-    with atomic_path(output / "report.md") as temporary:
-        text = "\n\n".join(part for part in [*head, _listed(made.notes), *parts] if part)
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_file(output / "report.md", "\n\n".join(filter(None, [*head, _listed(made.notes), *parts])) + "\n")
 
 
 def _listed(lines: Sequence[str]) -> str:

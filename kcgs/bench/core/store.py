@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs._atomic import atomic_path
+from kcgs._atomic import write_file
 from kcgs.codec import decode, encode
 from kcgs.codec.labels import encode_map
 from kcgs.evaluate import measure
@@ -140,7 +140,7 @@ class Store:
         kept = Kept(row, tuple(result.history), given_regions, segment_seconds)
         path = self._path(case)
         result.scene.save(path.with_suffix(".safetensors"))
-        _write_json(path, kept._asdict())
+        write_file(path, json.dumps(kept._asdict()))
         self._learn(case, time.monotonic() - begin)
 
     def _path(self, case: Case) -> Path:
@@ -161,12 +161,7 @@ class Store:
     def _learn(self, case: Case, seconds: float) -> None:
         known = self._known()
         known[case.settings()] = max(seconds, known.get(case.settings(), 0.0))
-        _write_json(self.folder / "seconds.json", known)
-
-
-def _write_json(path: Path, value: object) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(value), encoding="utf-8")
+        write_file(self.folder / "seconds.json", json.dumps(known))
 
 
 def _measure(case: Case, result: FitResult, image: Tensor, labels: Tensor | None) -> Row:
