@@ -52,7 +52,12 @@ def holds(condition: Tensor, words: str) -> bool:
     try:
         torch._assert_async(condition, words)
     except RuntimeError:
-        return False
+        inner = condition
+        while torch._C._functorch.is_functorch_wrapped_tensor(inner):  # vmap has no rule for assertions
+            inner = torch._C._functorch.get_unwrapped(inner)
+        if inner is not condition and not inner.all():  # nor for a message that shows values
+            raise ValueError(words) from None
+        return inner is not condition
     return True
 
 

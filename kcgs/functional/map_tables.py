@@ -36,7 +36,7 @@ class MapTables(NamedTuple):
 
 
 class _Kept(NamedTuple):
-    version: int
+    version: Any  # of labels made in inference mode, which count no writes, a copy
     widths: Tensor | None
     tables: MapTables
 
@@ -51,15 +51,17 @@ def keep_tables(
 ) -> None:
     """Keep the tables of a map at a size, and of few others; `widths` as the operator has them."""
     sizes = _kept.setdefault(labels, {})
-    sizes[supersample, *size] = _Kept(_version(labels), widths, tables)
+    sizes[supersample, *size] = _Kept(labels.clone() if labels.is_inference() else _version(labels), widths, tables)
     if len(sizes) > _MOST_SIZES:
-        del sizes[list(sizes)[1]]  # the first is the map's own
+        sizes.pop(list(sizes)[1], None)  # not the first, the map's own; another thread may have been before
 
 
 def find_tables(labels: Tensor, widths: Tensor | None, supersample: int, size: tuple[int, int]) -> MapTables | None:
     """Return the tables of a map at a size, unless there are none, or the labels were written to since."""
     kept: _Kept | None = _kept.get(labels, {}).get((supersample, *size))
-    if kept is None or kept.version != _version(labels):
+    if kept is None or not (
+        torch.equal(kept.version, labels) if labels.is_inference() else kept.version == _version(labels)
+    ):
         return None
     if kept.widths is not widths and (widths is None or kept.widths is None or not torch.equal(kept.widths, widths)):
         return None
@@ -68,7 +70,7 @@ def find_tables(labels: Tensor, widths: Tensor | None, supersample: int, size: t
 
 class _Index(NamedTuple):
     of: Any  # weak reference to the ids of the map
-    version: int
+    version: tuple[int, int]
     places: Tensor
     least: int
 
@@ -91,5 +93,6 @@ def find_index(tables: MapTables, region_ids: Tensor) -> tuple[Tensor, int]:
     return index, least
 
 
-def _version(labels: Tensor) -> int:
-    return -1 if labels.is_inference() else labels._version
+def _version(tensor: Tensor) -> tuple[int, int]:
+    # the address, too: `tensor.data = other` counts as no write
+    return tensor._version, tensor.data_ptr()

@@ -342,6 +342,23 @@ class TestOperator:
         assert torch.equal(region_splat(*gaussians, labels), region_splat(*gaussians, labels.clone()))
         assert not torch.equal(region_splat(*gaussians, labels), before)
 
+    @pytest.mark.parametrize("write", ["inference", "data"])
+    def test_labels_that_change_uncounted(self, field: GaussianField, write: str) -> None:
+        """Neither tensors made in inference mode nor those that are given other data count what is written to them."""
+        gaussians = field.means.detach(), field.cholesky.detach(), field.colors.detach()
+        ids = torch.zeros_like(field.region_ids)
+        with torch.inference_mode(write == "inference"):
+            labels = torch.zeros(SIZE, dtype=torch.long)
+            labels[:, 16:] = 3
+            before = region_splat(*gaussians, ids, labels)
+            if write == "inference":
+                labels.copy_(labels.flip(1))
+            else:
+                labels.data, ids.data = labels.flip(1), ids.clone()
+            after = region_splat(*gaussians, ids, labels)
+        assert torch.equal(after, region_splat(*gaussians, ids.clone(), labels.clone()))
+        assert not torch.equal(after, before)
+
     def test_ids_that_change_in_place(self, field: GaussianField, regions: RegionMap) -> None:
         gaussians, ids = (field.means, field.cholesky, field.colors), field.region_ids.clone()
         before = region_splat(*gaussians, ids, regions)
@@ -446,6 +463,18 @@ class TestFunctional:
         rows = torch.func.vmap(torch.func.grad(lambda c: draw(c).square().sum()))(colors)
         one = torch.func.grad(lambda c: draw(c).square().sum())(colors[2])
         torch.testing.assert_close(rows[2], one, rtol=1e-4, atol=1e-4)
+
+    def test_vmap_over_checks_of_values(self, field: GaussianField, regions: RegionMap) -> None:
+        """vmap has no rule for assertions; what looks regions up goes with the renderer."""
+        means = torch.stack([field.means.detach(), field.means.detach() + 3])
+
+        def draw(means: Tensor) -> Tensor:
+            ids = lookup_regions(means, regions.labels)
+            return region_splat(means, field.cholesky, field.colors, ids, regions)
+
+        assert torch.equal(torch.func.vmap(draw)(means), torch.stack([draw(m) for m in means]))
+        with pytest.raises(ValueError, match="means must be finite"):
+            torch.func.vmap(draw)(means / 0)
 
     def test_vmap_of_batches(self, backend: str) -> None:
         """Dimensions in any place, a map for each image of each batch, ids alone, levels in levels, none."""
