@@ -18,8 +18,8 @@ from kcgs.nn import GaussianField
 from kcgs.onnx import generic_decoder, scene_decoder, write_model
 from kcgs.scene import Scene, load
 
-from ._render_runs import renderer
-from ._workloads import STANDARD, workload
+from ._render_runs import DIRECT, EXACT, TRUTH_CUTOFF, renderer
+from ._workloads import FITTED, STANDARD, WIDE, resized, standard, workload
 from .core.cases import BEST, QUICK_ITERATIONS, Case
 from .core.clocks import clock, in_turns, threads
 from .core.jobs import check_made
@@ -27,9 +27,10 @@ from .core.options import Options
 from .core.store import Store
 
 SCENE, GENERIC, CPU, TILED = "onnxruntime, scene", "onnxruntime, generic", "torch, cpu", "torch, tiled"
-DECODERS = (SCENE, GENERIC, CPU, TILED)
-# the truth: what it leaves out of a sum is far below float32's rounding
-TRUTH_CUTOFF = 1e-12
+CPU_DIRECT = f"torch, {DIRECT}"
+DECODERS = (SCENE, GENERIC, CPU, CPU_DIRECT, TILED)
+# the others take seconds for a wide image
+FAST = (SCENE, CPU, CPU_DIRECT)
 CONTOURS = ("none", "hard", "soft")
 SOFTNESS = 0.7
 SEQUENCE = "blackswan"
@@ -64,6 +65,11 @@ class Subject(NamedTuple):
         return "hard" if regions.softness == 0.0 else "soft"
 
     @property
+    def is_typical(self) -> bool:
+        """Whether these are the contours that its figure and its memory are measured with."""
+        return self.contours == ("soft" if self.is_fitted else "hard")
+
+    @property
     def about(self) -> str:
         """What a reader must know of it."""
         (height, width), regions = self.scene.size, self.scene.regions
@@ -93,6 +99,12 @@ def standard_subjects(quick: bool) -> list[Subject]:
         for contours, scene in zip(CONTOURS, (Scene(plain), hard, soft), strict=True):
             made.append(Subject(f"{name} {contours}", f"workload {name} of `kcgs bench render`", scene))
     return made
+
+
+def zoo_subjects() -> list[Subject]:
+    """Read the fitted scenes of the zoo, each with its soft contours and with hard ones."""
+    names = [(name, f"{name} {contours}") for name in FITTED for contours in ("soft", "hard")]
+    return [Subject(name, f"{fitted} of the zoo", standard(name), is_fitted=True) for fitted, name in names]
 
 
 def fitted_subjects(output: Path, options: Options) -> list[Subject]:
@@ -131,21 +143,22 @@ def write_files(folder: Path, scene: Scene, cutoff: float) -> Files:
     return Files(*paths, cutoff)
 
 
-def decoders_of(scene: Scene) -> list[str]:
+def decoders_of(scene: Scene, size: str = "native") -> list[str]:
     """List the decoders that render this scene: the generic one has hard contours only, one label per pixel."""
     regions = scene.regions
     is_plain = regions is None or (regions.softness == 0.0 and regions.supersample == 1)
-    return [name for name in DECODERS if name != GENERIC or is_plain]
+    names = FAST if size == WIDE else DECODERS
+    return [name for name in names if name != GENERIC or is_plain]
 
 
 def open_decoder(name: str, files: Files, size: tuple[int, int], threads: int) -> Render:
     """Read the files and return what renders (C, H, W) at that size; torch has its own setting of threads."""
     if name == SCENE:
         return _session(files.decoder, {"size": np.array(size, np.int64)}, threads)
-    placed = _resized(load(files.scene), size)
+    placed = resized(load(files.scene), size)
     if name == GENERIC:
         return _session(files.generic, _generic_feeds(placed), threads)
-    return lambda: _splat(placed, {CPU: "cpu", TILED: "tiled"}[name], files.cutoff)
+    return lambda: _splat(placed, name.removeprefix("torch, "), files.cutoff)
 
 
 def open_and_render(name: str, files: Files, size: tuple[int, int]) -> Tensor:
@@ -177,19 +190,7 @@ def load_seconds(name: str, files: Files, size: tuple[int, int], rounds: int) ->
 
 def truth(scene: Scene, size: tuple[int, int]) -> Tensor:
     """Render in float64, tile by tile at a cutoff next to nothing."""
-    return _splat(_resized(copy.deepcopy(scene).double(), size), "tiled", TRUTH_CUTOFF)
-
-
-def _resized(scene: Scene, size: tuple[int, int]) -> Scene:
-    """Scale the Gaussians and sample the map anew: once, for all images of that size."""
-    field, regions = scene.field, scene.regions
-    down, across = size[0] / field.size[0], size[1] / field.size[1]
-    means, cholesky, colors = (t.detach() for t in (field.means, field.cholesky, field.merged_colors()))
-    means = means * means.new_tensor([across, down])
-    cholesky = cholesky * cholesky.new_tensor([across, down, down])
-    region_ids = None if regions is None else field.region_ids
-    placed = GaussianField(means, cholesky, colors, region_ids, size=size)
-    return Scene(placed, None if regions is None else regions.resize(size))
+    return _splat(resized(copy.deepcopy(scene).double(), size), EXACT, TRUTH_CUTOFF)
 
 
 def _splat(scene: Scene, backend: str, cutoff: float) -> Tensor:

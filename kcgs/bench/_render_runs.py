@@ -1,10 +1,14 @@
-"""What `kcgs bench render` times: the backends, and splatting in plain torch as it is written elsewhere."""
+"""What `kcgs bench render` times: the backends, and splatting in plain torch as it is written elsewhere.
+
+What it counts, too: the pairs of a Gaussian and a pixel that a render takes.
+"""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache, partial
 from typing import NamedTuple
 
@@ -13,12 +17,19 @@ from torch import Tensor
 
 from kcgs.functional import region_splat
 from kcgs.kernels import SplatInputs, resolve
+from kcgs.kernels.octaves import blocks_of, direct, most_spacing
+from kcgs.kernels.whitened import support_radius
 from kcgs.nn import RegionSplatRenderer
 from kcgs.scene import Scene
 
-from ._workloads import standard
+from ._workloads import resized, standard, target_size
+from .core.clocks import clock
 
 PEER = "pair-list autograd"
+# without coarse grids
+DIRECT, EXACT = "cpu, direct", "tiled, direct"
+# the truth, in float64: what it leaves out of a sum is far below float32's rounding
+TRUTH_CUTOFF = 1e-12
 # of the peer: it holds several tensors of as many elements at once
 MOST_PAIRS = 60_000_000
 
@@ -43,16 +54,21 @@ def backends() -> list[str]:
 
 
 def renderer(name: str) -> Render:
-    """Return a backend, or the peer, as a function (scene, cutoff) -> image."""
+    """Return a backend, or the peer, as a function (scene, cutoff) -> image; ", direct": without coarse grids."""
 
     def render(scene: Scene, cutoff: float) -> Tensor:
         field = scene.field
-        return region_splat(
-            field.means, field.cholesky, field.colors, field.region_ids, scene.regions,
-            size=scene.size, cutoff=cutoff, backend=name,
-        )  # fmt: skip
+        with _grids(name):  # the backward goes by the same plan
+            return region_splat(
+                field.means, field.cholesky, field.colors, field.region_ids, scene.regions,
+                size=scene.size, cutoff=cutoff, backend=name.partition(", ")[0],
+            )  # fmt: skip
 
     return splat_pairs if name == PEER else render
+
+
+def _grids(name: str) -> AbstractContextManager[None]:
+    return direct() if name in (DIRECT, EXACT) else nullcontext()
 
 
 @lru_cache(maxsize=2)
@@ -81,6 +97,23 @@ def timed(name: str, scene: Scene, cutoff: float, rounds: int) -> list[Timing]:
     return [once(renderer(name), scene, cutoff)[0] for _ in range(rounds + 1)][1:]
 
 
+def second(action: Callable[[], object]) -> float:
+    """Run twice and return the seconds of the second: the first finds the caches taken by what ran before."""
+    action()
+    return clock(action)
+
+
+@torch.no_grad()
+def forward(name: str, scene: Scene, cutoff: float) -> tuple[Tensor, list[Tensor]]:
+    """Render only; no gradients."""
+    return renderer(name)(scene, cutoff), []
+
+
+def both(name: str, scene: Scene, cutoff: float) -> tuple[Tensor, list[Tensor]]:
+    """Render and differentiate: image, gradients."""
+    return once(renderer(name), scene, cutoff)[1:]
+
+
 def in_turns(scene: Scene, cutoff: float, rounds: int) -> tuple[list[Timing], list[Timing]]:
     """Time the CPU kernel alone, and the module with autograd around it, in turns after one run each to warm up."""
     field, regions, module = scene.field, scene.regions, RegionSplatRenderer(cutoff, backend="cpu")
@@ -102,11 +135,54 @@ def in_turns(scene: Scene, cutoff: float, rounds: int) -> tuple[list[Timing], li
     return [kernel for kernel, _ in found], [around for _, around in found]
 
 
-def prepare(name: str, case: str, cutoff: float) -> Callable[[], object]:
-    """Return what renders and differentiates a standard workload."""
+def prepare(name: str, case: str, cutoff: float, size: str = "native") -> Callable[[], object]:
+    """Return what renders and differentiates a standard workload or, at another size than its own, renders it."""
     scene = standard(case)
+    if size != "native":
+        return partial(forward, name, resized(scene, target_size(scene, size)), cutoff)
     probe_of(scene.size, 3, torch.float32)
-    return partial(once, renderer(name), scene, cutoff)
+    return partial(both, name, scene, cutoff)
+
+
+def pairs_per_pixel(name: str, scene: Scene, cutoff: float) -> float:
+    """Count the pairs of a Gaussian and a pixel, or a node of its grid, and divide by the pixels of the image.
+
+    A pair counts where the weight, that of the region left out, is at least the cutoff, and the pixel is in the image
+    or the node on the grid.
+    """
+    means, (l11, l21, l22) = scene.field.means.detach().double(), scene.field.cholesky.detach().double().unbind(-1)
+    a, b, d = l11 * l11, l11 * l21, l21 * l21 + l22 * l22
+    total, product = a + d, a * d - b * b
+    with _grids(name):
+        spacing = most_spacing(cutoff)
+    # (h / s1)^4 + (h / s2)^4 <= spacing^4
+    widest = spacing * (product * product / (total * total - 2 * product)) ** 0.25
+    grids = blocks_of(None, scene.size, torch.device("cpu")).grids
+    level = widest.log2().floor().clamp(0, len(grids) - 1).long()
+    found = 0
+    for number, grid in enumerate(grids):
+        which, h = level == number, 2.0**number
+        places = means[which] / h + (1.5 if number else 0.0)
+        shapes = [t[which] / (h * h) for t in (a, b, d)]
+        if number:
+            shapes = [shapes[0] - 1 / 3, shapes[1], shapes[2] - 1 / 3]
+        radius = support_radius(cutoff, torch.float32)
+        found += _count_inside(places, shapes, radius, (grid.height, grid.width))
+    return found / math.prod(scene.size)
+
+
+def _count_inside(means: Tensor, covariance: list[Tensor], radius: float, size: tuple[int, int]) -> int:
+    """Count the pixel centres within each ellipse, row by row."""
+    a, b, d = covariance
+    reach = radius * d.sqrt()
+    first = (means[:, 1] - reach - 0.5).ceil().clamp_min(0)
+    rows = ((means[:, 1] + reach - 0.5).floor().clamp_max(size[0] - 1) - first + 1).clamp_min(0).long()
+    which = torch.repeat_interleave(rows)
+    dy = first[which] + torch.arange(len(which)) - (rows.cumsum(0) - rows)[which] + 0.5 - means[which, 1]
+    half = (radius**2 - dy * dy / d[which]).clamp_min(0).sqrt() * (a - b * b / d)[which].sqrt()
+    middle = means[which, 0] + (b / d)[which] * dy - 0.5
+    low, high = (middle - half).ceil().clamp_min(0), (middle + half).floor().clamp_max(size[1] - 1)
+    return int((high - low + 1).clamp_min(0).sum())
 
 
 def splat_pairs(scene: Scene, cutoff: float) -> Tensor:

@@ -1,4 +1,4 @@
-"""Scenes made by rule, so that anybody can render the same."""
+"""Scenes that anybody can render too: made by rule, and fitted ones of the zoo."""
 
 from __future__ import annotations
 
@@ -9,13 +9,18 @@ from torch import Tensor
 
 from kcgs.functional import RegionMap, lookup_regions, scale_rotation_to_cholesky
 from kcgs.nn import GaussianField
-from kcgs.scene import Scene
+from kcgs.scene import Scene, load
+from kcgs.zoo import find
 
 # mean number of Gaussians whose 3-sigma ellipse holds a pixel
 COVERAGE = 12.0
 NEEDLES_SIZE = (96, 128)
 # height, width, N
 STANDARD = {"W3": (200, 300, 20), "W1": (480, 854, 1_250), "W2": (480, 854, 7_500), "W4": (2160, 3840, 50_000)}
+# of the zoo: 3.7, 6.3 and 11.4 Gaussians per thousand pixels; W1 has 3.0, W2 18
+FITTED = ("rocket-1000", "coffee-1500", "astronaut-3000")
+WIDE = "3840 wide"
+SIZES = ("native", "2x", WIDE)
 
 
 def workload(height: int, width: int, count: int, *, spread: float | None = None) -> Scene:
@@ -39,8 +44,32 @@ def workload(height: int, width: int, count: int, *, spread: float | None = None
 
 
 def standard(name: str) -> Scene:
-    """Make one of the standard workloads."""
-    return workload(*STANDARD[name])
+    """Make one of the standard workloads, or read a fitted scene: its name in the zoo, "soft" or "hard" behind it."""
+    if name in STANDARD:
+        return workload(*STANDARD[name])
+    fitted, contours = name.split()
+    scene = load(find(fitted))
+    assert scene.regions is not None
+    return scene if contours == "soft" else Scene(scene.field, RegionMap.from_labels(scene.regions.labels))
+
+
+def target_size(scene: Scene, size: str) -> tuple[int, int]:
+    """Return height and width of one of SIZES."""
+    height, width = scene.size
+    factor = 3840 / width if size == WIDE else {"native": 1, "2x": 2}[size]
+    return round(factor * height), round(factor * width)
+
+
+def resized(scene: Scene, size: tuple[int, int]) -> Scene:
+    """Scale the Gaussians and sample the map anew: once, for all images of that size."""
+    field, regions = scene.field, scene.regions
+    down, across = size[0] / field.size[0], size[1] / field.size[1]
+    means, cholesky, colors = (t.detach() for t in (field.means, field.cholesky, field.merged_colors()))
+    means = means * means.new_tensor([across, down])
+    cholesky = cholesky * cholesky.new_tensor([across, down, down])
+    region_ids = None if regions is None else field.region_ids
+    placed = GaussianField(means, cholesky, colors, region_ids, size=size)
+    return Scene(placed, None if regions is None else regions.resize(size))
 
 
 def needles(sigma: float, anisotropy: float, count: int = 37) -> Scene:

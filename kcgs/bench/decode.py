@@ -19,8 +19,8 @@ from kcgs.plots import COLORS, figure, save_figure
 from kcgs.scene import Scene
 
 from . import _decoders as decoders
-from ._decoders import CPU, DECODERS, GENERIC, SCENE, TILED, Entrant, Files, Render, Subject, truth
-from ._workloads import workload
+from ._decoders import CPU, CPU_DIRECT, DECODERS, GENERIC, SCENE, TILED, Entrant, Files, Render, Subject, truth
+from ._workloads import SIZES, target_size, workload
 from .core.clocks import median_ratio, peak_bytes, threads
 from .core.figures import MARKERS, add_legend
 from .core.jobs import with_progress
@@ -33,15 +33,15 @@ from .core.rows import read_rows, write_rows
 CUTOFFS = (1e-2, 1 / 255, 1e-3, 1e-4, 1e-6)
 DEFAULT_CUTOFF = 1e-4
 THREADS = (1, 2)
-FACTORS = {"native": 1, "2x": 2}
-SWEPT = (SCENE, CPU, TILED)
+SWEPT = (SCENE, CPU, CPU_DIRECT, TILED)
 
 _SPEED_TEXT = """Milliseconds for one image, medians; all decoders of a scene are timed in turns in one process, on
 one thread and on two, at the default cutoff of 1e-4. `to cpu` is the median of the ratios to torch's `cpu` kernel on
 as many threads in the same round. torch's kernels and the generic decoder are given the Gaussians scaled and the
 label map sampled for the size that is rendered, once for all images; the scene decoder does both in every image.
-Errors are against the `tiled` kernel in float64 at a cutoff of 1e-12, colours in [0, 1]; values of the workloads'
-images go up to about 5, since they are sums of 12 Gaussians."""
+`cpu, direct` is the `cpu` kernel without its coarse grids. At 3840 wide only the fast ones run. Errors are against the
+`tiled` kernel in float64 without coarse grids at a cutoff of 1e-12, colours in [0, 1]; values of the workloads' images
+go up to about 5, since they are sums of 12 Gaussians."""
 _SWEEP_TEXT = "One thread, the scene's own size; all timed in turns. Left and below is better."
 _FILES_TEXT = """`bytes to scene` is the size of the scene decoder over that of the scene, which torch reads. The
 generic decoder is one file for all scenes and needs the scene beside it. Loading, in milliseconds, goes from the files
@@ -86,7 +86,8 @@ def report(folder: Path, made: Made) -> list[str]:
 @experiment("runs", report=report)
 def run(output: Path, options: Options) -> None:
     """Race the decoders; the fits are kept."""
-    subjects = [*decoders.standard_subjects(options.quick), *decoders.fitted_subjects(output, options)]
+    subjects = [*decoders.standard_subjects(options.quick), *([] if options.quick else decoders.zoo_subjects())]
+    subjects += decoders.fitted_subjects(output, options)
     with TemporaryDirectory() as folder:
         race = _Race(Path(folder), subjects, options.quick)
         rows = [row for step in with_progress(list(race.steps())) for row in step()]
@@ -105,22 +106,22 @@ class _Race:
     def __init__(self, folder: Path, subjects: list[Subject], quick: bool) -> None:
         self.folder, self.subjects, self.quick = folder, subjects, quick
         self.rounds = 1 if quick else 7
+        self.sizes = SIZES[:2] if quick else SIZES
         # first, so that none is timed cold
         self.small = self._write("warm-up", workload(48, 64, 40), DEFAULT_CUTOFF)
         self.files = {subject.name: self._write(subject.name, subject.scene, DEFAULT_CUTOFF) for subject in subjects}
 
     def steps(self) -> Iterator[tuple[str, Callable[[], list[Row]]]]:
         """List the measurements: memory first, then clocks."""
-        for subject in self.subjects[:1] if self.quick else self.subjects:
-            for size in ("native",) if self.quick else FACTORS:
+        for subject in self.subjects[:1] if self.quick else [s for s in self.subjects if s.is_typical]:
+            for size in self.sizes[:1] if self.quick else self.sizes:
                 yield f"memory {subject.name} {size}", partial(self._memory, subject, size)
         for subject in self.subjects:
             yield f"files {subject.name}", partial(self._files, subject)
-            for size in FACTORS:
+            for size in self.sizes:
                 yield f"speed {subject.name} {size}", partial(self._speed, subject, size)
-        # several regions with hard contours, and what was fitted
         for subject in self.subjects:
-            if subject.contours == "hard" or subject.is_fitted:
+            if subject.is_typical:
                 yield f"error against time {subject.name}", partial(self._sweep, subject)
 
     def _write(self, name: str, scene: Scene, cutoff: float) -> Files:
@@ -128,8 +129,11 @@ class _Race:
 
     def _memory(self, subject: Subject, size: str) -> list[Row]:
         rows = []
-        for name in decoders.decoders_of(subject.scene):
-            job, warm_up = (name, self.files[subject.name], _target(subject, size)), (name, self.small, (48, 64))
+        for name in decoders.decoders_of(subject.scene, size):
+            job, warm_up = (
+                (name, self.files[subject.name], target_size(subject.scene, size)),
+                (name, self.small, (48, 64)),
+            )
             peak = peak_bytes(partial, (decoders.open_and_render, *job), (decoders.open_and_render, *warm_up))
             rows.append(Row("memory", subject.name, size, name, 1, DEFAULT_CUTOFF, "peak", peak / 1e6, "MB"))
         return rows
@@ -140,18 +144,19 @@ class _Race:
             row(section="files", size="native", decoder=name, quantity="size", value=path.stat().st_size, unit="bytes")
             for name, path in {SCENE: files.decoder, GENERIC: files.generic, CPU: files.scene}.items()
         ]
-        for name, size in product(decoders.decoders_of(subject.scene), FACTORS):
-            seconds = decoders.load_seconds(name, files, _target(subject, size), 1 if self.quick else 3)
+        entrants = [name for name in decoders.decoders_of(subject.scene) if name != CPU_DIRECT]
+        for name, size in product(entrants, SIZES[:2]):
+            seconds = decoders.load_seconds(name, files, target_size(subject.scene, size), 1 if self.quick else 3)
             rows.append(row(section="load", size=size, decoder=name, quantity="load", value=1e3 * seconds, unit="ms"))
         return rows
 
     def _speed(self, subject: Subject, size: str) -> list[Row]:
         """Time all decoders in turns, on one thread and on two, and take their errors."""
-        files, target = self.files[subject.name], _target(subject, size)
+        files, target = self.files[subject.name], target_size(subject.scene, size)
         renders = {
             Entrant(name, count, DEFAULT_CUTOFF): decoders.open_decoder(name, files, target, count)
             for count in THREADS
-            for name in decoders.decoders_of(subject.scene)
+            for name in decoders.decoders_of(subject.scene, size)
         }
         rows = _raced("speed", subject.name, size, renders, self.rounds)
         alone = {entrant: render for entrant, render in renders.items() if entrant.threads == 1}
@@ -167,11 +172,6 @@ class _Race:
             }
         rows = _raced("error", subject.name, "native", renders, self.rounds)
         return rows + _errors("error", subject.name, "native", renders, truth(subject.scene, subject.scene.size))
-
-
-def _target(subject: Subject, size: str) -> tuple[int, int]:
-    height, width = subject.scene.size
-    return FACTORS[size] * height, FACTORS[size] * width
 
 
 def _raced(section: str, scene: str, size: str, renders: dict[Entrant, Render], rounds: int) -> list[Row]:
