@@ -16,6 +16,7 @@ from kcgs import GaussianField, RegionSplatRenderer
 from kcgs.bench import _decoders, run
 from kcgs.bench._decoders import (
     CPU,
+    CPU_DIRECT,
     DECODERS,
     GENERIC,
     SCENE,
@@ -31,6 +32,7 @@ from kcgs.bench._decoders import (
     truth,
     why_not_fitted,
     write_files,
+    zoo_subjects,
 )
 from kcgs.bench._render_runs import renderer
 from kcgs.bench.core.clocks import median_ratio, peak_bytes
@@ -87,6 +89,16 @@ def test_opacities_are_rendered(tmp_path: Path) -> None:
     files, exact = write_files(tmp_path / "files", scene, 1e-4), truth(scene, (32, 48))
     for name in DECODERS:
         assert (open_and_render(name, files, (32, 48)) - exact).abs().max() < 1e-3
+
+
+def test_scenes_of_the_zoo_at_every_size() -> None:
+    found = zoo_subjects()
+    assert len(found) == 6 and all(subject.is_fitted for subject in found)
+    assert [subject.contours for subject in found] == ["soft", "hard"] * 3
+    assert [subject.is_typical for subject in found] == [True, False] * 3
+    soft, hard = found[0].scene, found[1].scene
+    assert decoders_of(soft) == [SCENE, CPU, CPU_DIRECT, TILED] and decoders_of(hard) == list(DECODERS)
+    assert decoders_of(hard, "3840 wide") == [SCENE, CPU, CPU_DIRECT]
 
 
 def test_race_takes_turns() -> None:
@@ -153,7 +165,7 @@ def test_quick_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         if row["quantity"] == "max error" and row["section"] == "speed":
             assert 0 < float(row["value"]) < 1e-3
     worst = {(r["scene"], r["decoder"], r["cutoff"]): float(r["value"]) for r in rows if r["quantity"] == "max error"}
-    for name in (SCENE, CPU, TILED):
+    for name in (SCENE, CPU, CPU_DIRECT, TILED):
         errors = [worst["small hard", name, cutoff] for cutoff in ("0.01", "0.00392157", "0.001", "0.0001", "1e-06")]
         assert errors == sorted(errors, reverse=True) and errors[-1] < 1e-4
     report = (tmp_path / "report.md").read_text()
