@@ -191,6 +191,8 @@ class _Splat(torch.autograd.Function):
             found = operator(grad, *ctx.saved_tensors, *ctx.others, means or cholesky)
         finally:
             plans.kept = None
+        if not torch._C._autograd._get_current_graph_task_keep_graph():
+            ctx.kept = None  # as torch frees what is saved: a loss that is kept holds no plan
         return found[0] if means else None, found[1] if cholesky else None, found[2] if colors else None, *[None] * 8
 
 

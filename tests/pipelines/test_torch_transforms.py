@@ -383,6 +383,9 @@ class TestOperator:
         for _ in range(2):
             got = torch.autograd.grad(image.square().sum(), tensors, retain_graph=True)
             assert all(torch.equal(a, b) for a, b in zip(got, want, strict=True))
+        assert image.grad_fn.kept is not None
+        image.sum().backward()
+        assert image.grad_fn.kept is None  # a loss that is kept for its value does not hold megabytes
 
 
 class TestFunctional:
