@@ -6,8 +6,6 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -22,7 +20,7 @@ from kcgs.kernels import prepare, threads_for_kernels
 from .checkpoint import Checkpoint
 from .config import FitConfig
 from .descent import descend, log, log_is_due, render
-from .search import OnStep, fewest
+from .search import OnStep, Search
 from .start import start
 from .state import FitResult, FitState, HistoryEntry, StopReason
 from .strategies import Finish, MergeRegions, make_strategies
@@ -86,10 +84,11 @@ def fit(
     """
     config = FitConfig.from_recipe(recipe, **settings)
     if progress:
-        with _shown(config, on_step) as on_step:
+        # a search for a target has no known length
+        with Progress("fit", known=config.target_psnr is None) as bar:
             return fit(
-                image, regions, num_gaussians, recipe=config, seed=seed, on_step=on_step, checkpoint=checkpoint,
-                resume=resume,
+                image, regions, num_gaussians, recipe=config, seed=seed, on_step=_shown(bar, config, on_step),
+                checkpoint=checkpoint, resume=resume,
             )  # fmt: skip
     image, regions = check_problem(image, regions)
     num_gaussians = check_num_gaussians(num_gaussians, image)
@@ -101,7 +100,7 @@ def fit(
     prepare(config.backend, image.device, image.dtype, len(image))  # no fit's clock counts what compiles or loads once
     with threads_for_kernels(image[0].numel()):
         if config.target_psnr is not None:
-            return fewest(image, regions, num_gaussians, config, seed, _run, on_step)
+            return Search(image, regions, num_gaussians, config, seed, _run, on_step).search()
         state = start(image, regions, num_gaussians, config, seed, time.perf_counter())
         keeper = None if checkpoint is None else Checkpoint(checkpoint, state, regions)
         if not (keeper is not None and resume and keeper.read_into(state)) and config.merge_regions:
@@ -135,20 +134,18 @@ def _run(state: FitState, on_step: OnStep | None = None, keeper: Checkpoint | No
     return "iterations"
 
 
-@contextmanager
-def _shown(config: FitConfig, on_step: OnStep | None) -> Iterator[OnStep]:
-    """Yield a callback that shows how far a fit is, and calls `on_step`; a search for a target has no known length."""
+def _shown(bar: Progress, config: FitConfig, on_step: OnStep | None) -> OnStep:
+    """Return a callback that shows how far a fit is, and calls `on_step`."""
     start = time.perf_counter()
-    with Progress("fit", known=config.target_psnr is None) as shown:
 
-        def step(iteration: int, entry: HistoryEntry) -> bool | None:
-            share = iteration / config.iterations
-            if config.max_seconds is not None:
-                share = max(share, (time.perf_counter() - start) / config.max_seconds)
-            shown.update(share, f"iteration {iteration}, {entry.num_gaussians} Gaussians, {entry.psnr:.2f} dB")
-            return None if on_step is None else on_step(iteration, entry)
+    def step(iteration: int, entry: HistoryEntry) -> bool | None:
+        share = iteration / config.iterations
+        if config.max_seconds is not None:
+            share = max(share, (time.perf_counter() - start) / config.max_seconds)
+        bar.update(share, f"iteration {iteration}, {entry.num_gaussians} Gaussians, {entry.psnr:.2f} dB")
+        return None if on_step is None else on_step(iteration, entry)
 
-        yield step
+    return step
 
 
 def check_num_gaussians(value: object, image: Tensor) -> int:

@@ -6,6 +6,7 @@ Gaussians it is taken up again with some more, or without the faintest.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -15,7 +16,6 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap, psnr
-from kcgs.nn import GaussianField
 
 from .config import FitConfig
 from .start import make_optimizer, start
@@ -47,7 +47,13 @@ class _Probe:
 
 
 @dataclass
-class _Search:
+class Search:
+    """The fewest Gaussians, at most `most`, with which a finished fit reaches `target_psnr`.
+
+    `run` takes a fit from its state to its end. Where the most do not reach it, the result is theirs; where the clock
+    ends the search first, that of the best fit so far.
+    """
+
     image: Tensor
     regions: RegionMap | None
     most: int
@@ -55,12 +61,13 @@ class _Search:
     seed: int
     run: Callable[[FitState, OnStep | None], StopReason]
     on_step: OnStep | None
-    started: float
+    started: float = dataclasses.field(default_factory=time.perf_counter)
     iterations: int = 0
     """Of all fits so far."""
 
     @property
     def target(self) -> float:
+        """The PSNR in dB."""
         assert self.config.target_psnr is not None
         return self.config.target_psnr
 
@@ -83,21 +90,18 @@ class _Search:
     def fit_again(self, count: int, earlier: _Probe) -> _Probe:
         """Take up a fit with some more Gaussians, or without the faintest."""
         settings, scene = self.settings(self.left()), earlier.result.scene
-        field = scene.field
-        cholesky, colors = field.cholesky.detach(), field.colors.detach()
+        cholesky, colors = scene.field.cholesky.detach(), scene.field.colors.detach()
         energy = colors.square().sum(-1) * cholesky[:, 0] * cholesky[:, 2]
-        kept = energy.argsort(descending=True, stable=True)[:count].sort().values
-        ids = None if field.region_ids is None else field.region_ids[kept]
-        field = GaussianField(field.means.detach()[kept], cholesky[kept], colors[kept], ids, size=field.size)
+        field = scene.field.subset(energy.argsort(descending=True, stable=True)[:count].sort().values)
         state = replace(
             earlier.state, config=settings, num_gaussians=count, started=time.perf_counter(),
-            cutoff=max(settings.cutoff, settings.draft_cutoff), regions=scene.regions, region_ids=ids,
+            cutoff=max(settings.cutoff, settings.draft_cutoff), regions=scene.regions, region_ids=field.region_ids,
             iteration=round(_AGAIN * settings.iterations), first=count, wanted=count, late_moves=0, moving_seconds=0.0,
             merged=True, history=[], best=None, best_psnr=-math.inf,
         )  # fmt: skip
         state.optimizer = make_optimizer(settings, field, sigma=1.0)
         with torch.no_grad():
-            Densify(state).add(state, count - len(kept))
+            Densify(state).add(state, count - len(field))
         return self.finish(count, state)
 
     def finish(self, count: int, state: FitState) -> _Probe:
@@ -138,6 +142,7 @@ class _Search:
                 return count, slope, probe
 
     def within(self, count: float) -> int:
+        """Return a number of Gaussians that there may be."""
         return max(1, min(self.most, round(count)))
 
     def is_over(self, probe: _Probe) -> bool:
@@ -195,23 +200,6 @@ class _Search:
         if len(probes) > 3:  # on a curve that bends, the secant stays at one end
             between = math.sqrt(between * math.sqrt(low.count * high.count))
         return min(max(round(between), low.count + 1), high.count - 1)
-
-
-def fewest(
-    image: Tensor,
-    regions: RegionMap | None,
-    most: int,
-    config: FitConfig,
-    seed: int,
-    run: Callable[[FitState, OnStep | None], StopReason],
-    on_step: OnStep | None,
-) -> FitResult:
-    """Find the fewest Gaussians, at most `most`, with which a finished fit reaches `target_psnr`.
-
-    `run` takes a fit from its state to its end. Where the most do not reach it, the result is theirs; where the clock
-    ends the search first, that of the best fit so far.
-    """
-    return _Search(image, regions, most, config, seed, run, on_step, time.perf_counter()).search()
 
 
 def _slope(first: tuple[int, float], second: tuple[int, float]) -> float:
