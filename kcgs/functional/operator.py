@@ -13,6 +13,7 @@ from torch import Tensor
 from torch._functorch.utils import enable_single_level_autograd_function
 from torch.autograd import forward_ad
 
+from kcgs._check import check_labels
 from kcgs.kernels import OutOfRangeError, SplatInputs, Steps, resolve, with_autograd
 
 from .arguments import Arguments, KeptPlan, plans
@@ -127,6 +128,7 @@ def _prepare(given: Arguments, checked: bool = False) -> tuple[SplatInputs, Step
 def _tables(labels: Tensor, widths: Tensor | None, supersample: int, size: tuple[int, int]) -> MapTables:
     found = find_tables(labels, widths, supersample, size)
     if found is None:
+        check_labels("regions", labels)
         regions = RegionMap.from_labels(labels, softness_of(widths), supersample=supersample).resize(size)
         found = regions.tables
         keep_tables(labels, widths, supersample, size, found)
