@@ -115,7 +115,7 @@ def as_map(regions: object) -> RegionMap | Tensor:
     """Return a RegionMap, or labels, int64, whose values the operator checks; refuse anything else."""
     if isinstance(regions, RegionMap):
         return regions
-    if isinstance(regions, (Tensor, np.ndarray))  # graphs of torch 2.7 know no other form:
+    if isinstance(regions, (Tensor, np.ndarray)):  # graphs of torch 2.7 know no other form
         return check_labels("regions", regions, values=False)
     raise TypeError(f"regions must be a RegionMap, a label map or None; got {type(regions).__name__}")
 
