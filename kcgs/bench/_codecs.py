@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from bisect import bisect_right
-from functools import lru_cache
+from functools import lru_cache, partial
 from io import BytesIO
 from typing import Any, NamedTuple
 
@@ -69,7 +69,13 @@ def open_file(data: bytes) -> Tensor:
 
 def largest(codec: str, image: Tensor, most: int, *, quick: bool = False) -> Coded:
     """Make the largest file of at most `most` bytes, or the smallest; of the variants' the one with the higher PSNR."""
-    found = [_largest(CODECS[codec], variant, image, most, quick) for variant in CODECS[codec].variants]
+    pixels = (image * 255).round().byte().permute(1, 2, 0).contiguous().numpy().tobytes()
+    size, qualities, found = (image.shape[2], image.shape[1]), CODECS[codec].qualities, []
+    for variant in range(len(CODECS[codec].variants)):
+        encode = partial(_encode, codec, variant, quick, pixels, size)
+        # the last that fits, the first where none does
+        place = bisect_right(range(1, len(qualities)), most, key=lambda place: len(encode(qualities[place]).data))
+        found.append(encode(qualities[place]))
     small = [coded for coded in found if len(coded.data) <= most]
     if not small:
         return min(found, key=lambda coded: len(coded.data))
@@ -86,30 +92,15 @@ def lossless_bytes(labels: Tensor) -> int:
     return file.getbuffer().nbytes
 
 
-def _largest(codec: Codec, variant: dict[str, Any], image: Tensor, most: int, quick: bool) -> Coded:
-    pixels = (image * 255).round().byte().permute(1, 2, 0).contiguous().numpy()
-    settings = {**codec.settings, **variant}
-    if quick and "speed" in settings:
-        settings["speed"] = 6
-    hashable = tuple((k, tuple(v.items()) if isinstance(v, dict) else v) for k, v in settings.items())
-
-    def encode(place: int) -> Coded:
-        return _encode(codec.format, pixels.tobytes(), pixels.shape[:2], codec.qualities[place], hashable)
-
-    # the last that fits, the first where none does
-    return encode(bisect_right(range(1, len(codec.qualities)), most, key=lambda place: len(encode(place).data)))
-
-
 # a slow codec's files at several targets are often the same
 @lru_cache(maxsize=256)
-def _encode(
-    kind: str, pixels: bytes, size: tuple[int, ...], quality: int, options: tuple[tuple[str, Any], ...]
-) -> Coded:
-    image = Image.frombytes("RGB", (size[1], size[0]), pixels)
-    named = {k: dict(v) if k == "advanced" else v for k, v in options}
-    file = BytesIO()
+def _encode(codec: str, variant: int, quick: bool, pixels: bytes, size: tuple[int, int], quality: int) -> Coded:
+    kind, chosen = CODECS[codec], CODECS[codec].variants[variant]
+    settings = {**kind.settings, **chosen}
+    if quick and "speed" in settings:
+        settings["speed"] = 6
+    image, file = Image.frombytes("RGB", size, pixels), BytesIO()
     start = time.perf_counter()
-    image.save(file, kind, quality=quality, **named)
+    image.save(file, kind.format, quality=quality, **settings)
     seconds = time.perf_counter() - start
-    setting = " ".join([f"quality {quality}", *(str(v) for k, v in options if k == "subsampling")])
-    return Coded(file.getvalue(), setting, seconds)
+    return Coded(file.getvalue(), " ".join([f"quality {quality}", *chosen.values()]), seconds)

@@ -10,15 +10,12 @@ import torch
 from torch import Tensor
 
 from kcgs.data import Davis, chart_2x3, chart_pie, load_image
-from kcgs.functional import RegionMap
 from kcgs.segment import segment
 
 CHARTS = ("2x3", "pie")
 # stand in where there is no data
 QUICK = ("astronaut", "disc")
 PHOTOS = ("astronaut", "chelsea", "coffee", "rocket")
-# a pixel of the pie is the mean of 8 x 8 samples: with so many labels per pixel its contours are exact
-COVERAGE_LABELS = 8
 
 
 class Sample(NamedTuple):
@@ -67,11 +64,6 @@ def load(name: str, data: Path | None, stride: int = 1) -> Sample:
         image = image[:, ::stride, ::stride].contiguous()
         labels = None if labels is None else labels[::stride, ::stride].contiguous()
     return Sample(image, labels)
-
-
-def coverage_map() -> RegionMap:
-    """Return the pie's contours as its own edges were sampled."""
-    return RegionMap.from_labels(chart_pie(COVERAGE_LABELS).labels, supersample=COVERAGE_LABELS)
 
 
 def photo(name: str) -> Tensor:

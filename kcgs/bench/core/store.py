@@ -120,8 +120,8 @@ class Store:
         parallel = 1 if place.is_local else place.workers or os.cpu_count() or 1
         failed: list[str] = []
         for first in range(0, len(missing), parallel):
-            part = missing[first : first + parallel]
-            if time.monotonic() + max(map(self._expected, part)) <= deadline:
+            part, known = missing[first : first + parallel], self._known()
+            if time.monotonic() + max(known.get(case.settings(), 0.0) for case in part) <= deadline:
                 failed += make_all(self.make, part, place)
         return failed
 
@@ -148,12 +148,8 @@ class Store:
         key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:20]
         return self.folder / f"{case.image}-{case.n}-{key}.json"
 
-    def _expected(self, case: Case) -> float:
-        """Return the seconds that the slowest fit took with these settings and N."""
-        return self._known().get(case.settings(), 0.0)
-
     def _known(self) -> dict[str, float]:
-        """Read how long fits took: a file beside them, so that one goes on with what an earlier call learned."""
+        """Read what the slowest fit of each N and settings took: a file beside them, for the next call."""
         path = self.folder / "seconds.json"
         known: dict[str, float] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
         return known

@@ -84,8 +84,8 @@ def losses(rows: Sequence[Row], contests: Sequence[Contest], only: Sequence[int]
     for contest, kind, n, compared in _compared(rows, contests, only, tuple(QUANTITIES)):
         for quantity, found in compared.items():
             if found is not None and found.losses:
-                below = [image for image in found.worst if found.values[image] < 0][: found.losses]
-                which = ", ".join(f"{image} {difference(found.values[image], quantity)}" for image in below)
+                lost = found.worst[: found.losses]
+                which = ", ".join(f"{image} {difference(found.values[image], quantity)}" for image in lost)
                 where = f"{kind}, N = {n:,}, {QUANTITIES[quantity]}"
                 lines.append(f"- {contest}, {where}: {found.losses} of {len(found.values)}: {which}")
     return "\n".join(lines) or "Nowhere."

@@ -45,7 +45,7 @@ class TestStore:
         assert store.obtain(cases, HERE, time.monotonic() + 60) == [] and len(store.rows(cases)) == 1
         assert store.obtain([*cases, *cases], HERE, time.monotonic() + 200) == [] and len(store.rows(cases)) == 2
         assert store.kept(cases[0]) == made
-        assert store._expected(cases[0]._replace(image="other")) > 0
+        assert store._known()[cases[0]._replace(image="other").settings()] > 0
         store._path(cases[0]).with_suffix(".safetensors").unlink()
         assert store.row(cases[0]) is None  # a row without its scene cannot be shown
 
