@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap
+from kcgs.kernels.octaves import direct
 from kcgs.nn import GaussianField
 from kcgs.onnx import generic_decoder, scene_decoder, write_model
 from kcgs.scene import Scene, load
@@ -27,10 +28,11 @@ from .core.options import Options
 from .core.store import Store
 
 SCENE, GENERIC, CPU, TILED = "onnxruntime, scene", "onnxruntime, generic", "torch, cpu", "torch, tiled"
-CPU_DIRECT = f"torch, {DIRECT}"
-DECODERS = (SCENE, GENERIC, CPU, CPU_DIRECT, TILED)
+# without coarse grids
+SCENE_DIRECT, CPU_DIRECT = f"{SCENE}, direct", f"torch, {DIRECT}"
+DECODERS = (SCENE, SCENE_DIRECT, GENERIC, CPU, CPU_DIRECT, TILED)
 # the others take seconds for a wide image
-FAST = (SCENE, CPU, CPU_DIRECT)
+FAST = (SCENE, SCENE_DIRECT, CPU, CPU_DIRECT)
 CONTOURS = ("none", "hard", "soft")
 SOFTNESS = 0.7
 SEQUENCE = "blackswan"
@@ -83,6 +85,7 @@ class Files(NamedTuple):
 
     scene: Path
     decoder: Path
+    direct: Path
     generic: Path
     cutoff: float
 
@@ -136,11 +139,14 @@ def why_not_fitted(options: Options) -> str | None:
 def write_files(folder: Path, scene: Scene, cutoff: float) -> Files:
     """Write a scene and its decoders into a folder, which is made."""
     folder.mkdir(parents=True)
-    paths = folder / "scene.safetensors", folder / "scene.onnx", folder / "generic.onnx"
-    scene.save(paths[0])
-    write_model(scene_decoder(scene, cutoff=cutoff, clamp=False), paths[1])
-    write_model(generic_decoder(cutoff=cutoff, clamp=False), paths[2])
-    return Files(*paths, cutoff)
+    paths = folder / "scene.safetensors", folder / "scene.onnx", folder / "direct.onnx", folder / "generic.onnx"
+    files = Files(*paths, cutoff)
+    scene.save(files.scene)
+    write_model(scene_decoder(scene, cutoff=cutoff, clamp=False), files.decoder)
+    with direct():
+        write_model(scene_decoder(scene, cutoff=cutoff, clamp=False), files.direct)
+    write_model(generic_decoder(cutoff=cutoff, clamp=False), files.generic)
+    return files
 
 
 def decoders_of(scene: Scene, size: str = "native") -> list[str]:
@@ -153,8 +159,8 @@ def decoders_of(scene: Scene, size: str = "native") -> list[str]:
 
 def open_decoder(name: str, files: Files, size: tuple[int, int], threads: int) -> Render:
     """Read the files and return what renders (C, H, W) at that size; torch has its own setting of threads."""
-    if name == SCENE:
-        return _session(files.decoder, {"size": np.array(size, np.int64)}, threads)
+    if name in (SCENE, SCENE_DIRECT):
+        return _session(files.decoder if name == SCENE else files.direct, {"size": np.array(size, np.int64)}, threads)
     placed = resized(load(files.scene), size)
     if name == GENERIC:
         return _session(files.generic, _generic_feeds(placed), threads)

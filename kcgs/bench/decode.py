@@ -19,7 +19,20 @@ from kcgs.plots import COLORS, figure, save_figure
 from kcgs.scene import Scene
 
 from . import _decoders as decoders
-from ._decoders import CPU, CPU_DIRECT, DECODERS, GENERIC, SCENE, TILED, Entrant, Files, Render, Subject, truth
+from ._decoders import (
+    CPU,
+    CPU_DIRECT,
+    DECODERS,
+    GENERIC,
+    SCENE,
+    SCENE_DIRECT,
+    TILED,
+    Entrant,
+    Files,
+    Render,
+    Subject,
+    truth,
+)
 from ._workloads import SIZES, target_size, workload
 from .core.clocks import median_ratio, peak_bytes, threads
 from .core.figures import MARKERS, add_legend
@@ -33,13 +46,13 @@ from .core.rows import read_rows, write_rows
 CUTOFFS = (1e-2, 1 / 255, 1e-3, 1e-4, 1e-6)
 DEFAULT_CUTOFF = 1e-4
 THREADS = (1, 2)
-SWEPT = (SCENE, CPU, CPU_DIRECT, TILED)
+SWEPT = (SCENE, SCENE_DIRECT, CPU, CPU_DIRECT, TILED)
 
 _SPEED_TEXT = """Milliseconds for one image, medians; all decoders of a scene are timed in turns in one process, on
 one thread and on two, at the default cutoff of 1e-4. `to cpu` is the median of the ratios to torch's `cpu` kernel on
 as many threads in the same round. torch's kernels and the generic decoder are given the Gaussians scaled and the
 label map sampled for the size that is rendered, once for all images; the scene decoder does both in every image.
-`cpu, direct` is the `cpu` kernel without its coarse grids. At 3840 wide only the fast ones run. Errors are against the
+`direct` is without coarse grids. At 3840 wide only the fast ones run. Errors are against the
 `tiled` kernel in float64 without coarse grids at a cutoff of 1e-12, colours in [0, 1]; values of the workloads' images
 go up to about 5, since they are sums of 12 Gaussians."""
 _SWEEP_TEXT = "One thread, the scene's own size; all timed in turns. Left and below is better."
@@ -144,7 +157,7 @@ class _Race:
             row(section="files", size="native", decoder=name, quantity="size", value=path.stat().st_size, unit="bytes")
             for name, path in {SCENE: files.decoder, GENERIC: files.generic, CPU: files.scene}.items()
         ]
-        entrants = [name for name in decoders.decoders_of(subject.scene) if name != CPU_DIRECT]
+        entrants = [name for name in decoders.decoders_of(subject.scene) if name not in (SCENE_DIRECT, CPU_DIRECT)]
         for name, size in product(entrants, SIZES[:2]):
             seconds = decoders.load_seconds(name, files, target_size(subject.scene, size), 1 if self.quick else 3)
             rows.append(row(section="load", size=size, decoder=name, quantity="load", value=1e3 * seconds, unit="ms"))

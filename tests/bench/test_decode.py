@@ -20,6 +20,7 @@ from kcgs.bench._decoders import (
     DECODERS,
     GENERIC,
     SCENE,
+    SCENE_DIRECT,
     TILED,
     Entrant,
     Subject,
@@ -97,8 +98,8 @@ def test_scenes_of_the_zoo_at_every_size() -> None:
     assert [subject.contours for subject in found] == ["soft", "hard"] * 3
     assert [subject.is_typical for subject in found] == [True, False] * 3
     soft, hard = found[0].scene, found[1].scene
-    assert decoders_of(soft) == [SCENE, CPU, CPU_DIRECT, TILED] and decoders_of(hard) == list(DECODERS)
-    assert decoders_of(hard, "3840 wide") == [SCENE, CPU, CPU_DIRECT]
+    assert decoders_of(soft) == [SCENE, SCENE_DIRECT, CPU, CPU_DIRECT, TILED] and decoders_of(hard) == list(DECODERS)
+    assert decoders_of(hard, "3840 wide") == [SCENE, SCENE_DIRECT, CPU, CPU_DIRECT]
 
 
 def test_race_takes_turns() -> None:
@@ -165,7 +166,7 @@ def test_quick_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         if row["quantity"] == "max error" and row["section"] == "speed":
             assert 0 < float(row["value"]) < 1e-3
     worst = {(r["scene"], r["decoder"], r["cutoff"]): float(r["value"]) for r in rows if r["quantity"] == "max error"}
-    for name in (SCENE, CPU, CPU_DIRECT, TILED):
+    for name in (SCENE, SCENE_DIRECT, CPU, CPU_DIRECT, TILED):
         errors = [worst["small hard", name, cutoff] for cutoff in ("0.01", "0.00392157", "0.001", "0.0001", "1e-06")]
         assert errors == sorted(errors, reverse=True) and errors[-1] < 1e-4
     report = (tmp_path / "report.md").read_text()
