@@ -43,7 +43,12 @@ class Blocks(NamedTuple):
     keys: Tensor  # [K] int64, sorted: tile * num_regions + region
     parents: Tensor  # [K, 4] int64 into keys: above left, above right, below left, below right; K: none
     odd: Tensor  # [K] uint8: 1 in an odd column of tiles, 2 in an odd row, 3 both
-    first: int  # block of level 1 or above; those before are tiles of pixels
+    starts: tuple[int, ...]  # first block of each level, and the end
+
+    @property
+    def first(self) -> int:
+        """First block of level 1 or above; those before are tiles of pixels."""
+        return self.starts[1]
 
 
 def most_spacing(cutoff: float) -> float:
@@ -74,35 +79,38 @@ def _blocks_without_map(size: tuple[int, int], device: torch.device) -> Blocks:
     return _make_blocks(torch.arange(tiles, device=device), 1, (1, *size))
 
 
+def grids_of(size: tuple[int, int], maps: int) -> tuple[Grid, ...]:
+    """Return the grids of images of a size, the pixels first."""
+    height, width = size
+    grids = [Grid(height, width, -(-height // SIDE), -(-width // SIDE), 0)]
+    while max(height, width) > _SMALLEST:
+        last = grids[-1]
+        # the last pixel, at n - 1/2, needs two nodes after it; node n - 2 the one at its place, and one more
+        pixels = len(grids) == 1
+        height, width = ((n - 1) // 2 + 4 if pixels else (n - 2) // 2 + 3 for n in (height, width))
+        first_tile = last.first_tile + maps * last.rows * last.cols
+        grids.append(Grid(height, width, -(-height // SIDE), -(-width // SIDE), first_tile))
+    return tuple(grids)
+
+
 def _make_blocks(keys: Tensor, num_regions: int, shape: tuple[int, ...]) -> Blocks:
-    maps, height, width = shape
-    grid = Grid(height, width, -(-height // SIDE), -(-width // SIDE), 0)
-    grids, levels, parents, odd = [], [], [], []
-    while True:
-        grids.append(grid)
-        levels.append(keys)
+    maps, *size = shape
+    grids = grids_of((size[0], size[1]), maps)
+    levels, parents, odd, starts = [keys], [], [], [0, len(keys)]
+    for grid, coarser in zip(grids, (*grids[1:], None), strict=True):
         row, col = _places(keys, num_regions, grid)[1:3]
         odd.append(2 * (row % 2) + col % 2)
-        if max(grid.height, grid.width) <= _SMALLEST:
+        if coarser is None:
             break
-        coarse = _coarser(grid, maps)
-        wanted = _parent_keys(keys, num_regions, grid, coarse)
+        wanted = _parent_keys(keys, num_regions, grid, coarser)
         keys = wanted[wanted >= 0].unique()
-        place = torch.searchsorted(keys, wanted)
-        parents.append(torch.where(wanted < 0, -1, place + sum(map(len, levels))))
-        grid = coarse
-    total = sum(map(len, levels))
+        parents.append(torch.where(wanted < 0, -1, torch.searchsorted(keys, wanted) + starts[-1]))
+        levels.append(keys)
+        starts.append(starts[-1] + len(keys))
     parents.append(keys.new_full((len(keys), 4), -1))
     table = torch.cat(parents)
-    table[table < 0] = total
-    return Blocks(tuple(grids), torch.cat(levels), table, torch.cat(odd).to(torch.uint8), len(levels[0]))
-
-
-def _coarser(grid: Grid, maps: int) -> Grid:
-    # the last pixel, at n - 1/2, needs two nodes after it; node n - 2 the one at its place, and one more
-    pixels = grid.first_tile == 0
-    height, width = ((n - 1) // 2 + 4 if pixels else (n - 2) // 2 + 3 for n in (grid.height, grid.width))
-    return Grid(height, width, -(-height // SIDE), -(-width // SIDE), grid.first_tile + maps * grid.rows * grid.cols)
+    table[table < 0] = starts[-1]
+    return Blocks(grids, torch.cat(levels), table, torch.cat(odd).to(torch.uint8), tuple(starts))
 
 
 def _places(keys: Tensor, num_regions: int, grid: Grid) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -121,3 +129,51 @@ def _parent_keys(keys: Tensor, num_regions: int, fine: Grid, coarse: Grid) -> Te
         parent = coarse.first_tile + (one * coarse.rows + y) * coarse.cols + x
         found.append(torch.where(needed, parent * num_regions + region, -1))
     return torch.stack(found, -1)
+
+
+class Coarsened(NamedTuple):
+    """Gaussians of levels 1 and above as their levels have them, in float64, in nodes."""
+
+    level: Tensor  # [N] int64
+    means: Tensor  # [N, 2]
+    cholesky: Tensor  # [N, 3]
+    factor: Tensor  # [N] of the colours
+
+
+def choose_levels(cholesky: Tensor, spacing: float, levels: int) -> Tensor:
+    """Return the coarsest of so many levels whose nodes are close enough for each Gaussian, given in float64.
+
+    That is where (h / s1)^4 + (h / s2)^4 <= spacing^4, of the standard deviations along the axes of the ellipse.
+    """
+    l11, l21, l22 = cholesky.unbind(-1)
+    # of the variances along the axes: their sum, and their product
+    total, product = l11 * l11 + l21 * l21 + l22 * l22, l11 * l22 * l11 * l22
+    most = spacing**4 * product * product / (total * total - 2 * product)
+    bounds = torch.tensor([16.0**n for n in range(1, levels)], dtype=most.dtype, device=most.device)
+    return torch.searchsorted(bounds, most, right=True)
+
+
+def coarsen(level: Tensor, means: Tensor, cholesky: Tensor) -> Coarsened:
+    """Move float64 Gaussians to their levels, none of which is 0."""
+    h = (1 << level).double()[:, None]
+    l11, l21, l22 = cholesky.unbind(-1)
+    variance = h[:, 0] ** 2 / 3
+    rest = l11 * l11 - variance
+    c11 = rest.sqrt()
+    c22 = (l22 * l22 - variance * (1 + l21 * l21 / rest)).sqrt()
+    factors = torch.stack([c11, l11 * l21 / c11, c22], -1) / h
+    return Coarsened(level, means / h + 1.5, factors, l11 * l22 / (c11 * c22))
+
+
+def uncoarsen(
+    given: Tensor, coarse: Coarsened, means: Tensor, cholesky: Tensor, factor: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Turn gradients of what `coarsen` returned into those of the means and factors it was `given`, in float64."""
+    h = (1 << coarse.level).double()[:, None]
+    l11, l21, l22 = given.unbind(-1)
+    (c11, _, c22), (g11, g21, g22) = (coarse.cholesky * h).unbind(-1), (cholesky / h).unbind(-1)
+    scaled, lost = factor * coarse.factor, h[:, 0] ** 2 / 3 * l21 / (c11 * c11)
+    last = (g22 - scaled / c22) / c22
+    first = (g11 - scaled / c11) * l11 - g21 * lost + last * lost * l21 * l11 / c11
+    rows = [scaled / l11 + first / c11, g21 * l11 / c11 - last * lost, scaled / l22 + last * l22]
+    return means / h, torch.stack(rows, -1)

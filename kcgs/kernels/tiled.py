@@ -12,9 +12,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .bins import Bins, bin_gaussians, colors_of, to_gradients
 from .inputs import Gradients, SplatInputs, Steps
-from .tiles import TILE, Pairs, bin_gaussians, coefficients, expand_runs, grid_of, split_into_tiles, sum_runs
-from .whitened import least_exponent, sums_to_gradients
+from .nodes import gather, sample
+from .tiles import TILE, expand_runs, grid_of, join_tiles, split_into_tiles, sum_runs
+from .whitened import least_exponent
 
 _CHUNK_ELEMENTS = 1 << 18
 _LONGEST_LIST = 1024
@@ -30,10 +32,10 @@ class _Batch(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    pairs: Pairs
+    bins: Bins
     batches: list[_Batch]
     segment_tile: Tensor  # [S] int64, ascending
-    coefficients: Tensor  # [P + 1, 5]: z1 = k0 + k1 x, z2 = k2 + k3 x + k4 y in tile-centred pixels
+    coefficients: Tensor  # [P + 1, 5]
     masks: Tensor | None  # [K, 256], in the dtype of the inputs
 
 
@@ -43,26 +45,26 @@ def steps(inputs: SplatInputs) -> Steps:
 
 
 def _make_plan(inputs: SplatInputs) -> _Plan:
-    pairs = bin_gaussians(inputs)
+    bins = bin_gaussians(inputs)
     masks = None
-    if pairs.mask is not None and inputs.membership is not None:
+    if bins.mask is not None and inputs.membership is not None:
         masks = inputs.membership.tiles(TILE).masks.to(inputs.means.dtype)
 
     # segments: a tile's list cut into pieces of at most _LONGEST_LIST
-    order = torch.argsort(pairs.tile, stable=True)
-    tiles, lengths = torch.unique_consecutive(pairs.tile[order], return_counts=True)
+    order = torch.argsort(bins.tile, stable=True)
+    tiles, lengths = torch.unique_consecutive(bins.tile[order], return_counts=True)
     owner, piece = expand_runs(-(-lengths // _LONGEST_LIST))
     start = (lengths.cumsum(0) - lengths)[owner] + piece * _LONGEST_LIST
     length = (lengths[owner] - piece * _LONGEST_LIST).clamp_max(_LONGEST_LIST)
     mixed = torch.zeros_like(length, dtype=torch.bool)
-    if pairs.mask is not None:
-        mixed = pairs.mask[order][start] >= 0
+    if bins.mask is not None:
+        mixed = bins.mask[order][start] >= 0
     batches = [
         batch
         for kind in (False, True)
         for batch in _batches((mixed == kind).nonzero().flatten(), start, length, order, kind)
     ]
-    return _Plan(pairs, batches, tiles[owner], _padded(coefficients(pairs, inputs)), masks)
+    return _Plan(bins, batches, tiles[owner], _padded(bins.coefficients), masks)
 
 
 def _batches(chosen: Tensor, start: Tensor, length: Tensor, order: Tensor, mixed: bool) -> Iterator[_Batch]:
@@ -100,14 +102,14 @@ def _weights(plan: _Plan, batch: _Batch, bases: tuple[Tensor, Tensor], cutoff: f
     if cutoff > 0.0:
         weight.mul_(weight >= cutoff)
     if batch.mixed:
-        assert plan.masks is not None and plan.pairs.mask is not None
-        mask = torch.cat([plan.pairs.mask, plan.pairs.mask.new_zeros(1)])[batch.entries]
+        assert plan.masks is not None and plan.bins.mask is not None
+        mask = torch.cat([plan.bins.mask, plan.bins.mask.new_zeros(1)])[batch.entries]
         weight.mul_(plan.masks[mask])
     return z1, z2, weight
 
 
 def _padded_colors(plan: _Plan, inputs: SplatInputs) -> Tensor:
-    return _padded(inputs.colors.detach().flatten(0, 1)[plan.pairs.gaussian])  # [P + 1, C]
+    return _padded(colors_of(plan.bins, inputs)[plan.bins.gaussian])  # [P + 1, C]
 
 
 def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
@@ -117,22 +119,25 @@ def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
     for batch in plan.batches:
         _, _, weight = _weights(plan, batch, bases, inputs.cutoff)
         values[batch.segments] = colors[batch.entries].transpose(1, 2) @ weight
-    tiles, counts = torch.unique_consecutive(plan.segment_tile, return_counts=True)
-    if len(tiles) < len(values):
+    touched, counts = torch.unique_consecutive(plan.segment_tile, return_counts=True)
+    if len(touched) < len(values):
         values = sum_runs(values.flatten(1), counts).unflatten(1, (channels, _PIXELS))
-    grid = grid_of(inputs)
-    image = colors.new_zeros(grid.total, channels, _PIXELS)
-    image[tiles] = values
-    height, width = inputs.size
-    image = image.view(grid.batch, grid.rows, grid.cols, channels, TILE, TILE).permute(0, 3, 1, 4, 2, 5)
-    return image.reshape(grid.batch, channels, grid.rows * TILE, grid.cols * TILE)[..., :height, :width].contiguous()
+    tiles = colors.new_zeros(plan.bins.total, channels, _PIXELS)
+    tiles[touched] = values
+    tiles, grid = tiles.unflatten(2, (TILE, TILE)), grid_of(inputs)
+    if plan.bins.wide is not None:
+        at, values = sample(tiles[grid.total :], plan.bins.wide.nodes, plan.masks)
+        tiles[at] += values
+    return join_tiles(tiles[: grid.total].unflatten(0, grid), inputs.size)
 
 
 def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
-    grad = split_into_tiles(grad).flatten(0, 2).flatten(2)  # [tiles, C, 256]
+    grad = split_into_tiles(grad).flatten(0, 2)  # [tiles, C, 16, 16]
+    if plan.bins.wide is not None:
+        grad = torch.cat([grad, gather(grad, plan.bins.wide.nodes, plan.masks)])
+    grad = grad.flatten(2)
     colors, bases = _padded_colors(plan, inputs), _bases(inputs.means)
-    channels = colors.shape[-1]
-    sums = colors.new_zeros(len(colors), (5 if geometry else 0) + channels)
+    sums = colors.new_zeros(len(colors), (5 if geometry else 0) + colors.shape[-1])
     for batch in plan.batches:
         z1, z2, weight = _weights(plan, batch, bases, inputs.cutoff)
         local = grad[plan.segment_tile[batch.segments]]
@@ -140,9 +145,8 @@ def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: boo
         if geometry:
             parts.append(_moments(z1, z2, weight.mul_(colors[batch.entries] @ local)))
         sums[batch.entries] = torch.cat(parts, -1)
-    counts = torch.bincount(plan.pairs.gaussian, minlength=inputs.means.shape[0] * inputs.means.shape[1])
-    total = sum_runs(sums[:-1], counts).unflatten(0, inputs.means.shape[:2])
-    return sums_to_gradients(total, channels, inputs.cholesky)
+    counts = torch.bincount(plan.bins.gaussian, minlength=inputs.means.shape[0] * inputs.means.shape[1])
+    return to_gradients(plan.bins, inputs, sum_runs(sums[:-1], counts))
 
 
 def _moments(z1: Tensor, z2: Tensor, value: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .inputs import SplatInputs
-from .whitened import Z_LIMIT, support_radius
+from .whitened import Z_LIMIT
 
 TILE = 16
 
@@ -26,54 +26,25 @@ class TileGrid(NamedTuple):
         return self.batch * self.rows * self.cols
 
 
-class Pairs(NamedTuple):
-    """One entry for every (Gaussian, tile) that may give a weight, ordered by Gaussian."""
-
-    gaussian: Tensor  # [P] int64, b * N + i
-    tile: Tensor  # [P] int64
-    mask: Tensor | None  # [P] int64 row of TileMembership.masks, -1: weight 1; None where no map is used
-    origin: Tensor  # [P, 2] float64, tile's centre minus the Gaussian's mean
-
-
 def grid_of(inputs: SplatInputs) -> TileGrid:
     """Tiles that cover the batch."""
     height, width = inputs.size
     return TileGrid(inputs.means.shape[0], -(-height // TILE), -(-width // TILE))
 
 
-def bin_gaussians(inputs: SplatInputs) -> Pairs:
-    """List the tiles that each Gaussian's support touches and that hold its region."""
-    grid = grid_of(inputs)
-    means, cholesky = (t.detach().double().flatten(0, 1) for t in inputs[:2])
-    radius = support_radius(inputs.cutoff, inputs.means.dtype)
-    gaussian, place, origin = bounding_tiles(means, cholesky, radius, inputs.size)
-
-    keep = _reaches(origin, cholesky[gaussian], radius)
-    image = gaussian // inputs.means.shape[1]
-    tile = (image * grid.rows + place[:, 1]) * grid.cols + place[:, 0]
-    mask = None
-    if inputs.membership is not None and inputs.region_index is not None:
-        shared = inputs.membership.index.shape[0] == 1
-        local = tile - image * grid.rows * grid.cols if shared else tile
-        region = inputs.region_index.flatten()[gaussian]
-        table = inputs.membership.tiles(TILE)
-        position, present = find_keys(table.keys, local, region, inputs.membership.num_regions)
-        keep &= present
-        mask = table.mask[position[keep]]
-    return Pairs(gaussian[keep], tile[keep], mask, origin[keep])
-
-
 def bounding_tiles(
-    means: Tensor, cholesky: Tensor, radius: float, size: tuple[int, int], *, between: bool = False
+    means: Tensor, cholesky: Tensor, radius: float, size: tuple[int, int] | Tensor, *, between: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
     """List the tiles that the bounding box of each float64 Gaussian's support, of so many deviations, touches.
+
+    The size is that of the image, or of the grid of each Gaussian, (N, 2).
 
     With `between`, to touch is to hold any point of a tile; else the centre of one of its pixels in the image. Returns,
     ordered by Gaussian: it (P,), the tile's column and row (P, 2), and the tile's centre minus the mean (P, 2).
     """
     l11, l21, l22 = cholesky.unbind(-1)
     extent = torch.stack([l11, torch.hypot(l21, l22)], -1) * radius * (1 + 1e-5) + 1e-3
-    last = torch.tensor([size[1] - 1, size[0] - 1], device=means.device, dtype=means.dtype)
+    last = torch.as_tensor(size, device=means.device, dtype=means.dtype).flip(-1) - 1
     if between:
         last = (last / TILE).floor() * TILE + (TILE - 1)
         low, high = (means - extent).floor(), (means + extent).floor()
@@ -88,7 +59,8 @@ def bounding_tiles(
     return gaussian, place, place * float(TILE) + TILE / 2 - means[gaussian]
 
 
-def _reaches(origin: Tensor, cholesky: Tensor, radius: float) -> Tensor:
+def reaches(origin: Tensor, cholesky: Tensor, radius: float) -> Tensor:
+    """Say which tiles that a bounding box touches the support may touch too."""
     # the bounding box bounds z1; a slanted needle is thin in z2, whose least value over the tile is this
     l11, l21, l22 = cholesky.unbind(-1)
     slope = l21 / l11
@@ -104,13 +76,13 @@ def find_keys(keys: Tensor, tile: Tensor, region: Tensor, num_regions: int) -> t
     return position, keys[position] == key
 
 
-def coefficients(pairs: Pairs, inputs: SplatInputs) -> Tensor:
-    """Coefficients of z in tile-centred pixels, [P, 5]: z1 = k0 + k1 x, z2 = k2 + k3 x + k4 y; made in float64."""
-    l11, l21, l22 = inputs.cholesky.detach().double().flatten(0, 1)[pairs.gaussian].unbind(-1)
-    x, y = pairs.origin.unbind(-1)
+def coefficients(origin: Tensor, cholesky: Tensor) -> Tensor:
+    """Coefficients of z in tile-centred pixels, [P, 5], in float64: z1 = k0 + k1 x, z2 = k2 + k3 x + k4 y."""
+    l11, l21, l22 = cholesky.unbind(-1)
+    x, y = origin.unbind(-1)
     slope = l21 / l11
     rows = torch.stack([x / l11, 1 / l11, (y - slope * x) / l22, -slope / l22, 1 / l22], -1)
-    return rows.clamp(-Z_LIMIT, Z_LIMIT).to(inputs.means.dtype)
+    return rows.clamp(-Z_LIMIT, Z_LIMIT)
 
 
 def split_into_tiles(image: Tensor) -> Tensor:
@@ -119,6 +91,13 @@ def split_into_tiles(image: Tensor) -> Tensor:
     padded = torch.nn.functional.pad(image, (0, -width % TILE, 0, -height % TILE))
     batch, channels, *sides = padded.shape
     return padded.reshape(batch, channels, sides[0] // TILE, TILE, sides[1] // TILE, TILE).permute(0, 2, 4, 1, 3, 5)
+
+
+def join_tiles(tiles: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return the image of (B, rows, cols, C, TILE, TILE): the inverse of `split_into_tiles`."""
+    batch, rows, cols, channels = tiles.shape[:4]
+    image = tiles.permute(0, 3, 1, 4, 2, 5).reshape(batch, channels, rows * TILE, cols * TILE)
+    return image[..., : size[0], : size[1]].contiguous()
 
 
 def expand_runs(counts: Tensor) -> tuple[Tensor, Tensor]:

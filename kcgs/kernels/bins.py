@@ -1,0 +1,115 @@
+"""What the tiled kernels evaluate, as one list: Gaussians in tiles of pixels, and wide ones in blocks of nodes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .inputs import Gradients, SplatInputs
+from .nodes import Nodes, find_nodes
+from .octaves import Coarsened, Grid, blocks_of, choose_levels, coarsen, grids_of, most_spacing, uncoarsen
+from .tiles import TILE, bounding_tiles, coefficients, find_keys, grid_of, reaches
+from .whitened import sums_to_gradients, support_radius
+
+
+class Wide(NamedTuple):
+    """The Gaussians on coarse grids."""
+
+    which: Tensor  # [M] int64, b * N + i
+    gaussians: Coarsened
+    nodes: Nodes
+
+
+class Bins(NamedTuple):
+    """One entry for every (Gaussian, tile) that may give a weight, ordered by Gaussian.
+
+    Tiles are those of pixels, then the live blocks of nodes, and, if there are any, one that stays empty.
+    """
+
+    gaussian: Tensor  # [P] int64, b * N + i
+    tile: Tensor  # [P] int64
+    mask: Tensor | None  # [P] int64 row of TileMembership.masks, -1: weight 1; None where no map is used
+    coefficients: Tensor  # [P, 5], in the dtype of the inputs: see tiles.coefficients
+    cholesky: Tensor  # [B * N, 3] float64, as the Gaussians are evaluated
+    total: int  # number of tiles
+    wide: Wide | None  # None: all is evaluated at the pixels
+
+
+def bin_gaussians(inputs: SplatInputs) -> Bins:
+    """List the tiles and blocks that each Gaussian's support touches and that hold its region."""
+    means, cholesky = (t.detach().double().flatten(0, 1) for t in inputs[:2])
+    grids = grids_of(inputs.size, 1 if inputs.membership is None else len(inputs.membership.index))
+    level = choose_levels(cholesky, most_spacing(inputs.cutoff), len(grids))
+    which = level.nonzero().flatten()
+    if not len(which):
+        return _list_pairs(inputs, means, cholesky, grids[0])[0]
+    coarse = coarsen(level[which], means[which], cholesky[which])
+    means, cholesky = means.index_copy(0, which, coarse.means), cholesky.index_copy(0, which, coarse.cholesky)
+    grid = Grid(*torch.tensor(grids, device=means.device)[level].unbind(-1))  # type: ignore[arg-type]
+    bins, block = _list_pairs(inputs, means, cholesky, grid)
+
+    blocks = blocks_of(inputs.membership, inputs.size, means.device)
+    pairs = (block >= blocks.first).nonzero().flatten()
+    place = block[pairs] - blocks.first
+    copies = 1
+    if inputs.membership is None or len(inputs.membership.index) == 1:
+        copies = len(inputs.means)
+        place += bins.gaussian[pairs] // inputs.means.shape[1] * (len(blocks.keys) - blocks.first + 1)
+    nodes = find_nodes(blocks, inputs.membership, place, copies)
+    bins.tile[pairs] = nodes.number.view(-1)[place] + bins.total
+    return bins._replace(total=bins.total + nodes.count + 1, wide=Wide(which, coarse, nodes))
+
+
+def _list_pairs(inputs: SplatInputs, means: Tensor, cholesky: Tensor, grid: Grid) -> tuple[Bins, Tensor]:
+    """List pairs as if all tiles were of pixels; return their positions among the blocks of the map too.
+
+    The grid is that of all Gaussians, or, where its numbers are tensors, (B * N,), of each.
+    """
+    radius, of_pixels = support_radius(inputs.cutoff, inputs.means.dtype), grid_of(inputs)
+    wide = isinstance(grid.height, Tensor)
+    size = torch.stack(grid[:2], -1) if wide else grid[:2]
+    gaussian, place, origin = bounding_tiles(means, cholesky, radius, size)
+    keep, image = reaches(origin, cholesky[gaussian], radius), gaussian // inputs.means.shape[1]
+    tile = (image * of_pixels.rows + place[:, 1]) * of_pixels.cols + place[:, 0]
+
+    maps = 1 if inputs.membership is None else len(inputs.membership.index)
+    rows, cols, first = (t[gaussian] for t in grid[2:]) if wide else grid[2:]
+    block, mask = first + (image % maps * rows + place[:, 1]) * cols + place[:, 0], None
+    if inputs.membership is not None and inputs.region_index is not None:
+        table, region = inputs.membership.tiles(TILE), inputs.region_index.flatten()[gaussian]
+        keys = blocks_of(inputs.membership, inputs.size, means.device).keys if wide else table.keys
+        block, present = find_keys(keys, block, region, inputs.membership.num_regions)
+        keep &= present
+        # blocks of nodes come after those of pixels, and have no masks
+        mask = torch.cat([table.mask, table.mask.new_full((1,), -1)])[block[keep].clamp_max(len(table.mask))]
+    frame = coefficients(origin[keep], cholesky[gaussian[keep]]).to(inputs.means.dtype)
+    return Bins(gaussian[keep], tile[keep], mask, frame, cholesky, of_pixels.total, None), block[keep]
+
+
+def colors_of(bins: Bins, inputs: SplatInputs) -> Tensor:
+    """Return the colours with which the Gaussians are evaluated, (B * N, C)."""
+    colors = inputs.colors.detach().flatten(0, 1)
+    if bins.wide is None:
+        return colors
+    factor = bins.wide.gaussians.factor[:, None]
+    return colors.index_copy(0, bins.wide.which, (colors[bins.wide.which] * factor).to(colors.dtype))
+
+
+def to_gradients(bins: Bins, inputs: SplatInputs, sums: Tensor) -> Gradients:
+    """Turn sums over pixels and nodes, (B * N, C) or (B * N, C + 5), into gradients: see `sums_to_gradients`."""
+    shape, channels = inputs.means.shape[:2], inputs.colors.shape[-1]
+    if bins.wide is None:
+        return sums_to_gradients(sums.unflatten(0, shape), channels, inputs.cholesky)
+    means, cholesky, colors = sums_to_gradients(sums, channels, bins.cholesky)
+    which, coarse, _ = bins.wide
+    scaled = colors.index_copy(0, which, (colors[which] * coarse.factor[:, None]).to(colors.dtype)).unflatten(0, shape)
+    if means is None or cholesky is None:
+        return None, None, scaled
+    factor = (colors[which].double() * inputs.colors.detach().flatten(0, 1)[which]).sum(-1)
+    given = inputs.cholesky.detach().double().flatten(0, 1)[which]
+    rows = uncoarsen(given, coarse, means[which], cholesky[which], factor)
+    found = (t.index_copy(0, which, new) for t, new in zip((means, cholesky), rows, strict=True))
+    means, cholesky = (t.to(inputs.means.dtype).unflatten(0, shape) for t in found)
+    return means, cholesky, scaled

@@ -1,0 +1,157 @@
+"""Blocks of nodes in torch: refined from level to level, brought to the pixels, and back; any device.
+
+A block of 16 x 16 is made from a window of 11 x 11 nodes of the coarser grid: M W M^T, one M for all. The window lies in
+one block, or in two or four neighbours, where the block is in an odd row or column of tiles.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .membership import Membership
+from .octaves import SIDE, Blocks
+from .tiles import sum_runs
+
+_HALF = SIDE // 2
+_WINDOW = _HALF + 3
+# of a window along an axis, in even and in odd tiles: which of the two blocks, nodes of it, places in the window
+_PARTS = (
+    ((0, slice(0, _WINDOW), slice(0, _WINDOW)),),
+    ((0, slice(_HALF, SIDE), slice(0, _HALF)), (1, slice(0, _WINDOW - _HALF), slice(_HALF, _WINDOW))),
+)
+# blocks made at once
+_CHUNK = 2048
+
+
+class Step(NamedTuple):
+    """Blocks of one level, all alike in `odd`: no two of them have the same parent in the same place."""
+
+    blocks: Tensor  # [k] int64
+    parents: Tensor  # [k, 4] int64, live blocks of the next level; their number: zeros
+    odd: int  # as in Blocks
+    masks: Tensor | None  # [k] int64, rows of masks, where the region is not alone in the tile
+
+
+class Nodes(NamedTuple):
+    """The live blocks of nodes, those that are not all zero, and what is made from them."""
+
+    number: Tensor  # [copies, blocks of nodes + 1] int64, of each live block; of others how many are live
+    count: int
+    refinements: list[Step]  # live blocks, coarsest first
+    samples: list[Step]  # positions in `tiles`
+    tiles: Tensor  # [S] int64, ascending: of pixels, once for every region with live parents
+
+
+def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, copies: int) -> Nodes:
+    """Find what is live where Gaussians touch blocks, given as positions in Nodes.number, flat.
+
+    Images that share a map have a copy of its blocks each.
+    """
+    first, starts = blocks.first, blocks.starts
+    parents = blocks.parents - first
+    live = torch.zeros(copies, starts[-1] - first + 1, dtype=torch.bool, device=touched.device)
+    live.view(-1)[touched] = True
+    for low, high in reversed(list(zip(starts[1:], starts[2:], strict=False))):
+        live[:, low - first : high - first] |= live[:, parents[low:high]].any(-1)
+    count = int(live.sum())
+    number = torch.where(live, live.flatten().cumsum(0).view(live.shape) - 1, count)
+
+    copy, block = live[:, parents].any(-1).nonzero(as_tuple=True)
+    pixels = block < first
+    place = torch.where(pixels, pixels.cumsum(0) - 1, number[copy, (block - first).clamp_min(0)])
+    rows, regions = torch.full_like(block, -1), 1
+    if membership is not None:
+        rows[pixels], regions = membership.tiles(SIDE).mask[block[pixels]], membership.num_regions
+    levels = len(blocks.grids)
+    level = torch.searchsorted(torch.tensor(starts[1:-1], device=block.device), block, right=True)
+    group = 8 * (levels - 1 - level) + 4 * (rows >= 0) + blocks.odd[block]
+    order = torch.argsort(group, stable=True)
+    refinements: list[Step] = []
+    samples: list[Step] = []
+    for n, chosen in enumerate(order.split(torch.bincount(group, minlength=8 * levels).tolist())):
+        for part in chosen.split(_CHUNK) if len(chosen) else ():
+            step = Step(
+                place[part],
+                number[copy[part, None], parents[block[part]]],
+                n % 4,
+                rows[part] if n % 8 >= 4 else None,
+            )
+            (refinements if n // 8 < levels - 1 else samples).append(step)
+    tiles = (copy * blocks.grids[1].first_tile + blocks.keys[block] // regions)[pixels]
+    return Nodes(number, count, refinements, samples, tiles)
+
+
+def sample(nodes: Tensor, plan: Nodes, masks: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Refine live blocks in place, (count + 1, C, 16, 16), the last of zeros, and evaluate the splines at the pixels.
+
+    Return tiles, ascending, and their values, times the region weights.
+    """
+    refinement, sampling = _refinement(nodes.dtype, nodes.device), _sampling(nodes.dtype, nodes.device)
+    for step in plan.refinements:
+        nodes[step.blocks] += _spread(nodes, step, refinement)
+    values = nodes.new_empty(len(plan.tiles), *nodes.shape[1:])
+    for step in plan.samples:
+        values[step.blocks] = _weigh(_spread(nodes, step, sampling), step, masks)
+    tiles, counts = torch.unique_consecutive(plan.tiles, return_counts=True)
+    if len(tiles) < len(values):
+        values = sum_runs(values.flatten(1), counts).view(-1, *nodes.shape[1:])
+    return tiles, values
+
+
+def gather(grad: Tensor, plan: Nodes, masks: Tensor | None) -> Tensor:
+    """Turn gradients of tiles, (tiles, C, 16, 16), into those of nodes: the transpose of `sample`."""
+    refinement, sampling = _refinement(grad.dtype, grad.device), _sampling(grad.dtype, grad.device)
+    nodes = grad.new_zeros(plan.count + 1, *grad.shape[1:])
+    for step in plan.samples:
+        _collect(nodes, step, sampling, _weigh(grad[plan.tiles[step.blocks]], step, masks))
+    for step in reversed(plan.refinements):
+        _collect(nodes, step, refinement, nodes[step.blocks])
+    return nodes
+
+
+def _weigh(values: Tensor, step: Step, masks: Tensor | None) -> Tensor:
+    if step.masks is None:
+        return values
+    assert masks is not None
+    return values.mul_(masks[step.masks].view(-1, 1, SIDE, SIDE))
+
+
+def _spread(nodes: Tensor, step: Step, matrix: Tensor) -> Tensor:
+    rows = []
+    for down, y, _ in _PARTS[step.odd // 2]:
+        row = [nodes[step.parents[:, 2 * down + right], :, y, x] for right, x, _ in _PARTS[step.odd % 2]]
+        rows.append(torch.cat(row, -1))
+    return matrix @ torch.cat(rows, -2) @ matrix.T
+
+
+def _collect(nodes: Tensor, step: Step, matrix: Tensor, grad: Tensor) -> None:
+    window = matrix.T @ grad @ matrix
+    for down, y, top in _PARTS[step.odd // 2]:
+        for right, x, left in _PARTS[step.odd % 2]:
+            nodes[step.parents[:, 2 * down + right], :, y, x] += window[..., top, left]
+
+
+@functools.lru_cache(maxsize=4)
+def _refinement(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Two-scale relation of cubic B-splines, from a window, (16, 11)."""
+    weights = {k: math.comb(4, k) / 8 for k in range(5)}
+    rows = [[weights.get(p - 2 * n + 3, 0.0) for n in range(_WINDOW)] for p in range(SIDE)]
+    return torch.tensor(rows, dtype=dtype, device=device)
+
+
+@functools.lru_cache(maxsize=4)
+def _sampling(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Cubic B-splines at the centres of pixels, from a window, (16, 11)."""
+    rows = [[_spline(abs(p / 2 + 1.25 - n)) for n in range(_WINDOW)] for p in range(SIDE)]
+    return torch.tensor(rows, dtype=dtype, device=device)
+
+
+def _spline(distance: float) -> float:
+    if distance < 1:
+        return 2 / 3 - distance**2 + distance**3 / 2
+    return max(2 - distance, 0.0) ** 3 / 6
