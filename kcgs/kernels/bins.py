@@ -47,8 +47,7 @@ def bin_gaussians(inputs: SplatInputs) -> Bins:
         return _list_pairs(inputs, means, cholesky, grids[0])[0]
     coarse = coarsen(level[which], means[which], cholesky[which])
     means, cholesky = means.index_copy(0, which, coarse.means), cholesky.index_copy(0, which, coarse.cholesky)
-    grid = Grid(*torch.tensor(grids, device=means.device)[level].unbind(-1))  # type: ignore[arg-type]
-    bins, block = _list_pairs(inputs, means, cholesky, grid)
+    bins, block = _list_pairs(inputs, means, cholesky, torch.tensor(grids, device=means.device)[level])
 
     blocks = blocks_of(inputs.membership, inputs.size, means.device)
     pairs = (block >= blocks.first).nonzero().flatten()
@@ -59,27 +58,28 @@ def bin_gaussians(inputs: SplatInputs) -> Bins:
         place += bins.gaussian[pairs] // inputs.means.shape[1] * (len(blocks.keys) - blocks.first + 1)
     nodes = find_nodes(blocks, inputs.membership, place, copies)
     bins.tile[pairs] = nodes.number.view(-1)[place] + bins.total
-    return bins._replace(total=bins.total + nodes.count + 1, wide=Wide(which, coarse, nodes))
+    return bins._replace(total=bins.total + nodes.live + 1, wide=Wide(which, coarse, nodes))
 
 
-def _list_pairs(inputs: SplatInputs, means: Tensor, cholesky: Tensor, grid: Grid) -> tuple[Bins, Tensor]:
+def _list_pairs(inputs: SplatInputs, means: Tensor, cholesky: Tensor, grid: Grid | Tensor) -> tuple[Bins, Tensor]:
     """List pairs as if all tiles were of pixels; return their positions among the blocks of the map too.
 
-    The grid is that of all Gaussians, or, where its numbers are tensors, (B * N,), of each.
+    The grid is that of all Gaussians, or of each, (B * N, 5) with columns as in Grid.
     """
     radius, of_pixels = support_radius(inputs.cutoff, inputs.means.dtype), grid_of(inputs)
-    wide = isinstance(grid.height, Tensor)
-    size = torch.stack(grid[:2], -1) if wide else grid[:2]
+    size = grid[:2] if isinstance(grid, Grid) else grid[:, :2]
     gaussian, place, origin = bounding_tiles(means, cholesky, radius, size)
     keep, image = reaches(origin, cholesky[gaussian], radius), gaussian // inputs.means.shape[1]
     tile = (image * of_pixels.rows + place[:, 1]) * of_pixels.cols + place[:, 0]
 
     maps = 1 if inputs.membership is None else len(inputs.membership.index)
-    rows, cols, first = (t[gaussian] for t in grid[2:]) if wide else grid[2:]
+    rows, cols, first = grid[2:] if isinstance(grid, Grid) else grid[gaussian, 2:].unbind(-1)
     block, mask = first + (image % maps * rows + place[:, 1]) * cols + place[:, 0], None
     if inputs.membership is not None and inputs.region_index is not None:
         table, region = inputs.membership.tiles(TILE), inputs.region_index.flatten()[gaussian]
-        keys = blocks_of(inputs.membership, inputs.size, means.device).keys if wide else table.keys
+        keys = table.keys
+        if not isinstance(grid, Grid):
+            keys = blocks_of(inputs.membership, inputs.size, means.device).keys
         block, present = find_keys(keys, block, region, inputs.membership.num_regions)
         keep &= present
         # blocks of nodes come after those of pixels, and have no masks

@@ -1,4 +1,4 @@
-"""The splat in Triton, in float32: a program renders a tile of 16 x 16 pixels, or differentiates a piece of its list.
+"""The splat in Triton, in float32: a program renders a tile of pixels or nodes, or differentiates a piece of its list.
 
 Forward, a thread owns pixels and walks the tile's Gaussians; backward, it owns a Gaussian and walks the tile's pixels.
 Every sum has one owner: no atomics, and the same bits every time.
@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .bins import Bins, bin_gaussians, colors_of, to_gradients
 from .inputs import Gradients, SplatInputs, Steps
-from .tiles import TILE, Pairs, bin_gaussians, coefficients, expand_runs, grid_of, split_into_tiles, sum_runs
-from .whitened import sums_to_gradients
+from .nodes import gather, sample
+from .tiles import TILE, expand_runs, grid_of, join_tiles, split_into_tiles, sum_runs
 
 try:
     import triton
@@ -34,10 +35,8 @@ _OPTIONS = {"enable_fp_fusion": True}
 class _Plan(NamedTuple):
     """Pairs in the order of their tiles, and where the list of each tile starts."""
 
+    bins: Bins
     start: Tensor  # [tiles + 1] int64
-    coefficients: Tensor  # [P, 5]: z1 = k0 + k1 x, z2 = k2 + k3 x + k4 y in tile-centred pixels
-    gaussian: Tensor  # [P] int64, b * N + i
-    mask: Tensor | None  # [P] int64 row of masks, -1: weight 1
     masks: Tensor | None  # [K, 256] float32
     order: Tensor  # [P] int64, the pair's place in the order of the Gaussians
     counts: Tensor  # [B * N] int64, pairs of each Gaussian
@@ -61,15 +60,15 @@ def _interpreted() -> bool:
 
 
 def _make_plan(inputs: SplatInputs) -> _Plan:
-    pairs = bin_gaussians(inputs)
-    order = torch.argsort(pairs.tile, stable=True)
-    counts = _starts(pairs.gaussian, inputs.means.shape[0] * inputs.means.shape[1]).diff()
+    bins = bin_gaussians(inputs)
+    order = torch.argsort(bins.tile, stable=True)
+    counts = _starts(bins.gaussian, inputs.means.shape[0] * inputs.means.shape[1]).diff()
     mask, masks = None, None
-    if pairs.mask is not None and inputs.membership is not None:
-        mask, masks = pairs.mask[order], inputs.membership.derived("cuda", lambda m: m.tiles(TILE).masks.float())
-    pairs = Pairs(pairs.gaussian[order], pairs.tile[order], mask, pairs.origin[order])
-    start = _starts(pairs.tile, grid_of(inputs).total)
-    return _Plan(start, coefficients(pairs, inputs), pairs.gaussian, pairs.mask, masks, order, counts)
+    if bins.mask is not None and inputs.membership is not None:
+        mask, masks = bins.mask[order], inputs.membership.derived("cuda", lambda m: m.tiles(TILE).masks.float())
+    gaussian, tile, frame = bins.gaussian[order], bins.tile[order], bins.coefficients[order]
+    bins = bins._replace(gaussian=gaussian, tile=tile, mask=mask, coefficients=frame)
+    return _Plan(bins, _starts(tile, bins.total), masks, order, counts)
 
 
 def _starts(values: Tensor, total: int) -> Tensor:
@@ -78,27 +77,34 @@ def _starts(values: Tensor, total: int) -> Tensor:
 
 
 def _lists(plan: _Plan, inputs: SplatInputs) -> tuple[Any, ...]:
+    bins = plan.bins
     # where there are no maps, any address will do: it is not read
-    mask = plan.gaussian if plan.mask is None else plan.mask
-    masks = plan.coefficients if plan.masks is None else plan.masks
-    return plan.start, plan.coefficients, plan.gaussian, mask, masks, inputs.cutoff
+    mask = bins.gaussian if bins.mask is None else bins.mask
+    masks = bins.coefficients if plan.masks is None else plan.masks
+    return plan.start, bins.coefficients, bins.gaussian, mask, masks, inputs.cutoff
 
 
 def _constants(plan: _Plan, inputs: SplatInputs) -> dict[str, Any]:
     channels = inputs.colors.shape[-1]
     block = min(_MOST_CHANNELS, 1 << (channels - 1).bit_length())
-    return {"SIDE": TILE, "CHANNELS": channels, "BLOCK": block, "MAPPED": plan.mask is not None}
+    return {"SIDE": TILE, "CHANNELS": channels, "BLOCK": block, "MAPPED": plan.bins.mask is not None}
 
 
 def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
-    grid, channels = grid_of(inputs), inputs.colors.shape[-1]
+    grid, channels, bins = grid_of(inputs), inputs.colors.shape[-1], plan.bins
     image = inputs.colors.new_empty(grid.batch, channels, *inputs.size)
-    colors = inputs.colors.detach().flatten(0, 1).contiguous()
-    arguments = image, colors, grid.rows, grid.cols, *inputs.size
+    nodes = image.new_empty(bins.total - grid.total, channels, TILE, TILE)
+    colors = colors_of(bins, inputs).contiguous()
+    arguments = image, nodes, colors, grid.total, grid.rows, grid.cols, *inputs.size
     constants = _constants(plan, inputs)
-    programs = grid.total, -(-channels // constants["BLOCK"])
+    programs = bins.total, -(-channels // constants["BLOCK"])
     with torch.cuda.device_of(image):
         _render_tile[programs](*arguments, *_lists(plan, inputs), **constants, num_warps=_RENDER_WARPS, **_OPTIONS)
+    if bins.wide is not None:
+        tiles, values = sample(nodes, bins.wide.nodes, plan.masks)
+        spread = image.new_zeros(grid.total, channels, TILE, TILE)
+        spread[tiles] = values
+        image += join_tiles(spread.unflatten(0, grid), inputs.size)
     return image
 
 
@@ -111,15 +117,17 @@ def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: boo
     # pieces of the tiles' lists: their tiles and first pairs
     tile, piece = expand_runs((plan.start.diff() + _PIECE - 1) // _PIECE)
     first = plan.start[tile] + piece * _PIECE
-    by_tile = split_into_tiles(grad).permute(0, 1, 2, 4, 5, 3).reshape(-1, TILE * TILE, channels).contiguous()
+    by_tile = split_into_tiles(grad).flatten(0, 2)
+    if plan.bins.wide is not None:
+        by_tile = torch.cat([by_tile, gather(by_tile, plan.bins.wide.nodes, plan.masks)])
+    by_tile = by_tile.permute(0, 2, 3, 1).contiguous()
     # channels first, so that the compiler gives whole Gaussians to threads
-    colors = inputs.colors.detach().flatten(0, 1).T.contiguous()
+    colors = colors_of(plan.bins, inputs).T.contiguous()
     arguments = terms, plan.order, tile, first, by_tile, colors, colors.shape[1]
     constants = {**_constants(plan, inputs), "GEOMETRY": geometry, "PIECE": _PIECE}
     with torch.cuda.device_of(terms):
         _gather_piece[(len(tile),)](*arguments, *_lists(plan, inputs), **constants, num_warps=1, **_OPTIONS)
-    total = sum_runs(terms, plan.counts).unflatten(0, inputs.means.shape[:2])
-    return sums_to_gradients(total, channels, inputs.cholesky)
+    return to_gradients(plan.bins, inputs, sum_runs(terms, plan.counts))
 
 
 def _jit(function: Any) -> Any:
@@ -136,7 +144,7 @@ def _weigh(k0, k1, k2, k3, k4, x, y, cutoff):  # type: ignore[no-untyped-def]
 
 @_jit
 def _render_tile(  # type: ignore[no-untyped-def]
-    image, colors, rows, cols, height, width, start, coefficients, gaussian, mask_of, masks, cutoff,
+    image, nodes, colors, pixel_tiles, rows, cols, height, width, start, coefficients, gaussian, mask_of, masks, cutoff,
     SIDE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr, MAPPED: tl.constexpr,
 ):  # fmt: skip
     tile = tl.program_id(0).to(tl.int64)
@@ -155,12 +163,15 @@ def _render_tile(  # type: ignore[no-untyped-def]
         color = tl.load(colors + tl.load(gaussian + i) * CHANNELS + channel, mask=channel < CHANNELS, other=0.0)
         value += color * weight[None, :]
 
-    batch, local = tile // (rows * cols), tile % (rows * cols)
-    row += local // cols * SIDE
-    column += local % cols * SIDE
-    at = ((batch * CHANNELS + channel) * height + row[None, :]) * width + column[None, :]
-    inside = (row < height) & (column < width)
-    tl.store(image + at, value, mask=(channel < CHANNELS) & inside[None, :])
+    if tile < pixel_tiles:
+        batch, local = tile // (rows * cols), tile % (rows * cols)
+        down, across = row + local // cols * SIDE, column + local % cols * SIDE
+        at = ((batch * CHANNELS + channel) * height + down[None, :]) * width + across[None, :]
+        inside = (down < height) & (across < width)
+        tl.store(image + at, value, mask=(channel < CHANNELS) & inside[None, :])
+    else:
+        at = ((tile - pixel_tiles) * CHANNELS + channel) * (SIDE * SIDE) + pixel[None, :]
+        tl.store(nodes + at, value, mask=channel < CHANNELS)
 
 
 @_jit

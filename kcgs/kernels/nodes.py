@@ -1,13 +1,14 @@
 """Blocks of nodes in torch: refined from level to level, brought to the pixels, and back; any device.
 
-A block of 16 x 16 is made from a window of 11 x 11 nodes of the coarser grid: M W M^T, one M for all. The window lies in
-one block, or in two or four neighbours, where the block is in an odd row or column of tiles.
+A block of 16 x 16 is made from a window W of 11 x 11 nodes of the coarser grid: M W M^T, one M for all. The window lies
+in one block, or in two or four neighbours, where the block is in an odd row or column of tiles.
 """
 
 from __future__ import annotations
 
 import functools
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -40,8 +41,8 @@ class Step(NamedTuple):
 class Nodes(NamedTuple):
     """The live blocks of nodes, those that are not all zero, and what is made from them."""
 
-    number: Tensor  # [copies, blocks of nodes + 1] int64, of each live block; of others how many are live
-    count: int
+    number: Tensor  # [copies, blocks of nodes + 1] int64, of each live block; of others `live`
+    live: int
     refinements: list[Step]  # live blocks, coarsest first
     samples: list[Step]  # positions in `tiles`
     tiles: Tensor  # [S] int64, ascending: of pixels, once for every region with live parents
@@ -56,7 +57,7 @@ def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, c
     parents = blocks.parents - first
     live = torch.zeros(copies, starts[-1] - first + 1, dtype=torch.bool, device=touched.device)
     live.view(-1)[touched] = True
-    for low, high in reversed(list(zip(starts[1:], starts[2:], strict=False))):
+    for low, high in reversed(list(pairwise(starts[1:]))):
         live[:, low - first : high - first] |= live[:, parents[low:high]].any(-1)
     count = int(live.sum())
     number = torch.where(live, live.flatten().cumsum(0).view(live.shape) - 1, count)
@@ -87,7 +88,7 @@ def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, c
 
 
 def sample(nodes: Tensor, plan: Nodes, masks: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Refine live blocks in place, (count + 1, C, 16, 16), the last of zeros, and evaluate the splines at the pixels.
+    """Refine live blocks in place, (live + 1, C, 16, 16), the last of zeros, and evaluate the splines at the pixels.
 
     Return tiles, ascending, and their values, times the region weights.
     """
@@ -106,7 +107,7 @@ def sample(nodes: Tensor, plan: Nodes, masks: Tensor | None) -> tuple[Tensor, Te
 def gather(grad: Tensor, plan: Nodes, masks: Tensor | None) -> Tensor:
     """Turn gradients of tiles, (tiles, C, 16, 16), into those of nodes: the transpose of `sample`."""
     refinement, sampling = _refinement(grad.dtype, grad.device), _sampling(grad.dtype, grad.device)
-    nodes = grad.new_zeros(plan.count + 1, *grad.shape[1:])
+    nodes = grad.new_zeros(plan.live + 1, *grad.shape[1:])
     for step in plan.samples:
         _collect(nodes, step, sampling, _weigh(grad[plan.tiles[step.blocks]], step, masks))
     for step in reversed(plan.refinements):

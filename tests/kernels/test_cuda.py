@@ -38,8 +38,8 @@ def test_agrees_with_the_reference() -> None:
 
 TYPES = {
     **dict.fromkeys(("start", "gaussian", "mask_of", "order", "tiles", "firsts"), "*i64"),
-    **dict.fromkeys(("image", "colors", "coefficients", "masks", "terms", "grad"), "*fp32"),
-    **dict.fromkeys(("rows", "cols", "height", "width", "count"), "i32"),
+    **dict.fromkeys(("image", "nodes", "colors", "coefficients", "masks", "terms", "grad"), "*fp32"),
+    **dict.fromkeys(("pixel_tiles", "rows", "cols", "height", "width", "count"), "i32"),
     "cutoff": "fp32",
 }
 
