@@ -101,10 +101,9 @@ def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
     with torch.cuda.device_of(image):
         _render_tile[programs](*arguments, *_lists(plan, inputs), **constants, num_warps=_RENDER_WARPS, **_OPTIONS)
     if bins.wide is not None:
-        tiles, values = sample(nodes, bins.wide.nodes, plan.masks)
-        spread = image.new_zeros(grid.total, channels, TILE, TILE)
-        spread[tiles] = values
-        image += join_tiles(spread.unflatten(0, grid), inputs.size)
+        tiles = image.new_zeros(grid.total, channels, TILE, TILE)
+        sample(nodes, bins.wide.nodes, plan.masks, tiles)
+        image += join_tiles(tiles.unflatten(0, grid), inputs.size)
     return image
 
 

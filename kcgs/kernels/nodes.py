@@ -30,7 +30,10 @@ _CHUNK = 2048
 
 
 class Step(NamedTuple):
-    """Blocks of one level, all alike in `odd`: no two of them have the same parent in the same place."""
+    """Blocks of one level, all alike in `odd`: no two of them have the same parent in the same place.
+
+    So every sum has one owner, and is the same every time: the zeros alone are added to twice, and nothing reads that.
+    """
 
     blocks: Tensor  # [k] int64
     parents: Tensor  # [k, 4] int64, live blocks of the next level; their number: zeros
@@ -44,8 +47,8 @@ class Nodes(NamedTuple):
     number: Tensor  # [copies, blocks of nodes + 1] int64, of each live block; of others `live`
     live: int
     refinements: list[Step]  # live blocks, coarsest first
-    samples: list[Step]  # positions in `tiles`
-    tiles: Tensor  # [S] int64, ascending: of pixels, once for every region with live parents
+    samples: list[Step]  # tiles of pixels; those with `masks`: positions in `mixed`
+    mixed: Tensor  # [S] int64, ascending: tiles of several regions, once for each that has live parents
 
 
 def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, copies: int) -> Nodes:
@@ -63,14 +66,15 @@ def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, c
     number = torch.where(live, live.flatten().cumsum(0).view(live.shape) - 1, count)
 
     copy, block = live[:, parents].any(-1).nonzero(as_tuple=True)
-    pixels = block < first
-    place = torch.where(pixels, pixels.cumsum(0) - 1, number[copy, (block - first).clamp_min(0)])
-    rows, regions = torch.full_like(block, -1), 1
+    pixels, rows, regions = block < first, torch.full_like(block, -1), 1
     if membership is not None:
         rows[pixels], regions = membership.tiles(SIDE).mask[block[pixels]], membership.num_regions
+    mixed, tile = rows >= 0, copy * blocks.grids[1].first_tile + blocks.keys[block] // regions
+    place = torch.where(pixels, tile, number[copy, (block - first).clamp_min(0)])
+    place = torch.where(mixed, mixed.cumsum(0) - 1, place)
     levels = len(blocks.grids)
     level = torch.searchsorted(torch.tensor(starts[1:-1], device=block.device), block, right=True)
-    group = 8 * (levels - 1 - level) + 4 * (rows >= 0) + blocks.odd[block]
+    group = 8 * (levels - 1 - level) + 4 * mixed + blocks.odd[block]
     order = torch.argsort(group, stable=True)
     refinements: list[Step] = []
     samples: list[Step] = []
@@ -83,25 +87,26 @@ def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, c
                 rows[part] if n % 8 >= 4 else None,
             )
             (refinements if n // 8 < levels - 1 else samples).append(step)
-    tiles = (copy * blocks.grids[1].first_tile + blocks.keys[block] // regions)[pixels]
-    return Nodes(number, count, refinements, samples, tiles)
+    return Nodes(number, count, refinements, samples, tile[mixed])
 
 
-def sample(nodes: Tensor, plan: Nodes, masks: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Refine live blocks in place, (live + 1, C, 16, 16), the last of zeros, and evaluate the splines at the pixels.
+def sample(nodes: Tensor, plan: Nodes, masks: Tensor | None, tiles: Tensor) -> None:
+    """Refine live blocks in place, (live + 1, C, 16, 16), the last of zeros, and add their splines to the pixels.
 
-    Return tiles, ascending, and their values, times the region weights.
+    `tiles` are of pixels, (tiles, C, 16, 16). There, splines are multiplied by the region weights.
     """
     refinement, sampling = _refinement(nodes.dtype, nodes.device), _sampling(nodes.dtype, nodes.device)
     for step in plan.refinements:
-        nodes[step.blocks] += _spread(nodes, step, refinement)
-    values = nodes.new_empty(len(plan.tiles), *nodes.shape[1:])
+        nodes.index_add_(0, step.blocks, _spread(nodes, step, refinement))
+    mixed = nodes.new_empty(len(plan.mixed), *nodes.shape[1:])
     for step in plan.samples:
-        values[step.blocks] = _weigh(_spread(nodes, step, sampling), step, masks)
-    tiles, counts = torch.unique_consecutive(plan.tiles, return_counts=True)
-    if len(tiles) < len(values):
-        values = sum_runs(values.flatten(1), counts).view(-1, *nodes.shape[1:])
-    return tiles, values
+        values = _spread(nodes, step, sampling)
+        if step.masks is None:
+            tiles.index_add_(0, step.blocks, values)
+        else:
+            mixed[step.blocks] = values.mul_(_weights(masks, step))
+    several, counts = torch.unique_consecutive(plan.mixed, return_counts=True)
+    tiles.index_add_(0, several, sum_runs(mixed.flatten(1), counts).view(-1, *nodes.shape[1:]))
 
 
 def gather(grad: Tensor, plan: Nodes, masks: Tensor | None) -> Tensor:
@@ -109,32 +114,36 @@ def gather(grad: Tensor, plan: Nodes, masks: Tensor | None) -> Tensor:
     refinement, sampling = _refinement(grad.dtype, grad.device), _sampling(grad.dtype, grad.device)
     nodes = grad.new_zeros(plan.live + 1, *grad.shape[1:])
     for step in plan.samples:
-        _collect(nodes, step, sampling, _weigh(grad[plan.tiles[step.blocks]], step, masks))
+        if step.masks is None:
+            values = grad.index_select(0, step.blocks)
+        else:
+            values = grad.index_select(0, plan.mixed[step.blocks]).mul_(_weights(masks, step))
+        _collect(nodes, step, sampling, values)
     for step in reversed(plan.refinements):
-        _collect(nodes, step, refinement, nodes[step.blocks])
+        _collect(nodes, step, refinement, nodes.index_select(0, step.blocks))
     return nodes
 
 
-def _weigh(values: Tensor, step: Step, masks: Tensor | None) -> Tensor:
-    if step.masks is None:
-        return values
-    assert masks is not None
-    return values.mul_(masks[step.masks].view(-1, 1, SIDE, SIDE))
+def _weights(masks: Tensor | None, step: Step) -> Tensor:
+    assert masks is not None and step.masks is not None
+    return masks[step.masks].view(-1, 1, SIDE, SIDE)
 
 
 def _spread(nodes: Tensor, step: Step, matrix: Tensor) -> Tensor:
     rows = []
     for down, y, _ in _PARTS[step.odd // 2]:
-        row = [nodes[step.parents[:, 2 * down + right], :, y, x] for right, x, _ in _PARTS[step.odd % 2]]
+        row = [
+            nodes.index_select(0, step.parents[:, 2 * down + right])[..., y, x] for right, x, _ in _PARTS[step.odd % 2]
+        ]
         rows.append(torch.cat(row, -1))
-    return matrix @ torch.cat(rows, -2) @ matrix.T
+    return matrix @ (torch.cat(rows, -2) @ matrix.T)
 
 
 def _collect(nodes: Tensor, step: Step, matrix: Tensor, grad: Tensor) -> None:
     window = matrix.T @ grad @ matrix
     for down, y, top in _PARTS[step.odd // 2]:
         for right, x, left in _PARTS[step.odd % 2]:
-            nodes[step.parents[:, 2 * down + right], :, y, x] += window[..., top, left]
+            nodes[..., y, x].index_add_(0, step.parents[:, 2 * down + right], window[..., top, left])
 
 
 @functools.lru_cache(maxsize=4)

@@ -126,8 +126,7 @@ def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
     tiles[touched] = values
     tiles, grid = tiles.unflatten(2, (TILE, TILE)), grid_of(inputs)
     if plan.bins.wide is not None:
-        at, values = sample(tiles[grid.total :], plan.bins.wide.nodes, plan.masks)
-        tiles[at] += values
+        sample(tiles[grid.total :], plan.bins.wide.nodes, plan.masks, tiles[: grid.total])
     return join_tiles(tiles[: grid.total].unflatten(0, grid), inputs.size)
 
 
