@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs.kernels import Membership, SplatInputs, cuda, reference
+from kcgs.kernels import Membership, SplatInputs, cuda, reference, tiled
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 GPU = DEVICE.type == "cuda"
@@ -101,6 +101,18 @@ def test_tile_inside_one_region_beside_mixed_tiles() -> None:
     assert inputs.membership is not None
     assert len(inputs.membership.tiles(16).keys) > (inputs.membership.tiles(16).mask < 0).sum() > 0
     assert_matches_reference(inputs)
+
+
+@pytest.mark.parametrize(("regions", "batch"), [(2, 1), *([(1, 1), (3, 2)] if GPU else [])])
+def test_wide_gaussians_on_coarse_grids(regions: int, batch: int) -> None:
+    size = (70, 90) if GPU else (9, 33)
+    inputs = make_inputs(5, size, regions=regions, softness=0.7, channels=2, batch=batch, cutoff=1e-4)
+    inputs = inputs._replace(cholesky=inputs.cholesky * 3.0 ** torch.arange(5.0, device=DEVICE)[:, None] / 9)
+    wide = cuda.bin_gaussians(inputs).wide
+    assert wide is not None and 0 < len(wide.which) < inputs.colors[..., 0].numel()
+    double = SplatInputs(*(t.double() for t in inputs[:3]), *inputs[3:])
+    for a, b in zip(render(cuda, inputs), render(tiled, double), strict=True):
+        assert (a - b).abs().max() <= 5e-6 * b.abs().max()
 
 
 def test_list_longer_than_a_piece() -> None:
