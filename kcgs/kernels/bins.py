@@ -90,11 +90,14 @@ def _list_pairs(inputs: SplatInputs, means: Tensor, cholesky: Tensor, grid: Grid
 
 def colors_of(bins: Bins, inputs: SplatInputs) -> Tensor:
     """Return the colours with which the Gaussians are evaluated, (B * N, C)."""
-    colors = inputs.colors.detach().flatten(0, 1)
-    if bins.wide is None:
+    return _scale(inputs.colors.detach().flatten(0, 1), bins.wide)
+
+
+def _scale(colors: Tensor, wide: Wide | None) -> Tensor:
+    if wide is None:
         return colors
-    factor = bins.wide.gaussians.factor[:, None]
-    return colors.index_copy(0, bins.wide.which, (colors[bins.wide.which] * factor).to(colors.dtype))
+    scaled = colors[wide.which] * wide.gaussians.factor[:, None]
+    return colors.index_copy(0, wide.which, scaled.to(colors.dtype))
 
 
 def to_gradients(bins: Bins, inputs: SplatInputs, sums: Tensor) -> Gradients:
@@ -102,14 +105,14 @@ def to_gradients(bins: Bins, inputs: SplatInputs, sums: Tensor) -> Gradients:
     shape, channels = inputs.means.shape[:2], inputs.colors.shape[-1]
     if bins.wide is None:
         return sums_to_gradients(sums.unflatten(0, shape), channels, inputs.cholesky)
-    means, cholesky, colors = sums_to_gradients(sums, channels, bins.cholesky)
     which, coarse, _ = bins.wide
-    scaled = colors.index_copy(0, which, (colors[which] * coarse.factor[:, None]).to(colors.dtype)).unflatten(0, shape)
-    if means is None or cholesky is None:
-        return None, None, scaled
-    factor = (colors[which].double() * inputs.colors.detach().flatten(0, 1)[which]).sum(-1)
-    given = inputs.cholesky.detach().double().flatten(0, 1)[which]
-    rows = uncoarsen(given, coarse, means[which], cholesky[which], factor)
-    found = (t.index_copy(0, which, new) for t, new in zip((means, cholesky), rows, strict=True))
-    means, cholesky = (t.to(inputs.means.dtype).unflatten(0, shape) for t in found)
-    return means, cholesky, scaled
+    means, cholesky, colors = sums_to_gradients(sums, channels, bins.cholesky)
+    if means is not None and cholesky is not None:
+        given, given_colors = (t.detach().flatten(0, 1)[which].double() for t in inputs[1:3])
+        factor = (colors[which] * given_colors).sum(-1)
+        rows = uncoarsen(given, coarse, means[which], cholesky[which], factor)
+        means, cholesky = (
+            t.index_copy(0, which, new).to(colors.dtype).unflatten(0, shape)
+            for t, new in zip((means, cholesky), rows, strict=True)
+        )
+    return means, cholesky, _scale(colors, bins.wide).unflatten(0, shape)
