@@ -70,22 +70,27 @@ def _list_pairs(inputs: SplatInputs, means: Tensor, cholesky: Tensor, grid: Grid
     size = grid[:2] if isinstance(grid, Grid) else grid[:, :2]
     gaussian, place, origin = bounding_tiles(means, cholesky, radius, size)
     keep, image = reaches(origin, cholesky[gaussian], radius), gaussian // inputs.means.shape[1]
-    tile = (image * of_pixels.rows + place[:, 1]) * of_pixels.cols + place[:, 0]
+    col, row = place.unbind(1)
+    tile = (image * of_pixels.rows + row) * of_pixels.cols + col
 
-    maps = 1 if inputs.membership is None else len(inputs.membership.index)
     rows, cols, first = grid[2:] if isinstance(grid, Grid) else grid[gaussian, 2:].unbind(-1)
-    block, mask = first + (image % maps * rows + place[:, 1]) * cols + place[:, 0], None
+    if inputs.membership is not None and len(inputs.membership.index) > 1:
+        row = image * rows + row
+    block, masks = row * cols + col + first, None
     if inputs.membership is not None and inputs.region_index is not None:
         table, region = inputs.membership.tiles(TILE), inputs.region_index.flatten()[gaussian]
-        keys = table.keys
+        keys, masks = table.keys, table.mask
         if not isinstance(grid, Grid):
             keys = blocks_of(inputs.membership, inputs.size, means.device).keys
+            # blocks of nodes come after those of pixels, and have no masks
+            masks = torch.nn.functional.pad(masks, (0, len(keys) - len(masks)), value=-1)
         block, present = find_keys(keys, block, region, inputs.membership.num_regions)
         keep &= present
-        # blocks of nodes come after those of pixels, and have no masks
-        mask = torch.cat([table.mask, table.mask.new_full((1,), -1)])[block[keep].clamp_max(len(table.mask))]
-    frame = coefficients(origin[keep], cholesky[gaussian[keep]]).to(inputs.means.dtype)
-    return Bins(gaussian[keep], tile[keep], mask, frame, cholesky, of_pixels.total, None), block[keep]
+    keep = keep.nonzero().flatten()
+    gaussian, tile, block, origin = (t.index_select(0, keep) for t in (gaussian, tile, block, origin))
+    mask = None if masks is None else masks[block]
+    frame = coefficients(origin, cholesky[gaussian]).to(inputs.means.dtype)
+    return Bins(gaussian, tile, mask, frame, cholesky, of_pixels.total, None), block
 
 
 def colors_of(bins: Bins, inputs: SplatInputs) -> Tensor:
