@@ -16,7 +16,6 @@ from torch import Tensor
 
 from .membership import Membership
 from .octaves import SIDE, Blocks
-from .tiles import sum_runs
 
 _HALF = SIDE // 2
 _WINDOW = _HALF + 3
@@ -30,12 +29,12 @@ _CHUNK = 2048
 
 
 class Step(NamedTuple):
-    """Blocks of one level, all alike in `odd`: no two of them have the same parent in the same place.
+    """Blocks of one level, all alike in `odd`, no two of a tile: no two have the same parent in the same place.
 
     So every sum has one owner, and is the same every time: the zeros alone are added to twice, and nothing reads that.
     """
 
-    blocks: Tensor  # [k] int64
+    blocks: Tensor  # [k] int64, numbers of live blocks or of tiles
     parents: Tensor  # [k, 4] int64, live blocks of the next level; their number: zeros
     odd: int  # as in Blocks
     masks: Tensor | None  # [k] int64, rows of masks, where the region is not alone in the tile
@@ -47,8 +46,7 @@ class Nodes(NamedTuple):
     number: Tensor  # [copies, blocks of nodes + 1] int64, of each live block; of others `live`
     live: int
     refinements: list[Step]  # live blocks, coarsest first
-    samples: list[Step]  # tiles of pixels; those with `masks`: positions in `mixed`
-    mixed: Tensor  # [S] int64, ascending: tiles of several regions, once for each that has live parents
+    samples: list[Step]  # tiles of pixels
 
 
 def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, copies: int) -> Nodes:
@@ -66,28 +64,30 @@ def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, c
     number = torch.where(live, live.flatten().cumsum(0).view(live.shape) - 1, count)
 
     copy, block = live[:, parents].any(-1).nonzero(as_tuple=True)
-    pixels, rows, regions = block < first, torch.full_like(block, -1), 1
+    pixels, regions = block < first, 1
+    group = 4 * (
+        len(blocks.grids) - 1 - torch.bucketize(block, torch.tensor(starts[1:], device=block.device), right=True)
+    )
+    rows = torch.full_like(block, -1)
     if membership is not None:
         rows[pixels], regions = membership.tiles(SIDE).mask[block[pixels]], membership.num_regions
-    mixed, tile = rows >= 0, copy * blocks.grids[1].first_tile + blocks.keys[block] // regions
+    tile = copy * blocks.grids[1].first_tile + blocks.keys[block] // regions
     place = torch.where(pixels, tile, number[copy, (block - first).clamp_min(0)])
-    place = torch.where(mixed, mixed.cumsum(0) - 1, place)
-    levels = len(blocks.grids)
-    level = torch.searchsorted(torch.tensor(starts[1:-1], device=block.device), block, right=True)
-    group = 8 * (levels - 1 - level) + 4 * mixed + blocks.odd[block]
-    order = torch.argsort(group, stable=True)
+    # regions that share a tile go one after the other
+    of_pixels = tile[pixels]
+    rank = torch.arange(len(of_pixels), device=block.device) - torch.searchsorted(of_pixels, of_pixels) + 1
+    group[pixels] += 4 * torch.where(rows[pixels] < 0, 0, rank)
+    group += blocks.odd[block]
+
+    last, order = 4 * len(blocks.grids) - 4, torch.argsort(group, stable=True)
     refinements: list[Step] = []
     samples: list[Step] = []
-    for n, chosen in enumerate(order.split(torch.bincount(group, minlength=8 * levels).tolist())):
+    for n, chosen in enumerate(order.split(torch.bincount(group).tolist())):
         for part in chosen.split(_CHUNK) if len(chosen) else ():
-            step = Step(
-                place[part],
-                number[copy[part, None], parents[block[part]]],
-                n % 4,
-                rows[part] if n % 8 >= 4 else None,
-            )
-            (refinements if n // 8 < levels - 1 else samples).append(step)
-    return Nodes(number, count, refinements, samples, tile[mixed])
+            parent = number[copy[part, None], parents[block[part]]]
+            step = Step(place[part], parent, n % 4, rows[part] if n >= last + 4 else None)
+            (refinements if n < last else samples).append(step)
+    return Nodes(number, count, refinements, samples)
 
 
 def sample(nodes: Tensor, plan: Nodes, masks: Tensor | None, tiles: Tensor) -> None:
@@ -98,15 +98,8 @@ def sample(nodes: Tensor, plan: Nodes, masks: Tensor | None, tiles: Tensor) -> N
     refinement, sampling = _refinement(nodes.dtype, nodes.device), _sampling(nodes.dtype, nodes.device)
     for step in plan.refinements:
         nodes.index_add_(0, step.blocks, _spread(nodes, step, refinement))
-    mixed = nodes.new_empty(len(plan.mixed), *nodes.shape[1:])
     for step in plan.samples:
-        values = _spread(nodes, step, sampling)
-        if step.masks is None:
-            tiles.index_add_(0, step.blocks, values)
-        else:
-            mixed[step.blocks] = values.mul_(_weights(masks, step))
-    several, counts = torch.unique_consecutive(plan.mixed, return_counts=True)
-    tiles.index_add_(0, several, sum_runs(mixed.flatten(1), counts).view(-1, *nodes.shape[1:]))
+        tiles.index_add_(0, step.blocks, _weigh(_spread(nodes, step, sampling), step, masks))
 
 
 def gather(grad: Tensor, plan: Nodes, masks: Tensor | None) -> Tensor:
@@ -114,19 +107,16 @@ def gather(grad: Tensor, plan: Nodes, masks: Tensor | None) -> Tensor:
     refinement, sampling = _refinement(grad.dtype, grad.device), _sampling(grad.dtype, grad.device)
     nodes = grad.new_zeros(plan.live + 1, *grad.shape[1:])
     for step in plan.samples:
-        if step.masks is None:
-            values = grad.index_select(0, step.blocks)
-        else:
-            values = grad.index_select(0, plan.mixed[step.blocks]).mul_(_weights(masks, step))
-        _collect(nodes, step, sampling, values)
+        _collect(nodes, step, sampling, _weigh(grad.index_select(0, step.blocks), step, masks))
     for step in reversed(plan.refinements):
         _collect(nodes, step, refinement, nodes.index_select(0, step.blocks))
     return nodes
 
 
-def _weights(masks: Tensor | None, step: Step) -> Tensor:
-    assert masks is not None and step.masks is not None
-    return masks[step.masks].view(-1, 1, SIDE, SIDE)
+def _weigh(values: Tensor, step: Step, masks: Tensor | None) -> Tensor:
+    if masks is None or step.masks is None:
+        return values
+    return values.mul_(masks[step.masks].view(-1, 1, SIDE, SIDE))
 
 
 def _spread(nodes: Tensor, step: Step, matrix: Tensor) -> Tensor:
