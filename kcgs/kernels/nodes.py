@@ -64,11 +64,9 @@ def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, c
     number = torch.where(live, live.flatten().cumsum(0).view(live.shape) - 1, count)
 
     copy, block = live[:, parents].any(-1).nonzero(as_tuple=True)
-    pixels, regions = block < first, 1
-    group = 4 * (
-        len(blocks.grids) - 1 - torch.bucketize(block, torch.tensor(starts[1:], device=block.device), right=True)
-    )
-    rows = torch.full_like(block, -1)
+    pixels, rows, regions = block < first, torch.full_like(block, -1), 1
+    last, ends = 4 * len(blocks.grids) - 4, torch.tensor(starts[1:], device=block.device)
+    group = last - 4 * torch.bucketize(block, ends, right=True)  # coarsest first
     if membership is not None:
         rows[pixels], regions = membership.tiles(SIDE).mask[block[pixels]], membership.num_regions
     tile = copy * blocks.grids[1].first_tile + blocks.keys[block] // regions
@@ -79,7 +77,7 @@ def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, c
     group[pixels] += 4 * torch.where(rows[pixels] < 0, 0, rank)
     group += blocks.odd[block]
 
-    last, order = 4 * len(blocks.grids) - 4, torch.argsort(group, stable=True)
+    order = torch.argsort(group, stable=True)
     refinements: list[Step] = []
     samples: list[Step] = []
     for n, chosen in enumerate(order.split(torch.bincount(group).tolist())):
