@@ -70,13 +70,13 @@ def blocks_of(membership: Membership | None, size: tuple[int, int], device: torc
     """Return the blocks of a map, or of one region everywhere, made once and kept."""
     if membership is None:
         return _blocks_without_map(size, device)
-    return membership.derived("blocks", lambda m: _make_blocks(m.tiles(SIDE).keys, m.num_regions, m.index.shape))
+    return membership.derived("blocks", lambda m: make_blocks(m.tiles(SIDE).keys, m.num_regions, m.index.shape))
 
 
 @functools.lru_cache(maxsize=4)
 def _blocks_without_map(size: tuple[int, int], device: torch.device) -> Blocks:
     tiles = -(-size[0] // SIDE) * -(-size[1] // SIDE)
-    return _make_blocks(torch.arange(tiles, device=device), 1, (1, *size))
+    return make_blocks(torch.arange(tiles, device=device), 1, (1, *size))
 
 
 def grids_of(size: tuple[int, int], maps: int) -> tuple[Grid, ...]:
@@ -93,7 +93,8 @@ def grids_of(size: tuple[int, int], maps: int) -> tuple[Grid, ...]:
     return tuple(grids)
 
 
-def _make_blocks(keys: Tensor, num_regions: int, shape: tuple[int, ...]) -> Blocks:
+def make_blocks(keys: Tensor, num_regions: int, shape: tuple[int, ...]) -> Blocks:
+    """Return the blocks of all levels for those of pixels: keys, sorted, of maps of a shape (maps, height, width)."""
     maps, *size = shape
     grids = grids_of((size[0], size[1]), maps)
     levels, parents, odd, starts = [keys], [], [], [0, len(keys)]

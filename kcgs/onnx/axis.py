@@ -10,6 +10,8 @@ from .graph import FLOAT, INT64, Graph, Value
 
 # places between two pixel centres that hard contours are sampled at, as in `RegionMap.resize`
 _OFFSETS = 1024
+# nodes, two pixels apart, that the cubic B-splines of a tile read
+NODES = TILE // 2 + 3
 # parts of a pixel that the ends of a view are given in
 _PARTS = 1 << 20
 
@@ -101,3 +103,19 @@ class Axis:
             position = g("Reshape", position, g.constant([0, -1, 1]))
         window = np.arange(factor * TILE + 2 * halo, dtype=np.float32)
         return g("Relu", g("Sub", np.float32(1), g("Abs", g("Sub", position, window))))
+
+    def spline(self) -> Value:
+        """Weights of a tile's nodes, two pixels apart, at the pixels of each block, (blocks, side, NODES).
+
+        Beyond the scene the values of its border are held.
+        """
+        g = self.g
+        position = g("Div", g("Cast", self.local, to=FLOAT), g("Cast", self.parts, to=FLOAT))
+        last = g("Cast", g("Sub", np.int64(self.length), g("Mul", self.tile, TILE)), to=FLOAT)
+        last = g("Unsqueeze", g("Min", last, np.float32(TILE)), g.constant([1]))
+        position = g("Min", g("Max", position, np.float32(0)), last)
+        position = g("Add", g("Mul", g("Unsqueeze", position, g.constant([2])), np.float32(0.5)), np.float32(1))
+        distance = g("Abs", g("Sub", position, np.arange(NODES, dtype=np.float32)))
+        far, near = (g("Relu", g("Sub", np.float32(reach), distance)) for reach in (2, 1))
+        far, near = (g("Mul", g("Mul", part, part), part) for part in (far, near))
+        return g("Sub", g("Mul", far, np.float32(1 / 6)), g("Mul", near, np.float32(2 / 3)))

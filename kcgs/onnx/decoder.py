@@ -16,6 +16,7 @@ from .blocks import Blocks
 from .graph import Graph, Value
 from .layout import Layout, lay_out
 from .metadata import describe, image_doc
+from .planes import Planes
 from .stored import Stored
 from .windows import Windows
 
@@ -96,7 +97,8 @@ class _Plan(NamedTuple):
         regions, windows = self.scene.regions, None
         if regions is not None and any(group.regions > 1 for group in self.layout.groups):
             windows = Windows(g, self.layout.tiles, self.layout.groups, down, across, regions)
-        image = blocks.render(windows)
+        planes = None if self.layout.nodes is None else Planes(g, stored, self.layout.nodes, down, across, self.cutoff)
+        image = blocks.render(windows, planes)
         if self.clamp:
             image = g("Clip", image, np.float32(0), np.float32(1))
         shape = [1, stored.channels, "height", "width"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -11,13 +11,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.functional import RegionMap
-from kcgs.kernels.tiles import TILE, bounding_tiles, find_keys
-from kcgs.kernels.whitened import support_radius
+from kcgs.kernels.octaves import Blocks, Coarsened, make_blocks
+from kcgs.kernels.tiles import TILE
 from kcgs.nn import GaussianField
 
-_CHUNK = 1 << 20
-# what a group of lists costs beside its entries, in entries
-_GROUP_COST = 450
+from .lists import list_gaussians, place
+
+# what a group of lists costs beside its entries, in entries; one of nodes is evaluated only when a decoder is loaded
+_GROUP_COST, _NODES_COST = 450, 4000
+# what coarse grids cost, in entries: whatever they hold, and for each tile and region
+_GRIDS_COST, _SPLINE_COST = 2000, 7
 # rounding of a polynomial shows in log w where a Gaussian is narrow: pixels, where weights down to a hundred-thousandth
 # are wanted, and below that
 _NARROW, _NARROW_OF_FAINT = 0.15, 0.4
@@ -42,7 +45,7 @@ class Tiles(NamedTuple):
 
 
 class Gaussians(NamedTuple):
-    """The Gaussians that touch a pixel."""
+    """The Gaussians that touch a pixel; those of coarser grids as these see them."""
 
     means: Floats  # [N, 2]
     cholesky: Floats  # [N, 3]
@@ -50,14 +53,26 @@ class Gaussians(NamedTuple):
     region: Integers  # [N], position in the map
 
 
+class Nodes(NamedTuple):
+    """The blocks of coarser grids where anything is, and the table of all that there may be."""
+
+    place: Integers  # [n, 4] level - 1, region, row and column, ascending
+    shape: tuple[int, int, int, int]  # one level more than there are, one region more: nothing is there
+
+
 class Group(NamedTuple):
     """Tiles that are rendered together: lists of similar length, filled up with their last to the longest."""
 
-    tiles: Integers  # [T]
-    entries: Integers  # [T, L] into the Gaussians, ascending
+    tiles: Integers  # [T], or blocks of nodes, which are numbered behind the tiles
     lengths: Integers  # [T]
     regions: int  # of a tile, K; 1: no region weights
     narrow: bool  # whether to sum squares in place of a polynomial
+    nodes: bool  # whether these are blocks of nodes
+
+    @property
+    def longest(self) -> int:
+        """What all lists are filled up to, L."""
+        return max(1, int(self.lengths.max()))
 
 
 class Layout(NamedTuple):
@@ -65,49 +80,90 @@ class Layout(NamedTuple):
 
     tiles: Tiles
     gaussians: Gaussians
-    groups: list[Group]
+    groups: list[Group]  # those of nodes last
     pairs: Integers  # [2, P] Gaussian and tile of every entry, in this order
+    nodes: Nodes | None  # None: no coarser grids
 
 
 def lay_out(field: GaussianField, regions: RegionMap | None, cutoff: float) -> Layout:
     """Find what is rendered where, and group it."""
     tiles = find_tiles(regions, field.size)
-    gaussian, tile = list_gaussians(field, regions, tiles, cutoff)
+    count = 1 if regions is None else regions.num_regions
+    region = torch.zeros(len(field), dtype=torch.int64)
+    if regions is not None and field.region_ids is not None:
+        region = regions.index_of(field.region_ids).cpu()
+    keys = [number * count + r for number, found in enumerate(tiles.regions) for r in found]
+    blocks = make_blocks(torch.tensor(keys), count, (1, *field.size))
+    placed, gaussian, block = _find_pairs(field, region, count, blocks, cutoff)
+    nodes, number = _number_blocks(blocks, count, tiles, block)
+    tile = number[block]
     used = gaussian.unique()
     # neighbours get neighbouring numbers, so that lists are stored as small steps
-    column, row = (field.means.detach().cpu()[used] / TILE).floor().double().unbind(-1)
-    used = used[torch.argsort(row * (1 + 2 * column.abs().amax()) + column, stable=True)] if len(used) else used
-    number = torch.full((len(field),), -1)
-    number[used] = torch.arange(len(used))
-    entry = number[gaussian]
-    order = torch.argsort(tile * len(field) + entry)
-    gaussians = _read(field, regions, used)
+    column, row = (placed.means[used] / TILE).floor().unbind(-1)
+    rank = torch.argsort(row * (1 + 2 * column.abs().amax()) + column, stable=True) if len(used) else used
+    used = used[rank[torch.argsort(placed.level[used][rank], stable=True)]]
+    entry = torch.full((len(field),), -1)
+    entry[used] = torch.arange(len(used))
+    entry = entry[gaussian]
+    merged = field.merged_colors().detach().double().cpu() * placed.factor[:, None]
+    means, cholesky, colors = (t[used].float().numpy() for t in (placed.means, placed.cholesky, merged))
+    gaussians = Gaussians(means, cholesky, colors, region[used].numpy())
     narrow = _is_narrow(gaussians.cholesky, _NARROW if cutoff >= _FAINT else _NARROW_OF_FAINT)
-    pairs = torch.stack([entry, tile])[:, torch.argsort(entry * len(tiles.regions) + tile)].numpy()
-    return Layout(tiles, gaussians, _group_tiles(tile[order], entry[order], tiles, narrow), pairs)
+    pairs = torch.stack([entry, tile])[:, torch.argsort(entry * len(number) + tile)].numpy()
+    return Layout(tiles, gaussians, _group_tiles(pairs, tiles, narrow, nodes), pairs, nodes)
 
 
-def _read(field: GaussianField, regions: RegionMap | None, used: Tensor) -> Gaussians:
-    means, cholesky, colors = (
-        t.detach().float().cpu()[used].numpy() for t in (field.means, field.cholesky, field.merged_colors())
-    )
-    region = np.zeros(len(means), np.int64)
-    if regions is not None and field.region_ids is not None:
-        region = regions.index_of(field.region_ids).cpu()[used].numpy()
-    return Gaussians(means, cholesky, colors, region)
+def _find_pairs(
+    field: GaussianField, region: Tensor, count: int, blocks: Blocks, cutoff: float
+) -> tuple[Coarsened, Tensor, Tensor]:
+    """Pair Gaussians with blocks of pixels, or, if that saves enough of them, wide ones with blocks of nodes."""
+    means, cholesky = (t.detach().double().cpu() for t in (field.means, field.cholesky))
+    placed = place(means, cholesky, cutoff, 1)
+    gaussian, block = list_gaussians(placed, region, count, blocks, cutoff)
+    coarse = place(means, cholesky, cutoff, len(blocks.grids))
+    saved = int((coarse.level[gaussian] > 0).sum())
+    if saved <= _GRIDS_COST + _SPLINE_COST * blocks.first:
+        return placed, gaussian, block
+    return coarse, *list_gaussians(coarse, region, count, blocks, cutoff)
 
 
-def _group_tiles(tile: Tensor, entry: Tensor, tiles: Tiles, narrow: NDArray[np.bool_]) -> list[Group]:
+def _number_blocks(blocks: Blocks, count: int, tiles: Tiles, touched: Tensor) -> tuple[Nodes | None, Tensor]:
+    """Return the blocks of nodes where anything is, and the numbers of all blocks."""
+    number = blocks.keys // count
+    live = torch.zeros(len(number) + 1, dtype=torch.bool)
+    live[touched] = True
+    if not live[blocks.first :].any():
+        return None, number
+    for first, end in reversed(list(pairwise(blocks.starts[1:]))):
+        live[first:end] |= live[blocks.parents[first:end]].any(1)
+    chosen = live[blocks.first : -1].nonzero()[:, 0] + blocks.first
+    level = torch.searchsorted(torch.tensor(blocks.starts[1:]), chosen, right=True) - 1
+    cols, first_tile = torch.tensor([[grid.cols, grid.first_tile] for grid in blocks.grids[1:]])[level].T
+    tile = number[chosen] - first_tile
+    place = torch.stack([level, blocks.keys[chosen] % count, tile // cols, tile % cols], -1).numpy()
+    order = np.lexsort(place.T[::-1])
+    number[chosen[order]] = len(tiles.regions) + torch.arange(len(place))
+    return Nodes(place[order], (int(level.max()) + 2, count + 1, tiles.rows // 2 + 1, tiles.cols // 2 + 1)), number
+
+
+def _group_tiles(pairs: Integers, tiles: Tiles, is_narrow: NDArray[np.bool_], nodes: Nodes | None) -> list[Group]:
     """Sort tiles into groups so that little is filled up and there are few groups."""
-    numbers, counts = torch.unique_consecutive(tile, return_counts=True)
-    kinds: dict[tuple[int, bool], list[tuple[int, Integers]]] = {}
-    for number, part in zip(numbers.tolist(), entry.split(counts.tolist()), strict=True):
-        entries = part.numpy()
+    total = len(tiles.regions) + (0 if nodes is None else len(nodes.place))
+    lengths, narrow_ones = (np.bincount(tile, minlength=total) for tile in (pairs[1], pairs[1, is_narrow[pairs[0]]]))
+    kinds: dict[tuple[bool, int, bool], list[tuple[int, int]]] = {}
+    for number, length in enumerate(lengths.tolist()):
         regions = len(tiles.regions[number]) if number in tiles.windows else 1
-        # few kinds: counts of regions rise by powers of two
-        kind = (1 << (regions - 1).bit_length(), bool(narrow[entries].any()))
-        kinds.setdefault(kind, []).append((number, entries))
-    return [_make_group(part, *kind) for kind, lists in sorted(kinds.items()) for part in _split_by_length(lists)]
+        # a tile with several regions needs a list for what comes from coarser grids, too
+        if length or (nodes is not None and regions > 1):
+            # few kinds: counts of regions rise by powers of two
+            kind = (number >= len(tiles.regions), 1 << (regions - 1).bit_length(), bool(narrow_ones[number]))
+            kinds.setdefault(kind, []).append((length, number))
+    groups = []
+    for (of_nodes, regions, narrow), found in sorted(kinds.items()):
+        for part in _split_by_length(sorted(found), _NODES_COST if of_nodes else _GROUP_COST):
+            numbers, counts = np.array(sorted((number, length) for length, number in part)).T
+            groups.append(Group(numbers, counts, regions, narrow, of_nodes))
+    return groups
 
 
 def _is_narrow(cholesky: Floats, width: float) -> NDArray[np.bool_]:
@@ -116,14 +172,13 @@ def _is_narrow(cholesky: Floats, width: float) -> NDArray[np.bool_]:
     return steepest * width > 1
 
 
-def _split_by_length(lists: list[tuple[int, Integers]]) -> list[list[tuple[int, Integers]]]:
-    """Cut the lists, sorted by length, where that costs least: the best cuts by dynamic programming."""
-    lists = sorted(lists, key=lambda item: len(item[1]))
-    lengths, first = np.unique([len(entries) for _, entries in lists], return_index=True)
+def _split_by_length(lists: list[tuple[int, int]], group_cost: int) -> list[list[tuple[int, int]]]:
+    """Cut the lists, sorted by their lengths, where that costs least: the best cuts by dynamic programming."""
+    lengths, first = np.unique([length for length, _ in lists], return_index=True)
     ends = [*first[1:].tolist(), len(lists)]
     best, cut = [0.0], [0]
     for j, end in enumerate(ends):
-        costs = [best[i] + (end - first[i]) * lengths[j] + _GROUP_COST for i in range(j + 1)]
+        costs = [best[i] + (end - first[i]) * lengths[j] + group_cost for i in range(j + 1)]
         best.append(min(costs))
         cut.append(int(np.argmin(costs)))
     parts, j = [], len(ends)
@@ -132,12 +187,6 @@ def _split_by_length(lists: list[tuple[int, Integers]]) -> list[list[tuple[int, 
         parts.append(lists[first[i] : ends[j - 1]])
         j = i
     return parts[::-1]
-
-
-def _make_group(lists: list[tuple[int, Integers]], regions: int, narrow: bool) -> Group:
-    tiles, lengths = np.array([[tile, len(entries)] for tile, entries in lists]).T
-    entries = np.stack([np.pad(entries, (0, lengths.max() - len(entries)), mode="edge") for _, entries in lists])
-    return Group(tiles, entries, lengths, regions, narrow)
 
 
 def find_tiles(regions: RegionMap | None, size: tuple[int, int]) -> Tiles:
@@ -202,42 +251,3 @@ def _window_weights(regions: RegionMap, rows: Tensor, cols: Tensor, region: Tens
         for begin, length in zip((rows, cols), regions.size, strict=True)
     )
     return weights.gather(1, down[:, :, None].expand_as(weights)).gather(2, across[:, None, :].expand_as(weights))
-
-
-def list_gaussians(
-    field: GaussianField, regions: RegionMap | None, tiles: Tiles, cutoff: float
-) -> tuple[Tensor, Tensor]:
-    """Pair Gaussians, (P,), with the tiles, (P,), that they reach, between pixels too, and that hold their region."""
-    means, cholesky = (t.detach().double().cpu() for t in (field.means, field.cholesky))
-    radius = support_radius(cutoff, torch.float32)
-    gaussian, place, origin = bounding_tiles(means, cholesky, radius, field.size, between=True)
-    tile = place[:, 1] * tiles.cols + place[:, 0]
-    keep = torch.ones_like(tile, dtype=torch.bool)
-    if regions is not None:
-        assert field.region_ids is not None
-        region = regions.index_of(field.region_ids).cpu()[gaussian]
-        keys = [number * regions.num_regions + r for number, found in enumerate(tiles.regions) for r in found]
-        keep = find_keys(torch.tensor(keys), tile, region, regions.num_regions)[1]
-    parts = zip(origin[keep].split(_CHUNK), gaussian[keep].split(_CHUNK), strict=True)
-    distance = torch.cat([_nearest(offset, cholesky[part]) for offset, part in parts])
-    keep[keep.clone()] = distance <= radius * radius * (1 + 1e-5) + 1e-6
-    return gaussian[keep], tile[keep]
-
-
-def _nearest(offset: Tensor, cholesky: Tensor) -> Tensor:
-    """Least squared whitened distance from Gaussians (P, 3) to the points of tiles; `offset`, (P, 2), is to centres."""
-    l11, l21, l22 = cholesky.unbind(-1)
-    x, y = offset.unbind(-1)
-    half = TILE / 2
-    inside = (x.abs() <= half) & (y.abs() <= half)
-    k1, k3, k4 = 1 / l11, -l21 / (l11 * l22), 1 / l22
-    least = torch.full_like(x, torch.inf)
-    for sign in (-half, half):
-        # along a vertical side z is affine in y, along a horizontal one in x
-        z1, base = (x + sign) * k1, (x + sign) * k3
-        low = (-base / k4).clamp(y - half, y + half)
-        least = torch.minimum(least, z1 * z1 + (base + low * k4) ** 2)
-        base = (y + sign) * k4
-        low = (-base * k3 / (k1 * k1 + k3 * k3)).clamp(x - half, x + half)
-        least = torch.minimum(least, (low * k1) ** 2 + (base + low * k3) ** 2)
-    return torch.where(inside, 0.0, least)

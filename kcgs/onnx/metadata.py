@@ -65,6 +65,7 @@ def _left_out(scene: Scene, contours: str, layout: Layout, clamp: bool) -> list[
         "regions: the scene has one": contours == "none",
         one_region: contours != "none",
         "soft weights: contours are hard": contours == "hard",
+        "coarse grids: too few Gaussians are wide": layout.nodes is None,
         "the clip to [0, 1]": not clamp,
         "opacities: merged into the colours": scene.field.opacities is not None,
         f"{unseen} Gaussians that touch no pixel": unseen > 0,

@@ -10,11 +10,30 @@ import numpy as np
 from kcgs.kernels.tiles import TILE
 from kcgs.kernels.whitened import Z_LIMIT
 
-from .graph import FLOAT, INT64, Graph, Value
-from .layout import Layout
+from .graph import FLOAT, INT32, INT64, Graph, Value
+from .layout import Layout, Nodes
 
 F32 = np.float32
 _ROOT = math.sqrt(0.5)
+
+
+def monomials(g: Graph, x: Value, y: Value) -> Value:
+    """Make 1, x, y, xx, xy, yy at the pixels of a block, column by column, (6, P); of its columns and rows."""
+    x, y = g("Unsqueeze", x, g.constant([1])), g("Unsqueeze", y, g.constant([0]))
+    sides = g("Concat", g("Shape", x, end=1), g("Shape", y, start=1), axis=0)
+    x, y = (g("Reshape", g("Expand", part, sides), g.constant([-1])) for part in (x, y))
+    one = g("Add", g("Mul", x, F32(0)), F32(1))
+    rows = (one, x, y, g("Mul", x, x), g("Mul", x, y), g("Mul", y, y))
+    return g("Concat", *[g("Unsqueeze", r, g.constant([0])) for r in rows], axis=0)
+
+
+def weigh(g: Graph, exponent: Value, cutoff: float) -> Value:
+    """Make weights of their logarithms, 0 where they are below the cutoff."""
+    weight = g("Exp", exponent)
+    if cutoff == 0:
+        return weight
+    # keeps what is greater; the least weight that counts is the cutoff itself
+    return g("ThresholdedRelu", weight, alpha=float(np.nextafter(F32(cutoff), F32(0))))
 
 
 class Stored:
@@ -28,28 +47,32 @@ class Stored:
     def __init__(self, graph: Graph, layout: Layout, visible: Value | None, half: bool) -> None:
         g = self.g = graph
         self.layout, self.gaussians, groups = layout, layout.gaussians, layout.groups
+        self.visible = visible
         self.channels = self.gaussians.colors.shape[1]
-        # of each tile: its group, one beyond them where nothing touches it, and its slot there
-        group_of = np.full(len(layout.tiles.regions), len(groups))
-        slot_of = np.zeros(len(layout.tiles.regions), np.int64)
+        # of each tile or block: its group, one beyond them where nothing touches it, and its slot there
+        count = len(layout.tiles.regions) + (0 if layout.nodes is None else len(layout.nodes.place))
+        group_of = np.full(count, len(groups))
         for number, group in enumerate(groups):
-            group_of[group.tiles], slot_of[group.tiles] = number, np.arange(len(group.tiles))
-        self.group_of, self.slot_of = g.whole(group_of), g.whole(slot_of)
+            group_of[group.tiles] = number
+        self.group_of = g.whole(group_of)
+        # of equal keys the first comes first
+        order = self._argsort(self.group_of, count)
+        self.place = self._argsort(order, count)  # among those of all groups
+        starts = np.cumsum([0, *(len(group.tiles) for group in groups)])
+        self.slot_of = g("Sub", self.place, g("Gather", g.constant(starts.astype(np.int32)), self.group_of))
         if not groups:
             return
-        self._sizes = [group.entries.size for group in groups]
+        self.tiles = g.split(g("Slice", order, g.constant([0]), g.constant(starts[-1:])), np.diff(starts).tolist())
+        self._sizes = [len(group.tiles) * group.longest for group in groups]
         tile = self._tile_of_entries()
         entries, real = self._entries(tile)
         with np.errstate(over="ignore"):  # what is too large for 16 bits shows in the image
             stored = [a.astype(np.float16 if half else F32) for a in (self.gaussians.cholesky, self.gaussians.colors)]
         cholesky, colors = (g("Cast", a, to=FLOAT) if half else a for a in [g.constant(a) for a in stored])
-        if visible is not None:
-            shown = g("Gather", visible, g.whole(self.gaussians.region))
-            colors = g("Mul", colors, g("Unsqueeze", shown, g.constant([1])))
         squares, polynomials = self._whiten(entries, tile, cholesky)
         self._squares, self._polynomials = (g.split(part, self._sizes) for part in (squares, polynomials))
         self._colors = g.split(g("Mul", g("Gather", colors, entries), real), self._sizes)
-        if any(group.regions > 1 for group in groups):
+        if visible is not None or any(group.regions > 1 for group in groups):
             self._regions = g.split(g("Gather", g.whole(self.gaussians.region), entries), self._sizes)
 
     def coefficients(self, number: int) -> Value:
@@ -60,7 +83,10 @@ class Stored:
     def colors(self, number: int, regions: Value | None) -> Value:
         """Colours of a group, (T, K * C, L), zero where a Gaussian is of another of the tiles' regions, (T, K)."""
         g, group = self.g, self.layout.groups[number]
-        colors = g("Transpose", self._shaped(self._colors, number, self.channels), perm=[0, 2, 1])  # [T, C, L]
+        colors = self._shaped(self._colors, number, self.channels)
+        if self.visible is not None and not group.nodes:  # planes are made when the decoder is loaded
+            colors = g("Mul", colors, g("Gather", self.visible, self._shaped(self._regions, number, 1)))
+        colors = g("Transpose", colors, perm=[0, 2, 1])  # [T, C, L]
         if regions is None:
             return colors
         region = self._shaped(self._regions, number, place=(1, 1))
@@ -69,19 +95,20 @@ class Stored:
         return g("Reshape", colors, g.constant([0, group.regions * self.channels, -1]))
 
     def _shaped(self, values: Sequence[Value], number: int, *width: int, place: tuple[int, ...] = ()) -> Value:
-        count, length = self.layout.groups[number].entries.shape
-        return self.g("Reshape", values[number], self.g.constant([count, *place, length, *width]))
+        group = self.layout.groups[number]
+        return self.g("Reshape", values[number], self.g.constant([len(group.tiles), *place, group.longest, *width]))
 
     def _tile_of_entries(self) -> Value:
         """Place of each entry's tile among the tiles of all groups, (P,)."""
-        begins = [np.arange(group.entries.size) % group.entries.shape[1] == 0 for group in self.layout.groups]
+        sizes = zip(self._sizes, self.layout.groups, strict=True)
+        begins = [np.arange(size) % group.longest == 0 for size, group in sizes]
         return self.g("Sub", self.g("CumSum", self.g.flags(np.concatenate(begins)), np.int64(0)), np.int32(1))
 
     def _entries(self, tile: Value) -> tuple[Value, Value]:
         """Which Gaussian each entry is, (P,), and 1 for entries, 0 for what lists are filled up with, (P, 1)."""
         g, groups = self.g, self.layout.groups
         counts = g.whole(np.concatenate([group.lengths for group in groups]))
-        sides = g.whole(np.concatenate([np.full(len(group.tiles), group.entries.shape[1]) for group in groups]))
+        sides = g.piecewise(np.concatenate([np.full(len(group.tiles), group.longest) for group in groups]))
         firsts, begins = (g("CumSum", n, np.int64(0), exclusive=1) for n in (counts, sides))
         rank = g("Sub", g("Range", np.int32(0), np.int32(sum(self._sizes)), np.int32(1)), g("Gather", begins, tile))
         count = g("Gather", counts, tile)
@@ -95,7 +122,7 @@ class Stored:
         They are stored the other way, Gaussian by Gaussian: its first tile, and how many tiles lie between one and the
         next, which is mostly none.
         """
-        g, groups, (gaussian, tile) = self.g, self.layout.groups, self.layout.pairs
+        g, (gaussian, tile) = self.g, self.layout.pairs
         fresh = np.diff(gaussian, prepend=-1) > 0
         gaps = np.diff(tile, prepend=0) - 1
         gaps[fresh] = 0
@@ -108,16 +135,44 @@ class Stored:
         begin = g("Gather", path, g.apply("TopK", [flags, count], 2, axis=0)[1])
         base = g("Sub", g.whole(tile[fresh]), begin)
         number = g("Add", path, g("Gather", base, owner))
-        starts = np.cumsum([0, *(len(group.tiles) for group in groups)]).astype(np.int32)
-        place = g("Add", g("Gather", g.constant(starts), self.group_of), self.slot_of)
-        # of equal tiles, the first pair comes first
-        keys, count = g("Cast", g("Gather", place, number), to=INT64), g.constant([len(tile)])
-        return g("Gather", owner, g.apply("TopK", [keys, count], 2, largest=0, axis=0)[1])
+        return g("Gather", owner, self._argsort(g("Gather", self.place, number), len(tile)))
+
+    def _argsort(self, numbers: Value, count: int) -> Value:
+        """Sort numbers (count,); of equal ones, the first comes first."""
+        keys = self.g("Cast", numbers, to=INT64)
+        order = self.g.apply("TopK", [keys, self.g.constant([count])], 2, largest=0, axis=0)[1]
+        return self.g("Cast", order, to=INT32)
+
+    def _places(self) -> Value:
+        """Columns and rows of tiles, and of blocks of nodes, (n, 2)."""
+        g, tiles, nodes = self.g, self.layout.tiles, self.layout.nodes
+        tile = g("Range", np.int32(0), np.int32(len(tiles.regions)), np.int32(1))
+        places = [g(op, tile, np.int32(tiles.cols)) for op in ("Mod", "Div")]
+        if nodes is not None:
+            self._find_nodes(nodes)
+            places = [g("Concat", *pair, axis=0) for pair in zip(places, self.nodes[:1:-1], strict=True)]
+        return g("Concat", *[g("Unsqueeze", part, g.constant([1])) for part in places], axis=1)
+
+    def _find_nodes(self, nodes: Nodes) -> None:
+        """Make the table of the blocks of nodes by level, region, row and column, and their places in it."""
+        g, count = self.g, len(nodes.place)
+        flags = np.zeros(nodes.shape, np.bool_)
+        flags[tuple(nodes.place.T)] = True
+        present = g.flags(flags.ravel())
+        number = g("Sub", g("CumSum", present, np.int64(0)), np.int32(1))
+        # n, a block of zeros, where there is none
+        self.block_of = g("Where", g("Equal", present, np.int32(1)), number, np.int32(count))
+        absent = g("Sub", np.int32(1), present)
+        place = g("Slice", self._argsort(absent, flags.size), g.constant([0]), g.constant([count]))
+        self.nodes: list[Value] = []  # level - 1, region, row, column
+        for length in nodes.shape[:0:-1]:
+            self.nodes.insert(0, g("Mod", place, np.int32(length)))
+            place = g("Div", place, np.int32(length))
+        self.nodes.insert(0, place)
 
     def _whiten(self, entries: Value, tile: Value, cholesky: Value) -> tuple[Value, Value]:
-        g, cols = self.g, self.layout.tiles.cols
-        numbers = np.concatenate([group.tiles for group in self.layout.groups])
-        place = g("Cast", g.whole(np.stack([numbers % cols, numbers // cols], -1)), to=FLOAT)
+        g = self.g
+        place = g("Cast", g("Gather", self._places(), g("Concat", *self.tiles, axis=0)), to=FLOAT)
         centre = g("Mul", g("Add", place, F32(0.5)), F32(TILE))
         offset = g("Sub", g("Gather", centre, tile), g("Gather", g.constant(self.gaussians.means), entries))
         x, y = g.apply("Split", [offset], 2, axis=1, num_outputs=2)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.functional import region_splat
-from kcgs.onnx import describe_decoder, scene_decoder, write_model
+from kcgs.onnx import describe_decoder, layout, scene_decoder, write_model
 
 SIZES = [(37, 53), (74, 106), (111, 160), (20, 31), (1, 1), (5, 300)]
 
@@ -179,6 +179,70 @@ class TestImage:
             assert (
                 decode(session, size, view=view, visible=every) - RegionSplatRenderer()(field, regions)
             ).abs().max() < 1e-3
+
+
+class TestCoarseGrids:
+    """Wide Gaussians on grids that the decoder makes when it is loaded."""
+
+    @pytest.fixture(autouse=True)
+    def always(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """However small the image is."""
+        monkeypatch.setattr(layout, "_GRIDS_COST", -(10**9))
+
+    @pytest.mark.parametrize("kind", ["none", "hard", "soft", "wide", "pairs", "fine"])
+    def test_any_size(self, kind: str) -> None:
+        size = (75, 101)
+        labels = blobs(size, 7)
+        regions = {
+            "none": None,
+            "hard": RegionMap.from_labels(labels),
+            "soft": RegionMap.from_labels(labels, 0.8),
+            "wide": RegionMap.from_labels(labels, 6.0),
+            "pairs": RegionMap.from_labels(labels, {(2, 5): 0.0, (5, 8): 1.7, (2, 11): 0.6}),
+            "fine": RegionMap.from_labels(blobs((225, 303), 7), supersample=3),
+        }[kind]
+        field = scattered(60, size, regions)
+        assert "coarse grids" not in describe_decoder(scene_decoder(Scene(field, regions)))["left_out"]
+        assert_same(field, regions, [size, (150, 202), (110, 160), (41, 51), (1, 1), (5, 300)])
+
+    def test_only_wide_gaussians(self) -> None:
+        """No list of Gaussians is left for the pixels."""
+        size = (48, 80)
+        regions = RegionMap.from_labels(blobs(size, 3), 0.6)
+        for chosen in (None, regions):
+            field = scattered(8, size, chosen)
+            field.cholesky.data = torch.tensor([[12.0, 3.0, 9.0]]).repeat(8, 1)
+            assert_same(field, chosen, [size, (96, 160)])
+        # beyond the border its values are held
+        session = session_of(scene_decoder(Scene(field, regions), clamp=False, interactive=True))
+        around = decode(session, (56, 88), view=np.array([-4, -4, 84, 52], np.float32), visible=np.ones(3, np.float32))
+        inside = RegionSplatRenderer()(field, regions).detach()
+        assert (around[:, 4:-4, 4:-4] - inside).abs().max() < 1e-3
+        assert torch.equal(around[:, :3], around[:, 1:4]) and (around[:, 3] - around[:, 4]).abs().max() < 0.05
+        assert torch.equal(around[:, :, -3:], around[:, :, -4:-1])
+
+    def test_view_and_visible(self) -> None:
+        size = (80, 112)
+        regions = RegionMap.from_labels(blobs(size, 5), 0.6)
+        field = scattered(80, size, regions)
+        session = session_of(scene_decoder(Scene(field, regions), clamp=False, interactive=True))
+        whole, every = np.array([0, 0, 112, 80], np.float32), np.ones(5, np.float32)
+        with torch.no_grad():
+            large = RegionSplatRenderer()(field, regions, (80 * 4, 112 * 4))
+        part = decode(session, (50, 100), view=np.array([10, 7, 35, 19.5], np.float32), visible=every)
+        assert (part - large[:, 28:78, 40:140]).abs().max() < 1e-3
+        for hidden in range(5):
+            factor = every.copy()
+            factor[hidden] = 0
+            left = field.subset(field.region_ids != regions.ids[hidden])
+            with torch.no_grad():
+                want = RegionSplatRenderer()(left, regions)
+            assert (decode(session, size, view=whole, visible=factor) - want).abs().max() < 1e-3
+
+    def test_half_precision(self) -> None:
+        field = scattered(60, (75, 101))
+        exact, half = (session_of(scene_decoder(Scene(field), precision=p)) for p in ("fp32", "fp16"))
+        assert 0 < (decode(exact, (150, 202)) - decode(half, (150, 202))).abs().max() < 1 / 255
 
 
 class TestInteractive:
