@@ -55,7 +55,6 @@ class Stored:
         for number, group in enumerate(groups):
             group_of[group.tiles] = number
         self.group_of = g.whole(group_of)
-        # of equal keys the first comes first
         order = self._argsort(self.group_of, count)
         self.place = self._argsort(order, count)  # among those of all groups
         starts = np.cumsum([0, *(len(group.tiles) for group in groups)])
@@ -130,17 +129,18 @@ class Stored:
         owner = g("Sub", g("CumSum", is_first, np.int64(0)), np.int32(1))
         steps = g("Mul", g("Add", g.sparse(gaps), np.int32(1)), g("Sub", np.int32(1), is_first))
         path = g("CumSum", steps, np.int64(0))
-        # not Compress: onnxruntime leaves it for every run
-        flags, count = g("Cast", is_first, to=INT64), g.constant([int(fresh.sum())])
-        begin = g("Gather", path, g.apply("TopK", [flags, count], 2, axis=0)[1])
+        begin = g("Gather", path, self._argsort(is_first, int(fresh.sum()), largest=1))
         base = g("Sub", g.whole(tile[fresh]), begin)
         number = g("Add", path, g("Gather", base, owner))
         return g("Gather", owner, self._argsort(g("Gather", self.place, number), len(tile)))
 
-    def _argsort(self, numbers: Value, count: int) -> Value:
-        """Sort numbers (count,); of equal ones, the first comes first."""
+    def _argsort(self, numbers: Value, count: int, largest: int = 0) -> Value:
+        """Where the `count` smallest or largest numbers are, sorted; of equal ones, the first comes first.
+
+        So it finds flags, too: onnxruntime would leave Compress for every run.
+        """
         keys = self.g("Cast", numbers, to=INT64)
-        order = self.g.apply("TopK", [keys, self.g.constant([count])], 2, largest=0, axis=0)[1]
+        order = self.g.apply("TopK", [keys, self.g.constant([count])], 2, largest=largest, axis=0)[1]
         return self.g("Cast", order, to=INT32)
 
     def _places(self) -> Value:
@@ -162,8 +162,7 @@ class Stored:
         number = g("Sub", g("CumSum", present, np.int64(0)), np.int32(1))
         # n, a block of zeros, where there is none
         self.block_of = g("Where", g("Equal", present, np.int32(1)), number, np.int32(count))
-        absent = g("Sub", np.int32(1), present)
-        place = g("Slice", self._argsort(absent, flags.size), g.constant([0]), g.constant([count]))
+        place = self._argsort(present, count, largest=1)
         self.nodes: list[Value] = []  # level - 1, region, row, column
         for length in nodes.shape[:0:-1]:
             self.nodes.insert(0, g("Mod", place, np.int32(length)))
