@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kcgs.functional import region_splat
 from kcgs.kernels import SplatInputs, resolve
-from kcgs.kernels.octaves import blocks_of, direct, most_spacing
+from kcgs.kernels.octaves import choose_levels, coarsen, direct, grids_of, most_spacing
 from kcgs.kernels.whitened import support_radius
 from kcgs.nn import RegionSplatRenderer
 from kcgs.scene import Scene
@@ -150,37 +150,29 @@ def pairs_per_pixel(name: str, scene: Scene, cutoff: float) -> float:
     A pair counts where the weight, that of the region left out, is at least the cutoff, and the pixel is in the image
     or the node on the grid.
     """
-    means, (l11, l21, l22) = scene.field.means.detach().double(), scene.field.cholesky.detach().double().unbind(-1)
-    a, b, d = l11 * l11, l11 * l21, l21 * l21 + l22 * l22
-    total, product = a + d, a * d - b * b
+    means, cholesky = scene.field.means.detach().double(), scene.field.cholesky.detach().double()
+    grids, radius, found = grids_of(scene.size, 1), support_radius(cutoff, torch.float32), 0
     with _grids(name):
-        spacing = most_spacing(cutoff)
-    # (h / s1)^4 + (h / s2)^4 <= spacing^4
-    widest = spacing * (product * product / (total * total - 2 * product)) ** 0.25
-    grids = blocks_of(None, scene.size, torch.device("cpu")).grids
-    level = widest.log2().floor().clamp(0, len(grids) - 1).long()
-    found = 0
+        level = choose_levels(cholesky, most_spacing(cutoff), len(grids))
     for number, grid in enumerate(grids):
-        which, h = level == number, 2.0**number
-        places = means[which] / h + (1.5 if number else 0.0)
-        shapes = [t[which] / (h * h) for t in (a, b, d)]
+        which = level == number
+        places, factors = means[which], cholesky[which]
         if number:
-            shapes = [shapes[0] - 1 / 3, shapes[1], shapes[2] - 1 / 3]
-        radius = support_radius(cutoff, torch.float32)
-        found += _count_inside(places, shapes, radius, (grid.height, grid.width))
+            _, places, factors, _ = coarsen(level[which], places, factors)
+        found += _count_inside(places, factors, radius, (grid.height, grid.width))
     return found / math.prod(scene.size)
 
 
-def _count_inside(means: Tensor, covariance: list[Tensor], radius: float, size: tuple[int, int]) -> int:
+def _count_inside(means: Tensor, cholesky: Tensor, radius: float, size: tuple[int, int]) -> int:
     """Count the pixel centres within each ellipse, row by row."""
-    a, b, d = covariance
-    reach = radius * d.sqrt()
-    first = (means[:, 1] - reach - 0.5).ceil().clamp_min(0)
-    rows = ((means[:, 1] + reach - 0.5).floor().clamp_max(size[0] - 1) - first + 1).clamp_min(0).long()
+    l11, l21, l22 = cholesky.unbind(-1)
+    height = torch.hypot(l21, l22)
+    first = (means[:, 1] - radius * height - 0.5).ceil().clamp_min(0)
+    rows = ((means[:, 1] + radius * height - 0.5).floor().clamp_max(size[0] - 1) - first + 1).clamp_min(0).long()
     which = torch.repeat_interleave(rows)
     dy = first[which] + torch.arange(len(which)) - (rows.cumsum(0) - rows)[which] + 0.5 - means[which, 1]
-    half = (radius**2 - dy * dy / d[which]).clamp_min(0).sqrt() * (a - b * b / d)[which].sqrt()
-    middle = means[which, 0] + (b / d)[which] * dy - 0.5
+    half = (radius**2 - (dy / height[which]) ** 2).clamp_min(0).sqrt() * (l11 * l22 / height)[which]
+    middle = means[which, 0] + (l11 * l21 / height**2)[which] * dy - 0.5
     low, high = (middle - half).ceil().clamp_min(0), (middle + half).floor().clamp_max(size[1] - 1)
     return int((high - low + 1).clamp_min(0).sum())
 
