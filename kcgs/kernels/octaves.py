@@ -20,8 +20,8 @@ from .membership import Membership
 SIDE = 16  # of a block and of a tile
 # a grid of no more nodes than this is not coarsened again
 _SMALLEST = 2 * SIDE
-# the interpolation is off by 0.0042 (spacing / deviation)^4, which this keeps at 2.6 times the cutoff
-_SPACING = 5.0
+# the interpolation is off by 0.0042 (spacing / deviation)^4, which this keeps at 1.7 times the cutoff
+_SPACING = 4.5
 _MOST = 0.7
 _is_direct: ContextVar[bool] = ContextVar("direct", default=False)
 
