@@ -78,12 +78,12 @@ def test_pairs_are_counted() -> None:
     z2 = (d[..., 1] - l21 * z1) / l22
     inside = int((torch.exp(-0.5 * (z1 * z1 + z2 * z2)) >= 1e-4).sum())
     assert pairs_per_pixel(DIRECT, scene, 1e-4) == inside / 2400
-    # one of deviation 20: nodes 8 pixels apart, its variance there less by 8 * 8 / 3
-    means, cholesky = torch.tensor([[150.0, 130.0]]), torch.tensor([[20.0, 0.0, 20.0]])
+    # one of deviation 24: nodes 8 pixels apart, its variance there less by 8 * 8 / 3
+    means, cholesky = torch.tensor([[150.0, 130.0]]), torch.tensor([[24.0, 0.0, 24.0]])
     one = Scene(GaussianField(means, cholesky, torch.ones(1, 3), size=(300, 300)))
     area = math.pi * 2 * math.log(1e4)
-    assert 300 * 300 * pairs_per_pixel(DIRECT, one, 1e-4) == pytest.approx(area * 400, rel=0.01)
-    assert 300 * 300 * pairs_per_pixel("cpu", one, 1e-4) == pytest.approx(area * (400 - 64 / 3) / 64, rel=0.05)
+    assert 300 * 300 * pairs_per_pixel(DIRECT, one, 1e-4) == pytest.approx(area * 576, rel=0.01)
+    assert 300 * 300 * pairs_per_pixel("cpu", one, 1e-4) == pytest.approx(area * (576 - 64 / 3) / 64, rel=0.05)
 
 
 def test_fitted_scenes_and_sizes() -> None:
