@@ -15,14 +15,15 @@ import torch
 from torch import Tensor
 
 from .membership import Membership
-from .octaves import SIDE, Blocks
+from .octaves import Blocks
+from .tiles import TILE
 
-_HALF = SIDE // 2
+_HALF = TILE // 2
 _WINDOW = _HALF + 3
 # of a window along an axis, in even and in odd tiles: which of the two blocks, nodes of it, places in the window
 _PARTS = (
     ((0, slice(0, _WINDOW), slice(0, _WINDOW)),),
-    ((0, slice(_HALF, SIDE), slice(0, _HALF)), (1, slice(0, _WINDOW - _HALF), slice(_HALF, _WINDOW))),
+    ((0, slice(_HALF, TILE), slice(0, _HALF)), (1, slice(0, _WINDOW - _HALF), slice(_HALF, _WINDOW))),
 )
 # blocks made at once
 _CHUNK = 2048
@@ -68,7 +69,7 @@ def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, c
     last, ends = 4 * len(blocks.grids) - 4, torch.tensor(starts[1:], device=block.device)
     group = last - 4 * torch.bucketize(block, ends, right=True)  # coarsest first
     if membership is not None:
-        rows[pixels], regions = membership.tiles(SIDE).mask[block[pixels]], membership.num_regions
+        rows[pixels], regions = membership.tiles(TILE).mask[block[pixels]], membership.num_regions
     tile = copy * blocks.grids[1].first_tile + blocks.keys[block] // regions
     place = torch.where(pixels, tile, number[copy, (block - first).clamp_min(0)])
     # regions that share a tile go one after the other
@@ -114,7 +115,7 @@ def gather(grad: Tensor, plan: Nodes, masks: Tensor | None) -> Tensor:
 def _weigh(values: Tensor, step: Step, masks: Tensor | None) -> Tensor:
     if masks is None or step.masks is None:
         return values
-    return values.mul_(masks[step.masks].view(-1, 1, SIDE, SIDE))
+    return values.mul_(masks[step.masks].view(-1, 1, TILE, TILE))
 
 
 def _spread(nodes: Tensor, step: Step, matrix: Tensor) -> Tensor:
@@ -138,14 +139,14 @@ def _collect(nodes: Tensor, step: Step, matrix: Tensor, grad: Tensor) -> None:
 def _refinement(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Two-scale relation of cubic B-splines, from a window, (16, 11)."""
     weights = {k: math.comb(4, k) / 8 for k in range(5)}
-    rows = [[weights.get(p - 2 * n + 3, 0.0) for n in range(_WINDOW)] for p in range(SIDE)]
+    rows = [[weights.get(p - 2 * n + 3, 0.0) for n in range(_WINDOW)] for p in range(TILE)]
     return torch.tensor(rows, dtype=dtype, device=device)
 
 
 @functools.lru_cache(maxsize=4)
 def _sampling(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Cubic B-splines at the centres of pixels, from a window, (16, 11)."""
-    rows = [[_spline(abs(p / 2 + 1.25 - n)) for n in range(_WINDOW)] for p in range(SIDE)]
+    rows = [[_spline(abs(p / 2 + 1.25 - n)) for n in range(_WINDOW)] for p in range(TILE)]
     return torch.tensor(rows, dtype=dtype, device=device)
 
 

@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from .membership import Membership
+from .tiles import TILE
 
-SIDE = 16  # of a block and of a tile
 # a grid of no more nodes than this is not coarsened again
-_SMALLEST = 2 * SIDE
+_SMALLEST = 2 * TILE
 # the interpolation is off by 0.0042 (spacing / deviation)^4, which this keeps at 1.7 times the cutoff
 _SPACING = 4.5
 _MOST = 0.7
@@ -70,26 +70,26 @@ def blocks_of(membership: Membership | None, size: tuple[int, int], device: torc
     """Return the blocks of a map, or of one region everywhere, made once and kept."""
     if membership is None:
         return _blocks_without_map(size, device)
-    return membership.derived("blocks", lambda m: make_blocks(m.tiles(SIDE).keys, m.num_regions, m.index.shape))
+    return membership.derived("blocks", lambda m: make_blocks(m.tiles(TILE).keys, m.num_regions, m.index.shape))
 
 
 @functools.lru_cache(maxsize=4)
 def _blocks_without_map(size: tuple[int, int], device: torch.device) -> Blocks:
-    tiles = -(-size[0] // SIDE) * -(-size[1] // SIDE)
+    tiles = -(-size[0] // TILE) * -(-size[1] // TILE)
     return make_blocks(torch.arange(tiles, device=device), 1, (1, *size))
 
 
 def grids_of(size: tuple[int, int], maps: int) -> tuple[Grid, ...]:
     """Return the grids of images of a size, the pixels first."""
     height, width = size
-    grids = [Grid(height, width, -(-height // SIDE), -(-width // SIDE), 0)]
+    grids = [Grid(height, width, -(-height // TILE), -(-width // TILE), 0)]
     while max(height, width) > _SMALLEST:
         last = grids[-1]
         # the last pixel, at n - 1/2, needs two nodes after it; node n - 2 the one at its place, and one more
         pixels = len(grids) == 1
         height, width = ((n - 1) // 2 + 4 if pixels else (n - 2) // 2 + 3 for n in (height, width))
         first_tile = last.first_tile + maps * last.rows * last.cols
-        grids.append(Grid(height, width, -(-height // SIDE), -(-width // SIDE), first_tile))
+        grids.append(Grid(height, width, -(-height // TILE), -(-width // TILE), first_tile))
     return tuple(grids)
 
 

@@ -68,7 +68,7 @@ def plan(inputs: SplatInputs) -> _Plan:
     gaussians, start, entries, live = list_tiles(
         means, factors, colors, order, regions, images, batch, table, radius, most_spacing(inputs.cutoff)
     )
-    lists = Lists(gaussians, colors.ravel(), regions, start, entries, table, live, batch, radius, lowest)
+    lists = Lists(gaussians, colors.ravel(), regions, start, entries, table, live, radius, lowest)
     return _Plan(lists, order, live.any(), *order_rows(tuple(table.grids[:, ROWS].tolist()), batch))
 
 

@@ -59,7 +59,6 @@ class Lists(NamedTuple):
     entries: Any  # [E, 3] int32: Gaussian, first tile, last tile + 1; or Gaussian, -1, vectors of each row
     table: Table
     live: Any  # [copies * (blocks of nodes + 1)] bool: not all zero; the last block of a copy never is
-    batch: int
     radius: float  # largest |z|
     lowest: Any  # float32, least exponent of 2
 
@@ -123,7 +122,7 @@ def enter_tile(g, row, col, height, width, radius, coefficients):  # type: ignor
 
 @inner
 def enter_rows(g, row, height, width, radius, vectors, shape):  # type: ignore[no-untyped-def]
-    """Set the shape of a narrow Gaussian's rows (see simd); return the rows, first and last + 1, to visit."""
+    """Set the shape of a narrow Gaussian's rows (see rows); return the rows, first and last + 1, to visit."""
     reach, base = g[HEIGHT] * radius + MARGIN, row * SIDE
     first = max(math.ceil(g[MY] - reach - 0.5), base)
     last = min(math.floor(g[MY] + reach - 0.5), min(base + SIDE, height) - 1)

@@ -116,74 +116,66 @@ def _sample_row(lists, image, row, pixels, stride, nodes, channels, transposed):
             clear_rows(pixels, at, stride, SIDE * channels)  # type: ignore[call-arg]
 
 
-@inner
-def _add_row(lists, r, level, image, row, pixels, stride, channels, shape):  # type: ignore[no-untyped-def]
-    """Add the Gaussians of a row of tiles; pixels are those of the row, or the blocks of all nodes."""
-    per_tile = SIDE * SIDE * channels
-    table, gaussians, entries, colors = lists.table, lists.gaussians, lists.entries, lists.colors
-    num_regions, tile_start, regions, mask, masks = table[0], table.tile_start, table.regions, table.mask, table.masks
-    height, width = table.grids[level, ROWS_OF_NODES], table.grids[level, COLS_OF_NODES]
-    tile, first_block = first_tile(table, level, image, row), copy_of(table, image) - len(mask)
-    radius, lowest = lists.radius, lists.lowest
-    for e in range(lists.start[r], lists.start[r + 1]):
-        i = entries[e, 0]
-        if entries[e, 1] < 0:
-            first, last = enter_rows(gaussians[i], row, height, width, radius, entries[e, 2], shape)
-            add_sheared(  # type: ignore[call-arg]
-                pixels, PADDING, channels * stride, stride, channels, first, last, shape, colors, i * channels, lowest,
-                entries[e, 2],
-            )  # fmt: skip
-            continue
-        region = lists.regions[i]
-        for col in range(entries[e, 1], entries[e, 2]):
-            block = find_block(num_regions, tile_start, regions, tile + col, region)
-            if block < 0:
-                continue
-            first, last = enter_tile(gaussians[i], row, col, height, width, radius, shape)
-            if first < last:
+def _make_row_loop(gathers: bool) -> Any:
+    """Make the loop over the Gaussians of a row of tiles: it adds them, or gathers their gradients.
+
+    Pixels are those of the row, or the blocks of all nodes. Gathering fills out[e]: C colour gradients, 5 moments of
+    z * SCALE, and room.
+    """
+
+    @inner
+    def visit_row(lists, r, level, image, row, pixels, stride, channels, shape, sums, out, moments):  # type: ignore[no-untyped-def]
+        per_tile, across = SIDE * SIDE * channels, channels * stride
+        table, gaussians, entries, colors = lists.table, lists.gaussians, lists.entries, lists.colors
+        num_regions, tile_start, regions, mask = table[0], table.tile_start, table.regions, table.mask
+        height, width = table.grids[level, ROWS_OF_NODES], table.grids[level, COLS_OF_NODES]
+        tile, first_block = first_tile(table, level, image, row), copy_of(table, image) - len(mask)
+        masks, radius, lowest = table.masks, lists.radius, lists.lowest
+        for e in range(lists.start[r], lists.start[r + 1]):
+            i, start, end = entries[e, 0], entries[e, 1], entries[e, 2]
+            region = lists.regions[i]
+            if gathers:
+                for k in range(len(sums)):
+                    sums[k] = 0.0
+            if start < 0:
+                first, last = enter_rows(gaussians[i], row, height, width, radius, end, shape)
+                if gathers:
+                    gather_sheared(  # type: ignore[call-arg]
+                        pixels, PADDING, across, stride, channels, first, last, shape, colors, i * channels, lowest,
+                        end, sums, moments,
+                    )  # fmt: skip
+                else:
+                    add_sheared(  # type: ignore[call-arg]
+                        pixels, PADDING, across, stride, channels, first, last, shape, colors, i * channels, lowest, end
+                    )
+                start = end  # no tiles besides
+            for col in range(start, end):
+                block = find_block(num_regions, tile_start, regions, tile + col, region)
+                if block < 0:
+                    continue
+                first, last = enter_tile(gaussians[i], row, col, height, width, radius, shape)
+                if first >= last:
+                    continue
                 at, mask_at = (first_block + block) * per_tile, -1
                 if level == 0:
                     at, mask_at = PADDING + col * SIDE, mask[block] * SIDE * SIDE
-                add_rows(  # type: ignore[call-arg]
-                    pixels, at, channels * stride, stride, channels, first, last, shape, colors, i * channels, lowest,
-                    masks, mask_at,
-                )  # fmt: skip
+                if gathers:
+                    gather_rows(  # type: ignore[call-arg]
+                        pixels, at, across, stride, channels, first, last, shape, colors, i * channels, lowest, masks,
+                        mask_at, sums, moments,
+                    )  # fmt: skip
+                else:
+                    add_rows(  # type: ignore[call-arg]
+                        pixels, at, across, stride, channels, first, last, shape, colors, i * channels, lowest, masks,
+                        mask_at,
+                    )  # fmt: skip
+            if gathers:
+                sum_columns(sums, out.shape[1], out, e * out.shape[1])  # type: ignore[call-arg]
+
+    return visit_row
 
 
-@inner
-def _gather_row(lists, r, level, image, row, pixels, stride, channels, shape, sums, out, moments):  # type: ignore[no-untyped-def]
-    """Fill out[e] for the Gaussians of a row of tiles: C colour gradients, 5 moments of z * SCALE, and room."""
-    per_tile = SIDE * SIDE * channels
-    table, gaussians, entries, colors = lists.table, lists.gaussians, lists.entries, lists.colors
-    num_regions, tile_start, regions, mask, masks = table[0], table.tile_start, table.regions, table.mask, table.masks
-    height, width = table.grids[level, ROWS_OF_NODES], table.grids[level, COLS_OF_NODES]
-    tile, first_block = first_tile(table, level, image, row), copy_of(table, image) - len(mask)
-    radius, lowest = lists.radius, lists.lowest
-    for e in range(lists.start[r], lists.start[r + 1]):
-        i = entries[e, 0]
-        region = lists.regions[i]
-        for k in range(len(sums)):
-            sums[k] = 0.0
-        if entries[e, 1] < 0:
-            first, last = enter_rows(gaussians[i], row, height, width, radius, entries[e, 2], shape)
-            gather_sheared(  # type: ignore[call-arg]
-                pixels, PADDING, channels * stride, stride, channels, first, last, shape, colors, i * channels, lowest,
-                entries[e, 2], sums, moments,
-            )  # fmt: skip
-        for col in range(entries[e, 1], entries[e, 2] if entries[e, 1] >= 0 else -1):
-            block = find_block(num_regions, tile_start, regions, tile + col, region)
-            if block < 0:
-                continue
-            first, last = enter_tile(gaussians[i], row, col, height, width, radius, shape)
-            if first < last:
-                at, mask_at = (first_block + block) * per_tile, -1
-                if level == 0:
-                    at, mask_at = PADDING + col * SIDE, mask[block] * SIDE * SIDE
-                gather_rows(  # type: ignore[call-arg]
-                    pixels, at, channels * stride, stride, channels, first, last, shape, colors, i * channels, lowest,
-                    masks, mask_at, sums, moments,
-                )  # fmt: skip
-        sum_columns(sums, out.shape[1], out, e * out.shape[1])  # type: ignore[call-arg]
+_add_row, _gather_row = _make_row_loop(False), _make_row_loop(True)
 
 
 @program.entry
@@ -203,7 +195,7 @@ def render(lists, rows, image, nodes):  # type: ignore[no-untyped-def]
         elif level == 0:
             for at in range(len(pixels)):
                 pixels[at] = 0.0
-        _add_row(lists, r, level, b, row, values, step, channels, shape)
+        _add_row(lists, r, level, b, row, values, step, channels, shape, None, None, False)
         if level == 0:
             _exchange(pixels, stride, image, b, row, True)
 
@@ -281,7 +273,7 @@ def _example() -> tuple[Lists, Any]:
     table = Table(1, 1, grids, places[:1], places, parents, odd, places[:1], mask, numbers)
     nothing = np.zeros(1, np.bool_)
     lists = Lists(
-        np.ones((1, COLUMNS)), numbers, places, places, np.zeros((1, 3), np.int32), table, nothing, 1, 4.0, numbers[0]
+        np.ones((1, COLUMNS)), numbers, places, places, np.zeros((1, 3), np.int32), table, nothing, 4.0, numbers[0]
     )
     return lists, np.zeros((1, 8), np.float32)
 

@@ -11,7 +11,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from .simd import _FLOAT, _LONG, _START, SIDE, _broadcast, _call, _constant, _exp2, _load, _pointer, _ramp, _store
+from .simd import FLOAT, LONG, SIDE, START, apply, both, broadcast, constant, exp2, load, pointer, ramp, store
 
 
 class _Columns:
@@ -19,50 +19,67 @@ class _Columns:
 
     def __init__(self, builder: Any, coefficients: Any, lowest: Any) -> None:
         self.builder = builder
-        k = [
-            builder.fptrunc(builder.load(builder.gep(coefficients, [ir.Constant(_LONG, i)])), _FLOAT) for i in range(5)
-        ]
-        column = _ramp()
-        first = _call(builder, "fma", _broadcast(builder, k[1]), column, _broadcast(builder, k[0]))
+        k = [builder.fptrunc(builder.load(builder.gep(coefficients, [ir.Constant(LONG, i)])), FLOAT) for i in range(5)]
+        column = ramp()
+        first = apply(builder, "fma", broadcast(builder, k[1]), column, broadcast(builder, k[0]))
         self.first = first
         self.negative = builder.fneg(builder.fmul(first, first))
-        self.base = _call(builder, "fma", _broadcast(builder, k[3]), column, _broadcast(builder, k[2]))
-        self.slope = _broadcast(builder, k[4])
-        self.lowest = _broadcast(builder, lowest)
+        self.base = apply(builder, "fma", broadcast(builder, k[3]), column, broadcast(builder, k[2]))
+        self.slope = broadcast(builder, k[4])
+        self.lowest = lowest
 
     def weight(self, row: Any, mask: Any) -> tuple[Any, Any]:
         """Second coordinate and weight; `row` counts from the middle of the tile, `mask` is a pointer or None."""
         builder = self.builder
-        second = _call(builder, "fma", self.slope, _broadcast(builder, row), self.base)
-        exponent = _call(builder, "fma", builder.fneg(second), second, self.negative)
-        seen = builder.fcmp_ordered(">=", exponent, self.lowest)
-        weight = builder.select(seen, _exp2(builder, exponent), _constant(0.0))
+        second = apply(builder, "fma", self.slope, broadcast(builder, row), self.base)
+        weight = _weigh(builder, second, self.negative, self.lowest)
         if mask is not None:
-            weight = builder.fmul(weight, _load(builder, mask))
+            weight = builder.fmul(weight, load(builder, mask))
         return second, weight
 
 
-class _Call:
-    """The arguments that the loops over aligned rows share, as LLVM values."""
+def _weigh(builder: Any, second: Any, negative: Any, lowest: Any) -> Any:
+    """Return 2 ** (negative - second ** 2), 0 where the exponent is below the lowest."""
+    exponent = apply(builder, "fma", builder.fneg(second), second, negative)
+    return builder.select(builder.fcmp_ordered(">=", exponent, lowest), exp2(builder, exponent), constant(0.0))
+
+
+class _Rows:
+    """The arguments that all loops over rows share, as LLVM values."""
 
     def __init__(self, context: Any, builder: Any, types_of: Any, arguments: Any) -> None:
         self.builder = builder
         self.row_stride, self.channel_stride, self.channels = arguments[2:5]
         self.first, self.last = arguments[5:7]
-        self.pixels = _pointer(context, builder, types_of[0], arguments[0], arguments[1])
-        self.colors = _pointer(context, builder, types_of[8], arguments[8], arguments[9])
-        self.masks = _pointer(context, builder, types_of[11], arguments[11], arguments[12])
-        self.masked = builder.icmp_signed(">=", arguments[12], _START)
-        coefficients = _pointer(context, builder, types_of[7], arguments[7], _START)
-        self.geometry = _Columns(builder, coefficients, arguments[10])
+        self.pixels = pointer(context, builder, types_of[0], arguments[0], arguments[1])
+        self.shape = pointer(context, builder, types_of[7], arguments[7], START)
+        self.colors = pointer(context, builder, types_of[8], arguments[8], arguments[9])
+        self.lowest = broadcast(builder, arguments[10])
+        self.are_three = builder.icmp_signed("==", self.channels, ir.Constant(LONG, 3))
+
+    @contextmanager
+    def each_number(self) -> Iterator[Any]:
+        """Emit a loop over the numbers of the rows."""
+        with cgutils.for_range_slice(self.builder, self.first, self.last, ir.Constant(LONG, 1)) as (row, _):
+            yield row
+
+
+class _Aligned(_Rows):
+    """Rows of a tile, with a mask or without."""
+
+    def __init__(self, context: Any, builder: Any, types_of: Any, arguments: Any) -> None:
+        super().__init__(context, builder, types_of, arguments)
+        self.masks = pointer(context, builder, types_of[11], arguments[11], arguments[12])
+        self.masked = builder.icmp_signed(">=", arguments[12], START)
+        self.geometry = _Columns(builder, self.shape, self.lowest)
 
     @contextmanager
     def each_row(self, masked: bool) -> Iterator[tuple[Any, Any, Any]]:
         """Emit a loop over the rows; yield second coordinate, weight, and pointer to the pixels."""
         builder = self.builder
-        with cgutils.for_range_slice(builder, self.first, self.last, ir.Constant(_LONG, 1)) as (row, _):
-            mask = builder.gep(self.masks, [builder.mul(row, ir.Constant(_LONG, SIDE))]) if masked else None
-            middle = builder.fadd(builder.sitofp(row, _FLOAT), ir.Constant(_FLOAT, -(SIDE - 1) / 2))
+        with self.each_number() as row:
+            mask = builder.gep(self.masks, [builder.mul(row, ir.Constant(LONG, SIDE))]) if masked else None
+            middle = builder.fadd(builder.sitofp(row, FLOAT), ir.Constant(FLOAT, -(SIDE - 1) / 2))
             second, weight = self.geometry.weight(middle, mask)
             yield second, weight, builder.gep(self.pixels, [builder.mul(row, self.row_stride)])
 
@@ -74,35 +91,33 @@ _ROWS = (_LONGS,) * 6  # offset, strides of rows and channels, channels, first a
 class _Colors:
     """What is done for every channel: three of them without a loop, and what is summed stays in registers."""
 
-    def __init__(self, builder: Any, colors: Any, channels: Any, stride: Any, three: bool) -> None:
-        self.builder, self.colors, self.channels, self.stride, self.three = builder, colors, channels, stride, three
-
-    @contextmanager
-    def _loop(self) -> Iterator[Any]:
-        with cgutils.for_range(self.builder, self.channels) as loop:
-            yield loop.index
+    def __init__(self, rows: _Rows, three: bool) -> None:
+        self.builder, self.colors, self.channels = rows.builder, rows.colors, rows.channels
+        self.stride, self.three = rows.channel_stride, three
 
     def each(self, work: Callable[[Any, Any], None], pixels: Any) -> None:
         """Emit work(channel, pointer to its pixels)."""
-        builder = self.builder
+
+        def visit(channel: Any) -> None:
+            work(channel, self.builder.gep(pixels, [self.builder.mul(channel, self.stride)]))
+
         if self.three:
             for c in range(3):
-                channel = ir.Constant(_LONG, c)
-                work(channel, builder.gep(pixels, [builder.mul(channel, self.stride)]))
+                visit(ir.Constant(LONG, c))
         else:
-            with self._loop() as channel:
-                work(channel, builder.gep(pixels, [builder.mul(channel, self.stride)]))
+            with cgutils.for_range(self.builder, self.channels) as loop:
+                visit(loop.index)
 
     def color(self, channel: Any) -> Any:
         """Return a color in all elements of a vector."""
-        return _broadcast(self.builder, self.builder.load(self.builder.gep(self.colors, [channel])))
+        return broadcast(self.builder, self.builder.load(self.builder.gep(self.colors, [channel])))
 
     def add(self, weight: Any, pixels: Any) -> None:
         """Emit pixels[c] += weight * colors[c]."""
 
         def work(channel: Any, place: Any) -> None:
-            value = _call(self.builder, "fma", weight, self.color(channel), _load(self.builder, place))
-            _store(self.builder, value, place)
+            value = apply(self.builder, "fma", weight, self.color(channel), load(self.builder, place))
+            store(self.builder, value, place)
 
         self.each(work, pixels)
 
@@ -112,7 +127,7 @@ class _Sums:
 
     def __init__(self, builder: Any, colors: _Colors, sums: Any, moments: int) -> None:
         self.builder, self.colors, self.at = builder, colors, sums
-        zero = _constant(0.0)
+        zero = constant(0.0)
         self.totals = [cgutils.alloca_once_value(builder, zero) for _ in range(3 if colors.three else 0)]
         # variables, which LLVM keeps in registers
         self.moments = [cgutils.alloca_once_value(builder, zero) for _ in range(moments)]
@@ -121,17 +136,22 @@ class _Sums:
         """Add w g_c; return w sum_c g_c colors_c."""
         builder = self.builder
         # -0.0 added changes nothing, not even the sign of a zero
-        value = cgutils.alloca_once_value(builder, _constant(-0.0))
+        value = cgutils.alloca_once_value(builder, constant(-0.0))
 
         def work(channel: Any, place: Any) -> None:
-            grad = _load(builder, place)
+            grad = load(builder, place)
             if self.totals:
                 total = self.totals[channel.constant]
-                builder.store(_call(builder, "fma", weight, grad, builder.load(total)), total)
+                builder.store(apply(builder, "fma", weight, grad, builder.load(total)), total)
             else:
-                _store(builder, _call(builder, "fma", weight, grad, _load(builder, self.at, channel)), self.at, channel)
+                store(
+                    builder,
+                    apply(builder, "fma", weight, grad, load(builder, self.at, channel)),
+                    self.at,
+                    channel,
+                )
             if self.moments:
-                builder.store(_call(builder, "fma", grad, self.colors.color(channel), builder.load(value)), value)
+                builder.store(apply(builder, "fma", grad, self.colors.color(channel), builder.load(value)), value)
 
         self.colors.each(work, pixels)
         return builder.fmul(builder.load(value), weight)
@@ -142,32 +162,20 @@ class _Sums:
         if second is None:
             builder.store(builder.fadd(builder.load(total), first), total)
         else:
-            builder.store(_call(builder, "fma", first, second, builder.load(total)), total)
+            builder.store(apply(builder, "fma", first, second, builder.load(total)), total)
 
     def finish(self, moments: list[Any]) -> None:
         """Add what is in registers to the sums in memory."""
         builder = self.builder
-        terms = [(ir.Constant(_LONG, c), builder.load(total)) for c, total in enumerate(self.totals)]
+        terms = [(ir.Constant(LONG, c), builder.load(total)) for c, total in enumerate(self.totals)]
         for k, moment in enumerate(moments):
-            terms.append((builder.add(self.colors.channels, ir.Constant(_LONG, k)), moment))
+            terms.append((builder.add(self.colors.channels, ir.Constant(LONG, k)), moment))
         for at, term in terms:
-            _store(builder, builder.fadd(_load(builder, self.at, at), term), self.at, at)
-
-
-def _both(builder: Any, condition: Any, emit: Callable[[bool], None]) -> None:
-    with builder.if_else(condition) as (then, otherwise):
-        with then:
-            emit(True)
-        with otherwise:
-            emit(False)
+            store(builder, builder.fadd(load(builder, self.at, at), term), self.at, at)
 
 
 def _special_or(builder: Any, condition: Any, special: Callable[[], None], general: Callable[[], None]) -> None:
-    _both(builder, condition, lambda is_special: special() if is_special else general())
-
-
-def _is_three(builder: Any, channels: Any) -> Any:
-    return builder.icmp_signed("==", channels, ir.Constant(_LONG, 3))
+    both(builder, condition, lambda is_special: special() if is_special else general())
 
 
 @intrinsic
@@ -178,15 +186,15 @@ def add_rows(  # type: ignore[no-untyped-def]
     """pixels[row, c, :] += weight[row, :] * colors[c] for rows first ... last - 1; mask_at < 0: no mask."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        call = _Call(context, builder, signature.args, arguments)
+        call = _Aligned(context, builder, signature.args, arguments)
 
         def emit(masked: bool, three: bool = False) -> None:
-            colors = _Colors(builder, call.colors, call.channels, call.channel_stride, three)
+            colors = _Colors(call, three)
             with call.each_row(masked) as (_, weight, pixels):
                 colors.add(weight, pixels)
 
-        special = builder.and_(_is_three(builder, call.channels), builder.not_(call.masked))
-        _special_or(builder, special, lambda: emit(False, True), lambda: _both(builder, call.masked, emit))
+        special = builder.and_(call.are_three, builder.not_(call.masked))
+        _special_or(builder, special, lambda: emit(False, True), lambda: both(builder, call.masked, emit))
         return context.get_dummy_value()
 
     return types.void(pixels, *_ROWS, coefficients, colors, _LONGS, types.float32, masks, _LONGS), generate
@@ -201,11 +209,11 @@ def gather_rows(  # type: ignore[no-untyped-def]
     `moments` is true, v z1, v z2, v z1 z1, v z1 z2, v z2 z2."""  # noqa: D205, D209
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        call = _Call(context, builder, signature.args, arguments)
-        sums_at = _pointer(context, builder, signature.args[13], arguments[13], _START)
+        call = _Aligned(context, builder, signature.args, arguments)
+        sums_at = pointer(context, builder, signature.args[13], arguments[13], START)
 
         def emit(masked: bool, moments: bool, three: bool = False) -> None:
-            colors = _Colors(builder, call.colors, call.channels, call.channel_stride, three)
+            colors = _Colors(call, three)
             sums = _Sums(builder, colors, sums_at, 3 if moments else 0)
             with call.each_row(masked) as (second, weight, pixels):
                 value = sums.gather(weight, pixels)
@@ -222,13 +230,13 @@ def gather_rows(  # type: ignore[no-untyped-def]
                 totals = [once, totals[1], builder.fmul(once, first), builder.fmul(totals[1], first), totals[2]]
             sums.finish(totals)
 
-        special = builder.and_(_is_three(builder, call.channels), builder.not_(call.masked))
+        special = builder.and_(call.are_three, builder.not_(call.masked))
 
         def general() -> None:
-            _both(builder, arguments[14], lambda moments: _both(builder, call.masked, lambda m: emit(m, moments)))
+            both(builder, arguments[14], lambda moments: both(builder, call.masked, lambda m: emit(m, moments)))
 
         def of_three() -> None:
-            _both(builder, arguments[14], lambda moments: emit(False, moments, True))
+            both(builder, arguments[14], lambda moments: emit(False, moments, True))
 
         _special_or(builder, special, of_three, general)
         return context.get_dummy_value()
@@ -238,50 +246,43 @@ def gather_rows(  # type: ignore[no-untyped-def]
     ), generate
 
 
-class _Sheared:
+class _Sheared(_Rows):
     """Rows of a narrow Gaussian, each with vectors of its own around its middle there, where no mask is needed.
 
-    `shape` holds, in float64: how far the middle of row 0 is from the first pixel of its vectors' and by how much it
-    moves from row to row, the mean's x and row 0's distance to its y, and the three slopes of z.
+    `shape` holds nine float64. The first two are x of the first pixel of the vectors of row 0, before it is rounded,
+    and how much it grows from row to row. Then come the mean's x, the distance of row 0 from the mean's y, the three
+    slopes of z, and the least and largest x at which vectors may begin.
     """
 
     def __init__(self, context: Any, builder: Any, types_of: Any, arguments: Any) -> None:
-        self.builder = builder
-        self.row_stride, self.channel_stride, self.channels = arguments[2:5]
-        self.first, self.last = arguments[5:7]
-        self.pixels = _pointer(context, builder, types_of[0], arguments[0], arguments[1])
-        self.colors = _pointer(context, builder, types_of[8], arguments[8], arguments[9])
-        shape = _pointer(context, builder, types_of[7], arguments[7], _START)
-        self.shape = [builder.load(builder.gep(shape, [ir.Constant(_LONG, k)])) for k in range(9)]
-        self.lowest = _broadcast(builder, arguments[10])
+        super().__init__(context, builder, types_of, arguments)
+        self.numbers = [builder.load(builder.gep(self.shape, [ir.Constant(LONG, k)])) for k in range(9)]
         self.vectors = arguments[11]
 
     @contextmanager
     def each_vector(self) -> Iterator[tuple[Any, Any, Any, Any]]:
         """Emit loops over rows and vectors; yield z1, z2, weight, and pointer to the pixels."""
         builder = self.builder
-        start, shift, mean, down, rise1, rise2, rise3, low, high = self.shape
-        slopes = [_broadcast(builder, builder.fptrunc(rise, _FLOAT)) for rise in (rise1, rise2)]
-        ramp, double = _ramp(), ir.DoubleType()
-        with cgutils.for_range_slice(builder, self.first, self.last, ir.Constant(_LONG, 1)) as (row, _):
+        start, shift, mean, down, rise1, rise2, rise3, low, high = self.numbers
+        slopes = [broadcast(builder, builder.fptrunc(rise, FLOAT)) for rise in (rise1, rise2)]
+        columns, double = ramp(), ir.DoubleType()
+        with self.each_number() as row:
             number = builder.sitofp(row, double)
             left = _scalar(builder, "fma", shift, number, start)
             left = _scalar(builder, "floor", _scalar(builder, "minnum", _scalar(builder, "maxnum", left, low), high))
             dy = builder.fadd(number, down)
             # of the middle of the first vector
             dx = builder.fadd(builder.fsub(left, mean), ir.Constant(double, SIDE / 2))
-            at = builder.add(builder.fptosi(left, _LONG), builder.mul(row, self.row_stride))
+            at = builder.add(builder.fptosi(left, LONG), builder.mul(row, self.row_stride))
             with cgutils.for_range(builder, self.vectors) as loop:
-                along = builder.fadd(dx, builder.sitofp(builder.mul(loop.index, ir.Constant(_LONG, SIDE)), double))
+                along = builder.fadd(dx, builder.sitofp(builder.mul(loop.index, ir.Constant(LONG, SIDE)), double))
                 middle = [builder.fmul(rise1, along), _scalar(builder, "fma", rise2, along, builder.fmul(rise3, dy))]
                 z1, z2 = (
-                    _call(builder, "fma", slope, ramp, _broadcast(builder, builder.fptrunc(value, _FLOAT)))
+                    apply(builder, "fma", slope, columns, broadcast(builder, builder.fptrunc(value, FLOAT)))
                     for slope, value in zip(slopes, middle, strict=True)
                 )
-                exponent = _call(builder, "fma", builder.fneg(z2), z2, builder.fneg(builder.fmul(z1, z1)))
-                seen = builder.fcmp_ordered(">=", exponent, self.lowest)
-                weight = builder.select(seen, _exp2(builder, exponent), _constant(0.0))
-                place = builder.add(at, builder.mul(loop.index, ir.Constant(_LONG, SIDE)))
+                weight = _weigh(builder, z2, builder.fneg(builder.fmul(z1, z1)), self.lowest)
+                place = builder.add(at, builder.mul(loop.index, ir.Constant(LONG, SIDE)))
                 yield z1, z2, weight, builder.gep(self.pixels, [place])
 
 
@@ -302,11 +303,11 @@ def add_sheared(  # type: ignore[no-untyped-def]
         call = _Sheared(context, builder, signature.args, arguments)
 
         def emit(three: bool) -> None:
-            colors = _Colors(builder, call.colors, call.channels, call.channel_stride, three)
+            colors = _Colors(call, three)
             with call.each_vector() as (_, _, weight, pixels):
                 colors.add(weight, pixels)
 
-        _both(builder, _is_three(builder, call.channels), emit)
+        both(builder, call.are_three, emit)
         return context.get_dummy_value()
 
     return types.void(pixels, *_ROWS, shape, colors, _LONGS, types.float32, _LONGS), generate
@@ -321,10 +322,10 @@ def gather_sheared(  # type: ignore[no-untyped-def]
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         call = _Sheared(context, builder, signature.args, arguments)
-        sums_at = _pointer(context, builder, signature.args[12], arguments[12], _START)
+        sums_at = pointer(context, builder, signature.args[12], arguments[12], START)
 
         def emit(moments: bool, three: bool = False) -> None:
-            colors = _Colors(builder, call.colors, call.channels, call.channel_stride, three)
+            colors = _Colors(call, three)
             sums = _Sums(builder, colors, sums_at, 5 if moments else 0)
             with call.each_vector() as (z1, z2, weight, pixels):
                 value = sums.gather(weight, pixels)
@@ -337,8 +338,8 @@ def gather_sheared(  # type: ignore[no-untyped-def]
                     sums.add(4, two, z2)
             sums.finish([builder.load(total) for total in sums.moments])
 
-        three, moments = _is_three(builder, call.channels), arguments[13]
-        _both(builder, three, lambda t: _both(builder, moments, lambda m: emit(m, t)))
+        three, moments = call.are_three, arguments[13]
+        both(builder, three, lambda t: both(builder, moments, lambda m: emit(m, t)))
         return context.get_dummy_value()
 
     return types.void(pixels, *_ROWS, shape, colors, _LONGS, types.float32, _LONGS, sums, types.boolean), generate

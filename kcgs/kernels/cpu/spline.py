@@ -7,6 +7,7 @@ the coarser one, which begins at a block's first node or in its middle. Blocks l
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from llvmlite import ir
@@ -14,7 +15,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from .simd import _FLOAT, _INT, _LONG, _START, _VECTOR, SIDE, _call, _constant, _load, _pointer, _store
+from .simd import FLOAT, LONG, NOTHING, SIDE, START, VECTOR, apply, both, constant, load, pointer, shuffle, store
 
 # weights of the four neighbours: refinement of cubic B-splines, exact; and the spline at pixel centres, a quarter and
 # three quarters of the way from one node to the next
@@ -26,30 +27,26 @@ SAMPLE = (
 
 _HALF = SIDE // 2
 _WINDOW = _HALF + 3
-_NOTHING = ir.Constant(_VECTOR, ir.Undefined)
+# of two vectors: the last half of the first and the first half of the second
+_SECOND_HALF = range(_HALF, _HALF + SIDE)
 
 
 def _long(value: int) -> ir.Constant:
-    return ir.Constant(_LONG, value)
-
-
-def _shuffle(builder: Any, first: Any, second: Any, places: Any) -> Any:
-    kind = ir.VectorType(_INT, SIDE)
-    return builder.shuffle_vector(first, second, ir.Constant(kind, [ir.Constant(_INT, p) for p in places]))
+    return ir.Constant(LONG, value)
 
 
 def _multiply_add(builder: Any, factor: float, value: Any, total: Any) -> Any:
     if factor == 0.0:
         return total
     return (
-        builder.fmul(_constant(factor), value)
+        builder.fmul(constant(factor), value)
         if total is None
-        else _call(builder, "fma", _constant(factor), value, total)
+        else apply(builder, "fma", constant(factor), value, total)
     )
 
 
 def _alternating(even: float, odd: float) -> ir.Constant:
-    return ir.Constant(_VECTOR, [ir.Constant(_FLOAT, float(v)) for _ in range(_HALF) for v in (even, odd)])
+    return ir.Constant(VECTOR, [ir.Constant(FLOAT, float(v)) for _ in range(_HALF) for v in (even, odd)])
 
 
 class _Blocks:
@@ -57,13 +54,13 @@ class _Blocks:
 
     def __init__(self, context: Any, builder: Any, types_of: Any, arguments: Any) -> None:
         self.builder = builder
-        self.coarse, self.offsets, self.down, self.right = arguments[:4]
-        at = _pointer(context, builder, types_of[1], arguments[1], _START)
+        self.down, self.right = arguments[2:4]
+        at = pointer(context, builder, types_of[1], arguments[1], START)
         offsets = [builder.load(builder.gep(at, [_long(k)])) for k in range(4)]
-        self.parents = [_pointer(context, builder, types_of[0], arguments[0], offset) for offset in offsets]
-        self.fine = _pointer(context, builder, types_of[4], arguments[4], arguments[5])
+        self.parents = [pointer(context, builder, types_of[0], arguments[0], offset) for offset in offsets]
+        self.fine = pointer(context, builder, types_of[4], arguments[4], arguments[5])
         self.row_stride, self.channel_stride, self.channels = arguments[6:9]
-        self.masks = _pointer(context, builder, types_of[9], arguments[9], arguments[10])
+        self.masks = pointer(context, builder, types_of[9], arguments[9], arguments[10])
         self.mask_stride = arguments[11]
 
     def fine_row(self, channel: Any, row: int) -> Any:
@@ -74,7 +71,7 @@ class _Blocks:
 
     def mask(self, row: int) -> Any:
         """Weights of a row."""
-        return _load(self.builder, self.builder.gep(self.masks, [self.builder.mul(self.mask_stride, _long(row))]))
+        return load(self.builder, self.builder.gep(self.masks, [self.builder.mul(self.mask_stride, _long(row))]))
 
     def window_row(self, channel: Any, row: int) -> tuple[Any, Any]:
         """Return the pointers to a row of the window, in the left block and in the right one."""
@@ -88,68 +85,66 @@ class _Blocks:
 
     def each(self, emit: Callable[[Any, bool], None]) -> None:
         """Emit a loop over channels, for windows that begin in the middle of the left block and for others."""
-        builder = self.builder
-        with builder.if_else(self.right) as (then, otherwise):
-            for branch, right in ((then, True), (otherwise, False)):
-                with branch, cgutils.for_range(builder, self.channels) as loop:
-                    emit(loop.index, right)
+
+        def loop_over(right: bool) -> None:
+            with cgutils.for_range(self.builder, self.channels) as loop:
+                emit(loop.index, right)
+
+        both(self.builder, self.right, loop_over)
 
 
-def _signature(coarse: Any, offsets: Any, fine: Any, masks: Any) -> Any:
-    long = types.int64
-    return types.void(coarse, offsets, types.boolean, types.boolean, fine, long, long, long, long, masks, long, long)
+def _make_loop(emit: Callable[[_Blocks, Any, bool], None]) -> Any:
+    """Make a function for numba of a block, from what is emitted for a channel of it."""
+
+    @intrinsic
+    def loop(  # type: ignore[no-untyped-def]
+        typing_context, coarse, offsets, down, right, fine, at, row_stride, channel_stride, channels, masks, mask_at,
+        mask_stride,
+    ):  # fmt: skip
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            blocks = _Blocks(context, builder, signature.args, arguments)
+            blocks.each(partial(emit, blocks))
+            return context.get_dummy_value()
+
+        flag, long = types.boolean, types.int64
+        return types.void(coarse, offsets, flag, flag, fine, long, long, long, long, masks, long, long), generate
+
+    return loop
 
 
 def _make_add(even: tuple[float, ...], odd: tuple[float, ...], replaces: bool = False) -> Any:
+    """fine[row, c, :] += mask[row, :] * what the coarser grid says there; or = in place of +=."""
     used = [k for k in range(4) if even[k] or odd[k]]
 
     def widen(builder: Any, window: Any) -> Any:
         total = None
         for k in used:
-            spread = _shuffle(builder, window, _NOTHING, [j // 2 + k for j in range(SIDE)])
+            spread = shuffle(builder, window, NOTHING, [j // 2 + k for j in range(SIDE)])
             weights = _alternating(even[k], odd[k])
-            total = builder.fmul(weights, spread) if total is None else _call(builder, "fma", weights, spread, total)
+            total = builder.fmul(weights, spread) if total is None else apply(builder, "fma", weights, spread, total)
         return total
 
-    @intrinsic
-    def add(  # type: ignore[no-untyped-def]
-        typing_context, coarse, offsets, down, right, fine, at, row_stride, channel_stride, channels, masks, mask_at,
-        mask_stride,
-    ):  # fmt: skip
-        """fine[row, c, :] += mask[row, :] * what the coarser grid says there; or = in place of +=."""
+    def emit(blocks: _Blocks, channel: Any, right: bool) -> None:
+        builder, rows = blocks.builder, []
+        for n in range(_HALF + used[-1]):
+            places = blocks.window_row(channel, n)
+            window = load(builder, places[0])
+            if right:
+                window = shuffle(builder, window, load(builder, places[1]), _SECOND_HALF)
+            rows.append(widen(builder, window))
+        for row in range(SIDE):
+            total = None
+            for k in used:
+                total = _multiply_add(builder, (even, odd)[row % 2][k], rows[row // 2 + k], total)
+            place, mask = blocks.fine_row(channel, row), blocks.mask(row)
+            value = builder.fmul(total, mask) if replaces else apply(builder, "fma", total, mask, load(builder, place))
+            store(builder, value, place)
 
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            blocks = _Blocks(context, builder, signature.args, arguments)
-
-            def emit(channel: Any, right: bool) -> None:
-                rows = []
-                for n in range(_HALF + used[-1]):
-                    places = blocks.window_row(channel, n)
-                    window = _load(builder, places[0])
-                    if right:
-                        window = _shuffle(builder, window, _load(builder, places[1]), range(_HALF, _HALF + SIDE))
-                    rows.append(widen(builder, window))
-                for row in range(SIDE):
-                    total = None
-                    for k, weight in enumerate((even, odd)[row % 2]):
-                        if weight:
-                            total = _multiply_add(builder, weight, rows[row // 2 + k], total)
-                    place, mask = blocks.fine_row(channel, row), blocks.mask(row)
-                    if replaces:
-                        value = builder.fmul(total, mask)
-                    else:
-                        value = _call(builder, "fma", total, mask, _load(builder, place))
-                    _store(builder, value, place)
-
-            blocks.each(emit)
-            return context.get_dummy_value()
-
-        return _signature(coarse, offsets, fine, masks), generate
-
-    return add
+    return _make_loop(emit)
 
 
 def _make_gather(even: tuple[float, ...], odd: tuple[float, ...]) -> Any:
+    """Add to the coarser grid what mask * fine has for it: the transpose of `_make_add`."""
     used = [k for k in range(4) if even[k] or odd[k]]
 
     def narrow(builder: Any, given: Any) -> Any:
@@ -159,40 +154,25 @@ def _make_gather(even: tuple[float, ...], odd: tuple[float, ...]) -> Any:
             for j, weight in enumerate((even[k], odd[k])):
                 places = [2 * (n - k) + j if 0 <= n - k < _HALF else SIDE for n in range(SIDE)]
                 if weight:
-                    total = _multiply_add(builder, weight, _shuffle(builder, given, _constant(0.0), places), total)
+                    total = _multiply_add(builder, weight, shuffle(builder, given, constant(0.0), places), total)
         return total
 
-    @intrinsic
-    def gather(  # type: ignore[no-untyped-def]
-        typing_context, coarse, offsets, down, right, fine, at, row_stride, channel_stride, channels, masks, mask_at,
-        mask_stride,
-    ):  # fmt: skip
-        """Add to the coarser grid what mask * fine has for it: the transpose of `add`."""
+    def emit(blocks: _Blocks, channel: Any, right: bool) -> None:
+        builder = blocks.builder
+        rows: list[Any] = [None] * _WINDOW
+        for row in range(SIDE):
+            value = builder.fmul(load(builder, blocks.fine_row(channel, row)), blocks.mask(row))
+            for k in used:
+                rows[row // 2 + k] = _multiply_add(builder, (even, odd)[row % 2][k], value, rows[row // 2 + k])
+        for n, row in enumerate(rows[: _HALF + used[-1]]):
+            total, zero = narrow(builder, row), constant(0.0)
+            parts = [total]
+            if right:
+                parts = [shuffle(builder, a, b, _SECOND_HALF) for a, b in ((zero, total), (total, zero))]
+            for part, place in zip(parts, blocks.window_row(channel, n), strict=False):
+                store(builder, builder.fadd(load(builder, place), part), place)
 
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            blocks = _Blocks(context, builder, signature.args, arguments)
-
-            def emit(channel: Any, right: bool) -> None:
-                rows: list[Any] = [None] * _WINDOW
-                for row in range(SIDE):
-                    value = builder.fmul(_load(builder, blocks.fine_row(channel, row)), blocks.mask(row))
-                    for k, weight in enumerate((even, odd)[row % 2]):
-                        rows[row // 2 + k] = _multiply_add(builder, weight, value, rows[row // 2 + k])
-                for n, row in enumerate(rows[: _HALF + used[-1]]):
-                    total, zero = narrow(builder, row), _constant(0.0)
-                    low, high = (range(_HALF, _HALF + SIDE) for _ in range(2))
-                    parts = [total]
-                    if right:
-                        parts = [_shuffle(builder, zero, total, low), _shuffle(builder, total, zero, high)]
-                    for part, place in zip(parts, blocks.window_row(channel, n), strict=False):
-                        _store(builder, builder.fadd(_load(builder, place), part), place)
-
-            blocks.each(emit)
-            return context.get_dummy_value()
-
-        return _signature(coarse, offsets, fine, masks), generate
-
-    return gather
+    return _make_loop(emit)
 
 
 add_refined, gather_refined = _make_add(*REFINE), _make_gather(*REFINE)
