@@ -10,15 +10,6 @@ from .scene import Scene, load, save
 __version__ = "0.1.0"
 
 __all__ = [
-    "FitConfig",
-    "FitResult",
-    "GaussianField",
-    "RegionMap",
-    "RegionSplatRenderer",
-    "Scene",
-    "__version__",
-    "evaluate",
-    "fit",
-    "load",
-    "save",
-]
+    "FitConfig", "FitResult", "GaussianField", "RegionMap", "RegionSplatRenderer", "Scene", "__version__",
+    "evaluate", "fit", "load", "save",
+]  # fmt: skip

@@ -19,7 +19,7 @@ from kcgs.nn import GaussianField
 from kcgs.onnx import generic_decoder, scene_decoder, write_model
 from kcgs.scene import Scene, load
 
-from ._render_runs import DIRECT, EXACT, TRUTH_CUTOFF, renderer
+from ._render_runs import DIRECT, EXACT, TRUTH_CUTOFF, renderer, second
 from ._workloads import FITTED, STANDARD, WIDE, resized, standard, workload
 from .core.cases import BEST, QUICK_ITERATIONS, Case
 from .core.clocks import clock, in_turns, threads
@@ -173,18 +173,13 @@ def open_and_render(name: str, files: Files, size: tuple[int, int]) -> Tensor:
 
 
 def race(renders: Mapping[Entrant, Render], rounds: int) -> dict[Entrant, list[float]]:
-    """Time rendering in turns; seconds of each round.
+    """Time rendering in turns; seconds of each round."""
 
-    Each renders twice in its turn, and the second counts: the first finds the caches, and maybe a processor, still
-    taken by the one before.
-    """
-
-    def second(entrant: Entrant) -> float:
+    def timed(entrant: Entrant) -> float:
         with threads(entrant.threads):
-            renders[entrant]()
-            return clock(renders[entrant])
+            return second(renders[entrant])
 
-    return in_turns({entrant: partial(second, entrant) for entrant in renders}, rounds)
+    return in_turns({entrant: partial(timed, entrant) for entrant in renders}, rounds)
 
 
 def load_seconds(name: str, files: Files, size: tuple[int, int], rounds: int) -> float:

@@ -24,7 +24,7 @@ from kcgs.rate import compress, fit_bytes
 from kcgs.scene import Scene, load
 
 from ._codecs import CODECS, largest, lossless_bytes, open_file
-from .core import images
+from .core import eye, images
 from .core.cases import BEST, QUICK_ITERATIONS, Case
 from .core.store import Store, find_labels
 
@@ -59,6 +59,8 @@ class Point(NamedTuple):
     decode_seconds: float = math.nan
     num_gaussians: int = 0
     regions: int = 0  # of the map in the file, 1: there is none
+    ssimulacra2: float = math.nan  # measured afterwards, like butteraugli, where that can be
+    butteraugli: float = math.nan
 
 
 class Ask(NamedTuple):
@@ -79,6 +81,7 @@ class Files:
     def __init__(self, folder: Path, data: Path | None, quick: bool, makes: bool = True) -> None:
         self.fits = Store(folder, data)
         self.folder, self.data, self.quick, self.makes = folder, data, quick, makes
+        self.paths: dict[Ask, Path] = {}  # of what was asked for
         self.missed = 0  # how often something was not there that may not be made
         self.config = BEST.config(QUICK_ITERATIONS if quick else None)
         self.tuning = QUICK_TUNING if quick else ITERATIONS
@@ -197,11 +200,23 @@ class Files:
         if not path.is_file():
             self.missed += 1
             return []
-        return [Point(*json.loads(path.read_text(encoding="utf-8")))]
+        point, self.paths[ask] = Point(*json.loads(path.read_text(encoding="utf-8"))), path.with_suffix(".file")
+        if self.makes and not math.isnan(point.psnr):
+            seen = eye.look(point, lambda: (self.shown(point), self.sample(ask.image)[0].image))
+            if seen is not point:
+                write_file(path, json.dumps(seen))
+            return [seen]
+        return [point]
+
+    def shown(self, point: Point) -> Tensor:
+        """Decode a point's file."""
+        data = self.paths[Ask(*point[:4])].read_bytes()
+        return render(data) if point.codec in (KCGS, NO_REGIONS) else open_file(data)
 
     def path(self, ask: Ask, settings: Any, suffix: str) -> Path:
         """Say where a file is, or would be."""
-        parts = json.dumps([*ask, self.quick, settings, Point._fields], sort_keys=True)
+        fields = [name for name in Point._fields if name not in eye.MEASURES]
+        parts = json.dumps([*ask, self.quick, settings, fields], sort_keys=True)
         name = "-".join(map(str, ask))
         name = "".join(c if c.isalnum() or c in "-." else "_" for c in name)
         return self.folder / f"{name}-{hashlib.sha256(parts.encode()).hexdigest()[:16]}.{suffix}"

@@ -18,9 +18,10 @@ TUNED, PLAIN, DECODE = "encode, fine-tuned", "encode", "decode"
 PSNR, EF_PSNR = "psnr", "ef_psnr"
 # as tables call them, and their unit
 QUALITIES = {PSNR: ("PSNR", "dB"), EF_PSNR: ("EF-PSNR", "dB"), "ms_ssim": ("MS-SSIM", "1"), "ef_ssim": ("EF-SSIM", "1")}
+QUALITIES |= {"ssimulacra2": ("SSIMULACRA2", "points"), "butteraugli": ("butteraugli", "norm")}
 RIVALS = (*CODECS, NO_REGIONS)
 # a smaller difference is neither a win nor a loss
-TIE = {"dB": 0.005, "1": 0.0005, "%": 0.05}
+TIE = {"dB": 0.005, "1": 0.0005, "%": 0.05, "points": 0.05, "norm": 0.005}
 MOST_BYTES = 7_950
 
 
@@ -37,7 +38,18 @@ class Pair(NamedTuple):
 
     def gain(self, quality: str) -> float:
         """Difference in a quality, above zero where kcgs is better."""
-        return float(getattr(self.ours, quality)) - float(getattr(self.other, quality))
+        return score(self.ours, quality) - score(self.other, quality)
+
+
+def score(point: Point, quality: str) -> float:
+    """Return a quality, higher where it is better."""
+    value = float(getattr(point, quality))
+    return -value if QUALITIES[quality][1] == "norm" else value
+
+
+def qualities(points: Sequence[Point]) -> list[str]:
+    """Name those that are measured: without a program or a package some are not."""
+    return [name for name in QUALITIES if not all(math.isnan(getattr(p, name)) for p in points)]
 
 
 def pairs(points: Sequence[Point], rival: str) -> list[Pair]:
@@ -67,8 +79,8 @@ def deltas(points: Sequence[Point], group: str, rival: str, quality: str) -> dic
     """Compare kcgs' curve with another, image by image; similarities count as dB of what they lack."""
     curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for p in (p for p in points if p.group == group):
-        value = float(getattr(p, quality))
-        if QUALITIES[quality][1] != "dB":
+        value = score(p, quality)
+        if QUALITIES[quality][1] == "1":
             value = -10 * math.log10(1 - value) if value < 1 else math.inf
         if math.isfinite(value):
             curves.setdefault((p.codec, p.image), []).append((float(p.bytes), value))
@@ -118,25 +130,27 @@ def losses(points: Sequence[Point]) -> str:
 def matched_means(points: Sequence[Point]) -> str:
     """Means of what kcgs gains at no more bytes."""
     header = ["against", "frames", "its bytes", "kcgs' bytes"]
-    header += [cell for name, _ in QUALITIES.values() for cell in (f"{name} gained", "95 %", "won-lost")]
+    measured = qualities(points)
+    header += [cell for name in measured for cell in (f"{QUALITIES[name][0]} gained", "95 %", "won-lost")]
     lines = []
     for rival in RIVALS:
         found = pairs(points, rival)
         low = [pair for pair in found if pair.is_low]
         for name, group in ((rival, found), (f"{rival}, as low", low if len(low) < len(found) else [])):
             if group:
-                lines.append([name, *_pair_cells(group)])
+                lines.append([name, *_pair_cells(group, measured)])
     return markdown([*header, "s, encode", "s, decode", "kcgs, s, encode", "kcgs, s, decode"], lines)
 
 
 def bd_means(points: Sequence[Point], group: str) -> str:
     """Means of Bjontegaard's differences."""
     header = ["against", "images"]
-    header += [cell for name, _ in QUALITIES.values() for cell in (f"BD-rate of {name}, %", "95 %")]
+    measured = qualities(points)
+    header += [cell for name in measured for cell in (f"BD-rate of {QUALITIES[name][0]}, %", "95 %")]
     header += ["BD-PSNR, dB", "95 %", "BD-EF-PSNR, dB", "95 %"]
     lines = []
     for rival in RIVALS:
-        found = {quality: deltas(points, group, rival, quality) for quality in QUALITIES}
+        found = {quality: deltas(points, group, rival, quality) for quality in measured}
         line = [rival, str(len(found[PSNR]))]
         for by_image in found.values():
             line += _mean_cells({image: d.rate for image, d in by_image.items()}, "%")
@@ -195,11 +209,11 @@ def curve_groups(points: Sequence[Point]) -> list[str]:
     return list(dict.fromkeys(p.group for p in points if p.group.endswith("curve")))
 
 
-def _pair_cells(found: Sequence[Pair]) -> list[str]:
+def _pair_cells(found: Sequence[Pair], measured: Sequence[str]) -> list[str]:
     others = [pair.other for pair in found]
     cells = [str(len(found)), _mean_bytes(others), _mean_bytes([pair.ours for pair in found])]
-    for quality, (_, unit) in QUALITIES.items():
-        gain = gains(found, quality)
+    for quality in measured:
+        gain, unit = gains(found, quality), QUALITIES[quality][1]
         if gain is None:
             cells += ["", "", ""]
         else:
@@ -229,6 +243,6 @@ def _spread(found: Summary, unit: str) -> str:
 
 
 def _signed(value: float, unit: str) -> str:
-    if unit == "dB" or math.isnan(value):
+    if unit in ("dB", "norm") or math.isnan(value):
         return signed(value)
     return f"{value:+.3f}" if unit == "1" else f"{value:+.1f}"

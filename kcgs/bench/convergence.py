@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from kcgs.plots import COLORS, figure, save_figure
 
 from . import _siren
 from ._codecs import largest, open_file, present
-from .core import summaries
+from .core import eye, summaries
 from .core.cases import BASELINE, BEST, CLAMPED, PAPER, PUBLISHED_ITERATIONS, REFINED, UNCLAMPED, Case, plan
 from .core.compare import QUANTITIES, Contest, select
 from .core.figures import add_legend
@@ -73,11 +74,8 @@ def run(output: Path, options: Options) -> None:
     length = _NETWORK_SECONDS if budget is None else _NETWORK_SHARE * budget
     length = _QUICK_NETWORK_SECONDS if options.quick else length
 
-    def finish(output: Path, store: Store, wanted: Sequence[Case]) -> list[Row]:
-        return _finish(output, store, wanted, length)
-
     stages = [plan([name], [n], METHODS, options, iterations, QUICK_STRIDE)]
-    share = 1 - _NETWORK_SHARE
+    share, finish = 1 - _NETWORK_SHARE, partial(_finish, length=length)
     run_stages("convergence", report, output, options, stages, matched=(BASELINE,), finish=finish, share=share)
 
 
@@ -132,7 +130,8 @@ def _peer(ours: Row, name: str, render: Tensor, image: Tensor, labels: Tensor, f
     for key, value in measure(render, image, labels).items():
         fields |= {key: value, f"decoded_{key}": value} if key in QUANTITIES else {}
     none = ours._replace(n=0, method=name, seed=0, iterations=0, core_seconds=math.nan, num_gaussians=0, map_bytes=0)
-    return none._replace(**fields)
+    fields |= dict.fromkeys(eye.MEASURES, math.nan)
+    return eye.look(none._replace(**fields), lambda: (render, image))
 
 
 def seconds_to(steps: Sequence[Step], method: str, quantity: str, value: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from .core import figures, summaries
@@ -13,7 +14,7 @@ from .core.registry import experiment
 from .core.report import Made
 from .core.rows import read_rows
 from .core.stages import run_stages
-from .core.store import Row
+from .core.store import Row, Store
 
 METHODS = (BEST, BASELINE, PAPER, UNCLAMPED, CLAMPED, IMAGE_GS)
 NAMES = tuple(m.name for m in METHODS)
@@ -46,14 +47,26 @@ def report(output: Path, made: Made) -> list[str]:
     text = (
         f"Means over the sequences that all methods have at all N that are shown: {', '.join(sweep(asked, NAMES)[1])}."
     )
-    return [*parts, text, "![](against-n.png)"]
+    return [*parts, text, "![](against-n.png)", *figures.show_crops(output, BEST.name)]
 
 
 @experiment("engine", "workers", "sequences", "budget_seconds", "seeds", "iterations", "runs", report=report)
 def run(output: Path, options: Options) -> None:
     """Sweep N on first frames; with a budget, a sequence has all methods at the paper's two N before the next."""
     names = sequences(options.data, options.sequences, quick=options.quick)
-    run_stages("davis", report, output, options, _stages(names, options), matched=(BASELINE,))
+    run_stages("davis", report, output, options, _stages(names, options), matched=(BASELINE,), finish=_finish)
+
+
+def _finish(output: Path, store: Store, wanted: Sequence[Case]) -> list[Row]:
+    """Show where `best` is furthest from the photos at the first N, and its baseline there."""
+    pairs = [(c, c._replace(method=BASELINE)) for c in wanted if c[1:4] == (wanted[0].n, BEST, 0)]
+    pairs = [pair for pair in pairs if len(store.rows(pair)) == 2]
+    frames = (
+        (a.image, {"photo": a.load(store.data).image, **{c.method.name: store.scene(c).render() for c in (a, b)}})
+        for a, b in pairs
+    )
+    figures.plot_crops(output / figures.CROPS, frames)
+    return []
 
 
 def _stages(names: list[str], options: Options) -> list[list[Case]]:

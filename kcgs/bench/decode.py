@@ -19,20 +19,7 @@ from kcgs.plots import COLORS, figure, save_figure
 from kcgs.scene import Scene
 
 from . import _decoders as decoders
-from ._decoders import (
-    CPU,
-    CPU_DIRECT,
-    DECODERS,
-    GENERIC,
-    SCENE,
-    SCENE_DIRECT,
-    TILED,
-    Entrant,
-    Files,
-    Render,
-    Subject,
-    truth,
-)
+from ._decoders import CPU, CPU_DIRECT, DECODERS, GENERIC, SCENE, SCENE_DIRECT, TILED, Entrant, Files, Render, Subject
 from ._workloads import SIZES, target_size, workload
 from .core.clocks import median_ratio, peak_bytes, threads
 from .core.figures import MARKERS, add_legend
@@ -143,11 +130,8 @@ class _Race:
     def _memory(self, subject: Subject, size: str) -> list[Row]:
         rows = []
         for name in decoders.decoders_of(subject.scene, size):
-            job, warm_up = (
-                (name, self.files[subject.name], target_size(subject.scene, size)),
-                (name, self.small, (48, 64)),
-            )
-            peak = peak_bytes(partial, (decoders.open_and_render, *job), (decoders.open_and_render, *warm_up))
+            job, warm_up = (self.files[subject.name], target_size(subject.scene, size)), (self.small, (48, 64))
+            peak = peak_bytes(partial, *((decoders.open_and_render, name, *rest) for rest in (job, warm_up)))
             rows.append(Row("memory", subject.name, size, name, 1, DEFAULT_CUTOFF, "peak", peak / 1e6, "MB"))
         return rows
 
@@ -173,7 +157,7 @@ class _Race:
         }
         rows = _raced("speed", subject.name, size, renders, self.rounds)
         alone = {entrant: render for entrant, render in renders.items() if entrant.threads == 1}
-        return rows + _errors("speed", subject.name, size, alone, truth(subject.scene, target))
+        return rows + _errors("speed", subject.name, size, alone, decoders.truth(subject.scene, target))
 
     def _sweep(self, subject: Subject) -> list[Row]:
         """Take time and error at every cutoff, on one thread, all in turns."""
@@ -184,7 +168,8 @@ class _Race:
                 Entrant(name, 1, cutoff): decoders.open_decoder(name, files, subject.scene.size, 1) for name in SWEPT
             }
         rows = _raced("error", subject.name, "native", renders, self.rounds)
-        return rows + _errors("error", subject.name, "native", renders, truth(subject.scene, subject.scene.size))
+        exact = decoders.truth(subject.scene, subject.scene.size)
+        return rows + _errors("error", subject.name, "native", renders, exact)
 
 
 def _raced(section: str, scene: str, size: str, renders: dict[Entrant, Render], rounds: int) -> list[Row]:

@@ -107,11 +107,7 @@ def run(output: Path, options: Options) -> None:
 
 
 def images_of(data: Path | None) -> list[str]:
-    """List the images; without data scikit-image's photo is all there is.
-
-    Raises:
-        ValueError: there are no images in the data.
-    """
+    """List the images; without data scikit-image's photo is all there is. A ValueError: there are none in the data."""
     if data is None:
         return ["astronaut"]
     found = sorted((p.parent.name for p in (data / "bsds").glob("*/image.jpg")), key=lambda name: (len(name), name))

@@ -16,40 +16,26 @@ from kcgs.rate import compress
 from . import _rate_tables as tables
 from ._codecs import AVIF, AVIF_PSNR, JPEG, WEBP, present, versions
 from ._rate_files import FIRST_QUALITY, KCGS, MAPS, MOST_LOSS, NO_REGIONS, Ask, Files, Point, render, timed
-from ._rate_tables import (
-    DAVIS_CURVE,
-    DECODE,
-    EF_PSNR,
-    KODAK_CURVE,
-    MATCHED,
-    MOST_BYTES,
-    PLAIN,
-    PRECISION,
-    PSNR,
-    QUALITIES,
-    SPEED,
-    TUNED,
-)  # fmt: skip
 from .core import images
 from .core.clocks import threads
-from .core.figures import add_legend
+from .core.figures import CROPS, add_legend, plot_crops, show_crops
 from .core.jobs import with_progress
 from .core.options import Options
 from .core.registry import experiment
 from .core.report import Made, conclude
 from .core.rows import read_rows, write_rows
 
-GROUPS = (MATCHED, PRECISION, MAPS, DAVIS_CURVE, KODAK_CURVE, SPEED)
+GROUPS = (tables.MATCHED, tables.PRECISION, MAPS, tables.DAVIS_CURVE, tables.KODAK_CURVE, tables.SPEED)
 FRAMES = (
     *("blackswan", "dog", "train", "breakdance", "car-turn", "dance-jump", "mallard-water", "rollerblade"),
     *("bmx-trees", "cows", "kite-surf", "paragliding-launch"),
 )
 _NAMES = {
-    MATCHED: FRAMES,
-    PRECISION: FRAMES[:4],
-    DAVIS_CURVE: FRAMES[:3],
-    KODAK_CURVE: ("kodim23", "kodim07", "kodim19"),
-    SPEED: FRAMES[:1],
+    tables.MATCHED: FRAMES,
+    tables.PRECISION: FRAMES[:4],
+    tables.DAVIS_CURVE: FRAMES[:3],
+    tables.KODAK_CURVE: ("kodim23", "kodim07", "kodim19"),
+    tables.SPEED: FRAMES[:1],
 }
 QUICK_IMAGE, QUICK_BYTES = "disc", 700
 TARGETS, QUICK_TARGETS = (2_000, 4_000, 8_000, 16_000, 32_000), (450, 900)
@@ -70,14 +56,14 @@ _INTRODUCTION = f"""Bytes are those of real files, everything in them included. 
 the map that is given on DAVIS, and with the one that `kcgs.segment.segment` finds on Kodak; `{NO_REGIONS}` is the same
 without a map. Gained is what kcgs has over the other. The other codecs, and how curves are compared: docs/results.md.
 Seconds are medians, of kcgs those of the whole fit. Each file by itself: results.csv."""
-_MATCHED_TEXT = f"""Every codec made its largest file of at most {MOST_BYTES:,} bytes, or its smallest if it cannot go
-as low. Each meets the largest file of kcgs that has no more bytes. Without regions kcgs was asked for the bytes that it
-was fitted to with them."""
+_MATCHED_TEXT = f"""Every codec made its largest file of at most {tables.MOST_BYTES:,} bytes, or its smallest if it
+cannot go as low. Each meets the largest file of kcgs that has no more bytes. Without regions kcgs was asked for the
+bytes that it was fitted to with them."""
 _SECTIONS = {
-    PRECISION: ("Bits per Gaussian", tables.precision_table, f"""A fit of N Gaussians with the annotation's contours,
-and the smallest of a few files by `kcgs.rate.compress` that loses at most {MOST_LOSS} dB of its PSNR."""),
+    tables.PRECISION: ("Bits per Gaussian", tables.precision_table, f"""A fit of N Gaussians with the annotation's
+contours, and the smallest of a few files by `kcgs.rate.compress` that loses at most {MOST_LOSS} dB of its PSNR."""),
     MAPS: ("Label maps", tables.maps_table, """Bytes of a label map alone, beside Pillow's lossless WebP."""),
-    SPEED: ("Speed", tables.speed_table, f"""Medians on {SPEED_THREADS} threads: `kcgs.rate.compress`,
+    tables.SPEED: ("Speed", tables.speed_table, f"""Medians on {SPEED_THREADS} threads: `kcgs.rate.compress`,
 `kcgs.codec.encode`, and a file decoded and rendered, in a process that has done so before."""),
 }  # fmt: skip
 
@@ -94,7 +80,8 @@ def report(output: Path, made: Made) -> list[str]:
     parts += ["## Where kcgs loses", tables.losses(points)]
     rivals = [rival for rival in tables.RIVALS if tables.pairs(points, rival)]
     if rivals:
-        parts += [f"## At {MOST_BYTES:,} bytes: {MATCHED}", _MATCHED_TEXT, tables.matched_means(points)]
+        parts += [f"## At {tables.MOST_BYTES:,} bytes: {tables.MATCHED}", _MATCHED_TEXT, tables.matched_means(points)]
+        parts += show_crops(output, KCGS)
     for group in tables.curve_groups(points):
         of_group = [p for p in points if p.group == group]
         _plot_curves(of_group, output / f"{group}.png")
@@ -121,23 +108,23 @@ def run(output: Path, options: Options) -> None:
         for step in with_progress(todo):
             step()
     finally:
-        points, notes = _collect(Files(files.folder, files.data, files.quick, makes=False), chosen)
+        kept = Files(files.folder, files.data, files.quick, makes=False)
+        points, notes = _collect(kept, chosen)
         write_rows(output / "results.csv", Point, points)
+        pairs = ((a.image, {p.codec: kept.shown(p) for p in (a, b)}) for a, b in tables.pairs(points, AVIF))
+        frames = ((name, {"photo": kept.sample(name)[0].image, **shown}) for name, shown in pairs)
+        plot_crops(output / CROPS, frames)
         made = options.made("rate", notes)
         conclude(report, output, made._replace(machine=(versions(), f"Threads: {torch.get_num_threads()}")))
 
 
 def choose(options: Options) -> list[str]:
-    """List the groups that are asked for.
-
-    Raises:
-        ValueError: `only` names no group, or one without images in the data; there is nothing to run.
-    """
+    """List the groups that are asked for; a ValueError where one has no images in the data, or none has."""
     able = [group for group in GROUPS if names(group, options.data, options.quick)]
     if not able:
         raise ValueError("data must be a folder with DAVIS, bsds or kodak in it; without one there is only quick")
     if options.only is None:
-        return [group for group in able if options.quick or group != SPEED]
+        return [group for group in able if options.quick or group != tables.SPEED]
     wanted = options.only.replace(" ", "").split(",")
     if not set(wanted) <= set(able):
         raise ValueError(f"only must name groups with images, {', '.join(able)}, with commas; got {options.only!r}")
@@ -147,10 +134,10 @@ def choose(options: Options) -> list[str]:
 def names(group: str, data: Path | None, quick: bool) -> list[str]:
     """List a group's images that are there."""
     if quick:
-        return [] if group == KODAK_CURVE else [QUICK_IMAGE]  # one curve will do
+        return [] if group == tables.KODAK_CURVE else [QUICK_IMAGE]  # one curve will do
     if data is None:
         return []
-    if group == KODAK_CURVE:
+    if group == tables.KODAK_CURVE:
         return [name for name in _NAMES[group] if (data / "kodak" / f"{name}.png").is_file()]
     frames = images.davis(data).sequences if (data / "DAVIS").is_dir() else []
     if group != MAPS:
@@ -162,18 +149,18 @@ def names(group: str, data: Path | None, quick: bool) -> list[str]:
 def steps(group: str, files: Files) -> Iterator[tuple[str, Step]]:
     """List what a group measures, by name."""
     found = names(group, files.data, files.quick)
-    if group == MATCHED:
+    if group == tables.MATCHED:
         # without regions is the second thing to know, of all
         yield from ((image, partial(_matched, files, image)) for image in found)
         yield from ((f"{image}, no regions", partial(_matched_without, files, image)) for image in found)
-    elif group in (DAVIS_CURVE, KODAK_CURVE):
+    elif group in (tables.DAVIS_CURVE, tables.KODAK_CURVE):
         for image in found:
             for most in QUICK_TARGETS if files.quick else TARGETS:
                 yield f"{image} {most:,}", partial(_on_curve, files, group, image, most)
     elif group == MAPS:
         yield from ((image, partial(files.label_map, image)) for image in found)
     else:
-        measured = {PRECISION: _precision, SPEED: _speed}[group]
+        measured = {tables.PRECISION: _precision, tables.SPEED: _speed}[group]
         for image in found:
             for n in QUICK_COUNTS if files.quick else COUNTS:
                 yield f"{image} N = {n:,}", partial(measured, files, image, n)
@@ -203,10 +190,10 @@ def _matched(files: Files, image: str) -> list[Point]:
     A fit is made for the larger of AVIF's files. It is written again for the others, unless there is a file of nearly
     as many bytes already, or they could not go as low.
     """
-    most = QUICK_BYTES if files.quick else MOST_BYTES
-    others = [p for codec in present() for p in files.other(MATCHED, image, codec, most)]
+    most = QUICK_BYTES if files.quick else tables.MOST_BYTES
+    others = [p for codec in present() for p in files.other(tables.MATCHED, image, codec, most)]
     avif = sorted({p.bytes for p in others if p.codec in (AVIF, AVIF_PSNR)}, reverse=True) or [most]
-    ours = files.fitted(MATCHED, image, avif[0]) if len(others) == len(present()) else []
+    ours = files.fitted(tables.MATCHED, image, avif[0]) if len(others) == len(present()) else []
     for first in ours[:1]:
         for smaller in avif[1:]:
             ours += files.rewritten(first, smaller)
@@ -220,7 +207,7 @@ def _matched(files: Files, image: str) -> list[Point]:
 def _matched_without(files: Files, image: str) -> list[Point]:
     kept = Files(files.folder, files.data, files.quick, makes=False)
     ours = [p for p in _matched(kept, image) if p.regions]
-    return files.fitted(MATCHED, image, ours[0].asked, regions=False) if ours else []
+    return files.fitted(tables.MATCHED, image, ours[0].asked, regions=False) if ours else []
 
 
 def _on_curve(files: Files, group: str, image: str, most: int) -> list[Point]:
@@ -230,13 +217,13 @@ def _on_curve(files: Files, group: str, image: str, most: int) -> list[Point]:
 
 
 def _precision(files: Files, image: str, n: int) -> list[Point]:
-    scenes = files.scene(PRECISION, image, n)
+    scenes = files.scene(tables.PRECISION, image, n)
     return scenes + [p for scene in scenes for p in files.rounded(scene)]
 
 
 def _speed(files: Files, image: str, n: int) -> list[Point]:
     """Time files of the scene that the group of precision keeps."""
-    fitted = files.scene(PRECISION, image, n)
+    fitted = files.scene(tables.PRECISION, image, n)
     if not fitted:
         return []
     repeats = 1 if files.quick else 5
@@ -245,29 +232,29 @@ def _speed(files: Files, image: str, n: int) -> list[Point]:
         scene, sample = files.fits.scene(files.case(image, n)), files.sample(image)[0].image
         quality = fitted[0].psnr + FIRST_QUALITY
         with threads(SPEED_THREADS):
-            if what == TUNED:
+            if what == tables.TUNED:
                 tuned = partial(compress, scene, sample, quality=quality, iterations=files.tuning)
                 (data, _), seconds = timed(tuned, repeats)
             else:
                 data, seconds = timed(partial(encode, scene, quality=quality), repeats)
-            if what == DECODE:
+            if what == tables.DECODE:
                 seconds = timed(lambda: render(data), 3 * repeats)[1]
-        field = "decode_seconds" if what == DECODE else "encode_seconds"
+        field = "decode_seconds" if what == tables.DECODE else "encode_seconds"
         times: dict[str, Any] = {field: seconds, "num_gaussians": len(scene)}
-        return Point(SPEED, image, what, n, len(data), 8 * len(data) / sample[0].numel(), **times), data
+        return Point(tables.SPEED, image, what, n, len(data), 8 * len(data) / sample[0].numel(), **times), data
 
-    settings = [*files.settings(SPEED), repeats, SPEED_THREADS]
-    asks = [Ask(SPEED, image, what, n) for what in (TUNED, PLAIN, DECODE)]
+    settings = [*files.settings(tables.SPEED), repeats, SPEED_THREADS]
+    asks = [Ask(tables.SPEED, image, what, n) for what in (tables.TUNED, tables.PLAIN, tables.DECODE)]
     return [p for ask in asks for p in files.keep(ask, settings, partial(make, ask.codec))]
 
 
 def _plot_curves(points: Sequence[Point], path: Path) -> None:
-    """Plot PSNR and EF-PSNR over bits per pixel, a row for each image."""
+    """Plot tables.PSNR and EF-tables.PSNR over bits per pixel, a row for each image."""
     shown = list(dict.fromkeys(p.image for p in points))
     plot, axes = figure(len(shown), 2, width=9.5, height=0.8 + 3.0 * len(shown))
     rows = axes if len(shown) > 1 else [axes]
     for image, row in zip(shown, rows, strict=True):
-        for axis, quality in zip(row, (PSNR, EF_PSNR), strict=True):
+        for axis, quality in zip(row, (tables.PSNR, tables.EF_PSNR), strict=True):
             for codec, (color, line, marker) in _STYLES.items():
                 found = sorted((p.bpp, getattr(p, quality)) for p in points if (p.image, p.codec) == (image, codec))
                 if found:
@@ -275,6 +262,6 @@ def _plot_curves(points: Sequence[Point], path: Path) -> None:
                     axis.plot(x, y, line, marker=marker, color=color, markersize=4, linewidth=1.3, label=codec)
             axis.set_xscale("log", base=2)
             axis.xaxis.set_major_formatter("{x:g}")
-            axis.set(xlabel="bits per pixel", ylabel=f"{QUALITIES[quality][0]} (dB)", title=image)
+            axis.set(xlabel="bits per pixel", ylabel=f"{tables.QUALITIES[quality][0]} (dB)", title=image)
     add_legend(plot, rows[0][0], columns=len(_STYLES), where="upper")
     save_figure(plot, path)

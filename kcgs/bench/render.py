@@ -113,10 +113,7 @@ def run(output: Path, options: Options) -> None:
         *((f"overhead {name}", partial(_overhead, name)) for name in names),
         # last, since it leaves a gigabyte of memory in pieces behind it
         *((f"{runs.PEER} {name}", partial(_peer_speed, name, rounds)) for name in names),
-        *(
-            (f"memory {name}", partial(_memory, name))
-            for name in (names if quick else ("W1", "W2", "W4", *fitted[::2]))
-        ),
+        *((f"memory {name}", partial(_memory, name)) for name in (names if quick else (*names[1:], *fitted[::2]))),
         *((f"memory {name}", partial(_memory, name, WIDE)) for name in ([] if quick else fitted[::2])),
         *((f"error {name}", partial(_errors, name, rounds)) for name in (names if quick else ("W1", fitted[2]))),
         ("growth", partial(_growth, rounds, quick)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -65,7 +66,10 @@ def eval_command(
     if regions is not None:
         labels = load_labels(regions)
     contours = "" if labels is None else str(regions or "the scene")
-    print_report(measure_scene(loaded, target, labels, scene, scene.stat().st_size), as_json, str(scene), contours)
+    if find_spec("ssimulacra2") is None:
+        typer.echo('kcgs: ssimulacra2 is not measured without its package: pip install "kcgs[visual]"', err=True)
+    report = measure_scene(loaded, target, labels, scene, scene.stat().st_size)
+    print_report(report, as_json, str(scene), contours)
 
 
 @app.command()

@@ -6,16 +6,6 @@ from kcgs.data.images import load_image, save_image
 from kcgs.data.labels import colorize_labels, label_colors, load_labels, overlay_labels, save_labels
 
 __all__ = [
-    "ChartSample",
-    "Davis",
-    "DavisFrame",
-    "chart_2x3",
-    "chart_pie",
-    "colorize_labels",
-    "label_colors",
-    "load_image",
-    "load_labels",
-    "overlay_labels",
-    "save_image",
-    "save_labels",
-]
+    "ChartSample", "Davis", "DavisFrame", "chart_2x3", "chart_pie", "colorize_labels", "label_colors", "load_image",
+    "load_labels", "overlay_labels", "save_image", "save_labels",
+]  # fmt: skip

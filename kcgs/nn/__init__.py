@@ -3,7 +3,4 @@
 from .field import GaussianField
 from .renderer import RegionSplatRenderer
 
-__all__ = [
-    "GaussianField",
-    "RegionSplatRenderer",
-]
+__all__ = ["GaussianField", "RegionSplatRenderer"]

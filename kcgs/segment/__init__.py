@@ -22,29 +22,7 @@ from kcgs.segment.registry import (
 from kcgs.segment.snapping import snap_contours
 
 __all__ = [
-    "Cleanup",
-    "Prediction",
-    "Segmentation",
-    "Segmenter",
-    "auto",
-    "available_methods",
-    "connected_regions",
-    "davis",
-    "dino",
-    "felzenszwalb",
-    "file",
-    "kmeans",
-    "lseg",
-    "merge_similar",
-    "merge_small",
-    "onnx",
-    "order_by_area",
-    "register",
-    "sam",
-    "segment",
-    "segment_with_scores",
-    "slic",
-    "snap_contours",
-    "text",
-    "watershed",
-]
+    "Cleanup", "Prediction", "Segmentation", "Segmenter", "auto", "available_methods", "connected_regions", "davis",
+    "dino", "felzenszwalb", "file", "kmeans", "lseg", "merge_similar", "merge_small", "onnx", "order_by_area",
+    "register", "sam", "segment", "segment_with_scores", "slic", "snap_contours", "text", "watershed",
+]  # fmt: skip

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
+from kcgs.functional import psnr
 from kcgs.plots import COLORS, figure, save_figure
 
 from .compare import QUANTITIES, mean_over, select, sweep
 from .store import Row
+from .tables import db
 
+# a figure of the worst crops, their side in pixels, and how many
+CROPS, _CROP, _CROPS = "crops.png", 128, 3
 MARKERS = ("o", "s", "^", "D", "v", "P")
 _AXES = {"psnr": "PSNR (dB)", "ms_ssim": "MS-SSIM", "ef_psnr": "EF-PSNR (dB)", "ef_ssim": "edge SSIM"}
 
@@ -36,16 +41,47 @@ def plot_against_n(path: Path, rows: Sequence[Row], methods: Sequence[str]) -> N
     save_figure(plot, path)
 
 
-def plot_images(path: Path, images: Mapping[str, Tensor]) -> None:
-    """Show images (3, H, W) of one size beside each other, with their titles above."""
-    height, width = next(iter(images.values())).shape[-2:]
-    plot, axes = figure(1, len(images), width=2.15 * len(images), height=2.15 * height / width + 0.42)
-    for axis, (title, image) in zip(np.ravel(axes), images.items(), strict=True):
+def plot_images(path: Path, *rows: Mapping[str, Tensor]) -> None:
+    """Show rows of images (3, H, W) of one size beside each other, with their titles above."""
+    height, width = next(iter(rows[0].values())).shape[-2:]
+    size = {"width": 2.15 * len(rows[0]), "height": len(rows) * (2.15 * height / width + 0.42)}
+    plot, axes = figure(len(rows), len(rows[0]), **size)
+    images = [shown for row in rows for shown in row.items()]
+    for axis, (title, image) in zip(np.ravel(axes), images, strict=True):
         axis.imshow(image.permute(1, 2, 0).numpy(), interpolation="nearest")
         axis.set_title(title, fontsize=7.5)
         axis.set(xticks=[], yticks=[])
         axis.grid(False)
     save_figure(plot, path)
+
+
+def plot_crops(path: Path, frames: Iterable[tuple[str, Mapping[str, Tensor]]]) -> None:
+    """Show where the second image of a frame is furthest from its first, in three crops, at most two of a frame."""
+    found = []
+    for name, images in frames:
+        photo, ours = list(images.values())[:2]
+        size = min(_CROP, *photo.shape[1:])
+        step = size // 8
+        errors = avg_pool2d((ours - photo).square().mean(0)[None], size, step)[0]
+        for _ in range(2):
+            row, column = divmod(int(errors.argmax()), errors.shape[1])
+            y, x, error = row * step, column * step, float(errors[row, column])
+            # a copy: the frame can go
+            crops = {title: image[:, y : y + size, x : x + size].clone() for title, image in images.items()}
+            found += [(error, f"{name}, x = {x}, y = {y}", crops)] if error >= 0 else []
+            errors[max(0, row - 7) : row + 8, max(0, column - 7) : column + 8] = -1
+    rows = []
+    for _, name, crops in sorted(found, key=lambda crop: -crop[0])[:_CROPS]:
+        (_, photo), *others = crops.items()
+        rows.append({name: photo, **{f"{title}, {db(float(psnr(crop, photo)))} dB": crop for title, crop in others}})
+    if rows:
+        plot_images(path, *rows)
+
+
+def show_crops(folder: Path, name: str) -> list[str]:
+    """Return a report's lines on these crops, where they were made."""
+    text = f"Where `{name}` is furthest from the photo, in at most two crops of an image, with the PSNR there."
+    return [text, f"![]({CROPS})"] if (folder / CROPS).is_file() else []
 
 
 def add_legend(plot: Any, axis: Any, *, columns: int, where: str = "lower") -> None:

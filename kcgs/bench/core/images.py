@@ -26,23 +26,14 @@ class Sample(NamedTuple):
 
 
 def davis(data: Path | None) -> Davis:
-    """Open DAVIS in the folder, or in its sub-folder DAVIS.
-
-    Raises:
-        ValueError: no folder.
-        FileNotFoundError: it has not the official layout.
-    """
+    """Open DAVIS in the folder, or in its sub-folder DAVIS; a FileNotFoundError where the layout is another."""
     if data is None:
         raise ValueError("data must name a folder with DAVIS in it, --data DIR; got None")
     return Davis(data / "DAVIS" if (data / "DAVIS").is_dir() else data)
 
 
 def sequences(data: Path | None, wanted: str | None, *, quick: bool) -> list[str]:
-    """List the sequences named, with commas between them, or all; the quick form has two, or two images of its own.
-
-    Raises:
-        ValueError: no data, or no sequence of that name.
-    """
+    """List the sequences named, with commas between them, or all; the quick form has two, or two images of its own."""
     names = None if wanted is None else list(dict.fromkeys(wanted.replace(" ", "").split(",")))
     if data is None and quick:
         if not set(names or ()) <= set(QUICK):

@@ -35,11 +35,7 @@ class Options(NamedTuple):
         return None if self.budget_seconds is None else time.monotonic() + share * self.budget_seconds
 
     def check(self) -> None:
-        """Refuse numbers out of range.
-
-        Raises:
-            ValueError: one is.
-        """
+        """Refuse numbers out of range with a ValueError."""
         for name in ("budget_seconds", "seeds", "iterations"):
             value = getattr(self, name)
             if value is not None and value <= 0:

@@ -25,11 +25,7 @@ _COLUMNS = ("N left", "PSNR", "EF-PSNR", "bits per pixel", "PSNR decoded", "core
 
 
 def results(reports: Path) -> str:
-    """Write the tables of all reports that are there.
-
-    Args:
-        reports: folder with NAME/results.csv in it.
-    """
+    """Write the tables of all reports, NAME/results.csv, that are there."""
     parts = []
     for name, title in _TITLES.items():
         rows = read_rows(reports / name / "results.csv", Row)
@@ -51,11 +47,7 @@ def results(reports: Path) -> str:
 
 
 def put(page: str, text: str) -> str:
-    """Return the page with these tables between the marks.
-
-    Raises:
-        ValueError: the marks are not there.
-    """
+    """Return the page with these tables between the marks; a ValueError where they are not there."""
     before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):

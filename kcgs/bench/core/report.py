@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shutil
 from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,7 +17,9 @@ from typing import NamedTuple
 
 from kcgs._atomic import write_file
 
-_PACKAGES = ("kcgs", "torch", "numba", "numpy", "kornia", "triton")
+from .eye import PROGRAM
+
+_PACKAGES = ("kcgs", "torch", "numba", "numpy", "kornia", "triton", "ssimulacra2")
 QUICK_TEXT = "The short form, small images and few iterations: the numbers only show that all of it runs."
 
 
@@ -59,7 +62,7 @@ def describe() -> list[str]:
     versions = ", ".join(f"{name} {_version(name)}" for name in _PACKAGES)
     return [
         f"Processor: {_processor()}, {os.cpu_count()} cores, {_memory()}; {where}",
-        f"Python {platform.python_version()}; {versions}",
+        f"Python {platform.python_version()}; {versions}, {PROGRAM} {'' if shutil.which(PROGRAM) else 'not '}installed",
     ]
 
 

@@ -43,6 +43,8 @@ def run_stages(
     try:
         for stage in stages:
             failed += store.obtain(stage, options.place, deadline)
+            for case in stage:
+                store.look(case)
             for other, _ in product(matched, range(_TRIES)):
                 failed += [] if failed else store.obtain(rivals(store, stage, BEST, other), options.place, deadline)
     finally:

@@ -24,6 +24,7 @@ from kcgs.rate import quality_for
 from kcgs.scene import Scene, load
 from kcgs.segment import segment
 
+from . import eye
 from .cases import QUICK_ITERATIONS, Case
 from .jobs import Place, make_all
 from .options import Options
@@ -54,6 +55,8 @@ class Row(NamedTuple):
     decoded_ef_psnr: float
     decoded_ef_ssim: float
     note: str = ""
+    ssimulacra2: float = math.nan  # of the scene, measured afterwards, like butteraugli, where that can be
+    butteraugli: float = math.nan
 
     @property
     def bits_per_pixel(self) -> float:
@@ -100,6 +103,14 @@ class Store:
         kept = self.kept(case)
         return None if kept is None else kept.row
 
+    def look(self, case: Case) -> None:
+        """Add what the eye sees to a row that is there."""
+        kept = self.kept(case)
+        if kept is not None:
+            row = eye.look(kept.row, lambda: (self.scene(case).render(), case.load(self.data).image))
+            if row is not kept.row:
+                write_file(self._path(case), json.dumps(kept._replace(row=row)._asdict()))
+
     def rows(self, cases: Iterable[Case]) -> list[Row]:
         """Return the rows that are there, each once."""
         return [row for case in dict.fromkeys(cases) if (row := self.row(case)) is not None]
@@ -109,11 +120,7 @@ class Store:
         return load(self._path(case).with_suffix(".safetensors"))
 
     def obtain(self, cases: Iterable[Case], place: Place, deadline: float | None = None) -> list[str]:
-        """Make what is missing, leaving out what would not be done by `deadline` of the monotonic clock.
-
-        Returns:
-            What failed.
-        """
+        """Make what is missing but what would not be done by `deadline` of the monotonic clock; return what failed."""
         missing = [case for case in dict.fromkeys(cases) if self.row(case) is None]
         if deadline is None:
             return make_all(self.make, missing, place)
@@ -144,7 +151,8 @@ class Store:
         self._learn(case, time.monotonic() - begin)
 
     def _path(self, case: Case) -> Path:
-        parts = [case.image, case.seed, case.stride, case.source, str(self.data), Row._fields, case.settings()]
+        fields = [name for name in Row._fields if name not in eye.MEASURES]
+        parts = [case.image, case.seed, case.stride, case.source, str(self.data), fields, case.settings()]
         key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:20]
         return self.folder / f"{case.image}-{case.n}-{key}.json"
 

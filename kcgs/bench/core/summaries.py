@@ -8,9 +8,10 @@ from itertools import product
 
 from .cases import PUBLISHED, method
 from .compare import QUANTITIES, Contest, counts, equal_bits, equal_n, mean_over, select, shared
+from .eye import MEASURES
 from .statistics import Summary
 from .store import Row
-from .tables import count, db, markdown, seconds, signed, similarity
+from .tables import count, db, markdown, number, seconds, signed, similarity
 
 _KINDS: dict[str, Callable[..., Summary | None]] = {"equal N": equal_n, "equal bits": equal_bits}
 # columns of means: the field, and what writes it
@@ -20,6 +21,8 @@ COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
     "MS-SSIM": ("ms_ssim", similarity),
     "EF-PSNR": ("ef_psnr", db),
     "edge SSIM": ("ef_ssim", similarity),
+    "SSIMULACRA2": ("ssimulacra2", number),
+    "butteraugli": ("butteraugli", number),
     "bytes": ("bytes", count),
     "of these map": ("map_bytes", count),
     "bits per pixel": ("bits_per_pixel", "{:.3f}".format),
@@ -48,6 +51,8 @@ def short_runs(rows: Sequence[Row]) -> str:
 
 def means(rows: Sequence[Row], methods: Sequence[str], columns: Sequence[str] = tuple(COLUMNS)) -> str:
     """Means over the images that every method of an N has; other codecs have neither Gaussians nor iterations."""
+    measured = [name for name in MEASURES if not math.isnan(mean_over(rows, name))]
+    columns = [name for name in columns if COLUMNS[name][0] not in {*MEASURES} - {*measured}]
     lines = []
     for n, present, images in shared(rows, methods):
         for name in present if images else ():
