@@ -16,6 +16,7 @@ from kcgs.rate import compress
 from . import _rate_tables as tables
 from ._codecs import AVIF, AVIF_PSNR, JPEG, WEBP, present, versions
 from ._rate_files import FIRST_QUALITY, KCGS, MAPS, MOST_LOSS, NO_REGIONS, Ask, Files, Point, render, timed
+from ._rate_tables import MOST_BYTES, PRECISION
 from .core import images
 from .core.clocks import threads
 from .core.figures import CROPS, add_legend, plot_crops, show_crops
@@ -25,14 +26,14 @@ from .core.registry import experiment
 from .core.report import Made, conclude
 from .core.rows import read_rows, write_rows
 
-GROUPS = (tables.MATCHED, tables.PRECISION, MAPS, tables.DAVIS_CURVE, tables.KODAK_CURVE, tables.SPEED)
+GROUPS = (tables.MATCHED, PRECISION, MAPS, tables.DAVIS_CURVE, tables.KODAK_CURVE, tables.SPEED)
 FRAMES = (
     *("blackswan", "dog", "train", "breakdance", "car-turn", "dance-jump", "mallard-water", "rollerblade"),
     *("bmx-trees", "cows", "kite-surf", "paragliding-launch"),
 )
 _NAMES = {
     tables.MATCHED: FRAMES,
-    tables.PRECISION: FRAMES[:4],
+    PRECISION: FRAMES[:4],
     tables.DAVIS_CURVE: FRAMES[:3],
     tables.KODAK_CURVE: ("kodim23", "kodim07", "kodim19"),
     tables.SPEED: FRAMES[:1],
@@ -56,12 +57,12 @@ _INTRODUCTION = f"""Bytes are those of real files, everything in them included. 
 the map that is given on DAVIS, and with the one that `kcgs.segment.segment` finds on Kodak; `{NO_REGIONS}` is the same
 without a map. Gained is what kcgs has over the other. The other codecs, and how curves are compared: docs/results.md.
 Seconds are medians, of kcgs those of the whole fit. Each file by itself: results.csv."""
-_MATCHED_TEXT = f"""Every codec made its largest file of at most {tables.MOST_BYTES:,} bytes, or its smallest if it
-cannot go as low. Each meets the largest file of kcgs that has no more bytes. Without regions kcgs was asked for the
-bytes that it was fitted to with them."""
+_MATCHED_TEXT = f"""Every codec made its largest file of at most {MOST_BYTES:,} bytes, or its smallest if it cannot go
+as low. Each meets the largest file of kcgs that has no more bytes. Without regions kcgs was asked for the bytes that it
+was fitted to with them."""
 _SECTIONS = {
-    tables.PRECISION: ("Bits per Gaussian", tables.precision_table, f"""A fit of N Gaussians with the annotation's
-contours, and the smallest of a few files by `kcgs.rate.compress` that loses at most {MOST_LOSS} dB of its PSNR."""),
+    PRECISION: ("Bits per Gaussian", tables.precision_table, f"""A fit of N Gaussians with the annotation's contours,
+and the smallest of a few files by `kcgs.rate.compress` that loses at most {MOST_LOSS} dB of its PSNR."""),
     MAPS: ("Label maps", tables.maps_table, """Bytes of a label map alone, beside Pillow's lossless WebP."""),
     tables.SPEED: ("Speed", tables.speed_table, f"""Medians on {SPEED_THREADS} threads: `kcgs.rate.compress`,
 `kcgs.codec.encode`, and a file decoded and rendered, in a process that has done so before."""),
@@ -80,7 +81,7 @@ def report(output: Path, made: Made) -> list[str]:
     parts += ["## Where kcgs loses", tables.losses(points)]
     rivals = [rival for rival in tables.RIVALS if tables.pairs(points, rival)]
     if rivals:
-        parts += [f"## At {tables.MOST_BYTES:,} bytes: {tables.MATCHED}", _MATCHED_TEXT, tables.matched_means(points)]
+        parts += [f"## At {MOST_BYTES:,} bytes: {tables.MATCHED}", _MATCHED_TEXT, tables.matched_means(points)]
         parts += show_crops(output, KCGS)
     for group in tables.curve_groups(points):
         of_group = [p for p in points if p.group == group]
@@ -160,7 +161,7 @@ def steps(group: str, files: Files) -> Iterator[tuple[str, Step]]:
     elif group == MAPS:
         yield from ((image, partial(files.label_map, image)) for image in found)
     else:
-        measured = {tables.PRECISION: _precision, tables.SPEED: _speed}[group]
+        measured = {PRECISION: _precision, tables.SPEED: _speed}[group]
         for image in found:
             for n in QUICK_COUNTS if files.quick else COUNTS:
                 yield f"{image} N = {n:,}", partial(measured, files, image, n)
@@ -190,7 +191,7 @@ def _matched(files: Files, image: str) -> list[Point]:
     A fit is made for the larger of AVIF's files. It is written again for the others, unless there is a file of nearly
     as many bytes already, or they could not go as low.
     """
-    most = QUICK_BYTES if files.quick else tables.MOST_BYTES
+    most = QUICK_BYTES if files.quick else MOST_BYTES
     others = [p for codec in present() for p in files.other(tables.MATCHED, image, codec, most)]
     avif = sorted({p.bytes for p in others if p.codec in (AVIF, AVIF_PSNR)}, reverse=True) or [most]
     ours = files.fitted(tables.MATCHED, image, avif[0]) if len(others) == len(present()) else []
@@ -217,13 +218,13 @@ def _on_curve(files: Files, group: str, image: str, most: int) -> list[Point]:
 
 
 def _precision(files: Files, image: str, n: int) -> list[Point]:
-    scenes = files.scene(tables.PRECISION, image, n)
+    scenes = files.scene(PRECISION, image, n)
     return scenes + [p for scene in scenes for p in files.rounded(scene)]
 
 
 def _speed(files: Files, image: str, n: int) -> list[Point]:
     """Time files of the scene that the group of precision keeps."""
-    fitted = files.scene(tables.PRECISION, image, n)
+    fitted = files.scene(PRECISION, image, n)
     if not fitted:
         return []
     repeats = 1 if files.quick else 5

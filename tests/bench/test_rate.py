@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -154,15 +155,37 @@ class TestCodecs:
 class TestFilesOnDisk:
     def test_keeps(self, tmp_path: Path, stub: Stub) -> None:
         files, ask = Files(tmp_path / "files", None, False), Ask(MATCHED, "DAVIS/dog", KCGS, 100)
+        seen = point(ssimulacra2=50.0, butteraugli=1.0)
         dry = Files(files.folder, None, False, makes=False)
-        assert dry.keep(ask, 1, lambda: (point(), b"data")) == [] and dry.missed == 1
-        assert files.keep(ask, 1, lambda: (point(), b"data")) == [point()]
-        assert dry.keep(ask, 1, lambda: (point(), b"data")) == [point()] and dry.missed == 1
+        assert dry.keep(ask, 1, lambda: (seen, b"data")) == [] and dry.missed == 1
+        assert files.keep(ask, 1, lambda: (seen, b"data")) == [seen]
+        assert dry.keep(ask, 1, lambda: (seen, b"data")) == [seen] and dry.missed == 1
         assert files.path(ask, 1, "file").read_bytes() == b"data"
         others = [(ask._replace(asked=101), 1), (ask._replace(codec=NO_REGIONS), 1), (ask, 2)]
         quick = Files(files.folder, None, True, makes=False)
-        assert not any(dry.keep(*other, lambda: (point(), b"")) for other in others)
-        assert quick.keep(ask, 1, lambda: (point(), b"")) == []
+        assert not any(dry.keep(*other, lambda: (seen, b"")) for other in others)
+        assert quick.keep(ask, 1, lambda: (seen, b"")) == []
+
+    def test_files_of_earlier_runs_are_looked_at(
+        self, tmp_path: Path, stub: Stub, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        looks: list[tuple[Tensor, Tensor]] = []
+
+        def look(record: Point, pair: Any) -> Point:
+            looks.append(pair())
+            return record._replace(ssimulacra2=42.0)
+
+        files = Files(tmp_path, None, True)
+        monkeypatch.setattr(_rate_files.eye, "look", lambda record, images: record)
+        (made,) = files.other(MATCHED, QUICK_IMAGE, JPEG, 900)
+        path = next(tmp_path.glob("*JPEG*.json"))
+        path.write_text(json.dumps(made[:-2]))
+        monkeypatch.setattr(_rate_files.eye, "look", look)
+        (again,) = files.other(MATCHED, QUICK_IMAGE, JPEG, 900)
+        assert json.dumps(again) == json.dumps(made._replace(ssimulacra2=42.0))
+        assert float(psnr(*looks[0])) == made.psnr
+        dry = Files(tmp_path, None, True, makes=False)
+        assert dry.other(MATCHED, QUICK_IMAGE, JPEG, 900)[0].ssimulacra2 == 42.0 and len(looks) == 1
 
     def test_no_clock_counts_what_compiles_once(
         self, tmp_path: Path, stub: Stub, monkeypatch: pytest.MonkeyPatch
@@ -313,6 +336,24 @@ class TestReport:
         (line,) = _rate_tables.bd_means(files, DAVIS_CURVE).splitlines()[2:]
         assert line.startswith("| AVIF | 1 | +26.0 |  |") and line.endswith("| -1.00 |  | +40.00 |  |")
 
+    def test_what_the_eye_sees(self) -> None:
+        ours, other = {"ssimulacra2": 50.0, "butteraugli": 2.0}, {"ssimulacra2": 53.0, "butteraugli": 1.5}
+        files = [point(**ours), point(AVIF, **other), point(image="cows", **other)]
+        files += [point(AVIF, image="cows", **ours)]
+        table = _rate_tables.matched_means(files)
+        assert "| SSIMULACRA2 gained | 95 % | won-lost | butteraugli gained |" in table.splitlines()[0]
+        gained = {quality: gains(pairs(files, AVIF), quality) for quality in ours}
+        assert [gain and gain.values for gain in gained.values()] == [
+            {"dog": -3.0, "cows": 3.0},
+            {"dog": -0.5, "cows": 0.5},  # a smaller distance is better
+        ]
+        assert "SSIMULACRA2 against AVIF: 1 of 2 frames lose: dog -3.0" in _rate_tables.losses(files)
+        assert "butteraugli against AVIF: 1 of 2 frames lose: dog -0.50" in _rate_tables.losses(files)
+        assert "SSIMULACRA2" not in _rate_tables.matched_means([point(), point(AVIF)])
+        curves = [p._replace(ssimulacra2=2 * p.psnr, butteraugli=1 / p.psnr) for p in self.curves()]
+        for quality in ours:
+            assert deltas(curves, DAVIS_CURVE, AVIF, quality)["dog"].rate > 20
+
     def test_nothing_to_show(self, tmp_path: Path) -> None:
         conclude(report, tmp_path, Made("kcgs bench rate"))
         assert {p.name for p in tmp_path.iterdir()} == {"report.md", "made.json"}
@@ -321,7 +362,7 @@ class TestReport:
 class TestFiles:
     def test_quick_without_data_resumes(self, tmp_path: Path, stub: Stub) -> None:
         kcgs.bench.run("rate", tmp_path, quick=True)
-        made = {"results.csv", "report.md", "davis-curve.png", "files", "made.json"}
+        made = {"results.csv", "report.md", "davis-curve.png", "crops.png", "files", "made.json"}
         assert {p.name for p in tmp_path.iterdir()} == made
         with (tmp_path / "results.csv").open() as file:
             rows = list(csv.DictReader(file))

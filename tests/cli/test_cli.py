@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import logging
 import os
@@ -161,7 +162,7 @@ class TestFit:
         code, out, _ = kcgs("eval", "scene.safetensors", "photo.png", "--json", capsys=capsys)
         assert code == 0
         again = json.loads(out)
-        assert set(again) == KEYS
+        assert set(again) == KEYS | {"ssimulacra2"}
         assert again["psnr"] == pytest.approx(report["psnr"], abs=1e-4)
 
         code, out, _ = kcgs("info", "scene.safetensors", "--json", capsys=capsys)
@@ -170,6 +171,22 @@ class TestFit:
 
         assert kcgs("render", "scene.safetensors", "-o", "large.png", "--scale", "2", capsys=capsys)[0] == 0
         assert load_image("large.png").shape == (3, 80, 120)
+
+    def test_eval_says_what_it_lacks(
+        self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        Scene(GaussianField.random(5, (40, 60), seed=0)).save("scene.safetensors")
+        code, out, err = kcgs("eval", "scene.safetensors", "photo.png", capsys=capsys)
+        has_it = importlib.util.find_spec("ssimulacra2") is not None
+        assert (
+            code == 0 and "│ ssimulacra2 " in out and ("not defined" not in out.split("ssimulacra2")[1][:30]) == has_it
+        )
+        assert ('pip install "kcgs[visual]"' in err) != has_it
+        monkeypatch.setattr("kcgs.cli.scenes.find_spec", lambda name: None)
+        monkeypatch.setitem(sys.modules, "ssimulacra2", None)
+        code, out, err = kcgs("eval", "scene.safetensors", "photo.png", "--json", capsys=capsys)
+        assert code == 0 and json.loads(out)["ssimulacra2"] is None
+        assert err == 'kcgs: ssimulacra2 is not measured without its package: pip install "kcgs[visual]"\n'
 
     def test_the_same_scene_as_in_python(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
         image = load_image("photo.png")
