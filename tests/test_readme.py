@@ -21,7 +21,7 @@ def row(method: str, psnr: float, image: str = "pie") -> Row:
     decoded: dict[str, Any] = {f"decoded_{name}": value for name, value in figures.items()}
     return Row(
         image=image, n=20, method=method, seed=0, iterations=700, seconds=3.0, core_seconds=2.0, num_gaussians=20,
-        pixels=16_000, bytes=100, map_bytes=10, **figures, **decoded,
+        pixels=16_000, bytes=100, map_bytes=10, **figures, **decoded, ssimulacra2=40.0, butteraugli=2.0,
     )  # fmt: skip
 
 
