@@ -294,5 +294,5 @@ def _warm_up(config: FitConfig) -> None:
     """Compile what a file needs: no clock shall count it."""
     warm_up(config)
     ramp = torch.linspace(0.0, 1.0, 96).expand(3, 64, 96)
-    short = config.model_copy(update={"iterations": min(config.iterations, 20), "max_seconds": None})
+    short = config.model_copy(update={"iterations": min(config.usual_iterations, 20), "max_seconds": None})
     fit_bytes(ramp, (ramp[0] > 0.6).long().contiguous(), 300, recipe=short)

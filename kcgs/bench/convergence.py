@@ -70,7 +70,7 @@ def run(output: Path, options: Options) -> None:
     if options.data is not None:
         name = sequences(options.data, options.sequences, quick=False)[0]
     budget, n = options.budget_seconds, QUICK_GAUSSIANS if options.quick else NUM_GAUSSIANS
-    iterations = PAPER.config().iterations if budget is None else PUBLISHED_ITERATIONS
+    iterations = PAPER.config().usual_iterations if budget is None else PUBLISHED_ITERATIONS
     length = _NETWORK_SECONDS if budget is None else _NETWORK_SHARE * budget
     length = _QUICK_NETWORK_SECONDS if options.quick else length
 
@@ -157,7 +157,7 @@ def against_paper(rows: Sequence[Row], steps: Sequence[Step]) -> str:
         cells += [seconds(row.core_seconds), signed(row.psnr - paper.psnr), signed(row.ef_psnr - paper.ef_psnr)]
         lines += [] if row is paper else [[row.method, *cells]]
     text = (
-        f"`paper` at {paper.iterations:,} of its {PAPER.config().iterations:,} iterations took "
+        f"`paper` at {paper.iterations:,} of its {PAPER.config().usual_iterations:,} iterations took "
         f"{paper.core_seconds:.0f} s and ends at {paper.psnr:.2f} dB, EF-PSNR {paper.ef_psnr:.2f} dB. "
         "Times faster: these seconds through those to the same quality."
     )

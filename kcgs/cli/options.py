@@ -46,7 +46,9 @@ def fit_request(
         typer.Option("-n", "--num-gaussians", min=1, help=f"Number of Gaussians; default: {DEFAULT_GAUSSIANS}."),
     ] = None,
     recipe: Annotated[str, typer.Option(help="Recipe by name.")] = "best",
-    iterations: Annotated[int | None, typer.Option(min=1, help="Default: the recipe's.")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(min=1, help="Default: the recipe's, or as many as --max-seconds has time for.")
+    ] = None,
     max_seconds: Annotated[
         float | None, typer.Option(help="Wall time of the whole command; of fit-many, for each image.")
     ] = None,

@@ -13,6 +13,8 @@ from kcgs._repr import shorten
 from kcgs.functional import MAX_SOFTNESS
 from kcgs.kernels import BACKENDS
 
+_USUAL_ITERATIONS = 700
+
 
 class FitConfig(BaseModel):
     """Settings of a fit; the defaults are the recipe `best`.
@@ -86,8 +88,12 @@ class FitConfig(BaseModel):
     )
 
     # The length
-    iterations: int = Field(700, ge=1)
-    max_seconds: float | None = Field(None, gt=0.0, description="stop after this wall time; the schedule adapts to it")
+    iterations: int | None = Field(
+        None, ge=1, description="None: 700, or with `max_seconds` as many as there is time for"
+    )
+    max_seconds: float | None = Field(
+        None, gt=0.0, description="stop after this wall time; the schedule adapts to it, and uses all of it"
+    )
     target_psnr: float | None = Field(
         None, gt=0.0, description="the fewest Gaussians that reach this PSNR (dB), by a search over several fits"
     )
@@ -100,6 +106,11 @@ class FitConfig(BaseModel):
             raise ValueError(f"softness must be 'auto' or in [0, {MAX_SOFTNESS:g}] pixels; got {self.softness!r}")
         if self.max_move != "any" and self.max_move < 1.0:
             raise ValueError(f"max_move must be 'any' or at least 1 pixel; got {self.max_move!r}")
+
+    @property
+    def usual_iterations(self) -> int:
+        """Iterations of a fit without a clock."""
+        return _USUAL_ITERATIONS if self.iterations is None else self.iterations
 
     def __repr__(self) -> str:
         changed = self.model_dump(exclude_defaults=True)

@@ -39,11 +39,11 @@ def descend(state: FitState, rendered: Tensor, progress: float) -> None:
 
 def _backward(state: FitState, rendered: Tensor) -> None:
     """Leave the gradient of the loss at the Gaussians, but for a constant, which no optimizer here feels."""
-    difference = torch.sub(rendered.detach(), state.image)
     if state.config.loss == "l2":
-        rendered.backward(difference)
+        # in the render's own memory, which nothing needs again: new memory would take as long as the sum
+        rendered.backward(rendered.data.sub_(state.image))
         return
-    difference = difference.sign_()
+    difference = torch.sub(rendered.detach(), state.image).sign_()
     if state.config.loss == "l1+ssim":
         leaf = rendered.detach().requires_grad_()
         (slope,) = torch.autograd.grad(ssim(leaf, state.image), leaf)
@@ -51,12 +51,15 @@ def _backward(state: FitState, rendered: Tensor) -> None:
     rendered.backward(difference)
 
 
-def log_is_due(state: FitState, progress: float) -> bool:
-    """Say whether the history wants an entry: about a hundred over the fit, by iterations or by the clock."""
+def log_is_due(state: FitState) -> bool:
+    """Say whether the history wants an entry: about a hundred over the fit, of no more than N Gaussians."""
     config = state.config
+    if state.count() > state.num_gaussians:
+        return False
     if config.max_seconds is None:
-        return state.iteration % max(1, config.iterations // _HISTORY_POINTS) == 0
-    return progress * _HISTORY_POINTS >= len(state.history)
+        return state.iteration % max(1, config.usual_iterations // _HISTORY_POINTS) == 0
+    due = state.history[-1].seconds + config.max_seconds / _HISTORY_POINTS if state.history else 0.0
+    return state.seconds() >= due
 
 
 def log(state: FitState, rendered: Tensor, gaussians: Gaussians | None = None) -> None:

@@ -6,6 +6,7 @@ import math
 import os
 import time
 import warnings
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -98,6 +99,8 @@ def fit(
     if config.target_psnr is not None and checkpoint is not None:
         raise ValueError(f"checkpoint must be None with target_psnr, which takes several fits; got {checkpoint!r}")
     prepare(config.backend, image.device, image.dtype, len(image))  # no fit's clock counts what compiles or loads once
+    if config.densify_from < 1.0:
+        _load()
     with threads_for_kernels(image[0].numel()):
         if config.target_psnr is not None:
             return Search(image, regions, num_gaussians, config, seed, _run, on_step).search()
@@ -109,10 +112,21 @@ def fit(
         return Finish().apply(state, _run(state, on_step, keeper))
 
 
+def _load() -> None:
+    """Compile or load what adding and leaving out Gaussians needs."""
+    from . import greedy, redundancy
+
+    redundancy.program.start()
+    greedy.program.ready()
+    redundancy.program.ready()
+    for module in ("scipy.ndimage", "scipy.spatial"):
+        import_module(module)
+
+
 def _run(state: FitState, on_step: OnStep | None = None, keeper: Checkpoint | None = None) -> StopReason:
     """Descend, with what the strategies do meanwhile, until something says stop; return what did."""
     config, strategies = state.config, make_strategies(state)
-    while state.iteration < config.iterations:
+    while state.iteration < state.limit:
         if not state.optimizer.is_finite():
             warnings.warn(f"the fit diverged at iteration {state.iteration}: the best so far is kept", stacklevel=5)
             return "diverged"
@@ -121,11 +135,11 @@ def _run(state: FitState, on_step: OnStep | None = None, keeper: Checkpoint | No
             if strategy.due(share):
                 strategy.apply(state)
         rendered = render(state)
-        if log_is_due(state, share):
+        if log_is_due(state):
             log(state, rendered)
         descend(state, rendered, share)
 
-        if keeper is not None and (keeper.due() or state.iteration == config.iterations):
+        if keeper is not None and (keeper.due() or state.iteration == state.limit):
             keeper.write(state)
         if on_step is not None and on_step(state.iteration, state.history[-1]):
             return "callback"
@@ -139,7 +153,8 @@ def _shown(bar: Progress, config: FitConfig, on_step: OnStep | None) -> OnStep:
     start = time.perf_counter()
 
     def step(iteration: int, entry: HistoryEntry) -> bool | None:
-        share = iteration / config.iterations
+        # the clock alone may end it
+        share = 0.0 if config.iterations is None and config.max_seconds else iteration / config.usual_iterations
         if config.max_seconds is not None:
             share = max(share, (time.perf_counter() - start) / config.max_seconds)
         bar.update(share, f"iteration {iteration}, {entry.num_gaussians} Gaussians, {entry.psnr:.2f} dB")

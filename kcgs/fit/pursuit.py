@@ -189,31 +189,16 @@ def _pursue(candidates: _Candidates, count: int, floor: float) -> _Candidates:
     where that is more: in a region of one pixel all scales are the same. Those that overlap too much with one that was
     taken are out, for that is as far as the approximation carries.
     """
-    share = (candidates.inner / np.sqrt(candidates.norm)[:, None]).T.copy()  # [C, M], of normalised Gaussians
-    gain = candidates.gain.copy()
-    x, y, square, norm = candidates.x, candidates.y, candidates.sigma**2, candidates.norm
-    # sorted by region, then y: those near a place are within one slice
-    stride = 4.0 * (y.max(initial=0.0) + 1.0)
-    place = candidates.region * stride + y
-    widest = square.max(initial=0.0)
-    picked: list[int] = []
-    while len(picked) < min(count, len(gain)):
-        best = int(gain.argmax())
-        if gain[best] <= floor:
-            break
-        picked.append(best)
-        reach = min(_REACH * math.sqrt(square[best] + widest), stride / 4)
-        low, high = place.searchsorted((place[best] - reach, place[best] + reach))
-        near = low + (abs(x[low:high] - x[best]) <= reach).nonzero()[0]
-        both = square[near] + square[best]
-        distance = (x[near] - x[best]) ** 2 + (y[near] - y[best]) ** 2
-        width = np.sqrt(square[near] * square[best]) / both
-        cropped = np.sqrt(norm[near] * norm[best]) / (norm[near] + norm[best])
-        overlap = 2 * np.maximum(width, cropped) * np.exp(-0.5 * distance / both)
-        rest = share[:, near] - overlap * share[:, best, None]
-        share[:, near] = rest
-        gain[near] = np.where((overlap > _OVERLAP) | (gain[near] < 0), -1.0, (rest * rest).sum(0))
-    return candidates.take(np.array(picked, dtype=np.int64))
+    from .greedy import pick
+
+    share = candidates.inner / np.sqrt(candidates.norm)[:, None]  # [M, C], of normalised Gaussians
+    # sorted by region, then y: those near a place are within one stretch
+    stride = 4.0 * (candidates.y.max(initial=0.0) + 1.0)
+    picked = pick(
+        candidates.x, candidates.y, candidates.region * stride + candidates.y, candidates.sigma**2, candidates.norm,
+        share, candidates.gain, count, floor=floor, overlap=_OVERLAP, reach=_REACH, longest=stride / 4,
+    )  # fmt: skip
+    return candidates.take(picked)
 
 
 def _solve(

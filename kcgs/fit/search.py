@@ -1,11 +1,12 @@
 """The fewest Gaussians that reach a PSNR: a search over their number, by finished fits.
 
 Short fits say about where to look. From there on every fit is a whole one; where an earlier one had nearly as many
-Gaussians it is taken up again with some more, or without the faintest.
+Gaussians it is taken up again with some more, or without those that are missed least.
 """
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 import time
@@ -18,9 +19,10 @@ from torch import Tensor
 from kcgs.functional import RegionMap, psnr
 
 from .config import FitConfig
-from .start import make_optimizer, start
+from .start import start
 from .state import FitResult, FitState, HistoryEntry, StopReason
 from .strategies import Densify, Finish, MergeRegions
+from .strategies.densify import leave_out
 
 OnStep = Callable[[int, HistoryEntry], bool | None]
 
@@ -78,7 +80,8 @@ class Search:
     def settings(self, seconds: float, **changes: object) -> FitConfig:
         """Return those of one fit, which ends within these seconds."""
         clock = None if math.isinf(seconds) else max(seconds, 1e-3)
-        return self.config.model_copy(update={"target_psnr": None, "max_seconds": clock, **changes})
+        given = {"target_psnr": None, "max_seconds": clock, "iterations": self.config.usual_iterations}
+        return self.config.model_copy(update={**given, **changes})
 
     def fit(self, count: int, settings: FitConfig) -> _Probe:
         """Make a fit like any other."""
@@ -88,20 +91,18 @@ class Search:
         return self.finish(count, state)
 
     def fit_again(self, count: int, earlier: _Probe) -> _Probe:
-        """Take up a fit with some more Gaussians, or without the faintest."""
-        settings, scene = self.settings(self.left()), earlier.result.scene
-        cholesky, colors = scene.field.cholesky.detach(), scene.field.colors.detach()
-        energy = colors.square().sum(-1) * cholesky[:, 0] * cholesky[:, 2]
-        field = scene.field.subset(energy.argsort(descending=True, stable=True)[:count].sort().values)
+        """Take up a fit with some more Gaussians, or without those that are missed least."""
+        settings, kept = self.settings(self.left()), earlier.state
         state = replace(
-            earlier.state, config=settings, num_gaussians=count, started=time.perf_counter(),
-            cutoff=max(settings.cutoff, settings.draft_cutoff), regions=scene.regions, region_ids=field.region_ids,
-            iteration=round(_AGAIN * settings.iterations), first=count, wanted=count, late_moves=0, moving_seconds=0.0,
-            merged=True, history=[], best=None, best_psnr=-math.inf,
+            kept, config=settings, num_gaussians=count, started=time.perf_counter(),
+            cutoff=max(settings.cutoff, settings.draft_cutoff), iteration=round(_AGAIN * settings.usual_iterations),
+            first=count, wanted=count, late_moves=0, moving_seconds=0.0, merged=True, history=[], best=None,
+            best_psnr=-math.inf,
         )  # fmt: skip
-        state.optimizer = make_optimizer(settings, field, sigma=1.0)
+        state.optimizer = copy.deepcopy(kept.optimizer)
+        leave_out(state, state.count() - count)
         with torch.no_grad():
-            Densify(state).add(state, count - len(field))
+            Densify(state).add(state, count - state.count())
         return self.finish(count, state)
 
     def finish(self, count: int, state: FitState) -> _Probe:
@@ -121,7 +122,7 @@ class Search:
     def guess(self) -> tuple[int, float, _Probe]:
         """Return about how many are needed, the slope there, and the last short fit."""
         count, slope = max(1, min(self.most, self.image[0].numel() // _SPACING)), _SLOPE
-        iterations = max(1, round(_SHORT_SHARE * self.config.iterations))
+        iterations = max(1, round(_SHORT_SHARE * self.config.usual_iterations))
         known: dict[int, float] = {}
         while True:
             # what takes as long in a short fit: contours stay where they are, and merge only where there are too many
@@ -157,7 +158,7 @@ class Search:
             begun = time.perf_counter()
             near = min(probes, key=lambda p: abs(math.log(p.count / count)), default=None)
             again = near is not None and self.config.optimizer == "frame" and _ratio(near.count, count) <= _NEAR
-            if again and near is not None and len(near.result.scene):
+            if again and near is not None and near.result.stop_reason != "diverged":
                 probes.append(self.fit_again(count, near))
             else:
                 probes.append(self.fit(count, self.settings(self.left())))

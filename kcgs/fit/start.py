@@ -47,11 +47,19 @@ def start(
         # a map that comes with widths keeps them
         chooses_widths=config.softness == "auto" and regions is not None and regions.softness == 0.0,
         given=regions,
+        limit=_limit(image, fitting, num_gaussians, config),
         merged_for_count=0 if regions is None else regions.num_regions - (fitting.num_regions if fitting else 1),
         cutoff=max(config.cutoff, config.draft_cutoff),
     )
     begin(state, _regions_to_render(image, fitting, num_gaussians, config))
     return state
+
+
+def _limit(image: Tensor, regions: RegionMap | None, num_gaussians: int, config: FitConfig) -> float:
+    """Return how many iterations there may be: with a clock as many as it allows, but for what ends otherwise."""
+    refined = config.refine_flat and is_flat(image, regions, num_gaussians)
+    free = config.iterations is None and config.max_seconds is not None and not refined
+    return math.inf if free else config.usual_iterations
 
 
 def begin(state: FitState, regions: RegionMap | None) -> None:
@@ -77,7 +85,7 @@ def _as_many_as_gaussians(
 def make_optimizer(config: FitConfig, field: GaussianField, sigma: float) -> GaussianOptimizer:
     """Return what moves Gaussians that are about `sigma` pixels wide."""
     if config.optimizer == "adan":
-        return GaussianImageAdan(field, sigma, config.iterations, config.learning_rate_factor)
+        return GaussianImageAdan(field, sigma, config.usual_iterations, config.learning_rate_factor)
     return (FrameAdam if config.optimizer == "frame" else ImageGSAdam)(field, config.learning_rate_factor)
 
 

@@ -107,6 +107,7 @@ class FitState:
     band: Tensor | None  # pixels near a contour of the given map, where EF-PSNR is measured
     chooses_widths: bool  # the map came without widths, and the config asks for some
     given: RegionMap | None  # the map as it came
+    limit: float  # of iterations; infinite where the clock alone ends the fit
     merged_for_count: int  # regions that were merged before the fit, for they were more than Gaussians
 
     # What is rendered
@@ -150,8 +151,16 @@ class FitState:
 
         Learning rates and strategies go by it, so that a fit ends in time whichever runs out first.
         """
-        done = self.iteration / self.config.iterations
+        done = self.iteration / self.limit
         return done if self.config.max_seconds is None else max(done, self.seconds() / self.config.max_seconds)
+
+    def length(self) -> float:
+        """About how many iterations the fit will take."""
+        return self.limit if self.config.max_seconds is None else self.iteration / max(self.progress(), 1e-9)
+
+    def count(self) -> int:
+        """Return how many Gaussians there are now."""
+        return len(self.optimizer.raw[-1])
 
     def gaussians(self) -> Gaussians:
         """Return what is rendered now."""

@@ -16,5 +16,5 @@ def warm_up(config: FitConfig) -> None:
     ramp = torch.linspace(0.0, 1.0, 96)
     image = torch.stack([ramp.expand(64, 96), 1 - ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96)])
     labels = (ramp > 0.6).long().expand(64, 96).contiguous()
-    short = config.model_copy(update={"iterations": min(config.iterations, 20), "max_seconds": None})
+    short = config.model_copy(update={"iterations": min(config.usual_iterations, 20), "max_seconds": None})
     fit(image, labels, 24, recipe=short)

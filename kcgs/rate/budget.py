@@ -125,7 +125,7 @@ def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: Fi
         return None, config.contour_cost, {}
     given, pixels = regions.num_regions, image.shape[1] * image.shape[2]
     # by iterations, so that without a clock the same arguments give the same file
-    iterations = min(_TRIAL_ITERATIONS, config.iterations)
+    iterations = min(_TRIAL_ITERATIONS, config.usual_iterations)
     clock = None if config.max_seconds is None else _TRIAL_SHARE * config.max_seconds
     shorter = {"iterations": iterations, "max_seconds": clock, "merge_regions": False, "refine_flat": False}
     trial = FitConfig.from_recipe(config, **shorter)

@@ -12,7 +12,7 @@ from kcgs import FitConfig, RegionMap
 from kcgs.fit.contour_moves import accept_moves
 from kcgs.fit.optimizers import FrameAdam, GaussianImageAdan
 from kcgs.fit.start import start
-from kcgs.fit.state import FitState
+from kcgs.fit.state import FitState, HistoryEntry
 from kcgs.fit.strategies import Densify, MoveContours, Strategy, make_strategies
 from kcgs.fit.strategies.merge_regions import nearest_contour
 from kcgs.nn import GaussianField
@@ -23,16 +23,30 @@ def state_of(num_gaussians: int, started: float = 0.0, **settings: Any) -> FitSt
 
 
 class TestDensify:
-    def test_additions_are_even_and_end_at_n(self) -> None:
+    def test_the_number_grows_and_then_goes_up_and_down(self) -> None:
         densify = Densify(state_of(1000))
         counts = [densify.wanted(p / 1000) for p in range(1001)]
         assert counts[0] == counts[49] == 50
-        assert counts[-1] == densify.wanted(0.5) == 1000
-        assert len(set(counts)) == densify.steps + 1
-        assert all(b >= a for a, b in pairwise(counts))
+        growth, cycles, rest = counts[:401], counts[400:800], counts[800:]
+        assert all(b >= a for a, b in pairwise(growth))
+        assert len(set(growth)) == densify.steps + 1
+        assert growth[-1] == max(counts) == 1200
+        assert sum(b > a for a, b in pairwise(cycles)) == 2  # three cycles in 700 iterations
+        assert min(cycles) == cycles[-1] == 1000
+        assert set(rest) == {1000}
+
+    def test_longer_fits_have_more_cycles(self) -> None:
+        def cycles(iterations: int) -> int:
+            densify = Densify(state_of(1000, iterations=iterations))
+            return sum(b > a for a, b in pairwise(densify.wanted(p / 10_000) for p in range(4000, 10_000)))
+
+        assert [cycles(n) for n in (100, 700, 2800)] == [0, 2, 10]
 
     def test_is_due_where_more_are_wanted(self) -> None:
-        densify = Densify(state_of(100))
+        state = state_of(100)
+        densify = Densify(state)
+        assert not densify.due(0.05)  # nothing is logged yet
+        state.history.append(HistoryEntry(0, 0.0, 1.0, 10.0, 10.0, 5))
         assert not densify.due(0.04)
         assert densify.due(0.05)
 
@@ -59,6 +73,13 @@ class TestLearningRates:
 
 
 class TestProgress:
+    def test_the_clock_alone_uses_all_of_its_time(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        state = state_of(10, max_seconds=4.0)
+        monkeypatch.setattr("time.perf_counter", lambda: 1.0)
+        state.iteration = 5000
+        assert state.progress() == 0.25
+        assert state.length() == 20_000
+
     def test_is_the_scarcer_of_iterations_and_seconds(self, monkeypatch: pytest.MonkeyPatch) -> None:
         state = state_of(10, max_seconds=4.0, iterations=100)
         monkeypatch.setattr("time.perf_counter", lambda: 1.0)

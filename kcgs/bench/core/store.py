@@ -136,7 +136,7 @@ class Store:
         """Fit, encode, measure, and keep."""
         begin = time.monotonic()
         (image, labels), config = case.load(self.data), case.config()
-        if config.iterations > QUICK_ITERATIONS:  # the quick form's seconds mean nothing
+        if config.usual_iterations > QUICK_ITERATIONS:  # the quick form's seconds mean nothing
             warm_up(config)
         labels, segment_seconds = find_labels(case.source, image, labels)
         start, core_start = time.perf_counter(), time.process_time()
@@ -177,7 +177,7 @@ def _measure(case: Case, result: FitResult, image: Tensor, labels: Tensor | None
     fields: dict[str, Any] = {name: figures[name] for name in _FIGURES}
     fields |= {f"decoded_{name}": decoded[name] for name in _FIGURES}
     return Row(
-        image=case.image, n=case.n, method=case.method.name, seed=case.seed, iterations=result.config.iterations,
+        image=case.image, n=case.n, method=case.method.name, seed=case.seed, iterations=result.config.usual_iterations,
         **fields, seconds=math.nan, core_seconds=math.nan, num_gaussians=len(scene), pixels=image[0].numel(),
         bytes=len(data),
         map_bytes=len(encode_map(scene.regions)) if scene.regions is not None and scene.regions.num_regions > 1 else 0,

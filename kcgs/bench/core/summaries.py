@@ -44,7 +44,7 @@ def what_was_run(rows: Sequence[Row]) -> str:
 
 def short_runs(rows: Sequence[Row]) -> str:
     """Say that published recipes ran shorter than they were published."""
-    ran = {(row.iterations, method(row.method).config().iterations) for row in rows if row.method in PUBLISHED}
+    ran = {(row.iterations, method(row.method).config().usual_iterations) for row in rows if row.method in PUBLISHED}
     short = " or ".join(f"{count(own)} of their {count(full)}" for own, full in sorted(ran) if own < full)
     return f"Published recipes ran {short} iterations: differences to them are not final." if short else ""
 

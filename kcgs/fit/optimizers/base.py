@@ -59,6 +59,10 @@ class GaussianOptimizer(ABC):
         added = self.encode(means, cholesky, colors)
         self.set_raw([torch.cat([old.detach(), new]) for old, new in zip(self.raw, added, strict=True)])
 
+    def keep(self, mask: Tensor) -> None:
+        """Leave out the others."""
+        self.set_raw([t.detach()[mask] for t in self.raw])
+
     def recolor(self, colors: Tensor) -> None:
         """Replace the colours."""
         with torch.no_grad():

@@ -22,7 +22,7 @@ class FrameAdam(GaussianOptimizer):
     bounded: else a few Gaussians run away to 1e5 pixels, harmless to the render and ruinous to its numbers.
     """
 
-    learning_rate = 0.1
+    learning_rate = 0.14
     color_rate = 0.03
     betas = (0.9, 0.99)
     final_decay = 0.1
@@ -82,6 +82,11 @@ class FrameAdam(GaussianOptimizer):
         super().append(*self._bounded(means, cholesky), colors)
         more = (0, 0, 0, len(means))
         self.momentum, self.square, self.age = (pad(t, more) for t in (self.momentum, self.square, self.age))
+
+    def keep(self, mask: Tensor) -> None:
+        """Leave out the others, and their averages."""
+        super().keep(mask)
+        self.momentum, self.square, self.age = (t[mask] for t in (self.momentum, self.square, self.age))
 
     def state_dict(self) -> dict[str, Any]:
         """Return Gaussians and averages."""

@@ -1,4 +1,4 @@
-"""Gaussians are added where the error is."""
+"""Gaussians are added where the error is, and left out where they are missed least."""
 
 from __future__ import annotations
 
@@ -19,17 +19,30 @@ from .move_contours import MoveContours
 
 @dataclass(frozen=True)
 class Densify:
-    """Add Gaussians where they lower the squared error most, by matching pursuit, region by region."""
+    """Add Gaussians where they lower the squared error most, by matching pursuit, region by region.
+
+    First their number grows, to more than N. Then come cycles: in each, those that are missed least are left out, step
+    by step, until there are N, and the next begins with as many again as there were. So N places are chosen several
+    times over, each time knowing what the others do.
+    """
 
     state: FitState
     contours: MoveContours | None = None
-    """What moves the contours before an addition."""
-    steps: int = 10
-    """How often Gaussians are added."""
+    """What moves the contours before an addition while the number grows."""
+    steps: int = 8
+    """How often Gaussians are added until there are most."""
     begin: float = 0.05
     """Share of the fit at the first addition."""
-    end: float = 0.5
-    """Share of the fit at the last addition."""
+    end: float = 0.4
+    """Share of the fit when there are most for the first time."""
+    surplus: float = 0.2
+    """Most Gaussians that there are, over N, less 1; not where all are there from the start."""
+    settled: float = 0.8
+    """Share of the fit from which on there are N."""
+    cycle: int = 100
+    """About how many iterations a cycle takes."""
+    removals: int = 4
+    """How often Gaussians are left out in a cycle."""
     patience: float = 2.0
     """Where the clock ends the fit, descent gets this many times the seconds of the addition before it."""
     first_share: float = 0.8
@@ -39,18 +52,27 @@ class Densify:
 
     def wanted(self, progress: float) -> int:
         """Return how many Gaussians there should be."""
-        state = self.state
+        first, final = self.state.first, self.state.num_gaussians
+        surplus = self.surplus if self.state.config.densify_from < 1.0 else 0.0
+        most = round((1 + surplus) * final)
         if progress < self.begin:
-            return state.first
-        share = (progress - self.begin) / (self.end - self.begin)
-        step = min(self.steps, 1 + int(share * (self.steps - 1)))
-        return state.first + round((state.num_gaussians - state.first) * step / self.steps)
+            return first
+        if progress < self.end:
+            share = (progress - self.begin) / (self.end - self.begin)
+            return first + round((most - first) * (1 + int(share * (self.steps - 1))) / self.steps)
+        if progress >= self.settled:
+            return final
+        cycles = max(1, round((self.settled - self.end) * self.state.length() / self.cycle))
+        share = (progress - self.end) / (self.settled - self.end) * cycles % 1.0
+        return most - round((most - final) * int(share * (self.removals + 1)) / self.removals)
 
     def due(self, progress: float) -> bool:
-        """Say whether Gaussians are wanted, and the clock has time for them."""
-        state = self.state
-        if self.wanted(progress) <= state.wanted:
+        """Say whether another number of Gaussians is wanted, and the clock has time for more."""
+        state, wanted = self.state, self.wanted(progress)
+        if not state.history:  # where the clock is far on already: first one state that may be kept
             return False
+        if wanted <= state.wanted:
+            return wanted < state.wanted
         # against the clock, additions must end before the fit does, and leave time for the descent
         hurried = state.config.max_seconds is not None and progress < 0.9 * self.end
         in_time = state.has_time(state.addition_seconds or self.first_share * state.seconds())
@@ -58,13 +80,16 @@ class Densify:
 
     @torch.no_grad()
     def apply(self, state: FitState) -> None:
-        """Add Gaussians, after moving the contours, if that is due."""
-        start = state.seconds()
-        state.wanted = self.wanted(state.progress())
+        """Add Gaussians, after moving the contours, if that is due; or leave some out."""
+        start, progress = state.seconds(), state.progress()
+        before, state.wanted = state.wanted, self.wanted(progress)
+        if state.wanted < before:
+            leave_out(state, state.count() - state.wanted)
+            return
         state.densifications += 1
-        if self.contours is not None:
+        if self.contours is not None and progress < self.end:
             self.contours.before_addition(state)
-        self.add(state, state.wanted - len(state.optimizer.gaussians()[0]))
+        self.add(state, state.wanted - state.count())
         state.addition_seconds = state.seconds() - start
         state.densify_after = state.seconds() + self.patience * state.addition_seconds
 
@@ -83,12 +108,29 @@ class Densify:
         return propose(residual, state.regions, count, sigmas=self.sigmas, backend=state.config.backend)
 
 
+def leave_out(state: FitState, count: int) -> None:
+    """Leave out so many Gaussians, if any, those that are missed least; their neighbours make up for them."""
+    from kcgs.fit.redundancy import least_missed
+
+    while count > 0:
+        means, cholesky, colors, ids, regions = state.gaussians()
+        index = torch.zeros(len(means), dtype=torch.int64) if regions is None or ids is None else regions.index_of(ids)
+        table = torch.cat([means, cholesky, colors], -1).detach().cpu().numpy()
+        goes, handed = least_missed(table[:, :2], table[:, 2:5], table[:, 5:], index.cpu().numpy(), count)
+        kept = torch.from_numpy(~goes).to(means.device)
+        state.optimizer.recolor(torch.from_numpy(handed).to(colors))
+        state.optimizer.keep(kept)
+        state.region_ids = None if ids is None else ids[kept]
+        count -= int(goes.sum())
+
+
 @dataclass(frozen=True)
 class DensifyAtLargestError(Densify):
     """Add Gaussians at pixels that are sampled in proportion to their squared error, as Image-GS does."""
 
     steps: int = 4
     end: float = 0.2
+    surplus: float = 0.0
 
     def place(self, state: FitState, count: int) -> Proposal:
         """Return round Gaussians of half the spacing, of the colour that is missing at their pixel."""

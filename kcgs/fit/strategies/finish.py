@@ -15,6 +15,8 @@ from kcgs.fit.state import FitResult, FitState, Gaussians, StopReason
 from kcgs.pruning import prune
 from kcgs.scene import Scene
 
+from .densify import leave_out
+
 
 @dataclass(frozen=True)
 class EndDrafts:
@@ -50,6 +52,7 @@ class Finish:
             if drafted is not None:
                 log(state, render(state, drafted), drafted)
             if reason != "diverged" and state.optimizer.is_finite():
+                leave_out(state, state.count() - state.num_gaussians)
                 log(state, render(state))
         assert state.best is not None
         scene = state.best.scene(state.size)

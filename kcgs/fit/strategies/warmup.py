@@ -22,7 +22,7 @@ class RefreshIds:
 
     def due(self, progress: float) -> bool:
         """Say whether it is time; by iterations, as the paper has it."""
-        iteration, iterations = self.state.iteration, self.state.config.iterations
+        iteration, iterations = self.state.iteration, self.state.config.usual_iterations
         if self.state.regions is None or iteration % max(1, round(self.every * iterations)):
             return False
         return 0 < iteration <= self.until * iterations

@@ -1,0 +1,90 @@
+"""The greedy choice of matching pursuit, as a compiled loop."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kcgs.kernels.compiled import Program, inner
+
+# candidates of which the largest gain is kept
+_BLOCK = 128
+
+program = Program("matching pursuit", __name__, __file__, "greedy.py")
+
+
+@inner
+def _refresh(gain, leaders, first, last):  # type: ignore[no-untyped-def]
+    """Find the largest gain, of equal ones the first, of the blocks that hold candidates from first to last."""
+    for block in range(first // _BLOCK, (last + _BLOCK - 1) // _BLOCK):
+        best = block * _BLOCK
+        for i in range(best + 1, min(best + _BLOCK, len(gain))):
+            if gain[i] > gain[best]:
+                best = i
+        leaders[block] = best
+
+
+@program.entry
+def choose(places, square, norm, share, gain, limits, picked):  # type: ignore[no-untyped-def]
+    """Pick the largest gain, take its share of the error off its neighbours', and again; return how many.
+
+    Places are (x, y, order), sorted by the last: those near a place lie within one stretch of it. Limits are the least
+    gain, the largest overlap, the reach in standard deviations, and the longest reach.
+    """
+    floor, most, reach, longest = limits
+    widest = square.max()
+    leaders = np.empty((len(gain) + _BLOCK - 1) // _BLOCK, np.int64)
+    _refresh(gain, leaders, 0, len(gain))
+    order = places[:, 2]
+    for count in range(len(picked)):
+        best = leaders[0]
+        for leader in leaders[1:]:
+            if gain[leader] > gain[best]:
+                best = leader
+        if gain[best] <= floor:
+            return count
+        picked[count] = best
+        x, y, middle = places[best, 0], places[best, 1], order[best]
+        width, mass, taken = square[best], norm[best], share[best].copy()
+        far = min(reach * math.sqrt(width + widest), longest)
+        low = np.searchsorted(order, middle - far)
+        high = np.searchsorted(order, middle + far)
+        for i in range(low, high):
+            across = places[i, 0] - x
+            if abs(across) > far or gain[i] < 0.0:
+                continue
+            both, down = square[i] + width, places[i, 1] - y
+            # those inside a small region are alike, whatever their widths
+            like = max(math.sqrt(square[i] * width) / both, math.sqrt(norm[i] * mass) / (norm[i] + mass))
+            overlap = 2.0 * like * math.exp(-0.5 * (across * across + down * down) / both)
+            total = 0.0
+            for c in range(len(taken)):
+                share[i, c] -= overlap * taken[c]
+                total += share[i, c] * share[i, c]
+            gain[i] = -1.0 if overlap > most else total
+        _refresh(gain, leaders, low, high)
+    return len(picked)
+
+
+@program.part
+def choices() -> None:
+    """Compile."""
+    one = np.ones(1)
+    choose(np.ones((1, 3)), one, one, np.ones((1, 3)), one, (2.0, 1.0, 1.0, 1.0), np.zeros(1, np.int64))
+
+
+def pick(
+    x: NDArray[Any], y: NDArray[Any], order: NDArray[Any], square: NDArray[Any], norm: NDArray[Any],
+    share: NDArray[Any], gain: NDArray[Any], count: int, *, floor: float, overlap: float, reach: float, longest: float,
+) -> NDArray[np.int64]:  # fmt: skip
+    """Return the positions that are picked, at most `count`, the strongest first; arguments as in :func:`choose`."""
+    picked = np.zeros(min(count, len(gain)), np.int64)
+    if not len(picked):
+        return picked
+    numbers = (np.ascontiguousarray(a, np.float64) for a in (np.stack([x, y, order], -1), square, norm))
+    program.ready()
+    share, gain = (np.array(a, np.float64) for a in (share, gain))
+    return picked[: choose(*numbers, share, gain, (floor, overlap, reach, longest), picked)]
