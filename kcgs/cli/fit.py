@@ -160,7 +160,7 @@ def fit_into(
     quality = quality_for(max(entry.psnr for entry in result.history)) if target is None else None
     with Progress("writing the file", known=False, shown=progress):
         goal: Any = {"quality": quality, "target_psnr": target, "max_seconds": request.clock.left(image)}
-        file = compress(result.scene, image, seed=request.seed, **goal)
+        file = compress(result.scene, image, seed=request.seed, objective=config.objective, **goal)
     return Fitted(result, file.scene, write_file(output, file.data))
 
 

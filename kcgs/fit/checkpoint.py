@@ -18,7 +18,7 @@ from .state import FitState, Gaussians, HistoryEntry
 
 # a checkpoint is written when the fit has run this many times as long as the last one took to write
 _PATIENCE = 100.0
-_VERSION = 3
+_VERSION = 4
 _KEPT = ("cutoff", "region_ids", "anchor", "iteration", "first", "wanted", "densifications", "late_moves", "merged")
 
 
@@ -81,14 +81,14 @@ def _plain(state: FitState) -> dict[str, Any]:
         "regions": None if state.regions is None else state.regions.state(),
         "seconds": state.seconds(),
         "history": [tuple(entry) for entry in state.history],
-        "best_psnr": state.best_psnr,
+        "best_score": state.best_score,
         "best": None if state.best is None else state.best[:4],
         "best_regions": None if state.best is None or state.best.regions is None else state.best.regions.state(),
     }
 
 
 def _take_up(state: FitState, kept: dict[str, Any]) -> None:
-    for name in (*_KEPT, "best_psnr"):
+    for name in (*_KEPT, "best_score"):
         setattr(state, name, kept[name])
     state.optimizer.load_state_dict(kept["optimizer"])
     state.regions, best_regions = (

@@ -74,6 +74,9 @@ class FitConfig(BaseModel):
     merge_regions: bool = Field(True, description="merge regions where a trial says that their contour does not help")
 
     # The descent
+    objective: Literal["psnr", "visual"] = Field(
+        "psnr", description="visual: an error on several scales, less where the image is busy; needs loss l2"
+    )
     loss: Literal["l1", "l2", "l1+ssim"] = Field("l2", description="l1+ssim: L1 + 0.1 (1 - SSIM), as Image-GS")
     optimizer: Literal["frame", "adan", "adam"] = Field(
         "frame",
@@ -102,6 +105,8 @@ class FitConfig(BaseModel):
         """Check what a type cannot say."""
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {self.backend!r}")
+        if self.objective == "visual" and self.loss != "l2":
+            raise ValueError(f"objective 'visual' needs loss 'l2'; got {self.loss!r}")
         if self.softness != "auto" and not 0.0 <= self.softness <= MAX_SOFTNESS:
             raise ValueError(f"softness must be 'auto' or in [0, {MAX_SOFTNESS:g}] pixels; got {self.softness!r}")
         if self.max_move != "any" and self.max_move < 1.0:

@@ -41,7 +41,8 @@ def _backward(state: FitState, rendered: Tensor) -> None:
     """Leave the gradient of the loss at the Gaussians, but for a constant, which no optimizer here feels."""
     if state.config.loss == "l2":
         # in the render's own memory, which nothing needs again: new memory would take as long as the sum
-        rendered.backward(rendered.data.sub_(state.image))
+        difference = rendered.data.sub_(state.image)
+        rendered.backward(difference if state.objective is None else state.objective.apply(difference))
         return
     difference = torch.sub(rendered.detach(), state.image).sign_()
     if state.config.loss == "l1+ssim":
@@ -67,13 +68,16 @@ def log(state: FitState, rendered: Tensor, gaussians: Gaussians | None = None) -
     gaussians = gaussians or state.gaussians()
     difference = rendered.detach() - state.image
     loss = float(difference.square().mean() if state.config.loss == "l2" else difference.abs().mean())
-    error = (rendered.detach().clamp(0.0, 1.0) - state.image).square_().flatten(1)
+    difference = rendered.detach().clamp(0.0, 1.0) - state.image
+    seen = None if state.objective is None else state.objective.value(difference)
+    error = difference.square_().flatten(1)
     psnr = _decibel(float(error.mean()))
     ef_psnr = math.nan if state.band is None else _decibel(float(error.index_select(1, state.band).mean()))
     entry = HistoryEntry(state.iteration, state.seconds(), loss, psnr, ef_psnr, len(gaussians.means))
     state.history.append(entry)
-    if psnr > state.best_psnr:
-        state.best_psnr, state.best = psnr, gaussians.detached()
+    score = psnr if seen is None else _decibel(seen)
+    if score > state.best_score:
+        state.best_score, state.best = score, gaussians.detached()
 
 
 def _decibel(mean_square: float) -> float:

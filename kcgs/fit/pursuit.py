@@ -110,7 +110,7 @@ def _search(residual: Tensor, labels: NDArray[np.int32], sigmas: Sequence[float]
         averages, side = planes, 1
         for block, choices in scales.items():
             while side < block:
-                averages, side = _halve(averages), 2 * side
+                averages, side = halve(averages), 2 * side
             margin = math.ceil(_REACH * max(choices) / block)
             padded = pad(averages, (margin, margin, margin, margin))
             found += [_best_of_squares(padded, margin, region, sigma, block, (left, top), limit) for sigma in choices]
@@ -124,7 +124,7 @@ def _block(sigma: float) -> int:
     return int(2 ** max(0, math.floor(math.log2(sigma / _SIGMA_PER_BLOCK))))
 
 
-def _halve(planes: Tensor) -> Tensor:
+def halve(planes: Tensor) -> Tensor:
     """Average blocks of 2 x 2, (N, h, w) of even sides; five times faster on one core than torch's pooling."""
     rows = planes[:, ::2] + planes[:, 1::2]
     return (rows[..., ::2] + rows[..., 1::2]).mul_(0.25)

@@ -115,7 +115,12 @@ def scores() -> None:
 
 
 def least_missed(
-    means: NDArray[Any], cholesky: NDArray[Any], colors: NDArray[Any], region: NDArray[Any], count: int
+    means: NDArray[Any],
+    cholesky: NDArray[Any],
+    colors: NDArray[Any],
+    region: NDArray[Any],
+    count: int,
+    weight: NDArray[Any],
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     r"""Choose Gaussians to leave out, and hand their colours to their neighbours.
 
@@ -129,6 +134,7 @@ def least_missed(
         colors: (N, C).
         region: (N,), number of each one's region.
         count: how many should go; fewer do where too many are neighbours.
+        weight: (N,), what the squared error about each one counts.
 
     Returns:
         Which go, (N,), and the colours of all, (N, C).
@@ -147,7 +153,7 @@ def least_missed(
     colors *= norm[:, None]
     goes, stays = np.zeros(len(rows), np.bool_), np.zeros(len(rows), np.bool_)
     handed = colors.copy()
-    for i in np.argsort(rests * np.square(colors).sum(1), kind="stable"):
+    for i in np.argsort(rests * np.square(colors).sum(1) * weight[order], kind="stable"):
         if count == 0:
             break
         others = neighbors[i, : np.count_nonzero(neighbors[i] >= 0)]

@@ -97,7 +97,7 @@ class Search:
             kept, config=settings, num_gaussians=count, started=time.perf_counter(),
             cutoff=max(settings.cutoff, settings.draft_cutoff), iteration=round(_AGAIN * settings.usual_iterations),
             first=count, wanted=count, late_moves=0, moving_seconds=0.0, merged=True, history=[], best=None,
-            best_psnr=-math.inf,
+            best_score=-math.inf,
         )  # fmt: skip
         state.optimizer = copy.deepcopy(kept.optimizer)
         leave_out(state, state.count() - count)

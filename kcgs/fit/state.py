@@ -16,6 +16,7 @@ from kcgs.plots import history_figure
 from kcgs.scene import Scene
 
 from .config import FitConfig
+from .objective import VisualObjective
 from .optimizers import GaussianOptimizer
 from .region_report import RegionReport
 
@@ -107,6 +108,7 @@ class FitState:
     band: Tensor | None  # pixels near a contour of the given map, where EF-PSNR is measured
     chooses_widths: bool  # the map came without widths, and the config asks for some
     given: RegionMap | None  # the map as it came
+    objective: VisualObjective | None  # what the descent lowers; None: what `loss` says
     limit: float  # of iterations; infinite where the clock alone ends the fit
     merged_for_count: int  # regions that were merged before the fit, for they were more than Gaussians
 
@@ -131,7 +133,7 @@ class FitState:
     # What was measured
     history: list[HistoryEntry] = dataclasses.field(default_factory=list)
     best: Gaussians | None = None
-    best_psnr: float = float("-inf")
+    best_score: float = float("-inf")
 
     @property
     def size(self) -> tuple[int, int]:

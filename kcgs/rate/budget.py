@@ -106,7 +106,8 @@ def fit_bytes(
     changes = changes if config.guidance else {"dropped": "recipe"}
     result = result._replace(regions=report_regions(regions, result.scene, **changes))
     with Progress("writing the file", known=False, shown=progress):
-        data, scene = compress(result.scene, image, target_bytes=num_bytes, max_seconds=left(), seed=seed)
+        how: Any = {"max_seconds": left(), "seed": seed, "objective": config.objective}
+        data, scene = compress(result.scene, image, target_bytes=num_bytes, **how)
     return FitBytesResult(data, scene, result)
 
 

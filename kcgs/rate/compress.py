@@ -22,6 +22,7 @@ from kcgs.codec import QUALITIES, decode
 from kcgs.codec.gaussians.quantize import QPS, Codes, Parameters, Quantizer
 from kcgs.codec.scenes import SceneWriter
 from kcgs.fit.frame import local_gradient, move
+from kcgs.fit.objective import VisualObjective
 from kcgs.functional import RegionMap, psnr, region_splat
 from kcgs.kernels import threads_for_kernels
 from kcgs.scene import Scene
@@ -70,6 +71,7 @@ def compress(
     iterations: int = 100,
     max_seconds: float | None = None,
     seed: int = 0,
+    objective: str = "psnr",
 ) -> Compressed:
     """Write a scene as a `.kcgs` file, rounded with an eye on the image that it shows.
 
@@ -86,12 +88,14 @@ def compress(
         iterations: renders that the descent may take, at least 1.
         max_seconds: wall time, above 0; what it has no time for is rounded at once. None: as long as it takes.
         seed: of the order in which Gaussians are rounded.
+        objective: of the descent, as in :class:`kcgs.fit.FitConfig`: psnr or visual.
 
     Returns:
         The file, and the scene that it decodes to.
 
     Raises:
-        TypeError, ValueError: as :func:`kcgs.codec.encode`; an image that does not fit the scene; `iterations` below 1.
+        TypeError, ValueError: as :func:`kcgs.codec.encode`; an image that does not fit the scene; `iterations` below
+            1, another `objective`.
 
     Example:
         >>> from kcgs import fit
@@ -110,6 +114,9 @@ def compress(
         raise ValueError(f"target_psnr excludes quality and target_bytes; got {quality!r} and {target_bytes!r}")
     qp = writer.qp_for(quality, target_bytes)
     check_count("iterations", iterations)
+    if objective not in ("psnr", "visual"):
+        raise ValueError(f"objective must be psnr or visual; got {objective!r}")
+    visual = VisualObjective(target) if objective == "visual" else None
     end = math.inf
     if max_seconds is not None:
         end = time.perf_counter() + check_number("max_seconds", max_seconds, 0.0, unit="seconds", above=True)
@@ -119,7 +126,7 @@ def compress(
         kept = _pays(writer.gaussians, quantizer)
         gaussians = Parameters(*(numbers[kept] for numbers in writer.gaussians))
         region_ids = None if writer.regions is None else writer.regions.ids[torch.from_numpy(writer.ids[kept])]
-        tuning = _FineTuning(gaussians, region_ids, target, writer.regions, quantizer, seed)
+        tuning = _FineTuning(gaussians, region_ids, target, writer.regions, quantizer, seed, visual)
         with threads_for_kernels(target[0].numel()):
             tuned = tuning.run(steps, share * (end - time.perf_counter()))
         return writer.write(quantizer, tuned, writer.ids[kept])
@@ -174,7 +181,9 @@ class _FineTuning:
         regions: RegionMap | None,
         quantizer: Quantizer,
         seed: int,
+        objective: VisualObjective | None,
     ) -> None:
+        self.objective = objective
         self.region_ids, self.image, self.regions, self.quantizer = region_ids, image, regions, quantizer
         self.classes = quantizer.classify(gaussians)
         self.free = [torch.from_numpy(numbers).to(image) for numbers in gaussians]
@@ -220,7 +229,10 @@ class _FineTuning:
         size = self.quantizer.size
         x, factors, c = (t.detach().requires_grad_() for t in (means, cholesky, colors))
         render = region_splat(x, factors, c, self.region_ids, self.regions, size=size, cutoff=_DRAFT_CUTOFF)
-        gradients = torch.autograd.grad(render, (x, factors, c), render.detach() - self.image)
+        difference = render.detach() - self.image
+        if self.objective is not None:
+            difference = self.objective.apply(difference)
+        gradients = torch.autograd.grad(render, (x, factors, c), difference)
         area = (math.pi * cholesky[:, 0] * cholesky[:, 2]).clamp_max(size[0] * size[1])
         energy = (colors.square().sum(-1) * area).clamp_min(_FAINT)
         curvature = torch.tensor(_CURVATURE).to(energy) * energy[:, None]

@@ -46,7 +46,7 @@ def cheapest(g: NDArray[np.float64], colors: NDArray[np.float64], region: NDArra
 def test_the_one_that_is_missed_least_goes(seed: int) -> None:
     means, cholesky, colors, region = make(12, seed, regions=2)
     g = sampled(means, cholesky)
-    goes, handed = least_missed(means, cholesky, colors, region, 1)
+    goes, handed = least_missed(means, cholesky, colors, region, 1, np.ones(len(means)))
     assert np.flatnonzero(goes).tolist() == [cheapest(g, colors, region)]
     before, dropped, after = colors.T @ g, colors[~goes].T @ g[~goes], handed[~goes].T @ g[~goes]
     for r in set(region[goes]):  # what is left of the loss is what least squares leaves
@@ -59,7 +59,7 @@ def test_the_one_that_is_missed_least_goes(seed: int) -> None:
 def test_neighbours_of_one_that_goes_stay() -> None:
     means, cholesky, colors, region = make(2)
     means[1], cholesky[1] = means[0], cholesky[0]  # twins: one is enough
-    goes, handed = least_missed(means, cholesky, colors, region, 2)
+    goes, handed = least_missed(means, cholesky, colors, region, 2, np.ones(len(means)))
     assert goes.sum() == 1
     np.testing.assert_allclose(handed[~goes][0], colors.sum(0), rtol=2e-3)
 
@@ -67,7 +67,7 @@ def test_neighbours_of_one_that_goes_stay() -> None:
 def test_other_regions_do_not_help() -> None:
     means, cholesky, colors, _ = make(2)
     means[1], cholesky[1] = means[0], cholesky[0]
-    goes, handed = least_missed(means, cholesky, colors, np.array([0, 1]), 2)
+    goes, handed = least_missed(means, cholesky, colors, np.array([0, 1]), 2, np.ones(2))
     assert goes.all()
     np.testing.assert_allclose(handed, colors)
 
@@ -76,7 +76,7 @@ def test_other_regions_do_not_help() -> None:
 def test_extremes_are_finite(count: int) -> None:
     means, cholesky, colors, region = make(max(count, 1))
     means[:], cholesky[0] = 15.0, (1e4, 0.0, 0.1)
-    goes, handed = least_missed(means[:count], cholesky[:count], colors[:count], region[:count], count)
+    goes, handed = least_missed(means[:count], cholesky[:count], colors[:count], region[:count], count, np.ones(count))
     assert len(goes) == count and np.isfinite(handed).all()
 
 

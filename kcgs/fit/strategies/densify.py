@@ -104,8 +104,15 @@ class Densify:
 
     def place(self, state: FitState, count: int) -> Proposal:
         """Return the Gaussians to add."""
-        residual = state.image - render(state)
-        return propose(residual, state.regions, count, sigmas=self.sigmas, backend=state.config.backend)
+        residual, objective = state.image - render(state), state.objective
+        if objective is not None:
+            residual = objective.apply(residual)
+        added = propose(residual, state.regions, count, sigmas=self.sigmas, backend=state.config.backend)
+        if objective is None:
+            return added
+        # in the filtered residual, what counts more is larger
+        x, y = added.means.long().unbind(-1)
+        return added._replace(colors=added.colors / objective.importance[y, x, None])
 
 
 def leave_out(state: FitState, count: int) -> None:
@@ -116,7 +123,9 @@ def leave_out(state: FitState, count: int) -> None:
         means, cholesky, colors, ids, regions = state.gaussians()
         index = torch.zeros(len(means), dtype=torch.int64) if regions is None or ids is None else regions.index_of(ids)
         table = torch.cat([means, cholesky, colors], -1).detach().cpu().numpy()
-        goes, handed = least_missed(table[:, :2], table[:, 2:5], table[:, 5:], index.cpu().numpy(), count)
+        weight = torch.ones(len(means)) if state.objective is None else state.objective.weigh(means, cholesky)
+        geometry = table[:, :2], table[:, 2:5], table[:, 5:], index.cpu().numpy()
+        goes, handed = least_missed(*geometry, count, weight.cpu().numpy())
         kept = torch.from_numpy(~goes).to(means.device)
         state.optimizer.recolor(torch.from_numpy(handed).to(colors))
         state.optimizer.keep(kept)

@@ -33,7 +33,7 @@ class EndDrafts:
         """Sharpen; the next state that is measured is the best, for what was measured on drafts does not compare."""
         if state.cutoff != state.config.cutoff:
             state.cutoff = state.config.cutoff
-            state.best_psnr = float("-inf")
+            state.best_score = float("-inf")
 
 
 @dataclass(frozen=True)
