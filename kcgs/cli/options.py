@@ -50,8 +50,9 @@ def fit_request(
         int | None, typer.Option(min=1, help="Default: the recipe's, or as many as --max-seconds has time for.")
     ] = None,
     objective: Annotated[
-        Literal["psnr", "visual"], typer.Option(help="What is fitted for: the squared error, or what the eye sees.")
-    ] = "psnr",
+        Literal["psnr", "visual"] | None,
+        typer.Option(help="What is fitted for: the squared error, or what the eye sees; default: the recipe's."),
+    ] = None,
     max_seconds: Annotated[
         float | None, typer.Option(help="Wall time of the whole command; of fit-many, for each image.")
     ] = None,
@@ -70,10 +71,10 @@ def fit_request(
 
     if target_bytes is not None:
         exclude("--target-bytes", num_gaussians=num_gaussians, target_psnr=target_psnr)
-    settings: dict[str, Any] = {"iterations": iterations, "max_seconds": max_seconds, "target_psnr": target_psnr}
-    given: dict[str, Any] = {key: value for key, value in settings.items() if value is not None}
-    if objective != "psnr":
-        given["objective"] = objective
+    settings: dict[str, Any] = {
+        "iterations": iterations, "objective": objective, "max_seconds": max_seconds, "target_psnr": target_psnr,
+    }  # fmt: skip
+    given = {key: value for key, value in settings.items() if value is not None}
     if keep_contours:
         given |= {"move_contours": False, "merge_regions": False}
     config = FitConfig.from_recipe(recipe, backend=backend, **given)
