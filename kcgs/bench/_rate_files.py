@@ -31,9 +31,10 @@ from .core.store import Store, find_labels
 MAPS = "maps"
 # codecs of label maps
 LABELS, LOSSLESS_WEBP = "kcgs.codec.labels", "WebP, lossless"
-KCGS, NO_REGIONS, FLOAT = "kcgs", "kcgs, no regions", "float scene"
+KCGS, NO_REGIONS, VISUAL, FLOAT = "kcgs", "kcgs, no regions", "kcgs, visual", "float scene"
+OURS = (KCGS, NO_REGIONS, VISUAL)
 # of `compress`
-ITERATIONS, QUICK_TUNING = 100, 10
+ITERATIONS, QUICK_TUNING = 250, 10
 # a fit's file is rounded until it costs so many dB; the dB above its PSNR at which that is tried first
 MOST_LOSS, FIRST_QUALITY = 0.15, 14.5
 QUICK_STRIDE = 2
@@ -47,7 +48,7 @@ class Point(NamedTuple):
     group: str
     image: str
     codec: str
-    asked: int  # bytes that it may have; in the groups precision and speed: how many Gaussians
+    asked: int  # bytes that it may have; in the group precision: how many Gaussians
     bytes: int
     bpp: float  # bits per pixel, everything included
     setting: str = ""
@@ -99,20 +100,22 @@ class Files:
 
         return self.keep(ask, [*CODECS[codec]], make)
 
-    def fitted(self, group: str, image: str, most: int, *, regions: bool = True) -> list[Point]:
+    def fitted(self, group: str, image: str, most: int, codec: str = KCGS) -> list[Point]:
         """Return kcgs' file of a fit to so many bytes."""
-        ask = Ask(group, image, KCGS if regions else NO_REGIONS, most)
+        ask, regions = Ask(group, image, codec, most), codec != NO_REGIONS
+        config = self.config.model_copy(update={"objective": "visual" if codec == VISUAL else "psnr"})
+        settings = ["fit_bytes", codec_digest(), config.model_dump(mode="json")]
 
         def make() -> tuple[Point, bytes]:
             sample, segment_seconds = self.sample(image)
             labels = sample.labels if regions else None
             start = time.perf_counter()
-            made = fit_bytes(sample.image, labels, most, recipe=self.config)
+            made = fit_bytes(sample.image, labels, most, recipe=config)
             seconds = time.perf_counter() - start + (segment_seconds if regions else 0.0)
-            made.result.scene.save(self.path(ask, self.settings("fit_bytes"), "safetensors"))
+            made.result.scene.save(self.path(ask, settings, "safetensors"))
             return self._of_file(ask, made.data)._replace(encode_seconds=seconds), made.data
 
-        return self.keep(ask, self.settings("fit_bytes"), make)
+        return self.keep(ask, settings, make)
 
     def rewritten(self, fitted: Point, most: int) -> list[Point]:
         """Return the same fit's file of at most `most` bytes, fewer than it was made for."""
@@ -211,7 +214,7 @@ class Files:
     def shown(self, point: Point) -> Tensor:
         """Decode a point's file."""
         data = self.paths[Ask(*point[:4])].read_bytes()
-        return render(data) if point.codec in (KCGS, NO_REGIONS) else open_file(data)
+        return render(data) if point.codec in OURS else open_file(data)
 
     def path(self, ask: Ask, settings: Any, suffix: str) -> Path:
         """Say where a file is, or would be."""

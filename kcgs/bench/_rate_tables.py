@@ -8,13 +8,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 from ._codecs import CODECS
-from ._rate_files import FLOAT, KCGS, LABELS, LOSSLESS_WEBP, MAPS, NO_REGIONS, Point
+from ._rate_files import FLOAT, KCGS, LABELS, LOSSLESS_WEBP, MAPS, NO_REGIONS, VISUAL, Point
 from .core.statistics import Delta, Summary, delta, summarize
 from .core.tables import count, db, markdown, seconds, signed, table
 
 MATCHED, DAVIS_CURVE, KODAK_CURVE = "davis8k", "davis-curve", "kodak-curve"
-PRECISION, SPEED = "precision", "speed"
-TUNED, PLAIN, DECODE = "encode, fine-tuned", "encode", "decode"
+PRECISION = "precision"
 PSNR, EF_PSNR = "psnr", "ef_psnr"
 # as tables call them, and their unit
 QUALITIES = {PSNR: ("PSNR", "dB"), EF_PSNR: ("EF-PSNR", "dB"), "ms_ssim": ("MS-SSIM", "1"), "ef_ssim": ("EF-SSIM", "1")}
@@ -142,6 +141,27 @@ def matched_means(points: Sequence[Point]) -> str:
     return markdown([*header, "s, encode", "s, decode", "kcgs, s, encode", "kcgs, s, decode"], lines)
 
 
+def largest(points: Sequence[Point], codec: str) -> dict[str, Point]:
+    """Find the largest matched file of each image."""
+    matched = [p for p in points if (p.group, p.codec) == (MATCHED, codec)]
+    return {p.image: p for p in sorted(matched, key=lambda p: p.bytes)}
+
+
+def matched_figures(points: Sequence[Point]) -> str:
+    """Mean figures of each codec's largest files, of the images that all have."""
+    found = {codec: files for codec in (KCGS, VISUAL, *RIVALS) if (files := largest(points, codec))}
+    images = set.intersection(*(set(files) for files in found.values()))
+    lines = []
+    for codec, files in found.items():
+        same = [files[image] for image in sorted(images)]
+        line = [codec, str(len(same)), _mean_bytes(same)] if same else []
+        for name in qualities(points) if same else ():
+            mean, unit = statistics.fmean(getattr(p, name) for p in same), QUALITIES[name][1]
+            line.append(f"{mean:.4f}" if unit == "1" else f"{mean:.2f}")
+        lines += [line] if same else []
+    return markdown(["codec", "frames", "bytes", *(QUALITIES[name][0] for name in qualities(points))], lines)
+
+
 def bd_means(points: Sequence[Point], group: str) -> str:
     """Means of Bjontegaard's differences."""
     header = ["against", "images"]
@@ -190,18 +210,6 @@ def maps_table(points: Sequence[Point]) -> str:
         lines.append(line)
     header = ["maps", "how many", f"bytes, {LOSSLESS_WEBP}", f"bytes, {LABELS}", "share, mean", "95 %", "worst"]
     return markdown(header, lines)
-
-
-def speed_table(points: Sequence[Point]) -> str:
-    """Seconds of each step."""
-    columns: dict[str, Callable[[Point], str]] = {
-        "frame": lambda p: p.image,
-        "Gaussians": lambda p: count(p.num_gaussians),
-        "what": lambda p: p.codec,
-        "bytes": lambda p: count(p.bytes),
-        "ms, median": lambda p: f"{1e3 * (p.decode_seconds if p.codec == DECODE else p.encode_seconds):.0f}",
-    }
-    return table(columns, (p for p in points if p.group == SPEED))
 
 
 def curve_groups(points: Sequence[Point]) -> list[str]:

@@ -5,28 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
+from torch import Tensor
 
-from kcgs.codec import encode
 from kcgs.plots import COLORS, figure, save_figure
-from kcgs.rate import compress
 
 from . import _rate_tables as tables
 from ._codecs import AVIF, AVIF_PSNR, JPEG, WEBP, present, versions
-from ._rate_files import FIRST_QUALITY, KCGS, MAPS, MOST_LOSS, NO_REGIONS, Ask, Files, Point, render, timed
+from ._rate_files import KCGS, MAPS, MOST_LOSS, NO_REGIONS, VISUAL, Files, Point
 from ._rate_tables import MOST_BYTES, PRECISION
 from .core import images
-from .core.clocks import threads
-from .core.figures import CROPS, add_legend, plot_crops, show_crops
+from .core.figures import CROPS, add_legend, plot_crops, save_sheet, show_crops
 from .core.jobs import with_progress
 from .core.options import Options
 from .core.registry import experiment
 from .core.report import Made, conclude
 from .core.rows import read_rows, write_rows
 
-GROUPS = (tables.MATCHED, PRECISION, MAPS, tables.DAVIS_CURVE, tables.KODAK_CURVE, tables.SPEED)
+GROUPS = (tables.MATCHED, PRECISION, MAPS, tables.DAVIS_CURVE, tables.KODAK_CURVE)
 FRAMES = (
     *("blackswan", "dog", "train", "breakdance", "car-turn", "dance-jump", "mallard-water", "rollerblade"),
     *("bmx-trees", "cows", "kite-surf", "paragliding-launch"),
@@ -36,12 +33,12 @@ _NAMES = {
     PRECISION: FRAMES[:4],
     tables.DAVIS_CURVE: FRAMES[:3],
     tables.KODAK_CURVE: ("kodim23", "kodim07", "kodim19"),
-    tables.SPEED: FRAMES[:1],
 }
 QUICK_IMAGE, QUICK_BYTES = "disc", 700
 TARGETS, QUICK_TARGETS = (2_000, 4_000, 8_000, 16_000, 32_000), (450, 900)
 COUNTS, QUICK_COUNTS = (1_250, 7_500), (40,)
-SPEED_THREADS = 2
+# photo, kcgs for either objective, AVIF
+_SHEET = "frames.jpg"
 # share of another file's bytes that is nearly as many
 _NEAR = 0.98
 # colour, line and marker of each codec, the same everywhere
@@ -55,17 +52,16 @@ _STYLES = {
 }
 _INTRODUCTION = f"""Bytes are those of real files, everything in them included. `{KCGS}` is `kcgs.rate.fit_bytes` with
 the map that is given on DAVIS, and with the one that `kcgs.segment.segment` finds on Kodak; `{NO_REGIONS}` is the same
-without a map. Gained is what kcgs has over the other. The other codecs, and how curves are compared: docs/results.md.
-Seconds are medians, of kcgs those of the whole fit. Each file by itself: results.csv."""
+without a map, `{VISUAL}` with `objective="visual"`. Gained is what kcgs has over the other. The other codecs, and how
+curves are compared: docs/results.md. Seconds are medians, of kcgs those of the whole fit. Each file by itself:
+results.csv."""
 _MATCHED_TEXT = f"""Every codec made its largest file of at most {MOST_BYTES:,} bytes, or its smallest if it cannot go
-as low. Each meets the largest file of kcgs that has no more bytes. Without regions kcgs was asked for the bytes that it
-was fitted to with them."""
+as low. Each meets the largest file of kcgs that has no more bytes. Without regions, and with the visual objective, kcgs
+was asked for the bytes that it was fitted to with them. The second table has means of each one's largest files."""
 _SECTIONS = {
     PRECISION: ("Bits per Gaussian", tables.precision_table, f"""A fit of N Gaussians with the annotation's contours,
 and the smallest of a few files by `kcgs.rate.compress` that loses at most {MOST_LOSS} dB of its PSNR."""),
     MAPS: ("Label maps", tables.maps_table, """Bytes of a label map alone, beside Pillow's lossless WebP."""),
-    tables.SPEED: ("Speed", tables.speed_table, f"""Medians on {SPEED_THREADS} threads: `kcgs.rate.compress`,
-`kcgs.codec.encode`, and a file decoded and rendered, in a process that has done so before."""),
 }  # fmt: skip
 
 # makes some files of one image; those that are not there, and may not be made, are left out
@@ -82,7 +78,8 @@ def report(output: Path, made: Made) -> list[str]:
     rivals = [rival for rival in tables.RIVALS if tables.pairs(points, rival)]
     if rivals:
         parts += [f"## At {MOST_BYTES:,} bytes: {tables.MATCHED}", _MATCHED_TEXT, tables.matched_means(points)]
-        parts += show_crops(output, KCGS)
+        parts += [tables.matched_figures(points), *show_crops(output, KCGS)]
+        parts += [f"[All frames at full size]({_SHEET})"] if (output / _SHEET).is_file() else []
     for group in tables.curve_groups(points):
         of_group = [p for p in points if p.group == group]
         _plot_curves(of_group, output / f"{group}.png")
@@ -100,7 +97,7 @@ def run(output: Path, options: Options) -> None:
 
     Every finished file is kept in `output`/files, so that the same call goes on where an earlier one was interrupted;
     those of kcgs are made anew once the codec has changed. Remove the folder to measure changed fits anew. Without
-    `only`, all groups are run that can be but `speed`, whose clocks want a machine with nothing else to do.
+    `only`, all groups are run that can be.
     """
     chosen = choose(options)
     files = Files(output / "files", options.data, options.quick)
@@ -112,9 +109,8 @@ def run(output: Path, options: Options) -> None:
         kept = Files(files.folder, files.data, files.quick, makes=False)
         points, notes = _collect(kept, chosen)
         write_rows(output / "results.csv", Point, points)
-        pairs = ((a.image, {p.codec: kept.shown(p) for p in (a, b)}) for a, b in tables.pairs(points, AVIF))
-        frames = ((name, {"photo": kept.sample(name)[0].image, **shown}) for name, shown in pairs)
-        plot_crops(output / CROPS, frames)
+        plot_crops(output / CROPS, _frames(kept, points))
+        save_sheet(output / _SHEET, _frames(kept, points))
         made = options.made("rate", notes)
         conclude(report, output, made._replace(machine=(versions(), f"Threads: {torch.get_num_threads()}")))
 
@@ -125,7 +121,7 @@ def choose(options: Options) -> list[str]:
     if not able:
         raise ValueError("data must be a folder with DAVIS, bsds or kodak in it; without one there is only quick")
     if options.only is None:
-        return [group for group in able if options.quick or group != tables.SPEED]
+        return able
     wanted = options.only.replace(" ", "").split(",")
     if not set(wanted) <= set(able):
         raise ValueError(f"only must name groups with images, {', '.join(able)}, with commas; got {options.only!r}")
@@ -153,7 +149,8 @@ def steps(group: str, files: Files) -> Iterator[tuple[str, Step]]:
     if group == tables.MATCHED:
         # without regions is the second thing to know, of all
         yield from ((image, partial(_matched, files, image)) for image in found)
-        yield from ((f"{image}, no regions", partial(_matched_without, files, image)) for image in found)
+        others = [(image, codec) for codec in (NO_REGIONS, VISUAL) for image in found]
+        yield from ((f"{image}, {codec}", partial(_matched_other, files, image, codec)) for image, codec in others)
     elif group in (tables.DAVIS_CURVE, tables.KODAK_CURVE):
         for image in found:
             for most in QUICK_TARGETS if files.quick else TARGETS:
@@ -161,10 +158,9 @@ def steps(group: str, files: Files) -> Iterator[tuple[str, Step]]:
     elif group == MAPS:
         yield from ((image, partial(files.label_map, image)) for image in found)
     else:
-        measured = {PRECISION: _precision, tables.SPEED: _speed}[group]
         for image in found:
             for n in QUICK_COUNTS if files.quick else COUNTS:
-                yield f"{image} N = {n:,}", partial(measured, files, image, n)
+                yield f"{image} N = {n:,}", partial(_precision, files, image, n)
 
 
 def _collect(kept: Files, chosen: Sequence[str]) -> tuple[list[Point], list[str]]:
@@ -205,48 +201,30 @@ def _matched(files: Files, image: str) -> list[Point]:
     return [*others, *ours]
 
 
-def _matched_without(files: Files, image: str) -> list[Point]:
+def _matched_other(files: Files, image: str, codec: str) -> list[Point]:
     kept = Files(files.folder, files.data, files.quick, makes=False)
     ours = [p for p in _matched(kept, image) if p.regions]
-    return files.fitted(tables.MATCHED, image, ours[0].asked, regions=False) if ours else []
+    return files.fitted(tables.MATCHED, image, ours[0].asked, codec) if ours else []
+
+
+def _frames(kept: Files, points: Sequence[Point]) -> Iterator[tuple[str, dict[str, Tensor]]]:
+    """Show each matched photo beside its largest files."""
+    found = [tables.largest(points, codec) for codec in (KCGS, VISUAL, AVIF)]
+    for image in found[0]:
+        if all(image in files for files in found):
+            shown = {files[image].codec: kept.shown(files[image]) for files in found}
+            yield image, {"photo": kept.sample(image)[0].image, **shown}
 
 
 def _on_curve(files: Files, group: str, image: str, most: int) -> list[Point]:
     points = [p for codec in present() for p in files.other(group, image, codec, most)]
-    which = (True,) if files.quick else (True, False)
-    return points + [p for regions in which for p in files.fitted(group, image, most, regions=regions)]
+    ours = (KCGS,) if files.quick else (KCGS, NO_REGIONS)
+    return points + [p for codec in ours for p in files.fitted(group, image, most, codec)]
 
 
 def _precision(files: Files, image: str, n: int) -> list[Point]:
     scenes = files.scene(PRECISION, image, n)
     return scenes + [p for scene in scenes for p in files.rounded(scene)]
-
-
-def _speed(files: Files, image: str, n: int) -> list[Point]:
-    """Time files of the scene that the group of precision keeps."""
-    fitted = files.scene(PRECISION, image, n)
-    if not fitted:
-        return []
-    repeats = 1 if files.quick else 5
-
-    def make(what: str) -> tuple[Point, bytes]:
-        scene, sample = files.fits.scene(files.case(image, n)), files.sample(image)[0].image
-        quality = fitted[0].psnr + FIRST_QUALITY
-        with threads(SPEED_THREADS):
-            if what == tables.TUNED:
-                tuned = partial(compress, scene, sample, quality=quality, iterations=files.tuning)
-                (data, _), seconds = timed(tuned, repeats)
-            else:
-                data, seconds = timed(partial(encode, scene, quality=quality), repeats)
-            if what == tables.DECODE:
-                seconds = timed(lambda: render(data), 3 * repeats)[1]
-        field = "decode_seconds" if what == tables.DECODE else "encode_seconds"
-        times: dict[str, Any] = {field: seconds, "num_gaussians": len(scene)}
-        return Point(tables.SPEED, image, what, n, len(data), 8 * len(data) / sample[0].numel(), **times), data
-
-    settings = [*files.settings(tables.SPEED), repeats, SPEED_THREADS]
-    asks = [Ask(tables.SPEED, image, what, n) for what in (tables.TUNED, tables.PLAIN, tables.DECODE)]
-    return [p for ask in asks for p in files.keep(ask, settings, partial(make, ask.codec))]
 
 
 def _plot_curves(points: Sequence[Point], path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
@@ -23,8 +24,8 @@ from kcgs.scene import Scene
 
 from .compress import compress
 
-# bits per Gaussian where rounding costs half a dB, at `_COUNT` of them, and for each doubling
-_BITS, _COUNT, _BITS_PER_OCTAVE = 31.0, 2100, 1.9
+# bits per Gaussian where rounding costs half a dB, at `_COUNT` of them, and for each doubling; the eye wants more
+_BITS, _COUNT, _BITS_PER_OCTAVE = {"psnr": 31.0, "visual": 34.0}, 2100, 1.9
 _HEADER_BYTES = 60
 # squared error falls with the power of the bytes
 _POWER = 0.93
@@ -95,7 +96,7 @@ def fit_bytes(
     end = math.inf if config.max_seconds is None else time.perf_counter() + config.max_seconds
     with Progress("trial fits", known=False, shown=progress):
         chosen, cost, changes = _choose(image, regions, num_bytes, config, seed)
-    count = count_for(num_bytes - _map_bytes(chosen), image.shape[1] * image.shape[2])
+    count = count_for(num_bytes - _map_bytes(chosen), image.shape[1] * image.shape[2], config.objective)
 
     def left(share: float = 1.0) -> float | None:
         return None if math.isinf(end) else max(share * (end - time.perf_counter()), 1e-3)
@@ -111,12 +112,12 @@ def fit_bytes(
     return FitBytesResult(data, scene, result)
 
 
-def count_for(num_bytes: float, pixels: int) -> int:
+def count_for(num_bytes: float, pixels: int, objective: str = "psnr") -> int:
     """Return how many Gaussians make the best of so many bytes, at most one for each pixel."""
     bits = 8 * max(num_bytes - _HEADER_BYTES, 1)
-    count = bits / _BITS
+    count = bits / _BITS[objective]
     for _ in range(4):
-        count = bits / max(_BITS + _BITS_PER_OCTAVE * math.log2(max(count, 1.0) / _COUNT), 8.0)
+        count = bits / max(_BITS[objective] + _BITS_PER_OCTAVE * math.log2(max(count, 1.0) / _COUNT), 8.0)
     return min(max(1, round(count)), pixels)
 
 
@@ -124,7 +125,8 @@ def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: Fi
     """Choose the regions that pay for their bytes; return what a pixel of contour must save, and what went, too."""
     if regions is None or regions.num_regions == 1:
         return None, config.contour_cost, {}
-    given, pixels = regions.num_regions, image.shape[1] * image.shape[2]
+    given = regions.num_regions
+    count_of = partial(count_for, pixels=image.shape[1] * image.shape[2], objective=config.objective)
     # by iterations, so that without a clock the same arguments give the same file
     iterations = min(_TRIAL_ITERATIONS, config.usual_iterations)
     clock = None if config.max_seconds is None else _TRIAL_SHARE * config.max_seconds
@@ -132,18 +134,18 @@ def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: Fi
     trial = FitConfig.from_recipe(config, **shorter)
 
     def error(regions: RegionMap | None, left: int) -> float:
-        result = fit(image, regions, count_for(left, pixels), recipe=trial, seed=seed)
+        result = fit(image, regions, count_of(left), recipe=trial, seed=seed)
         return float(10 ** (-max(entry.psnr for entry in result.history) / 10))
 
     without = error(None, num_bytes)
     # what a bit saves, where it is spent on Gaussians
-    saved = _POWER * _TRIAL_TO_END * without * pixels / (8 * num_bytes)
+    saved = _POWER * _TRIAL_TO_END * without * image[0].numel() / (8 * num_bytes)
     # a pixel of contour must save what its bits would
     bits = 8 * _map_bytes(regions) / max(len(contour_edges(regions.fine_labels)[0]), 1)
     cost = saved * bits
     if config.merge_regions and regions.softness == 0.0 and regions.supersample == 1:
         regions = RegionMap.from_labels(merge_regions(image, regions.labels, cost))
-    paying, count = regions.num_regions, count_for(num_bytes - _map_bytes(regions), pixels)
+    paying, count = regions.num_regions, count_of(num_bytes - _map_bytes(regions))
     if config.merge_regions and paying > count:
         regions = regions.merge(pairs_to_merge(image, regions.labels, count))[0]
     kept = 1 if regions is None else regions.num_regions
@@ -151,7 +153,7 @@ def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: Fi
     if regions is None or kept == 1:
         return None, cost, merged
     left = num_bytes - _map_bytes(regions)
-    if count_for(left, pixels) < kept or error(regions, left) >= _FAVOUR * without:
+    if count_of(left) < kept or error(regions, left) >= _FAVOUR * without:
         return None, cost, {"dropped": "bytes"}
     return regions, cost, merged
 

@@ -68,7 +68,7 @@ def compress(
     quality: float | None = None,
     target_bytes: int | None = None,
     target_psnr: float | None = None,
-    iterations: int = 100,
+    iterations: int = 250,
     max_seconds: float | None = None,
     seed: int = 0,
     objective: str = "psnr",

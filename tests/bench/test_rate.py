@@ -12,22 +12,21 @@ import pytest
 from torch import Tensor
 
 import kcgs.bench
-from kcgs.bench import _codecs, _rate_files, _rate_tables, rate
+from kcgs.bench import _codecs, _rate_files, _rate_tables
 from kcgs.bench._codecs import AVIF, CODECS, JPEG, WEBP, largest, open_file, present
-from kcgs.bench._rate_files import FLOAT, KCGS, NO_REGIONS, Ask, Files, Point, codec_digest
+from kcgs.bench._rate_files import FLOAT, KCGS, NO_REGIONS, VISUAL, Ask, Files, Point, codec_digest
 from kcgs.bench._rate_tables import (
     DAVIS_CURVE,
-    DECODE,
     KODAK_CURVE,
     LABELS,
     LOSSLESS_WEBP,
     MAPS,
     MATCHED,
     PRECISION,
-    SPEED,
     bits_per_gaussian,
     deltas,
     gains,
+    matched_figures,
     pairs,
     shares,
 )  # fmt: skip
@@ -51,6 +50,7 @@ class Stub:
 
     def __init__(self) -> None:
         self.asked: list[tuple[str, int, bool]] = []
+        self.recipes: list[FitConfig] = []  # of files
         self.stop_at: int | None = None
 
     def _ask(self, what: str, number: int, labels: Tensor | None) -> None:
@@ -64,6 +64,7 @@ class Stub:
 
     def fit_bytes(self, image: Tensor, labels: Tensor | None, most: int, *, recipe: FitConfig) -> FitBytesResult:
         self._ask("fit_bytes", most, labels)
+        self.recipes.append(recipe)
         result = self._result(image, labels, 30, recipe)
         return FitBytesResult(encode(result.scene, target_bytes=most), result.scene, result)
 
@@ -80,8 +81,7 @@ class Stub:
 @pytest.fixture
 def stub(monkeypatch: pytest.MonkeyPatch) -> Stub:
     played = Stub()
-    for module in (_rate_files, rate):
-        monkeypatch.setattr(module, "compress", played.compress)
+    monkeypatch.setattr(_rate_files, "compress", played.compress)
     monkeypatch.setattr(store_module, "fit", played.fit)
     monkeypatch.setattr(store_module, "warm_up", lambda config: None)
     monkeypatch.setattr(_rate_files, "fit_bytes", played.fit_bytes)
@@ -227,7 +227,8 @@ class TestPlan:
 
     def test_groups(self, data: Path, tmp_path: Path) -> None:
         files = Files(tmp_path, data, False)
-        assert [name for name, _ in steps(MATCHED, files)] == ["dog", "dog, no regions"]
+        expected = ["dog", f"dog, {NO_REGIONS}", f"dog, {VISUAL}"]
+        assert [name for name, _ in steps(MATCHED, files)] == expected
         assert len(list(steps(DAVIS_CURVE, files))) == len(TARGETS)
         assert [name for name, _ in steps(PRECISION, files)] == ["dog N = 1,250", "dog N = 7,500"]
 
@@ -249,7 +250,20 @@ class TestMatched:
             assert pair.ours.codec == KCGS and (rival == NO_REGIONS or pair.ours.bytes <= pair.other.bytes)
         fits = [(most, labels) for what, most, labels in stub.asked if what == "fit_bytes"]
         avif = max((p.bytes for p in found if p.codec.startswith(AVIF)), default=QUICK_BYTES)
-        assert fits == [(avif, True), (avif, False)]
+        assert fits == [(avif, True), (avif, False), (avif, True)]
+        assert [config.objective for config in stub.recipes] == ["psnr", "psnr", "visual"]
+
+    def test_means_of_the_frames_that_all_have(self) -> None:
+        files = [point(size=7_000, quality=28.0), point(size=7_900, quality=28.5), point(AVIF, 7_950, quality=28.25)]
+        files += [point(VISUAL, 7_800, quality=27.5), point(image="train", size=7_700, quality=20.0)]
+        header, _, *lines = matched_figures(files).splitlines()
+        assert header.startswith("| codec | frames | bytes | PSNR |")
+        cells = [[cell.strip() for cell in line.strip("|").split("|")][:4] for line in lines]
+        assert cells == [
+            [KCGS, "1", "7,900", "28.50"],
+            [VISUAL, "1", "7,800", "27.50"],
+            [AVIF, "1", "7,950", "28.25"],
+        ]
 
     def test_pairs(self) -> None:
         files = [point(size=7_900, quality=28.5), point(size=7_000, quality=28.0), point(AVIF, 7_950, quality=28.25)]
@@ -298,9 +312,7 @@ def test_precision_and_shares() -> None:
     files = [point(FLOAT, 0, 30.0, group=PRECISION, asked=100, num_gaussians=100)]
     files += [point(KCGS, 620, 29.9, group=PRECISION, asked=100, num_gaussians=100)]
     files += [point(LABELS, 40, group=MAPS), point(LOSSLESS_WEBP, 100, group=MAPS)]
-    files += [point(DECODE, 40, group=SPEED, decode_seconds=0.2, num_gaussians=9)]
     assert shares(files) == {"dog": 40.0} and "| 49.6 | 30.00 | 0.10 |" in _rate_tables.precision_table(files)
-    assert "| dog | 9 | decode | 40 | 200 |" in _rate_tables.speed_table(files)
 
 
 class TestReport:
@@ -362,7 +374,7 @@ class TestReport:
 class TestFiles:
     def test_quick_without_data_resumes(self, tmp_path: Path, stub: Stub) -> None:
         kcgs.bench.run("rate", tmp_path, quick=True)
-        made = {"results.csv", "report.md", "davis-curve.png", "crops.png", "files", "made.json"}
+        made = {"results.csv", "report.md", "davis-curve.png", "crops.png", "frames.jpg", "files", "made.json"}
         assert {p.name for p in tmp_path.iterdir()} == made
         with (tmp_path / "results.csv").open() as file:
             rows = list(csv.DictReader(file))
@@ -382,9 +394,8 @@ class TestFiles:
         with pytest.raises(KeyboardInterrupt):
             kcgs.bench.run("rate", tmp_path / "out", data=data, only="davis8k,maps")
         text = (tmp_path / "out/report.md").read_text()
-        assert "- davis8k: stopped before its end, 0 of 2 steps are finished." in text
+        assert "- davis8k: stopped before its end, 0 of 3 steps are finished." in text
         assert "- precision: not chosen, 0 of 2 steps are finished." in text
-        assert "- speed: the data folder has none of its images." in text
         stub.stop_at = None
         kcgs.bench.run("rate", tmp_path / "out", data=data, only="davis8k,maps")
         assert "stopped before" not in (tmp_path / "out/report.md").read_text()

@@ -27,14 +27,14 @@ def photo(height: int, width: int, seed: int = 0) -> Tensor:
 def energy(image: Tensor, residual: Tensor) -> Tensor:
     """E by its formula; the window of the variance is scipy's."""
     total, norm = torch.zeros((), dtype=torch.float64), 0.0
-    for level, weight in enumerate((0.5, 4.0, 16.0, 16.0)):
+    for level, weight in enumerate((0.2, 4.0, 16.0, 32.0)):
         if level:
             image, residual = (avg_pool2d(t[None], 2)[0] for t in (image, residual))
         planes = image.numpy()
         mean, square = (
             np.stack([gaussian_filter(p, 4.0, mode="nearest") for p in t]) for t in (planes, planes * planes)
         )
-        mask = weight * (torch.from_numpy(square - mean**2).mean(0) + 0.03**2) ** -0.2
+        mask = weight * (torch.from_numpy(square - mean**2).mean(0) + 0.03**2) ** -0.4
         total = total + (mask * residual.square()).sum()
         norm += float(mask.mean())
     return total / norm

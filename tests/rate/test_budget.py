@@ -56,6 +56,7 @@ class TestFitBytes:
         assert done.result.regions is not None and done.result.regions.kept == done.result.regions.given == 2
 
     def test_count_grows_with_bytes(self) -> None:
+        assert count_for(8000, 10_000, "visual") < 0.95 * count_for(8000, 10_000)
         counts = [count_for(size, 10_000) for size in (100, 1000, 8000, 50_000)]
         assert counts == sorted(counts) and 1900 < counts[2] < 2300
         assert count_for(1, 10_000) == 1

@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from PIL import Image
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, pad
 
+from kcgs._atomic import atomic_path
 from kcgs.functional import psnr
 from kcgs.plots import COLORS, figure, save_figure
 
@@ -19,6 +22,8 @@ from .tables import db
 
 # a figure of the worst crops, their side in pixels, and how many
 CROPS, _CROP, _CROPS = "crops.png", 128, 3
+# of a sheet as JPEG: it is for the eye
+_SHEET_QUALITY = 75
 MARKERS = ("o", "s", "^", "D", "v", "P")
 _AXES = {"psnr": "PSNR (dB)", "ms_ssim": "MS-SSIM", "ef_psnr": "EF-PSNR (dB)", "ef_ssim": "edge SSIM"}
 
@@ -76,6 +81,17 @@ def plot_crops(path: Path, frames: Iterable[tuple[str, Mapping[str, Tensor]]]) -
         rows.append({name: photo, **{f"{title}, {db(float(psnr(crop, photo)))} dB": crop for title, crop in others}})
     if rows:
         plot_images(path, *rows)
+
+
+def save_sheet(path: Path, frames: Iterable[tuple[str, Mapping[str, Tensor]]]) -> None:
+    """Write whole frames at full size, a row of images for each, none where there are none."""
+    rows = [torch.cat([image.clamp(0, 1) for image in images.values()], 2) for _, images in frames]
+    if rows:
+        width = max(row.shape[2] for row in rows)
+        sheet = torch.cat([pad(row, (0, width - row.shape[2]), value=1.0) for row in rows], 1)
+        pixels = (255 * sheet).round().byte().permute(1, 2, 0).numpy()
+        with atomic_path(path) as temporary:
+            Image.fromarray(pixels).save(temporary, quality=_SHEET_QUALITY, optimize=True)
 
 
 def show_crops(folder: Path, name: str) -> list[str]:

@@ -114,6 +114,18 @@ class TestCrops:
         ]
         assert all(crop.shape == (3, 128, 128) for row in shown for crop in row.values())
 
+    def test_all_frames(self, tmp_path: Path) -> None:
+        figures.save_sheet(tmp_path / "frames.jpg", [])
+        assert not list(tmp_path.iterdir())
+        narrow = {"photo": torch.zeros(3, 20, 30), "ours": torch.full((3, 20, 30), 2.0)}
+        wide = {"photo": torch.full((3, 10, 40), 0.5), "ours": torch.zeros(3, 10, 40)}
+        figures.save_sheet(tmp_path / "frames.jpg", [("narrow", narrow), ("wide", wide)])
+        with Image.open(tmp_path / "frames.jpg") as sheet:
+            assert sheet.size == (80, 30)
+            expected = {(10, 10): 0, (45, 10): 255, (70, 10): 255, (20, 25): 128, (60, 25): 0}
+            for place, level in expected.items():
+                assert max(abs(c - level) for c in sheet.getpixel(place)) < 12  # type: ignore[arg-type, union-attr]
+
     def test_a_figure_where_there_are_any(self, tmp_path: Path) -> None:
         figures.plot_crops(tmp_path / figures.CROPS, [])
         assert figures.show_crops(tmp_path, "best") == []
