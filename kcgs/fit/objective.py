@@ -8,9 +8,9 @@ from torch import Tensor
 from .pursuit import halve
 
 # weight of the error in averages of 1, 2, 4 and 8 pixels a side
-_WEIGHTS = (0.2, 4.0, 16.0, 32.0)
+_WEIGHTS = (1.0, 4.0, 16.0, 32.0)
 # the error counts by the local variance, with this added, to this power
-_LEAST_VARIANCE, _POWER = 0.03**2, -0.4
+_LEAST_VARIANCE, _POWER = 0.03**2, -0.45
 # standard deviation of the window of the local variance, and its side, in pixels of the level
 _WINDOW, _SIDE = 4.0, 33
 
@@ -19,7 +19,7 @@ class VisualObjective:
     r"""The squared error on several scales, counted less where the image is busy.
 
     .. math:: E(r) = \sum_k \sum_p m_k(p)\, |(P_k r)(p)|^2, \quad
-        m_k = w_k (v_k + 0.03^2)^{-0.4} / Z
+        m_k = w_k (v_k + 0.03^2)^{-0.45} / Z
 
     :math:`P_k` averages blocks of :math:`2^k \times 2^k` pixels, :math:`v_k` is the local variance of :math:`P_k`
     image, channels averaged, and Z makes the mean of all :math:`m_k` together 1. It is quadratic: its gradient is 2 H
