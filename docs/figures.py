@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -51,6 +52,8 @@ def membership(path: Path) -> None:
 
 def objectives(path: Path) -> None:
     """Show scikit-image's coffee cup beside files of 6,000 bytes, one for each objective."""
+    if find_spec("ssimulacra2") is None:
+        raise RuntimeError('the figure needs SSIMULACRA2: pip install -e ".[visual]"')
     image = torch.from_numpy(coffee() / 255).permute(2, 0, 1).float()
     labels = segment(image)
     shown = {"photo": image}

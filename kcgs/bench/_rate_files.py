@@ -118,7 +118,7 @@ class Files:
         return self.keep(ask, settings, make)
 
     def rewritten(self, fitted: Point, most: int) -> list[Point]:
-        """Return the same fit's file of at most `most` bytes, fewer than it was made for."""
+        """Return the same fit's file of at most `most` bytes."""
         first = Ask(*fitted[:4])
         ask = first._replace(asked=most)
 

@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-from ._codecs import CODECS
+from ._codecs import AVIF, CODECS
 from ._rate_files import FLOAT, KCGS, LABELS, LOSSLESS_WEBP, MAPS, NO_REGIONS, VISUAL, Point
 from .core.statistics import Delta, Summary, delta, summarize
 from .core.tables import count, db, markdown, seconds, signed, table
@@ -51,15 +51,15 @@ def qualities(points: Sequence[Point]) -> list[str]:
     return [name for name in QUALITIES if not all(math.isnan(getattr(p, name)) for p in points)]
 
 
-def pairs(points: Sequence[Point], rival: str) -> list[Pair]:
-    """Pair each matched file of a codec with kcgs' largest that has no more bytes.
+def pairs(points: Sequence[Point], rival: str, codec: str = KCGS) -> list[Pair]:
+    """Pair each matched file of a rival with the largest of ours that has no more bytes.
 
     Without regions kcgs was asked for as many bytes as the first file with them, which is what that one meets.
     """
     matched = [p for p in points if p.group == MATCHED]
     found = []
     for other in (p for p in matched if p.codec == rival):
-        ours = [p for p in matched if (p.codec, p.image) == (KCGS, other.image)]
+        ours = [p for p in matched if (p.codec, p.image) == (codec, other.image)]
         if rival == NO_REGIONS:
             ours = [p for p in ours if p.asked == other.asked]
         else:
@@ -108,13 +108,14 @@ def shares(points: Sequence[Point]) -> dict[str, float]:
 def losses(points: Sequence[Point]) -> str:
     """Name what kcgs loses, worst first in each line."""
     lines = []
-    for rival in RIVALS:
+    for codec, rival in (*((KCGS, rival) for rival in RIVALS), (VISUAL, AVIF)):
         for quality, (name, unit) in QUALITIES.items():
-            gain = gains(pairs(points, rival), quality)
+            gain = gains(pairs(points, rival, codec), quality)
             if gain is not None and gain.losses:
                 which = ", ".join(f"{i} {_signed(gain.values[i], unit)}" for i in gain.worst[: gain.losses])
                 lost = f"{gain.losses} of {len(gain.values)} frames lose"
-                lines.append(f"- {MATCHED}, {name} against {rival}: {lost}: {which}")
+                whose = "" if codec == KCGS else f"{codec}, "
+                lines.append(f"- {MATCHED}, {whose}{name} against {rival}: {lost}: {which}")
     for group in curve_groups(points):
         for rival in RIVALS:
             for quality, (name, _) in QUALITIES.items():
@@ -132,34 +133,13 @@ def matched_means(points: Sequence[Point]) -> str:
     measured = qualities(points)
     header += [cell for name in measured for cell in (f"{QUALITIES[name][0]} gained", "95 %", "won-lost")]
     lines = []
-    for rival in RIVALS:
-        found = pairs(points, rival)
+    for codec, rival in (*((KCGS, rival) for rival in RIVALS), (VISUAL, AVIF)):
+        found, name = pairs(points, rival, codec), rival if codec == KCGS else f"{codec} against {rival}"
         low = [pair for pair in found if pair.is_low]
-        for name, group in ((rival, found), (f"{rival}, as low", low if len(low) < len(found) else [])):
+        for title, group in ((name, found), (f"{name}, as low", low if len(low) < len(found) else [])):
             if group:
-                lines.append([name, *_pair_cells(group, measured)])
+                lines.append([title, *_pair_cells(group, measured)])
     return markdown([*header, "s, encode", "s, decode", "kcgs, s, encode", "kcgs, s, decode"], lines)
-
-
-def largest(points: Sequence[Point], codec: str) -> dict[str, Point]:
-    """Find the largest matched file of each image."""
-    matched = [p for p in points if (p.group, p.codec) == (MATCHED, codec)]
-    return {p.image: p for p in sorted(matched, key=lambda p: p.bytes)}
-
-
-def matched_figures(points: Sequence[Point]) -> str:
-    """Mean figures of each codec's largest files, of the images that all have."""
-    found = {codec: files for codec in (KCGS, VISUAL, *RIVALS) if (files := largest(points, codec))}
-    images = set.intersection(*(set(files) for files in found.values()))
-    lines = []
-    for codec, files in found.items():
-        same = [files[image] for image in sorted(images)]
-        line = [codec, str(len(same)), _mean_bytes(same)] if same else []
-        for name in qualities(points) if same else ():
-            mean, unit = statistics.fmean(getattr(p, name) for p in same), QUALITIES[name][1]
-            line.append(f"{mean:.4f}" if unit == "1" else f"{mean:.2f}")
-        lines += [line] if same else []
-    return markdown(["codec", "frames", "bytes", *(QUALITIES[name][0] for name in qualities(points))], lines)
 
 
 def bd_means(points: Sequence[Point], group: str) -> str:

@@ -37,8 +37,8 @@ _NAMES = {
 QUICK_IMAGE, QUICK_BYTES = "disc", 700
 TARGETS, QUICK_TARGETS = (2_000, 4_000, 8_000, 16_000, 32_000), (450, 900)
 COUNTS, QUICK_COUNTS = (1_250, 7_500), (40,)
-# photo, kcgs for either objective, AVIF
 _SHEET = "frames.jpg"
+_SHEET_TEXT = f"[All frames at full size]({_SHEET}). From left to right: photo, {KCGS}, {VISUAL}, {AVIF}."
 # share of another file's bytes that is nearly as many
 _NEAR = 0.98
 # colour, line and marker of each codec, the same everywhere
@@ -56,8 +56,8 @@ without a map, `{VISUAL}` with `objective="visual"`. Gained is what kcgs has ove
 curves are compared: docs/results.md. Seconds are medians, of kcgs those of the whole fit. Each file by itself:
 results.csv."""
 _MATCHED_TEXT = f"""Every codec made its largest file of at most {MOST_BYTES:,} bytes, or its smallest if it cannot go
-as low. Each meets the largest file of kcgs that has no more bytes. Without regions, and with the visual objective, kcgs
-was asked for the bytes that it was fitted to with them. The second table has means of each one's largest files."""
+as low. Each meets the largest file of kcgs that has no more bytes. Without regions kcgs was asked for the bytes that it
+was fitted to with them, and with the visual objective for AVIF's."""
 _SECTIONS = {
     PRECISION: ("Bits per Gaussian", tables.precision_table, f"""A fit of N Gaussians with the annotation's contours,
 and the smallest of a few files by `kcgs.rate.compress` that loses at most {MOST_LOSS} dB of its PSNR."""),
@@ -78,8 +78,8 @@ def report(output: Path, made: Made) -> list[str]:
     rivals = [rival for rival in tables.RIVALS if tables.pairs(points, rival)]
     if rivals:
         parts += [f"## At {MOST_BYTES:,} bytes: {tables.MATCHED}", _MATCHED_TEXT, tables.matched_means(points)]
-        parts += [tables.matched_figures(points), *show_crops(output, KCGS)]
-        parts += [f"[All frames at full size]({_SHEET})"] if (output / _SHEET).is_file() else []
+        parts += show_crops(output, KCGS)
+        parts += [_SHEET_TEXT] if (output / _SHEET).is_file() else []
     for group in tables.curve_groups(points):
         of_group = [p for p in points if p.group == group]
         _plot_curves(of_group, output / f"{group}.png")
@@ -109,6 +109,8 @@ def run(output: Path, options: Options) -> None:
         kept = Files(files.folder, files.data, files.quick, makes=False)
         points, notes = _collect(kept, chosen)
         write_rows(output / "results.csv", Point, points)
+        for name in (CROPS, _SHEET):
+            (output / name).unlink(missing_ok=True)
         plot_crops(output / CROPS, _frames(kept, points))
         save_sheet(output / _SHEET, _frames(kept, points))
         made = options.made("rate", notes)
@@ -147,7 +149,7 @@ def steps(group: str, files: Files) -> Iterator[tuple[str, Step]]:
     """List what a group measures, by name."""
     found = names(group, files.data, files.quick)
     if group == tables.MATCHED:
-        # without regions is the second thing to know, of all
+        # first what all frames need, for a run that is stopped
         yield from ((image, partial(_matched, files, image)) for image in found)
         others = [(image, codec) for codec in (NO_REGIONS, VISUAL) for image in found]
         yield from ((f"{image}, {codec}", partial(_matched_other, files, image, codec)) for image, codec in others)
@@ -203,16 +205,19 @@ def _matched(files: Files, image: str) -> list[Point]:
 
 def _matched_other(files: Files, image: str, codec: str) -> list[Point]:
     kept = Files(files.folder, files.data, files.quick, makes=False)
-    ours = [p for p in _matched(kept, image) if p.regions]
-    return files.fitted(tables.MATCHED, image, ours[0].asked, codec) if ours else []
+    found = _matched(kept, image)
+    ours = [p.asked for p in found if p.regions]
+    avif = [p.bytes for p in found if p.codec == AVIF]
+    return files.fitted(tables.MATCHED, image, (avif if codec == VISUAL and avif else ours)[0], codec) if ours else []
 
 
 def _frames(kept: Files, points: Sequence[Point]) -> Iterator[tuple[str, dict[str, Tensor]]]:
-    """Show each matched photo beside its largest files."""
-    found = [tables.largest(points, codec) for codec in (KCGS, VISUAL, AVIF)]
-    for image in found[0]:
-        if all(image in files for files in found):
-            shown = {files[image].codec: kept.shown(files[image]) for files in found}
+    """Show each matched photo beside its files of no more bytes than AVIF's, and that."""
+    visual = {pair.other.image: pair.ours for pair in tables.pairs(points, AVIF, VISUAL)}
+    for pair in tables.pairs(points, AVIF):
+        image = pair.other.image
+        if image in visual:
+            shown = {p.codec: kept.shown(p) for p in (pair.ours, visual[image], pair.other)}
             yield image, {"photo": kept.sample(image)[0].image, **shown}
 
 
@@ -228,7 +233,7 @@ def _precision(files: Files, image: str, n: int) -> list[Point]:
 
 
 def _plot_curves(points: Sequence[Point], path: Path) -> None:
-    """Plot tables.PSNR and EF-tables.PSNR over bits per pixel, a row for each image."""
+    """Plot PSNR and EF-PSNR over bits per pixel, a row for each image."""
     shown = list(dict.fromkeys(p.image for p in points))
     plot, axes = figure(len(shown), 2, width=9.5, height=0.8 + 3.0 * len(shown))
     rows = axes if len(shown) > 1 else [axes]

@@ -22,7 +22,7 @@ from .tables import db
 
 # a figure of the worst crops, their side in pixels, and how many
 CROPS, _CROP, _CROPS = "crops.png", 128, 3
-# of a sheet as JPEG: it is for the eye
+# of a sheet as JPEG
 _SHEET_QUALITY = 65
 MARKERS = ("o", "s", "^", "D", "v", "P")
 _AXES = {"psnr": "PSNR (dB)", "ms_ssim": "MS-SSIM", "ef_psnr": "EF-PSNR (dB)", "ef_ssim": "edge SSIM"}
