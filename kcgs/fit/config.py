@@ -84,6 +84,12 @@ class FitConfig(BaseModel):
         "own parameters and learning rates",
     )
     learning_rate_factor: float = Field(1.0, gt=0.0, description="factor on all learning rates of the optimizer")
+    least_sigma: float | None = Field(
+        None,
+        ge=0.1,
+        description="least standard deviation of a Gaussian, in pixels, with the optimizer frame; None: 0.5. Thinner "
+        "ones fit the pixels' centres better, and are dots and needles between them when a scene is enlarged",
+    )
     refine_flat: bool = Field(
         True,
         description="flat scenes of few Gaussians: sub-pixel contours, where contours may move, and "
@@ -107,6 +113,8 @@ class FitConfig(BaseModel):
             raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {self.backend!r}")
         if self.objective == "visual" and self.loss != "l2":
             raise ValueError(f"objective 'visual' needs loss 'l2'; got {self.loss!r}")
+        if self.least_sigma is not None and self.optimizer != "frame":
+            raise ValueError(f"least_sigma needs optimizer 'frame'; got {self.optimizer!r}, which has its own")
         if self.softness != "auto" and not 0.0 <= self.softness <= MAX_SOFTNESS:
             raise ValueError(f"softness must be 'auto' or in [0, {MAX_SOFTNESS:g}] pixels; got {self.softness!r}")
         if self.max_move != "any" and self.max_move < 1.0:

@@ -14,6 +14,25 @@ def local_gradient(cholesky: Tensor, means_gradient: Tensor, cholesky_gradient: 
     return torch.stack([l11 * gx + l21 * gy, l22 * gy, l11 * g11 + l21 * g21, l22 * g21, l22 * g22], -1)
 
 
+def widen(cholesky: Tensor, least_sigma: float) -> Tensor:
+    """Make Gaussians (N, 3) no thinner than this, in pixels, in any direction; those that are wide enough stay.
+
+    The variances along the axes of the ellipse are raised, and the axes stay.
+    """
+    l11, l21, l22 = cholesky.unbind(-1)
+    xx, xy, yy = l11**2, l11 * l21, l21**2 + l22**2
+    mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    gap = torch.hypot(half, xy)
+    long, short = mean + gap, (l11 * l22) ** 2 / (mean + gap)
+    new_long, new_short = long.clamp_min(least_sigma**2), short.clamp_min(least_sigma**2)
+    # what is added along both axes, and along the shorter one alone; a circle has any axes
+    both, more = new_long - long, (new_short - short) - (new_long - long)
+    cos, sin = (torch.where(gap > 0, part / gap, 0.0) for part in (half, xy))
+    w11 = (xx + both + 0.5 * more * (1 - cos)).sqrt()
+    widened = torch.stack([w11, (xy - 0.5 * more * sin) / w11, (new_long * new_short).sqrt() / w11], -1)
+    return torch.where((short < least_sigma**2)[:, None], widened, cholesky)
+
+
 def move(means: Tensor, cholesky: Tensor, step: Tensor, *, exact: bool = True) -> tuple[Tensor, Tensor]:
     """Move Gaussians by (d1, d2, k11, k21, k22) in their own frames: centres by L d, factors to L exp K.
 

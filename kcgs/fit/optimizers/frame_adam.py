@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from kcgs.fit.frame import local_gradient, move
+from kcgs.fit.frame import local_gradient, move, widen
 from kcgs.nn import GaussianField
 
 from .base import LEAST_SIGMA, GaussianOptimizer
@@ -19,7 +19,8 @@ class FrameAdam(GaussianOptimizer):
     """Adam in each Gaussian's own frame, so that one learning rate suits all sizes and every image.
 
     A step moves the centre by d mu = L d and the factor by L <- L exp(K), K lower triangular. Centres and scales are
-    bounded: else a few Gaussians run away to 1e5 pixels, harmless to the render and ruinous to its numbers.
+    bounded: else a few Gaussians run away to 1e5 pixels, harmless to the render and ruinous to its numbers. None gets
+    thinner than `least_sigma`, in pixels.
     """
 
     learning_rate = 0.14
@@ -31,8 +32,9 @@ class FrameAdam(GaussianOptimizer):
     outside = 2.0
     """How far outside the image a centre may lie, in its own standard deviations."""
 
-    def __init__(self, field: GaussianField, rate_factor: float) -> None:
+    def __init__(self, field: GaussianField, rate_factor: float, least_sigma: float = LEAST_SIGMA) -> None:
         super().__init__(field)
+        self.least_sigma = least_sigma
         colors = self.raw[-1]
         rates = [self.learning_rate] * 5 + [self.color_rate] * colors.shape[1]
         self.rates = colors.detach().new_tensor(rates) * rate_factor
@@ -74,7 +76,8 @@ class FrameAdam(GaussianOptimizer):
         l11, l22 = l11.clamp(LEAST_SIGMA, self.limit), l22.clamp(LEAST_SIGMA, self.limit)
         l21 = l21.clamp(-self.limit, self.limit)
         reach = self.outside * torch.stack([l11, torch.hypot(l21, l22)], -1)
-        return torch.minimum(torch.maximum(means, -reach), self.extent + reach), torch.stack([l11, l21, l22], -1)
+        means = torch.minimum(torch.maximum(means, -reach), self.extent + reach)
+        return means, widen(torch.stack([l11, l21, l22], -1), self.least_sigma)
 
     @torch.no_grad()
     def append(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> None:

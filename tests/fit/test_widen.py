@@ -1,0 +1,55 @@
+"""The least width of a Gaussian, against eigenvalues in float64."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs.fit import FitConfig, fit
+from kcgs.fit.frame import widen
+
+
+def covariance(cholesky: Tensor) -> Tensor:
+    l11, l21, l22 = cholesky.double().unbind(-1)
+    factor = torch.stack([torch.stack([l11, torch.zeros_like(l11)], -1), torch.stack([l21, l22], -1)], -2)
+    return factor @ factor.mT
+
+
+def test_raises_the_eigenvalues() -> None:
+    generator = torch.Generator().manual_seed(0)
+    cholesky = torch.rand(500, 3, generator=generator) * torch.tensor([2.0, 4.0, 2.0]) + torch.tensor([0.1, -2.0, 0.1])
+    values, vectors = torch.linalg.eigh(covariance(cholesky))
+    expected = vectors @ torch.diag_embed(values.clamp_min(0.25)) @ vectors.mT
+    widened = widen(cholesky, 0.5)
+    torch.testing.assert_close(covariance(widened), expected, rtol=1e-4, atol=1e-4)
+    wide = values[:, 0] > 0.251
+    assert 50 < int(wide.sum()) < 450
+    assert torch.equal(widened[wide], cholesky[wide])
+
+
+@pytest.mark.parametrize("sides", [(0.1, 0.1), (0.1, 1e4), (1e4, 0.1), (0.5, 0.5)])
+def test_circles_and_needles(sides: tuple[float, float]) -> None:
+    cholesky = torch.tensor([[sides[0], 0.0, sides[1]]])
+    expected = torch.tensor([[max(sides[0], 0.5), 0.0, max(sides[1], 0.5)]])
+    torch.testing.assert_close(widen(cholesky, 0.5), expected)
+
+
+class TestFit:
+    def image(self) -> Tensor:
+        return torch.rand(3, 24, 36, generator=torch.Generator().manual_seed(0))
+
+    def least(self, **settings: float) -> float:
+        field = fit(self.image(), None, 60, iterations=60, **settings).scene.field
+        return float(torch.linalg.eigvalsh(covariance(field.cholesky.detach())).min().sqrt())
+
+    def test_none_is_thinner(self) -> None:
+        assert self.least() >= 0.4999
+        assert self.least(least_sigma=0.8) >= 0.7999
+        assert self.least(least_sigma=0.1) < 0.4
+
+    def test_bad_values(self) -> None:
+        with pytest.raises(ValueError, match="least_sigma: Input should be greater than or equal to 0.1; got 0.01"):
+            FitConfig.from_recipe("best", least_sigma=0.01)
+        with pytest.raises(ValueError, match="least_sigma needs optimizer 'frame'; got 'adan', which has its own"):
+            FitConfig.from_recipe("paper", least_sigma=0.5)
