@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -13,17 +14,23 @@ from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
 from .checks import Numbers, check_editable, check_field, check_ids, check_offset, check_scene, color_tensor, ids_of
+from .fill import Fill, check_fill, fill_hole
+from .inpaint import grow
 
 # standard deviation of a Gaussian that is flat over the image, in its longer sides: 1 to 3 in 10^7
 _FLAT = 1e3
+# a contour is cut at so many of its standard deviations
+_CONTOUR_SIGMAS = 4.0
 
 
-def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[float]) -> Scene:
+def move_region(
+    scene: Scene, region_ids: int | Iterable[int], offset: Sequence[float], *, fill: Fill | None = "inpaint"
+) -> Scene:
     """Move regions: their Gaussians and their labels, over whatever lies there.
 
     Convention: pixels that they leave take the label of the nearest pixel of another region (Euclidean; of equal
-    distances, the smallest id), and show what the Gaussians of that region paint there; pixels that leave the image
-    are lost. A region that is covered whole, or leaves the image, is no region any more: its Gaussians are lost too.
+    distances, the smallest id), and are filled, see `fill`; pixels that leave the image are lost. A region that is
+    covered whole, or leaves the image, is no region any more: its Gaussians are lost too.
     Where pairs of regions have widths, the contour with a region that a moved one did not touch before takes the mean
     width of those it had.
 
@@ -31,13 +38,17 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
         scene: unbatched, with a map of its own size, not a resized one.
         region_ids: an id in the map, or several, which move together.
         offset: (dx, dy) in pixels, whole; with ``supersample`` k, whole multiples of 1/k.
+        fill: "inpaint": what is uncovered continues its surroundings smoothly, by Gaussians that are fitted there, some
+            of them new; other pixels change by a few hundredths at most, as measured. None: no fit; what is uncovered
+            shows what the Gaussians of its new region paint there, streaks, or black.
 
     Returns:
         A new scene, without a graph.
 
     Raises:
         TypeError: wrong types.
-        ValueError: a batch, no map or one of another size, an unknown id, all regions, an offset between labels.
+        ValueError: a batch, no map or one of another size, an unknown id, all regions, an offset between labels;
+            another `fill`, or "inpaint" where the regions reach into every pixel.
 
     Warns:
         UserWarning: the ids of regions that are lost.
@@ -48,11 +59,13 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
         >>> move_region(scene, 7, (2, 0)).regions.labels
         tensor([[0, 0, 0, 7, 7, 0]])
     """
+    check_fill(fill)
     regions, chosen = check_editable(scene, region_ids)
     steps = check_offset(offset, regions.supersample)
     before = regions.fine_labels
     inside = torch.isin(before, chosen)
-    labels = _fill(before, inside)
+    labels = _nearest_labels(before, inside)
+    behind = labels.clone()
     rows, cols = (_overlap(n, step) for n, step in zip(before.shape, steps[::-1], strict=True))
     landed = torch.zeros_like(inside)
     landed[rows[1], cols[1]] = inside[rows[0], cols[0]]
@@ -64,7 +77,10 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
     if lost:
         warnings.warn(f"regions {', '.join(map(str, lost))} are lost: covered, or out of the image", stacklevel=2)
 
-    moved = scene.field.subset(torch.isin(ids_of(scene.field), labels))
+    field = scene.field
+    if fill is not None:
+        field = _filled_behind(scene, regions.relabel(behind), inside, landed)
+    moved = field.subset(torch.isin(ids_of(field), labels))
     with torch.no_grad():
         shift = moved.means.new_tensor(steps) / regions.supersample
         moved.means += torch.where(torch.isin(ids_of(moved), chosen)[:, None], shift, 0.0)
@@ -112,11 +128,11 @@ def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers,
     return Scene(result, scene.regions, scene.metadata)
 
 
-def delete_region(scene: Scene, region_ids: int | Iterable[int]) -> Scene:
+def delete_region(scene: Scene, region_ids: int | Iterable[int], *, fill: Fill | None = "inpaint") -> Scene:
     """Delete regions: their Gaussians go, their pixels fall to their neighbours. Arguments: see :func:`move_region`.
 
     Convention: each of their pixels takes the label of the nearest pixel that stays (Euclidean; of equal distances, the
-    smallest id), and shows what the Gaussians of that region paint there: nothing, black, where they do not reach.
+    smallest id), and is filled, see `fill` there.
     Where pairs of regions have widths, contours between regions that did not touch before are hard.
 
     Example:
@@ -125,10 +141,12 @@ def delete_region(scene: Scene, region_ids: int | Iterable[int]) -> Scene:
         >>> delete_region(scene, 3).regions.labels
         tensor([[0, 0, 0, 0, 5, 5]])
     """
+    check_fill(fill)
     regions, chosen = check_editable(scene, region_ids)
-    labels = _fill(regions.fine_labels, torch.isin(regions.fine_labels, chosen))
+    hole = torch.isin(regions.fine_labels, chosen)
     field = scene.field.subset(~torch.isin(ids_of(scene.field), chosen))
-    return Scene(field, regions.relabel(labels), scene.metadata)
+    rest = Scene(field, regions.relabel(_nearest_labels(regions.fine_labels, hole)), scene.metadata)
+    return rest if fill is None else fill_hole(rest, hole, hole)
 
 
 def extract_region(scene: Scene, region_ids: int | Iterable[int]) -> Scene:
@@ -214,7 +232,7 @@ def _with_flat(field: GaussianField, region_id: int, color: Tensor) -> GaussianF
     return GaussianField(means, cholesky, colors, ids, opacities, size=field.size)
 
 
-def _fill(labels: Tensor, hole: Tensor) -> Tensor:
+def _nearest_labels(labels: Tensor, hole: Tensor) -> Tensor:
     """Give pixels of the hole the label of the nearest other pixel, of equals the smallest."""
     from scipy.ndimage import distance_transform_edt
 
@@ -232,6 +250,30 @@ def _fill(labels: Tensor, hole: Tensor) -> Tensor:
     result = labels.clone()
     result[rows, cols] = filled.to(labels.device)
     return result
+
+
+def _filled_behind(scene: Scene, behind: RegionMap, hole: Tensor, landed: Tensor) -> GaussianField:
+    """Return the field, what is behind the regions that were in the hole filled where they have not landed again."""
+    before = scene.regions
+    assert before is not None
+    widths = before.softness
+    width = widths if isinstance(widths, float) else max(widths.values(), default=0.0)
+    # through a soft contour one sees what is behind
+    if not (hole & ~landed).any():
+        return scene.field
+    uncovered = grow(~landed, math.ceil((1.0 + _CONTOUR_SIGMAS * width) * before.supersample))
+    stays = ~torch.isin(ids_of(scene.field), before.fine_labels[hole].unique())
+    filled = fill_hole(Scene(scene.field.subset(stays), behind), hole, hole & uncovered).field
+    movers = scene.field.subset(~stays)
+    tensors = [
+        torch.cat([one.detach(), other.detach()]) for one, other in zip(_tensors(filled), _tensors(movers), strict=True)
+    ]
+    return GaussianField(*tensors, size=scene.size)
+
+
+def _tensors(field: GaussianField) -> list[Tensor]:
+    tensors = [field.means, field.cholesky, field.colors, ids_of(field)]
+    return tensors if field.opacities is None else [*tensors, field.opacities]
 
 
 def _overlap(length: int, step: int) -> tuple[slice, slice]:
