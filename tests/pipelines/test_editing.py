@@ -74,6 +74,7 @@ EDITS = {
     "move": lambda s: move_region(s, BOX, (-4, 2)),
     "recolor": lambda s: recolor_region(s, DISC, 0.5, 0.1),
     "delete": lambda s: delete_region(s, [BOX]),
+    "delete-unfilled": lambda s: delete_region(s, [BOX], fill=None),
     "extract": lambda s: extract_region(s, [BOX, DISC]),
     "background": lambda s: replace_background(s, GROUND, recolor_region(s, GROUND, 0.0, 0.9)),
 }
@@ -114,6 +115,8 @@ class TestEditing(BaseTester):
             (lambda s: delete_region(resized(s), BOX), ValueError, r"one map of the size \(48, 64\)"),
             (lambda s: delete_region(s, [BOX, DISC, GROUND]), ValueError, "leave a region .*got all 3"),
             (lambda s: delete_region(s, []), ValueError, "region_ids must hold an id"),
+            (lambda s: delete_region(s, BOX, fill="blur"), ValueError, "fill must be \"inpaint\" or None; got 'blur'"),
+            (lambda s: move_region(s, BOX, (1, 0), fill=1), ValueError, 'fill must be "inpaint" or None; got 1'),
             (lambda s: delete_region(s, "box"), TypeError, "region_ids must be an integer; got 'b'"),
             (lambda s: delete_region((s.field, s.regions), BOX), TypeError, "scene must be a Scene; got tuple"),
             (lambda s: delete_region(Scene(s.field), BOX), ValueError, "scene must have a label map"),
@@ -258,26 +261,26 @@ class TestMove:
     def test_cut_out_is_shifted(self, regions: RegionMap, offset: tuple[int, int]) -> None:
         scene = scene_of(regions)
         before = cut(scene, BOX)
-        moved = move_region(scene, BOX, offset)
+        moved = move_region(scene, BOX, offset, fill=None)
         after = cut(moved, BOX)
         torch.testing.assert_close(after, before.roll((offset[1], offset[0]), (1, 2)), rtol=0, atol=1e-5)
 
     def test_by_half_a_pixel_of_a_finer_map(self) -> None:
         regions = MAPS["fine"]()
-        moved = move_region(scene_of(regions), DISC, (-0.5, 1))
+        moved = move_region(scene_of(regions), DISC, (-0.5, 1), fill=None)
         disc = (regions.fine_labels == DISC).roll((2, -1), (0, 1))
         assert torch.equal(map_of(moved).fine_labels == DISC, disc)
 
     def test_two_regions_move_together(self) -> None:
         scene = scene_of(MAPS["hard"]())
-        moved = map_of(move_region(scene, [BOX, DISC], (-4, 2))).labels
+        moved = map_of(move_region(scene, [BOX, DISC], (-4, 2), fill=None)).labels
         for region in (BOX, DISC):
             assert torch.equal(moved == region, (map_of(scene).labels == region).roll((2, -4), (0, 1)))
 
     def test_nothing_else_changes(self, regions: RegionMap) -> None:
         scene = scene_of(regions)
         means, labels = scene.field.means.detach().clone(), regions.labels.clone()
-        moved = move_region(scene, BOX, (-4, 0))
+        moved = move_region(scene, BOX, (-4, 0), fill=None)
         still = ids_of(scene) != BOX
         assert torch.equal(moved.field.means[still], means[still])
         assert torch.equal(scene.field.means, means) and torch.equal(regions.labels, labels)
@@ -286,7 +289,7 @@ class TestMove:
 
     def test_what_it_leaves_and_what_it_covers(self) -> None:
         regions = MAPS["hard"]()
-        moved = map_of(move_region(scene_of(regions), BOX, (20, 0))).labels
+        moved = map_of(move_region(scene_of(regions), BOX, (20, 0), fill=None)).labels
         assert (moved[18:30, 36:48] == BOX).all() and int((moved == BOX).sum()) == 144
         assert (moved[18:30, 16:28] == GROUND).all()
         assert int((moved == DISC).sum()) < int((regions.labels == DISC).sum())
@@ -294,16 +297,16 @@ class TestMove:
     def test_out_of_the_image(self) -> None:
         regions = MAPS["hard"]()
         with pytest.warns(UserWarning, match=f"regions {BOX} are lost: covered, or out of the image"):
-            gone = move_region(scene_of(regions), BOX, (1000, 0))
+            gone = move_region(scene_of(regions), BOX, (1000, 0), fill=None)
         assert map_of(gone).ids.tolist() == [GROUND, DISC]
         with pytest.warns(UserWarning, match=f"regions {BOX}, {DISC} are lost"):
-            move_region(scene_of(regions), [BOX, DISC], (0, -1000))
-        part = map_of(move_region(scene_of(regions), BOX, (-22, 0))).labels
+            move_region(scene_of(regions), [BOX, DISC], (0, -1000), fill=None)
+        part = map_of(move_region(scene_of(regions), BOX, (-22, 0), fill=None)).labels
         assert int((part == BOX).sum()) == 12 * 6
 
     def test_widths_of_new_neighbours(self) -> None:
         """The box has never touched the disc: their contour becomes as soft as the box has been."""
-        moved = map_of(move_region(scene_of(MAPS["pairs"]()), BOX, (20, 0)))
+        moved = map_of(move_region(scene_of(MAPS["pairs"]()), BOX, (20, 0), fill=None))
         assert moved.softness == {(GROUND, BOX): 1.0, (GROUND, DISC): 0.5, (BOX, DISC): 1.0}  # type: ignore[comparison-overlap]
 
 
@@ -347,15 +350,15 @@ class TestDelete:
         for region, gain in ((BOX, (1.0, 0.0, 0.0)), (DISC, (0.0, 1.0, 1.0)), (GROUND, (0.0, 1.0, 1.0))):
             scene = recolor_region(scene, region, torch.tensor(gain))
         assert scene().detach()[0].max() > 0.1
-        rest = delete_region(scene, BOX)
+        rest = delete_region(scene, BOX, fill=None)
         assert rest().detach()[0].abs().max() == 0.0
         assert map_of(rest).ids.tolist() == [GROUND, DISC] and not (ids_of(rest) == BOX).any()
         assert map_of(rest).supersample == regions.supersample
-        assert map_of(delete_region(scene, [BOX, DISC])).ids.tolist() == [GROUND]
+        assert map_of(delete_region(scene, [BOX, DISC], fill=None)).ids.tolist() == [GROUND]
 
     def test_pixels_go_to_the_nearest(self) -> None:
         labels = torch.tensor([[1, 1, 2, 2, 2, 3, 3], [1, 2, 2, 2, 2, 2, 3]])
-        left = map_of(delete_region(scene_of(labels), 2)).labels
+        left = map_of(delete_region(scene_of(labels), 2, fill=None)).labels
         # the middle one above is 2 from both and falls to the smaller id; below, both are nearer by the other row
         assert left.tolist() == [[1, 1, 1, 1, 3, 3, 3], [1, 1, 1, 1, 3, 3, 3]]
 
@@ -363,7 +366,7 @@ class TestDelete:
         generator = torch.Generator().manual_seed(0)
         coarse = torch.randint(0, 5, (6, 8), generator=generator)
         labels = coarse.repeat_interleave(4, 0).repeat_interleave(4, 1)
-        got = map_of(delete_region(scene_of(labels), 2)).labels
+        got = map_of(delete_region(scene_of(labels), 2, fill=None)).labels
         stays = (labels != 2).nonzero()
         for y, x in (labels == 2).nonzero().tolist():
             squared = (stays - torch.tensor([y, x])).square().sum(1)

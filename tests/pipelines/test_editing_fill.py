@@ -1,0 +1,130 @@
+"""Holes of deleted and moved regions, filled from what is around them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs import GaussianField, RegionMap, Scene, fit
+from kcgs.editing import delete_region, move_region
+from kcgs.editing.inpaint import inpaint
+
+SIZE = (48, 72)
+
+
+def object_mask(scale: int = 1) -> Tensor:
+    y, x = ((torch.arange(n * scale) + 0.5) / scale for n in SIZE)
+    return (y[:, None] - 24) ** 2 / 120 + (x[None, :] - 30) ** 2 / 200 < 1
+
+
+def photo(channels: int = 3) -> Tensor:
+    """A waving ground, and a bright object on it."""
+    y, x = torch.meshgrid(torch.arange(SIZE[0]), torch.arange(SIZE[1]), indexing="ij")
+    ground = torch.stack([0.45 + 0.2 * torch.sin(x / (6.0 + k) + y / 9.0) for k in range(channels)])
+    return torch.where(object_mask(), 0.95, ground).float()
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return fit(photo(), object_mask().long(), 120, iterations=150).scene
+
+
+def slope(image: Tensor) -> Tensor:
+    down, across = np.gradient(image.double().numpy(), axis=(1, 2))
+    return torch.from_numpy(np.hypot(down, across).max(0))
+
+
+def same(one: Scene, other: Scene) -> bool:
+    pairs = zip(one.state_dict().items(), other.state_dict().items(), strict=True)
+    return all(torch.equal(a, b) for (name, a), (_, b) in pairs if isinstance(a, Tensor))
+
+
+def tensors(scene: Scene) -> list[Tensor]:
+    return [t.detach() for t in (scene.field.means, scene.field.cholesky, scene.field.colors)]
+
+
+def test_hole_is_in_range_and_about_as_steep_as_around(scene: Scene) -> None:
+    hole = object_mask()
+    before, after = (delete_region(scene, 1, fill=f)().detach() for f in (None, "inpaint"))
+    assert after[:, hole].min() > -0.02 and after[:, hole].max() < 1.02
+    # this ground has no texture: the hole is about as steep as its steepest slope
+    assert slope(after)[hole].max() <= 1.1 * slope(after)[~hole].quantile(0.999)
+    assert (after - before)[:, ~hole].abs().max() < 0.03
+    # the ground goes on: what was bright is not, nor is it black
+    assert 0.2 < after[:, hole].min() and after[:, hole].max() < 0.75
+
+
+def test_none_is_the_edit_alone(scene: Scene) -> None:
+    edited = delete_region(scene, 1, fill=None)
+    assert scene.field.region_ids is not None
+    kept = scene.field.subset(scene.field.region_ids != 1)
+    assert all(torch.equal(a, b) for a, b in zip(tensors(edited), tensors(Scene(kept)), strict=True))
+    moved = move_region(scene, 1, (40, 0), fill=None)
+    assert len(moved) == len(scene)
+
+
+def test_same_bits_again(scene: Scene) -> None:
+    assert same(delete_region(scene, 1), delete_region(scene, 1))
+    assert same(move_region(scene, 1, (10, 3)), move_region(scene, 1, (10, 3)))
+
+
+def test_move_fills_what_it_uncovers(scene: Scene) -> None:
+    moved = move_region(scene, 1, (9, 0))
+    assert moved.regions is not None
+    landed = moved.regions.labels == 1
+    today = move_region(scene, 1, (9, 0), fill=None)
+    torch.testing.assert_close(moved()[:, landed], today()[:, landed], rtol=0, atol=1e-5)
+    left = object_mask() & ~landed
+    assert moved().detach()[:, left].max() < 0.75 and moved().detach()[:, left].min() > 0.2
+
+
+def test_move_that_uncovers_nothing_is_not_fitted(scene: Scene) -> None:
+    assert same(move_region(scene, 1, (0, 0)), move_region(scene, 1, (0, 0), fill=None))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("channels", [1, 4])
+def test_channels_dtypes_opacities_and_soft_fine_maps(channels: int, dtype: torch.dtype) -> None:
+    labels = object_mask(2).long()
+    labels[:20] += 4
+    regions = RegionMap.from_labels(labels, {(0, 1): 0.8, (0, 4): 0.4}, supersample=2)
+    field = GaussianField.random(80, SIZE, channels=channels, regions=regions, seed=0, dtype=dtype)
+    alpha = torch.linspace(0.2, 1.0, len(field), dtype=dtype)
+    scene = Scene(GaussianField(field.means, field.cholesky, field.colors, field.region_ids, alpha, size=SIZE), regions)
+    for edited in (delete_region(scene, 1), move_region(scene, 1, (8.5, 0))):
+        assert edited().dtype == dtype and edited().shape == (channels, *SIZE) and edited().isfinite().all()
+        assert edited.field.opacities is not None and edited.field.opacities.shape == (len(edited),)
+
+
+def test_nothing_to_continue() -> None:
+    checks = (torch.arange(8)[:, None] + torch.arange(8)) % 2
+    regions = RegionMap.from_labels(checks, supersample=2)
+    scene = Scene(GaussianField.random(9, (4, 4), regions=regions, seed=0), regions)
+    with pytest.raises(ValueError, match="fill must be None where the hole reaches into every pixel"):
+        delete_region(scene, 1)
+    assert delete_region(scene, 1, fill=None).regions is not None
+
+
+def test_hole_of_one_pixel_and_no_gaussian_left() -> None:
+    labels = torch.zeros(5, 7).long()
+    labels[2, 3] = 1
+    field = GaussianField(
+        torch.tensor([[3.5, 2.5]]), torch.ones(1, 3), torch.ones(1, 3), torch.tensor([1]), size=(5, 7)
+    )
+    assert delete_region(Scene(field, labels), 1)().abs().max() < 0.02
+
+
+def test_scene_without_regions_is_refused() -> None:
+    with pytest.raises(ValueError, match="scene must have region ids"):
+        delete_region(Scene(GaussianField.random(5, (8, 8), seed=0)), 0)
+
+
+def test_membrane_is_the_mean_of_its_neighbours() -> None:
+    """A ramp stays a ramp, and a constant a constant."""
+    ramp = torch.linspace(0, 1, 60).expand(2, 40, 60).double()
+    hole = torch.zeros(40, 60).bool()
+    hole[12:28, 20:40] = True
+    torch.testing.assert_close(inpaint(ramp, hole), ramp, rtol=0, atol=0.04)
+    torch.testing.assert_close(inpaint(torch.full_like(ramp, 0.3), hole), torch.full_like(ramp, 0.3))
