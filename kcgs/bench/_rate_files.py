@@ -104,7 +104,7 @@ class Files:
         """Return kcgs' file of a fit to so many bytes."""
         ask, regions = Ask(group, image, codec, most), codec != NO_REGIONS
         config = self.config.model_copy(update={"objective": "visual" if codec == VISUAL else "psnr"})
-        settings = ["fit_bytes", codec_digest(), config.model_dump(mode="json")]
+        settings = self.settings("fit_bytes", config)
 
         def make() -> tuple[Point, bytes]:
             sample, segment_seconds = self.sample(image)
@@ -224,9 +224,9 @@ class Files:
         name = "".join(c if c.isalnum() or c in "-." else "_" for c in name)
         return self.folder / f"{name}-{hashlib.sha256(parts.encode()).hexdigest()[:16]}.{suffix}"
 
-    def settings(self, how: str) -> list[Any]:
+    def settings(self, how: str, config: FitConfig | None = None) -> list[Any]:
         """Return what a file of kcgs depends on."""
-        return [how, codec_digest(), self.config.model_dump(mode="json")]
+        return [how, codec_digest(), (config or self.config).model_dump(mode="json")]
 
     def sample(self, image: str) -> tuple[images.Sample, float]:
         """Read an image, and how long finding its map took where it has none."""

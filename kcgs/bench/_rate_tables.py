@@ -19,6 +19,8 @@ PSNR, EF_PSNR = "psnr", "ef_psnr"
 QUALITIES = {PSNR: ("PSNR", "dB"), EF_PSNR: ("EF-PSNR", "dB"), "ms_ssim": ("MS-SSIM", "1"), "ef_ssim": ("EF-SSIM", "1")}
 QUALITIES |= {"ssimulacra2": ("SSIMULACRA2", "points"), "butteraugli": ("butteraugli", "norm")}
 RIVALS = (*CODECS, NO_REGIONS)
+# whose files meet which others at the same bytes
+_CONTESTS = (*((KCGS, rival) for rival in RIVALS), (VISUAL, AVIF))
 # a smaller difference is neither a win nor a loss
 TIE = {"dB": 0.005, "1": 0.0005, "%": 0.05, "points": 0.05, "norm": 0.005}
 MOST_BYTES = 7_950
@@ -108,7 +110,7 @@ def shares(points: Sequence[Point]) -> dict[str, float]:
 def losses(points: Sequence[Point]) -> str:
     """Name what kcgs loses, worst first in each line."""
     lines = []
-    for codec, rival in (*((KCGS, rival) for rival in RIVALS), (VISUAL, AVIF)):
+    for codec, rival in _CONTESTS:
         for quality, (name, unit) in QUALITIES.items():
             gain = gains(pairs(points, rival, codec), quality)
             if gain is not None and gain.losses:
@@ -133,7 +135,7 @@ def matched_means(points: Sequence[Point]) -> str:
     measured = qualities(points)
     header += [cell for name in measured for cell in (f"{QUALITIES[name][0]} gained", "95 %", "won-lost")]
     lines = []
-    for codec, rival in (*((KCGS, rival) for rival in RIVALS), (VISUAL, AVIF)):
+    for codec, rival in _CONTESTS:
         found, name = pairs(points, rival, codec), rival if codec == KCGS else f"{codec} against {rival}"
         low = [pair for pair in found if pair.is_low]
         for title, group in ((name, found), (f"{name}, as low", low if len(low) < len(found) else [])):

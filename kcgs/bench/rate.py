@@ -111,8 +111,9 @@ def run(output: Path, options: Options) -> None:
         write_rows(output / "results.csv", Point, points)
         for name in (CROPS, _SHEET):
             (output / name).unlink(missing_ok=True)
-        plot_crops(output / CROPS, _frames(kept, points))
-        save_sheet(output / _SHEET, _frames(kept, points))
+        frames = list(_frames(kept, points))
+        plot_crops(output / CROPS, frames)
+        save_sheet(output / _SHEET, frames)
         made = options.made("rate", notes)
         conclude(report, output, made._replace(machine=(versions(), f"Threads: {torch.get_num_threads()}")))
 
@@ -206,9 +207,10 @@ def _matched(files: Files, image: str) -> list[Point]:
 def _matched_other(files: Files, image: str, codec: str) -> list[Point]:
     kept = Files(files.folder, files.data, files.quick, makes=False)
     found = _matched(kept, image)
-    ours = [p.asked for p in found if p.regions]
-    avif = [p.bytes for p in found if p.codec == AVIF]
-    return files.fitted(tables.MATCHED, image, (avif if codec == VISUAL and avif else ours)[0], codec) if ours else []
+    most = [p.asked for p in found if p.regions]
+    if codec == VISUAL and most:
+        most = [p.bytes for p in found if p.codec == AVIF] or most
+    return files.fitted(tables.MATCHED, image, most[0], codec) if most else []
 
 
 def _frames(kept: Files, points: Sequence[Point]) -> Iterator[tuple[str, dict[str, Tensor]]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from kcgs.nn import GaussianField
 from kcgs.scene import Scene, check_unbatched
 
 Numbers = Tensor | NDArray[Any] | Sequence[Any] | float
+Fill = Literal["inpaint"]
 
 
 def check_field(scene: Scene) -> GaussianField:
@@ -74,6 +75,12 @@ def check_offset(offset: Sequence[float], supersample: int) -> tuple[int, int]:
         unit = "1 pixel" if supersample == 1 else f"1/{supersample} pixel, the spacing of the labels"
         raise ValueError(f"offset must be whole multiples of {unit}; got {offset!r}")
     return round(steps[0]), round(steps[1])
+
+
+def check_fill(fill: object) -> None:
+    """Refuse what is no way to fill a hole."""
+    if fill is not None and fill != "inpaint":
+        raise ValueError(f'fill must be "inpaint" or None; got {fill!r}')
 
 
 def color_tensor(name: str, value: Numbers, colors: Tensor, shapes: list[tuple[int, ...]]) -> Tensor:

@@ -9,13 +9,25 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 from torch import Tensor
 
+from kcgs.fit.fill import fill_hole
+from kcgs.fit.inpaint import grow
 from kcgs.functional import PairWidths, RegionMap, touching_pairs
 from kcgs.nn import GaussianField
+from kcgs.nn.field import join
 from kcgs.scene import Scene
 
-from .checks import Numbers, check_editable, check_field, check_ids, check_offset, check_scene, color_tensor, ids_of
-from .fill import Fill, check_fill, fill_hole
-from .inpaint import grow
+from .checks import (
+    Fill,
+    Numbers,
+    check_editable,
+    check_field,
+    check_fill,
+    check_ids,
+    check_offset,
+    check_scene,
+    color_tensor,
+    ids_of,
+)
 
 # standard deviation of a Gaussian that is flat over the image, in its longer sides: 1 to 3 in 10^7
 _FLAT = 1e3
@@ -224,12 +236,9 @@ def _with_flat(field: GaussianField, region_id: int, color: Tensor) -> GaussianF
     height, width = field.size
     sigma = _FLAT * max(height, width)
     rows = [(field.means, [width / 2, height / 2]), (field.cholesky, [sigma, 0.0, sigma]), (field.colors, color)]
-    means, cholesky, colors = (torch.cat([t.detach(), torch.as_tensor(row).to(t)[None]]) for t, row in rows)
-    ids = torch.cat([ids_of(field), ids_of(field).new_tensor([region_id])])
-    opacities = None
-    if field.opacities is not None:
-        opacities = torch.cat([field.opacities.detach(), field.opacities.new_ones(1)])
-    return GaussianField(means, cholesky, colors, ids, opacities, size=field.size)
+    means, cholesky, colors = (torch.as_tensor(row).to(t)[None] for t, row in rows)
+    flat = GaussianField(means, cholesky, colors, ids_of(field).new_tensor([region_id]), size=field.size)
+    return join(field, flat)
 
 
 def _nearest_labels(labels: Tensor, hole: Tensor) -> Tensor:
@@ -240,7 +249,7 @@ def _nearest_labels(labels: Tensor, hole: Tensor) -> Tensor:
     lines = [hole.any(axis).nonzero().flatten() for axis in (1, 0)]
     rows, cols = (slice(max(0, int(line[0]) - 1), int(line[-1]) + 2) for line in lines)
     part, inside = labels[rows, cols], hole[rows, cols]
-    touching = torch.nn.functional.max_pool2d(inside[None].float(), 3, 1, 1)[0] > 0
+    touching = grow(inside, 1)
     best = torch.full(part.shape, torch.inf, dtype=torch.float64)
     filled = part.cpu().clone()
     for region in part[touching & ~inside].unique().tolist():
@@ -254,26 +263,17 @@ def _nearest_labels(labels: Tensor, hole: Tensor) -> Tensor:
 
 def _filled_behind(scene: Scene, behind: RegionMap, hole: Tensor, landed: Tensor) -> GaussianField:
     """Return the field, what is behind the regions that were in the hole filled where they have not landed again."""
+    if not (hole & ~landed).any():
+        return scene.field
     before = scene.regions
     assert before is not None
     widths = before.softness
     width = widths if isinstance(widths, float) else max(widths.values(), default=0.0)
     # through a soft contour one sees what is behind
-    if not (hole & ~landed).any():
-        return scene.field
     uncovered = grow(~landed, math.ceil((1.0 + _CONTOUR_SIGMAS * width) * before.supersample))
     stays = ~torch.isin(ids_of(scene.field), before.fine_labels[hole].unique())
     filled = fill_hole(Scene(scene.field.subset(stays), behind), hole, hole & uncovered).field
-    movers = scene.field.subset(~stays)
-    tensors = [
-        torch.cat([one.detach(), other.detach()]) for one, other in zip(_tensors(filled), _tensors(movers), strict=True)
-    ]
-    return GaussianField(*tensors, size=scene.size)
-
-
-def _tensors(field: GaussianField) -> list[Tensor]:
-    tensors = [field.means, field.cholesky, field.colors, ids_of(field)]
-    return tensors if field.opacities is None else [*tensors, field.opacities]
+    return join(filled, scene.field.subset(~stays))
 
 
 def _overlap(length: int, step: int) -> tuple[slice, slice]:

@@ -27,7 +27,7 @@ _SATURATED = 0.25
 # share of the gradient in the density of Image-GS's centres; the rest is uniform
 _GRADIENT_SHARE = 0.7
 # thinner than this, in pixels, a Gaussian would fall between the pixel centres
-LEAST_SIGMA = 0.5
+_LEAST_SIGMA = 0.5
 
 
 def start(
@@ -89,7 +89,7 @@ def make_optimizer(config: FitConfig, field: GaussianField, sigma: float) -> Gau
     if config.optimizer == "adan":
         return GaussianImageAdan(field, sigma, config.usual_iterations, config.learning_rate_factor)
     if config.optimizer == "frame":
-        least_sigma = LEAST_SIGMA if config.least_sigma is None else config.least_sigma
+        least_sigma = _LEAST_SIGMA if config.least_sigma is None else config.least_sigma
         return FrameAdam(field, config.learning_rate_factor, least_sigma)
     return ImageGSAdam(field, config.learning_rate_factor)
 
@@ -186,7 +186,7 @@ def gradient_field(image: Tensor, num_gaussians: int, regions: RegionMap | None,
     pixels = sample_pixels(chance, num_gaussians, rng)
     places = np.stack([pixels % planes.shape[2], pixels // planes.shape[2]], -1) + 0.5
     centres = spread_repeats(places, pixels, rng)
-    sigma = np.maximum(0.5 / np.sqrt(num_gaussians * chance[pixels]), LEAST_SIGMA)
+    sigma = np.maximum(0.5 / np.sqrt(num_gaussians * chance[pixels]), _LEAST_SIGMA)
     # Gaussians of half the spacing add up to pi / 2
     colors = planes.reshape(len(planes), -1).T[pixels] / (math.pi / 2)
     cholesky = np.stack([sigma, np.zeros_like(sigma), sigma], -1)

@@ -234,3 +234,19 @@ class GaussianField(nn.Module):
         confined = "confined" if self.region_ids is not None else "not confined"
         images = f"{len(self.means)} x " if self.means.ndim == 3 else ""
         return f"{images}{len(self)} Gaussians, {self.colors.shape[-1]} channels, size={self.size}, {confined}"
+
+
+def join(first: GaussianField, second: GaussianField) -> GaussianField:
+    """Put two fields of one image, both with region ids or neither, into one without the graph; no opacity is 1."""
+
+    def both(one: Tensor, other: Tensor) -> Tensor:
+        return torch.cat([one.detach(), other.detach()])
+
+    ids = opacities = None
+    if first.region_ids is not None and second.region_ids is not None:
+        ids = both(first.region_ids, second.region_ids)
+    if first.opacities is not None or second.opacities is not None:
+        one, other = (f.means.new_ones(len(f)) if f.opacities is None else f.opacities for f in (first, second))
+        opacities = both(one, other)
+    means, cholesky = both(first.means, second.means), both(first.cholesky, second.cholesky)
+    return GaussianField(means, cholesky, both(first.colors, second.colors), ids, opacities, size=first.size)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, Scene, fit
 from kcgs.editing import delete_region, move_region
-from kcgs.editing.inpaint import inpaint
+from kcgs.fit.inpaint import inpaint
 
 SIZE = (48, 72)
 

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcgs.fit.optimizers import FrameAdam
 from kcgs.functional import RegionMap, region_splat
 from kcgs.nn import GaussianField
+from kcgs.nn.field import join
 from kcgs.scene import Scene
 
-from .checks import ids_of
 from .inpaint import inpaint
-
-Fill = Literal["inpaint"]
+from .optimizers import FrameAdam
 
 # pixels around the hole that the fit sees, and that the target is made from
 _MARGIN = 40
@@ -68,12 +66,6 @@ class _Window(NamedTuple):
         return like.new_tensor([self.cols.start, self.rows.start])
 
 
-def check_fill(fill: object) -> None:
-    """Refuse what is no way to fill a hole."""
-    if fill is not None and fill != "inpaint":
-        raise ValueError(f'fill must be "inpaint" or None; got {fill!r}')
-
-
 def fill_hole(scene: Scene, hole: Tensor, seen: Tensor) -> Scene:
     """Fill a hole smoothly from its surroundings.
 
@@ -88,8 +80,8 @@ def fill_hole(scene: Scene, hole: Tensor, seen: Tensor) -> Scene:
     Raises:
         ValueError: no pixel is free of the hole.
     """
-    regions = scene.regions
-    assert regions is not None
+    regions, ids = scene.regions, scene.field.region_ids
+    assert regions is not None and ids is not None
     unknown, wanted = (_pixels(mask, regions.supersample) for mask in (hole, seen))
     if not wanted.any():
         return scene
@@ -101,15 +93,16 @@ def fill_hole(scene: Scene, hole: Tensor, seen: Tensor) -> Scene:
     unknown_part, wanted_part, now = (window.part(image) for image in (unknown, wanted, rendered))
     target = inpaint(now, unknown_part)
     part = _crop(regions, window)
-    free = _reaching_in(scene, unknown, window, part)
-    start = _chosen(scene.field, free, window)
+    free = _reaching_in(scene, ids, unknown, window) & torch.isin(ids, part.ids)
+    start = _chosen(scene.field, ids, free, window)
     missing = target - now
     spread = _spread(missing, wanted_part, part)
     weight = torch.where(unknown_part, wanted_part.to(target.dtype), _KNOWN_WEIGHT)
     # what all others make, which stays
     fixed = now - start.render(part)
     fitted = _fit(start.with_more(spread), part, target - fixed, weight)
-    return Scene(_joined(scene.field, ~free, fitted, window), regions, scene.metadata)
+    moved = GaussianField(fitted.means + window.origin(fitted.means), *fitted[1:], size=scene.size)
+    return Scene(join(scene.field.subset(~free), moved), regions, scene.metadata)
 
 
 def _pixels(mask: Tensor, supersample: int) -> Tensor:
@@ -131,11 +124,11 @@ def _crop(regions: RegionMap, window: _Window) -> RegionMap:
     return RegionMap.from_labels(labels, softness, supersample=k)
 
 
-def _reaching_in(scene: Scene, unknown: Tensor, window: _Window, part: RegionMap) -> Tensor:
+def _reaching_in(scene: Scene, ids: Tensor, unknown: Tensor, window: _Window) -> Tensor:
     """Say which Gaussians the fit may move, (N) bool: they have weight in the hole and hardly any out of sight."""
     field = scene.field
     ones = field.colors.detach().new_ones(len(field), 1).requires_grad_()
-    total = region_splat(field.means.detach(), field.cholesky.detach(), ones, ids_of(field), scene.regions)[0]
+    total = region_splat(field.means.detach(), field.cholesky.detach(), ones, ids, scene.regions)[0]
     sight = torch.zeros_like(unknown)
     sight[window.rows, window.cols] = True
     # the render is linear in the colours: the gradient of a sum is the weight that each Gaussian has there
@@ -143,14 +136,13 @@ def _reaching_in(scene: Scene, unknown: Tensor, window: _Window, part: RegionMap
         torch.autograd.grad((total * mask).sum(), ones, retain_graph=True)[0][:, 0]
         for mask in (unknown, ~sight, torch.ones_like(unknown))
     )
-    reaches = (hole > _IN_HOLE * everywhere) & (outside < _OUT_OF_SIGHT * everywhere)
-    return reaches & torch.isin(ids_of(field), part.ids)
+    return (hole > _IN_HOLE * everywhere) & (outside < _OUT_OF_SIGHT * everywhere)
 
 
-def _chosen(field: GaussianField, mask: Tensor, window: _Window) -> _Gaussians:
+def _chosen(field: GaussianField, ids: Tensor, mask: Tensor, window: _Window) -> _Gaussians:
     """Take Gaussians as they are in the window, opacities merged."""
     means, cholesky, colors = (t.detach()[mask] for t in (field.means, field.cholesky, field.merged_colors()))
-    return _Gaussians(means - window.origin(means), cholesky, colors, ids_of(field)[mask])
+    return _Gaussians(means - window.origin(means), cholesky, colors, ids[mask])
 
 
 def _spread(missing: Tensor, wanted: Tensor, regions: RegionMap) -> _Gaussians:
@@ -201,18 +193,3 @@ def _at_errors(error: Tensor, regions: RegionMap) -> _Gaussians:
     best = score.sort(descending=True, stable=True).indices[:count]
     y, x = best // error.shape[2], best % error.shape[2]
     return _round(x, y, _ADDED_SIGMA, -_ADDED_GAIN * error[:, y, x].T, regions)
-
-
-def _joined(field: GaussianField, stays: Tensor, fitted: _Gaussians, window: _Window) -> GaussianField:
-    """Put fitted Gaussians behind those that stay."""
-    kept = field.subset(stays)
-    rows = zip(
-        (kept.means, kept.cholesky, kept.colors, ids_of(kept)),
-        (fitted.means + window.origin(fitted.means), *fitted[1:]),
-        strict=True,
-    )
-    means, cholesky, colors, ids = (torch.cat([old.detach(), new]) for old, new in rows)
-    opacities = None
-    if kept.opacities is not None:
-        opacities = torch.cat([kept.opacities.detach(), kept.opacities.new_ones(len(fitted.means))])
-    return GaussianField(means, cholesky, colors, ids, opacities, size=field.size)
