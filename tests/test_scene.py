@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import io
 import pickle
-from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -118,55 +117,12 @@ class TestProcesses:
         """Scenes with their maps, from two workers; they are rendered before, and render alike on both sides."""
         scenes = [make_scene(name) for name in MAPS]
         images = [scene().detach() for scene in scenes]
-        loader = DataLoader(scenes, 2, num_workers=2, collate_fn=as_they_are, multiprocessing_context=start)  # type: ignore[arg-type]
+        loader = DataLoader(scenes, 2, num_workers=2, collate_fn=as_they_are, multiprocessing_context=start, timeout=60)  # type: ignore[arg-type]
         got = [scene for batch in loader for scene in batch]
         for scene, sent, image in zip(got, scenes, images, strict=True):
             assert torch.equal(scene(), image) and torch.equal(sent(), image) and scene.metadata == sent.metadata
             scene().sum().backward()
             assert scene.field.means.grad is not None and scene.field.means.grad.any()
-
-    @pytest.mark.skipif(not torch.distributed.is_available(), reason="torch is built without distributed")
-    @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
-    def test_data_parallel(self, tmp_path: Path) -> None:
-        """Two processes, each with a target of its own, train as one does on the mean of both losses."""
-        context = get_context("fork")
-        processes = [
-            context.Process(target=train_in_parallel, args=(rank, str(tmp_path)), daemon=True) for rank in range(2)
-        ]
-        for process in processes:
-            process.start()
-        for process in processes:
-            process.join(30)
-            assert process.exitcode == 0
-        scene, optimizer = trained_scene()
-        for _ in range(3):
-            optimizer.zero_grad()
-            sum((scene() - target).square().mean() / 2 for target in (0.2, 0.8)).backward()  # type: ignore[union-attr]
-            optimizer.step()
-        first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2))
-        assert torch.equal(first["field.colors"], second["field.colors"])
-        loaded = Scene(GaussianField.random(40, SIZE, seed=1))
-        loaded.load_state_dict(first)
-        torch.testing.assert_close(loaded(), scene(), rtol=1e-4, atol=1e-5)
-        assert not torch.allclose(scene(), make_scene()())
-
-
-def trained_scene() -> tuple[Scene, torch.optim.Optimizer]:
-    scene = make_scene()
-    return scene, torch.optim.SGD(scene.parameters(), lr=1.0)
-
-
-def train_in_parallel(rank: int, folder: str) -> None:
-    """Train a scene as one of two processes, and save its state."""
-    torch.distributed.init_process_group("gloo", init_method=f"file://{folder}/group", rank=rank, world_size=2)
-    scene, optimizer = trained_scene()
-    wrapped = torch.nn.parallel.DistributedDataParallel(scene)
-    for _ in range(3):
-        optimizer.zero_grad()
-        (wrapped() - (0.2, 0.8)[rank]).square().mean().backward()
-        optimizer.step()
-    torch.save(scene.state_dict(), f"{folder}/{rank}.pt")
-    torch.distributed.destroy_process_group()
 
 
 def scene_on(device: torch.device, dtype: torch.dtype, name: str = "soft") -> Scene:

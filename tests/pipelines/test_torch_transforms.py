@@ -591,26 +591,3 @@ class TestState:
         with torch.no_grad():
             other.field.colors.zero_()
         assert torch.equal(module(torch.ones(1)).detach(), want[0])
-
-    @pytest.mark.skipif(not torch.distributed.is_available(), reason="torch is built without distributed")
-    def test_data_parallel(self, field: GaussianField, regions: RegionMap, tmp_path: Path) -> None:
-        """One process of a group: the wrapped module draws and trains as the module does, integer ids and all."""
-        torch.manual_seed(0)
-        alone = Picture(copy.deepcopy(field), regions)
-        torch.distributed.init_process_group("gloo", init_method=f"file://{tmp_path}/group", rank=0, world_size=1)
-        try:
-            wrapped = nn.parallel.DistributedDataParallel(copy.deepcopy(alone))
-            optimizers = [torch.optim.SGD(m.parameters(), lr=0.1) for m in (alone, wrapped)]
-            for _ in range(3):
-                pictures = [m(torch.ones(1)) for m in (alone, wrapped)]
-                assert torch.equal(*pictures)
-                for picture, optimizer in zip(pictures, optimizers, strict=True):
-                    optimizer.zero_grad()
-                    picture.square().sum().backward()
-                    optimizer.step()
-            state = wrapped.module.state_dict()
-        finally:
-            torch.distributed.destroy_process_group()
-        for name, value in alone.state_dict().items():
-            if isinstance(value, Tensor):
-                assert torch.equal(value, state[name]), name
