@@ -51,8 +51,9 @@ def move_region(
         region_ids: an id in the map, or several, which move together.
         offset: (dx, dy) in pixels, whole; with ``supersample`` k, whole multiples of 1/k.
         fill: "inpaint": what is uncovered continues its surroundings smoothly, by Gaussians that are fitted there, some
-            of them new; other pixels change by a few hundredths at most, as measured. None: no fit; what is uncovered
-            shows what the Gaussians of its new region paint there, streaks, or black.
+            of them new, and so do 3 pixels around it, which have colours of the object; others change by a few
+            hundredths at most, as measured. None: no fit; what is uncovered shows what the Gaussians of its new region
+            paint there, streaks, or black.
 
     Returns:
         A new scene, without a graph.

@@ -13,9 +13,11 @@ from kcgs.nn import GaussianField
 from kcgs.nn.field import join
 from kcgs.scene import Scene
 
-from .inpaint import inpaint
+from .inpaint import grow, inpaint
 from .optimizers import FrameAdam
 
+# so many pixels around the hole still have colours of what was there: they are filled too
+_FRINGE = 3
 # pixels around the hole that the fit sees, and that the target is made from
 _MARGIN = 40
 # the fit moves a Gaussian with more than this share of its weight in the hole, and less than this where it cannot see
@@ -83,6 +85,8 @@ def fill_hole(scene: Scene, hole: Tensor, seen: Tensor) -> Scene:
     regions, ids = scene.regions, scene.field.region_ids
     assert regions is not None and ids is not None
     unknown, wanted = (_pixels(mask, regions.supersample) for mask in (hole, seen))
+    wanted = wanted | _fringe(wanted, regions.labels)
+    unknown = unknown | wanted
     if not wanted.any():
         return scene
     if unknown.all():
@@ -110,6 +114,12 @@ def _pixels(mask: Tensor, supersample: int) -> Tensor:
     if supersample == 1:
         return mask
     return torch.nn.functional.max_pool2d(mask[None].float(), supersample)[0] > 0
+
+
+def _fringe(mask: Tensor, labels: Tensor) -> Tensor:
+    """Say which pixels are near a mask, of the regions that are in it and go on farther away."""
+    near = grow(mask, _FRINGE)
+    return near & torch.isin(labels, labels[mask].unique()) & torch.isin(labels, labels[~near].unique())
 
 
 def _crop(regions: RegionMap, window: _Window) -> RegionMap:

@@ -11,8 +11,6 @@ from torch import Tensor
 
 # blocks are averaged until the hole has at most so many: the time of the solution grows faster than they
 _MOST_UNKNOWN = 10_000
-# so many pixels around the hole still have colours of what was there: nothing is continued from them
-_FRINGE = 3
 # within so many pixels of the hole its colours are those next to it, then these fade over as many more
 _PLATEAU, _JOIN, _BLUR = 3.0, 5.0, 1.5
 # pixels around the hole whose range of values, but for this share at either end, the hole keeps
@@ -24,8 +22,8 @@ _INSET = 0.03
 def inpaint(image: Tensor, unknown: Tensor) -> Tensor:
     """Continue an image into its unknown pixels.
 
-    Convention: a membrane, every value the mean of its neighbours, held by what is some pixels away from the hole, and
-    led over to what is next to it. A plate (biharmonic) is smoother where it starts, but overshoots in large holes.
+    Convention: a membrane, every value the mean of its neighbours, held by what is around the hole, and led over to
+    what is next to it. A plate (biharmonic) is smoother where it starts, but overshoots in large holes.
 
     Args:
         image: :math:`(C, H, W)`.
@@ -51,8 +49,7 @@ def grow(mask: Tensor, reach: int) -> Tensor:
 def _membrane(image: Tensor, unknown: Tensor) -> NDArray[np.float64]:
     """Solve for the membrane on block means, and enlarge it."""
     step = max(1, math.ceil((int(unknown.sum()) / _MOST_UNKNOWN) ** 0.5))
-    near = grow(unknown, _FRINGE)
-    known = (unknown if near.all() else near).logical_not().to(image)[None]
+    known = unknown.logical_not().to(image)[None]
     height, width = unknown.shape
     pad = (0, -width % step, 0, -height % step)
     shares, sums = (
