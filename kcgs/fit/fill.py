@@ -69,7 +69,7 @@ class _Window(NamedTuple):
 
 
 def fill_hole(scene: Scene, hole: Tensor, seen: Tensor) -> Scene:
-    """Fill a hole smoothly from its surroundings.
+    """Fill a hole from its surroundings.
 
     Args:
         scene: what is left; its map covers the hole.

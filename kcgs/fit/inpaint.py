@@ -1,4 +1,4 @@
-"""Continue an image smoothly into a hole: the target that a filled hole is fitted to."""
+"""Continue an image into a hole: the target that a filled hole is fitted to."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from .texture import texture
 
 # blocks are averaged until the hole has at most so many: the time of the solution grows faster than they
 _MOST_UNKNOWN = 10_000
@@ -23,7 +25,7 @@ def inpaint(image: Tensor, unknown: Tensor) -> Tensor:
     """Continue an image into its unknown pixels.
 
     Convention: a membrane, every value the mean of its neighbours, held by what is around the hole, and led over to
-    what is next to it. A plate (biharmonic) is smoother where it starts, but overshoots in large holes.
+    what is next to it; and texture. A plate (biharmonic) is smoother where it starts, but overshoots in large holes.
 
     Args:
         image: :math:`(C, H, W)`.
@@ -34,6 +36,7 @@ def inpaint(image: Tensor, unknown: Tensor) -> Tensor:
     """
     values, hole = image.to(torch.float64).cpu(), unknown.cpu()
     inner = _lead_over(values.numpy(), _membrane(values, hole), hole.numpy())
+    inner += texture(torch.where(hole, torch.from_numpy(inner), values), hole).numpy()
     ring = values[:, grow(hole, _RING) & ~hole].numpy()
     low, high = np.quantile(ring, [_TAIL, 1 - _TAIL], axis=1)[..., None, None]
     inset = _INSET * (high - low)

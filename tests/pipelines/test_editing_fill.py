@@ -10,6 +10,7 @@ from torch import Tensor
 from kcgs import GaussianField, RegionMap, Scene, fit
 from kcgs.editing import delete_region, move_region
 from kcgs.fit.inpaint import grow, inpaint
+from kcgs.fit.texture import texture
 
 SIZE = (48, 72)
 
@@ -147,3 +148,22 @@ def test_membrane_is_the_mean_of_its_neighbours() -> None:
     hole[12:28, 20:40] = True
     torch.testing.assert_close(inpaint(ramp, hole), ramp, rtol=0, atol=0.04)
     torch.testing.assert_close(inpaint(torch.full_like(ramp, 0.3), hole), torch.full_like(ramp, 0.3))
+
+
+def test_texture_is_that_of_places_of_the_same_colour() -> None:
+    """Dark and smooth on the left, bright and noisy on the right, and so is the hole."""
+    noise = torch.randn(3, 80, 120, generator=torch.Generator().manual_seed(0)).double()
+    right = torch.arange(120) >= 60
+    ground = torch.where(right, 0.7, 0.2).expand(3, 80, 120).double()
+    hole = torch.zeros(80, 120).bool()
+    hole[30:50, 30:90] = True
+    added = texture(ground + noise * right * ~hole * 0.05, hole)
+    assert not added[:, ~hole].any()
+    assert added[:, 34:46, 34:42].abs().max() < 0.02
+    assert 0.02 < added[:, 34:46, 78:88].std() < 0.06
+
+
+def test_texture_where_no_whole_cell_is_known() -> None:
+    hole = torch.ones(4, 5).bool()
+    hole[0, 0] = False
+    assert texture(torch.rand(1, 4, 5).double(), hole).isfinite().all()
