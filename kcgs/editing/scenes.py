@@ -52,8 +52,8 @@ def move_region(
         offset: (dx, dy) in pixels, whole; with ``supersample`` k, whole multiples of 1/k.
         fill: "inpaint": what is uncovered continues its surroundings, colours and texture, by Gaussians that are fitted
             there, some of them new, and so do 3 pixels around it, which have colours of the object; others change by a
-            few hundredths, as measured. None: no fit; what is uncovered shows what the Gaussians of its new region paint
-            there, streaks, or black.
+            few hundredths. None: no fit; what is uncovered shows what the Gaussians of its new region paint there,
+            streaks, or black.
 
     Returns:
         A new scene, without a graph.
