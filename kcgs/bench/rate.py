@@ -24,14 +24,10 @@ from .core.report import Made, conclude
 from .core.rows import read_rows, write_rows
 
 GROUPS = (tables.MATCHED, PRECISION, MAPS, tables.DAVIS_CURVE, tables.KODAK_CURVE)
-FRAMES = (
-    *("blackswan", "dog", "train", "breakdance", "car-turn", "dance-jump", "mallard-water", "rollerblade"),
-    *("bmx-trees", "cows", "kite-surf", "paragliding-launch"),
-)
 _NAMES = {
-    tables.MATCHED: FRAMES,
-    PRECISION: FRAMES[:4],
-    tables.DAVIS_CURVE: FRAMES[:3],
+    tables.MATCHED: images.FRAMES,
+    PRECISION: images.FRAMES[:4],
+    tables.DAVIS_CURVE: images.FRAMES[:3],
     tables.KODAK_CURVE: ("kodim23", "kodim07", "kodim19"),
 }
 QUICK_IMAGE, QUICK_BYTES = "disc", 700

@@ -73,6 +73,7 @@ class Case(NamedTuple):
     iterations: int | None = None  # none: the recipe's own
     stride: int = 1  # one of so many pixels is taken
     source: str = "given"  # of the label map: the image's own, or a segmenter by name
+    factor: int = 1  # that the image is reduced by
 
     def config(self) -> FitConfig:
         """All settings."""
@@ -80,7 +81,7 @@ class Case(NamedTuple):
 
     def load(self, data: Path | None) -> images.Sample:
         """Read the image."""
-        return images.load(self.image, data, self.stride)
+        return images.load(self.image, data, self.stride, self.factor)
 
     def regions(self, labels: Tensor | None) -> RegionMap | None:
         """Return the map that the fit is given, from the image's labels."""
@@ -94,6 +95,7 @@ class Case(NamedTuple):
 
     def __str__(self) -> str:
         parts = [self.image, f"N = {self.n:,}", self.method.name]
+        parts += [f"reduced by {self.factor}"] if self.factor > 1 else []
         parts += [f"map: {self.source}"] if self.source != "given" else []
         return ", ".join(parts + ([f"seed {self.seed}"] if self.seed else []))
 

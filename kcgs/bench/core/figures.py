@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from .tables import db
 
 # a figure of the worst crops, their side in pixels, and how many
 CROPS, _CROP, _CROPS = "crops.png", 128, 3
+Crop = tuple[float, dict[str, Tensor]]
 # of a sheet as JPEG
 _SHEET_QUALITY = 65
 MARKERS = ("o", "s", "^", "D", "v", "P")
@@ -62,25 +64,34 @@ def plot_images(path: Path, *rows: Mapping[str, Tensor]) -> None:
 
 def plot_crops(path: Path, frames: Iterable[tuple[str, Mapping[str, Tensor]]]) -> None:
     """Show where the second image of a frame is furthest from its first, in three crops, at most two of a frame."""
-    found = []
+    found = list[Crop]()
     for name, images in frames:
         photo, ours = list(images.values())[:2]
-        size = min(_CROP, *photo.shape[1:])
-        step = size // 8
-        errors = avg_pool2d((ours - photo).square().mean(0)[None], size, step)[0]
-        for _ in range(2):
-            row, column = divmod(int(errors.argmax()), errors.shape[1])
-            y, x, error = row * step, column * step, float(errors[row, column])
-            # a copy: the frame can go
-            crops = {title: image[:, y : y + size, x : x + size].clone() for title, image in images.items()}
-            found += [(error, f"{name}, x = {x}, y = {y}", crops)] if error >= 0 else []
-            errors[max(0, row - 7) : row + 8, max(0, column - 7) : column + 8] = -1
-    rows = []
-    for _, name, crops in sorted(found, key=lambda crop: -crop[0])[:_CROPS]:
-        (_, photo), *others = crops.items()
-        rows.append({name: photo, **{f"{title}, {db(float(psnr(crop, photo)))} dB": crop for title, crop in others}})
+        found += cut_crops(name, images, (ours - photo).square().mean(0), 2)
+    rows = [row for _, row in sorted(found, key=lambda crop: -crop[0])[:_CROPS]]
     if rows:
         plot_images(path, *rows)
+
+
+def cut_crops(name: str, images: Mapping[str, Tensor], errors: Tensor, most: int) -> Iterator[Crop]:
+    """Yield the crops of highest mean error, of (H, W), apart from each other: that mean, and the images there.
+
+    The first image has the title `name` and the place, the others theirs and the PSNR to the first.
+    """
+    size = min(_CROP, *errors.shape)
+    step = size // 8
+    means = avg_pool2d(errors[None], size, step)[0]
+    for _ in range(most):
+        row, column = divmod(int(means.argmax()), means.shape[1])
+        y, x, error = row * step, column * step, float(means[row, column])
+        if math.isinf(error):
+            return
+        # a copy: the frame can go
+        crops = {title: image[:, y : y + size, x : x + size].clone() for title, image in images.items()}
+        (_, photo), *others = crops.items()
+        titled = {f"{title}, {db(float(psnr(crop, photo)))} dB": crop for title, crop in others}
+        yield error, {f"{name}, x = {x}, y = {y}": photo, **titled}
+        means[max(0, row - 7) : row + 8, max(0, column - 7) : column + 8] = -math.inf
 
 
 def save_sheet(path: Path, frames: Iterable[tuple[str, Mapping[str, Tensor]]]) -> None:

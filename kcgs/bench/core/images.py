@@ -8,13 +8,19 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from kcgs.data import Davis, chart_2x3, chart_pie, load_image
+from kcgs.functional.labels import largest_share
 from kcgs.segment import segment
 
 CHARTS = ("2x3", "pie")
 # stand in where there is no data
 QUICK = ("astronaut", "disc")
+FRAMES = (
+    *("blackswan", "dog", "train", "breakdance", "car-turn", "dance-jump", "mallard-water", "rollerblade"),
+    *("bmx-trees", "cows", "kite-surf", "paragliding-launch"),
+)
 PHOTOS = ("astronaut", "chelsea", "coffee", "rocket")
 
 
@@ -48,13 +54,28 @@ def sequences(data: Path | None, wanted: str | None, *, quick: bool) -> list[str
 
 
 @lru_cache(maxsize=4)
-def load(name: str, data: Path | None, stride: int = 1) -> Sample:
-    """Read a chart, a photo of scikit-image, BSDS (a number) or Kodak (kodimN), a disc, or a sequence's first frame."""
+def load(name: str, data: Path | None, stride: int = 1, factor: int = 1) -> Sample:
+    """Read a chart, a photo of scikit-image, BSDS (a number) or Kodak (kodimN), a disc, or a sequence's first frame.
+
+    One of `stride` pixels is taken a side; a `factor` reduces by area, whole blocks of the middle, labels by majority.
+    """
     image, labels = _read(name, data)
     if stride > 1:
         image = image[:, ::stride, ::stride].contiguous()
         labels = None if labels is None else labels[::stride, ::stride].contiguous()
+    if factor > 1:
+        image, labels = whole_blocks(Sample(image, labels), factor)
+        labels = None if labels is None else largest_share(labels[None], factor)[0]
+        image = avg_pool2d(image, factor)
     return Sample(image, labels)
+
+
+def whole_blocks(sample: Sample, factor: int) -> Sample:
+    """Cut the middle whose sides are multiples of a factor."""
+    starts = [(side % factor // 2, side // factor * factor) for side in sample.image.shape[1:]]
+    rows, columns = (slice(start, start + length) for start, length in starts)
+    labels = None if sample.labels is None else sample.labels[rows, columns].contiguous()
+    return Sample(sample.image[:, rows, columns].contiguous(), labels)
 
 
 def photo(name: str) -> Tensor:

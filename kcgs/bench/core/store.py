@@ -153,6 +153,7 @@ class Store:
     def _path(self, case: Case) -> Path:
         fields = [name for name in Row._fields if name not in eye.MEASURES]
         parts = [case.image, case.seed, case.stride, case.source, str(self.data), fields, case.settings()]
+        parts += [case.factor] if case.factor > 1 else []
         key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:20]
         return self.folder / f"{case.image}-{case.n}-{key}.json"
 

@@ -53,7 +53,7 @@ class TestStore:
         store, case = Store(tmp_path, None), Case("disc", 5, BEST)
         changes: list[dict[str, Any]] = [
             {"n": 6}, {"method": PAPER}, {"seed": 1}, {"stride": 2}, {"iterations": 9}, {"image": "pie"},
-            {"source": "slic"},
+            {"source": "slic"}, {"factor": 2},
         ]  # fmt: skip
         paths = {store._path(case._replace(**change)) for change in changes}
         assert len({store._path(case), Store(tmp_path, tmp_path)._path(case), *paths}) == 2 + len(changes)
