@@ -50,8 +50,8 @@ in the original. Pillow enlarges floats, its bicubic has a = -0.5. Gained is wha
 means of at least 0, better +0.2, and no image below -{MOST_LOSS}. *s* is the wall time from the scene, or the small
 photo, to the large image, *core s* the processor time of the fit and of finding its map, on one thread. In the figure
 solid lines are with the fit, dashed ones without."""
-_CROPS_TEXT = f"""The {_CROPS} images with the least gain in PSNR, then {_CROPS} next to the median, each where
-`{SCENE}` is furthest behind `{OWN}`, with the PSNR there."""
+_CROPS_TEXT = f"""The {_CROPS} images with the least gain in PSNR, where `{SCENE}` is furthest behind `{OWN}`; then
+{_CROPS} next to the median, where it is furthest from the original. The PSNR is that of the crop."""
 
 
 def report(output: Path, made: Made) -> list[str]:
@@ -80,7 +80,7 @@ def run(output: Path, options: Options) -> None:
         present, rounds = [(str(c), c) for c in wanted if store.row(c) is not None], 1 if options.quick else _ROUNDS
         measured = {case: compare(store, case, rounds) for case in with_progress(present)}
         write_rows(output / "results.csv", Row, [row for rows in measured.values() for row in rows])
-        crops = [crop for case in chosen(measured) for crop in _crop(store, case)]
+        crops = [crop for index, case in enumerate(chosen(measured)) for crop in _crop(store, case, index < _CROPS)]
         plot_images(output / CROPS, *crops) if crops else (output / CROPS).unlink(missing_ok=True)
         notes = [] if options.quick else missing(wanted)
         notes += [f"Stopped: {len(present)} of {len(wanted)} fits are there."] if len(present) < len(wanted) else []
@@ -171,12 +171,12 @@ def chosen(measured: Mapping[Case, Sequence[Row]]) -> list[Case]:
     return list(found.values())
 
 
-def _crop(store: Store, case: Case) -> list[dict[str, Tensor]]:
+def _crop(store: Store, case: Case, is_worst: bool) -> list[dict[str, Tensor]]:
     (image, _), steps = views(store, case)
     shown = {"original": image, **{name: steps[name]() for name in (SCENE, OWN, PHOTO)}}
-    behind = (shown[SCENE] - image).square() - (shown[OWN] - image).square()
-    name = f"{case.image}, {case.factor}x, N = {case.n:,}"
-    return [row for _, row in cut_crops(name, shown, behind.mean(0), 1)]
+    scene, own = ((shown[name] - image).square().mean(0) for name in (SCENE, OWN))
+    name = f"{case.image}, {case.factor}x\nN = {case.n:,}"  # titles are no wider than crops
+    return [row for _, row in cut_crops(name, shown, scene - own if is_worst else scene, 1)]
 
 
 @lru_cache(maxsize=4)
