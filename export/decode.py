@@ -133,9 +133,22 @@ def run(decoder: Decoder, feeds: Mapping[str, Array], size: tuple[int, int]) -> 
         image: Array = decoder.session.run(["image"], dict(feeds))[0]
     except Exception as error:  # as above
         raise DecodeError(f"{decoder.path} failed at {size[1]}x{size[0]}: {_short(error, 300)}") from error
-    if image.ndim != 4 or image.shape[0] != 1 or image.shape[2:] != size:
-        raise DecodeError(f"{decoder.path} must give an image of shape (1, C, {size[0]}, {size[1]}); got {image.shape}")
-    return np.asarray(image[0])
+    height, width = feeds["labels"].shape if "labels" in feeds else size
+    if image.ndim != 4 or image.shape[0] != 1 or image.shape[2:] != (height, width):
+        raise DecodeError(f"{decoder.path} must give an image of shape (1, C, {height}, {width}); got {image.shape}")
+    return shrink(np.asarray(image[0]), size)
+
+
+def shrink(image: Array, size: tuple[int, int]) -> Array:
+    """Reduce an image (C, H, W): each pixel is the mean over its share of the height and width."""
+    down, across = (_shares(old, new) for old, new in zip(image.shape[1:], size, strict=True))
+    return image if image.shape[1:] == size else np.asarray(down @ image @ across.T)
+
+
+def _shares(old: int, new: int) -> Array:
+    begin, line = np.arange(new)[:, None] * old, np.arange(old) * new
+    overlap = np.minimum(begin + old, line + new) - np.maximum(begin, line)
+    return (overlap.clip(0) / old).astype(np.float32)
 
 
 def scene_feeds(decoder: Decoder, args: argparse.Namespace) -> tuple[dict[str, Array], tuple[int, int]]:
@@ -158,17 +171,21 @@ def scene_feeds(decoder: Decoder, args: argparse.Namespace) -> tuple[dict[str, A
 
 
 def generic_feeds(scene: Scene, args: argparse.Namespace) -> tuple[dict[str, Array], tuple[int, int]]:
-    """Inputs of a generic decoder, and the image's size."""
+    """Inputs of a generic decoder, and the image's size, which may be smaller than that of the labels."""
     size = target_size(args, scene.size)
     left, top, right, bottom = args.view or (0.0, 0.0, float(scene.size[1]), float(scene.size[0]))
-    down, across = size[0] / (bottom - top), size[1] / (right - left)
+    # of a smaller image pixels no larger than the scene's are rendered first
+    finer = max(size[0], math.ceil(bottom - top)), max(size[1], math.ceil(right - left))
     labels = scene.labels
     if labels is None:
-        labels = np.zeros(size, np.int64)
-    elif args.view or labels.shape != size:
-        if labels.shape != scene.size:
-            raise DecodeError(f"{args.scene}: labels must have the size {scene.size} of the scene; got {labels.shape}")
-        labels = sample_labels(labels, size, args.view)
+        labels = np.zeros(finer, np.int64)
+    elif labels.shape == size != scene.size and not args.view:
+        finer = size
+    elif labels.shape != scene.size:
+        raise DecodeError(f"{args.scene}: labels must have the size {scene.size} of the scene; got {labels.shape}")
+    elif args.view or labels.shape != finer:
+        labels = sample_labels(labels, finer, args.view)
+    down, across = finer[0] / (bottom - top), finer[1] / (right - left)
     keep = _chosen(scene.region_ids, np.zeros(1, np.int64) if scene.labels is None else scene.labels, args.region)
     # in the scene's own precision, as kcgs scales it
     dtype = scene.means.dtype.type

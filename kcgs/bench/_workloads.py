@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcgs.functional import RegionMap, lookup_regions, scale_rotation_to_cholesky
 from kcgs.nn import GaussianField
+from kcgs.nn.field import scaled
 from kcgs.scene import Scene, load
 from kcgs.zoo import find
 
@@ -63,10 +64,7 @@ def target_size(scene: Scene, size: str) -> tuple[int, int]:
 def resized(scene: Scene, size: tuple[int, int]) -> Scene:
     """Scale the Gaussians and sample the map anew: once, for all images of that size."""
     field, regions = scene.field, scene.regions
-    down, across = size[0] / field.size[0], size[1] / field.size[1]
-    means, cholesky, colors = (t.detach() for t in (field.means, field.cholesky, field.merged_colors()))
-    means = means * means.new_tensor([across, down])
-    cholesky = cholesky * cholesky.new_tensor([across, down, down])
+    means, cholesky, colors = (t.detach() for t in (*scaled(field, size), field.merged_colors()))
     region_ids = None if regions is None else field.region_ids
     placed = GaussianField(means, cholesky, colors, region_ids, size=size)
     return Scene(placed, None if regions is None else regions.resize(size))

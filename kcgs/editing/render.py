@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_image, check_size
+from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField, RegionSplatRenderer
+from kcgs.nn.renderer import area_mean, rendered_size
 from kcgs.scene import Scene
 
 from .checks import check_field, check_scene, ids_of
@@ -43,18 +45,22 @@ def render_region(
     """
     target = check_field(scene).size if size is None else check_size("size", size)
     regions, chosen = check_scene(scene, region_ids, target)
-    regions = regions.resize(target)
+    finer = _rendered_size(scene, regions, target)
+    regions = regions.resize(finer)
     weights = {region: regions.weights(region) for region in chosen.tolist()}
     total = torch.stack([*weights.values()]).sum(0)
     alpha = total.clamp_max(1.0).to(scene.field.colors.dtype)
-    colors = scene.field.colors.new_zeros(scene.field.colors.shape[-1], *target)
+    colors = scene.field.colors.new_zeros(scene.field.colors.shape[-1], *finer)
     for region, weight in weights.items():
         # rendered alone and not confined, which is the colour itself: nothing is divided by a small alpha
         members = _part(scene.field, ids_of(scene.field) == region)
         members.region_ids = None
-        alone = RegionSplatRenderer()(members, None, target)
+        alone = RegionSplatRenderer()(members, None, finer)
         share = (weight / torch.where(total > 0, total, 1.0)).to(alone.dtype)
         colors = colors + torch.where(alpha > 0, alone * share, 0.0)
+    if finer != target:
+        colors, alpha = area_mean(colors * alpha, target), area_mean(alpha, target)
+        colors = torch.where(alpha > 0, colors / torch.where(alpha > 0, alpha, 1.0), 0.0)
     return torch.cat([colors.clamp(0.0, 1.0) if clamp else colors, alpha[None]])
 
 
@@ -89,8 +95,15 @@ def render_over(scene: Scene, region_ids: int | Iterable[int], image: Tensor) ->
     regions, gone = check_scene(scene, region_ids, target)
     stays = _part(scene.field, ~torch.isin(ids_of(scene.field), gone))
     rendered: Tensor = RegionSplatRenderer()(stays, regions, target)
-    share = regions.resize(target).weights(gone.tolist()).clamp_max(1.0).to(rendered.dtype)
+    finer = _rendered_size(scene, regions, target)
+    share = regions.resize(finer).weights(gone.tolist()).clamp_max(1.0).to(rendered.dtype)
+    share = area_mean(share, target)
     return rendered + share * image.to(rendered)
+
+
+def _rendered_size(scene: Scene, regions: RegionMap, target: tuple[int, int]) -> tuple[int, int]:
+    """Return the size of the image that the renderer shrinks to `target`."""
+    return rendered_size(scene.size, target) if regions.size == scene.size else target
 
 
 def _part(field: GaussianField, mask: Tensor) -> GaussianField:

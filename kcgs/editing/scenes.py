@@ -13,7 +13,7 @@ from kcgs.fit.fill import fill_hole
 from kcgs.fit.inpaint import grow
 from kcgs.functional import PairWidths, RegionMap, touching_pairs
 from kcgs.nn import GaussianField
-from kcgs.nn.field import join
+from kcgs.nn.field import join, scaled
 from kcgs.scene import Scene
 
 from .checks import (
@@ -220,14 +220,10 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
         fine = RegionMap.from_labels(background.regions.fine_labels).resize((inside.shape[0], inside.shape[1]))
         behind, ids = fine.labels.to(behind.device) + first, other.region_ids.to(behind.device) + first
     labels = torch.where(inside, behind, regions.fine_labels)
-    down, across = (new / old for new, old in zip(scene.size, other.size, strict=True))
+    stretched = *scaled(other, scene.size), other.merged_colors()
     stays = field.subset(~torch.isin(ids_of(field), chosen))
-    stretched = [
-        (stays.means, other.means.detach() * other.means.new_tensor([across, down])),
-        (stays.cholesky, other.cholesky.detach() * other.cholesky.new_tensor([across, down, down])),
-        (stays.merged_colors(), other.merged_colors().detach()),
-    ]
-    means, cholesky, colors = (torch.cat([ours.detach(), theirs.to(ours)]) for ours, theirs in stretched)
+    ours = stays.means, stays.cholesky, stays.merged_colors()
+    means, cholesky, colors = (torch.cat([a, b.to(a)]).detach() for a, b in zip(ours, stretched, strict=True))
     both = torch.cat([ids_of(stays), ids])
     joined = GaussianField(means, cholesky, colors, both, size=scene.size).subset(torch.isin(both, labels))
     return Scene(joined, regions.relabel(labels, "mean"), scene.metadata)

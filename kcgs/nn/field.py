@@ -236,6 +236,19 @@ class GaussianField(nn.Module):
         return f"{images}{len(self)} Gaussians, {self.colors.shape[-1]} channels, size={self.size}, {confined}"
 
 
+def scaled(field: GaussianField, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Return means and Cholesky factors as they are on an image of another size, with the graph."""
+    means, cholesky = field.means, field.cholesky
+    if size == field.size:
+        return means, cholesky
+    if not torch.compiler.is_compiling():
+        factors = torch.tensor([size[1] / field.size[1], size[0] / field.size[0]], dtype=torch.float64)
+    else:  # a graph of any size takes its sides as tensors only
+        factors = torch.stack([torch.full((), size[k], dtype=torch.float64) / field.size[k] for k in (1, 0)])
+    factors = factors.to(means)
+    return means * factors, cholesky * factors[[0, 1, 1]]
+
+
 def join(first: GaussianField, second: GaussianField) -> GaussianField:
     """Put two fields of one image, both with region ids or neither, into one without the graph; no opacity is 1."""
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor, nn
 
 from kcgs._check import check_cutoff, check_size
 from kcgs.functional import RegionMap
 from kcgs.functional.splat import as_map, map_size, splat_at
 
-from .field import GaussianField
+from .field import GaussianField, scaled
 
 
 class SceneLike(Protocol):
@@ -24,7 +25,7 @@ class RegionSplatRenderer(nn.Module):
     r"""Render a field, at its own size or any other.
 
     Convention: at another size the Gaussians are scaled and the label map is sampled again, so that contours stay
-    sharp. The module holds no state.
+    sharp. A smaller image is the area mean of the one at the field's size. The module holds no state.
 
     Args:
         cutoff: weights below it are skipped, in [0, 1); see :func:`kcgs.functional.region_splat`.
@@ -79,11 +80,7 @@ class RegionSplatRenderer(nn.Module):
                 raise TypeError(f"field must be a GaussianField or a Scene; got {type(field).__name__}")
             field, regions = inner, scene.regions if regions is None else regions
         target = field.size if size is None else check_size("size", size)
-        means, cholesky, ids = field.means, field.cholesky, field.region_ids
-        if target != field.size:
-            down, across = target[0] / field.size[0], target[1] / field.size[1]
-            means = means * means.new_tensor([across, down])
-            cholesky = cholesky * cholesky.new_tensor([across, down, down])
+        ids, finer = field.region_ids, rendered_size(field.size, target)
         if regions is not None:
             if ids is None:
                 raise ValueError(
@@ -93,14 +90,18 @@ class RegionSplatRenderer(nn.Module):
             found = map_size(regions)
             if found not in (target, field.size):
                 raise ValueError(f"regions must have the size {field.size} of the field or {target}; got {found}")
+            if found != field.size:  # it does not say what there is between its pixels
+                finer = target
         elif ids is not None:
             raise ValueError(
                 "regions must be given for a field that is confined to regions; got None: pass its label map or its "
                 "Scene, or set field.region_ids to None to render it without contours"
             )
+        means, cholesky = scaled(field, finer)
         image = splat_at(
-            target, means, cholesky, field.merged_colors(), ids, regions, cutoff=self.cutoff, backend=self.backend
+            finer, means, cholesky, field.merged_colors(), ids, regions, cutoff=self.cutoff, backend=self.backend
         )
+        image = area_mean(image, target)
         if not self.keepdim and image.ndim == 3:
             image = image[None]
         return image.clamp(0.0, 1.0) if self.clamp else image
@@ -118,3 +119,42 @@ class RegionSplatRenderer(nn.Module):
     def extra_repr(self) -> str:
         """Show the settings."""
         return f"cutoff={self.cutoff:g}, clamp={self.clamp}, backend={self.backend!r}, keepdim={self.keepdim}"
+
+
+def rendered_size(own: tuple[int, int], size: tuple[int, int]) -> tuple[int, int]:
+    """Return the size at which a field of size `own` is rendered for an image of `size`: neither side below its own."""
+    return torch.sym_max(own[0], size[0]), torch.sym_max(own[1], size[1])
+
+
+def area_mean(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """Shrink an image, (..., H, W): each pixel is the mean over its share of the height and width, fractions included.
+
+    Example:
+        >>> area_mean(torch.tensor([[0.0, 3.0, 6.0]]), (1, 2))
+        tensor([[1., 5.]])
+    """
+    rows = _shrink(image, -2, size[0])
+    return _shrink(rows, -1, size[1])
+
+
+def _shrink(image: Tensor, dim: int, size: int) -> Tensor:
+    from torch.fx.experimental.symbolic_shapes import statically_known_true
+
+    length = image.shape[dim]
+    if statically_known_true(size == length):
+        return image
+    begin = torch.arange(size, device=image.device) * length  # in units of 1 / (size * length) of the whole
+
+    def share(line: Tensor) -> Tensor:
+        ends = torch.minimum(begin + length, (line + 1) * size) - torch.maximum(begin, line * size)
+        return (ends.clamp_min(0) / length).to(image.dtype)
+
+    if not torch.compiler.is_compiling():  # many times as fast as a matrix, which a graph of any size takes
+        total = torch.zeros_like(image.narrow(dim, 0, size))
+        for step in range(-(-length // size) + 1):
+            line = begin // size + step
+            taken = image.index_select(dim, line.clamp_max(length - 1))
+            total = total + taken * (share(line) if dim == -1 else share(line)[:, None])
+        return total
+    matrix = share(torch.arange(length, device=image.device)[:, None])  # (length, size)
+    return image @ matrix if dim == -1 else matrix.T @ image

@@ -23,17 +23,19 @@ class Axis:
     `TILE` pixels, with some pixels to spare at the ends of runs. Places are integers over a common denominator: pixel i
     is at (2 n start + (2 i + 1) (end - start)) / 2 n, so that a contour's pixels fall on the same side everywhere, and
     not all runtimes have float64. `size`, int64 (1,), counts the pixels of the output, `length` those of the scene;
-    `ends`, float32 (1,) each, bound the part of the scene that fills the output.
+    `ends`, float32 (1,) each, bound the part of the scene that fills the output. Where its pixels are
+    larger than those of the scene, the image is first rendered with as many as the scene has there, `size`.
     """
 
     def __init__(self, graph: Graph, size: Value, length: int, ends: tuple[Value, Value] | None = None) -> None:
         g = self.g = graph
-        self.size, self.length, self.tiles = size, length, -(-length // TILE)
+        self.output, self.length, self.tiles = size, length, -(-length // TILE)
         if ends is None:
             start, extent = g.constant([0]), g.constant([length * _PARTS])
         else:
             start, end = (g("Cast", g("Mul", bound, np.float32(_PARTS)), to=INT64) for bound in ends)
             extent = g("Sub", end, start)
+        size = self.size = g("Max", size, g("Div", g("Add", extent, _PARTS - 1), _PARTS))
         self.extent, self.parts = extent, g("Mul", size, 2 * _PARTS)  # of the scene; of a pixel of it
         self.step = g("Div", g("Cast", extent, to=FLOAT), g("Cast", g("Mul", size, _PARTS), to=FLOAT))
         places = g("Range", np.int64(0), g("Squeeze", size), np.int64(1))
@@ -119,3 +121,17 @@ class Axis:
         far, near = (g("Relu", g("Sub", np.float32(reach), distance)) for reach in (2, 1))
         far, near = (g("Mul", g("Mul", part, part), part) for part in (far, near))
         return g("Sub", g("Mul", far, np.float32(1 / 6)), g("Mul", near, np.float32(2 / 3)))
+
+    def shrink(self, g: Graph, image: Value, axis: int) -> Value:
+        """Reduce `size` pixels to those of the output: each is the mean over its share of the length."""
+        begin = g("Mul", g("Range", np.int64(0), g("Squeeze", self.output), np.int64(1)), self.size)
+        begin = g("Unsqueeze", begin, g.constant([1]))
+        most = g("Add", g("Div", g("Add", self.size, g("Sub", self.output, 1)), self.output), 1)
+        lines = g("Add", g("Div", begin, self.output), g("Range", np.int64(0), g("Squeeze", most), np.int64(1)))
+        ends = g("Min", g("Add", begin, self.size), g("Mul", g("Add", lines, 1), self.output))
+        shares = g("Sub", ends, g("Max", begin, g("Mul", lines, self.output)))
+        shares = g("Div", g("Cast", g("Max", shares, 0), to=FLOAT), g("Cast", self.size, to=FLOAT))
+        if axis == 2:
+            shares = g("Unsqueeze", shares, g.constant([2]))
+        taken = g("Gather", image, g("Min", lines, g("Sub", self.size, 1)), axis=axis)
+        return g("ReduceSum", g("Mul", taken, shares), g.constant([axis + 1]), keepdims=0)

@@ -99,6 +99,12 @@ class _Plan(NamedTuple):
             windows = Windows(g, self.layout.tiles, self.layout.groups, down, across, regions)
         planes = None if self.layout.nodes is None else Planes(g, stored, self.layout.nodes, down, across, self.cutoff)
         image = blocks.render(windows, planes)
+        branches = {
+            "then_branch": g.body(lambda inner: [across.shrink(inner, down.shrink(inner, image, 2), 3)], "smaller"),
+            "else_branch": g.body(lambda inner: [inner("Identity", image)], "as_it_is"),
+        }
+        smaller = g("Or", *(g("Less", axis.output, axis.size) for axis in (down, across)))
+        image = g("If", smaller, **branches)
         if self.clamp:
             image = g("Clip", image, np.float32(0), np.float32(1))
         shape = [1, stored.channels, "height", "width"]

@@ -237,6 +237,22 @@ class TestRegionSplatRenderer(BaseTester):
         wide = RegionSplatRenderer(cutoff=0)(field, None, (24, 108))
         torch.testing.assert_close(wide[:, :, 1::3], RegionSplatRenderer(cutoff=0)(field), rtol=1e-4, atol=1e-5)
 
+    @pytest.mark.parametrize("size", [(12, 18), (7, 36), (24, 11), (1, 1), (30, 11), (23, 35)])
+    @pytest.mark.parametrize("softness", [None, 0.0, 0.8])
+    def test_a_smaller_image_is_the_area_mean(
+        self, field: GaussianField, labels: Tensor, size: tuple[int, int], softness: float | None
+    ) -> None:
+        """Means over shares, fractions included: of pixels that are repeated until shares are whole."""
+        if softness is None:
+            field.region_ids = None
+        scene = Scene(field, None if softness is None else RegionMap.from_labels(labels, softness))
+        rendered = (max(SIZE[0], size[0]), max(SIZE[1], size[1]))
+        image = RegionSplatRenderer()(scene, size=rendered).double()
+        for dim, side in ((1, size[0]), (2, size[1])):
+            parts = image.repeat_interleave(side, dim).unflatten(dim, (side, -1))
+            image = parts.mean(dim + 1)
+        torch.testing.assert_close(scene(size), image.float(), rtol=1e-5, atol=1e-6)
+
     def test_regions_of_the_target_size(self, field: GaussianField, labels: Tensor) -> None:
         fine = labels.repeat_interleave(2, 0).repeat_interleave(2, 1)
         assert RegionSplatRenderer()(field, fine, (48, 72)).shape == (3, 48, 72)
@@ -265,7 +281,7 @@ class TestRegionSplatRenderer(BaseTester):
         dot = torch.zeros(SIZE, dtype=torch.long)
         dot[5, 5] = 1
         field.region_ids = torch.ones(len(field), dtype=torch.long)
-        assert RegionSplatRenderer()(field, dot, (2, 3)).eq(0).all()
+        assert RegionSplatRenderer()(field, RegionMap.from_labels(dot).resize((2, 3)), (2, 3)).eq(0).all()
         assert RegionSplatRenderer()(GaussianField.random(0, SIZE, regions=dot), dot).eq(0).all()
 
 
