@@ -16,6 +16,7 @@ from kcgs._atomic import atomic_path
 from kcgs._check import check_memory, check_size
 from kcgs._repr import png, shorten
 from kcgs.functional import RegionMap
+from kcgs.functional.softness import CONTOURS, check_contours
 from kcgs.nn import GaussianField, RegionSplatRenderer
 
 FORMATS = {".safetensors": "kcgs.storage", ".kcgs": "kcgs.codec"}
@@ -26,7 +27,8 @@ _IMAGE_BYTES, _MAP_BYTES = 12, 42
 # pixels of the longer side in a notebook
 _SHOWN_SIDE = 1024
 
-_render = RegionSplatRenderer()  # without a state: one for all
+# without a state: for all scenes
+_renderers = {contours: RegionSplatRenderer(contours=contours) for contours in CONTOURS}
 
 
 class Scene(nn.Module):
@@ -73,29 +75,31 @@ class Scene(nn.Module):
         """Number of Gaussians per image."""
         return len(self.field)
 
-    def forward(self, size: tuple[int, int] | None = None) -> Tensor:
+    def forward(self, size: tuple[int, int] | None = None, contours: str = "scaled") -> Tensor:
         """Render, differentiably and not clipped; other settings: :class:`kcgs.RegionSplatRenderer`.
 
         Args:
-            size: (height, width); None: the scene's own. Contours stay sharp at every size.
+            size: (height, width); None: the scene's own.
+            contours: "scaled", as wide as they were fitted, and wider in a larger image; "crisp", about one pixel at
+                any size.
 
         Returns:
             Image, :math:`(C, H, W)`, or :math:`(B, C, H, W)` for a batch.
 
         Raises:
-            TypeError, ValueError: as :func:`kcgs.functional.region_splat`; a map without region ids.
+            TypeError, ValueError: as :func:`kcgs.functional.region_splat`; a map without region ids; other contours.
         """
-        image: Tensor = _render(self.field, self.regions, size)
+        image: Tensor = _renderers[check_contours(contours)](self.field, self.regions, size)
         return image
 
-    def render(self, size: tuple[int, int] | None = None) -> Tensor:
+    def render(self, size: tuple[int, int] | None = None, contours: str = "scaled") -> Tensor:
         """Render what one shows or saves: as :meth:`forward`, but clipped to [0, 1] and without a graph.
 
         On the CPU, ValueError says how much memory a size needs that is more than is free.
         """
         self.check_size("size", size)
         with torch.no_grad():
-            image: Tensor = self(size)
+            image: Tensor = self(size, contours)
             return image.clamp(0.0, 1.0)
 
     def check_size(self, name: str, size: tuple[int, int] | None) -> None:

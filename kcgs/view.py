@@ -73,6 +73,7 @@ def serve(
     *,
     name: str = "scene",
     original: Path | None = None,
+    contours: str = "scaled",
     port: int = 0,
     browser: bool = True,
     say: Callable[[str], object] = print,
@@ -80,9 +81,9 @@ def serve(
 ) -> None:
     """Export a scene to a temporary folder and serve the viewer on loopback until Ctrl-C.
 
-    `name` is the scene's title on the page, `original` an image file to compare with; port 0 is any that is free;
-    `browser` opens a window, `say` takes the line that says where the page is. `page` is the folder of the built page;
-    None: the package's own.
+    `name` is the scene's title on the page, `original` an image file to compare with, `contours` scaled or crisp; port
+    0 is any that is free; `browser` opens a window, `say` takes the line that says where the page is. `page` is the
+    folder of the built page; None: the package's own.
     """
     page = _PAGE if page is None else page
     if not (page / "index.html").is_file():
@@ -93,7 +94,7 @@ def serve(
     if original is not None and not original.is_file():
         raise FileNotFoundError(f"--original must be an image file; {original} is not there")
     with tempfile.TemporaryDirectory() as folder:
-        model = scene_decoder(scene, interactive=True)
+        model = scene_decoder(scene, interactive=True, contours=contours)
         write_model(model, Path(folder) / "decoder.onnx")
         query = {"decoder": "scene/decoder.onnx", "name": name}
         if original is not None:

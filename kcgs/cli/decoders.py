@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from .common import Json, SceneFile, app, check_output, print_report
-from .options import EngineName
+from .options import Contours, EngineName
 
 
 @app.command()
@@ -31,6 +31,7 @@ def export(
     hard_contours: Annotated[
         bool, typer.Option("--hard-contours", help="Give each pixel to its label alone, whatever the contours' widths.")
     ] = False,
+    contours: Contours = "scaled",
     as_json: Json = False,
 ) -> None:
     """Write a scene's decoder as ONNX: it needs no torch and no kcgs."""
@@ -42,15 +43,17 @@ def export(
     if hard_contours and loaded.regions is not None:
         loaded = Scene(loaded.field, loaded.regions.labels, loaded.metadata)
     if kind == "generic":
-        if interactive or precision == "fp16":
-            raise typer.BadParameter("--interactive and --precision are for --kind scene")
+        if interactive or precision == "fp16" or contours == "crisp":
+            raise typer.BadParameter("--interactive, --precision and --contours are for --kind scene")
         regions = loaded.regions
         if regions is not None and regions.num_regions > 1 and (regions.softness != 0.0 or regions.supersample > 1):
             why = "a generic decoder renders hard contours, and this scene's are soft or finer"
             raise ValueError(f"--kind must be scene, or come with --hard-contours: {why}")
         model = generic_decoder(cutoff=cutoff, clamp=clamp)
     else:
-        model = scene_decoder(loaded, cutoff=cutoff, clamp=clamp, precision=precision, interactive=interactive)
+        model = scene_decoder(
+            loaded, cutoff=cutoff, clamp=clamp, precision=precision, interactive=interactive, contours=contours
+        )
     report = {**describe_decoder(model), "bytes": write_model(model, output)}
     if not as_json:
         left_out = report["left_out"]
@@ -64,6 +67,7 @@ def export(
 def view(
     scene: SceneFile,
     original: Annotated[Path | None, typer.Option(help="Image to compare with.")] = None,
+    contours: Contours = "scaled",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 0,
     browser: Annotated[bool, typer.Option(help="Open a browser window.")] = True,
 ) -> None:
@@ -71,7 +75,8 @@ def view(
     from kcgs import load
     from kcgs.view import serve
 
-    serve(load(scene), name=scene.stem, original=original, port=port, browser=browser, say=typer.echo)
+    name = scene.stem
+    serve(load(scene), name=name, original=original, contours=contours, port=port, browser=browser, say=typer.echo)
 
 
 @app.command()

@@ -24,6 +24,10 @@ EngineName = Annotated[
     Engine, typer.Option(help="local: processes of this machine; ray: the cluster at RAY_ADDRESS, or one started here.")
 ]
 Scale = Annotated[float | None, typer.Option(help="Magnification.")]
+Contours = Annotated[
+    Literal["scaled", "crisp"],
+    typer.Option(help="Width of contours: scaled with the image, or crisp, about a pixel of the image."),
+]
 Size = Annotated[str | None, typer.Option(metavar="WxH", help="Width and height in pixels.")]
 
 

@@ -13,7 +13,7 @@ from kcgs._progress import Progress
 
 from .common import OUTPUT_IMAGES, ImageFile, Json, Quiet, SceneFile, app, check_output, print_report
 from .fit import describe_size, measure_scene
-from .options import Scale, Size, exclude, target_size
+from .options import Contours, Scale, Size, exclude, target_size
 
 OutputImage = Annotated[Path, typer.Option("-o", "--output", help="Image file to write.")]
 
@@ -24,6 +24,7 @@ def render(
     output: OutputImage,
     scale: Scale = None,
     size: Size = None,
+    contours: Contours = "scaled",
     region: Annotated[int | None, typer.Option(help="Render only this region; the rest is black.")] = None,
 ) -> None:
     """Render a scene at any size."""
@@ -39,7 +40,7 @@ def render(
         if loaded.regions is None or loaded.field.region_ids is None:
             raise ValueError(f"--region must not be given: {scene} has no regions")
         loaded = extract_region(loaded, region)
-    save_image(output, loaded.render(target))
+    save_image(output, loaded.render(target, contours))
 
 
 @app.command("eval")
@@ -151,6 +152,7 @@ def decode(
     num_bytes: Annotated[int | None, typer.Option("--bytes", min=1, help="Read only the first bytes.")] = None,
     scale: Scale = None,
     size: Size = None,
+    contours: Contours = "scaled",
 ) -> None:
     """Render a compressed file, or the coarser image that its first bytes hold."""
     from kcgs import codec
@@ -165,4 +167,4 @@ def decode(
     if decoded.layers < decoded.num_layers:
         part = f"{decoded.layers} of {decoded.num_layers} layers, {len(scene)} Gaussians"
         typer.echo(f"{file}: a coarser image, {part}", err=True)
-    save_image(output, scene.render(target_size(scene, scale, size)))
+    save_image(output, scene.render(target_size(scene, scale, size), contours))

@@ -15,6 +15,7 @@ from kcgs.kernels.whitened import least_exponent, support_radius
 
 from .arguments import Arguments
 from .map_windows import MapWindows
+from .softness import is_crisp
 
 _SIDE = 32  # of a tile, in pixels
 _CHUNK = 64  # Gaussians evaluated at once
@@ -27,6 +28,10 @@ _SLACK = 1.001
 def decompose(*arguments: Any) -> Tensor:
     """Render as `kcgs::region_splat` does, whose arguments these are; to be traced, and slow in eager mode."""
     given = Arguments(*arguments)
+    if is_crisp(given.widths):
+        raise ValueError(
+            "contours must be scaled in graphs of torch.onnx.export; got crisp: kcgs.onnx.scene_decoder has both"
+        )
     if given.means.ndim == 2:
         return decompose(*(None if t is None else t[None] for t in given[:4]), *given[4:]).squeeze(0)
     # a graph that renders only: loops cannot all be differentiated

@@ -11,6 +11,8 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from kcgs.kernels import Membership
 
+from .softness import is_crisp
+
 
 class MapTables(NamedTuple):
     """The ids of a map, where each is among them, and what the kernels evaluate."""
@@ -51,14 +53,16 @@ def keep_tables(
 ) -> None:
     """Keep the tables of a map at a size, and of few others; `widths` as the operator has them."""
     sizes = _kept.setdefault(labels, {})
-    sizes[supersample, *size] = _Kept(labels.clone() if labels.is_inference() else _version(labels), widths, tables)
+    sizes[supersample, *size, is_crisp(widths)] = _Kept(
+        labels.clone() if labels.is_inference() else _version(labels), widths, tables
+    )
     if len(sizes) > _MOST_SIZES:
         sizes.pop(list(sizes)[1], None)  # not the first, the map's own; another thread may have been before
 
 
 def find_tables(labels: Tensor, widths: Tensor | None, supersample: int, size: tuple[int, int]) -> MapTables | None:
     """Return the tables of a map at a size, unless there are none, or the labels were written to since."""
-    kept: _Kept | None = _kept.get(labels, {}).get((supersample, *size))
+    kept: _Kept | None = _kept.get(labels, {}).get((supersample, *size, is_crisp(widths)))
     if kept is None or not (
         torch.equal(kept.version, labels) if labels.is_inference() else kept.version == _version(labels)
     ):

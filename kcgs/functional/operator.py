@@ -19,7 +19,7 @@ from kcgs.kernels import OutOfRangeError, SplatInputs, Steps, resolve, with_auto
 from .arguments import Arguments, KeptPlan, plans
 from .map_tables import MapTables, find_index, find_tables, keep_tables
 from .regions import RegionMap
-from .softness import softness_of
+from .softness import is_crisp, softness_of
 from .values import check_id_values, check_values
 
 _ARGUMENTS = (
@@ -129,7 +129,8 @@ def _tables(labels: Tensor, widths: Tensor | None, supersample: int, size: tuple
     found = find_tables(labels, widths, supersample, size)
     if found is None:
         check_labels("regions", labels)
-        regions = RegionMap.from_labels(labels, softness_of(widths), supersample=supersample).resize(size)
+        softness, contours = (0.0, "crisp") if is_crisp(widths) else (softness_of(widths), "scaled")
+        regions = RegionMap.from_labels(labels, softness, supersample=supersample).resize(size, contours)
         found = regions.tables
         keep_tables(labels, widths, supersample, size, found)
     return found

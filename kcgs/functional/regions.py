@@ -13,11 +13,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_count, check_labels, check_size
-from kcgs.kernels import Membership, Resampled
+from kcgs.kernels import Crisp, Membership, Resampled
 
 from .labels import compact, largest_share, sample_labels, touching_pairs
 from .map_tables import MapTables, keep_tables
-from .softness import PairWidths, check_softness, merged_widths, scaled_widths, widths_of
+from .softness import (
+    CRISP_WIDTH,
+    PairWidths,
+    check_contours,
+    check_softness,
+    crisp_widths,
+    is_crisp,
+    merged_widths,
+    scaled_widths,
+    widths_of,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +60,7 @@ class RegionMap:
     def __post_init__(self) -> None:
         """Keep the tables where the operator finds them."""
         given = self.given
-        keep_tables(given.fine_labels, given.widths, given.supersample, self.size, self.tables)
+        keep_tables(given.fine_labels, self.widths, given.supersample, self.size, self.tables)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Keep the tables of a copy where the operator finds them, too."""
@@ -147,7 +157,7 @@ class RegionMap:
 
     @property
     def resized(self) -> bool:
-        """Whether these are memberships of another map's pixels, interpolated."""
+        """Whether these are memberships of another map's pixels, interpolated, or made crisp."""
         return self._origin is not None
 
     def index_of(self, region_ids: Tensor) -> Tensor:
@@ -275,7 +285,7 @@ class RegionMap:
         if self.labels.ndim == 2:
             return (self,)
         if self._origin is not None:
-            return tuple(one.resize(self.size) for one in self._origin.unbind())
+            return tuple(one.resize(self.size, self.contours) for one in self._origin.unbind())
         return tuple(self._with_labels(labels, self.softness) for labels in self.fine_labels)
 
     def _with_labels(self, labels: Tensor, widths: float | Mapping[tuple[int, int], float]) -> RegionMap:
@@ -288,7 +298,7 @@ class RegionMap:
     def state(self) -> dict[str, Any]:
         """Return what :meth:`from_state` makes the same map of: tensors, numbers, tuples and None only."""
         if self._origin is not None:
-            return {**self._origin.state(), "size": self.size}
+            return {**self._origin.state(), "size": self.size, "contours": self.contours}
         widths = self.softness if isinstance(self.softness, float) else tuple(self.softness.items())
         return {"labels": self.fine_labels, "softness": widths, "supersample": self.supersample, "size": self.size}
 
@@ -297,9 +307,15 @@ class RegionMap:
         """Make the map that :meth:`state` describes."""
         widths = state["softness"]
         softness = widths if isinstance(widths, float) else {tuple(pair): width for pair, width in widths}
-        return cls.from_labels(state["labels"], softness, supersample=state["supersample"]).resize(state["size"])
+        given = cls.from_labels(state["labels"], softness, supersample=state["supersample"])
+        return given.resize(state["size"], state.get("contours", "scaled"))
 
-    def resize(self, size: tuple[int, int]) -> RegionMap:
+    @property
+    def contours(self) -> str:
+        """How contours were resized: "scaled" or "crisp"."""
+        return "crisp" if is_crisp(self.widths) else "scaled"
+
+    def resize(self, size: tuple[int, int], contours: str = "scaled") -> RegionMap:
         """Sample the map at another resolution; contours are smoothed, not stepped.
 
         Hard contours stay hard: between pixel centres a point has the label with the largest share among its four
@@ -313,30 +329,47 @@ class RegionMap:
 
         The same size gives the same map, also from one that was resized before.
 
+        Crisp contours are about one pixel wide at any size, the map's own too, whatever their widths: a smooth curve
+        that leaves the centres of the map's pixels on their side. ``softness`` is then 0.5, and all regions stay.
+
         Args:
             size: (height, width).
+            contours: scaled or crisp.
 
         Raises:
-            TypeError, ValueError: not two positive integers.
+            TypeError, ValueError: not two positive integers; other contours.
 
         Example:
             >>> RegionMap.from_labels(torch.eye(3).long()).resize((6, 6)).labels[0]
             tensor([1, 1, 0, 0, 0, 0])
         """
         height, width = check_size("size", size)
-        if (height, width) == self.size:
+        if check_contours(contours) == self.contours and (height, width) == self.size:
             return self
         if self._origin is not None:
-            return self._origin.resize((height, width))
+            return self._origin.resize((height, width), contours)
         k = self.supersample
+        if contours == "crisp" and self.num_regions > 1:
+            return self._resampled(Crisp, sample_labels(self.labels, height, width, 1))
+        if (height, width) == self.size:
+            return self
         if self.softness == 0.0:
             sampled = RegionMap.from_labels(sample_labels(self.fine_labels, height, width, k), supersample=k)
             return replace(sampled, tables=sampled.tables._replace(whole=False))
-        labels = sample_labels(self.labels, height, width, 1)
+        return self._resampled(Resampled, sample_labels(self.labels, height, width, 1))
+
+    def smoothed(self) -> RegionMap:
+        """Make the map whose contours are crisp ones before they are made crisp: as wide as one label."""
+        return RegionMap.from_labels(self.fine_labels, 1.0 / self.supersample, supersample=self.supersample)
+
+    def _resampled(self, kind: type[Resampled], labels: Tensor) -> RegionMap:
         index = self.index_of(labels).to(torch.int32)
-        membership = Resampled(index if index.ndim == 3 else index[None], self.membership)
+        membership = kind(index if index.ndim == 3 else index[None], self.membership)
+        scale = math.sqrt(labels.shape[-2] * labels.shape[-1] / (self.size[0] * self.size[1]))
+        crisp = kind is Crisp
+        softness = CRISP_WIDTH if crisp else scaled_widths(self.softness, scale)
         return RegionMap(
-            labels, self.ids, scaled_widths(self.softness, math.sqrt(height * width / (self.size[0] * self.size[1]))),
-            fine_labels=labels, widths=self.widths, _origin=self,
+            labels, self.ids, softness, fine_labels=labels, _origin=self,
+            widths=crisp_widths(labels.device) if crisp else self.widths,
             tables=self.tables._replace(membership=membership),
         )  # fmt: skip

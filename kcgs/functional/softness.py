@@ -12,6 +12,8 @@ from kcgs._check import check_number
 from kcgs.kernels.membership import RADIUS_SIGMAS
 
 MAX_SOFTNESS = 64.0  # pixels
+CONTOURS = ("scaled", "crisp")
+CRISP_WIDTH = 0.5  # pixels, of contours that are crisp
 _FEW = 4
 
 
@@ -102,6 +104,23 @@ def widths_of(softness: float | PairWidths, supersample: int, device: torch.devi
     if isinstance(softness, float):
         return rows[0].to(device)
     return torch.cat([torch.tensor(list(softness), dtype=torch.float64), rows], 1).to(device)
+
+
+def check_contours(contours: str) -> str:
+    """Return `contours` if it says how contours are rendered."""
+    if contours not in CONTOURS:
+        raise ValueError(f"contours must be one of {', '.join(CONTOURS)}; got {contours!r}")
+    return contours
+
+
+def crisp_widths(device: torch.device) -> Tensor:
+    """Return widths as the operator takes them where contours are crisp: a number below 0."""
+    return torch.full((1,), -1.0, dtype=torch.float64, device=device)
+
+
+def is_crisp(widths: Tensor | None) -> bool:
+    """Whether widths are those of :func:`crisp_widths`."""
+    return widths is not None and widths.shape == (1,)
 
 
 def softness_of(widths: Tensor | None) -> float | dict[tuple[int, int], float]:

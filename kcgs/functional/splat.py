@@ -12,6 +12,7 @@ from kcgs.kernels import check_backend
 from .decomposition import decompose
 from .operator import splat_operator
 from .regions import RegionMap
+from .softness import crisp_widths
 
 # what torch.onnx.export puts in place of the operator; compilers and torch.export do not
 torch._decomp.register_decomposition(splat_operator)(decompose)
@@ -97,6 +98,7 @@ def splat_at(
     region_ids: Tensor | None,
     regions: RegionMap | Tensor | None,
     *,
+    contours: str = "scaled",
     cutoff: float,
     backend: str,
 ) -> Tensor:
@@ -105,6 +107,8 @@ def splat_at(
     dtype = torch.float64 if torch.float64 in (means.dtype, cholesky.dtype, colors.dtype) else torch.float32
     arrays = [t if t.dtype == dtype else t.to(dtype) for t in (means, cholesky, colors)]
     ids, labels, widths, supersample = _resolve_regions(means, region_ids, regions)
+    if labels is not None and contours == "crisp":
+        widths = crisp_widths(labels.device)
     image: Tensor = splat_operator(
         *arrays, ids, labels, widths, supersample, *size, check_cutoff(cutoff), check_backend(backend)
     )
@@ -152,7 +156,7 @@ def _resolve_regions(
     assert region_ids is not None
     if isinstance(regions, RegionMap):
         given = regions.given
-        labels, widths, supersample = given.fine_labels, given.widths, given.supersample
+        labels, widths, supersample = given.fine_labels, regions.widths, given.supersample
     else:
         labels, widths, supersample = regions, None, 1
     if labels.device != means.device:

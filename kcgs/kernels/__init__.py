@@ -3,10 +3,10 @@
 from .inputs import OutOfRangeError, SplatInputs, Steps, with_autograd
 from .membership import Membership
 from .registry import BACKENDS, check_backend, compile_ahead, prepare, resolve
-from .resampled import Resampled
+from .resampled import Crisp, Resampled
 from .threads import threads_for_kernels
 
 __all__ = [
-    "BACKENDS", "Membership", "OutOfRangeError", "Resampled", "SplatInputs", "Steps", "check_backend", "compile_ahead",
-    "prepare", "resolve", "threads_for_kernels", "with_autograd",
+    "BACKENDS", "Crisp", "Membership", "OutOfRangeError", "Resampled", "SplatInputs", "Steps", "check_backend",
+    "compile_ahead", "prepare", "resolve", "threads_for_kernels", "with_autograd",
 ]  # fmt: skip

@@ -196,6 +196,10 @@ class Membership:
                     weights[chunk[found]] += _pool(torch.where(inside[found], blurred, 0.0), k)
         return weights
 
+    def window_labels(self, place: tuple[Tensor, ...], span: Sequence[int]) -> Tensor:
+        """Read the labels of pixels over windows, (P, *span); `place` as of :meth:`window_weights`."""
+        return self._read(self.index, place, span, 0)[0]
+
     def _read(
         self, grid: Tensor, place: tuple[Tensor, ...], sides: Sequence[int], reach: int
     ) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,7 +1,10 @@
-"""Soft membership at another size: s_r of the map's own pixels, interpolated bilinearly."""
+"""Membership at another size: weights of the map's own pixels, interpolated bilinearly; contours may be made crisp."""
 
 from __future__ import annotations
 
+import functools
+import math
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -10,6 +13,7 @@ from torch import Tensor
 from .membership import Membership, TileMembership
 
 _CHUNK_ELEMENTS = 1 << 21
+MARGIN = 0.25  # so that a line one pixel wide stays about that wide
 
 
 class _Axis(NamedTuple):
@@ -39,11 +43,13 @@ class Resampled(Membership):
     def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
         """Evaluate s_r of one region over one whole map, (H, W): the definition, without tables."""
         weights = self.source.weights(batch, region, torch.float64)
-        down, across = (
-            _matrix(axis, torch.zeros(1, dtype=torch.int64, device=weights.device), n)[0]
-            for axis, n in zip(self._axes(1), weights.shape, strict=True)
-        )
+        down, across = self._matrices(weights.shape)
         return (down @ weights @ across.T).to(dtype)
+
+    def _matrices(self, shape: Sequence[int]) -> Iterator[Tensor]:
+        """Make the interpolation of whole columns and rows."""
+        first = torch.zeros(1, dtype=torch.int64, device=self.index.device)
+        return (_matrix(axis, first, n)[0] for axis, n in zip(self._axes(1), shape, strict=True))
 
     def _axes(self, tile: int) -> tuple[_Axis, _Axis]:
         """Return rows and columns, filled up with the last one to whole tiles."""
@@ -67,14 +73,111 @@ class Resampled(Membership):
         numbers = torch.arange(len(batch), device=batch.device)
         single, keys = source.list_keys(numbers, corner, sides, source.radius * k)
         tiles, region = keys // self.num_regions, keys % self.num_regions
+        groups = tiles.unique(return_inverse=True)[1]
         masks = torch.zeros(len(keys), tile * tile, dtype=torch.float64, device=keys.device)
-        step = max(1, _CHUNK_ELEMENTS // (spans[0] * spans[1] + tile * tile))
-        for chunk in torch.arange(len(keys), device=keys.device).split(step):
+        # regions of a tile stay in one chunk: they may be weighed against each other
+        most = max(1, _CHUNK_ELEMENTS // (spans[0] * spans[1] + tile * tile))
+        for chunk in _chunks(groups, most):
             t, y, x = tiles[chunk], row[tiles[chunk]], col[tiles[chunk]]
-            window = self.source.window_weights(batch[t], region[chunk], firsts[0][y], firsts[1][x], spans)
-            masks[chunk] = (down[y] @ window @ across[x].mT).flatten(1)
+            begins = batch[t], firsts[0][y], firsts[1][x]
+            window = self._windows(begins, region[chunk], groups[chunk], spans)
+            masks[chunk] = self._settle(down[y] @ window @ across[x].mT, groups[chunk]).flatten(1)
         seen = (masks > 0).any(1)
         return TileMembership.assemble(single, keys[seen], masks[seen])
+
+    def _windows(self, place: tuple[Tensor, ...], region: Tensor, group: Tensor, spans: Sequence[int]) -> Tensor:
+        """Evaluate the weights of the map's own pixels over windows, (P, *spans); those of a group cover one place."""
+        batch, rows, cols = place
+        return self.source.window_weights(batch, region, rows, cols, spans)
+
+    def _settle(self, weights: Tensor, group: Tensor) -> Tensor:
+        """Turn what was interpolated, (P, n, n), into weights."""
+        return weights
+
+
+class Crisp(Resampled):
+    """Membership of contours that are about one pixel wide at any size: a smooth curve between the map's pixels.
+
+    Labels are blurred by the width of one label; where that takes the largest share at the centre of a pixel from its
+    own label, it is given back, with `MARGIN` more than any other. Interpolated bilinearly to weights u_r, that makes
+    the weights s_r = u_r**e / (sum of all u**e): along a straight contour, a step of 1/2 pixel's deviation with
+    e = 2 k sqrt(new pixels / old pixels), 1 at least.
+    """
+
+    def __init__(self, index: Tensor, labels: Membership) -> None:
+        """Take labels at the new size, (B, H, W), and the map at its own, whatever its widths."""
+        smooth = labels.derived("smooth", _smooth)
+        super().__init__(index, smooth)
+        ratio = index.shape[1] * index.shape[2] / (labels.index.shape[1] * labels.index.shape[2])
+        self.exponent = max(1.0, 2.0 * labels.supersample * math.sqrt(ratio))
+
+    def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
+        """Evaluate s_r of one region over one whole map, (H, W): the definition, without tables."""
+        source = self.source
+        own = self._own(source.index[batch])
+        best = functools.reduce(torch.maximum, (source.weights(batch, r, torch.float64) for r in self._all))
+        down, across = self._matrices(best.shape)
+
+        def interpolated(r: int) -> Tensor:
+            return down @ _keep(source.weights(batch, r, torch.float64), best, own == r) @ across.T
+
+        most = functools.reduce(torch.maximum, map(interpolated, self._all))
+        total = functools.reduce(torch.add, ((interpolated(r) / most) ** self.exponent for r in self._all))
+        return ((interpolated(region) / most) ** self.exponent / total).to(dtype)
+
+    @property
+    def _all(self) -> range:
+        return range(self.num_regions)
+
+    def _own(self, index: Tensor) -> Tensor:
+        """Take the labels that keep their pixels' centres: none of a supersampled map."""
+        return index if self.source.supersample == 1 else torch.full_like(index, -1)
+
+    def _windows(self, place: tuple[Tensor, ...], region: Tensor, group: Tensor, spans: Sequence[int]) -> Tensor:
+        weights = super()._windows(place, region, group, spans)
+        seen = self._own(self.source.window_labels(place, spans))
+        best = _most(weights, group)
+        return _keep(weights, best, seen == region[:, None, None])
+
+    def _settle(self, weights: Tensor, group: Tensor) -> Tensor:
+        powers = (weights / _most(weights, group)) ** self.exponent
+        first = int(group[0])
+        total = torch.zeros(int(group[-1]) - first + 1, *weights.shape[1:], dtype=weights.dtype, device=weights.device)
+        return powers / total.index_add_(0, group - first, powers)[group - first]
+
+    def to(self, device: torch.device) -> Crisp:
+        """Return the same membership on `device`, tables not carried along."""
+        return Crisp(self.index.to(device), self.source.to(device))
+
+
+def _smooth(labels: Membership) -> Membership:
+    return Membership(labels.index, labels.num_regions, 1.0 / labels.supersample, fine=labels.fine)
+
+
+def _keep(weights: Tensor, best: Tensor, own: Tensor) -> Tensor:
+    return torch.where(own & (weights < best), best + MARGIN, weights)
+
+
+def _most(weights: Tensor, group: Tensor) -> Tensor:
+    """Find the largest weights of each group, whose numbers ascend, for each of its rows."""
+    place = group - group[0]
+    most = weights.new_zeros(int(place[-1]) + 1, *weights.shape[1:])
+    most.scatter_reduce_(0, place.view(-1, 1, 1).expand_as(weights), weights, "amax")
+    return most[place]
+
+
+def _chunks(groups: Tensor, most: int) -> Iterator[Tensor]:
+    """Cut rows, by ascending group, into chunks of whole groups of about `most` rows."""
+    numbers = torch.arange(len(groups), device=groups.device)
+    if len(groups) == 0:
+        return
+    begins = (groups.diff(prepend=groups[:1] - 1) > 0).nonzero().flatten().tolist()
+    start = 0
+    for begin, end in zip(begins, [*begins[1:], len(groups)], strict=True):
+        if end - start > most and begin > start:
+            yield numbers[start:begin]
+            start = begin
+    yield numbers[start:]
 
 
 def _axis(new: int, old: int, tile: int, device: torch.device) -> _Axis:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from kcgs._check import check_cutoff, check_size
 from kcgs.functional import RegionMap
+from kcgs.functional.softness import check_contours
 from kcgs.functional.splat import as_map, map_size, splat_at
 
 from .field import GaussianField, scaled
@@ -32,9 +33,11 @@ class RegionSplatRenderer(nn.Module):
         clamp: clip the image to [0, 1].
         backend: auto, reference, tiled, cpu or cuda.
         keepdim: give (C, H, W) for an unbatched field; False: always (B, C, H, W), as Kornia's modules take it.
+        contours: "scaled": as wide as the map says, and wider in a larger image; "crisp": about one pixel at any size,
+            whatever the map says.
 
     Raises:
-        ValueError: cutoff out of range.
+        ValueError: cutoff out of range; other contours.
 
     Example:
         >>> field = GaussianField.random(10, (32, 48), seed=0)
@@ -42,12 +45,20 @@ class RegionSplatRenderer(nn.Module):
         (torch.Size([3, 32, 48]), torch.Size([3, 64, 96]))
     """
 
-    def __init__(self, cutoff: float = 1e-4, clamp: bool = False, backend: str = "auto", keepdim: bool = True) -> None:
+    def __init__(
+        self,
+        cutoff: float = 1e-4,
+        clamp: bool = False,
+        backend: str = "auto",
+        keepdim: bool = True,
+        contours: str = "scaled",
+    ) -> None:
         super().__init__()
         self.cutoff = check_cutoff(cutoff)
         self.clamp = clamp
         self.backend = backend
         self.keepdim = keepdim
+        self.contours = check_contours(contours)
 
     def forward(
         self,
@@ -99,8 +110,9 @@ class RegionSplatRenderer(nn.Module):
             )
         means, cholesky = scaled(field, finer)
         image = splat_at(
-            finer, means, cholesky, field.merged_colors(), ids, regions, cutoff=self.cutoff, backend=self.backend
-        )
+            finer, means, cholesky, field.merged_colors(), ids, regions,
+            contours=self.contours, cutoff=self.cutoff, backend=self.backend,
+        )  # fmt: skip
         image = area_mean(image, target)
         if not self.keepdim and image.ndim == 3:
             image = image[None]
@@ -118,7 +130,8 @@ class RegionSplatRenderer(nn.Module):
 
     def extra_repr(self) -> str:
         """Show the settings."""
-        return f"cutoff={self.cutoff:g}, clamp={self.clamp}, backend={self.backend!r}, keepdim={self.keepdim}"
+        crisp = ", contours='crisp'" if self.contours == "crisp" else ""
+        return f"cutoff={self.cutoff:g}, clamp={self.clamp}, backend={self.backend!r}, keepdim={self.keepdim}{crisp}"
 
 
 def rendered_size(own: tuple[int, int], size: tuple[int, int]) -> tuple[int, int]:

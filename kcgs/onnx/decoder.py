@@ -9,6 +9,8 @@ import numpy as np
 import onnx
 
 from kcgs._check import check_cutoff
+from kcgs.functional import RegionMap
+from kcgs.functional.softness import check_contours
 from kcgs.scene import Scene, check_scene
 
 from .axis import Axis
@@ -26,7 +28,13 @@ _LARGEST_CHANGE = 1 / 255
 
 
 def scene_decoder(
-    scene: Scene, *, cutoff: float = 1e-4, clamp: bool = True, precision: str = "fp32", interactive: bool = False
+    scene: Scene,
+    *,
+    cutoff: float = 1e-4,
+    clamp: bool = True,
+    precision: str = "fp32",
+    interactive: bool = False,
+    contours: str = "scaled",
 ) -> onnx.ModelProto:
     r"""Build the ONNX graph that renders one scene at any size.
 
@@ -42,6 +50,7 @@ def scene_decoder(
         interactive: two more inputs. ``view``, float32 (4,): left, top, right and bottom of the part of the scene that
             fills the image, in pixels of the scene. ``visible``, float32 (R,): a factor on the Gaussians of each
             region, in the order of the map's ids.
+        contours: "scaled" or "crisp", as :class:`kcgs.RegionSplatRenderer` takes them.
 
     Returns:
         A checked model; its metadata say what it is, by which recipe the scene was fitted if the scene knows, and what
@@ -64,9 +73,13 @@ def scene_decoder(
     cutoff = check_cutoff(cutoff)
     if precision not in PRECISIONS:
         raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}; got {precision!r}")
-    layout = lay_out(scene.field, scene.regions, cutoff)
-    facts = describe(scene, layout, cutoff=cutoff, clamp=clamp)
-    plan = _Plan(scene, layout, cutoff, clamp, interactive)
+    regions = scene.regions
+    crisp = check_contours(contours) == "crisp" and regions is not None
+    if crisp and regions is not None:
+        regions = regions.smoothed()
+    layout = lay_out(scene.field, regions, cutoff)
+    facts = describe(scene, layout, cutoff=cutoff, clamp=clamp, crisp=crisp)
+    plan = _Plan(scene, regions, layout, cutoff, clamp, interactive, crisp)
     exact = plan.build("fp32", facts)
     if precision == "fp32":
         return exact
@@ -79,14 +92,16 @@ class _Plan(NamedTuple):
     """What a graph is built of."""
 
     scene: Scene
+    regions: RegionMap | None
     layout: Layout
     cutoff: float
     clamp: bool
     interactive: bool
+    crisp: bool
 
     @property
     def num_regions(self) -> int:
-        return 1 if self.scene.regions is None else self.scene.regions.num_regions
+        return 1 if self.regions is None else self.regions.num_regions
 
     def build(self, precision: str, facts: Mapping[str, str]) -> onnx.ModelProto:
         """Build the graph."""
@@ -94,9 +109,9 @@ class _Plan(NamedTuple):
         down, across, visible = self._inputs(g)
         stored = Stored(g, self.layout, visible, half=precision == "fp16")
         blocks = Blocks(g, stored, down, across, self.cutoff)
-        regions, windows = self.scene.regions, None
+        regions, windows = self.regions, None
         if regions is not None and any(group.regions > 1 for group in self.layout.groups):
-            windows = Windows(g, self.layout.tiles, self.layout.groups, down, across, regions)
+            windows = Windows(g, self.layout.tiles, self.layout.groups, down, across, regions, self.crisp)
         planes = None if self.layout.nodes is None else Planes(g, stored, self.layout.nodes, down, across, self.cutoff)
         image = blocks.render(windows, planes)
         branches = {

@@ -36,11 +36,12 @@ def header(kind: str, cutoff: float, clamp: bool) -> dict[str, str]:
     }
 
 
-def describe(scene: Scene, layout: Layout, *, cutoff: float, clamp: bool) -> dict[str, str]:
+def describe(scene: Scene, layout: Layout, *, cutoff: float, clamp: bool, crisp: bool) -> dict[str, str]:
     """Collect the facts, what was left out among them."""
     field, regions = scene.field, scene.regions
     count = 1 if regions is None else regions.num_regions
     contours = "none" if count == 1 else "hard" if regions is None or regions.softness == 0.0 else "soft"
+    contours = "crisp" if crisp and count > 1 else contours
     return {
         **header("scene", cutoff, clamp),
         "recipe": scene.metadata.get("recipe", ""),

@@ -9,6 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from kcgs.functional import RegionMap
+from kcgs.kernels.resampled import MARGIN
 from kcgs.kernels.tiles import TILE
 
 from .axis import Axis
@@ -25,11 +26,19 @@ class Windows:
     """Samples region weights at the pixels of blocks, whose rows and columns are `down` and `across`.
 
     Windows are made when the decoder is loaded: of hard contours they are stored as labels; soft ones are the blur of
-    labels, or stored as weights where contours are very wide or finer than pixels.
+    labels, or stored as weights where contours are very wide or finer than pixels. With `crisp`, where the map is that
+    of `crisp_map`, what is sampled becomes crisp contours, as :class:`kcgs.kernels.Crisp` has them.
     """
 
     def __init__(
-        self, graph: Graph, tiles: Tiles, groups: Sequence[Group], down: Axis, across: Axis, regions: RegionMap
+        self,
+        graph: Graph,
+        tiles: Tiles,
+        groups: Sequence[Group],
+        down: Axis,
+        across: Axis,
+        regions: RegionMap,
+        crisp: bool = False,
     ) -> None:
         g, soft = graph, regions.softness != 0.0
         factor = self.factor = 1 if soft else regions.supersample  # labels along a side of a pixel
@@ -37,6 +46,10 @@ class Windows:
         self.across = across.weights(factor, margin(factor), soft)
         self.down = g("Transpose", down.weights(factor, margin(factor), soft), perm=[0, 2, 1])
         self.sides = across.side, down.side
+        self._exponent = self._owns = None
+        if crisp:
+            ratio = g("Reciprocal", g("Sqrt", g("Mul", down.step, across.step)))
+            self._exponent = g("Max", g("Mul", ratio, F32(2 * regions.supersample)), F32(1))
         mixed = [group for group in groups if group.regions > 1]
         self._numbers = {id(group): number for number, group in enumerate(mixed)}
         chosen = np.concatenate([group.tiles for group in mixed])
@@ -45,6 +58,9 @@ class Windows:
         self._sample = (self._blurred if blurs else self._soft) if soft else self._hard
         if self._sample == self._blurred:
             self._blurs = self._blur(chosen)
+            if crisp:
+                labels = self._piecewise(self._cut(regions.membership.grid[0].cpu().numpy(), chosen))
+                self._owns = g.split(labels, [len(group.tiles) for group in mixed])
         elif not soft:
             labels = self._piecewise(np.stack([tiles.windows[tile].numpy() for tile in chosen.tolist()]))
             self._labels = g.split(labels, [len(group.tiles) for group in mixed])
@@ -64,6 +80,10 @@ class Windows:
         if not self.soft:
             best = g("ReduceMax", weights, one, keepdims=1)
             weights = g("Cast", g("Equal", weights, best), to=FLOAT)
+        if self._exponent is not None:
+            weights = g("Relu", weights)  # the last region's is what is left of one, up to rounding
+            powers = g("Pow", g("Div", weights, g("ReduceMax", weights, one, keepdims=1)), self._exponent)
+            weights = g("Div", powers, g("ReduceSum", powers, one, keepdims=1))
         if self.factor > 1:
             k = g.constant([self.factor])
             split = g("Concat", g.constant([0, group.regions]), self.sides[0], k, self.sides[1], k, axis=0)
@@ -107,19 +127,32 @@ class Windows:
         windows = g("Gather", self._blurs, g.whole(places if most > 1 else places[:, :, 0]))
         windows = g("ReduceSum", windows, g.constant([2]), keepdims=0) if most > 1 else windows
         # beyond the map there is no label, and nothing weighs
-        return g("Div", windows, g("Max", g("ReduceSum", windows, one, keepdims=1), F32(1e-30)))
+        windows = g("Div", windows, g("Max", g("ReduceSum", windows, one, keepdims=1), F32(1e-30)))
+        if self._owns is None:
+            return windows
+        number, best = self._numbers[id(group)], g("ReduceMax", windows, one, keepdims=1)
+        ids = np.full((len(group.tiles), group.regions, 1, 1), -1, np.int32)
+        for row, tile in zip(ids[..., 0, 0], group.tiles.tolist(), strict=True):
+            row[: len(self.tiles.regions[tile])] = self.tiles.regions[tile]
+        own = g("And", g("Equal", g("Unsqueeze", self._owns[number], one), ids), g("Less", windows, best))
+        return g("Where", own, g("Add", best, F32(MARGIN)), windows)
+
+    def _cut(self, grid: Integers, chosen: Integers) -> Integers:
+        """Cut windows, (T, S, S), out of what each pixel has."""
+        sides = [
+            (1, TILE * count - length + 1)
+            for count, length in zip((self.tiles.rows, self.tiles.cols), grid.shape, strict=True)
+        ]
+        padded = np.pad(grid.astype(np.int64), sides, mode="edge")
+        windows: Integers = sliding_window_view(padded, (_SOFT, _SOFT))[::TILE, ::TILE].reshape(-1, _SOFT, _SOFT)
+        return windows[chosen]
 
     def _blur(self, chosen: Integers) -> Value:
         """Blur labels: a window of zeros, then one for every tile, region and width, 0 where pixels have another."""
         g, (widths, level) = self.g, self.map.membership.levels
         found = np.zeros((len(chosen), _SOFT, _SOFT), np.int64)
         if level is not None:
-            sides = [
-                (1, TILE * count - length + 1)
-                for count, length in zip((self.tiles.rows, self.tiles.cols), level.shape[1:], strict=True)
-            ]
-            padded = np.pad(level[0].cpu().numpy().astype(np.int64), sides, mode="edge")
-            found = sliding_window_view(padded, (_SOFT, _SOFT))[::TILE, ::TILE].reshape(-1, _SOFT, _SOFT)[chosen]
+            found = self._cut(level[0].cpu().numpy(), chosen)
         triples: list[tuple[int, int, int]] = []
         self._firsts, self._widths = dict[int, int](), dict[int, int]()
         for number, tile in enumerate(chosen.tolist()):

@@ -18,6 +18,7 @@ import torch
 
 from kcgs import GaussianField, RegionMap, Scene, load, save
 from kcgs.cli import main
+from kcgs.data import load_image
 from kcgs.view import _Handler, _Server, serve
 
 
@@ -47,6 +48,18 @@ class TestExport:
         assert facts["recipe"] == "best" and facts["bytes"] == out.stat().st_size and facts["left_out"]
         names = [i.name for i in onnxruntime.InferenceSession(str(out)).get_inputs()]
         assert names == ["size", "view", "visible"]
+
+    def test_crisp(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: Path) -> None:
+        out = scene.with_name("decoder.onnx")
+        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--contours", "crisp", "--json") == 0
+        assert json.loads(capsys.readouterr().out)["contours"] == "crisp"
+        (image,) = onnxruntime.InferenceSession(str(out)).run(None, {"size": np.array([64, 96])})
+        assert np.abs(image[0] - load(scene).render((64, 96), "crisp").numpy()).max() < 1e-3
+        png = scene.with_name("crisp.png")
+        assert run(monkeypatch, "render", str(scene), "-o", str(png), "--scale", "2", "--contours", "crisp") == 0
+        assert (load_image(png) - load(scene).render((64, 96), "crisp")).abs().max() <= 0.5 / 255 + 1e-6
+        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic", "--contours", "crisp") == 2
+        assert "--contours are for" in capsys.readouterr().err
 
     def test_generic_and_half(self, monkeypatch: pytest.MonkeyPatch, scene: Path) -> None:
         out = scene.with_name("generic.onnx")

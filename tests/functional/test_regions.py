@@ -11,7 +11,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from kcgs import RegionMap
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.functional import PairWidths, edge_band, lookup_regions
 from kcgs.kernels.tiles import TILE
 from tests.tester import BaseTester
@@ -343,6 +343,104 @@ class TestResize:
     def test_bad_size(self, size: object) -> None:
         with pytest.raises((ValueError, TypeError), match="size must"):
             RegionMap.from_labels(blobs()).resize(size)  # type: ignore[arg-type]
+
+
+def stated_crisp(labels: Tensor, factor: int, size: tuple[int, int]) -> Tensor:
+    """Weights of crisp contours by their definition, from whole maps: (R, H, W)."""
+    shares = []
+    for region in labels.unique().tolist():
+        inside = (labels == region).double().numpy()
+        blurred, ones = (ndimage.gaussian_filter(a, 1.0, mode="constant", radius=4) for a in (inside, 0 * inside + 1))
+        shares.append(torch.nn.functional.avg_pool2d(torch.from_numpy(blurred / ones)[None], factor)[0])
+    stacked = torch.stack(shares)
+    if factor == 1:
+        most, own = stacked.amax(0), torch.nn.functional.one_hot(labels).movedim(-1, 0).bool()
+        stacked = torch.where(own & (stacked < most), most + 0.25, stacked)
+    large = torch.nn.functional.interpolate(stacked[None], size, mode="bilinear", align_corners=False)[0]
+    height, width = (n // factor for n in labels.shape)
+    powers = large ** max(1.0, 2 * factor * math.sqrt(size[0] * size[1] / (height * width)))
+    return powers / powers.sum(0)
+
+
+class TestCrisp:
+    @pytest.mark.parametrize("size", [(45, 70), (45, 71), (180, 280), (100, 70), (23, 31)])
+    @pytest.mark.parametrize("factor", [1, 2])
+    @pytest.mark.parametrize("softness", [0.0, 1.7])
+    def test_weights_are_the_stated_ones(self, size: tuple[int, int], factor: int, softness: float) -> None:
+        """For whole maps and in tiles, whatever the contours' own widths."""
+        fine = blobs((45 * factor, 70 * factor))
+        crisp = RegionMap.from_labels(fine, softness, supersample=factor).resize(size, "crisp")
+        assert crisp.contours == "crisp" and crisp.softness == 0.5 and crisp.size == size
+        want, table, tiles_x = stated_crisp(fine, factor, size), crisp.membership.tiles(16), -(-size[1] // 16)
+        found = torch.zeros(4, -(-size[0] // 16) * 16, tiles_x * 16, dtype=torch.float64)
+        for key, mask in zip(table.keys.tolist(), table.mask.tolist(), strict=True):
+            y, x = key // 4 // tiles_x * 16, key // 4 % tiles_x * 16
+            found[key % 4, y : y + 16, x : x + 16] = 1.0 if mask < 0 else table.masks[mask].view(16, 16)
+        # what is beyond the blur's reach of 4 deviations differs by less than its weights there
+        assert (found[:, : size[0], : size[1]] - want).abs().max() < 1e-6
+        for region in range(4):
+            assert (crisp.membership.weights(0, region, torch.float64) - want[region]).abs().max() < 1e-9
+
+    def test_a_disc_is_round(self) -> None:
+        """The half-way line stays within 0.4 pixels of the map from the circle; stairs are 0.7 off."""
+        y, x = torch.meshgrid(*[torch.arange(64) + 0.5] * 2, indexing="ij")
+        inside = (((x - 32) ** 2 + (y - 32) ** 2).sqrt() < 20.3).long()
+        weights = RegionMap.from_labels(inside).resize((512, 512), "crisp").weights(1)
+        y, x = torch.meshgrid(*[(torch.arange(512) + 0.5) / 8] * 2, indexing="ij")
+        radius = ((x - 32) ** 2 + (y - 32) ** 2).sqrt()
+        assert (weights[radius < 20.3 - 0.4] > 0.5).all() and (weights[radius > 20.3 + 0.4] < 0.5).all()
+
+    @pytest.mark.parametrize("factor", [1, 3, 8])
+    def test_one_pixel_wide_at_any_size(self, factor: int) -> None:
+        """A straight edge, as steep as that of a blur by half a pixel of the image."""
+        labels = (torch.arange(24) > 11).long().expand(24, 24)
+        row = RegionMap.from_labels(labels, 2.0).resize((24 * factor, 24 * factor), "crisp").weights(1)[12 * factor]
+        assert 0.9 < float(row.diff().max()) / math.erf(0.5 / (0.5 * math.sqrt(2))) < 1.15
+        assert int(((row > 0.01) & (row < 0.99)).sum()) <= 4
+
+    def test_thin_lines_stay(self) -> None:
+        labels = torch.zeros(30, 40, dtype=torch.long)
+        labels[12], labels[:, 20], labels[3, 5] = 1, 2, 3
+        large = RegionMap.from_labels(labels).resize((150, 200), "crisp")
+        shares = torch.stack([large.weights(k) for k in range(4)])
+        assert torch.equal(shares.argmax(0)[2::5, 2::5], labels)
+        assert (shares[1].amax(0)[:95] > 0.7).all() and (shares[2].amax(1) > 0.7).all()
+        # about as wide as the line, 5 pixels there
+        assert 2 <= (shares[1][:, 40] > 0.5).sum() <= 5
+
+    def test_renders_alike_everywhere(self, backend: str) -> None:
+        regions = RegionMap.from_labels(blobs(), 1.2)
+        field = GaussianField.random(40, (45, 70), regions=regions, seed=0)
+        crisp, scaled = RegionSplatRenderer(backend=backend, contours="crisp"), RegionSplatRenderer(backend=backend)
+        assert "crisp" in repr(crisp) and "crisp" not in repr(scaled)
+        image = crisp(field, regions, (90, 140))
+        assert (image - scaled(field, regions, (90, 140))).abs().max() > 0.05
+        assert torch.equal(image, Scene(field, regions)((90, 140), "crisp")) or backend != "auto"
+        assert torch.equal(image, scaled(field, regions.resize((90, 140), "crisp"), (90, 140)))
+        alone = RegionMap.from_labels(regions.labels.clone())  # of which no tables are kept
+        assert torch.equal(image, crisp(field, alone, (90, 140)))
+        assert torch.equal(crisp(field, regions), crisp(field, alone)) and not torch.equal(
+            crisp(field, regions), scaled(field, regions)
+        )
+
+    def test_copies_and_parts(self) -> None:
+        regions = RegionMap.from_labels(torch.stack([blobs(seed=0), blobs(seed=1)]), 0.7)
+        crisp = regions.resize((90, 140), "crisp")
+        others = pickle.loads(pickle.dumps(crisp)), copy.deepcopy(crisp), RegionMap.from_state(crisp.state())
+        for other in others:
+            assert other.contours == "crisp" and torch.equal(
+                other.membership.tiles(16).masks, crisp.membership.tiles(16).masks
+            )
+        assert torch.equal(crisp.unbind()[1].weights(2), crisp.membership.weights(1, 2, torch.float64))
+        assert crisp.resize((45, 70)) is regions and crisp.resize((90, 140), "crisp") is crisp
+        assert RegionMap.from_labels(torch.zeros(4, 5).long()).resize((4, 5), "crisp").num_regions == 1
+
+    def test_other_words(self) -> None:
+        regions = RegionMap.from_labels(blobs())
+        with pytest.raises(ValueError, match="contours must be one of scaled, crisp; got 'sharp'"):
+            regions.resize((90, 140), "sharp")
+        with pytest.raises(ValueError, match="contours must be one of"):
+            RegionSplatRenderer(contours="hard")
 
 
 class TestLookup:
