@@ -10,15 +10,17 @@ import torch
 from skimage.data import coffee
 from torch import Tensor
 
-from kcgs import RegionMap, evaluate
+from kcgs import RegionMap, evaluate, load
 from kcgs.functional import region_splat
 from kcgs.rate import fit_bytes
 from kcgs.segment import segment
+from kcgs.zoo import find
 
 IMAGES = Path(__file__).resolve().parent / "images"
 SIZE = (160, 240)
 SOFTNESS = 6.0  # pixels
 NUM_BYTES = 6_000
+PART = ((50, 170), (120, 280))  # rows and columns of a scene
 
 
 def membership(path: Path) -> None:
@@ -71,6 +73,21 @@ def objectives(path: Path) -> None:
     plt.close(figure)
 
 
+def contours(path: Path) -> None:
+    """Show a part of a scene, enlarged six times, with contours of both kinds."""
+    scene = load(find("zoo:coffee-1500"))
+    size = (6 * scene.size[0], 6 * scene.size[1])
+    rows, columns = (slice(6 * begin, 6 * end) for begin, end in PART)
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+    for axis, kind in zip(axes, ("scaled", "crisp"), strict=True):
+        axis.imshow(scene.render(size, kind)[:, rows, columns].permute(1, 2, 0))
+        axis.set_title(f'contours="{kind}"', fontsize=10)
+        axis.set_axis_off()
+    figure.savefig(path, dpi=110, pil_kwargs={"quality": 85})
+    plt.close(figure)
+
+
 if __name__ == "__main__":
+    contours(IMAGES / "contours.jpg")
     objectives(IMAGES / "objectives.jpg")
     membership(IMAGES / "membership.png")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 
 import torch
 from torch import Tensor
@@ -131,6 +132,23 @@ def unique_pairs(pairs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     codes, place, counts = (ends[:, 0] * len(ids) + ends[:, 1]).unique(return_inverse=True, return_counts=True)
     rows = torch.stack([codes // max(1, len(ids)), codes % max(1, len(ids))], 1)
     return ids[rows], place, counts
+
+
+def union(ids: Iterable[int], pairs: Iterable[tuple[int, int]]) -> Callable[[int], int]:
+    """Unite pairs of ids; what comes back gives the least id of those that one is united with."""
+    root = {region: region for region in ids}
+
+    def find(region: int) -> int:
+        if region not in root:
+            raise ValueError(f"pairs must hold ids of the map; got {region}")
+        while root[region] != region:
+            region = root[region]
+        return region
+
+    for one, other in pairs:
+        low, high = sorted((find(one), find(other)))
+        root[high] = low
+    return find
 
 
 def largest_share(index: Tensor, factor: int) -> Tensor:

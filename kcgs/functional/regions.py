@@ -15,7 +15,7 @@ from torch import Tensor
 from kcgs._check import check_count, check_labels, check_size
 from kcgs.kernels import Crisp, Membership, Resampled
 
-from .labels import compact, largest_share, sample_labels, touching_pairs
+from .labels import compact, largest_share, sample_labels, touching_pairs, union
 from .map_tables import MapTables, keep_tables
 from .softness import (
     CRISP_WIDTH,
@@ -228,9 +228,7 @@ class RegionMap:
         return dict.fromkeys(touching_pairs(labels) - touching_pairs(self.fine_labels), width)
 
     def merge(self, pairs: Iterable[tuple[int, int]]) -> tuple[RegionMap | None, Tensor]:
-        """Merge pairs of regions; what is merged has the least of their ids.
-
-        The width of a contour is then the mean of those that it is made of.
+        """Merge pairs of regions: to the least of their ids, and contours to the mean of the widths they are made of.
 
         Args:
             pairs: ids in the map.
@@ -246,19 +244,8 @@ class RegionMap:
             >>> regions.labels, new_ids
             (tensor([[1, 4, 4]]), tensor([1, 4, 4]))
         """
-        root = {region: region for region in self.ids.tolist()}
-
-        def find(region: int) -> int:
-            if region not in root:
-                raise ValueError(f"pairs must hold ids of the map; got {region}")
-            while root[region] != region:
-                region = root[region]
-            return region
-
-        for one, other in pairs:
-            low, high = sorted((find(one), find(other)))
-            root[high] = low
-        new_ids = torch.tensor([find(region) for region in root], device=self.ids.device)
+        find = union(self.ids.tolist(), pairs)
+        new_ids = torch.tensor([find(region) for region in self.ids.tolist()], device=self.ids.device)
         if len(new_ids.unique()) == 1:
             return None, new_ids
         labels = new_ids[self.index_of(self.fine_labels)]
@@ -325,12 +312,11 @@ class RegionMap:
         regions.
 
         Soft contours widen along with the map: between pixel centres a point has the bilinear mean of its four
-        neighbours' memberships. ``softness`` says the new widths; all regions stay.
+        neighbours' memberships. ``softness`` says the new widths; all regions stay. The same size gives the same map,
+        also from one that was resized before.
 
-        The same size gives the same map, also from one that was resized before.
-
-        Crisp contours are about one pixel wide at any size, the map's own too, whatever their widths: a smooth curve
-        that leaves the centres of the map's pixels on their side. ``softness`` is then 0.5, and all regions stay.
+        Crisp contours are about one pixel wide at any size, the map's own too: a smooth curve that leaves the centres
+        of the map's pixels on their side. ``softness`` is then 0.5, and all regions stay.
 
         Args:
             size: (height, width).
@@ -344,32 +330,21 @@ class RegionMap:
             tensor([1, 1, 0, 0, 0, 0])
         """
         height, width = check_size("size", size)
-        if check_contours(contours) == self.contours and (height, width) == self.size:
+        crisp = check_contours(contours) == "crisp" and self.num_regions > 1
+        if crisp == (self.contours == "crisp") and (height, width) == self.size:
             return self
         if self._origin is not None:
             return self._origin.resize((height, width), contours)
-        k = self.supersample
-        if contours == "crisp" and self.num_regions > 1:
-            return self._resampled(Crisp, sample_labels(self.labels, height, width, 1))
-        if (height, width) == self.size:
-            return self
-        if self.softness == 0.0:
+        if not crisp and self.softness == 0.0:
+            k = self.supersample
             sampled = RegionMap.from_labels(sample_labels(self.fine_labels, height, width, k), supersample=k)
             return replace(sampled, tables=sampled.tables._replace(whole=False))
-        return self._resampled(Resampled, sample_labels(self.labels, height, width, 1))
-
-    def smoothed(self) -> RegionMap:
-        """Make the map whose contours are crisp ones before they are made crisp: as wide as one label."""
-        return RegionMap.from_labels(self.fine_labels, 1.0 / self.supersample, supersample=self.supersample)
-
-    def _resampled(self, kind: type[Resampled], labels: Tensor) -> RegionMap:
+        labels = sample_labels(self.labels, height, width, 1)
         index = self.index_of(labels).to(torch.int32)
-        membership = kind(index if index.ndim == 3 else index[None], self.membership)
-        scale = math.sqrt(labels.shape[-2] * labels.shape[-1] / (self.size[0] * self.size[1]))
-        crisp = kind is Crisp
-        softness = CRISP_WIDTH if crisp else scaled_widths(self.softness, scale)
+        membership = (Crisp if crisp else Resampled)(index if index.ndim == 3 else index[None], self.membership)
+        widened = scaled_widths(self.softness, math.sqrt(height * width / (self.size[0] * self.size[1])))
         return RegionMap(
-            labels, self.ids, softness, fine_labels=labels, _origin=self,
+            labels, self.ids, CRISP_WIDTH if crisp else widened, fine_labels=labels, _origin=self,
             widths=crisp_widths(labels.device) if crisp else self.widths,
             tables=self.tables._replace(membership=membership),
         )  # fmt: skip

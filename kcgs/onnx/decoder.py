@@ -75,8 +75,9 @@ def scene_decoder(
         raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}; got {precision!r}")
     regions = scene.regions
     crisp = check_contours(contours) == "crisp" and regions is not None
-    if crisp and regions is not None:
-        regions = regions.smoothed()
+    if crisp and regions is not None:  # what crisp contours are made of is as wide as one label
+        k = regions.supersample
+        regions = RegionMap.from_labels(regions.fine_labels, 1.0 / k, supersample=k)
     layout = lay_out(scene.field, regions, cutoff)
     facts = describe(scene, layout, cutoff=cutoff, clamp=clamp, crisp=crisp)
     plan = _Plan(scene, regions, layout, cutoff, clamp, interactive, crisp)
