@@ -89,17 +89,21 @@ def _sum_regions(
 ) -> Tensor:
     """Add up the regions of a tile, in the order of their ids; `seen` begins with these, sorted."""
 
-    def more(place: Tensor, total: Tensor, *rest: Tensor) -> Tensor:
+    def more(place: Tensor, total: Tensor, weight: Tensor, *rest: Tensor) -> Tensor:
         return place < rest[6].shape[0]
 
-    def add(place: Tensor, total: Tensor, near: Tensor, ids: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
+    def add(
+        place: Tensor, total: Tensor, weight: Tensor, near: Tensor, ids: Tensor, *rest: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         region = rest[4].index_select(0, place.reshape(1))
         part = _sum_list(near & (ids == region), rest[:4], torch.zeros_like(total), cutoff)
-        return (rest[4] <= region).sum(), total + part * maps.weigh(rest[5:], region).reshape(1, -1)
+        share = maps.weigh(rest[5:], region).reshape(1, -1)
+        return (rest[4] <= region).sum(), total + part * share, weight + share
 
-    start = torch.zeros_like(gaussians[2])
-    total: Tensor = torch.ops.higher_order.while_loop(more, add, (start, black), (*gaussians, *seen))[1]
-    return total
+    start = torch.zeros_like(gaussians[2]), black, torch.zeros_like(black[:1])
+    found = torch.ops.higher_order.while_loop(more, add, start, (*gaussians, *seen))
+    total: Tensor = found[1]
+    return total / found[2] if maps.soft and maps.resized else total
 
 
 def _sum_list(near: Tensor, gaussians: tuple[Tensor, ...], black: Tensor, cutoff: float) -> Tensor:

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kcgs.kernels.resampled import sharpness
+
 from .arguments import Arguments
 from .labels import most_shared, sample_places
 
@@ -36,10 +38,15 @@ class MapWindows:
         axes = tuple(zip((given.height, given.width), labels.shape[-2:], strict=True))
         self.resized = not all(statically_known_true(old == self.factor * new) for new, old in axes)
         sizes = (labels.shape[0] if labels.ndim == 3 else 1, *labels.shape[-2:])
+        counts = [
+            torch.full((), n, dtype=torch.float64, device=labels.device)
+            for n in (*labels.shape[-2:], given.height, given.width)
+        ]
+        lost = (1 - counts[0] * counts[1] / (self.factor**2 * counts[2] * counts[3])).clamp_min(0).to(self.dtype)
         numbers = torch.stack([torch.full((), n, dtype=torch.int64, device=labels.device) for n in sizes])
         down, across = (self._axis(*axis, labels.device) for axis in axes)
         self._per_axis = len(down)
-        self.tables = (numbers, labels.flatten(), *down, *across, *(() if widths is None else (widths,)))
+        self.tables = (numbers, labels.flatten(), *down, *across, *(() if widths is None else (lost, widths)))
 
     def _axis(self, new: int, length: int, device: torch.device) -> tuple[Tensor, ...]:
         """Return tables of the rows, or columns, of tiles; the last pixel is repeated past the edge."""
@@ -99,7 +106,8 @@ class MapWindows:
         if not self.soft:
             return ids, window
         widths, inside = tables[-1], (down[1], across[1])
-        kernels = widths[None, 1:]
+        kernels, variances = widths[None, 1:], widths[:1].square() if widths.ndim == 1 else widths[:, 2].square()
+        variance = variances[:1]
         if self.pairs:
             hard = (torch.arange(self.reach + 1, device=labels.device) == 0).to(widths.dtype)
             # where there is one region, any blur is right
@@ -107,21 +115,32 @@ class MapWindows:
             given = window, widths, *inside
             level = torch.ops.higher_order.cond(ids[0] != ids[-1], find, skip, given)[0]
             kernels = torch.cat([widths[:, 3:], hard[None]]).index_select(0, level)
+            variance = torch.cat([variances, torch.zeros_like(variances[:1])]).index_select(0, level)
         both = torch.arange(-self.reach, self.reach + 1, device=labels.device).abs()
-        return ids, window, *inside, kernels.to(self.dtype).index_select(1, both), *down[2:], *across[2:]
+        rest = (*down[2:], *across[2:])
+        if self.resized:
+            sides = [n - 2 * self.halo for n in window.shape]
+            squares = self._pool(variance.to(self.dtype).expand(sides[0] * sides[1]).reshape(sides))
+            rest = (*rest, sharpness(rest[0] @ squares @ rest[1].T, tables[-2]))
+        return ids, window, *inside, kernels.to(self.dtype).index_select(1, both), *rest
 
     def weigh(self, seen: Sequence[Tensor], region: Tensor) -> Tensor:
-        """Evaluate the weights of a region, (1,), at the pixels of a tile, from what `look` found."""
+        """Evaluate the weights of a region, (1,), at the pixels of a tile, from what `look` found.
+
+        Of a soft map at another size they are to be divided by their sum.
+        """
         window, k = seen[0], self.factor
         if not self.soft:
             return (window == region).to(self.dtype).reshape(self.side, k, self.side, k).mean((1, 3))
         rows, columns = (slice(self.halo - self.reach, n - self.halo + self.reach) for n in window.shape)
         down, across = seen[1][rows], seen[2][columns]
         marked = (window[rows, columns] == region).to(self.dtype) * down[:, None] * across
-        weights = self._blur(marked, seen[3], down, across)
-        if k > 1:
-            weights = weights.reshape(weights.shape[0] // k, k, weights.shape[1] // k, k).mean((1, 3))
-        return seen[4] @ weights @ seen[5].T if self.resized else weights
+        weights = self._pool(self._blur(marked, seen[3], down, across))
+        return (seen[4] @ weights @ seen[5].T).clamp_min(0) ** seen[6] if self.resized else weights
+
+    def _pool(self, pixels: Tensor) -> Tensor:
+        k = self.factor
+        return pixels.reshape(pixels.shape[0] // k, k, pixels.shape[1] // k, k).mean((1, 3)) if k > 1 else pixels
 
     def _blur(self, marked: Tensor, kernels: Tensor, down: Tensor, across: Tensor) -> Tensor:
         """Blur a window by one kernel, (1, 2 R + 1), or by one for each pixel inside of its halo of R."""

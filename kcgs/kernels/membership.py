@@ -196,9 +196,14 @@ class Membership:
                     weights[chunk[found]] += _pool(torch.where(inside[found], blurred, 0.0), k)
         return weights
 
-    def window_labels(self, place: tuple[Tensor, ...], span: Sequence[int]) -> Tensor:
-        """Read the labels of pixels over windows, (P, *span); `place` as of :meth:`window_weights`."""
-        return self._read(self.index, place, span, 0)[0]
+    def read(self, pixels: Tensor, place: tuple[Tensor, ...], span: Sequence[int]) -> Tensor:
+        """Read (B, H, W) over windows, (P, *span): image, first row and first column (P,) each; the border is held."""
+        return self._read(pixels, place, span, 0)[0]
+
+    @property
+    def variances(self) -> Tensor:
+        """Squared widths of contours at pixels, (B, H, W) float64: means over their sub-pixels."""
+        return self.derived("variances", _find_variances)
 
     def _read(
         self, grid: Tensor, place: tuple[Tensor, ...], sides: Sequence[int], reach: int
@@ -253,6 +258,14 @@ def _find_levels(membership: Membership) -> Levels:
             rows, cols = distance_transform_edt(~touch, return_distances=False, return_indices=True)
             one[:] = one[rows, cols]
     return Levels(tuple(widths.tolist()), torch.from_numpy(level).to(membership.grid.device))
+
+
+def _find_variances(membership: Membership) -> Tensor:
+    widths, level = membership.levels
+    squares = torch.tensor(widths, dtype=torch.float64, device=membership.index.device).square()
+    if level is None:
+        return squares.expand(membership.index.shape)
+    return _pool(squares[level.long()], membership.supersample)
 
 
 def _across(labels: Any) -> Any:

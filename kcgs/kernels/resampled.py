@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from torch import Tensor
 from .membership import Membership, TileMembership
 
 _CHUNK_ELEMENTS = 1 << 21
+TINY = 1e-6  # of variances, which are above 0
 MARGIN = 0.25  # so that a line one pixel wide stays about that wide
 
 
@@ -27,14 +28,18 @@ class _Axis(NamedTuple):
 class Resampled(Membership):
     """Membership of a soft map at another size.
 
-    A point between the centres of four pixels has the bilinear mean of their memberships; beyond the outermost centres
-    those of the border are held. At the size of the map that would be the map itself.
+    A point between the centres of four pixels has u_r, the bilinear mean of their memberships; beyond the outermost
+    centres those of the border are held. In a larger image that is too soft: where v is the variance of the blur, which
+    the image's own pixels have part in, v - 1/12 is that of the contour alone, and v + 1/6 is what interpolation makes
+    of it. So there s_r = u_r**e / (sum of all u**e), with e**2 = (v + q / 6) / max(v - q / 12, q / 24) and
+    q = 1 - old pixels / new pixels; v is interpolated as u is. At the size of the map that would be the map itself.
     """
 
     def __init__(self, index: Tensor, source: Membership) -> None:
         """Take labels at the new size, (B, H, W), and the map at its own."""
         super().__init__(index, source.num_regions, source.softness)
         self.source = source
+        self.ratio = index.shape[1] * index.shape[2] / (source.index.shape[1] * source.index.shape[2])
 
     def to(self, device: torch.device) -> Resampled:
         """Return the same membership on `device`, tables not carried along."""
@@ -42,9 +47,43 @@ class Resampled(Membership):
 
     def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
         """Evaluate s_r of one region over one whole map, (H, W): the definition, without tables."""
-        weights = self.source.weights(batch, region, torch.float64)
+        mean = self._interpolated(batch, region)
+        if self._exponents() is None:
+            return mean.to(dtype)
+        exponent, most, total = self.derived(("sums", batch), lambda _: self._sums(batch))
+        return ((mean / most) ** exponent / total).to(dtype)
+
+    def _sums(self, batch: int) -> tuple[float | Tensor, Tensor, Tensor]:
+        """Return the exponents of a map, the largest u, and the sum of powers of what they are to it."""
+        exponent = self._exponents()
+        assert exponent is not None
+        if isinstance(exponent, Tensor):
+            down, across = self._matrices(exponent.shape[1:])
+            exponent = sharpness(down @ exponent[batch] @ across.T, self._lost)
+        regions = range(self.num_regions)
+        most = functools.reduce(torch.maximum, (self._interpolated(batch, r) for r in regions))
+        powers = ((self._interpolated(batch, r) / most) ** exponent for r in regions)
+        return exponent, most, functools.reduce(torch.add, powers)
+
+    def _interpolated(self, batch: int, region: int) -> Tensor:
+        weights = self._own_weights(batch, region)
         down, across = self._matrices(weights.shape)
-        return (down @ weights @ across.T).to(dtype)
+        return down @ weights @ across.T
+
+    def _own_weights(self, batch: int, region: int) -> Tensor:
+        """Evaluate what is interpolated, at the map's own size."""
+        return self.source.weights(batch, region, torch.float64)
+
+    @property
+    def _lost(self) -> float:
+        return max(0.0, 1.0 - 1.0 / self.ratio)
+
+    def _exponents(self) -> float | Tensor | None:
+        """Return the exponent, or, where pixels of the map have several, their variances; None: u are the weights."""
+        widths, level = self.source.levels
+        if self._lost == 0.0:
+            return None
+        return sharpness(widths[0] ** 2, self._lost) if level is None else self.source.variances
 
     def _matrices(self, shape: Sequence[int]) -> Iterator[Tensor]:
         """Make the interpolation of whole columns and rows."""
@@ -80,8 +119,11 @@ class Resampled(Membership):
         for chunk in _chunks(groups, most):
             t, y, x = tiles[chunk], row[tiles[chunk]], col[tiles[chunk]]
             begins = batch[t], firsts[0][y], firsts[1][x]
-            window = self._windows(begins, region[chunk], groups[chunk], spans)
-            masks[chunk] = self._settle(down[y] @ window @ across[x].mT, groups[chunk]).flatten(1)
+            mean = down[y] @ self._windows(begins, region[chunk], groups[chunk], spans) @ across[x].mT
+            exponent = self._exponents()
+            if isinstance(exponent, Tensor):
+                exponent = sharpness(down[y] @ source.read(exponent, begins, spans) @ across[x].mT, self._lost)
+            masks[chunk] = (mean if exponent is None else _sharpen(mean, groups[chunk], exponent)).flatten(1)
         seen = (masks > 0).any(1)
         return TileMembership.assemble(single, keys[seen], masks[seen])
 
@@ -89,10 +131,6 @@ class Resampled(Membership):
         """Evaluate the weights of the map's own pixels over windows, (P, *spans); those of a group cover one place."""
         batch, rows, cols = place
         return self.source.window_weights(batch, region, rows, cols, spans)
-
-    def _settle(self, weights: Tensor, group: Tensor) -> Tensor:
-        """Turn what was interpolated, (P, n, n), into weights."""
-        return weights
 
 
 class Crisp(Resampled):
@@ -106,28 +144,19 @@ class Crisp(Resampled):
 
     def __init__(self, index: Tensor, labels: Membership) -> None:
         """Take labels at the new size, (B, H, W), and the map at its own, whatever its widths."""
-        smooth = labels.derived("smooth", _smooth)
-        super().__init__(index, smooth)
-        ratio = index.shape[1] * index.shape[2] / (labels.index.shape[1] * labels.index.shape[2])
-        self.exponent = max(1.0, 2.0 * labels.supersample * math.sqrt(ratio))
+        super().__init__(index, labels.derived("smooth", _smooth))
 
-    def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
-        """Evaluate s_r of one region over one whole map, (H, W): the definition, without tables."""
-        source = self.source
-        own = self._own(source.index[batch])
-        best = functools.reduce(torch.maximum, (source.weights(batch, r, torch.float64) for r in self._all))
-        down, across = self._matrices(best.shape)
+    def _exponents(self) -> float:
+        return max(1.0, 2.0 * self.source.supersample * math.sqrt(self.ratio))
 
-        def interpolated(r: int) -> Tensor:
-            return down @ _keep(source.weights(batch, r, torch.float64), best, own == r) @ across.T
+    def _own_weights(self, batch: int, region: int) -> Tensor:
+        best = self.derived(("best", batch), lambda _: self._best(batch))
+        own = self._own(self.source.index[batch])
+        return _keep(super()._own_weights(batch, region), best, own == region)
 
-        most = functools.reduce(torch.maximum, map(interpolated, self._all))
-        total = functools.reduce(torch.add, ((interpolated(r) / most) ** self.exponent for r in self._all))
-        return ((interpolated(region) / most) ** self.exponent / total).to(dtype)
-
-    @property
-    def _all(self) -> range:
-        return range(self.num_regions)
+    def _best(self, batch: int) -> Tensor:
+        weights = (self.source.weights(batch, r, torch.float64) for r in range(self.num_regions))
+        return functools.reduce(torch.maximum, weights)
 
     def _own(self, index: Tensor) -> Tensor:
         """Take the labels that keep their pixels' centres: none of a supersampled map."""
@@ -135,15 +164,9 @@ class Crisp(Resampled):
 
     def _windows(self, place: tuple[Tensor, ...], region: Tensor, group: Tensor, spans: Sequence[int]) -> Tensor:
         weights = super()._windows(place, region, group, spans)
-        seen = self._own(self.source.window_labels(place, spans))
+        seen = self._own(self.source.read(self.source.index, place, spans))
         best = _most(weights, group)
         return _keep(weights, best, seen == region[:, None, None])
-
-    def _settle(self, weights: Tensor, group: Tensor) -> Tensor:
-        powers = (weights / _most(weights, group)) ** self.exponent
-        first = int(group[0])
-        total = torch.zeros(int(group[-1]) - first + 1, *weights.shape[1:], dtype=weights.dtype, device=weights.device)
-        return powers / total.index_add_(0, group - first, powers)[group - first]
 
     def to(self, device: torch.device) -> Crisp:
         """Return the same membership on `device`, tables not carried along."""
@@ -156,6 +179,24 @@ def _smooth(labels: Membership) -> Membership:
 
 def _keep(weights: Tensor, best: Tensor, own: Tensor) -> Tensor:
     return torch.where(own & (weights < best), best + MARGIN, weights)
+
+
+def sharpness(variance: Any, lost: Any) -> Any:
+    """Evaluate the exponent of :class:`Resampled` for variances, numbers or a Tensor; `lost` is its q."""
+    if isinstance(variance, Tensor):
+        variance = variance.clamp_min(TINY)
+        return (
+            (variance + lost / 6) / torch.maximum(variance - lost / 12, torch.as_tensor(lost).to(variance) / 24)
+        ).sqrt()
+    return math.sqrt((max(variance, TINY) + lost / 6) / max(variance - lost / 12, lost / 24, TINY))
+
+
+def _sharpen(weights: Tensor, group: Tensor, exponent: float | Tensor) -> Tensor:
+    """Raise the weights of each group, (P, n, n), to a power, and let them sum to one."""
+    powers = (weights / _most(weights, group)) ** exponent
+    first = int(group[0])
+    total = torch.zeros(int(group[-1]) - first + 1, *weights.shape[1:], dtype=weights.dtype, device=weights.device)
+    return powers / total.index_add_(0, group - first, powers)[group - first]
 
 
 def _most(weights: Tensor, group: Tensor) -> Tensor:

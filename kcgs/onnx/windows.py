@@ -9,7 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from kcgs.functional import RegionMap
-from kcgs.kernels.resampled import MARGIN
+from kcgs.kernels.resampled import MARGIN, TINY
 from kcgs.kernels.tiles import TILE
 
 from .axis import Axis
@@ -20,6 +20,7 @@ F32 = np.float32
 _STEPS = 65535
 _FARTHEST = 16  # pixels that a contour reaches where its blur is computed in the graph
 _SOFT = TILE + 2  # side of a window of weights
+_SQUARES = 1 << 14  # steps of 1 that variances are stored in
 
 
 class Windows:
@@ -46,10 +47,15 @@ class Windows:
         self.across = across.weights(factor, margin(factor), soft)
         self.down = g("Transpose", down.weights(factor, margin(factor), soft), perm=[0, 2, 1])
         self.sides = across.side, down.side
-        self._exponent = self._owns = None
+        self._exponent: Value | None = None
+        self._owns = self._variances = None
+        pixel = g("Mul", down.step, across.step)  # of the output, in pixels of the scene
+        self._lost = g("Relu", g("Sub", F32(1), pixel))
+        (width, *_), level = regions.membership.levels
         if crisp:
-            ratio = g("Reciprocal", g("Sqrt", g("Mul", down.step, across.step)))
-            self._exponent = g("Max", g("Mul", ratio, F32(2 * regions.supersample)), F32(1))
+            self._exponent = g("Max", g("Div", F32(2 * regions.supersample), g("Sqrt", pixel)), F32(1))
+        elif soft and level is None:
+            self._exponent = self._sharpness(g.constant(np.array([width**2], F32)))
         mixed = [group for group in groups if group.regions > 1]
         self._numbers = {id(group): number for number, group in enumerate(mixed)}
         chosen = np.concatenate([group.tiles for group in mixed])
@@ -61,7 +67,11 @@ class Windows:
             if crisp:
                 labels = self._piecewise(self._cut(regions.membership.grid[0].cpu().numpy(), chosen))
                 self._owns = g.split(labels, [len(group.tiles) for group in mixed])
-        elif not soft:
+        if soft and self._exponent is None:
+            squares = np.round(regions.membership.variances[0].cpu().numpy() * _SQUARES)
+            steps = g("Cast", self._piecewise(self._cut(squares, chosen)), to=FLOAT)
+            self._variances = g.split(g("Mul", steps, F32(1 / _SQUARES)), [len(group.tiles) for group in mixed])
+        if not soft:
             labels = self._piecewise(np.stack([tiles.windows[tile].numpy() for tile in chosen.tolist()]))
             self._labels = g.split(labels, [len(group.tiles) for group in mixed])
 
@@ -80,15 +90,29 @@ class Windows:
         if not self.soft:
             best = g("ReduceMax", weights, one, keepdims=1)
             weights = g("Cast", g("Equal", weights, best), to=FLOAT)
-        if self._exponent is not None:
+        if self.soft:
+            exponent = self._exponent
+            if self._variances is not None:
+                squares = g("Gather", self._variances[self._numbers[id(group)]], slots)
+                squares = g("MatMul", g("MatMul", g("Squeeze", across, one), squares), g("Squeeze", down, one))
+                exponent = self._sharpness(g("Unsqueeze", squares, one))
+            assert exponent is not None
             weights = g("Relu", weights)  # the last region's is what is left of one, up to rounding
-            powers = g("Pow", g("Div", weights, g("ReduceMax", weights, one, keepdims=1)), self._exponent)
+            powers = g("Pow", g("Div", weights, g("ReduceMax", weights, one, keepdims=1)), exponent)
             weights = g("Div", powers, g("ReduceSum", powers, one, keepdims=1))
         if self.factor > 1:
             k = g.constant([self.factor])
             split = g("Concat", g.constant([0, group.regions]), self.sides[0], k, self.sides[1], k, axis=0)
             weights = g("ReduceMean", g("Reshape", weights, split), g.constant([3, 5]), keepdims=0)
         return g("Reshape", weights, g.constant([0, 0, 1, -1]))
+
+    def _sharpness(self, variance: Value) -> Value:
+        """Evaluate `kcgs.kernels.resampled.sharpness`, which is 1 where nothing is lost."""
+        g = self.g
+        variance = g("Max", variance, F32(TINY))
+        most = g("Add", variance, g("Mul", self._lost, F32(1 / 6)))
+        least = g("Max", g("Sub", variance, g("Mul", self._lost, F32(1 / 12))), g("Mul", self._lost, F32(1 / 24)))
+        return g("Sqrt", g("Div", most, least))
 
     def _piecewise(self, windows: Integers) -> Value:
         """Store windows (T, S, S), column by column."""

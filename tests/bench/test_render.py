@@ -92,8 +92,8 @@ def test_fitted_scenes_and_sizes() -> None:
     assert soft.regions.softness != 0 and hard.regions.softness == 0
     assert torch.equal(soft.regions.labels, hard.regions.labels) and len(soft) == len(hard) == 1_500
     assert [target_size(soft, size) for size in SIZES] == [(400, 600), (800, 1200), (2560, 3840)]
-    (image, _), small = forward("cpu", resized(soft, (100, 150)), 1e-4), soft.render((100, 150))
-    assert (image.clamp(0, 1) - small).abs().max() < 1e-6
+    (image, _), large = forward("cpu", resized(soft, (600, 900)), 1e-4), soft.render((600, 900))
+    assert (image.clamp(0, 1) - large).abs().max() < 1e-6
 
 
 def test_peak_memory_is_the_childs_own() -> None:
