@@ -48,7 +48,9 @@ class Windows:
         self.down = g("Transpose", down.weights(factor, margin(factor), soft), perm=[0, 2, 1])
         self.sides = across.side, down.side
         self._exponent: Value | None = None
-        self._owns = self._variances = None
+        self._levels: Value | None = None
+        self._owns: Sequence[Value] | None = None
+        self._variances: Sequence[Value] | None = None
         pixel = g("Mul", down.step, across.step)  # of the output, in pixels of the scene
         self._lost = g("Relu", g("Sub", F32(1), pixel))
         (width, *_), level = regions.membership.levels
@@ -62,18 +64,28 @@ class Windows:
         self._reach = regions.membership.radius
         blurs = regions.supersample == 1 and self._reach <= _FARTHEST
         self._sample = (self._blurred if blurs else self._soft) if soft else self._hard
+        self._store(chosen, [len(group.tiles) for group in mixed], crisp)
+
+    def _store(self, chosen: Integers, counts: Sequence[int], crisp: bool) -> None:
+        """Make what is sampled, or how it is: of all tiles with several regions, whose groups have so many."""
+        g, membership = self.g, self.map.membership
+        if not self.soft:
+            labels = self._piecewise(np.stack([self.tiles.windows[tile].numpy() for tile in chosen.tolist()]))
+            self._labels = g.split(labels, counts)
+            return
         if self._sample == self._blurred:
             self._blurs = self._blur(chosen)
             if crisp:
-                labels = self._piecewise(self._cut(regions.membership.grid[0].cpu().numpy(), chosen))
-                self._owns = g.split(labels, [len(group.tiles) for group in mixed])
-        if soft and self._exponent is None:
-            squares = np.round(regions.membership.variances[0].cpu().numpy() * _SQUARES)
-            steps = g("Cast", self._piecewise(self._cut(squares, chosen)), to=FLOAT)
-            self._variances = g.split(g("Mul", steps, F32(1 / _SQUARES)), [len(group.tiles) for group in mixed])
-        if not soft:
-            labels = self._piecewise(np.stack([tiles.windows[tile].numpy() for tile in chosen.tolist()]))
-            self._labels = g.split(labels, [len(group.tiles) for group in mixed])
+                labels = self._piecewise(self._cut(membership.grid[0].cpu().numpy(), chosen))
+                self._owns = g.split(labels, counts)
+        if self._exponent is not None:
+            return
+        if self._levels is not None:
+            squares = g("Gather", g.constant(np.array(membership.levels.widths, F32) ** 2), self._levels)
+        else:
+            steps = np.round(membership.variances[0].cpu().numpy() * _SQUARES)
+            squares = g("Mul", g("Cast", self._piecewise(self._cut(steps, chosen)), to=FLOAT), F32(1 / _SQUARES))
+        self._variances = g.split(squares, counts)
 
     def weights(self, group: Group, slots: Value, row: Value, col: Value) -> Value:
         """Sample the K region weights of blocks, (B, K, 1, P), column by column.
@@ -190,7 +202,8 @@ class Windows:
         blurred = g("MatMul", kernels, g("Cast", inside, to=FLOAT))
         blurred = g("MatMul", blurred, g("Transpose", kernels, perm=[0, 2, 1]))
         if level is not None:
-            has = g("Equal", g("Gather", self._piecewise(found), window), g("Unsqueeze", width, axes))
+            self._levels = self._piecewise(found)
+            has = g("Equal", g("Gather", self._levels, window), g("Unsqueeze", width, axes))
             blurred = g("Mul", blurred, g("Cast", has, to=FLOAT))
         return g("Concat", np.zeros((1, _SOFT, _SOFT), F32), blurred, axis=0)
 
