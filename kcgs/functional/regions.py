@@ -311,9 +311,9 @@ class RegionMap:
         spread over the new pixel, or over one old pixel where that is smaller. Labels that are left with none are no
         regions.
 
-        Soft contours widen along with the map: between pixel centres a point has the bilinear mean of its four
-        neighbours' memberships. ``softness`` says the new widths; all regions stay. The same size gives the same map,
-        also from one that was resized before.
+        Soft contours widen along with the map: a point has the bilinear mean of its four neighbours' memberships; in a
+        larger map to a power, and summing to one, against the blur of pixels and of the mean. ``softness`` says the
+        new widths; all regions stay. The same size gives the same map, also from one that was resized before.
 
         Crisp contours are about one pixel wide at any size, the map's own too: a smooth curve that leaves the centres
         of the map's pixels on their side. ``softness`` is then 0.5, and all regions stay.
