@@ -175,7 +175,9 @@ def generic_feeds(scene: Scene, args: argparse.Namespace) -> tuple[dict[str, Arr
     size = target_size(args, scene.size)
     left, top, right, bottom = args.view or (0.0, 0.0, float(scene.size[1]), float(scene.size[0]))
     # of a smaller image pixels no larger than the scene's are rendered first
-    finer = max(size[0], math.ceil(bottom - top)), max(size[1], math.ceil(right - left))
+    extents, whole = (bottom - top, right - left), scene.size
+    needed = [min(math.ceil(extents[k] - 1 / 256), 2 * whole[k]) for k in (0, 1)]
+    finer = max(size[0], needed[0]), max(size[1], needed[1])
     labels = scene.labels
     if labels is None:
         labels = np.zeros(finer, np.int64)

@@ -18,6 +18,7 @@ from kcgs._repr import png, shorten
 from kcgs.functional import RegionMap
 from kcgs.functional.softness import CONTOURS, check_contours
 from kcgs.nn import GaussianField, RegionSplatRenderer
+from kcgs.nn.renderer import rendered_size
 
 FORMATS = {".safetensors": "kcgs.storage", ".kcgs": "kcgs.codec"}
 """File formats by suffix: a module, imported on use, with ``serialize(scene)`` and ``deserialize(data)``."""
@@ -108,7 +109,8 @@ class Scene(nn.Module):
             numbers = self.field.colors.shape[-1] * self.field.means.shape[:-2].numel()
             finer = 0 if self.regions is None else self.regions.supersample**2
             per_pixel = max(_IMAGE_BYTES * numbers, 4 * numbers + _MAP_BYTES * finer)
-            check_memory(name, self.size if size is None else check_size(name, size), per_pixel)
+            asked = self.size if size is None else check_size(name, size)
+            check_memory(name, rendered_size(self.size, asked), per_pixel)
 
     def unbind(self) -> tuple[Scene, ...]:
         """Take a batch apart: a scene for each image, without the graph; a scene of one image gives itself.

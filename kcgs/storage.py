@@ -38,6 +38,8 @@ def serialize(scene: Scene) -> bytes:
     notes = _describe(scene)
     tensors = {name: getattr(scene.field, name) for name in (*_REQUIRED, "opacities", "region_ids")}
     if scene.regions is not None:
+        if scene.regions.contours == "crisp":
+            raise ValueError('regions must have scaled contours; got crisp ones: render(contours="crisp") makes them')
         tensors["labels"] = scene.regions.fine_labels
     packed = {}
     for name, tensor in tensors.items():

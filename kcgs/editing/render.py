@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_image, check_size
-from kcgs.functional import RegionMap
+from kcgs.functional import RegionMap, region_splat
 from kcgs.nn import GaussianField, RegionSplatRenderer
+from kcgs.nn.field import scaled
 from kcgs.nn.renderer import area_mean, rendered_size
 from kcgs.scene import Scene
 
@@ -55,7 +56,7 @@ def render_region(
         # rendered alone and not confined, which is the colour itself: nothing is divided by a small alpha
         members = _part(scene.field, ids_of(scene.field) == region)
         members.region_ids = None
-        alone = RegionSplatRenderer()(members, None, finer)
+        alone = region_splat(*scaled(members, finer), members.merged_colors(), size=finer)
         share = (weight / torch.where(total > 0, total, 1.0)).to(alone.dtype)
         colors = colors + torch.where(alpha > 0, alone * share, 0.0)
     if finer != target:

@@ -67,7 +67,11 @@ def find_tables(labels: Tensor, widths: Tensor | None, supersample: int, size: t
         torch.equal(kept.version, labels) if labels.is_inference() else kept.version == _version(labels)
     ):
         return None
-    if kept.widths is not widths and (widths is None or kept.widths is None or not torch.equal(kept.widths, widths)):
+    if (
+        kept.widths is not widths
+        and not is_crisp(widths)
+        and (widths is None or kept.widths is None or not torch.equal(kept.widths, widths))
+    ):
         return None
     return kept.tables
 

@@ -130,7 +130,9 @@ def _tables(labels: Tensor, widths: Tensor | None, supersample: int, size: tuple
     if found is None:
         check_labels("regions", labels)
         softness, contours = (0.0, "crisp") if is_crisp(widths) else (softness_of(widths), "scaled")
-        regions = RegionMap.from_labels(labels, softness, supersample=supersample).resize(size, contours)
+        # of a tensor of its own: tables of the map itself stay where they are
+        own = labels.view_as(labels) if contours == "crisp" else labels
+        regions = RegionMap.from_labels(own, softness, supersample=supersample).resize(size, contours)
         found = regions.tables
         keep_tables(labels, widths, supersample, size, found)
     return found

@@ -186,7 +186,7 @@ class RegionMap:
             raise ValueError(f"weights needs one map; got labels of shape {tuple(self.labels.shape)}")
         chosen = [region_ids] if isinstance(region_ids, int) else sorted(set(region_ids))
         places = self.index_of(torch.tensor(chosen, dtype=torch.int64, device=self.ids.device)).tolist()
-        found = [self.membership.weights(0, place, torch.float64) for place in places if place >= 0]
+        found = [self.membership.whole(0, place) for place in places if place >= 0]
         total = torch.zeros(self.size, dtype=torch.float64, device=self.labels.device)
         return (sum(found[1:], found[0]) if found else total).to(dtype)
 
@@ -311,12 +311,12 @@ class RegionMap:
         spread over the new pixel, or over one old pixel where that is smaller. Labels that are left with none are no
         regions.
 
-        Soft contours widen along with the map: a point has the bilinear mean of its four neighbours' memberships; in a
-        larger map to a power, and summing to one, against the blur of pixels and of the mean. ``softness`` says the
-        new widths; all regions stay. The same size gives the same map, also from one that was resized before.
+        Soft contours widen along with the map: a point has the bilinear mean of its four neighbours' memberships. A
+        larger map raises them to a power that takes out the blur of pixels, and makes them sum to one. All regions
+        stay. The same size gives the same map. No means are taken in a smaller one; a renderer takes them of images.
 
-        Crisp contours are about one pixel wide at any size, the map's own too: a smooth curve that leaves the centres
-        of the map's pixels on their side. ``softness`` is then 0.5, and all regions stay.
+        Crisp contours are about one pixel wide in the mean of both directions, at any size, the map's own too: a smooth
+        curve that leaves the centres of the map's pixels on their side. ``softness`` is then 0.5.
 
         Args:
             size: (height, width).

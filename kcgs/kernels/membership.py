@@ -126,6 +126,19 @@ class Membership:
         """Tables for square tiles of `tile` pixels."""
         return self.derived(("tiles", tile), lambda _: self._build_tiles(tile))
 
+    def whole(self, batch: int, region: int, tile: int = 16) -> Tensor:
+        """Put s_r of one region together from the tables of tiles, (H, W) float64."""
+        (maps, height, width), table = self.index.shape, self.tiles(tile)
+        rows, cols = -(-height // tile), -(-width // tile)
+        mine = (table.keys % self.num_regions == region).nonzero().flatten()
+        tiles, mask = table.keys[mine] // self.num_regions, table.mask[mine]
+        found = torch.zeros(maps * rows * cols, tile * tile, dtype=torch.float64, device=self.index.device)
+        found[tiles] = 1.0
+        several = mask >= 0
+        found[tiles[several]] = table.masks[mask[several]].double()
+        image = found.view(maps, rows, cols, tile, tile)[batch].transpose(1, 2).reshape(rows * tile, cols * tile)
+        return image[:height, :width]
+
     def derived(self, key: object, build: Callable[[Membership], T]) -> T:
         """Return what `build` makes of this membership, made once and kept."""
         if key not in self._derived:

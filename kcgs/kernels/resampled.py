@@ -114,9 +114,10 @@ class Resampled(Membership):
         tiles, region = keys // self.num_regions, keys % self.num_regions
         groups = tiles.unique(return_inverse=True)[1]
         masks = torch.zeros(len(keys), tile * tile, dtype=torch.float64, device=keys.device)
-        # regions of a tile stay in one chunk: they may be weighed against each other
+        # regions of a tile stay in one chunk where they are weighed against each other
         most = max(1, _CHUNK_ELEMENTS // (spans[0] * spans[1] + tile * tile))
-        for chunk in _chunks(groups, most):
+        alone = torch.arange(len(keys), device=keys.device).split(most)
+        for chunk in alone if self._exponents() is None else _chunks(groups, most):
             t, y, x = tiles[chunk], row[tiles[chunk]], col[tiles[chunk]]
             begins = batch[t], firsts[0][y], firsts[1][x]
             mean = down[y] @ self._windows(begins, region[chunk], groups[chunk], spans) @ across[x].mT
@@ -184,11 +185,10 @@ def _keep(weights: Tensor, best: Tensor, own: Tensor) -> Tensor:
 def sharpness(variance: Any, lost: Any) -> Any:
     """Evaluate the exponent of :class:`Resampled` for variances, numbers or a Tensor; `lost` is its q."""
     if isinstance(variance, Tensor):
-        variance = variance.clamp_min(TINY)
-        return (
-            (variance + lost / 6) / torch.maximum(variance - lost / 12, torch.as_tensor(lost).to(variance) / 24)
-        ).sqrt()
-    return math.sqrt((max(variance, TINY) + lost / 6) / max(variance - lost / 12, lost / 24, TINY))
+        variance, least = variance.clamp_min(TINY), torch.as_tensor(lost).to(variance) / 24
+        return ((variance + lost / 6) / torch.maximum(variance - lost / 12, least)).sqrt()
+    variance = max(variance, TINY)
+    return math.sqrt((variance + lost / 6) / max(variance - lost / 12, lost / 24))
 
 
 def _sharpen(weights: Tensor, group: Tensor, exponent: float | Tensor) -> Tensor:

@@ -239,7 +239,13 @@ class GaussianField(nn.Module):
 def scaled(field: GaussianField, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Return means and Cholesky factors as they are on an image of another size, with the graph."""
     means, cholesky = field.means, field.cholesky
-    if size == field.size:
+    if torch.compiler.is_compiling():  # a comparison would become a guard, which graphs in ONNX have not
+        from torch.fx.experimental.symbolic_shapes import statically_known_true
+
+        same = all(statically_known_true(new == old) for new, old in zip(size, field.size, strict=True))
+    else:
+        same = size == field.size
+    if same:
         return means, cholesky
     if not torch.compiler.is_compiling():
         factors = torch.tensor([size[1] / field.size[1], size[0] / field.size[0]], dtype=torch.float64)

@@ -99,7 +99,7 @@ class RegionSplatRenderer(nn.Module):
                 )
             regions = as_map(regions)
             found = map_size(regions)
-            if found not in (target, field.size):
+            if found != field.size and found != target:
                 raise ValueError(f"regions must have the size {field.size} of the field or {target}; got {found}")
             if found != field.size:  # it does not say what there is between its pixels
                 finer = target
@@ -151,23 +151,30 @@ def area_mean(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _shrink(image: Tensor, dim: int, size: int) -> Tensor:
-    from torch.fx.experimental.symbolic_shapes import statically_known_true
-
     length = image.shape[dim]
-    if statically_known_true(size == length):
+    if _is_same(size, length):
         return image
     begin = torch.arange(size, device=image.device) * length  # in units of 1 / (size * length) of the whole
 
     def share(line: Tensor) -> Tensor:
         ends = torch.minimum(begin + length, (line + 1) * size) - torch.maximum(begin, line * size)
-        return (ends.clamp_min(0) / length).to(image.dtype)
+        return ends.clamp_min(0).to(image.dtype) / length
 
     if not torch.compiler.is_compiling():  # many times as fast as a matrix, which a graph of any size takes
         total = torch.zeros_like(image.narrow(dim, 0, size))
-        for step in range(-(-length // size) + 1):
+        for step in range(length // size + 2 * (length % size > 0)):
             line = begin // size + step
             taken = image.index_select(dim, line.clamp_max(length - 1))
             total = total + taken * (share(line) if dim == -1 else share(line)[:, None])
         return total
     matrix = share(torch.arange(length, device=image.device)[:, None])  # (length, size)
-    return image @ matrix if dim == -1 else matrix.T @ image
+    with torch.autocast(image.device.type, enabled=False):
+        return image @ matrix if dim == -1 else matrix.T @ image
+
+
+def _is_same(size: int, length: int) -> bool:
+    if not torch.compiler.is_compiling():
+        return size == length
+    from torch.fx.experimental.symbolic_shapes import statically_known_true
+
+    return statically_known_true(size == length)

@@ -24,7 +24,8 @@ class Axis:
     is at (2 n start + (2 i + 1) (end - start)) / 2 n, so that a contour's pixels fall on the same side everywhere, and
     not all runtimes have float64. `size`, int64 (1,), counts the pixels of the output, `length` those of the scene;
     `ends`, float32 (1,) each, bound the part of the scene that fills the output. Where its pixels are
-    larger than those of the scene, the image is first rendered with as many as the scene has there, `size`.
+    larger than those of the scene, more are rendered first, as many as the scene has there and at most twice those of
+    the whole; `shrink` then takes means. So the attribute `size` is what is rendered.
     """
 
     def __init__(self, graph: Graph, size: Value, length: int, ends: tuple[Value, Value] | None = None) -> None:
@@ -35,7 +36,9 @@ class Axis:
         else:
             start, end = (g("Cast", g("Mul", bound, np.float32(_PARTS)), to=INT64) for bound in ends)
             extent = g("Sub", end, start)
-        size = self.size = g("Max", size, g("Div", g("Add", extent, _PARTS - 1), _PARTS))
+        # rounded up, but for what rounding of the ends may add; a view far beyond the scene has no more to show
+        needed = g("Div", g("Add", extent, _PARTS - 1 - _PARTS // 256), _PARTS)
+        size = self.size = g("Max", size, g("Min", needed, 2 * length))
         self.extent, self.parts = extent, g("Mul", size, 2 * _PARTS)  # of the scene; of a pixel of it
         self.step = g("Div", g("Cast", extent, to=FLOAT), g("Cast", g("Mul", size, _PARTS), to=FLOAT))
         places = g("Range", np.int64(0), g("Squeeze", size), np.int64(1))

@@ -145,7 +145,7 @@ class _Plan(NamedTuple):
 def _check(scene: object) -> None:
     regions = check_scene(scene).regions
     if regions is not None and regions.resized:
-        raise ValueError("scene must have the map itself; got a soft one that was resized")
+        raise ValueError("scene must have the map itself; got one that was resized")
 
 
 def _check_change(exact: onnx.ModelProto, half: onnx.ModelProto, plan: _Plan) -> None:

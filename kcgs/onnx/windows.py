@@ -17,18 +17,19 @@ from .graph import FLOAT, Graph, Value
 from .layout import Group, Integers, Tiles, margin
 
 F32 = np.float32
-_STEPS = 65535
+_STEPS, _FINE_STEPS = (1 << 16) - 1, (1 << 24) - 1  # the latter of weights that are raised to high powers
 _FARTHEST = 16  # pixels that a contour reaches where its blur is computed in the graph
 _SOFT = TILE + 2  # side of a window of weights
-_SQUARES = 1 << 14  # steps of 1 that variances are stored in
+_WIDTHS = 1 << 14  # steps per pixel that widths are stored in
 
 
 class Windows:
     """Samples region weights at the pixels of blocks, whose rows and columns are `down` and `across`.
 
     Windows are made when the decoder is loaded: of hard contours they are stored as labels; soft ones are the blur of
-    labels, or stored as weights where contours are very wide or finer than pixels. With `crisp`, where the map is that
-    of `crisp_map`, what is sampled becomes crisp contours, as :class:`kcgs.kernels.Crisp` has them.
+    labels, or stored as weights where contours are very wide or finer than pixels. What is sampled loses the blur of
+    pixels, as :class:`kcgs.kernels.Resampled` has it, or with `crisp`, of labels that are blurred by the width of one,
+    becomes as narrow as :class:`kcgs.kernels.Crisp` has it.
     """
 
     def __init__(
@@ -47,6 +48,7 @@ class Windows:
         self.across = across.weights(factor, margin(factor), soft)
         self.down = g("Transpose", down.weights(factor, margin(factor), soft), perm=[0, 2, 1])
         self.sides = across.side, down.side
+        self._is_crisp = crisp
         self._exponent: Value | None = None
         self._levels: Value | None = None
         self._owns: Sequence[Value] | None = None
@@ -83,8 +85,9 @@ class Windows:
         if self._levels is not None:
             squares = g("Gather", g.constant(np.array(membership.levels.widths, F32) ** 2), self._levels)
         else:
-            steps = np.round(membership.variances[0].cpu().numpy() * _SQUARES)
-            squares = g("Mul", g("Cast", self._piecewise(self._cut(steps, chosen)), to=FLOAT), F32(1 / _SQUARES))
+            steps = np.round(np.sqrt(membership.variances[0].cpu().numpy()) * _WIDTHS)
+            widths = g("Mul", g("Cast", self._piecewise(self._cut(steps, chosen)), to=FLOAT), F32(1 / _WIDTHS))
+            squares = g("Mul", widths, widths)
         self._variances = g.split(squares, counts)
 
     def weights(self, group: Group, slots: Value, row: Value, col: Value) -> Value:
@@ -137,7 +140,7 @@ class Windows:
         return g("Cast", g("Equal", labels, np.arange(group.regions, dtype=np.int32)[:, None, None]), to=FLOAT)
 
     def _soft(self, group: Group) -> Value:
-        """All but the last region's are stored, in 65,535 steps; they sum to one."""
+        """All but the last region's are stored, in steps; they sum to one."""
         g = self.g
         windows = [self.tiles.windows[tile].numpy() for tile in group.tiles.tolist()]
         stored = np.concatenate([window[:-1] for window in windows]).swapaxes(1, 2)
@@ -145,8 +148,9 @@ class Windows:
         place = np.arange(group.regions)
         # which of the stored a region has; the one beyond them is zero
         which = np.where(place < counts - 1, np.cumsum(counts - 1)[:, None] - counts + 1 + place, len(stored))
-        masks = g("Cast", g.whole(np.round(stored * _STEPS).astype(np.int64)), to=FLOAT)
-        masks = g("Pad", g("Mul", masks, F32(1 / _STEPS)), np.array([0, 0, 0, 1, 0, 0]))
+        steps = _FINE_STEPS if self._is_crisp else _STEPS
+        masks = g("Cast", g.whole(np.round(stored * steps).astype(np.int64)), to=FLOAT)
+        masks = g("Pad", g("Mul", masks, F32(1 / steps)), np.array([0, 0, 0, 1, 0, 0]))
         weights = g("Gather", masks, g.whole(which))
         rest = g("Sub", F32(1), g("ReduceSum", weights, g.constant([1]), keepdims=1))
         last = g("Cast", g.constant((place == counts - 1)[:, :, None, None]), to=FLOAT)

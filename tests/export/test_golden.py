@@ -174,10 +174,12 @@ class Described:
 
     def image(self, size: tuple[int, ...], view: Any = None, factors: Any = None) -> np.ndarray:
         left, top, right, bottom = (0, 0, self.size[1], self.size[0]) if view is None else view.tolist()
-        finer = max(size[0], math.ceil(bottom - top)), max(size[1], math.ceil(right - left))
-        if finer != tuple(
-            size
-        ):  # every pixel in as many parts as the smaller image has, which then go into whole means
+        needed = (
+            min(math.ceil(e - 1 / 256), 2 * n) for e, n in zip((bottom - top, right - left), self.size, strict=True)
+        )
+        finer = tuple(max(*pair) for pair in zip(size, needed, strict=True))
+        if finer != tuple(size):
+            # every pixel in as many parts as the smaller image has, which then go into whole means
             image = self.image(finer, np.array([left, top, right, bottom]), factors)
             for axis, side in ((1, size[0]), (2, size[1])):
                 shape = (*image.shape[:axis], side, image.shape[axis], *image.shape[axis + 1 :])

@@ -425,7 +425,7 @@ class TestCrisp:
         assert "crisp" in repr(crisp) and "crisp" not in repr(scaled)
         image = crisp(field, regions, (90, 140))
         assert (image - scaled(field, regions, (90, 140))).abs().max() > 0.05
-        assert torch.equal(image, Scene(field, regions)((90, 140), "crisp")) or backend != "auto"
+        torch.testing.assert_close(image, Scene(field, regions)((90, 140), "crisp"), rtol=1e-4, atol=1e-4)
         assert torch.equal(image, scaled(field, regions.resize((90, 140), "crisp"), (90, 140)))
         alone = RegionMap.from_labels(regions.labels.clone())  # of which no tables are kept
         assert torch.equal(image, crisp(field, alone, (90, 140)))
@@ -441,7 +441,8 @@ class TestCrisp:
             assert other.contours == "crisp" and torch.equal(
                 other.membership.tiles(16).masks, crisp.membership.tiles(16).masks
             )
-        assert torch.equal(crisp.unbind()[1].weights(2), crisp.membership.weights(1, 2, torch.float64))
+        want = crisp.membership.weights(1, 2, torch.float64)
+        torch.testing.assert_close(crisp.unbind()[1].weights(2), want, rtol=0, atol=1e-9)
         assert crisp.resize((45, 70)) is regions and crisp.resize((90, 140), "crisp") is crisp
         assert RegionMap.from_labels(torch.zeros(4, 5).long()).resize((4, 5), "crisp").num_regions == 1
 

@@ -223,6 +223,23 @@ class TestCoarseGrids:
         assert torch.equal(around[:, :3], around[:, 1:4]) and (around[:, 3] - around[:, 4]).abs().max() < 0.05
         assert torch.equal(around[:, :, -3:], around[:, :, -4:-1])
 
+    def test_pans_at_native_scale_are_sharp(self) -> None:
+        """Rounding of a view's ends asks for no more pixels than it has: moved by a pixel, it shows the same."""
+        size = (32, 64)
+        field = scattered(60, size)
+        session = session_of(scene_decoder(Scene(field), clamp=False, interactive=True))
+        every = np.ones(1, np.float32)
+        for left in (0.1, 3.3, 7.7, 11.9, 12.30001):
+            views = [np.array([left + k, 0.2, left + k + 32, 24.2], np.float32) for k in (0, 1)]
+            first, second = (decode(session, (24, 32), view=view, visible=every) for view in views)
+            assert (first[:, :, 1:] - second[:, :, :-1]).abs().max() < 1e-3
+
+    def test_views_far_beyond_the_scene_are_bounded(self) -> None:
+        size = (32, 64)
+        session = session_of(scene_decoder(Scene(scattered(60, size)), interactive=True))
+        view = np.array([-3e5, -3e5, 3e5, 3e5], np.float32)
+        assert decode(session, (9, 9), view=view, visible=np.ones(1, np.float32)).shape == (3, 9, 9)
+
     @pytest.mark.parametrize("contours", ["scaled", "crisp"])
     def test_view_and_visible(self, contours: str) -> None:
         size = (80, 112)

@@ -188,6 +188,19 @@ class TestTorchExport:
             image = torch.rand(3, *size)
             assert_close(run(program.model_proto, image), module(image), 3e-4)
 
+    @pytest.mark.parametrize("traced", [(13, 17), SIZE, (90, 99), (13, 99)])
+    def test_a_scene_at_sizes_below_and_above_its_own(self, traced: tuple[int, int]) -> None:
+        regions = RegionMap.from_labels(labels_of(SIZE), 0.7)
+        module = Resized(Scene(GaussianField.random(40, SIZE, seed=0, regions=regions), regions)).eval()
+        shapes = ({1: "H", 2: "W"},)
+        program = torch.onnx.export(
+            module, (torch.rand(3, *traced),), dynamo=True, verbose=False, dynamic_shapes=shapes
+        )
+        assert program is not None
+        for size in ((13, 17), SIZE, (90, 99), (13, 99)):
+            image = torch.rand(3, *size)
+            assert_close(run(program.model_proto, image), module(image), 3e-4)
+
     def test_crisp_contours_are_refused(self) -> None:
         regions = RegionMap.from_labels(labels_of(SIZE))
         scene = Scene(GaussianField.random(40, SIZE, seed=0, regions=regions), regions)

@@ -191,6 +191,15 @@ class TestEditing(BaseTester):
 
 
 class TestRenderRegion:
+    def test_a_map_of_the_images_size(self) -> None:
+        """As the renderer: no means are taken then."""
+        scene = scene_of(MAPS["hard"]())
+        small = Scene(scene.field, map_of(scene).labels[::2, ::2])
+        size = map_of(small).size
+        cuts = torch.stack([cut(small, r, size) for r in map_of(small).ids.tolist()])
+        image = (cuts[:, 3:] * cuts[:, :3]).sum(0)
+        torch.testing.assert_close(image, small(size).detach(), rtol=0, atol=1e-5)
+
     @pytest.mark.parametrize("size", [None, (96, 128), (30, 50)])
     def test_all_regions_together_are_the_image(self, regions: RegionMap, size: tuple[int, int] | None) -> None:
         scene = scene_of(regions, opacities=True)
