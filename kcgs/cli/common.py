@@ -82,7 +82,11 @@ OUTPUT_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 IMAGES = (*OUTPUT_IMAGES, ".gif")
 
 
-def _scene_path(text: str) -> Path:
+# what label maps are read from
+_LABEL_MAPS = (".png", ".npy", ".tif", ".tiff", ".gif", ".bmp", ".webp")
+
+
+def _scene_path(text: str, others: tuple[str, ...] = ()) -> Path:
     from kcgs.scene import FORMATS
     from kcgs.zoo import PREFIX, find
 
@@ -90,13 +94,17 @@ def _scene_path(text: str) -> Path:
         path = find(text) if text.startswith(PREFIX) else Path(text)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
-    if path.suffix not in FORMATS:
-        raise typer.BadParameter(f"it must end in {' or '.join(FORMATS)}, or be {PREFIX}NAME; got {text!r}")
+    if path.suffix not in FORMATS and path.suffix.lower() not in others:
+        raise typer.BadParameter(f"it must end in {' or '.join((*FORMATS, *others))}, or be {PREFIX}NAME; got {text!r}")
     return path
 
 
 SceneFile = Annotated[
     Path, typer.Argument(help="Scene file (.safetensors or .kcgs), or zoo:NAME.", metavar="SCENE", parser=_scene_path)
+]
+_EITHER = "Scene file, or zoo:NAME; or label map: .png, .npy and others."
+SceneOrMap = Annotated[
+    Path, typer.Argument(help=_EITHER, metavar="FILE", parser=lambda text: _scene_path(text, _LABEL_MAPS))
 ]
 ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE", dir_okay=False)]
 

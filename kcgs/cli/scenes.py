@@ -1,4 +1,4 @@
-"""Commands that read a scene: render, eval, info, encode, decode."""
+"""Commands that read a scene: render, eval, info, encode, decode; the last three take label maps, too."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import typer
 from kcgs._atomic import write_file
 from kcgs._progress import Progress
 
-from .common import OUTPUT_IMAGES, ImageFile, Json, Quiet, SceneFile, app, check_output, print_report
+from .common import OUTPUT_IMAGES, ImageFile, Json, Quiet, SceneFile, SceneOrMap, app, check_output, print_report
 from .fit import describe_size, measure_scene
 from .options import Contours, Scale, Size, exclude, target_size
 
@@ -75,9 +75,12 @@ def eval_command(
 
 @app.command()
 def info(scene: SceneFile, as_json: Json = False) -> None:
-    """Say what a scene file holds."""
+    """Say what a file holds: a scene, or a label map."""
     from kcgs import load
 
+    if (labels := _read_map(scene)) is not None:
+        print_report(_describe_map(scene, labels), as_json, str(scene))
+        return
     loaded = load(scene)
     softness = 0.0 if loaded.regions is None else loaded.regions.softness
     if not isinstance(softness, float):
@@ -98,7 +101,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
 
 @app.command()
 def encode(
-    scene: SceneFile,
+    scene: SceneOrMap,
     output: Annotated[Path, typer.Option("-o", "--output", help="File to write (.kcgs).")],
     target_bytes: Annotated[int | None, typer.Option(min=1, help="The finest file that is not larger.")] = None,
     quality: Annotated[
@@ -114,11 +117,19 @@ def encode(
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Compress a scene."""
+    """Compress a scene, or a label map without loss."""
     from kcgs import codec, load
+    from kcgs.data import load_labels
     from kcgs.functional import psnr
+    from kcgs.scene import FORMATS
 
     check_output(output, ".kcgs")
+    if scene.suffix not in FORMATS:
+        exclude("a label map", target_bytes=target_bytes, quality=quality, image=image)
+        labels = load_labels(scene, rgb_ids=True)
+        write_file(output, codec.encode_labels(labels))
+        print_report(_describe_map(output, labels), as_json, str(output))
+        return
     if target_bytes is not None:
         exclude("--target-bytes", quality=quality)
     loaded = load(scene)
@@ -148,16 +159,24 @@ def encode(
 @app.command()
 def decode(
     file: Annotated[Path, typer.Argument(help="Compressed file (.kcgs).", metavar="FILE", dir_okay=False)],
-    output: OutputImage,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Image file; of a label map .png or .npy.")],
     num_bytes: Annotated[int | None, typer.Option("--bytes", min=1, help="Read only the first bytes.")] = None,
     scale: Scale = None,
     size: Size = None,
     contours: Contours = "scaled",
 ) -> None:
-    """Render a compressed file, or the coarser image that its first bytes hold."""
-    from kcgs import codec
-    from kcgs.data import save_image
+    """Render a compressed file, or the coarser image that its first bytes hold; or write its label map.
 
+    A PNG has ids as palette indices, above 255 as 16-bit grey, above 65,535 as colours R + 256 G + 65536 B.
+    """
+    from kcgs import codec
+    from kcgs.data import save_image, save_labels
+
+    if (labels := _read_map(file)) is not None:
+        exclude("a label map", bytes=num_bytes, scale=scale, size=size)
+        check_output(output, ".png", ".npy")
+        save_labels(output, labels, rgb_ids=output.suffix != ".npy" and bool(labels.max() > 65535))
+        return
     check_output(output, *OUTPUT_IMAGES)
     try:
         decoded = codec.decode(file.read_bytes(), max_bytes=num_bytes)
@@ -168,3 +187,22 @@ def decode(
         part = f"{decoded.layers} of {decoded.num_layers} layers, {len(scene)} Gaussians"
         typer.echo(f"{file}: a coarser image, {part}", err=True)
     save_image(output, scene.render(target_size(scene, scale, size), contours))
+
+
+def _read_map(file: Path) -> Any:
+    """Return the label map of a file that is one, and None of any other."""
+    from kcgs import codec
+
+    if file.suffix != ".kcgs" or not (data := file.read_bytes()).startswith(codec.MAP_MAGIC):
+        return None
+    try:
+        return codec.decode_labels(data)
+    except codec.CodecError as error:
+        raise codec.CodecError(f"cannot decode {file}: {error}") from error
+
+
+def _describe_map(file: Path, labels: Any) -> dict[str, Any]:
+    ids = labels.long().unique()
+    report = {"holds": "label map", "height": labels.shape[0], "width": labels.shape[1], "regions": len(ids)}
+    report |= {"largest_id": int(ids[-1]), "dtype": str(labels.dtype).removeprefix("torch.")}
+    return report | describe_size(file, file.stat().st_size, tuple(labels.shape))

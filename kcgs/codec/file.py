@@ -11,6 +11,8 @@ from .gaussians.quantize import ENERGIES, QPS
 from .rangecoder import CodecError
 
 MAGIC, VERSION = b"kcgs", 1
+MAP_MAGIC = b"kcgm"
+"""What a file begins with that is a label map and no scene."""
 # a decoder's memory: pixels of a map; Gaussians in all, and numbers of their colours
 MOST_LABELS = 1 << 26
 MOST_GAUSSIANS, MOST_COLORS = (1 << 21) - 1, 1 << 27
@@ -111,7 +113,9 @@ def _read_layers(stream: ByteReader, header: Header) -> Iterator[bytes]:
 
 def _read_header(stream: ByteReader) -> tuple[Header, int]:
     """Read the header; return it and the length of the map."""
-    if stream.take(4) != MAGIC:
+    if (magic := stream.take(4)) == MAP_MAGIC:
+        raise CodecError("it is a label map, no scene: kcgs.codec.decode_labels reads it, and kcgs decode")
+    if magic != MAGIC:
         raise CodecError(f"it must start with {MAGIC!r}; got {stream.data[:4]!r}")
     if (version := stream.take(1)[0]) != VERSION:
         raise CodecError(f"its version must be {VERSION}; got {version}")

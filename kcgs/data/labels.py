@@ -34,9 +34,10 @@ _SAFE_COLORS = (
     (0.800, 0.475, 0.655),
 )
 _TINT = 0.45
+_RGB = np.array([1, 1 << 8, 1 << 16])  # what R, G and B count where colours are ids
 
 
-def load_labels(path: str | os.PathLike[str]) -> Tensor:
+def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False) -> Tensor:
     """Read a label map.
 
     What counts as the label depends on what the file stores:
@@ -49,6 +50,7 @@ def load_labels(path: str | os.PathLike[str]) -> Tensor:
 
     Args:
         path: PNG, TIFF, GIF, BMP, lossless WebP or .npy. Formats that change pixel values are refused.
+        rgb_ids: colours are ids, R + 256 G + 65536 B, as in COCO's panoptic maps; any number of them, all opaque.
 
     Returns:
         :math:`(H, W)` int64, non-negative; ids need not be consecutive.
@@ -78,18 +80,19 @@ def load_labels(path: str | os.PathLike[str]) -> Tensor:
     if values.shape[-1] == 2 and (values[..., 1] != values[0, 0, 1]).any():
         raise ValueError(f"grey label maps must have no varying transparency; got {path}")
     if values.shape[-1] >= 3:
-        return _from_colors(values, path)
+        return _from_ids(values, path) if rgb_ids else _from_colors(values, path)
     return _checked(values[..., 0], path)
 
 
-def save_labels(path: str | os.PathLike[str], labels: Tensor) -> None:
+def save_labels(path: str | os.PathLike[str], labels: Tensor, *, rgb_ids: bool = False) -> None:
     """Write a label map losslessly, whole or not at all.
 
     A .png is an 8-bit palette image whose index is the label if all ids are below 256, else 16-bit grey.
 
     Args:
         path: the file to write, .png or .npy; its folder must exist.
-        labels: :math:`(H, W)` integer, non-negative; at most 65535 for .png.
+        labels: :math:`(H, W)` integer, non-negative; at most 65535 for .png, 2**24 - 1 with ``rgb_ids``.
+        rgb_ids: write an RGB .png whose colours are ids, as `load_labels` reads them with ``rgb_ids``.
 
     Raises:
         FileNotFoundError: the folder of ``path`` does not exist.
@@ -105,18 +108,21 @@ def save_labels(path: str | os.PathLike[str], labels: Tensor) -> None:
         [[0, 100000]]
     """
     suffix = Path(path).suffix.lower()
-    if suffix not in (".png", ".npy"):
-        raise ValueError(f"path must end in .png or .npy; got {str(path)!r}")
+    if suffix != ".png" and (rgb_ids or suffix != ".npy"):
+        raise ValueError(f"path must end in .png{'' if rgb_ids else ' or .npy'}; got {str(path)!r}")
     values = check_labels("labels", labels, dims=(2,)).cpu().numpy()
     highest = int(values.max())
     if suffix == ".npy":
         with atomic_path(path) as temporary:
             np.save(temporary, values.astype(np.min_scalar_type(highest)), allow_pickle=False)
         return
-    if highest > 65535:
-        raise ValueError(f"labels for a .png must be at most 65535; got {highest}: renumber or save as .npy")
-    stored = Image.fromarray(values.astype(np.uint8 if highest < 256 else np.uint16))
-    if highest < 256:
+    most = (1 << 24) - 1 if rgb_ids else 65535
+    if highest > most:
+        raise ValueError(f"labels for a .png must be at most {most}; got {highest}: renumber or save as .npy")
+    if rgb_ids:
+        values = values[..., None] // _RGB % 256
+    stored = Image.fromarray(values.astype(np.uint8 if rgb_ids or highest < 256 else np.uint16))
+    if highest < 256 and not rgb_ids:
         stored.putpalette((label_colors(256) * 255 + 0.5).floor().to(torch.uint8).flatten().tolist())
     with atomic_path(path) as temporary:
         stored.save(temporary, format="PNG")
@@ -239,6 +245,12 @@ def _checked(values: Array, path: str | os.PathLike[str]) -> Tensor:
     if low < 0 or high > np.iinfo(np.int64).max:
         raise ValueError(f"labels must lie in 0 ... 2^63 - 1; got {low} ... {high} in {path}")
     return torch.from_numpy(values.astype(np.int64))
+
+
+def _from_ids(values: Array, path: str | os.PathLike[str]) -> Tensor:
+    if values.dtype != np.uint8 or (values[..., 3:] != 255).any():
+        raise ValueError(f"colours that are ids must be opaque RGB of 8 bits; got {values.dtype} in {path}")
+    return torch.from_numpy(values[..., :3].astype(np.int64) @ _RGB)
 
 
 def _from_colors(values: Array, path: str | os.PathLike[str]) -> Tensor:

@@ -29,10 +29,10 @@ STRETCH = [bisect.bisect_left(RISE, 16 * q + 8) - 3071 for q in range(4096)]
 
 
 class Prior:
-    """The tables of the label model."""
+    """The tables of the label model, whose layers have `a` and `b` units."""
 
-    def __init__(self) -> None:
-        data = (Path(kcgs.codec.__file__).parent / "labels" / "prior.bin").read_bytes()
+    def __init__(self, name: str, a: int, b: int) -> None:
+        data = (Path(kcgs.codec.__file__).parent / "labels" / name).read_bytes()
 
         def take(kind: str, *shape: int) -> Any:
             nonlocal data
@@ -40,11 +40,11 @@ class Prior:
             array, data = np.frombuffer(data[:size], kind).reshape(shape), data[size:]
             return array.tolist()
 
-        self.layer1 = take("<i1", len(TEMPLATE), 2, 48)
-        self.bias1 = take("<i2", 48)
-        self.layer2 = list(zip(*take("<i1", 48, 16), strict=True))
-        self.bias2 = take("<i4", 16)
-        self.layer3 = list(zip(*take("<i1", 16, 2), strict=True))
+        self.layer1 = take("<i1", len(TEMPLATE), 2, a)
+        self.bias1 = take("<i2", a)
+        self.layer2 = list(zip(*take("<i1", a, b), strict=True))
+        self.bias2 = take("<i4", b)
+        self.layer3 = list(zip(*take("<i1", b, 2), strict=True))
         self.bias3 = take("<i4", 2)
         self.mixer = take("<i4", 4)
         assert not data
@@ -62,14 +62,14 @@ class Prior:
         ]
 
 
-PRIOR = Prior()
+OF_SCENES, OF_MAPS = Prior("prior.bin", 48, 16), Prior("prior2.bin", 96, 32)
 
 
 class Decision:
     """`contexts`, of one of the two."""
 
-    def __init__(self) -> None:
-        self.weights = [list(PRIOR.mixer) for _ in range(4)]
+    def __init__(self, prior: Prior) -> None:
+        self.prior, self.weights = prior, [list(prior.mixer) for _ in range(4)]
         self.counters: list[dict[tuple[int, ...], list[int]]] = [{}, {}, {}]
 
 
@@ -102,7 +102,7 @@ class Pixel:
         second = next(label for label in around if label != first)
         self.candidates = [first, second]
         f = [0 if label == first else 1 if label == second else 2 for label in around]
-        logits = PRIOR.logits(f)
+        logits = decisions[0].prior.logits(f)
         seen = [tuple(value > 0 for value in f[1 : 1 + nearest]) for nearest in (6, 11, 16)]
         self.which = Question(decisions[0], logits[0], seen)
         self.neither = Question(decisions[1], logits[1], [(), tuple(f[1:5]), tuple(f[1:9])])

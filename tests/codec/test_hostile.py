@@ -14,7 +14,7 @@ from kcgs.codec.file import Header, pack
 from kcgs.codec.gaussians.layers import LayerCoder
 from kcgs.codec.gaussians.occupancy import Grid, Occupancy, _code_counts
 from kcgs.codec.gaussians.quantize import Quantizer
-from kcgs.codec.labels.coding import Remaining
+from kcgs.codec.labels.ids import Remaining
 from kcgs.codec.rangecoder import Writer
 
 from .test_file import assert_sound

@@ -168,7 +168,7 @@ class TestSize:
 class TestWork:
     """What takes minutes is written plainly, and refused where it is not."""
 
-    @pytest.mark.parametrize("limit", ["_MOST_ASKED", "_MOST_ESCAPES"])
+    @pytest.mark.parametrize("limit", ["_MOST_ASKED", "MOST_ESCAPES"])
     def test_bounded(self, limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
         specks = np.random.default_rng(0).random((80, 120))
         labels = np.where(specks < 0.02, (specks * 300).astype(np.int64), np.arange(120) // 18)

@@ -12,11 +12,11 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from kcgs import RegionMap
+from kcgs import RegionMap, codec
 from kcgs.codec import decode
 from kcgs.codec.labels import encode_labels, encode_map
 
-from .chances import TEMPLATE, Decision, Pixel
+from .chances import OF_MAPS, OF_SCENES, TEMPLATE, Decision, Pixel, Prior
 from .symbols import Bits, Bytes, Choices, Learnt, Symbols
 
 Labels = NDArray[np.int64]
@@ -28,11 +28,11 @@ QUIET = [(-2, 0), (-1, 0), *((dx, -1) for dx in range(-2, 8)), *((dx, -2) for dx
 class Map:
     """Labels: from the wavefront to pixels."""
 
-    def __init__(self, bits: Bits, height: int, width: int, regions: int) -> None:
+    def __init__(self, bits: Bits, height: int, width: int, regions: int, prior: Prior = OF_SCENES) -> None:
         self.bits, self.height, self.width, self.regions = bits, height, width, regions
         self.rows = [[-1] * width for _ in range(height)]
         self.wave, self.met = 0, 1
-        self.decisions = [Decision(), Decision()]
+        self.decisions = [Decision(prior), Decision(prior)]
         self.new = {True: Learnt(), False: Learnt()}
         self.near = {start: [Learnt() for _ in range(3)] for start in (True, False)}
 
@@ -133,10 +133,7 @@ class Map:
 def read_labels(data: bytes, height: int, width: int) -> Rows:
     """`labels`, **Regions** and **Noise**."""
     bits = Bits(data)
-    length = 0
-    while bits.number(2):
-        length += 1
-    regions = 1 << length | bits.plain(length)
+    regions = read_regions(bits)
     ids = [*range(regions)]
     if bits.number(2):
         left, last = [], -1
@@ -144,13 +141,58 @@ def read_labels(data: bytes, height: int, width: int) -> Rows:
             last += 1 + bits.magnitude()
             left.append(last)
         ids = [left.pop(bits.number(len(left))) for _ in range(regions)]
-    if regions == 1:
+    return read_pixels(bits, height, width, ids, OF_SCENES)
+
+
+def read_regions(bits: Bits) -> int:
+    length = 0
+    while bits.number(2):
+        length += 1
+    return 1 << length | bits.plain(length)
+
+
+def read_pixels(bits: Bits, height: int, width: int, ids: list[int], prior: Prior) -> Rows:
+    if len(ids) == 1:
         return [[ids[0]] * width for _ in range(height)]
     if bits.bit(64):
-        rows = [[bits.uniform(regions) for _ in range(width)] for _ in range(height)]
+        rows = [[bits.uniform(len(ids)) for _ in range(width)] for _ in range(height)]
     else:
-        rows = Map(bits, height, width, regions).read()
+        rows = Map(bits, height, width, len(ids), prior).read()
     return [[ids[label] for label in row] for row in rows]
+
+
+def read_file(data: bytes) -> tuple[str, Rows]:
+    """`A file of a label map`: the type of its numbers, and its rows."""
+    assert int.from_bytes(data[-4:], "big") == zlib.crc32(data[:-4])
+    stream = Bytes(data[:-4])
+    assert stream.take(4) == b"kcgm"
+    (form,) = stream.take(1)
+    turn, kind = form % 8, form // 8
+    height, width = stream.varint(), stream.varint()
+    bits = Bits(stream.data)
+    ids = read_ids(bits, read_regions(bits))
+    rows = read_pixels(bits, *((width, height) if turn & 4 else (height, width)), ids, OF_MAPS)
+    if turn & 1:
+        rows = [row[::-1] for row in rows]
+    if turn & 2:
+        rows = rows[::-1]
+    if turn & 4:
+        rows = [list(column) for column in zip(*rows, strict=True)]
+    return ["bool", "uint8", "int8", "uint16", "int16", "uint32", "int32", "int64"][kind], rows
+
+
+def read_ids(bits: Bits, regions: int) -> list[int]:
+    left = [*range(regions)]
+    if bits.number(2):
+        if regions == 2 and bits.number(2):
+            left = [0, 255]
+        else:
+            left, last, lengths = [], -1, Choices(8.0, *[1.0] * 16, *[0.125] * 47)
+            for _ in range(regions):
+                (length,) = lengths.read(bits)
+                last += 1 + (1 << length - 1 | bits.plain(length - 1) if length else 0)
+                left.append(last)
+    return [left.pop(bits.number(len(left))) for _ in range(regions)] if bits.number(2) else left
 
 
 def read_map(data: bytes, height: int, width: int) -> tuple[int, Rows, dict[tuple[int, int], float]]:
@@ -248,6 +290,19 @@ CASES = {
 def test_labels(name: str) -> None:
     labels = np.asarray(CASES[name], np.int64)
     assert np.array_equal(read_labels(encode_labels(labels), *labels.shape), labels)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_files(name: str) -> None:
+    labels = np.asarray(CASES[name], np.int64)
+    assert read_file(codec.encode_labels(labels)) == ("int64", labels.tolist())
+
+
+@pytest.mark.parametrize("ids", [[0, 255], [255, 0], [0, 1], [1, 0], [7, 9], [0, 3, 2, 1, 5], [9, 1, 200, 3, 254]])
+@pytest.mark.parametrize("kind", ["uint8", "uint16", "int32"])
+def test_ids_of_files(ids: list[int], kind: str) -> None:
+    labels = np.array(ids, kind)[cells(20, 30, len(ids))]
+    assert read_file(codec.encode_labels(labels)) == (kind, labels.tolist())
 
 
 @pytest.mark.parametrize("seed", range(12))

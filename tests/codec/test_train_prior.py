@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from kcgs.codec.labels.contexts import FEATURE, INPUT, INPUTS, LAYOUT, TEMPLATE, load_prior, network
+from kcgs.codec.labels.contexts import FEATURE, INPUT, INPUTS, PRIORS, TEMPLATE, layout, load_prior, make_network
 from kcgs.codec.labels.wavefront import new_work
 
 from . import train_prior
@@ -15,18 +15,20 @@ from . import train_prior
 def test_tables_have_the_format(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(train_prior, "SHAPES", 3)  # maps beside those given
     labels = train_prior.shapes(np.random.default_rng(1))
-    data = train_prior.pack(train_prior.train([labels], steps=3, seed=0))
-    assert len(data) == sum(np.dtype(kind).itemsize * int(np.prod(shape)) for kind, shape in LAYOUT)
+    data = train_prior.pack(train_prior.train([labels], steps=3, seed=0, units=(8, 4)))
+    assert len(data) == sum(np.dtype(kind).itemsize * int(np.prod(shape)) for kind, shape in layout(8, 4))
 
 
-def test_the_network_is_the_one_that_codes() -> None:
-    tables = [torch.from_numpy(table).float() for table in load_prior()[:-1]]
+@pytest.mark.parametrize("name", PRIORS)
+def test_the_network_is_the_one_that_codes(name: str) -> None:
+    tables = [torch.from_numpy(table).float() for table in load_prior(name)[:-1]]
     parameters = [t / scale for t, (scale, _) in zip(tables, train_prior.limits(), strict=True)]
     parameters[0] = parameters[0].flatten(0, 1)
     features = torch.randint(3, (50, len(TEMPLATE)), generator=torch.Generator().manual_seed(0), dtype=torch.int8)
-    rows = new_work(50)[0]
+    rows = new_work(50, load_prior(name))[0]
     rows[:, FEATURE : FEATURE + len(TEMPLATE)] = features.numpy()
+    network = make_network(load_prior(name)).py_func
     for row in rows:
-        network.py_func(row)
+        network(row)
     coded = torch.from_numpy(rows[:, INPUT : INPUT + 2 * INPUTS : INPUTS]) / 256
     assert (train_prior.network(features, parameters) - coded).abs().max() < 0.1

@@ -16,18 +16,20 @@ from kcgs.codec.rangecoder import CodecError, Coder, Reader, Writer
 from kcgs.functional import MAX_SOFTNESS, PairWidths, RegionMap
 from kcgs.functional.labels import compact, touching_pairs
 
-from .contexts import CODED, LABEL, LEFT, RIGHT, TOP, new_tables
-from .wavefront import DECIDED, RANKS, REGIONS, STATE, advance, nearest, new_work, program, survey
+from .contexts import CODED, LABEL, LEFT, RIGHT, TOP, load_prior, new_tables
+from .ids import code_ids, code_ids_of_file
+from .wavefront import DECIDED, RANKS, REGIONS, STATE, WIDE, advance, nearest, new_work, program, survey
 
 # what a reader may be asked to work through: seconds
-_MOST_ASKED, _MOST_ESCAPES = 1 << 23, 1 << 18
+_MOST_ASKED, MOST_ESCAPES = 1 << 23, 1 << 18
 _NOISY = np.array([2.0**-10])  # chance of a map that the model makes larger
-_MOST_BITS = 24  # of the number of regions
 _SIZES = 8  # contexts of seeds, by how many are in the block
 _FORTIETHS = 40  # of a pixel
 _MOST_WIDTH = int(MAX_SOFTNESS) * _FORTIETHS
 _MOST_SUPERSAMPLE = 64
 _TOGETHER = 32  # pairs that are coded before their model learns
+# ways to turn a map and to mirror it; how many are tried, and with how many seeds more than the fewest
+TURNS, _TRIED, _NEAR = 8, 2, 3
 
 
 def encode_labels(labels: Integers) -> bytes:
@@ -39,9 +41,42 @@ def encode_labels(labels: Integers) -> bytes:
         True
     """
     ids, index = (found.numpy() for found in compact(torch.from_numpy(labels))[:2])
+    return encode_regions(ids, index)
+
+
+def encode_turned(labels: Integers) -> tuple[int, bytes]:
+    """Write a map in the form of files, turned as it takes the fewest bytes among the ways with the fewest seeds."""
+    ids, index = (found.numpy() for found in compact(torch.from_numpy(labels))[:2])
+    check_count("number of regions", len(ids), 1, MOST_REGIONS)
+    program.ready()
+    seeds = [int(survey(turned(index, turn), len(ids))[1].sum()) for turn in range(TURNS)]
+    tried = [t for t in sorted(range(TURNS), key=seeds.__getitem__)[:_TRIED] if seeds[t] <= min(seeds) + _NEAR]
+    found = [(turn, encode_regions(ids, turned(index, turn), alone=True)) for turn in tried]
+    return min(found, key=lambda coded: len(coded[1]))
+
+
+def decode_turned(data: bytes, size: tuple[int, int], turn: int) -> Integers:
+    """Read a map that `encode_turned` wrote."""
+    # more are noise, of more bytes; as many a reader may be asked to list
+    most = min(MOST_REGIONS, max(MOST_ESCAPES + 1, 4 * len(data)))
+    labels = decode_labels(data, *(size[::-1] if turn & 4 else size), max_regions=most, alone=True)
+    found: Integers = turned(labels, turn, back=True)
+    return found
+
+
+def turned(labels: Any, turn: int, *, back: bool = False) -> Any:
+    """Transpose a map if `turn` has 4, reverse its rows if 2, then its columns if 1; or take that back."""
+    labels = labels.T if turn & 4 and not back else labels
+    labels = labels[:: -1 if turn & 2 else 1, :: -1 if turn & 1 else 1]
+    return np.ascontiguousarray(labels.T if turn & 4 and back else labels)
+
+
+def encode_regions(ids: Integers, index: Any, *, alone: bool = False) -> bytes:
+    """Write a map of positions among ids; `alone`: in the form of files."""
+    code = code_ids_of_file if alone else code_ids
     if len(ids) == 1:
         writer = Writer()
-        _code_ids(writer, ids.tolist(), 1)
+        code(writer, ids.tolist(), 1)
         return writer.finish()
     program.ready()
     truth, seeds, order = survey(index, len(ids))
@@ -49,55 +84,57 @@ def encode_labels(labels: Integers) -> bytes:
 
     def begin(noisy: int) -> Writer:
         writer = Writer()
-        _code_ids(writer, numbered, len(ids))
+        code(writer, numbered, len(ids))
         writer.bits(_NOISY, np.array([noisy], np.int32))
         return writer
 
     try:
         writer = begin(0)
-        _code_pixels(writer, truth, seeds, len(ids))
+        _code_pixels(writer, truth, seeds, len(ids), alone)
         data = writer.finish()
-        if 8 * len(data) <= labels.size * math.log2(len(ids)) + 64:
+        if 8 * len(data) <= index.size * math.log2(len(ids)) + 64:
             return data
     except _Laborious:
         pass  # noise, or nearly
     writer = begin(1)
-    writer.numbers(truth.reshape(-1), len(ids), labels.size)
+    writer.numbers(truth.reshape(-1), len(ids), index.size)
     return writer.finish()
 
 
-def decode_labels(data: bytes, height: int, width: int, *, max_regions: int) -> Integers:
-    """Read a label map (H, W) that `encode_labels` wrote; what is none, or has more regions, is a CodecError.
+def decode_labels(data: bytes, height: int, width: int, *, max_regions: int, alone: bool = False) -> Integers:
+    """Read a label map (H, W), `alone` in the form of files; what is none, or has more regions, is a CodecError.
 
     Example:
         >>> labels = np.array([[7, 7, 3], [7, 3, 3]])
         >>> (decode_labels(encode_labels(labels), 2, 3, max_regions=2) == labels).all()
         np.True_
     """
-    reader = Reader(data)
-    ids = np.array(_code_ids(reader, [], min(max_regions, height * width)), np.int64)
+    reader, code = Reader(data), code_ids_of_file if alone else code_ids
+    ids = np.array(code(reader, [], min(max_regions, height * width)), np.int64)
     if len(ids) == 1:
         return np.full((height, width), ids[0], np.int64)
     if reader.bits(_NOISY, np.zeros(1, np.int32))[0]:
         index = reader.numbers(None, len(ids), height * width).reshape(height, width)
     else:
-        index = _code_pixels(reader, np.zeros((0, 0), np.int32), np.zeros((height, width), np.uint8), len(ids))
+        empty, seeds = np.zeros((0, 0), np.int32), np.zeros((height, width), np.uint8)
+        index = _code_pixels(reader, empty, seeds, len(ids), alone)
     labels: Integers = ids[index]
     return labels
 
 
-def _code_pixels(coder: Coder, truth: Any, seeds: Any, regions: int) -> Any:
+def _code_pixels(coder: Coder, truth: Any, seeds: Any, regions: int, alone: bool) -> Any:
     """Code a map of numbered regions; a reader has an empty `truth` and fills in `seeds`."""
     program.ready()
     _code_seeds(coder, seeds)
     height, width = seeds.shape
-    rows, chances, lines = new_work(height)
+    tables = load_prior("prior2.bin" if alone else "prior.bin")
+    rows, chances, lines = new_work(height, tables)
     labels = np.zeros((height + TOP + 1, width + LEFT + RIGHT), np.int32)
     state = np.zeros(STATE, np.int64)
-    state[REGIONS] = regions
+    state[REGIONS], state[WIDE] = regions, alone
     escapes = _Escapes(coder, labels, regions)
     answers = np.zeros(2 * height, np.int32)
-    memory = (truth, answers, state, labels, seeds, *new_tables(), rows, chances, lines)
+    memory = (truth, answers, state, labels, seeds, *new_tables(tables), rows, chances, lines)
     bits, asked = answers[:0], 0
     while count := advance(bits, *memory):
         decided = int(state[DECIDED])
@@ -132,8 +169,8 @@ class _Escapes:
         asked = rows[:, CODED] == 0
         asked[~asked] = neither
         self._count += int(asked.sum())
-        if self._count > _MOST_ESCAPES:
-            raise _Laborious(f"data must hold at most {_MOST_ESCAPES} labels that no neighbour has; got more")
+        if self._count > MOST_ESCAPES:
+            raise _Laborious(f"data must hold at most {MOST_ESCAPES} labels that no neighbour has; got more")
         for place in np.flatnonzero(asked):
             rows[place, LABEL] = self._code(rows[place])
 
@@ -206,61 +243,6 @@ def _code_places(coder: Coder, pairs: int, count: int, places: Integers | None) 
         part = slice(start, start + _TOGETHER)
         found[part] = model.code(coder, len(found[part]), None if places is None else places[part])
     return found
-
-
-def _code_ids(coder: Coder, ids: list[int], limit: int) -> list[int]:
-    """Code the ids in the order in which the wavefront meets their regions; a reader gives none."""
-    extra = 0
-    while coder.fair(len(ids) >= 2 << extra):
-        extra += 1
-        if extra == _MOST_BITS:
-            raise CodecError(f"data must hold at most {limit} regions; got {1 << extra} or more")
-    count = 1 << extra | coder.plain(len(ids), extra)
-    if count > limit:
-        raise CodecError(f"data must hold at most {limit} regions; got {count}")
-    if not coder.fair(ids != list(range(len(ids)))):
-        return list(range(count))
-    given, ordered, last = sorted(ids), [], -1
-    for i in range(count):
-        last += 1 + coder.unbounded(0 if coder.reads else given[i] - last - 1)
-        ordered.append(last)
-    if last >= 1 << 63:
-        raise CodecError(f"data must hold ids below 2**63; got {last}")
-    left, places, found = Remaining(count), {region: i for i, region in enumerate(given)}, []
-    for i in range(count):
-        rank = coder.number(0 if coder.reads else left.rank(places[ids[i]]), count - i)
-        if rank >= count - i:
-            raise CodecError(f"data must name one of {count - i} ids that are left; got number {rank}")
-        found.append(ordered[left.take(rank)])
-    return found
-
-
-class Remaining:
-    """Which of so many things in order are left: a tree of counts, so that millions take seconds."""
-
-    def __init__(self, count: int) -> None:
-        self._tree = [i & -i for i in range(count + 1)]
-
-    def rank(self, place: int) -> int:
-        """Return how many are left before the one at `place`."""
-        total = 0
-        while place:
-            total += self._tree[place]
-            place &= place - 1
-        return total
-
-    def take(self, rank: int) -> int:
-        """Remove the one that so many are left before; return its place."""
-        place, step = 0, 1 << len(self._tree).bit_length()
-        while step := step >> 1:
-            if place + step >= len(self._tree):
-                continue
-            if self._tree[place + step] <= rank:
-                place += step
-                rank -= self._tree[place]
-            else:
-                self._tree[place + step] -= 1
-        return place
 
 
 def _code_seeds(coder: Coder, seeds: Any) -> None:

@@ -17,30 +17,20 @@ from kcgs.kernels.compiled import inner
 _REACH = ((-8, -1), (-8, 7), (-7, 8), (-6, 7), (-5, 6), (-3, 4), (-2, 3))
 _OFFSETS = [(dx, -dy) for dy, (low, high) in enumerate(_REACH) for dx in range(low, high + 1)]
 TEMPLATE = sorted(_OFFSETS, key=lambda place: (place[0] ** 2 + place[1] ** 2, -place[1], place[0]))
-HIDDEN, LATENT = 48, 16
-# weights are in 1/64, biases of the second and third layer in 1/4096, first estimates of the mixer in 1/65536
-LAYOUT = (
-    ("<i1", (len(TEMPLATE), 2, HIDDEN)),  # layer1
-    ("<i2", (HIDDEN,)),  # bias1
-    ("<i1", (HIDDEN, LATENT)),  # layer2
-    ("<i4", (LATENT,)),  # bias2
-    ("<i1", (LATENT, 2)),  # layer3
-    ("<i4", (2,)),  # bias3
-    ("<i4", (4,)),  # mixer
-)
+# tables of scenes and of files of maps, with the units of their layers; weights are in 1/64, biases of the second and
+# third layer in 1/4096, first estimates of the mixer in 1/65536
+PRIORS = {"prior.bin": (48, 16), "prior2.bin": (96, 32)}
 
 LEFT, RIGHT, TOP = 8, 9, 6  # margins around the map
 CLIP = 3071  # largest logit, in 1/256
 HEADS, INPUTS = 2, 4  # decisions: which of two candidates, or neither; estimates that are mixed
 # columns of a pixel's row: its place, the candidates, whether it is decided by bits, its label; then for each decision
-# the estimates, and the three counters, the mixer's weights, the chance; then the template, and the network's units
+# the estimates, and the three counters, the mixer's weights, the chance; then the template, and room for the network
 X, Y, FIRST, SECOND, CODED, LABEL, INPUT = 0, 1, 2, 3, 4, 5, 6
 SLOT = INPUT + HEADS * INPUTS
 CHOSEN, MIXED, DECISION = 3, 4, 5
 FEATURE = SLOT + HEADS * DECISION
-_LATENT = FEATURE + len(TEMPLATE)
-_HIDDEN = _LATENT + LATENT
-COLUMNS = _HIDDEN + HIDDEN
+UNITS = FEATURE + len(TEMPLATE)
 
 # where the counters of each context begin
 _BASES = np.array([[0, 1 << 6, (1 << 6) + (1 << 11)], [67648, 67649, 67649 + 3**4]], np.int32)
@@ -51,27 +41,33 @@ _MEMORY = 40  # decisions that a counter remembers
 _SURE = 16  # least chance, in 1/65536
 
 
-def load_prior() -> list[Any]:
-    """Read the tables that come with the package, as int32, in the order of `LAYOUT`."""
-    data = resources.files(__package__).joinpath("prior.bin").read_bytes()
-    tables = np.frombuffer(data, [("", kind, shape) for kind, shape in LAYOUT])[0]
-    return [table.astype(np.int32) for table in tables]
+def layout(hidden: int, latent: int) -> list[tuple[str, tuple[int, ...]]]:
+    """Return type and shape of each table: weights and biases of three layers, then the mixer's first weights."""
+    weights = ("<i1", (len(TEMPLATE), 2, hidden)), ("<i1", (hidden, latent)), ("<i1", (latent, HEADS))
+    biases = ("<i2", (hidden,)), ("<i4", (latent,)), ("<i4", (HEADS,))
+    return [table for layer in zip(weights, biases, strict=True) for table in layer] + [("<i4", (INPUTS,))]
 
 
-# constants of the loops: the template, the network, 65536 / (1 + e**(-x / 256)) for logits from -CLIP, its inverse.
-# No value of the third but 32768 is within 1e-6 of a half before it is rounded: any machine's exp gives the same table.
+def load_prior(name: str = "prior.bin") -> tuple[Any, ...]:
+    """Read tables that come with the package, as int32, in the order of `layout`."""
+    data = resources.files(__package__).joinpath(name).read_bytes()
+    tables = np.frombuffer(data, [("", kind, shape) for kind, shape in layout(*PRIORS[name])])[0]
+    return tuple(table.astype(np.int32) for table in tables)
+
+
+# constants of the loops: the template, 65536 / (1 + e**(-x / 256)) for logits from -CLIP, its inverse. No value of the
+# second but 32768 is within 1e-6 of a half before it is rounded: any machine's exp gives the same table.
 _DX, _DY = (np.array(axis, np.int32) for axis in zip(*TEMPLATE, strict=True))
-_LAYER1, _BIAS1, _LAYER2, _BIAS2, _LAYER3, _BIAS3, _MIXER = load_prior()
 SQUASH = np.rint(65536 / (1 + np.exp(np.arange(CLIP, -CLIP - 1, -1) / 256))).astype(np.int32)
 _STRETCH = (np.searchsorted(SQUASH, np.arange(4096) * 16 + 8) - CLIP).astype(np.int32)
 
 
-def new_tables() -> tuple[Any, Any]:
+def new_tables(prior: tuple[Any, ...]) -> tuple[Any, Any]:
     """Return what adapts, as every stream starts with it.
 
     Counters [slots, 2] uint16, a chance in 1/65536 and how often it was seen; the mixer's weights [HEADS, 4, INPUTS].
     """
-    return np.zeros((_SLOTS, 2), np.uint16), np.tile(_MIXER, (HEADS, 4, 1))
+    return np.zeros((_SLOTS, 2), np.uint16), np.tile(prior[-1], (HEADS, 4, 1))
 
 
 @inner
@@ -105,32 +101,44 @@ def describe(labels, y, x, row):  # type: ignore[no-untyped-def]
     row[SECOND] = second
 
 
-@inner
-def network(row):  # type: ignore[no-untyped-def]
-    """Two layers of rectified sums of small integers; the first estimate of each decision, a logit in 1/256."""
-    # lengths that a compiler cannot know: it would write known loops out, and not use vectors, at three times the time
-    latent, hidden = row[_LATENT : len(row) - HIDDEN], row[_HIDDEN:]
-    for j in range(len(hidden)):
-        hidden[j] = _BIAS1[j]
-    for t in range(len(_DX)):
-        kind = row[FEATURE + t]
-        if kind > 0:
-            weights = _LAYER1[t, kind - 1]
-            for j in range(len(hidden)):
-                hidden[j] += weights[j]
-    for k in range(len(latent)):
-        latent[k] = _BIAS2[k]
-    for j in range(HIDDEN):
-        value = min(hidden[j], 4095)
-        if value > 0:
-            weights = _LAYER2[j]
-            for k in range(len(latent)):
-                latent[k] += value * weights[k]
-    for h in range(HEADS):
-        total = _BIAS3[h]
-        for k in range(LATENT):
-            total += min(max(latent[k] >> 6, 0), 4095) * _LAYER3[k, h]
-        row[INPUT + h * INPUTS] = min(max(total >> 4, -CLIP), CLIP)
+def make_network(prior: tuple[Any, ...]) -> Any:
+    """Return the network of these tables, compiled; they are constants of its loops, which as arguments slow them.
+
+    Two layers of rectified sums of small integers give the first estimate of each decision, a logit in 1/256.
+    """
+    layer1, bias1, layer2, bias2, layer3, bias3, _ = prior
+    num_hidden, num_latent = layer2.shape
+
+    @inner
+    def network(row):  # type: ignore[no-untyped-def]
+        # lengths that a compiler cannot know: known loops it would write out, without vectors, at three times the time
+        latent, hidden = row[UNITS : len(row) - num_hidden], row[UNITS + num_latent :]
+        for j in range(len(hidden)):
+            hidden[j] = bias1[j]
+        for t in range(len(_DX)):
+            kind = row[FEATURE + t]
+            if kind > 0:
+                weights = layer1[t, kind - 1]
+                for j in range(len(hidden)):
+                    hidden[j] += weights[j]
+        for k in range(len(latent)):
+            latent[k] = bias2[k]
+        for j in range(num_hidden):
+            value = min(hidden[j], 4095)
+            if value > 0:
+                weights = layer2[j]
+                for k in range(len(latent)):
+                    latent[k] += value * weights[k]
+        for h in range(HEADS):
+            total = bias3[h]
+            for k in range(num_latent):
+                total += min(max(latent[k] >> 6, 0), 4095) * layer3[k, h]
+            row[INPUT + h * INPUTS] = min(max(total >> 4, -CLIP), CLIP)
+
+    return network
+
+
+network, network2 = map(make_network, map(load_prior, PRIORS))
 
 
 @inner

@@ -14,20 +14,22 @@ from kcgs.kernels.compiled import Program, inner
 
 from .contexts import (
     CODED,
-    COLUMNS,
     FIRST,
     LABEL,
     LEFT,
     RIGHT,
     SECOND,
     TOP,
+    UNITS,
     X,
     Y,
     contexts,
     describe,
     learn,
+    load_prior,
     mix,
     network,
+    network2,
     new_tables,
     quiet,
 )
@@ -35,17 +37,18 @@ from .contexts import (
 SLANT = 8  # pixels (x, y) of equal x + SLANT * y make a wavefront
 RANKS = 3  # nearest labels that one that is neither candidate is compared with
 _FAR = 32  # pixels within which they are looked for
-# entries of the state: the wavefront, its rows, those of them that bits decide; regions in all
-FRONT, ROWS, DECIDED, REGIONS, STATE = 0, 1, 2, 3, 4
+# entries of the state: the wavefront, its rows, those of them that bits decide; regions in all; whether the network is
+# that of files of maps
+FRONT, ROWS, DECIDED, REGIONS, WIDE, STATE = 0, 1, 2, 3, 4, 5
 # of a row of the map: its last pixel that differs from the one before, the next seed, the wavefront until which it is
 # quiet
 _CHANGE, _SEED, _WAKE, _LINE = 0, 1, 2, 3
 
 
-def new_work(height: int) -> tuple[Any, Any, Any]:
+def new_work(height: int, prior: tuple[Any, ...]) -> tuple[Any, Any, Any]:
     """Return room for the pixels of a wavefront, the chances of their bits, and what is known of the map's rows."""
     lines = np.zeros((TOP + height + 2, _LINE), np.int32)
-    return np.zeros((height, COLUMNS), np.int32), np.zeros(2 * height), lines
+    return np.zeros((height, UNITS + sum(prior[2].shape)), np.int32), np.zeros(2 * height), lines
 
 
 @inner
@@ -149,7 +152,10 @@ def _weigh(truth, answers, state, counters, weights, rows, chances):  # type: ig
         if len(truth) > 0:
             row[LABEL] = truth[row[Y] - TOP, row[X] - LEFT]
         if row[CODED]:
-            network(row)
+            if state[WIDE]:
+                network2(row)
+            else:
+                network(row)
             contexts(row)
             if escapes > 0:
                 chances[asked] = mix(counters, weights, row, 1)
@@ -159,7 +165,7 @@ def _weigh(truth, answers, state, counters, weights, rows, chances):  # type: ig
             asked += 1
 
 
-program = Program("label coder", __name__, __file__, "contexts.py", "prior.bin", "wavefront.py")
+program = Program("label coder", __name__, __file__, "contexts.py", "prior.bin", "prior2.bin", "wavefront.py")
 
 
 @program.entry
@@ -230,13 +236,13 @@ def survey(index, regions):  # type: ignore[no-untyped-def]
 @program.part
 def fronts() -> None:
     """Compile what goes from wavefront to wavefront."""
-    work, bits, state = new_work(2), np.zeros(4, np.int32), np.zeros(STATE, np.int64)
+    prior, bits, state = load_prior(), np.zeros(4, np.int32), np.zeros(STATE, np.int64)
     labels, index = np.zeros((2 + TOP + 1, 2 + LEFT + RIGHT), np.int32), np.zeros((2, 2), np.int32)
-    advance(bits, index, bits, state, labels, index.astype(np.uint8), *new_tables(), *work)
+    advance(bits, index, bits, state, labels, index.astype(np.uint8), *new_tables(prior), *new_work(2, prior))
 
 
 @program.part
 def places() -> None:
     """Compile what looks for labels."""
     survey(np.eye(2, dtype=np.int32), 2)
-    nearest(np.zeros((TOP + 1, LEFT + RIGHT), np.int32), np.zeros(COLUMNS, np.int32), np.zeros(RANKS, np.int32))
+    nearest(np.zeros((TOP + 1, LEFT + RIGHT), np.int32), np.zeros(UNITS, np.int32), np.zeros(RANKS, np.int32))
