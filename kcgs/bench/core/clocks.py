@@ -30,11 +30,11 @@ def threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def clock(action: Callable[[], object]) -> float:
+def clock(action: Callable[[], object], timer: Callable[[], float] = time.perf_counter) -> float:
     """Return the seconds that an action takes."""
-    start = time.perf_counter()
+    start = timer()
     action()
-    return time.perf_counter() - start
+    return timer() - start
 
 
 def in_turns(actions: Mapping[Key, Callable[[], Result]], rounds: int) -> dict[Key, list[Result]]:
