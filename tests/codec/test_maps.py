@@ -68,6 +68,14 @@ class TestLossless:
         assert torch.equal(decode_labels(encode_labels(array)), torch.from_numpy(array))
         assert encode_labels(array[:, ::-1]) == encode_labels(np.ascontiguousarray(array[:, ::-1]))
 
+    @pytest.mark.parametrize("height", [1, 3])
+    def test_wide(self, height: int) -> None:
+        """A row is written as far as it is read, so that its changes do not cost its width each."""
+        labels = (torch.arange(1 << 18) // 2 % 2).expand(height, -1)
+        start = time.process_time()
+        assert len(roundtrip(labels.contiguous())) < 60
+        assert time.process_time() - start < 60
+
     def test_all_pixels_different(self) -> None:
         roundtrip(torch.arange(70 * 90).view(70, 90))
         roundtrip(torch.randperm(70 * 90, generator=torch.Generator().manual_seed(0)).view(70, 90) * 2_600)

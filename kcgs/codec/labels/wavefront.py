@@ -41,8 +41,9 @@ _FAR = 32  # pixels within which they are looked for
 # that of files of maps
 FRONT, ROWS, DECIDED, REGIONS, WIDE, STATE = 0, 1, 2, 3, 4, 5
 # of a row of the map: its last pixel that differs from the one before, the next seed, the wavefront until which it is
-# quiet
-_CHANGE, _SEED, _WAKE, _LINE = 0, 1, 2, 3
+# quiet, how far its last label is written
+_CHANGE, _SEED, _WAKE, _END, _LINE = 0, 1, 2, 3, 4
+_AHEAD = 128  # pixels that a row is written at a time: to its end, a change would cost its width
 
 
 def new_work(height: int, prior: tuple[Any, ...]) -> tuple[Any, Any, Any]:
@@ -70,18 +71,23 @@ def _set(labels, y, x, label, lines):  # type: ignore[no-untyped-def]
         lines[y, _CHANGE] = x
         for below in range(3):  # these rows see it
             lines[y + below, _WAKE] = 0
-    _put(labels, y, x, label)
+        _continue(labels, y, x, label, lines)
+    _margins(labels, y, x, label)
 
 
 @inner
-def _put(labels, y, x, label):  # type: ignore[no-untyped-def]
-    """Give a pixel its label, and what repeats it: the rest of its row, until that changes, and the margins."""
-    if label != labels[y, x - 1]:
-        labels[y, x:] = label
+def _continue(labels, y, x, label, lines):  # type: ignore[no-untyped-def]
+    labels[y, x : x + _AHEAD] = label
+    lines[y, _END] = x + _AHEAD
+
+
+@inner
+def _margins(labels, y, x, label):  # type: ignore[no-untyped-def]
+    """Repeat the label of a pixel in the margins above and left of the map."""
     if y == TOP:
         labels[:TOP, x : x + RIGHT + 1] = label
     if x == LEFT:
-        labels[y + 1] = label
+        labels[y + 1, :LEFT] = label
 
 
 @inner
@@ -120,10 +126,12 @@ def _look(state, labels, seeds, rows, lines):  # type: ignore[no-untyped-def]
     height, width = seeds.shape
     front = state[FRONT]
     for j in range(max(0, -((width - 1 - front) // SLANT)), min(height - 1, front // SLANT) + 1):
-        line = lines[j + TOP]
+        x, y = front - SLANT * j + LEFT, j + TOP
+        line = lines[y]
+        if x + RIGHT >= line[_END]:
+            _continue(labels, y, x, labels[y, x - 1], lines)
         if line[_WAKE] > front:
             continue
-        x, y = front - SLANT * j + LEFT, j + TOP
         seed = _next_seed(seeds, j, x - LEFT, line) + LEFT
         n = state[ROWS]
         row = rows[n]
@@ -137,7 +145,7 @@ def _look(state, labels, seeds, rows, lines):  # type: ignore[no-untyped-def]
             row[LABEL] = 1 - row[FIRST]  # unless there are more than two regions
             state[ROWS] += 1
         else:
-            _put(labels, y, x, labels[y, x - 1])
+            _margins(labels, y, x, labels[y, x - 1])
             if y >= TOP + 2 and lines[y - 2, _CHANGE] < x:
                 line[_WAKE] = front + seed - x
 
@@ -229,7 +237,9 @@ def survey(index, regions):  # type: ignore[no-untyped-def]
             x, y = i + LEFT, j + TOP
             truth[j, i] = number[index[j, i]]
             seeds[j, i] = truth[j, i] != labels[y, x - 1] and quiet(labels, y, x)
-            _put(labels, y, x, truth[j, i])
+            labels[y, x] = truth[j, i]
+            _margins(labels, y, x, truth[j, i])
+        labels[y, LEFT + width :] = truth[j, width - 1]
     return truth, seeds, order
 
 
