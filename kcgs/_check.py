@@ -151,6 +151,8 @@ def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values:
     if isinstance(value, np.ndarray):
         if value.dtype.kind not in "biu":
             raise TypeError(f"{name} must have an integer dtype; got {value.dtype}")
+        if values and value.dtype == np.uint64 and value.size and value.max() >= 1 << 63:
+            raise ValueError(f"{name} must hold ids below 2**63; got {value.max()}")
         value = torch.from_numpy(np.array(value, np.int64, order="C"))
     elif isinstance(value, Tensor) and value.dtype == torch.bool:
         value = value.long()

@@ -95,7 +95,9 @@ def _scene_path(text: str, others: tuple[str, ...] = ()) -> Path:
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
     if path.suffix not in FORMATS and path.suffix.lower() not in others:
-        raise typer.BadParameter(f"it must end in {' or '.join((*FORMATS, *others))}, or be {PREFIX}NAME; got {text!r}")
+        photo = ": kcgs fit makes scenes of images" if path.suffix.lower() in IMAGES else ""
+        kinds = " or ".join((*FORMATS, *others))
+        raise typer.BadParameter(f"it must end in {kinds}, or be {PREFIX}NAME; got {text!r}{photo}")
     return path
 
 
@@ -123,7 +125,7 @@ Json = Annotated[bool, typer.Option("--json", callback=_hush, help="Print one JS
 def check_output(path: Path, *suffixes: str, option: str = "--output") -> None:
     """Refuse an output that cannot be written, before the work, not after it."""
     # scenes are written by their exact suffix, images in any case
-    suffix = path.suffix.lower() if path.suffix.lower() in OUTPUT_IMAGES else path.suffix
+    suffix = path.suffix.lower() if path.suffix.lower() in (*OUTPUT_IMAGES, ".npy") else path.suffix
     if suffix not in suffixes:
         raise ValueError(f"{option} must end in {' or '.join(suffixes)}; got {str(path)!r}")
     check_writable(option, path)

@@ -15,6 +15,9 @@ from .common import OUTPUT_IMAGES, ImageFile, Json, Quiet, SceneFile, SceneOrMap
 from .fit import describe_size, measure_scene
 from .options import Contours, Scale, Size, exclude, target_size
 
+# a label map of fewer pixels per id, and of more ids, is perhaps a photo
+_PIXELS_PER_ID, _FEW_IDS = 64, 256
+
 OutputImage = Annotated[Path, typer.Option("-o", "--output", help="Image file to write.")]
 
 
@@ -78,8 +81,8 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
     """Say what a file holds: a scene, or a label map."""
     from kcgs import load
 
-    if (labels := _read_map(scene)) is not None:
-        print_report(_describe_map(scene, labels), as_json, str(scene))
+    if (found := _read_map(scene)) is not None:
+        print_report(_describe_map(scene, *found), as_json, str(scene))
         return
     loaded = load(scene)
     softness = 0.0 if loaded.regions is None else loaded.regions.softness
@@ -127,8 +130,11 @@ def encode(
     if scene.suffix not in FORMATS:
         exclude("a label map", target_bytes=target_bytes, quality=quality, image=image)
         labels = load_labels(scene, rgb_ids=True)
+        ids = labels.unique()
+        if len(ids) * _PIXELS_PER_ID > labels.numel() and len(ids) > _FEW_IDS:
+            typer.echo(f"kcgs: {scene} has {len(ids)} ids, as photos have, which kcgs fit takes", err=True)
         write_file(output, codec.encode_labels(labels))
-        print_report(_describe_map(output, labels), as_json, str(output))
+        print_report(_describe_map(output, labels, ids), as_json, str(output))
         return
     if target_bytes is not None:
         exclude("--target-bytes", quality=quality)
@@ -172,10 +178,11 @@ def decode(
     from kcgs import codec
     from kcgs.data import save_image, save_labels
 
-    if (labels := _read_map(file)) is not None:
+    if (found := _read_map(file)) is not None:
+        labels, ids = found
         exclude("a label map", bytes=num_bytes, scale=scale, size=size)
         check_output(output, ".png", ".npy")
-        save_labels(output, labels, rgb_ids=output.suffix != ".npy" and bool(labels.max() > 65535))
+        save_labels(output, labels, rgb_ids=output.suffix.lower() != ".npy" and int(ids.max()) > 65535)
         return
     check_output(output, *OUTPUT_IMAGES)
     try:
@@ -190,19 +197,23 @@ def decode(
 
 
 def _read_map(file: Path) -> Any:
-    """Return the label map of a file that is one, and None of any other."""
+    """Return the label map of a file that is one, with its ids, and None of any other."""
     from kcgs import codec
+    from kcgs.codec.maps import decode_with_ids
 
-    if file.suffix != ".kcgs" or not (data := file.read_bytes()).startswith(codec.MAP_MAGIC):
-        return None
     try:
-        return codec.decode_labels(data)
+        with file.open("rb") as stream:
+            if stream.read(len(codec.MAP_MAGIC)) != codec.MAP_MAGIC:
+                return None
+    except OSError:
+        return None  # whoever reads it as a scene says so
+    try:
+        return decode_with_ids(file.read_bytes())
     except codec.CodecError as error:
         raise codec.CodecError(f"cannot decode {file}: {error}") from error
 
 
-def _describe_map(file: Path, labels: Any) -> dict[str, Any]:
-    ids = labels.long().unique()
+def _describe_map(file: Path, labels: Any, ids: Any) -> dict[str, Any]:
     report = {"holds": "label map", "height": labels.shape[0], "width": labels.shape[1], "regions": len(ids)}
-    report |= {"largest_id": int(ids[-1]), "dtype": str(labels.dtype).removeprefix("torch.")}
+    report |= {"largest_id": int(ids.max()), "dtype": str(labels.dtype).removeprefix("torch.")}
     return report | describe_size(file, file.stat().st_size, tuple(labels.shape))

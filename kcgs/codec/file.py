@@ -114,7 +114,9 @@ def _read_layers(stream: ByteReader, header: Header) -> Iterator[bytes]:
 def _read_header(stream: ByteReader) -> tuple[Header, int]:
     """Read the header; return it and the length of the map."""
     if (magic := stream.take(4)) == MAP_MAGIC:
-        raise CodecError("it is a label map, no scene: kcgs.codec.decode_labels reads it, and kcgs decode")
+        raise CodecError(
+            "it is a label map, no scene: kcgs decode writes it as .png or .npy, kcgs.codec.decode_labels reads it"
+        )
     if magic != MAGIC:
         raise CodecError(f"it must start with {MAGIC!r}; got {stream.data[:4]!r}")
     if (version := stream.take(1)[0]) != VERSION:

@@ -11,20 +11,20 @@ from torch import Tensor
 
 from kcgs._check import check_count, check_labels
 
-from .file import MAP_MAGIC, MOST_LABELS, MOST_SIDE, ByteReader, varint
+from .file import MAGIC, MAP_MAGIC, MOST_LABELS, MOST_SIDE, ByteReader, varint
 from .rangecoder import CodecError
 
 VERSION = 1
 _TURNS, _CRC = 8, 4  # ways to turn a map; bytes
-_TYPES = (torch.bool, torch.uint8, torch.int8, torch.uint16, torch.int16, torch.uint32, torch.int32, torch.int64)
+_TYPES = ("bool", "uint8", "int8", "uint16", "int16", "uint32", "int32", "int64")
 
 
 def encode_labels(labels: Tensor | NDArray[Any]) -> bytes:
     """Write a label map as a `.kcgs` file; nothing is lost, and the same map gives the same bytes.
 
     Args:
-        labels: :math:`(H, W)` integer or bool, any non-negative ids; a numpy array will do. At most 2**26 pixels, 2**20
-            on a side, and fewer than 2**24 regions.
+        labels: :math:`(H, W)` integer or bool, ids of 0 to 2**63 - 1; a numpy array will do. At most 2**26 pixels,
+            2**20 on a side, and fewer than 2**24 regions.
 
     Returns:
         The file. A photo's segmentation takes a few hundred bytes.
@@ -39,10 +39,10 @@ def encode_labels(labels: Tensor | NDArray[Any]) -> bytes:
         >>> len(data), torch.equal(decode_labels(data), labels), decode_labels(data).dtype
         (14, True, torch.uint8)
     """
+    if isinstance(labels, Tensor) and labels.dtype == torch.uint64:
+        labels = labels.cpu().numpy()  # of which torch has no minimum
     ids = check_labels("labels", labels, dims=(2,))
-    dtype = labels.dtype if isinstance(labels, Tensor) else getattr(torch, labels.dtype.name)
-    if dtype not in _TYPES:
-        raise TypeError(f"labels must have a dtype of at most 63 bits; got {dtype}")
+    dtype = str(labels.dtype).removeprefix("torch.").replace("uint64", "int64")
     check_count("pixels per side of labels", max(ids.shape), 1, MOST_SIDE)
     check_count("pixels of labels", ids.numel(), 1, MOST_LABELS)
     from .labels.coding import encode_turned  # loads numba
@@ -60,7 +60,7 @@ def decode_labels(data: bytes) -> Tensor:
         data: the whole file.
 
     Returns:
-        :math:`(H, W)` on the CPU, in the dtype that was given.
+        :math:`(H, W)` on the CPU, in the dtype that was given; of uint64, int64.
 
     Raises:
         TypeError: ``data`` is no bytes.
@@ -71,13 +71,19 @@ def decode_labels(data: bytes) -> Tensor:
         tensor([[      0, 1000000, 2000000],
                 [3000000, 4000000, 5000000]])
     """
+    return decode_with_ids(data)[0]
+
+
+def decode_with_ids(data: bytes) -> tuple[Tensor, NDArray[Any]]:
+    """Return a file's label map, and the ids in it."""
     if not isinstance(data, bytes | bytearray | memoryview):
         raise TypeError(f"data must be bytes; got {type(data).__name__}")
-    content, checksum = bytes(data[:-_CRC]), bytes(data[-_CRC:])
-    if not content.startswith(MAP_MAGIC):
-        what = "a scene, which kcgs.codec.decode reads" if content.startswith(b"kcgs") else f"{content[:4]!r}"
+    data = bytes(data)
+    content, checksum = data[:-_CRC], data[-_CRC:]
+    if not data.startswith(MAP_MAGIC):
+        what = "a scene, which kcgs.codec.decode reads" if data.startswith(MAGIC) else f"{data[:4]!r}"
         raise CodecError(f"data must be a label map, which starts with {MAP_MAGIC!r}; got {what}")
-    if zlib.crc32(content) != int.from_bytes(checksum, "big"):
+    if len(data) < len(MAP_MAGIC) + _CRC or zlib.crc32(content) != int.from_bytes(checksum, "big"):
         raise CodecError("the file is damaged or ends early: its checksum is another")
     reader = ByteReader(content[len(MAP_MAGIC) :])
     version, form = divmod(reader.take(1)[0], _TURNS * len(_TYPES))
@@ -88,9 +94,6 @@ def decode_labels(data: bytes) -> Tensor:
         raise CodecError(f"a map must have at most {MOST_LABELS} pixels; got {height} x {width}")
     from .labels.coding import decode_turned  # loads numba
 
-    labels = decode_turned(reader.data[reader.position :], (height, width), form % _TURNS)
-    dtype = _TYPES[form // _TURNS]
-    most = 1 if dtype == torch.bool else torch.iinfo(dtype).max
-    if (highest := int(labels.max())) > most:
-        raise CodecError(f"ids of {dtype} must be at most {most}; got {highest}")
-    return torch.from_numpy(labels).to(dtype)
+    stream, dtype = reader.data[reader.position :], _TYPES[form // _TURNS]
+    labels, ids = decode_turned(stream, (height, width), form % _TURNS, dtype)
+    return torch.from_numpy(labels), ids

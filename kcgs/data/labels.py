@@ -34,7 +34,6 @@ _SAFE_COLORS = (
     (0.800, 0.475, 0.655),
 )
 _TINT = 0.45
-_RGB = np.array([1, 1 << 8, 1 << 16])  # what R, G and B count where colours are ids
 
 
 def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False) -> Tensor:
@@ -113,14 +112,14 @@ def save_labels(path: str | os.PathLike[str], labels: Tensor, *, rgb_ids: bool =
     values = check_labels("labels", labels, dims=(2,)).cpu().numpy()
     highest = int(values.max())
     if suffix == ".npy":
-        with atomic_path(path) as temporary:
-            np.save(temporary, values.astype(np.min_scalar_type(highest)), allow_pickle=False)
+        with atomic_path(path) as temporary, Path(temporary).open("wb") as file:  # np.save would add .npy to .NPY
+            np.save(file, values.astype(np.min_scalar_type(highest)), allow_pickle=False)
         return
     most = (1 << 24) - 1 if rgb_ids else 65535
     if highest > most:
         raise ValueError(f"labels for a .png must be at most {most}; got {highest}: renumber or save as .npy")
     if rgb_ids:
-        values = values[..., None] // _RGB % 256
+        values = np.stack([(values >> shift).astype(np.uint8) for shift in (0, 8, 16)], -1)
     stored = Image.fromarray(values.astype(np.uint8 if rgb_ids or highest < 256 else np.uint16))
     if highest < 256 and not rgb_ids:
         stored.putpalette((label_colors(256) * 255 + 0.5).floor().to(torch.uint8).flatten().tolist())
@@ -249,8 +248,12 @@ def _checked(values: Array, path: str | os.PathLike[str]) -> Tensor:
 
 def _from_ids(values: Array, path: str | os.PathLike[str]) -> Tensor:
     if values.dtype != np.uint8 or (values[..., 3:] != 255).any():
-        raise ValueError(f"colours that are ids must be opaque RGB of 8 bits; got {values.dtype} in {path}")
-    return torch.from_numpy(values[..., :3].astype(np.int64) @ _RGB)
+        got = "transparent pixels" if values.dtype == np.uint8 else values.dtype
+        raise ValueError(f"colours that are ids must be opaque RGB of 8 bits; got {got} in {path}")
+    ids = values[..., 2].astype(np.int64)
+    for channel in (1, 0):
+        ids = ids << 8 | values[..., channel]
+    return torch.from_numpy(ids)
 
 
 def _from_colors(values: Array, path: str | os.PathLike[str]) -> Tensor:

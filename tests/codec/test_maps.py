@@ -68,13 +68,18 @@ class TestLossless:
         assert torch.equal(decode_labels(encode_labels(array)), torch.from_numpy(array))
         assert encode_labels(array[:, ::-1]) == encode_labels(np.ascontiguousarray(array[:, ::-1]))
 
-    @pytest.mark.parametrize("height", [1, 3])
-    def test_wide(self, height: int) -> None:
+    @pytest.mark.parametrize(("height", "most"), [(1, 60), (3, 120)])
+    def test_wide(self, height: int, most: int) -> None:
         """A row is written as far as it is read, so that its changes do not cost its width each."""
         labels = (torch.arange(1 << 18) // 2 % 2).expand(height, -1)
         start = time.process_time()
-        assert len(roundtrip(labels.contiguous())) < 60
+        assert len(roundtrip(labels.contiguous())) < most
         assert time.process_time() - start < 60
+
+    def test_uint64(self) -> None:
+        array = shapes(1).astype(np.uint64) << np.uint64(40)
+        for labels in (array, torch.from_numpy(array)):
+            assert torch.equal(decode_labels(encode_labels(labels)), torch.from_numpy(array.astype(np.int64)))
 
     def test_all_pixels_different(self) -> None:
         roundtrip(torch.arange(70 * 90).view(70, 90))
@@ -119,7 +124,7 @@ class TestRefused:
             (torch.zeros(1, 3, 3).long(), ValueError, "labels must have 2 dimensions"),
             (torch.zeros(0, 3).long(), ValueError, "labels must have at least one pixel"),
             (torch.tensor([[-1]]), ValueError, "labels must hold non-negative ids"),
-            (np.zeros((3, 3), np.uint64), TypeError, "labels must have a dtype of at most 63 bits"),
+            (np.full((3, 3), 1 << 63, np.uint64), ValueError, r"must hold ids below 2\*\*63; got 9223372036854775808"),
             (torch.zeros(1, (1 << 20) + 1, dtype=torch.uint8), ValueError, "pixels per side of labels must be in"),
         ],
     )
@@ -133,6 +138,11 @@ class TestRefused:
         for data, words in {b"": "got b''", b"kcgs\1 and so on": "a scene, which kcgs.codec.decode reads"}.items():
             with pytest.raises(CodecError, match=f"data must be a label map.*{words}"):
                 decode_labels(data)
+
+    @pytest.mark.parametrize("length", [4, 6, 7])
+    def test_beginnings(self, length: int) -> None:
+        with pytest.raises(CodecError, match="the file is damaged or ends early"):
+            decode_labels(encode_labels(shapes(0))[:length])
 
     def test_scenes_are_told_from_maps(self, tmp_path: Path) -> None:
         (tmp_path / "mask.kcgs").write_bytes(encode_labels(shapes(0)))
@@ -198,7 +208,7 @@ class TestDamage:
     def test_ids_beyond_the_type(self) -> None:
         data = encode_labels(shapes(0) * 200)
         low = forged(data[4] % 8 + 8, data[5:8], data[8:-4])
-        with pytest.raises(CodecError, match=r"ids of torch.uint8 must be at most 255; got 1000"):
+        with pytest.raises(CodecError, match=r"ids of uint8 must be at most 255; got 1000"):
             decode_labels(low)
 
     def test_many_regions_of_few_bytes(self) -> None:
@@ -228,7 +238,7 @@ class TestColors:
         with pytest.raises(ValueError, match="path must end in .png; got"):
             save_labels(tmp_path / "a.npy", torch.tensor([[1]]), rgb_ids=True)
         Image.fromarray(np.full((4, 4, 4), 9, np.uint8)).save(tmp_path / "a.png")
-        with pytest.raises(ValueError, match="must be opaque RGB of 8 bits"):
+        with pytest.raises(ValueError, match="must be opaque RGB of 8 bits; got transparent pixels"):
             load_labels(tmp_path / "a.png", rgb_ids=True)
 
 
@@ -237,13 +247,13 @@ class TestCommands:
     def run(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Any:
         monkeypatch.chdir(tmp_path)
 
-        def run(*arguments: str, code: int = 0) -> str:
+        def run(*arguments: str, code: int = 0, err: bool = False) -> str:
             monkeypatch.setattr("sys.argv", ["kcgs", *arguments])
             with pytest.raises(SystemExit) as ended:
                 main()
             captured = capsys.readouterr()
             assert (ended.value.code or 0) == code, captured.err
-            return captured.err if code else captured.out
+            return captured.err if code or err else captured.out
 
         return run
 
@@ -257,6 +267,10 @@ class TestCommands:
         facts = json.loads(run("encode", f"mask.{suffix}", "-o", "mask.kcgs", "--json"))
         assert facts["bytes"] == Path("mask.kcgs").stat().st_size < 400
         run("decode", "mask.kcgs", "-o", f"again.{suffix}")
+        Path("mask.kcgs").rename("mask.other")
+        run("decode", "mask.other", "-o", f"other.{suffix.upper()}")
+        assert Path(f"other.{suffix.upper()}").read_bytes() == Path(f"again.{suffix}").read_bytes()
+        Path("mask.other").rename("mask.kcgs")
         assert torch.equal(load_labels(f"again.{suffix}", rgb_ids=True), labels)
         assert not mode or opened("again.png").mode == mode
         info = json.loads(run("info", "mask.kcgs", "--json"))
@@ -270,13 +284,20 @@ class TestCommands:
         assert "excludes --quality" in run("encode", "mask.png", "-o", "b.kcgs", "--quality", "40", code=2)
         assert "excludes --scale" in run("decode", "mask.kcgs", "-o", "b.png", "--scale", "2", code=2)
         assert ".png or .npy" in run("decode", "mask.kcgs", "-o", "b.jpg", code=2)
-        assert "must end in .safetensors" in run("encode", "photo.jpg", "-o", "b.kcgs", code=2)
+        assert "kcgs fit" in run("encode", "photo.jpg", "-o", "b.kcgs", code=2)
+        assert "kcgs decode writes it" in run("encode", "mask.kcgs", "-o", "b.kcgs", code=1)
         assert "it is a label map, no scene" in run("render", "mask.kcgs", "-o", "b.png", code=1)
         assert "no such file" in run("encode", "none.png", "-o", "b.kcgs", code=1)
         Path("mask.kcgs").write_bytes(Path("mask.kcgs").read_bytes()[:-1])
         for command in (["info", "mask.kcgs"], ["decode", "mask.kcgs", "-o", "b.png"]):
             assert "cannot decode mask.kcgs: the file is damaged" in run(*command, code=1)
         assert not Path("b.png").exists() and not Path("b.kcgs").exists()
+
+    def test_photo(self, run: Any) -> None:
+        Image.fromarray(np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)).save("photo.png")
+        assert "kcgs fit" in run("encode", "photo.png", "-o", "photo.kcgs", err=True)
+        save_labels("mask.png", torch.arange(200).view(10, 20))
+        assert run("encode", "mask.png", "-o", "mask.kcgs", err=True) == ""
 
 
 @pytest.mark.parametrize("every", [6, pytest.param(1, marks=pytest.mark.slow)])

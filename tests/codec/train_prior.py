@@ -62,11 +62,10 @@ SMOOTH = (0.7, 1.0, 1.5, 2.0, 3.0)
 UNIT = 64  # weights and activations are whole 1 / UNIT
 _MEASURE = """
 import sys
-from kcgs.codec.labels import encode_labels
-from kcgs.data import load_image, load_labels
-from kcgs.segment import segment
+from kcgs.codec import encode_labels
+from kcgs.data import load_labels
 for path in sys.argv[1:]:
-    print(len(encode_labels(load_labels(path).numpy())))
+    print(len(encode_labels(load_labels(path))))
 """
 
 
@@ -233,7 +232,12 @@ def compare(prior: bytes, maps: list[Path]) -> None:
 
 def measure(root: Path, maps: list[Path]) -> list[int]:
     """Code maps in a process of its own, whose loops hold the tables of the kcgs at `root`."""
-    command = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(root)!r}){_MEASURE}", *map(str, maps)]
+    command = [
+        sys.executable,
+        "-c",
+        f"import sys; sys.path.insert(0, {str(root)!r}){_MEASURE}",
+        *(str(path.resolve()) for path in maps),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=root)
     return [int(line) for line in done.stdout.split()]
 

@@ -55,13 +55,15 @@ def encode_turned(labels: Integers) -> tuple[int, bytes]:
     return min(found, key=lambda coded: len(coded[1]))
 
 
-def decode_turned(data: bytes, size: tuple[int, int], turn: int) -> Integers:
-    """Read a map that `encode_turned` wrote."""
+def decode_turned(data: bytes, size: tuple[int, int], turn: int, dtype: str) -> tuple[Any, Integers]:
+    """Read a map that `encode_turned` wrote, in the type of its ids, and the ids."""
     # more are noise, of more bytes; as many a reader may be asked to list
     most = min(MOST_REGIONS, max(MOST_ESCAPES + 1, 4 * len(data)))
-    labels = decode_labels(data, *(size[::-1] if turn & 4 else size), max_regions=most, alone=True)
-    found: Integers = turned(labels, turn, back=True)
-    return found
+    ids, index = _decode_regions(data, *(size[::-1] if turn & 4 else size), most, alone=True)
+    highest = 1 if dtype == "bool" else np.iinfo(dtype).max
+    if ids.max() > highest:
+        raise CodecError(f"ids of {dtype} must be at most {highest}; got {ids.max()}")
+    return turned(ids.astype(dtype)[index], turn, back=True), ids
 
 
 def turned(labels: Any, turn: int, *, back: bool = False) -> Any:
@@ -101,25 +103,29 @@ def encode_regions(ids: Integers, index: Any, *, alone: bool = False) -> bytes:
     return writer.finish()
 
 
-def decode_labels(data: bytes, height: int, width: int, *, max_regions: int, alone: bool = False) -> Integers:
-    """Read a label map (H, W), `alone` in the form of files; what is none, or has more regions, is a CodecError.
+def decode_labels(data: bytes, height: int, width: int, *, max_regions: int) -> Integers:
+    """Read a label map (H, W); what is none, or has more regions, is a CodecError.
 
     Example:
         >>> labels = np.array([[7, 7, 3], [7, 3, 3]])
         >>> (decode_labels(encode_labels(labels), 2, 3, max_regions=2) == labels).all()
         np.True_
     """
+    ids, index = _decode_regions(data, height, width, max_regions, alone=False)
+    labels: Integers = ids[index]
+    return labels
+
+
+def _decode_regions(data: bytes, height: int, width: int, max_regions: int, *, alone: bool) -> tuple[Integers, Any]:
+    """Return a map's ids, and of each pixel the position of its own."""
     reader, code = Reader(data), code_ids_of_file if alone else code_ids
     ids = np.array(code(reader, [], min(max_regions, height * width)), np.int64)
     if len(ids) == 1:
-        return np.full((height, width), ids[0], np.int64)
+        return ids, np.broadcast_to(np.int32(0), (height, width))
     if reader.bits(_NOISY, np.zeros(1, np.int32))[0]:
-        index = reader.numbers(None, len(ids), height * width).reshape(height, width)
-    else:
-        empty, seeds = np.zeros((0, 0), np.int32), np.zeros((height, width), np.uint8)
-        index = _code_pixels(reader, empty, seeds, len(ids), alone)
-    labels: Integers = ids[index]
-    return labels
+        return ids, reader.numbers(None, len(ids), height * width).reshape(height, width)
+    empty, seeds = np.zeros((0, 0), np.int32), np.zeros((height, width), np.uint8)
+    return ids, _code_pixels(reader, empty, seeds, len(ids), alone)
 
 
 def _code_pixels(coder: Coder, truth: Any, seeds: Any, regions: int, alone: bool) -> Any:
