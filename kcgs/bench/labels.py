@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib import import_module
+from importlib.metadata import packages_distributions, version
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
@@ -13,7 +14,7 @@ from time import process_time
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
+from PIL import Image, features
 from torch import Tensor
 
 from kcgs.codec import decode_labels, encode_labels
@@ -39,9 +40,10 @@ SETS: dict[str, tuple[str, Callable[[Path], Tensor]]] = {
     "Kodak, found": ("kodak/*.png", lambda path: segment(load_image(path))),
 }
 _INTRODUCTION = """Bytes: means of whole files. `to WebP`: the sum of a set's bytes over WebP's. Speeds: medians, of one
-core's time, all codecs in turns. Other codecs get regions by number: ids cost them nothing. PNG: optimised, few bits or
-16-bit grey. WebP: exact, quality 100, method 6. JPEG XL: effort 9. RLE: COCO's strings, one per region. crackle: Markov
-model of order 5. The tables of kcgs were trained on maps of the Kodak photos, so that these are no test of it."""
+core's time, all codecs in turns. Other codecs get regions by number: ids cost them nothing. PNG: optimised, the smaller
+of grey and a palette of as many colours as regions. WebP: exact, quality 100, method 6. JPEG XL: effort 9. RLE: COCO's
+strings, one per region but the first. crackle: Markov model of order 5. The tables of kcgs were trained on maps of the
+Kodak photos: that set is no test of it."""
 
 
 class Codec(NamedTuple):
@@ -67,16 +69,23 @@ class Result(NamedTuple):
 
 def _write(format: str, index: Any, **settings: Any) -> bytes:
     file, most = BytesIO(), int(index.max())
-    if format == "PNG" and most < 256:
-        image = Image.fromarray(index.astype(np.uint8))
-        image.putpalette(list(range(256)) * 3)
-        settings["bits"] = next(bits for bits in (1, 2, 4, 8) if most < 1 << bits)
-    elif format == "WEBP":
+    if format == "WEBP":
         image = Image.fromarray(np.stack([index >> 16, index >> 8, index], -1).astype(np.uint8))
     else:
         image = Image.fromarray(index.astype(np.uint8 if most < 256 else np.uint16))
     image.save(file, format, **settings)
     return file.getvalue()
+
+
+def _png(index: Any) -> bytes:
+    """Take the smaller of a palette of as many colours as there are regions, in few bits, and grey."""
+    grey, most = _write("PNG", index, optimize=True), int(index.max())
+    if most > 255:
+        return grey
+    file, image = BytesIO(), Image.fromarray(index.astype(np.uint8))
+    image.putpalette(list(range(most + 1)) * 3)
+    image.save(file, "PNG", optimize=True, bits=next(bits for bits in (1, 2, 4, 8) if most < 1 << bits))
+    return min(grey, file.getvalue(), key=len)
 
 
 def _read(data: bytes) -> Any:
@@ -92,7 +101,8 @@ def _jxl(index: Any) -> bytes:
 
 
 def _rle(index: Any) -> Any:
-    masks = np.asfortranarray(index[..., None] == np.arange(index.max() + 1), np.uint8)
+    """Encode all regions but the first, which is what they leave."""
+    masks = np.asfortranarray(index[..., None] == np.arange(1, max(2, index.max() + 1)), np.uint8)
     return import_module("pycocotools.mask").encode(masks)
 
 
@@ -103,10 +113,10 @@ def _crackle(index: Any) -> Any:
 
 CODECS = {
     KCGS: Codec("kcgs", encode_labels, decode_labels),
-    "PNG": Codec("PIL", partial(_write, "PNG", optimize=True), _read),
+    "PNG": Codec("PIL", _png, _read),
     WEBP: Codec("PIL", partial(_write, "WEBP", lossless=True, quality=100, method=6, exact=True), _read),
     "JPEG XL": Codec("pillow_jxl", _jxl, _read),
-    "RLE": Codec("pycocotools", _rle, lambda rles: import_module("pycocotools.mask").decode(rles).argmax(-1)),
+    "RLE": Codec("pycocotools", _rle, lambda f: import_module("pycocotools.mask").decode(f) @ np.arange(1, len(f) + 1)),
     "crackle": Codec("crackle", _crackle, lambda data: import_module("crackle").decompress(data, parallel=1)),
 }
 
@@ -168,5 +178,8 @@ def run(output: Path, options: Options) -> None:
     steps = [(f"{name} {which}", partial(measure, name, which, read, rounds)) for name, which, read in wanted]
     write_rows(output / "results.csv", Result, [row for step in with_progress(steps) for row in step()])
     notes = [f"{c} is left out: its package {CODECS[c].package} is missing" for c in CODECS if not _is_there(c)]
+    here = {CODECS[c].package for c in CODECS if c != KCGS and _is_there(c)}
+    names = sorted({name for package in here for name in packages_distributions().get(package, ())})
+    notes.append(", ".join([f"libwebp {features.version('webp')}", *(f"{name} {version(name)}" for name in names)]))
     notes += [f"{name} is not in the data" for name in SETS if options.data and name not in {w[0] for w in wanted}]
     conclude(report, output, Made(options.command("labels"), options.quick, (), tuple(notes)))

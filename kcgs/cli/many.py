@@ -72,7 +72,8 @@ def fit_many_command(
 
     orders = [order(image) for image in images]
     if workers is None and engine == "local":
-        workers = max(1, _cores() // threads)
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        workers = max(1, cores // threads)
     # one image needs no process of its own
     workers = None if workers is None else min(workers, len(orders))
     if engine == "local" and len(orders) > 1:
@@ -174,11 +175,6 @@ def _masks(folder: Path) -> dict[str, tuple[Path, ...]]:
         if path.suffix.lower() in (*IMAGES, ".npy"):
             found[path.stem] = (*found.get(path.stem, ()), path)
     return found
-
-
-def _cores() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _write_down(

@@ -15,9 +15,6 @@ from .common import OUTPUT_IMAGES, ImageFile, Json, Quiet, SceneFile, SceneOrMap
 from .fit import describe_size, measure_scene
 from .options import Contours, Scale, Size, exclude, target_size
 
-# a label map of fewer pixels per id, and of more ids, is perhaps a photo
-_PIXELS_PER_ID, _FEW_IDS = 64, 256
-
 OutputImage = Annotated[Path, typer.Option("-o", "--output", help="Image file to write.")]
 
 
@@ -131,7 +128,7 @@ def encode(
         exclude("a label map", target_bytes=target_bytes, quality=quality, image=image)
         labels = load_labels(scene, rgb_ids=True)
         ids = labels.unique()
-        if len(ids) * _PIXELS_PER_ID > labels.numel() and len(ids) > _FEW_IDS:
+        if len(ids) > max(256, labels.numel() / 64):
             typer.echo(f"kcgs: {scene} has {len(ids)} ids, as photos have, which kcgs fit takes", err=True)
         write_file(output, codec.encode_labels(labels))
         print_report(_describe_map(output, labels, ids), as_json, str(output))
@@ -201,14 +198,10 @@ def _read_map(file: Path) -> Any:
     from kcgs import codec
     from kcgs.codec.maps import decode_with_ids
 
+    if not file.is_file() or not (data := file.read_bytes()).startswith(codec.MAP_MAGIC):
+        return None
     try:
-        with file.open("rb") as stream:
-            if stream.read(len(codec.MAP_MAGIC)) != codec.MAP_MAGIC:
-                return None
-    except OSError:
-        return None  # whoever reads it as a scene says so
-    try:
-        return decode_with_ids(file.read_bytes())
+        return decode_with_ids(data)
     except codec.CodecError as error:
         raise codec.CodecError(f"cannot decode {file}: {error}") from error
 

@@ -250,10 +250,7 @@ def _from_ids(values: Array, path: str | os.PathLike[str]) -> Tensor:
     if values.dtype != np.uint8 or (values[..., 3:] != 255).any():
         got = "transparent pixels" if values.dtype == np.uint8 else values.dtype
         raise ValueError(f"colours that are ids must be opaque RGB of 8 bits; got {got} in {path}")
-    ids = values[..., 2].astype(np.int64)
-    for channel in (1, 0):
-        ids = ids << 8 | values[..., channel]
-    return torch.from_numpy(ids)
+    return torch.from_numpy((values[..., 2].astype(np.int64) << 8 | values[..., 1]) << 8 | values[..., 0])
 
 
 def _from_colors(values: Array, path: str | os.PathLike[str]) -> Tensor:

@@ -66,16 +66,6 @@ def _still(labels, y, x, lines):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _set(labels, y, x, label, lines):  # type: ignore[no-untyped-def]
-    if label != labels[y, x - 1]:
-        lines[y, _CHANGE] = x
-        for below in range(3):  # these rows see it
-            lines[y + below, _WAKE] = 0
-        _continue(labels, y, x, label, lines)
-    _margins(labels, y, x, label)
-
-
-@inner
 def _continue(labels, y, x, label, lines):  # type: ignore[no-untyped-def]
     labels[y, x : x + _AHEAD] = label
     lines[y, _END] = x + _AHEAD
@@ -108,16 +98,12 @@ def _settle(state, labels, bits, counters, weights, rows, lines):  # type: ignor
                 learn(counters, weights, row, 0, bit)
                 row[LABEL] = row[SECOND] if bit else row[FIRST]
             asked += 1
-        _set(labels, row[Y], row[X], row[LABEL], lines)
-
-
-@inner
-def _next_seed(seeds, j, i, line):  # type: ignore[no-untyped-def]
-    column = max(line[_SEED], i)
-    while column < seeds.shape[1] and seeds[j, column] == 0:
-        column += 1
-    line[_SEED] = column
-    return column
+        y, x, label = row[Y], row[X], row[LABEL]
+        if label != labels[y, x - 1]:
+            lines[y, _CHANGE] = x
+            lines[y : y + 3, _WAKE] = 0  # these rows see it
+            _continue(labels, y, x, label, lines)
+        _margins(labels, y, x, label)
 
 
 @inner
@@ -132,7 +118,10 @@ def _look(state, labels, seeds, rows, lines):  # type: ignore[no-untyped-def]
             _continue(labels, y, x, labels[y, x - 1], lines)
         if line[_WAKE] > front:
             continue
-        seed = _next_seed(seeds, j, x - LEFT, line) + LEFT
+        seed = max(line[_SEED], x)
+        while seed < width + LEFT and seeds[j, seed - LEFT] == 0:
+            seed += 1
+        line[_SEED] = seed
         n = state[ROWS]
         row = rows[n]
         if not _still(labels, y, x, lines):
