@@ -72,8 +72,7 @@ def fit_many_command(
 
     orders = [order(image) for image in images]
     if workers is None and engine == "local":
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        workers = max(1, cores // threads)
+        workers = max(1, _cores() // threads)
     # one image needs no process of its own
     workers = None if workers is None else min(workers, len(orders))
     if engine == "local" and len(orders) > 1:
@@ -175,6 +174,11 @@ def _masks(folder: Path) -> dict[str, tuple[Path, ...]]:
         if path.suffix.lower() in (*IMAGES, ".npy"):
             found[path.stem] = (*found.get(path.stem, ()), path)
     return found
+
+
+def _cores() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _write_down(

@@ -114,8 +114,7 @@ def _check_polygons(polygons: Tensor | Sequence[Tensor]) -> list[Tensor]:
 def _coverage(outline: Tensor, height: int, width: int) -> Tensor:
     """Return [H, W]: areas add up from the left, so only pixels that an edge meets need a number."""
     row, near, far, drop = _rows(outline, height)
-    x, y = (outline.detach() - outline.detach()[0]).unbind(1)
-    drop = torch.where((x * y.roll(-1) - x.roll(-1) * y).sum() > 0, -drop, drop)
+    drop = drop * _orientation(outline)
     left = torch.minimum(near, far).detach().floor().clamp(0, width).long()
     right = torch.maximum(near, far).detach().floor().clamp(-1, width - 2).long() + 1
     of, step = expand_runs((right - left + 1).clamp_min(0))
@@ -159,3 +158,8 @@ def _right_of(near: Tensor, far: Tensor, column: Tensor) -> Tensor:
     inner_low, inner_high = low.clamp(0, 1), high.clamp(0, 1)
     area = (inner_high - inner_low) * (inner_high + inner_low) / 2 + (high - low.clamp_min(1)).clamp_min(0)
     return torch.where(upright, ((a + b) / 2).clamp(0, 1), area / torch.where(upright, 1.0, span))
+
+
+def _orientation(outline: Tensor) -> Tensor:
+    x, y = (outline.detach() - outline.detach()[0]).unbind(1)
+    return torch.where((x * y.roll(-1) - x.roll(-1) * y).sum() > 0, -1.0, 1.0).to(outline.dtype)

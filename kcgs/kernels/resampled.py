@@ -145,17 +145,19 @@ class Crisp(Resampled):
 
     def __init__(self, index: Tensor, labels: Membership) -> None:
         """Take labels at the new size, (B, H, W), and the map at its own, whatever its widths."""
-        smooth = labels.derived("smooth", lambda m: Membership(m.index, m.num_regions, 1 / m.supersample, fine=m.fine))
-        super().__init__(index, smooth)
+        super().__init__(index, labels.derived("smooth", _smooth))
 
     def _exponents(self) -> float:
         return max(1.0, 2.0 * self.source.supersample * math.sqrt(self.ratio))
 
     def _own_weights(self, batch: int, region: int) -> Tensor:
-        each = (self.source.weights(batch, r, torch.float64) for r in range(self.num_regions))
-        best = self.derived(("best", batch), lambda _: functools.reduce(torch.maximum, each))
+        best = self.derived(("best", batch), lambda _: self._best(batch))
         own = self._own(self.source.index[batch])
         return _keep(super()._own_weights(batch, region), best, own == region)
+
+    def _best(self, batch: int) -> Tensor:
+        weights = (self.source.weights(batch, r, torch.float64) for r in range(self.num_regions))
+        return functools.reduce(torch.maximum, weights)
 
     def _own(self, index: Tensor) -> Tensor:
         """Take the labels that keep their pixels' centres: none of a supersampled map."""
@@ -170,6 +172,10 @@ class Crisp(Resampled):
     def to(self, device: torch.device) -> Crisp:
         """Return the same membership on `device`, tables not carried along."""
         return Crisp(self.index.to(device), self.source.to(device))
+
+
+def _smooth(labels: Membership) -> Membership:
+    return Membership(labels.index, labels.num_regions, 1.0 / labels.supersample, fine=labels.fine)
 
 
 def _keep(weights: Tensor, best: Tensor, own: Tensor) -> Tensor:

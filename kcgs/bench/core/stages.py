@@ -89,11 +89,7 @@ def _approach(store: Store, first: Case, row: Row, size: int) -> list[Case]:
     """Return fits ever nearer to `size` bytes, until one has as many, or little more, or is not made yet."""
     made, found = {row.n: row.bytes}, list[Case]()
     while len(found) < _TRIES and not any(size <= count <= _NEAR * size for count in made.values()):
-        # by the line through the two nearest files, or through the only one and nothing
-        wanted = _ABOVE * size
-        (n, count), (other, beside) = sorted([*made.items(), (0, 0)], key=lambda point: abs(point[1] - wanted))[:2]
-        step = 0 if count == beside else (wanted - count) * (n - other) / (count - beside)
-        case = first._replace(n=n + 1 if count == beside else max(1, 1 + math.ceil(n + step)))
+        case = first._replace(n=_guess(made, _ABOVE * size))
         if case.n in made:
             break
         found.append(case)
@@ -102,3 +98,9 @@ def _approach(store: Store, first: Case, row: Row, size: int) -> list[Case]:
             break
         made[case.n] = reached.bytes
     return found
+
+
+def _guess(made: dict[int, int], size: float) -> int:
+    """Return the N of so many bytes, by the line through the two nearest files, or through the only one and nothing."""
+    (n, count), (other, beside) = sorted([*made.items(), (0, 0)], key=lambda point: abs(point[1] - size))[:2]
+    return n + 1 if count == beside else max(1, 1 + math.ceil(n + (size - count) * (n - other) / (count - beside)))
