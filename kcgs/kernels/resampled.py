@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -83,7 +83,9 @@ class Resampled(Membership):
         widths, level = self.source.levels
         if self._lost == 0.0:
             return None
-        return sharpness(widths[0] ** 2, self._lost) if level is None else self.source.variances
+        if level is not None:
+            return self.source.variances
+        return float(sharpness(torch.tensor(widths[0] ** 2, dtype=torch.float64), self._lost))
 
     def _matrices(self, shape: Sequence[int]) -> Iterator[Tensor]:
         """Make the interpolation of whole columns and rows."""
@@ -182,13 +184,10 @@ def _keep(weights: Tensor, best: Tensor, own: Tensor) -> Tensor:
     return torch.where(own & (weights < best), best + MARGIN, weights)
 
 
-def sharpness(variance: Any, lost: Any) -> Any:
-    """Evaluate the exponent of :class:`Resampled` for variances, numbers or a Tensor; `lost` is its q."""
-    if isinstance(variance, Tensor):
-        variance, least = variance.clamp_min(TINY), torch.as_tensor(lost).to(variance) / 24
-        return ((variance + lost / 6) / torch.maximum(variance - lost / 12, least)).sqrt()
-    variance = max(variance, TINY)
-    return math.sqrt((variance + lost / 6) / max(variance - lost / 12, lost / 24))
+def sharpness(variance: Tensor, lost: float | Tensor) -> Tensor:
+    """Evaluate the exponent of :class:`Resampled` for variances; `lost` is its q."""
+    variance, least = variance.clamp_min(TINY), torch.as_tensor(lost).to(variance) / 24
+    return ((variance + lost / 6) / torch.maximum(variance - lost / 12, least)).sqrt()
 
 
 def _sharpen(weights: Tensor, group: Tensor, exponent: float | Tensor) -> Tensor:

@@ -105,7 +105,7 @@ class Windows:
         if not self.soft:
             best = g("ReduceMax", weights, one, keepdims=1)
             weights = g("Cast", g("Equal", weights, best), to=FLOAT)
-        if self.soft:
+        else:
             exponent = self._exponent
             if self._variances is not None:
                 squares = g("Gather", self._variances[self._numbers[id(group)]], slots)
