@@ -1,0 +1,151 @@
+/** The stream of a layer (docs/format.md); models go on from layer to layer. */
+
+import { AdaptiveMagnitude } from "../models/adaptive_magnitude.ts";
+import { AdaptiveNumber } from "../models/adaptive_number.ts";
+import { AdaptiveSymbol } from "../models/adaptive_symbol.ts";
+import { type Cells, Occupancy } from "../models/occupancy.ts";
+import type { Header } from "../header.ts";
+import { RangeDecoder } from "../range_decoder.ts";
+import { DecodeError } from "../scene.ts";
+import { angles, LEAST_SIZE, MOST_SIZE, places, Quantizer, restoreColor, restoreShape, type Steps } from "./quantizer.ts";
+import { COUNTS, GREY, HUE, HUE2, RATIO, STRAYS } from "./weights.ts";
+
+const CLASSES = 64; // of size, that a stream may name
+const FAINT = 0.35;
+const STRONG = 0.8;
+
+/** The Gaussians of a layer; `regions` are positions among the ids of the map, null without a map. */
+export interface Layer {
+  readonly count: number;
+  readonly means: Float32Array;
+  readonly cholesky: Float32Array;
+  readonly colors: Float32Array;
+  readonly regions: Int32Array | null;
+}
+
+/** The position of the region of each pixel of the image, row by row. */
+export type PixelRegions = Int32Array;
+
+export class LayerDecoder {
+  private readonly quantizer: Quantizer;
+  private readonly counts = new AdaptiveNumber(COUNTS);
+  private readonly occupancy: Occupancy;
+  private readonly ratio = new AdaptiveMagnitude(RATIO);
+  private readonly colors = [
+    new AdaptiveMagnitude(GREY),
+    new AdaptiveMagnitude(HUE, 3),
+    new AdaptiveMagnitude(HUE2, 3),
+  ] as const;
+  private readonly strays = new AdaptiveSymbol(STRAYS);
+
+  constructor(
+    private readonly header: Header,
+    private readonly pixels: PixelRegions | null,
+  ) {
+    const { quantizationParameter, height, width } = header;
+    this.quantizer = new Quantizer(quantizationParameter, height, width);
+    this.occupancy = new Occupancy(height, width);
+  }
+
+  /** Read a layer of one class of energy, of at most so many Gaussians. */
+  read(bytes: Uint8Array, energy: number, most: number): Layer {
+    const decoder = new RangeDecoder(bytes);
+    const steps = this.quantizer.steps(energy);
+    const classes = this.readClasses(decoder, most);
+    const count = classes.reduce((sum, { cells }) => sum + cells.row.length, 0);
+    const scale = new Int32Array(count).map(() => decoder.uniform(steps.scales));
+    const ratio = this.ratio.read(decoder, 2 / steps.ratio, new Uint8Array(count));
+    const beyond = ratio.find((steep) => steep > steps.mostRatio);
+    if (beyond !== undefined) throw new DecodeError(`a ratio must be at most ${steps.mostRatio} steps; got ${beyond}`);
+    const share = Float64Array.from(ratio, (steep) => {
+      const turns = angles(steps, steep);
+      return decoder.uniform(turns) / turns;
+    });
+    const codes = this.readColors(decoder, count, steps.loud);
+    const shape = new Float64Array(3 * count);
+    const colors = new Float32Array(codes.length);
+    let n = 0;
+    for (const { size, cells } of classes) {
+      const step = this.quantizer.colorStep(size);
+      for (const end = n + cells.row.length; n < end; n++) {
+        restoreShape(steps, size, scale[n]!, ratio[n]!, share[n]!, shape, 3 * n);
+        restoreColor(codes, this.header.channels, step, colors, this.header.channels * n);
+      }
+    }
+    const means = new Float32Array(2 * count);
+    for (const axis of [0, 1] as const) readMeans(decoder, steps, classes, shape, axis, means);
+    const regions = this.pixels && this.readRegions(decoder, means, this.pixels);
+    return { count, means, cholesky: Float32Array.from(shape), colors, regions };
+  }
+
+  /** Read the classes of size, falling, and the cells of their Gaussians. */
+  private readClasses(decoder: RangeDecoder, most: number): Class[] {
+    const first = decoder.uniform(CLASSES);
+    const last = first + decoder.uniform(CLASSES - first);
+    const counts: { size: number; count: number }[] = [];
+    let total = 0;
+    for (let position = first; position <= last; position++) {
+      const count = this.counts.read(decoder);
+      total += count;
+      if (count) counts.unshift({ size: position + LEAST_SIZE, count });
+    }
+    if (total > most) throw new DecodeError(`a layer must hold at most ${most} Gaussians; got ${total}`);
+    const largest = counts[0];
+    if (!largest) throw new DecodeError("a layer must hold Gaussians; got none");
+    if (largest.size > MOST_SIZE)
+      throw new DecodeError(`a class of size must be at most ${MOST_SIZE}; got ${largest.size}`);
+    return counts.map(({ size, count }) => ({ size, cells: this.occupancy.read(decoder, count) }));
+  }
+
+  private readColors(decoder: RangeDecoder, count: number, loud: number): Int32Array {
+    const { channels } = this.header;
+    const codes = new Int32Array(channels * count);
+    const contexts = new Uint8Array(count);
+    for (let channel = 0; channel < channels; channel++) {
+      const sizes = this.colors[channel === 0 ? 0 : channel === 1 ? 1 : 2].read(decoder, loud, contexts);
+      for (let n = 0; n < count; n++) {
+        const size = sizes[n]!;
+        codes[channels * n + channel] = size && decoder.uniform(2) ? -size : size;
+        contexts[n] = size > STRONG * loud ? 2 : size > FAINT * loud ? 1 : 0;
+      }
+    }
+    return codes;
+  }
+
+  /** Read the region of each Gaussian: that under its centre, or another. */
+  private readRegions(decoder: RangeDecoder, means: Float32Array, pixels: PixelRegions): Int32Array {
+    const { height, width, regions } = this.header;
+    const strays = this.strays.read(decoder, means.length / 2);
+    return strays.map((stray, n) => {
+      const x = Math.min(Math.max(Math.floor(means[2 * n]!), 0), width - 1);
+      const y = Math.min(Math.max(Math.floor(means[2 * n + 1]!), 0), height - 1);
+      const under = pixels[y * width + x]!;
+      return stray ? (under + 1 + decoder.uniform(regions - 1)) % regions : under;
+    });
+  }
+}
+
+interface Class {
+  readonly size: number;
+  readonly cells: Cells;
+}
+
+/** Read the places along an axis, 0 for x, within the cells. */
+function readMeans(
+  decoder: RangeDecoder,
+  steps: Steps,
+  classes: readonly Class[],
+  shape: Float64Array,
+  axis: 0 | 1,
+  means: Float32Array,
+): void {
+  let n = 0;
+  for (const { cells } of classes) {
+    const { side } = cells;
+    for (const cell of axis ? cells.row : cells.column) {
+      const count = places(steps, side, shape[3 * n + 2 * axis]!);
+      means[2 * n + axis] = side * (cell + (decoder.uniform(count) + 0.5) / count);
+      n++;
+    }
+  }
+}

@@ -1,0 +1,76 @@
+import { beginnings, type RangeDecoder } from "../range_decoder.ts";
+
+const BINS = 24;
+const PARTS = 256;
+// sizes below 16 have a bucket each, each octave above has eight
+const BOUNDS: number[] = Array.from({ length: 16 }, (_, size) => size);
+for (let octave = 4; octave < 24; octave++)
+  for (let eighth = 8; eighth < 16; eighth++) BOUNDS.push(eighth * 2 ** (octave - 3));
+BOUNDS.push(2 ** 24);
+const BUCKETS = BOUNDS.length - 1;
+
+/** Sizes 0, 1, 2 ... in units of a given scale: a shape over size / scale, learned for all scales. */
+export class AdaptiveMagnitude {
+  private readonly shapes: Float64Array[];
+
+  /** `bins`: the shape at first, of each of the contexts. */
+  constructor(bins: readonly number[], contexts = 1) {
+    this.shapes = Array.from({ length: contexts }, () => Float64Array.from(bins));
+  }
+
+  /** Read a group of sizes, one for each context. */
+  read(decoder: RangeDecoder, scale: number, contexts: Uint8Array): Int32Array {
+    const begins = this.shapes.map((shape) => beginnings(weights(shape, scale)));
+    const sizes = new Int32Array(contexts.length);
+    for (let i = 0; i < sizes.length; i++) sizes[i] = decoder.categorical(begins[contexts[i]!]!);
+    for (let i = 0; i < sizes.length; i++) {
+      const bucket = sizes[i]!;
+      sizes[i] = BOUNDS[bucket]! + decoder.uniform(BOUNDS[bucket + 1]! - BOUNDS[bucket]!);
+    }
+    this.learn(scale, contexts, sizes);
+    return sizes;
+  }
+
+  private learn(scale: number, contexts: Uint8Array, sizes: Int32Array): void {
+    const edges = borders(scale);
+    edges[BINS] = Infinity;
+    const learned = this.shapes.map(() => new Float64Array(BINS));
+    for (let n = 0; n < sizes.length; n++) {
+      const size = sizes[n]!;
+      const low = Math.max(size - 0.5, 0);
+      const high = size + 0.5;
+      const bins = learned[contexts[n]!]!;
+      for (let i = 0; i < BINS && edges[i]! < high; i++) {
+        const covered = Math.min(high, edges[i + 1]!) - Math.max(low, edges[i]!);
+        if (covered > 0) bins[i]! += Math.floor((covered / (high - low)) * PARTS + 0.5);
+      }
+    }
+    this.shapes.forEach((shape, context) => {
+      for (let i = 0; i < BINS; i++) shape[i]! += learned[context]![i]! / PARTS;
+    });
+  }
+}
+
+const borders = (scale: number): Float64Array => new Float64Array(BINS + 1).map((_, i) => i * (scale * 0.125));
+
+/** The weights of the buckets. */
+function weights(shape: Float64Array, scale: number): Float64Array {
+  const edges = borders(scale);
+  const sums = new Float64Array(BINS + 1);
+  for (let i = 0; i < BINS; i++) sums[i + 1] = sums[i]! + shape[i]!;
+  const total = sums[BINS]!;
+  let bin = 0;
+  // F of the format; its arguments rise
+  const rise = (x: number): number => {
+    while (bin < BINS - 1 && edges[bin + 1]! <= x) bin++;
+    const share = Math.min((x - edges[bin]!) / (edges[bin + 1]! - edges[bin]!), 1);
+    return sums[bin]! + share * (sums[bin + 1]! - sums[bin]!);
+  };
+  let before = rise(0);
+  return new Float64Array(BUCKETS).map((_, bucket) => {
+    const after = rise(BOUNDS[bucket + 1]! - 0.5);
+    const weight = after - before + (0.001 * total) / BUCKETS;
+    before = after;
+    return weight;
+  });
+}

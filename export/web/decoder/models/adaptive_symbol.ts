@@ -1,0 +1,26 @@
+import { beginnings, type RangeDecoder } from "../range_decoder.ts";
+
+/** One of a few symbols, with the weights that they have at first. */
+export class AdaptiveSymbol {
+  private readonly weights: Float64Array;
+
+  constructor(weights: readonly number[]) {
+    this.weights = Float64Array.from(weights);
+  }
+
+  /** Read a group of symbols, which are learned from together. */
+  read(decoder: RangeDecoder, count: number): Int32Array {
+    const begins = beginnings(this.weights);
+    const found = new Int32Array(count);
+    for (let i = 0; i < count; i++) found[i] = decoder.categorical(begins);
+    for (const symbol of found) this.weights[symbol]! += 1;
+    return found;
+  }
+
+  /** Read a symbol that is coded alone. */
+  readOne(decoder: RangeDecoder): number {
+    const symbol = decoder.categorical(beginnings(this.weights));
+    this.weights[symbol]! += 1;
+    return symbol;
+  }
+}

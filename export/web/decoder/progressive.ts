@@ -1,0 +1,139 @@
+/** A scene from bytes as they arrive. */
+
+import { ByteReader, EndOfBytes } from "./bytes.ts";
+import { crc16 } from "./checksums.ts";
+import { LayerDecoder } from "./gaussians/layers.ts";
+import { Growing } from "./growing.ts";
+import { type Header, mostGaussians, readHeader } from "./header.ts";
+import { pixelRegions, type ReadMap, readRegionMap } from "./region_map.ts";
+import { DecodeError, type Scene } from "./scene.ts";
+
+const SPARE = 64; // Gaussians that a layer of no bytes may hold
+
+/** A scene with the ids of regions above 2**53 too, which a Float64Array rounds. */
+export interface ExactScene extends Scene {
+  readonly positions: Int32Array | null; // N: the region of each Gaussian, a position among the ids
+  readonly exactIds: BigInt64Array | null; // rising
+}
+
+/** What the first bytes of a file have given. */
+interface Opened {
+  readonly header: Header;
+  readonly regions: ReadMap | null;
+  readonly layers: LayerDecoder;
+}
+
+export class ProgressiveDecoder {
+  private readonly bytes = new Growing<Uint8Array>(new Uint8Array(0));
+  private opened: Opened | null = null;
+  private position = 0; // of the next layer
+  private layers = 0;
+  private count = 0;
+  private readonly means = new Growing<Float32Array>(new Float32Array(0));
+  private readonly cholesky = new Growing<Float32Array>(new Float32Array(0));
+  private readonly colors = new Growing<Float32Array>(new Float32Array(0));
+  private readonly regions = new Growing<Int32Array>(new Int32Array(0));
+  private scene: ExactScene | null = null;
+  /** What was wrong with the bytes so far; what follows is not read. */
+  error: DecodeError | null = null;
+
+  /** Take the next bytes; return the scene of all whole layers if new ones became whole. */
+  push(bytes: Uint8Array): ExactScene | null {
+    if (this.error) return null;
+    this.bytes.add(bytes);
+    const before = this.layers;
+    let damage: DecodeError | null = null;
+    try {
+      this.readOn();
+    } catch (error) {
+      damage = damageOf(error);
+    }
+    const more = this.layers > before;
+    if (more) this.scene = this.makeScene();
+    if (damage) this.error = new DecodeError(damage.message, this.scene);
+    return more ? this.scene : null;
+  }
+
+  /** End the file; a DecodeError if it was damaged, or too short to be whole. */
+  finish(): ExactScene {
+    if (this.error) throw this.error;
+    if (!this.scene) throw new EndOfBytes(`the file ends early: ${this.bytes.length} bytes hold no layer`);
+    if (!this.scene.complete) {
+      const all = this.opened!.header.layers.length;
+      throw new EndOfBytes(`the file ends early, with ${this.layers} of ${all} layers`, this.scene);
+    }
+    return this.scene;
+  }
+
+  /** Read as far as the bytes go. */
+  private readOn(): void {
+    const data = this.bytes.all();
+    const { header, layers } = (this.opened ??= this.open(data));
+    while (this.layers < header.layers.length) {
+      const { energy, bytes } = header.layers[this.layers]!;
+      const reader = new ByteReader(data.subarray(this.position), EndOfBytes);
+      const layer = reader.take(bytes);
+      if (reader.number(2) !== crc16(layer)) {
+        const sound = this.layers ? `; its first ${this.position} bytes are sound` : "";
+        throw new DecodeError(`the file is damaged: the checksum of its layer ${this.layers + 1} is another${sound}`);
+      }
+      // each Gaussian takes more than a bit, and all must fit into memory
+      const most = Math.min(8 * bytes + SPARE, mostGaussians(header.channels) - this.count);
+      const gaussians = layers.read(layer, energy, most);
+      this.means.add(gaussians.means);
+      this.cholesky.add(gaussians.cholesky);
+      this.colors.add(gaussians.colors);
+      if (gaussians.regions) this.regions.add(gaussians.regions);
+      this.count += gaussians.count;
+      this.position += bytes + 2;
+      this.layers++;
+    }
+    if (data.length > this.position)
+      throw new DecodeError(`the file must end after ${this.position} bytes; got ${data.length}`);
+  }
+
+  private open(data: Uint8Array): Opened {
+    const reader = new ByteReader(data, EndOfBytes);
+    const { header, map } = readHeader(reader);
+    this.position = reader.position;
+    const regions = header.regions > 1 ? readRegionMap(map, header) : null;
+    const pixels = regions && pixelRegions(regions.map, header.height, header.width);
+    return { header, regions, layers: new LayerDecoder(header, pixels) };
+  }
+
+  private makeScene(): ExactScene {
+    const { header, regions } = this.opened!;
+    const { height, width, channels } = header;
+    const positions = regions && this.regions.all().slice();
+    return {
+      height,
+      width,
+      channels,
+      count: this.count,
+      means: this.means.all().slice(),
+      cholesky: this.cholesky.all().slice(),
+      colors: this.colors.all().slice(),
+      regionIds: positions && Float64Array.from(positions, (position) => regions!.map.ids[position]!),
+      regions: regions && regions.map,
+      layers: this.layers,
+      complete: this.layers === header.layers.length,
+      positions,
+      exactIds: regions && regions.ids,
+    };
+  }
+}
+
+/** What is wrong with bytes that cannot be read, null if there are only too few of them. */
+function damageOf(error: unknown): DecodeError | null {
+  if (error instanceof EndOfBytes) return null;
+  if (error instanceof RangeError) return new DecodeError(`the scene needs more memory than there is: ${error.message}`);
+  if (error instanceof DecodeError) return error;
+  throw error;
+}
+
+/** Read a file, or the coarser scene that its first bytes hold; a DecodeError on damage. */
+export function decode(bytes: Uint8Array): ExactScene {
+  const decoder = new ProgressiveDecoder();
+  const scene = decoder.push(bytes);
+  return scene && !decoder.error ? scene : decoder.finish();
+}
