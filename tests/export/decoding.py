@@ -1,0 +1,106 @@
+"""The web's decoder behind a pipe (export/web/test/decode.mjs), and what Python makes of the same files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import queue
+import subprocess
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kcgs.codec import CodecError, decode, decode_labels
+
+WEB = Path(__file__).resolve().parents[2] / "export" / "web"
+SECONDS = 20  # within which any file must be decoded or refused
+
+
+class Node:
+    """The built decoder in node: one command at a time, each within a time limit."""
+
+    def __init__(self, bundle: Path, scratch: Path) -> None:
+        self._file, self._log = scratch / "bytes.kcgs", (scratch / "errors.txt").open("w")
+        command = ["node", str(WEB / "test" / "decode.mjs"), str(bundle)]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True
+        )
+        self._lines: queue.Queue[str] = queue.Queue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._lines.put(line)
+        self._lines.put("")
+
+    def do(self, action: str, data: bytes, **arguments: Any) -> dict[str, Any]:
+        assert self._process.stdin is not None
+        self._file.write_bytes(data)
+        self._process.stdin.write(json.dumps({"do": action, "path": str(self._file), **arguments}) + "\n")
+        self._process.stdin.flush()
+        line = self._lines.get(timeout=SECONDS)
+        assert line, "node ended"
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def close(self) -> None:
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.close()
+        self._process.kill()
+        self._process.wait()
+        self._reader.join(timeout=10)
+        self._process.stdout.close()
+        self._log.close()
+
+
+def digest(array: Any, dtype: str = "<f4") -> str:
+    numbers: NDArray[Any] = np.ascontiguousarray(array, dtype=dtype)
+    return hashlib.sha256(numbers.tobytes()).hexdigest()
+
+
+def scene_of(data: bytes) -> dict[str, Any]:
+    """Decode in Python; describe it as describe.mjs does."""
+    found = decode(data)
+    field, regions = found.scene.field, found.scene.regions
+    numbers = {name: getattr(field, name).detach().numpy() for name in ("means", "cholesky", "colors")}
+    described: dict[str, Any] = {name: digest(array) for name, array in numbers.items()}
+    described |= {"height": field.size[0], "width": field.size[1], "channels": field.colors.shape[-1]}
+    described |= {"count": len(field), "layers": found.layers, "complete": found.layers == found.num_layers}
+    described |= {"regions": None, "regionIds": None, "positions": None, "exactIds": None}
+    if regions is None or field.region_ids is None:
+        return described
+    labels, ids = regions.index_of(regions.fine_labels).numpy(), regions.ids.numpy()
+    described["regionIds"] = digest(field.region_ids.numpy(), "<f8")
+    described["positions"] = digest(regions.index_of(field.region_ids).numpy(), "<i4")
+    described["exactIds"] = digest(ids, "<i8")
+    one = isinstance(regions.softness, float)
+    described["regions"] = {
+        "supersample": regions.supersample, "labels": digest(labels, "<i4"), "ids": digest(ids, "<f8"),
+        "softness": regions.softness if one else None,
+        "pairs": [] if one else [[*np.searchsorted(ids, pair).tolist(), w] for pair, w in regions.softness.items()],
+    }  # fmt: skip
+    return described
+
+
+def labels_of(data: bytes) -> dict[str, Any]:
+    labels = decode_labels(data).numpy()
+    described = digest(labels, labels.dtype.str)
+    return {"height": labels.shape[0], "width": labels.shape[1], "type": str(labels.dtype), "labels": described}
+
+
+def check_same(node: Node, data: bytes, *, labels: bool = False) -> bool:
+    """Both give the same bits, or both refuse; return whether they gave any."""
+    answer = node.do("labels" if labels else "scene", data)
+    answer.pop("memory")
+    try:
+        expected = (labels_of if labels else scene_of)(data)
+    except CodecError as error:
+        assert answer.get("error") == "DecodeError", (str(error), answer)
+        return False
+    assert answer == expected
+    return True

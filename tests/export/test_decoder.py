@@ -1,0 +1,221 @@
+"""The web's decoder of `.kcgs` against Python's: the same bits, or an error, on every file."""
+
+from __future__ import annotations
+
+import math
+import random
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from kcgs import GaussianField, RegionMap, Scene, codec, load
+from kcgs.codec import encode
+from kcgs.codec.file import pack, unpack
+
+from .decoding import WEB, Node, check_same
+
+MODELS = WEB.parents[1] / "models"
+GOLDEN = WEB.parents[1] / "tests" / "codec" / "golden.kcgs"
+MEMORY = 1 << 30  # that node, which has about 50 MB at first, may take at most
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The decoder, built as `npm run build` builds it."""
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed")
+    vite = WEB / "node_modules" / "vite" / "bin" / "vite.js"
+    if not vite.exists():
+        pytest.skip("export/web has no node_modules, with which its decoder is built: npm --prefix export/web ci")
+    folder = tmp_path_factory.mktemp("decoder")
+    command = ["node", str(vite), "build", "--config", "decoder/vite.config.ts", "--outDir", str(folder)]
+    done = subprocess.run(command, cwd=WEB, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def node(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
+    running = Node(bundle, tmp_path_factory.mktemp("node"))
+    yield running
+    running.close()
+
+
+def random_labels(generator: np.random.Generator, size: tuple[int, int], regions: int) -> np.ndarray:
+    """Cells about random points, with specks now and then, and ids of all kinds."""
+    rows, columns = np.mgrid[: size[0], : size[1]]
+    places = generator.integers(0, size, (regions, 2))
+    nearest = ((rows[..., None] - places[:, 0]) ** 2 + (columns[..., None] - places[:, 1]) ** 2).argmin(-1)
+    if generator.random() < 0.3:
+        noise = generator.choice([0.002, 0.02, 0.5])
+        nearest = np.where(generator.random(size) < noise, generator.integers(0, regions, size), nearest)
+    kind = generator.integers(3)
+    if kind == 0:
+        return nearest
+    most = 1 << (16 if kind == 1 else 62)
+    return np.unique(generator.integers(0, most, regions + 200))[: regions + 1][generator.permutation(regions)][nearest]
+
+
+def random_scene(seed: int) -> Scene:
+    """Gaussians of all sizes, angles and strengths, some outside the image, with any map that a file may hold."""
+    generator = np.random.default_rng(seed)
+    size = (int(generator.integers(1, 60)), int(generator.integers(1, 90)))
+    count, channels = int(generator.integers(1, 300)), 1 + seed % 4
+    means = (1.4 * generator.random((count, 2)) - 0.2) * size[::-1]
+    wide, long = 0.3 * 60.0 ** generator.random((2, count))
+    angle = math.pi * generator.random(count)
+    l11 = np.sqrt((wide * np.cos(angle)) ** 2 + (long * np.sin(angle)) ** 2)
+    l21 = (wide**2 - long**2) * np.cos(angle) * np.sin(angle) / l11
+    colors = generator.normal(size=(count, channels)) * 3.0 ** (-4 * generator.random((count, 1)))
+    numbers = (torch.from_numpy(n).float() for n in (means, np.stack([l11, l21, wide * long / l11], -1), colors))
+    regions = int(generator.choice([1, 2, 3, 8, 40, 200]))
+    if regions == 1:
+        return Scene(GaussianField(*numbers, size=size))
+    k = int(generator.choice([1, 1, 2, 3]))
+    labels = random_labels(generator, (k * size[0], k * size[1]), regions)
+    given = RegionMap.from_labels(labels, supersample=k)
+    softness: float | dict[tuple[int, int], float] = float(generator.choice([0.0, 0.5, 1.3]))
+    pairs = sorted(codec.labels.coding.touching_pairs(given.fine_labels))
+    if generator.random() < 0.4:
+        softness = {pair: float(generator.choice([0.0, 0.25, 0.7, 2.0])) for pair in pairs}
+    ids = given.ids[torch.from_numpy(generator.integers(0, given.num_regions, count))]
+    return Scene(GaussianField(*numbers, ids, size=size), RegionMap.from_labels(labels, softness, supersample=k))
+
+
+def check_scenes(node: Node, seeds: range) -> None:
+    for seed in seeds:
+        assert check_same(node, encode(random_scene(seed), quality=float(20 + seed % 5 * 15))), seed
+
+
+def damaged(data: bytes, other: bytes, generator: random.Random) -> bytes:
+    """Bits flipped, bytes lost, added or repeated, the end cut off, or that of another file put there."""
+    content = bytearray(data)
+    at, kind = generator.randrange(len(content)), generator.randrange(6)
+    if kind == 0:
+        for _ in range(generator.randint(1, 4)):
+            content[generator.randrange(len(content))] ^= 1 << generator.randrange(8)
+    elif kind == 1:
+        del content[at : at + generator.randint(1, 9)]
+    elif kind == 2:
+        content[at:at] = generator.randbytes(generator.randint(1, 9))
+    elif kind == 3:
+        content[at : at + 8] = generator.randbytes(8)
+    elif kind == 4:
+        del content[at:]
+    else:
+        content[at:] = other[generator.randrange(len(other)) :]
+    return bytes(content)
+
+
+def hostile(data: bytes, other: bytes, generator: random.Random) -> bytes:
+    """Damage with right checksums, which no checksum finds."""
+    header, region_map, layers = unpack(data)
+    layers, kind = list(layers), generator.randrange(4)
+    if kind == 0 and region_map:
+        region_map = damaged(region_map, other, generator) or b"\0"
+    elif kind == 1:
+        sizes = [(1, 1), (7, 9), (300, 400), (1 << 20, 1), (1, 1 << 20), (1 << 20, 1 << 20)]
+        header = header._replace(size=generator.choice(sizes))
+    elif kind == 2:
+        options = [("channels", [1, 2, 4, 900]), ("qp", [-512, 0, 1023]), ("regions", [1, 2, 4, 70000])]
+        name, values = generator.choice(options)
+        header = header._replace(**{name: generator.choice(values)})
+    else:
+        at = generator.randrange(len(layers))
+        layers[at] = damaged(layers[at], other, generator) or b"\0"
+    header = header._replace(layers=tuple((e, len(x)) for (e, _), x in zip(header.layers, layers, strict=True)))
+    return pack(header, region_map, layers)
+
+
+def attack(node: Node, count: int, seed: int) -> None:
+    generator = random.Random(seed)
+    files = [encode(random_scene(seed + n), quality=40.0) for n in range(min(max(count // 20, 5), 40))]
+    whole = 0
+    for n in range(count):
+        data, other = generator.sample(files, 2)
+        content = (hostile if n % 2 else damaged)(data, other, generator)
+        whole += check_same(node, content)
+    assert 0 < whole < count  # some are scenes still
+    assert node.do("scene", files[0])["memory"] < MEMORY
+
+
+class TestConformance:
+    def test_golden(self, node: Node) -> None:
+        assert check_same(node, GOLDEN.read_bytes())
+
+    def test_some_scenes(self, node: Node) -> None:
+        check_scenes(node, range(20))
+
+    @pytest.mark.slow
+    def test_two_hundred_scenes(self, node: Node) -> None:
+        check_scenes(node, range(20, 220))
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("name", sorted(path.parent.name for path in MODELS.glob("*/scene.safetensors")))
+    def test_zoo(self, node: Node, name: str) -> None:
+        for quality in (30.0, 46.0, 70.0):
+            assert check_same(node, encode(load(MODELS / name / "scene.safetensors"), quality=quality))
+
+    def test_label_maps(self, node: Node) -> None:
+        for seed in range(12):
+            generator = np.random.default_rng(seed)
+            labels = random_labels(generator, (9 + 7 * seed, 40), [1, 2, 3, 30][seed % 4])
+            types = [t for t in (bool, "u1", "i1", "u2", "i2", "u4", "i4", "i8") if labels.max() <= _highest(t)]
+            for dtype in types[-2:]:
+                data = codec.encode_labels(labels.astype(dtype))
+                assert check_same(node, data, labels=True)
+                assert not check_same(node, data[:-1], labels=True)
+
+
+def _highest(dtype: object) -> int:
+    return 1 if dtype is bool else int(np.iinfo(np.dtype(dtype)).max)  # type: ignore[call-overload]
+
+
+class TestDamage:
+    def test_a_hundred(self, node: Node) -> None:
+        attack(node, 100, seed=0)
+
+    @pytest.mark.slow
+    def test_two_thousand(self, node: Node) -> None:
+        attack(node, 2000, seed=1000)
+
+    def test_what_is_wrong_is_named_and_whole_layers_are_kept(self, node: Node) -> None:
+        data = GOLDEN.read_bytes()
+        flipped = data[:-9] + bytes([data[-9] ^ 1]) + data[-8:]
+        answer, layers = node.do("scene", flipped), len(unpack(data)[2])
+        assert f"the checksum of its layer {layers} is another" in answer["message"]
+        assert answer["partial"]["layers"] == layers - 1
+        for content, message in [
+            (b"kcgs\2" + data[5:], "its version must be 1; got 2"),
+            (b"GIF89a", 'it must start with "kcgs"; got "GIF8"'),
+            (data[:9], "the file ends early"),
+            (data + b"\0", f"the file must end after {len(data)} bytes; got {len(data) + 1}"),
+            (codec.encode_labels(np.eye(9, dtype=np.uint8)), "it is a label map, no scene"),
+        ]:
+            answer = node.do("scene", content)
+            assert answer["error"] == "DecodeError" and message in answer["message"]
+
+
+class TestProgressive:
+    @pytest.mark.parametrize("step", [1, 100, 1 << 20])
+    def test_layers_as_they_arrive(self, node: Node, step: int) -> None:
+        data = GOLDEN.read_bytes()
+        whole = node.do("scene", data)
+        answer = node.do("stream", data, step=step)
+        assert answer["layers"] == sorted(set(answer["layers"])) and answer["layers"][-1] == whole["layers"]
+        assert step > 1 or answer["layers"] == [*range(1, whole["layers"] + 1)]
+        whole.pop("memory")
+        assert answer["last"] == whole
+
+    def test_a_file_that_ends_early(self, node: Node) -> None:
+        data = GOLDEN.read_bytes()[:-1]
+        part = node.do("scene", data)
+        last = node.do("stream", data, step=64)["last"]
+        part.pop("memory")
+        assert last["error"] == "DecodeError" and "the file ends early, with" in last["message"]
+        assert last["partial"] == part and part["complete"] is False
