@@ -16,6 +16,7 @@ import torch
 from kcgs import GaussianField, RegionMap, Scene, codec, load
 from kcgs.codec import encode
 from kcgs.codec.file import pack, unpack
+from kcgs.functional.labels import touching_pairs
 
 from .decoding import WEB, Node, check_same
 
@@ -80,7 +81,7 @@ def random_scene(seed: int) -> Scene:
     labels = random_labels(generator, (k * size[0], k * size[1]), regions)
     given = RegionMap.from_labels(labels, supersample=k)
     softness: float | dict[tuple[int, int], float] = float(generator.choice([0.0, 0.5, 1.3]))
-    pairs = sorted(codec.labels.coding.touching_pairs(given.fine_labels))
+    pairs = sorted(touching_pairs(given.fine_labels))
     if generator.random() < 0.4:
         softness = {pair: float(generator.choice([0.0, 0.25, 0.7, 2.0])) for pair in pairs}
     ids = given.ids[torch.from_numpy(generator.integers(0, given.num_regions, count))]

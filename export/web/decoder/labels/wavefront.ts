@@ -5,7 +5,8 @@ import { DecodeError } from "../scene.ts";
 import { Decision } from "./decision.ts";
 import { Escapes } from "./escapes.ts";
 import { LEFT, Margins, TOP } from "./margins.ts";
-import { type Network, TEMPLATE } from "./network.ts";
+import type { Network } from "./network.ts";
+import { TEMPLATE } from "./template.ts";
 
 const SLANT = 8;
 const MOST_ASKED = 2 ** 23; // pixels that bits decide; more take minutes
