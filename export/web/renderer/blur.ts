@@ -1,0 +1,114 @@
+/** The blur of a label map at one pixel: how much of each region lies around it. */
+
+import type { Levels } from "./levels.ts";
+
+const RADIUS_SIGMAS = 4;
+
+interface Kernel {
+  readonly reach: number; // labels
+  readonly weights: Float64Array; // at distance 0, 1 ... reach
+  readonly sums: Float64Array; // of the weights from -reach up to, but without, -reach + i
+}
+
+/** Regions and their weights, in no order. */
+export interface Shares {
+  readonly regions: number[];
+  readonly weights: number[];
+}
+
+export class Blur {
+  private readonly kernels: Kernel[];
+  private readonly widest: number;
+  private readonly runEnds: Int32Array; // where the run of equal labels in its row ends that a label lies in
+  private readonly across: Int32Array; // integral image of changes along rows
+  private readonly down: Int32Array; // changes along columns, from the top
+  private readonly sums: Float64Array; // of regions
+  private readonly shares: Shares = { regions: [], weights: [] };
+
+  constructor(
+    private readonly labels: Int32Array,
+    private readonly width: number,
+    private readonly height: number,
+    regions: number,
+    private readonly levels: Levels,
+    private readonly perPixel: number,
+  ) {
+    this.kernels = levels.widths.map((sigma) => kernelOf(sigma * perPixel));
+    this.widest = Math.max(...this.kernels.map((kernel) => kernel.reach));
+    this.sums = new Float64Array(regions);
+    this.runEnds = new Int32Array(labels.length);
+    this.across = new Int32Array((width + 1) * (height + 1));
+    this.down = new Int32Array(labels.length);
+    this.scan();
+  }
+
+  private scan(): void {
+    const { labels, width, height, runEnds, across, down } = this;
+    for (let y = 0; y < height; y++) {
+      const row = y * width;
+      for (let x = width - 1, end = width; x >= 0; x--) {
+        runEnds[row + x] = end;
+        if (x > 0 && labels[row + x] !== labels[row + x - 1]) end = x;
+      }
+      for (let x = 0, changes = 0; x < width; x++) {
+        const at = row + x;
+        if (x > 0 && labels[at] !== labels[at - 1]) changes++;
+        across[(y + 1) * (width + 1) + x + 1] = across[y * (width + 1) + x + 1]! + changes;
+        if (y > 0) down[at] = down[at - width]! + Number(labels[at] !== labels[at - width]);
+      }
+    }
+  }
+
+  /** Whether no contour reaches into a pixel. */
+  alone(x: number, y: number): boolean {
+    const { width, height, perPixel, widest, across, down } = this;
+    const [x0, x1] = [Math.max(0, x * perPixel - widest), Math.min(width, (x + 1) * perPixel + widest)];
+    const [y0, y1] = [Math.max(0, y * perPixel - widest), Math.min(height, (y + 1) * perPixel + widest)];
+    const [above, below] = [y0 * (width + 1), y1 * (width + 1)];
+    const changes = across[below + x1]! - across[below + x0 + 1]! - across[above + x1]! + across[above + x0 + 1]!;
+    return changes === 0 && down[(y1 - 1) * width + x0] === down[y0 * width + x0];
+  }
+
+  /** The weights of the regions around a pixel, means over its labels; the next call overwrites them. */
+  weigh(x: number, y: number): Shares {
+    const { perPixel, width, levels, sums, shares } = this;
+    shares.regions.length = shares.weights.length = 0;
+    for (let row = y * perPixel; row < (y + 1) * perPixel; row++) {
+      for (let column = x * perPixel; column < (x + 1) * perPixel; column++) {
+        const level = levels.of === null ? 0 : levels.of[row * width + column]!;
+        this.spread(column, row, this.kernels[level]!);
+      }
+    }
+    for (const region of shares.regions) {
+      shares.weights.push(sums[region]! / (perPixel * perPixel));
+      sums[region] = 0;
+    }
+    return shares;
+  }
+
+  private spread(x: number, y: number, { reach, weights, sums }: Kernel): void {
+    const { labels, width, height, runEnds, sums: regions, shares } = this;
+    const [x0, x1] = [Math.max(0, x - reach), Math.min(width, x + reach + 1)];
+    const [y0, y1] = [Math.max(0, y - reach), Math.min(height, y + reach + 1)];
+    // the weight of what lies within the map
+    const whole = (sums[x1 - x + reach]! - sums[x0 - x + reach]!) * (sums[y1 - y + reach]! - sums[y0 - y + reach]!);
+    for (let row = y0; row < y1; row++) {
+      const factor = weights[Math.abs(row - y)]! / whole;
+      for (let at = x0; at < x1; ) {
+        const region = labels[row * width + at]!;
+        const end = Math.min(x1, runEnds[row * width + at]!);
+        if (regions[region] === 0) shares.regions.push(region);
+        regions[region]! += factor * (sums[end - x + reach]! - sums[at - x + reach]!) + Number.MIN_VALUE;
+        at = end;
+      }
+    }
+  }
+}
+
+function kernelOf(sigma: number): Kernel {
+  const reach = Math.ceil(RADIUS_SIGMAS * sigma);
+  const weights = Float64Array.from({ length: reach + 1 }, (_, i) => (i === 0 ? 1 : Math.exp(-0.5 * (i / sigma) ** 2)));
+  const sums = new Float64Array(2 * reach + 2);
+  for (let i = 0; i <= 2 * reach; i++) sums[i + 1] = sums[i]! + weights[Math.abs(i - reach)]!;
+  return { reach, weights, sums };
+}

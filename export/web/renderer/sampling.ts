@@ -1,0 +1,71 @@
+/** Where the pixels of an output lie: between which cells of a label map, and over which pixels of a finer render. */
+
+import type { Rect } from "../src/view.ts";
+
+/** A part of the scene, in its pixels, and the size in pixels to render it at. */
+export interface View {
+  readonly rect: Rect;
+  readonly width: number;
+  readonly height: number;
+}
+
+/** Points of one axis: the cells before and after each, and the share of the one after. */
+export interface Axis {
+  readonly low: Int32Array;
+  readonly high: Int32Array;
+  readonly share: Float32Array<ArrayBuffer>;
+}
+
+// places between two cells at which hard contours are sampled, as odd multiples of half of one
+const OFFSETS = 1024;
+// rounding errors of positions in float64
+const NOISE = 1e-9;
+
+/** Place the centres of `count` pixels, `step` scene pixels apart from `start` on, between `cells` cells. */
+export function softAxis(start: number, step: number, count: number, cells: number): Axis {
+  return axis(count, cells, (i) => {
+    const at = start + (i + 0.5) * step - 0.5;
+    const low = Math.floor(at + NOISE);
+    return [low, Math.max(0, at - low)];
+  });
+}
+
+/** The same for hard contours: `perPixel` points for each pixel, between labels. */
+export function hardAxis(start: number, step: number, count: number, cells: number, perPixel: number): Axis {
+  return axis(count * perPixel, cells, (i) => {
+    const pixel = Math.floor(i / perPixel);
+    const place = (i % perPixel) - (perPixel - 1) / 2;
+    const at = perPixel * (start + (pixel + 0.5) * step) + place * Math.min(1, step) - 0.5;
+    const low = Math.floor(at + NOISE);
+    return [low, (Math.floor((at - low + NOISE) * OFFSETS) + 0.5) / OFFSETS];
+  });
+}
+
+function axis(count: number, cells: number, place: (i: number) => [low: number, share: number]): Axis {
+  const [low, high, share] = [new Int32Array(count), new Int32Array(count), new Float32Array(count)];
+  for (let i = 0; i < count; i++) {
+    const [first, part] = place(i);
+    low[i] = Math.min(Math.max(first, 0), cells - 1);
+    high[i] = Math.min(Math.max(first + 1, 0), cells - 1);
+    share[i] = part;
+  }
+  return { low, high, share };
+}
+
+/** One axis of a render that is at least as fine as the scene, and how its pixels join to those of the output. */
+export interface FineAxis {
+  readonly start: number; // scene pixels
+  readonly step: number;
+  readonly count: number;
+  /** Each pixel of the output is the mean from `from + i * span` on over `span` fine ones; null: each is one. */
+  readonly mean: { from: number; span: number } | null;
+}
+
+/** A scene that shrinks is rendered at its own size, of which area means are taken. */
+export function fineAxis(start: number, end: number, count: number, length: number): FineAxis {
+  const step = (end - start) / count;
+  if (step <= 1 + NOISE) return { start, step, count, mean: null };
+  const first = Math.min(Math.max(Math.floor(start + NOISE), 0), length - 1);
+  const last = Math.max(first + 1, Math.min(Math.ceil(end - NOISE), length));
+  return { start: first, step: 1, count: last - first, mean: { from: start - first, span: step } };
+}
