@@ -1,0 +1,36 @@
+/** Renders scenes onto canvases: on the GPU where there is one, else on the CPU. */
+
+import { renderSoftware } from "./software.ts";
+import type { Prepared } from "./software.ts";
+import type { View } from "./sampling.ts";
+import { WebGl } from "./webgl.ts";
+
+/** What renders: auto takes a real GPU or else the CPU; webgl2 takes an emulated GPU too. */
+export type Device = "auto" | "webgl2" | "cpu";
+
+const contexts = new Map<boolean, WebGl | null>();
+
+function openGpu(emulated: boolean): WebGl | null {
+  const found = contexts.get(emulated);
+  if (found === undefined || found?.lost) contexts.set(emulated, WebGl.open(emulated));
+  return contexts.get(emulated) ?? null;
+}
+
+/** Render a view onto a canvas at (x, y); says what rendered it: "webgl2 float32", "webgl2 float16" or "cpu". */
+export function paint(
+  context: CanvasRenderingContext2D, x: number, y: number,
+  scene: Prepared, view: View, visible: Uint8Array, device: Device,
+): string {
+  const gpu = device === "cpu" ? null : openGpu(device === "webgl2");
+  if (gpu?.takes(scene)) {
+    gpu.render(scene, view, visible);
+    if (!gpu.lost) {
+      context.clearRect(x, y, view.width, view.height);
+      context.drawImage(gpu.canvas, 0, 0, view.width, view.height, x, y, view.width, view.height);
+      return `webgl2 ${gpu.precision}`;
+    }
+  }
+  if (device === "webgl2") throw new Error("this browser cannot render with WebGL2, or not a scene of this size.");
+  context.putImageData(renderSoftware(scene, view, visible), x, y);
+  return "cpu";
+}

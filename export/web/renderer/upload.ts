@@ -1,0 +1,131 @@
+/** Label maps and Gaussians in a GPU's memory. */
+
+import { texture } from "./gl.ts";
+import type { Membership } from "./membership.ts";
+import { SHARED } from "./membership.ts";
+import { SLOTS_OF_A_LAYER } from "./shaders.ts";
+import { mostRegions } from "./slots.ts";
+import type { Prepared } from "./software.ts";
+
+/** As many regions of a pixel are kept; of more, those with the largest shares. */
+const MOST_LAYERS = 4;
+const LIST_WIDTH = 1 << 12;
+const VISIBLE_WIDTH = 1 << 8;
+// mean, factor, colour, radius, region, bounds
+const SIZES = [2, 3, 4, 1, 1, 4];
+const REGION = 4;
+const STRIDE = SIZES.reduce((sum, size) => sum + size);
+
+export interface MapTextures {
+  readonly layers: number;
+  readonly heads: WebGLTexture;
+  readonly lists: WebGLTexture;
+  readonly visible: WebGLTexture;
+  readonly variances: WebGLTexture;
+  readonly bounds: Float32Array; // of regions in scene pixels: left, top, right, bottom
+  show(visible: Uint8Array): void;
+  free(): void;
+}
+
+export function uploadMembership(gl: WebGL2RenderingContext, membership: Membership, regions: number): MapTextures {
+  const { width, height, heads, lists, variances } = membership;
+  const integers = (data: Uint32Array, across: number): WebGLTexture => {
+    const made = texture(gl);
+    const down = Math.ceil(data.length / across);
+    const padded = data.length === across * down ? data : new Uint32Array(across * down);
+    if (padded !== data) padded.set(data);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32UI, across, down, 0, gl.RED_INTEGER, gl.UNSIGNED_INT, padded);
+    return made;
+  };
+  const made = {
+    heads: integers(heads, width),
+    lists: integers(lists, LIST_WIDTH),
+    visible: texture(gl),
+    variances: texture(gl),
+  };
+  const squares = variances ?? new Float32Array(1);
+  gl.bindTexture(gl.TEXTURE_2D, made.variances);
+  const size = variances === null ? ([1, 1] as const) : ([width, height] as const);
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32F, ...size, 0, gl.RED, gl.FLOAT, squares);
+  const most = mostRegions(membership, MOST_LAYERS * SLOTS_OF_A_LAYER);
+  return {
+    ...made,
+    layers: Math.ceil(most / SLOTS_OF_A_LAYER),
+    bounds: boundsOf(membership, regions),
+    show: (visible) => {
+      const padded = new Uint8Array(Math.ceil(visible.length / VISIBLE_WIDTH) * VISIBLE_WIDTH);
+      padded.set(visible);
+      gl.bindTexture(gl.TEXTURE_2D, made.visible);
+      const down = padded.length / VISIBLE_WIDTH;
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.R8UI, VISIBLE_WIDTH, down, 0, gl.RED_INTEGER, gl.UNSIGNED_BYTE, padded);
+    },
+    free: () => Object.values(made).forEach((kept) => gl.deleteTexture(kept)),
+  };
+}
+
+/** The boxes outside of which regions have no weight. */
+function boundsOf({ width, height, perPixel, heads, lists }: Membership, regions: number): Float32Array {
+  const bounds = new Float32Array(4 * regions);
+  if (perPixel === 0) return bounds.map((_, i) => (i % 4 < 2 ? -Infinity : Infinity));
+  for (let r = 0; r < regions; r++) bounds.set([Infinity, Infinity, -Infinity, -Infinity], 4 * r);
+  const note = (region: number, x: number, y: number): void => {
+    const at = 4 * region;
+    if (x < bounds[at]!) bounds[at] = x;
+    if (y < bounds[at + 1]!) bounds[at + 1] = y;
+    if (x > bounds[at + 2]!) bounds[at + 2] = x;
+    if (y > bounds[at + 3]!) bounds[at + 3] = y;
+  };
+  for (let y = 0, at = 0; y < height; y++) {
+    for (let x = 0; x < width; x++, at++) {
+      const head = heads[at]!;
+      if (head < SHARED) note(head, x, y);
+      else for (let entry = head - SHARED; lists[entry] !== 0; entry++) note(lists[entry]! >>> 16, x, y);
+    }
+  }
+  // a pixel, at most one of the scene, that has a part in weights that reach to the next cell; the border is held
+  const ends = [width, height].map((cells) => cells - 1);
+  return bounds.map((value, i) => {
+    const low = i % 4 < 2;
+    if (low ? value === 0 : value === ends[i % 2]!) return low ? -Infinity : Infinity;
+    return low ? (value - 1) / perPixel - 0.5 : (value + 2) / perPixel + 0.5;
+  });
+}
+
+export interface GaussianBuffer {
+  readonly count: number;
+  readonly array: WebGLVertexArrayObject;
+  free(): void;
+}
+
+export function uploadGaussians(gl: WebGL2RenderingContext, { gaussians }: Prepared, map: MapTextures): GaussianBuffer {
+  const { count, channels, means, cholesky, colors, radii, regions } = gaussians;
+  const floats = new Float32Array(count * STRIDE);
+  const whole = new Uint32Array(floats.buffer);
+  for (let i = 0, at = 0; i < count; i++, at += STRIDE) {
+    floats.set(means.subarray(2 * i, 2 * i + 2), at);
+    floats.set(cholesky.subarray(3 * i, 3 * i + 3), at + 2);
+    floats.set(colors.subarray(channels * i, channels * (i + 1)), at + 5);
+    floats[at + 9] = radii[i]!;
+    whole[at + 10] = regions[i]!;
+    floats.set(map.bounds.subarray(4 * regions[i]!, 4 * regions[i]! + 4), at + 11);
+  }
+  const array = gl.createVertexArray();
+  const buffer = gl.createBuffer();
+  gl.bindVertexArray(array);
+  gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+  gl.bufferData(gl.ARRAY_BUFFER, floats, gl.STATIC_DRAW);
+  let offset = 0;
+  SIZES.forEach((size, place) => {
+    gl.enableVertexAttribArray(place);
+    gl.vertexAttribDivisor(place, 1);
+    if (place === REGION) gl.vertexAttribIPointer(place, size, gl.UNSIGNED_INT, 4 * STRIDE, offset);
+    else gl.vertexAttribPointer(place, size, gl.FLOAT, false, 4 * STRIDE, offset);
+    offset += 4 * size;
+  });
+  gl.bindVertexArray(null);
+  const free = (): void => {
+    gl.deleteVertexArray(array);
+    gl.deleteBuffer(buffer);
+  };
+  return { count, array, free };
+}
