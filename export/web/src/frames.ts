@@ -60,6 +60,8 @@ export class FrameTimes {
   private times: number[] = [];
   private costPerPixel = 0;
 
+  constructor(private readonly budget = MOVING_BUDGET) {}
+
   add(milliseconds: number, pixels: number): void {
     this.times = [...this.times, milliseconds].slice(-KEPT_TIMES);
     const cost = milliseconds / pixels;
@@ -79,7 +81,7 @@ export class FrameTimes {
   }
 
   divisorFor(pixels: number): number {
-    const wanted = Math.ceil(Math.sqrt((pixels * this.costPerPixel) / MOVING_BUDGET));
+    const wanted = Math.ceil(Math.sqrt((pixels * this.costPerPixel) / this.budget));
     return Math.min(Math.max(wanted, 1), MAX_DIVISOR);
   }
 }

@@ -55,15 +55,28 @@ export class Glide {
   }
 }
 
-export function listen(canvas: HTMLCanvasElement, place: Place, hands: Hands): Glide {
+/** Where keys that zoom are listened to, and what ends it all. */
+export interface Listening {
+  keyboard: EventTarget;
+  signal?: AbortSignal;
+}
+
+export function listen(
+  canvas: HTMLCanvasElement,
+  place: Place,
+  hands: Hands,
+  { keyboard, signal }: Listening = { keyboard: window },
+): Glide {
   const glide = new Glide(hands);
-  listenToWheel(canvas, place, hands, glide);
-  listenToPointers(canvas, place, hands, glide);
-  listenToKeys(canvas, hands, glide);
+  const until = signal === undefined ? {} : { signal };
+  listenToWheel(canvas, place, hands, glide, until);
+  listenToPointers(canvas, place, hands, glide, until);
+  // arrows pan where the focus is: on the canvas, or on what holds the keyboard
+  listenToKeys(canvas, hands, glide, keyboard === window ? [canvas, window] : [keyboard, keyboard], until);
   return glide;
 }
 
-function listenToWheel(canvas: HTMLCanvasElement, place: Place, hands: Hands, glide: Glide): void {
+function listenToWheel(canvas: HTMLCanvasElement, place: Place, hands: Hands, glide: Glide, until: AddEventListenerOptions): void {
   const turn = (event: WheelEvent): void => {
     event.preventDefault();
     const delta = event.deltaMode === WheelEvent.DOM_DELTA_LINE ? event.deltaY * LINE_HEIGHT : event.deltaY;
@@ -72,17 +85,17 @@ function listenToWheel(canvas: HTMLCanvasElement, place: Place, hands: Hands, gl
     if (event.ctrlKey) hands.zoom(Math.exp(-delta * PINCH_WHEEL_RATE), hands.anchorAt(x, y));
     else glide.add(Math.exp(-delta * WHEEL_RATE), x, y);
   };
-  canvas.addEventListener("wheel", turn, { passive: false });
+  canvas.addEventListener("wheel", turn, { passive: false, ...until });
 }
 
-function listenToPointers(canvas: HTMLCanvasElement, place: Place, hands: Hands, glide: Glide): void {
+function listenToPointers(canvas: HTMLCanvasElement, place: Place, hands: Hands, glide: Glide, until: AddEventListenerOptions): void {
   const pointers = new Map<number, [x: number, y: number]>();
   canvas.addEventListener("pointerdown", (event) => {
     if (event.button !== 0) return;
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, place(event));
     canvas.classList.add("held");
-  });
+  }, until);
   canvas.addEventListener("pointermove", (event) => {
     const before = pointers.get(event.pointerId);
     if (before === undefined) return;
@@ -97,32 +110,39 @@ function listenToPointers(canvas: HTMLCanvasElement, place: Place, hands: Hands,
     hands.pan((now[0] - before[0]) / 2, (now[1] - before[1]) / 2);
     const middle = hands.anchorAt((now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
     hands.zoom(spread(now) / Math.max(spread(before), 1), middle);
-  });
+  }, until);
   const lift = (event: PointerEvent): void => {
     pointers.delete(event.pointerId);
     canvas.classList.toggle("held", pointers.size > 0);
   };
-  canvas.addEventListener("pointerup", lift);
-  canvas.addEventListener("pointercancel", lift);
-  canvas.addEventListener("dblclick", (event) => glide.add(event.shiftKey ? 0.5 : 2, ...place(event)));
+  canvas.addEventListener("pointerup", lift, until);
+  canvas.addEventListener("pointercancel", lift, until);
+  canvas.addEventListener("dblclick", (event) => glide.add(event.shiftKey ? 0.5 : 2, ...place(event)), until);
 }
 
-function listenToKeys(canvas: HTMLCanvasElement, hands: Hands, glide: Glide): void {
+function listenToKeys(
+  canvas: HTMLCanvasElement,
+  hands: Hands,
+  glide: Glide,
+  [panned, zoomed]: [EventTarget, EventTarget],
+  until: AddEventListenerOptions,
+): void {
   const pans: Record<string, [number, number]> = {
     ArrowLeft: [1, 0],
     ArrowRight: [-1, 0],
     ArrowUp: [0, 1],
     ArrowDown: [0, -1],
   };
-  canvas.addEventListener("keydown", (event) => {
+  const panKey = (event: KeyboardEvent): void => {
     const direction = pans[event.key];
     if (direction === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();
     const step = KEY_PAN * Math.min(canvas.width, canvas.height);
     hands.pan(direction[0] * step, direction[1] * step);
-  });
+  };
+  panned.addEventListener("keydown", panKey as EventListener, until);
   // Zooming works from anywhere on the page, except where the key already means something.
-  addEventListener("keydown", (event) => {
+  const zoomKey = (event: KeyboardEvent): void => {
     const target = event.target as HTMLElement;
     if (event.ctrlKey || event.metaKey || event.altKey || target.matches("select, input:not([type=checkbox])")) return;
     if (event.key === "+" || event.key === "=") zoomAtMiddle(canvas, glide, KEY_FACTOR);
@@ -131,7 +151,8 @@ function listenToKeys(canvas: HTMLCanvasElement, hands: Hands, glide: Glide): vo
     else if (event.key === "1") hands.native();
     else return;
     event.preventDefault();
-  });
+  };
+  zoomed.addEventListener("keydown", zoomKey as EventListener, until);
 }
 
 export function zoomAtMiddle(canvas: HTMLCanvasElement, glide: Glide, factor: number): void {

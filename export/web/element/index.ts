@@ -1,0 +1,16 @@
+/** Defines `<kcgs-image>`. */
+
+import { KcgsImage } from "./kcgs-image.ts";
+
+export { decode, DecodeError, ProgressiveDecoder } from "../decoder/index.ts";
+export type { ContourWidth, RegionMap, Scene } from "../decoder/index.ts";
+export type { Ids, ImageOptions, RegionClick } from "./kcgs-image.ts";
+export { KcgsImage };
+
+declare global {
+  interface HTMLElementTagNameMap {
+    "kcgs-image": KcgsImage;
+  }
+}
+
+if (!customElements.get("kcgs-image")) customElements.define("kcgs-image", KcgsImage);

@@ -1,0 +1,301 @@
+/** The custom element `<kcgs-image>`: an image from a `.kcgs` file. The README beside it says what it takes. */
+
+import type { Scene } from "../decoder/scene.ts";
+import type { Contours } from "../renderer/membership.ts";
+import type { Device } from "../renderer/painter.ts";
+import { listen, zoomAtMiddle } from "../src/gestures.ts";
+import type { Glide } from "../src/gestures.ts";
+import type { Transform } from "../src/view.ts";
+import { move, recolour } from "./edits.ts";
+import type { Channels, Edit } from "./edits.ts";
+import { load } from "./loading.ts";
+import { Stage } from "./stage.ts";
+import { elementStyle, sizeStyle } from "./style.ts";
+
+/** An id of a region, or several. */
+export type Ids = number | Iterable<number>;
+
+export interface RegionClick {
+  readonly id: number;
+  readonly x: number; // in pixels of the scene
+  readonly y: number;
+}
+
+// a press that moves farther, in CSS pixels, is no click
+const CLICK = 5;
+
+export class KcgsImage extends HTMLElement {
+  static readonly observedAttributes = ["src", "alt", "zoom", "regions", "contours", "renderer"];
+
+  private readonly stage: Stage;
+  private readonly sizes = new CSSStyleSheet();
+  private readonly internals = this.attachInternals();
+  private readonly fallback = document.createElement("slot");
+  private readonly observer = new ResizeObserver((entries) => this.measure(entries.at(-1)!));
+  private loaded: Scene | null = null; // as it came
+  private current: Scene | null = null; // as it was edited
+  private edits: Edit[] = [];
+  private readonly hiddenIds = new Set<number>();
+  private loading: AbortController | null = null;
+  private gestures: AbortController | null = null;
+  private glide: Glide | null = null;
+
+  constructor() {
+    super();
+    const root = this.attachShadow({ mode: "open" });
+    const canvas = document.createElement("canvas");
+    canvas.hidden = true;
+    root.append(canvas, this.fallback);
+    root.adoptedStyleSheets = [elementStyle(), this.sizes];
+    this.stage = new Stage(canvas, () => this.viewChanged(), (error) => this.fail(error));
+    this.listenToClicks(canvas);
+  }
+
+  connectedCallback(): void {
+    this.observer.observe(this.stage.canvas, { box: "content-box" });
+    if (this.loaded === null && this.loading === null) this.start();
+  }
+
+  disconnectedCallback(): void {
+    this.observer.disconnect();
+    this.loading?.abort();
+    this.loading = null;
+  }
+
+  attributeChangedCallback(name: string, before: string | null, value: string | null): void {
+    if (before === value) return;
+    if (name === "src" && this.isConnected) this.start();
+    else if (name === "alt") this.describe();
+    else if (name === "zoom") this.listenToGestures();
+    else if (name === "regions") this.describe();
+    else if (name === "contours") this.setContours(value ?? "scaled");
+    else if (name === "renderer") this.setDevice(value ?? "auto");
+  }
+
+  /** The scene that is shown, edits included; one that is set is shown in place of that of `src`. */
+  get scene(): Scene | null {
+    return this.current;
+  }
+
+  set scene(scene: Scene | null) {
+    this.loading?.abort();
+    this.loading = null;
+    this.forget();
+    if (scene !== null) this.take(scene);
+  }
+
+  /** What rendered last: "webgl2 float32", "webgl2 float16", "cpu", or "" before anything did. */
+  get renderer(): string {
+    return this.stage.renderer;
+  }
+
+  /** The ids of the regions, rising. */
+  get regionIds(): number[] {
+    return Array.from(this.current?.regions?.ids ?? []);
+  }
+
+  /** The point of the scene in the middle of the canvas, and canvas pixels to a pixel of the scene. */
+  get view(): Transform {
+    return { ...this.stage.transform };
+  }
+
+  /** Hide regions, or show them again: what they covered is transparent. */
+  hide(ids: Ids, hidden = true): void {
+    for (const id of this.known(ids)) {
+      if (hidden) this.hiddenIds.add(id);
+      else this.hiddenIds.delete(id);
+    }
+    this.stage.hide(this.hiddenPlaces());
+  }
+
+  /** Move regions by pixels of the scene, whole ones; what they leave falls to the nearest other region. */
+  move(ids: Ids, dx: number, dy: number): void {
+    this.edit(move(this.known(ids), dx, dy));
+  }
+
+  /** Multiply the colours of regions by `gain`, a number or one for each channel, and add `bias`. */
+  recolour(ids: Ids, gain: Channels, bias: Channels | null = null): void {
+    this.edit(recolour(this.known(ids), gain, bias));
+  }
+
+  /** Show the scene as it came: nothing hidden, moved or recoloured. */
+  reset(): void {
+    this.edits = [];
+    this.hiddenIds.clear();
+    if (this.loaded !== null) this.take(this.loaded);
+  }
+
+  /** Zoom about the middle; 0 shows all. */
+  zoomBy(factor: number): void {
+    if (factor === 0) this.stage.fit();
+    else if (this.glide !== null) zoomAtMiddle(this.stage.canvas, this.glide, factor);
+    else this.stage.zoom(factor, this.stage.anchorAt(this.stage.size.width / 2, this.stage.size.height / 2));
+  }
+
+  /** The id of the region at a point, in pixels of the scene; null where there is none. */
+  regionAt(x: number, y: number): number | null {
+    const scene = this.current;
+    if (scene === null || scene.regions === null) return null;
+    if (x < 0 || y < 0 || x >= scene.width || y >= scene.height) return null;
+    const { supersample: k, labels, ids } = scene.regions;
+    return ids[labels[Math.floor(y * k) * scene.width * k + Math.floor(x * k)]!]!;
+  }
+
+  /** The whole image as a file, at its own size or another. */
+  toBlob({ width, height, type = "image/png", quality }: ImageOptions = {}): Promise<Blob> {
+    const { current } = this;
+    if (current === null) return Promise.reject(new Error("there is no scene yet"));
+    const ratio = current.height / current.width;
+    const across = width ?? (height === undefined ? current.width : Math.round(height / ratio));
+    const down = height ?? Math.max(1, Math.round(across * ratio));
+    const canvas = this.stage.image(Math.max(1, across), down);
+    return new Promise((resolve, reject) => {
+      const made = (blob: Blob | null): void =>
+        blob === null ? reject(new Error(`no image of ${across} x ${down} could be made`)) : resolve(blob);
+      canvas.toBlob(made, type, quality);
+    });
+  }
+
+  /** Wait until the view rests and is rendered. */
+  settled(): Promise<void> {
+    return this.stage.settled();
+  }
+
+  private start(): void {
+    this.loading?.abort();
+    this.forget();
+    const src = this.getAttribute("src");
+    if (src === null || src === "") return;
+    const loading = new AbortController();
+    this.loading = loading;
+    load(src, loading.signal, (scene) => this.take(scene)).then(
+      () => this.dispatchEvent(new Event("load")),
+      (error: unknown) => loading.signal.aborted || this.fail(error as Error),
+    );
+  }
+
+  private forget(): void {
+    this.loaded = this.current = null;
+    this.edits = [];
+    this.hiddenIds.clear();
+    this.stage.show(null, this.hiddenIds);
+    this.stage.canvas.hidden = true;
+    this.fallback.hidden = false;
+  }
+
+  /** Take a scene, or one of more layers, and edit it as the one before. */
+  private take(scene: Scene): void {
+    const edited = this.edits.reduce((before, edit) => edit(before), scene);
+    this.stage.show(edited, this.placesOf(edited, this.hiddenIds));
+    this.loaded = scene;
+    this.current = edited;
+    this.sizes.replaceSync(sizeStyle(scene.width, scene.height));
+    this.stage.canvas.hidden = false;
+    this.fallback.hidden = true;
+    this.describe();
+    this.dispatchEvent(new Event("progress"));
+  }
+
+  private edit(edit: Edit): void {
+    if (this.current === null) throw new Error("there is no scene yet");
+    const edited = edit(this.current);
+    this.stage.show(edited, this.placesOf(edited, this.hiddenIds));
+    this.current = edited;
+    this.edits.push(edit);
+  }
+
+  private known(ids: Ids): Set<number> {
+    const wanted = new Set(typeof ids === "number" ? [ids] : ids);
+    const all = new Set(this.regionIds);
+    for (const id of wanted) if (!all.has(id)) throw new RangeError(`ids must be of the scene's regions; got ${id}`);
+    return wanted;
+  }
+
+  private hiddenPlaces(): Set<number> {
+    return this.placesOf(this.current, this.hiddenIds);
+  }
+
+  private placesOf(scene: Scene | null, ids: ReadonlySet<number>): Set<number> {
+    return new Set([...(scene?.regions?.ids.keys() ?? [])].filter((place) => ids.has(scene!.regions!.ids[place]!)));
+  }
+
+  private setContours(value: string): void {
+    this.stage.contours = value === "crisp" ? "crisp" : ("scaled" satisfies Contours);
+    if (this.current !== null) this.stage.show(this.current, this.hiddenPlaces());
+  }
+
+  private setDevice(value: string): void {
+    this.stage.device = value === "cpu" || value === "webgl2" ? value : ("auto" satisfies Device);
+    this.stage.want();
+  }
+
+  private fail(error: Error): void {
+    if (this.stage.renderer === "") {
+      this.stage.canvas.hidden = true;
+      this.fallback.hidden = false;
+    }
+    const { message } = error;
+    this.dispatchEvent(new ErrorEvent("error", { error, message }));
+  }
+
+  private measure(entry: ResizeObserverEntry): void {
+    const box = entry.contentBoxSize[0]!;
+    const pixels = (length: number): number => Math.max(1, Math.round(length * devicePixelRatio));
+    if (!this.stage.canvas.hidden) this.stage.resize(pixels(box.inlineSize), pixels(box.blockSize));
+  }
+
+  private describe(): void {
+    const alt = this.getAttribute("alt");
+    this.internals.role = alt === "" ? "presentation" : "img";
+    this.internals.ariaLabel = alt === "" ? null : alt;
+    const active = this.hasAttribute("zoom") || this.hasAttribute("regions");
+    if (active && !this.hasAttribute("tabindex")) this.tabIndex = 0;
+  }
+
+  private listenToGestures(): void {
+    this.gestures?.abort();
+    this.gestures = this.glide = null;
+    this.describe();
+    if (!this.hasAttribute("zoom")) return;
+    this.gestures = new AbortController();
+    const { signal } = this.gestures;
+    this.glide = listen(this.stage.canvas, (event) => this.stage.at(event), this.stage, { keyboard: this, signal });
+  }
+
+  private listenToClicks(canvas: HTMLCanvasElement): void {
+    let pressed: [number, number] = [0, 0];
+    canvas.addEventListener("pointerdown", (event) => (pressed = [event.clientX, event.clientY]));
+    canvas.addEventListener("click", (event) => {
+      if (Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) < CLICK) this.pick(...this.stage.at(event));
+    });
+    this.addEventListener("keydown", (event) => {
+      if (event.key !== "Enter" || event.target !== this) return;
+      this.pick(canvas.width / 2, canvas.height / 2);
+    });
+  }
+
+  /** Tell of the region at a position on the canvas. */
+  private pick(x: number, y: number): void {
+    if (!this.hasAttribute("regions")) return;
+    const [sceneX, sceneY] = this.stage.anchorAt(x, y).scene;
+    const id = this.regionAt(sceneX, sceneY);
+    if (id === null) return;
+    const detail: RegionClick = { id, x: sceneX, y: sceneY };
+    this.dispatchEvent(new CustomEvent("regionclick", { detail, bubbles: true, composed: true }));
+  }
+
+  private viewChanged(): void {
+    const { canvas, transform } = this.stage;
+    const whole = this.current === null || transform.scale * this.current.width <= canvas.width * 1.001;
+    // one finger scrolls the page as long as all of the image is there
+    canvas.classList.toggle("near", !whole);
+    this.dispatchEvent(new Event("viewchange"));
+  }
+}
+
+export interface ImageOptions {
+  width?: number;
+  height?: number;
+  type?: string;
+  quality?: number;
+}
