@@ -1,4 +1,4 @@
-"""A scene in the browser: its decoder and the viewer's page, served on this machine alone."""
+"""A scene or a decoder in the browser: a page, served on this machine alone."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from typing import Any, ClassVar
 from urllib.parse import quote, urlencode
 
 from kcgs._shipped import shipped_folder
-from kcgs.onnx import scene_decoder, write_model
+from kcgs.page import page_html, web_bytes
 from kcgs.scene import Scene
 
-_PAGE = shipped_folder("web", checkout="export/web/dist")
+_DECODER_PAGE = shipped_folder("web", checkout="export/web/dist")
 
 
 class _Handler(SimpleHTTPRequestHandler):
@@ -69,7 +69,7 @@ class _Server(ThreadingHTTPServer):
 
 
 def serve(
-    scene: Scene,
+    scene: Scene | bytes,
     *,
     name: str = "scene",
     original: Path | None = None,
@@ -77,33 +77,62 @@ def serve(
     port: int = 0,
     browser: bool = True,
     say: Callable[[str], object] = print,
-    page: Path | None = None,
 ) -> None:
-    """Export a scene to a temporary folder and serve the viewer on loopback until Ctrl-C.
+    """Serve the page of a scene, or of a `.kcgs` file's bytes, on loopback until Ctrl-C.
 
     `name` is the scene's title on the page, `original` an image file to compare with, `contours` scaled or crisp; port
-    0 is any that is free; `browser` opens a window, `say` takes the line that says where the page is. `page` is the
-    folder of the built page; None: the package's own.
+    0 is any that is free; `browser` opens a window, `say` takes the line that says where the page is.
     """
-    page = _PAGE if page is None else page
+    with tempfile.TemporaryDirectory() as text:
+        folder = Path(text)
+        beside = None if original is None else f"scene/{_copy_original(original, folder)}"
+        (folder / "scene.kcgs").write_bytes(web_bytes(scene) if isinstance(scene, Scene) else scene)
+        page = page_html("scene/scene.kcgs", title=name, contours=contours, original=beside)
+        (folder / "index.html").write_text(page, encoding="utf-8")
+        _serve(folder, folder, "", port=port, browser=browser, say=say)
+
+
+def serve_decoder(
+    decoder: Path,
+    *,
+    original: Path | None = None,
+    port: int = 0,
+    browser: bool = True,
+    say: Callable[[str], object] = print,
+    page: Path | None = None,
+) -> None:
+    """Serve the page that opens an ONNX decoder of a scene; see :func:`serve`.
+
+    `page` is the folder of the built page; None: the package's own.
+    """
+    page = _DECODER_PAGE if page is None else page
     if not (page / "index.html").is_file():
         raise FileNotFoundError(
-            f"the viewer's page is not built: there is no {page / 'index.html'}; install a wheel that holds it, or run "
-            "`make page` in a checkout"
+            f"the page for decoders is not built: there is no {page / 'index.html'}; install a wheel that holds it, or "
+            "run `make page` in a checkout"
         )
-    if original is not None and not original.is_file():
-        raise FileNotFoundError(f"--original must be an image file; {original} is not there")
-    with tempfile.TemporaryDirectory() as folder:
-        model = scene_decoder(scene, interactive=True, contours=contours)
-        write_model(model, Path(folder) / "decoder.onnx")
-        query = {"decoder": "scene/decoder.onnx", "name": name}
+    with tempfile.TemporaryDirectory() as text:
+        folder = Path(text)
+        shutil.copyfile(decoder, folder / "decoder.onnx")
+        query = {"decoder": "scene/decoder.onnx", "name": decoder.stem}
         if original is not None:
-            shutil.copyfile(original, Path(folder) / f"original{original.suffix.lower()}")
-            query["original"] = f"scene/original{original.suffix.lower()}"
-        handler = partial(_Handler, directory=str(page), extra=Path(folder))
-        with _Server(("127.0.0.1", port), handler) as server:
-            url = f"http://127.0.0.1:{server.server_address[1]}/?{urlencode(query, quote_via=quote, safe='/')}"
-            say(f"{url} (Ctrl-C ends)")
-            if browser:
-                webbrowser.open(url)
-            server.serve_forever()
+            query["original"] = f"scene/{_copy_original(original, folder)}"
+        address = f"?{urlencode(query, quote_via=quote, safe='/')}"
+        _serve(page, folder, address, port=port, browser=browser, say=say)
+
+
+def _copy_original(original: Path, folder: Path) -> str:
+    if not original.is_file():
+        raise FileNotFoundError(f"--original must be an image file; {original} is not there")
+    name = f"original{original.suffix.lower()}"
+    shutil.copyfile(original, folder / name)
+    return name
+
+
+def _serve(page: Path, extra: Path, address: str, *, port: int, browser: bool, say: Callable[[str], object]) -> None:
+    with _Server(("127.0.0.1", port), partial(_Handler, directory=str(page), extra=extra)) as server:
+        url = f"http://127.0.0.1:{server.server_address[1]}/{address}"
+        say(f"{url} (Ctrl-C ends)")
+        if browser:
+            webbrowser.open(url)
+        server.serve_forever()

@@ -7,14 +7,14 @@ from typing import Annotated, Literal
 
 import typer
 
-from .common import Json, SceneFile, app, check_output, print_report
+from .common import Json, SceneFile, SceneOrDecoder, app, check_output, print_report
 from .options import Contours, EngineName
 
 
 @app.command()
 def export(
     scene: SceneFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="ONNX file to write.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="ONNX file to write, or .html: one web page.")],
     kind: Annotated[
         Literal["scene", "generic"],
         typer.Option(help="scene: this scene's decoder; generic: one that takes any scene's numbers."),
@@ -34,11 +34,16 @@ def export(
     contours: Contours = "scaled",
     as_json: Json = False,
 ) -> None:
-    """Write a scene's decoder as ONNX: it needs no torch and no kcgs."""
+    """Write a scene's decoder as ONNX, or the scene as one web page: neither needs torch or kcgs."""
     from kcgs import Scene, load
     from kcgs.onnx import describe_decoder, generic_decoder, scene_decoder, write_model
 
-    check_output(output, ".onnx")
+    check_output(output, ".onnx", ".html")
+    if output.suffix == ".html":
+        if kind == "generic" or precision == "fp16" or cutoff != 1e-4 or not clamp or interactive or hard_contours:
+            raise typer.BadParameter("a page takes --contours only; the other options are for .onnx")
+        print_report(_write_page(scene, output, contours), as_json, str(output))
+        return
     loaded = load(scene)
     if hard_contours and loaded.regions is not None:
         loaded = Scene(loaded.field, loaded.regions.labels, loaded.metadata)
@@ -63,9 +68,27 @@ def export(
     print_report(report, as_json, str(output))
 
 
+def _write_page(scene: Path, output: Path, contours: str) -> dict[str, object]:
+    """Write the page of a scene file; a `.kcgs` file is kept as it is."""
+    from kcgs import load
+    from kcgs._atomic import atomic_path
+    from kcgs.page import scene_page, web_bytes
+
+    loaded = load(scene)
+    data = scene.read_bytes() if scene.suffix == ".kcgs" else web_bytes(loaded)
+    with atomic_path(output) as temporary:
+        temporary.write_text(scene_page(data, title=output.stem, contours=contours), encoding="utf-8")
+        size = temporary.stat().st_size
+    height, width = loaded.size
+    return {
+        "width": width, "height": height, "num_gaussians": len(loaded), "contours": contours,
+        "scene_bytes": len(data), "bytes": size,
+    }  # fmt: skip
+
+
 @app.command()
 def view(
-    scene: SceneFile,
+    scene: SceneOrDecoder,
     original: Annotated[Path | None, typer.Option(help="Image to compare with.")] = None,
     contours: Contours = "scaled",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 0,
@@ -73,10 +96,16 @@ def view(
 ) -> None:
     """Look at a scene in the browser: zoom, compare, hide regions. Ends with Ctrl-C."""
     from kcgs import load
-    from kcgs.view import serve
+    from kcgs.view import serve, serve_decoder
 
-    name = scene.stem
-    serve(load(scene), name=name, original=original, contours=contours, port=port, browser=browser, say=typer.echo)
+    if scene.suffix == ".onnx":
+        if contours == "crisp":
+            raise typer.BadParameter("--contours are those of the decoder; kcgs export has them")
+        serve_decoder(scene, original=original, port=port, browser=browser, say=typer.echo)
+        return
+    loaded = load(scene)
+    shown = scene.read_bytes() if scene.suffix == ".kcgs" else loaded
+    serve(shown, name=scene.stem, original=original, contours=contours, port=port, browser=browser, say=typer.echo)
 
 
 @app.command()

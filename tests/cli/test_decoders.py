@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import http.client
 import json
+import re
 import threading
 import urllib.error
 import urllib.parse
 import urllib.request
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -18,8 +22,10 @@ import torch
 
 from kcgs import GaussianField, RegionMap, Scene, load, save
 from kcgs.cli import main
+from kcgs.codec import decode
 from kcgs.data import load_image
-from kcgs.view import _Handler, _Server, serve
+from kcgs.page import scene_page
+from kcgs.view import _Handler, _Server, serve, serve_decoder
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -76,7 +82,8 @@ class TestExport:
     @pytest.mark.parametrize(
         ("arguments", "words"),
         [
-            (["-o", "decoder.txt"], "--output must end in .onnx"),
+            (["-o", "decoder.txt"], "--output must end in .onnx or .html"),
+            (["-o", "decoder.html", "--interactive"], "a page takes --contours only"),
             (["-o", "decoder.onnx", "--cutoff", "3"], "--cutoff must"),
         ],
     )
@@ -127,36 +134,81 @@ class TestZoo:
         assert "zoo entry must be one of" in " ".join(capsys.readouterr().err.split())
 
 
+def start(target: Any, source: object, **settings: Any) -> str:
+    """Serve in a thread; return the address."""
+    said: list[str] = []
+    arguments = {"browser": False, "say": said.append, **settings}
+    serving = threading.Thread(target=target, args=(source,), kwargs=arguments, daemon=True)
+    serving.start()
+    for _ in range(1000):
+        if said:
+            break
+        serving.join(0.02)
+    return said[0].split(" ")[0]
+
+
+class TestPage:
+    """What it does in a browser is tested in tests/export/test_element.py."""
+
+    def test_holds_the_scene(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: Path
+    ) -> None:
+        out = scene.with_name("a & b.html")
+        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--contours", "crisp", "--json") == 0
+        report = json.loads(capsys.readouterr().out)
+        page = out.read_text(encoding="utf-8")
+        assert report["bytes"] == out.stat().st_size and report["num_gaussians"] == 30
+        assert "<title>a &amp; b</title>" in page and 'contours="crisp"' in page
+        found = re.search(r'src="data:application/octet-stream;base64,([^"]+)"', page)
+        assert found is not None
+        data = base64.b64decode(found[1])
+        assert len(data) == report["scene_bytes"]
+        assert (decode(data).scene.render() - load(scene).render()).abs().max() < 1 / 255
+
+    def test_keeps_a_file_as_it_is(self, monkeypatch: pytest.MonkeyPatch, scene: Path) -> None:
+        file, out = scene.with_suffix(".kcgs"), scene.with_suffix(".html")
+        save(file, load(scene))
+        assert run(monkeypatch, "export", str(file), "-o", str(out)) == 0
+        assert base64.b64encode(file.read_bytes()).decode() in out.read_text(encoding="utf-8")
+
+    def test_the_policy_names_script_and_style(self) -> None:
+        page = scene_page(Scene(GaussianField.random(5, (8, 9), seed=0)))
+        policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]+)"', page)
+        assert policy is not None and "'unsafe" not in policy[1] and "default-src 'none'" in policy[1]
+        for kind, tag in (("script", '<script type="module">(.*)</script>'), ("style", "<style>(.*)</style>")):
+            text = re.search(tag, page, re.DOTALL)
+            assert text is not None
+            digest = base64.b64encode(hashlib.sha256(text[1].encode()).digest()).decode()
+            assert f"{kind}-src 'sha256-{digest}'" in policy[1]
+
+    def test_channels(self) -> None:
+        with pytest.raises(ValueError, match="1, 3 or 4 channels"):
+            scene_page(Scene(GaussianField.random(5, (8, 9), channels=2, seed=0)))
+
+
 class TestView:
-    def test_serves_the_page_and_the_decoder_on_loopback(self, tmp_path: Path) -> None:
+    def test_serves_a_scene_on_loopback(self, tmp_path: Path) -> None:
+        (tmp_path / "photo.PNG").write_bytes(b"png")
+        scene = Scene(GaussianField.random(5, (8, 9), seed=0))
+        root = start(serve, scene, name="five", original=tmp_path / "photo.PNG")
+        page = urllib.request.urlopen(root).read().decode()
+        assert "<title>five</title>" in page and 'data-original="scene/original.png"' in page
+        assert "connect-src 'self';" in page
+        shown = decode(urllib.request.urlopen(root + "scene/scene.kcgs").read()).scene
+        assert (shown.render() - scene.render()).abs().max() < 1 / 255
+        assert urllib.request.urlopen(root + "scene/original.png").read() == b"png"
+
+    def test_serves_a_decoder_on_loopback(self, tmp_path: Path) -> None:
         (tmp_path / "page").mkdir()
         (tmp_path / "page" / "index.html").write_text("<p>page</p>")
         (tmp_path / "photo.PNG").write_bytes(b"png")
-        said: list[str] = []
-        scene = Scene(GaussianField.random(5, (8, 9), seed=0))
-        serving = threading.Thread(
-            target=serve,
-            args=(scene,),
-            kwargs={
-                "browser": False,
-                "say": said.append,
-                "page": tmp_path / "page",
-                "original": tmp_path / "photo.PNG",
-            },
-            daemon=True,
-        )
-        serving.start()
-        for _ in range(1000):
-            if said:
-                break
-            serving.join(0.02)
-        url = said[0].split(" ")[0]
+        (tmp_path / "small.onnx").write_bytes(b"onnx")
+        url = start(serve_decoder, tmp_path / "small.onnx", page=tmp_path / "page", original=tmp_path / "photo.PNG")
         assert url.startswith("http://127.0.0.1:") and "original=scene/original.png" in url
         root = url.partition("?")[0]
         assert urllib.request.urlopen(root).read() == b"<p>page</p>"
         answer = urllib.request.urlopen(root + "scene/decoder.onnx")
-        assert answer.headers["Cross-Origin-Embedder-Policy"] == "require-corp"
-        onnxruntime.InferenceSession(answer.read())
+        assert answer.headers["Cross-Origin-Embedder-Policy"] == "require-corp" and answer.read() == b"onnx"
         for hidden in ("scene/..", "scene/../", "scene/", "scene/page", "page"):
             connection = http.client.HTTPConnection("127.0.0.1", urllib.parse.urlsplit(root).port)
             connection.request("GET", f"/{hidden}")
@@ -177,4 +229,4 @@ class TestView:
 
     def test_page_that_is_not_built(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError, match="make page"):
-            serve(Scene(GaussianField.random(5, (8, 9))), page=tmp_path)
+            serve_decoder(tmp_path / "decoder.onnx", page=tmp_path)

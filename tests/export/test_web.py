@@ -5,16 +5,10 @@ The decoders are made here, node by node, and not by the exporter: any graph tha
 
 from __future__ import annotations
 
-import base64
-import functools
-import http.server
 import json
 import os
-import queue
 import re
 import shutil
-import subprocess
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,11 +21,11 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from PIL import Image
 
-WEB = Path(__file__).resolve().parents[2] / "export" / "web"
+from .browser import WEB, Browser, array, npm, serving
+
 LEVEL = 1 / 255
 WIDTH, HEIGHT = 96, 64
 REGIONS = [0, 3, 7]  # three upright stripes
-SECONDS = 120
 
 
 def make_decoder(path: Path, *, interactive: bool = True, kind: str = "scene", channels: int = 3) -> Path:
@@ -115,38 +109,8 @@ def decode(path: Path, size: tuple[int, int], **inputs: list[float]) -> NDArray[
     return np.asarray(image, dtype=np.float32)
 
 
-class Browser:
-    """Headless Chromium behind a pipe; see export/web/test/drive.mjs."""
-
-    def __init__(self, chromium: str, errors: Path) -> None:
-        self.errors = errors
-        self._log = errors.open("w")
-        command = ["node", str(WEB / "test" / "drive.mjs"), chromium]
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True
-        )
-        self._lines: queue.Queue[str] = queue.Queue()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            self._lines.put(line)
-        self._lines.put("")
-
-    def do(self, action: str, **arguments: Any) -> Any:
-        assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps({"do": action, **arguments}) + "\n")
-        self._process.stdin.flush()
-        line = self._lines.get(timeout=SECONDS)
-        assert line, f"the browser's driver ended: {self.errors.read_text()[-2000:]}"
-        answer = json.loads(line)
-        assert "error" not in answer, answer["error"]
-        return answer["value"]
-
-    def evaluate(self, expression: str) -> Any:
-        return self.do("evaluate", expression=expression)
+class Viewer(Browser):
+    """The viewer's page; see export/web/test/drive.mjs."""
 
     def settle(self) -> None:
         self.evaluate("kcgs.settled()")
@@ -169,66 +133,6 @@ class Browser:
     def alert(self) -> str:
         return str(self.evaluate("document.querySelector('[role=alert]').textContent"))
 
-    def close(self) -> None:
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.close()
-        try:
-            self._process.wait(timeout=30)
-        finally:
-            self._process.kill()
-            self._process.wait()
-            self._reader.join(timeout=10)
-            self._process.stdout.close()
-            self._log.close()
-
-
-def array(packed: dict[str, Any]) -> NDArray[np.float32]:
-    data = np.frombuffer(base64.b64decode(packed["data"]["float32"]), dtype=np.float32)
-    return data.reshape(packed["dims"])
-
-
-class Handler(http.server.SimpleHTTPRequestHandler):
-    """A plain static server; below /isolated/ with the two headers that allow threads."""
-
-    def translate_path(self, path: str) -> str:
-        return super().translate_path(path.removeprefix("/isolated"))
-
-    def end_headers(self) -> None:
-        if getattr(self, "path", "").startswith("/isolated/"):
-            self.send_header("Cross-Origin-Opener-Policy", "same-origin")
-            self.send_header("Cross-Origin-Embedder-Policy", "require-corp")
-        # a test may rewrite a file within the second that dates count in: what was read before must not come again
-        self.send_header("Cache-Control", "no-store")
-        super().end_headers()
-
-    def log_message(self, format: str, *args: Any) -> None:
-        pass
-
-
-def npm(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(["npm", *arguments], cwd=WEB, capture_output=True, text=True, timeout=600)
-
-
-@pytest.fixture(scope="module")
-def chromium() -> str:
-    for program in ("node", "npm", "chromium"):
-        if shutil.which(program) is None:
-            pytest.skip(f"{program} is not installed")
-    return str(shutil.which("chromium"))
-
-
-@pytest.fixture(scope="module")
-def node_modules(chromium: str) -> Path:
-    """Packages of the lock file, installed into export/web where they are missing or older than it."""
-    lock, installed = WEB / "package-lock.json", WEB / "node_modules" / ".package-lock.json"
-    if not lock.exists():
-        pytest.skip("the sources of the page are not here")
-    if not installed.exists() or installed.stat().st_mtime < lock.stat().st_mtime:
-        done = npm("ci", "--no-audit", "--no-fund")
-        if done.returncode != 0:
-            pytest.skip(f"npm ci failed, so the page cannot be built: {done.stderr.strip()[-500:]}")
-    return installed.parent
-
 
 @pytest.fixture(scope="module")
 def site(node_modules: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str]]:
@@ -237,18 +141,13 @@ def site(node_modules: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     done = npm("run", "build", "--", "--outDir", str(folder), "--emptyOutDir")
     assert done.returncode == 0, done.stdout + done.stderr
     shutil.rmtree(folder / "examples", ignore_errors=True)
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=str(folder)))
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    yield folder, f"http://127.0.0.1:{server.server_port}/"
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with serving(folder) as address:
+        yield folder, address
 
 
 @pytest.fixture(scope="module")
-def browser(chromium: str, site: tuple[Path, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    driven = Browser(chromium, tmp_path_factory.mktemp("browser") / "errors.txt")
+def browser(chromium: str, site: tuple[Path, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Viewer]:
+    driven = Viewer(chromium, tmp_path_factory.mktemp("browser") / "errors.txt")
     yield driven
     driven.close()
 
@@ -259,7 +158,7 @@ def decoder(site: tuple[Path, str]) -> Path:
 
 
 @pytest.fixture
-def page(browser: Browser, site: tuple[Path, str], decoder: Path) -> Iterator[Browser]:
+def page(browser: Viewer, site: tuple[Path, str], decoder: Path) -> Iterator[Viewer]:
     """The page with the decoder open, at rest; nothing may have been asked of another server when a test ends."""
     browser.do("look", width=1000, height=700)
     start = f"{site[1]}?decoder=waves.onnx"
@@ -296,7 +195,7 @@ class TestPicture:
         ids=["native", "twice", "view", "hidden"],
     )
     def test_render(
-        self, page: Browser, decoder: Path, size: tuple[int, int], view: list[float], visible: list[float]
+        self, page: Viewer, decoder: Path, size: tuple[int, int], view: list[float], visible: list[float]
     ) -> None:
         want = decode(decoder, size, view=view, visible=visible)
         got = page.render(size, view=view, visible=visible)
@@ -305,7 +204,7 @@ class TestPicture:
         np.testing.assert_allclose(got, want, atol=LEVEL)
 
     @pytest.mark.parametrize("scale", ["fit", "native", "near"])
-    def test_canvas(self, page: Browser, decoder: Path, scale: str) -> None:
+    def test_canvas(self, page: Viewer, decoder: Path, scale: str) -> None:
         if scale == "native":
             page.do("click", on="#native")
         elif scale == "near":
@@ -318,7 +217,7 @@ class TestPicture:
             assert (part["width"], part["height"], part["rect"]) == (WIDTH, HEIGHT, [0, 0, WIDTH, HEIGHT])
         np.testing.assert_allclose(got, np.clip(want, 0, 1), atol=LEVEL)
 
-    def test_hidden_region_on_the_canvas(self, page: Browser, decoder: Path) -> None:
+    def test_hidden_region_on_the_canvas(self, page: Viewer, decoder: Path) -> None:
         assert page.do("text", on="#regions").split() == ["Region", "0", "Region", "3", "Region", "7"]
         page.do("click", on="#regions li:nth-child(2) input")
         part, got = page.canvas()
@@ -329,7 +228,7 @@ class TestPicture:
         page.do("click", on="[data-show=all]")
         assert page.canvas()[1].max() > 0.9
 
-    def test_wasm_where_webgpu_fails(self, page: Browser, decoder: Path) -> None:
+    def test_wasm_where_webgpu_fails(self, page: Viewer, decoder: Path) -> None:
         """The browser of the tests has no GPU: choosing it anyway is a session that fails, said once."""
         page.evaluate(
             "(async () => { const select = document.querySelector('#provider'); select.options[0].disabled = false;"
@@ -341,7 +240,7 @@ class TestPicture:
         np.testing.assert_allclose(got, np.clip(want, 0, 1), atol=LEVEL)
         page.evaluate("document.querySelector('#provider').value = 'wasm'")
 
-    def test_threads_where_the_page_is_isolated(self, page: Browser, site: tuple[Path, str], decoder: Path) -> None:
+    def test_threads_where_the_page_is_isolated(self, page: Viewer, site: tuple[Path, str], decoder: Path) -> None:
         page.do("goto", url=f"{site[1]}isolated/?decoder=waves.onnx")
         assert page.evaluate("crossOriginIsolated") is True
         view = [0.0, 0.0, WIDTH, HEIGHT]
@@ -349,7 +248,7 @@ class TestPicture:
         np.testing.assert_allclose(page.render((HEIGHT, WIDTH), view=view, visible=[1, 1, 1]), want, atol=LEVEL)
 
     @pytest.mark.parametrize("channels", [1, 3])
-    def test_without_interaction(self, page: Browser, tmp_path: Path, channels: int) -> None:
+    def test_without_interaction(self, page: Viewer, tmp_path: Path, channels: int) -> None:
         path = make_decoder(tmp_path / "plain.onnx", interactive=False, channels=channels)
         page.do("files", on="#decoder-file", paths=[str(path)])
         page.do("wait", expression="document.title.startsWith('plain')")
@@ -378,7 +277,7 @@ class TestRefusal:
             ("damaged", "could not be loaded"),
         ],
     )
-    def test_file(self, page: Browser, decoder: Path, tmp_path: Path, name: str, says: str) -> None:
+    def test_file(self, page: Viewer, decoder: Path, tmp_path: Path, name: str, says: str) -> None:
         before = page.canvas()[1]
         path = tmp_path / f"{name}.onnx"
         whole = decoder.read_bytes()
@@ -403,16 +302,16 @@ class TestRefusal:
         page.do("press", key="+")
         assert not np.array_equal(page.canvas()[1], before)
 
-    def test_address_elsewhere(self, page: Browser, site: tuple[Path, str]) -> None:
+    def test_address_elsewhere(self, page: Viewer, site: tuple[Path, str]) -> None:
         page.do("goto", url=f"{site[1]}?decoder=http://example.invalid/a.onnx")
         assert "the server that this page came from" in page.alert()
 
-    def test_address_missing(self, page: Browser, site: tuple[Path, str]) -> None:
+    def test_address_missing(self, page: Viewer, site: tuple[Path, str]) -> None:
         page.do("goto", url=f"{site[1]}?decoder=nowhere.onnx")
         assert "404" in page.alert()
         assert page.evaluate("kcgs.metadata") is None
 
-    def test_original_that_is_no_image(self, page: Browser, tmp_path: Path) -> None:
+    def test_original_that_is_no_image(self, page: Viewer, tmp_path: Path) -> None:
         (tmp_path / "broken.png").write_bytes(b"no picture")
         page.do("files", on="#original-file", paths=[str(tmp_path / "broken.png")])
         page.do("wait", expression="document.querySelector('[role=alert]').textContent !== ''")
@@ -420,7 +319,7 @@ class TestRefusal:
 
 
 class TestView:
-    def test_keys(self, page: Browser) -> None:
+    def test_keys(self, page: Viewer) -> None:
         start = page.evaluate("kcgs.scale")
         page.do("press", key="+")
         assert page.evaluate("kcgs.scale") == pytest.approx(start * 2**0.5)
@@ -436,7 +335,7 @@ class TestView:
         page.do("press", key="-")
         assert page.evaluate("kcgs.scale") < start
 
-    def test_wheel_keeps_the_point_under_the_pointer(self, page: Browser) -> None:
+    def test_wheel_keeps_the_point_under_the_pointer(self, page: Viewer) -> None:
         here = (
             "(() => { const {x, y, rect} = kcgs.part, s = kcgs.scale;"
             "return [rect[0] + (300 - x) / s, rect[1] + (250 - y) / s]; })()"
@@ -457,12 +356,12 @@ class TestView:
         page.do("drag", **{"from": [box["x"] + 300, box["y"] + 250]}, to=[box["x"] + 340, box["y"] + 250])
         assert page.evaluate("kcgs.part.rect[0]") == pytest.approx(rect[0] - 40 / page.evaluate("kcgs.scale"), abs=0.2)
 
-    def test_pinch(self, page: Browser) -> None:
+    def test_pinch(self, page: Viewer) -> None:
         scale = page.evaluate("kcgs.scale")
         page.do("pinch", at=[300, 300], **{"from": 100}, to=300)
         assert page.evaluate("kcgs.scale") == pytest.approx(3 * scale, rel=0.02)
 
-    def test_frames_do_not_pile_up(self, page: Browser, decoder: Path) -> None:
+    def test_frames_do_not_pile_up(self, page: Viewer, decoder: Path) -> None:
         """Many moves while a frame is drawn ask for few frames, and the last view is what remains."""
         page.evaluate(
             "(() => { const {prototype} = Worker, {postMessage} = prototype; window.sent = 0;"
@@ -478,7 +377,7 @@ class TestView:
 
 
 class TestCompare:
-    def test_slider_by_keyboard(self, page: Browser, decoder: Path, tmp_path: Path) -> None:
+    def test_slider_by_keyboard(self, page: Viewer, decoder: Path, tmp_path: Path) -> None:
         assert page.evaluate("document.querySelector('[role=slider]').hidden") is True
         original = original_of(decoder, tmp_path / "original.png")
         page.do("files", on="#original-file", paths=[str(original)])
@@ -496,7 +395,7 @@ class TestCompare:
         np.testing.assert_allclose(got[0, ..., :edge], shown[..., :edge], atol=1e-6)
         np.testing.assert_allclose(got[0, ..., edge:], np.clip(decoded, 0, 1)[..., edge:], atol=LEVEL)
 
-    def test_psnr(self, page: Browser, decoder: Path, site: tuple[Path, str]) -> None:
+    def test_psnr(self, page: Viewer, decoder: Path, site: tuple[Path, str]) -> None:
         original = original_of(decoder, site[0] / "original.png")
         page.do("goto", url=f"{site[1]}?decoder=waves.onnx&original=original.png")
         page.do("wait", expression="kcgs.psnr !== null")
@@ -510,7 +409,7 @@ class TestCompare:
 
 
 class TestDrop:
-    def test_decoder_and_original_together(self, page: Browser, site: tuple[Path, str], decoder: Path) -> None:
+    def test_decoder_and_original_together(self, page: Viewer, site: tuple[Path, str], decoder: Path) -> None:
         original_of(decoder, site[0] / "dropped.png")
         page.evaluate(
             "(async () => { const transfer = new DataTransfer();"
@@ -523,7 +422,7 @@ class TestDrop:
 
 
 class TestExamples:
-    def test_first_example_opens_by_itself(self, page: Browser, site: tuple[Path, str], decoder: Path) -> None:
+    def test_first_example_opens_by_itself(self, page: Viewer, site: tuple[Path, str], decoder: Path) -> None:
         folder = site[0] / "examples"
         folder.mkdir()
         shutil.copy(decoder, folder / "stripes.onnx")
@@ -550,7 +449,7 @@ class TestRealDecoders:
     """What kcgs exports, in the browser."""
 
     @pytest.mark.parametrize("name", sorted(path.stem for path in GOLDEN.glob("*.npz")))
-    def test_golden(self, page: Browser, site: tuple[Path, str], name: str) -> None:
+    def test_golden(self, page: Viewer, site: tuple[Path, str], name: str) -> None:
         shutil.copy(GOLDEN / f"{name}.onnx", site[0])
         page.evaluate(f"kcgs.open('{name}.onnx')")
         page.settle()
@@ -571,7 +470,7 @@ class TestRealDecoders:
                 np.testing.assert_allclose(got[0], case["image_visible"], atol=1e-3)
 
     @pytest.mark.parametrize("name", ["chelsea-500", "chart-pie"])
-    def test_bundled_example(self, page: Browser, site: tuple[Path, str], name: str) -> None:
+    def test_bundled_example(self, page: Viewer, site: tuple[Path, str], name: str) -> None:
         path = site[0] / f"{name}.onnx"
         shutil.copy(MODELS / name / "decoder.onnx", path)
         page.evaluate(f"kcgs.open('{name}.onnx')")

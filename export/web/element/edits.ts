@@ -76,7 +76,7 @@ function movedLabels(map: RegionMap, width: number, moved: ReadonlySet<number>, 
   return labels;
 }
 
-/** Give each label of a hole the nearest other one: exact along columns, then rows (Felzenszwalb's envelope). */
+/** Give each label of a hole the nearest other one, of several the lowest: along columns, then along rows. */
 function nearestOthers(labels: Int32Array, width: number, height: number, hole: ReadonlySet<number>): Int32Array {
   const rows = nearestInColumns(labels, width, height, hole);
   const result = labels.slice();
@@ -84,15 +84,17 @@ function nearestOthers(labels: Int32Array, width: number, height: number, hole: 
   for (let y = 0; y < height; y++) {
     for (let x = 0; x < width; x++) {
       if (!hole.has(labels[y * width + x]!)) continue;
-      let [best, from] = [square(x, y), x];
-      for (let step = 1; step * step <= best && step < width; step++) {
+      let [best, label] = [FAR, 0];
+      for (let step = 0; step * step <= best && step < width; step++) {
         for (const other of [x - step, x + step]) {
-          if (other < 0 || other >= width || step * step + square(other, y) >= best) continue;
-          best = step * step + square(other, y);
-          from = other;
+          if (other < 0 || other >= width) continue;
+          const distance = step * step + square(other, y);
+          if (distance > best || distance >= FAR) continue;
+          const found = labels[rows[y * width + other]! * width + other]!;
+          if (distance < best || found < label) [best, label] = [distance, found];
         }
       }
-      result[y * width + x] = labels[rows[y * width + from]! * width + from]!;
+      result[y * width + x] = label;
     }
   }
   return result;
@@ -108,8 +110,10 @@ function nearestInColumns(labels: Int32Array, width: number, height: number, hol
     }
     for (let y = height - 1, next = -1; y >= 0; y--) {
       if (!hole.has(labels[y * width + x]!)) next = y;
-      const above = rows[y * width + x]!;
-      if (next >= 0 && (above < 0 || next - y < y - above)) rows[y * width + x] = next;
+      const last = rows[y * width + x]!;
+      const lower = (): boolean => labels[next * width + x]! < labels[last * width + x]!;
+      const nearer = next - y - (y - last);
+      if (next >= 0 && (last < 0 || nearer < 0 || (nearer === 0 && lower()))) rows[y * width + x] = next;
     }
   }
   return rows;

@@ -1,5 +1,6 @@
 /** Defines `<kcgs-image>`. */
 
+import type { RegionClick } from "./kcgs-image.ts";
 import { KcgsImage } from "./kcgs-image.ts";
 
 export { decode, DecodeError, ProgressiveDecoder } from "../decoder/index.ts";
@@ -8,6 +9,9 @@ export type { Ids, ImageOptions, RegionClick } from "./kcgs-image.ts";
 export { KcgsImage };
 
 declare global {
+  interface HTMLElementEventMap {
+    regionclick: CustomEvent<RegionClick>;
+  }
   interface HTMLElementTagNameMap {
     "kcgs-image": KcgsImage;
   }

@@ -47,7 +47,7 @@ export class KcgsImage extends HTMLElement {
     canvas.hidden = true;
     root.append(canvas, this.fallback);
     root.adoptedStyleSheets = [elementStyle(), this.sizes];
-    this.stage = new Stage(canvas, () => this.viewChanged(), (error) => this.fail(error));
+    this.stage = new Stage(canvas, () => this.viewChanged(), (error) => this.fail(error, false));
     this.listenToClicks(canvas);
   }
 
@@ -170,7 +170,7 @@ export class KcgsImage extends HTMLElement {
     this.loading = loading;
     load(src, loading.signal, (scene) => this.take(scene)).then(
       () => this.dispatchEvent(new Event("load")),
-      (error: unknown) => loading.signal.aborted || this.fail(error as Error),
+      (error: unknown) => loading.signal.aborted || this.fail(error as Error, this.current !== null),
     );
   }
 
@@ -229,11 +229,10 @@ export class KcgsImage extends HTMLElement {
     this.stage.want();
   }
 
-  private fail(error: Error): void {
-    if (this.stage.renderer === "") {
-      this.stage.canvas.hidden = true;
-      this.fallback.hidden = false;
-    }
+  /** Tell of an error; where there is nothing to be seen, show what is inside of the element. */
+  private fail(error: Error, shown: boolean): void {
+    this.stage.canvas.hidden = !shown;
+    this.fallback.hidden = shown;
     const { message } = error;
     this.dispatchEvent(new ErrorEvent("error", { error, message }));
   }

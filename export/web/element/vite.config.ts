@@ -4,19 +4,20 @@ import { defineConfig } from "vite";
 
 const path = (name: string): string => fileURLToPath(new URL(name, import.meta.url));
 
-// The element with renderer and decoder, one module; and the script of the page that `kcgs export` and `kcgs view` make.
-export default defineConfig({
+// The element with renderer and decoder: a module of a package, or, with `--mode page`, the script of the page that
+// `kcgs export` and `kcgs view` write, which the Python package holds.
+export default defineConfig(({ mode }) => ({
   root: path("."),
   publicDir: false,
   build: {
     target: "es2022",
-    outDir: path("dist"),
-    emptyOutDir: true,
+    outDir: mode === "page" ? path("../../../kcgs/page") : path("dist"),
+    emptyOutDir: mode !== "page",
     modulePreload: false,
     rolldownOptions: {
-      input: path("index.ts"),
-      preserveEntrySignatures: "strict",
-      output: { entryFileNames: "kcgs-image.js" },
+      input: mode === "page" ? path("page.ts") : path("index.ts"),
+      ...(mode !== "page" && { preserveEntrySignatures: "strict" as const }),
+      output: { entryFileNames: mode === "page" ? "page.js" : "kcgs-image.js" },
     },
   },
-});
+}));

@@ -25,7 +25,7 @@ interface Target {
   readonly slotBuffer: WebGLFramebuffer;
 }
 
-/** Said by the caller: a GPU that is emulated is slower than the CPU's own renderer. */
+/** Of the sums of colours; float16 is off by up to a level of 255 where many Gaussians overlap. */
 export type Precision = "float32" | "float16";
 
 export class WebGl {
@@ -58,8 +58,9 @@ export class WebGl {
       failIfMajorPerformanceCaveat: !emulated,
       powerPreference: "high-performance",
     });
+    if (gl === null || (!emulated && isEmulated(gl))) return null;
     try {
-      return gl === null ? null : new WebGl(canvas, gl);
+      return new WebGl(canvas, gl);
     } catch {
       return null;
     }
@@ -208,6 +209,13 @@ export class WebGl {
     gl.drawBuffers(attachments);
     return (this.target = { width, height, layers, sums, slots, sumBuffer, slotBuffer });
   }
+}
+
+/** Whether a GPU is a program on the CPU, which not all browsers call a performance caveat. */
+function isEmulated(gl: WebGL2RenderingContext): boolean {
+  const names = gl.getExtension("WEBGL_debug_renderer_info");
+  const name: unknown = gl.getParameter(names?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER);
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(String(name));
 }
 
 /** A block of the output, and the fine render that it is made of. */

@@ -63,6 +63,10 @@ const actions = {
     await page.goto(url);
     await page.evaluate(() => window.kcgs.ready);
   },
+  open: async ({ url }) => {
+    requests.length = problems.length = 0;
+    await page.goto(url);
+  },
   evaluate: ({ expression }) => page.evaluate(encode(expression)),
   press: ({ key, on }) => (on ? page.press(on, key) : page.keyboard.press(key)),
   click: ({ on }) => page.click(on),

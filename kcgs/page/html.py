@@ -1,0 +1,73 @@
+"""The text of the page: the element's script, a policy that allows that script only, and the scene."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+from pathlib import Path
+
+from kcgs.codec import encode
+from kcgs.functional.softness import check_contours
+from kcgs.scene import Scene, check_scene
+
+_FOLDER = Path(__file__).resolve().parent
+# against the scene's own render, in dB: no difference of a level of 255
+_QUALITY = 60.0
+
+
+def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "scaled") -> str:
+    r"""Write a scene as one HTML page that opens from disk, offline.
+
+    Convention: the page zooms, pans, and hides regions. It holds the scene as a `.kcgs` file and loads nothing.
+
+    Args:
+        scene: of one image, with 1, 3 or 4 channels; or the bytes of a `.kcgs` file, which are kept as they are.
+        title: of the page, and what it calls the image for who does not see it.
+        contours: "scaled" or "crisp", as :meth:`kcgs.Scene.render` has them.
+
+    Returns:
+        The page, about 100 kB and 4/3 of the scene's file.
+
+    Raises:
+        TypeError, ValueError: as :func:`kcgs.codec.encode`; other contours, another number of channels.
+
+    Example:
+        >>> from kcgs import GaussianField
+        >>> page = scene_page(Scene(GaussianField.random(100, (32, 48), seed=0)), title="Blobs & more")
+        >>> page[:15], "<title>Blobs &amp; more</title>" in page
+        ('<!doctype html>', True)
+    """
+    data = web_bytes(scene) if isinstance(scene, Scene) else scene
+    source = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    return page_html(source, title=title, contours=contours)
+
+
+def web_bytes(scene: Scene) -> bytes:
+    """Write a scene as a `.kcgs` file whose render is within a level of 255 of the scene's own."""
+    channels = check_scene(scene).field.colors.shape[-1]
+    if channels not in (1, 3, 4):
+        raise ValueError(f"scene must have 1, 3 or 4 channels for a page to show it; got {channels}")
+    return encode(scene, quality=_QUALITY)
+
+
+def page_html(source: str, *, title: str, contours: str = "scaled", original: str | None = None) -> str:
+    """Return the page of a scene at an address, and maybe of an original to compare with; see :func:`scene_page`."""
+    style, script, page = ((_FOLDER / f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html"))
+    script = script.strip()
+    hashes = {name: _policy_hash(text) for name, text in (("style", style), ("script", script))}
+    # a page of an address asks its own server; one that holds its scene asks nobody
+    images, asked = ("", "'none'") if source.startswith("data:") else (" 'self'", "'self'")
+    policy = (
+        f"default-src 'none'; script-src '{hashes['script']}' 'wasm-unsafe-eval'; style-src '{hashes['style']}'; "
+        f"img-src blob: data:{images}; connect-src {asked}; base-uri 'none'; form-action 'none'"
+    )
+    beside = "" if original is None else f' data-original="{html.escape(original)}"'
+    return page.format(
+        policy=policy, title=html.escape(title), style=style, script=script,
+        contours=check_contours(contours), src=html.escape(source), original=beside,
+    )  # fmt: skip
+
+
+def _policy_hash(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

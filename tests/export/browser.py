@@ -1,0 +1,106 @@
+"""Headless Chromium for tests, a server for its pages, and npm."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import http.server
+import json
+import queue
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+WEB = Path(__file__).resolve().parents[2] / "export" / "web"
+SECONDS = 120
+
+
+class Browser:
+    """Headless Chromium behind a pipe; see export/web/test/drive.mjs."""
+
+    def __init__(self, chromium: str, errors: Path) -> None:
+        self.errors = errors
+        self._log = errors.open("w")
+        command = ["node", str(WEB / "test" / "drive.mjs"), chromium]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True
+        )
+        self._lines: queue.Queue[str] = queue.Queue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._lines.put(line)
+        self._lines.put("")
+
+    def do(self, action: str, **arguments: Any) -> Any:
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps({"do": action, **arguments}) + "\n")
+        self._process.stdin.flush()
+        line = self._lines.get(timeout=SECONDS)
+        assert line, f"the browser's driver ended: {self.errors.read_text()[-2000:]}"
+        answer = json.loads(line)
+        assert "error" not in answer, answer["error"]
+        return answer["value"]
+
+    def evaluate(self, expression: str) -> Any:
+        return self.do("evaluate", expression=expression)
+
+    def close(self) -> None:
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.close()
+        try:
+            self._process.wait(timeout=30)
+        finally:
+            self._process.kill()
+            self._process.wait()
+            self._reader.join(timeout=10)
+            self._process.stdout.close()
+            self._log.close()
+
+
+def array(packed: dict[str, Any]) -> NDArray[np.float32]:
+    data = np.frombuffer(base64.b64decode(packed["data"]["float32"]), dtype=np.float32)
+    return data.reshape(packed["dims"])
+
+
+class Handler(http.server.SimpleHTTPRequestHandler):
+    """A plain static server; below /isolated/ with the two headers that allow threads."""
+
+    def translate_path(self, path: str) -> str:
+        return super().translate_path(path.removeprefix("/isolated"))
+
+    def end_headers(self) -> None:
+        if getattr(self, "path", "").startswith("/isolated/"):
+            self.send_header("Cross-Origin-Opener-Policy", "same-origin")
+            self.send_header("Cross-Origin-Embedder-Policy", "require-corp")
+        # a test may rewrite a file within the second that dates count in: what was read before must not come again
+        self.send_header("Cache-Control", "no-store")
+        super().end_headers()
+
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+@contextmanager
+def serving(folder: Path) -> Iterator[str]:
+    """Serve a folder; give its address."""
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=str(folder)))
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}/"
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def npm(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["npm", *arguments], cwd=WEB, capture_output=True, text=True, timeout=600)

@@ -1,0 +1,319 @@
+"""The element `<kcgs-image>` and the page of a scene, in headless Chromium, against `Scene.render` in Python."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from kcgs import GaussianField, RegionMap, Scene, load
+from kcgs.codec import encode
+from kcgs.editing import move_region, recolor_region
+from kcgs.page import scene_page
+
+from .browser import WEB, Browser, array, npm, serving
+
+MODELS = WEB.parents[1] / "models"
+PAGE = WEB.parents[1] / "kcgs" / "page"
+MOST_BYTES = 40_000
+LEVELS = 2 / 255
+HTML = """<!doctype html><meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; connect-src 'self'; img-src blob: 'self';
+ script-src 'self' 'wasm-unsafe-eval' 'nonce-test'">
+<script type="module" src="kcgs-image.js"></script>
+<script type="module" nonce="test">
+const events = [];
+window.kcgs = { ready: Promise.resolve(), events, async show(markup, wanted = "load") {
+  document.querySelector("#here").innerHTML = markup;
+  const image = document.querySelector("kcgs-image");
+  for (const name of ["load", "error", "progress", "regionclick"])
+    image.addEventListener(name, (event) => events.push([name, event.message ?? event.detail ?? null]));
+  window.image = image;
+  events.length = 0;
+  while (!events.some(([name]) => name === "load" || name === "error")) await new Promise((r) => setTimeout(r, 5));
+  await image.settled();
+}, async pixels(width, height) {
+  const bitmap = await createImageBitmap(await image.toBlob({ width, height }));
+  const canvas = Object.assign(document.createElement("canvas"), { width, height });
+  const context = canvas.getContext("2d");
+  context.drawImage(bitmap, 0, 0);
+  return { data: Float32Array.from(context.getImageData(0, 0, width, height).data), dims: [height, width, 4] };
+} };
+</script>
+<div id="here"></div>
+"""
+
+
+def cells(size: tuple[int, int], count: int, supersample: int = 1) -> torch.Tensor:
+    """Label pixels by the nearest of some points, ids 2, 5, 8 ..."""
+    generator = torch.Generator().manual_seed(count)
+    places = torch.rand(count, 2, generator=generator) * torch.tensor(size)
+    rows, columns = (torch.arange(n * supersample) / supersample for n in size)
+    squares = (rows[:, None, None] - places[:, 0]) ** 2 + (columns[None, :, None] - places[:, 1]) ** 2
+    return squares.argmin(-1) * 3 + 2
+
+
+def random_scene(kind: str, channels: int = 3) -> Scene:
+    size, supersample = (60, 90), 2 if "fine" in kind else 1
+    softness: Any = {"hard": 0.0, "soft": 1.3, "wide": 5.0}.get(kind.split()[0], 0.0)
+    labels = cells(size, 12, supersample)
+    if kind.startswith("pairs"):
+        ids = labels.unique().tolist()
+        pairs = [(a, b) for a in ids for b in ids if a < b]
+        softness = {pair: (0.0, 0.5, 1.0, 2.5)[i % 4] for i, pair in enumerate(pairs)}
+    regions = None if kind == "plain" else RegionMap.from_labels(labels, softness, supersample=supersample)
+    return Scene(GaussianField.random(150, size, channels=channels, regions=regions, seed=1), regions)
+
+
+SCENES = {
+    **{kind: lambda kind=kind: random_scene(kind) for kind in ("soft", "pairs fine", "hard fine")},
+    "chart-pie": lambda: load(MODELS / "chart-pie" / "scene.safetensors"),
+}
+MORE = {
+    **{kind: lambda kind=kind: random_scene(kind) for kind in ("plain", "hard", "wide", "pairs")},
+    "grey": lambda: random_scene("soft fine", 1),
+    **{name: lambda name=name: load(MODELS / name / "scene.safetensors") for name in ("chelsea-500", "rocket-1000")},
+}
+EVERY = [
+    *(pytest.param(make, id=name) for name, make in SCENES.items()),
+    *(pytest.param(make, id=name, marks=pytest.mark.slow) for name, make in MORE.items()),
+]
+
+
+@pytest.fixture(scope="module")
+def site(node_modules: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str]]:
+    """A folder with the built element and a page, and its address."""
+    folder = tmp_path_factory.mktemp("element")
+    done = npm("exec", "--", "vite", "build", "--config", "element/vite.config.ts", "--outDir", str(folder))
+    assert done.returncode == 0, done.stdout + done.stderr
+    (folder / "index.html").write_text(HTML)
+    (folder / "grey.png").write_bytes(b"")
+    with serving(folder) as address:
+        yield folder, address
+
+
+@pytest.fixture(scope="module")
+def browser(chromium: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    driven = Browser(chromium, tmp_path_factory.mktemp("browser") / "errors.txt")
+    yield driven
+    driven.close()
+
+
+@pytest.fixture
+def page(browser: Browser, site: tuple[Path, str]) -> Iterator[Browser]:
+    """The page; when a test ends nothing may have gone wrong, nor been asked of another server."""
+    browser.do("look", width=1000, height=700)
+    browser.do("goto", url=site[1])
+    yield browser
+    assert all(address.startswith((site[1], f"blob:{site[1]}")) for address in browser.do("requests"))
+    assert [text for text in browser.do("problems") if "404" not in text] == []
+
+
+def show(page: Browser, site: tuple[Path, str], scene: Scene | bytes, attributes: str = "", inside: str = "") -> Scene:
+    """Put a scene into the page's element; return what its file holds."""
+    path = site[0] / "scene.kcgs"
+    path.write_bytes(scene if isinstance(scene, bytes) else encode(scene))
+    markup = f'<kcgs-image src="scene.kcgs" {attributes}>{inside}</kcgs-image>'
+    page.evaluate(f"kcgs.show({json.dumps(markup)})")
+    return load(path) if not isinstance(scene, bytes) else Scene(GaussianField.random(1, (1, 1)))
+
+
+def pixels(page: Browser, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Render in the element at a size: (4, H, W) in [0, 1]."""
+    return array(page.evaluate(f"kcgs.pixels({size[1]}, {size[0]})")).transpose(2, 0, 1) / 255
+
+
+def check(page: Browser, want: torch.Tensor) -> None:
+    got = pixels(page, (want.shape[-2], want.shape[-1]))
+    assert want.std() > 0.02
+    np.testing.assert_allclose(got[:3], want.expand(3, -1, -1).numpy(), atol=LEVELS, rtol=0)
+
+
+class TestPixels:
+    @pytest.mark.parametrize("renderer", ["cpu", "webgl2"])
+    @pytest.mark.parametrize("make", EVERY)
+    def test_sizes(self, page: Browser, site: tuple[Path, str], make: Any, renderer: str) -> None:
+        scene = show(page, site, make(), f'renderer="{renderer}"')
+        assert page.evaluate("image.renderer").startswith(renderer)
+        height, width = scene.size
+        for size in ((height, width), (height // 2, width // 2), (3 * height, 3 * width), (height - 13, 2 * width + 5)):
+            check(page, scene.render(size))
+
+    @pytest.mark.parametrize("renderer", ["cpu", "webgl2"])
+    def test_crisp(self, page: Browser, site: tuple[Path, str], renderer: str) -> None:
+        scene = show(page, site, random_scene("pairs"), f'renderer="{renderer}" contours="crisp"')
+        for size in ((60, 90), (150, 225)):
+            check(page, scene.render(size, "crisp"))
+
+    def test_alpha(self, page: Browser, site: tuple[Path, str]) -> None:
+        scene = show(page, site, random_scene("soft", 4))
+        want = scene.render().numpy()
+        for renderer in ("cpu", "webgl2"):
+            page.evaluate(f"(image.setAttribute('renderer', '{renderer}'), 1)")
+            got = pixels(page, scene.size)
+            np.testing.assert_allclose(got[3], want[3], atol=LEVELS)
+            np.testing.assert_allclose((got[:3] * got[3]), want[:3] * want[3], atol=LEVELS)
+
+    def test_an_emulated_gpu_is_not_taken(self, page: Browser, site: tuple[Path, str]) -> None:
+        show(page, site, random_scene("soft"))
+        assert page.evaluate("image.renderer") == "cpu"
+
+    @pytest.mark.parametrize("renderer", ["cpu", "webgl2"])
+    def test_hidden_regions_are_clear(self, page: Browser, site: tuple[Path, str], renderer: str) -> None:
+        scene = show(page, site, random_scene("soft"), f'renderer="{renderer}"')
+        regions = scene.regions
+        assert regions is not None
+        hidden = regions.ids[:3].tolist()
+        page.evaluate(f"(image.hide({hidden}), image.hide({hidden[2]}, false), 1)")
+        got = pixels(page, scene.size)
+        left = regions.weights(regions.ids[2:].tolist()).numpy()
+        np.testing.assert_allclose(got[3], left, atol=LEVELS)
+        inside = left > 1 - 1e-6
+        np.testing.assert_allclose(got[:3, inside], scene.render().numpy()[:, inside], atol=LEVELS)
+
+
+class TestEdits:
+    def test_as_python_edits(self, page: Browser, site: tuple[Path, str]) -> None:
+        scene = show(page, site, random_scene("pairs fine"))
+        assert scene.regions is not None
+        first, second = scene.regions.ids[3:5].tolist()
+        page.evaluate(f"(image.move([{first}, {second}], 11, -7.5), 1)")
+        moved = move_region(scene, [first, second], (11, -7.5), fill=None)
+        check(page, moved.render())
+        page.evaluate(f"(image.recolour({first}, [0.5, 1, -1], [0.1, 0, 0.9]), 1)")
+        check(page, recolor_region(moved, first, [0.5, 1, -1], [0.1, 0.0, 0.9]).render())
+        page.evaluate("(image.reset(), 1)")
+        check(page, scene.render())
+
+    @pytest.mark.parametrize(
+        ("call", "says"),
+        [
+            ("hide(77)", "ids must be of the scene's regions; got 77"),
+            ("move(5, 0.3, 0)", "dx and dy must be whole; got 0.3, 0"),
+            ("recolour(5, [1, 2])", "gain must be a number or 3 of them; got 1,2"),
+        ],
+    )
+    def test_errors(self, page: Browser, site: tuple[Path, str], call: str, says: str) -> None:
+        show(page, site, random_scene("soft"))
+        said = page.evaluate(
+            f"(() => {{ try {{ image.{call}; return ''; }} catch (error) {{ return error.message; }} }})()"
+        )
+        assert said == says
+
+
+class TestElement:
+    def test_size_and_role(self, page: Browser, site: tuple[Path, str]) -> None:
+        show(page, site, random_scene("soft"), 'alt="Cells"', '<img src="grey.png" alt="instead">')
+        facts = "[image.offsetWidth, image.offsetHeight, image.querySelector('img').offsetWidth, image.tabIndex]"
+        assert page.evaluate(facts) == [90, 60, 0, -1]
+        page.evaluate("(image.style.setProperty('width', '300px'), new Promise((r) => setTimeout(r, 100)))")
+        canvas = "image.shadowRoot.querySelector('canvas')"
+        assert page.evaluate(f"[image.offsetHeight, {canvas}.width, {canvas}.height]") == [200, 300, 200]
+        assert page.evaluate("document.querySelector('kcgs-image').matches(':focus')") is False
+
+    def test_layers_as_they_arrive(self, page: Browser, site: tuple[Path, str]) -> None:
+        show(page, site, load(MODELS / "chelsea-500" / "scene.safetensors"))
+        events = [name for name, _ in page.evaluate("kcgs.events")]
+        assert events[-1] == "load" and "progress" in events and "error" not in events
+        assert page.evaluate("[image.scene.complete, image.scene.count]")[0] is True
+
+    def test_a_file_that_ends_early_shows_what_is_whole(self, page: Browser, site: tuple[Path, str]) -> None:
+        data = encode(load(MODELS / "chelsea-500" / "scene.safetensors"))
+        show(page, site, data[: len(data) * 3 // 4])
+        assert [name for name, _ in page.evaluate("kcgs.events")] == ["progress", "error"]
+        assert "ends early" in page.evaluate("kcgs.events.at(-1)[1]")
+        assert page.evaluate("[image.scene.complete, image.shadowRoot.firstChild.hidden]") == [False, False]
+        assert pixels(page, (300, 451)).std() > 0.1
+
+    @pytest.mark.parametrize(("src", "says"), [("none.kcgs", "404"), ("index.html", 'must start with "kcgs"')])
+    def test_the_fallback_stays(self, page: Browser, src: str, says: str) -> None:
+        inside = "<p>instead</p>"
+        page.evaluate(f"kcgs.show({json.dumps(f'<kcgs-image src={src}>{inside}</kcgs-image>')})")
+        name, message = page.evaluate("kcgs.events.at(-1)")
+        assert name == "error" and says in message
+        assert page.evaluate("image.querySelector('p').offsetHeight") > 0
+
+    def test_keyboard_wheel_and_touch(self, page: Browser, site: tuple[Path, str]) -> None:
+        show(page, site, random_scene("soft"), 'zoom regions alt="Cells"')
+        assert (
+            page.evaluate("(image.style.setProperty('width', '600px'), new Promise((r) => setTimeout(r, 100)))") is None
+        )
+        whole = page.evaluate("image.view.scale")
+        page.evaluate("(image.focus(), 1)")
+        for key, larger in (("+", True), ("0", False)):
+            page.do("press", key=key, on="kcgs-image")
+            page.evaluate("image.settled()")
+            assert (page.evaluate("image.view.scale") > 1.2 * whole) is larger
+        page.do("wheel", x=100, y=100, delta=-400)
+        page.evaluate("image.settled()")
+        near, x = page.evaluate("[image.view.scale, image.view.x]")
+        assert near > 1.5 * whole
+        page.do("press", key="ArrowRight", on="kcgs-image")
+        assert page.evaluate("image.settled().then(() => image.view.x)") > x
+        page.do("pinch", at=[300, 200], **{"from": 60, "to": 180})
+        assert page.evaluate("image.settled().then(() => image.view.scale)") > 1.5 * near
+        page.do("drag", **{"from": [300, 200], "to": [340, 200]})
+        assert "regionclick" not in [name for name, _ in page.evaluate("kcgs.events")]
+
+    def test_a_click_tells_the_region(self, page: Browser, site: tuple[Path, str]) -> None:
+        scene = show(page, site, random_scene("hard"), "regions")
+        assert scene.regions is not None
+        page.do("click", on="kcgs-image")
+        page.do("press", key="Enter", on="kcgs-image")
+        (_, click), (_, enter) = [event for event in page.evaluate("kcgs.events") if event[0] == "regionclick"]
+        assert click["id"] == enter["id"] == int(scene.regions.labels[30, 45])
+
+    def test_a_page_of_many_frees_what_it_leaves(self, page: Browser, site: tuple[Path, str]) -> None:
+        scene = show(page, site, random_scene("soft"))
+        for _ in range(3):
+            show(page, site, random_scene("soft"), 'renderer="webgl2"')
+        check(page, scene.render())
+
+
+class TestPage:
+    def test_opens_from_disk_and_asks_nothing(self, browser: Browser, node_modules: Path, tmp_path: Path) -> None:
+        scene = random_scene("pairs")
+        path = tmp_path / "page.html"
+        path.write_text(scene_page(scene, title='"Cells" & more'), encoding="utf-8")
+        browser.do("open", url=path.as_uri())
+        browser.do("wait", expression="document.querySelector('#note').textContent.includes('Gaussians')")
+        assert browser.evaluate("document.title") == '"Cells" & more'
+        browser.evaluate("document.querySelector('kcgs-image').settled()")
+        assert browser.evaluate("document.querySelector('kcgs-image').renderer") == "cpu"
+        browser.do("click", on="#bar button:last-of-type")
+        assert len(browser.do("text", on="#regions").split("Region")) == scene.regions.num_regions + 1  # type: ignore[union-attr]
+        browser.do("click", on="#regions label:nth-child(1) input")
+        browser.do("click", on="#bar button:nth-of-type(2)")
+        browser.evaluate("document.querySelector('kcgs-image').settled()")
+        assert browser.evaluate("document.querySelector('kcgs-image').view.scale") > 1
+        assert browser.do("requests") == [path.as_uri()] and browser.do("problems") == []
+
+
+class TestSources:
+    def test_small_enough(self, site: tuple[Path, str]) -> None:
+        assert len(gzip.compress((site[0] / "kcgs-image.js").read_bytes(), 9)) <= MOST_BYTES
+
+    def test_the_page_that_python_has_is_the_one_that_is_built(self, node_modules: Path, tmp_path: Path) -> None:
+        done = npm("run", "build:page", "--", "--outDir", str(tmp_path))
+        assert done.returncode == 0, done.stdout + done.stderr
+        fresh, ours = (folder.joinpath("page.js").read_text() for folder in (tmp_path, PAGE))
+        assert fresh == ours, "run npm --prefix export/web run build:page, and commit kcgs/page/page.js"
+
+    def test_the_package(self, node_modules: Path, tmp_path: Path) -> None:
+        done = npm("run", "build:element")
+        assert done.returncode == 0, done.stdout + done.stderr
+        done = npm("pack", "--prefix", "element", "--json", "--pack-destination", str(tmp_path), "./element")
+        assert done.returncode == 0, done.stdout + done.stderr
+        (packed,) = json.loads(done.stdout)
+        names = {file["path"] for file in packed["files"]}
+        assert {"package.json", "README.md", "dist/kcgs-image.js", "dist/types/element/index.d.ts"} <= names
+        assert not any(name.endswith((".ts",)) and not name.endswith(".d.ts") for name in names)
+        package = json.loads((WEB / "element" / "package.json").read_text())
+        assert "dependencies" not in package
