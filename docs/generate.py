@@ -27,6 +27,7 @@ PACKAGES = (
     "kcgs.codec",
     "kcgs.segment",
     "kcgs.onnx",
+    "kcgs.page",
     "kcgs.data",
     "kcgs.engine",
 )

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 from urllib.parse import quote, urlencode
 
 from kcgs._shipped import shipped_folder
-from kcgs.page import page_html, web_bytes
+from kcgs.page.html import page_html, web_bytes
 from kcgs.scene import Scene
 
 _DECODER_PAGE = shipped_folder("web", checkout="export/web/dist")

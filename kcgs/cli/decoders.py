@@ -72,7 +72,7 @@ def _write_page(scene: Path, output: Path, contours: str) -> dict[str, object]:
     """Write the page of a scene file; a `.kcgs` file is kept as it is."""
     from kcgs import load
     from kcgs._atomic import atomic_path
-    from kcgs.page import scene_page, web_bytes
+    from kcgs.page.html import scene_page, web_bytes
 
     loaded = load(scene)
     data = scene.read_bytes() if scene.suffix == ".kcgs" else web_bytes(loaded)

@@ -1,5 +1,5 @@
 """A scene as one web page, which needs no server and no network."""
 
-from .html import page_html, scene_page, web_bytes
+from .html import scene_page
 
-__all__ = ["page_html", "scene_page", "web_bytes"]
+__all__ = ["scene_page"]
