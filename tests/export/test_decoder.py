@@ -33,6 +33,10 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     vite = WEB / "node_modules" / "vite" / "bin" / "vite.js"
     if not vite.exists():
         pytest.skip("export/web has no node_modules, with which its decoder is built: npm --prefix export/web ci")
+    program, sources = WEB / "decoder" / "program.wasm", (WEB / "decoder" / "assembly").glob("*.ts")
+    if not program.exists() or program.stat().st_mtime < max(source.stat().st_mtime for source in sources):
+        done = subprocess.run(["npm", "run", "wasm"], cwd=WEB, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stdout + done.stderr
     folder = tmp_path_factory.mktemp("decoder")
     command = ["node", str(vite), "build", "--config", "decoder/vite.config.ts", "--outDir", str(folder)]
     done = subprocess.run(command, cwd=WEB, capture_output=True, text=True, timeout=120)

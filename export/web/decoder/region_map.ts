@@ -27,8 +27,7 @@ export function readRegionMap(bytes: Uint8Array, header: Header): ReadMap {
   if (height * width > MOST_LABELS)
     throw new DecodeError(`a map must have at most ${MOST_LABELS} labels; got ${height} x ${width}`);
   const stream = reader.take(reader.varint("length of the labels", 1, bytes.length));
-  const { ids, labels } = readLabels(stream, height, width, labelModel, header.regions);
-  const met = countRegions(labels, ids.length);
+  const { ids, labels, met } = readLabels(stream, height, width, labelModel, header.regions);
   if (met !== header.regions) throw new DecodeError(`the map must have ${header.regions} regions; got ${met}`);
   const count = reader.varint("contour widths", 1, Math.min(MOST_WIDTH + 1, bytes.length));
   const widths = Array.from({ length: count }, () => reader.varint("a contour width", 0, MOST_WIDTH) / FORTIETHS);
@@ -38,12 +37,6 @@ export function readRegionMap(bytes: Uint8Array, header: Header): ReadMap {
     count > 1 ? readPairs(reader.take(reader.left), touchingPairs(labels, width, ids.length), ids.length, widths) : [];
   const map = { supersample: k, labels, ids: Float64Array.from(ids, Number), softness: count > 1 ? null : widths[0]! };
   return { map: { ...map, pairs }, ids };
-}
-
-function countRegions(labels: Int32Array, regions: number): number {
-  const met = new Uint8Array(regions);
-  for (const label of labels) met[label] = 1;
-  return met.reduce((sum, one) => sum + one, 0);
 }
 
 /** Read the width of each pair. */

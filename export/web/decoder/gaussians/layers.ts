@@ -5,6 +5,7 @@ import { AdaptiveNumber } from "../models/adaptive_number.ts";
 import { AdaptiveSymbol } from "../models/adaptive_symbol.ts";
 import { type Cells, Occupancy } from "../models/occupancy.ts";
 import type { Header } from "../header.ts";
+import { startProgram } from "../program.ts";
 import { RangeDecoder } from "../range_decoder.ts";
 import { DecodeError } from "../scene.ts";
 import { angles, LEAST_SIZE, MOST_SIZE, places, Quantizer, restoreColor, restoreShape, type Steps } from "./quantizer.ts";
@@ -37,6 +38,7 @@ export class LayerDecoder {
     new AdaptiveMagnitude(HUE2, 3),
   ] as const;
   private readonly strays = new AdaptiveSymbol(STRAYS);
+  private readonly program = startProgram();
 
   constructor(
     private readonly header: Header,
@@ -49,7 +51,7 @@ export class LayerDecoder {
 
   /** Read a layer of one class of energy, of at most so many Gaussians. */
   read(bytes: Uint8Array, energy: number, most: number): Layer {
-    const decoder = new RangeDecoder(bytes);
+    const decoder = new RangeDecoder(bytes, this.program);
     const steps = this.quantizer.steps(energy);
     const classes = this.readClasses(decoder, most);
     const count = classes.reduce((sum, { cells }) => sum + cells.row.length, 0);

@@ -1,8 +1,8 @@
 import tables from "../../../../kcgs/codec/labels/prior.bin?url&inline";
 import { unpack } from "../inline.ts";
-import { Network } from "./network.ts";
+import type { LabelModel } from "./pixels.ts";
 
-let network: Network | undefined;
+let model: LabelModel | undefined;
 
 /** The label model of scenes. */
-export const labelModel = (): Network => (network ??= new Network(unpack(tables), [48, 16]));
+export const labelModel = (): LabelModel => (model ??= { tables: unpack(tables), units: [48, 16] });

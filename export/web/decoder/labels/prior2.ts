@@ -1,8 +1,8 @@
 import tables from "../../../../kcgs/codec/labels/prior2.bin?url&inline";
 import { unpack } from "../inline.ts";
-import { Network } from "./network.ts";
+import type { LabelModel } from "./pixels.ts";
 
-let network: Network | undefined;
+let model: LabelModel | undefined;
 
 /** The label model of files of label maps. */
-export const labelModelOfFiles = (): Network => (network ??= new Network(unpack(tables), [96, 32]));
+export const labelModelOfFiles = (): LabelModel => (model ??= { tables: unpack(tables), units: [96, 32] });

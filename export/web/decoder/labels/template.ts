@@ -13,21 +13,19 @@ const REACH = [
 
 type Place = readonly [dx: number, dy: number];
 
-/** Row by row. */
-const PLACES: readonly Place[] = REACH.flatMap(([first, last], row) =>
-  Array.from({ length: last - first + 1 }, (_, i) => [first + i, row ? -row : 0] as const),
-);
-
 /** By distance. */
-export const TEMPLATE: readonly Place[] = [...PLACES].sort(
+export const TEMPLATE: readonly Place[] = REACH.flatMap(([first, last], row) =>
+  Array.from({ length: last - first + 1 }, (_, i) => [first + i, row ? -row : 0] as const),
+).sort(
   ([ax, ay], [bx, by]) => ax * ax + ay * ay - bx * bx - by * by || by - ay || ax - bx,
 );
 
-/** Neighbours in a row, up to four, as places of the template: most are of one label, which says nothing. */
+/** Neighbours in a row, up to four, as places of the template; 255 where there is none. */
 export const GROUPS: readonly (readonly number[])[] = REACH.flatMap(([first, last], row) =>
   Array.from({ length: Math.ceil((last - first + 1) / 4) }, (_, group) =>
-    PLACES.filter(([dx, dy]) => dy === (row ? -row : 0) && (dx - first) >> 2 === group).map((place) =>
-      TEMPLATE.indexOf(place),
-    ),
+    [0, 1, 2, 3].map((i) => {
+      const place = TEMPLATE.findIndex(([dx, dy]) => dx === first + 4 * group + i && dy === (row ? -row : 0));
+      return place < 0 ? 255 : place;
+    }),
   ),
 );

@@ -1,4 +1,4 @@
-import { beginnings, type RangeDecoder } from "../range_decoder.ts";
+import type { RangeDecoder } from "../range_decoder.ts";
 
 const BINS = 24;
 const PARTS = 256;
@@ -20,9 +20,9 @@ export class AdaptiveMagnitude {
 
   /** Read a group of sizes, one for each context. */
   read(decoder: RangeDecoder, scale: number, contexts: Uint8Array): Int32Array {
-    const begins = this.shapes.map((shape) => beginnings(weights(shape, scale)));
+    this.shapes.forEach((shape, context) => decoder.prepare(context, weights(shape, scale)));
     const sizes = new Int32Array(contexts.length);
-    for (let i = 0; i < sizes.length; i++) sizes[i] = decoder.categorical(begins[contexts[i]!]!);
+    for (let i = 0; i < sizes.length; i++) sizes[i] = decoder.categorical(contexts[i]!);
     for (let i = 0; i < sizes.length; i++) {
       const bucket = sizes[i]!;
       sizes[i] = BOUNDS[bucket]! + decoder.uniform(BOUNDS[bucket + 1]! - BOUNDS[bucket]!);
@@ -67,10 +67,11 @@ function weights(shape: Float64Array, scale: number): Float64Array {
     return sums[bin]! + share * (sums[bin + 1]! - sums[bin]!);
   };
   let before = rise(0);
-  return new Float64Array(BUCKETS).map((_, bucket) => {
+  const found = new Float64Array(BUCKETS);
+  for (let bucket = 0; bucket < BUCKETS; bucket++) {
     const after = rise(BOUNDS[bucket + 1]! - 0.5);
-    const weight = after - before + (0.001 * total) / BUCKETS;
+    found[bucket] = after - before + (0.001 * total) / BUCKETS;
     before = after;
-    return weight;
-  });
+  }
+  return found;
 }

@@ -1,4 +1,5 @@
-import { beginnings, type RangeDecoder } from "../range_decoder.ts";
+import type { RangeDecoder } from "../range_decoder.ts";
+
 
 /** One of a few symbols, with the weights that they have at first. */
 export class AdaptiveSymbol {
@@ -10,17 +11,15 @@ export class AdaptiveSymbol {
 
   /** Read a group of symbols, which are learned from together. */
   read(decoder: RangeDecoder, count: number): Int32Array {
-    const begins = beginnings(this.weights);
+    decoder.prepare(0, this.weights);
     const found = new Int32Array(count);
-    for (let i = 0; i < count; i++) found[i] = decoder.categorical(begins);
-    for (const symbol of found) this.weights[symbol]! += 1;
+    for (let i = 0; i < count; i++) found[i] = decoder.categorical(0);
+    for (let i = 0; i < count; i++) this.weights[found[i]!]! += 1;
     return found;
   }
 
   /** Read a symbol that is coded alone. */
   readOne(decoder: RangeDecoder): number {
-    const symbol = decoder.categorical(beginnings(this.weights));
-    this.weights[symbol]! += 1;
-    return symbol;
+    return this.read(decoder, 1)[0]!;
   }
 }

@@ -1,11 +1,10 @@
 /** The number of Gaussians in each cell of a grid over the image (docs/format.md, "Occupancy"). */
 
-import { beginnings, type RangeDecoder } from "../range_decoder.ts";
+import type { RangeDecoder } from "../range_decoder.ts";
 import { DecodeError } from "../scene.ts";
 import { AdaptiveNumber } from "./adaptive_number.ts";
 
 const MOST_MARGIN = 255;
-const FULL = 7; // a cell with this many has another symbol
 
 /** For each Gaussian of a class the column and the row of its cell; in order, row by row. */
 export interface Cells {
@@ -37,27 +36,42 @@ export class Occupancy {
     const wide = columns + 2 * margin;
     const cells = rows * columns;
     const ring = (rows + 2 * margin) * wide - cells;
-    const inside = readCounts(decoder, Math.max(count * (1 - share), 0.01) / cells, cells, count);
+    const inside = readCells(decoder, Math.max(count * (1 - share), 0.01) / cells, cells, count);
     const left = count - inside.length;
-    const outside = readCounts(decoder, Math.max(count * share, 0.01) / Math.max(ring, 1), ring, left);
+    const outside = readCells(decoder, Math.max(count * share, 0.01) / Math.max(ring, 1), ring, left);
     if (outside.length < left)
       throw new DecodeError(`cells must hold ${count} Gaussians; got ${inside.length + outside.length}`);
     if (margin) {
       this.outside += outside.length;
       this.all += count;
     }
-    const place = new Float64Array(count);
-    inside.forEach((cell, i) => {
-      place[i] = (Math.floor(cell / columns) + margin) * wide + (cell % columns) + margin;
-    });
-    outside.forEach((cell, i) => (place[inside.length + i] = placeOutside(cell, rows, columns, margin)));
-    if (margin) place.sort();
-    return {
-      side,
-      column: Int32Array.from(place, (at) => (at % wide) - margin),
-      row: Int32Array.from(place, (at) => Math.floor(at / wide) - margin),
-    };
+    const column = new Int32Array(count);
+    const row = new Int32Array(count);
+    const place = merge(inside, outside, rows, columns, margin);
+    for (let i = 0; i < count; i++) {
+      row[i] = Math.floor(place[i]! / wide) - margin;
+      column[i] = (place[i]! % wide) - margin;
+    }
+    return { side, column, row };
   }
+}
+
+/** Where cells inside and outside are among all cells, row by row, in order. */
+function merge(
+  inside: Uint32Array,
+  outside: Uint32Array,
+  rows: number,
+  columns: number,
+  margin: number,
+): Float64Array {
+  const place = new Float64Array(inside.length + outside.length);
+  for (let i = 0; i < inside.length; i++) {
+    const cell = inside[i]!;
+    place[i] = cell + margin * (columns + 2 * margin) + (2 * Math.floor(cell / columns) + 1) * margin;
+  }
+  for (let i = 0; i < outside.length; i++)
+    place[inside.length + i] = placeOutside(outside[i]!, rows, columns, margin);
+  return outside.length ? place.sort() : place;
 }
 
 /** The side of the cells of so many Gaussians, a power of two. */
@@ -87,35 +101,14 @@ function placeOutside(cell: number, rows: number, columns: number, margin: numbe
 }
 
 /** Read which of the cells each Gaussian lies in, in order; there are at most so many. */
-function readCounts(decoder: RangeDecoder, rate: number, cells: number, most: number): Float64Array {
+function readCells(decoder: RangeDecoder, rate: number, cells: number, most: number): Uint32Array {
   const p = rate / (1 + rate);
-  const weights = [1 - p];
-  for (let i = 0; i < FULL; i++) weights.push(weights[i]! * p);
-  weights[FULL]! /= 1 - p;
-  const begins = beginnings(weights);
-  const occupied: number[] = [];
-  const counts: number[] = [];
-  let left = most;
-  const add = (count: number): number => {
-    left -= count;
-    if (left < 0) throw new DecodeError(`cells must hold ${most} Gaussians; got more`);
-    return count;
-  };
-  for (let cell = 0; cell < cells; cell++) {
-    const count = decoder.categorical(begins);
-    if (count === 0) continue;
-    occupied.push(cell);
-    counts.push(add(count));
-  }
-  let full = counts.flatMap((count, i) => (count === FULL ? [i] : []));
-  while (full.length)
-    full = full.filter((i) => {
-      const more = add(decoder.categorical(begins));
-      counts[i]! += more;
-      return more === FULL;
-    });
-  const found = new Float64Array(most - left);
-  let start = 0;
-  counts.forEach((count, i) => found.fill(occupied[i]!, start, (start += count)));
-  return found;
+  const weights = new Float64Array(8);
+  weights[0] = 1 - p;
+  for (let i = 1; i < 8; i++) weights[i] = weights[i - 1]! * p;
+  weights[7]! /= 1 - p;
+  decoder.prepare(0, weights);
+  const { program } = decoder;
+  const count = program.readCells(0, cells, most);
+  return new Uint32Array(program.memory.buffer, program.cells.value, count).slice();
 }

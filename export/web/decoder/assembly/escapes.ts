@@ -1,0 +1,59 @@
+// Labels of seeds, and of pixels that have neither candidate (docs/format.md, "Pixels").
+
+import { adaptiveBits, readAdaptive } from "./adaptive_bit";
+import { label, stride } from "./margins";
+import { allot, fail, MANY_ESCAPES, NO_REGION } from "./memory";
+import { number } from "./range_decoder";
+
+const MOST: i32 = 1 << 18; // more take minutes
+const RANKS: i32 = 3;
+const FAR: i32 = 32;
+
+let regions: i32 = 0;
+let met: i32 = 1;
+let count: i32 = 0;
+let fresh: usize = 0; // [2] of seeds, of others
+let ranks: usize = 0; // [2, RANKS]
+let found: usize = 0; // [RANKS] i32
+
+export function openEscapes(all: i32): void {
+  regions = all;
+  fresh = adaptiveBits(2);
+  ranks = adaptiveBits(2 * RANKS);
+  found = allot(4 * RANKS);
+}
+
+/** Read the label of pixel (x, y) with these candidates; a seed has one, and -1. */
+export function readEscape(y: i32, x: i32, first: i32, second: i32): i32 {
+  if (++count > MOST) fail(MANY_ESCAPES);
+  const kind = second < 0 ? 0 : 1;
+  if (met < regions && readAdaptive(fresh, kind)) return met++;
+  const most = listNearest(y, x, first, second);
+  for (let rank = 0; rank < most; rank++)
+    if (readAdaptive(ranks, kind * RANKS + rank)) return load<i32>(found + 4 * rank);
+  const escaped = <i32>number(met);
+  if (escaped >= met) fail(NO_REGION);
+  return escaped;
+}
+
+/** List up to three labels other than the candidates, by distance from a pixel; return how many. */
+function listNearest(y: i32, x: i32, first: i32, second: i32): i32 {
+  let listed = 0;
+  for (let radius = 1; radius <= FAR; radius++)
+    for (let dy = -min(radius, y); dy <= 0; dy++) {
+      const step = dy === -radius ? 1 : 2 * radius;
+      for (let dx = -radius; dx <= radius && dx < -8 * dy; dx += step) {
+        if (x + dx < 0 || x + dx >= stride) continue;
+        const near = label(y + dy, x + dx);
+        if (near === first || near === second || isListed(near, listed)) continue;
+        store<i32>(found + 4 * listed, near);
+        if (++listed === RANKS) return listed;
+      }
+    }
+  return listed;
+}
+
+function isListed(near: i32, listed: i32): bool {
+  for (let i = 0; i < listed; i++) if (load<i32>(found + 4 * i) === near) return true;
+  return false;
+}

@@ -1,0 +1,51 @@
+/** The program that `assembly` is compiled to. */
+
+import { unpack } from "./inline.ts";
+import program from "./program.wasm?url&inline";
+import { DecodeError } from "./scene.ts";
+
+/** `assembly/index.ts`; addresses are in its memory. */
+export interface Program {
+  readonly memory: WebAssembly.Memory;
+  readonly weights: WebAssembly.Global<"i32">;
+  readonly cells: WebAssembly.Global<"i32">;
+  readonly met: WebAssembly.Global<"i32">;
+  allot(bytes: number): number;
+  open(stream: number, bytes: number): void;
+  uniform(n: number): number;
+  prepare(table: number, values: number): void;
+  categorical(table: number, values: number): number;
+  readCells(table: number, cells: number, most: number): number;
+  model(tables: number, a: number, b: number, groups: number, squash: number, stretch: number): void;
+  readLabels(height: number, width: number, regions: number, template: number, positions: number): number;
+}
+
+// by the numbers of `assembly/memory.ts`
+const PROBLEMS = [
+  "data must be an encoder's stream; got bytes that no encoder wrote",
+  "data must mark at most the pixels of the map; got more",
+  "data must mark pixels of the map",
+  `data must ask for at most ${2 ** 23} pixels near contours; got more`,
+  `data must hold at most ${2 ** 18} labels that no neighbour has; got more`,
+  "data must hold labels of regions that were met; got another",
+  "cells must hold the Gaussians of their class; got more",
+  "the file needs more memory than there is",
+];
+
+let compiled: WebAssembly.Module | undefined;
+
+/** Start the program, with memory of its own, which does not shrink. */
+export function startProgram(): Program {
+  compiled ??= new WebAssembly.Module(unpack(program));
+  const fail = (problem: number): never => {
+    throw new DecodeError(PROBLEMS[problem]!);
+  };
+  return new WebAssembly.Instance(compiled, { decoder: { fail } }).exports as unknown as Program;
+}
+
+/** Put numbers into the program's memory; return where. */
+export function put({ memory, allot }: Program, array: Uint8Array | Int8Array | Int32Array): number {
+  const at = allot(array.byteLength);
+  new Uint8Array(memory.buffer, at).set(new Uint8Array(array.buffer, array.byteOffset, array.byteLength));
+  return at;
+}
