@@ -104,3 +104,11 @@ def serving(folder: Path) -> Iterator[str]:
 
 def npm(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["npm", *arguments], cwd=WEB, capture_output=True, text=True, timeout=600)
+
+
+def compile_decoder() -> None:
+    """Make the decoder's WebAssembly, where it is missing or older than its sources."""
+    program, sources = WEB / "decoder" / "program.wasm", (WEB / "decoder" / "assembly").glob("*.ts")
+    if not program.exists() or program.stat().st_mtime < max(source.stat().st_mtime for source in sources):
+        done = npm("run", "wasm")
+        assert done.returncode == 0, done.stdout + done.stderr

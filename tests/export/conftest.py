@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from .browser import WEB, npm
+from .browser import WEB, compile_decoder, npm
 
 
 @pytest.fixture(scope="session")
@@ -28,4 +28,5 @@ def node_modules(chromium: str) -> Path:
         done = npm("ci", "--no-audit", "--no-fund")
         if done.returncode != 0:
             pytest.skip(f"npm ci failed, so the page cannot be built: {done.stderr.strip()[-500:]}")
+    compile_decoder()
     return installed.parent

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from kcgs.codec import CodecError, decode, decode_labels
 
-WEB = Path(__file__).resolve().parents[2] / "export" / "web"
+from .browser import WEB
+
 SECONDS = 20  # within which any file must be decoded or refused
 
 

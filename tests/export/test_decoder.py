@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 import shutil
-import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 import torch
 
-from kcgs import GaussianField, RegionMap, Scene, codec, load
-from kcgs.codec import encode
+from kcgs import GaussianField, RegionMap, Scene, codec, fit, load
+from kcgs.codec import decode, encode
 from kcgs.codec.file import pack, unpack
+from kcgs.data import load_image, load_labels
 from kcgs.functional.labels import touching_pairs
 
-from .decoding import WEB, Node, check_same
+from .browser import WEB, Browser, compile_decoder, npm, serving
+from .decoding import Node, check_same, scene_of
 
 MODELS = WEB.parents[1] / "models"
 GOLDEN = WEB.parents[1] / "tests" / "codec" / "golden.kcgs"
@@ -30,18 +32,51 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The decoder, built as `npm run build` builds it."""
     if shutil.which("node") is None:
         pytest.skip("node is not installed")
-    vite = WEB / "node_modules" / "vite" / "bin" / "vite.js"
-    if not vite.exists():
+    if not (WEB / "node_modules" / "vite").exists():
         pytest.skip("export/web has no node_modules, with which its decoder is built: npm --prefix export/web ci")
-    program, sources = WEB / "decoder" / "program.wasm", (WEB / "decoder" / "assembly").glob("*.ts")
-    if not program.exists() or program.stat().st_mtime < max(source.stat().st_mtime for source in sources):
-        done = subprocess.run(["npm", "run", "wasm"], cwd=WEB, capture_output=True, text=True, timeout=120)
-        assert done.returncode == 0, done.stdout + done.stderr
+    compile_decoder()
     folder = tmp_path_factory.mktemp("decoder")
-    command = ["node", str(vite), "build", "--config", "decoder/vite.config.ts", "--outDir", str(folder)]
-    done = subprocess.run(command, cwd=WEB, capture_output=True, text=True, timeout=120)
+    done = npm("exec", "--", "vite", "build", "--config", "decoder/vite.config.ts", "--outDir", str(folder))
     assert done.returncode == 0, done.stdout + done.stderr
     return folder
+
+
+PAGE = """<!doctype html>
+<script type="module">
+import { decode } from "./decoder.js";
+import { attempt, describeScene } from "./describe.mjs";
+const bytes = async (url) => new Uint8Array(await (await fetch(url)).arrayBuffer());
+window.kcgs = {
+  ready: Promise.resolve(),
+  describe: async (url) => { const file = await bytes(url); return attempt(() => describeScene(decode(file))); },
+  time: async (url, count) => {
+    const file = await bytes(url);
+    return Array.from({ length: count }, () => {
+      const start = performance.now();
+      decode(file);
+      return performance.now() - start;
+    });
+  },
+};
+</script>
+"""
+
+
+@pytest.fixture(scope="module")
+def site(bundle: Path) -> Iterator[tuple[Path, str]]:
+    """A page with the decoder, and its address."""
+    shutil.copy(WEB / "test" / "describe.mjs", bundle)
+    (bundle / "index.html").write_text(PAGE)
+    with serving(bundle) as address:
+        yield bundle, address
+
+
+@pytest.fixture(scope="module")
+def browser(chromium: str, site: tuple[Path, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    driven = Browser(chromium, tmp_path_factory.mktemp("browser") / "errors.txt")
+    driven.do("goto", url=site[1])
+    yield driven
+    driven.close()
 
 
 @pytest.fixture(scope="module")
@@ -224,3 +259,32 @@ class TestProgressive:
         part.pop("memory")
         assert last["error"] == "DecodeError" and "the file ends early, with" in last["message"]
         assert last["partial"] == part and part["complete"] is False
+
+
+class TestChromium:
+    def test_golden_and_random_scenes(self, browser: Browser, site: tuple[Path, str]) -> None:
+        for data in (GOLDEN.read_bytes(), *(encode(random_scene(seed)) for seed in range(300, 308))):
+            (site[0] / "scene.kcgs").write_bytes(data)
+            assert browser.evaluate("kcgs.describe('scene.kcgs')") == scene_of(data)
+
+    def test_damage(self, browser: Browser, site: tuple[Path, str]) -> None:
+        (site[0] / "scene.kcgs").write_bytes(GOLDEN.read_bytes()[:-1] + b"?")
+        assert browser.evaluate("kcgs.describe('scene.kcgs')")["error"] == "DecodeError"
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize(("count", "most"), [(1250, 50), (7500, 150)])
+    def test_speed(self, browser: Browser, site: tuple[Path, str], data_root: Path, count: int, most: float) -> None:
+        frame, mask = (data_root / "DAVIS" / kind / "480p" / "dog" for kind in ("JPEGImages", "Annotations"))
+        image, labels = load_image(frame / "00000.jpg"), load_labels(mask / "00000.png")
+        file = encode(fit(image, labels, count, iterations=200).scene)
+        (site[0] / "speed.kcgs").write_bytes(file)
+        browser.do("goto", url=site[1])
+        first, *others = browser.evaluate("kcgs.time('speed.kcgs', 12)")
+        python = []
+        for _ in range(8):
+            start = time.perf_counter()
+            decode(file)
+            python.append(1000 * (time.perf_counter() - start))
+        print(f"{count}: first {first:.0f} ms, then {min(others):.1f}; Python {python[0]:.0f}, then {min(python):.1f}")
+        assert min(others) <= min(most, *python)
+        assert first <= 2 * most  # the page's first, which nothing has made fast yet, on a machine that may be busy
