@@ -1,7 +1,7 @@
 /** The program that `assembly` is compiled to. */
 
-import { unpack } from "./inline.ts";
-import program from "./program.wasm?url&inline";
+import { unpack } from "./packed_text.ts";
+import program from "./program.wasm?packed";
 import { DecodeError } from "./scene.ts";
 
 /** `assembly/index.ts`; addresses are in its memory. */

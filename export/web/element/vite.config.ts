@@ -2,6 +2,8 @@ import { fileURLToPath } from "node:url";
 
 import { defineConfig } from "vite";
 
+import { packed } from "../decoder/packed.ts";
+
 const path = (name: string): string => fileURLToPath(new URL(name, import.meta.url));
 
 // The element with renderer and decoder: a module of a package, or, with `--mode page`, the script of the page that
@@ -9,6 +11,7 @@ const path = (name: string): string => fileURLToPath(new URL(name, import.meta.u
 export default defineConfig(({ mode }) => ({
   root: path("."),
   publicDir: false,
+  plugins: [packed()],
   build: {
     target: "es2022",
     outDir: mode === "page" ? path("../../../kcgs/page") : path("dist"),

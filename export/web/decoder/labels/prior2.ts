@@ -1,5 +1,5 @@
-import tables from "../../../../kcgs/codec/labels/prior2.bin?url&inline";
-import { unpack } from "../inline.ts";
+import tables from "../../../../kcgs/codec/labels/prior2.bin?packed";
+import { unpack } from "../packed_text.ts";
 import type { LabelModel } from "./pixels.ts";
 
 let model: LabelModel | undefined;
