@@ -271,6 +271,16 @@ class TestChromium:
         (site[0] / "scene.kcgs").write_bytes(GOLDEN.read_bytes()[:-1] + b"?")
         assert browser.evaluate("kcgs.describe('scene.kcgs')")["error"] == "DecodeError"
 
+    def test_a_policy_without_webassembly_is_named(self, browser: Browser, site: tuple[Path, str]) -> None:
+        policy = "<meta http-equiv=\"Content-Security-Policy\" content=\"script-src 'self' 'nonce-a'\">"
+        page = PAGE.replace("<script", f'{policy}<script nonce="a"')
+        (site[0] / "strict.html").write_text(page)
+        (site[0] / "scene.kcgs").write_bytes(GOLDEN.read_bytes())
+        browser.do("goto", url=site[1] + "strict.html")
+        answer = browser.evaluate("kcgs.describe('scene.kcgs')")
+        browser.do("goto", url=site[1])
+        assert answer["error"] == "DecodeError" and "'wasm-unsafe-eval'" in answer["message"]
+
     @pytest.mark.slow
     @pytest.mark.parametrize(("count", "most"), [(1250, 50), (7500, 150)])
     def test_speed(self, browser: Browser, site: tuple[Path, str], data_root: Path, count: int, most: float) -> None:

@@ -34,9 +34,19 @@ const PROBLEMS = [
 
 let compiled: WebAssembly.Module | undefined;
 
+function compile(): WebAssembly.Module {
+  try {
+    return new WebAssembly.Module(unpack(program));
+  } catch (error) {
+    throw new DecodeError(
+      `the decoder needs WebAssembly with SIMD, which a Content-Security-Policy allows by 'wasm-unsafe-eval'; ${error}`,
+    );
+  }
+}
+
 /** Start the program, with memory of its own, which does not shrink. */
 export function startProgram(): Program {
-  compiled ??= new WebAssembly.Module(unpack(program));
+  compiled ??= compile();
   const fail = (problem: number): never => {
     throw new DecodeError(PROBLEMS[problem]!);
   };
