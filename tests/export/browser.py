@@ -9,6 +9,7 @@ import json
 import queue
 import subprocess
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -73,10 +74,19 @@ def array(packed: dict[str, Any]) -> NDArray[np.float32]:
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """A plain static server; below /isolated/ with the two headers that allow threads."""
+    """A plain static server; below /isolated/ with the two headers that allow threads, below /slow/ in two halves."""
 
     def translate_path(self, path: str) -> str:
-        return super().translate_path(path.removeprefix("/isolated"))
+        return super().translate_path(path.removeprefix("/isolated").removeprefix("/slow"))
+
+    def copyfile(self, source: Any, outputfile: Any) -> None:
+        data = source.read()
+        half = len(data) // 2 if self.path.startswith("/slow/") else len(data)
+        outputfile.write(data[:half])
+        outputfile.flush()
+        if half < len(data):
+            time.sleep(0.5)
+            outputfile.write(data[half:])
 
     def end_headers(self) -> None:
         if getattr(self, "path", "").startswith("/isolated/"):

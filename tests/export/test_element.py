@@ -34,7 +34,7 @@ window.kcgs = { ready: Promise.resolve(), events, async show(markup, wanted = "l
   document.querySelector("#here").innerHTML = markup;
   const image = document.querySelector("kcgs-image");
   for (const name of ["load", "error", "progress", "regionclick"])
-    image.addEventListener(name, (event) => events.push([name, event.message ?? event.detail ?? null]));
+    image.addEventListener(name, (e) => events.push([name, e.message ?? e.detail ?? image.scene?.complete]));
   window.image = image;
   events.length = 0;
   while (!events.some(([name]) => name === "load" || name === "error")) await new Promise((r) => setTimeout(r, 5));
@@ -218,11 +218,26 @@ class TestElement:
         assert page.evaluate(f"[image.offsetHeight, {canvas}.width, {canvas}.height]") == [200, 300, 200]
         assert page.evaluate("document.querySelector('kcgs-image').matches(':focus')") is False
 
+    def test_pixels_of_a_dense_screen(self, page: Browser, site: tuple[Path, str]) -> None:
+        page.do("density", ratio=2.5)
+        try:
+            show(page, site, random_scene("soft"), 'alt="Cells"')
+            canvas = "image.shadowRoot.firstChild"
+            assert page.evaluate(f"[image.offsetWidth, {canvas}.width, {canvas}.height]") == [90, 225, 150]
+        finally:
+            page.do("density", ratio=1)
+
+    def test_what_a_screen_reader_is_told(self, page: Browser, site: tuple[Path, str]) -> None:
+        show(page, site, random_scene("soft"), 'zoom alt="Cells"')
+        assert ["image", "Cells"] in page.do("accessible") and page.evaluate("image.tabIndex") == 0
+        page.evaluate("(image.alt = '', image.setAttribute('alt', ''), 1)")
+        assert "image" not in [role for role, _ in page.do("accessible")]
+
     def test_layers_as_they_arrive(self, page: Browser, site: tuple[Path, str]) -> None:
         show(page, site, load(MODELS / "chelsea-500" / "scene.safetensors"))
-        events = [name for name, _ in page.evaluate("kcgs.events")]
-        assert events[-1] == "load" and "progress" in events and "error" not in events
-        assert page.evaluate("[image.scene.complete, image.scene.count]")[0] is True
+        page.evaluate("kcgs.show('<kcgs-image src=slow/scene.kcgs></kcgs-image>')")
+        first, *_, last = page.evaluate("kcgs.events")
+        assert first == ["progress", False] and last == ["load", True]
 
     def test_a_file_that_ends_early_shows_what_is_whole(self, page: Browser, site: tuple[Path, str]) -> None:
         data = encode(load(MODELS / "chelsea-500" / "scene.safetensors"))
@@ -252,9 +267,8 @@ class TestElement:
             page.evaluate("image.settled()")
             assert (page.evaluate("image.view.scale") > 1.2 * whole) is larger
         page.do("wheel", x=100, y=100, delta=-400)
-        page.evaluate("image.settled()")
-        near, x = page.evaluate("[image.view.scale, image.view.x]")
-        assert near > 1.5 * whole
+        page.do("wait", expression=f"image.view.scale > {1.5 * whole}")
+        near, x = page.evaluate("image.settled().then(() => [image.view.scale, image.view.x])")
         page.do("press", key="ArrowRight", on="kcgs-image")
         assert page.evaluate("image.settled().then(() => image.view.x)") > x
         page.do("pinch", at=[300, 200], **{"from": 60, "to": 180})

@@ -1,4 +1,4 @@
-/** Changes of regions: each takes a scene and gives another. They follow `kcgs.editing`, without its filling of holes. */
+/** Changes of regions: each takes a scene and gives another, as `kcgs.editing` does, without its filling of holes. */
 
 import type { ContourWidth, RegionMap, Scene } from "../decoder/scene.ts";
 

@@ -23,6 +23,8 @@ export interface RegionClick {
 
 // a press that moves farther, in CSS pixels, is no click
 const CLICK = 5;
+// whether the browser tells the pixels of the screen that an element covers, and when they change
+const PIXEL_BOX = "devicePixelContentBoxSize" in ResizeObserverEntry.prototype;
 
 export class KcgsImage extends HTMLElement {
   static readonly observedAttributes = ["src", "alt", "zoom", "regions", "contours", "renderer"];
@@ -38,6 +40,7 @@ export class KcgsImage extends HTMLElement {
   private readonly hiddenIds = new Set<number>();
   private loading: AbortController | null = null;
   private gestures: AbortController | null = null;
+  private density: AbortController | null = null;
   private glide: Glide | null = null;
 
   constructor() {
@@ -47,17 +50,22 @@ export class KcgsImage extends HTMLElement {
     canvas.hidden = true;
     root.append(canvas, this.fallback);
     root.adoptedStyleSheets = [elementStyle(), this.sizes];
-    this.stage = new Stage(canvas, () => this.viewChanged(), (error) => this.fail(error, false));
+    this.stage = new Stage(
+      canvas,
+      () => this.viewChanged(),
+      (error) => this.fail(error, false),
+    );
     this.listenToClicks(canvas);
   }
 
   connectedCallback(): void {
-    this.observer.observe(this.stage.canvas, { box: "content-box" });
+    this.observe();
     if (this.loaded === null && this.loading === null) this.start();
   }
 
   disconnectedCallback(): void {
     this.observer.disconnect();
+    this.density?.abort();
     this.loading?.abort();
     this.loading = null;
   }
@@ -238,9 +246,24 @@ export class KcgsImage extends HTMLElement {
   }
 
   private measure(entry: ResizeObserverEntry): void {
-    const box = entry.contentBoxSize[0]!;
-    const pixels = (length: number): number => Math.max(1, Math.round(length * devicePixelRatio));
-    if (!this.stage.canvas.hidden) this.stage.resize(pixels(box.inlineSize), pixels(box.blockSize));
+    if (this.stage.canvas.hidden) return;
+    const [size, exact] = [entry.contentBoxSize[0]!, PIXEL_BOX ? entry.devicePixelContentBoxSize[0]! : null];
+    const pixels = (length: number, told = NaN): number => {
+      const about = length * devicePixelRatio;
+      // a browser that plays another screen tells the pixels of its own
+      return Math.max(1, Math.abs(told - about) < 1 ? told : Math.round(about));
+    };
+    this.stage.resize(pixels(size.inlineSize, exact?.inlineSize), pixels(size.blockSize, exact?.blockSize));
+  }
+
+  /** Measure the canvas now, and whenever its size or the screen's density changes. */
+  private observe(): void {
+    this.density?.abort();
+    this.density = new AbortController();
+    const { signal } = this.density;
+    matchMedia(`(resolution: ${devicePixelRatio}dppx)`).addEventListener("change", () => this.observe(), { signal });
+    this.observer.disconnect();
+    this.observer.observe(this.stage.canvas, { box: PIXEL_BOX ? "device-pixel-content-box" : "content-box" });
   }
 
   private describe(): void {
@@ -265,7 +288,8 @@ export class KcgsImage extends HTMLElement {
     let pressed: [number, number] = [0, 0];
     canvas.addEventListener("pointerdown", (event) => (pressed = [event.clientX, event.clientY]));
     canvas.addEventListener("click", (event) => {
-      if (Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) < CLICK) this.pick(...this.stage.at(event));
+      if (Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) < CLICK)
+        this.pick(...this.stage.at(event));
     });
     this.addEventListener("keydown", (event) => {
       if (event.key !== "Enter" || event.target !== this) return;

@@ -2,7 +2,7 @@
 
 import { type DecodeError, ProgressiveDecoder, type Scene } from "../decoder/index.ts";
 
-/** Read an address; `found` takes each scene of more whole layers. What is damaged is an error after its whole layers. */
+/** Read an address; `found` takes each scene of more whole layers. Damage is an error, after the whole layers. */
 export async function load(src: string, signal: AbortSignal, found: (scene: Scene) => void): Promise<void> {
   const decoder = new ProgressiveDecoder();
   for await (const bytes of chunks(src, signal)) {

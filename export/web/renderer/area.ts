@@ -3,7 +3,13 @@
 import type { FineAxis } from "./sampling.ts";
 
 /** Shrink (rows, columns, channels) along both axes. */
-export function areaMean(image: Float32Array, channels: number, across: FineAxis, down: FineAxis, size: [number, number]): Float32Array {
+export function areaMean(
+  image: Float32Array,
+  channels: number,
+  across: FineAxis,
+  down: FineAxis,
+  size: [number, number],
+): Float32Array {
   const narrow = across.mean === null ? image : shrink(image, down.count, across, channels, size[1]);
   return down.mean === null ? narrow : shrink(narrow, 1, down, size[1] * channels, size[0]);
 }

@@ -94,7 +94,7 @@ export class Blur {
     const whole = (sums[x1 - x + reach]! - sums[x0 - x + reach]!) * (sums[y1 - y + reach]! - sums[y0 - y + reach]!);
     for (let row = y0; row < y1; row++) {
       const factor = weights[Math.abs(row - y)]! / whole;
-      for (let at = x0; at < x1; ) {
+      for (let at = x0; at < x1;) {
         const region = labels[row * width + at]!;
         const end = Math.min(x1, runEnds[row * width + at]!);
         if (regions[region] === 0) shares.regions.push(region);

@@ -183,7 +183,12 @@ class RunWriter {
     for (let i = 0; i < count; i++) starts[runs[5 * i]! + 1]!++;
     for (let r = 0; r < visible.length; r++) starts[r + 1]! += starts[r]!;
     const next = starts.slice();
-    const [rows, from, to, weights] = [1, 2, 3, 4].map(() => new Int32Array(count)) as [Int32Array, Int32Array, Int32Array, Int32Array];
+    const [rows, from, to, weights] = [1, 2, 3, 4].map(() => new Int32Array(count)) as [
+      Int32Array,
+      Int32Array,
+      Int32Array,
+      Int32Array,
+    ];
     for (let i = 0; i < count; i++) {
       const at = next[runs[5 * i]!]!++;
       rows[at] = runs[5 * i + 1]!;

@@ -28,7 +28,10 @@ export function contourLevels(map: RegionMap, width: number, height: number): Le
 
 /** Give each label that touches a contour the level of that, and -1 to others: above, left, right, below, the first. */
 function touchingLevels(
-  labels: Int32Array, width: number, height: number, levelOf: (a: number, b: number) => number,
+  labels: Int32Array,
+  width: number,
+  height: number,
+  levelOf: (a: number, b: number) => number,
 ): Int32Array {
   const levels = new Int32Array(labels.length).fill(-1);
   for (let y = 0, at = 0; y < height; y++) {

@@ -141,7 +141,7 @@ class Lists {
   }
 }
 
-/** What weights between cells are raised to, `lost` being 1 - cells / pixels of the output; 1 leaves them as they are. */
+/** What weights between cells are raised to; `lost` is 1 - cells / pixels of the output, and 1 changes nothing. */
 export function sharpness(variance: number, lost: number): number {
   const least = Math.max(variance, LEAST_VARIANCE);
   return Math.sqrt((least + lost / 6) / Math.max(least - lost / 12, lost / 24));

@@ -18,8 +18,13 @@ function openGpu(emulated: boolean): WebGl | null {
 
 /** Render a view onto a canvas at (x, y); says what rendered it: "webgl2 float32", "webgl2 float16" or "cpu". */
 export function paint(
-  context: CanvasRenderingContext2D, x: number, y: number,
-  scene: Prepared, view: View, visible: Uint8Array, device: Device,
+  context: CanvasRenderingContext2D,
+  x: number,
+  y: number,
+  scene: Prepared,
+  view: View,
+  visible: Uint8Array,
+  device: Device,
 ): string {
   const gpu = device === "cpu" ? null : openGpu(device === "webgl2");
   if (gpu?.takes(scene)) {

@@ -176,7 +176,10 @@ void main() {
 
 /** A Gaussian's weight at a pixel, times the share that its region has of it. */
 export function splatShader(layers: number): string {
-  const more = layers === 1 ? "" : `
+  const more =
+    layers === 1
+      ? ""
+      : `
   for (int layer = 1; layer < ${layers} && share == 0.0 && slots.w != ${EMPTY}; layer++) {
     slots = texelFetch(contours, ivec3(pixel, layer), 0);
     share = find(slots);

@@ -35,8 +35,14 @@ interface Row {
 const row: Row = { weight: 0, ratio: 0, bend: 0 };
 
 type Add = (
-  image: Float32Array, at: number, count: number, colors: Float32Array, color: number, channels: number,
-  shares: Float32Array | null, share: number,
+  image: Float32Array,
+  at: number,
+  count: number,
+  colors: Float32Array,
+  color: number,
+  channels: number,
+  shares: Float32Array | null,
+  share: number,
 ) => void;
 
 /**
@@ -44,11 +50,22 @@ type Add = (
  * times a constant. In float64 that is off by count^2 rounding errors.
  */
 function addGaussian(
-  image: Float32Array, gaussians: Gaussians, i: number, runs: Runs, rowStarts: Int32Array,
-  top: number, bottom: number, across: FineAxis, down: FineAxis, add: Add,
+  image: Float32Array,
+  gaussians: Gaussians,
+  i: number,
+  runs: Runs,
+  rowStarts: Int32Array,
+  top: number,
+  bottom: number,
+  across: FineAxis,
+  down: FineAxis,
+  add: Add,
 ): void {
   const { means, cholesky, colors, radii, channels } = gaussians;
-  const [x, y] = [(means[2 * i]! - across.start) / across.step - 0.5, (means[2 * i + 1]! - down.start) / down.step - 0.5];
+  const [x, y] = [
+    (means[2 * i]! - across.start) / across.step - 0.5,
+    (means[2 * i + 1]! - down.start) / down.step - 0.5,
+  ];
   const l11 = cholesky[3 * i]! / across.step;
   const [l21, l22] = [cholesky[3 * i + 1]! / down.step, cholesky[3 * i + 2]! / down.step];
   const square = radii[i]! * radii[i]!;
@@ -77,14 +94,29 @@ function addGaussian(
       row.ratio = Math.exp((-0.5 * (2 * t + 1)) / narrow);
       const place = runs.weights[r]!;
       const shares = place < 0 ? null : runs.shares;
-      add(image, (line * across.count + from) * channels, to - from, colors, i * channels, channels, shares, place + from - runs.from[r]!);
+      add(
+        image,
+        (line * across.count + from) * channels,
+        to - from,
+        colors,
+        i * channels,
+        channels,
+        shares,
+        place + from - runs.from[r]!,
+      );
     }
   }
 }
 
 function addColors(
-  image: Float32Array, at: number, count: number, colors: Float32Array, color: number, _: number,
-  shares: Float32Array | null, share: number,
+  image: Float32Array,
+  at: number,
+  count: number,
+  colors: Float32Array,
+  color: number,
+  _: number,
+  shares: Float32Array | null,
+  share: number,
 ): void {
   const [red, green, blue] = [colors[color]!, colors[color + 1]!, colors[color + 2]!];
   let { weight, ratio } = row;
@@ -111,8 +143,14 @@ function addColors(
 }
 
 function addAny(
-  image: Float32Array, at: number, count: number, colors: Float32Array, color: number, channels: number,
-  shares: Float32Array | null, share: number,
+  image: Float32Array,
+  at: number,
+  count: number,
+  colors: Float32Array,
+  color: number,
+  channels: number,
+  shares: Float32Array | null,
+  share: number,
 ): void {
   let { weight, ratio } = row;
   for (let i = 0; i < count; i++) {

@@ -101,7 +101,10 @@ export class WebGl {
       for (let x = 0; x < view.width; x += across) {
         const [width, height] = [Math.min(across, view.width - x), Math.min(down, view.height - y)];
         yield {
-          x, y, width, height,
+          x,
+          y,
+          width,
+          height,
           across: fineAxis(left + x * dx, left + (x + width) * dx, width, scene.width),
           down: fineAxis(top + y * dy, top + (y + height) * dy, height, scene.height),
         };
@@ -124,12 +127,21 @@ export class WebGl {
     gl.useProgram(program.program);
     if (perPixel > 0) {
       const place = (fine: FineAxis, cells: number): Axis =>
-        hard ? hardAxis(fine.start, fine.step, fine.count, cells, perPixel) : softAxis(fine.start, fine.step, fine.count, cells);
+        hard
+          ? hardAxis(fine.start, fine.step, fine.count, cells, perPixel)
+          : softAxis(fine.start, fine.step, fine.count, cells);
       [place(across, width), place(down, height)].forEach((axis, i) => this.uploadAxis(this.axes[i]!, axis));
     }
     const lost = lostOf(across, down);
     const ratio = 1 / (across.step * down.step);
-    program.textures({ heads: map.heads, lists: map.lists, visible: map.visible, columns: this.axes[0], rows: this.axes[1], variances: map.variances });
+    program.textures({
+      heads: map.heads,
+      lists: map.lists,
+      visible: map.visible,
+      columns: this.axes[0],
+      rows: this.axes[1],
+      variances: map.variances,
+    });
     program.float("whole", whole);
     program.float("lost", lost);
     program.float("exponent", crisp !== null ? crispness(crisp, ratio) : lost > 0 ? sharpness(variance, lost) : 1);
@@ -160,10 +172,18 @@ export class WebGl {
   private show(scene: Prepared, { x, y, width, height, across, down }: Part, target: Target, hides: boolean): void {
     const { gl, canvas } = this;
     const { channels } = scene.gaussians;
-    const program = this.program(`show ${target.layers} ${channels}`, FULLSCREEN, () => showShader(target.layers, channels));
+    const program = this.program(`show ${target.layers} ${channels}`, FULLSCREEN, () =>
+      showShader(target.layers, channels),
+    );
     gl.useProgram(program.program);
     program.textures({ sums: target.sums, contours: target.slots });
-    gl.uniform4f(program.uniform("spans"), across.mean?.from ?? 0, across.mean?.span ?? 0, down.mean?.from ?? 0, down.mean?.span ?? 0);
+    gl.uniform4f(
+      program.uniform("spans"),
+      across.mean?.from ?? 0,
+      across.mean?.span ?? 0,
+      down.mean?.from ?? 0,
+      down.mean?.span ?? 0,
+    );
     gl.uniform2i(program.uniform("corner"), x, canvas.height - y - height);
     gl.uniform1i(program.uniform("height"), height);
     gl.uniform1i(program.uniform("hides"), Number(hides));

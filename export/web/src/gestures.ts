@@ -76,7 +76,13 @@ export function listen(
   return glide;
 }
 
-function listenToWheel(canvas: HTMLCanvasElement, place: Place, hands: Hands, glide: Glide, until: AddEventListenerOptions): void {
+function listenToWheel(
+  canvas: HTMLCanvasElement,
+  place: Place,
+  hands: Hands,
+  glide: Glide,
+  until: AddEventListenerOptions,
+): void {
   const turn = (event: WheelEvent): void => {
     event.preventDefault();
     const delta = event.deltaMode === WheelEvent.DOM_DELTA_LINE ? event.deltaY * LINE_HEIGHT : event.deltaY;
@@ -88,29 +94,43 @@ function listenToWheel(canvas: HTMLCanvasElement, place: Place, hands: Hands, gl
   canvas.addEventListener("wheel", turn, { passive: false, ...until });
 }
 
-function listenToPointers(canvas: HTMLCanvasElement, place: Place, hands: Hands, glide: Glide, until: AddEventListenerOptions): void {
+function listenToPointers(
+  canvas: HTMLCanvasElement,
+  place: Place,
+  hands: Hands,
+  glide: Glide,
+  until: AddEventListenerOptions,
+): void {
   const pointers = new Map<number, [x: number, y: number]>();
-  canvas.addEventListener("pointerdown", (event) => {
-    if (event.button !== 0) return;
-    canvas.setPointerCapture(event.pointerId);
-    pointers.set(event.pointerId, place(event));
-    canvas.classList.add("held");
-  }, until);
-  canvas.addEventListener("pointermove", (event) => {
-    const before = pointers.get(event.pointerId);
-    if (before === undefined) return;
-    const now = place(event);
-    pointers.set(event.pointerId, now);
-    const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
-    if (other === undefined) {
-      hands.pan(now[0] - before[0], now[1] - before[1]);
-      return;
-    }
-    const spread = (point: [number, number]): number => Math.hypot(point[0] - other[0], point[1] - other[1]);
-    hands.pan((now[0] - before[0]) / 2, (now[1] - before[1]) / 2);
-    const middle = hands.anchorAt((now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
-    hands.zoom(spread(now) / Math.max(spread(before), 1), middle);
-  }, until);
+  canvas.addEventListener(
+    "pointerdown",
+    (event) => {
+      if (event.button !== 0) return;
+      canvas.setPointerCapture(event.pointerId);
+      pointers.set(event.pointerId, place(event));
+      canvas.classList.add("held");
+    },
+    until,
+  );
+  canvas.addEventListener(
+    "pointermove",
+    (event) => {
+      const before = pointers.get(event.pointerId);
+      if (before === undefined) return;
+      const now = place(event);
+      pointers.set(event.pointerId, now);
+      const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
+      if (other === undefined) {
+        hands.pan(now[0] - before[0], now[1] - before[1]);
+        return;
+      }
+      const spread = (point: [number, number]): number => Math.hypot(point[0] - other[0], point[1] - other[1]);
+      hands.pan((now[0] - before[0]) / 2, (now[1] - before[1]) / 2);
+      const middle = hands.anchorAt((now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
+      hands.zoom(spread(now) / Math.max(spread(before), 1), middle);
+    },
+    until,
+  );
   const lift = (event: PointerEvent): void => {
     pointers.delete(event.pointerId);
     canvas.classList.toggle("held", pointers.size > 0);

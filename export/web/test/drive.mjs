@@ -38,6 +38,7 @@ context.setDefaultTimeout(TIMEOUT);
 const page = context.pages()[0] ?? (await context.newPage());
 const requests = [];
 const problems = [];
+let dense = null;
 page.on("request", (request) => requests.push(request.url()));
 page.on("pageerror", (error) => problems.push(String(error)));
 page.on("console", (message) => message.type() === "error" && problems.push(message.text()));
@@ -93,7 +94,10 @@ const actions = {
   pinch: async ({ at: [x, y], from, to }) => {
     const session = await context.newCDPSession(page);
     const touch = (type, points) => session.send("Input.dispatchTouchEvent", { type, touchPoints: points });
-    const fingers = (apart) => [{ x: x - apart / 2, y }, { x: x + apart / 2, y }];
+    const fingers = (apart) => [
+      { x: x - apart / 2, y },
+      { x: x + apart / 2, y },
+    ];
     await touch("touchStart", fingers(from));
     for (let step = 1; step <= 5; step++) await touch("touchMove", fingers(from + ((to - from) * step) / 5));
     await touch("touchEnd", []);
@@ -102,6 +106,22 @@ const actions = {
   look: async ({ width, height, scheme, motion }) => {
     await page.emulateMedia({ colorScheme: scheme ?? "light", reducedMotion: motion ?? "reduce" });
     await page.setViewportSize({ width: width ?? 1000, height: height ?? 700 });
+  },
+  // Until another call with ratio 1, the screen has so many pixels for each of CSS.
+  density: async ({ ratio }) => {
+    await dense?.detach();
+    dense = ratio === 1 ? null : await context.newCDPSession(page);
+    const { width, height } = page.viewportSize();
+    const metrics = { width, height, deviceScaleFactor: ratio, mobile: false };
+    await dense?.send("Emulation.setDeviceMetricsOverride", metrics);
+    if (dense === null) await page.setViewportSize({ width: width + 1, height });
+  },
+  // Roles and names as a screen reader is told them.
+  accessible: async () => {
+    const session = await context.newCDPSession(page);
+    const { nodes } = await session.send("Accessibility.getFullAXTree");
+    await session.detach();
+    return nodes.filter((node) => !node.ignored).map((node) => [node.role?.value, node.name?.value ?? ""]);
   },
   screenshot: ({ path }) => page.screenshot({ path }).then(() => null),
   requests: () => requests,
