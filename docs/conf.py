@@ -17,6 +17,7 @@ sys.path[:0] = [str(ROOT), str(HERE)]
 import generate  # noqa: E402
 
 import kcgs  # noqa: E402
+from kcgs.zoo import entries  # noqa: E402
 
 project = "kcgs"
 author = "the kcgs authors"
@@ -32,6 +33,7 @@ html_theme = "furo"
 html_title = "kcgs"
 html_static_path = ["static"]
 html_css_files = ["kcgs.css"]
+html_extra_path = [f"generated/gallery-{entry.name}.html" for entry in entries()]
 html_theme_options = {"navigation_with_keys": True}
 html_copy_source = False
 copybutton_prompt_text = r">>> |\.\.\. |\$ "

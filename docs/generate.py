@@ -44,6 +44,7 @@ def write(folder: Path) -> None:
     documented: dict[str, str] = {}
     for name in PACKAGES:
         pages[f"{name}.rst"] = reference(name, documented)
+    pages |= gallery()
     folder.mkdir(exist_ok=True)
     for stale in {path.name for path in folder.iterdir()} - pages.keys():
         (folder / stale).unlink()
@@ -154,6 +155,26 @@ def _plain(text: str) -> str:
 def _cell(text: str) -> str:
     """Return the same with the options that it mentions set as code."""
     return re.sub(r"(?<![\w`-])--[a-z][a-z-]+", r"`\g<0>`", _plain(text))
+
+
+def gallery() -> dict[str, str]:
+    """Return a page for each scene of the zoo, and the Markdown that shows them all, by file name."""
+    from kcgs import load
+    from kcgs.page import scene_page
+    from kcgs.zoo import entries, find
+
+    pages, shown = {}, []
+    for entry in sorted(entries(), key=lambda entry: entry.name.startswith("chart")):
+        scene, name = load(find(entry.name)), f"gallery-{entry.name}.html"
+        height, width = scene.size
+        pages[name] = scene_page(scene, title=entry.title)
+        facts = f"{entry.num_gaussians} Gaussians, {entry.num_regions} regions; {entry.licence}"
+        shown.append(
+            f'<iframe src="{name}" title="{entry.title}" loading="lazy" style="aspect-ratio: {width} / {height}">'
+            f'</iframe>\n<p>{entry.title[0].upper()}{entry.title[1:]}. {facts}. <a href="{name}">In a window</a></p>'
+        )
+    pages["gallery.md"] = "\n\n".join(shown) + "\n"
+    return pages
 
 
 def segmenters() -> str:

@@ -93,3 +93,12 @@ def test_readme_has_the_figures_of_the_results() -> None:
         method = title.split("`")[1]
         for n, cell in zip(counts, cells, strict=True):
             assert cell.strip() == known[method, n], (method, n)
+
+
+def test_gallery_has_the_zoo(site: Path) -> None:
+    from kcgs.zoo import entries
+
+    gallery = (site / "gallery.html").read_text(encoding="utf-8")
+    for entry in entries():
+        assert f'<iframe src="gallery-{entry.name}.html"' in gallery
+        assert "<kcgs-image " in (site / f"gallery-{entry.name}.html").read_text(encoding="utf-8")

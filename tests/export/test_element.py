@@ -276,6 +276,12 @@ class TestElement:
         page.do("drag", **{"from": [300, 200], "to": [340, 200]})
         assert "regionclick" not in [name for name, _ in page.evaluate("kcgs.events")]
 
+    def test_a_wheel_that_needs_ctrl(self, page: Browser, site: tuple[Path, str]) -> None:
+        show(page, site, random_scene("soft"), "zoom=ctrl")
+        turn = "image.shadowRoot.firstChild.dispatchEvent(new WheelEvent('wheel', {{deltaY: -50, cancelable: true{}}}))"
+        assert page.evaluate(f"[{turn.format('')}, image.view.scale]") == [True, 1]
+        assert page.evaluate(f"{turn.format(', ctrlKey: true')} || image.view.scale > 1.2")
+
     def test_a_click_tells_the_region(self, page: Browser, site: tuple[Path, str]) -> None:
         scene = show(page, site, random_scene("hard"), "regions")
         assert scene.regions is not None

@@ -281,7 +281,9 @@ export class KcgsImage extends HTMLElement {
     if (!this.hasAttribute("zoom")) return;
     this.gestures = new AbortController();
     const { signal } = this.gestures;
-    this.glide = listen(this.stage.canvas, (event) => this.stage.at(event), this.stage, { keyboard: this, signal });
+    const wheelNeedsCtrl = this.getAttribute("zoom") === "ctrl";
+    const { stage } = this;
+    this.glide = listen(stage.canvas, (event) => stage.at(event), stage, { keyboard: this, wheelNeedsCtrl, signal });
   }
 
   private listenToClicks(canvas: HTMLCanvasElement): void {

@@ -24,6 +24,8 @@ function button(text: string, title: string, press: () => void): HTMLButtonEleme
   return make("button", { type: "button", title, ariaLabel: title, onclick: press }, text);
 }
 
+// within another page the wheel scrolls that one
+if (window.top !== window) image.setAttribute("zoom", "ctrl");
 bar.append(
   button("−", "Zoom out (−)", () => image.zoomBy(0.5)),
   zoom,

@@ -55,9 +55,10 @@ export class Glide {
   }
 }
 
-/** Where keys that zoom are listened to, and what ends it all. */
+/** Where keys that zoom are listened to, whether a wheel zooms with Ctrl held only, and what ends it all. */
 export interface Listening {
   keyboard: EventTarget;
+  wheelNeedsCtrl?: boolean;
   signal?: AbortSignal;
 }
 
@@ -65,11 +66,11 @@ export function listen(
   canvas: HTMLCanvasElement,
   place: Place,
   hands: Hands,
-  { keyboard, signal }: Listening = { keyboard: window },
+  { keyboard, wheelNeedsCtrl = false, signal }: Listening = { keyboard: window },
 ): Glide {
   const glide = new Glide(hands);
   const until = signal === undefined ? {} : { signal };
-  listenToWheel(canvas, place, hands, glide, until);
+  listenToWheel(canvas, place, hands, glide, wheelNeedsCtrl, until);
   listenToPointers(canvas, place, hands, glide, until);
   // arrows pan where the focus is: on the canvas, or on what holds the keyboard
   listenToKeys(canvas, hands, glide, keyboard === window ? [canvas, window] : [keyboard, keyboard], until);
@@ -81,9 +82,11 @@ function listenToWheel(
   place: Place,
   hands: Hands,
   glide: Glide,
+  needsCtrl: boolean,
   until: AddEventListenerOptions,
 ): void {
   const turn = (event: WheelEvent): void => {
+    if (needsCtrl && !event.ctrlKey && !event.metaKey) return;
     event.preventDefault();
     const delta = event.deltaMode === WheelEvent.DOM_DELTA_LINE ? event.deltaY * LINE_HEIGHT : event.deltaY;
     const [x, y] = place(event);
