@@ -6,6 +6,7 @@ import math
 import random
 import shutil
 import time
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -184,6 +185,20 @@ def attack(node: Node, count: int, seed: int) -> None:
     assert node.do("scene", files[0])["memory"] < MEMORY
 
 
+def attack_labels(node: Node, count: int, seed: int) -> None:
+    """Damage of label maps with right checksums."""
+    generator, files = random.Random(seed), []
+    for n in range(12):
+        labels = random_labels(np.random.default_rng(seed + n), (20 + n, 40), [1, 2, 3, 30][n % 4])
+        files.append(codec.encode_labels(labels.astype(np.int64)))
+    whole = 0
+    for _ in range(count):
+        data, other = (content[4:-4] for content in generator.sample(files, 2))
+        content = b"kcgm" + damaged(data, other, generator)
+        whole += check_same(node, content + zlib.crc32(content).to_bytes(4, "big"), labels=True)
+    assert 0 < whole < count
+
+
 class TestConformance:
     def test_golden(self, node: Node) -> None:
         assert check_same(node, GOLDEN.read_bytes())
@@ -219,10 +234,12 @@ def _highest(dtype: object) -> int:
 class TestDamage:
     def test_a_hundred(self, node: Node) -> None:
         attack(node, 100, seed=0)
+        attack_labels(node, 100, seed=0)
 
     @pytest.mark.slow
     def test_two_thousand(self, node: Node) -> None:
         attack(node, 2000, seed=1000)
+        attack_labels(node, 2000, seed=1000)
 
     def test_what_is_wrong_is_named_and_whole_layers_are_kept(self, node: Node) -> None:
         data = GOLDEN.read_bytes()

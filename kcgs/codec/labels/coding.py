@@ -189,7 +189,9 @@ class _Escapes:
             guess = int(self._found[rank])
             if self._rank[coded][rank].code(self._coder, label == guess):
                 return guess
-        return self._coder.number(label, self._met)
+        if (found := self._coder.number(label, self._met)) >= self._met:
+            raise CodecError(f"data must hold labels of {self._met} regions that were met; got {found}")
+        return found
 
 
 def encode_map(regions: RegionMap) -> bytes:

@@ -66,7 +66,8 @@ export function readWavefronts(rows: i32, columns: i32, marks: usize, regions: i
   for (let t: usize = 0; t < PLACES; t++)
     store<i32>(offsets + 4 * t, 4 * (load<i8>(template + 2 * t) + load<i8>(template + 2 * t + 1) * stride));
   const last = width - 1 + SLANT * (height - 1);
-  for (let front = 0; front <= last; front++) {
+  // the first pixel is of region 0, since regions are numbered as they are met
+  for (let front = 1; front <= last; front++) {
     look(front);
     if (listed === 0) continue;
     readBits();
