@@ -26,6 +26,7 @@ LONGEST = (
     "notebooks/test_notebooks.py",
     "golden/test_golden.py",
     "export/test_web.py",
+    "export/test_element.py",
     "cli/test_cli.py",
     "engine/test_ray.py",
     "cli/test_many.py",

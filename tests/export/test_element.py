@@ -165,6 +165,18 @@ class TestPixels:
         show(page, site, random_scene("soft"))
         assert page.evaluate("image.renderer") == "cpu"
 
+    def test_sums_of_16_bits(self, page: Browser, site: tuple[Path, str]) -> None:
+        """As on a GPU that does not blend floats of 32 bits."""
+        page.evaluate(
+            "(() => { const find = WebGL2RenderingContext.prototype.getExtension;"
+            "WebGL2RenderingContext.prototype.getExtension = function (name) {"
+            "  return name === 'EXT_float_blend' ? null : find.call(this, name); }; return 1; })()"
+        )
+        scene = show(page, site, load(MODELS / "chelsea-500" / "scene.safetensors"), 'renderer="webgl2"')
+        assert page.evaluate("image.renderer") == "webgl2 float16"
+        got = pixels(page, scene.size)[:3]
+        np.testing.assert_allclose(got, scene.render().numpy(), atol=LEVELS)
+
     @pytest.mark.parametrize("renderer", ["cpu", "webgl2"])
     def test_hidden_regions_are_clear(self, page: Browser, site: tuple[Path, str], renderer: str) -> None:
         scene = show(page, site, random_scene("soft"), f'renderer="{renderer}"')

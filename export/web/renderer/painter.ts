@@ -27,15 +27,25 @@ export function paint(
   device: Device,
 ): string {
   const gpu = device === "cpu" ? null : openGpu(device === "webgl2");
-  if (gpu?.takes(scene)) {
-    gpu.render(scene, view, visible);
-    if (!gpu.lost) {
-      context.clearRect(x, y, view.width, view.height);
-      context.drawImage(gpu.canvas, 0, 0, view.width, view.height, x, y, view.width, view.height);
-      return `webgl2 ${gpu.precision}`;
-    }
+  if (gpu?.takes(scene) && renders(gpu, scene, view, visible, device)) {
+    context.clearRect(x, y, view.width, view.height);
+    context.drawImage(gpu.canvas, 0, 0, view.width, view.height, x, y, view.width, view.height);
+    return `webgl2 ${gpu.precision}`;
   }
   if (device === "webgl2") throw new Error("this browser cannot render with WebGL2, or not a scene of this size.");
   context.putImageData(renderSoftware(scene, view, visible), x, y);
   return "cpu";
+}
+
+/** Try a GPU; of one that fails, where the CPU may do it too, the console is told, and it is not tried again. */
+function renders(gpu: WebGl, scene: Prepared, view: View, visible: Uint8Array, device: Device): boolean {
+  try {
+    gpu.render(scene, view, visible);
+  } catch (error) {
+    if (device !== "auto") throw error;
+    console.warn(`kcgs-image: the CPU renders, because ${(error as Error).message}`);
+    contexts.set(false, null);
+    return false;
+  }
+  return !gpu.lost;
 }

@@ -227,6 +227,11 @@ export class WebGl {
     const attachments = Array.from({ length: layers }, (_, i) => gl.COLOR_ATTACHMENT0 + i);
     attachments.forEach((point, i) => gl.framebufferTextureLayer(gl.FRAMEBUFFER, point, slots, 0, i));
     gl.drawBuffers(attachments);
+    for (const buffer of [sumBuffer, slotBuffer]) {
+      gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
+      const whole = gl.checkFramebufferStatus(gl.FRAMEBUFFER) === gl.FRAMEBUFFER_COMPLETE;
+      if (!whole && !this.lost) throw new Error(`the GPU has no room for ${width} x ${height} pixels.`);
+    }
     return (this.target = { width, height, layers, sums, slots, sumBuffer, slotBuffer });
   }
 }
