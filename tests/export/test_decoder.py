@@ -237,9 +237,10 @@ class TestDamage:
         attack_labels(node, 100, seed=0)
 
     @pytest.mark.slow
-    def test_two_thousand(self, node: Node) -> None:
-        attack(node, 2000, seed=1000)
-        attack_labels(node, 2000, seed=1000)
+    @pytest.mark.parametrize("seed", [1000, 2000, 3000, 4000])
+    def test_two_thousand(self, node: Node, seed: int) -> None:
+        attack(node, 500, seed)
+        attack_labels(node, 500, seed)
 
     def test_what_is_wrong_is_named_and_whole_layers_are_kept(self, node: Node) -> None:
         data = GOLDEN.read_bytes()
