@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -106,18 +107,27 @@ class SceneWriter:
         most = round(share * check_count("target_bytes", target_bytes))
         low, high = QPS[0], self.qp_for(QUALITIES[1])
         qp, best = min(max(self.qp_for(DEFAULT_QUALITY), low), high), None
-        slope = self._count_numbers() / (8 * 32)
         while low <= high:
             data = write(qp)
             if len(data) <= most:
                 best, low = (qp, data), qp + 1
             else:
                 least, high = len(data), qp - 1
-            qp = min(max(qp + math.floor((most - len(data)) / slope), low), high)
+            qp = min(max(self.next_qp(qp, len(data), most), low), high)
         if best is None:
             needed = math.ceil(least / share)
             raise ValueError(f"target_bytes must be at least {needed} for this scene; got {target_bytes}")
         return best
+
+    def next_qp(self, qp: int, num_bytes: int, target_bytes: int) -> int:
+        """Return the quantization parameter for so many bytes, where that of `qp` has `num_bytes`."""
+        return qp + math.floor((target_bytes - num_bytes) * 8 * 32 / self._count_numbers())
+
+    def of(self, gaussians: Parameters, ids: Integers) -> SceneWriter:
+        """Return a writer of other Gaussians with the same map."""
+        other = copy.copy(self)
+        other.gaussians, other.ids = gaussians, ids
+        return other
 
     def write_rounded(self, qp: int) -> bytes:
         """Write the file of Gaussians that are rounded one by one."""

@@ -25,7 +25,7 @@ _MOST_LEVELS = 1 << 20
 _MOST_COLOR = 1 << 24
 _LN2 = 0.6931471805599453
 # an opposition of colours: grey, red against blue, green against both; orthonormal
-_OPPONENT = (
+OPPONENT = (
     (0.5773502691896258, 0.5773502691896258, 0.5773502691896258),
     (0.7071067811865476, 0.0, -0.7071067811865476),
     (-0.408248290463863, 0.816496580927726, -0.408248290463863),
@@ -193,7 +193,7 @@ def opponent(colors: Floats, *, back: bool = False) -> Floats:
     """Rotate RGB [N, 3] into grey and two oppositions, or back; other numbers of channels stay."""
     if colors.shape[1] != 3:
         return colors
-    rows = tuple(zip(*_OPPONENT, strict=True)) if back else _OPPONENT
+    rows = tuple(zip(*OPPONENT, strict=True)) if back else OPPONENT
     # not a matrix product: its order of summation is the machine's
     return np.stack([colors[:, 0] * a + colors[:, 1] * b + colors[:, 2] * c for a, b, c in rows], -1)
 

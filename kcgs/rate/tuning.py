@@ -1,0 +1,145 @@
+"""Gaussians that descend on their error and their bits, and are then rounded a few at a time.
+
+Gaussians overlap, so what rounding one of them does to the image its neighbours can partly undo, as long as they may
+still move. So they are rounded a few at a time, shapes first and colours last, and those that are still free descend
+meanwhile. A step is a gradient divided by the known curvature of the squared error (docs/format.md), with momentum.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcgs.codec.exact import Integers
+from kcgs.codec.gaussians.quantize import Codes, Parameters, Quantizer
+from kcgs.fit.frame import local_gradient, move
+from kcgs.fit.objective import VisualObjective
+from kcgs.functional import RegionMap, region_splat
+
+from .bits import soft_bits
+
+# a Gaussian whose whole energy is below this many times the distortion costs more bits than it saves: at the best rate
+# a bit saves 2 ln 2 D for each number, and a Gaussian has about 30
+_PAYING = 20.0
+# what a bit must save, in units of the distortion: 2 ln 2 where nobody makes up for rounding; found by trial
+_BIT = 0.9
+# share of the iterations in which shapes are rounded; colours are in the rest
+_SHAPES = 0.65
+_STEP, _MOMENTUM = 0.09, 0.9
+# the largest step, in standard deviations and in log scale; and the largest share of Newton's
+_LARGEST, _NEWTON = 0.2, 0.3
+# energies below it have next to no curvature: steps are as if they had this
+_FAINT = 1e-2
+# half the second derivatives of the squared error by a step in a Gaussian's frame, in units of its energy
+_CURVATURE = (0.5, 0.5, 0.75, 0.25, 0.75)
+# pixels: a sum over pixel centres of something narrower is as if it had this standard deviation, where it hits one
+_NARROW = 0.56
+_DRAFT_CUTOFF = 1e-3
+
+
+def pays(gaussians: Parameters, quantizer: Quantizer) -> NDArray[np.bool_]:
+    """Say which Gaussians pay for their bits; one at least."""
+    _, cholesky, colors = (torch.from_numpy(numbers) for numbers in gaussians)
+    area = (math.pi * cholesky[:, 0] * cholesky[:, 2]).clamp_max(quantizer.size[0] * quantizer.size[1])
+    energy = colors.square().sum(-1) * area
+    kept = energy >= _PAYING * quantizer.distortion
+    kept[energy.argmax()] = True
+    return kept.numpy()
+
+
+class Tuning:
+    """Gaussians that show an image (C, H, W), on the CPU; `ids` are the positions of their regions' ids in the map."""
+
+    def __init__(
+        self,
+        gaussians: Parameters,
+        ids: Integers,
+        image: Tensor,
+        regions: RegionMap | None,
+        quantizer: Quantizer,
+        objective: VisualObjective | None,
+    ) -> None:
+        self.ids, self.image, self.regions, self.objective = ids, image, regions, objective
+        self.quantizer = quantizer
+        self._free = [torch.from_numpy(numbers).to(image) for numbers in gaussians]
+        self._speed = torch.zeros(len(ids), 5 + gaussians.colors.shape[1]).to(image)
+
+    @property
+    def gaussians(self) -> Parameters:
+        """What the Gaussians are now, in float64."""
+        return Parameters(*(numbers.double().numpy() for numbers in self._free))
+
+    def drop(self) -> None:
+        """Leave out the Gaussians that do not pay for their bits."""
+        kept = pays(self.gaussians, self.quantizer)
+        if not kept.all():
+            self.ids, index = self.ids[kept], torch.from_numpy(kept)
+            self._free, self._speed = [numbers[index] for numbers in self._free], self._speed[index]
+
+    def descend(self, iterations: int) -> None:
+        """Move all Gaussians downhill, so many steps."""
+        for _ in range(iterations):
+            downhill = self._downhill(*self._free)
+            self._speed = _MOMENTUM * self._speed + downhill
+            self._free = self._moved(self._free)
+
+    def round(self, iterations: int, seed: int, seconds: float = math.inf) -> Codes:
+        """Round everything in so many iterations and seconds, in an order of the seed; return the whole numbers."""
+        generator = torch.Generator().manual_seed(seed)
+        turn = torch.rand(2, len(self.ids), generator=generator).to(self.image)
+        classes = self.quantizer.classify(self.gaussians)
+        start, share = time.perf_counter(), 0.0
+        for iteration in range(iterations):
+            share = max(share, iteration / iterations)
+            if seconds < math.inf:
+                share = max(share, (time.perf_counter() - start) / max(seconds, 1e-9))
+            if share >= 1:
+                break
+            shaped = turn[0] < share / _SHAPES
+            colored = turn[1] < (share - _SHAPES) / (1 - _SHAPES)
+            codes = self.quantizer.quantize(self.gaussians, classes)
+            self._step(codes, shaped[:, None], colored[:, None])
+        return self.quantizer.quantize(self.gaussians, classes)
+
+    def _step(self, codes: Codes, shaped: Tensor, colored: Tensor) -> None:
+        """Move what is free, against the render of what is rounded and what is not."""
+        rounded = [torch.from_numpy(t).to(self.image) for t in self.quantizer.restore(codes)]
+        fixed = (shaped, shaped, colored)
+        current = [torch.where(fix, r, f) for fix, r, f in zip(fixed, rounded, self._free, strict=True)]
+        downhill = self._downhill(*current)
+        stopped = torch.cat([shaped.expand(-1, 5), colored.expand(-1, downhill.shape[1] - 5)], -1)
+        self._speed = torch.where(stopped, 0.0, _MOMENTUM * self._speed + downhill)
+        moved = self._moved(current)
+        self._free = [torch.where(fix, f, m) for fix, f, m in zip(fixed, self._free, moved, strict=True)]
+
+    def _moved(self, current: list[Tensor]) -> list[Tensor]:
+        step = _STEP * self._speed
+        means, cholesky = move(current[0], current[1], step[:, :5].clamp(-_LARGEST, _LARGEST), exact=False)
+        return [means, cholesky, current[2] + step[:, 5:]]
+
+    def _downhill(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
+        """Return Newton's steps of each number alone: of centre and factor in the Gaussian's frame, of colours."""
+        size = self.quantizer.size
+        x, factors, c = (t.detach().requires_grad_() for t in (means, cholesky, colors))
+        render = region_splat(x, factors, c, self._region_ids, self.regions, size=size, cutoff=_DRAFT_CUTOFF)
+        difference = render.detach() - self.image
+        if self.objective is not None:
+            difference = self.objective.apply(difference)
+        # half the squared error, as its gradient is the difference
+        bits = 0.5 * _BIT * self.quantizer.distortion * soft_bits(factors, c, self.quantizer).sum()
+        gradients = torch.autograd.grad((render, bits), (x, factors, c), (difference, None))
+        narrow = cholesky[:, ::2].clamp_min(_NARROW)
+        area = (math.pi * narrow.prod(-1)).clamp_max(size[0] * size[1])
+        energy = (colors.square().sum(-1) * area).clamp_min(_FAINT)
+        curvature = torch.tensor(_CURVATURE).to(energy) * energy[:, None]
+        shape = (local_gradient(cholesky, *gradients[:2]) / curvature).clamp(-_NEWTON, _NEWTON)
+        return -torch.cat([shape, gradients[2] / area[:, None]], -1)
+
+    @property
+    def _region_ids(self) -> Tensor | None:
+        return None if self.regions is None else self.regions.ids[torch.from_numpy(self.ids)]
