@@ -30,6 +30,7 @@ _MARGIN = 14.5
 _FINER = (0.0, 2.0, 5.0, 9.0, 14.0, 20.0, 30.0, 50.0)
 # share of the iterations before anything is rounded, and how many go by between two looks at the distortion
 _FREE, _LOOK = 0.7, 50
+_DROP = 0.8
 # files that are tried for a number of bytes, and how much smaller tuned ones are
 _TRIES, _TUNED = 4, 1.01
 # of the seconds that are left, for the first of several files, and for what comes before
@@ -131,7 +132,7 @@ class _Press:
     ) -> None:
         self.writer, self.image, self.objective = writer, image, objective
         self.seed, self.end = seed, end
-        self.free = round(_FREE * iterations)
+        self.free = int(_FREE * iterations)
         self.rounds = iterations - self.free
 
     def write(self, qp: int, share: float = 1.0) -> bytes:
@@ -184,7 +185,8 @@ class _Press:
             if tuning is None:
                 tuning = self._tuning(writer, quantizer)
             tuning.quantizer = quantizer
-            tuning.drop()
+            if done >= _DROP * self.free:
+                tuning.drop()
             tuning.descend(min(_LOOK, self.free - done))
             writer = writer.of(tuning.gaussians, tuning.ids)
         return writer

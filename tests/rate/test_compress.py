@@ -10,7 +10,10 @@ import torch
 
 from kcgs import GaussianField, RegionMap, Scene
 from kcgs.codec import decode, encode
+from kcgs.codec.gaussians.quantize import Quantizer
+from kcgs.codec.scenes import SceneWriter
 from kcgs.rate import compress, quality_for
+from kcgs.rate.bits import soft_bits
 
 from .conftest import Photo, psnr
 
@@ -47,7 +50,8 @@ class TestCompress:
         colors = field.merged_colors().detach().clone()
         colors[::3] *= 1e-4
         with_faint = GaussianField(field.means, field.cholesky, colors, field.region_ids, size=field.size)
-        done = compress(Scene(with_faint, fitted.regions), photo[0], quality=36, iterations=2)
+        # before a descent, which may make them pay
+        done = compress(Scene(with_faint, fitted.regions), photo[0], quality=36, iterations=1)
         assert len(done.scene) <= 200
 
     @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
@@ -71,3 +75,39 @@ class TestCompress:
         ):
             with pytest.raises(ValueError, match=match):
                 compress(**{"scene": fitted, "image": image, **changed})
+
+
+class TestSoftBits:
+    def test_they_follow_the_files(self, fitted: Scene) -> None:
+        # weaker and rounder Gaussians make a smaller file, by about as much
+        field, quantizer = fitted.field, Quantizer(150, fitted.size)
+        means, cholesky, colors = (t.detach() for t in (field.means, field.cholesky, field.merged_colors()))
+        changed = (0.5 * colors, cholesky), (colors, cholesky * torch.tensor([1.0, 0.3, 1.0]))
+        for new_colors, new_cholesky in changed:
+            other = GaussianField(means, new_cholesky, new_colors, field.region_ids, size=field.size)
+            files = [SceneWriter(Scene(f, fitted.regions)).write_rounded(150) for f in (field, other)]
+            saved = 8 * (len(files[0]) - len(files[1]))
+            told = float(
+                (soft_bits(cholesky, colors, quantizer) - soft_bits(new_cholesky, new_colors, quantizer)).sum()
+            )
+            assert saved > 0 and 0.5 * saved < told < 1.6 * saved
+
+    def test_gradients(self) -> None:
+        generator = torch.Generator().manual_seed(0)
+        cholesky = torch.rand(6, 3, generator=generator, dtype=torch.float64) * 4 + 0.8
+        colors = torch.rand(6, 3, generator=generator, dtype=torch.float64) - 0.5
+        quantizer = Quantizer(150, (48, 64))
+        inputs = cholesky.requires_grad_(), colors.requires_grad_()
+        assert torch.autograd.gradcheck(lambda a, b: soft_bits(a, b, quantizer), inputs)
+
+    def test_tiny_ones_are_no_cheaper(self) -> None:
+        cholesky = torch.tensor([[0.1, 0.0, 0.1]], requires_grad=True)
+        soft_bits(cholesky, torch.ones(1, 3), Quantizer(150, (48, 64))).sum().backward()
+        assert cholesky.grad is not None and not cholesky.grad[:, ::2].any()
+
+    def test_bits_are_spared_at_the_same_error(
+        self, photo: Photo, fitted: Scene, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        spared = compress(fitted, photo[0], target_bytes=1100).scene
+        monkeypatch.setattr("kcgs.rate.tuning._BIT", 0.0)
+        assert psnr(compress(fitted, photo[0], target_bytes=1100).scene, photo[0]) + 0.05 < psnr(spared, photo[0])
