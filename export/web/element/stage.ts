@@ -154,7 +154,7 @@ export class Stage implements Hands {
     const part = visiblePart(this.transform, scene, this.size);
     this.divisor = this.moving ? this.times.divisorFor(part.width * part.height) : 1;
     const [width, height] = [Math.ceil(part.width / this.divisor), Math.ceil(part.height / this.divisor)];
-    const view = { rect: part.rect, width, height };
+    const view = { rect: part.rect, width, height, draft: this.divisor > 1 };
     const start = performance.now();
     const before = this.renderer;
     try {

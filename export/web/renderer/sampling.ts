@@ -7,6 +7,8 @@ export interface View {
   readonly rect: Rect;
   readonly width: number;
   readonly height: number;
+  /** Look at one point for each pixel where the scene shrinks: quicker than area means, for what moves. */
+  readonly draft?: boolean;
 }
 
 /** Points of one axis: the cells before and after each, and the share of the one after. */
@@ -62,9 +64,9 @@ export interface FineAxis {
 }
 
 /** A scene that shrinks is rendered at its own size, of which area means are taken. */
-export function fineAxis(start: number, end: number, count: number, length: number): FineAxis {
+export function fineAxis(start: number, end: number, count: number, length: number, draft = false): FineAxis {
   const step = (end - start) / count;
-  if (step <= 1 + NOISE) return { start, step, count, mean: null };
+  if (step <= 1 + NOISE || draft) return { start, step, count, mean: null };
   const first = Math.min(Math.max(Math.floor(start + NOISE), 0), length - 1);
   const last = Math.max(first + 1, Math.min(Math.ceil(end - NOISE), length));
   return { start: first, step: 1, count: last - first, mean: { from: start - first, span: step } };

@@ -21,8 +21,8 @@ export function renderSoftware(scene: Prepared, view: View, visible: Uint8Array)
   const [left, top, right, bottom] = view.rect;
   const { gaussians, membership } = scene;
   const size: [number, number] = [view.height, view.width];
-  const across = fineAxis(left, right, view.width, scene.width);
-  const down = fineAxis(top, bottom, view.height, scene.height);
+  const across = fineAxis(left, right, view.width, scene.width, view.draft);
+  const down = fineAxis(top, bottom, view.height, scene.height, view.draft);
   const runs = runsOf(membership, across, down, visible);
   const { channels } = gaussians;
   const colors = areaMean(sumGaussians(gaussians, runs, across, down), channels, across, down, size);

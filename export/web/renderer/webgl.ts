@@ -95,7 +95,8 @@ export class WebGl {
     const [left, top, right, bottom] = view.rect;
     const [dx, dy] = [(right - left) / view.width, (bottom - top) / view.height];
     const tile = Math.min(TILE, Math.floor(this.limit / Math.max(1, scene.membership.perPixel)));
-    const along = (step: number): number => Math.max(1, Math.floor(tile / Math.max(1, step) - 2));
+    const finer = (step: number): number => (view.draft === true ? 1 : Math.max(1, step));
+    const along = (step: number): number => Math.max(1, Math.floor(tile / finer(step) - 2));
     const [across, down] = [along(dx), along(dy)];
     for (let y = 0; y < view.height; y += down) {
       for (let x = 0; x < view.width; x += across) {
@@ -105,8 +106,8 @@ export class WebGl {
           y,
           width,
           height,
-          across: fineAxis(left + x * dx, left + (x + width) * dx, width, scene.width),
-          down: fineAxis(top + y * dy, top + (y + height) * dy, height, scene.height),
+          across: fineAxis(left + x * dx, left + (x + width) * dx, width, scene.width, view.draft),
+          down: fineAxis(top + y * dy, top + (y + height) * dy, height, scene.height, view.draft),
         };
       }
     }
