@@ -62,7 +62,7 @@ def cells(size: tuple[int, int], count: int, supersample: int = 1) -> torch.Tens
 
 def random_scene(kind: str, channels: int = 3) -> Scene:
     size, supersample = (60, 90), 2 if "fine" in kind else 1
-    softness: Any = {"hard": 0.0, "soft": 1.3, "wide": 5.0}.get(kind.split()[0], 0.0)
+    softness: Any = {"hard": 0.0, "soft": 1.3, "wide": 5.0, "widest": 24.0}.get(kind.split()[0], 0.0)
     labels = cells(size, 12, supersample)
     if kind.startswith("pairs"):
         ids = labels.unique().tolist()
@@ -77,7 +77,7 @@ SCENES = {
     "chart-pie": lambda: load(MODELS / "chart-pie" / "scene.safetensors"),
 }
 MORE = {
-    **{kind: lambda kind=kind: random_scene(kind) for kind in ("plain", "hard", "wide", "pairs")},
+    **{kind: lambda kind=kind: random_scene(kind) for kind in ("plain", "hard", "wide", "widest fine", "pairs")},
     "grey": lambda: random_scene("soft fine", 1),
     **{name: lambda name=name: load(MODELS / name / "scene.safetensors") for name in ("chelsea-500", "rocket-1000")},
 }

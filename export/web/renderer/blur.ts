@@ -3,11 +3,15 @@
 import type { Levels } from "./levels.ts";
 
 const RADIUS_SIGMAS = 4;
+/** Wide blurs are evaluated at nodes, so many to a standard deviation: bilinear between them is off by 0.001 at most. */
+const NODES = 8;
 
 interface Kernel {
   readonly reach: number; // labels
   readonly weights: Float64Array; // at distance 0, 1 ... reach
   readonly sums: Float64Array; // of the weights from -reach up to, but without, -reach + i
+  readonly spacing: number; // of nodes; 1: none
+  readonly nodes: Map<number, Shares>;
 }
 
 /** Regions and their weights, in no order. */
@@ -16,14 +20,38 @@ export interface Shares {
   readonly weights: number[];
 }
 
+/** Sums weights by region. */
+class Tally {
+  private readonly sums: Float64Array;
+  private regions: number[] = [];
+
+  constructor(regions: number) {
+    this.sums = new Float64Array(regions);
+  }
+
+  add(region: number, weight: number): void {
+    if (this.sums[region] === 0) this.regions.push(region);
+    this.sums[region]! += weight + Number.MIN_VALUE;
+  }
+
+  /** The sums times a factor; what follows begins at none. */
+  take(factor: number): Shares {
+    const { regions, sums } = this;
+    const weights = regions.map((region) => sums[region]! * factor);
+    for (const region of regions) sums[region] = 0;
+    this.regions = [];
+    return { regions, weights };
+  }
+}
+
 export class Blur {
   private readonly kernels: Kernel[];
   private readonly widest: number;
   private readonly runEnds: Int32Array; // where the run of equal labels in its row ends that a label lies in
   private readonly across: Int32Array; // integral image of changes along rows
   private readonly down: Int32Array; // changes along columns, from the top
-  private readonly sums: Float64Array; // of regions
-  private readonly shares: Shares = { regions: [], weights: [] };
+  private readonly pixel: Tally;
+  private readonly node: Tally;
 
   constructor(
     private readonly labels: Int32Array,
@@ -35,7 +63,8 @@ export class Blur {
   ) {
     this.kernels = levels.widths.map((sigma) => kernelOf(sigma * perPixel));
     this.widest = Math.max(...this.kernels.map((kernel) => kernel.reach));
-    this.sums = new Float64Array(regions);
+    this.pixel = new Tally(regions);
+    this.node = new Tally(regions);
     this.runEnds = new Int32Array(labels.length);
     this.across = new Int32Array((width + 1) * (height + 1));
     this.down = new Int32Array(labels.length);
@@ -69,39 +98,64 @@ export class Blur {
     return changes === 0 && down[(y1 - 1) * width + x0] === down[y0 * width + x0];
   }
 
-  /** The weights of the regions around a pixel, means over its labels; the next call overwrites them. */
+  /** The weights of the regions around a pixel: means over its labels. */
   weigh(x: number, y: number): Shares {
-    const { perPixel, width, levels, sums, shares } = this;
-    shares.regions.length = shares.weights.length = 0;
+    const { perPixel, width, levels } = this;
     for (let row = y * perPixel; row < (y + 1) * perPixel; row++) {
       for (let column = x * perPixel; column < (x + 1) * perPixel; column++) {
-        const level = levels.of === null ? 0 : levels.of[row * width + column]!;
-        this.spread(column, row, this.kernels[level]!);
+        const kernel = this.kernels[levels.of === null ? 0 : levels.of[row * width + column]!]!;
+        if (kernel.spacing === 1) this.spread(this.pixel, column, row, kernel);
+        else this.interpolate(column, row, kernel);
       }
     }
-    for (const region of shares.regions) {
-      shares.weights.push(sums[region]! / (perPixel * perPixel));
-      sums[region] = 0;
-    }
-    return shares;
+    return this.pixel.take(1 / (perPixel * perPixel));
   }
 
-  private spread(x: number, y: number, { reach, weights, sums }: Kernel): void {
-    const { labels, width, height, runEnds, sums: regions, shares } = this;
+  private spread(into: Tally, x: number, y: number, { reach, weights, sums }: Kernel): void {
+    const { labels, width, height, runEnds } = this;
     const [x0, x1] = [Math.max(0, x - reach), Math.min(width, x + reach + 1)];
     const [y0, y1] = [Math.max(0, y - reach), Math.min(height, y + reach + 1)];
     // the weight of what lies within the map
     const whole = (sums[x1 - x + reach]! - sums[x0 - x + reach]!) * (sums[y1 - y + reach]! - sums[y0 - y + reach]!);
     for (let row = y0; row < y1; row++) {
       const factor = weights[Math.abs(row - y)]! / whole;
-      for (let at = x0; at < x1;) {
+      for (let at = x0; at < x1; ) {
         const region = labels[row * width + at]!;
         const end = Math.min(x1, runEnds[row * width + at]!);
-        if (regions[region] === 0) shares.regions.push(region);
-        regions[region]! += factor * (sums[end - x + reach]! - sums[at - x + reach]!) + Number.MIN_VALUE;
+        into.add(region, factor * (sums[end - x + reach]! - sums[at - x + reach]!));
         at = end;
       }
     }
+  }
+
+  /** Add the blur at a label, from that at the four nodes around it. */
+  private interpolate(x: number, y: number, kernel: Kernel): void {
+    const { spacing } = kernel;
+    const [column, row] = [Math.floor(x / spacing), Math.floor(y / spacing)];
+    const [i, j] = [x / spacing - column, y / spacing - row];
+    for (const [right, down, share] of [
+      [0, 0, (1 - i) * (1 - j)],
+      [1, 0, i * (1 - j)],
+      [0, 1, (1 - i) * j],
+      [1, 1, i * j],
+    ] as const) {
+      if (share === 0) continue;
+      const { regions, weights } = this.blurAt(column + right, row + down, kernel);
+      for (let at = 0; at < regions.length; at++) this.pixel.add(regions[at]!, share * weights[at]!);
+    }
+  }
+
+  /** The blur at a node, which may lie beyond the map; evaluated once. */
+  private blurAt(column: number, row: number, kernel: Kernel): Shares {
+    const { spacing, nodes } = kernel;
+    const key = row * this.width + column;
+    let shares = nodes.get(key);
+    if (shares === undefined) {
+      this.spread(this.node, column * spacing, row * spacing, kernel);
+      shares = this.node.take(1);
+      nodes.set(key, shares);
+    }
+    return shares;
   }
 }
 
@@ -110,5 +164,5 @@ function kernelOf(sigma: number): Kernel {
   const weights = Float64Array.from({ length: reach + 1 }, (_, i) => (i === 0 ? 1 : Math.exp(-0.5 * (i / sigma) ** 2)));
   const sums = new Float64Array(2 * reach + 2);
   for (let i = 0; i <= 2 * reach; i++) sums[i + 1] = sums[i]! + weights[Math.abs(i - reach)]!;
-  return { reach, weights, sums };
+  return { reach, weights, sums, spacing: Math.max(1, Math.floor(sigma / NODES)), nodes: new Map() };
 }
