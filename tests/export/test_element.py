@@ -251,6 +251,10 @@ class TestElement:
         first, *_, last = page.evaluate("kcgs.events")
         assert first == ["progress", False] and last == ["load", True]
 
+    def test_asks_for_the_file_alone(self, page: Browser, site: tuple[Path, str]) -> None:
+        show(page, site, random_scene("soft"), "zoom regions")
+        assert page.do("requests") == [site[1] + name for name in ("", "kcgs-image.js", "scene.kcgs")]
+
     def test_a_file_that_ends_early_shows_what_is_whole(self, page: Browser, site: tuple[Path, str]) -> None:
         data = encode(load(MODELS / "chelsea-500" / "scene.safetensors"))
         show(page, site, data[: len(data) * 3 // 4])
