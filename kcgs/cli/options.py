@@ -54,8 +54,11 @@ def fit_request(
         int | None, typer.Option(min=1, help="Default: the recipe's, or as many as --max-seconds has time for.")
     ] = None,
     objective: Annotated[
-        Literal["psnr", "visual"] | None,
-        typer.Option(help="What is fitted for: the squared error, or what the eye sees; default: the recipe's."),
+        Literal["psnr", "visual", "progressive"] | None,
+        typer.Option(
+            help="What is fitted for: the squared error, what the eye sees, or the squared error of a file's first "
+            "bytes, too; default: the recipe's."
+        ),
     ] = None,
     max_seconds: Annotated[
         float | None, typer.Option(help="Wall time of the whole command; of fit-many, for each image.")

@@ -10,16 +10,18 @@ from typing import NamedTuple
 from .gaussians.quantize import ENERGIES, QPS
 from .rangecoder import CodecError
 
-MAGIC, VERSION = b"kcgs", 1
+MAGIC, VERSIONS = b"kcgs", (1, 2)
 MAP_MAGIC = b"kcgm"
 """What a file begins with that is a label map and no scene."""
 # a decoder's memory: pixels of a map; Gaussians in all, and numbers of their colours
 MOST_LABELS = 1 << 26
 MOST_GAUSSIANS, MOST_COLORS = (1 << 21) - 1, 1 << 27
 MOST_SIDE, MOST_CHANNELS, MOST_REGIONS = 1 << 20, 1 << 10, (1 << 24) - 1
+# of version 1, and of version 2, which is written only for several layers of one energy
+_MOST_LAYERS = ENERGIES[1] - ENERGIES[0] + 1, 128
 # Gaussians that a layer of no bytes may hold
 SPARE = 64
-_HEADER_CRC, _LAYER_CRC = 4, 2  # bytes
+_HEADER_CRC, LAYER_CRC = 4, 2  # bytes
 
 
 class Header(NamedTuple):
@@ -69,7 +71,8 @@ def most_gaussians(channels: int) -> int:
 def pack(header: Header, region_map: bytes, layers: list[bytes]) -> bytes:
     """Put a file together."""
     numbers = [*header.size, header.channels, header.qp - QPS[0], header.regions]
-    head = bytearray(MAGIC + bytes([VERSION]) + b"".join(map(varint, numbers)))
+    split = len(dict(header.layers)) < len(layers)
+    head = bytearray(MAGIC + bytes([VERSIONS[split]]) + b"".join(map(varint, numbers)))
     if header.regions > 1:
         head += varint(len(region_map))
     head += varint(len(layers))
@@ -78,7 +81,7 @@ def pack(header: Header, region_map: bytes, layers: list[bytes]) -> bytes:
         head += varint(last - energy) + varint(len(layer))
         last = energy
     checksum = zlib.crc32(region_map, zlib.crc32(head)).to_bytes(_HEADER_CRC, "big")
-    checked = [layer + binascii.crc_hqx(layer, 0).to_bytes(_LAYER_CRC, "big") for layer in layers]
+    checked = [layer + binascii.crc_hqx(layer, 0).to_bytes(LAYER_CRC, "big") for layer in layers]
     return b"".join([head, checksum, region_map, *checked])
 
 
@@ -100,10 +103,10 @@ def unpack(data: bytes) -> tuple[Header, bytes, list[bytes]]:
 def _read_layers(stream: ByteReader, header: Header) -> Iterator[bytes]:
     for number, (_, length) in enumerate(header.layers, 1):
         start = stream.position
-        if start + length + _LAYER_CRC > len(stream.data):
+        if start + length + LAYER_CRC > len(stream.data):
             return
         layer = stream.take(length)
-        if binascii.crc_hqx(layer, 0) != int.from_bytes(stream.take(_LAYER_CRC), "big"):
+        if binascii.crc_hqx(layer, 0) != int.from_bytes(stream.take(LAYER_CRC), "big"):
             sound = f"; its first {start} bytes are sound" if number > 1 else ""
             raise CodecError(f"the file is damaged: the checksum of its layer {number} is another{sound}")
         yield layer
@@ -119,8 +122,9 @@ def _read_header(stream: ByteReader) -> tuple[Header, int]:
         )
     if magic != MAGIC:
         raise CodecError(f"it must start with {MAGIC!r}; got {stream.data[:4]!r}")
-    if (version := stream.take(1)[0]) != VERSION:
-        raise CodecError(f"its version must be {VERSION}; got {version}")
+    if (version := stream.take(1)[0]) not in VERSIONS:
+        raise CodecError(f"its version must be one of {VERSIONS}; got {version}")
+    split = VERSIONS.index(version)
     size = stream.varint("height", 1, MOST_SIDE), stream.varint("width", 1, MOST_SIDE)
     channels = stream.varint("channels", 1, MOST_CHANNELS)
     qp = stream.varint("quantization parameter", 0, QPS[1] - QPS[0]) + QPS[0]
@@ -130,10 +134,10 @@ def _read_header(stream: ByteReader) -> tuple[Header, int]:
         if size[0] * size[1] > MOST_LABELS:
             raise CodecError(f"an image with regions must have at most {MOST_LABELS} pixels; got {size}")
         length = stream.varint("length of the map", 1, 1 << 32)  # bytes that are not there end the file early
-    count = stream.varint("layers", 1, ENERGIES[1] - ENERGIES[0] + 1)
+    count = stream.varint("layers", 1, _MOST_LAYERS[split])
     layers, energy = [], ENERGIES[1]
     for i in range(count):
-        energy -= stream.varint("energy", min(i, 1), energy - ENERGIES[0])
+        energy -= stream.varint("energy", 0 if split else min(i, 1), energy - ENERGIES[0])
         layers.append((energy, stream.varint("length of a layer", 1, 1 << 32)))
     return Header(size, channels, qp, regions, tuple(layers)), length
 

@@ -18,7 +18,7 @@ from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
 from .exact import Integers
-from .file import MOST_CHANNELS, MOST_SIDE, SPARE, Header, most_gaussians, pack, unpack
+from .file import LAYER_CRC, MOST_CHANNELS, MOST_SIDE, SPARE, Header, most_gaussians, pack, unpack
 from .gaussians.layers import LayerCoder
 from .gaussians.quantize import QPS, Classes, Codes, Parameters, Quantizer
 from .rangecoder import CodecError, Reader, Writer
@@ -26,6 +26,8 @@ from .rangecoder import CodecError, Reader, Writer
 # of the decoded image against the scene's own, in dB
 QUALITIES = (10.0, 90.0)
 DEFAULT_QUALITY = 46.0
+# of a mark's bytes, filled by what is estimated; and bytes that a layer more takes
+_FILLED, _LAYER_BYTES = 0.985, 8
 
 
 def encode(scene: Scene, *, quality: float | None = None, target_bytes: int | None = None) -> bytes:
@@ -139,24 +141,63 @@ class SceneWriter:
         codes = quantizer.quantize(gaussians, Classes(*(numbers[kept] for numbers in classes)))
         return self.write(quantizer, codes, self.ids[kept])
 
-    def write(self, quantizer: Quantizer, codes: Codes, ids: Integers) -> bytes:
-        """Write the file of Gaussians that are whole numbers already, with the positions of their regions' ids."""
-        # by energy, then size, falling; then by cell, row by row
-        order = np.lexsort((codes.cell[:, 0], codes.cell[:, 1], -codes.size, -codes.energy))
+    def write(self, quantizer: Quantizer, codes: Codes, ids: Integers, *, marks: tuple[float, ...] = ()) -> bytes:
+        """Write the file of Gaussians that are whole numbers already, with the positions of their regions' ids.
+
+        With `marks`, rising shares of the file's bytes, a layer ends just before each.
+        """
+        header, layers = self._code(quantizer, codes, ids, np.zeros(len(ids), np.int64))
+        data = pack(header, self.region_map, layers)
+        if not marks:
+            return data
+        parts = _divide(codes, header, len(data), marks)
+        header, layers = self._code(quantizer, codes, ids, parts)
+        return pack(header, self.region_map, layers)
+
+    def _code(self, quantizer: Quantizer, codes: Codes, ids: Integers, parts: Integers) -> tuple[Header, list[bytes]]:
+        """Code a layer for each energy, or for each part of the Gaussians of one energy, from 0."""
+        # by energy, falling, and part, then by size, falling; then by cell, row by row
+        key = parts - codes.energy * (parts.max() + 1)
+        order = np.lexsort((codes.cell[:, 0], codes.cell[:, 1], -codes.size, key))
         codes, ids = codes.pick(order), ids[order]
         model, layers, listed = LayerCoder(quantizer, self.channels, self.regions), [], []
-        energies, starts, counts = np.unique(-codes.energy, return_index=True, return_counts=True)
-        for energy, start, count in zip((-energies).tolist(), starts.tolist(), counts.tolist(), strict=True):
-            writer, part = Writer(), slice(start, start + count)
+        _, starts, counts = np.unique(key[order], return_index=True, return_counts=True)
+        for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
+            writer, part, energy = Writer(), slice(start, start + count), int(codes.energy[start])
             model.code(writer, energy, codes.pick(part), ids[part], len(ids))
             # each Gaussian takes more than a bit, but zeros at the end are left out
             layers.append(writer.finish().ljust(-(-(count - SPARE) // 8), b"\0"))
             listed.append((energy, len(layers[-1])))
-        header = Header(self.size, self.channels, quantizer.qp, model.num_regions, tuple(listed))
-        return pack(header, self.region_map, layers)
+        return Header(self.size, self.channels, quantizer.qp, model.num_regions, tuple(listed)), layers
 
     def _count_numbers(self) -> int:
         return len(self.ids) * (5 + self.channels)
+
+
+def _divide(codes: Codes, header: Header, num_bytes: int, marks: tuple[float, ...]) -> Integers:
+    """Return parts of the Gaussians of each energy, whole sizes, so that layers end just before shares of a file."""
+    parts, left = np.zeros(len(codes.energy), np.int64), [_FILLED * mark * num_bytes for mark in marks]
+    start = num_bytes - sum(length + LAYER_CRC for _, length in header.layers)
+    for energy, length in header.layers:
+        end, part = start + length + LAYER_CRC, 0
+        rest = codes.energy == energy
+        while left and left[0] < end:
+            sizes, counts = np.unique(codes.size[rest], return_counts=True)
+            costs = np.ceil((end - start) * counts / counts.sum()).astype(np.int64)
+            filled: dict[int, list[int]] = {0: []}  # sizes, by the bytes that they take
+            for size, cost in zip(sizes.tolist(), costs.tolist(), strict=True):
+                for total, chosen in list(filled.items()):
+                    if total + cost <= left[0] - start - _LAYER_BYTES:
+                        filled.setdefault(total + cost, [*chosen, size])
+            left.pop(0)
+            if most := max(filled):
+                first = rest & np.isin(codes.size, filled[most])
+                rest &= ~first
+                parts[first], start, part = part, start + most + _LAYER_BYTES, part + 1
+                end += _LAYER_BYTES
+        parts[rest] = part
+        start = end
+    return parts
 
 
 def _check_field(field: GaussianField) -> None:

@@ -13,7 +13,7 @@ from kcgs._repr import shorten
 from kcgs.functional import MAX_SOFTNESS
 from kcgs.kernels import BACKENDS
 
-_USUAL_ITERATIONS = 700
+_USUAL_ITERATIONS, _PROGRESSIVE_ITERATIONS = 700, 900
 
 
 class FitConfig(BaseModel):
@@ -74,8 +74,10 @@ class FitConfig(BaseModel):
     merge_regions: bool = Field(True, description="merge regions where a trial says that their contour does not help")
 
     # The descent
-    objective: Literal["psnr", "visual"] = Field(
-        "psnr", description="visual: an error on several scales, less where the image is busy; needs loss l2"
+    objective: Literal["psnr", "visual", "progressive"] = Field(
+        "psnr",
+        description="visual: an error on several scales, less where the image is busy; progressive: the error of the "
+        "strongest Gaussians alone counts, too, so that the first bytes of a file are an image; both need loss l2",
     )
     loss: Literal["l1", "l2", "l1+ssim"] = Field("l2", description="l1+ssim: L1 + 0.1 (1 - SSIM), as Image-GS")
     optimizer: Literal["frame", "adan", "adam"] = Field(
@@ -98,7 +100,9 @@ class FitConfig(BaseModel):
 
     # The length
     iterations: int | None = Field(
-        None, ge=1, description="None: 700, or with `max_seconds` as many as there is time for"
+        None,
+        ge=1,
+        description="None: 700 (900 with objective progressive), or with `max_seconds` as many as there is time for",
     )
     max_seconds: float | None = Field(
         None, gt=0.0, description="stop after this wall time; the schedule adapts to it, and uses all of it"
@@ -111,8 +115,8 @@ class FitConfig(BaseModel):
         """Check what a type cannot say."""
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {self.backend!r}")
-        if self.objective == "visual" and self.loss != "l2":
-            raise ValueError(f"objective 'visual' needs loss 'l2'; got {self.loss!r}")
+        if self.objective != "psnr" and self.loss != "l2":
+            raise ValueError(f"objective {self.objective!r} needs loss 'l2'; got {self.loss!r}")
         if self.least_sigma is not None and self.optimizer != "frame":
             raise ValueError(f"least_sigma needs optimizer 'frame'; got {self.optimizer!r}, which has its own")
         if self.softness != "auto" and not 0.0 <= self.softness <= MAX_SOFTNESS:
@@ -123,7 +127,9 @@ class FitConfig(BaseModel):
     @property
     def usual_iterations(self) -> int:
         """Iterations of a fit without a clock."""
-        return _USUAL_ITERATIONS if self.iterations is None else self.iterations
+        if self.iterations is not None:
+            return self.iterations
+        return _PROGRESSIVE_ITERATIONS if self.objective == "progressive" else _USUAL_ITERATIONS
 
     def __repr__(self) -> str:
         changed = self.model_dump(exclude_defaults=True)

@@ -88,6 +88,11 @@ class Gaussians(NamedTuple):
         means, cholesky, colors = (t.detach().clone() for t in self[:3])
         return Gaussians(means, cholesky, colors, self.region_ids, self.regions)
 
+    def pick(self, index: Tensor) -> Gaussians:
+        """Return some of them."""
+        region_ids = None if self.region_ids is None else self.region_ids[index]
+        return Gaussians(self.means[index], self.cholesky[index], self.colors[index], region_ids, self.regions)
+
     def scene(self, size: tuple[int, int]) -> Scene:
         """Make a scene of them."""
         means, cholesky, colors = (t.detach() for t in self[:3])

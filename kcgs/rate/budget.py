@@ -26,7 +26,7 @@ from .compress import compress
 
 # bits per Gaussian that is fitted, some of which are left out, at `_COUNT` of them, and for each doubling; what was
 # lost to rounding shows more to the eye than Gaussians that are left out
-_BITS, _COUNT, _BITS_PER_OCTAVE = {"psnr": 26.5, "visual": 29.0}, 2100, 1.9
+_BITS, _COUNT, _BITS_PER_OCTAVE = {"psnr": 26.5, "visual": 29.0, "progressive": 26.5}, 2100, 1.9
 _HEADER_BYTES = 60
 # squared error falls with the power of the bytes
 _POWER = 0.93
@@ -131,7 +131,14 @@ def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: Fi
     # by iterations, so that without a clock the same arguments give the same file
     iterations = min(_TRIAL_ITERATIONS, config.usual_iterations)
     clock = None if config.max_seconds is None else _TRIAL_SHARE * config.max_seconds
-    shorter = {"iterations": iterations, "max_seconds": clock, "merge_regions": False, "refine_flat": False}
+    shorter: dict[str, Any] = {
+        "iterations": iterations,
+        "max_seconds": clock,
+        "merge_regions": False,
+        "refine_flat": False,
+    }
+    if config.objective == "progressive":  # the whole decides
+        shorter["objective"] = "psnr"
     trial = FitConfig.from_recipe(config, **shorter)
 
     def error(regions: RegionMap | None, left: int) -> float:
