@@ -123,7 +123,7 @@ def _read_header(stream: ByteReader) -> tuple[Header, int]:
     if magic != MAGIC:
         raise CodecError(f"it must start with {MAGIC!r}; got {stream.data[:4]!r}")
     if (version := stream.take(1)[0]) not in VERSIONS:
-        raise CodecError(f"its version must be one of {VERSIONS}; got {version}")
+        raise CodecError(f"its version must be 1 or 2; got {version}")
     split = VERSIONS.index(version)
     size = stream.varint("height", 1, MOST_SIDE), stream.varint("width", 1, MOST_SIDE)
     channels = stream.varint("channels", 1, MOST_CHANNELS)

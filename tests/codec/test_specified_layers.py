@@ -196,8 +196,9 @@ def as_the_words_say(data: bytes, known: Decoded) -> None:
         assert [id for _, id in found] == regions.index_of(field.region_ids).tolist()
 
 
-def test_golden() -> None:
-    data = (Path(__file__).parent / "golden.kcgs").read_bytes()
+@pytest.mark.parametrize("name", ["golden.kcgs", "golden2.kcgs"])
+def test_golden(name: str) -> None:
+    data = (Path(__file__).parent / name).read_bytes()
     as_the_words_say(data, decode(data))
 
 

@@ -4,7 +4,6 @@ import type { ByteReader } from "./bytes.ts";
 import { crc32 } from "./checksums.ts";
 import { DecodeError } from "./scene.ts";
 
-export const VERSION = 1;
 export const MOST_SIDE = 2 ** 20;
 export const MOST_LABELS = 2 ** 26;
 export const MOST_REGIONS = 2 ** 24 - 1;
@@ -12,6 +11,8 @@ const MOST_CHANNELS = 1024;
 const MOST_GAUSSIANS = 2 ** 21 - 1;
 const MOST_COLORS = 2 ** 27;
 const MOST_BYTES = 2 ** 32;
+// of version 1, and of version 2, in which several layers may be of one energy
+const MOST_LAYERS = [65, 128];
 const ENERGIES = { least: -24, most: 40 };
 const PARAMETERS = { least: -512, most: 1023 };
 
@@ -35,7 +36,7 @@ export function readHeader(reader: ByteReader): { header: Header; map: Uint8Arra
   if (magic === "kcgm") throw new DecodeError("it is a label map, no scene: decodeLabels reads it");
   if (magic !== "kcgs") throw new DecodeError(`it must start with "kcgs"; got ${text(reader.data.subarray(0, 4))}`);
   const version = reader.number(1);
-  if (version !== VERSION) throw new DecodeError(`its version must be ${VERSION}; got ${version}`);
+  if (version !== 1 && version !== 2) throw new DecodeError(`its version must be 1 or 2; got ${version}`);
   const height = reader.varint("height", 1, MOST_SIDE);
   const width = reader.varint("width", 1, MOST_SIDE);
   const channels = reader.varint("channels", 1, MOST_CHANNELS);
@@ -45,7 +46,7 @@ export function readHeader(reader: ByteReader): { header: Header; map: Uint8Arra
   if (regions > 1 && height * width > MOST_LABELS)
     throw new DecodeError(`an image with regions must have at most ${MOST_LABELS} pixels; got ${height} x ${width}`);
   const length = regions > 1 ? reader.varint("length of the map", 1, MOST_BYTES) : 0;
-  const layers = readLayers(reader);
+  const layers = readLayers(reader, version);
   const above = reader.data.subarray(0, reader.position);
   const checksum = reader.number(4);
   const map = reader.take(length);
@@ -54,11 +55,11 @@ export function readHeader(reader: ByteReader): { header: Header; map: Uint8Arra
   return { header: { height, width, channels, quantizationParameter, regions, layers }, map };
 }
 
-function readLayers(reader: ByteReader): { energy: number; bytes: number }[] {
+function readLayers(reader: ByteReader, version: number): { energy: number; bytes: number }[] {
   let energy = ENERGIES.most;
-  const count = reader.varint("layers", 1, ENERGIES.most - ENERGIES.least + 1);
+  const count = reader.varint("layers", 1, MOST_LAYERS[version - 1]!);
   return Array.from({ length: count }, (_, i) => {
-    energy -= reader.varint("energy", Math.min(i, 1), energy - ENERGIES.least);
+    energy -= reader.varint("energy", version === 1 ? Math.min(i, 1) : 0, energy - ENERGIES.least);
     return { energy, bytes: reader.varint("length of a layer", 1, MOST_BYTES) };
   });
 }

@@ -1,0 +1,97 @@
+"""Files of version 2: layers that end just before shares of the bytes."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import pytest
+import torch
+
+from kcgs import Scene
+from kcgs.codec import CodecError, decode, encode
+from kcgs.codec.file import pack, unpack
+from kcgs.codec.gaussians.quantize import Quantizer
+from kcgs.codec.scenes import SceneWriter
+
+from .conftest import make_scene
+
+MARKS = (0.25, 0.5, 0.75)
+GOLDEN = Path(__file__).parent / "golden2.kcgs"
+
+
+def write(scene: Scene, quality: float, marks: tuple[float, ...] = MARKS) -> bytes:
+    writer = SceneWriter(scene)
+    quantizer = Quantizer(writer.qp_for(quality), writer.size)
+    codes = quantizer.quantize(writer.gaussians, quantizer.classify(writer.gaussians))
+    return writer.write(quantizer, codes, writer.ids, marks=marks)
+
+
+def ends(data: bytes) -> list[float]:
+    """Return the shares of a file at which its layers end."""
+    lengths = [length + 2 for _, length in unpack(data)[0].layers]
+    return [1 - sum(lengths[i + 1 :]) / len(data) for i in range(len(lengths))]
+
+
+def rows(scene: Scene) -> list[list[float]]:
+    field = scene.field
+    ids = torch.zeros(len(field)) if field.region_ids is None else field.region_ids
+    return sorted(torch.cat([field.means, field.cholesky, field.colors, ids[:, None]], -1).detach().tolist())
+
+
+@pytest.mark.parametrize(("regions", "seed"), [(1, 0), (3, 1), (2, 2)])
+def test_layers_end_just_before_the_marks(regions: int, seed: int) -> None:
+    scene = make_scene(2500, (96, 128), regions, seed=seed)
+    data, whole = write(scene, 40.0), write(scene, 40.0, ())
+    assert data[4] == 2 and whole[4] == 1 and len(whole) < len(data) < len(whole) + 60
+    for mark in MARKS:
+        assert mark - 0.06 < max(end for end in ends(data) if end <= mark)
+    assert sorted(energy for energy, _ in unpack(data)[0].layers)[::-1] == [e for e, _ in unpack(data)[0].layers]
+
+
+def test_the_same_gaussians(scene: Scene) -> None:
+    for quality in (20.0, 50.0):
+        parts, whole = decode(write(scene, quality)), decode(write(scene, quality, ()))
+        assert parts.layers == parts.num_layers > whole.num_layers
+        assert len(parts.scene) == len(whole.scene)
+        # a centre is as fine as its cell allows, which depends on how many a layer holds
+        torch.testing.assert_close(parts.scene.render(), whole.scene.render(), rtol=0, atol=0.05)
+
+
+def test_what_version_1_can_say_stays(scene: Scene) -> None:
+    one = make_scene(1)
+    assert write(one, 40.0) == write(one, 40.0, ()) and write(one, 40.0)[4] == 1
+    assert write(scene, 40.0, (0.001,)) == write(scene, 40.0, ())
+
+
+def test_every_cut_is_a_coarser_scene_or_refused() -> None:
+    data, counts = GOLDEN.read_bytes(), set()
+    for length in range(len(data)):
+        try:
+            counts.add(len(decode(data[:length]).scene))
+        except CodecError:
+            assert not counts
+    assert len(counts) == decode(data).num_layers - 1
+
+
+def test_golden_is_decoded_as_ever() -> None:
+    found = decode(GOLDEN.read_bytes())
+    assert GOLDEN.read_bytes()[4] == 2 and (found.num_layers, len(found.scene)) == (13, 300)
+
+
+def test_layers_of_one_energy_are_no_version_1() -> None:
+    data = bytearray(write(make_scene(300, regions=1), 40.0))
+    start = len(data) - sum(length + 2 for _, length in unpack(bytes(data))[0].layers) - 4
+    data[4] = 1
+    data[start : start + 4] = zlib.crc32(data[:start]).to_bytes(4, "big")
+    with pytest.raises(CodecError, match=r"energy must be in \[1"):
+        decode(bytes(data))
+
+
+def test_limits(scene: Scene) -> None:
+    header, region_map, layers = unpack(encode(scene))
+    many = header._replace(layers=(header.layers[0],) * 129)
+    with pytest.raises(CodecError, match=r"layers must be in \[1, 128\]; got 129"):
+        decode(pack(many, region_map, [layers[0]] * 129))
+    with pytest.raises(CodecError, match="its version must be 1 or 2; got 3"):
+        decode(b"kcgs\3" + encode(scene)[5:])
