@@ -84,6 +84,7 @@ class TestFit:
         assert value["visual"] < value["psnr"]
 
     @pytest.mark.parametrize("loss", ["l1", "l1+ssim"])
-    def test_other_losses_are_refused(self, loss: Any) -> None:
-        with pytest.raises(ValueError, match="objective 'visual' needs loss 'l2'"):
-            fit(torch.rand(3, 16, 16), None, 4, objective="visual", loss=loss)
+    @pytest.mark.parametrize("name", ["visual", "progressive"])
+    def test_other_losses_are_refused(self, loss: Any, name: Any) -> None:
+        with pytest.raises(ValueError, match=f"objective {name!r} needs loss 'l2'"):
+            fit(torch.rand(3, 16, 16), None, 4, objective=name, loss=loss)
