@@ -27,6 +27,8 @@ from .tuning import Tuning
 # and by more where so few Gaussians are rounded that errors do not average out
 _MARGIN = 14.5
 # dB by which files are finer that are tried until one is good enough
+# shares of the bytes before which a layer of a progressive file ends
+_MARKS = (0.25, 0.5, 0.75)
 _FINER = (0.0, 2.0, 5.0, 9.0, 14.0, 20.0, 30.0, 50.0)
 # share of the iterations before anything is rounded, and how many go by between two looks at the distortion
 _FREE, _LOOK = 0.7, 50
@@ -75,7 +77,8 @@ def compress(
         iterations: renders that the descent may take, at least 1.
         max_seconds: wall time, above 0; what it has no time for is rounded at once. None: as long as it takes.
         seed: of the order in which Gaussians are rounded.
-        objective: of the descent, as in :class:`kcgs.fit.FitConfig`: psnr or visual.
+        objective: of the descent, as in :class:`kcgs.fit.FitConfig`: psnr, visual or progressive, whose layers end just before a
+            quarter, a half and three quarters of the file.
 
     Returns:
         The file, and the scene that it decodes to.
@@ -101,13 +104,12 @@ def compress(
         raise ValueError(f"target_psnr excludes quality and target_bytes; got {quality!r} and {target_bytes!r}")
     qp = writer.qp_for(quality, target_bytes)
     check_count("iterations", iterations)
-    if objective not in ("psnr", "visual"):
-        raise ValueError(f"objective must be psnr or visual; got {objective!r}")
+    if objective not in ("psnr", "visual", "progressive"):
+        raise ValueError(f"objective must be psnr, visual or progressive; got {objective!r}")
     seconds = math.inf
     if max_seconds is not None:
         seconds = check_number("max_seconds", max_seconds, 0.0, unit="seconds", above=True)
-    visual = VisualObjective(target) if objective == "visual" else None
-    press = _Press(writer, target, visual, iterations, seed, time.perf_counter() + seconds)
+    press = _Press(writer, target, objective, iterations, seed, time.perf_counter() + seconds)
     with threads_for_kernels(target[0].numel()):
         if target_bytes is not None:
             data = press.largest(target_bytes)
@@ -125,12 +127,13 @@ class _Press:
         self,
         writer: SceneWriter,
         image: Tensor,
-        objective: VisualObjective | None,
+        objective: str,
         iterations: int,
         seed: int,
         end: float,
     ) -> None:
-        self.writer, self.image, self.objective = writer, image, objective
+        self.writer, self.image, self.progressive = writer, image, objective == "progressive"
+        self.objective = VisualObjective(image) if objective == "visual" else None
         self.seed, self.end = seed, end
         self.free = int(_FREE * iterations)
         self.rounds = iterations - self.free
@@ -195,10 +198,12 @@ class _Press:
         tuning = self._tuning(writer, Quantizer(qp, writer.size))
         tuning.drop()
         codes = tuning.round(iterations, self.seed, share * (self.end - time.perf_counter()))
-        return writer.write(tuning.quantizer, codes, tuning.ids)
+        return writer.write(tuning.quantizer, codes, tuning.ids, marks=_MARKS if self.progressive else ())
 
     def _tuning(self, writer: SceneWriter, quantizer: Quantizer) -> Tuning:
-        return Tuning(writer.gaussians, writer.ids, self.image, writer.regions, quantizer, self.objective)
+        return Tuning(
+            writer.gaussians, writer.ids, self.image, writer.regions, quantizer, self.objective, self.progressive
+        )
 
 
 def quality_for(decibels: float) -> float:

@@ -19,6 +19,7 @@ from kcgs.codec.exact import Integers
 from kcgs.codec.gaussians.quantize import Codes, Parameters, Quantizer
 from kcgs.fit.frame import local_gradient, move
 from kcgs.fit.objective import VisualObjective
+from kcgs.fit.prefixes import strongest
 from kcgs.functional import RegionMap, region_splat
 
 from .bits import soft_bits
@@ -63,9 +64,11 @@ class Tuning:
         regions: RegionMap | None,
         quantizer: Quantizer,
         objective: VisualObjective | None,
+        progressive: bool = False,
     ) -> None:
         self.ids, self.image, self.regions, self.objective = ids, image, regions, objective
-        self.quantizer = quantizer
+        self.quantizer, self.progressive, self._steps = quantizer, progressive, 0
+        self._still: Tensor | None = None  # [N, 1] Gaussians that this step leaves as they are
         self._free = [torch.from_numpy(numbers).to(image) for numbers in gaussians]
         self._speed = torch.zeros(len(ids), 5 + gaussians.colors.shape[1]).to(image)
 
@@ -85,7 +88,7 @@ class Tuning:
         """Move all Gaussians downhill, so many steps."""
         for _ in range(iterations):
             downhill = self._downhill(*self._free)
-            self._speed = _MOMENTUM * self._speed + downhill
+            self._speed = self._faster(downhill)
             self._free = self._moved(self._free)
 
     def round(self, iterations: int, seed: int, seconds: float = math.inf) -> Codes:
@@ -113,20 +116,36 @@ class Tuning:
         current = [torch.where(fix, r, f) for fix, r, f in zip(fixed, rounded, self._free, strict=True)]
         downhill = self._downhill(*current)
         stopped = torch.cat([shaped.expand(-1, 5), colored.expand(-1, downhill.shape[1] - 5)], -1)
-        self._speed = torch.where(stopped, 0.0, _MOMENTUM * self._speed + downhill)
+        self._speed = torch.where(stopped, 0.0, self._faster(downhill))
         moved = self._moved(current)
         self._free = [torch.where(fix, f, m) for fix, f, m in zip(fixed, self._free, moved, strict=True)]
 
+    def _faster(self, downhill: Tensor) -> Tensor:
+        speed = _MOMENTUM * self._speed + downhill
+        return speed if self._still is None else torch.where(self._still, self._speed, speed)
+
     def _moved(self, current: list[Tensor]) -> list[Tensor]:
-        step = _STEP * self._speed
+        step = _STEP * (self._speed if self._still is None else self._speed.masked_fill(self._still, 0.0))
         means, cholesky = move(current[0], current[1], step[:, :5].clamp(-_LARGEST, _LARGEST), exact=False)
         return [means, cholesky, current[2] + step[:, 5:]]
 
     def _downhill(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
+        """Return Newton's steps; in a progressive descent now and then those of the strongest Gaussians alone."""
+        self._still, ids = None, self._region_ids
+        index = strongest(cholesky, colors, self.quantizer.size, 0, self._steps) if self.progressive else None
+        self._steps += 1
+        if index is None:
+            return self._newton(means, cholesky, colors, ids)
+        steps = self._newton(means[index], cholesky[index], colors[index], None if ids is None else ids[index])
+        # the others stand still: momentum that misses every third gradient swings ever wider
+        self._still = torch.ones(len(means), 1, dtype=torch.bool).index_fill(0, index, False)
+        return torch.zeros_like(self._speed).index_copy(0, index, steps)
+
+    def _newton(self, means: Tensor, cholesky: Tensor, colors: Tensor, ids: Tensor | None) -> Tensor:
         """Return Newton's steps of each number alone: of centre and factor in the Gaussian's frame, of colours."""
         size = self.quantizer.size
         x, factors, c = (t.detach().requires_grad_() for t in (means, cholesky, colors))
-        render = region_splat(x, factors, c, self._region_ids, self.regions, size=size, cutoff=_DRAFT_CUTOFF)
+        render = region_splat(x, factors, c, ids, self.regions, size=size, cutoff=_DRAFT_CUTOFF)
         difference = render.detach() - self.image
         if self.objective is not None:
             difference = self.objective.apply(difference)
