@@ -131,15 +131,9 @@ def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: Fi
     # by iterations, so that without a clock the same arguments give the same file
     iterations = min(_TRIAL_ITERATIONS, config.usual_iterations)
     clock = None if config.max_seconds is None else _TRIAL_SHARE * config.max_seconds
-    shorter: dict[str, Any] = {
-        "iterations": iterations,
-        "max_seconds": clock,
-        "merge_regions": False,
-        "refine_flat": False,
-    }
-    if config.objective == "progressive":  # the whole decides
-        shorter["objective"] = "psnr"
-    trial = FitConfig.from_recipe(config, **shorter)
+    shorter: dict[str, Any] = {"iterations": iterations, "max_seconds": clock, "refine_flat": False}
+    seen = "psnr" if config.objective == "progressive" else config.objective  # the whole decides
+    trial = FitConfig.from_recipe(config, merge_regions=False, objective=seen, **shorter)
 
     def error(regions: RegionMap | None, left: int) -> float:
         result = fit(image, regions, count_of(left), recipe=trial, seed=seed)
