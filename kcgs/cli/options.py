@@ -55,10 +55,7 @@ def fit_request(
     ] = None,
     objective: Annotated[
         Literal["psnr", "visual", "progressive"] | None,
-        typer.Option(
-            help="What is fitted for: the squared error, what the eye sees, or the squared error of a file's first "
-            "bytes, too; default: the recipe's."
-        ),
+        typer.Option(help="The squared error, what the eye sees, or a file's first bytes, too; default: the recipe's."),
     ] = None,
     max_seconds: Annotated[
         float | None, typer.Option(help="Wall time of the whole command; of fit-many, for each image.")

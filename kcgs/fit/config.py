@@ -127,9 +127,7 @@ class FitConfig(BaseModel):
     @property
     def usual_iterations(self) -> int:
         """Iterations of a fit without a clock."""
-        if self.iterations is not None:
-            return self.iterations
-        return _PROGRESSIVE_ITERATIONS if self.objective == "progressive" else _USUAL_ITERATIONS
+        return self.iterations or (_PROGRESSIVE_ITERATIONS if self.objective == "progressive" else _USUAL_ITERATIONS)
 
     def __repr__(self) -> str:
         changed = self.model_dump(exclude_defaults=True)

@@ -27,15 +27,7 @@ def choose_prefix(state: FitState, progress: float) -> Gaussians | None:
 
 
 def strongest(cholesky: Tensor, colors: Tensor, size: tuple[int, int], seed: int, iteration: int) -> Tensor | None:
-    """Return the indices of a share of the Gaussians, in the order of a file; None in the iterations between.
-
-    Args:
-        cholesky: :math:`(N, 3)`.
-        colors: :math:`(N, C)`.
-        size: (height, width) of the image.
-        seed: with the iteration it says which share.
-        iteration: from 0.
-    """
+    """Return the indices of a share of the Gaussians, in the order of a file; None in the iterations between."""
     if iteration % _EVERY != _EVERY - 1:
         return None
     share = float(np.random.default_rng([seed, iteration]).choice(_SHARES))

@@ -77,8 +77,8 @@ def compress(
         iterations: renders that the descent may take, at least 1.
         max_seconds: wall time, above 0; what it has no time for is rounded at once. None: as long as it takes.
         seed: of the order in which Gaussians are rounded.
-        objective: of the descent, as in :class:`kcgs.fit.FitConfig`: psnr, visual or progressive, which ends layers just
-            before a quarter, a half and three quarters of the file.
+        objective: of the descent, as in :class:`kcgs.fit.FitConfig`: psnr, visual or progressive, which ends layers
+            just before a quarter, a half and three quarters of the file.
 
     Returns:
         The file, and the scene that it decodes to.
