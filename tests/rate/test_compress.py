@@ -65,10 +65,22 @@ class TestCompress:
             assert compress(scene, image.clone(), quality=30, iterations=3)
             assert compress(fitted, image, quality=30, iterations=3).data == expected
 
+    def test_progressive(self, photo: Photo, fitted: Scene) -> None:
+        image, target = photo[0], 1300
+        usual, first = (
+            compress(fitted, image, target_bytes=target, objective=name) for name in ("psnr", "progressive")
+        )
+        assert usual.data[4] == 1 and first.data[4] == 2 and 0.97 * target < len(first.data) <= target
+        for mark, gain in ((0.5, 0.5), (0.75, 0.3), (1.0, -1.5)):
+            parts = (decode(data.data, max_bytes=int(mark * target)).scene for data in (usual, first))
+            before, now = (psnr(part, image) for part in parts)
+            assert now > before + gain, mark
+
     def test_refusals(self, photo: Photo, fitted: Scene) -> None:
         image = photo[0]
         for changed, match in (
             ({"image": image[:, :50]}, "image must have shape"),
+            ({"objective": "l1"}, "objective must be psnr, visual or progressive; got 'l1'"),
             ({"iterations": 0}, "iterations must be at least 1; got 0"),
             ({"quality": 40, "target_bytes": 900}, "exclude each other"),
             ({"target_bytes": 40}, "target_bytes must be at least [0-9]+ for this scene; got 40"),
