@@ -34,7 +34,7 @@ _FINER = (0.0, 2.0, 5.0, 9.0, 14.0, 20.0, 30.0, 50.0)
 _FREE, _LOOK = 0.7, 50
 _DROP = 0.8
 # files that are tried for a number of bytes, and how much smaller tuned ones are
-_TRIES, _TUNED = 4, 1.01
+_TRIES, _TUNED = 4, 1.006
 # of the seconds that are left, for the first of several files, and for what comes before
 _SHARE = 0.5
 

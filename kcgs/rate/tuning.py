@@ -71,6 +71,8 @@ class Tuning:
         self._still: Tensor | None = None  # [N, 1] Gaussians that this step leaves as they are
         self._free = [torch.from_numpy(numbers).to(image) for numbers in gaussians]
         self._speed = torch.zeros(len(ids), 5 + gaussians.colors.shape[1]).to(image)
+        # what the distortion counts in the error
+        self._counts = 1.0 if objective is None else float(objective.weigh(*self._free[:2]).mean())
 
     @property
     def gaussians(self) -> Parameters:
@@ -150,7 +152,8 @@ class Tuning:
         if self.objective is not None:
             difference = self.objective.apply(difference)
         # half the squared error, as its gradient is the difference
-        bits = 0.5 * _BIT * self.quantizer.distortion * soft_bits(factors, c, self.quantizer).sum()
+        price = 0.5 * _BIT * self._counts * self.quantizer.distortion
+        bits = price * soft_bits(factors, c, self.quantizer).sum()
         gradients = torch.autograd.grad((render, bits), (x, factors, c), (difference, None))
         narrow = cholesky[:, ::2].clamp_min(_NARROW)
         area = (math.pi * narrow.prod(-1)).clamp_max(size[0] * size[1])

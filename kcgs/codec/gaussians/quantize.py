@@ -136,13 +136,17 @@ class Quantizer:
         """Return the steps at which every parameter adds the distortion; cells are of all Gaussians of a class."""
         relative: Floats = self._relative[classes.energy - ENERGIES[0]]
         scale = relative * (math.sqrt(0.5) / _LN2)
-        _, group, counts = np.unique(np.stack(classes), axis=1, return_inverse=True, return_counts=True)
-        sides = [Grid.over(self.size, count).side for count in counts.tolist()]
+        # one number for each pair of classes
+        pair = (classes.energy - ENERGIES[0]) * (SIZES[1] - SIZES[0] + 1) + classes.size - SIZES[0]
+        counts = np.bincount(pair)
+        sides = np.zeros(len(counts), np.int64)
+        for found in np.flatnonzero(counts).tolist():
+            sides[found] = Grid.over(self.size, int(counts[found])).side
         return Steps(
             classes.size, place=relative * math.sqrt(2.0),
             scales=np.clip(np.floor(OCTAVES / scale + 0.5), 1, _MOST_LEVELS).astype(np.int64),
             ratio=np.maximum(relative * (1.0 / _LN2), MOST_RATIO / _MOST_LEVELS), angle=relative,
-            color=self._color[classes.size - SIZES[0]], side=np.array(sides, np.int64)[group],
+            color=self._color[classes.size - SIZES[0]], side=sides[pair],
         )  # fmt: skip
 
     def quantize(self, gaussians: Parameters, classes: Classes) -> Codes:
