@@ -123,7 +123,8 @@ class SceneWriter:
 
     def next_qp(self, qp: int, num_bytes: int, target_bytes: int) -> int:
         """Return the quantization parameter for so many bytes, where that of `qp` has `num_bytes`."""
-        return qp + math.floor((target_bytes - num_bytes) * 8 * 32 / self._count_numbers())
+        found = qp + math.floor((target_bytes - num_bytes) * 8 * 32 / self._count_numbers())
+        return min(max(found, QPS[0]), QPS[1])
 
     def of(self, gaussians: Parameters, ids: Integers) -> SceneWriter:
         """Return a writer of other Gaussians with the same map."""

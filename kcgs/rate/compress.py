@@ -190,7 +190,7 @@ class _Press:
             tuning.quantizer = quantizer
             if done >= _DROP * self.free:
                 tuning.drop()
-            tuning.descend(min(_LOOK, self.free - done))
+            tuning.descend(min(_LOOK, self.free - done), end - time.perf_counter())
             writer = writer.of(tuning.gaussians, tuning.ids)
         return writer
 

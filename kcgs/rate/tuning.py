@@ -86,9 +86,12 @@ class Tuning:
             self.ids, index = self.ids[kept], torch.from_numpy(kept)
             self._free, self._speed = [numbers[index] for numbers in self._free], self._speed[index]
 
-    def descend(self, iterations: int) -> None:
-        """Move all Gaussians downhill, so many steps."""
+    def descend(self, iterations: int, seconds: float = math.inf) -> None:
+        """Move all Gaussians downhill, so many steps, or so many seconds."""
+        end = time.perf_counter() + seconds
         for _ in range(iterations):
+            if time.perf_counter() >= end:
+                break
             downhill = self._downhill(*self._free)
             self._speed = self._faster(downhill)
             self._free = self._moved(self._free)
