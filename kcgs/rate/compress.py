@@ -124,13 +124,7 @@ class _Press:
     """Writes a scene with an eye on its image, until a time of the clock."""
 
     def __init__(
-        self,
-        writer: SceneWriter,
-        image: Tensor,
-        objective: str,
-        iterations: int,
-        seed: int,
-        end: float,
+        self, writer: SceneWriter, image: Tensor, objective: str, iterations: int, seed: int, end: float
     ) -> None:
         self.writer, self.image, self.progressive = writer, image, objective == "progressive"
         self.objective = VisualObjective(image) if objective == "visual" else None
