@@ -86,7 +86,7 @@ def serve(
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
         beside = None if original is None else f"scene/{_copy_original(original, folder)}"
-        (folder / "scene.kcgs").write_bytes(web_bytes(scene) if isinstance(scene, Scene) else scene)
+        (folder / "scene.kcgs").write_bytes(web_bytes(scene))
         page = page_html("scene/scene.kcgs", title=name, contours=contours, original=beside)
         (folder / "index.html").write_text(page, encoding="utf-8")
         _serve(folder, folder, "", port=port, browser=browser, say=say)

@@ -75,7 +75,7 @@ def _write_page(scene: Path, output: Path, contours: str) -> dict[str, object]:
     from kcgs.page.html import scene_page, web_bytes
 
     loaded = load(scene)
-    data = scene.read_bytes() if scene.suffix == ".kcgs" else web_bytes(loaded)
+    data = web_bytes(scene.read_bytes() if scene.suffix == ".kcgs" else loaded)
     with atomic_path(output) as temporary:
         temporary.write_text(scene_page(data, title=output.stem, contours=contours), encoding="utf-8")
         size = temporary.stat().st_size

@@ -7,7 +7,7 @@ import hashlib
 import html
 from pathlib import Path
 
-from kcgs.codec import encode
+from kcgs.codec import decode, encode
 from kcgs.functional.softness import check_contours
 from kcgs.scene import Scene, check_scene
 
@@ -22,7 +22,7 @@ def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "s
     Convention: the page zooms, pans, and hides regions. It holds the scene as a `.kcgs` file and loads nothing.
 
     Args:
-        scene: of one image, with 1, 3 or 4 channels; or the bytes of a `.kcgs` file, which are kept as they are.
+        scene: of one image, with 1, 3 or 4 channels; or the bytes of its `.kcgs` file, which are kept as they are.
         title: of the page, and what it calls the image for who does not see it.
         contours: "scaled" or "crisp", as :meth:`kcgs.Scene.render` has them.
 
@@ -30,7 +30,8 @@ def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "s
         The page, about 100 kB and 4/3 of the scene's file.
 
     Raises:
-        TypeError, ValueError: as :func:`kcgs.codec.encode`; other contours, another number of channels.
+        TypeError, ValueError: as :func:`kcgs.codec.encode` and :func:`kcgs.codec.decode`; other contours, another
+            number of channels.
 
     Example:
         >>> from kcgs import GaussianField
@@ -38,17 +39,17 @@ def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "s
         >>> page[:15], "<title>Blobs &amp; more</title>" in page
         ('<!doctype html>', True)
     """
-    data = web_bytes(scene) if isinstance(scene, Scene) else scene
-    source = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    source = "data:application/octet-stream;base64," + base64.b64encode(web_bytes(scene)).decode()
     return page_html(source, title=title, contours=contours)
 
 
-def web_bytes(scene: Scene) -> bytes:
-    """Write a scene as a `.kcgs` file whose render is within a level of 255 of the scene's own."""
-    channels = check_scene(scene).field.colors.shape[-1]
+def web_bytes(scene: Scene | bytes) -> bytes:
+    """Write a scene as a `.kcgs` file whose render is within a level of 255 of the scene's own; a file is kept."""
+    loaded = check_scene(scene) if isinstance(scene, Scene) else decode(scene).scene
+    channels = loaded.field.colors.shape[-1]
     if channels not in (1, 3, 4):
         raise ValueError(f"scene must have 1, 3 or 4 channels for a page to show it; got {channels}")
-    return encode(scene, quality=_QUALITY)
+    return encode(scene, quality=_QUALITY) if isinstance(scene, Scene) else scene
 
 
 def page_html(source: str, *, title: str, contours: str = "scaled", original: str | None = None) -> str:

@@ -22,7 +22,7 @@ import torch
 
 from kcgs import GaussianField, RegionMap, Scene, load, save
 from kcgs.cli import main
-from kcgs.codec import decode
+from kcgs.codec import CodecError, decode, encode
 from kcgs.data import load_image
 from kcgs.page import scene_page
 from kcgs.view import _Handler, _Server, serve, serve_decoder
@@ -182,8 +182,14 @@ class TestPage:
             assert f"{kind}-src 'sha256-{digest}'" in policy[1]
 
     def test_channels(self) -> None:
-        with pytest.raises(ValueError, match="1, 3 or 4 channels"):
-            scene_page(Scene(GaussianField.random(5, (8, 9), channels=2, seed=0)))
+        two = Scene(GaussianField.random(5, (8, 9), channels=2, seed=0))
+        for scene in (two, encode(two)):
+            with pytest.raises(ValueError, match="1, 3 or 4 channels"):
+                scene_page(scene)
+
+    def test_a_damaged_file_is_no_page(self) -> None:
+        with pytest.raises(CodecError, match="must start with"):
+            scene_page(b"no scene")
 
 
 class TestView:
