@@ -210,12 +210,15 @@ class TestEdits:
             ("hide(77)", "ids must be of the scene's regions; got 77"),
             ("move(5, 0.3, 0)", "dx and dy must be whole; got 0.3, 0"),
             ("recolour(5, [1, 2])", "gain must be a number or 3 of them; got 1,2"),
+            ("zoomBy(-1)", "factor must be 0 or more; got -1"),
+            ("toBlob({width: 0.5})", "width must be a whole number of pixels, 1 or more; got 0.5"),
+            ("toBlob({width: 1e5, height: 1e5})", "no image of 100000 x 100000 can be made"),
         ],
     )
     def test_errors(self, page: Browser, site: tuple[Path, str], call: str, says: str) -> None:
         show(page, site, random_scene("soft"))
         said = page.evaluate(
-            f"(() => {{ try {{ image.{call}; return ''; }} catch (error) {{ return error.message; }} }})()"
+            f"(async () => {{ try {{ await image.{call}; return ''; }} catch (error) {{ return error.message; }} }})()"
         )
         assert said == says
 
@@ -250,6 +253,17 @@ class TestElement:
         page.evaluate("kcgs.show('<kcgs-image src=slow/scene.kcgs></kcgs-image>')")
         first, *_, last = page.evaluate("kcgs.events")
         assert first == ["progress", False] and last == ["load", True]
+
+    def test_leaves_the_page_and_comes_back(self, page: Browser, site: tuple[Path, str]) -> None:
+        show(page, site, load(MODELS / "chelsea-500" / "scene.safetensors"))
+        page.evaluate(
+            "(async () => { const here = document.querySelector('#here'), slow = document.createElement('kcgs-image');"
+            "let next = new Promise((r) => (slow.onprogress = r)); slow.setAttribute('src', 'slow/scene.kcgs');"
+            "here.replaceChildren(slow); await next; slow.remove(); here.append(slow); window.image = slow; })()"
+        )
+        page.do("wait", expression="image.scene?.complete === true")
+        page.evaluate("(image.remove(), image.setAttribute('src', 'none.kcgs'), document.body.append(image), 1)")
+        page.do("wait", expression="image.scene === null")
 
     def test_asks_for_the_file_alone(self, page: Browser, site: tuple[Path, str]) -> None:
         show(page, site, random_scene("soft"), "zoom regions")

@@ -6,6 +6,7 @@ import type { Device } from "../renderer/painter.ts";
 import { listen, zoomAtMiddle } from "../src/gestures.ts";
 import type { Glide } from "../src/gestures.ts";
 import type { Transform } from "../src/view.ts";
+import { oneOf } from "./attribute.ts";
 import { move, recolour } from "./edits.ts";
 import type { Channels, Edit } from "./edits.ts";
 import { load } from "./loading.ts";
@@ -38,6 +39,7 @@ export class KcgsImage extends HTMLElement {
   private current: Scene | null = null; // as it was edited
   private edits: Edit[] = [];
   private readonly hiddenIds = new Set<number>();
+  private unread = true; // whether `src` is to be read when the element is part of a page
   private loading: AbortController | null = null;
   private gestures: AbortController | null = null;
   private density: AbortController | null = null;
@@ -60,20 +62,24 @@ export class KcgsImage extends HTMLElement {
 
   connectedCallback(): void {
     this.observe();
-    if (this.loaded === null && this.loading === null) this.start();
+    if (this.unread) this.start();
   }
 
   disconnectedCallback(): void {
     this.observer.disconnect();
     this.density?.abort();
+    // what is cut off begins again
+    this.unread ||= this.loading !== null;
     this.loading?.abort();
     this.loading = null;
   }
 
   attributeChangedCallback(name: string, before: string | null, value: string | null): void {
     if (before === value) return;
-    if (name === "src" && this.isConnected) this.start();
-    else if (name === "alt") this.describe();
+    if (name === "src") {
+      this.unread = true;
+      if (this.isConnected) this.start();
+    } else if (name === "alt") this.describe();
     else if (name === "zoom") this.listenToGestures();
     else if (name === "regions") this.describe();
     else if (name === "contours") this.setContours(value ?? "scaled");
@@ -86,6 +92,7 @@ export class KcgsImage extends HTMLElement {
   }
 
   set scene(scene: Scene | null) {
+    this.unread = false;
     this.loading?.abort();
     this.loading = null;
     this.forget();
@@ -135,6 +142,7 @@ export class KcgsImage extends HTMLElement {
 
   /** Zoom about the middle; 0 shows all. */
   zoomBy(factor: number): void {
+    if (!(factor >= 0 && factor < Infinity)) throw new RangeError(`factor must be 0 or more; got ${factor}`);
     if (factor === 0) this.stage.fit();
     else if (this.glide !== null) zoomAtMiddle(this.stage.canvas, this.glide, factor);
     else this.stage.zoom(factor, this.stage.anchorAt(this.stage.size.width / 2, this.stage.size.height / 2));
@@ -144,22 +152,26 @@ export class KcgsImage extends HTMLElement {
   regionAt(x: number, y: number): number | null {
     const scene = this.current;
     if (scene === null || scene.regions === null) return null;
-    if (x < 0 || y < 0 || x >= scene.width || y >= scene.height) return null;
+    if (!(x >= 0 && y >= 0 && x < scene.width && y < scene.height)) return null;
     const { supersample: k, labels, ids } = scene.regions;
     return ids[labels[Math.floor(y * k) * scene.width * k + Math.floor(x * k)]!]!;
   }
 
   /** The whole image as a file, at its own size or another. */
-  toBlob({ width, height, type = "image/png", quality }: ImageOptions = {}): Promise<Blob> {
+  async toBlob({ width, height, type = "image/png", quality }: ImageOptions = {}): Promise<Blob> {
     const { current } = this;
-    if (current === null) return Promise.reject(new Error("there is no scene yet"));
+    if (current === null) throw new Error("there is no scene yet");
+    for (const [name, length] of Object.entries({ width, height })) {
+      if (length === undefined || (Number.isInteger(length) && length > 0)) continue;
+      throw new RangeError(`${name} must be a whole number of pixels, 1 or more; got ${length}`);
+    }
     const ratio = current.height / current.width;
-    const across = width ?? (height === undefined ? current.width : Math.round(height / ratio));
+    const across = width ?? (height === undefined ? current.width : Math.max(1, Math.round(height / ratio)));
     const down = height ?? Math.max(1, Math.round(across * ratio));
-    const canvas = this.stage.image(Math.max(1, across), down);
+    const canvas = this.stage.image(across, down);
     return new Promise((resolve, reject) => {
       const made = (blob: Blob | null): void =>
-        blob === null ? reject(new Error(`no image of ${across} x ${down} could be made`)) : resolve(blob);
+        blob === null ? reject(new Error(`no image of ${across} x ${down} can be made`)) : resolve(blob);
       canvas.toBlob(made, type, quality);
     });
   }
@@ -170,15 +182,22 @@ export class KcgsImage extends HTMLElement {
   }
 
   private start(): void {
+    this.unread = false;
     this.loading?.abort();
+    this.loading = null;
     this.forget();
     const src = this.getAttribute("src");
     if (src === null || src === "") return;
     const loading = new AbortController();
     this.loading = loading;
+    const end = (tell: () => void): void => {
+      if (loading.signal.aborted) return;
+      this.loading = null;
+      tell();
+    };
     load(src, loading.signal, (scene) => this.take(scene)).then(
-      () => this.dispatchEvent(new Event("load")),
-      (error: unknown) => loading.signal.aborted || this.fail(error as Error, this.current !== null),
+      () => end(() => this.dispatchEvent(new Event("load"))),
+      (error: unknown) => end(() => this.fail(error as Error, this.current !== null)),
     );
   }
 
@@ -228,12 +247,12 @@ export class KcgsImage extends HTMLElement {
   }
 
   private setContours(value: string): void {
-    this.stage.contours = value === "crisp" ? "crisp" : ("scaled" satisfies Contours);
+    this.stage.contours = oneOf("contours", value, ["scaled", "crisp"] satisfies Contours[]);
     if (this.current !== null) this.stage.show(this.current, this.hiddenPlaces());
   }
 
   private setDevice(value: string): void {
-    this.stage.device = value === "cpu" || value === "webgl2" ? value : ("auto" satisfies Device);
+    this.stage.device = oneOf("renderer", value, ["auto", "webgl2", "cpu"] satisfies Device[]);
     this.stage.want();
   }
 

@@ -21,10 +21,15 @@ async function* chunks(src: string, signal: AbortSignal): AsyncGenerator<Uint8Ar
   const response = await fetch(url, { signal });
   if (!response.ok) throw new Error(`the server answers ${response.status} ${response.statusText}`.trim());
   const reader = response.body!.getReader();
-  for (;;) {
-    const { done, value } = await reader.read();
-    if (done) return;
-    yield value;
+  try {
+    for (;;) {
+      const { done, value } = await reader.read();
+      if (done) return;
+      yield value;
+    }
+  } finally {
+    // of a file that is damaged the rest is not asked for
+    reader.cancel().catch(() => {});
   }
 }
 

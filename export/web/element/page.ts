@@ -37,7 +37,7 @@ image.addEventListener("viewchange", () => {
   zoom.value = `${scale < 10 ? scale.toFixed(2) : Math.round(scale)}×`;
 });
 image.addEventListener("error", ({ message }) => {
-  note.textContent = `The scene could not be shown: ${message}`;
+  note.textContent = `The scene could not be shown${image.scene === null ? "" : " in full"}: ${message}`;
 });
 image.addEventListener("load", () => {
   const { scene, regionIds } = image;
@@ -60,7 +60,7 @@ function listRegions(areas: Map<number, number>): void {
   for (const [id, area] of [...areas].sort((a, b) => b[1] - a[1])) {
     const box = make("input", { type: "checkbox", checked: true, onchange: () => image.hide(id, !box.checked) });
     boxes.set(id, box);
-    list.append(make("label", {}, box, `Region ${id}`, make("small", {}, `${(100 * area).toFixed(1)} %`)));
+    list.append(make("label", {}, box, `Region ${id} `, make("small", {}, `${(100 * area).toFixed(1)} %`)));
   }
   const toggle = button("Regions", "List the regions, to hide some", () => {
     list.hidden = !list.hidden;

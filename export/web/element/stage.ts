@@ -111,7 +111,11 @@ export class Stage implements Hands {
     if (this.scene === null) throw new Error("there is no scene yet");
     const canvas = Object.assign(document.createElement("canvas"), { width, height });
     const view = { rect: [0, 0, this.scene.width, this.scene.height] as const, width, height };
-    paint(canvas.getContext("2d")!, 0, 0, this.scene, { ...view, rect: [...view.rect] }, this.visible, this.device);
+    const context = canvas.getContext("2d")!;
+    // of a canvas that is too large browsers tell nothing: it keeps no pixels
+    context.fillRect(0, 0, 1, 1);
+    if (context.getImageData(0, 0, 1, 1).data[3] === 0) throw new Error(`no image of ${width} x ${height} can be made`);
+    paint(context, 0, 0, this.scene, { ...view, rect: [...view.rect] }, this.visible, this.device);
     return canvas;
   }
 

@@ -27,12 +27,12 @@ export function paint(
   device: Device,
 ): string {
   const gpu = device === "cpu" ? null : openGpu(device === "webgl2");
-  if (gpu?.takes(scene) && renders(gpu, scene, view, visible, device)) {
+  if (gpu?.takes(scene, view) && renders(gpu, scene, view, visible, device)) {
     context.clearRect(x, y, view.width, view.height);
     context.drawImage(gpu.canvas, 0, 0, view.width, view.height, x, y, view.width, view.height);
     return `webgl2 ${gpu.precision}`;
   }
-  if (device === "webgl2") throw new Error("this browser cannot render with WebGL2, or not a scene of this size.");
+  if (device === "webgl2") throw new Error("this browser cannot render with WebGL2, or not a scene or an image of this size.");
   context.putImageData(renderSoftware(scene, view, visible), x, y);
   return "cpu";
 }

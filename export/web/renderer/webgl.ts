@@ -70,9 +70,9 @@ export class WebGl {
     return this.gl.isContextLost();
   }
 
-  /** Whether the tables of a scene fit into textures. */
-  takes({ membership }: Prepared): boolean {
-    return Math.max(membership.width, membership.height) <= this.limit;
+  /** Whether the tables of a scene fit into textures, and a view onto the canvas. */
+  takes({ membership }: Prepared, view: View): boolean {
+    return Math.max(membership.width, membership.height, view.width, view.height) <= this.limit;
   }
 
   /** Render into the upper left corner of `canvas`, which shows it until the task ends. */
@@ -80,6 +80,9 @@ export class WebGl {
     const { canvas, gl } = this;
     if (canvas.width < view.width) canvas.width = view.width;
     if (canvas.height < view.height) canvas.height = view.height;
+    if (gl.drawingBufferWidth < canvas.width || gl.drawingBufferHeight < canvas.height) {
+      throw new Error(`the GPU has no room for ${canvas.width} x ${canvas.height} pixels.`);
+    }
     const map = this.maps.get(scene.membership, () => uploadMembership(gl, scene.membership, visible.length));
     const gaussians = this.buffers.get(scene, () => uploadGaussians(gl, scene, map));
     map.show(visible);
