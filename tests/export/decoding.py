@@ -25,7 +25,7 @@ class Node:
 
     def __init__(self, bundle: Path, scratch: Path) -> None:
         self._file, self._log = scratch / "bytes.kcgs", (scratch / "errors.txt").open("w")
-        command = ["node", str(WEB / "test" / "decode.mjs"), str(bundle)]
+        command = ["node", "--expose-gc", str(WEB / "test" / "decode.mjs"), str(bundle)]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True
         )

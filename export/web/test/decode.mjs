@@ -1,7 +1,7 @@
 /**
  * Decodes for a test in another language: a line of JSON in, a line of JSON out.
  *
- *     node decode.mjs FOLDER-OF-THE-BUILT-DECODER
+ *     node --expose-gc decode.mjs FOLDER-OF-THE-BUILT-DECODER
  *     {"do": "scene", "path": "a.kcgs"}    ->  {"height": 24, ..., "memory": bytes at most so far}
  */
 
@@ -25,6 +25,8 @@ const actions = {
 for await (const line of createInterface({ input: process.stdin })) {
   const command = JSON.parse(line);
   const bytes = new Uint8Array(readFileSync(command.path));
+  // or the memory would be that of many files, as the collector happens to run
+  gc();
   const answer = await attempt(() => actions[command.do](bytes, command));
   answer.memory = process.resourceUsage().maxRSS * 1024;
   process.stdout.write(`${JSON.stringify(answer)}\n`);
