@@ -8,16 +8,23 @@ import queue
 import subprocess
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kcgs.codec import CodecError, decode, decode_labels
 
-from .browser import WEB
+from .browser import WEB, Browser
 
 SECONDS = 20  # within which any file must be decoded or refused
+
+
+class Reader(Protocol):
+    """The web's decoder, wherever it runs."""
+
+    def do(self, action: str, data: bytes) -> dict[str, Any]:
+        """Describe a scene or labels, or the error."""
 
 
 class Node:
@@ -59,6 +66,19 @@ class Node:
         self._log.close()
 
 
+class Page:
+    """The built decoder in a browser; scenes only."""
+
+    def __init__(self, browser: Browser, folder: Path) -> None:
+        self._browser, self._file = browser, folder / "scene.kcgs"
+
+    def do(self, action: str, data: bytes) -> dict[str, Any]:
+        assert action == "scene"
+        self._file.write_bytes(data)
+        answer: dict[str, Any] = self._browser.evaluate("kcgs.describe('scene.kcgs')")
+        return answer
+
+
 def digest(array: Any, dtype: str = "<f4") -> str:
     numbers: NDArray[Any] = np.ascontiguousarray(array, dtype=dtype)
     return hashlib.sha256(numbers.tobytes()).hexdigest()
@@ -94,10 +114,10 @@ def labels_of(data: bytes) -> dict[str, Any]:
     return {"height": labels.shape[0], "width": labels.shape[1], "type": str(labels.dtype), "labels": described}
 
 
-def check_same(node: Node, data: bytes, *, labels: bool = False) -> bool:
+def check_same(reader: Reader, data: bytes, *, labels: bool = False) -> bool:
     """Both give the same bits, or both refuse; return whether they gave any."""
-    answer = node.do("labels" if labels else "scene", data)
-    answer.pop("memory")
+    answer = reader.do("labels" if labels else "scene", data)
+    answer.pop("memory", None)
     try:
         expected = (labels_of if labels else scene_of)(data)
     except CodecError as error:
