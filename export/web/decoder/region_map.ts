@@ -35,8 +35,11 @@ export function readRegionMap(bytes: Uint8Array, header: Header): ReadMap {
     throw new DecodeError(`the map must end after ${reader.position} bytes; got ${bytes.length}`);
   const pairs =
     count > 1 ? readPairs(reader.take(reader.left), touchingPairs(labels, width, ids.length), ids.length, widths) : [];
-  const map = { supersample: k, labels, ids: Float64Array.from(ids, Number), softness: count > 1 ? null : widths[0]! };
-  return { map: { ...map, pairs }, ids };
+  // widths that are listed need not be used: then all contours may have one after all
+  const first = pairs[0]?.width ?? widths[0]!;
+  const one = pairs.every(({ width }) => width === first);
+  const map = { supersample: k, labels, ids: Float64Array.from(ids, Number), softness: one ? first : null };
+  return { map: { ...map, pairs: one ? [] : pairs }, ids };
 }
 
 /** Read the width of each pair. */
