@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import math
 import statistics
@@ -24,6 +25,7 @@ from kcgs.rate import compress, fit_bytes
 from kcgs.scene import Scene, load
 
 from ._codecs import CODECS, largest, lossless_bytes, open_file
+from ._render_runs import pairs_per_pixel
 from .core import eye, images
 from .core.cases import BEST, QUICK_ITERATIONS, Case
 from .core.store import Store, find_labels
@@ -34,10 +36,12 @@ LABELS, LOSSLESS_WEBP = "kcgs.codec.labels", "WebP, lossless"
 KCGS, NO_REGIONS, VISUAL, FLOAT = "kcgs", "kcgs, no regions", "kcgs, visual", "float scene"
 OURS = (KCGS, NO_REGIONS, VISUAL)
 # of `compress`
-ITERATIONS, QUICK_TUNING = 250, 10
+ITERATIONS, QUICK_TUNING = inspect.signature(compress).parameters["iterations"].default, 10
 # a fit's file is rounded until it costs so many dB; the dB above its PSNR at which that is tried first
 MOST_LOSS, FIRST_QUALITY = 0.15, 14.5
 QUICK_STRIDE = 2
+# of renders
+CUTOFF = 1e-4
 _TRIES, _NEAR = 4, 0.02
 Result = TypeVar("Result")
 
@@ -62,6 +66,7 @@ class Point(NamedTuple):
     regions: int = 0  # of the map in the file, 1: there is none
     ssimulacra2: float = math.nan  # measured afterwards, like butteraugli, where that can be
     butteraugli: float = math.nan
+    pairs_per_pixel: float = 0.0  # of Gaussians and pixels, which decoding evaluates
 
 
 class Ask(NamedTuple):
@@ -218,7 +223,7 @@ class Files:
 
     def path(self, ask: Ask, settings: Any, suffix: str) -> Path:
         """Say where a file is, or would be."""
-        fields = [name for name in Point._fields if name not in eye.MEASURES]
+        fields = [name for name in Point._fields if name not in (*eye.MEASURES, "pairs_per_pixel")]
         parts = json.dumps([*ask, self.quick, settings, fields], sort_keys=True)
         name = "-".join(map(str, ask))
         name = "".join(c if c.isalnum() or c in "-." else "_" for c in name)
@@ -236,7 +241,9 @@ class Files:
         """Measure kcgs' own."""
         shown, seconds = timed(lambda: render(data))
         point = self._measured(ask, shown, len(data))
-        return _with_counts(point._replace(decode_seconds=seconds), decode(data).scene)
+        scene = decode(data).scene
+        pairs = pairs_per_pixel("cpu", scene, CUTOFF)
+        return _with_counts(point._replace(decode_seconds=seconds, pairs_per_pixel=pairs), scene)
 
     def _measured(self, ask: Ask, shown: Tensor, size: int) -> Point:
         sample = self.sample(ask.image)[0]

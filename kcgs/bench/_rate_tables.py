@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 from typing import NamedTuple
 
-from ._codecs import AVIF, CODECS
+from ._codecs import AVIF, AVIF_FAST, CODECS
 from ._rate_files import FLOAT, KCGS, LABELS, LOSSLESS_WEBP, MAPS, NO_REGIONS, VISUAL, Point
 from .core.statistics import Delta, Summary, delta, summarize
-from .core.tables import count, db, markdown, seconds, signed, table
+from .core.tables import count, db, markdown, seconds, signed, similarity, table
 
-MATCHED, DAVIS_CURVE, KODAK_CURVE = "davis8k", "davis-curve", "kodak-curve"
+MATCHED, DAVIS_CURVE, KODAK = "davis8k", "davis-curve", "kodak"
 PRECISION = "precision"
 PSNR, EF_PSNR = "psnr", "ef_psnr"
 # as tables call them, and their unit
@@ -24,6 +25,27 @@ _CONTESTS = (*((KCGS, rival) for rival in RIVALS), (VISUAL, AVIF))
 # a smaller difference is neither a win nor a loss
 TIE = {"dB": 0.005, "1": 0.0005, "%": 0.05, "points": 0.05, "norm": 0.005}
 MOST_BYTES = 7_950
+# of Kodak's photos, all of as many pixels: bits per pixel by bytes
+KODAK_PIXELS = 512 * 768
+RATES = {math.floor(rate * KODAK_PIXELS / 8): rate for rate in (0.08, 0.15, 0.3, 0.5, 0.8)}
+KODAK_CODECS = (NO_REGIONS, KCGS, AVIF_FAST)
+# mean PSNR over all 24 photos of other codecs, read off what they printed
+PRINTED = {
+    "VTM": {0.08: 27.55, 0.1: 28.17, 0.15: 29.49, 0.2: 30.49, 0.3: 32.08, 0.5: 34.37},
+    "C3": {0.08: 27.06, 0.1: 27.75, 0.15: 29.05, 0.2: 30.05, 0.3: 31.71, 0.5: 34.22},
+    "BPG": {0.08: 26.68, 0.1: 27.29, 0.15: 28.52, 0.2: 29.48, 0.3: 31.01, 0.5: 33.31},
+    "RECOMBINER": {0.08: 26.37, 0.1: 26.96, 0.15: 28.09, 0.2: 28.97, 0.3: 30.27, 0.5: 32.04},
+    "JPEG 2000": {0.15: 26.94},
+    "GaussianImage++": {0.15: 25.3},
+    "COIN++": {0.15: 25.14},
+    "Cool-chic 5": {0.0839: 27.44, 0.2186: 30.86, 0.4819: 34.52},
+}
+_PRINTED_TEXT = """Mean PSNR. In parentheses: over how many photos. The data have {} of Kodak's 24 photos. What other
+codecs printed is over all 24, so means of these and of those cannot be compared directly: photos differ by more than
+codecs do. Only lines of the same photos can, the measured ones. Cool-chic 5 printed its own rates."""
+# of one pair: 5 for the exponent, 6 for the power of two, 3 for the colours; of one pixel: 30 for the splines
+_PAIR_PRODUCTS, _PIXEL_PRODUCTS = 14, 30
+_MEANS = ("bpp", PSNR, "ms_ssim", "ssimulacra2", "pairs_per_pixel")
 
 
 class Pair(NamedTuple):
@@ -76,16 +98,16 @@ def gains(found: Sequence[Pair], quality: str) -> Summary | None:
     return summarize({pair.other.image: pair.gain(quality) for pair in found}, TIE[QUALITIES[quality][1]])
 
 
-def deltas(points: Sequence[Point], group: str, rival: str, quality: str) -> dict[str, Delta]:
+def deltas(points: Sequence[Point], group: str, rival: str, quality: str, codec: str = KCGS) -> dict[str, Delta]:
     """Compare kcgs' curve with another, image by image; similarities count as dB of what they lack."""
     curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    for p in (p for p in points if p.group == group):
+    for p in (p for p in points if p.group == group and p.codec in (codec, rival)):
         value = score(p, quality)
         if QUALITIES[quality][1] == "1":
             value = -10 * math.log10(1 - value) if value < 1 else math.inf
         if math.isfinite(value):
             curves.setdefault((p.codec, p.image), []).append((float(p.bytes), value))
-    ours = {image: curve for (codec, image), curve in curves.items() if codec == KCGS}
+    ours = {image: curve for (whose, image), curve in curves.items() if whose == codec}
     both = {image: (curve, curves.get((rival, image), [])) for image, curve in ours.items()}
     return {image: delta(*pair) for image, pair in both.items() if min(map(len, pair)) > 1}
 
@@ -118,14 +140,15 @@ def losses(points: Sequence[Point]) -> str:
                 lost = f"{gain.losses} of {len(gain.values)} frames lose"
                 whose = "" if codec == KCGS else f"{codec}, "
                 lines.append(f"- {MATCHED}, {whose}{name} against {rival}: {lost}: {which}")
-    for group in curve_groups(points):
-        for rival in RIVALS:
+    for group, ours in ((DAVIS_CURVE, KCGS), (KODAK, NO_REGIONS)):
+        for rival in (rival for rival in RIVALS if rival != ours):
             for quality, (name, _) in QUALITIES.items():
-                by_image = deltas(points, group, rival, quality)
+                by_image = deltas(points, group, rival, quality, ours)
                 above = sorted(((d.rate, i) for i, d in by_image.items() if d.rate > TIE["%"]), reverse=True)
                 if above:
                     which = ", ".join(f"{image} {rate:+.0f} %" for rate, image in above)
-                    lines.append(f"- {group}, BD-rate of {name} against {rival}: more bits on {which}")
+                    whose = "" if ours == KCGS else f"{ours}, "
+                    lines.append(f"- {group}, {whose}BD-rate of {name} against {rival}: more bits on {which}")
     return "\n".join(lines) or "Nowhere."
 
 
@@ -144,15 +167,58 @@ def matched_means(points: Sequence[Point]) -> str:
     return markdown([*header, "s, encode", "s, decode", "kcgs, s, encode", "kcgs, s, decode"], lines)
 
 
-def bd_means(points: Sequence[Point], group: str) -> str:
+def kodak(points: Sequence[Point]) -> str:
+    """All of Kodak."""
+    text = _PRINTED_TEXT.format(len({p.image for p in points if p.group == KODAK}))
+    parts = [kodak_means(points), text, printed_means(points), f"`{NO_REGIONS}` against the others, photo by photo:"]
+    return "\n\n".join([*parts, bd_means(points, KODAK, NO_REGIONS)])
+
+
+def kodak_means(points: Sequence[Point]) -> str:
+    """Means over photos by rate, of what was measured."""
+    header = ["bpp asked", "codec", "photos", "bpp", "PSNR", "MS-SSIM", "SSIMULACRA2", "gained on them"]
+    lines = []
+    for most, codec in product(RATES, KODAK_CODECS):
+        of_rate = [p for p in points if (p.group, p.asked) == (KODAK, most)]
+        found, first = ([p for p in of_rate if p.codec == name] for name in (codec, NO_REGIONS))
+        if not found:
+            continue
+        mean = {name: statistics.fmean(getattr(p, name) for p in found) for name in _MEANS}
+        other = {p.image: p.psnr for p in found}
+        gained = [p.psnr - other[p.image] for p in first if codec != NO_REGIONS and p.image in other]
+        eye = "" if math.isnan(mean["ssimulacra2"]) else f"{mean['ssimulacra2']:.1f}"
+        work = "" if codec == AVIF_FAST else count(_PAIR_PRODUCTS * mean["pairs_per_pixel"] + _PIXEL_PRODUCTS)
+        line = [f"{RATES[most]:g}", codec, str(len(found)), f"{mean['bpp']:.4f}", db(mean["psnr"])]
+        line += [similarity(mean["ms_ssim"]), eye, signed(statistics.fmean(gained)) if gained else ""]
+        lines.append([*line, *_times(found), work])
+    return markdown([*header, "s, encode", "s, decode", "products per pixel"], lines)
+
+
+def printed_means(points: Sequence[Point]) -> str:
+    """Mean PSNR by rate beside what other codecs printed; how many photos where they are not all 24."""
+    rates, lines = sorted({*RATES.values(), *(rate for line in PRINTED.values() for rate in line)}), []
+    for codec in KODAK_CODECS:
+        cells = []
+        for rate in rates:
+            found = [p.psnr for p in points if (p.group, p.codec, RATES.get(p.asked)) == (KODAK, codec, rate)]
+            cells.append(f"{statistics.fmean(found):.2f} ({len(found)})" if found else "")
+        lines += [[f"{codec}, measured", *cells]] if any(cells) else []
+    lines += [
+        [f"{name}, as printed, all 24 photos", *(db(of.get(r, math.nan)) for r in rates)]
+        for name, of in PRINTED.items()
+    ]
+    return markdown(["bpp", *(f"{rate:g}" for rate in rates)], lines)
+
+
+def bd_means(points: Sequence[Point], group: str, codec: str = KCGS) -> str:
     """Means of Bjontegaard's differences."""
     header = ["against", "images"]
     measured = qualities(points)
     header += [cell for name in measured for cell in (f"BD-rate of {QUALITIES[name][0]}, %", "95 %")]
     header += ["BD-PSNR, dB", "95 %", "BD-EF-PSNR, dB", "95 %"]
     lines = []
-    for rival in RIVALS:
-        found = {quality: deltas(points, group, rival, quality) for quality in measured}
+    for rival in (rival for rival in RIVALS if rival != codec):
+        found = {quality: deltas(points, group, rival, quality, codec) for quality in measured}
         line = [rival, str(len(found[PSNR]))]
         for by_image in found.values():
             line += _mean_cells({image: d.rate for image, d in by_image.items()}, "%")
@@ -192,11 +258,6 @@ def maps_table(points: Sequence[Point]) -> str:
         lines.append(line)
     header = ["maps", "how many", f"bytes, {LOSSLESS_WEBP}", f"bytes, {LABELS}", "share, mean", "95 %", "worst"]
     return markdown(header, lines)
-
-
-def curve_groups(points: Sequence[Point]) -> list[str]:
-    """Name the groups with curves."""
-    return list(dict.fromkeys(p.group for p in points if p.group.endswith("curve")))
 
 
 def _pair_cells(found: Sequence[Pair], measured: Sequence[str]) -> list[str]:

@@ -13,11 +13,11 @@ from torch import Tensor
 
 import kcgs.bench
 from kcgs.bench import _codecs, _rate_files, _rate_tables
-from kcgs.bench._codecs import AVIF, CODECS, JPEG, WEBP, largest, open_file, present
+from kcgs.bench._codecs import AVIF, AVIF_FAST, CODECS, JPEG, WEBP, largest, open_file, present
 from kcgs.bench._rate_files import FLOAT, KCGS, NO_REGIONS, VISUAL, Ask, Files, Point, codec_digest
 from kcgs.bench._rate_tables import (
     DAVIS_CURVE,
-    KODAK_CURVE,
+    KODAK,
     LABELS,
     LOSSLESS_WEBP,
     MAPS,
@@ -214,7 +214,7 @@ class TestFilesOnDisk:
 class TestPlan:
     def test_images(self, data: Path) -> None:
         assert names(MATCHED, data, False) == names(DAVIS_CURVE, data, False) == ["dog"]
-        assert names(KODAK_CURVE, data, False) == ["kodim23"]
+        assert names(KODAK, data, False) == ["kodim23"]
         assert names(MAPS, data, False) == ["DAVIS/dog", "bsds/7/mask", "bsds/103/mask"]
         assert names(MATCHED, None, False) == names(MATCHED, data / "bsds", False) == []
 
@@ -230,14 +230,18 @@ class TestPlan:
         assert [name for name, _ in steps(MATCHED, files)] == expected
         assert len(list(steps(DAVIS_CURVE, files))) == len(TARGETS)
         assert [name for name, _ in steps(PRECISION, files)] == ["dog N = 1,250", "dog N = 7,500"]
+        save_image(data / "kodak/kodim07.png", sample().image)
+        planned = [name for name, _ in steps(KODAK, files)]
+        assert planned[:3] == [f"kodim{p}, {NO_REGIONS}" for p in ("07 3,932", "23 3,932", "07 7,372")]
+        assert len(planned) == 30 and planned[-1] == f"kodim23 39,321, {AVIF_FAST}"
 
     def test_what_may_be_asked(self, tmp_path: Path, data: Path) -> None:
         with pytest.raises(ValueError, match=r"data must be a folder with DAVIS, bsds or kodak in it"):
             choose(Options())
         with pytest.raises(ValueError, match=r"only must name groups with images, davis8k, .*; got 'maps,curve'"):
             choose(Options(data=data, only="maps,curve"))
-        with pytest.raises(ValueError, match=r"only must name groups .*; got 'kodak-curve,maps'"):
-            choose(Options(quick=True, data=data, only="kodak-curve,maps"))
+        with pytest.raises(ValueError, match=r"only must name groups .*; got 'kodak,maps'"):
+            choose(Options(quick=True, data=data, only="kodak,maps"))
 
 
 class TestMatched:
@@ -279,7 +283,7 @@ class TestMatched:
         shown = _rate_files.render(data)
         assert found.bytes == len(data) <= 600 and found.bpp == 8 * len(data) / labels.numel()
         assert found.psnr == float(psnr(shown, image))
-        assert found.ef_psnr == float(ef_psnr(shown, image, labels))
+        assert found.ef_psnr == float(ef_psnr(shown, image, labels)) and found.pairs_per_pixel > 0
         (smaller,) = files.rewritten(found, 500)
         assert smaller.bytes <= 500 and smaller.encode_seconds > found.encode_seconds
 
@@ -342,6 +346,28 @@ class TestReport:
         (line,) = _rate_tables.bd_means(files, DAVIS_CURVE).splitlines()[2:]
         assert line.startswith("| AVIF | 1 | +26.0 |  |") and line.endswith("| -1.00 |  | +40.00 |  |")
 
+    def test_kodak(self, tmp_path: Path) -> None:
+        kinds = {NO_REGIONS: 30.0, KCGS: 29.5, AVIF_FAST: 31.0}
+        files = [
+            point(codec, most - 4, quality + place, group=KODAK, image=image, asked=most, pairs_per_pixel=10.0)
+            for codec, quality in kinds.items()
+            for place, most in enumerate(_rate_tables.RATES)
+            for image in ("kodim07", "kodim23")
+            if (codec, most, image) != (KCGS, 3_932, "kodim23")
+        ]
+        write_rows(tmp_path / "results.csv", Point, files)
+        conclude(report, tmp_path, Made("kcgs bench rate"))
+        text = (tmp_path / "report.md").read_text()
+        assert "The data have 2 of Kodak's 24 photos" in text and "nan" not in text
+        assert "| 0.08 | kcgs | 1 | 0.0786 | 29.50 | 0.9000 |  | +0.50 | 2 | 0.1 | 170 |" in text
+        assert f"| {AVIF_FAST}, measured | 31.00 (2) |  |  | 32.00 (2) |  |" in text
+        assert "| COIN++, as printed, all 24 photos |  |  |  | 25.14 |  |" in text
+        assert f"- kodak, {NO_REGIONS}, BD-rate of PSNR against {AVIF_FAST}: more bits on kodim" in text
+
+    def test_fast_avif(self) -> None:
+        assert AVIF_FAST not in present() and CODECS[AVIF_FAST].settings["advanced"] == {"tune": "psnr"}
+        assert Files(Path(), None, True).tuning == 10 and _rate_files.ITERATIONS == 600
+
     def test_what_the_eye_sees(self) -> None:
         ours, other = {"ssimulacra2": 50.0, "butteraugli": 2.0}, {"ssimulacra2": 53.0, "butteraugli": 1.5}
         files = [point(**ours), point(AVIF, **other), point(image="cows", **other)]
@@ -372,7 +398,7 @@ class TestFiles:
         assert {p.name for p in tmp_path.iterdir()} == made
         with (tmp_path / "results.csv").open() as file:
             rows = list(csv.DictReader(file))
-        assert {row["group"] for row in rows} == set(GROUPS) - {KODAK_CURVE}
+        assert {row["group"] for row in rows} == set(GROUPS) - {KODAK}
         assert all(
             int(row["bytes"]) <= int(row["asked"]) for row in rows if row["group"] == MATCHED and row["regions"] == "2"
         )
