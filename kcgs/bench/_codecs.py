@@ -16,8 +16,7 @@ from torch import Tensor
 from kcgs.functional import psnr
 
 JPEG, WEBP, AVIF, AVIF_PSNR = "JPEG", "WebP", "AVIF", "AVIF, tune=psnr"
-# for groups of many files: a tenth of the time
-AVIF_FAST = f"{AVIF_PSNR}, speed 4"
+AVIF_FAST = f"{AVIF_PSNR}, speed 4"  # for groups of many files
 # one quality for each of AVIF's 64 quantizers: the others give the same files
 _AVIF_QUALITIES = tuple(sorted({((100 - q) * 63 + 50) // 100: q for q in range(101)}.values()))
 _SUBSAMPLING = ({"subsampling": "4:2:0"}, {"subsampling": "4:4:4"})

@@ -40,8 +40,7 @@ ITERATIONS, QUICK_TUNING = inspect.signature(compress).parameters["iterations"].
 # a fit's file is rounded until it costs so many dB; the dB above its PSNR at which that is tried first
 MOST_LOSS, FIRST_QUALITY = 0.15, 14.5
 QUICK_STRIDE = 2
-# of renders
-CUTOFF = 1e-4
+CUTOFF = 1e-4  # of renders
 _TRIES, _NEAR = 4, 0.02
 Result = TypeVar("Result")
 

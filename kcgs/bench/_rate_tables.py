@@ -26,8 +26,7 @@ _CONTESTS = (*((KCGS, rival) for rival in RIVALS), (VISUAL, AVIF))
 TIE = {"dB": 0.005, "1": 0.0005, "%": 0.05, "points": 0.05, "norm": 0.005}
 MOST_BYTES = 7_950
 # of Kodak's photos, all of as many pixels: bits per pixel by bytes
-KODAK_PIXELS = 512 * 768
-RATES = {math.floor(rate * KODAK_PIXELS / 8): rate for rate in (0.08, 0.15, 0.3, 0.5, 0.8)}
+RATES = {math.floor(rate * 512 * 768 / 8): rate for rate in (0.08, 0.15, 0.3, 0.5, 0.8)}
 KODAK_CODECS = (NO_REGIONS, KCGS, AVIF_FAST)
 # mean PSNR over all 24 photos of other codecs, read off what they printed
 PRINTED = {

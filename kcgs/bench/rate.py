@@ -56,11 +56,10 @@ as low. Each meets the largest file of kcgs that has no more bytes. Without regi
 was fitted to with them, and with the visual objective for AVIF's."""
 _KODAK_TEXT = f"""Every file has at most the bytes of the bits per pixel that were asked for. Gained is the PSNR that
 `{NO_REGIONS}` has over the line's codec on the photos that both have. AVIF's steps are coarse, so its files are
-smaller; BD-rates allow for that. Products per pixel are an estimate of what the renderer multiplies: 14 for each pair of a
-Gaussian and a pixel, or a node of its coarse grid, whose weight is at least the cutoff (5 for the exponent, 6 for the
-power of two, 3 for the colours), and 30 for the splines. Pairs that a vector of 16 pixels evaluates beside its ellipse,
-and the decoding of the bytes, are not counted. `{AVIF_FAST}` takes a tenth of the time of speed 0; on one photo it lost
-0.1 to 0.2 dB to it."""
+smaller; BD-rates allow for that. Products per pixel are an estimate of what the renderer multiplies: 14 for each pair
+of a Gaussian and a pixel, or a node of its coarse grid, whose weight is at least the cutoff (5 for the exponent, 6 for
+the power of two, 3 for the colours), and 30 for the splines. Evaluated pairs outside of ellipses, and the decoding of
+the bytes, are not counted. `{AVIF_FAST}` takes a tenth of the time of speed 0; it lost 0.1 to 0.2 dB on one photo."""
 _SECTIONS = {
     tables.KODAK: ("Kodak", tables.kodak, _KODAK_TEXT),
     PRECISION: ("Bits per Gaussian", tables.precision_table, f"""A fit of N Gaussians with the annotation's contours,
