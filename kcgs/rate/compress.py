@@ -132,7 +132,7 @@ class _Press:
         self.free = int(_FREE * iterations)
         self.rounds = iterations - self.free
 
-    def write(self, qp: int, share: float = 1.0) -> bytes:
+    def write(self, qp: int, share: float = 0.8) -> bytes:
         """Return the file at a quantization parameter."""
         writer = self._spare(lambda _: qp)
         return self._round(writer, qp, self.rounds, share)
