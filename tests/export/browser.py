@@ -22,15 +22,14 @@ WEB = Path(__file__).resolve().parents[2] / "export" / "web"
 SECONDS = 120
 
 
-class Browser:
-    """Headless Chromium behind a pipe; see export/web/test/drive.mjs."""
+class Pipe:
+    """A program of node that answers a line of JSON with another."""
 
-    def __init__(self, chromium: str, errors: Path) -> None:
+    def __init__(self, *arguments: str, errors: Path) -> None:
         self.errors = errors
         self._log = errors.open("w")
-        command = ["node", str(WEB / "test" / "drive.mjs"), chromium]
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True
+            ["node", *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True
         )
         self._lines: queue.Queue[str] = queue.Queue()
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -42,18 +41,14 @@ class Browser:
             self._lines.put(line)
         self._lines.put("")
 
-    def do(self, action: str, **arguments: Any) -> Any:
+    def ask(self, action: str, *, seconds: float, **arguments: Any) -> dict[str, Any]:
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps({"do": action, **arguments}) + "\n")
         self._process.stdin.flush()
-        line = self._lines.get(timeout=SECONDS)
-        assert line, f"the browser's driver ended: {self.errors.read_text()[-2000:]}"
-        answer = json.loads(line)
-        assert "error" not in answer, answer["error"]
-        return answer["value"]
-
-    def evaluate(self, expression: str) -> Any:
-        return self.do("evaluate", expression=expression)
+        line = self._lines.get(timeout=seconds)
+        assert line, f"the program ended: {self.errors.read_text()[-2000:]}"
+        answer: dict[str, Any] = json.loads(line)
+        return answer
 
     def close(self) -> None:
         assert self._process.stdin is not None and self._process.stdout is not None
@@ -66,6 +61,21 @@ class Browser:
             self._reader.join(timeout=10)
             self._process.stdout.close()
             self._log.close()
+
+
+class Browser(Pipe):
+    """Headless Chromium; see export/web/test/drive.mjs."""
+
+    def __init__(self, chromium: str, errors: Path) -> None:
+        super().__init__(str(WEB / "test" / "drive.mjs"), chromium, errors=errors)
+
+    def do(self, action: str, **arguments: Any) -> Any:
+        answer = self.ask(action, seconds=SECONDS, **arguments)
+        assert "error" not in answer, answer["error"]
+        return answer["value"]
+
+    def evaluate(self, expression: str) -> Any:
+        return self.do("evaluate", expression=expression)
 
 
 def array(packed: dict[str, Any]) -> NDArray[np.float32]:

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
-import queue
-import subprocess
-import threading
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,7 +11,7 @@ from numpy.typing import NDArray
 
 from kcgs.codec import CodecError, decode, decode_labels
 
-from .browser import WEB, Browser
+from .browser import WEB, Browser, Pipe
 
 SECONDS = 20  # within which any file must be decoded or refused
 
@@ -27,43 +23,16 @@ class Reader(Protocol):
         """Describe a scene or labels, or the error."""
 
 
-class Node:
+class Node(Pipe):
     """The built decoder in node: one command at a time, each within a time limit."""
 
     def __init__(self, bundle: Path, scratch: Path) -> None:
-        self._file, self._log = scratch / "bytes.kcgs", (scratch / "errors.txt").open("w")
-        command = ["node", "--expose-gc", str(WEB / "test" / "decode.mjs"), str(bundle)]
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True
-        )
-        self._lines: queue.Queue[str] = queue.Queue()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            self._lines.put(line)
-        self._lines.put("")
+        super().__init__("--expose-gc", str(WEB / "test" / "decode.mjs"), str(bundle), errors=scratch / "errors.txt")
+        self._file = scratch / "bytes.kcgs"
 
     def do(self, action: str, data: bytes, **arguments: Any) -> dict[str, Any]:
-        assert self._process.stdin is not None
         self._file.write_bytes(data)
-        self._process.stdin.write(json.dumps({"do": action, "path": str(self._file), **arguments}) + "\n")
-        self._process.stdin.flush()
-        line = self._lines.get(timeout=SECONDS)
-        assert line, "node ended"
-        answer: dict[str, Any] = json.loads(line)
-        return answer
-
-    def close(self) -> None:
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.close()
-        self._process.kill()
-        self._process.wait()
-        self._reader.join(timeout=10)
-        self._process.stdout.close()
-        self._log.close()
+        return self.ask(action, seconds=SECONDS, path=str(self._file), **arguments)
 
 
 class Page:
