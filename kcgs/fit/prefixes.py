@@ -26,11 +26,16 @@ def choose_prefix(state: FitState, progress: float) -> Gaussians | None:
     return None if index is None else gaussians.pick(index)
 
 
+def energies(cholesky: Tensor, colors: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return the squared colours times the area, which is at most the image's, (N,)."""
+    area = (math.pi * cholesky[:, 0] * cholesky[:, 2]).clamp_max(size[0] * size[1])
+    return colors.square().sum(-1) * area
+
+
 def strongest(cholesky: Tensor, colors: Tensor, size: tuple[int, int], seed: int, iteration: int) -> Tensor | None:
     """Return the indices of a share of the Gaussians, in the order of a file; None in the iterations between."""
     if iteration % _EVERY != _EVERY - 1:
         return None
     share = float(np.random.default_rng([seed, iteration]).choice(_SHARES))
-    area = (math.pi * cholesky[:, 0] * cholesky[:, 2]).clamp_max(size[0] * size[1])
-    energy = (colors.square().sum(-1) * area).detach()
+    energy = energies(cholesky, colors, size).detach()
     return energy.argsort(descending=True, stable=True)[: max(1, round(share * len(energy)))]

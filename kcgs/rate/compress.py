@@ -35,8 +35,8 @@ _FREE, _LOOK = 0.7, 50
 _DROP = 0.8
 # files that are tried for a number of bytes, and how much smaller tuned ones are
 _TRIES, _TUNED = 4, 1.006
-# of the seconds that are left, for the first of several files, and for what comes before
-_SHARE = 0.5
+# of the seconds that are left: for the first of several files, and what comes before; for rounding a single file
+_SHARE, _ALONE = 0.5, 0.8
 
 
 @brief
@@ -132,10 +132,9 @@ class _Press:
         self.free = int(_FREE * iterations)
         self.rounds = iterations - self.free
 
-    def write(self, qp: int, share: float = 0.8) -> bytes:
+    def write(self, qp: int, share: float = _ALONE) -> bytes:
         """Return the file at a quantization parameter."""
-        writer = self._spare(lambda _: qp)
-        return self._round(writer, qp, self.rounds, share)
+        return self._round(self._spare(lambda _: qp), qp, self.rounds, share)
 
     def first_that_shows(self, decibels: float, scene: Scene) -> bytes:
         """Return the first of ever finer files that shows so much; where the scene does not, one nearly as good."""
@@ -179,8 +178,7 @@ class _Press:
             if time.perf_counter() >= end:
                 break
             quantizer = Quantizer(follow(writer), writer.size)
-            if tuning is None:
-                tuning = self._tuning(writer, quantizer)
+            tuning = tuning or self._tuning(writer, quantizer)
             tuning.quantizer = quantizer
             if done >= _DROP * self.free:
                 tuning.drop()
@@ -195,9 +193,8 @@ class _Press:
         return writer.write(tuning.quantizer, codes, tuning.ids, marks=_MARKS if self.progressive else ())
 
     def _tuning(self, writer: SceneWriter, quantizer: Quantizer) -> Tuning:
-        return Tuning(
-            writer.gaussians, writer.ids, self.image, writer.regions, quantizer, self.objective, self.progressive
-        )
+        given = writer.gaussians, writer.ids, self.image, writer.regions, quantizer, self.objective
+        return Tuning(*given, self.progressive)
 
 
 def quality_for(decibels: float) -> float:

@@ -19,7 +19,7 @@ from kcgs.codec.exact import Integers
 from kcgs.codec.gaussians.quantize import Codes, Parameters, Quantizer
 from kcgs.fit.frame import local_gradient, move
 from kcgs.fit.objective import VisualObjective
-from kcgs.fit.prefixes import strongest
+from kcgs.fit.prefixes import energies, strongest
 from kcgs.functional import RegionMap, region_splat
 
 from .bits import soft_bits
@@ -46,8 +46,7 @@ _DRAFT_CUTOFF = 1e-3
 def pays(gaussians: Parameters, quantizer: Quantizer) -> NDArray[np.bool_]:
     """Say which Gaussians pay for their bits; one at least."""
     _, cholesky, colors = (torch.from_numpy(numbers) for numbers in gaussians)
-    area = (math.pi * cholesky[:, 0] * cholesky[:, 2]).clamp_max(quantizer.size[0] * quantizer.size[1])
-    energy = colors.square().sum(-1) * area
+    energy = energies(cholesky, colors, quantizer.size)
     kept = energy >= _PAYING * quantizer.distortion
     kept[energy.argmax()] = True
     return kept.numpy()
@@ -92,8 +91,7 @@ class Tuning:
         for _ in range(iterations):
             if time.perf_counter() >= end:
                 break
-            downhill = self._downhill(*self._free)
-            self._speed = self._faster(downhill)
+            self._speed = self._faster(self._downhill(*self._free))
             self._free = self._moved(self._free)
 
     def round(self, iterations: int, seed: int, seconds: float = math.inf) -> Codes:
