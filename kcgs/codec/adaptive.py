@@ -24,6 +24,7 @@ _MIDDLES = np.maximum(np.append(_LOW, _HIGH[-1]) - 0.5, 0.0)  # between the magn
 # bins of the shape that all scales share, in units of the scale
 _BINS, _WIDTH = 24, 0.125
 _PARTS = 256
+_TURN = 16  # bins of half a turn
 # magnitudes that are learned from together, so that their tables fit into memory
 _TOGETHER = 1 << 12
 
@@ -71,31 +72,39 @@ class AdaptiveNumber:
 
 
 class AdaptiveMagnitude:
-    """Magnitudes 0, 1, 2 ... whose scale is known: a shape over magnitude / scale, learned for all scales.
+    """Magnitudes 0, 1, 2 ... whose scales are known: a shape over magnitude / scale, learned for all scales.
 
-    `shape` has the weights of the `_BINS` bins at first; each of the contexts learns by itself.
+    `shapes` [contexts, bins] has the weights of the `_BINS` bins at first; each of the contexts learns by itself.
     """
 
-    def __init__(self, shape: Floats, contexts: int = 1) -> None:
-        self._shape = np.tile(shape[:, None], (1, contexts)).T.copy()  # [contexts, bins]
+    def __init__(self, shapes: Floats) -> None:
+        self._shapes = shapes.copy()
 
-    def code(self, coder: Coder, scale: float, context: Integers, values: Integers | None) -> Integers:
-        """Code one magnitude for each context [n]; `scale` is what it is measured in, above 0."""
-        tables = self._tables(scale)
+    def code(
+        self, coder: Coder, scales: Floats, level: Integers, context: Integers, values: Integers | None
+    ) -> Integers:
+        """Code one magnitude for each context [n]; `level` [n] says by which of the scales, above 0, it is measured."""
+        present, level = np.unique(level, return_inverse=True)
+        measures = scales[present].tolist()
+        tables = np.concatenate([self._tables(scale) for scale in measures])
         bucket = None if values is None else np.searchsorted(_LOW, values, side="right") - 1
-        bucket = coder.choose(tables, context, bucket)
+        bucket = coder.choose(tables, level * len(self._shapes) + context, bucket)
         width = _HIGH[bucket] - _LOW[bucket]
         found = _LOW[bucket] + coder.uniform(width, None if values is None else values - _LOW[bucket])
-        self._learn(scale, context, found)
+        learned = np.zeros(self._shapes.shape)
+        for i, scale in enumerate(measures):
+            these = level == i
+            learned += self._parts(scale, context[these], found[these])
+        self._shapes += learned / _PARTS
         return found
 
-    def _learn(self, scale: float, context: Integers, values: Integers) -> None:
+    def _parts(self, scale: float, context: Integers, values: Integers) -> Floats:
         # a magnitude stands for what rounds to it; in whole parts, whose sums no order changes: equal ones at once
         edges = np.arange(_BINS + 1) * (scale * _WIDTH)
         edges[-1] = np.inf
-        contexts = len(self._shape)
+        contexts = len(self._shapes)
         kinds, counts = np.unique(values * contexts + context, return_counts=True)
-        learned = np.zeros(self._shape.shape)
+        learned = np.zeros(self._shapes.shape)
         for start in range(0, len(kinds), _TOGETHER):
             part = slice(start, start + _TOGETHER)
             value, row = np.divmod(kinds[part], contexts)
@@ -104,12 +113,12 @@ class AdaptiveMagnitude:
             share = np.floor(overlap * _PARTS + 0.5) * counts[part, None]
             cell = row[:, None] * _BINS + np.arange(_BINS)
             learned += np.bincount(cell.ravel(), share.ravel(), learned.size).reshape(learned.shape)
-        self._shape += learned / _PARTS
+        return learned
 
     def _tables(self, scale: float) -> Floats:
         # the share of each bucket: the integral of the shape between its bounds, by linear interpolation; its sums by
         # hand, since numpy's have an order of their own
-        total = np.array([list(itertools.accumulate(shape, initial=0.0)) for shape in self._shape.tolist()])
+        total = np.array([list(itertools.accumulate(shape, initial=0.0)) for shape in self._shapes.tolist()])
         edges: Floats = np.arange(_BINS + 1.0) * (scale * _WIDTH)
         # numpy's own interpolation may order its operations otherwise
         index = np.minimum(np.searchsorted(edges, _MIDDLES, side="right") - 1, _BINS - 1)
@@ -118,3 +127,28 @@ class AdaptiveMagnitude:
         cumulative: Floats = low + share * (total.take(index + 1, 1) - low)
         tables: Floats = (cumulative[:, 1:] - cumulative[:, :-1]) + 1e-3 * total[:, -1:] / _BUCKETS
         return tables
+
+
+class AdaptiveAngle:
+    """Angles, each one of so many in half a turn; with the weights of bins about 0, 1/16, 2/16 ... at first."""
+
+    def __init__(self, weights: Floats) -> None:
+        self._weights = weights.copy()
+
+    def code(self, coder: Coder, turns: Integers, values: Integers | None) -> Integers:
+        """Code one of 0 to `turns` - 1 each, (n,); bins know nothing of fewer angles than there are bins."""
+        many = turns >= _TURN
+        shift, sizes = np.where(many, turns // (2 * _TURN), 0), np.where(many, 1, turns)
+        turned = None if values is None else (values + shift) % turns
+        kinds, row = np.unique(turns[many], return_inverse=True)
+        borders = np.arange(_TURN + 1) * kinds[:, None] // _TURN
+        known = None
+        if turned is not None:
+            known = (borders[row, 1:] <= turned[many, None]).sum(1)
+        bins = coder.choose(self._weights * np.diff(borders), row, known) if len(row) else np.zeros(0, np.int64)
+        low = np.zeros(len(turns), np.int64)
+        low[many] = borders[row, bins]
+        sizes[many] = borders[row, bins + 1] - low[many]
+        found = low + coder.uniform(sizes, None if turned is None else turned - low)
+        np.add.at(self._weights, bins, 1.0)
+        return (found - shift) % turns

@@ -10,14 +10,14 @@ from typing import NamedTuple
 from .gaussians.quantize import ENERGIES, QPS
 from .rangecoder import CodecError
 
-MAGIC, VERSIONS = b"kcgs", (1, 2)
+MAGIC, VERSIONS = b"kcgs", (1, 2, 3)
 MAP_MAGIC = b"kcgm"
 """What a file begins with that is a label map and no scene."""
 # a decoder's memory: pixels of a map; Gaussians in all, and numbers of their colours
 MOST_LABELS = 1 << 26
 MOST_GAUSSIANS, MOST_COLORS = (1 << 21) - 1, 1 << 27
 MOST_SIDE, MOST_CHANNELS, MOST_REGIONS = 1 << 20, 1 << 10, (1 << 24) - 1
-# of version 1, and of version 2, which is written only for several layers of one energy
+# of version 1, and of those in which several layers may hold one energy
 _MOST_LAYERS = ENERGIES[1] - ENERGIES[0] + 1, 128
 # Gaussians that a layer of no bytes may hold
 SPARE = 64
@@ -31,7 +31,8 @@ class Header(NamedTuple):
     channels: int
     qp: int
     regions: int = 1
-    layers: tuple[tuple[int, int], ...] = ()  # energy, bytes
+    layers: tuple[tuple[int, int], ...] = ()  # highest energy, bytes
+    version: int = VERSIONS[-1]
 
 
 class ByteReader:
@@ -71,8 +72,7 @@ def most_gaussians(channels: int) -> int:
 def pack(header: Header, region_map: bytes, layers: list[bytes]) -> bytes:
     """Put a file together."""
     numbers = [*header.size, header.channels, header.qp - QPS[0], header.regions]
-    split = len(dict(header.layers)) < len(layers)
-    head = bytearray(MAGIC + bytes([VERSIONS[split]]) + b"".join(map(varint, numbers)))
+    head = bytearray(MAGIC + bytes([header.version]) + b"".join(map(varint, numbers)))
     if header.regions > 1:
         head += varint(len(region_map))
     head += varint(len(layers))
@@ -123,8 +123,8 @@ def _read_header(stream: ByteReader) -> tuple[Header, int]:
     if magic != MAGIC:
         raise CodecError(f"it must start with {MAGIC!r}; got {stream.data[:4]!r}")
     if (version := stream.take(1)[0]) not in VERSIONS:
-        raise CodecError(f"its version must be 1 or 2; got {version}")
-    split = VERSIONS.index(version)
+        raise CodecError(f"its version must be 1, 2 or 3; got {version}")
+    split = version > VERSIONS[0]
     size = stream.varint("height", 1, MOST_SIDE), stream.varint("width", 1, MOST_SIDE)
     channels = stream.varint("channels", 1, MOST_CHANNELS)
     qp = stream.varint("quantization parameter", 0, QPS[1] - QPS[0]) + QPS[0]
@@ -139,7 +139,7 @@ def _read_header(stream: ByteReader) -> tuple[Header, int]:
     for i in range(count):
         energy -= stream.varint("energy", 0 if split else min(i, 1), energy - ENERGIES[0])
         layers.append((energy, stream.varint("length of a layer", 1, 1 << 32)))
-    return Header(size, channels, qp, regions, tuple(layers)), length
+    return Header(size, channels, qp, regions, tuple(layers), version), length
 
 
 def varint(value: int) -> bytes:

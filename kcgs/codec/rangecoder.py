@@ -91,7 +91,7 @@ class Coder(ABC):
         if len(tables) == 1:
             return self.repeat(tables[0], len(rows), values)
         # one by one, since the library makes a model anew for each row of many tables
-        models, code = [self._categorical(table) for table in tables], self._code
+        models, code = {row: self._categorical(tables[row]) for row in np.unique(rows).tolist()}, self._code
         given = [None] * len(rows) if values is None else values.tolist()
         return np.array([code(v, models[row]) for v, row in zip(given, rows.tolist(), strict=True)], np.int64)
 

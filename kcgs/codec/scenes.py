@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,7 +19,7 @@ from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
 from .exact import Integers
-from .file import LAYER_CRC, MOST_CHANNELS, MOST_SIDE, SPARE, Header, most_gaussians, pack, unpack
+from .file import LAYER_CRC, MOST_CHANNELS, MOST_SIDE, SPARE, VERSIONS, Header, most_gaussians, pack, unpack
 from .gaussians.layers import LayerCoder
 from .gaussians.quantize import QPS, Classes, Codes, Parameters, Quantizer
 from .rangecoder import CodecError, Reader, Writer
@@ -28,6 +29,8 @@ QUALITIES = (10.0, 90.0)
 DEFAULT_QUALITY = 46.0
 # of a mark's bytes, filled by what is estimated; and bytes that a layer more takes
 _FILLED, _LAYER_BYTES = 0.985, 8
+# of the Gaussians of a file, which a layer holds at least
+_LEAST_SHARE = 1 / 16
 
 
 def encode(scene: Scene, *, quality: float | None = None, target_bytes: int | None = None) -> bytes:
@@ -147,32 +150,49 @@ class SceneWriter:
 
         With `marks`, rising shares of the file's bytes, a layer ends just before each.
         """
-        header, layers = self._code(quantizer, codes, ids, np.zeros(len(ids), np.int64))
-        data = pack(header, self.region_map, layers)
+        whole = np.zeros(len(ids), np.int64)
         if not marks:
-            return data
-        parts = _divide(codes, header, len(data), marks)
+            header, layers = self._code(quantizer, codes, ids, whole, joined=True)
+            return pack(header, self.region_map, layers)
+        header, layers = self._code(quantizer, codes, ids, whole)
+        parts = _divide(codes, header, len(pack(header, self.region_map, layers)), marks)
         header, layers = self._code(quantizer, codes, ids, parts)
         return pack(header, self.region_map, layers)
 
-    def _code(self, quantizer: Quantizer, codes: Codes, ids: Integers, parts: Integers) -> tuple[Header, list[bytes]]:
-        """Code a layer for each energy, or for each part of the Gaussians of one energy, from 0."""
+    def _code(
+        self, quantizer: Quantizer, codes: Codes, ids: Integers, parts: Integers, *, joined: bool = False
+    ) -> tuple[Header, list[bytes]]:
+        """Code a layer for each energy, or each part of the Gaussians of one energy, from 0; `joined`: or several."""
         # by energy, falling, and part, then by size, falling; then by cell, row by row
         key = parts - codes.energy * (parts.max() + 1)
         order = np.lexsort((codes.cell[:, 0], codes.cell[:, 1], -codes.size, key))
         codes, ids = codes.pick(order), ids[order]
         model, layers, listed = LayerCoder(quantizer, self.channels, self.regions), [], []
-        _, starts, counts = np.unique(key[order], return_index=True, return_counts=True)
-        for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
-            writer, part, energy = Writer(), slice(start, start + count), int(codes.energy[start])
-            model.code(writer, energy, codes.pick(part), ids[part], len(ids))
+        starts = [*np.unique(key[order], return_index=True)[1].tolist(), len(ids)]
+        groups = [slice(*ends) for ends in itertools.pairwise(starts)]
+        for layer in _join(groups, len(ids)) if joined else [[group] for group in groups]:
+            writer = Writer()
+            model.code(writer, int(codes.energy[layer[0].start]), [(codes.pick(g), ids[g]) for g in layer], len(ids))
             # each Gaussian takes more than a bit, but zeros at the end are left out
+            count = layer[-1].stop - layer[0].start
             layers.append(writer.finish().ljust(-(-(count - SPARE) // 8), b"\0"))
-            listed.append((energy, len(layers[-1])))
+            listed.append((int(codes.energy[layer[0].start]), len(layers[-1])))
         return Header(self.size, self.channels, quantizer.qp, model.num_regions, tuple(listed)), layers
 
     def _count_numbers(self) -> int:
         return len(self.ids) * (5 + self.channels)
+
+
+def _join(groups: list[slice], count: int) -> list[list[slice]]:
+    """Return the groups of each layer: it takes bytes of its own, so none holds few of the `count` Gaussians."""
+    layers: list[list[slice]] = []
+    for group in groups:
+        first = layers[-1][0].start if layers else 0
+        if layers and min(group.start - first, count - group.start) < _LEAST_SHARE * count:
+            layers[-1].append(group)
+        else:
+            layers.append([group])
+    return layers
 
 
 def _divide(codes: Codes, header: Header, num_bytes: int, marks: tuple[float, ...]) -> Integers:
@@ -267,14 +287,15 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
         from .labels import decode_map  # loads numba
 
         regions = decode_map(region_map, header.size, header.regions)
-    model = LayerCoder(Quantizer(header.qp, header.size), header.channels, regions)
+    plain = header.version < VERSIONS[-1]
+    model = LayerCoder(Quantizer(header.qp, header.size), header.channels, regions, plain=plain)
     parts, ids, left = [], [], most_gaussians(header.channels)
     for (energy, _), layer in zip(header.layers, layers, strict=False):
         # each Gaussian takes more than a bit, and all must fit into memory
-        gaussians, positions = model.code(Reader(layer), energy, None, None, min(8 * len(layer) + SPARE, left))
-        parts.append(gaussians)
-        ids.append(positions)
-        left -= len(positions)
+        for gaussians, positions in model.code(Reader(layer), energy, None, min(8 * len(layer) + SPARE, left)):
+            parts.append(gaussians)
+            ids.append(positions)
+            left -= len(positions)
     means, cholesky, colors = (torch.from_numpy(np.concatenate(numbers)) for numbers in zip(*parts, strict=True))
     region_ids = None if regions is None else regions.ids[torch.from_numpy(np.concatenate(ids))]
     try:

@@ -12,50 +12,75 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kcgs.codec.adaptive import AdaptiveMagnitude, AdaptiveNumber, AdaptiveSymbol
-from kcgs.codec.exact import Integers
+from kcgs.codec.adaptive import AdaptiveAngle, AdaptiveMagnitude, AdaptiveNumber, AdaptiveSymbol
+from kcgs.codec.exact import Floats, Integers, exp2
 from kcgs.codec.rangecoder import CodecError, Coder
 from kcgs.functional import RegionMap
 from kcgs.functional.labels import lookup_regions
 
-from .occupancy import Occupancy
-from .quantize import MOST_RATIO, SIZES, Classes, Codes, Parameters, Quantizer
+from .occupancy import MOST_BITS, Occupancy, PlainOccupancy
+from .quantize import ENERGIES, MOST_RATIO, OCTAVES, SIZES, Classes, Codes, Parameters, Quantizer
+from .shapes import ALIKE, ANGLE, APART
 
 _CLASSES = 64  # that a stream may name, of size
-_MOST_BITS = 21
 # half the log2 of the ratio of scales is measured in this
 _RATIO_SCALE = 2.0
 # a colour's part is faint, middling or strong against the whole
 _FAINT, _STRONG = 0.35, 0.8
-# where learning starts: shapes found on photos that no report measures, in parts of a thousand
-_GREY = np.array([1, 1, 2, 3, 12, 22, 49, 80, 102, 110, 110, 103, 88, 74, 62, 46, 34, 27, 22, 17, 12, 6, 6, 12])
-_HUE = np.array([382, 247, 144, 96, 51, 30, 21, 12, 7, 3, 2, 2, 1, 1, *[0.5] * 10])
-_HUE2 = np.array([547, 224, 98, 63, 27, 13, 12, 9, 5, 1, 1, *[0.5] * 13])
-_RATIO = np.array([102, 159, 168, 150, 125, 98, 69, 46, 30, 21, 14, 8, 5, 3, 2, 1, *[0.5] * 8])
-# what a start weighs against what is seen, in Gaussians
-_WEIGHT = 0.05
+# sizes within a class, by which colours are measured; classes of size that have ratios of their own
+_LEVELS, _LEAST_SIZE = 8, -1
+
+
+# what follows a group: no other, that of the next energy down, or of an energy below that
+_END, _HOLDS, _EMPTY = 0, 1, 2
+Group = tuple[Codes, Integers]
+"""Gaussians of one energy, and the positions of their regions' ids."""
 
 
 class LayerCoder:
-    """Codes layers one after another; what was learned in one helps the next. The map is on the CPU."""
+    """Codes layers one after another; what was learned in one helps the next. The map is on the CPU.
 
-    def __init__(self, quantizer: Quantizer, channels: int, regions: RegionMap | None) -> None:
-        self.quantizer, self.channels, self.regions = quantizer, channels, regions
+    `plain`: as versions 1 and 2 of the format have it, with fewer contexts.
+    """
+
+    def __init__(self, quantizer: Quantizer, channels: int, regions: RegionMap | None, *, plain: bool = False) -> None:
+        self.quantizer, self.channels, self.regions, self._plain = quantizer, channels, regions, plain
         self.num_regions = 1 if regions is None else regions.num_regions
-        shapes = (_GREY, 1), (_HUE, 3), (_HUE2, 3)
-        self._colors = [AdaptiveMagnitude(_WEIGHT * bins, contexts) for bins, contexts in shapes]
-        self._ratio = AdaptiveMagnitude(_WEIGHT * _RATIO)
+        self._magnitudes = [AdaptiveMagnitude(shapes) for shapes in (ALIKE if plain else APART)]
+        self._angle = AdaptiveAngle(ANGLE)
         self._strays = AdaptiveSymbol(np.array([20.0, 0.5]))
-        self._count = AdaptiveNumber(np.array([2.0, *[1.0] * 9, *[0.3] * (_MOST_BITS - 9)]))
-        self._occupancy = Occupancy(quantizer.size)
+        self._count = AdaptiveNumber(np.array([2.0, *[1.0] * 9, *[0.3] * (MOST_BITS - 9)]))
+        self._occupancy = (PlainOccupancy if plain else Occupancy)(quantizer.size)
 
     def code(
-        self, coder: Coder, energy: int, codes: Codes | None, ids: Integers | None, most: int
-    ) -> tuple[Parameters, Integers]:
-        """Code the layer of one energy, at most so many Gaussians; return them and the positions of their regions' ids.
+        self, coder: Coder, energy: int, groups: list[Group] | None, most: int
+    ) -> list[tuple[Parameters, Integers]]:
+        """Code a layer, at most so many Gaussians, as groups of falling energies, the first of which is given.
 
-        `codes` is in the order of a file; None: to read.
+        Returns the Gaussians of each group and the positions of their regions' ids. `groups` are in the order of
+        a file; None: to read.
         """
+        if self._plain:
+            return [self._code_group(coder, energy, None, most)]
+        found, waiting = [], None if groups is None else list(groups)
+        following = _HOLDS
+        while following != _END:
+            if following == _HOLDS:
+                found.append(self._code_group(coder, energy, None if waiting is None else waiting.pop(0), most))
+                most -= len(found[-1][1])
+            energy -= 1
+            if waiting is not None:
+                following = _EMPTY if waiting else _END
+                if waiting and waiting[0][0].energy[0] == energy:
+                    following = _HOLDS
+            following = coder.number(following, 3)
+            if following != _END and energy < ENERGIES[0]:
+                raise CodecError(f"a class of energy must be at least {ENERGIES[0]}; got {energy}")
+        return found
+
+    def _code_group(self, coder: Coder, energy: int, group: Group | None, most: int) -> tuple[Parameters, Integers]:
+        """Code the Gaussians of one energy, at most so many."""
+        codes, ids = (None, None) if group is None else group
         counts = self._code_counts(coder, codes)
         if counts.sum() > most:
             raise CodecError(f"a layer must hold at most {most} Gaussians; got {counts.sum()}")
@@ -64,10 +89,11 @@ class LayerCoder:
         if not counts.any():
             raise CodecError("a layer must hold Gaussians; got none")
         cells, start = [], 0
-        for count in counts[counts > 0][::-1].tolist():
-            known = None if codes is None else codes.cell[start : start + count]
-            cells.append(self._occupancy.code(coder, count, known))
-            start += count
+        for size in np.flatnonzero(counts)[::-1].tolist():
+            end = start + int(counts[size])
+            known = None if codes is None else codes.cell[start:end]
+            cells.append(self._occupancy.code(coder, size + SIZES[0], end - start, known))
+            start = end
         size = np.repeat(np.arange(_CLASSES)[::-1], counts[::-1]) + SIZES[0]
         classes = Classes(np.full(start, energy), size)
         gaussians = self._code_numbers(coder, classes, np.concatenate(cells), codes)
@@ -89,29 +115,37 @@ class LayerCoder:
     def _code_numbers(self, coder: Coder, classes: Classes, cell: Integers, codes: Codes | None) -> Parameters:
         steps, zero = self.quantizer.steps(classes), np.zeros(len(cell), np.int64)
         scale = coder.uniform(steps.scales, None if codes is None else codes.scale)
-        ratio = self._ratio.code(coder, _RATIO_SCALE / steps.ratio[0], zero, None if codes is None else codes.ratio)
+        last = len(APART.ratio) - 1
+        about = zero if self._plain else np.clip(classes.size - _LEAST_SIZE, 0, last)
+        given = None if codes is None else codes.ratio
+        ratio = self._magnitudes[-1].code(coder, _RATIO_SCALE / steps.ratio[:1], zero, about, given)
         if (ratio > (most := math.floor(MOST_RATIO / steps.ratio[0] + 0.5))).any():
             raise CodecError(f"a ratio must be at most {most} steps; got {ratio.max()}")
         turns = steps.turns(ratio)
-        angle = coder.uniform(turns, None if codes is None else codes.angle)
-        # how many steps the amplitude of a Gaussian of this energy has
+        given = None if codes is None else codes.angle
+        angle = coder.uniform(turns, given) if self._plain else self._angle.code(coder, turns, given)
+        # how many steps the amplitude of a Gaussian of this energy has, where it is as large as the middle of its class
         loud = math.ldexp(math.sqrt(math.pi / (12.0 * self.quantizer.distortion)), int(classes.energy[0]))
-        colors = self._code_colors(coder, len(cell), loud, None if codes is None else codes.colors)
+        level, scales = zero, np.array([loud])
+        if not self._plain:
+            level = (_LEVELS * scale + _LEVELS // 2) // steps.scales
+            scales = loud * exp2(OCTAVES * (0.5 - (np.arange(_LEVELS) + 0.5) / _LEVELS))
+        colors = self._code_colors(coder, scales, level, None if codes is None else codes.colors)
         shape = steps.shape(scale, ratio, angle / turns)
         parts = steps.places(shape)
         place = [coder.uniform(parts[:, axis], None if codes is None else codes.place[:, axis]) for axis in range(2)]
         return steps.restore(Codes(*classes, scale, ratio, angle, colors, cell, np.stack(place, -1)), shape)
 
-    def _code_colors(self, coder: Coder, count: int, loud: float, colors: Integers | None) -> Integers:
+    def _code_colors(self, coder: Coder, scales: Floats, level: Integers, colors: Integers | None) -> Integers:
         channels: list[Integers] = []
         for channel in range(self.channels):
-            context = np.zeros(count, np.int64)
+            context = np.zeros(len(level), np.int64)
             if channel:
-                last = np.abs(channels[-1])
+                last, loud = np.abs(channels[-1]), scales[level]
                 context = (last > _FAINT * loud).astype(np.int64) + (last > _STRONG * loud)
             value = None if colors is None else colors[:, channel]
-            model = self._colors[min(channel, 2)]
-            magnitude = model.code(coder, loud, context, None if value is None else np.abs(value))
+            model = self._magnitudes[min(channel, 2)]
+            magnitude = model.code(coder, scales, level, context, None if value is None else np.abs(value))
             sign = coder.uniform(1 + (magnitude > 0), None if value is None else (value < 0).astype(np.int64))
             channels.append(np.where(sign == 1, -magnitude, magnitude))
         return np.stack(channels, -1)

@@ -1,0 +1,65 @@
+"""Where the models of Gaussians begin: shapes found on photos that no report measures, in parts of a thousand.
+
+`ALIKE` are those of versions 1 and 2 of the format, in which all contexts begin alike, `APART` those of version 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from kcgs.codec.exact import Floats
+
+# what a start weighs against what is seen, in Gaussians
+_WEIGHT = 0.05
+
+
+class Shapes(NamedTuple):
+    """Weights of bins at first, for each context of each magnitude: [contexts, bins]."""
+
+    grey: Floats
+    hue: Floats
+    hue2: Floats
+    ratio: Floats
+
+
+def _shapes(*tables: Sequence[Sequence[float]]) -> Shapes:
+    return Shapes(*(_WEIGHT * np.array(table) for table in tables))
+
+
+# fmt: off
+_GREY = [1, 1, 2, 3, 12, 22, 49, 80, 102, 110, 110, 103, 88, 74, 62, 46, 34, 27, 22, 17, 12, 6, 6, 12]
+_HUE = [382, 247, 144, 96, 51, 30, 21, 12, 7, 3, 2, 2, 1, 1, *[0.5] * 10]
+_HUE2 = [547, 224, 98, 63, 27, 13, 12, 9, 5, 1, 1, *[0.5] * 13]
+_RATIO = [102, 159, 168, 150, 125, 98, 69, 46, 30, 21, 14, 8, 5, 3, 2, 1, *[0.5] * 8]
+ALIKE = _shapes([_GREY], [_HUE] * 3, [_HUE2] * 3, [_RATIO])
+APART = _shapes(
+    [
+        [5, 4, 3, 5, 7, 11, 24, 58, 115, 132, 129, 118, 106, 92, 76, 56, 33, 17, 9, 5, 3, 2, 1, 1],
+    ],
+    [
+        [29, 30, 30, 31, 34, 40, 54, 79, 106, 110, 111, 85, 66, 69, 52, 37, 22, 13, 5, 3, 2, 2, 1, 1],
+        [151, 134, 110, 53, 57, 73, 80, 82, 67, 49, 40, 33, 27, 21, 14, 9, 5, 2, 1, 1, 1, 1, 1, 1],
+        [476, 254, 123, 66, 34, 20, 12, 8, 5, 3, 2, 2, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1],
+    ],
+    [
+        [655, 228, 78, 27, 6, 3, 2, 2, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1],
+        [498, 262, 104, 54, 33, 18, 12, 9, 6, 3, 2, 2, 2, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1],
+        [283, 205, 150, 108, 71, 57, 40, 30, 21, 16, 9, 4, 4, 3, 3, 2, 1, 1, 1, 1, 1, 1, 1, 1],
+    ],
+    [
+        [263, 234, 192, 150, 91, 38, 17, 9, 5, 3, 2, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1],
+        [104, 132, 155, 170, 163, 133, 83, 40, 15, 6, 3, 2, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1],
+        [91, 105, 117, 123, 124, 127, 119, 92, 60, 29, 12, 4, 2, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1],
+        [116, 120, 126, 118, 110, 97, 86, 70, 55, 42, 33, 21, 9, 3, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1],
+        [111, 118, 140, 139, 125, 99, 77, 59, 42, 33, 20, 17, 11, 9, 5, 3, 1, 1, 1, 1, 1, 1, 1, 1],
+        [101, 109, 143, 147, 142, 104, 85, 56, 44, 24, 17, 12, 8, 4, 4, 4, 4, 1, 1, 1, 1, 1, 1, 1],
+        [154, 183, 172, 137, 115, 74, 60, 38, 26, 19, 9, 5, 5, 4, 1, 1, 3, 1, 1, 1, 1, 1, 1, 1],
+        [219, 282, 216, 116, 69, 40, 17, 17, 10, 8, 4, 3, 2, 1, 1, 2, 2, 1, 1, 1, 1, 1, 1, 1],
+    ],
+)
+# fmt: on
+# of the bins of an angle
+ANGLE = np.array([4.5, 3.5, 2.7, 2.5, 2.4, 2.5, 2.7, 3.5] * 2)
