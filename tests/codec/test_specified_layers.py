@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import bisect
+import itertools
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +16,11 @@ import torch
 from kcgs.codec import Decoded, decode, encode
 from kcgs.codec.exact import exp2, turn
 from kcgs.codec.file import Header, unpack
-from kcgs.codec.gaussians.layers import _GREY, _HUE, _HUE2, _RATIO
 from kcgs.codec.gaussians.quantize import opponent
+from kcgs.codec.gaussians.shapes import ALIKE, ANGLE, APART
 
 from .conftest import make_scene
-from .symbols import Choices, Symbols
+from .symbols import Bits, Choices, Symbols
 
 LN2 = 0.6931471805599453
 BUCKETS = [
@@ -29,8 +31,8 @@ BUCKETS = [
 
 
 class Magnitudes:
-    def __init__(self, table: Any, contexts: int = 1) -> None:
-        self.shapes = [[0.05 * float(value) for value in table] for _ in range(contexts)]
+    def __init__(self, shapes: Any) -> None:
+        self.shapes = shapes.tolist()
 
     @staticmethod
     def weights(shape: list[float], t: float) -> list[float]:
@@ -47,13 +49,14 @@ class Magnitudes:
         at = [rise(max(bucket - 0.5, 0.0)) for bucket in BUCKETS]
         return [(at[i + 1] - at[i]) + 0.001 * heights[-1] / 176 for i in range(176)]
 
-    def read(self, symbols: Symbols, t: float, contexts: list[int]) -> list[int]:
-        tables = [self.weights(shape, t) for shape in self.shapes]
-        buckets = [symbols.categorical(tables[context]) for context in contexts]
+    def read(self, symbols: Symbols, scales: list[float], contexts: list[int]) -> list[int]:
+        kinds = list(zip(contexts, scales, strict=True))
+        tables = {(context, t): self.weights(self.shapes[context], t) for context, t in set(kinds)}
+        buckets = [symbols.categorical(tables[kind]) for kind in kinds]
         sizes = [BUCKETS[b] + symbols.uniform(BUCKETS[b + 1] - BUCKETS[b]) for b in buckets]
-        edges = [*(i * (t * 0.125) for i in range(24)), math.inf]
         learned = [[0] * 24 for _ in self.shapes]
-        for context, size in zip(contexts, sizes, strict=True):
+        for (context, t), size in zip(kinds, sizes, strict=True):
+            edges = [*(i * (t * 0.125) for i in range(24)), math.inf]
             low, high = max(size - 0.5, 0.0), size + 0.5
             for i in range(24):
                 covered = max(min(high, edges[i + 1]) - max(low, edges[i]), 0.0)
@@ -63,8 +66,135 @@ class Magnitudes:
         return sizes
 
 
+class Angles:
+    def __init__(self) -> None:
+        self.weights = ANGLE.tolist()
+
+    def read(self, symbols: Symbols, turns: list[int]) -> list[int]:
+        begins = [[b * t // 16 for b in range(17)] for t in turns]
+        bins = [
+            symbols.categorical([w * (begin[b + 1] - begin[b]) for b, w in enumerate(self.weights)]) if t >= 16 else -1
+            for t, begin in zip(turns, begins, strict=True)
+        ]
+        found = []
+        for t, begin, b in zip(turns, begins, bins, strict=True):
+            if t < 16:
+                found.append(symbols.uniform(t))
+            else:
+                found.append((begin[b] + symbols.uniform(begin[b + 1] - begin[b]) - t // 32) % t)
+                self.weights[b] += 1
+        return found
+
+
 def power(x: float) -> float:
     return float(exp2(np.array([x]))[0])
+
+
+def read_length(symbols: Symbols, choices: Choices) -> int:
+    bits = choices.read(symbols)[0]
+    return (1 << (bits - 1)) + symbols.uniform(1 << (bits - 1)) if bits else 0
+
+
+class Occupancy:
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self.margins = Choices(3.0, *[1.0] * 4, *[0.3] * 4)
+        self.beyond = Choices(0.3, *[1.0] * 4, *[0.3] * 17)
+        self.earlier: list[tuple[int, float, float]] = []  # the class of size, and the middle of the cell
+
+    def side(self, count: int) -> int:
+        q = self.size[0] * self.size[1] // (16 * count)
+        return int(2 ** (math.floor(math.log2(q) / 2))) if q else 1
+
+    def read(self, symbols: Bits, s: int, count: int) -> list[tuple[int, int]]:
+        side = self.side(count)
+        rows, columns = (math.ceil(pixels / side) for pixels in self.size)
+        m = read_length(symbols, self.margins)
+        every = [(row, column) for row in range(-m, rows + m) for column in range(-m, columns + m)]
+        inside = [at for at in every if 0 <= at[0] < rows and 0 <= at[1] < columns]
+        beyond = [at for at in every if not (0 <= at[0] < rows and 0 <= at[1] < columns)]
+        held = self.read_cells(symbols, s, count, rows, inside, beyond)
+        found = [at for at in sorted(held) for _ in range(held[at])]
+        self.earlier += [(s, (row + 0.5) * side, (column + 0.5) * side) for row, column in found]
+        return found
+
+    def read_cells(self, symbols: Bits, s: int, count: int, rows: int, inside: Any, beyond: Any) -> dict[Any, int]:
+        outside = read_length(symbols, self.beyond) if beyond else 0
+        bands = max(8, math.ceil(len(inside) / 65536))
+        borders = [rows * i // bands * (len(inside) // rows) for i in range(bands + 1)]
+        held = self.fill(symbols, count - outside, self.weigh(s, self.side(count), inside), borders)
+        bands = max(8, math.ceil(len(beyond) / 65536))
+        borders = [len(beyond) * i // bands for i in range(bands + 1)]
+        return held | self.fill(symbols, outside, dict.fromkeys(beyond, 1), borders)
+
+    def weigh(self, s: int, side: int, inside: Any) -> dict[tuple[int, int], int]:
+        def mirror(place: int, cells: int) -> int:
+            while not 0 <= place < cells:
+                place = -1 - place if place < 0 else 2 * cells - 1 - place
+            return place
+
+        rows, columns = inside[-1][0] + 1, inside[-1][1] + 1
+        weights = dict.fromkeys(inside, max(480000 // len(inside), 1))
+        for other, y, x in self.earlier:
+            row, column = math.floor(y / side), math.floor(x / side)
+            if other in (s, s + 1, s + 2) and (row, column) in weights:
+                for dy in range(-4, 5):
+                    for dx in range(-4, 5):
+                        at = mirror(row + dy, rows), mirror(column + dx, columns)
+                        weights[at] += 64 * (5 - abs(dx)) * (5 - abs(dy))
+        return weights
+
+    def fill(self, symbols: Bits, left: int, weights: dict[Any, int], borders: list[int]) -> dict[Any, int]:
+        held, places = dict.fromkeys(weights, 0), list(weights)
+        for start, end in itertools.pairwise(borders):
+            total = sum(weights[at] for at in places[start:])
+            chances = {}
+            for at in places[start:end] if left else []:
+                chance = math.floor(65536 * (left * weights[at]) / (left * weights[at] + total))
+                chances[at] = min(max(chance, 16), 65520)
+            left -= sum(self.count(symbols, chances, held))
+        return held
+
+    def count(self, symbols: Bits, chances: dict[Any, int], held: dict[Any, int]) -> Iterator[int]:
+        cells = list(chances)
+        while cells:
+            cells = [at for at in cells if symbols.bit(chances[at])]
+            for at in cells:
+                held[at] += 1
+            yield len(cells)
+
+
+class PlainOccupancy(Occupancy):
+    """Of versions 1 and 2."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        super().__init__(size)
+        self.outside, self.seen = 0.5, 20
+
+    def read_cells(self, symbols: Bits, s: int, count: int, rows: int, inside: Any, beyond: Any) -> dict[Any, int]:
+        f = self.outside / self.seen if beyond else 0.0
+        held = self.repeat(symbols, max(count * (1 - f), 0.01) / len(inside), inside)
+        if beyond:
+            told = self.repeat(symbols, max(count * f, 0.01) / len(beyond), beyond)
+            held |= told
+            self.outside += sum(told.values())
+            self.seen += count
+        return held
+
+    def repeat(self, symbols: Symbols, rate: float, cells: Any) -> dict[Any, int]:
+        p = rate / (1 + rate)
+        weights = [1 - p]
+        for _ in range(7):
+            weights.append(weights[-1] * p)
+        weights[7] /= 1 - p
+        held = {at: symbols.categorical(weights) for at in cells}
+        full = [at for at in cells if held[at] == 7]
+        while full:
+            more = {at: symbols.categorical(weights) for at in full}
+            for at, count in more.items():
+                held[at] += count
+            full = [at for at, count in more.items() if count == 7]
+        return held
 
 
 class File:
@@ -72,70 +202,43 @@ class File:
 
     def __init__(self, header: Header, index: Any, regions: int) -> None:
         self.size, self.channels, self.index, self.regions = header.size, header.channels, index, regions
+        self.plain = header.version < 3
         self.distortion = power(-header.qp / 32)
         self.lengths = Choices(2.0, *[1.0] * 9, *[0.3] * 12)
-        self.margins = Choices(3.0, *[1.0] * 4, *[0.3] * 4)
         self.strays = Choices(20.0, 0.5)
-        self.colors = [Magnitudes(_GREY), Magnitudes(_HUE, 3), Magnitudes(_HUE2, 3)]
-        self.ratio = Magnitudes(_RATIO)
-        self.outside, self.seen = 0.5, 20
+        *self.colors, self.ratio = (Magnitudes(shapes) for shapes in (ALIKE if self.plain else APART))
+        self.angles = Angles()
+        self.occupancy = (PlainOccupancy if self.plain else Occupancy)(header.size)
 
-    def read_length(self, symbols: Symbols, choices: Choices) -> int:
-        bits = choices.read(symbols)[0]
-        return (1 << (bits - 1)) + symbols.uniform(1 << (bits - 1)) if bits else 0
+    def layer(self, symbols: Bits, e: int) -> list[tuple[list[float], int]]:
+        found, follows = self.group(symbols, e), 0 if self.plain else symbols.number(3)
+        while follows:
+            e -= 1
+            assert e >= -24
+            if follows == 1:
+                found += self.group(symbols, e)
+            follows = symbols.number(3)
+        return found
 
-    def fill(self, symbols: Symbols, rate: float, cells: int) -> list[int]:
-        p = rate / (1 + rate)
-        weights = [1 - p]
-        for _ in range(7):
-            weights.append(weights[-1] * p)
-        weights[7] /= 1 - p
-        held = [symbols.categorical(weights) for _ in range(cells)]
-        full = [i for i in range(cells) if held[i] == 7]
-        while full:
-            more = [symbols.categorical(weights) for _ in full]
-            for i, count in zip(full, more, strict=True):
-                held[i] += count
-            full = [i for i, count in zip(full, more, strict=True) if count == 7]
-        return held
-
-    def side(self, count: int) -> int:
-        q = self.size[0] * self.size[1] // (16 * count)
-        return int(2 ** (math.floor(math.log2(q) / 2))) if q else 1
-
-    def cells(self, symbols: Symbols, count: int) -> list[tuple[int, int]]:
-        side = self.side(count)
-        rows, columns = (math.ceil(pixels / side) for pixels in self.size)
-        m = self.read_length(symbols, self.margins)
-        f = self.outside / self.seen if m else 0.0
-        every = [(row, column) for row in range(-m, rows + m) for column in range(-m, columns + m)]
-        inside = [at for at in every if 0 <= at[0] < rows and 0 <= at[1] < columns]
-        beyond = [at for at in every if at not in set(inside)]
-        held = dict(zip(inside, self.fill(symbols, max(count * (1 - f), 0.01) / len(inside), len(inside)), strict=True))
-        if m:
-            told = self.fill(symbols, max(count * f, 0.01) / len(beyond), len(beyond))
-            held |= dict(zip(beyond, told, strict=True))
-            self.outside += sum(told)
-            self.seen += count
-        return [at for at in sorted(held) for _ in range(held[at])]
-
-    def layer(self, symbols: Symbols, e: int) -> list[tuple[list[float], int]]:
+    def group(self, symbols: Bits, e: int) -> list[tuple[list[float], int]]:
         first = symbols.uniform(64)
         last = first + symbols.uniform(64 - first)
-        counts = {s - 8: self.read_length(symbols, self.lengths) for s in range(first, last + 1)}
-        kinds = [(s, *at) for s in sorted(counts, reverse=True) if counts[s] for at in self.cells(symbols, counts[s])]
+        counts = {s - 8: read_length(symbols, self.lengths) for s in range(first, last + 1)}
+        classes = [s for s in sorted(counts, reverse=True) if counts[s]]
+        kinds = [(s, *at) for s in classes for at in self.occupancy.read(symbols, s, counts[s])]
         u = math.sqrt(12 * self.distortion / math.pi * power(-2 * e - 1))
         scales = min(max(math.floor(0.75 / (u * (math.sqrt(0.5) / LN2)) + 0.5), 1), 2**20)
         step = max(u * (1 / LN2), 12 / 2**20)
         scale = [symbols.uniform(scales) for _ in kinds]
-        ratio = self.ratio.read(symbols, 2 / step, [0] * len(kinds))
+        contexts = [0 if self.plain else min(max(s + 1, 0), 7) for s, _, _ in kinds]
+        ratio = self.ratio.read(symbols, [2 / step] * len(kinds), contexts)
         stretch = [0.5 * (power(2 * r * step) - power(-2 * r * step)) for r in ratio]
         turns = [
             min(max(math.floor(math.pi * s / u + 0.5), 2), 2**20) if r else 1
             for s, r in zip(stretch, ratio, strict=True)
         ]
-        angle = [symbols.uniform(n) for n in turns]
-        colors = self.read_colors(symbols, e, len(kinds))
+        angle = [symbols.uniform(n) for n in turns] if self.plain else self.angles.read(symbols, turns)
+        colors = self.read_colors(symbols, e, [(8 * one + 4) // scales for one in scale])
         shapes, parts, sides = [], [], []
         for i, (s, _, _) in enumerate(kinds):
             m, h = 0.75 * (s + (scale[i] + 0.5) / scales), ratio[i] * step
@@ -143,7 +246,7 @@ class File:
             cos, sin = (float(t[0]) for t in turn(np.array([angle[i] / turns[i]])))
             l11 = math.sqrt((one * cos) * (one * cos) + (two * sin) * (two * sin))
             shapes.append([l11, (one * one - two * two) * cos * sin / l11, one * two / l11])
-            sides.append(self.side(counts[s]))
+            sides.append(self.occupancy.side(counts[s]))
             places = (math.ceil(sides[i] / (u * math.sqrt(2) * length)) for length in shapes[i][::2])
             parts.append([min(max(n, 1), 2**20) for n in places])
         across, down = ([symbols.uniform(part[axis]) for part in parts] for axis in range(2))
@@ -156,12 +259,16 @@ class File:
             found.append([x, y, *shapes[i], *opponent(told, back=True)[0]])
         return list(zip(found, self.read_regions(symbols, found), strict=True))
 
-    def read_colors(self, symbols: Symbols, e: int, count: int) -> list[list[int]]:
+    def read_colors(self, symbols: Symbols, e: int, levels: list[int]) -> list[list[int]]:
         loud = math.sqrt(math.pi / (12 * self.distortion)) * 2.0**e
-        colors: list[list[int]] = [[] for _ in range(count)]
+        scales = [loud if self.plain else loud * power(0.75 * (0.5 - (v + 0.5) / 8)) for v in levels]
+        colors: list[list[int]] = [[] for _ in levels]
         for channel in range(self.channels):
-            contexts = [(abs(c[-1]) > 0.35 * loud) + (abs(c[-1]) > 0.8 * loud) if channel else 0 for c in colors]
-            sizes = self.colors[min(channel, 2)].read(symbols, loud, contexts)
+            contexts = [0] * len(levels)
+            if channel:
+                sizes = [abs(color[-1]) for color in colors]
+                contexts = [(a > 0.35 * t) + (a > 0.8 * t) for a, t in zip(sizes, scales, strict=True)]
+            sizes = self.colors[min(channel, 2)].read(symbols, scales, contexts)
             signs = [symbols.uniform(2 if size else 1) for size in sizes]
             for color, size, sign in zip(colors, sizes, signs, strict=True):
                 color.append(-size if sign else size)
@@ -185,9 +292,7 @@ def as_the_words_say(data: bytes, known: Decoded) -> None:
     index = None if regions is None else regions.index_of(regions.labels).numpy()
     file = File(header, index, header.regions)
     found = [
-        row
-        for (energy, _), layer in zip(header.layers, layers, strict=True)
-        for row in file.layer(Symbols(layer), energy)
+        row for (energy, _), layer in zip(header.layers, layers, strict=True) for row in file.layer(Bits(layer), energy)
     ]
     expected = torch.cat([field.means, field.cholesky, field.colors], -1).detach().numpy()
     assert np.array_equal(np.array([numbers for numbers, _ in found]).astype(np.float32), expected)
@@ -196,7 +301,7 @@ def as_the_words_say(data: bytes, known: Decoded) -> None:
         assert [id for _, id in found] == regions.index_of(field.region_ids).tolist()
 
 
-@pytest.mark.parametrize("name", ["golden.kcgs", "golden2.kcgs"])
+@pytest.mark.parametrize("name", ["golden.kcgs", "golden2.kcgs", "golden3.kcgs"])
 def test_golden(name: str) -> None:
     data = (Path(__file__).parent / name).read_bytes()
     as_the_words_say(data, decode(data))
