@@ -1,14 +1,15 @@
-"""Files of version 2: layers that end just before shares of the bytes."""
+"""Layers that end just before shares of the bytes, and layers of several energies."""
 
 from __future__ import annotations
 
+import itertools
 import zlib
 from pathlib import Path
 
 import pytest
 import torch
 
-from kcgs import Scene
+from kcgs import GaussianField, Scene
 from kcgs.codec import CodecError, decode, encode
 from kcgs.codec.file import pack, unpack
 from kcgs.codec.gaussians.quantize import Quantizer
@@ -43,7 +44,7 @@ def rows(scene: Scene) -> list[list[float]]:
 def test_layers_end_just_before_the_marks(regions: int, seed: int) -> None:
     scene = make_scene(2500, (96, 128), regions, seed=seed)
     data, whole = write(scene, 40.0), write(scene, 40.0, ())
-    assert data[4] == 2 and whole[4] == 1 and len(whole) < len(data) < len(whole) + 60
+    assert data[4] == whole[4] == 3 and len(whole) < len(data) < len(whole) + 60
     for mark in MARKS:
         assert mark - 0.06 < max(end for end in ends(data) if end <= mark)
     assert sorted(energy for energy, _ in unpack(data)[0].layers)[::-1] == [e for e, _ in unpack(data)[0].layers]
@@ -58,10 +59,37 @@ def test_the_same_gaussians(scene: Scene) -> None:
         torch.testing.assert_close(parts.scene.render(), whole.scene.render(), rtol=0, atol=0.05)
 
 
-def test_what_version_1_can_say_stays(scene: Scene) -> None:
+def test_a_mark_before_which_nothing_fits(scene: Scene) -> None:
     one = make_scene(1)
-    assert write(one, 40.0) == write(one, 40.0, ()) and write(one, 40.0)[4] == 1
-    assert write(scene, 40.0, (0.001,)) == write(scene, 40.0, ())
+    assert write(one, 40.0) == write(one, 40.0, ())
+    marked, whole = write(scene, 40.0, (0.001,)), write(scene, 40.0, ())
+    energies = [energy for energy, _ in unpack(marked)[0].layers]
+    assert len(set(energies)) == len(energies) > len(unpack(whole)[0].layers)
+    assert rows(decode(marked).scene) == rows(decode(whole).scene)
+
+
+def test_layers_of_several_energies() -> None:
+    scene = make_scene(800, (96, 128))
+    data = write(scene, 40.0, ())
+    counts, ended = [], len(data) - sum(length + 2 for _, length in unpack(data)[0].layers)
+    for _, length in unpack(data)[0].layers:
+        ended += length + 2
+        counts.append(len(decode(data[:ended]).scene))
+    assert len(counts) < len(unpack(write(scene, 40.0, (0.001,)))[0].layers)
+    layers = [end - start for start, end in itertools.pairwise([0, *counts])]
+    assert sum(layers) == len(decode(data).scene) and min(layers) >= sum(layers) / 16
+
+
+def test_energies_that_nothing_has() -> None:
+    means = torch.rand(60, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([36, 24])
+    strengths = torch.tensor([4e3, 3e2, *[0.5] * 58])
+    alike = torch.tensor([[3.0, 0.5, 2.0]]).expand(60, -1)
+    field = GaussianField(means, alike, strengths[:, None].expand(-1, 3), size=(24, 36))
+    data = write(Scene(field), 70.0, ())
+    # the two strong ones are too few for a layer of their own
+    assert len(unpack(data)[0].layers) == 1
+    found = decode(data).scene.field
+    assert torch.allclose(found.colors.amax(1).sort(descending=True).values, strengths, rtol=0.02)
 
 
 def test_every_cut_is_a_coarser_scene_or_refused() -> None:
@@ -93,5 +121,5 @@ def test_limits(scene: Scene) -> None:
     many = header._replace(layers=(header.layers[0],) * 129)
     with pytest.raises(CodecError, match=r"layers must be in \[1, 128\]; got 129"):
         decode(pack(many, region_map, [layers[0]] * 129))
-    with pytest.raises(CodecError, match="its version must be 1 or 2; got 3"):
-        decode(b"kcgs\3" + encode(scene)[5:])
+    with pytest.raises(CodecError, match="its version must be 1, 2 or 3; got 4"):
+        decode(b"kcgs\4" + encode(scene)[5:])

@@ -21,6 +21,7 @@ from kcgs.codec.gaussians.shapes import ALIKE, ANGLE, APART
 
 from .conftest import make_scene
 from .symbols import Bits, Choices, Symbols
+from .test_hostile import write_cells
 
 LN2 = 0.6931471805599453
 BUCKETS = [
@@ -145,14 +146,14 @@ class Occupancy:
         return weights
 
     def fill(self, symbols: Bits, left: int, weights: dict[Any, int], borders: list[int]) -> dict[Any, int]:
-        held, places = dict.fromkeys(weights, 0), list(weights)
+        held, places, total = dict.fromkeys(weights, 0), list(weights), sum(weights.values())
         for start, end in itertools.pairwise(borders):
-            total = sum(weights[at] for at in places[start:])
             chances = {}
             for at in places[start:end] if left else []:
                 chance = math.floor(65536 * (left * weights[at]) / (left * weights[at] + total))
                 chances[at] = min(max(chance, 16), 65520)
             left -= sum(self.count(symbols, chances, held))
+            total -= sum(weights[at] for at in places[start:end])
         return held
 
     def count(self, symbols: Bits, chances: dict[Any, int], held: dict[Any, int]) -> Iterator[int]:
@@ -311,3 +312,11 @@ def test_golden(name: str) -> None:
 def test_others(regions: int, channels: int, quality: float) -> None:
     data = encode(make_scene(120, regions=regions, channels=channels, seed=3), quality=quality)
     as_the_words_say(data, decode(data))
+
+
+@pytest.mark.parametrize("size", [(525, 1000), (1, 300), (300, 1), (2, 3)])
+def test_cells(size: tuple[int, int]) -> None:
+    data, listed = write_cells(size, min(36_000, size[0] * size[1]))
+    symbols, occupancy = Bits(data), Occupancy(size)
+    for s, cell in listed:
+        assert occupancy.read(symbols, s, len(cell)) == [(row, column) for column, row in cell.tolist()]

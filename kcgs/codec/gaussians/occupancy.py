@@ -128,7 +128,7 @@ class Occupancy:
 def _borders(length: int, cells: int) -> list[int]:
     """Divide a length into bands, so that none has many of so many cells."""
     bands = max(_BANDS, -(-cells // _TOGETHER))
-    return [length * i // bands for i in range(bands + 1)]
+    return sorted({length * i // bands for i in range(bands + 1)})
 
 
 def _crowd(column: Integers, row: Integers, shape: tuple[int, int], first: int, last: int) -> Floats:
@@ -136,7 +136,7 @@ def _crowd(column: Integers, row: Integers, shape: tuple[int, int], first: int, 
     top, bottom = max(first - _REACH, 0), min(last + _REACH, shape[0])
     these = (row >= top) & (row < bottom)
     place = (row[these] - top) * shape[1] + column[these]
-    near = np.bincount(place, minlength=(bottom - top) * shape[1]).reshape(-1, shape[1])
+    near = np.bincount(place, minlength=(bottom - top) * shape[1]).reshape(-1, shape[1]).astype(np.int32)
     above, below = _REACH - (first - top), _REACH - (bottom - last)
     near = np.pad(near, [(above if top == 0 else 0, below if bottom == shape[0] else 0), (_REACH, _REACH)], "symmetric")
     for _ in range(2):
@@ -155,10 +155,11 @@ def _fill(
 ) -> Integers:
     """Code which cell each of `count` Gaussians lies in, in order, band by band; all cells together weigh `total`."""
     left, found = count, [np.zeros(0, np.int64)]
-    for first in range(0, len(borders) - 1, _BANDS):
+    together = _BANDS if borders[-1] <= _TOGETHER else 1  # whose weights are in memory
+    for first in range(0, len(borders) - 1, together):
         if not left:
             break
-        bands = borders[first : first + _BANDS + 1]
+        bands = borders[first : first + together + 1]
         weights = weigh(bands[0], bands[-1])
         for start, end in itertools.pairwise(bands):
             weight = weights[start - bands[0] : end - bands[0]]
