@@ -104,12 +104,12 @@ class SceneWriter:
         distortion = samples * 10 ** (-decibels / 10) / self._count_numbers()
         return min(max(math.floor(-32 * math.log2(max(distortion, 1e-12)) + 0.5), QPS[0]), QPS[1])
 
-    def finest(self, write: Callable[[int], bytes], target_bytes: int, *, share: float = 1.0) -> tuple[int, bytes]:
-        """Return the quantization parameter of the largest file of at most `share` of `target_bytes`, and the file.
+    def finest(self, write: Callable[[int], bytes], target_bytes: int) -> tuple[int, bytes]:
+        """Return the quantization parameter of the largest file of at most `target_bytes`, and the file.
 
         A step of the parameter is 1/32 of a bit for each number of a Gaussian, so that a few files tell which.
         """
-        most = round(share * check_count("target_bytes", target_bytes))
+        most = check_count("target_bytes", target_bytes)
         low, high = QPS[0], self.qp_for(QUALITIES[1])
         qp, best = min(max(self.qp_for(DEFAULT_QUALITY), low), high), None
         while low <= high:
@@ -120,8 +120,7 @@ class SceneWriter:
                 least, high = len(data), qp - 1
             qp = min(max(self.next_qp(qp, len(data), most), low), high)
         if best is None:
-            needed = math.ceil(least / share)
-            raise ValueError(f"target_bytes must be at least {needed} for this scene; got {target_bytes}")
+            raise ValueError(f"target_bytes must be at least {least} for this scene; got {target_bytes}")
         return best
 
     def next_qp(self, qp: int, num_bytes: int, target_bytes: int) -> int:

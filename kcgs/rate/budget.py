@@ -33,6 +33,9 @@ _POWER = 0.93
 # contours show: an image with them may have this much more squared error, 0.1 dB
 _FAVOUR = 1.023
 _TRIAL_ITERATIONS, _TRIAL_TO_END = 80, 0.65
+# share of its length that is left of a fit: the rest is for the last digits, which the descent on bits sees to, but for
+# the last move of contours; not where Gaussians are so few that they may be refined
+_FIT_END, _CONTOURS_END, _FEW = 0.845, 0.89, 64
 # shares of the clock: each of two trials, and the fit of what is left then
 _TRIAL_SHARE, _FIT_SHARE = 0.08, 0.75
 _Choice = tuple[RegionMap | None, float, dict[str, Any]]
@@ -73,8 +76,8 @@ def fit_bytes(
         seed: as there.
         on_step: as there, for the fit itself, not the trials.
         progress: as there.
-        settings: as there; `contour_cost` is replaced by the coder's, and `max_seconds` counts the trials, the fit and
-            the rounding.
+        settings: as there; `contour_cost` is replaced by the coder's, the descent on bits replaces the last iterations
+            (11 or 15 %), and `max_seconds` counts the trials, the fit and the rounding.
 
     Returns:
         The file, what it decodes to, and the fit.
@@ -103,10 +106,20 @@ def fit_bytes(
         return None if math.isinf(end) else max(share * (end - time.perf_counter()), 1e-3)
 
     settings = {"contour_cost": cost, "max_seconds": left(_FIT_SHARE)}
+    if chosen is not None and chosen.num_regions == 2:
+        settings["merge_regions"] = False  # the trials said so
     config = config.model_copy(update=settings)
-    result = fit(image, chosen, count, recipe=config, seed=seed, on_step=on_step, progress=progress)
+    share = _FIT_END if chosen is None else _CONTOURS_END
+    last = math.inf if config.max_seconds or count <= _FEW else math.ceil(share * config.usual_iterations)
+
+    def step(iteration: int, entry: HistoryEntry) -> bool:
+        return (on_step is not None and bool(on_step(iteration, entry))) or iteration >= last
+
+    result = fit(image, chosen, count, recipe=config, seed=seed, on_step=step, progress=progress)
     changes = changes if config.guidance else {"dropped": "recipe"}
     result = result._replace(regions=report_regions(regions, result.scene, **changes))
+    if result.history[-1].iteration >= last:
+        result = result._replace(stop_reason="iterations")
     with Progress("writing the file", known=False, shown=progress):
         how: Any = {"max_seconds": left(), "seed": seed, "objective": config.objective}
         data, scene = compress(result.scene, image, target_bytes=num_bytes, **how)
@@ -136,7 +149,8 @@ def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: Fi
     trial = FitConfig.from_recipe(config, merge_regions=False, objective=seen, **shorter)
 
     def error(regions: RegionMap | None, left: int) -> float:
-        result = fit(image, regions, count_of(left), recipe=trial, seed=seed)
+        end = math.ceil(_FIT_END * iterations)
+        result = fit(image, regions, count_of(left), recipe=trial, seed=seed, on_step=lambda i, _: i >= end)
         return float(10 ** (-max(entry.psnr for entry in result.history) / 10))
 
     without = error(None, num_bytes)

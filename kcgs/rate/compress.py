@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 from kcgs._check import as_image, check_count, check_number
 from kcgs._repr import brief
 from kcgs.codec import QUALITIES, decode
-from kcgs.codec.gaussians.quantize import QPS, Quantizer
+from kcgs.codec.gaussians.quantize import Codes, Quantizer
 from kcgs.codec.scenes import SceneWriter
 from kcgs.fit.objective import VisualObjective
 from kcgs.functional import psnr
@@ -26,15 +26,18 @@ from .tuning import Tuning
 # dB of a file's image against the scene's own above the scene's PSNR: the error grows by about a 28th, 0.15 dB,
 # and by more where so few Gaussians are rounded that errors do not average out
 _MARGIN = 14.5
-# dB by which files are finer that are tried until one is good enough
 # shares of the bytes before which a layer of a progressive file ends
 _MARKS = (0.25, 0.5, 0.75)
+# dB by which files are finer that are tried until one is good enough
 _FINER = (0.0, 2.0, 5.0, 9.0, 14.0, 20.0, 30.0, 50.0)
 # share of the iterations before anything is rounded, and how many go by between two looks at the distortion
-_FREE, _LOOK = 0.7, 50
+_FREE, _LOOK = 0.7, 70
 _DROP = 0.8
-# files that are tried for a number of bytes, and how much smaller tuned ones are
-_TRIES, _TUNED = 4, 1.006
+# of the bytes: what the descent goes by, for tuned files are smaller; what is aimed at in rounding, where Gaussians too
+# many are left out; and what is near enough not to try again, up to so many times
+_TUNED, _AIM, _NEAR, _TRIES = 1.006, 1.01, 0.995, 3
+# many numbers are small, and take no more bits where all are finer: a step for more bytes is longer by this factor
+_GAIN = 1.3
 # of the seconds that are left: for the first of several files, and what comes before; for rounding a single file
 _SHARE, _ALONE = 0.5, 0.8
 
@@ -147,28 +150,25 @@ class _Press:
 
     def largest(self, target_bytes: int) -> bytes:
         """Return a file that is hardly smaller."""
-        qp = self.writer.finest(lambda qp: self._round(self.writer, qp, 0), target_bytes)[0]
+        qp = self.writer.qp_for(None)
 
         def follow(writer: SceneWriter) -> int:
             nonlocal qp
-            qp = writer.next_qp(qp, len(writer.write_rounded(qp)), round(_TUNED * target_bytes))
+            size = len(writer.write_rounded(qp))
+            qp = writer.next_qp(qp, size, size + round(_GAIN * (_TUNED * target_bytes - size)))
             return qp
 
+        follow(self.writer)
         writer = self._spare(follow)
         qp, data = writer.finest(lambda qp: self._round(writer, qp, 0), target_bytes)
-        qp = writer.next_qp(qp, len(data), round(_TUNED * target_bytes))
-        low, high = QPS[0] - 1, QPS[1] + 1
-        for tried in itertools.count(1):
-            made = self._round(writer, qp, self.rounds, _SHARE)
-            following = writer.next_qp(qp, len(made), target_bytes)
-            if len(made) <= target_bytes:
-                low, data = qp, made
-            else:
-                high, following = qp, min(following, qp - 1)
-            qp = min(following, high - 1)
-            if qp <= low or (tried >= _TRIES and low >= QPS[0]):
+        best, plain, most = b"", data, self.writer.qp_for(QUALITIES[1])
+        for _ in range(_TRIES):
+            qp = min(writer.next_qp(qp, len(data), round(_AIM * target_bytes)), most)
+            data = self._round(writer, qp, self.rounds, _SHARE, target_bytes)
+            best = max(best, data if len(data) <= target_bytes else b"", key=len)
+            if len(data) >= _NEAR * target_bytes or qp == most:
                 break
-        return data
+        return best or plain
 
     def _spare(self, follow: Callable[[SceneWriter], int]) -> SceneWriter:
         """Descend with nothing rounded, at the quantization parameter that `follow` says now and then."""
@@ -186,11 +186,18 @@ class _Press:
             writer = writer.of(tuning.gaussians, tuning.ids)
         return writer
 
-    def _round(self, writer: SceneWriter, qp: int, iterations: int, share: float = 1.0) -> bytes:
+    def _round(self, writer: SceneWriter, qp: int, rounds: int, share: float = 1.0, most: float = math.inf) -> bytes:
         tuning = self._tuning(writer, Quantizer(qp, writer.size))
         tuning.drop()
-        codes = tuning.round(iterations, self.seed, share * (self.end - time.perf_counter()))
-        return writer.write(tuning.quantizer, codes, tuning.ids, marks=_MARKS if self.progressive else ())
+        write = partial(writer.write, tuning.quantizer, marks=_MARKS if self.progressive else ())
+
+        def excess(codes: Codes) -> int:
+            size = len(write(codes, tuning.ids))
+            return max(0, math.ceil((size - most) * len(tuning.ids) / size))
+
+        seconds = share * (self.end - time.perf_counter())
+        codes = tuning.round(rounds, self.seed, seconds, None if math.isinf(most) else excess)
+        return write(codes, tuning.ids)
 
     def _tuning(self, writer: SceneWriter, quantizer: Quantizer) -> Tuning:
         given = writer.gaussians, writer.ids, self.image, writer.regions, quantizer, self.objective

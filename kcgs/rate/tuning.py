@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.codec.exact import Integers
-from kcgs.codec.gaussians.quantize import Codes, Parameters, Quantizer
+from kcgs.codec.gaussians.quantize import Classes, Codes, Parameters, Quantizer
 from kcgs.fit.frame import local_gradient, move
 from kcgs.fit.objective import VisualObjective
 from kcgs.fit.prefixes import energies, strongest
@@ -29,8 +30,8 @@ from .bits import soft_bits
 _PAYING = 20.0
 # what a bit must save, in units of the distortion: 2 ln 2 where nobody makes up for rounding; found by trial
 _BIT = 0.9
-# share of the iterations in which shapes are rounded; colours are in the rest
-_SHAPES = 0.65
+# share of the iterations in which shapes are rounded; colours are in the rest; and when Gaussians too many are left out
+_SHAPES, _LOOKS = 0.65, (0.3, 0.65, 0.9)
 _STEP, _MOMENTUM = 0.09, 0.9
 # the largest step, in standard deviations and in log scale; and the largest share of Newton's
 _LARGEST, _NEWTON = 0.2, 0.3
@@ -41,6 +42,8 @@ _CURVATURE = (0.5, 0.5, 0.75, 0.25, 0.75)
 # pixels: a sum over pixel centres of something narrower is as if it had this standard deviation, where it hits one
 _NARROW = 0.56
 _DRAFT_CUTOFF = 1e-3
+# steps for which the slope of the bits is kept, and those between two times of rounding
+_CHARGED, _GROUP = 4, 3
 
 
 def pays(gaussians: Parameters, quantizer: Quantizer) -> NDArray[np.bool_]:
@@ -67,6 +70,7 @@ class Tuning:
     ) -> None:
         self.ids, self.image, self.regions, self.objective = ids, image, regions, objective
         self.quantizer, self.progressive, self._steps = quantizer, progressive, 0
+        self._charge: Tensor | None = None  # [N, 3 + C] slopes of the bits' price, by factors and colours
         self._still: Tensor | None = None  # [N, 1] Gaussians that this step leaves as they are
         self._free = [torch.from_numpy(numbers).to(image) for numbers in gaussians]
         self._speed = torch.zeros(len(ids), 5 + gaussians.colors.shape[1]).to(image)
@@ -80,10 +84,7 @@ class Tuning:
 
     def drop(self) -> None:
         """Leave out the Gaussians that do not pay for their bits."""
-        kept = pays(self.gaussians, self.quantizer)
-        if not kept.all():
-            self.ids, index = self.ids[kept], torch.from_numpy(kept)
-            self._free, self._speed = [numbers[index] for numbers in self._free], self._speed[index]
+        self._keep(pays(self.gaussians, self.quantizer))
 
     def descend(self, iterations: int, seconds: float = math.inf) -> None:
         """Move all Gaussians downhill, so many steps, or so many seconds."""
@@ -94,29 +95,54 @@ class Tuning:
             self._speed = self._faster(self._downhill(*self._free))
             self._free = self._moved(self._free)
 
-    def round(self, iterations: int, seed: int, seconds: float = math.inf) -> Codes:
-        """Round everything in so many iterations and seconds, in an order of the seed; return the whole numbers."""
+    def round(
+        self, iterations: int, seed: int, seconds: float = math.inf, excess: Callable[[Codes], int] | None = None
+    ) -> Codes:
+        """Round everything in so many iterations and seconds, in an order of the seed; return the whole numbers.
+
+        `excess` says how many Gaussians are too many; the weakest go, early enough for others to make up for them.
+        """
         generator = torch.Generator().manual_seed(seed)
         turn = torch.rand(2, len(self.ids), generator=generator).to(self.image)
         classes = self.quantizer.classify(self.gaussians)
-        start, share = time.perf_counter(), 0.0
+        start, share, looks = time.perf_counter(), 0.0, [*_LOOKS, math.inf]
         for iteration in range(iterations):
             share = max(share, iteration / iterations)
             if seconds < math.inf:
                 share = max(share, (time.perf_counter() - start) / max(seconds, 1e-9))
             if share >= 1:
                 break
-            shaped = turn[0] < share / _SHAPES
-            colored = turn[1] < (share - _SHAPES) / (1 - _SHAPES)
+            if iteration % _GROUP == 0:
+                if excess is not None and share >= looks[0]:
+                    looks.pop(0)
+                    kept = self._leave_out(excess(self.quantizer.quantize(self.gaussians, classes)))
+                    turn, classes = turn[:, kept], Classes(*(numbers[kept] for numbers in classes))
+                rounded = self.quantizer.restore(self.quantizer.quantize(self.gaussians, classes))
+                shaped, colored = turn[0] < share / _SHAPES, turn[1] < (share - _SHAPES) / (1 - _SHAPES)
+            self._step(rounded, shaped[:, None], colored[:, None])
+        while True:
             codes = self.quantizer.quantize(self.gaussians, classes)
-            self._step(codes, shaped[:, None], colored[:, None])
-        return self.quantizer.quantize(self.gaussians, classes)
+            if excess is None or len(self.ids) == 1 or not (count := excess(codes)):
+                return codes
+            kept = self._leave_out(count)
+            classes = Classes(*(numbers[kept] for numbers in classes))
 
-    def _step(self, codes: Codes, shaped: Tensor, colored: Tensor) -> None:
+    def _leave_out(self, count: int) -> NDArray[np.bool_]:
+        """Leave out so many of the weakest, but for the last; return which stay."""
+        _, cholesky, colors = self._free
+        rank = energies(cholesky, colors, self.quantizer.size).argsort(stable=True).argsort().numpy()
+        return self._keep(rank >= min(count, len(rank) - 1))
+
+    def _keep(self, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        self.ids, index = self.ids[kept], torch.from_numpy(kept)
+        self._free, self._speed = [numbers[index] for numbers in self._free], self._speed[index]
+        self._charge = None
+        return kept
+
+    def _step(self, rounded: Parameters, shaped: Tensor, colored: Tensor) -> None:
         """Move what is free, against the render of what is rounded and what is not."""
-        rounded = [torch.from_numpy(t).to(self.image) for t in self.quantizer.restore(codes)]
-        fixed = (shaped, shaped, colored)
-        current = [torch.where(fix, r, f) for fix, r, f in zip(fixed, rounded, self._free, strict=True)]
+        fixed, restored = (shaped, shaped, colored), (torch.from_numpy(t).to(self.image) for t in rounded)
+        current = [torch.where(fix, r, f) for fix, r, f in zip(fixed, restored, self._free, strict=True)]
         downhill = self._downhill(*current)
         stopped = torch.cat([shaped.expand(-1, 5), colored.expand(-1, downhill.shape[1] - 5)], -1)
         self._speed = torch.where(stopped, 0.0, self._faster(downhill))
@@ -135,16 +161,23 @@ class Tuning:
     def _downhill(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
         """Return Newton's steps; in a progressive descent now and then those of the strongest Gaussians alone."""
         self._still, ids = None, self._region_ids
+        if self._charge is None or self._steps % _CHARGED == 0:
+            factors, c = (t.detach().requires_grad_() for t in (cholesky, colors))
+            # half the squared error, as its gradient is the difference
+            price = 0.5 * _BIT * self._counts * self.quantizer.distortion
+            bits = price * soft_bits(factors, c, self.quantizer).sum()
+            self._charge = torch.cat(torch.autograd.grad(bits, (factors, c)), -1)
         index = strongest(cholesky, colors, self.quantizer.size, 0, self._steps) if self.progressive else None
         self._steps += 1
         if index is None:
-            return self._newton(means, cholesky, colors, ids)
-        steps = self._newton(means[index], cholesky[index], colors[index], None if ids is None else ids[index])
+            return self._newton(means, cholesky, colors, ids, self._charge)
+        ids = None if ids is None else ids[index]
+        steps = self._newton(means[index], cholesky[index], colors[index], ids, self._charge[index])
         # the others stand still: momentum that misses every third gradient swings ever wider
         self._still = torch.ones(len(means), 1, dtype=torch.bool).index_fill(0, index, False)
         return torch.zeros_like(self._speed).index_copy(0, index, steps)
 
-    def _newton(self, means: Tensor, cholesky: Tensor, colors: Tensor, ids: Tensor | None) -> Tensor:
+    def _newton(self, means: Tensor, cholesky: Tensor, colors: Tensor, ids: Tensor | None, charge: Tensor) -> Tensor:
         """Return Newton's steps of each number alone: of centre and factor in the Gaussian's frame, of colours."""
         size = self.quantizer.size
         x, factors, c = (t.detach().requires_grad_() for t in (means, cholesky, colors))
@@ -152,10 +185,8 @@ class Tuning:
         difference = render.detach() - self.image
         if self.objective is not None:
             difference = self.objective.apply(difference)
-        # half the squared error, as its gradient is the difference
-        price = 0.5 * _BIT * self._counts * self.quantizer.distortion
-        bits = price * soft_bits(factors, c, self.quantizer).sum()
-        gradients = torch.autograd.grad((render, bits), (x, factors, c), (difference, None))
+        slopes = torch.autograd.grad(render, (x, factors, c), difference)
+        gradients = slopes[0], slopes[1] + charge[:, :3], slopes[2] + charge[:, 3:]
         narrow = cholesky[:, ::2].clamp_min(_NARROW)
         area = (math.pi * narrow.prod(-1)).clamp_max(size[0] * size[1])
         energy = (colors.square().sum(-1) * area).clamp_min(_FAINT)

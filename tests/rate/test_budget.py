@@ -29,6 +29,12 @@ class TestFitBytes:
         assert 1.0 < time.perf_counter() - start < 4.0  # rounding alone took as long as it liked
         assert done.result.stop_reason == "seconds" and 0.9 * 1500 < len(done.data) <= 1500
 
+    def test_a_fit_ends_early_and_says_what_ended_it(self, photo: Photo) -> None:
+        assert fit_bytes(photo[0], None, 600, iterations=100).result.stop_reason == "iterations"
+        seen: list[int] = []
+        done = fit_bytes(photo[0], None, 600, iterations=100, on_step=lambda i, _: seen.append(i) or i == 60)
+        assert done.result.stop_reason == "callback" and seen[-1] == 60
+
     def test_more_bytes_are_better(self, photo: Photo) -> None:
         image, labels = photo
         psnrs = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from kcgs.codec.gaussians.quantize import Quantizer
 from kcgs.codec.scenes import SceneWriter
 from kcgs.rate import compress, quality_for
 from kcgs.rate.bits import soft_bits
+from kcgs.rate.tuning import Tuning
 
 from .conftest import Photo, psnr
 
@@ -26,6 +28,14 @@ class TestCompress:
         for data in (plain, tuned.data):
             assert 0.97 * target < len(data) <= target
         assert psnr(decode(plain).scene, image) + 0.1 < psnr(tuned.scene, image)
+
+    @pytest.mark.parametrize("target", [700, 1300])
+    def test_one_rounding_fills_the_bytes(self, photo: Photo, fitted: Scene, target: int) -> None:
+        with patch.object(Tuning, "round", autospec=True, side_effect=Tuning.round) as rounded:
+            done = compress(fitted, photo[0], target_bytes=target, iterations=100)
+        assert 0.99 * target <= len(done.data) <= target
+        # the others are of no iterations: they ask for a size
+        assert sum(call.args[1] > 0 for call in rounded.call_args_list) == 1
 
     def test_scene_is_what_the_file_holds(self, photo: Photo, fitted: Scene) -> None:
         done = compress(fitted, photo[0], quality=40, iterations=2)
