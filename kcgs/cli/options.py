@@ -30,6 +30,11 @@ Contours = Annotated[
 ]
 Size = Annotated[str | None, typer.Option(metavar="WxH", help="Width and height in pixels.")]
 
+Objective = Annotated[
+    Literal["psnr", "visual", "ms-ssim", "progressive"] | None,
+    typer.Option("--objective", "--metric", help="What is to be best; progressive: of the first bytes, too."),
+]
+
 
 class FitRequest(NamedTuple):
     """What is asked of a fit besides the image and its regions."""
@@ -53,10 +58,7 @@ def fit_request(
     iterations: Annotated[
         int | None, typer.Option(min=1, help="Default: the recipe's, or as many as --max-seconds has time for.")
     ] = None,
-    objective: Annotated[
-        Literal["psnr", "visual", "progressive"] | None,
-        typer.Option(help="The squared error, what the eye sees, or a file's first bytes, too; default: the recipe's."),
-    ] = None,
+    objective: Objective = None,
     max_seconds: Annotated[
         float | None, typer.Option(help="Wall time of the whole command; of fit-many, for each image.")
     ] = None,

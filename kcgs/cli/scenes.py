@@ -13,7 +13,7 @@ from kcgs._progress import Progress
 
 from .common import OUTPUT_IMAGES, ImageFile, Json, Quiet, SceneFile, SceneOrMap, app, check_output, print_report
 from .fit import describe_size, measure_scene
-from .options import Contours, Scale, Size, exclude, target_size
+from .options import Contours, Objective, Scale, Size, exclude, target_size
 
 OutputImage = Annotated[Path, typer.Option("-o", "--output", help="Image file to write.")]
 
@@ -114,6 +114,7 @@ def encode(
             help="The image that the scene shows: Gaussians then make up for each other's rounding.", dir_okay=False
         ),
     ] = None,
+    objective: Objective = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -125,7 +126,7 @@ def encode(
 
     check_output(output, ".kcgs")
     if scene.suffix not in FORMATS:
-        exclude("a label map", target_bytes=target_bytes, quality=quality, image=image)
+        exclude("a label map", target_bytes=target_bytes, quality=quality, image=image, objective=objective)
         labels = load_labels(scene, rgb_ids=True)
         ids = labels.unique()
         if len(ids) > max(256, labels.numel() / 64):
@@ -135,6 +136,8 @@ def encode(
         return
     if target_bytes is not None:
         exclude("--target-bytes", quality=quality)
+    if image is None:
+        exclude("a scene without --image", objective=objective)
     loaded = load(scene)
     goal: dict[str, Any] = {"quality": quality, "target_bytes": target_bytes}
     with Progress("writing the file", known=False, shown=not quiet):
@@ -144,7 +147,7 @@ def encode(
             from kcgs.data import load_image
             from kcgs.rate import compress
 
-            data = compress(loaded, load_image(image), **goal).data
+            data = compress(loaded, load_image(image), **goal, objective=objective or "psnr").data
     write_file(output, data)
     decoded = codec.decode(data)
     rounded = decoded.scene

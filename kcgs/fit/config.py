@@ -13,6 +13,7 @@ from kcgs._repr import shorten
 from kcgs.functional import MAX_SOFTNESS
 from kcgs.kernels import BACKENDS
 
+Objective = Literal["psnr", "visual", "ms-ssim", "progressive"]
 _USUAL_ITERATIONS, _PROGRESSIVE_ITERATIONS = 700, 900
 
 
@@ -74,10 +75,11 @@ class FitConfig(BaseModel):
     merge_regions: bool = Field(True, description="merge regions where a trial says that their contour does not help")
 
     # The descent
-    objective: Literal["psnr", "visual", "progressive"] = Field(
+    objective: Objective = Field(
         "psnr",
-        description="visual: an error on several scales, less where the image is busy; progressive: the error of the "
-        "strongest Gaussians alone counts, too, so that the first bytes of a file are an image; both need loss l2",
+        description="visual: an error on several scales, less where the image is busy; ms-ssim: that measure; "
+        "progressive: the error of the strongest Gaussians alone counts, too, so that the first bytes of a file are an "
+        "image; they need loss l2",
     )
     loss: Literal["l1", "l2", "l1+ssim"] = Field("l2", description="l1+ssim: L1 + 0.1 (1 - SSIM), as Image-GS")
     optimizer: Literal["frame", "adan", "adam"] = Field(

@@ -15,7 +15,7 @@ from kcgs.nn import GaussianField
 from .config import FitConfig
 from .kmeans import kmeans_field
 from .levenberg_marquardt import is_flat
-from .objective import VisualObjective
+from .objective import make_objective
 from .optimizers import FrameAdam, GaussianImageAdan, GaussianOptimizer, ImageGSAdam
 from .sampling import sample_pixels, spread_repeats
 from .state import FitState
@@ -48,7 +48,7 @@ def start(
         # a map that comes with widths keeps them
         chooses_widths=config.softness == "auto" and regions is not None and regions.softness == 0.0,
         given=regions,
-        objective=VisualObjective(image) if config.objective == "visual" else None,
+        objective=make_objective(config.objective, image),
         limit=_limit(image, fitting, num_gaussians, config),
         merged_for_count=0 if regions is None else regions.num_regions - (fitting.num_regions if fitting else 1),
         cutoff=max(config.cutoff, config.draft_cutoff),

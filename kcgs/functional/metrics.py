@@ -13,12 +13,12 @@ from kcgs._check import check_image, check_labels
 
 from .labels import edge_band
 
-_WINDOW = 11  # pixels; torchmetrics makes it int(3.5 sigma + 0.5) * 2 + 1 whatever kernel size it is given
-_SIGMA = 1.5
-_K1, _K2 = 0.01, 0.03
-_MARGIN = _WINDOW // 2
-_SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
-_MS_SSIM_SIDE = (_WINDOW - 1) * 2 ** (len(_SCALE_WEIGHTS) - 1) + 1
+SSIM_WINDOW = 11  # pixels; torchmetrics makes it int(3.5 sigma + 0.5) * 2 + 1 whatever kernel size it is given
+SSIM_SIGMA = 1.5
+K1, K2 = 0.01, 0.03
+_MARGIN = SSIM_WINDOW // 2
+SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+_MS_SSIM_SIDE = (SSIM_WINDOW - 1) * 2 ** (len(SCALE_WEIGHTS) - 1) + 1
 # torchmetrics holds some fifteen maps of the whole image, 700 bytes per pixel; images of more pixels than the first go
 # by blocks of rows, of about so many pixels as the second, which stay in a processor's cache
 _LARGE, _BLOCK = 1 << 20, 1 << 17
@@ -69,8 +69,8 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     similarity", 2004.
     """
     image, target, lead = _check_pair(image, target)
-    if min(image.shape[-2:]) < _WINDOW:
-        return _too_small("ssim", image, lead, _WINDOW)
+    if min(image.shape[-2:]) < SSIM_WINDOW:
+        return _too_small("ssim", image, lead, SSIM_WINDOW)
     return _mean_ssim(image, target).reshape(lead)
 
 
@@ -100,10 +100,10 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
     # torchmetrics averages channels before the powers are taken: hand it one channel at a time
     image, target = image.flatten(0, 1)[:, None], target.flatten(0, 1)[:, None]
     product, large = image.new_ones(batch * channels), _is_large(image)
-    for weight in _SCALE_WEIGHTS[:-1]:
+    for weight in SCALE_WEIGHTS[:-1]:
         product = product * _mean_ssim(image, target, contrast=True, by_rows=large).relu() ** weight
         image, target = _halve(image), _halve(target)
-    product = product * _mean_ssim(image, target, by_rows=large).relu() ** _SCALE_WEIGHTS[-1]
+    product = product * _mean_ssim(image, target, by_rows=large).relu() ** SCALE_WEIGHTS[-1]
     return product.reshape(batch, channels).mean(1).reshape(lead)
 
 
@@ -160,8 +160,8 @@ def ef_ssim(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> 
     """
     image, target, lead = _check_pair(image, target)
     band = _check_band("ef_ssim", image, labels, width)
-    if min(image.shape[-2:]) < _WINDOW:
-        return _too_small("ef_ssim", image, lead, _WINDOW)
+    if min(image.shape[-2:]) < SSIM_WINDOW:
+        return _too_small("ef_ssim", image, lead, SSIM_WINDOW)
     return _mean_ssim(image, target, band=band).reshape(lead)
 
 
@@ -246,7 +246,7 @@ def _ssim_map(image: Tensor, target: Tensor, contrast: bool) -> Tensor:
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     result = structural_similarity_index_measure(
-        image, target, sigma=_SIGMA, kernel_size=_WINDOW, reduction="none", data_range=1.0, k1=_K1, k2=_K2,
+        image, target, sigma=SSIM_SIGMA, kernel_size=SSIM_WINDOW, reduction="none", data_range=1.0, k1=K1, k2=K2,
         return_full_image=not contrast, return_contrast_sensitivity=contrast,
     )  # fmt: skip
     return torch.as_tensor(result[1])
@@ -256,7 +256,7 @@ def _mean_by_rows(image: Tensor, target: Tensor, contrast: bool, band: Tensor | 
     """Mean as `_mean_ssim` gives it, (B), in the memory of a few rows."""
     if band is not None:
         image, target = (pad(t, [_MARGIN] * 4, mode="reflect") for t in (image, target))
-    overlap = _WINDOW - 1
+    overlap = SSIM_WINDOW - 1
     rows = max(4 * overlap, _BLOCK // image.shape[-1])
     total: Tensor | float = 0.0
     count, above = 0, image.new_empty((2, *image.shape[:-2], 0, image.shape[-1]))
@@ -273,17 +273,17 @@ def _mean_by_rows(image: Tensor, target: Tensor, contrast: bool, band: Tensor | 
 
 def _similarity(image: Tensor, target: Tensor, contrast: bool) -> Tensor:
     """SSIM, or its contrast and structure alone, where the window lies inside; as torchmetrics has it."""
-    moments = _blur(torch.stack([image, target, image * image, target * target, image * target]))
+    moments = window_mean(torch.stack([image, target, image * image, target * target, image * target]))
     squares, product = (moments[:2] * moments[:2]), moments[0] * moments[1]
     variances = (moments[2:4] - squares).clamp_min(0.0).sum(0)
-    c1, c2 = _K1**2, _K2**2
+    c1, c2 = K1**2, K2**2
     structure = (2 * (moments[4] - product) + c2) / (variances + c2)
     return structure if contrast else structure * (2 * product + c1) / (squares.sum(0) + c1)
 
 
-def _blur(maps: Tensor) -> Tensor:
+def window_mean(maps: Tensor) -> Tensor:
     """Filter by the Gaussian window along both sides, one after the other, without padding."""
-    weights = [math.exp(-0.5 * (offset / _SIGMA) ** 2) for offset in range(-_MARGIN, _MARGIN + 1)]
+    weights = [math.exp(-0.5 * (offset / SSIM_SIGMA) ** 2) for offset in range(-_MARGIN, _MARGIN + 1)]
     for dim in (-2, -1):
         length = maps.shape[dim] - 2 * _MARGIN
         blurred = maps.narrow(dim, _MARGIN, length) * (1 / sum(weights))

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -16,7 +16,8 @@ from kcgs._repr import brief
 from kcgs.codec import QUALITIES, decode
 from kcgs.codec.gaussians.quantize import Codes, Quantizer
 from kcgs.codec.scenes import SceneWriter
-from kcgs.fit.objective import VisualObjective
+from kcgs.fit.config import Objective
+from kcgs.fit.objective import make_objective
 from kcgs.functional import psnr
 from kcgs.kernels import threads_for_kernels
 from kcgs.scene import Scene
@@ -80,8 +81,8 @@ def compress(
         iterations: renders that the descent may take, at least 1.
         max_seconds: wall time, above 0; what it has no time for is rounded at once. None: as long as it takes.
         seed: of the order in which Gaussians are rounded.
-        objective: of the descent, as in :class:`kcgs.fit.FitConfig`: psnr, visual or progressive, which ends layers
-            just before a quarter, a half and three quarters of the file.
+        objective: of the descent, as in :class:`kcgs.fit.FitConfig`: psnr, visual, ms-ssim, or progressive, which ends
+            layers just before a quarter, a half and three quarters of the file.
 
     Returns:
         The file, and the scene that it decodes to.
@@ -107,8 +108,8 @@ def compress(
         raise ValueError(f"target_psnr excludes quality and target_bytes; got {quality!r} and {target_bytes!r}")
     qp = writer.qp_for(quality, target_bytes)
     check_count("iterations", iterations)
-    if objective not in ("psnr", "visual", "progressive"):
-        raise ValueError(f"objective must be psnr, visual or progressive; got {objective!r}")
+    if objective not in get_args(Objective):
+        raise ValueError(f"objective must be one of {', '.join(get_args(Objective))}; got {objective!r}")
     seconds = math.inf
     if max_seconds is not None:
         seconds = check_number("max_seconds", max_seconds, 0.0, unit="seconds", above=True)
@@ -130,7 +131,7 @@ class _Press:
         self, writer: SceneWriter, image: Tensor, objective: str, iterations: int, seed: int, end: float
     ) -> None:
         self.writer, self.image, self.progressive = writer, image, objective == "progressive"
-        self.objective = VisualObjective(image) if objective == "visual" else None
+        self.objective = make_objective(objective, image)
         self.seed, self.end = seed, end
         self.free = int(_FREE * iterations)
         self.rounds = iterations - self.free

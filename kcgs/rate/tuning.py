@@ -11,9 +11,7 @@ import math
 import time
 from collections.abc import Callable
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.codec.exact import Integers
@@ -46,15 +44,6 @@ _DRAFT_CUTOFF = 1e-3
 _CHARGED, _GROUP = 4, 3
 
 
-def pays(gaussians: Parameters, quantizer: Quantizer) -> NDArray[np.bool_]:
-    """Say which Gaussians pay for their bits; one at least."""
-    _, cholesky, colors = (torch.from_numpy(numbers) for numbers in gaussians)
-    energy = energies(cholesky, colors, quantizer.size)
-    kept = energy >= _PAYING * quantizer.distortion
-    kept[energy.argmax()] = True
-    return kept.numpy()
-
-
 class Tuning:
     """Gaussians that show an image (C, H, W), on the CPU; `ids` are the positions of their regions' ids in the map."""
 
@@ -75,7 +64,7 @@ class Tuning:
         self._free = [torch.from_numpy(numbers).to(image) for numbers in gaussians]
         self._speed = torch.zeros(len(ids), 5 + gaussians.colors.shape[1]).to(image)
         # what the distortion counts in the error
-        self._counts = 1.0 if objective is None else float(objective.weigh(*self._free[:2]).mean())
+        self._counts = float(self._weights(*self._free[:2]).mean())
 
     @property
     def gaussians(self) -> Parameters:
@@ -83,8 +72,11 @@ class Tuning:
         return Parameters(*(numbers.double().numpy() for numbers in self._free))
 
     def drop(self) -> None:
-        """Leave out the Gaussians that do not pay for their bits."""
-        self._keep(pays(self.gaussians, self.quantizer))
+        """Leave out the Gaussians that do not pay for their bits; one stays at least."""
+        energy = self._energy()
+        kept = energy >= _PAYING * self._counts * self.quantizer.distortion
+        kept[energy.argmax()] = True
+        self._keep(kept.numpy())
 
     def descend(self, iterations: int, seconds: float = math.inf) -> None:
         """Move all Gaussians downhill, so many steps, or so many seconds."""
@@ -188,11 +180,15 @@ class Tuning:
         slopes = torch.autograd.grad(render, (x, factors, c), difference)
         gradients = slopes[0], slopes[1] + charge[:, :3], slopes[2] + charge[:, 3:]
         narrow = cholesky[:, ::2].clamp_min(_NARROW)
-        area = (math.pi * narrow.prod(-1)).clamp_max(size[0] * size[1])
+        area = (math.pi * narrow.prod(-1)).clamp_max(size[0] * size[1]) * self._weights(means, cholesky)
         energy = (colors.square().sum(-1) * area).clamp_min(_FAINT)
         curvature = torch.tensor(_CURVATURE).to(energy) * energy[:, None]
         shape = (local_gradient(cholesky, *gradients[:2]) / curvature).clamp(-_NEWTON, _NEWTON)
         return -torch.cat([shape, gradients[2] / area[:, None]], -1)
+
+    def _weights(self, means: Tensor, cholesky: Tensor) -> Tensor:
+        """Return what the squared error of Gaussians counts in the objective, (N,)."""
+        return torch.ones_like(means[:, 0]) if self.objective is None else self.objective.weigh(means, cholesky)
 
     @property
     def _region_ids(self) -> Tensor | None:

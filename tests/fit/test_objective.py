@@ -1,4 +1,4 @@
-"""The visual objective, against autograd of its formula in float64."""
+"""The visual objective and that of MS-SSIM, against autograd of their formulas in float64."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import torch
 from scipy.ndimage import gaussian_filter
 from skimage import data
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, conv2d
 
 from kcgs import fit
-from kcgs.fit.objective import VisualObjective
+from kcgs.fit.objective import MsSsimObjective, VisualObjective
+from kcgs.functional import ms_ssim
 
 
 def photo(height: int, width: int, seed: int = 0) -> Tensor:
@@ -73,6 +74,64 @@ def test_narrow_and_busy_count_less() -> None:
         assert weight == pytest.approx(objective.value(g) / float(g.square().mean()), rel=0.35)
 
 
+def lacking(image: Tensor, residual: Tensor) -> Tensor:
+    """What MS-SSIM lacks without its finest scale, as a logarithm, channels averaged."""
+    line = torch.exp(-0.5 * (torch.arange(-5.0, 6.0, dtype=torch.float64) / 1.5) ** 2)
+    window = (line[:, None] * line / line.sum() ** 2)[None, None]
+    x, y, total = image[:, None], (image + residual)[:, None], torch.zeros((), dtype=torch.float64)
+    for scale, weight in enumerate((0.2856, 0.3001, 0.2363, 0.1333), 1):
+        x, y = avg_pool2d(x, 2), avg_pool2d(y, 2)
+        mean_x, mean_y, xx, yy, xy = (conv2d(t, window) for t in (x, y, x * x, y * y, x * y))
+        score = (2 * (xy - mean_x * mean_y) + 0.03**2) / (xx - mean_x**2 + yy - mean_y**2 + 0.03**2)
+        if scale == 4:
+            score = score * (2 * mean_x * mean_y + 0.01**2) / (mean_x**2 + mean_y**2 + 0.01**2)
+        total = total - weight * score.mean((1, 2, 3)).log().mean()
+    return total
+
+
+class TestMsSsim:
+    def test_is_the_gradient_of_its_formula(self) -> None:
+        image, residual = photo(192, 208), 0.1 * photo(192, 208, seed=1)
+        leaf = residual.clone().requires_grad_()
+        objective = MsSsimObjective(image)
+        squared = 0.003 * leaf.square().sum()
+        expected = lacking(image, leaf) / (objective.value(residual) - squared.detach() / leaf.numel())
+        scale = float(expected.detach())  # the constant Z and the mean over pixels
+        (slope,) = torch.autograd.grad(lacking(image, leaf) * leaf.numel() / scale + squared, leaf)
+        torch.testing.assert_close(2 * objective.apply(residual), slope, rtol=1e-6, atol=1e-9)
+
+    def test_follows_the_metric(self) -> None:
+        # with the finest scale at its weight of 4 %
+        image = photo(192, 208)
+        generator = torch.Generator().manual_seed(2)
+        residuals = [s * torch.randn(3, 192, 208, generator=generator).double() for s in (0.02, 0.04, 0.08)]
+        values = [MsSsimObjective(image).value(r) for r in residuals]
+        scores = [float(ms_ssim((image + r).clamp(0, 1), image)) for r in residuals]
+        assert values == sorted(values) and scores == sorted(scores, reverse=True)
+
+    def test_is_symmetric_and_quadratic_near_the_image(self) -> None:
+        image = photo(192, 208)
+        objective, (a, b) = MsSsimObjective(image), (1e-4 * (photo(192, 208, seed=s) - 0.5) for s in (1, 2))
+        first, second = float((a * objective.apply(b)).sum()), float((b * objective.apply(a)).sum())
+        assert first == pytest.approx(second, rel=1e-3)
+        assert objective.value(2 * a) == pytest.approx(4 * objective.value(a), rel=1e-2)
+        # weights are those of the quadratic form
+        means = torch.tensor([[60.5, 90.5]] * 3, dtype=torch.float64)
+        sigmas = torch.tensor([2.0, 6.0, 20.0], dtype=torch.float64)
+        cholesky = torch.stack([sigmas, 0 * sigmas, sigmas], -1)
+        y, x = torch.meshgrid(torch.arange(192.0) + 0.5, torch.arange(208.0) + 0.5, indexing="ij")
+        for weight, sigma in zip(objective.weigh(means, cholesky), sigmas, strict=True):
+            g = 1e-4 * torch.exp(-0.5 * ((x - 60.5) ** 2 + (y - 90.5) ** 2) / sigma**2).expand(3, -1, -1).double()
+            assert float(weight) == pytest.approx(objective.value(g) / float(g.square().mean()), rel=0.5)
+
+    @pytest.mark.parametrize("size", [(1, 1), (1, 9), (21, 30), (22, 30), (50, 47)])
+    def test_small_images(self, size: tuple[int, int]) -> None:
+        objective = MsSsimObjective(torch.full((1, *size), 0.5))
+        assert objective.apply(torch.ones(1, *size)).isfinite().all()
+        assert objective.value(torch.ones(1, *size)) > 0
+        assert objective.weigh(torch.ones(1, 2), torch.tensor([[3.0, 0.0, 3.0]])).isfinite().all()
+
+
 class TestFit:
     def test_lowers_its_own_error_more(self) -> None:
         image = torch.from_numpy(data.astronaut()[:96, 160:288] / 255).permute(2, 0, 1).float()
@@ -84,7 +143,7 @@ class TestFit:
         assert value["visual"] < value["psnr"]
 
     @pytest.mark.parametrize("loss", ["l1", "l1+ssim"])
-    @pytest.mark.parametrize("name", ["visual", "progressive"])
+    @pytest.mark.parametrize("name", ["visual", "ms-ssim", "progressive"])
     def test_other_losses_are_refused(self, loss: Any, name: Any) -> None:
         with pytest.raises(ValueError, match=f"objective {name!r} needs loss 'l2'"):
             fit(torch.rand(3, 16, 16), None, 4, objective=name, loss=loss)

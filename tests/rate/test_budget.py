@@ -6,8 +6,10 @@ import time
 
 import pytest
 import torch
+from torch import Tensor
 
 from kcgs.codec import decode
+from kcgs.functional import ms_ssim
 from kcgs.rate import fit_bytes
 from kcgs.rate.budget import count_for
 
@@ -60,6 +62,14 @@ class TestFitBytes:
         done = fit_bytes(image, disc.long(), 250, iterations=150)
         assert done.scene.regions is not None and psnr(done.scene, image) > 35
         assert done.result.regions is not None and done.result.regions.kept == done.result.regions.given == 2
+
+    def test_ms_ssim(self, astronaut: Tensor) -> None:
+        image = astronaut[:, 20:196, 130:306]
+        shown = {
+            name: fit_bytes(image, None, 900, iterations=150, objective=name).scene.render()
+            for name in ("psnr", "ms-ssim")
+        }
+        assert ms_ssim(shown["psnr"], image) + 0.005 < ms_ssim(shown["ms-ssim"], image)
 
     def test_count_grows_with_bytes(self) -> None:
         assert count_for(8000, 10_000, "visual") < 0.95 * count_for(8000, 10_000)

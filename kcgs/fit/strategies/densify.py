@@ -106,13 +106,15 @@ class Densify:
         """Return the Gaussians to add."""
         residual, objective = state.image - render(state), state.objective
         if objective is not None:
-            residual = objective.apply(residual)
+            # a pixel's gradient by the root of what it counts: the square is what a Gaussian may gain
+            root = objective.importance.sqrt()
+            residual = -objective.apply(-residual) / root
         added = propose(residual, state.regions, count, sigmas=self.sigmas, backend=state.config.backend)
         if objective is None:
             return added
         # in the filtered residual, what counts more is larger
         x, y = added.means.long().unbind(-1)
-        return added._replace(colors=added.colors / objective.importance[y, x, None])
+        return added._replace(colors=added.colors / root[y, x, None])
 
 
 def leave_out(state: FitState, count: int) -> None:
