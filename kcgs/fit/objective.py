@@ -166,22 +166,22 @@ class MsSsimObjective(VisualObjective):
         for level, (image, mean, variance, weight) in enumerate(self._scales, 1):
             plane = halve(_even(plane))
             shown = image + plane
-            of_shown, square, product = window_mean(torch.stack([shown, shown * shown, image * shown]))
-            both = variance + (square - of_shown * of_shown).clamp_min_(0.0) + K2**2
-            like = (2.0 * (product - mean * of_shown) + K2**2) / both
-            last = level == len(self._scales)
-            bright = mean * mean + of_shown * of_shown + K1**2
-            light = (2.0 * mean * of_shown + K1**2) / bright if last else torch.ones_like(mean)
+            # one after the other, which stays in a processor's cache
+            of_shown, square, product = (window_mean(t) for t in (shown, shown * shown, image * shown))
+            both = (square - of_shown * of_shown).clamp_min_(0.0).add_(variance).add_(K2**2)
+            like = (product - mean * of_shown).mul_(2.0).add_(K2**2).div_(both)
+            light, darker = like.new_ones(()), like.new_zeros(())
+            if level == len(self._scales):
+                bright = mean * mean + of_shown * of_shown + K1**2
+                light = (2.0 * mean * of_shown + K1**2) / bright
+                darker = like * (light * of_shown - mean) / bright
             score = (like * light).mean((1, 2)).clamp_min(_LEAST_SCORE)
             total -= weight / self._norm * mean[0].numel() * score.log().mean()
             share = weight / self._norm * 0.25**level / score[:, None, None]
             pull = share * light / both
             hold = pull * like
-            rest = pull * mean - hold * of_shown
-            if last:
-                rest += share * like * (light * of_shown - mean) / bright
-            hold, pull, rest = _spread(torch.stack([hold, pull, rest]))
-            slopes.append(hold * shown - pull * image + rest)
+            rest = pull * mean - hold * of_shown + share * darker
+            slopes.append(_spread(hold) * shown - _spread(pull) * image + _spread(rest))
         return total, self._sum_up(slopes)
 
 

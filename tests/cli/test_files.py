@@ -53,6 +53,16 @@ class TestEncode:
         run("encode", scene, "-o", tmp_path / "a.kcgs", "--target-bytes", 700, "--image", photo)
         assert (tmp_path / "a.kcgs").stat().st_size <= 700
 
+    def test_for_a_metric(self, scene: Path, photo: Path, tmp_path: Path) -> None:
+        out, wanted = tmp_path / "a.kcgs", ("--target-bytes", 700, "--metric", "ms-ssim")
+        run("encode", scene, "-o", out, "--target-bytes", 700, "--image", photo)
+        usual = out.read_bytes()
+        run("encode", scene, "-o", out, *wanted, "--image", photo)
+        assert out.stat().st_size <= 700 and out.read_bytes() != usual
+        run("fit", photo, "--regions", "none", "--iterations", 30, "-o", out, *wanted)
+        assert out.stat().st_size <= 700
+        run("encode", scene, "-o", out, *wanted, code=2)
+
     def test_nothing_is_written_on_failure(self, scene: Path, tmp_path: Path) -> None:
         run("encode", scene, "-o", tmp_path / "a.kcgs", "--target-bytes", 900, "--quality", 40, code=2)
         result = runner.invoke(app, ["encode", str(scene), "-o", str(tmp_path / "a.kcgs"), "--target-bytes", "9"])
