@@ -44,7 +44,6 @@ def test_imports_are_light() -> None:
         "constriction",
         "ray",
         "skimage",
-        "torchmetrics",
         "transformers",
         "triton",
         "typer",

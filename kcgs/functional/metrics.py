@@ -13,15 +13,14 @@ from kcgs._check import check_image, check_labels
 
 from .labels import edge_band
 
-SSIM_WINDOW = 11  # pixels; torchmetrics makes it int(3.5 sigma + 0.5) * 2 + 1 whatever kernel size it is given
+SSIM_WINDOW = 11  # pixels
 SSIM_SIGMA = 1.5
 K1, K2 = 0.01, 0.03
 _MARGIN = SSIM_WINDOW // 2
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 _MS_SSIM_SIDE = (SSIM_WINDOW - 1) * 2 ** (len(SCALE_WEIGHTS) - 1) + 1
-# torchmetrics holds some fifteen maps of the whole image, 700 bytes per pixel; images of more pixels than the first go
-# by blocks of rows, of about so many pixels as the second, which stay in a processor's cache
-_LARGE, _BLOCK = 1 << 20, 1 << 17
+# images go by blocks of rows, of about so many pixels, which stay in a processor's cache
+_BLOCK = 1 << 17
 
 
 def psnr(image: Tensor, target: Tensor) -> Tensor:
@@ -97,13 +96,13 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
     if min(image.shape[-2:]) < _MS_SSIM_SIDE:
         return _too_small("ms_ssim", image, lead, _MS_SSIM_SIDE)
     batch, channels = image.shape[:2]
-    # torchmetrics averages channels before the powers are taken: hand it one channel at a time
+    # the powers are taken before channels are averaged: one at a time
     image, target = image.flatten(0, 1)[:, None], target.flatten(0, 1)[:, None]
-    product, large = image.new_ones(batch * channels), _is_large(image)
+    product = image.new_ones(batch * channels)
     for weight in SCALE_WEIGHTS[:-1]:
-        product = product * _mean_ssim(image, target, contrast=True, by_rows=large).relu() ** weight
+        product = product * _mean_ssim(image, target, contrast=True).relu() ** weight
         image, target = _halve(image), _halve(target)
-    product = product * _mean_ssim(image, target, by_rows=large).relu() ** SCALE_WEIGHTS[-1]
+    product = product * _mean_ssim(image, target).relu() ** SCALE_WEIGHTS[-1]
     return product.reshape(batch, channels).mean(1).reshape(lead)
 
 
@@ -218,38 +217,12 @@ def _halve(image: Tensor) -> Tensor:
     return avg_pool2d(pad(image, (0, width % 2, 0, height % 2), mode="replicate"), 2)
 
 
-def _is_large(image: Tensor) -> bool:
-    # compiled, a loop over blocks would be a graph of thousands of nodes
-    return image.shape[-2] * image.shape[-1] > _LARGE and not torch.compiler.is_compiling()
-
-
-def _mean_ssim(
-    image: Tensor, target: Tensor, *, contrast: bool = False, band: Tensor | None = None, by_rows: bool | None = None
-) -> Tensor:
+def _mean_ssim(image: Tensor, target: Tensor, *, contrast: bool = False, band: Tensor | None = None) -> Tensor:
     """Mean SSIM, or contrast and structure alone, where the window lies inside the image, or over a band; (B)."""
     # variances are differences of near-equal convolutions and need every digit: neither TF32 nor autocast
     working = torch.float64 if image.is_cuda else image.dtype
     with torch.autocast(image.device.type, enabled=False):
-        if _is_large(image) if by_rows is None else by_rows:
-            return _mean_by_rows(image.to(working), target.to(working), contrast, band).to(image.dtype)
-        result = _ssim_map(image.to(working), target.to(working), contrast).to(image.dtype)
-    if contrast:
-        return result
-    if band is not None:
-        return _band_mean(result, band)
-    # torchmetrics' own mean takes the padded rim too
-    return result[..., _MARGIN:-_MARGIN, _MARGIN:-_MARGIN].flatten(1).mean(1)
-
-
-def _ssim_map(image: Tensor, target: Tensor, contrast: bool) -> Tensor:
-    """SSIM at every pixel, (B, C, H, W); or of contrast and structure alone the mean over the valid area, (B)."""
-    from torchmetrics.functional.image import structural_similarity_index_measure
-
-    result = structural_similarity_index_measure(
-        image, target, sigma=SSIM_SIGMA, kernel_size=SSIM_WINDOW, reduction="none", data_range=1.0, k1=K1, k2=K2,
-        return_full_image=not contrast, return_contrast_sensitivity=contrast,
-    )  # fmt: skip
-    return torch.as_tensor(result[1])
+        return _mean_by_rows(image.to(working), target.to(working), contrast, band).to(image.dtype)
 
 
 def _mean_by_rows(image: Tensor, target: Tensor, contrast: bool, band: Tensor | None) -> Tensor:
@@ -257,7 +230,8 @@ def _mean_by_rows(image: Tensor, target: Tensor, contrast: bool, band: Tensor | 
     if band is not None:
         image, target = (pad(t, [_MARGIN] * 4, mode="reflect") for t in (image, target))
     overlap = SSIM_WINDOW - 1
-    rows = max(4 * overlap, _BLOCK // image.shape[-1])
+    # compiled, a loop over blocks would be a graph of thousands of nodes
+    rows = image.shape[-2] if torch.compiler.is_compiling() else max(4 * overlap, _BLOCK // image.shape[-1])
     total: Tensor | float = 0.0
     count, above = 0, image.new_empty((2, *image.shape[:-2], 0, image.shape[-1]))
     for block in zip(image.split(rows, -2), target.split(rows, -2), strict=True):
@@ -272,7 +246,7 @@ def _mean_by_rows(image: Tensor, target: Tensor, contrast: bool, band: Tensor | 
 
 
 def _similarity(image: Tensor, target: Tensor, contrast: bool) -> Tensor:
-    """SSIM, or its contrast and structure alone, where the window lies inside; as torchmetrics has it."""
+    """SSIM, or its contrast and structure alone, where the window lies inside."""
     moments = window_mean(torch.stack([image, target, image * image, target * target, image * target]))
     squares, product = (moments[:2] * moments[:2]), moments[0] * moments[1]
     variances = (moments[2:4] - squares).clamp_min(0.0).sum(0)

@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from cases import CASES
 
 EXPECTED = Path(__file__).with_name("expected.json")
-_PACKAGES = ("torch", "numpy", "numba", "llvmlite", "scipy", "scikit-image", "constriction", "kornia", "torchmetrics")
+_PACKAGES = ("torch", "numpy", "numba", "llvmlite", "scipy", "scikit-image", "constriction", "kornia")
 _FILE_PACKAGES = ("onnx", "onnx-ir", "onnxruntime", "safetensors")
 
 
