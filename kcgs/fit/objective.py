@@ -52,7 +52,7 @@ class VisualObjective:
             if masks:
                 if min(plane.shape[1:]) < 2:
                     break
-                plane = halve(_even(plane))
+                plane = halve(plane)
             # the variance does not change with a constant, and rounding does less harm to small numbers
             centred = (plane - plane.mean((1, 2), keepdim=True))[None]
             mean, square = (
@@ -79,7 +79,7 @@ class VisualObjective:
         """Return H r, (C, H, W): half the gradient at a residual r, render - image."""
         planes = [residual]
         for _ in self.masks[1:]:
-            planes.append(halve(_even(planes[-1])))
+            planes.append(halve(planes[-1]))
         levels = enumerate(zip(planes, self.masks, strict=True))
         return self._sum_up([plane * (mask * 0.25**level) for level, (plane, mask) in levels])
 
@@ -132,7 +132,7 @@ class MsSsimObjective(VisualObjective):
         self._scales: list[tuple[Tensor, Tensor, Tensor, float]] = []
         masks, plane = [], image
         for weight in SCALE_WEIGHTS[1:]:
-            plane = halve(_even(plane))
+            plane = halve(plane)
             if min(plane.shape[1:]) < SSIM_WINDOW:
                 break
             mean, square = window_mean(torch.stack([plane, plane * plane]))
@@ -164,7 +164,7 @@ class MsSsimObjective(VisualObjective):
         """Return E without the squared error, as a sum over pixels, and half the gradient of all of E."""
         total, slopes, plane = residual.new_zeros(()), [_SQUARED * residual], residual
         for level, (image, mean, variance, weight) in enumerate(self._scales, 1):
-            plane = halve(_even(plane))
+            plane = halve(plane)
             shown = image + plane
             # one after the other, which stays in a processor's cache
             of_shown, square, product = (window_mean(t) for t in (shown, shown * shown, image * shown))
@@ -194,8 +194,3 @@ def make_objective(name: str, image: Tensor) -> VisualObjective | None:
 def _spread(maps: Tensor) -> Tensor:
     """Return the transpose of `window_mean` on maps (..., H, W), larger by the window."""
     return window_mean(pad(maps, [SSIM_WINDOW - 1] * 4))
-
-
-def _even(planes: Tensor) -> Tensor:
-    """Leave out the last row and column where their number is odd."""
-    return planes[:, : planes.shape[1] // 2 * 2, : planes.shape[2] // 2 * 2]

@@ -125,9 +125,9 @@ def _block(sigma: float) -> int:
 
 
 def halve(planes: Tensor) -> Tensor:
-    """Average blocks of 2 x 2, (N, h, w) of even sides; five times faster on one core than torch's pooling."""
-    rows = planes[:, ::2] + planes[:, 1::2]
-    return (rows[..., ::2] + rows[..., 1::2]).mul_(0.25)
+    """Average blocks of 2 x 2, (N, h, w), without an odd last row; five times faster on one core than torch's."""
+    rows = planes[:, : planes.shape[1] // 2 * 2 : 2] + planes[:, 1::2]
+    return (rows[..., : rows.shape[2] // 2 * 2 : 2] + rows[..., 1::2]).mul_(0.25)
 
 
 def _best_of_squares(

@@ -53,8 +53,8 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     r"""Structural similarity: 11 x 11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03.
 
     Convention: arguments, range and errors are those of :func:`psnr`; the mean over channels and over the positions
-    where the window lies inside the image, without padding. Differentiable. On CUDA float32 is computed in float64,
-    since the TF32 that convolutions may use there has too few digits for SSIM (errors up to 0.03 on photographs).
+    where the window lies inside the image, without padding. Differentiable. Sums, not convolutions: variances are small
+    differences, and the TF32 of CUDA's convolutions has too few digits for them (errors up to 0.03 on photographs).
 
     Returns:
         In [-1, 1], 0-dim or :math:`(B)`. NaN, with a RuntimeWarning, where a side is below 11 pixels.
@@ -135,7 +135,9 @@ def ef_psnr(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> 
     """
     image, target, lead = _check_pair(image, target)
     band = _check_band("ef_psnr", image, labels, width)
-    return -10.0 * torch.log10(_band_mean((image - target).square(), band).reshape(lead))
+    # an empty band gives 0 / 0, the NaN that was announced
+    error = ((image - target).square() * band).sum((1, 2, 3)) / (band.sum((1, 2, 3)) * image.shape[1])
+    return -10.0 * torch.log10(error.reshape(lead))
 
 
 def ef_ssim(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> Tensor:
@@ -206,12 +208,6 @@ def _too_small(name: str, image: Tensor, lead: torch.Size, side: int) -> Tensor:
     return image.new_full(lead, math.nan)
 
 
-def _band_mean(values: Tensor, band: Tensor) -> Tensor:
-    # an empty band gives 0 / 0, the NaN that was announced
-    count = band.sum((1, 2, 3)) * values.shape[1]
-    return (values * band).sum((1, 2, 3)) / count
-
-
 def _halve(image: Tensor) -> Tensor:
     height, width = image.shape[-2:]
     return avg_pool2d(pad(image, (0, width % 2, 0, height % 2), mode="replicate"), 2)
@@ -219,14 +215,6 @@ def _halve(image: Tensor) -> Tensor:
 
 def _mean_ssim(image: Tensor, target: Tensor, *, contrast: bool = False, band: Tensor | None = None) -> Tensor:
     """Mean SSIM, or contrast and structure alone, where the window lies inside the image, or over a band; (B)."""
-    # variances are differences of near-equal convolutions and need every digit: neither TF32 nor autocast
-    working = torch.float64 if image.is_cuda else image.dtype
-    with torch.autocast(image.device.type, enabled=False):
-        return _mean_by_rows(image.to(working), target.to(working), contrast, band).to(image.dtype)
-
-
-def _mean_by_rows(image: Tensor, target: Tensor, contrast: bool, band: Tensor | None) -> Tensor:
-    """Mean as `_mean_ssim` gives it, (B), in the memory of a few rows."""
     if band is not None:
         image, target = (pad(t, [_MARGIN] * 4, mode="reflect") for t in (image, target))
     overlap = SSIM_WINDOW - 1
@@ -242,7 +230,7 @@ def _mean_by_rows(image: Tensor, target: Tensor, contrast: bool, band: Tensor | 
         values = values if band is None else values * band[..., count : count + height, :]
         total, count = total + values.sum((1, 2, 3), dtype=torch.float64), count + height
     pixels = count * (image.shape[-1] - overlap) if band is None else band.sum((1, 2, 3))
-    return torch.as_tensor(total / (pixels * image.shape[1]))
+    return torch.as_tensor(total / (pixels * image.shape[1])).to(image.dtype)
 
 
 def _similarity(image: Tensor, target: Tensor, contrast: bool) -> Tensor:
