@@ -114,9 +114,10 @@ class MsSsimObjective(VisualObjective):
 
     x is the image, :math:`P_k` averages blocks, v is the variance under the window of SSIM, and the last :math:`s_k` is
     times the luminance. Scales and weights are those of :func:`kcgs.functional.ms_ssim`, without the finest, which
-    has a weight of 4 % and would take three quarters of the time; small images have fewer. Near the image E is
-    quadratic, and `importance` and `weigh` are that form's. Farther off it is not: where texture is missing, the
-    render's own variance counts for it, so `apply` is half the gradient of E itself.
+    has a weight of 4 % and would take three quarters of the time. Windows that the border cuts count as much as others,
+    else the outer tenth of an image would be worth little. Near the image E is quadratic, and `importance` and `weigh`
+    are that form's. Farther off it is not: where texture is missing, more variance in the render is better, so `apply`
+    is half the gradient of E itself.
 
     Args:
         image: (C, H, W) in [0, 1].
@@ -129,16 +130,17 @@ class MsSsimObjective(VisualObjective):
     """
 
     def __init__(self, image: Tensor) -> None:
-        self._scales: list[tuple[Tensor, Tensor, Tensor, float]] = []
+        self._scales: list[tuple[Tensor, Tensor, Tensor, Tensor, float]] = []
         masks, plane = [], image
         for weight in SCALE_WEIGHTS[1:]:
             plane = halve(plane)
-            if min(plane.shape[1:]) < SSIM_WINDOW:
+            if not plane.numel():
                 break
-            mean, square = window_mean(torch.stack([plane, plane * plane]))
-            variance = (square - mean * mean).clamp_min(0.0)
-            self._scales.append((plane, mean, variance, weight / mean[0].numel()))
-            masks.append(_spread(weight / mean[0].numel() / (2.0 * variance + K2**2)).mean(0))
+            inside = 1.0 / _blur(torch.ones_like(plane[:1]))
+            mean, square = (inside * _blur(t) for t in (plane, plane * plane))
+            variance, weight = (square - mean * mean).clamp_min(0.0), weight / mean[0].numel()
+            self._scales.append((plane, inside, mean, variance, weight))
+            masks.append(_blur(inside * weight / (2.0 * variance + K2**2)).mean(0))
         self._norm = sum(float(mask.mean()) for mask in masks)
         self.masks = [torch.full_like(image[0], _SQUARED), *(mask / self._norm for mask in masks)]
         self.importance = self._sum_up([mask[None] * 0.25**level for level, mask in enumerate(self.masks)])[0]
@@ -148,8 +150,8 @@ class MsSsimObjective(VisualObjective):
             blocks, window = (4**level - 1) / 12, SSIM_SIGMA**2 * 4**level
             self._bands.append((level, blocks, blocks + window, mask))
         if self._scales:
-            _, mean, _, weight = self._scales[-1]
-            bright = _spread(weight / self._norm / (2.0 * mean * mean + K1**2)).mean(0)
+            _, inside, mean, _, weight = self._scales[-1]
+            bright = _blur(inside * weight / self._norm / (2.0 * mean * mean + K1**2)).mean(0)
             self._bands.append((level, blocks + window, math.inf, bright))
 
     def apply(self, residual: Tensor) -> Tensor:
@@ -163,11 +165,11 @@ class MsSsimObjective(VisualObjective):
     def _measure(self, residual: Tensor) -> tuple[Tensor, Tensor]:
         """Return E without the squared error, as a sum over pixels, and half the gradient of all of E."""
         total, slopes, plane = residual.new_zeros(()), [_SQUARED * residual], residual
-        for level, (image, mean, variance, weight) in enumerate(self._scales, 1):
+        for level, (image, inside, mean, variance, weight) in enumerate(self._scales, 1):
             plane = halve(plane)
             shown = image + plane
             # one after the other, which stays in a processor's cache
-            of_shown, square, product = (window_mean(t) for t in (shown, shown * shown, image * shown))
+            of_shown, square, product = (inside * _blur(t) for t in (shown, shown * shown, image * shown))
             both = (square - of_shown * of_shown).clamp_min_(0.0).add_(variance).add_(K2**2)
             like = (product - mean * of_shown).mul_(2.0).add_(K2**2).div_(both)
             light, darker = like.new_ones(()), like.new_zeros(())
@@ -177,11 +179,11 @@ class MsSsimObjective(VisualObjective):
                 darker = like * (light * of_shown - mean) / bright
             score = (like * light).mean((1, 2)).clamp_min(_LEAST_SCORE)
             total -= weight / self._norm * mean[0].numel() * score.log().mean()
-            share = weight / self._norm * 0.25**level / score[:, None, None]
+            share = inside * (weight / self._norm * 0.25**level) / score[:, None, None]
             pull = share * light / both
             hold = pull * like
             rest = pull * mean - hold * of_shown + share * darker
-            slopes.append(_spread(hold) * shown - _spread(pull) * image + _spread(rest))
+            slopes.append(_blur(hold) * shown - _blur(pull) * image + _blur(rest))
         return total, self._sum_up(slopes)
 
 
@@ -191,6 +193,6 @@ def make_objective(name: str, image: Tensor) -> VisualObjective | None:
     return kinds[name](image) if name in kinds else None
 
 
-def _spread(maps: Tensor) -> Tensor:
-    """Return the transpose of `window_mean` on maps (..., H, W), larger by the window."""
-    return window_mean(pad(maps, [SSIM_WINDOW - 1] * 4))
+def _blur(maps: Tensor) -> Tensor:
+    """Filter by the window of SSIM, with zeros beyond the border; it is its own transpose."""
+    return window_mean(pad(maps, [SSIM_WINDOW // 2] * 4))

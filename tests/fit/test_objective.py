@@ -81,7 +81,8 @@ def lacking(image: Tensor, residual: Tensor) -> Tensor:
     x, y, total = image[:, None], (image + residual)[:, None], torch.zeros((), dtype=torch.float64)
     for scale, weight in enumerate((0.2856, 0.3001, 0.2363, 0.1333), 1):
         x, y = avg_pool2d(x, 2), avg_pool2d(y, 2)
-        mean_x, mean_y, xx, yy, xy = (conv2d(t, window) for t in (x, y, x * x, y * y, x * y))
+        inside = conv2d(torch.ones_like(x), window, padding=5)  # of windows that the border cuts
+        mean_x, mean_y, xx, yy, xy = (conv2d(t, window, padding=5) / inside for t in (x, y, x * x, y * y, x * y))
         score = (2 * (xy - mean_x * mean_y) + 0.03**2) / (xx - mean_x**2 + yy - mean_y**2 + 0.03**2)
         if scale == 4:
             score = score * (2 * mean_x * mean_y + 0.01**2) / (mean_x**2 + mean_y**2 + 0.01**2)
