@@ -115,7 +115,7 @@ class MsSsimObjective(VisualObjective):
     x is the image, :math:`P_k` averages blocks, v is the variance under the window of SSIM, and the last :math:`s_k` is
     times the luminance. Scales and weights are those of :func:`kcgs.functional.ms_ssim`, without the finest, which
     has a weight of 4 % and would take three quarters of the time. Windows that the border cuts count as much as others,
-    else the outer tenth of an image would be worth little. Near the image E is quadratic, and `importance` and `weigh`
+    else the outer tenth of an image would count little. Near the image E is quadratic, and `importance` and `weigh`
     are that form's. Farther off it is not: where texture is missing, more variance in the render is better, so `apply`
     is half the gradient of E itself.
 
