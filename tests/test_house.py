@@ -94,7 +94,7 @@ def test_files_are_short() -> None:
     lengths = {path: len(path.read_text().splitlines()) for path in modules().values()}
     assert not {str(path): count for path, count in lengths.items() if count > 350}
     bench = sum(count for path, count in lengths.items() if "bench" in path.relative_to(ROOT).parts)
-    assert sum(lengths.values()) <= 28_450 and bench <= 5_120
+    assert sum(lengths.values()) <= 28_500 and bench <= 5_120
     assert len((ROOT / "README.md").read_text().splitlines()) <= 160
 
 

@@ -11,7 +11,9 @@ import math
 import time
 from collections.abc import Callable
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.codec.exact import Integers
@@ -121,8 +123,7 @@ class Tuning:
 
     def _leave_out(self, count: int) -> NDArray[np.bool_]:
         """Leave out so many of the weakest, but for the last; return which stay."""
-        _, cholesky, colors = self._free
-        rank = energies(cholesky, colors, self.quantizer.size).argsort(stable=True).argsort().numpy()
+        rank = self._energy().argsort(stable=True).argsort().numpy()
         return self._keep(rank >= min(count, len(rank) - 1))
 
     def _keep(self, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -185,6 +186,11 @@ class Tuning:
         curvature = torch.tensor(_CURVATURE).to(energy) * energy[:, None]
         shape = (local_gradient(cholesky, *gradients[:2]) / curvature).clamp(-_NEWTON, _NEWTON)
         return -torch.cat([shape, gradients[2] / area[:, None]], -1)
+
+    def _energy(self) -> Tensor:
+        """Return what the objective loses without each Gaussian, (N,)."""
+        means, cholesky, colors = (numbers.double() for numbers in self._free)
+        return self._weights(means, cholesky) * energies(cholesky, colors, self.quantizer.size)
 
     def _weights(self, means: Tensor, cholesky: Tensor) -> Tensor:
         """Return what the squared error of Gaussians counts in the objective, (N,)."""
