@@ -34,7 +34,8 @@ MAPS = "maps"
 # codecs of label maps
 LABELS, LOSSLESS_WEBP = "kcgs.codec.labels", "WebP, lossless"
 KCGS, NO_REGIONS, VISUAL, FLOAT = "kcgs", "kcgs, no regions", "kcgs, visual", "float scene"
-OURS = (KCGS, NO_REGIONS, VISUAL)
+MS_SSIM = "kcgs, ms-ssim"
+OBJECTIVES = {KCGS: "psnr", NO_REGIONS: "psnr", VISUAL: "visual", MS_SSIM: "ms-ssim"}
 # of `compress`
 ITERATIONS, QUICK_TUNING = inspect.signature(compress).parameters["iterations"].default, 10
 # a fit's file is rounded until it costs so many dB; the dB above its PSNR at which that is tried first
@@ -107,7 +108,7 @@ class Files:
     def fitted(self, group: str, image: str, most: int, codec: str = KCGS) -> list[Point]:
         """Return kcgs' file of a fit to so many bytes."""
         ask, regions = Ask(group, image, codec, most), codec != NO_REGIONS
-        config = self.config.model_copy(update={"objective": "visual" if codec == VISUAL else "psnr"})
+        config = self.config.model_copy(update={"objective": OBJECTIVES[codec]})
         settings = self.settings("fit_bytes", config)
 
         def make() -> tuple[Point, bytes]:
@@ -218,7 +219,7 @@ class Files:
     def shown(self, point: Point) -> Tensor:
         """Decode a point's file."""
         data = self.paths[Ask(*point[:4])].read_bytes()
-        return render(data) if point.codec in OURS else open_file(data)
+        return render(data) if point.codec in OBJECTIVES else open_file(data)
 
     def path(self, ask: Ask, settings: Any, suffix: str) -> Path:
         """Say where a file is, or would be."""

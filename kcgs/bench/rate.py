@@ -14,7 +14,7 @@ from kcgs.plots import COLORS, figure, save_figure
 
 from . import _rate_tables as tables
 from ._codecs import AVIF, AVIF_FAST, AVIF_PSNR, JPEG, WEBP, present, versions
-from ._rate_files import KCGS, MAPS, MOST_LOSS, NO_REGIONS, VISUAL, Files, Point
+from ._rate_files import KCGS, MAPS, MOST_LOSS, MS_SSIM, NO_REGIONS, VISUAL, Files, Point
 from ._rate_tables import MOST_BYTES, PRECISION
 from .core import images
 from .core.figures import CROPS, add_legend, plot_crops, save_sheet, show_crops
@@ -48,12 +48,12 @@ _STYLES = {
 }
 _INTRODUCTION = f"""Bytes are those of real files, everything in them included. `{KCGS}` is `kcgs.rate.fit_bytes` with
 the map that is given on DAVIS, and with the one that `kcgs.segment.segment` finds on Kodak; `{NO_REGIONS}` is the same
-without a map, `{VISUAL}` with `objective="visual"`. Gained is what kcgs has over the other. The other codecs, and how
+without a map, `{VISUAL}` and `{MS_SSIM}` with those objectives. Gained is what kcgs has over the other. The other codecs, and how
 curves are compared: docs/results.md. Seconds are medians, of kcgs those of the whole fit. Each file by itself:
 results.csv."""
 _MATCHED_TEXT = f"""Every codec made its largest file of at most {MOST_BYTES:,} bytes, or its smallest if it cannot go
 as low. Each meets the largest file of kcgs that has no more bytes. Without regions kcgs was asked for the bytes that it
-was fitted to with them, and with the visual objective for AVIF's."""
+was fitted to with them, and with the other objectives for AVIF's."""
 _KODAK_TEXT = f"""Every file has at most the bytes of the bits per pixel that were asked for. Gained is the PSNR that
 `{NO_REGIONS}` has over the line's codec on the photos that both have. AVIF's steps are coarse, so its files are
 smaller; BD-rates allow for that. Products per pixel are an estimate of what the renderer multiplies: 14 for each pair
@@ -155,7 +155,7 @@ def steps(group: str, files: Files) -> Iterator[tuple[str, Step]]:
     if group == tables.MATCHED:
         # first what all frames need, for a run that is stopped
         yield from ((image, partial(_matched, files, image)) for image in found)
-        others = [(image, codec) for codec in (NO_REGIONS, VISUAL) for image in found]
+        others = [(image, codec) for codec in (NO_REGIONS, MS_SSIM, VISUAL) for image in found]
         yield from ((f"{image}, {codec}", partial(_matched_other, files, image, codec)) for image, codec in others)
     elif group == tables.KODAK:
         # whole means first, for a run that is stopped
@@ -218,7 +218,7 @@ def _matched_other(files: Files, image: str, codec: str) -> list[Point]:
     kept = Files(files.folder, files.data, files.quick, makes=False)
     found = _matched(kept, image)
     most = [p.asked for p in found if p.regions]
-    if codec == VISUAL and most:
+    if codec != NO_REGIONS and most:
         most = [p.bytes for p in found if p.codec == AVIF] or most
     return files.fitted(tables.MATCHED, image, most[0], codec) if most else []
 
