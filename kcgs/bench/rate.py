@@ -48,9 +48,9 @@ _STYLES = {
 }
 _INTRODUCTION = f"""Bytes are those of real files, everything in them included. `{KCGS}` is `kcgs.rate.fit_bytes` with
 the map that is given on DAVIS, and with the one that `kcgs.segment.segment` finds on Kodak; `{NO_REGIONS}` is the same
-without a map, `{VISUAL}` and `{MS_SSIM}` with those objectives. Gained is what kcgs has over the other. The other codecs, and how
-curves are compared: docs/results.md. Seconds are medians, of kcgs those of the whole fit. Each file by itself:
-results.csv."""
+without a map, `{VISUAL}` and `{MS_SSIM}` with those objectives. Gained is what kcgs has over the other. The other
+codecs, and how curves are compared: docs/results.md. Seconds are medians, of kcgs those of the whole fit. Each file by
+itself: results.csv."""
 _MATCHED_TEXT = f"""Every codec made its largest file of at most {MOST_BYTES:,} bytes, or its smallest if it cannot go
 as low. Each meets the largest file of kcgs that has no more bytes. Without regions kcgs was asked for the bytes that it
 was fitted to with them, and with the other objectives for AVIF's."""
