@@ -163,7 +163,12 @@ def hostile(data: bytes, other: bytes, generator: random.Random) -> bytes:
         sizes = [(1, 1), (7, 9), (300, 400), (1 << 20, 1), (1, 1 << 20), (1 << 20, 1 << 20)]
         header = header._replace(size=generator.choice(sizes))
     elif kind == 2:
-        options = [("channels", [1, 2, 4, 900]), ("qp", [-512, 0, 1023]), ("regions", [1, 2, 4, 70000])]
+        options = [
+            ("channels", [1, 2, 4, 900]),
+            ("qp", [-512, 0, 1023]),
+            ("regions", [1, 2, 4, 70000]),
+            ("version", [1, 2]),
+        ]
         name, values = generator.choice(options)
         header = header._replace(**{name: generator.choice(values)})
     else:
@@ -203,6 +208,7 @@ class TestConformance:
     def test_golden(self, node: Node) -> None:
         assert check_same(node, GOLDEN.read_bytes())
         assert check_same(node, GOLDEN.with_name("golden2.kcgs").read_bytes())
+        assert check_same(node, GOLDEN.with_name("golden3.kcgs").read_bytes())
 
     def test_some_scenes(self, node: Node) -> None:
         check_scenes(node, range(20))
@@ -250,7 +256,7 @@ class TestDamage:
         assert f"the checksum of its layer {layers} is another" in answer["message"]
         assert answer["partial"]["layers"] == layers - 1
         for content, message in [
-            (b"kcgs\3" + data[5:], "its version must be 1 or 2; got 3"),
+            (b"kcgs\4" + data[5:], "its version must be 1, 2 or 3; got 4"),
             (b"GIF89a", 'it must start with "kcgs"; got "GIF8"'),
             (data[:9], "the file ends early"),
             (data + b"\0", f"the file must end after {len(data)} bytes; got {len(data) + 1}"),

@@ -11,12 +11,13 @@ const MOST_CHANNELS = 1024;
 const MOST_GAUSSIANS = 2 ** 21 - 1;
 const MOST_COLORS = 2 ** 27;
 const MOST_BYTES = 2 ** 32;
-// of version 1, and of version 2, in which several layers may be of one energy
-const MOST_LAYERS = [65, 128];
-const ENERGIES = { least: -24, most: 40 };
+// of version 1, and of those in which several layers may be of one energy
+const MOST_LAYERS = [65, 128, 128];
+export const ENERGIES = { least: -24, most: 40 };
 const PARAMETERS = { least: -512, most: 1023 };
 
 export interface Header {
+  readonly version: number;
   readonly height: number;
   readonly width: number;
   readonly channels: number;
@@ -36,7 +37,7 @@ export function readHeader(reader: ByteReader): { header: Header; map: Uint8Arra
   if (magic === "kcgm") throw new DecodeError("it is a label map, no scene: decodeLabels reads it");
   if (magic !== "kcgs") throw new DecodeError(`it must start with "kcgs"; got ${text(reader.data.subarray(0, 4))}`);
   const version = reader.number(1);
-  if (version !== 1 && version !== 2) throw new DecodeError(`its version must be 1 or 2; got ${version}`);
+  if (version < 1 || version > 3) throw new DecodeError(`its version must be 1, 2 or 3; got ${version}`);
   const height = reader.varint("height", 1, MOST_SIDE);
   const width = reader.varint("width", 1, MOST_SIDE);
   const channels = reader.varint("channels", 1, MOST_CHANNELS);
@@ -52,7 +53,7 @@ export function readHeader(reader: ByteReader): { header: Header; map: Uint8Arra
   const map = reader.take(length);
   if (crc32(map, crc32(above)) !== checksum)
     throw new DecodeError("the file is damaged: the checksum of its header and map is another");
-  return { header: { height, width, channels, quantizationParameter, regions, layers }, map };
+  return { header: { version, height, width, channels, quantizationParameter, regions, layers }, map };
 }
 
 function readLayers(reader: ByteReader, version: number): { energy: number; bytes: number }[] {

@@ -15,7 +15,10 @@ export interface Program {
   uniform(n: number): number;
   prepare(table: number, values: number): void;
   categorical(table: number, values: number): number;
+  angleBin(turns: number): number;
   readCells(table: number, cells: number, most: number): number;
+  openEarlier(count: number): number;
+  readNear(rows: number, columns: number, least: number, near: number, most: number): number;
   model(tables: number, a: number, b: number, groups: number, squash: number, stretch: number): void;
   readLabels(height: number, width: number, regions: number, template: number, positions: number): number;
 }

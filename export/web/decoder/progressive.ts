@@ -79,12 +79,13 @@ export class ProgressiveDecoder {
       }
       // each Gaussian takes more than a bit, and all must fit into memory
       const most = Math.min(8 * bytes + SPARE, mostGaussians(header.channels) - this.count);
-      const gaussians = layers.read(layer, energy, most);
-      this.means.add(gaussians.means);
-      this.cholesky.add(gaussians.cholesky);
-      this.colors.add(gaussians.colors);
-      if (gaussians.regions) this.regions.add(gaussians.regions);
-      this.count += gaussians.count;
+      for (const group of layers.read(layer, energy, most)) {
+        this.means.add(group.means);
+        this.cholesky.add(group.cholesky);
+        this.colors.add(group.colors);
+        if (group.regions) this.regions.add(group.regions);
+        this.count += group.count;
+      }
       this.position += bytes + 2;
       this.layers++;
     }

@@ -6,7 +6,7 @@ const ALPHABET = 2 ** 16;
 
 /** Turns bytes into symbols; zeros follow the last byte. A program has one stream at a time. */
 export class RangeDecoder {
-  private readonly sizes = [0, 0, 0]; // of the tables
+  private readonly sizes: number[] = []; // of the tables
 
   constructor(
     data: Uint8Array,
@@ -20,7 +20,7 @@ export class RangeDecoder {
     return n === 1 ? 0 : this.program.uniform(n);
   }
 
-  /** Prepare one of three tables of categorical symbols, by weights above 0, of at most 2,562 values. */
+  /** Prepare one of 24 tables of categorical symbols, by weights above 0, of at most 2,562 values. */
   prepare(table: number, weights: Float64Array): void {
     const { memory, prepare, weights: at } = this.program;
     new Float64Array(memory.buffer, at.value, weights.length).set(weights);

@@ -8,8 +8,8 @@ import { readSeeds } from "./seeds";
 import { readWavefronts } from "./wavefront";
 
 export { allot } from "./memory";
-export { cells, readCells } from "./occupancy";
-export { categorical, open, prepare, uniform, weights } from "./range_decoder";
+export { cells, openEarlier, readCells, readNear } from "./occupancy";
+export { angleBin, categorical, open, prepare, uniform, weights } from "./range_decoder";
 
 const NOISE: i32 = 64; // chance
 

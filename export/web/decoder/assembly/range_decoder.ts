@@ -4,7 +4,8 @@ import { allot, fail, NOT_A_STREAM } from "./memory";
 
 const CODES: u64 = 1 << 24;
 const VALUES: u32 = 2562; // of a categorical symbol, at most
-const TABLES: u32 = 3;
+const TABLES: u32 = 24;
+const BINS: u32 = 16; // of angles
 
 let data: usize = 0;
 let end: usize = 0;
@@ -67,13 +68,18 @@ export function number(n: u32): u32 {
 
 /** A bit that is 1 with a chance in 1/65536. */
 export function bit(chance: i32): i32 {
-  const border = CODES - 256 * <u64>chance;
-  if (code() < border) {
-    take(0, border);
-    return 0;
+  // no code is needed, and so no quotient
+  const step = range >> 24;
+  const border = (CODES - 256 * <u64>chance) * step;
+  if (difference >= CODES * step) fail(NOT_A_STREAM);
+  const found = difference >= border;
+  difference -= found ? border : 0;
+  range = found ? CODES * step - border : border;
+  if (!(range >> 32)) {
+    difference = (difference << 32) | word();
+    range <<= 32;
   }
-  take(border, CODES);
-  return 1;
+  return <i32>found;
 }
 
 export function unbounded(): u64 {
@@ -89,6 +95,16 @@ export function unbounded(): u64 {
 @inline
 function begin(table: u32, value: u32): usize {
   return tables + 4 * (table * (VALUES + 1) + value);
+}
+
+/** The bin of an angle, one of so many; the weights of a model of bins follow `weights` by as many places. */
+export function angleBin(turns: u32): u32 {
+  for (let b: u32 = 0; b < BINS; b++) {
+    const angles = ((b + 1) * turns) / BINS - (b * turns) / BINS;
+    store<f64>(weights + 8 * b, load<f64>(weights + 8 * (BINS + b)) * <f64>angles);
+  }
+  prepare(0, BINS);
+  return categorical(0, BINS);
 }
 
 /** Find where the codes of each value begin, of so many weights. */

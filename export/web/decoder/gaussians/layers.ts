@@ -1,22 +1,28 @@
 /** The stream of a layer (docs/format.md); models go on from layer to layer. */
 
+import { AdaptiveAngle } from "../models/adaptive_angle.ts";
 import { AdaptiveMagnitude } from "../models/adaptive_magnitude.ts";
 import { AdaptiveNumber } from "../models/adaptive_number.ts";
 import { AdaptiveSymbol } from "../models/adaptive_symbol.ts";
 import { type Cells, Occupancy } from "../models/occupancy.ts";
-import type { Header } from "../header.ts";
+import { exp2 } from "../exact.ts";
+import { ENERGIES, type Header } from "../header.ts";
 import { startProgram } from "../program.ts";
 import { RangeDecoder } from "../range_decoder.ts";
 import { DecodeError } from "../scene.ts";
-import { angles, LEAST_SIZE, MOST_SIZE, places, Quantizer, restoreColor, restoreShape, type Steps } from "./quantizer.ts";
-import { COUNTS, GREY, HUE, HUE2, RATIO, STRAYS } from "./weights.ts";
+import { angles, LEAST_SIZE, MOST_SIZE, OCTAVES, places, Quantizer, restoreColor, restoreShape, type Steps } from "./quantizer.ts";
+import { ALIKE, ANGLES, APART, COUNTS, STRAYS } from "./weights.ts";
 
 const CLASSES = 64; // of size, that a stream may name
 const FAINT = 0.35;
 const STRONG = 0.8;
+const LEVELS = 8; // of size within a class
+// what follows a group of Gaussians
+const END = 0;
+const HOLDS = 1; // the next energy
 
-/** The Gaussians of a layer; `regions` are positions among the ids of the map, null without a map. */
-export interface Layer {
+/** Gaussians of one energy; `regions` are positions among the ids of the map, null without a map. */
+export interface Group {
   readonly count: number;
   readonly means: Float32Array;
   readonly cholesky: Float32Array;
@@ -31,12 +37,10 @@ export class LayerDecoder {
   private readonly quantizer: Quantizer;
   private readonly counts = new AdaptiveNumber(COUNTS);
   private readonly occupancy: Occupancy;
-  private readonly ratio = new AdaptiveMagnitude(RATIO);
-  private readonly colors = [
-    new AdaptiveMagnitude(GREY),
-    new AdaptiveMagnitude(HUE, 3),
-    new AdaptiveMagnitude(HUE2, 3),
-  ] as const;
+  private readonly ratio: AdaptiveMagnitude;
+  private readonly colors: readonly AdaptiveMagnitude[];
+  private readonly angle = new AdaptiveAngle(ANGLES);
+  private readonly plain: boolean; // versions 1 and 2
   private readonly strays = new AdaptiveSymbol(STRAYS);
   private readonly program = startProgram();
 
@@ -44,33 +48,51 @@ export class LayerDecoder {
     private readonly header: Header,
     private readonly pixels: PixelRegions | null,
   ) {
-    const { quantizationParameter, height, width } = header;
+    const { version, quantizationParameter, height, width } = header;
+    this.plain = version < 3;
+    const { grey, hue, hue2, ratio } = this.plain ? ALIKE : APART;
+    this.colors = [grey, hue, hue2].map((shapes) => new AdaptiveMagnitude(shapes));
+    this.ratio = new AdaptiveMagnitude(ratio);
     this.quantizer = new Quantizer(quantizationParameter, height, width);
-    this.occupancy = new Occupancy(height, width);
+    this.occupancy = new Occupancy(height, width, this.plain);
   }
 
-  /** Read a layer of one class of energy, of at most so many Gaussians. */
-  read(bytes: Uint8Array, energy: number, most: number): Layer {
+  /** Read a layer, whose highest energy is given, of at most so many Gaussians. */
+  read(bytes: Uint8Array, energy: number, most: number): Group[] {
     const decoder = new RangeDecoder(bytes, this.program);
+    const groups: Group[] = [];
+    let left = most;
+    for (let follows = HOLDS; follows !== END; energy--) {
+      if (energy < ENERGIES.least)
+        throw new DecodeError(`a class of energy must be at least ${ENERGIES.least}; got ${energy}`);
+      if (follows === HOLDS) {
+        const group = this.readGroup(decoder, energy, left);
+        groups.push(group);
+        left -= group.count;
+      }
+      follows = this.plain ? END : decoder.uniform(3);
+    }
+    return groups;
+  }
+
+  private readGroup(decoder: RangeDecoder, energy: number, most: number): Group {
     const steps = this.quantizer.steps(energy);
     const classes = this.readClasses(decoder, most);
     const count = classes.reduce((sum, { cells }) => sum + cells.row.length, 0);
     const scale = new Int32Array(count).map(() => decoder.uniform(steps.scales));
-    const ratio = this.ratio.read(decoder, 2 / steps.ratio, new Uint8Array(count));
+    const ratio = this.ratio.read(decoder, [2 / steps.ratio], new Uint8Array(count), this.ratioContexts(classes, count));
     const beyond = ratio.find((steep) => steep > steps.mostRatio);
     if (beyond !== undefined) throw new DecodeError(`a ratio must be at most ${steps.mostRatio} steps; got ${beyond}`);
-    const share = Float64Array.from(ratio, (steep) => {
-      const turns = angles(steps, steep);
-      return decoder.uniform(turns) / turns;
-    });
-    const codes = this.readColors(decoder, count, steps.loud);
+    const turns = ratio.map((steep) => angles(steps, steep));
+    const angle = this.plain ? turns.map((all) => decoder.uniform(all)) : this.angle.read(decoder, turns);
+    const codes = this.readColors(decoder, steps, scale);
     const shape = new Float64Array(3 * count);
     const colors = new Float32Array(codes.length);
     let n = 0;
     for (const { size, cells } of classes) {
       const step = this.quantizer.colorStep(size);
       for (const end = n + cells.row.length; n < end; n++) {
-        restoreShape(steps, size, scale[n]!, ratio[n]!, share[n]!, shape, 3 * n);
+        restoreShape(steps, size, scale[n]!, ratio[n]!, angle[n]! / turns[n]!, shape, 3 * n);
         restoreColor(codes, this.header.channels, step, colors, this.header.channels * n);
       }
     }
@@ -96,19 +118,38 @@ export class LayerDecoder {
     if (!largest) throw new DecodeError("a layer must hold Gaussians; got none");
     if (largest.size > MOST_SIZE)
       throw new DecodeError(`a class of size must be at most ${MOST_SIZE}; got ${largest.size}`);
-    return counts.map(({ size, count }) => ({ size, cells: this.occupancy.read(decoder, count) }));
+    return counts.map(({ size, count }) => ({ size, cells: this.occupancy.read(decoder, size, count) }));
   }
 
-  private readColors(decoder: RangeDecoder, count: number, loud: number): Int32Array {
+  private ratioContexts(classes: readonly Class[], count: number): Uint8Array {
+    const contexts = new Uint8Array(count);
+    let n = 0;
+    for (const { size, cells } of classes) {
+      const end = n + cells.row.length;
+      contexts.fill(this.plain ? 0 : Math.min(Math.max(size + 1, 0), 7), n, end);
+      n = end;
+    }
+    return contexts;
+  }
+
+  private readColors(decoder: RangeDecoder, { loud, scales }: Steps, scale: Int32Array): Int32Array {
     const { channels } = this.header;
+    const count = scale.length;
+    const levels = new Uint8Array(count);
+    let measures = [loud];
+    if (!this.plain) {
+      levels.set(scale.map((place) => Math.floor((LEVELS * place + LEVELS / 2) / scales)));
+      measures = Array.from({ length: LEVELS }, (_, v) => loud * exp2(OCTAVES * (0.5 - (v + 0.5) / LEVELS)));
+    }
     const codes = new Int32Array(channels * count);
     const contexts = new Uint8Array(count);
     for (let channel = 0; channel < channels; channel++) {
-      const sizes = this.colors[channel === 0 ? 0 : channel === 1 ? 1 : 2].read(decoder, loud, contexts);
+      const sizes = this.colors[Math.min(channel, 2)]!.read(decoder, measures, levels, contexts);
       for (let n = 0; n < count; n++) {
         const size = sizes[n]!;
         codes[channels * n + channel] = size && decoder.uniform(2) ? -size : size;
-        contexts[n] = size > STRONG * loud ? 2 : size > FAINT * loud ? 1 : 0;
+        const measure = measures[levels[n]!]!;
+        contexts[n] = size > STRONG * measure ? 2 : size > FAINT * measure ? 1 : 0;
       }
     }
     return codes;

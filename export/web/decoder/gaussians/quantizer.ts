@@ -3,7 +3,7 @@
 import { cosine, exp2, sine } from "../exact.ts";
 
 const LN2 = 0.6931471805599453;
-const OCTAVES = 0.75; // that a class of size spans
+export const OCTAVES = 0.75; // that a class of size spans
 const MOST_RATIO = 12;
 const MOST_LEVELS = 2 ** 20;
 // grey, red against blue, green against both: how much of each of the three a channel has

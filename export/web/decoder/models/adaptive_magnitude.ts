@@ -9,34 +9,41 @@ for (let octave = 4; octave < 24; octave++)
 BOUNDS.push(2 ** 24);
 const BUCKETS = BOUNDS.length - 1;
 
-/** Sizes 0, 1, 2 ... in units of a given scale: a shape over size / scale, learned for all scales. */
+/** Sizes 0, 1, 2 ... each in units of a scale: a shape over size / scale, learned for all scales. */
 export class AdaptiveMagnitude {
   private readonly shapes: Float64Array[];
 
-  /** `bins`: the shape at first, of each of the contexts. */
-  constructor(bins: readonly number[], contexts = 1) {
-    this.shapes = Array.from({ length: contexts }, () => Float64Array.from(bins));
+  /** `shapes`: the bins at first, of each context. */
+  constructor(shapes: readonly (readonly number[])[]) {
+    this.shapes = shapes.map((bins) => Float64Array.from(bins));
   }
 
-  /** Read a group of sizes, one for each context. */
-  read(decoder: RangeDecoder, scale: number, contexts: Uint8Array): Int32Array {
-    this.shapes.forEach((shape, context) => decoder.prepare(context, weights(shape, scale)));
+  /** Read a group of sizes, one for each context; `levels` say by which of the scales, at most 8. */
+  read(decoder: RangeDecoder, scales: readonly number[], levels: Uint8Array, contexts: Uint8Array): Int32Array {
     const sizes = new Int32Array(contexts.length);
-    for (let i = 0; i < sizes.length; i++) sizes[i] = decoder.categorical(contexts[i]!);
+    const prepared: boolean[] = [];
+    for (let i = 0; i < sizes.length; i++) {
+      const context = contexts[i]!;
+      const table = levels[i]! * this.shapes.length + context;
+      if (!prepared[table]) decoder.prepare(table, weights(this.shapes[context]!, scales[levels[i]!]!));
+      prepared[table] = true;
+      sizes[i] = decoder.categorical(table);
+    }
     for (let i = 0; i < sizes.length; i++) {
       const bucket = sizes[i]!;
       sizes[i] = BOUNDS[bucket]! + decoder.uniform(BOUNDS[bucket + 1]! - BOUNDS[bucket]!);
     }
-    this.learn(scale, contexts, sizes);
+    this.learn(scales, levels, contexts, sizes);
     return sizes;
   }
 
-  private learn(scale: number, contexts: Uint8Array, sizes: Int32Array): void {
-    const edges = borders(scale);
-    edges[BINS] = Infinity;
+  private learn(scales: readonly number[], levels: Uint8Array, contexts: Uint8Array, sizes: Int32Array): void {
+    const edgesOf = scales.map(borders);
+    edgesOf.forEach((edges) => (edges[BINS] = Infinity));
     const learned = this.shapes.map(() => new Float64Array(BINS));
     for (let n = 0; n < sizes.length; n++) {
       const size = sizes[n]!;
+      const edges = edgesOf[levels[n]!]!;
       const low = Math.max(size - 0.5, 0);
       const high = size + 0.5;
       const bins = learned[contexts[n]!]!;

@@ -1,10 +1,14 @@
 /** The number of Gaussians in each cell of a grid over the image (docs/format.md, "Occupancy"). */
 
+import { BEYOND, MARGINS } from "../gaussians/weights.ts";
+import type { Program } from "../program.ts";
 import type { RangeDecoder } from "../range_decoder.ts";
 import { DecodeError } from "../scene.ts";
 import { AdaptiveNumber } from "./adaptive_number.ts";
 
 const MOST_MARGIN = 255;
+const NEAR = 2; // classes of size
+const EVERYWHERE = 480000;
 
 /** For each Gaussian of a class the column and the row of its cell; in order, row by row. */
 export interface Cells {
@@ -13,38 +17,45 @@ export interface Cells {
   readonly row: Int32Array;
 }
 
+/** The cells of an image, and how many more the margin has. */
+interface Grid {
+  readonly rows: number;
+  readonly columns: number;
+  readonly side: number;
+  readonly ring: number;
+}
+
+/** Where Gaussians are among the cells inside and outside. */
+type Places = readonly [Uint32Array, Uint32Array];
+
 /** Reads the cells of one class after another; what was learned in one helps the next. */
 export class Occupancy {
-  private readonly margin = new AdaptiveNumber([3, 1, 1, 1, 1, 0.3, 0.3, 0.3, 0.3]);
+  private readonly margin = new AdaptiveNumber(MARGINS);
+  private readonly beyond = new AdaptiveNumber(BEYOND);
+  private readonly earlier = new Map<number, Cells[]>(); // by class of size
   private outside = 0.5;
   private all = 20;
 
+  /** `plain`: as versions 1 and 2 have it. */
   constructor(
     private readonly height: number,
     private readonly width: number,
+    private readonly plain: boolean,
   ) {}
 
-  /** Read the cells of `count` Gaussians. */
-  read(decoder: RangeDecoder, count: number): Cells {
+  /** Read the cells of `count` Gaussians of a class of size. */
+  read(decoder: RangeDecoder, size: number, count: number): Cells {
     const side = cellSide(this.height, this.width, count);
     const rows = Math.ceil(this.height / side);
     const columns = Math.ceil(this.width / side);
     const margin = this.margin.read(decoder);
     const most = mostMargin(rows, columns);
     if (margin > most) throw new DecodeError(`a margin must be at most ${most} cells; got ${margin}`);
-    const share = margin ? this.outside / this.all : 0;
     const wide = columns + 2 * margin;
-    const cells = rows * columns;
-    const ring = (rows + 2 * margin) * wide - cells;
-    const inside = readCells(decoder, Math.max(count * (1 - share), 0.01) / cells, cells, count);
-    const left = count - inside.length;
-    const outside = readCells(decoder, Math.max(count * share, 0.01) / Math.max(ring, 1), ring, left);
-    if (outside.length < left)
+    const grid = { rows, columns, side, ring: (rows + 2 * margin) * wide - rows * columns };
+    const [inside, outside] = this.plain ? this.readAlike(decoder, grid, count) : this.readNear(decoder, grid, size, count);
+    if (inside.length + outside.length < count)
       throw new DecodeError(`cells must hold ${count} Gaussians; got ${inside.length + outside.length}`);
-    if (margin) {
-      this.outside += outside.length;
-      this.all += count;
-    }
     const column = new Int32Array(count);
     const row = new Int32Array(count);
     const place = merge(inside, outside, rows, columns, margin);
@@ -52,7 +63,43 @@ export class Occupancy {
       row[i] = Math.floor(place[i]! / wide) - margin;
       column[i] = (place[i]! % wide) - margin;
     }
-    return { side, column, row };
+    const found = { side, column, row };
+    this.earlier.set(size, [...(this.earlier.get(size) ?? []), found]);
+    return found;
+  }
+
+  /** Read cells that are the more likely, the more earlier Gaussians of about this size are near. */
+  private readNear(decoder: RangeDecoder, { rows, columns, side, ring }: Grid, size: number, count: number): Places {
+    const { program } = decoder;
+    const beyond = ring ? this.beyond.read(decoder) : 0;
+    if (beyond > count) throw new DecodeError(`at most ${count} Gaussians may lie outside; got ${beyond}`);
+    const near: number[] = [];
+    for (let other = size; other <= size + NEAR; other++)
+      for (const cells of this.earlier.get(other) ?? [])
+        cells.row.forEach((each, n) => {
+          const row = Math.floor(((each + 0.5) * cells.side) / side);
+          const column = Math.floor(((cells.column[n]! + 0.5) * cells.side) / side);
+          if (row >= 0 && row < rows && column >= 0 && column < columns) near.push(row, column);
+        });
+    const at = program.openEarlier(near.length / 2);
+    new Int32Array(program.memory.buffer, at, near.length).set(near);
+    const least = Math.max(Math.floor(EVERYWHERE / (rows * columns)), 1);
+    const inside = listed(program, program.readNear(rows, columns, least, near.length / 2, count - beyond));
+    return [inside, listed(program, program.readNear(ring, 1, 1, 0, beyond))];
+  }
+
+  /** Read cells that are all as likely. */
+  private readAlike(decoder: RangeDecoder, { rows, columns, ring }: Grid, count: number): Places {
+    const share = ring ? this.outside / this.all : 0;
+    const cells = rows * columns;
+    const inside = readCells(decoder, Math.max(count * (1 - share), 0.01) / cells, cells, count);
+    const left = count - inside.length;
+    const outside = readCells(decoder, Math.max(count * share, 0.01) / Math.max(ring, 1), ring, left);
+    if (ring) {
+      this.outside += outside.length;
+      this.all += count;
+    }
+    return [inside, outside];
   }
 }
 
@@ -109,6 +156,9 @@ function readCells(decoder: RangeDecoder, rate: number, cells: number, most: num
   weights[7]! /= 1 - p;
   decoder.prepare(0, weights);
   const { program } = decoder;
-  const count = program.readCells(0, cells, most);
-  return new Uint32Array(program.memory.buffer, program.cells.value, count).slice();
+  return listed(program, program.readCells(0, cells, most));
 }
+
+/** The cells that the program has listed. */
+const listed = ({ memory, cells }: Program, count: number): Uint32Array =>
+  new Uint32Array(memory.buffer, cells.value, count).slice();
