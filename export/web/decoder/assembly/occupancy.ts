@@ -11,68 +11,49 @@ const MASS: f64 = 625; // of a Gaussian, over all cells
 const FULL: u32 = 7; // of versions 1 and 2: a cell with this many has another symbol
 const VALUES: u32 = 8;
 
-let capacity: u32 = 0;
-let occupied: usize = 0; // u32: cells that hold any
-let counts: usize = 0; // u32: how many
-let chances: usize = 0; // i32: of one more
-let going: usize = 0; // u32: places in these lists that may hold more
-/** The cell of each Gaussian, u32. */
+let most: u32 = 0;
+let found: u32 = 0;
+/** The cell of each Gaussian, u32, in no order. */
 export let cells: usize = 0;
+let chances: usize = 0; // i32: that its cell holds another one
 
-let listed: u32 = 0; // occupied cells
-let found: u32 = 0; // Gaussians in `cells`
-let left: u32 = 0;
-let total: f64 = 0; // weight of the cells that may hold them
-
-let earlierRoom: u32 = 0;
 let earlier: usize = 0; // i32 [2]: row, column
-let rowsRoom: usize = 0;
 let rowsNear: usize = 0; // u32 [rows of a band, REACH + columns + REACH]
 
-function begin(most: u32): void {
-  left = most;
-  listed = found = 0;
-  if (most <= capacity) return;
-  capacity = max(most, 2 * capacity);
-  occupied = allot(4 * capacity);
-  counts = allot(4 * capacity);
-  chances = allot(4 * capacity);
-  going = allot(4 * capacity);
-  cells = allot(4 * capacity);
+// what each of the lists has: i32 [4, 2] bytes, where
+const rooms = allot(32);
+const CELLS = 0;
+const CHANCES = 1;
+const EARLIER = 2;
+const ROWS = 3;
+
+/** Room of at least so many bytes for a list. */
+function room(list: usize, bytes: usize): usize {
+  const at = rooms + 8 * list;
+  if (bytes > load<u32>(at)) {
+    store<u32>(at, 2 * bytes);
+    store<u32>(at, allot(2 * bytes), 4);
+  }
+  return load<u32>(at, 4);
 }
 
-/** Put Gaussians into a listed cell. */
-function add(place: usize, more: u32): void {
-  if (more > left) fail(MANY_GAUSSIANS);
-  left -= more;
-  store<u32>(counts + 4 * place, load<u32>(counts + 4 * place) + more);
+function begin(count: u32): void {
+  most = count;
+  found = 0;
+  cells = room(CELLS, 4 * count);
+  chances = room(CHANCES, 4 * count);
 }
 
-/** List a cell that holds so many. */
-function occupy(cell: u32, held: u32): void {
-  if (held > left) fail(MANY_GAUSSIANS);
-  store<u32>(occupied + 4 * listed, cell);
-  store<u32>(counts + 4 * listed, 0);
-  add(listed++, held);
-}
-
-/** Add the Gaussians of the listed cells to `cells`. */
-function gather(): u32 {
-  for (let i: usize = 0; i < listed; i++)
-    for (let held = load<u32>(counts + 4 * i); held > 0; held--) {
-      store<u32>(cells + 4 * found, load<u32>(occupied + 4 * i));
-      found++;
-    }
-  listed = 0;
-  return found;
+function add(cell: u32, chance: i32): void {
+  if (found === most) fail(MANY_GAUSSIANS);
+  store<u32>(cells + 4 * found, cell);
+  store<i32>(chances + 4 * found, chance);
+  found++;
 }
 
 /** Room for the row and the column of so many Gaussians, for `readNear`. */
 export function openEarlier(count: u32): usize {
-  if (count > earlierRoom) {
-    earlierRoom = max(count, 2 * earlierRoom);
-    earlier = allot(8 * earlierRoom);
-  }
+  earlier = room(EARLIER, 8 * count);
   return earlier;
 }
 
@@ -80,58 +61,42 @@ export function openEarlier(count: u32): usize {
  * Read which cell each of so many Gaussians lies in: of the weight `least`, and more where earlier ones are near. Return
  * how many there are.
  */
-export function readNear(rows: u32, columns: u32, least: u32, near: u32, most: u32): u32 {
-  begin(most);
+export function readNear(rows: u32, columns: u32, least: u32, near: u32, count: u32): u32 {
+  begin(count);
   const all = rows * columns;
-  total = <f64>least * all + PARTS * MASS * near;
+  let total = <f64>least * all + PARTS * MASS * near;
   const bands = max(BANDS, (all + TOGETHER - 1) / TOGETHER);
-  for (let band: u32 = 0; band < bands && left; band++) {
+  for (let band: u32 = 0; band < bands && found < count; band++) {
     const first = <u32>((<u64>rows * band) / bands);
     const last = <u32>((<u64>rows * (band + 1)) / bands);
     if (near) spread(rows, columns, near, first, last);
-    const gaussians = <f64>left;
+    const left = <f64>(count - found);
+    let before = found;
     let sum: f64 = 0;
     let cell = first * columns;
     for (let row = first, at = rowsNear; row < last; row++, at += 8 * REACH)
       for (const end = cell + columns; cell < end; cell++, at += 4) {
         const weight = near ? least + PARTS * window(at) : <f64>least;
         sum += weight;
-        const rate = gaussians * weight;
+        const rate = left * weight;
         const chance = <i32>min(max(floor((65536 * rate) / (rate + total)), 16), 65520);
-        if (!bit(chance)) continue;
-        store<i32>(chances + 4 * listed, chance);
-        store<u32>(going + 4 * listed, listed);
-        occupy(cell, 1);
+        if (bit(chance)) add(cell, chance);
       }
-    readMore();
+    // cells that hold one may hold another
+    for (; before < found; before++) {
+      const chance = load<i32>(chances + 4 * before);
+      if (bit(chance)) add(load<u32>(cells + 4 * before), chance);
+    }
     total -= sum;
   }
   return found;
-}
-
-/** Read the further bits of a band, and list its Gaussians. */
-function readMore(): void {
-  for (let count = listed; count > 0; ) {
-    let kept: u32 = 0;
-    for (let i: u32 = 0; i < count; i++) {
-      const place = load<u32>(going + 4 * i);
-      if (!bit(load<i32>(chances + 4 * place))) continue;
-      add(place, 1);
-      store<u32>(going + 4 * kept++, place);
-    }
-    count = kept;
-  }
-  gather();
 }
 
 /** Spread Gaussians over the rows of a band that are near theirs, and mirror these rows at their ends. */
 function spread(rows: i32, columns: i32, near: u32, first: i32, last: i32): void {
   const stride = columns + 2 * REACH;
   const bytes: usize = 4 * (last - first) * stride;
-  if (bytes > rowsRoom) {
-    rowsRoom = max(bytes, 2 * rowsRoom);
-    rowsNear = allot(rowsRoom);
-  }
+  rowsNear = room(ROWS, bytes);
   memory.fill(rowsNear, 0, bytes);
   for (let i: u32 = 0; i < near; i++) {
     const row = load<i32>(earlier + 8 * i);
@@ -145,9 +110,9 @@ function spread(rows: i32, columns: i32, near: u32, first: i32, last: i32): void
     }
   }
   for (let row = rowsNear + 4 * REACH; row < rowsNear + bytes; row += 4 * stride)
-    for (let off = 0; off < REACH; off++) {
-      store<u32>(row - 4 * (off + 1), load<u32>(row + 4 * mirror(-1 - off, columns)));
-      store<u32>(row + 4 * (columns + off), load<u32>(row + 4 * mirror(columns + off, columns)));
+    for (let off = -REACH; off < REACH; off++) {
+      const column = off < 0 ? off : columns + off;
+      store<u32>(row + 4 * column, load<u32>(row + 4 * mirror(column, columns)));
     }
 }
 
@@ -172,21 +137,15 @@ function window(at: usize): f64 {
 }
 
 /** As versions 1 and 2 have it: read which of the cells each Gaussian lies in, by a table. */
-export function readCells(table: u32, all: u32, most: u32): u32 {
-  begin(most);
-  for (let cell: u32 = 0; cell < all; cell++) {
-    const held = categorical(table, VALUES);
-    if (held) occupy(cell, held);
-  }
-  // add to full cells until none is
-  for (let full = FULL, more = true; more; full += FULL) {
-    more = false;
-    for (let i: u32 = 0; i < listed; i++) {
-      if (load<u32>(counts + 4 * i) !== full) continue;
-      const held = categorical(table, VALUES);
-      add(i, held);
-      more = more || held === FULL;
-    }
-  }
-  return gather();
+export function readCells(table: u32, all: u32, count: u32): u32 {
+  begin(count);
+  for (let cell: u32 = 0; cell < all; cell++) readOne(table, cell);
+  // add to full cells until none is: the seventh is marked
+  for (let i: u32 = 0; i < found; i++) if (load<i32>(chances + 4 * i)) readOne(table, load<u32>(cells + 4 * i));
+  return found;
+}
+
+function readOne(table: u32, cell: u32): void {
+  const held = categorical(table, VALUES);
+  for (let i: u32 = 1; i <= held; i++) add(cell, i === FULL ? 1 : 0);
 }

@@ -103,7 +103,7 @@ export class Occupancy {
   }
 }
 
-/** Where cells inside and outside are among all cells, row by row, in order. */
+/** Where cells inside and outside are among all cells, row by row. */
 function merge(
   inside: Uint32Array,
   outside: Uint32Array,
@@ -118,7 +118,7 @@ function merge(
   }
   for (let i = 0; i < outside.length; i++)
     place[inside.length + i] = placeOutside(outside[i]!, rows, columns, margin);
-  return outside.length ? place.sort() : place;
+  return place.sort();
 }
 
 /** The side of the cells of so many Gaussians, a power of two. */
@@ -147,7 +147,7 @@ function placeOutside(cell: number, rows: number, columns: number, margin: numbe
   return cell + (row + (beside < margin ? 0 : 1)) * columns;
 }
 
-/** Read which of the cells each Gaussian lies in, in order; there are at most so many. */
+/** Read which of the cells each Gaussian lies in; there are at most so many. */
 function readCells(decoder: RangeDecoder, rate: number, cells: number, most: number): Uint32Array {
   const p = rate / (1 + rate);
   const weights = new Float64Array(8);
@@ -159,6 +159,6 @@ function readCells(decoder: RangeDecoder, rate: number, cells: number, most: num
   return listed(program, program.readCells(0, cells, most));
 }
 
-/** The cells that the program has listed. */
+/** The cells that the program has found, in no order. */
 const listed = ({ memory, cells }: Program, count: number): Uint32Array =>
   new Uint32Array(memory.buffer, cells.value, count).slice();
