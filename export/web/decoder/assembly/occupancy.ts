@@ -66,15 +66,20 @@ export function readNear(rows: u32, columns: u32, least: u32, near: u32, count: 
   const all = rows * columns;
   let total = <f64>least * all + PARTS * MASS * near;
   const bands = max(BANDS, (all + TOGETHER - 1) / TOGETHER);
+  let at: usize = 0;
   for (let band: u32 = 0; band < bands && found < count; band++) {
     const first = <u32>((<u64>rows * band) / bands);
     const last = <u32>((<u64>rows * (band + 1)) / bands);
-    if (near) spread(rows, columns, near, first, last);
+    // all bands at once, where they are small
+    if (near && (bands > BANDS || band === 0)) {
+      spread(rows, columns, near, first, bands > BANDS ? last : rows);
+      at = rowsNear;
+    }
     const left = <f64>(count - found);
     let before = found;
     let sum: f64 = 0;
     let cell = first * columns;
-    for (let row = first, at = rowsNear; row < last; row++, at += 8 * REACH)
+    for (let row = first; row < last; row++, at += 8 * REACH)
       for (const end = cell + columns; cell < end; cell++, at += 4) {
         const weight = near ? least + PARTS * window(at) : <f64>least;
         sum += weight;
@@ -92,7 +97,7 @@ export function readNear(rows: u32, columns: u32, least: u32, near: u32, count: 
   return found;
 }
 
-/** Spread Gaussians over the rows of a band that are near theirs, and mirror these rows at their ends. */
+/** Spread Gaussians over those rows from `first` to `last` that are near theirs, and mirror these rows at their ends. */
 function spread(rows: i32, columns: i32, near: u32, first: i32, last: i32): void {
   const stride = columns + 2 * REACH;
   const bytes: usize = 4 * (last - first) * stride;
@@ -103,7 +108,8 @@ function spread(rows: i32, columns: i32, near: u32, first: i32, last: i32): void
     if (row < first - REACH || row >= last + REACH) continue;
     const column = load<i32>(earlier + 8 * i + 4);
     for (let off = -REACH; off <= REACH; off++) {
-      const at = mirror(row + off, rows);
+      let at = row + off;
+      if (<u32>at >= <u32>rows) at = mirror(at, rows);
       if (at < first || at >= last) continue;
       const sum = rowsNear + 4 * <usize>((at - first) * stride + REACH + column);
       store<u32>(sum, load<u32>(sum) + REACH + 1 - abs(off));

@@ -74,11 +74,12 @@ export class Occupancy {
     const beyond = ring ? this.beyond.read(decoder) : 0;
     if (beyond > count) throw new DecodeError(`at most ${count} Gaussians may lie outside; got ${beyond}`);
     const near: number[] = [];
+    const shift = 32 - Math.clz32(side); // of half pixels
     for (let other = size; other <= size + NEAR; other++)
       for (const cells of this.earlier.get(other) ?? [])
         cells.row.forEach((each, n) => {
-          const row = Math.floor(((each + 0.5) * cells.side) / side);
-          const column = Math.floor(((cells.column[n]! + 0.5) * cells.side) / side);
+          const row = ((2 * each + 1) * cells.side) >> shift;
+          const column = ((2 * cells.column[n]! + 1) * cells.side) >> shift;
           if (row >= 0 && row < rows && column >= 0 && column < columns) near.push(row, column);
         });
     const at = program.openEarlier(near.length / 2);
