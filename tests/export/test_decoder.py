@@ -213,6 +213,15 @@ class TestConformance:
     def test_some_scenes(self, node: Node) -> None:
         check_scenes(node, range(20))
 
+    @pytest.mark.parametrize("size", [(1, 550_000), (550_000, 1), (550, 1000), (3, 2000)])
+    def test_many_cells(self, node: Node, size: tuple[int, int]) -> None:
+        count, generator = 34_500, torch.Generator().manual_seed(0)
+        means = torch.rand(2, count, 2, generator=generator).prod(0) * torch.tensor(size[::-1])
+        cholesky = torch.tensor([[1.0, 0.0, 1.0]]).expand(count, -1)
+        strengths = torch.where(torch.arange(count) % 9 == 0, 0.3, 1.0)
+        field = GaussianField(means, cholesky, strengths[:, None], size=size)
+        assert check_same(node, encode(Scene(field), quality=10.0))
+
     @pytest.mark.slow
     def test_two_hundred_scenes(self, node: Node) -> None:
         check_scenes(node, range(20, 220))
