@@ -14,7 +14,7 @@ from torch import Tensor
 import kcgs.bench
 from kcgs.bench import _codecs, _rate_files, _rate_tables
 from kcgs.bench._codecs import AVIF, AVIF_FAST, CODECS, JPEG, WEBP, largest, open_file, present
-from kcgs.bench._rate_files import FLOAT, KCGS, NO_REGIONS, VISUAL, Ask, Files, Point, codec_digest
+from kcgs.bench._rate_files import FLOAT, KCGS, MS_SSIM, NO_REGIONS, VISUAL, Ask, Files, Point, codec_digest
 from kcgs.bench._rate_tables import (
     DAVIS_CURVE,
     KODAK,
@@ -226,14 +226,18 @@ class TestPlan:
 
     def test_groups(self, data: Path, tmp_path: Path) -> None:
         files = Files(tmp_path, data, False)
-        expected = ["dog", f"dog, {NO_REGIONS}", f"dog, {VISUAL}"]
+        expected = ["dog", *(f"dog, {codec}" for codec in (NO_REGIONS, MS_SSIM, VISUAL))]
         assert [name for name, _ in steps(MATCHED, files)] == expected
         assert len(list(steps(DAVIS_CURVE, files))) == len(TARGETS)
         assert [name for name, _ in steps(PRECISION, files)] == ["dog N = 1,250", "dog N = 7,500"]
         save_image(data / "kodak/kodim07.png", sample().image)
         planned = [name for name, _ in steps(KODAK, files)]
         assert planned[:3] == [f"kodim{p}, {NO_REGIONS}" for p in ("07 3,932", "23 3,932", "07 7,372")]
-        assert len(planned) == 30 and planned[-1] == f"kodim23 39,321, {AVIF_FAST}"
+        assert (
+            len(planned) == 30
+            and planned[-1] == f"kodim23 39,321, {KCGS}"
+            and planned[10] == f"kodim07 3,932, {AVIF_FAST}"
+        )
 
     def test_what_may_be_asked(self, tmp_path: Path, data: Path) -> None:
         with pytest.raises(ValueError, match=r"data must be a folder with DAVIS, bsds or kodak in it"):
@@ -254,8 +258,8 @@ class TestMatched:
         fits = [(most, labels) for what, most, labels in stub.asked if what == "fit_bytes"]
         avif = max((p.bytes for p in found if p.codec.startswith(AVIF)), default=QUICK_BYTES)
         own = next((p.bytes for p in found if p.codec == AVIF), QUICK_BYTES)
-        assert fits == [(avif, True), (avif, False), (own, True)]
-        assert [config.objective for config in stub.recipes] == ["psnr", "psnr", "visual"]
+        assert fits == [(avif, True), (avif, False), (own, True), (own, True)]
+        assert [config.objective for config in stub.recipes] == ["psnr", "psnr", "ms-ssim", "visual"]
 
     def test_pairs(self) -> None:
         files = [point(size=7_900, quality=28.5), point(size=7_000, quality=28.0), point(AVIF, 7_950, quality=28.25)]
@@ -414,7 +418,7 @@ class TestFiles:
         with pytest.raises(KeyboardInterrupt):
             kcgs.bench.run("rate", tmp_path / "out", data=data, only="davis8k,maps")
         text = (tmp_path / "out/report.md").read_text()
-        assert "- davis8k: stopped before its end, 0 of 3 steps are finished." in text
+        assert "- davis8k: stopped before its end, 0 of 4 steps are finished." in text
         assert "- precision: not chosen, 0 of 2 steps are finished." in text
         stub.stop_at = None
         kcgs.bench.run("rate", tmp_path / "out", data=data, only="davis8k,maps")
