@@ -224,6 +224,22 @@ def test_cells_that_hold_others_than_were_named(margin: int, beyond: int, bit: i
         decode(pack(Header((9, 9), 1, 0, 1, ((0, len(layer)),)), b"", [layer]))
 
 
+def test_grids_that_would_take_hours(monkeypatch: pytest.MonkeyPatch) -> None:
+    size, writer, encoder = (9, 9), Writer(), Occupancy((9, 9))
+    far = np.full((1, 2), -Grid.over(size, 1).most_margin)
+    for class_of_size in range(5):
+        encoder.code(writer, class_of_size, 1, far)
+    reader, decoder = Reader(writer.finish()), Occupancy(size)
+    monkeypatch.setattr(f"{Occupancy.__module__}._ALL_OUTSIDE", 4 << 17)
+    for class_of_size in range(4):
+        decoder.code(reader, class_of_size, 1, None)
+    with pytest.raises(CodecError, match="at most 524288 cells outside; got 6"):
+        decoder.code(reader, 4, 1, None)
+    monkeypatch.setattr(f"{Occupancy.__module__}._ALL_CLASSES", 4)
+    with pytest.raises(CodecError, match="at most 4 classes of size; got more"):
+        decoder.code(reader, 4, 1, None)
+
+
 def test_what_is_left_by_rank() -> None:
     generator = np.random.default_rng(0)
     for count in (1, 2, 7, 8, 100):
