@@ -32,7 +32,7 @@ Size = Annotated[str | None, typer.Option(metavar="WxH", help="Width and height 
 
 Objective = Annotated[
     Literal["psnr", "visual", "ms-ssim", "progressive"] | None,
-    typer.Option("--objective", "--metric", help="What is to be best; progressive: of the first bytes, too."),
+    typer.Option("--objective", "--metric", help="What to maximize; progressive: PSNR, of the first bytes, too."),
 ]
 
 

@@ -30,7 +30,7 @@ from .bits import soft_bits
 _PAYING = 20.0
 # what a bit must save, in units of the distortion: 2 ln 2 where nobody makes up for rounding; found by trial
 _BIT = 0.9
-# share of the iterations in which shapes are rounded; colours are in the rest; and when Gaussians too many are left out
+# share of the iterations in which shapes are rounded; colours are in the rest; and when surplus Gaussians are left out
 _SHAPES, _LOOKS = 0.65, (0.3, 0.65, 0.9)
 _STEP, _MOMENTUM = 0.09, 0.9
 # the largest step, in standard deviations and in log scale; and the largest share of Newton's
