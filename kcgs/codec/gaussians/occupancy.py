@@ -17,8 +17,9 @@ from kcgs.codec.rangecoder import ONE, CodecError, Coder
 MOST_BITS = 21  # of a number of Gaussians
 _MOST_MARGIN = 255
 _CELLS_OUTSIDE = 1 << 17
-# of a file, which else would take hours to read: cells outside, and classes of size; an encoder has 65 * 37 at most
-_ALL_OUTSIDE, _ALL_CLASSES = 1 << 26, 1 << 12
+# of a file, which else would take hours to read: cells outside, and those for each Gaussian, and classes of size; an
+# encoder has 65 * 37 at most
+_ALL_OUTSIDE, _EACH_OUTSIDE, _ALL_CLASSES = 1 << 26, 1 << 10, 1 << 12
 # larger counts of a cell are coded by repeating this
 _FULL = 7
 # cells that are coded together
@@ -95,7 +96,7 @@ class Occupancy:
         self._margin = AdaptiveNumber(np.array([3.0, *[1.0] * 4, *[0.3] * 4]))
         self._beyond = AdaptiveNumber(np.array([0.3, *[1.0] * 4, *[0.3] * (MOST_BITS - 4)]))
         self._classes: list[tuple[int, Integers]] = []
-        self._outside = 0  # cells, so far
+        self._outside, self._count = 0, 0  # cells there and Gaussians, so far
 
     def code(self, coder: Coder, size: int, count: int, cell: Integers | None) -> Integers:
         """Code the cells (N, 2) of `count` Gaussians of a class of size, sorted row by row; None: to read."""
@@ -109,9 +110,10 @@ class Occupancy:
             raise CodecError(f"at most {count} Gaussians may lie outside; got {beyond}")
         inside = self._fill_inside(coder, grid, size, count - beyond, places[0])
         ring = grid.num_outside
+        self._count += count
         self._outside += ring if beyond else 0
-        if self._outside > _ALL_OUTSIDE:
-            raise CodecError(f"grids must have at most {_ALL_OUTSIDE} cells outside; got {self._outside}")
+        if self._outside > (most := _ALL_OUTSIDE + _EACH_OUTSIDE * self._count):
+            raise CodecError(f"grids must have at most {most} cells outside; got {self._outside}")
         outside = _fill(coder, _borders(ring, ring), lambda start, end: np.ones(end - start), ring, beyond, places[1])
         cell = grid.join(inside, outside)
         self._classes.append((size, (2 * cell + 1) * grid.side))

@@ -9,6 +9,10 @@ import { AdaptiveNumber } from "./adaptive_number.ts";
 const MOST_MARGIN = 255;
 const NEAR = 2; // classes of size
 const EVERYWHERE = 480000;
+// of a file: classes of size, cells outside, and those for each Gaussian
+const MOST_CLASSES = 4096;
+const MOST_OUTSIDE = 2 ** 26;
+const EACH_OUTSIDE = 1024;
 
 /** For each Gaussian of a class the column and the row of its cell; in order, row by row. */
 export interface Cells {
@@ -33,15 +37,19 @@ export class Occupancy {
   private readonly margin = new AdaptiveNumber(MARGINS);
   private readonly beyond = new AdaptiveNumber(BEYOND);
   private readonly earlier = new Map<number, Cells[]>(); // by class of size
-  private outside = 0.5;
-  private all = 20;
+  private outside: number;
+  private all: number;
+  private classes = 0;
 
   /** `plain`: as versions 1 and 2 have it. */
   constructor(
     private readonly height: number,
     private readonly width: number,
     private readonly plain: boolean,
-  ) {}
+  ) {
+    this.outside = plain ? 0.5 : 0;
+    this.all = plain ? 20 : 0;
+  }
 
   /** Read the cells of `count` Gaussians of a class of size. */
   read(decoder: RangeDecoder, size: number, count: number): Cells {
@@ -70,6 +78,8 @@ export class Occupancy {
 
   /** Read cells that are the more likely, the more earlier Gaussians of about this size are near. */
   private readNear(decoder: RangeDecoder, { rows, columns, side, ring }: Grid, size: number, count: number): Places {
+    if (this.classes++ === MOST_CLASSES)
+      throw new DecodeError(`groups must have at most ${MOST_CLASSES} classes of size; got more`);
     const { program } = decoder;
     const beyond = ring ? this.beyond.read(decoder) : 0;
     if (beyond > count) throw new DecodeError(`at most ${count} Gaussians may lie outside; got ${beyond}`);
@@ -86,6 +96,10 @@ export class Occupancy {
     new Int32Array(program.memory.buffer, at, near.length).set(near);
     const least = Math.max(Math.floor(EVERYWHERE / (rows * columns)), 1);
     const inside = listed(program, program.readNear(rows, columns, least, near.length / 2, count - beyond));
+    this.all += count;
+    if (beyond) this.outside += ring;
+    const most = MOST_OUTSIDE + EACH_OUTSIDE * this.all;
+    if (this.outside > most) throw new DecodeError(`grids must have at most ${most} cells outside; got ${this.outside}`);
     return [inside, listed(program, program.readNear(ring, 1, 1, 0, beyond))];
   }
 
