@@ -9,9 +9,9 @@ import { AdaptiveNumber } from "./adaptive_number.ts";
 const MOST_MARGIN = 255;
 const NEAR = 2; // classes of size
 const EVERYWHERE = 480000;
-// of a file: classes of size, cells outside, and those for each Gaussian
+// of a file: classes of size, cells outside (less what `outside` and `all` begin with), and those for each Gaussian
 const MOST_CLASSES = 4096;
-const MOST_OUTSIDE = 2 ** 26;
+const MOST_OUTSIDE = 2 ** 26 - 20479.5;
 const EACH_OUTSIDE = 1024;
 
 /** For each Gaussian of a class the column and the row of its cell; in order, row by row. */
@@ -37,8 +37,8 @@ export class Occupancy {
   private readonly margin = new AdaptiveNumber(MARGINS);
   private readonly beyond = new AdaptiveNumber(BEYOND);
   private readonly earlier = new Map<number, Cells[]>(); // by class of size
-  private outside: number;
-  private all: number;
+  private outside = 0.5;
+  private all = 20;
   private classes = 0;
 
   /** `plain`: as versions 1 and 2 have it. */
@@ -46,10 +46,7 @@ export class Occupancy {
     private readonly height: number,
     private readonly width: number,
     private readonly plain: boolean,
-  ) {
-    this.outside = plain ? 0.5 : 0;
-    this.all = plain ? 20 : 0;
-  }
+  ) {}
 
   /** Read the cells of `count` Gaussians of a class of size. */
   read(decoder: RangeDecoder, size: number, count: number): Cells {
@@ -78,11 +75,13 @@ export class Occupancy {
 
   /** Read cells that are the more likely, the more earlier Gaussians of about this size are near. */
   private readNear(decoder: RangeDecoder, { rows, columns, side, ring }: Grid, size: number, count: number): Places {
-    if (this.classes++ === MOST_CLASSES)
-      throw new DecodeError(`groups must have at most ${MOST_CLASSES} classes of size; got more`);
     const { program } = decoder;
     const beyond = ring ? this.beyond.read(decoder) : 0;
     if (beyond > count) throw new DecodeError(`at most ${count} Gaussians may lie outside; got ${beyond}`);
+    this.all += count;
+    if (beyond) this.outside += ring;
+    if (this.classes++ === MOST_CLASSES || this.outside > MOST_OUTSIDE + EACH_OUTSIDE * this.all)
+      throw new DecodeError("a file must have fewer grids of cells");
     const near: number[] = [];
     const shift = 32 - Math.clz32(side); // of half pixels
     for (let other = size; other <= size + NEAR; other++)
@@ -96,10 +95,6 @@ export class Occupancy {
     new Int32Array(program.memory.buffer, at, near.length).set(near);
     const least = Math.max(Math.floor(EVERYWHERE / (rows * columns)), 1);
     const inside = listed(program, program.readNear(rows, columns, least, near.length / 2, count - beyond));
-    this.all += count;
-    if (beyond) this.outside += ring;
-    const most = MOST_OUTSIDE + EACH_OUTSIDE * this.all;
-    if (this.outside > most) throw new DecodeError(`grids must have at most ${most} cells outside; got ${this.outside}`);
     return [inside, listed(program, program.readNear(ring, 1, 1, 0, beyond))];
   }
 
