@@ -155,7 +155,10 @@ class MsSsimObjective(VisualObjective):
             self._bands.append((level, blocks + window, math.inf, bright))
 
     def apply(self, residual: Tensor) -> Tensor:
-        """Return half the gradient of E, (C, H, W), at a residual r, render - image."""
+        """Return half the gradient of E, (C, H, W), at a residual r, render - image.
+
+        Where the mean of a scale is below 0.2, E takes it as 0.2, and the slope is that of the mean by 0.2.
+        """
         return self._measure(residual)[1]
 
     def value(self, residual: Tensor) -> float:

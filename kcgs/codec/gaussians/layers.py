@@ -27,10 +27,10 @@ _CLASSES = 64  # that a stream may name, of size
 _RATIO_SCALE = 2.0
 # a colour's part is faint, middling or strong against the whole
 _FAINT, _STRONG = 0.35, 0.8
-# sizes within a class, by which colours are measured; classes of size that have ratios of their own
-_LEVELS, _LEAST_SIZE = 8, -1
-
-
+# sizes within a class, by which colours are measured
+_LEVELS = 8
+# the first of the classes of size that have ratios of their own
+_LEAST_SIZE = -1
 # what follows a group: no other, that of the next energy down, or of an energy below that
 _END, _HOLDS, _EMPTY = 0, 1, 2
 Group = tuple[Codes, Integers]
