@@ -170,12 +170,12 @@ class SceneWriter:
         starts = [*np.unique(key[order], return_index=True)[1].tolist(), len(ids)]
         groups = [slice(*ends) for ends in itertools.pairwise(starts)]
         for layer in _join(groups, len(ids)) if joined else [[group] for group in groups]:
-            writer = Writer()
-            model.code(writer, int(codes.energy[layer[0].start]), [(codes.pick(g), ids[g]) for g in layer], len(ids))
+            writer, energy = Writer(), int(codes.energy[layer[0].start])
+            model.code(writer, energy, [(codes.pick(group), ids[group]) for group in layer], len(ids))
             # each Gaussian takes more than a bit, but zeros at the end are left out
             count = layer[-1].stop - layer[0].start
             layers.append(writer.finish().ljust(-(-(count - SPARE) // 8), b"\0"))
-            listed.append((int(codes.energy[layer[0].start]), len(layers[-1])))
+            listed.append((energy, len(layers[-1])))
         return Header(self.size, self.channels, quantizer.qp, model.num_regions, tuple(listed)), layers
 
     def _count_numbers(self) -> int:

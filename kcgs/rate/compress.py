@@ -191,14 +191,17 @@ class _Press:
         tuning = self._tuning(writer, Quantizer(qp, writer.size))
         tuning.drop()
         write = partial(writer.write, tuning.quantizer, marks=_MARKS if self.progressive else ())
+        data = b""
 
         def excess(codes: Codes) -> int:
-            size = len(write(codes, tuning.ids))
-            return max(0, math.ceil((size - most) * len(tuning.ids) / size))
+            nonlocal data
+            data = write(codes, tuning.ids)
+            return max(0, math.ceil((len(data) - most) * len(tuning.ids) / len(data)))
 
         seconds = share * (self.end - time.perf_counter())
         codes = tuning.round(rounds, self.seed, seconds, None if math.isinf(most) else excess)
-        return write(codes, tuning.ids)
+        # the codes are those that `excess` was asked last
+        return data or write(codes, tuning.ids)
 
     def _tuning(self, writer: SceneWriter, quantizer: Quantizer) -> Tuning:
         given = writer.gaussians, writer.ids, self.image, writer.regions, quantizer, self.objective

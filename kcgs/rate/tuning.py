@@ -116,7 +116,7 @@ class Tuning:
             self._step(rounded, shaped[:, None], colored[:, None])
         while True:
             codes = self.quantizer.quantize(self.gaussians, classes)
-            if excess is None or len(self.ids) == 1 or not (count := excess(codes)):
+            if excess is None or not (count := excess(codes)) or len(self.ids) == 1:
                 return codes
             kept = self._leave_out(count)
             classes = Classes(*(numbers[kept] for numbers in classes))

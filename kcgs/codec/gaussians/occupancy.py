@@ -20,6 +20,7 @@ _CELLS_OUTSIDE = 1 << 17
 # of a file, which else would take hours to read: cells outside, and those for each Gaussian, and classes of size; an
 # encoder has 65 * 37 at most
 _ALL_OUTSIDE, _EACH_OUTSIDE, _ALL_CLASSES = 1 << 26, 1 << 10, 1 << 12
+_MARGINS = np.array([3.0, *[1.0] * 4, *[0.3] * 4])  # weights at first
 # larger counts of a cell are coded by repeating this
 _FULL = 7
 # cells that are coded together
@@ -93,7 +94,7 @@ class Occupancy:
 
     def __init__(self, size: tuple[int, int]) -> None:
         self._size = size
-        self._margin = AdaptiveNumber(np.array([3.0, *[1.0] * 4, *[0.3] * 4]))
+        self._margin = AdaptiveNumber(_MARGINS)
         self._beyond = AdaptiveNumber(np.array([0.3, *[1.0] * 4, *[0.3] * (MOST_BITS - 4)]))
         self._classes: list[tuple[int, Integers]] = []
         self._outside, self._count = 0, 0  # cells there and Gaussians, so far
@@ -204,7 +205,7 @@ class PlainOccupancy:
 
     def __init__(self, size: tuple[int, int]) -> None:
         self._size = size
-        self._margin = AdaptiveNumber(np.array([3.0, *[1.0] * 4, *[0.3] * 4]))
+        self._margin = AdaptiveNumber(_MARGINS)
         self._outside = 0.5, 20.0
 
     def code(self, coder: Coder, size: int, count: int, cell: Integers | None) -> Integers:

@@ -9,9 +9,9 @@ import { AdaptiveNumber } from "./adaptive_number.ts";
 const MOST_MARGIN = 255;
 const NEAR = 2; // classes of size
 const EVERYWHERE = 480000;
-// of a file: classes of size, cells outside (less what `outside` and `all` begin with), and those for each Gaussian
+// of a file: classes of size, cells outside, and those for each Gaussian
 const MOST_CLASSES = 4096;
-const MOST_OUTSIDE = 2 ** 26 - 20479.5;
+const MOST_OUTSIDE = 2 ** 26;
 const EACH_OUTSIDE = 1024;
 
 /** For each Gaussian of a class the column and the row of its cell; in order, row by row. */
@@ -37,9 +37,9 @@ export class Occupancy {
   private readonly margin = new AdaptiveNumber(MARGINS);
   private readonly beyond = new AdaptiveNumber(BEYOND);
   private readonly earlier = new Map<number, Cells[]>(); // by class of size
-  private outside = 0.5;
-  private all = 20;
   private classes = 0;
+  private all = 0; // Gaussians so far; in versions 1 and 2 those of grids with a margin
+  private outside = 0; // cells there, so far; in versions 1 and 2 Gaussians there
 
   /** `plain`: as versions 1 and 2 have it. */
   constructor(
@@ -100,7 +100,7 @@ export class Occupancy {
 
   /** Read cells that are all as likely. */
   private readAlike(decoder: RangeDecoder, { rows, columns, ring }: Grid, count: number): Places {
-    const share = ring ? this.outside / this.all : 0;
+    const share = ring ? (this.outside + 0.5) / (this.all + 20) : 0;
     const cells = rows * columns;
     const inside = readCells(decoder, Math.max(count * (1 - share), 0.01) / cells, cells, count);
     const left = count - inside.length;
