@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 import torch
@@ -11,8 +12,10 @@ from typer.testing import CliRunner
 
 from kcgs import save
 from kcgs.cli import app
+from kcgs.cli.options import Objective
 from kcgs.codec import decode
 from kcgs.data import load_image, save_image
+from kcgs.fit import FitConfig
 from tests.codec.conftest import make_scene
 
 runner = CliRunner()
@@ -107,6 +110,10 @@ class TestOtherCommands:
 
 
 class TestFit:
+    def test_objectives_are_those_of_fits(self) -> None:
+        choices, _ = get_args(get_args(Objective)[0])  # of Annotated[Literal[...] | None, ...]
+        assert get_args(choices) == get_args(get_type_hints(FitConfig)["objective"])
+
     def test_to_a_budget(self, photo: Path, tmp_path: Path) -> None:
         file = tmp_path / "a.kcgs"
         report = json.loads(
