@@ -200,8 +200,7 @@ class _Press:
 
         seconds = share * (self.end - time.perf_counter())
         codes = tuning.round(rounds, self.seed, seconds, None if math.isinf(most) else excess)
-        # the codes are those that `excess` was asked last
-        return data or write(codes, tuning.ids)
+        return data or write(codes, tuning.ids)  # the codes are those that `excess` was asked last
 
     def _tuning(self, writer: SceneWriter, quantizer: Quantizer) -> Tuning:
         given = writer.gaussians, writer.ids, self.image, writer.regions, quantizer, self.objective

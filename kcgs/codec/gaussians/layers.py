@@ -1,7 +1,6 @@
 """The numbers of Gaussians, coded in layers, the strongest first, so that a part is an image.
 
-A layer has a group for each of a few classes of energy. A group holds, for each class of size, how many Gaussians there
-are, and then what each is (docs/format.md).
+A layer has a group for each of its classes of energy: by class of size, how many Gaussians, then each (docs/format.md).
 """
 
 from __future__ import annotations
