@@ -18,12 +18,12 @@ from kcgs.functional.labels import compact, touching_pairs
 
 from .contexts import CODED, LABEL, LEFT, RIGHT, TOP, load_prior, new_tables
 from .ids import code_ids, code_ids_of_file
+from .seeds import code_seeds
 from .wavefront import DECIDED, RANKS, REGIONS, STATE, WIDE, advance, nearest, new_work, program, survey
 
 # what a reader may be asked to work through: seconds
 _MOST_ASKED, MOST_ESCAPES = 1 << 23, 1 << 18
 _NOISY = np.array([2.0**-10])  # chance of a map that the model makes larger
-_SIZES = 8  # contexts of seeds, by how many are in the block
 _FORTIETHS = 40  # of a pixel
 _MOST_WIDTH = int(MAX_SOFTNESS) * _FORTIETHS
 _MOST_SUPERSAMPLE = 64
@@ -131,7 +131,7 @@ def _decode_regions(data: bytes, height: int, width: int, max_regions: int, *, a
 def _code_pixels(coder: Coder, truth: Any, seeds: Any, regions: int, alone: bool) -> Any:
     """Code a map of numbered regions; a reader has an empty `truth` and fills in `seeds`."""
     program.ready()
-    _code_seeds(coder, seeds)
+    code_seeds(coder, seeds)
     height, width = seeds.shape
     tables = load_prior("prior2.bin" if alone else "prior.bin")
     rows, chances, lines = new_work(height, tables)
@@ -251,50 +251,3 @@ def _code_places(coder: Coder, pairs: int, count: int, places: Integers | None) 
         part = slice(start, start + _TOGETHER)
         found[part] = model.code(coder, len(found[part]), None if places is None else places[part])
     return found
-
-
-def _code_seeds(coder: Coder, seeds: Any) -> None:
-    """Code which entries of `seeds`, (H, W) uint8, are 1, by how many lie in each half of ever smaller blocks.
-
-    A reader sets them.
-    """
-    count = coder.unbounded(int(np.count_nonzero(seeds)))
-    if count > seeds.size:
-        raise CodecError(f"data must mark at most {seeds.size} pixels; got {count}")
-    extreme = [AdaptiveBit() for _ in range(_SIZES)]
-    waiting = [(seeds, count)]
-    while waiting:
-        block, count = waiting.pop()
-        if count == 1:
-            place = coder.number(0 if coder.reads else int(block.argmax()), block.size)
-            if place >= block.size:
-                raise CodecError("data must mark pixels of the map")
-            block[place // block.shape[1], place % block.shape[1]] = 1
-        elif count == block.size:
-            block[:] = 1
-        elif count:
-            first, second = _halves(block)
-            inside = _code_count(coder, first, count, second.size, extreme[min(count.bit_length() - 2, _SIZES - 1)])
-            waiting += [(first, inside), (second, count - inside)]
-
-
-def _halves(block: Any) -> tuple[Any, Any]:
-    """Cut across the longer side; the first half is the smaller."""
-    height, width = block.shape
-    if height >= width:
-        return block[: height // 2], block[height // 2 :]
-    return block[:, : width // 2], block[:, width // 2 :]
-
-
-def _code_count(coder: Coder, half: Any, seeds: int, rest: int, extreme: AdaptiveBit) -> int:
-    """Code how many of a block's seeds are in its first half: all, none, or some number between."""
-    low, high = max(0, seeds - rest), min(seeds, half.size)
-    if low == high:
-        return low
-    count = 0 if coder.reads else int(np.count_nonzero(half))
-    if high - low < 2 or extreme.code(coder, count in (low, high)):
-        return high if coder.fair(count == high) else low
-    count = low + 1 + coder.number(count - low - 1, high - low - 1)
-    if count >= high:
-        raise CodecError("data must mark pixels of the map")
-    return count
