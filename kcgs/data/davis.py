@@ -1,9 +1,11 @@
 """Frames and annotations of the DAVIS video segmentation data sets, 2016 and 2017."""
 
+from __future__ import annotations
+
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 from torch import Tensor
 
@@ -23,6 +25,35 @@ class DavisFrame(NamedTuple):
     sequence: str
     image: Tensor
     labels: Tensor
+
+
+class DavisSequence(Sequence[DavisFrame]):
+    """All frames of one sequence of DAVIS, each read on access; `Davis.sequence` makes it.
+
+    Attributes:
+        name: of the sequence.
+    """
+
+    def __init__(self, name: str, numbers: list[int], read: Callable[[str, int], DavisFrame]) -> None:
+        self.name, self._numbers, self._read = name, numbers, read
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    @overload
+    def __getitem__(self, key: int) -> DavisFrame: ...
+
+    @overload
+    def __getitem__(self, key: slice) -> DavisSequence: ...
+
+    def __getitem__(self, key: int | slice) -> DavisFrame | DavisSequence:
+        """Read the frame at a position; a slice is the shorter sequence, not yet read."""
+        if isinstance(key, slice):
+            return DavisSequence(self.name, self._numbers[key], self._read)
+        return self._read(self.name, self._numbers[key])
+
+    def __repr__(self) -> str:
+        return f"DavisSequence({self.name!r}, {len(self)} frames)"
 
 
 class Davis:
@@ -51,8 +82,9 @@ class Davis:
         ...     save_labels(f"{root}/Annotations/480p/cows/00000.png", torch.ones(4, 6).long())
         ...     davis = Davis(root)
         ...     name, image, labels = davis["cows"]
-        >>> davis.sequences, tuple(image.shape), tuple(labels.shape)
-        (['cows'], (3, 4, 6), (4, 6))
+        ...     cows = [frame.labels.max().item() for frame in davis.sequence("cows")]
+        >>> davis.sequences, tuple(image.shape), tuple(labels.shape), cows
+        (['cows'], (3, 4, 6), (4, 6), [1])
     """
 
     def __init__(
@@ -100,11 +132,33 @@ class Davis:
         if isinstance(key, int) and not -len(self) <= key < len(self):
             raise IndexError(f"there are {len(self)} sequences; got position {key}")
         name = self._sequences[key] if isinstance(key, int) else self._select([key], self._sequences)[0]
-        image_path = self._images / name / f"{self._frame:05d}.jpg"
-        labels_path = self._annotations / name / f"{self._frame:05d}.png"
+        return self._read(name, self._frame)
+
+    def sequence(self, name: str) -> DavisSequence:
+        """Take a whole sequence: all frames that have an image, each with its labels, read one at a time.
+
+        Args:
+            name: one of ``sequences``.
+
+        Returns:
+            A sequence of DavisFrames, which reads on access; every pass starts anew.
+
+        Raises:
+            FileNotFoundError: no image is there; on access, a frame lacks its annotation.
+            ValueError: there is no sequence of this name.
+        """
+        name = self._select([name], self._sequences)[0]
+        numbers = sorted(int(path.stem) for path in (self._images / name).glob("*.jpg") if path.stem.isdigit())
+        if not numbers:
+            raise FileNotFoundError(f"sequence {name!r} has no frames in {self._images / name}")
+        return DavisSequence(name, numbers, self._read)
+
+    def _read(self, name: str, frame: int) -> DavisFrame:
+        image_path = self._images / name / f"{frame:05d}.jpg"
+        labels_path = self._annotations / name / f"{frame:05d}.png"
         for path in (image_path, labels_path):
             if not path.is_file():
-                raise FileNotFoundError(f"frame {self._frame} of sequence {name!r} lacks {path}")
+                raise FileNotFoundError(f"frame {frame} of sequence {name!r} lacks {path}")
         image, labels = load_image(image_path), load_labels(labels_path)
         if image.shape[-2:] != labels.shape:
             raise ValueError(

@@ -77,6 +77,22 @@ class TestDavis:
         davis.sequences.clear()
         assert len(davis) == 3
 
+    def test_sequence(self, root: Path) -> None:
+        add_frame(root, "dog", frame=12)
+        dog = Davis(root).sequence("dog")
+        assert (dog.name, len(dog), repr(dog)) == ("dog", 3, "DavisSequence('dog', 3 frames)")
+        for _ in range(2):
+            frames = list(dog)
+            assert all(isinstance(frame, DavisFrame) and frame.sequence == "dog" for frame in frames)
+            assert [round(float(frame.image[0].mean()) * 25.5) for frame in frames] == [0, 7, 12]
+        assert torch.equal(dog[-1].image, frames[2].image)
+        assert len(dog[1:]) == 2 and torch.equal(dog[1:][0].image, frames[1].image)
+        with pytest.raises(ValueError, match="no sequence 'cat'"):
+            Davis(root).sequence("cat")
+        (root / "Annotations" / "480p" / "dog" / "00007.png").unlink()
+        with pytest.raises(FileNotFoundError, match="frame 7 of sequence 'dog' lacks"):
+            list(dog)
+
     def test_another_frame(self, root: Path) -> None:
         first, later = Davis(root)[0].image, Davis(root, frame=7)[0].image
         assert (later - first).abs().max() > 0.2
