@@ -13,6 +13,8 @@ from .rangecoder import CodecError
 MAGIC, VERSIONS = b"kcgs", (1, 2, 3)
 MAP_MAGIC = b"kcgm"
 """What a file begins with that is a label map and no scene."""
+CLIP_VERSION = 4
+"""Of files that hold frames, which `clips/file.py` reads."""
 # a decoder's memory: pixels of a map; Gaussians in all, and numbers of their colours
 MOST_LABELS = 1 << 26
 MOST_GAUSSIANS, MOST_COLORS = (1 << 21) - 1, 1 << 27
@@ -122,7 +124,9 @@ def _read_header(stream: ByteReader) -> tuple[Header, int]:
         )
     if magic != MAGIC:
         raise CodecError(f"it must start with {MAGIC!r}; got {stream.data[:4]!r}")
-    if (version := stream.take(1)[0]) not in VERSIONS:
+    if (version := stream.take(1)[0]) == CLIP_VERSION:
+        raise CodecError("it is a clip, no scene: kcgs render writes it as a video, kcgs.Clip.load reads it")
+    if version not in VERSIONS:
         raise CodecError(f"its version must be 1, 2 or 3; got {version}")
     split = version > VERSIONS[0]
     size = stream.varint("height", 1, MOST_SIDE), stream.varint("width", 1, MOST_SIDE)

@@ -121,5 +121,7 @@ def test_limits(scene: Scene) -> None:
     many = header._replace(layers=(header.layers[0],) * 129)
     with pytest.raises(CodecError, match=r"layers must be in \[1, 128\]; got 129"):
         decode(pack(many, region_map, [layers[0]] * 129))
-    with pytest.raises(CodecError, match="its version must be 1, 2 or 3; got 4"):
+    with pytest.raises(CodecError, match="its version must be 1, 2 or 3; got 5"):
+        decode(b"kcgs\5" + encode(scene)[5:])
+    with pytest.raises(CodecError, match="it is a clip, no scene: .* kcgs.Clip.load reads it"):
         decode(b"kcgs\4" + encode(scene)[5:])

@@ -1,0 +1,119 @@
+"""Scenes as the frames of a clip, without their images: each is rounded to its differences from the one before."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kcgs.codec.exact import Floats, Integers
+from kcgs.codec.file import ByteReader, unpack
+from kcgs.codec.gaussians.quantize import QPS, Parameters, Quantizer
+from kcgs.codec.scenes import SceneWriter
+from kcgs.scene import Scene, check_scene
+
+from .carried import Change, ClipPart, born_codes
+from .differences import Differences
+from .file import KEY, ClipHeader, Record
+from .frames import FrameReader, carried_record, key_record
+
+# Gaussians are the same where centres, in these standard deviations, logarithms of sizes and colours, in these, agree
+_PIXELS, _LOGARITHMS, _COLORS, _FARTHEST = 4.0, 0.5, 0.25, 2.0
+_APART = 1e3  # of regions
+
+
+class Asked(NamedTuple):
+    """How a frame is to be written."""
+
+    qp: int
+    numbers: Integers | None  # motions of the regions by their ids' positions [R, 6]; None: a key frame
+    ids: Integers  # of the regions
+
+
+def asked_of(records: list[Record], header: ClipHeader) -> Iterable[tuple[Asked, Scene]]:
+    """Yield how each frame of a clip was written, and the frame."""
+    reader = FrameReader(header)
+    for record in records:
+        frame = reader.read(record)
+        part = reader.part
+        assert part is not None
+        if record.kind == KEY:
+            yield Asked(unpack(record.data)[0].qp, None, part.ids), part.scene(frame)
+        else:
+            qp = ByteReader(record.data).varint("quantization parameter", 0, QPS[1] - QPS[0]) + QPS[0]
+            yield Asked(qp, frame.numbers, part.ids), part.scene(frame)
+
+
+class ClipWriter:
+    """Writes scenes one after another, all of one size."""
+
+    def __init__(self) -> None:
+        self._part: ClipPart | None = None
+
+    def add(self, scene: Scene, asked: Asked) -> Record:
+        """Write the next frame; a key frame where that is asked for, or the last one does not know its regions."""
+        scene = check_scene(scene)
+        part = self._part
+        ids = np.zeros(1, np.int64) if scene.regions is None else scene.regions.ids.numpy()
+        mapped = scene.regions is not None and scene.regions.num_regions > 1
+        known = part is not None and mapped == (part.frame.index is not None) and bool(np.isin(ids, part.ids).all())
+        if part is None or asked.numbers is None or (mapped and not known):
+            data = SceneWriter(scene).write_rounded(asked.qp)
+            reader = FrameReader(ClipHeader(scene.size, scene.field.colors.shape[-1], None))  # type: ignore[arg-type]
+            reader.part = part
+            reader.read(key_record(data))
+            self._part = reader.part
+            return key_record(data)
+        numbers = part.motions.last.copy()
+        both, mine, theirs = np.intersect1d(part.ids, asked.ids, return_indices=True)
+        if len(both):
+            numbers[mine] = asked.numbers[theirs]
+        return carried_record(part, asked.qp, numbers, _change(part, numbers, scene, asked.qp))
+
+
+def _change(part: ClipPart, numbers: Integers, scene: Scene, qp: int) -> Change:
+    """Return how a scene differs from the moved frame before."""
+    moved, predicted = part.moved(numbers)
+    field, index, region = scene.field, None, np.zeros(len(scene.field), np.int64)
+    if predicted is not None:
+        assert scene.regions is not None and field.region_ids is not None
+        index = np.searchsorted(part.ids, scene.regions.labels.numpy()).astype(np.int32)
+        region = np.searchsorted(part.ids, field.region_ids.numpy())
+    tensors = field.means, field.cholesky, field.merged_colors()
+    new = Parameters(*(t.detach().double().numpy() for t in tensors))
+    last = part.frame.region
+    left = np.zeros(len(last), np.bool_) if index is None else ~np.isin(last, np.unique(index))
+    old, found = _match(moved, last, new, region)
+    kept = ~left[old]
+    old, found = old[kept], found[kept]
+    gone = ~left
+    gone[old] = False
+    stays = np.flatnonzero(~(left | gone))
+    order = np.argsort(old)  # the same as `stays`
+    base = Parameters(*(t[stays] for t in moved))
+    differences = Differences(base, Quantizer(qp, part.size).distortion, part.size)
+    matched = Parameters(*(t[found[order]] for t in new))
+    codes = np.floor(differences.measure(matched) + 0.5).astype(np.int64)
+    born = np.setdiff1d(np.arange(len(region)), found)
+    added = Parameters(*(t[born] for t in new))
+    return Change(index, gone, codes, born_codes(added, qp, part.size), region[born])
+
+
+def _match(old: Parameters, old_region: Integers, new: Parameters, new_region: Integers) -> tuple[Integers, Integers]:
+    """Return which Gaussians of two frames are the same: those that are nearest to each other."""
+    from scipy.spatial import cKDTree
+
+    first, second = _features(old, old_region), _features(new, new_region)
+    distance, forth = cKDTree(second).query(first, distance_upper_bound=_FARTHEST)
+    _, back = cKDTree(first).query(second)
+    near = np.flatnonzero(np.isfinite(distance))
+    mutual = near[back[forth[near]] == near]
+    return mutual, forth[mutual]
+
+
+def _features(gaussians: Parameters, region: Integers) -> Floats:
+    means, cholesky, colors = gaussians
+    logs = np.log(np.maximum(cholesky[:, ::2], 1e-6)) / _LOGARITHMS
+    parts: list[Any] = [means / _PIXELS, logs, colors / _COLORS, _APART * region[:, None]]
+    return np.concatenate(parts, 1)
