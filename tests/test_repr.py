@@ -7,6 +7,7 @@ import inspect
 import io
 import pkgutil
 from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,10 @@ import torch
 from PIL import Image
 
 import kcgs
-from kcgs import FitConfig, GaussianField, RegionMap, RegionSplatRenderer, Scene, codec, fit
-from kcgs.data import ChartSample, Davis, DavisFrame
+from kcgs import Clip, FitConfig, GaussianField, RegionMap, RegionSplatRenderer, Scene, codec, fit
+from kcgs.codec.clips.file import ClipHeader
+from kcgs.codec.clips.frames import key_record
+from kcgs.data import ChartSample, Davis, DavisFrame, read_label_maps, read_video, save_image, save_labels
 from kcgs.engine import run_jobs
 from kcgs.fit import FitResult, available_recipes
 from kcgs.functional import BandGain, BoundaryScore, PairWidths
@@ -47,6 +50,7 @@ def objects(result: FitResult, folder: Path) -> Iterator[Any]:
     image, data = torch.rand(3, *SIZE), codec.encode(result.scene)
     yield from (result, result.history[0], result.regions, field, regions, regions.resize((128, 192)), scene)
     yield from (PairWidths(WIDTHS), RegionSplatRenderer())
+    yield Clip(ClipHeader(SIZE, 3, Fraction(30000, 1001)), [key_record(data)] * 3)
     yield from (FitConfig.from_recipe(recipe) for recipe in available_recipes())
     yield from (codec.decode(data), Compressed(data, scene), FitBytesResult(data, scene, result), prune(result.scene))
     yield from (Segmentation(LABELS, torch.rand(21), {i: f"name {i}" for i in range(21)}), Cleanup())
@@ -55,7 +59,10 @@ def objects(result: FitResult, folder: Path) -> Iterator[Any]:
     yield BoundaryScore(*torch.rand(3, 2))
     for kind in ("JPEGImages", "Annotations"):
         (folder / kind / "480p" / "bear").mkdir(parents=True)
-    yield Davis(folder)
+    save_image(folder / "JPEGImages/480p/bear/00000.jpg", image)
+    save_labels(folder / "Annotations/480p/bear/00000.png", LABELS)
+    yield from (Davis(folder), Davis(folder).sequence("bear"))
+    yield from (read_video(folder / "JPEGImages/480p/bear"), read_label_maps(folder / "Annotations/480p/bear"))
     for done in run_jobs(fail, [image, image]):
         yield from (done, done.error)
 

@@ -1,0 +1,49 @@
+"""The bytes of a clip, shared out among its frames."""
+
+from __future__ import annotations
+
+import math
+
+from kcgs.codec.clips.file import ClipHeader, Record, pack_end, pack_header, pack_record
+
+# how many carried frames cost what a key frame does, and how many times its even share a carried one may take
+_KEY_FRAMES, _MOST = 4.5, 1.6
+# a step of the quantization parameter changes the logarithm of a carried frame's bytes by this; the largest step
+SLOPE, _LARGEST = 0.0073, 24
+# bytes that each frame to come is sure of
+_LEAST = 48
+
+
+class Budget:
+    """What is left of `num_bytes` for `count` frames."""
+
+    def __init__(self, num_bytes: int, count: int, header: ClipHeader) -> None:
+        self._left = num_bytes - len(pack_header(header)) - len(pack_end(count))
+        self._frames, self._number = count, 0
+
+    def spend(self, record: Record) -> None:
+        """Take a frame off."""
+        self._left -= len(pack_record(record, self._number))
+        self._number += 1
+
+    def for_key(self, interval: int) -> int:
+        """Return the bytes of a key frame that begins here, less those of its record."""
+        rest = self._frames - self._number
+        others = min(rest, interval) - 1
+        keys = math.ceil(rest / interval)
+        share = self._left / (keys * _KEY_FRAMES + rest - keys) * _KEY_FRAMES
+        return max(1, int(share if others else self._left) - 16)
+
+    def most(self) -> int:
+        """Return the bytes that a carried frame may have at most, less those of its record."""
+        after = self._frames - self._number - 1
+        fair = self._left / (after + 1)
+        return max(0, int(min(self._left - after * _LEAST, _MOST * fair if after else self._left)) - 16)
+
+    def step(self, num_bytes: int) -> int:
+        """Return by how much the next frame's quantization parameter should rise, after a carried one of so many."""
+        rest = self._frames - self._number
+        if rest < 1:
+            return 0
+        wanted = math.log(max(self._left / rest, 1.0) / max(num_bytes, 1)) / SLOPE
+        return round(min(max(0.5 * wanted, -_LARGEST), _LARGEST))

@@ -1,0 +1,194 @@
+"""Frames become records: a key frame, then what is carried on."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcgs.codec import decode
+from kcgs.codec.clips.carried import ClipPart
+from kcgs.codec.clips.file import KEY, ClipHeader, Record
+from kcgs.codec.clips.frames import FrameReader, carried_record, key_record
+from kcgs.codec.clips.motion import quantize_motion
+from kcgs.codec.exact import Integers
+from kcgs.codec.file import unpack
+from kcgs.codec.gaussians.quantize import QPS
+from kcgs.fit import FitConfig, fit
+from kcgs.functional import psnr
+from kcgs.kernels import threads_for_kernels
+from kcgs.rate.budget import count_for
+from kcgs.rate.compress import compress, quality_for
+
+from .budget import SLOPE, Budget
+from .carrying import Carrying
+from .registration import register
+
+# steps of the quantization parameter by which a carried frame is coarser than its key frame, without a budget
+_COARSER = 64
+# dB below the key frame, or below so many dB if that is better, and share of its bytes, beyond which a frame is fitted
+# anew
+_LOST, _GOOD, _LARGE = 4.0, 40.0, 0.85
+# share of the last key frame's bytes that a budget must have for another one
+_AFFORDED = 0.6
+# how often a frame is made coarser for a budget; the last time only its motions are left
+_TRIES = 4
+
+
+class Report(NamedTuple):
+    """A frame that was fitted; see `FrameReport`."""
+
+    is_key: bool
+    psnr: float
+    num_bytes: int
+    num_gaussians: int
+    born: int
+    seconds: float
+
+
+class VideoEncoder:
+    """Fits frames one after another."""
+
+    def __init__(
+        self, config: FitConfig, num_gaussians: int | None, seed: int, key_interval: int, budget: Budget | None = None
+    ) -> None:
+        self._config = config.model_copy(update={"refine_flat": False})
+        self._wanted, self._seed, self._interval, self._budget = num_gaussians, seed, key_interval, budget
+        self._most, self._coarser = num_gaussians or 1, _COARSER
+        self._part: ClipPart | None = None
+        self._last: Tensor | None = None  # the frame before, as it was given
+        self._qp, self._key_bytes, self._key_psnr, self._since = 0, 0, 0.0, 0
+        self._positions: dict[int, int] = {}  # of given ids among those of the part
+        self._number = 0
+
+    def add(self, image: Tensor, labels: Tensor | None) -> tuple[Record, Report]:
+        """Fit the next frame, (C, H, W), with its map, or None: it is carried on."""
+        start = time.process_time()
+        with threads_for_kernels(image[0].numel()):
+            found = self._carry(image, labels)
+            record, value, born = self._begin(image, labels) if found is None else found
+        assert self._part is not None
+        self._go_on(image, record)
+        count = len(self._part.frame.region)
+        return record, Report(found is None, value, len(record.data), count, born, time.process_time() - start)
+
+    def skip(self, image: Tensor, labels: Tensor | None, record: Record) -> Record:
+        """Take a frame that was fitted before."""
+        if record.kind == KEY:
+            self._plan_key(image)
+            self._start(record.data, image, labels)
+        else:
+            header = ClipHeader((image.shape[1], image.shape[2]), len(image), None)  # type: ignore[arg-type]
+            reader = FrameReader(header)
+            reader.part = self._part
+            reader.read(record)
+        self._go_on(image, record)
+        return record
+
+    def _go_on(self, image: Tensor, record: Record) -> None:
+        if self._budget is not None:
+            self._budget.spend(record)
+            if record.kind != KEY:
+                self._coarser -= self._budget.step(len(record.data))
+        self._last, self._number, self._since = image, self._number + 1, self._since + 1
+
+    def _begin(self, image: Tensor, labels: Tensor | None) -> tuple[Record, float, int]:
+        """Fit a key frame."""
+        if labels is None and self._part is not None and (regions := self._part.regions(self._part.frame.index)):
+            labels = regions.labels
+        goal = self._plan_key(image)
+        result = fit(image, labels, self._most, recipe=self._config, seed=self._seed)
+        if not goal:
+            goal["quality"] = quality_for(max(entry.psnr for entry in result.history))
+        data = compress(result.scene, image, seed=self._seed, objective=self._config.objective, **goal).data
+        self._start(data, image, labels)
+        assert self._part is not None
+        return key_record(data), self._key_psnr, len(self._part.frame.region)
+
+    def _plan_key(self, image: Tensor) -> dict[str, Any]:
+        """Choose how many Gaussians the next part has, and return the bytes of its key frame, if there is a budget."""
+        if self._budget is None:
+            return {}
+        num_bytes = self._budget.for_key(self._interval)
+        self._most = self._wanted or count_for(num_bytes, image[0].numel(), self._config.objective)
+        return {"target_bytes": num_bytes}
+
+    def _start(self, data: bytes, image: Tensor, labels: Tensor | None) -> None:
+        """Begin a part with a still file."""
+        scene = decode(data).scene
+        self._part = ClipPart(scene, 0 if self._part is None else self._part.next_key)
+        self._qp, self._key_bytes, self._since = unpack(data)[0].qp, len(data), 0
+        self._key_psnr = float(psnr(scene.render(), image))
+        self._positions = {}
+        if labels is not None and self._part.frame.index is not None:
+            index = torch.from_numpy(self._part.frame.index)
+            for region in torch.unique(labels).tolist():  # the fit may have merged some
+                self._positions[region] = int(torch.mode(index[labels == region]).values)
+
+    def _carry(self, image: Tensor, labels: Tensor | None) -> tuple[Record, float, int] | None:
+        """Carry the last frame on; None where a key frame is better."""
+        part, last = self._part, self._last
+        if part is None or last is None or self._since >= self._interval:
+            return None
+        given = self._given(labels)
+        if labels is not None and part.frame.index is not None and given is None:
+            return None  # a region that the key frame does not know
+        numbers = self._motions(part, last, image)
+        record, born, part = self._write(part, numbers, image, given)
+        value = float(psnr(part.scene().render(), image))
+        if (
+            value < min(self._key_psnr, _GOOD) - _LOST or len(record.data) > _LARGE * self._key_bytes
+        ) and self._affords_key():
+            return None
+        self._part = part
+        return record, value, born
+
+    def _affords_key(self) -> bool:
+        least = _AFFORDED * self._key_bytes
+        return self._budget is None or self._budget.for_key(self._interval) >= least
+
+    def _write(self, part: ClipPart, numbers: Integers, image: Tensor, given: Any) -> tuple[Record, int, ClipPart]:
+        """Write a carried frame, as the budget allows; return how many Gaussians are new, and the part, gone on."""
+        most = math.inf if self._budget is None else self._budget.most()
+        coarser = self._coarser
+        for attempt in range(_TRIES):
+            ahead = copy.deepcopy(part)
+            qp = min(max(self._qp - coarser, QPS[0]), QPS[1])
+            carrying = Carrying(part, numbers, image, given, self._config, qp)
+            stands = attempt == _TRIES - 1
+            change = carrying.stand() if stands else carrying.fit(self._most, self._seed + self._number)
+            record = carried_record(ahead, qp, numbers, change)
+            if len(record.data) <= most:
+                return record, len(change.born_region), ahead
+            coarser += 4 + round(math.log(len(record.data) / max(most, 1)) / SLOPE)
+        raise ValueError(f"target_bytes must leave {len(record.data)} bytes for frame {self._number}; it leaves {most}")
+
+    def _given(self, labels: Tensor | None) -> Any:
+        """Return a given map as positions of the part's regions; None where there is none, or they do not know it."""
+        if labels is None or not self._positions:
+            return None
+        ids, inverse = torch.unique(labels, return_inverse=True)
+        positions = [self._positions.get(region, -1) for region in ids.tolist()]
+        if min(positions) < 0:
+            return None
+        return torch.tensor(positions, dtype=torch.int32)[inverse].numpy()
+
+    @staticmethod
+    def _motions(part: ClipPart, last: Tensor, image: Tensor) -> Integers:
+        """Find the motion of each region, as numbers of a file."""
+        index, size = part.frame.index, part.size
+        numbers = part.motions.last.copy()
+        present = [0] if index is None else np.unique(index).tolist()
+        for region in present:
+            mask = torch.ones(size, dtype=torch.bool) if index is None else torch.from_numpy(index == region)
+            motion = torch.eye(3, dtype=torch.float64)
+            motion[:2] = register(last, image, mask)
+            if abs(float(torch.linalg.det(motion[:2, :2])) - 1.0) > 0.5:
+                motion = torch.eye(3, dtype=torch.float64)
+            numbers[region] = quantize_motion(torch.linalg.inv(motion)[:2].numpy(), size)
+        return numbers

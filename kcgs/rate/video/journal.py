@@ -1,0 +1,65 @@
+"""The frames of a clip that is being fitted, on disk, so that a stopped fit can go on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from kcgs._atomic import check_writable
+from kcgs.codec.clips.file import ClipHeader, Record, pack_header, pack_record, unpack
+
+
+class Journal:
+    """A file that frames are added to: a line that says of which fit, then a clip without its end.
+
+    Args:
+        path: the file.
+        asked: arguments of the fit, which JSON can write.
+        resume: go on from what is there.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], asked: dict[str, Any], *, resume: bool) -> None:
+        check_writable("checkpoint", path)
+        self._path, self._asked = Path(path), asked
+        self._kept: tuple[ClipHeader, list[Record]] | None = None
+        self._started = False
+        if resume and self._path.exists():
+            self._read()
+
+    def done(self, header: ClipHeader, number: int) -> Record | None:
+        """Return a frame that was fitted before; the first that was not ends what is there."""
+        if self._kept is None or number >= len(self._kept[1]):
+            return None
+        if self._kept[0] != header:
+            raise ValueError(f"checkpoint {str(self._path)!r} is of another video: {self._kept[0]}, not {header}")
+        return self._kept[1][number]
+
+    def write(self, header: ClipHeader, record: Record, number: int) -> None:
+        """Add a frame."""
+        if not self._started:
+            whole = [] if self._kept is None else self._kept[1]
+            content = self._line() + pack_header(header)
+            content += b"".join(pack_record(one, place) for place, one in enumerate(whole))
+            self._path.write_bytes(content)
+            self._started = True
+        with self._path.open("ab") as file:
+            file.write(pack_record(record, number))
+            file.flush()
+            os.fsync(file.fileno())
+
+    def _line(self) -> bytes:
+        digest = hashlib.sha256(json.dumps(self._asked, sort_keys=True, default=str).encode()).hexdigest()
+        return f"kcgs.video {digest}\n".encode()
+
+    def _read(self) -> None:
+        data = self._path.read_bytes()
+        line = self._line()
+        if not data.startswith(b"kcgs.video "):
+            raise ValueError(f"checkpoint {str(self._path)!r} is no checkpoint of a video")
+        if not data.startswith(line):
+            raise ValueError(f"checkpoint {str(self._path)!r} is of a fit with other arguments")
+        header, records, _ = unpack(data[len(line) :])
+        self._kept = header, records

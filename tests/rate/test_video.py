@@ -1,0 +1,173 @@
+"""Videos become clips: what moves is followed, and every promise of `fit_video` holds on small frames."""
+
+from __future__ import annotations
+
+import warnings
+from fractions import Fraction
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs import Clip, fit_video
+from kcgs.functional import psnr
+from kcgs.rate.video.registration import register
+
+SIZE = (48, 64)
+SETTINGS = {"num_gaussians": 60, "iterations": 40}
+
+
+def moving_disc(number: int) -> tuple[Tensor, Tensor]:
+    """Return a frame with a bright disc that moves over waves, and its label map."""
+    y, x = torch.meshgrid(torch.arange(SIZE[0]) + 0.5, torch.arange(SIZE[1]) + 0.5, indexing="ij")
+    ground = 0.4 + 0.2 * torch.sin((x + number) / 5) * torch.cos(y / 7)
+    inside = (x - 20 - 3 * number) ** 2 + (y - 24 + number) ** 2 < 100
+    image = torch.where(inside, torch.stack([0.9 - y / 200, 0.5 + x / 400, 0.2 + 0 * x]), ground.expand(3, -1, -1))
+    return image, inside.long() * 7
+
+
+FRAMES, MAPS = zip(*(moving_disc(number) for number in range(5)), strict=True)
+
+
+@pytest.fixture(scope="module")
+def clip() -> Clip:
+    return fit_video(FRAMES, MAPS, **SETTINGS)
+
+
+def test_frames_are_carried_on_and_shown_well(clip: Clip) -> None:
+    assert len(clip) == 5 and clip.key_frames == (0,)
+    shown = [float(psnr(scene.render(), frame)) for scene, frame in zip(clip, FRAMES, strict=True)]
+    assert min(shown) > 40
+    assert max(clip.frame_bytes[1:]) < 0.7 * clip.frame_bytes[0]
+    for scene, labels in zip(clip, MAPS, strict=True):
+        assert scene.regions is not None
+        assert (scene.regions.labels != labels).float().mean() < 0.04
+
+
+def test_the_same_frames_give_the_same_clip(clip: Clip) -> None:
+    assert fit_video(iter(FRAMES), iter(MAPS), **SETTINGS).to_bytes() == clip.to_bytes()
+
+
+def test_a_map_of_the_first_frame_is_carried_on() -> None:
+    clip = fit_video(FRAMES, MAPS[0], **SETTINGS)
+    regions = clip[4].regions
+    assert regions is not None
+    union = (regions.labels == 7) | (MAPS[4] == 7)
+    both = (regions.labels == 7) & (MAPS[4] == 7)
+    assert both.sum() / union.sum() > 0.8
+
+
+def test_without_maps_there_are_no_regions() -> None:
+    assert fit_video(FRAMES[:2], **SETTINGS)[1].regions is None
+
+
+def test_a_scene_cut_begins_a_key_frame() -> None:
+    noise = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0))
+    other = torch.nn.functional.avg_pool2d(noise[None], 7, 1, 3)[0]
+    clip = fit_video([*FRAMES[:2], other], [*MAPS[:2], MAPS[0]], **SETTINGS)
+    assert clip.key_frames == (0, 2)
+
+
+def test_key_frames_come_as_often_as_is_asked() -> None:
+    assert fit_video(FRAMES, MAPS, key_interval=2, **SETTINGS).key_frames == (0, 2, 4)
+
+
+def test_a_region_may_be_new_or_leave() -> None:
+    third = MAPS[1].clone()
+    third[40:, 50:] = 3
+    assert fit_video(FRAMES[:2], [MAPS[0], third], **SETTINGS).key_frames == (0, 1)
+    empty = torch.where(MAPS[1] == 7, 0.4, FRAMES[1])
+    gone = fit_video([FRAMES[0], empty], [MAPS[0], torch.zeros_like(MAPS[0])], **SETTINGS)
+    assert gone[1].regions is None or gone[1].regions.num_regions == 1
+
+
+def test_a_clip_keeps_to_its_bytes() -> None:
+    for asked in (1500, 4000):
+        clip = fit_video(FRAMES, MAPS, target_bytes=asked, iterations=40)
+        assert 0.75 * asked < clip.num_bytes <= asked
+    rated = fit_video(FRAMES, MAPS, kbps=30, frame_rate=10, iterations=40)
+    assert rated.num_bytes <= 30 * 125 * 5 / 10
+    with pytest.raises(ValueError, match="target_bytes"):
+        fit_video(FRAMES, target_bytes=90, iterations=30)
+    with pytest.raises(ValueError, match="length"):
+        fit_video(iter(FRAMES), target_bytes=900)
+
+
+def test_a_stopped_fit_goes_on_to_the_same_clip(clip: Clip, tmp_path) -> None:
+    path = tmp_path / "video.checkpoint"
+    part = fit_video(FRAMES, MAPS, checkpoint=path, on_frame=lambda report: report.number == 2, **SETTINGS)
+    assert len(part) == 3
+    path.write_bytes(path.read_bytes()[:-5])  # killed while it was writing
+    fitted = []
+    whole = fit_video(
+        FRAMES, MAPS, checkpoint=path, resume=True, on_frame=lambda r: fitted.append(r.number), **SETTINGS
+    )
+    assert fitted == [2, 3, 4] and whole.to_bytes() == clip.to_bytes()
+    with pytest.raises(ValueError, match="other arguments"):
+        fit_video(FRAMES, MAPS, checkpoint=path, resume=True, num_gaussians=50, iterations=40)
+    with pytest.raises(ValueError, match="another video"):
+        fit_video([frame[:, :40] for frame in FRAMES], checkpoint=path, resume=True, **SETTINGS)
+
+
+def test_a_resumed_budget_is_that_of_the_whole(tmp_path) -> None:
+    path, asked = tmp_path / "video.checkpoint", {"target_bytes": 2000, "iterations": 40}
+    whole = fit_video(FRAMES, MAPS, **asked)
+    fit_video(FRAMES, MAPS, checkpoint=path, on_frame=lambda report: report.number == 1, **asked)
+    assert fit_video(FRAMES, MAPS, checkpoint=path, resume=True, **asked).to_bytes() == whole.to_bytes()
+
+
+@pytest.mark.parametrize("objective", ["visual", "psnr"])
+def test_grey_frames_and_other_objectives(objective: str) -> None:
+    clip = fit_video([frame[:1] for frame in FRAMES[:2]], MAPS[:2], objective=objective, **SETTINGS)
+    assert clip[1].render().shape == (1, *SIZE)
+
+
+@pytest.mark.parametrize(
+    ("frames", "settings", "message"),
+    [
+        ([], {}, "at least one frame"),
+        ([FRAMES[0], FRAMES[1][:, :30]], {}, "frames must have one size"),
+        ([FRAMES[0], FRAMES[1] * 2], {}, "frame 1: image"),
+        (FRAMES, {"label_maps": MAPS[:2]}, "label_maps"),
+        (FRAMES[:1], {"num_gaussians": 0}, "num_gaussians"),
+        (FRAMES[:1], {"key_interval": 0}, "key_interval"),
+        (FRAMES[:1], {"frame_rate": 0}, "frame_rate"),
+        (FRAMES[:1], {"target_bytes": 900, "kbps": 3}, "exclude"),
+        (FRAMES[:1], {"max_seconds": 3}, "max_seconds"),
+        (FRAMES[:1], {"resume": True}, "checkpoint"),
+        (FRAMES[:1], {"speed": 3}, "unknown setting"),
+    ],
+)
+def test_bad_arguments_are_named(frames, settings, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        fit_video(frames, **{"num_gaussians": 20, "iterations": 5, **settings})
+
+
+def test_frame_rates_are_kept_as_fractions() -> None:
+    clip = fit_video(FRAMES[:1], num_gaussians=20, iterations=5, frame_rate=Fraction(30000, 1001))
+    assert Clip.from_bytes(clip.to_bytes()).frame_rate == Fraction(30000, 1001)
+
+
+def test_the_motion_of_a_region_is_found() -> None:
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.nn.functional.avg_pool2d(torch.rand(1, 3, 140, 180, generator=generator), 9, 1, 4)
+    y, x = torch.meshgrid(torch.arange(96) + 0.5, torch.arange(128) + 0.5, indexing="ij")
+
+    def view(a: float, shift: tuple[float, float]) -> Tensor:
+        u, v = a * x + 20 + shift[0], a * y + 20 + shift[1]
+        grid = torch.stack([2 * u / 180 - 1, 2 * v / 140 - 1], -1)[None]
+        return torch.nn.functional.grid_sample(noise, grid, align_corners=False)[0]
+
+    source, target = view(1.0, (0, 0)), view(1.02, (5.0, -3.0))
+    mask = torch.ones(96, 128, dtype=torch.bool)
+    found = register(source, target, mask)
+    # the point that was at p is where 1.02 q + shift = p
+    expected = torch.tensor([[1 / 1.02, 0, -5 / 1.02], [0, 1 / 1.02, 3 / 1.02]]).double()
+    assert (found - expected).abs()[:, :2].max() < 2e-3 and (found - expected).abs()[:, 2].max() < 0.15
+    assert torch.equal(register(source, target, torch.zeros_like(mask)), torch.eye(3).double()[:2])
+
+
+def test_inference_mode_and_warnings_do_no_harm() -> None:
+    with torch.inference_mode(), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(fit_video(FRAMES[:2], MAPS[:2], **SETTINGS)) == 2
