@@ -80,6 +80,7 @@ def _options(
 OUTPUT_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 # the files of a folder that are images; a file that is named is tried whatever it is called
 IMAGES = (*OUTPUT_IMAGES, ".gif")
+VIDEOS = (".mp4", ".mkv", ".mov", ".webm")
 
 
 # what label maps are read from

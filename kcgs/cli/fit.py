@@ -15,7 +15,7 @@ from kcgs._atomic import check_writable, write_file
 from kcgs._progress import Progress
 
 from . import options
-from .common import ImageFile, Json, Quiet, Stop, app, check_output, interrupted, print_report
+from .common import VIDEOS, ImageFile, Json, Quiet, Stop, app, check_output, interrupted, print_report
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -54,6 +54,8 @@ def fit_command(
     """Fit Gaussians to an image and save the scene."""
     from kcgs.data import load_image
 
+    if image.suffix.lower() in VIDEOS:
+        raise typer.BadParameter(f"IMAGE must be an image; got {str(image)!r}: kcgs fit-video fits videos")
     suffixes = (".safetensors", ".kcgs") if request.target_bytes is None else (".kcgs",)
     output = Path(f"{image.stem}{suffixes[0]}") if output is None else output
     check_output(output, *suffixes)

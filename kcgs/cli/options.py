@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from fractions import Fraction
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
@@ -87,9 +88,11 @@ def fit_request(
     return FitRequest(num_gaussians, target_bytes, recipe, config, seed, Clock(max_seconds, process_began()))
 
 
-def with_fit_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of `fit_request` in place of its argument `request`."""
-    shared = inspect.signature(fit_request, eval_str=True).parameters
+def with_fit_options(command: Callable[..., None], *, without: tuple[str, ...] = ()) -> Callable[..., None]:
+    """Give a command the options of `fit_request`, but for some, in place of its argument `request`."""
+    shared = dict(inspect.signature(fit_request, eval_str=True).parameters)
+    for name in without:
+        del shared[name]
     parameters: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
         parameters.extend(shared.values() if name == "request" else [parameter])
@@ -108,6 +111,17 @@ def exclude(option: str, **others: object) -> None:
     for name, given in others.items():
         if given is not None:
             raise typer.BadParameter(f"{option} excludes --{name.replace('_', '-')}")
+
+
+def frame_rate(text: str) -> Fraction:
+    """Return the frames per second that an option says: 24, 29.97 or 30000/1001."""
+    try:
+        rate = Fraction(text)
+    except (ValueError, ZeroDivisionError):
+        rate = Fraction(0)
+    if not 0 < rate <= 1000:
+        raise typer.BadParameter(f"it must be frames per second, such as 24 or 30000/1001, at most 1000; got {text!r}")
+    return rate
 
 
 def target_size(scene: Scene, scale: float | None, wanted: str | None) -> tuple[int, int]:

@@ -1,10 +1,11 @@
-"""Move, recolour, delete and extract regions, and put other scenes behind them: a new scene each."""
+"""Move, recolour, delete and extract regions, and put other scenes behind them: a new scene each, or a new clip."""
 
 from __future__ import annotations
 
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -28,6 +29,7 @@ from .checks import (
     color_tensor,
     ids_of,
 )
+from .clips import takes_clips
 
 # standard deviation of a Gaussian that is flat over the image, in its longer sides: 1 to 3 in 10^7
 _FLAT = 1e3
@@ -35,6 +37,7 @@ _FLAT = 1e3
 _CONTOUR_SIGMAS = 4.0
 
 
+@takes_clips
 def move_region(
     scene: Scene, region_ids: int | Iterable[int], offset: Sequence[float], *, fill: Fill | None = "inpaint"
 ) -> Scene:
@@ -47,7 +50,8 @@ def move_region(
     width of those it had.
 
     Args:
-        scene: unbatched, with a map of its own size, not a resized one.
+        scene: unbatched, with a map of its own size, not a resized one; or a :class:`kcgs.Clip`, of which every frame
+            that has any of the regions is edited, by itself: a fill may flicker.
         region_ids: an id in the map, or several, which move together.
         offset: (dx, dy) in pixels, whole; with ``supersample`` k, whole multiples of 1/k.
         fill: "inpaint": what is uncovered continues its surroundings, colours and texture, by Gaussians that are fitted
@@ -56,7 +60,7 @@ def move_region(
             streaks, or black.
 
     Returns:
-        A new scene, without a graph.
+        A new scene, without a graph; of a clip a new clip.
 
     Raises:
         TypeError: wrong types.
@@ -88,7 +92,7 @@ def move_region(
 
     lost = regions.ids[~torch.isin(regions.ids, labels)].tolist()
     if lost:
-        warnings.warn(f"regions {', '.join(map(str, lost))} are lost: covered, or out of the image", stacklevel=2)
+        warnings.warn(f"regions {', '.join(map(str, lost))} are lost: covered, or out of the image", stacklevel=3)
 
     field = scene.field
     if fill is not None:
@@ -100,6 +104,7 @@ def move_region(
     return Scene(moved, regions.relabel(labels, _new_widths(regions, chosen.tolist())), scene.metadata)
 
 
+@partial(takes_clips, by_gaussians=True)
 def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers, bias: Numbers | None = None) -> Scene:
     r"""Change the colours of regions, c' = gain c + bias, exactly so in the image.
 
@@ -107,13 +112,13 @@ def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers,
     it is one more Gaussian per region, flat over the whole image.
 
     Args:
-        scene: unbatched, with region ids.
+        scene: unbatched, with region ids; or a clip, see :func:`move_region`.
         region_ids: an id that some of its Gaussians have, or several.
         gain: a number, one for each channel :math:`(C)`, or a matrix :math:`(C, C)`: tensors, arrays or lists.
         bias: a number, or one for each channel :math:`(C)`; None: none, and no Gaussian more.
 
     Returns:
-        A new scene, without a graph.
+        A new scene, without a graph; of a clip a new clip.
 
     Raises:
         TypeError, ValueError: a batch, an id that no Gaussian has, wrong types or shapes, values that are not finite.
@@ -141,6 +146,7 @@ def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers,
     return Scene(result, scene.regions, scene.metadata)
 
 
+@takes_clips
 def delete_region(scene: Scene, region_ids: int | Iterable[int], *, fill: Fill | None = "inpaint") -> Scene:
     """Delete regions: their Gaussians go, their pixels fall to their neighbours. Arguments: see :func:`move_region`.
 
@@ -179,6 +185,7 @@ def extract_region(scene: Scene, region_ids: int | Iterable[int]) -> Scene:
     return Scene(scene.field.subset(torch.isin(ids_of(scene.field), chosen)), regions, scene.metadata)
 
 
+@takes_clips
 def replace_background(scene: Scene, region_ids: int | Iterable[int], background: Scene) -> Scene:
     """Put another scene in place of some regions, stretched to the size of this one.
 
@@ -186,12 +193,12 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
     regions of the scene have widths, contours that are new take their mean.
 
     Args:
-        scene: unbatched, with a map of its own size, not a resized one.
+        scene: unbatched, with a map of its own size, not a resized one; or a clip, see :func:`move_region`.
         region_ids: the regions that make the background now: an id in the map, or several.
         background: unbatched, with as many channels.
 
     Returns:
-        A new scene, without a graph.
+        A new scene, without a graph; of a clip a new clip.
 
     Raises:
         TypeError, ValueError: as :func:`extract_region`; another number of channels.

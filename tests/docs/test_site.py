@@ -68,7 +68,8 @@ def test_every_page_has_commands_recipes_and_figures(site: Path, generate: Modul
     from kcgs.fit import FitConfig, available_recipes
 
     commands, recipes = ((site / f"{name}.html").read_text(encoding="utf-8") for name in ("command-line", "recipes"))
-    for name in ("fit", "render", "eval", "segment", "info", "encode", "decode", "export", "view", "bench", "fit-many"):
+    shown = "fit", "render", "eval", "segment", "info", "encode", "decode", "export", "view", "bench"
+    for name in (*shown, "fit-many", "fit-video"):
         assert f'id="kcgs-{name}"' in commands
     for name in (*FitConfig.model_fields, *available_recipes()):
         assert name in recipes
