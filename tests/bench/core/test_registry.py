@@ -16,7 +16,7 @@ NAMES = ("ablation", "charts", "convergence", "davis", "decode", "enlarge", "fil
 
 
 def test_names() -> None:
-    assert {*NAMES, "demo", "zoo"} == set(kcgs.bench.available_experiments())
+    assert {*NAMES, "demo", "video", "zoo"} == set(kcgs.bench.available_experiments())
     with pytest.raises(ValueError, match="name must be one of .*; got 'core'"):
         kcgs.bench.run("core", Path())
 
