@@ -21,7 +21,7 @@ from kcgs.data import load_image, read_video, save_image, save_labels, write_vid
 from kcgs.functional import psnr
 
 Run = Callable[..., tuple[int, str, str]]
-FIT = ("fit-video", "frames", "-n", "30", "--iterations", "20")
+FIT = ("fit-video", "frames", "-n", "30", "--iterations", "20", "-q")
 FRAMES = 4
 
 
@@ -85,7 +85,7 @@ class TestFitVideo:
     def test_a_file_is_the_clip_of_its_frames(self, run: Run) -> None:
         pytest.importorskip("av")
         write_video("video.mp4", make_frames()[:2], 25)
-        assert run("fit-video", "video.mp4", *FIT[2:], "--regions", "none", "-q", "-o", "a.kcgs", "--seed", "3")[0] == 0
+        assert run("fit-video", "video.mp4", *FIT[2:], "--regions", "none", "-o", "a.kcgs", "--seed", "3")[0] == 0
         video = read_video("video.mp4")
         same = kcgs.fit_video(video, None, 30, frame_rate=25, iterations=20, seed=3)
         assert Path("a.kcgs").read_bytes() == same.to_bytes()
@@ -117,7 +117,7 @@ class TestFitVideo:
             monkeypatch.setattr(
                 "kcgs.data._frames.ImageFolder.num_frames", property(lambda _: None, lambda *_: None), raising=False
             )
-        arguments = ("fit-video", "frames", "--iterations", "20", "--regions", "none", "--json")
+        arguments = ("fit-video", "frames", "--iterations", "20", "--regions", "none", "--json", "-q")
         code, out, err = run(*arguments, "--target-bytes", "700")
         assert (code, err) == (0, "")
         report = json.loads(out)
