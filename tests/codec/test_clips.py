@@ -261,3 +261,22 @@ def test_editing_nothing_changes_next_to_nothing_and_edits_hold() -> None:
         assert float((mine.render() - theirs.render()).abs().mean()) < 0.02
     with pytest.raises(TypeError, match="frame 0"):
         clip.edit(lambda scene: scene.render())
+
+
+class LowWriter(Writer):
+    """Names an energy for new Gaussians that none has."""
+
+    def number(self, value: int, size: int) -> int:
+        super().number(5 if size == 128 else value, size)
+        return value
+
+
+def test_new_gaussians_of_an_energy_that_none_has_are_refused() -> None:
+    header, records, _ = unpack(clip_of(1, mapped=False).to_bytes())
+    reader, other = FrameReader(header), FrameReader(header)
+    reader.read(records[0])
+    other.read(records[0])
+    numbers, writer = np.zeros((1, 6), np.int64), LowWriter()
+    reader.part.code(writer, QP, numbers, change_of(reader.part, 1, numbers))
+    with pytest.raises(CodecError, match="a class of energy must be -24 to 40; got -59"):
+        other.part.code(Reader(writer.finish()), QP, None, None)

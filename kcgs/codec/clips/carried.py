@@ -14,7 +14,7 @@ from kcgs.codec.adaptive import AdaptiveNumber, AdaptiveSymbols
 from kcgs.codec.exact import Integers
 from kcgs.codec.file import most_gaussians
 from kcgs.codec.gaussians.layers import LayerCoder
-from kcgs.codec.gaussians.quantize import Classes, Codes, Parameters, Quantizer
+from kcgs.codec.gaussians.quantize import ENERGIES, Classes, Codes, Parameters, Quantizer
 from kcgs.codec.rangecoder import CodecError, Coder
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
@@ -163,6 +163,8 @@ class ClipPart:
             groups = _grouped(change.born, positions)
             energy = int(groups[0][0].energy[0])
         energy = coder.number(energy + 64, 128) - 64
+        if not ENERGIES[0] <= energy <= ENERGIES[1]:
+            raise CodecError(f"a class of energy must be {ENERGIES[0]} to {ENERGIES[1]}; got {energy}")
         parts = model.code(coder, energy, groups, count)
         born = Parameters(*(np.concatenate(numbers) for numbers in zip(*(part[0] for part in parts), strict=True)))
         region = here[np.concatenate([part[1] for part in parts])]
