@@ -166,6 +166,6 @@ class AdaptiveSymbols:
             return np.zeros(0, np.int64)
         found = coder.choose(self._weights, context, values)
         np.add.at(self._weights, (context, found), 1.0)
-        full = self._weights.sum(1) > self._memory
+        full = np.cumsum(self._weights, 1)[:, -1] > self._memory  # from left to right, as `sum` does not add
         self._weights[full] *= 0.5
         return found
