@@ -280,3 +280,13 @@ def test_new_gaussians_of_an_energy_that_none_has_are_refused() -> None:
     reader.part.code(writer, QP, numbers, change_of(reader.part, 1, numbers))
     with pytest.raises(CodecError, match="a class of energy must be -24 to 40; got -59"):
         other.part.code(Reader(writer.finish()), QP, None, None)
+
+
+def test_an_edit_that_takes_the_map_away_begins_a_key_frame() -> None:
+    clip, seen = clip_of(3), []
+
+    def edit(scene: Scene) -> Scene:
+        seen.append(scene)
+        return scene if len(seen) < 3 else Scene(GaussianField.random(20, SIZE, seed=0))
+
+    assert clip.edit(edit).key_frames == (0, 2)

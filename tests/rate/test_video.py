@@ -9,8 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs import Clip, fit_video
+from kcgs import Clip, FitConfig, fit_video
+from kcgs.codec.clips.file import ClipHeader
+from kcgs.codec.clips.frames import FrameReader
 from kcgs.functional import psnr
+from kcgs.rate.video.budget import Budget
+from kcgs.rate.video.encoder import VideoEncoder
 from kcgs.rate.video.registration import register
 
 SIZE = (48, 64)
@@ -172,3 +176,14 @@ def test_inference_mode_and_warnings_do_no_harm() -> None:
     with torch.inference_mode(), warnings.catch_warnings():
         warnings.simplefilter("error")
         assert len(fit_video(FRAMES[:2], MAPS[:2], **SETTINGS)) == 2
+
+
+def test_a_frame_that_can_only_stand_is_read_though_its_map_lost_a_region() -> None:
+    scenes = VideoEncoder(FitConfig(iterations=20), 60, 0, 9)
+    record, _ = scenes.add(*moving_disc(0))
+    reader = FrameReader(ClipHeader(SIZE, 3, Fraction(24)))
+    reader.read(record)
+    scenes._budget = Budget(200, 2, reader.header)
+    record, report = scenes.add(FRAMES[1], torch.zeros_like(MAPS[1]))
+    assert not report.is_key and len(record.data) < 100
+    assert reader.read(record).index.max() == 1

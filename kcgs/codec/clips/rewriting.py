@@ -55,10 +55,7 @@ class ClipWriter:
         """Write the next frame; a key frame where that is asked for, or the last one does not know its regions."""
         scene = check_scene(scene)
         part = self._part
-        ids = np.zeros(1, np.int64) if scene.regions is None else scene.regions.ids.numpy()
-        mapped = scene.regions is not None and scene.regions.num_regions > 1
-        known = part is not None and mapped == (part.frame.index is not None) and bool(np.isin(ids, part.ids).all())
-        if part is None or asked.numbers is None or (mapped and not known):
+        if part is None or asked.numbers is None or not _knows(part, scene):
             data = SceneWriter(scene).write_rounded(asked.qp)
             reader = FrameReader(ClipHeader(scene.size, scene.field.colors.shape[-1], None))  # type: ignore[arg-type]
             reader.part = part
@@ -70,6 +67,14 @@ class ClipWriter:
         if len(both):
             numbers[mine] = asked.numbers[theirs]
         return carried_record(part, asked.qp, numbers, _change(part, numbers, scene, asked.qp))
+
+
+def _knows(part: ClipPart, scene: Scene) -> bool:
+    """Say whether a scene's regions are those of a part, or fewer."""
+    regions = scene.regions
+    if part.frame.index is None:
+        return regions is None or regions.num_regions == 1
+    return regions is not None and bool(np.isin(regions.ids.numpy(), part.ids).all())
 
 
 def _change(part: ClipPart, numbers: Integers, scene: Scene, qp: int) -> Change:

@@ -96,7 +96,7 @@ class Carrying:
         still = np.zeros((len(self._region), 5 + self.part.channels), np.int64)
         none = Parameters(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, self.part.channels)))
         left = np.zeros(0, np.int64)
-        return Change(self._predicted, self._gone, still, born_codes(none, self.qp, self.part.size), left)
+        return Change(self.index, self._gone, still, born_codes(none, self.qp, self.part.size), left)
 
     def _follow(self, base: Parameters, region: Integers, born: int) -> Following:
         ids = None if self.index is None else torch.from_numpy(self.part.ids[region])

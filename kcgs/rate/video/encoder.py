@@ -159,8 +159,8 @@ class VideoEncoder:
         for attempt in range(_TRIES):
             ahead = copy.deepcopy(part)
             qp = min(max(self._qp - coarser, QPS[0]), QPS[1])
-            carrying = Carrying(part, numbers, image, given, self._config, qp)
-            stands = attempt == _TRIES - 1
+            stands = attempt == _TRIES - 1  # as predicted, its map too
+            carrying = Carrying(part, numbers, image, None if stands else given, self._config, qp)
             change = carrying.stand() if stands else carrying.fit(self._most, self._seed + self._number)
             record = carried_record(ahead, qp, numbers, change)
             if len(record.data) <= most:

@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from kcgs._atomic import check_writable
+from kcgs._atomic import check_writable, write_file
 from kcgs.codec.clips.file import ClipHeader, Record, pack_header, pack_record, unpack
 
 
@@ -43,7 +43,7 @@ class Journal:
             whole = [] if self._kept is None else self._kept[1]
             content = self._line() + pack_header(header)
             content += b"".join(pack_record(one, place) for place, one in enumerate(whole))
-            self._path.write_bytes(content)
+            write_file(self._path, content)
             self._started = True
         with self._path.open("ab") as file:
             file.write(pack_record(record, number))
