@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -46,7 +47,8 @@ class Clip(Sequence[Scene]):
         self._reader, self._next = FrameReader(header), 0
         # the last two frames that were read, by number: times between them need both
         self._recent: dict[int, tuple[ClipPart, Frame]] = {}
-        if not self._records or self._records[0].kind != KEY:
+        self._keys = tuple(number for number, record in enumerate(self._records) if record.kind == KEY)
+        if not self._keys or self._keys[0]:
             raise ValueError("records must begin with a key frame")
 
     @property
@@ -62,7 +64,7 @@ class Clip(Sequence[Scene]):
     @property
     def key_frames(self) -> tuple[int, ...]:
         """Numbers of the frames that need no other."""
-        return tuple(number for number, record in enumerate(self._records) if record.kind == KEY)
+        return self._keys
 
     @property
     def frame_bytes(self) -> tuple[int, ...]:
@@ -86,10 +88,6 @@ class Clip(Sequence[Scene]):
             raise IndexError(f"a frame of this clip must be {-len(self)} to {len(self) - 1}; got {number}")
         part, frame = self._frame(number % len(self))
         return part.scene(frame)
-
-    def __iter__(self) -> Iterator[Scene]:
-        """Yield the frames."""
-        return (self[number] for number in range(len(self)))
 
     def at(self, time: float) -> Scene:
         """Return the scene at a time between frames: 0.5 is halfway between the first two.
@@ -158,15 +156,15 @@ class Clip(Sequence[Scene]):
         """Return a frame, and the part of the clip that it is of."""
         if number in self._recent:
             return self._recent[number]
-        key = max(place for place in self.key_frames if place <= number)
+        key = self._keys[bisect_right(self._keys, number) - 1]
         if not key < self._next <= number + 1:  # what was read last is no way to this one
             self._next = key
+            self._recent.clear()
         while self._next <= number:
             frame = self._reader.read(self._records[self._next])
             assert self._reader.part is not None
-            self._recent = {place: kept for place, kept in self._recent.items() if place == self._next - 1} | {
-                self._next: (self._reader.part, frame)
-            }
+            self._recent.pop(self._next - 2, None)
+            self._recent[self._next] = self._reader.part, frame
             self._next += 1
         return self._recent[number]
 

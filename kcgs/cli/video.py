@@ -23,7 +23,7 @@ from .fit import compile_ahead, read_regions
 if TYPE_CHECKING:
     from kcgs.clip import Clip
     from kcgs.data import FrameReader
-    from kcgs.rate.video.fitting import FrameReport
+    from kcgs.rate.video.report import FrameReport
 
 # a clip has frames of one kind, so that goals of a still are none of its own
 _OF_STILLS = ("max_seconds", "target_psnr", "target_bytes")

@@ -26,6 +26,10 @@ SPARE = 64
 _HEADER_CRC, LAYER_CRC = 4, 2  # bytes
 
 
+class EndsEarly(CodecError):
+    """A file that ends before it should."""
+
+
 class Header(NamedTuple):
     """What a file says before its content."""
 
@@ -46,7 +50,7 @@ class ByteReader:
     def take(self, count: int) -> bytes:
         """Return the next bytes."""
         if count > len(self.data) - self.position:
-            raise CodecError(f"the file ends early: {len(self.data)} bytes are no image")
+            raise EndsEarly(f"the file ends early: {len(self.data)} bytes are no image")
         self.position += count
         return self.data[self.position - count : self.position]
 

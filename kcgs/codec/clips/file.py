@@ -6,7 +6,7 @@ import zlib
 from fractions import Fraction
 from typing import NamedTuple
 
-from kcgs.codec.file import CLIP_VERSION, MAGIC, MOST_CHANNELS, MOST_SIDE, ByteReader, varint
+from kcgs.codec.file import CLIP_VERSION, MAGIC, MOST_CHANNELS, MOST_SIDE, ByteReader, EndsEarly, varint
 from kcgs.codec.rangecoder import CodecError
 
 KEY, CARRIED, END = range(3)
@@ -93,10 +93,8 @@ def _read_record(stream: ByteReader, number: int) -> Record | None:
         length = stream.varint("length of a record", 0, _MOST_BYTES)
         head = stream.data[start : stream.position]
         content, checksum = stream.take(length), stream.take(_CRC)
-    except CodecError as error:
-        if len(stream.data) - start < 16 or "ends early" in str(error):
-            return None
-        raise
+    except EndsEarly:
+        return None
     if checksum != _checksum(head, content, number):
         raise CodecError(f"the file is damaged: the checksum of frame {number} is another; those before are sound")
     return Record(kind, content)

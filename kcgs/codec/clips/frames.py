@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from kcgs._check import check_count
 from kcgs.codec.exact import Integers
-from kcgs.codec.file import ByteReader, varint
+from kcgs.codec.file import ByteReader, unpack, varint
 from kcgs.codec.gaussians.quantize import QPS
 from kcgs.codec.rangecoder import CodecError, Reader, Writer
 from kcgs.codec.scenes import deserialize
+from kcgs.scene import Scene
 
 from .carried import Change, ClipPart, Frame
 from .file import CARRIED, KEY, ClipHeader, Record
@@ -46,7 +46,7 @@ class FrameReader:
                     f"a key frame must be {self.header.size}, {self.header.channels} channels; got {found}"
                 )
             try:
-                self.part = ClipPart(still, 0 if self.part is None else self.part.next_key)
+                self.part = begin_part(still, self.part)
             except CodecError:
                 raise
             except ValueError as error:
@@ -54,17 +54,28 @@ class FrameReader:
             return self.part.frame
         if self.part is None:
             raise CodecError("a carried frame must follow a key frame")
-        stream = ByteReader(record.data)
-        qp = stream.varint("quantization parameter", 0, QPS[1] - QPS[0]) + QPS[0]
-        try:
-            return self.part.code(Reader(record.data[stream.position :]), qp, None, None)
-        except CodecError:
-            raise
-        except (ValueError, OverflowError) as error:
-            raise CodecError(f"the frame cannot be read: {error}") from error
+        return read_carried(self.part, record)
 
 
-def check_frame_number(name: str, value: object, count: int) -> int:
-    """Return the number of a frame, from 0; negative ones count from the end."""
-    number = check_count(name, value, -count, count - 1)
-    return number % count
+def begin_part(still: Scene, last: ClipPart | None) -> ClipPart:
+    """Return what begins with a key frame's scene; the Gaussians of the part before have other numbers."""
+    return ClipPart(still, 0 if last is None else last.next_key)
+
+
+def read_qp(record: Record) -> tuple[int, int]:
+    """Return the quantization parameter of a frame, and where a carried one's stream begins."""
+    if record.kind == KEY:
+        return unpack(record.data)[0].qp, 0
+    stream = ByteReader(record.data)
+    return stream.varint("quantization parameter", 0, QPS[1] - QPS[0]) + QPS[0], stream.position
+
+
+def read_carried(part: ClipPart, record: Record) -> Frame:
+    """Read the next frame of a part, which goes on to it."""
+    qp, start = read_qp(record)
+    try:
+        return part.code(Reader(record.data[start:]), qp, None, None)
+    except CodecError:
+        raise
+    except (ValueError, OverflowError) as error:
+        raise CodecError(f"the frame cannot be read: {error}") from error

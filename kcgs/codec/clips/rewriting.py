@@ -8,15 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kcgs.codec.exact import Floats, Integers
-from kcgs.codec.file import ByteReader, unpack
-from kcgs.codec.gaussians.quantize import QPS, Parameters, Quantizer
-from kcgs.codec.scenes import SceneWriter
+from kcgs.codec.gaussians.quantize import Parameters, Quantizer
+from kcgs.codec.scenes import SceneWriter, deserialize
 from kcgs.scene import Scene, check_scene
 
 from .carried import Change, ClipPart, born_codes
 from .differences import Differences
 from .file import KEY, ClipHeader, Record
-from .frames import FrameReader, carried_record, key_record
+from .frames import FrameReader, begin_part, carried_record, read_qp
 
 # Gaussians are the same where centres, in these standard deviations, logarithms of sizes and colours, in these, agree
 _PIXELS, _LOGARITHMS, _COLORS, _FARTHEST = 4.0, 0.5, 0.25, 2.0
@@ -38,11 +37,8 @@ def asked_of(records: list[Record], header: ClipHeader) -> Iterable[tuple[Asked,
         frame = reader.read(record)
         part = reader.part
         assert part is not None
-        if record.kind == KEY:
-            yield Asked(unpack(record.data)[0].qp, None, part.ids), part.scene(frame)
-        else:
-            qp = ByteReader(record.data).varint("quantization parameter", 0, QPS[1] - QPS[0]) + QPS[0]
-            yield Asked(qp, frame.numbers, part.ids), part.scene(frame)
+        numbers = None if record.kind == KEY else frame.numbers
+        yield Asked(read_qp(record)[0], numbers, part.ids), part.scene(frame)
 
 
 class ClipWriter:
@@ -57,11 +53,8 @@ class ClipWriter:
         part = self._part
         if part is None or asked.numbers is None or not _knows(part, scene):
             data = SceneWriter(scene).write_rounded(asked.qp)
-            reader = FrameReader(ClipHeader(scene.size, scene.field.colors.shape[-1], None))  # type: ignore[arg-type]
-            reader.part = part
-            reader.read(key_record(data))
-            self._part = reader.part
-            return key_record(data)
+            self._part = begin_part(deserialize(data), part)
+            return Record(KEY, data)
         numbers = part.motions.last.copy()
         both, mine, theirs = np.intersect1d(part.ids, asked.ids, return_indices=True)
         if len(both):

@@ -10,8 +10,8 @@ from kcgs.codec.clips.file import ClipHeader, Record, pack_end, pack_header, pac
 _KEY_FRAMES, _MOST = 4.5, 1.6
 # a step of the quantization parameter changes the logarithm of a carried frame's bytes by this; the largest step
 SLOPE, _LARGEST = 0.0073, 24
-# bytes that each frame to come is sure of
-_LEAST = 48
+# bytes that each frame to come is sure of; most that a record takes beside its content
+_LEAST, _RECORD = 48, 16
 
 
 class Budget:
@@ -32,13 +32,13 @@ class Budget:
         others = min(rest, interval) - 1
         keys = math.ceil(rest / interval)
         share = self._left / (keys * _KEY_FRAMES + rest - keys) * _KEY_FRAMES
-        return max(1, int(share if others else self._left) - 16)
+        return max(1, int(share if others else self._left) - _RECORD)
 
     def most(self) -> int:
         """Return the bytes that a carried frame may have at most, less those of its record."""
         after = self._frames - self._number - 1
         fair = self._left / (after + 1)
-        return max(0, int(min(self._left - after * _LEAST, _MOST * fair if after else self._left)) - 16)
+        return max(0, int(min(self._left - after * _LEAST, _MOST * fair if after else self._left)) - _RECORD)
 
     def step(self, num_bytes: int) -> int:
         """Return by how much the next frame's quantization parameter should rise, after a carried one of so many."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,8 +13,8 @@ from torch import Tensor
 
 from kcgs.codec import decode
 from kcgs.codec.clips.carried import ClipPart
-from kcgs.codec.clips.file import KEY, ClipHeader, Record
-from kcgs.codec.clips.frames import FrameReader, carried_record, key_record
+from kcgs.codec.clips.file import KEY, Record
+from kcgs.codec.clips.frames import begin_part, carried_record, key_record, read_carried
 from kcgs.codec.clips.motion import quantize_motion
 from kcgs.codec.exact import Integers
 from kcgs.codec.file import unpack
@@ -28,6 +28,7 @@ from kcgs.rate.compress import compress, quality_for
 from .budget import SLOPE, Budget
 from .carrying import Carrying
 from .registration import register
+from .report import FrameReport
 
 # steps of the quantization parameter by which a carried frame is coarser than its key frame, without a budget
 _COARSER = 64
@@ -38,17 +39,6 @@ _LOST, _GOOD, _LARGE = 4.0, 40.0, 0.85
 _AFFORDED = 0.6
 # how often a frame is made coarser for a budget; the last time only its motions are left
 _TRIES = 4
-
-
-class Report(NamedTuple):
-    """A frame that was fitted; see `FrameReport`."""
-
-    is_key: bool
-    psnr: float
-    num_bytes: int
-    num_gaussians: int
-    born: int
-    seconds: float
 
 
 class VideoEncoder:
@@ -66,16 +56,17 @@ class VideoEncoder:
         self._positions: dict[int, int] = {}  # of given ids among those of the part
         self._number = 0
 
-    def add(self, image: Tensor, labels: Tensor | None) -> tuple[Record, Report]:
+    def add(self, image: Tensor, labels: Tensor | None) -> tuple[Record, FrameReport]:
         """Fit the next frame, (C, H, W), with its map, or None: it is carried on."""
         start = time.process_time()
         with threads_for_kernels(image[0].numel()):
             found = self._carry(image, labels)
             record, value, born = self._begin(image, labels) if found is None else found
         assert self._part is not None
+        number, count = self._number, len(self._part.frame.region)
         self._go_on(image, record)
-        count = len(self._part.frame.region)
-        return record, Report(found is None, value, len(record.data), count, born, time.process_time() - start)
+        seconds = time.process_time() - start
+        return record, FrameReport(number, found is None, value, len(record.data), count, born, seconds)
 
     def skip(self, image: Tensor, labels: Tensor | None, record: Record) -> Record:
         """Take a frame that was fitted before."""
@@ -83,10 +74,8 @@ class VideoEncoder:
             self._plan_key(image)
             self._start(record.data, image, labels)
         else:
-            header = ClipHeader((image.shape[1], image.shape[2]), len(image), None)  # type: ignore[arg-type]
-            reader = FrameReader(header)
-            reader.part = self._part
-            reader.read(record)
+            assert self._part is not None
+            read_carried(self._part, record)
         self._go_on(image, record)
         return record
 
@@ -121,7 +110,7 @@ class VideoEncoder:
     def _start(self, data: bytes, image: Tensor, labels: Tensor | None) -> None:
         """Begin a part with a still file."""
         scene = decode(data).scene
-        self._part = ClipPart(scene, 0 if self._part is None else self._part.next_key)
+        self._part = begin_part(scene, self._part)
         self._qp, self._key_bytes, self._since = unpack(data)[0].qp, len(data), 0
         self._key_psnr = float(psnr(scene.render(), image))
         self._positions = {}

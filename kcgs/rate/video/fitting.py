@@ -8,7 +8,7 @@ import operator
 import os
 from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,26 +22,11 @@ from kcgs.fit.loop import check_problem
 
 from .budget import Budget
 from .journal import Journal
+from .report import FrameReport
 
 # Gaussians of a frame where nothing is said
 _USUAL = 1000
-OnFrame = Callable[["FrameReport"], bool | None]
-
-
-class FrameReport(NamedTuple):
-    """A frame that was fitted."""
-
-    number: int
-    """From 0."""
-    is_key: bool
-    psnr: float
-    """Of the frame as the clip holds it, in dB."""
-    num_bytes: int
-    num_gaussians: int
-    born: int
-    """Gaussians that are new since the frame before; all, of a key frame."""
-    seconds: float
-    """Processor time."""
+OnFrame = Callable[[FrameReport], bool | None]
 
 
 @torch.inference_mode(False)
@@ -144,7 +129,7 @@ def fit_video(
                 journal.write(header, record, number)
             if count:
                 bar.update((number + 1) / count, f"frame {number + 1} of {count}, {report.psnr:.2f} dB")
-            if on_frame is not None and on_frame(FrameReport(number, *report)):
+            if on_frame is not None and on_frame(report):
                 break
     if header is None:
         raise ValueError("frames must hold at least one frame; got none")
