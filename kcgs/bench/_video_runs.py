@@ -31,8 +31,8 @@ from kcgs.functional import edge_band, ef_psnr, psnr
 from kcgs.rate import compress, fit_bytes, quality_for
 from kcgs.rate.video import carrying, fit_video
 from kcgs.rate.video.encoder import VideoEncoder
-from kcgs.rate.video.report import FrameReport
 from kcgs.rate.video.registration import register
+from kcgs.rate.video.report import FrameReport
 
 from . import _video_codecs
 from ._rate_files import codec_digest
