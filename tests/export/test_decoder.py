@@ -20,26 +20,12 @@ from kcgs.codec.file import pack, unpack
 from kcgs.data import load_image, load_labels
 from kcgs.functional.labels import touching_pairs
 
-from .browser import WEB, Browser, compile_decoder, npm, serving
+from .browser import WEB, Browser, serving
 from .decoding import Node, Page, Reader, check_same
 
 MODELS = WEB.parents[1] / "models"
 GOLDEN = WEB.parents[1] / "tests" / "codec" / "golden.kcgs"
 MEMORY = 1 << 30  # that node, which has about 50 MB at first, may take at most
-
-
-@pytest.fixture(scope="module")
-def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The decoder, built as `npm run build` builds it."""
-    if shutil.which("node") is None:
-        pytest.skip("node is not installed")
-    if not (WEB / "node_modules" / "vite").exists():
-        pytest.skip("export/web has no node_modules, with which its decoder is built: npm --prefix export/web ci")
-    compile_decoder()
-    folder = tmp_path_factory.mktemp("decoder")
-    done = npm("exec", "--", "vite", "build", "--config", "decoder/vite.config.ts", "--outDir", str(folder))
-    assert done.returncode == 0, done.stdout + done.stderr
-    return folder
 
 
 PAGE = """<!doctype html>
@@ -78,13 +64,6 @@ def browser(chromium: str, site: tuple[Path, str], tmp_path_factory: pytest.Temp
     driven.do("goto", url=site[1])
     yield driven
     driven.close()
-
-
-@pytest.fixture(scope="module")
-def node(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
-    running = Node(bundle, tmp_path_factory.mktemp("node"))
-    yield running
-    running.close()
 
 
 def random_labels(generator: np.random.Generator, size: tuple[int, int], regions: int) -> np.ndarray:

@@ -7,14 +7,14 @@ import { DecodeError } from "./scene.ts";
 export const MOST_SIDE = 2 ** 20;
 export const MOST_LABELS = 2 ** 26;
 export const MOST_REGIONS = 2 ** 24 - 1;
-const MOST_CHANNELS = 1024;
+export const MOST_CHANNELS = 1024;
 const MOST_GAUSSIANS = 2 ** 21 - 1;
 const MOST_COLORS = 2 ** 27;
 const MOST_BYTES = 2 ** 32;
 // of version 1, and of those in which several layers may be of one energy
 const MOST_LAYERS = [65, 128, 128];
 export const ENERGIES = { least: -24, most: 40 };
-const PARAMETERS = { least: -512, most: 1023 };
+export const PARAMETERS = { least: -512, most: 1023 };
 
 export interface Header {
   readonly version: number;

@@ -1,6 +1,6 @@
 /** The range coder and its symbols with fixed chances (docs/format.md). */
 
-import { type Program, put, startProgram } from "./program.ts";
+import { put, startProgram, type StreamProgram } from "./program.ts";
 
 const ALPHABET = 2 ** 16;
 
@@ -10,7 +10,7 @@ export class RangeDecoder {
 
   constructor(
     data: Uint8Array,
-    readonly program: Program = startProgram(),
+    readonly program: StreamProgram = startProgram(),
   ) {
     program.open(put(program, data), data.length);
   }
