@@ -7,8 +7,9 @@ from typing import Annotated, Literal
 
 import typer
 
+from .clips import is_clip, read_clip
 from .common import Json, SceneFile, SceneOrDecoder, app, check_output, print_report
-from .options import Contours, EngineName
+from .options import Contours, EngineName, exclude
 
 
 @app.command()
@@ -94,7 +95,7 @@ def view(
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 0,
     browser: Annotated[bool, typer.Option(help="Open a browser window.")] = True,
 ) -> None:
-    """Look at a scene in the browser: zoom, compare, hide regions. Ends with Ctrl-C."""
+    """Look at a scene in the browser: zoom, compare, hide regions; or play a clip. Ends with Ctrl-C."""
     from kcgs import load
     from kcgs.view import serve, serve_decoder
 
@@ -103,8 +104,12 @@ def view(
             raise typer.BadParameter("--contours are those of the decoder; kcgs export has them")
         serve_decoder(scene, original=original, port=port, browser=browser, say=typer.echo)
         return
-    loaded = load(scene)
-    shown = scene.read_bytes() if scene.suffix == ".kcgs" else loaded
+    clip = is_clip(scene)
+    if clip:
+        exclude("a clip", original=original)
+        read_clip(scene)
+    loaded = None if clip else load(scene)
+    shown = loaded if loaded is not None and scene.suffix != ".kcgs" else scene.read_bytes()
     serve(shown, name=scene.stem, original=original, contours=contours, port=port, browser=browser, say=typer.echo)
 
 

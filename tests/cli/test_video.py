@@ -287,7 +287,7 @@ class TestOtherCommands:
         assert (code, err) == (2, "kcgs: IMAGE must have the size (32, 48) of SCENE; got (8, 9)\n")
 
     @pytest.mark.parametrize(
-        "arguments", [("encode", "-o", "a.kcgs"), ("export", "-o", "a.onnx"), ("export", "-o", "a.html"), ("view",)]
+        "arguments", [("encode", "-o", "a.kcgs"), ("export", "-o", "a.onnx"), ("export", "-o", "a.html")]
     )
     def test_what_takes_scenes_only_says_what_a_clip_is_for(
         self, run: Run, clip: Clip, arguments: tuple[str, ...]
@@ -299,6 +299,22 @@ class TestOtherCommands:
         )
         with pytest.raises(ValueError, match="kcgs.Clip.load reads it"):
             kcgs.load("clip.kcgs")
+
+    def test_view_serves_the_page_of_a_clip(
+        self, run: Run, clip: Clip, fitted: bytes, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        shown: list[tuple[str, bytes]] = []
+
+        def serve(page: Path, *_: object, **__: object) -> None:
+            shown.append(((page / "index.html").read_text(), (page / "scene.kcgs").read_bytes()))
+
+        monkeypatch.setattr("kcgs.view._serve", serve)
+        assert run("view", "clip.kcgs", "--contours", "crisp") == (0, "", "")
+        ((page, data),) = shown
+        assert data == fitted and 'contours="crisp" data-clip="scene/scene.kcgs"' in page
+        assert "a clip excludes --original" in run("view", "clip.kcgs", "--original", "mask.png")[2]
+        Path("clip.kcgs").write_bytes(fitted[:-9])
+        assert run("view", "clip.kcgs")[0] != 0 and len(shown) == 1
 
     def test_eval_of_a_scene_takes_no_folder(self, run: Run) -> None:
         Scene(GaussianField.random(5, (32, 48), seed=0)).save("still.kcgs")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import gzip
 import json
 from collections.abc import Iterator
@@ -13,10 +14,11 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from kcgs import GaussianField, RegionMap, Scene, load
+from kcgs import Clip, GaussianField, RegionMap, Scene, load
 from kcgs.codec import encode
 from kcgs.editing import move_region, recolor_region
 from kcgs.page import scene_page
+from kcgs.page.html import page_html
 
 from .browser import WEB, Browser, array, npm, serving
 
@@ -24,6 +26,14 @@ MODELS = WEB.parents[1] / "models"
 PAGE = WEB.parents[1] / "kcgs" / "page"
 MOST_BYTES = 40_000
 LEVELS = 2 / 255
+CLIP = WEB.parents[1] / "tests" / "codec" / "golden4.kcgs"
+CLIP_PIXELS = """(async () => {
+  const image = document.querySelector("kcgs-image");
+  const bitmap = await createImageBitmap(await image.toBlob({ width: 120, height: 80 }));
+  const context = Object.assign(document.createElement("canvas"), { width: 120, height: 80 }).getContext("2d");
+  context.drawImage(bitmap, 0, 0);
+  return { data: Float32Array.from(context.getImageData(0, 0, 120, 80).data), dims: [80, 120, 4] };
+})()"""
 HTML = """<!doctype html><meta charset="utf-8">
 <meta http-equiv="Content-Security-Policy" content="default-src 'none'; connect-src 'self'; img-src blob: 'self';
  script-src 'self' 'wasm-unsafe-eval' 'nonce-test'">
@@ -346,15 +356,51 @@ class TestPage:
         assert browser.do("requests") == [path.as_uri()] and browser.do("problems") == []
 
 
+class TestClipPage:
+    def test_plays_and_shows_any_frame(self, browser: Browser, node_modules: Path, tmp_path: Path) -> None:
+        clip = Clip.load(CLIP)
+        path = tmp_path / "page.html"
+        path.write_text(scene_page(clip.to_bytes(), title="Moving"), encoding="utf-8")
+        browser.do("open", url=path.as_uri())
+        browser.do("wait", expression="document.querySelector('#note').textContent.includes('5 frames, 24 per second')")
+        # it plays to its end by itself
+        browser.do("wait", expression="document.querySelector('input[type=range]').value === '4'")
+        browser.do("wait", expression="document.querySelector('#bar button').title === 'Play'")
+        for number in (1, 4, 2):
+            slider = "document.querySelector('input[type=range]')"
+            browser.evaluate(f"({slider}.value = '{number}', {slider}.oninput(), 0)")
+            assert browser.do("text", on="#bar output") == f"{number / 24:.2f} s"
+            got = array(browser.evaluate(CLIP_PIXELS))
+            want = clip.render(number, (80, 120)).permute(1, 2, 0).numpy()
+            np.testing.assert_allclose(got[..., :3] / 255, want, atol=LEVELS, rtol=0)
+        browser.do("click", on="#bar button")
+        browser.do("wait", expression="document.querySelector('input[type=range]').value === '4'")
+        assert browser.do("requests") == [path.as_uri()] and browser.do("problems") == []
+
+    def test_damage_is_named(self, browser: Browser, node_modules: Path, tmp_path: Path) -> None:
+        data = bytearray(CLIP.read_bytes())
+        data[-60] ^= 1
+        path = tmp_path / "page.html"
+        page = page_html(
+            "data:application/octet-stream;base64," + base64.b64encode(data).decode(), title="a", clip=True
+        )
+        path.write_text(page, encoding="utf-8")
+        browser.do("open", url=path.as_uri())
+        browser.do("wait", expression="document.querySelector('#note').textContent.includes('checksum of frame 4')")
+
+
 class TestSources:
     def test_small_enough(self, site: tuple[Path, str]) -> None:
         assert len(gzip.compress((site[0] / "kcgs-image.js").read_bytes(), 9)) <= MOST_BYTES
 
-    def test_the_page_that_python_has_is_the_one_that_is_built(self, node_modules: Path, tmp_path: Path) -> None:
-        done = npm("run", "build:page", "--", "--outDir", str(tmp_path))
+    @pytest.mark.parametrize("name", ["page", "clip"])
+    def test_the_page_that_python_has_is_the_one_that_is_built(
+        self, node_modules: Path, tmp_path: Path, name: str
+    ) -> None:
+        done = npm("run", f"build:{name}", "--", "--outDir", str(tmp_path))
         assert done.returncode == 0, done.stdout + done.stderr
-        fresh, ours = (folder.joinpath("page.js").read_text() for folder in (tmp_path, PAGE))
-        assert fresh == ours, "run npm --prefix export/web run build:page, and commit kcgs/page/page.js"
+        fresh, ours = (folder.joinpath(f"{name}.js").read_text() for folder in (tmp_path, PAGE))
+        assert fresh == ours, f"run npm --prefix export/web run build:{name}, and commit kcgs/page/{name}.js"
 
     def test_the_package(self, node_modules: Path, tmp_path: Path) -> None:
         done = npm("run", "build:element")

@@ -1,28 +1,14 @@
 /** The page that `kcgs export` and `kcgs view` write: the element in a window of its own, with buttons around it. */
 
 import { origin } from "../src/view.ts";
+import { button, make } from "./controls.ts";
 import { KcgsImage } from "./index.ts";
 
-const image = document.querySelector("kcgs-image") as KcgsImage;
-const bar = document.querySelector<HTMLElement>("#bar")!;
+export const image = document.querySelector("kcgs-image") as KcgsImage;
+export const bar = document.querySelector<HTMLElement>("#bar")!;
 const list = document.querySelector<HTMLElement>("#regions")!;
 const note = document.querySelector<HTMLElement>("#note")!;
 const zoom = document.createElement("output");
-
-/** Make an element with properties and children. */
-function make<K extends keyof HTMLElementTagNameMap>(
-  tag: K,
-  properties: Partial<HTMLElementTagNameMap[K]>,
-  ...children: (Node | string)[]
-): HTMLElementTagNameMap[K] {
-  const made = Object.assign(document.createElement(tag), properties);
-  made.append(...children);
-  return made;
-}
-
-function button(text: string, title: string, press: () => void): HTMLButtonElement {
-  return make("button", { type: "button", title, ariaLabel: title, onclick: press }, text);
-}
 
 // within another page the wheel scrolls that one
 if (window.top !== window) image.setAttribute("zoom", "ctrl");
@@ -40,12 +26,16 @@ image.addEventListener("error", ({ message }) => {
   note.textContent = `The scene could not be shown${image.scene === null ? "" : " in full"}: ${message}`;
 });
 image.addEventListener("load", () => {
-  const { scene, regionIds } = image;
-  const regions = regionIds.length > 1 ? `, ${regionIds.length} regions` : "";
-  note.textContent = `${scene!.width} × ${scene!.height}, ${scene!.count} Gaussians${regions}`;
-  if (regionIds.length > 1) listRegions(shares());
+  describe(`${image.scene!.count} Gaussians`);
   compare(image.dataset["original"]);
 });
+/** Say what is shown, and list its regions. */
+export function describe(content: string): void {
+  const { scene, regionIds } = image;
+  const regions = regionIds.length > 1 ? `, ${regionIds.length} regions` : "";
+  note.textContent = `${scene!.width} × ${scene!.height}, ${content}${regions}`;
+  if (regionIds.length > 1) listRegions(shares());
+}
 
 /** The share of the image that each region has. */
 function shares(): Map<number, number> {
@@ -55,10 +45,15 @@ function shares(): Map<number, number> {
   return new Map(Array.from(ids, (id, place) => [id, counts[place]! / labels.length]));
 }
 
+/** Hide a region; a later part of a clip need not have it. */
+function hide(id: number, hidden: boolean): void {
+  if (image.regionIds.includes(id)) image.hide(id, hidden);
+}
+
 function listRegions(areas: Map<number, number>): void {
   const boxes = new Map<number, HTMLInputElement>();
   for (const [id, area] of [...areas].sort((a, b) => b[1] - a[1])) {
-    const box = make("input", { type: "checkbox", checked: true, onchange: () => image.hide(id, !box.checked) });
+    const box = make("input", { type: "checkbox", checked: true, onchange: () => hide(id, !box.checked) });
     boxes.set(id, box);
     list.append(make("label", {}, box, `Region ${id} `, make("small", {}, `${(100 * area).toFixed(1)} %`)));
   }

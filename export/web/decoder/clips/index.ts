@@ -123,5 +123,5 @@ function withLabels(first: RegionMap, labels: Int32Array, width: number): Region
     b: pair % ids.length,
     width: widths.get(pair) ?? mean,
   }));
-  return { ...first, labels, pairs: found };
+  return { ...first, labels, pairs: found, softness: found.length ? null : 0 };
 }

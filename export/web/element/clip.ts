@@ -1,0 +1,17 @@
+/** The page of a clip: that of a scene, with a player. */
+
+import { bar, describe, image } from "./page.ts";
+import { loadClip, Player } from "./player.ts";
+
+try {
+  const clip = await loadClip(image.dataset["clip"]!);
+  const player = new Player(image, clip);
+  bar.prepend(player.button, player.slider, player.time);
+  player.show(0);
+  if (image.scene !== null) {
+    describe(`${clip.frames} frames, ${Number(clip.frameRate.toFixed(3))} per second`);
+    if (clip.frames > 1 && !matchMedia("(prefers-reduced-motion: reduce)").matches) player.toggle();
+  }
+} catch (error) {
+  image.dispatchEvent(new ErrorEvent("error", { error, message: (error as Error).message }));
+}
