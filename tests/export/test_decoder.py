@@ -244,7 +244,7 @@ class TestDamage:
         assert f"the checksum of its layer {layers} is another" in answer["message"]
         assert answer["partial"]["layers"] == layers - 1
         for content, message in [
-            (b"kcgs\4" + data[5:], "its version must be 1, 2 or 3; got 4"),
+            (b"kcgs\4" + data[5:], "its version must be 1 to 3 (4: a clip); got 4"),
             (b"GIF89a", 'it must start with "kcgs"; got "GIF8"'),
             (data[:9], "the file ends early"),
             (data + b"\0", f"the file must end after {len(data)} bytes; got {len(data) + 1}"),

@@ -37,7 +37,7 @@ export function readHeader(reader: ByteReader): { header: Header; map: Uint8Arra
   if (magic === "kcgm") throw new DecodeError("it is a label map, no scene: decodeLabels reads it");
   if (magic !== "kcgs") throw new DecodeError(`it must start with "kcgs"; got ${text(reader.data.subarray(0, 4))}`);
   const version = reader.number(1);
-  if (version < 1 || version > 3) throw new DecodeError(`its version must be 1, 2 or 3; got ${version}`);
+  if (version < 1 || version > 3) throw new DecodeError(`its version must be 1 to 3 (4: a clip); got ${version}`);
   const height = reader.varint("height", 1, MOST_SIDE);
   const width = reader.varint("width", 1, MOST_SIDE);
   const channels = reader.varint("channels", 1, MOST_CHANNELS);

@@ -50,7 +50,9 @@ export class FollowingLabels {
     program.follow();
     const found = new Int32Array(this.labels.length);
     this.rows().forEach((row, y) => found.set(row, y * width));
-    if (found.some((label, i) => label !== this.labels[i])) this.labels = found;
+    let same = 0;
+    while (same < found.length && found[same] === this.labels[same]) same++;
+    if (same < found.length) this.labels = found;
     return this.labels;
   }
 

@@ -123,12 +123,7 @@ export class ClipPart {
     if (count === 0) return [];
     const ids = present && Int32Array.from(present.keys()).filter((region) => present[region]! > 0);
     const regions = ids === null ? 1 : ids.length;
-    let pixels = null;
-    if (ids !== null && labels !== null && regions > 1) {
-      const places = new Int32Array(this.ids);
-      ids.forEach((region, place) => (places[region] = place));
-      pixels = labels.map((region) => places[region]!);
-    }
+    const pixels = ids !== null && labels !== null && regions > 1 ? placesOf(labels, ids, this.ids) : null;
     const energy = decoder.uniform(128) - SHIFTED;
     if (energy < ENERGIES.least || energy > ENERGIES.most)
       throw new DecodeError(`a class of energy must be ${ENERGIES.least} to ${ENERGIES.most}; got ${energy}`);
@@ -143,6 +138,16 @@ export class ClipPart {
       regions: group.regions?.map((place) => ids![place]!) ?? new Int32Array(group.count).fill(one),
     }));
   }
+}
+
+/** Labels as places among the ids of regions that have pixels. */
+function placesOf(labels: Int32Array, ids: Int32Array, regions: number): Int32Array {
+  if (ids.length === regions) return labels;
+  const places = new Int32Array(regions);
+  ids.forEach((region, place) => (places[region] = place));
+  const found = new Int32Array(labels.length);
+  for (let i = 0; i < labels.length; i++) found[i] = places[labels[i]!]!;
+  return found;
 }
 
 /** Which regions have pixels. */
