@@ -94,12 +94,13 @@ def frame_of(clip: Clip, number: int) -> dict[str, Any]:
     described |= {"count": len(field), "keys": digest(keys, "<i4"), "regionIds": None, "regions": None}
     if regions is None or field.region_ids is None:
         return described
-    one = isinstance(regions.softness, float)
-    pairs = {} if one else regions.softness
+    pairs = {} if isinstance(regions.softness, float) else regions.softness
+    widths = {regions.softness} if isinstance(regions.softness, float) else set(pairs.values())
+    one = len(widths) == 1  # whether it is said once, or for each pair
     described["regionIds"] = digest(field.region_ids.numpy(), "<f8")
     described["regions"] = {
-        "labels": digest(regions.labels.numpy(), "<f8"), "softness": regions.softness if one else None,
-        "pairs": sorted([*pair, width] for pair, width in pairs.items()),
+        "labels": digest(regions.labels.numpy(), "<f8"), "softness": widths.pop() if one else None,
+        "pairs": [] if one else sorted([*pair, width] for pair, width in pairs.items()),
     }  # fmt: skip
     return described
 

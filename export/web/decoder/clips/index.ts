@@ -123,5 +123,7 @@ function withLabels(first: RegionMap, labels: Int32Array, width: number): Region
     b: pair % ids.length,
     width: widths.get(pair) ?? mean,
   }));
-  return { ...first, labels, pairs: found, softness: found.length ? null : 0 };
+  const softness = found[0]?.width ?? 0;
+  const one = found.every((pair) => pair.width === softness);
+  return { ...first, labels, pairs: one ? [] : found, softness: one ? softness : null };
 }
