@@ -361,6 +361,7 @@ class TestClipPage:
         clip = Clip.load(CLIP)
         path = tmp_path / "page.html"
         path.write_text(scene_page(clip.to_bytes(), title="Moving"), encoding="utf-8")
+        browser.do("look", motion="no-preference", width=1000, height=700)
         browser.do("open", url=path.as_uri())
         browser.do("wait", expression="document.querySelector('#note').textContent.includes('5 frames, 24 per second')")
         # it plays to its end by itself
