@@ -35,7 +35,7 @@ def export(
     contours: Contours = "scaled",
     as_json: Json = False,
 ) -> None:
-    """Write a scene's decoder as ONNX, or the scene as one web page: neither needs torch or kcgs."""
+    """Write a scene's decoder as ONNX, or a scene or a clip as one web page: neither needs torch or kcgs."""
     from kcgs import Scene, load
     from kcgs.onnx import describe_decoder, generic_decoder, scene_decoder, write_model
 
@@ -69,21 +69,23 @@ def export(
     print_report(report, as_json, str(output))
 
 
-def _write_page(scene: Path, output: Path, contours: str) -> dict[str, object]:
-    """Write the page of a scene file; a `.kcgs` file is kept as it is."""
+def _write_page(path: Path, output: Path, contours: str) -> dict[str, object]:
+    """Write the page of a scene or a clip; a `.kcgs` file is kept as it is."""
     from kcgs import load
     from kcgs._atomic import atomic_path
     from kcgs.page.html import scene_page, web_bytes
 
-    loaded = load(scene)
-    data = web_bytes(scene.read_bytes() if scene.suffix == ".kcgs" else loaded)
+    clip = read_clip(path) if is_clip(path) else None
+    shown = load(path) if clip is None else clip[0]
+    data = web_bytes(path.read_bytes() if path.suffix == ".kcgs" else shown)
     with atomic_path(output) as temporary:
         temporary.write_text(scene_page(data, title=output.stem, contours=contours), encoding="utf-8")
         size = temporary.stat().st_size
-    height, width = loaded.size
+    height, width = shown.size
     return {
-        "width": width, "height": height, "num_gaussians": len(loaded), "contours": contours,
-        "scene_bytes": len(data), "bytes": size,
+        "width": width, "height": height, **({} if clip is None else {"frames": len(clip)}),
+        "num_gaussians": len(shown), "contours": contours,
+        "clip_bytes" if clip is not None else "scene_bytes": len(data), "bytes": size,
     }  # fmt: skip
 
 

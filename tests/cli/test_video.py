@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import signal
@@ -315,6 +316,13 @@ class TestOtherCommands:
         assert "a clip excludes --original" in run("view", "clip.kcgs", "--original", "mask.png")[2]
         Path("clip.kcgs").write_bytes(fitted[:-9])
         assert run("view", "clip.kcgs")[0] != 0 and len(shown) == 1
+
+    def test_export_writes_a_page(self, run: Run, clip: Clip, fitted: bytes) -> None:
+        code, out, _ = run("export", "clip.kcgs", "-o", "clip.html", "--json")
+        report, page = json.loads(out), Path("clip.html").read_text()
+        assert code == 0 and report["frames"] == len(clip) and report["clip_bytes"] == len(fitted)
+        assert base64.b64encode(fitted).decode() in page and report["bytes"] == len(page.encode())
+        assert "it is a clip" in run("export", "clip.kcgs", "-o", "clip.onnx")[2]
 
     def test_eval_of_a_scene_takes_no_folder(self, run: Run) -> None:
         Scene(GaussianField.random(5, (32, 48), seed=0)).save("still.kcgs")
