@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from kcgs.functional import RegionMap
 from kcgs.functional.metrics import K1, K2, SCALE_WEIGHTS, SSIM_SIGMA, SSIM_WINDOW, window_mean
 
-from .pursuit import halve
+from .pursuit import Proposal, halve, propose
 
 # weight of the error in averages of 1, 2, 4 and 8 pixels a side
 _WEIGHTS = (1.0, 4.0, 16.0, 32.0)
@@ -194,6 +196,26 @@ def make_objective(name: str, image: Tensor) -> VisualObjective | None:
     """Return the objective of a name, None where it is the squared error."""
     kinds = {"visual": VisualObjective, "ms-ssim": MsSsimObjective}
     return kinds[name](image) if name in kinds else None
+
+
+def propose_by(
+    objective: VisualObjective | None,
+    residual: Tensor,
+    regions: RegionMap | None,
+    count: int,
+    *,
+    sigmas: Sequence[float],
+    backend: str = "auto",
+) -> Proposal:
+    """Find at most `count` Gaussians that lower the objective most, of a residual, image - render: see `propose`."""
+    if objective is None:
+        return propose(residual, regions, count, sigmas=sigmas, backend=backend)
+    # a pixel's gradient by the root of what it counts: the square is what a Gaussian may gain
+    root = objective.importance.sqrt()
+    added = propose(-objective.apply(-residual) / root, regions, count, sigmas=sigmas, backend=backend)
+    # in the filtered residual, what counts more is larger
+    x, y = added.means.long().unbind(-1)
+    return added._replace(colors=added.colors / root[y, x, None])
 
 
 def _blur(maps: Tensor) -> Tensor:

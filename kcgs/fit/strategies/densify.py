@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from kcgs.fit.descent import render, squared_error
-from kcgs.fit.pursuit import Proposal, propose
+from kcgs.fit.objective import propose_by
+from kcgs.fit.pursuit import Proposal
 from kcgs.fit.sampling import sample_pixels
 from kcgs.fit.state import FitState
 from kcgs.functional import lookup_regions
@@ -104,17 +105,8 @@ class Densify:
 
     def place(self, state: FitState, count: int) -> Proposal:
         """Return the Gaussians to add."""
-        residual, objective = state.image - render(state), state.objective
-        if objective is not None:
-            # a pixel's gradient by the root of what it counts: the square is what a Gaussian may gain
-            root = objective.importance.sqrt()
-            residual = -objective.apply(-residual) / root
-        added = propose(residual, state.regions, count, sigmas=self.sigmas, backend=state.config.backend)
-        if objective is None:
-            return added
-        # in the filtered residual, what counts more is larger
-        x, y = added.means.long().unbind(-1)
-        return added._replace(colors=added.colors / root[y, x, None])
+        residual, backend = state.image - render(state), state.config.backend
+        return propose_by(state.objective, residual, state.regions, count, sigmas=self.sigmas, backend=backend)
 
 
 def leave_out(state: FitState, count: int) -> None:

@@ -16,9 +16,8 @@ from kcgs.codec.gaussians.quantize import Codes, Parameters, Quantizer
 from kcgs.codec.labels.settling import settle_labels
 from kcgs.fit import FitConfig
 from kcgs.fit.contour_moves import accept_moves, refine_contours
-from kcgs.fit.objective import make_objective
+from kcgs.fit.objective import make_objective, propose_by
 from kcgs.fit.prefixes import energies
-from kcgs.fit.pursuit import propose
 from kcgs.fit.redundancy import least_missed
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
@@ -141,20 +140,15 @@ class Carrying:
         """Return new Gaussians that may pay for their bits, strongest first."""
         count = max(0, most - len(self._region)) + round(_SURPLUS * most)
         residual = self.image - following.render()
-        if self.objective is not None:
-            root = self.objective.importance.sqrt()
-            residual = -self.objective.apply(-residual) / root
-        added = propose(residual, following.regions, count, sigmas=_SIGMAS)
-        colors = added.colors
-        if self.objective is not None:
-            x, y = added.means.long().unbind(-1)
-            colors = colors / root[y, x, None]
+        added = propose_by(self.objective, residual, following.regions, count, sigmas=_SIGMAS)
         gain = energies(added.cholesky, added.colors, self.part.size)
+        if self.objective is not None:
+            gain *= self.objective.weigh(added.means, added.cholesky)
         pays = (gain > self._born_price()).nonzero()[:, 0]
         pays = pays[gain[pays].argsort(descending=True, stable=True)]
         ids = np.zeros(len(pays), np.int64) if added.region_ids is None else added.region_ids[pays].numpy()
         self._born_region = np.searchsorted(self.part.ids, ids) if self.index is not None else ids
-        return Parameters(*(t[pays].double().numpy() for t in (added.means, added.cholesky, colors)))
+        return Parameters(*(t[pays].double().numpy() for t in (added.means, added.cholesky, added.colors)))
 
     def _born_price(self) -> float:
         return _AT_ONCE * _BORN_BITS * _BIT * self.distortion
