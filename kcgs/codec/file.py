@@ -50,7 +50,7 @@ class ByteReader:
     def take(self, count: int) -> bytes:
         """Return the next bytes."""
         if count > len(self.data) - self.position:
-            raise EndsEarly(f"the file ends early: {len(self.data)} bytes are no image")
+            raise EndsEarly(f"the file ends early: it has {len(self.data)} bytes")
         self.position += count
         return self.data[self.position - count : self.position]
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import warnings
 from fractions import Fraction
+from pathlib import Path
 
 import pytest
 import torch
+from kornia.geometry.transform import ImageRegistrator, warp_perspective
 from torch import Tensor
 
 from kcgs import Clip, FitConfig, fit_video
 from kcgs.codec.clips.file import ClipHeader
 from kcgs.codec.clips.frames import FrameReader
+from kcgs.data import Davis
 from kcgs.functional import psnr
 from kcgs.rate.video.budget import Budget
 from kcgs.rate.video.encoder import VideoEncoder
@@ -111,6 +114,9 @@ def test_a_stopped_fit_goes_on_to_the_same_clip(clip: Clip, tmp_path) -> None:
         fit_video(FRAMES, MAPS, checkpoint=path, resume=True, num_gaussians=50, iterations=40)
     with pytest.raises(ValueError, match="another video"):
         fit_video([frame[:, :40] for frame in FRAMES], checkpoint=path, resume=True, **SETTINGS)
+    path.write_bytes(path.read_bytes()[:-50] + bytes(50))
+    with pytest.raises(ValueError, match=r"video\.checkpoint' cannot be read: .* checksum"):
+        fit_video(FRAMES, MAPS, checkpoint=path, resume=True, **SETTINGS)
 
 
 def test_a_resumed_budget_is_that_of_the_whole(tmp_path) -> None:
@@ -187,3 +193,31 @@ def test_a_frame_that_can_only_stand_is_read_though_its_map_lost_a_region() -> N
     record, report = scenes.add(FRAMES[1], torch.zeros_like(MAPS[1]))
     assert not report.is_key and len(record.data) < 100
     assert reader.read(record).index.max() == 1
+
+
+@pytest.mark.slow
+def test_regions_are_followed_better_than_frames_are_registered(data_root: Path) -> None:
+    davis = Davis(data_root / "DAVIS")
+    gains = []
+    for name in ("dog", "train"):
+        sequence = davis.sequence(name)
+        source, target, labels = sequence[12].image, sequence[13].image, sequence[12].labels
+        registrator = ImageRegistrator("homography", num_iterations=100, tolerance=0.0)
+        registrator.register(source[None], target[None])
+        warped = registrator.warp_dst_into_src(target[None])[0].detach()
+        for region in labels.unique():
+            mask = labels == region
+            ours = followed(target, register(source, target, mask))
+            gains.append(float(psnr(ours * mask, source * mask) - psnr(warped * mask, source * mask)))
+    assert min(gains) > 0 and sum(gains) / len(gains) > 3
+
+
+def followed(target: Tensor, motion: Tensor) -> Tensor:
+    """Return the source that a motion from it to the target finds there."""
+    height, width = target.shape[1:]
+    matrix = torch.eye(3, dtype=torch.float64)
+    matrix[:2] = motion
+    # kornia's homographies are between centres of pixels at whole numbers
+    half = torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    matrix = torch.linalg.inv(torch.linalg.inv(half) @ matrix @ half)
+    return warp_perspective(target[None], matrix[None].float(), (height, width), padding_mode="border")[0]

@@ -18,7 +18,7 @@ export class ByteReader {
   }
 
   take(count: number): Uint8Array {
-    if (count > this.left) throw new this.Early(`the file ends early: ${this.data.length} bytes are no image`);
+    if (count > this.left) throw new this.Early(`the file ends early: it has ${this.data.length} bytes`);
     this.position += count;
     return this.data.subarray(this.position - count, this.position);
   }

@@ -10,6 +10,7 @@ from typing import Any
 
 from kcgs._atomic import check_writable, write_file
 from kcgs.codec.clips.file import ClipHeader, Record, pack_header, pack_record, unpack
+from kcgs.codec.rangecoder import CodecError
 
 
 class Journal:
@@ -61,5 +62,8 @@ class Journal:
             raise ValueError(f"checkpoint {str(self._path)!r} is no checkpoint of a video")
         if not data.startswith(line):
             raise ValueError(f"checkpoint {str(self._path)!r} is of a fit with other arguments")
-        header, records, _ = unpack(data[len(line) :])
+        try:
+            header, records, _ = unpack(data[len(line) :])
+        except CodecError as error:
+            raise ValueError(f"checkpoint {str(self._path)!r} cannot be read: {error}") from error
         self._kept = header, records
