@@ -290,3 +290,13 @@ def test_an_edit_that_takes_the_map_away_begins_a_key_frame() -> None:
         return scene if len(seen) < 3 else Scene(GaussianField.random(20, SIZE, seed=0))
 
     assert clip.edit(edit).key_frames == (0, 2)
+
+
+def test_an_edit_may_make_gaussians_as_thin_as_it_likes() -> None:
+    def thin(scene: Scene) -> Scene:
+        scene.field.cholesky.data[:, 2] *= 1e-6
+        return scene
+
+    edited = clip_of(3).edit(thin)
+    for scene in Clip.from_bytes(edited.to_bytes()):
+        assert scene.field.cholesky[:, ::2].min() > 1e-3

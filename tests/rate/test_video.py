@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from kornia.geometry.transform import ImageRegistrator, warp_perspective
 from torch import Tensor
 
-from kcgs import Clip, FitConfig, fit_video
+from kcgs import Clip, FitConfig, GaussianField, Scene, fit_video
+from kcgs.codec.clips.carried import Change, ClipPart
+from kcgs.codec.clips.differences import Differences
 from kcgs.codec.clips.file import ClipHeader
-from kcgs.codec.clips.frames import FrameReader
+from kcgs.codec.clips.frames import FrameReader, begin_part, carried_record
+from kcgs.codec.clips.motion import quantize_motion
+from kcgs.codec.exact import Integers
 from kcgs.data import Davis
 from kcgs.functional import psnr
 from kcgs.rate.video.budget import Budget
+from kcgs.rate.video.carrying import Carrying
 from kcgs.rate.video.encoder import VideoEncoder
+from kcgs.rate.video.following import Following
 from kcgs.rate.video.registration import register
 
 SIZE = (48, 64)
@@ -193,6 +201,30 @@ def test_a_frame_that_can_only_stand_is_read_though_its_map_lost_a_region() -> N
     record, report = scenes.add(FRAMES[1], torch.zeros_like(MAPS[1]))
     assert not report.is_key and len(record.data) < 100
     assert reader.read(record).index.max() == 1
+
+
+def test_gaussians_that_get_too_thin_are_left_out_or_kept_wide_enough() -> None:
+    field = GaussianField.random(40, SIZE, seed=0)
+    with torch.no_grad():
+        field.cholesky[:20, 2] = 1.05e-3
+        field.cholesky[20:30, 2] = 2.5e-3
+    part = begin_part(Scene(field), None)
+    smaller = quantize_motion(np.array([[1.2, 0.0, -6.0], [0.0, 1.2, -5.0]]), SIZE)[None]
+    carrying = Carrying(part, smaller, FRAMES[0], None, FitConfig(), 128)
+    for change in (carrying.stand(), carrying.fit(60, 0)):
+        assert change.gone[:20].all() and not change.gone[20:].all()
+        frame = part_after(part, smaller, change).frame
+        assert frame.gaussians.cholesky[:, ::2].min() > 1e-3
+    following = Following(FRAMES[0], None, None, Differences(part.frame.gaussians, 0.05, SIZE), 0, 0.1)
+    following.take(following.gaussians, torch.full_like(following.speed, -50.0))
+    following.descend(9)
+    assert following.gaussians[1][:, ::2].min() == following.gaussians[1].new_tensor(2e-3)
+
+
+def part_after(part: ClipPart, numbers: Integers, change: Change) -> ClipPart:
+    ahead = copy.deepcopy(part)
+    carried_record(ahead, 128, numbers, change)
+    return ahead
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from kcgs.codec.adaptive import AdaptiveNumber, AdaptiveSymbols
 from kcgs.codec.exact import Integers
 from kcgs.codec.file import most_gaussians
 from kcgs.codec.gaussians.layers import LayerCoder
-from kcgs.codec.gaussians.quantize import ENERGIES, Classes, Codes, Parameters, Quantizer
+from kcgs.codec.gaussians.quantize import ENERGIES, Codes, Parameters, Quantizer
 from kcgs.codec.rangecoder import CodecError, Coder
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
@@ -31,6 +31,8 @@ _FORTIETHS = 40  # of a pixel: contour widths are whole ones
 _GONE_WEIGHTS, _GONE_MEMORY = np.array([[40.0, 1.0]] * 4 + [[3.0, 1.0]] * 4), 2000.0
 # standard deviations, in pixels, and centres and colours, that a decoder renders
 _SIGMAS, _FARTHEST, _LOUDEST = (1e-3, 1e7), 1e8, 1e12
+# those that an encoder keeps to, since rounding changes them by half a step
+KEPT_SIGMAS = (2e-3, 5e6)
 
 
 class Frame(NamedTuple):
@@ -213,19 +215,29 @@ def born_order(codes: Codes) -> Integers:
 
 
 def born_codes(gaussians: Parameters, qp: int, size: tuple[int, int]) -> Codes:
-    """Return Gaussians that are born as whole numbers."""
+    """Return Gaussians that are born as whole numbers; those that would be too thin to render are round."""
     quantizer = Quantizer(qp, size)
-    classes: Classes = quantizer.classify(gaussians)
-    return quantizer.quantize(gaussians, classes)
+
+    def rounded(gaussians: Parameters) -> Codes:
+        return quantizer.quantize(gaussians, quantizer.classify(gaussians))
+
+    codes = rounded(gaussians)
+    thin = ~are_sound(quantizer.restore(codes))
+    if thin.any():
+        scale = np.sqrt(gaussians.cholesky[:, 0] * gaussians.cholesky[:, 2])
+        circles = np.stack([scale, np.zeros_like(scale), scale], -1)
+        codes = rounded(gaussians._replace(cholesky=np.where(thin[:, None], circles, gaussians.cholesky)))
+    return codes
+
+
+def are_sound(gaussians: Parameters) -> NDArray[np.bool_]:
+    """Say of each Gaussian, as float32 has it, whether a decoder renders it, [N]."""
+    means, cholesky, colors = (numbers.astype(np.float32) for numbers in gaussians)
+    sound = (cholesky[:, ::2] > _SIGMAS[0]).all(1) & (np.abs(cholesky) < _SIGMAS[1]).all(1)
+    return np.asarray(sound & (np.abs(means) < _FARTHEST).all(1) & (np.abs(colors) < _LOUDEST).all(1), np.bool_)
 
 
 def _check(gaussians: Parameters) -> None:
     """Refuse numbers that cannot be rendered."""
-    means, cholesky, colors = gaussians
-    sound = np.isfinite(means).all() and np.isfinite(cholesky).all() and np.isfinite(colors).all()
-    if sound:
-        scales = cholesky[:, ::2]
-        sound = (scales > _SIGMAS[0]).all() and (np.abs(cholesky) < _SIGMAS[1]).all()
-        sound = sound and (np.abs(means) < _FARTHEST).all() and (np.abs(colors) < _LOUDEST).all()
-    if not sound:
+    if not are_sound(gaussians).all():
         raise CodecError("a frame holds Gaussians that cannot be rendered")

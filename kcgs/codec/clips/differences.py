@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kcgs.codec.adaptive import AdaptiveSymbols
 from kcgs.codec.exact import Floats, Integers, exp2
@@ -68,11 +69,17 @@ class Differences:
         colored = opponent(gaussians.colors) - opponent(colors)
         return np.concatenate([np.stack([d1, d2, k11, k21, k22], -1), colored], 1) / self.steps
 
+    def can_be(self, codes: Integers) -> NDArray[np.bool_]:
+        """Say of each Gaussian whether a file may say that it changes so much, [N]."""
+        change = np.abs(codes * self.steps)
+        small = (change[:, [0, 1, 3]] <= _MOST_CHANGE).all(1) & (change[:, [2, 4]] <= _MOST_DOUBLINGS).all(1)
+        return np.asarray(small, np.bool_)
+
     def restore(self, codes: Integers) -> Parameters:
         """Return the Gaussians that a decoder finds, in float32."""
         means, cholesky, colors = self.base
         change = codes * self.steps
-        if (np.abs(change[:, [0, 1, 3]]) > _MOST_CHANGE).any() or (np.abs(change[:, [2, 4]]) > _MOST_DOUBLINGS).any():
+        if not self.can_be(codes).all():
             raise CodecError(f"a difference must be within {_MOST_CHANGE:g}; got {np.abs(change).max():g}")
         l11, l21, l22 = cholesky.T
         d1, d2, k11, k21, k22 = change[:, :5].T

@@ -12,7 +12,7 @@ from kcgs.codec.gaussians.quantize import Parameters, Quantizer
 from kcgs.codec.scenes import SceneWriter, deserialize
 from kcgs.scene import Scene, check_scene
 
-from .carried import Change, ClipPart, born_codes
+from .carried import KEPT_SIGMAS, Change, ClipPart, are_sound, born_codes
 from .differences import Differences
 from .file import KEY, ClipHeader, Record
 from .frames import FrameReader, begin_part, carried_record, read_qp
@@ -80,26 +80,27 @@ def _change(part: ClipPart, numbers: Integers, scene: Scene, qp: int) -> Change:
         region = np.searchsorted(part.ids, field.region_ids.numpy())
     tensors = field.means, field.cholesky, field.merged_colors()
     new = Parameters(*(t.detach().double().numpy() for t in tensors))
+    least, most = KEPT_SIGMAS
+    new = new._replace(cholesky=new.cholesky.clip([least, -most, least], most))
     last = part.frame.region
     left = np.zeros(len(last), np.bool_) if index is None else ~np.isin(last, np.unique(index))
     old, found = _match(moved, last, new, region)
-    kept = ~left[old]
-    old, found = old[kept], found[kept]
+    differences = Differences(_pick(moved, old), Quantizer(qp, part.size).distortion, part.size)
+    codes = np.floor(differences.measure(_pick(new, found)) + 0.5).astype(np.int64)
+    kept = ~left[old] & are_sound(moved)[old] & differences.can_be(codes)
+    old, found, codes = old[kept], found[kept], codes[kept]
     gone = ~left
     gone[old] = False
-    stays = np.flatnonzero(~(left | gone))
-    order = np.argsort(old)  # the same as `stays`
-    base = Parameters(*(t[stays] for t in moved))
-    differences = Differences(base, Quantizer(qp, part.size).distortion, part.size)
-    matched = Parameters(*(t[found[order]] for t in new))
-    codes = np.floor(differences.measure(matched) + 0.5).astype(np.int64)
     born = np.setdiff1d(np.arange(len(region)), found)
-    added = Parameters(*(t[born] for t in new))
-    return Change(index, gone, codes, born_codes(added, qp, part.size), region[born])
+    return Change(index, gone, codes, born_codes(_pick(new, born), qp, part.size), region[born])
+
+
+def _pick(gaussians: Parameters, which: Integers) -> Parameters:
+    return Parameters(*(numbers[which] for numbers in gaussians))
 
 
 def _match(old: Parameters, old_region: Integers, new: Parameters, new_region: Integers) -> tuple[Integers, Integers]:
-    """Return which Gaussians of two frames are the same: those that are nearest to each other."""
+    """Return which Gaussians of two frames are the same, in the first one's order: those nearest to each other."""
     from scipy.spatial import cKDTree
 
     first, second = _features(old, old_region), _features(new, new_region)

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs.codec.clips.carried import Change, ClipPart, born_codes
+from kcgs.codec.clips.carried import Change, ClipPart, are_sound, born_codes
 from kcgs.codec.clips.differences import Differences
 from kcgs.codec.exact import Integers
 from kcgs.codec.gaussians.quantize import Codes, Parameters, Quantizer
@@ -67,7 +67,7 @@ class Carrying:
             index = settle_labels(given, index, _JITTER)
         self.index, region = index, part.frame.region
         self._left = np.zeros(len(region), np.bool_) if index is None else ~np.isin(region, np.unique(index))
-        self._gone = _is_outside(moved, part.size) & ~self._left
+        self._gone = (_are_outside(moved, part.size) | ~are_sound(moved)) & ~self._left
         stays = ~(self._left | self._gone)
         self._base, self._region = Parameters(*(numbers[stays] for numbers in moved)), region[stays]
 
@@ -198,7 +198,7 @@ class Carrying:
         return codes
 
 
-def _is_outside(gaussians: Parameters, size: tuple[int, int]) -> NDArray[np.bool_]:
+def _are_outside(gaussians: Parameters, size: tuple[int, int]) -> NDArray[np.bool_]:
     means, cholesky, _ = gaussians
     reach = _OUTSIDE * np.stack([cholesky[:, 0], np.hypot(cholesky[:, 1], cholesky[:, 2])], -1)
     beyond = (means < -reach) | (means > np.array([size[1], size[0]]) + reach)

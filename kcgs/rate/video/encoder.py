@@ -32,9 +32,9 @@ from .report import FrameReport
 
 # steps of the quantization parameter by which a carried frame is coarser than its key frame, without a budget
 _COARSER = 64
-# dB below the key frame, or below so many dB if that is better, and share of its bytes, beyond which a frame is fitted
-# anew
-_LOST, _GOOD, _LARGE = 4.0, 40.0, 0.85
+# dB below the key frame, or below so many dB if that is better, beyond which a frame is fitted anew; fewer are enough
+# where it saves few bytes: so many, and those that each halving of them brings
+_LOST, _GOOD, _SAVED_NONE, _HALVED = 4.0, 40.0, 1.0, 2.0
 # share of the last key frame's bytes that a budget must have for another one
 _AFFORDED = 0.6
 # how often a frame is made coarser for a budget; the last time only its motions are left
@@ -130,9 +130,8 @@ class VideoEncoder:
         numbers = self._motions(part, last, image)
         record, born, part = self._write(part, numbers, image, given)
         value = float(psnr(part.scene().render(), image))
-        if (
-            value < min(self._key_psnr, _GOOD) - _LOST or len(record.data) > _LARGE * self._key_bytes
-        ) and self._affords_key():
+        lost = min(_LOST, _SAVED_NONE + _HALVED * math.log2(self._key_bytes / len(record.data)))
+        if value < min(self._key_psnr, _GOOD) - lost and self._affords_key():
             return None
         self._part = part
         return record, value, born

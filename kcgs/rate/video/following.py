@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcgs.codec.clips.carried import KEPT_SIGMAS
 from kcgs.codec.clips.differences import CURVATURE, Differences
 from kcgs.codec.exact import Integers
 from kcgs.codec.gaussians.quantize import OPPONENT, Parameters
@@ -139,6 +140,8 @@ class Following:
     def _moved(self, current: list[Tensor], speed: Tensor) -> list[Tensor]:
         step = _STEP * speed
         means, cholesky = move(current[0], current[1], step[:, :5].clamp(-_LARGEST, _LARGEST), exact=False)
+        least, most = KEPT_SIGMAS
+        cholesky = cholesky.clamp(cholesky.new_tensor([least, -most, least]), cholesky.new_tensor(most))
         return [means, cholesky, current[2] + step[:, 5:] @ self._opponent]
 
     def _downhill(self, current: list[Tensor]) -> Tensor:
