@@ -161,7 +161,14 @@ class Clip(Sequence[Scene]):
             self._next = key
             self._recent.clear()
         while self._next <= number:
-            frame = self._reader.read(self._records[self._next])
+            try:
+                frame = self._reader.read(self._records[self._next])
+            except BaseException as error:  # what the reader has learned is of half a frame
+                failed, self._next = self._next, 0
+                self._recent.clear()
+                if isinstance(error, CodecError):
+                    raise CodecError(f"frame {failed}: {error}") from error
+                raise
             assert self._reader.part is not None
             self._recent.pop(self._next - 2, None)
             self._recent[self._next] = self._reader.part, frame

@@ -76,6 +76,8 @@ def render_clip(
         raise typer.BadParameter(f"--output must be a video or a folder, or come with --frame; got {str(output)!r}")
     if output.suffix:
         check_output(output, *VIDEOS)
+    if (channels := clip[0].field.colors.shape[-1]) not in (1, 3):
+        raise ValueError(f"a video must have 1 or 3 channels; got a clip of {channels}: --frame writes one time of it")
     wanted = _wanted_rate(rate, clip.frame_rate)
     times = _times(clip, wanted)
     codec = _CODECS.get(output.suffix.lower(), "libx264")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterable, Iterator, Sized
 from fractions import Fraction
@@ -84,9 +83,6 @@ def fit_video_command(
     has_budget = target_bytes is not None or kbps is not None
     frames = _frames(reader, first, counted=has_budget)
     maps = _read_maps(regions, reader, frames, progress=not quiet)
-    count = request.num_gaussians
-    if count is None and not has_budget:
-        count = min(options.DEFAULT_GAUSSIANS, math.prod(reader.size))
     seconds: list[float] = []
     start = time.perf_counter()
     with Stop() as stop:
@@ -97,7 +93,7 @@ def fit_video_command(
             return stop.step(report.number, report)
 
         clip = fit_video(
-            frames, maps, count, target_bytes=target_bytes, kbps=kbps, key_interval=key_interval,
+            frames, maps, request.num_gaussians, target_bytes=target_bytes, kbps=kbps, key_interval=key_interval,
             frame_rate=reader.frame_rate, recipe=request.config, seed=request.seed, checkpoint=checkpoint,
             resume=resume, on_frame=on_frame, progress=not quiet,
         )  # fmt: skip

@@ -52,7 +52,7 @@ def encode(scene: Scene, *, quality: float | None = None, target_bytes: int | No
 
     Raises:
         TypeError: an argument of the wrong type.
-        ValueError: a batch, no Gaussians, values that are not finite, region ids that the map does not hold, both
+        ValueError: a batch, values that are not finite, region ids that the map does not hold, both
             `quality` and `target_bytes`, numbers out of range, more than a file may hold (:mod:`kcgs.codec.file`),
             a target that the coarsest file misses.
 
@@ -82,6 +82,8 @@ class SceneWriter:
         if not isinstance(scene, Scene):
             raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
         field, regions = scene.field, scene.regions
+        if field.means.ndim == 2 and not len(field):
+            field = _black(field, regions)
         _check_field(field)
         self.size, self.channels = field.size, field.colors.shape[-1]
         tensors = field.means, field.cholesky, field.merged_colors()
@@ -231,6 +233,14 @@ def _check_field(field: GaussianField) -> None:
     check_count("pixels per side", max(field.size), 1, MOST_SIDE)
     check_count("channels", channels, 1, MOST_CHANNELS)
     check_count("number of Gaussians", len(field), 1, most_gaussians(channels))
+
+
+def _black(field: GaussianField, regions: RegionMap | None) -> GaussianField:
+    """Return one Gaussian that shows nothing: a file holds at least one."""
+    height, width = field.size
+    region = None if regions is None else regions.labels[height // 2, width // 2][None]
+    centre, color = torch.tensor([[0.5 * width, 0.5 * height]]), torch.zeros(1, field.colors.shape[-1])
+    return GaussianField(centre, torch.tensor([[1.0, 0.0, 1.0]]), color, region, size=field.size)
 
 
 def _positions(field: GaussianField, regions: RegionMap) -> Integers:

@@ -7,6 +7,7 @@ import hashlib
 import html
 from pathlib import Path
 
+from kcgs.clip import Clip
 from kcgs.codec import CodecError, decode, encode
 from kcgs.codec.clips.file import is_clip, unpack
 from kcgs.functional.softness import check_contours
@@ -17,15 +18,15 @@ _FOLDER = Path(__file__).resolve().parent
 _QUALITY = 60.0
 
 
-def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "scaled") -> str:
+def scene_page(scene: Scene | Clip | bytes, *, title: str = "scene", contours: str = "scaled") -> str:
     r"""Write a scene as one HTML page that opens from disk, offline.
 
     Convention: the page zooms, pans, and hides regions; a clip it plays. It holds the scene as a `.kcgs` file and loads
     nothing.
 
     Args:
-        scene: of one image, with 1, 3 or 4 channels; or the bytes of a `.kcgs` file, of a scene or of a clip, which are
-            kept as they are.
+        scene: a scene of one image, or a clip, with 1, 3 or 4 channels; or the bytes of a `.kcgs` file of either, which
+            are kept as they are.
         title: of the page, and what it calls the image for who does not see it.
         contours: "scaled" or "crisp", as :meth:`kcgs.Scene.render` has them.
 
@@ -47,8 +48,10 @@ def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "s
     return page_html(source, title=title, contours=contours, clip=is_clip(data))
 
 
-def web_bytes(scene: Scene | bytes) -> bytes:
+def web_bytes(scene: Scene | Clip | bytes) -> bytes:
     """Write a scene as a `.kcgs` file whose render is within a level of 255 of the scene's own; files are kept."""
+    if isinstance(scene, Clip):
+        scene = scene.to_bytes()
     if isinstance(scene, Scene):
         channels = check_scene(scene).field.colors.shape[-1]
     elif isinstance(scene, bytes) and is_clip(scene):

@@ -31,8 +31,8 @@ _FORTIETHS = 40  # of a pixel: contour widths are whole ones
 _GONE_WEIGHTS, _GONE_MEMORY = np.array([[40.0, 1.0]] * 4 + [[3.0, 1.0]] * 4), 2000.0
 # standard deviations, in pixels, and centres and colours, that a decoder renders
 _SIGMAS, _FARTHEST, _LOUDEST = (1e-3, 1e7), 1e8, 1e12
-# those that an encoder keeps to, since rounding changes them by half a step
-KEPT_SIGMAS = (2e-3, 5e6)
+# factors that an encoder keeps to, since rounding changes them by half a step
+LEAST_FACTOR, MOST_FACTOR = (2e-3, -5e6, 2e-3), 5e6
 
 
 class Frame(NamedTuple):
@@ -206,12 +206,6 @@ def _grouped(codes: Codes, region: Integers) -> list[tuple[Codes, Integers]]:
     starts = np.flatnonzero(np.diff(codes.energy, prepend=codes.energy[0] + 1))
     ends = [*starts[1:].tolist(), len(region)]
     return [(codes.pick(slice(a, b)), region[a:b]) for a, b in zip(starts.tolist(), ends, strict=True)]
-
-
-def born_order(codes: Codes) -> Integers:
-    """Return the order in which a decoder finds Gaussians that are born together."""
-    order: Integers = np.lexsort((codes.cell[:, 0], codes.cell[:, 1], -codes.size, -codes.energy))
-    return order
 
 
 def born_codes(gaussians: Parameters, qp: int, size: tuple[int, int]) -> Codes:

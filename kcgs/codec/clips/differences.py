@@ -22,6 +22,7 @@ _LOG2_E = 1.4426950408889634
 # what a number may change in a frame: standard deviations, and doublings
 _MOST_CHANGE = 1024.0
 _MOST_DOUBLINGS = 40.0
+_MOST_STEPS = 1 << 24
 # Gaussians that are coded before their models learn
 _TOGETHER = 128
 # classes of what a Gaussian did in the last frame: nothing, a little, much, or it was not there
@@ -73,7 +74,7 @@ class Differences:
         """Say of each Gaussian whether a file may say that it changes so much, [N]."""
         change = np.abs(codes * self.steps)
         small = (change[:, [0, 1, 3]] <= _MOST_CHANGE).all(1) & (change[:, [2, 4]] <= _MOST_DOUBLINGS).all(1)
-        return np.asarray(small, np.bool_)
+        return np.asarray(small & (np.abs(codes) <= _MOST_STEPS).all(1), np.bool_)
 
     def restore(self, codes: Integers) -> Parameters:
         """Return the Gaussians that a decoder finds, in float32."""
@@ -128,8 +129,8 @@ class DifferenceCoder:
             size = self._sizes.code(coder, kind * _SUMS + np.minimum(total, _SUMS - 1), size)
             for row in np.flatnonzero(size == _ESCAPE).tolist():
                 beyond = coder.unbounded(0 if values is None else abs(int(values[row])) - _ESCAPE)
-                if beyond > 1 << 24:
-                    raise CodecError(f"a difference must be at most {1 << 24} steps; got {beyond}")
+                if beyond > _MOST_STEPS:
+                    raise CodecError(f"a difference must be at most {_MOST_STEPS} steps; got {beyond}")
                 size[row] += beyond
             sign = coder.uniform(1 + (size > 0), None if values is None else (values < 0).astype(np.int64))
             found[:, place] = np.where(sign == 1, -size, size)

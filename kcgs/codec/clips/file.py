@@ -56,7 +56,7 @@ def unpack(data: bytes) -> tuple[ClipHeader, list[Record], bool]:
     """Take a clip apart: its header, the frames that are whole, and whether it ends where it should.
 
     Raises:
-        CodecError: it is no clip, or damaged before the first of its frames ends.
+        CodecError: it is no clip, or damaged.
     """
     stream = ByteReader(data)
     if stream.take(len(MAGIC)) != MAGIC:
@@ -96,7 +96,7 @@ def _read_record(stream: ByteReader, number: int) -> Record | None:
     except EndsEarly:
         return None
     if checksum != _checksum(head, content, number):
-        raise CodecError(f"the file is damaged: the checksum of frame {number} is another; those before are sound")
+        raise CodecError(f"the file is damaged: the checksum of frame {number} is another")
     return Record(kind, content)
 
 

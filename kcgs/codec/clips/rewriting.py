@@ -12,7 +12,7 @@ from kcgs.codec.gaussians.quantize import Parameters, Quantizer
 from kcgs.codec.scenes import SceneWriter, deserialize
 from kcgs.scene import Scene, check_scene
 
-from .carried import KEPT_SIGMAS, Change, ClipPart, are_sound, born_codes
+from .carried import LEAST_FACTOR, MOST_FACTOR, Change, ClipPart, are_sound, born_codes
 from .differences import Differences
 from .file import KEY, ClipHeader, Record
 from .frames import FrameReader, begin_part, carried_record, read_qp
@@ -80,14 +80,15 @@ def _change(part: ClipPart, numbers: Integers, scene: Scene, qp: int) -> Change:
         region = np.searchsorted(part.ids, field.region_ids.numpy())
     tensors = field.means, field.cholesky, field.merged_colors()
     new = Parameters(*(t.detach().double().numpy() for t in tensors))
-    least, most = KEPT_SIGMAS
-    new = new._replace(cholesky=new.cholesky.clip([least, -most, least], most))
+    new = new._replace(cholesky=new.cholesky.clip(LEAST_FACTOR, MOST_FACTOR))
     last = part.frame.region
     left = np.zeros(len(last), np.bool_) if index is None else ~np.isin(last, np.unique(index))
     old, found = _match(moved, last, new, region)
+    kept = ~left[old] & are_sound(moved)[old]
+    old, found = old[kept], found[kept]
     differences = Differences(_pick(moved, old), Quantizer(qp, part.size).distortion, part.size)
     codes = np.floor(differences.measure(_pick(new, found)) + 0.5).astype(np.int64)
-    kept = ~left[old] & are_sound(moved)[old] & differences.can_be(codes)
+    kept = differences.can_be(codes)
     old, found, codes = old[kept], found[kept], codes[kept]
     gone = ~left
     gone[old] = False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from kcgs.codec.clips.file import ClipHeader, Record, pack_end, pack_header, pack_record
+from kcgs.codec.clips.file import KEY, ClipHeader, Record, pack_end, pack_header, pack_record
 
 # how many carried frames cost what a key frame does, and how many times its even share a carried one may take
 _KEY_FRAMES, _MOST = 4.5, 1.6
@@ -15,35 +15,41 @@ _LEAST, _RECORD = 48, 16
 
 
 class Budget:
-    """What is left of `num_bytes` for `count` frames."""
+    """What is left of `num_bytes` for `count` frames, key frames at least every `interval` of them."""
 
-    def __init__(self, num_bytes: int, count: int, header: ClipHeader) -> None:
+    def __init__(self, num_bytes: int, count: int, header: ClipHeader, interval: int) -> None:
         self._left = num_bytes - len(pack_header(header)) - len(pack_end(count))
-        self._frames, self._number = count, 0
+        self._frames, self._number, self._interval = count, 0, interval
+        self._until = 0  # frames before the next key frame, if none comes earlier
 
     def spend(self, record: Record) -> None:
         """Take a frame off."""
         self._left -= len(pack_record(record, self._number))
+        self._until = (self._interval if record.kind == KEY else self._until) - 1
         self._number += 1
 
-    def for_key(self, interval: int) -> int:
+    def for_key(self) -> int:
         """Return the bytes of a key frame that begins here, less those of its record."""
-        rest = self._frames - self._number
-        others = min(rest, interval) - 1
-        keys = math.ceil(rest / interval)
-        share = self._left / (keys * _KEY_FRAMES + rest - keys) * _KEY_FRAMES
-        return max(1, int(share if others else self._left) - _RECORD)
+        return max(1, int(_KEY_FRAMES * self._fair(0) if self._rest > 1 else self._left) - _RECORD)
 
     def most(self) -> int:
         """Return the bytes that a carried frame may have at most, less those of its record."""
-        after = self._frames - self._number - 1
-        fair = self._left / (after + 1)
-        return max(0, int(min(self._left - after * _LEAST, _MOST * fair if after else self._left)) - _RECORD)
+        after = self._rest - 1
+        fair = _MOST * self._fair(self._until) if after else self._left
+        return max(0, int(min(self._left - after * _LEAST, fair)) - _RECORD)
 
     def step(self, num_bytes: int) -> int:
         """Return by how much the next frame's quantization parameter should rise, after a carried one of so many."""
-        rest = self._frames - self._number
-        if rest < 1:
+        if self._rest < 1:
             return 0
-        wanted = math.log(max(self._left / rest, 1.0) / max(num_bytes, 1)) / SLOPE
+        wanted = math.log(max(self._fair(self._until), 1.0) / max(num_bytes, 1)) / SLOPE
         return round(min(max(0.5 * wanted, -_LARGEST), _LARGEST))
+
+    @property
+    def _rest(self) -> int:
+        return self._frames - self._number
+
+    def _fair(self, until: int) -> float:
+        """Return the bytes of each carried frame if they are even, and key frames begin after so many frames."""
+        keys = math.ceil(max(0, self._rest - until) / self._interval)
+        return self._left / (keys * _KEY_FRAMES + self._rest - keys)

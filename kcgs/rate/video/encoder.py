@@ -14,7 +14,7 @@ from torch import Tensor
 from kcgs.codec import decode
 from kcgs.codec.clips.carried import ClipPart
 from kcgs.codec.clips.file import KEY, Record
-from kcgs.codec.clips.frames import begin_part, carried_record, key_record, read_carried
+from kcgs.codec.clips.frames import begin_part, carried_record, key_record, read_carried, read_qp
 from kcgs.codec.clips.motion import quantize_motion
 from kcgs.codec.exact import Integers
 from kcgs.codec.file import unpack
@@ -38,7 +38,9 @@ _LOST, _GOOD, _SAVED_NONE, _HALVED = 4.0, 40.0, 1.0, 2.0
 # share of the last key frame's bytes that a budget must have for another one
 _AFFORDED = 0.6
 # how often a frame is made coarser for a budget; the last time only its motions are left
-_TRIES = 4
+_TRIES = 5
+# of the slope that is usual, the least that two tries may show
+_LEAST_SLOPE = 0.25
 
 
 class VideoEncoder:
@@ -72,7 +74,7 @@ class VideoEncoder:
         """Take a frame that was fitted before."""
         if record.kind == KEY:
             self._plan_key(image)
-            self._start(record.data, image, labels)
+            self._start(record.data, image, self._carried_map(image, labels))
         else:
             assert self._part is not None
             read_carried(self._part, record)
@@ -83,13 +85,12 @@ class VideoEncoder:
         if self._budget is not None:
             self._budget.spend(record)
             if record.kind != KEY:
-                self._coarser -= self._budget.step(len(record.data))
+                self._coarser = self._qp - read_qp(record)[0] - self._budget.step(len(record.data))
         self._last, self._number, self._since = image, self._number + 1, self._since + 1
 
     def _begin(self, image: Tensor, labels: Tensor | None) -> tuple[Record, float, int]:
         """Fit a key frame."""
-        if labels is None and self._part is not None and (regions := self._part.regions(self._part.frame.index)):
-            labels = regions.labels
+        labels = self._carried_map(image, labels)
         goal = self._plan_key(image)
         result = fit(image, labels, self._most, recipe=self._config, seed=self._seed)
         if not goal:
@@ -103,9 +104,17 @@ class VideoEncoder:
         """Choose how many Gaussians the next part has, and return the bytes of its key frame, if there is a budget."""
         if self._budget is None:
             return {}
-        num_bytes = self._budget.for_key(self._interval)
+        num_bytes = self._budget.for_key()
         self._most = self._wanted or count_for(num_bytes, image[0].numel(), self._config.objective)
         return {"target_bytes": num_bytes}
+
+    def _carried_map(self, image: Tensor, labels: Tensor | None) -> Tensor | None:
+        """Return the map of a key frame: where none is given, the last one as its regions move."""
+        part, last = self._part, self._last
+        if labels is not None or part is None or last is None or part.frame.index is None:
+            return labels
+        regions = part.regions(part.moved(self._motions(part, last, image))[1])
+        return None if regions is None else regions.labels
 
     def _start(self, data: bytes, image: Tensor, labels: Tensor | None) -> None:
         """Begin a part with a still file."""
@@ -114,10 +123,10 @@ class VideoEncoder:
         self._qp, self._key_bytes, self._since = unpack(data)[0].qp, len(data), 0
         self._key_psnr = float(psnr(scene.render(), image))
         self._positions = {}
-        if labels is not None and self._part.frame.index is not None:
-            index = torch.from_numpy(self._part.frame.index)
-            for region in torch.unique(labels).tolist():  # the fit may have merged some
-                self._positions[region] = int(torch.mode(index[labels == region]).values)
+        index = self._part.frame.index
+        for region in [] if labels is None else torch.unique(labels).tolist():  # the fit may have merged some, or all
+            inside = None if index is None else torch.from_numpy(index)[labels == region]
+            self._positions[region] = 0 if inside is None else int(torch.mode(inside).values)
 
     def _carry(self, image: Tensor, labels: Tensor | None) -> tuple[Record, float, int] | None:
         """Carry the last frame on; None where a key frame is better."""
@@ -125,36 +134,47 @@ class VideoEncoder:
         if part is None or last is None or self._since >= self._interval:
             return None
         given = self._given(labels)
-        if labels is not None and part.frame.index is not None and given is None:
+        if labels is not None and given is None:
             return None  # a region that the key frame does not know
         numbers = self._motions(part, last, image)
-        record, born, part = self._write(part, numbers, image, given)
+        found = self._write(part, numbers, image, given)
+        if found is None:
+            return None
+        record, born, part = found
         value = float(psnr(part.scene().render(), image))
-        lost = min(_LOST, _SAVED_NONE + _HALVED * math.log2(self._key_bytes / len(record.data)))
-        if value < min(self._key_psnr, _GOOD) - lost and self._affords_key():
+        lost = _SAVED_NONE + _HALVED * math.log2(self._key_bytes / len(record.data))
+        if value < min(self._key_psnr, _GOOD) - min(max(lost, 0.0), _LOST) and self._affords_key():
             return None
         self._part = part
         return record, value, born
 
     def _affords_key(self) -> bool:
         least = _AFFORDED * self._key_bytes
-        return self._budget is None or self._budget.for_key(self._interval) >= least
+        return self._budget is None or self._budget.for_key() >= least
 
-    def _write(self, part: ClipPart, numbers: Integers, image: Tensor, given: Any) -> tuple[Record, int, ClipPart]:
-        """Write a carried frame, as the budget allows; return how many Gaussians are new, and the part, gone on."""
+    def _write(
+        self, part: ClipPart, numbers: Integers, image: Tensor, given: Any
+    ) -> tuple[Record, int, ClipPart] | None:
+        """Write a carried frame, as the budget allows; return how many Gaussians are new, and the part, gone on.
+
+        None: no Gaussian is left.
+        """
         most = math.inf if self._budget is None else self._budget.most()
-        coarser = self._coarser
+        coarser, tried = self._coarser, list[tuple[int, float]]()  # quantization parameters, and logarithms of bytes
         for attempt in range(_TRIES):
             ahead = copy.deepcopy(part)
             qp = min(max(self._qp - coarser, QPS[0]), QPS[1])
             stands = attempt == _TRIES - 1  # as predicted, its map too
             carrying = Carrying(part, numbers, image, None if stands else given, self._config, qp)
             change = carrying.stand() if stands else carrying.fit(self._most, self._seed + self._number)
+            if not len(change.codes) + len(change.born_region):
+                return None
             record = carried_record(ahead, qp, numbers, change)
             if len(record.data) <= most:
                 return record, len(change.born_region), ahead
-            coarser += 4 + round(math.log(len(record.data) / max(most, 1)) / SLOPE)
-        raise ValueError(f"target_bytes must leave {len(record.data)} bytes for frame {self._number}; it leaves {most}")
+            tried.append((qp, math.log(len(record.data))))
+            coarser += 4 + round((tried[-1][1] - math.log(max(most, 1))) / _slope(tried))
+        raise ValueError(f"target_bytes or kbps must leave {len(record.data)} bytes; they leave {most}")
 
     def _given(self, labels: Tensor | None) -> Any:
         """Return a given map as positions of the part's regions; None where there is none, or they do not know it."""
@@ -180,3 +200,11 @@ class VideoEncoder:
                 motion = torch.eye(3, dtype=torch.float64)
             numbers[region] = quantize_motion(torch.linalg.inv(motion)[:2].numpy(), size)
         return numbers
+
+
+def _slope(tried: list[tuple[int, float]]) -> float:
+    """Return how the logarithm of a frame's bytes rises with its quantization parameter, by the last two tries."""
+    if len(tried) < 2 or tried[-2][0] == tried[-1][0]:
+        return SLOPE
+    (finer, more), (coarser, less) = tried[-2:]
+    return min(max((more - less) / (finer - coarser), _LEAST_SLOPE * SLOPE), SLOPE)

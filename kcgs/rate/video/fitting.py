@@ -74,7 +74,7 @@ def fit_video(
             show any frame.
         on_frame: called after each frame with a :class:`FrameReport`; returning True ends the clip there.
         progress: show a bar.
-        checkpoint: a file to which every frame is added when it is done.
+        checkpoint: a file to which every frame is added when it is done; it knows the frames and maps by checksums.
         resume: go on from `checkpoint` where it exists; the result is that of an uninterrupted fit.
         settings: of the key frames, fields of :class:`kcgs.FitConfig`.
 
@@ -107,7 +107,7 @@ def fit_video(
     count = operator.length_hint(frames, 0) or None
     num_bytes = _check_budget(target_bytes, kbps, count, rate)
     given = {"num_gaussians": num_gaussians, "seed": seed, "key_interval": key_interval, "num_bytes": num_bytes}
-    asked = {**given, "config": config.model_dump()}
+    asked = {**given, "config": config.model_dump(), "frames": None if num_bytes is None else count}
     journal = None if checkpoint is None else Journal(checkpoint, asked, resume=resume)
     records: list[Record] = []
     header = encoder = None
@@ -115,18 +115,23 @@ def fit_video(
         for number, (image, labels) in enumerate(_pairs(frames, label_maps)):
             if header is None or encoder is None:
                 header = ClipHeader((image.shape[1], image.shape[2]), image.shape[0], rate)
-                budget = None if num_bytes is None or count is None else Budget(num_bytes, count, header)
-                most = num_gaussians if num_bytes is not None else num_gaussians or _USUAL
-                encoder = VideoEncoder(config, most, seed, key_interval, budget)
+                budget = None if num_bytes is None or count is None else Budget(num_bytes, count, header, key_interval)
+                usual = None if num_bytes is not None else min(_USUAL, image[0].numel())
+                encoder = VideoEncoder(config, num_gaussians or usual, seed, key_interval, budget)
             elif (image.shape[1:], len(image)) != (torch.Size(header.size), header.channels):
                 raise ValueError(f"frames must have one size; got {tuple(image.shape)} for frame {number}")
-            if journal is not None and (done := journal.done(header, number)) is not None:
+            elif num_bytes is not None and number == count:
+                raise ValueError(f"frames must be as many as their length says, {count}; got more")
+            if journal is not None and (done := journal.done(header, number, image, labels)) is not None:
                 records.append(encoder.skip(image, labels, done))
                 continue
-            record, report = encoder.add(image, labels)
+            try:
+                record, report = encoder.add(image, labels)
+            except ValueError as error:
+                raise ValueError(f"frame {number}: {error}") from error
             records.append(record)
             if journal is not None:
-                journal.write(header, record, number)
+                journal.write(header, number, image, labels, record)
             if count:
                 bar.update((number + 1) / count, f"frame {number + 1} of {count}, {report.psnr:.2f} dB")
             if on_frame is not None and on_frame(report):

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs.codec.clips.carried import KEPT_SIGMAS
+from kcgs.codec.clips.carried import LEAST_FACTOR, MOST_FACTOR, are_sound
 from kcgs.codec.clips.differences import CURVATURE, Differences
 from kcgs.codec.exact import Integers
 from kcgs.codec.gaussians.quantize import OPPONENT, Parameters
@@ -101,7 +101,8 @@ class Following:
             moved = self._moved(current, self.speed)
             self.gaussians = [torch.where(f, g, m) for f, g, m in zip(fixed, self.gaussians, moved, strict=True)]
         codes: Integers = self._quantize().double().numpy().astype(np.int64)
-        return codes
+        codes *= self.differences.can_be(codes)[:, None]
+        return codes * are_sound(self.differences.restore(codes))[:, None]
 
     def parameters(self) -> Parameters:
         """Return the Gaussians in float64."""
@@ -140,8 +141,7 @@ class Following:
     def _moved(self, current: list[Tensor], speed: Tensor) -> list[Tensor]:
         step = _STEP * speed
         means, cholesky = move(current[0], current[1], step[:, :5].clamp(-_LARGEST, _LARGEST), exact=False)
-        least, most = KEPT_SIGMAS
-        cholesky = cholesky.clamp(cholesky.new_tensor([least, -most, least]), cholesky.new_tensor(most))
+        cholesky = cholesky.clamp(cholesky.new_tensor(LEAST_FACTOR), cholesky.new_tensor(MOST_FACTOR))
         return [means, cholesky, current[2] + step[:, 5:] @ self._opponent]
 
     def _downhill(self, current: list[Tensor]) -> Tensor:

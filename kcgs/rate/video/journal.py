@@ -5,16 +5,23 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import zlib
 from pathlib import Path
 from typing import Any
+
+from torch import Tensor
 
 from kcgs._atomic import check_writable, write_file
 from kcgs.codec.clips.file import ClipHeader, Record, pack_header, pack_record, unpack
 from kcgs.codec.rangecoder import CodecError
 
+_SUM = 4  # bytes
+
 
 class Journal:
     """A file that frames are added to: a line that says of which fit, then a clip without its end.
+
+    Each of its records begins with a checksum of the frame and the map that were given.
 
     Args:
         path: the file.
@@ -30,15 +37,18 @@ class Journal:
         if resume and self._path.exists():
             self._read()
 
-    def done(self, header: ClipHeader, number: int) -> Record | None:
+    def done(self, header: ClipHeader, number: int, image: Tensor, labels: Tensor | None) -> Record | None:
         """Return a frame that was fitted before; the first that was not ends what is there."""
         if self._kept is None or number >= len(self._kept[1]):
             return None
         if self._kept[0] != header:
             raise ValueError(f"checkpoint {str(self._path)!r} is of another video: {self._kept[0]}, not {header}")
-        return self._kept[1][number]
+        kind, data = self._kept[1][number]
+        if data[:_SUM] != _sum(image, labels):
+            raise ValueError(f"checkpoint {str(self._path)!r} is of another video: frame {number} or its map differs")
+        return Record(kind, data[_SUM:])
 
-    def write(self, header: ClipHeader, record: Record, number: int) -> None:
+    def write(self, header: ClipHeader, number: int, image: Tensor, labels: Tensor | None, record: Record) -> None:
         """Add a frame."""
         if not self._started:
             whole = [] if self._kept is None else self._kept[1]
@@ -47,7 +57,7 @@ class Journal:
             write_file(self._path, content)
             self._started = True
         with self._path.open("ab") as file:
-            file.write(pack_record(record, number))
+            file.write(pack_record(Record(record.kind, _sum(image, labels) + record.data), number))
             file.flush()
             os.fsync(file.fileno())
 
@@ -67,3 +77,11 @@ class Journal:
         except CodecError as error:
             raise ValueError(f"checkpoint {str(self._path)!r} cannot be read: {error}") from error
         self._kept = header, records
+
+
+def _sum(image: Tensor, labels: Tensor | None) -> bytes:
+    """Return the checksum of a frame and its map."""
+    found = zlib.crc32(image.detach().cpu().contiguous().numpy().tobytes())
+    if labels is not None:
+        found = zlib.crc32(labels.cpu().contiguous().numpy().tobytes(), found)
+    return found.to_bytes(_SUM, "big")
