@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from kcgs import GaussianField, RegionMap, Scene
-from kcgs.codec import encode
+from kcgs.codec import CodecError, encode
 from kcgs.codec.clips.carried import Change, ClipPart, born_codes
 from kcgs.codec.clips.differences import Differences
 from kcgs.codec.clips.file import ClipHeader, Record, pack_end, pack_header, pack_record, unpack
@@ -119,6 +119,20 @@ def attack(node: Node, count: int, seed: int) -> None:
     assert frames and refused
 
 
+def assert_same_container(node: Node, data: bytes) -> None:
+    """Both take a file apart into as many frames, say whether it is whole, or refuse it; no frame is decoded."""
+    answer = node.do("clip", data, numbers=[])
+    try:
+        _, records, complete = unpack(data)
+    except CodecError as error:
+        assert answer.get("error") == "DecodeError", (str(error), answer)
+        return
+    if records:
+        assert (answer.get("frames"), answer.get("complete")) == (len(records), complete), answer
+    else:
+        assert answer["error"] == "DecodeError" and "it holds no whole frame" in answer["message"]
+
+
 class TestConformance:
     def test_golden(self, node: Node) -> None:
         assert check_clip(node, GOLDEN.read_bytes()) == 5
@@ -157,6 +171,22 @@ class TestDamage:
         found = {check_clip(node, data[:end]) for end in [*range(0, len(data), 37), len(data) - 1]}
         assert found == {0, 1, 2, 3, 4, 5}
 
+    @pytest.mark.parametrize("mask", [1, 0x80, 0xFF])
+    def test_damage_of_the_last_bytes(self, node: Node, mask: int) -> None:
+        data = GOLDEN.read_bytes()
+        for place in range(len(data) - 20, len(data)):
+            damaged = bytearray(data)
+            damaged[place] ^= mask
+            for end in (len(data) - 1, len(data)):
+                assert_same_container(node, bytes(damaged[:end]))
+            assert_same_container(node, bytes(damaged) + b"\0")
+
+    @pytest.mark.slow
+    def test_every_end(self, node: Node) -> None:
+        data = GOLDEN.read_bytes()
+        for end in range(len(data) + 1):
+            assert_same_container(node, data[:end])
+
     def test_what_is_wrong_is_named(self, node: Node, tmp_path: Path) -> None:
         data = GOLDEN.read_bytes()
         header, records, _ = unpack(data)
@@ -171,3 +201,10 @@ class TestDamage:
         ]:
             answer = node.do("clip", content)
             assert answer["error"] == "DecodeError" and message in answer["message"], answer
+
+    def test_a_bad_frame_is_named(self, node: Node) -> None:
+        header, records, _ = unpack(GOLDEN.read_bytes())
+        data = packed(header, [*records[:3], Record(records[3].kind, b""), records[4]])
+        for number in (3, 4):
+            answer = node.do("clip", data, numbers=[number])
+            assert answer["error"] == "DecodeError" and answer["message"].startswith("frame 3: "), answer

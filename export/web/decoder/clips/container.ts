@@ -11,7 +11,6 @@ const END = 2;
 const MOST_RATE = 2 ** 20;
 const MOST_BYTES = 2 ** 32;
 const MOST_FRAMES = 2 ** 30;
-const SHORTEST = 16; // bytes; fewer may be the beginning of any record
 
 /** A frame as bytes: a still file, or what changed since the frame before. */
 export interface ClipRecord {
@@ -81,7 +80,7 @@ function readRecord(reader: ByteReader, number: number): { kind: number; data: U
       );
     return { kind, data };
   } catch (error) {
-    if (error instanceof EndOfBytes || reader.data.length - start < SHORTEST) return null;
+    if (error instanceof EndOfBytes) return null;
     throw error;
   }
 }

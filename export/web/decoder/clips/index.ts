@@ -13,7 +13,8 @@ const FORTIETHS = 40; // of a pixel
 
 /** A frame as a scene. All frames from one key frame on have the same ids of regions. */
 export interface ClipFrame extends ExactScene {
-  readonly keys: Int32Array; // N: a Gaussian has the same in all frames that it is in
+  /** N: a Gaussian keeps its number in frames read one after another from a key frame on; a jump may give others. */
+  readonly keys: Int32Array;
 }
 
 /** Scenes one after another. A frame after the last one that was read takes one step, any other those since its key frame. */
@@ -45,8 +46,9 @@ export class Clip {
     if (number === this.number && this.scene !== null) return this.scene;
     const key = this.keyFrames.findLast((place) => place <= number)!;
     const next = this.part !== null && key <= this.number && this.number < number ? this.number + 1 : key;
+    let place = next;
     try {
-      for (let place = next; place <= number; place++) this.read(place);
+      for (; place <= number; place++) this.read(place);
       const part = this.part!;
       this.scene = sceneOf(part, this.scene);
     } catch (error) {
@@ -54,6 +56,7 @@ export class Clip {
       this.number = -1;
       if (error instanceof RangeError)
         throw new DecodeError(`the clip needs more memory than there is: ${error.message}`);
+      if (error instanceof DecodeError) error.message = `frame ${place}: ${error.message}`;
       throw error;
     }
     return this.scene;
