@@ -6,6 +6,7 @@ import base64
 import gzip
 import json
 from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from kcgs import Clip, GaussianField, RegionMap, Scene, load
 from kcgs.codec import encode
+from kcgs.codec.clips.file import KEY, ClipHeader, Record, pack_end, pack_header, pack_record
 from kcgs.editing import move_region, recolor_region
 from kcgs.page import scene_page
 from kcgs.page.html import page_html
@@ -356,6 +358,18 @@ class TestPage:
         assert browser.do("requests") == [path.as_uri()] and browser.do("problems") == []
 
 
+def open_clip(browser: Browser, folder: Path, data: bytes) -> None:
+    source = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    path = folder / "page.html"
+    path.write_text(page_html(source, title="a", clip=True), encoding="utf-8")
+    browser.do("open", url=path.as_uri())
+
+
+def halves(first: int) -> RegionMap:
+    """A left half and a right one, whose ids are `first` and the next."""
+    return RegionMap.from_labels(first + (torch.arange(60) >= 30).long().expand(40, 60), 0.0)
+
+
 class TestClipPage:
     def test_plays_and_shows_any_frame(self, browser: Browser, node_modules: Path, tmp_path: Path) -> None:
         clip = Clip.load(CLIP)
@@ -378,15 +392,49 @@ class TestClipPage:
         browser.do("wait", expression="document.querySelector('input[type=range]').value === '4'")
         assert browser.do("requests") == [path.as_uri()] and browser.do("problems") == []
 
+    def test_a_clip_that_ends_early_says_so(self, browser: Browser, node_modules: Path, tmp_path: Path) -> None:
+        open_clip(browser, tmp_path, CLIP.read_bytes()[:-60])
+        browser.do("wait", expression="document.querySelector('#note').textContent.includes('after 4 whole frames')")
+        assert "ends early" in browser.do("text", on="#note")
+
+    def test_regions_of_a_later_part(self, browser: Browser, node_modules: Path, tmp_path: Path) -> None:
+        scenes = [Scene(GaussianField.random(90, (40, 60), regions=r), r) for r in map(halves, (1, 2))]
+        header = ClipHeader((40, 60), 3, Fraction(24))
+        records = [pack_record(Record(KEY, encode(scene)), number) for number, scene in enumerate(scenes)]
+        browser.do("look", motion="reduce", width=1000, height=700)
+        open_clip(browser, tmp_path, b"".join([pack_header(header), *records, pack_end(2)]))
+        browser.do("wait", expression="document.querySelector('#note').textContent.includes('2 regions')")
+        browser.do("click", on="#bar button:last-of-type")
+
+        def hidden(number: int) -> float:
+            slider = "document.querySelector('input[type=range]')"
+            browser.evaluate(f"({slider}.value = '{number}', {slider}.oninput(), 0)")
+            return float((array(browser.evaluate(CLIP_PIXELS))[..., 3] == 0).mean())
+
+        def tick(region: int) -> None:
+            rows = "[...document.querySelectorAll('#regions label')]"
+            browser.evaluate(
+                f"({rows}.find((row) => row.textContent.startsWith('Region {region} ')).firstChild.click(), 0)"
+            )
+
+        assert browser.do("text", on="#regions").count("Region") == 2 and hidden(1) == 0
+        assert browser.do("text", on="#regions").count("Region") == 3
+        tick(3)  # which the second part alone has
+        assert hidden(1) == pytest.approx(1 / 2, abs=0.02) and hidden(0) == 0
+        tick(3)
+        assert hidden(1) == 0
+        tick(1)  # which the first part alone has
+        assert hidden(1) == 0 and hidden(0) == pytest.approx(1 / 2, abs=0.02)
+        assert hidden(1) == 0
+        tick(1)
+        tick(2)  # both
+        assert hidden(0) == hidden(1) == pytest.approx(1 / 2, abs=0.02)
+        assert browser.do("problems") == []
+
     def test_damage_is_named(self, browser: Browser, node_modules: Path, tmp_path: Path) -> None:
         data = bytearray(CLIP.read_bytes())
         data[-60] ^= 1
-        path = tmp_path / "page.html"
-        page = page_html(
-            "data:application/octet-stream;base64," + base64.b64encode(data).decode(), title="a", clip=True
-        )
-        path.write_text(page, encoding="utf-8")
-        browser.do("open", url=path.as_uri())
+        open_clip(browser, tmp_path, bytes(data))
         browser.do("wait", expression="document.querySelector('#note').textContent.includes('checksum of frame 4')")
 
 

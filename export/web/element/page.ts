@@ -9,6 +9,9 @@ export const bar = document.querySelector<HTMLElement>("#bar")!;
 const list = document.querySelector<HTMLElement>("#regions")!;
 const note = document.querySelector<HTMLElement>("#note")!;
 const zoom = document.createElement("output");
+const boxes = new Map<number, HTMLInputElement>(); // of the regions that are listed
+const unticked = new Set<number>();
+let listed: Float64Array | undefined; // the ids of the regions that were shown last
 
 // within another page the wheel scrolls that one
 if (window.top !== window) image.setAttribute("zoom", "ctrl");
@@ -34,7 +37,7 @@ export function describe(content: string): void {
   const { scene, regionIds } = image;
   const regions = regionIds.length > 1 ? `, ${regionIds.length} regions` : "";
   note.textContent = `${scene!.width} × ${scene!.height}, ${content}${regions}`;
-  if (regionIds.length > 1) listRegions(shares());
+  listRegions();
 }
 
 /** The share of the image that each region has. */
@@ -45,18 +48,36 @@ function shares(): Map<number, number> {
   return new Map(Array.from(ids, (id, place) => [id, counts[place]! / labels.length]));
 }
 
-/** Hide a region; a later part of a clip need not have it. */
-function hide(id: number, hidden: boolean): void {
-  if (image.regionIds.includes(id)) image.hide(id, hidden);
+/** List regions that are not listed yet, and hide those that are not ticked: each part of a clip has its own. */
+export function listRegions(): void {
+  const ids = image.scene?.regions?.ids;
+  if (ids === listed) return;
+  listed = ids;
+  const first = boxes.size === 0;
+  const fresh = ids && ids.length > 1 ? [...new Set(ids)].filter((id) => !boxes.has(id)) : [];
+  if (fresh.length > 0) {
+    if (first) addToggle();
+    const areas = shares();
+    for (const id of fresh.sort((a, b) => areas.get(b)! - areas.get(a)!)) addBox(id, areas.get(id)!);
+  }
+  if (first) return;
+  image.hide(image.regionIds, false);
+  image.hide(image.regionIds.filter((id) => unticked.has(id)));
 }
 
-function listRegions(areas: Map<number, number>): void {
-  const boxes = new Map<number, HTMLInputElement>();
-  for (const [id, area] of [...areas].sort((a, b) => b[1] - a[1])) {
-    const box = make("input", { type: "checkbox", checked: true, onchange: () => hide(id, !box.checked) });
-    boxes.set(id, box);
-    list.append(make("label", {}, box, `Region ${id} `, make("small", {}, `${(100 * area).toFixed(1)} %`)));
-  }
+function addBox(id: number, area: number): void {
+  const onchange = (): void => {
+    if (box.checked) unticked.delete(id);
+    else unticked.add(id);
+    // the part of a clip that is shown need not have it
+    if (image.regionIds.includes(id)) image.hide(id, !box.checked);
+  };
+  const box = make("input", { type: "checkbox", checked: true, onchange });
+  boxes.set(id, box);
+  list.append(make("label", {}, box, `Region ${id} `, make("small", {}, `${(100 * area).toFixed(1)} %`)));
+}
+
+function addToggle(): void {
   const toggle = button("Regions", "List the regions, to hide some", () => {
     list.hidden = !list.hidden;
     toggle.ariaExpanded = String(!list.hidden);
