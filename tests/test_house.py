@@ -95,7 +95,7 @@ def test_files_are_short() -> None:
     lengths = {path: len(path.read_text().splitlines()) for path in modules().values()}
     assert not {str(path): count for path, count in lengths.items() if count > 350}
     bench = sum(count for path, count in lengths.items() if "bench" in path.relative_to(ROOT).parts)
-    assert sum(lengths.values()) <= 33_700 and bench <= 6_150
+    assert sum(lengths.values()) <= 33_800 and bench <= 6_150
     assert len((ROOT / "README.md").read_text().splitlines()) <= 160
 
 

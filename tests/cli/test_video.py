@@ -287,9 +287,7 @@ class TestOtherCommands:
         code, _, err = run("eval", "clip.kcgs", "small")
         assert (code, err) == (2, "kcgs: IMAGE must have the size (32, 48) of SCENE; got (8, 9)\n")
 
-    @pytest.mark.parametrize(
-        "arguments", [("encode", "-o", "a.kcgs"), ("export", "-o", "a.onnx"), ("export", "-o", "a.html")]
-    )
+    @pytest.mark.parametrize("arguments", [("encode", "-o", "a.kcgs"), ("export", "-o", "a.onnx")])
     def test_what_takes_scenes_only_says_what_a_clip_is_for(
         self, run: Run, clip: Clip, arguments: tuple[str, ...]
     ) -> None:

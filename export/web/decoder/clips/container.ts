@@ -76,7 +76,7 @@ function readRecord(reader: ByteReader, number: number): { kind: number; data: U
     const data = reader.take(length);
     if (reader.number(4) !== crc32(data, crc32(head, crc32(varint(number)))))
       throw new DecodeError(
-        `the file is damaged: the checksum of frame ${number} is another; those before are sound`,
+        `the file is damaged: the checksum of frame ${number} is another`,
       );
     return { kind, data };
   } catch (error) {
