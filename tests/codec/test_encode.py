@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from kcgs import GaussianField, RegionMap, Scene, load
+from kcgs import GaussianField, RegionMap, Scene, fit, load
 from kcgs.codec import decode, encode
 from kcgs.functional import region_splat
 
@@ -210,3 +210,11 @@ class TestRefusals:
             file.write(data[:-20])
         with pytest.raises(ValueError, match=r"cannot load .*scene.kcgs: it ends early"):
             load(path)
+
+
+@pytest.mark.parametrize("labels", [None, (torch.arange(48) >= 24).long().expand(32, 48)])
+def test_a_scene_without_gaussians_is_black(labels: torch.Tensor | None) -> None:
+    scene = fit(torch.zeros(3, 32, 48), labels, num_gaussians=20, iterations=5).scene
+    assert len(scene) == 0
+    for data in (encode(scene), encode(scene, target_bytes=300)):
+        assert torch.equal(decode(data).scene.render(), scene.render())
