@@ -13,7 +13,8 @@ from kcgs.bench.core.options import Options
 
 REPORTS = Path(kcgs.__file__).resolve().parent.parent / "notebooks/reports"
 NAMES = (
-    "ablation", "charts", "convergence", "davis", "decode", "enlarge", "fill", "labels", "maps", "rate", "render", "video",
+    "ablation", "charts", "convergence", "davis", "decode", "enlarge", "fill", "labels", "maps", "rate", "render",
+    "video",
 )  # fmt: skip
 
 
