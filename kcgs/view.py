@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 from urllib.parse import quote, urlencode
 
 from kcgs._shipped import shipped_folder
+from kcgs.clip import Clip
 from kcgs.codec.clips.file import is_clip
 from kcgs.page.html import page_html, web_bytes
 from kcgs.scene import Scene
@@ -70,7 +71,7 @@ class _Server(ThreadingHTTPServer):
 
 
 def serve(
-    scene: Scene | bytes,
+    scene: Scene | Clip | bytes,
     *,
     name: str = "scene",
     original: Path | None = None,
@@ -79,7 +80,7 @@ def serve(
     browser: bool = True,
     say: Callable[[str], object] = print,
 ) -> None:
-    """Serve the page of a scene, or of the bytes of a `.kcgs` file, a clip's too, on loopback until Ctrl-C.
+    """Serve the page of a scene or a clip, or of the bytes of a `.kcgs` file of either, on loopback until Ctrl-C.
 
     `name` is the scene's title on the page, `original` an image file to compare with, `contours` scaled or crisp; port
     0 is any that is free; `browser` opens a window, `say` takes the line that says where the page is.

@@ -106,12 +106,10 @@ def view(
             raise typer.BadParameter("--contours are those of the decoder; kcgs export has them")
         serve_decoder(scene, original=original, port=port, browser=browser, say=typer.echo)
         return
-    clip = is_clip(scene)
-    if clip:
+    if clip := is_clip(scene):
         exclude("a clip", original=original)
-        read_clip(scene)
-    loaded = None if clip else load(scene)
-    shown = loaded if loaded is not None and scene.suffix != ".kcgs" else scene.read_bytes()
+    loaded = read_clip(scene) if clip else load(scene)
+    shown = scene.read_bytes() if scene.suffix == ".kcgs" else loaded
     serve(shown, name=scene.stem, original=original, contours=contours, port=port, browser=browser, say=typer.echo)
 
 

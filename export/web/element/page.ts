@@ -32,6 +32,7 @@ image.addEventListener("load", () => {
   describe(`${image.scene!.count} Gaussians`);
   compare(image.dataset["original"]);
 });
+
 /** Say what is shown, and list its regions. */
 export function describe(content: string): void {
   const { scene, regionIds } = image;

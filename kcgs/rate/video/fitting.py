@@ -63,7 +63,8 @@ def fit_video(
         frames: tensors :math:`(C, H, W)`, or what else :func:`kcgs.fit` takes, of one size.
         label_maps: one for each frame, an iterable of what :func:`kcgs.fit` takes as regions; or one alone, of the
             first frame, which is carried on; None: no regions. In an iterable None stands for a map that is carried.
-        num_gaussians: N, the most that a frame may have. None: 1,000, or with a budget as many as suit it.
+        num_gaussians: N, the most that a frame may have. None: 1,000, of small frames one for each of their pixels, or
+            with a budget as many as suit it.
         target_bytes: the clip is not larger, and nearly as large: frames get coarser or finer as they go. It needs to
             be known how many frames there are: `frames` has a length.
         kbps: thousands of bits per second, in place of `target_bytes`.
