@@ -27,6 +27,7 @@ from kcgs.rate.video.carrying import Carrying
 from kcgs.rate.video.encoder import VideoEncoder
 from kcgs.rate.video.following import Following
 from kcgs.rate.video.registration import register
+from kcgs.rate.video.report import FrameReport
 
 SIZE = (48, 64)
 SETTINGS = {"num_gaussians": 60, "iterations": 40}
@@ -81,6 +82,25 @@ def test_a_scene_cut_begins_a_key_frame() -> None:
     other = torch.nn.functional.avg_pool2d(noise[None], 7, 1, 3)[0]
     clip = fit_video([*FRAMES[:2], other], [*MAPS[:2], MAPS[0]], num_gaussians=60, iterations=20)
     assert clip.key_frames == (0, 2)
+
+
+def soft_noise(count: int) -> list[torch.Tensor]:
+    noise = torch.rand(count, 3, *SIZE, generator=torch.Generator().manual_seed(0))
+    return list(torch.nn.functional.avg_pool2d(noise, 7, 1, 3))
+
+
+def test_frames_that_have_nothing_in_common_are_key_frames_and_share_a_budget() -> None:
+    clip = fit_video(soft_noise(4), target_bytes=2400, iterations=30)
+    assert clip.key_frames == (0, 1, 2, 3) and clip.num_bytes <= 2400
+    assert max(clip.frame_bytes[1:]) < 1.3 * min(clip.frame_bytes[1:]) < clip.frame_bytes[0]
+
+
+def test_a_frame_with_more_detail_may_show_less() -> None:
+    (first,) = soft_noise(1)
+    checks = 0.15 * (torch.arange(SIZE[0])[:, None] // 2 + torch.arange(SIZE[1]) // 2).remainder(2)
+    reports: list[FrameReport] = []
+    fit_video([first, first + checks], num_gaussians=60, iterations=30, on_frame=reports.append)
+    assert reports[1].psnr < reports[0].psnr - 5 and not reports[1].is_key
 
 
 def test_key_frames_come_as_often_as_is_asked() -> None:
@@ -192,12 +212,13 @@ def test_inference_mode_and_warnings_do_no_harm() -> None:
         assert len(fit_video(FRAMES[:2], MAPS[:2], **SETTINGS)) == 2
 
 
-def test_a_frame_that_can_only_stand_is_read_though_its_map_lost_a_region() -> None:
+def test_a_frame_that_can_only_stand_is_read_though_its_map_lost_a_region(monkeypatch) -> None:
     scenes = VideoEncoder(FitConfig(iterations=20), 60, 0, 9)
     record, _ = scenes.add(*moving_disc(0))
     reader = FrameReader(ClipHeader(SIZE, 3, Fraction(24)))
     reader.read(record)
     scenes._budget = Budget(145, 2, reader.header, 9)
+    monkeypatch.setattr(scenes, "_affords_key", lambda: False)
     record, report = scenes.add(FRAMES[1], torch.zeros_like(MAPS[1]))
     assert not report.is_key and len(record.data) < 30
     assert reader.read(record).index.max() == 1

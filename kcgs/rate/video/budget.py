@@ -32,6 +32,10 @@ class Budget:
         """Return the bytes of a key frame that begins here, less those of its record."""
         return max(1, int(_KEY_FRAMES * self._fair(0) if self._rest > 1 else self._left) - _RECORD)
 
+    def for_frame(self) -> int:
+        """Return the bytes of any frame if all are like it, less those of its record."""
+        return max(1, int(self._left / self._rest) - _RECORD)
+
     def most(self) -> int:
         """Return the bytes that a carried frame may have at most, less those of its record."""
         after = self._rest - 1

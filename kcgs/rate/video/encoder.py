@@ -32,9 +32,12 @@ from .report import FrameReport
 
 # steps of the quantization parameter by which a carried frame is coarser than its key frame, without a budget
 _COARSER = 64
-# dB below the key frame, or below so many dB if that is better, beyond which a frame is fitted anew; fewer are enough
-# where it saves few bytes: so many, and those that each halving of them brings
-_LOST, _GOOD, _SAVED_NONE, _HALVED = 4.0, 40.0, 1.0, 2.0
+# dB below a new key frame that a carried frame may lose at most, and for each halving of its bytes: files lose as much;
+# what is above so many dB is good
+_LOST, _HALVED, _GOOD = 4.0, 1.9, 40.0
+# what a key frame cannot show is what a blur takes away: its width in radii of each Gaussian's share of the image, at
+# least in pixels; dB of the error for each dB of that
+_BLUR, _LEAST_BLUR, _FOLLOWS = 0.4, 0.5, 1.25
 # share of the last key frame's bytes that a budget must have for another one
 _AFFORDED = 0.6
 # how often a frame is made coarser for a budget; the last time only its motions are left
@@ -54,7 +57,8 @@ class VideoEncoder:
         self._most, self._coarser = num_gaussians or 1, _COARSER
         self._part: ClipPart | None = None
         self._last: Tensor | None = None  # the frame before, as it was given
-        self._qp, self._key_bytes, self._key_psnr, self._since = 0, 0, 0.0, 0
+        self._qp, self._key_bytes, self._since = 0, 0, 0
+        self._key_psnr = self._key_detail = 0.0
         self._positions: dict[int, int] = {}  # of given ids among those of the part
         self._number = 0
 
@@ -73,7 +77,6 @@ class VideoEncoder:
     def skip(self, image: Tensor, labels: Tensor | None, record: Record) -> Record:
         """Take a frame that was fitted before."""
         if record.kind == KEY:
-            self._plan_key(image)
             self._start(record.data, image, self._carried_map(image, labels))
         else:
             assert self._part is not None
@@ -91,8 +94,9 @@ class VideoEncoder:
     def _begin(self, image: Tensor, labels: Tensor | None) -> tuple[Record, float, int]:
         """Fit a key frame."""
         labels = self._carried_map(image, labels)
-        goal = self._plan_key(image)
-        result = fit(image, labels, self._most, recipe=self._config, seed=self._seed)
+        goal: dict[str, Any] = {} if self._budget is None else {"target_bytes": self._key_share()}
+        count = self._count(goal.get("target_bytes", 0), image)
+        result = fit(image, labels, count, recipe=self._config, seed=self._seed)
         if not goal:
             goal["quality"] = quality_for(max(entry.psnr for entry in result.history))
         data = compress(result.scene, image, seed=self._seed, objective=self._config.objective, **goal).data
@@ -100,13 +104,21 @@ class VideoEncoder:
         assert self._part is not None
         return key_record(data), self._key_psnr, len(self._part.frame.region)
 
-    def _plan_key(self, image: Tensor) -> dict[str, Any]:
-        """Choose how many Gaussians the next part has, and return the bytes of its key frame, if there is a budget."""
-        if self._budget is None:
-            return {}
-        num_bytes = self._budget.for_key()
-        self._most = self._wanted or count_for(num_bytes, image[0].numel(), self._config.objective)
-        return {"target_bytes": num_bytes}
+    def _key_share(self) -> int:
+        """Return the bytes of a key frame that begins here.
+
+        Where the frame before is one and carrying failed at once, it will again: they all are key frames, and have even
+        shares.
+        """
+        assert self._budget is not None
+        return self._budget.for_frame() if self._fails_at_once() else self._budget.for_key()
+
+    def _fails_at_once(self) -> bool:
+        return self._since == 1 < self._interval
+
+    def _count(self, num_bytes: int, image: Tensor) -> int:
+        """Return how many Gaussians a part has at most; with a budget its key frame has so many bytes."""
+        return self._wanted or count_for(num_bytes, image[0].numel(), self._config.objective)
 
     def _carried_map(self, image: Tensor, labels: Tensor | None) -> Tensor | None:
         """Return the map of a key frame: where none is given, the last one as its regions move."""
@@ -121,7 +133,8 @@ class VideoEncoder:
         scene = decode(data).scene
         self._part = begin_part(scene, self._part)
         self._qp, self._key_bytes, self._since = unpack(data)[0].qp, len(data), 0
-        self._key_psnr = float(psnr(scene.render(), image))
+        self._most = self._count(len(data), image)
+        self._key_psnr, self._key_detail = float(psnr(scene.render(), image)), _detail(image, self._most)
         self._positions = {}
         index = self._part.frame.index
         for region in [] if labels is None else torch.unique(labels).tolist():  # the fit may have merged some, or all
@@ -142,15 +155,21 @@ class VideoEncoder:
             return None
         record, born, part = found
         value = float(psnr(part.scene().render(), image))
-        lost = _SAVED_NONE + _HALVED * math.log2(self._key_bytes / len(record.data))
-        if value < min(self._key_psnr, _GOOD) - min(max(lost, 0.0), _LOST) and self._affords_key():
+        lost = min(max(_HALVED * math.log2(self._key_bytes / len(record.data)), 0.0), _LOST)
+        if value < self._expected(image) - lost and self._affords_key():
             return None
         self._part = part
         return record, value, born
 
+    def _expected(self, image: Tensor) -> float:
+        """Return the PSNR that a new key frame would about have, or what is good enough."""
+        harder = _detail(image, self._most) - self._key_detail
+        return min(self._key_psnr - _FOLLOWS * harder, _GOOD)
+
     def _affords_key(self) -> bool:
-        least = _AFFORDED * self._key_bytes
-        return self._budget is None or self._budget.for_key() >= least
+        if self._budget is None or self._fails_at_once():
+            return True
+        return self._budget.for_key() >= _AFFORDED * self._key_bytes
 
     def _write(
         self, part: ClipPart, numbers: Integers, image: Tensor, given: Any
@@ -200,6 +219,16 @@ class VideoEncoder:
                 motion = torch.eye(3, dtype=torch.float64)
             numbers[region] = quantize_motion(torch.linalg.inv(motion)[:2].numpy(), size)
         return numbers
+
+
+def _detail(image: Tensor, count: int) -> float:
+    """Return how much of an image so many Gaussians leave out, in dB, by what a blur takes away."""
+    from kornia.filters import gaussian_blur2d
+
+    sigma = max(_BLUR * math.sqrt(image[0].numel() / (math.pi * count)), _LEAST_BLUR)
+    side = 2 * math.ceil(3 * sigma) + 1
+    blurred = gaussian_blur2d(image[None], (side, side), (sigma, sigma), border_type="replicate")[0]
+    return 10 * math.log10(max(float((image - blurred).square().mean()), 10 ** (-_GOOD / 10)))
 
 
 def _slope(tried: list[tuple[int, float]]) -> float:
