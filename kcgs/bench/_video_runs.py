@@ -49,6 +49,10 @@ BETWEEN, MEAN, MEAN_PHOTO = "in between", "mean of two renders", "mean of two ph
 _STEPS = ("_BEFORE", "_CYCLE", "_FREE", "_ROUND")
 
 
+# frames are carried on whatever that loses: bytes, quality and seconds are those of carried frames alone
+_ALL_CARRIED: list[tuple[Any, str, Any]] = [(VideoEncoder, "_affords_key", lambda self: False)]
+
+
 def _times(share: float) -> list[tuple[Any, str, Any]]:
     return [(carrying, name, round(share * getattr(carrying, name))) for name in _STEPS]
 
@@ -178,7 +182,7 @@ class Runs:
     def _clip(self, run: Run, samples: Sequence[images.Sample]) -> Made:
         reports: list[FrameReport] = []
         maps = None if run.method == NO_MAPS else [sample.labels for sample in samples]
-        with _changed(VARIANTS.get(run.method, [])):
+        with _changed([*_ALL_CARRIED, *VARIANTS[run.method]] if run.method in VARIANTS else []):
             clip = fit_video(
                 [sample.image for sample in samples], maps, run.n, recipe=self.config, on_frame=reports.append
             )

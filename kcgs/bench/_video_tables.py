@@ -249,7 +249,7 @@ class Part(NamedTuple):
 def parts(results: Results) -> list[Part]:
     """Compare clips with parts of the encoder taken out with those of the encoder as it is, which comes first."""
     found = []
-    fields = ("bytes", *_QUALITIES, *_FLICKER, "seconds", "is_key")
+    fields = ("bytes", *_QUALITIES, *_FLICKER, "seconds")
     for n in results.counts[:1]:
         for method in VARIANTS:
             pairs = {field: list(results.pairs(n, method, AS_IT_IS, field).values()) for field in fields}
@@ -266,7 +266,6 @@ def parts_table(found: Sequence[Part]) -> str:
         line = [name, count(ours["bytes"]), f"{100 * (ours['bytes'] / whole['bytes'] - 1):+.1f} %"]
         for field in _QUALITIES:
             line += [db(ours[field]), signed(ours[field] - whole[field])]
-        line += [number(ours[field]) for field in (*_FLICKER, "seconds")]
-        lines.append([*line, f"{100 * ours['is_key']:.0f} %"])
-    header = ["clip", "bytes", "", "PSNR", "", "EF-PSNR", "", *_FLICKER.values(), "s", "new key frames"]
+        lines.append(line + [number(ours[field]) for field in (*_FLICKER, "seconds")])
+    header = ["clip", "bytes", "", "PSNR", "", "EF-PSNR", "", *_FLICKER.values(), "s"]
     return markdown(header, lines)

@@ -49,7 +49,7 @@ class Plan(NamedTuple):
     part_sequences: tuple[str, ...]
 
 
-FULL = Plan((1_250, 2_500), 24, ((0, 1), (11, 12), (22, 23)), 12, ("car-turn", "dog", "mallard-water"))
+FULL = Plan((1_250, 2_500), 24, ((0, 1), (11, 12), (22, 23)), 12, ("car-turn", "dance-jump", "dog"))
 QUICK = Plan((60,), 4, ((2, 3),), 3, ("blackswan", images.QUICK[0]))
 _FRAMES, _TIME = "psnr.png", "error-against-time.png"
 _INTRODUCTION = f"""A clip is `kcgs.fit_video` with the annotated maps, its frame 0 a key frame, all in one file.
@@ -65,10 +65,9 @@ of a clip's frames but would be one of few here; bytes are those of all frames, 
 from frame 0 to 1 is also one from a key frame to a carried one, whose bits are fewer."""
 _BETWEEN_TEXT = """A clip of every second frame is rendered halfway between its frames and compared with the frame that
 was left out; beside it the means of the two neighbouring frames, as the clip renders them and as photos."""
-_PARTS_TEXT = """Means over the frames that the encoder as it is carries, the first line, of {frames}-frame clips of
-{names}, N = {n:,}. In the other lines a part is taken out, or descents have other lengths. Where that shows less, some
-of these frames become key frames, of which the last column tells: they take more bytes and seconds, and show more. So
-no column says enough alone."""
+_PARTS_TEXT = """Means over the carried frames of {frames}-frame clips of {names}, N = {n:,}, whose frames are all
+carried but the first, whatever that loses. The first line is the encoder as it is; in the others a part is taken out,
+or descents have other lengths."""
 
 
 def report(output: Path, made: Made) -> list[str]:
@@ -235,6 +234,6 @@ def _plot_times(path: Path, found: Sequence[tables.Part]) -> None:
             axis.plot(point["seconds"], point[field], linestyle="", label=name, markersize=5, **style)
         line = [(points[name]["seconds"], points[name][field]) for name in lengths]
         axis.plot(*zip(*line, strict=True), color="0.6", linewidth=1, zorder=0)
-        axis.set(xlabel="seconds of a frame, key frames too", ylabel=title)
+        axis.set(xlabel="seconds of a carried frame", ylabel=title)
     add_legend(plot, axes[0], columns=4)
     save_figure(plot, path)
