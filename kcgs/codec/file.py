@@ -63,7 +63,7 @@ class ByteReader:
             shift += 7
             if byte < 128:
                 break
-            if shift > 35:
+            if shift >= 35:
                 raise CodecError(f"{name} must be in [{low}, {high}]; got a number of more than 35 bits")
         if not low <= value <= high:
             raise CodecError(f"{name} must be in [{low}, {high}]; got {value}")

@@ -9,7 +9,7 @@ import torch
 
 from kcgs import RegionMap, Scene
 from kcgs.codec import CodecError, Decoded, decode, encode
-from kcgs.codec.file import pack, unpack
+from kcgs.codec.file import ByteReader, pack, unpack
 
 from .conftest import make_scene
 
@@ -33,6 +33,12 @@ def assert_sound(found: Decoded) -> None:
     if regions is not None:
         assert field.region_ids is not None and (regions.index_of(field.region_ids) >= 0).all()
         assert regions.size == field.size
+
+
+def test_varints_have_five_bytes_at_most() -> None:
+    assert ByteReader(bytes([129, 128, 128, 128, 0])).varint("width", 0, 1) == 1
+    with pytest.raises(CodecError, match=r"width must be in \[0, 1\]; got a number of more than 35 bits"):
+        ByteReader(bytes([129, 128, 128, 128, 128, 0])).varint("width", 0, 1)
 
 
 def damaged(data: bytes, generator: random.Random) -> bytes:

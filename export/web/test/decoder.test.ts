@@ -22,6 +22,8 @@ test("checksums are those of zlib and of XMODEM", () => {
 test("varints have the lowest bits first, and limits", () => {
   assert.equal(new ByteReader(Uint8Array.of(0xe5, 0x8e, 0x26)).varint("number", 0, 1e6), 624485);
   assert.throws(() => new ByteReader(Uint8Array.of(7)).varint("height", 8, 9), /height must be in \[8, 9\]; got 7/);
+  assert.equal(new ByteReader(Uint8Array.of(129, 128, 128, 128, 0)).varint("width", 0, 1), 1);
+  assert.throws(() => new ByteReader(Uint8Array.of(129, 128, 128, 128, 128, 0)).varint("width", 0, 1), /35 bits/);
   assert.throws(() => new ByteReader(new Uint8Array(9).fill(255)).varint("width", 0, 1), /more than 35 bits/);
   assert.throws(() => new ByteReader(Uint8Array.of(255), EndOfBytes).varint("width", 0, 1), EndOfBytes);
 });
