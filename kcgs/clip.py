@@ -185,7 +185,7 @@ class Clip(Sequence[Scene]):
         """Read a clip; with `whole` False also one that ends early: its whole frames."""
         header, records, ended = unpack(data)
         if whole and not ended:
-            raise CodecError(f"the clip ends early, after {len(records)} whole frames")
+            raise CodecError(f"the clip ends early, after {len(records)} whole frames: whole=False takes what is there")
         if not records:
             raise CodecError("the clip ends early: it holds no whole frame")
         return cls(header, records)

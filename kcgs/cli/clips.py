@@ -100,7 +100,7 @@ def _wanted_rate(text: str | None, rate: Fraction) -> Fraction:
     try:
         number = frame_rate(text[:-1] if times else text)
     except typer.BadParameter as error:
-        raise typer.BadParameter(f"{error.message}, or 2x", param_hint="'--frame-rate'") from error
+        raise typer.BadParameter(f"{error.message}; 2x is twice the clip's", param_hint="'--frame-rate'") from error
     return rate * number if times else number
 
 
@@ -148,7 +148,7 @@ def show_clip(report: dict[str, Any], as_json: bool, title: str, contours: str =
     if not as_json:
         keys = report["key_frames"]
         more = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
-        report = report | {"key_frames": ", ".join(map(str, keys[:_SHOWN])) + more}
+        report = report | {"key_frames": f"{len(keys)} ({', '.join(map(str, keys[:_SHOWN]))}{more})"}
     print_report(report, as_json, title, contours)
 
 

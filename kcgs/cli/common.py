@@ -103,16 +103,21 @@ def _scene_path(text: str, others: tuple[str, ...] = ()) -> Path:
 
 
 SceneFile = Annotated[
-    Path, typer.Argument(help="Scene file (.safetensors or .kcgs), or zoo:NAME.", metavar="SCENE", parser=_scene_path)
+    Path,
+    typer.Argument(
+        help="Scene (.safetensors or .kcgs), clip (.kcgs), or zoo:NAME.", metavar="SCENE", parser=_scene_path
+    ),
 ]
-_EITHER = "Scene file, or zoo:NAME; or label map: .png, .npy and others."
+_EITHER = "Scene or clip, or zoo:NAME; or label map: .png, .npy and others."
 SceneOrMap = Annotated[
     Path, typer.Argument(help=_EITHER, metavar="FILE", parser=lambda text: _scene_path(text, _LABEL_MAPS))
 ]
 SceneOrDecoder = Annotated[
     Path,
     typer.Argument(
-        help="Scene file, zoo:NAME, or ONNX decoder.", metavar="FILE", parser=lambda text: _scene_path(text, (".onnx",))
+        help="Scene or clip, zoo:NAME, or ONNX decoder.",
+        metavar="FILE",
+        parser=lambda text: _scene_path(text, (".onnx",)),
     ),
 ]
 ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE", dir_okay=False)]

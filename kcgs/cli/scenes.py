@@ -113,6 +113,8 @@ def _eval_clip(file: Path, video: Path, regions: Path | None, quiet: bool, as_js
     clip, reader = read_clip(file), read_video(video)
     if reader.size != clip.size:
         raise ValueError(f"IMAGE must have the size {clip.size} of SCENE; got {reader.size}")
+    if (reader.num_frames or 0) > len(clip):
+        typer.echo(f"kcgs: IMAGE has {reader.num_frames} frames; the first {len(clip)} are compared", err=True)
     maps = None if regions is None else read_label_maps(regions)
     report = measure_clip(clip, reader, maps, progress=not quiet)
     show_clip(report, as_json, str(file), str(regions or "the clip"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Iterator
 from fractions import Fraction
 from functools import partial
 from itertools import islice
@@ -81,7 +81,7 @@ def fit_video_command(
     compile_ahead(request.config, regions != "none")
     reader = read_video(video, frame_rate=frame_rate)
     has_budget = target_bytes is not None or kbps is not None
-    frames = _frames(reader, first, counted=has_budget)
+    frames = _Frames(reader, first, counted=has_budget)
     maps = _read_maps(regions, reader, frames, progress=not quiet)
     seconds: list[float] = []
     start = time.perf_counter()
@@ -101,15 +101,16 @@ def fit_video_command(
         clip.save(output)
         report = _report(clip, reader, maps, took, seconds, progress=not quiet)
     missed = _describe_miss(report, target_bytes, kbps)
-    report["stop_reason"] = "interrupted" if stop.wanted else "end"
+    report["stop_reason"] = "interrupted" if stop.wanted else "end" if frames.error is None else "error"
     report["target_reached"] = not missed if has_budget else None
     show_clip(report, as_json, str(output), _whose(regions))
+    done = f"{len(clip)} frames that are" if len(clip) > 1 else "frame that is"
+    goes_on = "" if checkpoint is None else "; --resume goes on"
+    saved = f"saved the {done} done to {output}{goes_on}"
     if stop.wanted:
-        done = f"{len(clip)} frames that are" if len(clip) > 1 else "frame that is"
-        goes_on = "" if checkpoint is None else "; --resume goes on"
-        raise interrupted(f"saved the {done} done to {output}{goes_on}")
-    if missed:
-        typer.echo(f"kcgs: {missed}", err=True)
+        raise interrupted(saved)
+    if frames.error is not None or missed:
+        typer.echo(f"kcgs: {missed if frames.error is None else f'{frames.error}; {saved}'}", err=True)
         raise typer.Exit(1)
 
 
@@ -128,30 +129,37 @@ def _describe_miss(report: dict[str, Any], target_bytes: int | None, kbps: float
     return ""
 
 
-class _Sized:
-    """The first frames of a video, which says how many it has."""
+class _Frames:
+    """The frames of a video, or the first ones, as far as they can be read; what ends them early is kept."""
 
-    def __init__(self, frames: Iterable[Any], count: int, first: int | None) -> None:
-        self._frames, self._count, self._first = frames, count, first
+    def __init__(self, reader: FrameReader, first: int | None, *, counted: bool) -> None:
+        self._reader, self._first = reader, first
+        self.error: Exception | None = None
+        count = reader.num_frames
+        if count is None and counted:
+            count = sum(1 for _ in islice(iter(reader), first))
+        self.count = count if count is None or first is None else min(first, count)
 
-    def __len__(self) -> int:
-        return self._count
+    def __length_hint__(self) -> int:
+        return self.count or 0
 
     def __iter__(self) -> Iterator[Any]:
-        return islice(iter(self._frames), self._first)
+        reading, number = islice(iter(self._reader), self._first), 0
+        while True:
+            try:
+                frame = next(reading)
+            except StopIteration:
+                return
+            except (OSError, ValueError) as error:
+                if not number:
+                    raise
+                self.error = error
+                return
+            yield frame
+            number += 1
 
 
-def _frames(reader: FrameReader, first: int | None, *, counted: bool) -> Iterable[Any]:
-    """Return the frames, or so many; they have a length where the file says it, or they are to be counted."""
-    count = reader.num_frames
-    if count is None and counted:
-        count = sum(1 for _ in islice(iter(reader), first))
-    if count is None:
-        return islice(iter(reader), first)
-    return _Sized(reader, count if first is None else min(first, count), first)
-
-
-def _read_maps(regions: str, reader: FrameReader, frames: Iterable[Any], *, progress: bool) -> Any:
+def _read_maps(regions: str, reader: FrameReader, frames: _Frames, *, progress: bool) -> Any:
     """Return the label maps that the option --regions names: one for each frame, or the first frame's, or None."""
     from kcgs.data import read_label_maps
 
@@ -166,8 +174,8 @@ def _read_maps(regions: str, reader: FrameReader, frames: Iterable[Any], *, prog
     maps = read_label_maps(regions)
     if maps.size != reader.size:
         raise ValueError(f"--regions must have maps of the size {reader.size} of VIDEO; got {maps.size} in {regions}")
-    if isinstance(frames, Sized) and len(maps) < len(frames):
-        raise ValueError(f"--regions must have a map for each of {len(frames)} frames; got {len(maps)} in {regions}")
+    if len(maps) < (frames.count or 0):
+        raise ValueError(f"--regions must have a map for each of {frames.count} frames; got {len(maps)} in {regions}")
     return maps
 
 

@@ -168,6 +168,17 @@ class TestFitVideo:
         code, _, err = run(*arguments, "--seed", "1")
         assert code == 1 and "is of a fit with other arguments" in err
 
+    def test_a_frame_that_cannot_be_read_keeps_those_before(self, run: Run) -> None:
+        Path("frames/00002.png").write_bytes(Path("frames/00002.png").read_bytes()[:300])
+        code, out, err = run(*FIT, "--regions", "none", "--json", "-o", "a.kcgs")
+        assert code == 1 and len(Clip.load("a.kcgs")) == 2 and err.count("\n") == 1
+        assert "00002.png" in err and err.endswith("; saved the 2 frames that are done to a.kcgs\n")
+        assert json.loads(out)["stop_reason"] == "error"
+        save_image("frames/00000.png", torch.zeros(3, 8, 9))
+        code, out, err = run(*FIT, "--regions", "none", "-o", "b.kcgs")
+        assert code == 1 and "│ frames         │ 1" in out and len(Clip.load("b.kcgs")) == 1
+        assert "00001.png" in err and err.endswith("; saved the frame that is done to b.kcgs\n")
+
     @pytest.mark.parametrize(
         ("arguments", "code", "message"),
         [
@@ -224,7 +235,8 @@ class TestRender:
         assert code == 1 and err == "kcgs: cannot decode clip.kcgs: the clip ends early: it holds no whole frame\n"
         Path("clip.kcgs").write_bytes(clip.to_bytes()[:part])
         code, _, err = run("render", "clip.kcgs", "-o", "none")
-        assert code == 1 and err == "kcgs: cannot load clip.kcgs: the clip ends early, after 3 whole frames\n"
+        begins = "kcgs: cannot load clip.kcgs: the clip ends early, after 3 whole frames"
+        assert code == 1 and err == f"{begins}: whole=False takes what is there\n"
 
     @pytest.mark.parametrize(
         ("arguments", "message"),
@@ -262,7 +274,7 @@ class TestOtherCommands:
             "kbps": pytest.approx(8 * size / 1000 * 12 / FRAMES),
             "bits_per_pixel": pytest.approx(8 * size / (FRAMES * 32 * 48)),
         }  # fmt: skip
-        assert "│ key_frames     │ 0" in run("info", "clip.kcgs")[1]
+        assert "│ key_frames     │ 1 (0)" in run("info", "clip.kcgs")[1]
 
     def test_eval(self, run: Run, clip: Clip) -> None:
         code, out, err = run("eval", "clip.kcgs", "frames", "--json")
@@ -276,6 +288,10 @@ class TestOtherCommands:
             save_labels(f"masks/{number}.png", make_labels(2 * number))
         code, out, err = run("eval", "clip.kcgs", "frames", "--regions", "masks")
         assert code == 0 and "│ along the contours of masks" in out, err
+        save_image("frames/00004.png", make_frames()[3])
+        code, _, err = run("eval", "clip.kcgs", "frames")
+        assert (code, err) == (0, "kcgs: IMAGE has 5 frames; the first 4 are compared\n")
+        Path("frames/00004.png").unlink()
         Path("masks/3.png").unlink()
         code, _, err = run("eval", "clip.kcgs", "frames", "--regions", "masks")
         assert (code, err) == (2, "kcgs: --regions must have a map for each of 4 frames; got 3\n")

@@ -292,6 +292,15 @@ def test_an_edit_that_takes_the_map_away_begins_a_key_frame() -> None:
     assert clip.edit(edit).key_frames == (0, 2)
 
 
+def test_what_an_edit_makes_anew_is_as_fine_as_a_key_frame() -> None:
+    made = [Scene(GaussianField.random(60, SIZE, seed=seed)) for seed in range(3)]
+    numbered = iter(made)
+    edited = clip_of(3, mapped=False).edit(lambda scene: next(numbered))
+    assert edited.key_frames == (0,)
+    errors = [float((a.render() - b.render()).square().mean()) for a, b in zip(edited, made, strict=True)]
+    assert max(errors[1:]) < 2 * errors[0]
+
+
 def test_an_edit_may_make_gaussians_as_thin_as_it_likes() -> None:
     def thin(scene: Scene) -> Scene:
         scene.field.cholesky.data[:, 2] *= 1e-6

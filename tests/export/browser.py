@@ -126,6 +126,12 @@ def npm(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["npm", *arguments], cwd=WEB, capture_output=True, text=True, timeout=600)
 
 
+def build(script: str, *arguments: str) -> None:
+    """Run a script that builds, without what comes before and after it: the decoder is there."""
+    done = npm("run", "--ignore-scripts", script, *arguments)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def compile_decoder() -> None:
     """Make the decoder's WebAssembly, where it is missing or older than its sources."""
     programs = [WEB / "decoder" / name for name in ("program.wasm", "clips.wasm")]

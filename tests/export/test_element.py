@@ -22,7 +22,7 @@ from kcgs.editing import move_region, recolor_region
 from kcgs.page import scene_page
 from kcgs.page.html import page_html
 
-from .browser import WEB, Browser, array, npm, serving
+from .browser import WEB, Browser, array, build, npm, serving
 
 MODELS = WEB.parents[1] / "models"
 PAGE = WEB.parents[1] / "kcgs" / "page"
@@ -446,14 +446,12 @@ class TestSources:
     def test_the_page_that_python_has_is_the_one_that_is_built(
         self, node_modules: Path, tmp_path: Path, name: str
     ) -> None:
-        done = npm("run", f"build:{name}", "--", "--outDir", str(tmp_path))
-        assert done.returncode == 0, done.stdout + done.stderr
+        build(f"build:{name}", "--", "--outDir", str(tmp_path))
         fresh, ours = (folder.joinpath(f"{name}.js").read_text() for folder in (tmp_path, PAGE))
         assert fresh == ours, f"run npm --prefix export/web run build:{name}, and commit kcgs/page/{name}.js"
 
     def test_the_package(self, node_modules: Path, tmp_path: Path) -> None:
-        done = npm("run", "build:element")
-        assert done.returncode == 0, done.stdout + done.stderr
+        build("build:element")
         done = npm("pack", "--prefix", "element", "--json", "--pack-destination", str(tmp_path), "./element")
         assert done.returncode == 0, done.stdout + done.stderr
         (packed,) = json.loads(done.stdout)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from PIL import Image
 
-from .browser import WEB, Browser, array, npm, serving
+from .browser import WEB, Browser, array, build, npm, serving
 
 LEVEL = 1 / 255
 WIDTH, HEIGHT = 96, 64
@@ -138,8 +138,7 @@ class Viewer(Browser):
 def site(node_modules: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str]]:
     """The built page in a folder of its own, and its address."""
     folder = tmp_path_factory.mktemp("site")
-    done = npm("run", "build", "--", "--outDir", str(folder), "--emptyOutDir")
-    assert done.returncode == 0, done.stdout + done.stderr
+    build("build", "--", "--outDir", str(folder), "--emptyOutDir")
     shutil.rmtree(folder / "examples", ignore_errors=True)
     with serving(folder) as address:
         yield folder, address

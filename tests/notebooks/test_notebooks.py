@@ -33,6 +33,8 @@ PRINTED = {
     "07_compact_files": r"kcgs: +\d[\d,]* bytes, PSNR [23]\d\.\d\d dB, EF-PSNR [23]\d\.\d\d dB",
     "08_video": r"carried frames: \d[\d,]* bytes, [23]\d\.\d\d dB at last, \d\.\d\d s each",
 }
+# those that take half a minute in their quick form, too
+SLOW = ("06_differentiable_layer", "07_compact_files")
 SECONDS = 180
 _COMPILE = (
     "import torch\n"
@@ -66,14 +68,16 @@ def run_quick(name: str, folder: Path) -> Run:
 
 
 @pytest.fixture(scope="module")
-def quick(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Future[Run]]]:
+def quick(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Future[Run]]]:
     """Run all, two at a time unless tests do: a kernel takes one thread, and seconds to import what it needs."""
     # Compiled and kept here, so that no tutorial has to, and says so. In a new process, as they are: this one may have
     # the code in memory when it is on disk no more, since two that keep theirs at once may drop the other's.
     subprocess.run([sys.executable, "-c", _COMPILE], check=True, timeout=SECONDS)
     folder = tmp_path_factory.mktemp("quick")
     with ThreadPoolExecutor(1 if "PYTEST_XDIST_WORKER" in os.environ else 2) as pool:
-        yield {name: pool.submit(run_quick, name, folder) for name in PRINTED}
+        chosen = {item.name for item in request.session.items}
+        wanted = [name for name in PRINTED if f"test_runs[{name}]" in chosen]
+        yield {name: pool.submit(run_quick, name, folder) for name in wanted}
         pool.shutdown(cancel_futures=True)
 
 
@@ -103,7 +107,9 @@ def test_all_are_here() -> None:
     assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == list(PRINTED)
 
 
-@pytest.mark.parametrize("name", PRINTED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in PRINTED]
+)
 def test_runs(name: str, quick: dict[str, Future[Run]]) -> None:
     """In its quick form; what it claims it asserts itself."""
     run = quick[name].result()

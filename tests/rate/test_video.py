@@ -122,7 +122,7 @@ def test_a_clip_keeps_to_its_bytes() -> None:
     assert 3000 < clip.num_bytes <= 4000
     rated = fit_video(FRAMES[:3], MAPS, kbps=30, frame_rate=10, iterations=20)
     assert rated.num_bytes <= 30 * 125 * 3 / 10
-    with pytest.raises(ValueError, match="target_bytes"):
+    with pytest.raises(ValueError, match=r"target_bytes, or kbps, must allow \d{3} bytes for 5 frames; got 40"):
         fit_video(FRAMES, target_bytes=40, iterations=30)
     with pytest.raises(ValueError, match="length"):
         fit_video((frame for frame in FRAMES), target_bytes=900)

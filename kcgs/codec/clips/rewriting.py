@@ -17,9 +17,12 @@ from .differences import Differences
 from .file import KEY, ClipHeader, Record
 from .frames import FrameReader, begin_part, carried_record, read_qp
 
-# Gaussians are the same where centres, in these standard deviations, logarithms of sizes and colours, in these, agree
-_PIXELS, _LOGARITHMS, _COLORS, _FARTHEST = 4.0, 0.5, 0.25, 2.0
+# Gaussians are the same where centres, in these standard deviations, logarithms of sizes and colours, in these, agree,
+# and energy does not grow more than so many times: steps would be too large
+_PIXELS, _LOGARITHMS, _COLORS, _FARTHEST, _LOUDER = 4.0, 0.5, 0.25, 2.0, 2.0
 _APART = 1e3  # of regions
+# share of new Gaussians above which a frame is as fine as its key frame: no descent makes up for how they are rounded
+_MANY = 0.02
 
 
 class Asked(NamedTuple):
@@ -46,6 +49,7 @@ class ClipWriter:
 
     def __init__(self) -> None:
         self._part: ClipPart | None = None
+        self._key_qp = 0
 
     def add(self, scene: Scene, asked: Asked) -> Record:
         """Write the next frame; a key frame where that is asked for, or the last one does not know its regions."""
@@ -53,13 +57,16 @@ class ClipWriter:
         part = self._part
         if part is None or asked.numbers is None or not _knows(part, scene):
             data = SceneWriter(scene).write_rounded(asked.qp)
-            self._part = begin_part(deserialize(data), part)
+            self._part, self._key_qp = begin_part(deserialize(data), part), asked.qp
             return Record(KEY, data)
         numbers = part.motions.last.copy()
         both, mine, theirs = np.intersect1d(part.ids, asked.ids, return_indices=True)
         if len(both):
             numbers[mine] = asked.numbers[theirs]
-        return carried_record(part, asked.qp, numbers, _change(part, numbers, scene, asked.qp))
+        qp, change = asked.qp, _change(part, numbers, scene, asked.qp)
+        if len(change.born_region) > _MANY * len(scene.field):
+            qp, change = self._key_qp, _change(part, numbers, scene, self._key_qp)
+        return carried_record(part, qp, numbers, change)
 
 
 def _knows(part: ClipPart, scene: Scene) -> bool:
@@ -109,7 +116,13 @@ def _match(old: Parameters, old_region: Integers, new: Parameters, new_region: I
     _, back = cKDTree(first).query(second)
     near = np.flatnonzero(np.isfinite(distance))
     mutual = near[back[forth[near]] == near]
-    return mutual, forth[mutual]
+    louder = _energies(new)[forth[mutual]] > _LOUDER * _energies(old)[mutual]
+    return mutual[~louder], forth[mutual[~louder]]
+
+
+def _energies(gaussians: Parameters) -> Floats:
+    _, cholesky, colors = gaussians
+    return np.asarray((colors * colors).sum(1) * cholesky[:, 0] * cholesky[:, 2])
 
 
 def _features(gaussians: Parameters, region: Integers) -> Floats:

@@ -8,8 +8,9 @@ from kcgs.codec.clips.file import KEY, ClipHeader, Record, pack_end, pack_header
 
 # how many carried frames cost what a key frame does, and how many times its even share a carried one may take
 _KEY_FRAMES, _MOST = 4.5, 1.6
-# a step of the quantization parameter changes the logarithm of a carried frame's bytes by this; the largest step
-SLOPE, _LARGEST = 0.0073, 24
+# by how much a step of the quantization parameter changes the logarithm of a carried frame's bytes; share of a
+# difference that the next frame makes up for; the largest step
+SLOPE, _MADE_UP, _LARGEST = 0.0073, 0.8, 48
 # bytes that each frame to come is sure of; most that a record takes beside its content
 _LEAST, _RECORD = 48, 16
 
@@ -19,6 +20,9 @@ class Budget:
 
     def __init__(self, num_bytes: int, count: int, header: ClipHeader, interval: int) -> None:
         self._left = num_bytes - len(pack_header(header)) - len(pack_end(count))
+        if self._left < count * _LEAST:
+            least = num_bytes - self._left + count * _LEAST
+            raise ValueError(f"target_bytes, or kbps, must allow {least} bytes for {count} frames; got {num_bytes}")
         self._frames, self._number, self._interval = count, 0, interval
         self._until = 0  # frames before the next key frame, if none comes earlier
 
@@ -47,7 +51,7 @@ class Budget:
         if self._rest < 1:
             return 0
         wanted = math.log(max(self._fair(self._until), 1.0) / max(num_bytes, 1)) / SLOPE
-        return round(min(max(0.5 * wanted, -_LARGEST), _LARGEST))
+        return round(min(max(_MADE_UP * wanted, -_LARGEST), _LARGEST))
 
     @property
     def _rest(self) -> int:
