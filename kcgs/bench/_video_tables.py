@@ -43,23 +43,26 @@ class Results:
         return [name for name in self.sequences if all(self.of(name, n, method) for method in methods)]
 
     def value(self, sequence: str, n: int, method: str, field: str, frames: Iterable[int] | None = None) -> float:
-        """Return a mean over frames, by default the carried ones of the clip and as many of others; NaN: none."""
+        """Return a mean over frames, by default all but the clip's first; NaN: none."""
         shots = self.of(sequence, n, method)
-        wanted = self.carried(sequence, n, method) if frames is None else frames
+        wanted = self.later(sequence, n, method) if frames is None else frames
         return mean(getattr(shots[frame], field) for frame in wanted if frame in shots)
 
-    def carried(self, sequence: str, n: int, method: str) -> set[int]:
-        """Return the frames of a method that the clip carries; all of those in between."""
+    def later(self, sequence: str, n: int, method: str) -> set[int]:
+        """Return the frames of a method but the clip's first; all of those in between."""
         if method in (BETWEEN, MEAN, MEAN_PHOTO):
             return set(self.of(sequence, n, method))
-        keys = {frame for frame, shot in self.of(sequence, n, CLIP).items() if shot.is_key}
-        return set(self.of(sequence, n, method)) - keys
+        return set(self.of(sequence, n, method)) - set(sorted(self.of(sequence, n, CLIP))[:1])
+
+    def carried(self, sequence: str, n: int, field: str) -> float:
+        """Return a mean over the frames that the clip carries; NaN: none."""
+        return mean(getattr(shot, field) for shot in self.of(sequence, n, CLIP).values() if not shot.is_key)
 
     def pairs(self, n: int, ours: str, other: str, field: str) -> dict[str, tuple[float, float]]:
-        """Return both methods' means over the carried frames that both have."""
+        """Return both methods' means over the frames that both have, but the first."""
         found = {}
         for name in self.whose(n, ours, other):
-            both = self.carried(name, n, ours) & self.carried(name, n, other)
+            both = self.later(name, n, ours) & self.later(name, n, other)
             one, two = ({f: getattr(self.of(name, n, method)[f], field) for f in both} for method in (ours, other))
             defined = [f for f in both if not math.isnan(one[f] + two[f])]
             if defined:
@@ -100,10 +103,11 @@ def bytes_share(results: Results, n: int) -> Values:
 
 
 def time_share(results: Results, n: int) -> Values:
-    """Processor time of a carried frame by that of the key frame."""
+    """Processor time of a carried frame by that of the key frame, of clips that have any."""
     found = {name: results.of(name, n, CLIP) for name in results.whose(n, CLIP)}
     key = {name: mean(shot.seconds for shot in shots.values() if shot.is_key) for name, shots in found.items()}
-    return {name: results.value(name, n, CLIP, "seconds") / key[name] for name in found}
+    shares = {name: results.carried(name, n, "seconds") / key[name] for name in found}
+    return {name: share for name, share in shares.items() if not math.isnan(share)}
 
 
 GOALS = (
@@ -146,17 +150,8 @@ def against_codecs(results: Results) -> str:
 
 
 def means(results: Results, frames: Mapping[str, Iterable[int] | None]) -> str:
-    """Write means over sequences, of each method over these frames; None: over all carried ones."""
-    header = [
-        "N",
-        "method",
-        "sequences",
-        "bytes per frame",
-        "PSNR",
-        "EF-PSNR",
-        *_FLICKER.values(),
-    ]
-    lines = []
+    """Write means over sequences, of each method over these frames; None: over all but the first."""
+    header, lines = ["N", "method", "sequences", "bytes per frame", *_QUALITIES.values(), *_FLICKER.values()], []
     for n in results.counts:
         for method, which in frames.items():
             if names := results.whose(n, method):
@@ -177,16 +172,12 @@ def by_sequence(results: Results, n: int) -> str:
     for name in results.whose(n, CLIP):
         shots, files = results.of(name, n, CLIP).values(), results.of(name, n, QUALITY).values()
         key = [shot for shot in shots if shot.is_key]
-        line = [
-            name,
-            str(len(key)),
-            count(mean(shot.bytes for shot in key)),
-            count(results.value(name, n, CLIP, "bytes")),
-        ]
+        sizes = mean(shot.bytes for shot in key), results.carried(name, n, "bytes")
+        line = [name, str(len(key)), *map(count, sizes)]
         line += [count(sum(shot.bytes for shot in shots)), db(mean(shot.psnr for shot in shots))]
-        line += [db(mean(shot.ef_psnr for shot in shots)), number(results.value(name, n, CLIP, "born"))]
-        line += [f"{100 * results.value(name, n, CLIP, 'changed'):.0f} %", number(mean(shot.seconds for shot in key))]
-        line.append(number(results.value(name, n, CLIP, "seconds")))
+        line += [db(mean(shot.ef_psnr for shot in shots)), number(results.carried(name, n, "born"))]
+        line += [_percent(results.carried(name, n, "changed")), number(mean(shot.seconds for shot in key))]
+        line.append(number(results.carried(name, n, "seconds")))
         lines.append(line + [number(mean(getattr(s, field) for s in files)) for field in ("seconds", "fit_seconds")])
     header = [
         "sequence",

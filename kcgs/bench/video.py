@@ -60,9 +60,10 @@ mean squared error, in 8-bit levels, of the change between two frames beside tha
 motion*, the change of the error at places that move with their region, as the photos do: what an eye sees that follows
 it. Seconds are processor time. Each frame by itself: results.csv."""
 _SAMPLE_TEXT = """Files of single frames are made of the neighbouring frames {pairs} only, to save hours, and those of
-equal bytes of the later of each pair. Clips are compared with them on these frames without the key frame, which is one
-of a clip's frames but would be one of few here; bytes are those of all frames, the key frame's included. The change
-from frame 0 to 1 is also one from a key frame to a carried one, whose bits are fewer."""
+equal bytes of the later of each pair. Clips are compared with them on these frames without frame 0, a key frame, which
+is one of a clip's frames but would be one of few here; bytes are those of all frames. The change from frame 0 to 1 is
+also one from a key frame to a carried one, whose bits are fewer. Where carrying does not pay all frames are key frames,
+and the clip is files of single frames in one."""
 _BETWEEN_TEXT = """A clip of every second frame is rendered halfway between its frames and compared with the frame that
 was left out; beside it the means of the two neighbouring frames, as the clip renders them and as photos."""
 _PARTS_TEXT = """Means over the carried frames of {frames}-frame clips of {names}, N = {n:,}, whose frames are all
@@ -83,7 +84,7 @@ def report(output: Path, made: Made) -> list[str]:
     parts += ["## Against other codecs at the clip's bytes", tables.against_codecs(results)]
     _plot_frames(output / _FRAMES, results)
     parts += [f"![]({_FRAMES})", *(["## Crops", _crops_text(plan), f"![]({CROPS})"] if _has_crops(output) else [])]
-    parts += ["## All carried frames", tables.means(results, dict.fromkeys((CLIP, *CODECS)))]
+    parts += ["## All frames but the first", tables.means(results, dict.fromkeys((CLIP, *CODECS)))]
     later = [pair[1] for pair in plan.pairs]
     which = f"## Frame{'s' * (len(later) > 1)} {', '.join(map(str, later))}"
     parts += [which, tables.means(results, dict.fromkeys((CLIP, QUALITY, BYTES, *CODECS), later))]

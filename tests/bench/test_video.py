@@ -73,6 +73,12 @@ class TestArithmetic:
         assert results.shares(1_250, CLIP, QUALITY, "flicker") == {"dog": 0.4}
         assert time_share(results, 1_250) == {"dog": 0.1}
 
+    def test_a_clip_of_key_frames_is_compared_too(self) -> None:
+        clip = [shot(frame, psnr=28.0, is_key=1) for frame in range(3)]
+        results = Results([*clip, *(shot(frame, "x264", psnr=30.0) for frame in range(3))])
+        assert results.gains(1_250, CLIP, "x264", "psnr") == {"dog": -2.0} and time_share(results, 1_250) == {}
+        assert "nan" not in by_sequence(results, 1_250) + goals(results)
+
     def test_goals(self, results: Results) -> None:
         lines = goals(results).splitlines()[2:]
         assert len(lines) == len(GOALS)
