@@ -184,10 +184,11 @@ class Clip(Sequence[Scene]):
     def from_bytes(cls, data: bytes, *, whole: bool = True) -> Clip:
         """Read a clip; with `whole` False also one that ends early: its whole frames."""
         header, records, ended = unpack(data)
-        if whole and not ended:
-            raise CodecError(f"the clip ends early, after {len(records)} whole frames: whole=False takes what is there")
         if not records:
             raise CodecError("the clip ends early: it holds no whole frame")
+        if whole and not ended:
+            way = "kcgs decode --bytes, or whole=False, reads these"
+            raise CodecError(f"the clip ends early, after {len(records)} whole frames: {way}")
         return cls(header, records)
 
     def save(self, path: str | os.PathLike[str]) -> int:

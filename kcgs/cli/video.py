@@ -137,7 +137,7 @@ class _Frames:
         self.error: Exception | None = None
         count = reader.num_frames
         if count is None and counted:
-            count = sum(1 for _ in islice(iter(reader), first))
+            count, self.error = sum(1 for _ in self), None
         self.count = count if count is None or first is None else min(first, count)
 
     def __length_hint__(self) -> int:

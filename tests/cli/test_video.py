@@ -236,7 +236,7 @@ class TestRender:
         Path("clip.kcgs").write_bytes(clip.to_bytes()[:part])
         code, _, err = run("render", "clip.kcgs", "-o", "none")
         begins = "kcgs: cannot load clip.kcgs: the clip ends early, after 3 whole frames"
-        assert code == 1 and err == f"{begins}: whole=False takes what is there\n"
+        assert code == 1 and err == f"{begins}: kcgs decode --bytes, or whole=False, reads these\n"
 
     @pytest.mark.parametrize(
         ("arguments", "message"),

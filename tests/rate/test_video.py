@@ -90,9 +90,17 @@ def soft_noise(count: int) -> list[torch.Tensor]:
 
 
 def test_frames_that_have_nothing_in_common_are_key_frames_and_share_a_budget() -> None:
-    clip = fit_video(soft_noise(4), target_bytes=2400, iterations=30)
-    assert clip.key_frames == (0, 1, 2, 3) and clip.num_bytes <= 2400
-    assert max(clip.frame_bytes[1:]) < 1.3 * min(clip.frame_bytes[1:]) < clip.frame_bytes[0]
+    clip = fit_video(soft_noise(7), target_bytes=3500, iterations=30)
+    assert clip.key_frames == tuple(range(7)) and clip.num_bytes <= 3500
+    even, keys = clip.frame_bytes[2:], clip.frame_bytes[:2]
+    assert max(even) < 1.3 * min(even) < min(keys)
+
+
+def test_a_scene_cut_after_the_first_frame_has_the_bytes_of_a_key_frame() -> None:
+    (other,) = soft_noise(1)
+    panned = [other.roll(shift, 2) for shift in range(6)]
+    clip = fit_video([FRAMES[0], *panned], target_bytes=4000, iterations=30)
+    assert clip.key_frames == (0, 1) and clip.frame_bytes[1] > 3 * max(clip.frame_bytes[2:])
 
 
 def test_a_frame_with_more_detail_may_show_less() -> None:
@@ -217,7 +225,8 @@ def test_a_frame_that_can_only_stand_is_read_though_its_map_lost_a_region(monkey
     record, _ = scenes.add(*moving_disc(0))
     reader = FrameReader(ClipHeader(SIZE, 3, Fraction(24)))
     reader.read(record)
-    scenes._budget = Budget(145, 2, reader.header, 9)
+    scenes._budget = Budget(400, 2, reader.header, 9)
+    scenes._budget._left = 120
     monkeypatch.setattr(scenes, "_affords_key", lambda: False)
     record, report = scenes.add(FRAMES[1], torch.zeros_like(MAPS[1]))
     assert not report.is_key and len(record.data) < 30

@@ -31,17 +31,20 @@ class Asked(NamedTuple):
     qp: int
     numbers: Integers | None  # motions of the regions by their ids' positions [R, 6]; None: a key frame
     ids: Integers  # of the regions
+    born: int = 0  # Gaussians that were new
 
 
 def asked_of(records: list[Record], header: ClipHeader) -> Iterable[tuple[Asked, Scene]]:
     """Yield how each frame of a clip was written, and the frame."""
     reader = FrameReader(header)
+    first = 0
     for record in records:
         frame = reader.read(record)
         part = reader.part
         assert part is not None
         numbers = None if record.kind == KEY else frame.numbers
-        yield Asked(read_qp(record)[0], numbers, part.ids), part.scene(frame)
+        yield Asked(read_qp(record)[0], numbers, part.ids, part.next_key - first), part.scene(frame)
+        first = part.next_key
 
 
 class ClipWriter:
@@ -56,15 +59,16 @@ class ClipWriter:
         scene = check_scene(scene)
         part = self._part
         if part is None or asked.numbers is None or not _knows(part, scene):
-            data = SceneWriter(scene).write_rounded(asked.qp)
-            self._part, self._key_qp = begin_part(deserialize(data), part), asked.qp
+            self._key_qp = asked.qp if asked.numbers is None else max(asked.qp, self._key_qp)
+            data = SceneWriter(scene).write_rounded(self._key_qp)
+            self._part = begin_part(deserialize(data), part)
             return Record(KEY, data)
         numbers = part.motions.last.copy()
         both, mine, theirs = np.intersect1d(part.ids, asked.ids, return_indices=True)
         if len(both):
             numbers[mine] = asked.numbers[theirs]
         qp, change = asked.qp, _change(part, numbers, scene, asked.qp)
-        if len(change.born_region) > _MANY * len(scene.field):
+        if qp < self._key_qp and len(change.born_region) - asked.born > _MANY * len(scene.field):
             qp, change = self._key_qp, _change(part, numbers, scene, self._key_qp)
         return carried_record(part, qp, numbers, change)
 

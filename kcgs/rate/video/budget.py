@@ -20,8 +20,8 @@ class Budget:
 
     def __init__(self, num_bytes: int, count: int, header: ClipHeader, interval: int) -> None:
         self._left = num_bytes - len(pack_header(header)) - len(pack_end(count))
-        if self._left < count * _LEAST:
-            least = num_bytes - self._left + count * _LEAST
+        least = num_bytes - self._left + math.ceil((_KEY_FRAMES + count - 1) * _LEAST)
+        if num_bytes < least:
             raise ValueError(f"target_bytes, or kbps, must allow {least} bytes for {count} frames; got {num_bytes}")
         self._frames, self._number, self._interval = count, 0, interval
         self._until = 0  # frames before the next key frame, if none comes earlier

@@ -57,7 +57,7 @@ class VideoEncoder:
         self._most, self._coarser = num_gaussians or 1, _COARSER
         self._part: ClipPart | None = None
         self._last: Tensor | None = None  # the frame before, as it was given
-        self._qp, self._key_bytes, self._since = 0, 0, 0
+        self._qp, self._key_bytes, self._since, self._keys = 0, 0, 0, 0  # key frames since the last carried one
         self._key_psnr = self._key_detail = 0.0
         self._positions: dict[int, int] = {}  # of given ids among those of the part
         self._number = 0
@@ -76,15 +76,17 @@ class VideoEncoder:
 
     def skip(self, image: Tensor, labels: Tensor | None, record: Record) -> Record:
         """Take a frame that was fitted before."""
-        if record.kind == KEY:
-            self._start(record.data, image, self._carried_map(image, labels))
-        else:
-            assert self._part is not None
-            read_carried(self._part, record)
+        with threads_for_kernels(image[0].numel()):
+            if record.kind == KEY:
+                self._start(record.data, image, self._carried_map(image, labels))
+            else:
+                assert self._part is not None
+                read_carried(self._part, record)
         self._go_on(image, record)
         return record
 
     def _go_on(self, image: Tensor, record: Record) -> None:
+        self._keys = self._keys + 1 if record.kind == KEY else 0
         if self._budget is not None:
             self._budget.spend(record)
             if record.kind != KEY:
@@ -107,14 +109,13 @@ class VideoEncoder:
     def _key_share(self) -> int:
         """Return the bytes of a key frame that begins here.
 
-        Where the frame before is one and carrying failed at once, it will again: they all are key frames, and have even
-        shares.
+        Where carrying failed twice, each time at once, it will again: all are key frames, and have even shares.
         """
         assert self._budget is not None
         return self._budget.for_frame() if self._fails_at_once() else self._budget.for_key()
 
     def _fails_at_once(self) -> bool:
-        return self._since == 1 < self._interval
+        return self._keys >= 2 and self._interval > 1
 
     def _count(self, num_bytes: int, image: Tensor) -> int:
         """Return how many Gaussians a part has at most; with a budget its key frame has so many bytes."""
