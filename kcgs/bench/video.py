@@ -235,6 +235,6 @@ def _plot_times(path: Path, found: Sequence[tables.Part]) -> None:
             axis.plot(point["seconds"], point[field], linestyle="", label=name, markersize=5, **style)
         line = [(points[name]["seconds"], points[name][field]) for name in lengths]
         axis.plot(*zip(*line, strict=True), color="0.6", linewidth=1, zorder=0)
-        axis.set(xlabel="seconds of a carried frame", ylabel=title)
+        axis.set(xlabel="processor seconds of a carried frame", ylabel=title)
     add_legend(plot, axes[0], columns=4)
     save_figure(plot, path)

@@ -144,19 +144,15 @@ class _Frames:
         return self.count or 0
 
     def __iter__(self) -> Iterator[Any]:
-        reading, number = islice(iter(self._reader), self._first), 0
-        while True:
-            try:
-                frame = next(reading)
-            except StopIteration:
-                return
-            except (OSError, ValueError) as error:
-                if not number:
-                    raise
-                self.error = error
-                return
-            yield frame
-            number += 1
+        number = 0
+        try:
+            for frame in islice(self._reader, self._first):
+                yield frame
+                number += 1
+        except (OSError, ValueError) as error:
+            if not number:
+                raise
+            self.error = error
 
 
 def _read_maps(regions: str, reader: FrameReader, frames: _Frames, *, progress: bool) -> Any:

@@ -66,7 +66,7 @@ def results() -> Results:
 
 
 class TestArithmetic:
-    def test_bytes_are_of_all_frames_and_quality_of_carried_ones(self, results: Results) -> None:
+    def test_bytes_are_of_all_frames_and_quality_of_all_but_the_first(self, results: Results) -> None:
         assert bytes_share(results, 1_250) == {"dog": 2_500 / 7_000}
         assert results.gains(1_250, CLIP, QUALITY, "psnr")["dog"] == pytest.approx(-0.2)
         assert results.gains(1_250, CLIP, "x264", "psnr") == {"dog": -0.5}
