@@ -22,7 +22,7 @@ PACKAGES = (
     "kcgs.functional",
     "kcgs.nn",
     "kcgs.editing",
-    "kcgs.fit",
+    "kcgs.fitting",
     "kcgs.rate",
     "kcgs.codec",
     "kcgs.segment",
@@ -193,7 +193,7 @@ def segmenters() -> str:
 
 def recipes() -> str:
     """Return what each recipe is, the settings of a fit with their defaults, and the recipes as they are on disk."""
-    from kcgs.fit import FitConfig, available_recipes
+    from kcgs.fitting import FitConfig, available_recipes
 
     table, blocks = ["| recipe | what it is |", "|---|---|"], []
     for name in available_recipes():

@@ -1,13 +1,16 @@
 """kcgs: contour-aware 2D Gaussian splatting of images, as differentiable torch modules."""
 
-from . import _interrupts as _interrupts  # first: the others take seconds to load
-from .clip import Clip
-from .evaluate import evaluate
-from .fit import FitConfig, FitResult, fit
-from .functional import RegionMap
-from .nn import GaussianField, RegionSplatRenderer
-from .rate.video import fit_video
-from .scene import Scene, load, save
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .clip import Clip
+    from .evaluation import evaluate
+    from .fitting import FitConfig, FitResult, fit
+    from .functional import RegionMap
+    from .nn import GaussianField, RegionSplatRenderer
+    from .rate.video import fit_video
+    from .scene import Scene, load, save
 
 __version__ = "0.1.0"
 
@@ -15,3 +18,28 @@ __all__ = [
     "Clip", "FitConfig", "FitResult", "GaussianField", "RegionMap", "RegionSplatRenderer", "Scene", "__version__",
     "evaluate", "fit", "fit_video", "load", "save",
 ]  # fmt: skip
+
+# Public names by module, which is imported when a name is used: the command's help loads no torch.
+_MODULES = {
+    "clip": ("Clip",),
+    "evaluation": ("evaluate",),
+    "fitting": ("FitConfig", "FitResult", "fit"),
+    "functional": ("RegionMap",),
+    "nn": ("GaussianField", "RegionSplatRenderer"),
+    "rate.video": ("fit_video",),
+    "scene": ("Scene", "load", "save"),
+}
+_PACKAGES = ("codec", "data", "editing", "fitting", "functional", "nn", "onnx", "rate", "segment")
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PACKAGES:
+        return import_module(f".{name}", __name__)
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(import_module(f".{module}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*__all__, *_PACKAGES})

@@ -21,13 +21,13 @@ LAYERS = [
     {"page"},
     {"rate", "editing"},
     {"clip"},
-    {"fit", "codec", "onnx", "segment"},
-    {"data", "evaluate", "pruning", "storage"},
+    {"fitting", "codec", "onnx", "segment"},
+    {"data", "evaluation", "pruning", "storage"},
     {"scene"},
     {"nn"},
     {"functional"},
     {"kernels", "engine", "plots"},
-    {"_check", "_atomic", "_shipped", "_interrupts", "_progress", "_repr"},
+    {"_check", "_atomic", "_shipped", "_progress", "_repr"},
 ]
 GONE = {
     "image, render": r"\bpictures?\b|\bdraw(s|n|ing|ings)?\b",

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import kcgs
 
 ROOT = Path(kcgs.__file__).resolve().parent.parent
@@ -27,6 +29,49 @@ def test_public_names() -> None:
         assert hasattr(kcgs, name)
     for name in ("region_splat", "edge_band", "psnr", "ssim", "ms_ssim", "ef_psnr", "ef_ssim"):
         assert name in kcgs.functional.__all__
+
+
+def run(code: str, *arguments: str) -> str:
+    command = [sys.executable, "-W", "error", "-c", code, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+def test_an_import_changes_nothing() -> None:
+    code = """
+import os, signal, sys
+sys.argv = ["kcgs", "fit"]
+before = dict(os.environ), signal.getsignal(signal.SIGINT), sys.unraisablehook
+import kcgs
+assert "torch" not in sys.modules
+kcgs.Scene, kcgs.fit, kcgs.functional.psnr
+assert before == (dict(os.environ), signal.getsignal(signal.SIGINT), sys.unraisablehook)
+"""
+    run(code)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--help",),
+        ("--version",),
+        ("fit",),
+        ("fit", "--help"),
+        ("fit", "photo.png", "--seed", "x"),
+        ("fit", "photo.png", "-n", "5", "--target-bytes", "900"),
+        ("render", "scene.png", "-o", "large.png"),
+    ],
+    ids=" ".join,
+)
+def test_help_and_usage_errors_load_no_torch(arguments: tuple[str, ...]) -> None:
+    code = """
+import sys
+from kcgs.cli import main
+try:
+    main()
+except SystemExit:
+    print(*[name for name in ("torch", "numpy", "numba") if name in sys.modules])
+"""
+    assert run(code, *arguments).splitlines()[-1] == ""
 
 
 def test_imports_are_light() -> None:
@@ -55,5 +100,4 @@ def test_imports_are_light() -> None:
         "    importlib.import_module(name)\n"
         f"    print(name, *[m for m in {heavy!r} if m in sys.modules])\n"
     )
-    out = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.split() == list(modules)
+    assert run(code).split() == list(modules)

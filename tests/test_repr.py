@@ -22,7 +22,7 @@ from kcgs.codec.clips.file import ClipHeader
 from kcgs.codec.clips.frames import key_record
 from kcgs.data import ChartSample, Davis, DavisFrame, read_label_maps, read_video, save_image, save_labels
 from kcgs.engine import run_jobs
-from kcgs.fit import FitResult, available_recipes
+from kcgs.fitting import FitResult, available_recipes
 from kcgs.functional import BandGain, BoundaryScore, PairWidths
 from kcgs.pruning import prune
 from kcgs.rate import Compressed, FitBytesResult

@@ -19,8 +19,8 @@ from torch import Tensor
 from kcgs._atomic import write_file
 from kcgs.codec import decode
 from kcgs.data import load_labels
-from kcgs.evaluate import measure
-from kcgs.fit import FitConfig, warm_up
+from kcgs.evaluation import measure
+from kcgs.fitting import FitConfig, warm_up
 from kcgs.rate import compress, fit_bytes
 from kcgs.scene import Scene, load
 

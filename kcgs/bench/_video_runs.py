@@ -26,7 +26,7 @@ from kcgs.codec.clips.carried import Frame
 from kcgs.codec.clips.file import KEY, unpack
 from kcgs.codec.clips.frames import FrameReader
 from kcgs.codec.clips.motion import expand, move_gaussians
-from kcgs.fit import FitConfig, fit, warm_up
+from kcgs.fitting import FitConfig, fit, warm_up
 from kcgs.functional import edge_band, ef_psnr, psnr
 from kcgs.rate import compress, fit_bytes, quality_for
 from kcgs.rate.video import carrying, fit_video

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from kcgs.evaluate import measure
+from kcgs.evaluation import measure
 from kcgs.plots import COLORS, figure, save_figure
 
 from . import _siren

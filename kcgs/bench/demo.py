@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 
 from kcgs.data import colorize_labels, save_image, save_labels
-from kcgs.evaluate import measure
-from kcgs.fit import FitConfig, FitResult, fit, warm_up
+from kcgs.evaluation import measure
+from kcgs.fitting import FitConfig, FitResult, fit, warm_up
 from kcgs.plots import COLORS, history_figure, save_figure
 from kcgs.scene import load
 from kcgs.segment import segment

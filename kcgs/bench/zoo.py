@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from kcgs._atomic import write_file
 from kcgs.data import save_image
-from kcgs.evaluate import evaluate
-from kcgs.fit import FitConfig, fit
+from kcgs.evaluation import evaluate
+from kcgs.fitting import FitConfig, fit
 from kcgs.onnx import scene_decoder, write_model
 from kcgs.scene import Scene
 from kcgs.zoo import Entry, entries

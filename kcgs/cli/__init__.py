@@ -1,6 +1,7 @@
 """The command `kcgs`."""
 
 import logging
+import os
 import re
 import sys
 import warnings
@@ -19,6 +20,9 @@ def main() -> None:
 
     Wrong usage is also what the library refuses by a message that says what an option or argument must be.
     """
+    # read when torch is loaded, which no import above does: its threads sleep while they wait, and take no core from
+    # other programs
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     logging.basicConfig(format="%(message)s")
     logging.getLogger("kcgs").setLevel(logging.INFO)
     try:

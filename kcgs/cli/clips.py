@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from kcgs._check import check_number
 from kcgs._progress import Progress
 
 from .common import OUTPUT_IMAGES, VIDEOS, check_output, print_report
@@ -69,6 +68,8 @@ def render_clip(
     if frame is not None:
         exclude("--frame", frame_rate=rate)
         check_output(output, *OUTPUT_IMAGES)
+        from kcgs._check import check_number
+
         check_number("frame", frame, 0.0, len(clip) - 1.0, unit="frames")
         save_image(output, clip.render(frame, target, contours))
         return
@@ -159,7 +160,7 @@ def measure_clip(
 
     Edge-focused metrics are along given maps, or the clip's. Of a video and maps that go on, the rest is not looked at.
     """
-    from kcgs.evaluate import measure
+    from kcgs.evaluation import measure
 
     found: list[dict[str, float]] = []
     counts = []

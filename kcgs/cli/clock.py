@@ -48,7 +48,7 @@ def process_began() -> float:
 def _seconds_per_pixel() -> float:
     import torch
 
-    from kcgs.evaluate import measure
+    from kcgs.evaluation import measure
 
     image = torch.rand(3, 176, 176)
     for _ in range(2):  # the first time loads what it takes

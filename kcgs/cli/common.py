@@ -13,14 +13,14 @@ from typing import Annotated, Any
 
 import typer
 
-from kcgs import _interrupts
 from kcgs._atomic import check_writable
 from kcgs._progress import Progress
 
 # typer may have click or a copy of it
 _UsageError: Any = typer.BadParameter.__mro__[1]
-# who read the standard output has left, as the shell would say of other programs
-_CLOSED = 128 + 13
+# exit statuses, as a shell gives them to a program that a signal ended
+_INTERRUPTED = 128 + signal.SIGINT
+_PIPE_CLOSED = 128 + 13
 
 
 class _Commands(typer.core.TyperGroup):
@@ -28,28 +28,25 @@ class _Commands(typer.core.TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command."""
-        with _interrupts.raised() as came:
-            Progress.forget()
-            try:
-                return super().invoke(ctx)
-            except BrokenPipeError as error:
-                # what is left in the buffer has nowhere to go
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-                raise typer.Exit(_CLOSED) from error
-            except _UsageError as error:
-                if "unexpected extra argument" in error.message and error.ctx and error.ctx.info_name == "fit":
-                    raise _UsageError(f"{error.message}: kcgs fit-many fits several images", error.ctx) from None
-                raise
-            except BaseException as error:
-                if not came and not isinstance(error, KeyboardInterrupt):
-                    raise
-                raise interrupted(str(error) if isinstance(error, KeyboardInterrupt) else "") from None
+        Progress.forget()
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as error:
+            raise interrupted(str(error)) from None
+        except BrokenPipeError as error:
+            # what is left in the buffer has nowhere to go
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(_PIPE_CLOSED) from error
+        except _UsageError as error:
+            if "unexpected extra argument" in error.message and error.ctx and error.ctx.info_name == "fit":
+                raise _UsageError(f"{error.message}: kcgs fit-many fits several images", error.ctx) from None
+            raise
 
 
 def interrupted(detail: str = "") -> typer.Exit:
     """Say in one line that Ctrl-C came, and return what ends the command."""
     typer.echo(f"kcgs: interrupted{detail and ': ' + detail}", err=True)
-    return typer.Exit(_interrupts.STATUS)
+    return typer.Exit(_INTERRUPTED)
 
 
 app = typer.Typer(
@@ -77,28 +74,30 @@ def _options(
     """Take options that come before a command."""
 
 
+SCENES = (".safetensors", ".kcgs")
 OUTPUT_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 # the files of a folder that are images; a file that is named is tried whatever it is called
 IMAGES = (*OUTPUT_IMAGES, ".gif")
 VIDEOS = (".mp4", ".mkv", ".mov", ".webm")
-
-
+# before the name of a shipped scene
+_ZOO = "zoo:"
 # what label maps are read from
 _LABEL_MAPS = (".png", ".npy", ".tif", ".tiff", ".gif", ".bmp", ".webp")
 
 
 def _scene_path(text: str, others: tuple[str, ...] = ()) -> Path:
-    from kcgs.scene import FORMATS
-    from kcgs.zoo import PREFIX, find
+    path = Path(text)
+    if text.startswith(_ZOO):
+        from kcgs.zoo import find
 
-    try:
-        path = find(text) if text.startswith(PREFIX) else Path(text)
-    except ValueError as error:
-        raise typer.BadParameter(str(error)) from error
-    if path.suffix not in FORMATS and path.suffix.lower() not in others:
+        try:
+            path = find(text)
+        except ValueError as error:
+            raise typer.BadParameter(str(error)) from error
+    if path.suffix not in SCENES and path.suffix.lower() not in others:
         photo = ": kcgs fit makes scenes of images" if path.suffix.lower() in IMAGES else ""
-        kinds = " or ".join((*FORMATS, *others))
-        raise typer.BadParameter(f"it must end in {kinds}, or be {PREFIX}NAME; got {text!r}{photo}")
+        kinds = " or ".join((*SCENES, *others))
+        raise typer.BadParameter(f"it must end in {kinds}, or be {_ZOO}NAME; got {text!r}{photo}")
     return path
 
 
@@ -190,6 +189,6 @@ class Stop:
         self.wanted = True
 
     def step(self, iteration: int, entry: Any) -> bool:
-        """Say whether the fit is to stop; `on_step` of :func:`kcgs.fit.fit`."""
+        """Say whether the fit is to stop; `on_step` of :func:`kcgs.fit`."""
         self._began = True
         return self.wanted

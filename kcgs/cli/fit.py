@@ -20,7 +20,7 @@ from .common import VIDEOS, ImageFile, Json, Quiet, Stop, app, check_output, int
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from kcgs.fit import FitConfig, FitResult
+    from kcgs.fitting import FitConfig, FitResult
     from kcgs.kernels.compiled import Program
     from kcgs.scene import Scene
 
@@ -136,7 +136,7 @@ def fit_into(
     notes: Mapping[str, str] | None = None,
 ) -> Fitted:
     """Fit, and write the scene, with notes in it, or the compressed file, as the suffix says."""
-    from kcgs.fit import fit
+    from kcgs.fitting import fit
     from kcgs.kernels import prepare
     from kcgs.rate import compress, fit_bytes, quality_for
     from kcgs.scene import Scene
@@ -200,7 +200,7 @@ def measure_scene(
     Edge-focused metrics look at the contours of `labels`; `seconds` are those of the fit. Without these the time of
     the rendering is taken, and SSIMULACRA2, which fits do not wait for.
     """
-    from kcgs.evaluate import measure, ssimulacra2
+    from kcgs.evaluation import measure, ssimulacra2
     from kcgs.kernels import prepare
 
     colors = scene.field.colors

@@ -9,18 +9,20 @@ import os
 import statistics
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from kcgs._atomic import atomic_path
 from kcgs._progress import Progress
-from kcgs.engine import Done, run_jobs
 
 from . import options
 from .common import IMAGES, Json, Quiet, app, print_report
 from .fit import compile_ahead
 from .many_jobs import Order, Outcome, fit_one
+
+if TYPE_CHECKING:
+    from kcgs.engine import Done
 
 _MILLION = 1_000_000
 _METRICS = ("psnr", "ssim", "ms_ssim", "ef_psnr", "ef_ssim", "num_gaussians", "seconds", "bytes", "bits_per_pixel")
@@ -57,6 +59,8 @@ def fit_many_command(
     The same command again goes on where an earlier one was stopped: what is there from the same image, mask
     and settings is kept. One image's failure stops no other; with any, the exit status is 1.
     """
+    from kcgs.engine import run_jobs
+
     if request.target_bytes is not None and suffix == ".safetensors":
         options.exclude("--target-bytes", suffix=suffix)
     images = _expand(patterns)

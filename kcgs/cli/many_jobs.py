@@ -15,7 +15,7 @@ from .fit import fit_into, measure_scene, read_regions, report_fit
 from .options import DEFAULT_GAUSSIANS, FitRequest
 
 if TYPE_CHECKING:
-    from kcgs.fit import FitConfig
+    from kcgs.fitting import FitConfig
 
 # of the note in a scene that says what it was made from
 _NOTE = "fit"
@@ -136,7 +136,7 @@ def _warm_up(config: FitConfig, segments: bool) -> None:
     import torch
 
     from kcgs import GaussianField, Scene
-    from kcgs.fit.warm_up import warm_up
+    from kcgs.fitting.warm_up import warm_up
 
     warm_up(config)
     # as large as MS-SSIM needs

@@ -12,7 +12,7 @@ import typer
 from .clock import Clock, process_began
 
 if TYPE_CHECKING:
-    from kcgs.fit import FitConfig
+    from kcgs.fitting import FitConfig
     from kcgs.scene import Scene
 
 DEFAULT_GAUSSIANS = 1000
@@ -74,10 +74,10 @@ def fit_request(
     backend: Annotated[Backend, typer.Option(help="Kernel.")] = "auto",
 ) -> FitRequest:
     """Return what the options ask for; None where one was not given."""
-    from kcgs.fit import FitConfig
-
     if target_bytes is not None:
         exclude("--target-bytes", num_gaussians=num_gaussians, target_psnr=target_psnr)
+    from kcgs.fitting import FitConfig
+
     settings: dict[str, Any] = {
         "iterations": iterations, "objective": objective, "max_seconds": max_seconds, "target_psnr": target_psnr,
     }  # fmt: skip

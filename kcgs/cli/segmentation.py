@@ -103,7 +103,7 @@ def _parse_options(pairs: list[str]) -> dict[str, Any]:
 
 def _rows(image: Tensor, found: Segmentation) -> tuple[list[dict[str, Any]], float]:
     """Return a row for each region, and the alignment of the whole map; None is what is not known."""
-    from kcgs.fit.kmeans import gaussian_shares
+    from kcgs.fitting.kmeans import gaussian_shares
     from kcgs.functional import RegionMap, edge_alignment_map
 
     aligned = edge_alignment_map(image, found.labels).flatten()

@@ -10,8 +10,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from kcgs.fit.fill import fill_hole
-from kcgs.fit.inpaint import grow
+from kcgs.fitting.fill import fill_hole
+from kcgs.fitting.inpaint import grow
 from kcgs.functional import PairWidths, RegionMap, touching_pairs
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join, scaled

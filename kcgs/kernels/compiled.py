@@ -47,7 +47,7 @@ inner = cast(Any, numba.njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, er
 
 
 class Program:
-    """The loops of a module, compiled together and kept on disk by the text of `sources`, beside `file`.
+    """The loops of a module, compiled together and kept on disk by its name and the text of `sources`, beside `file`.
 
     The module must not need torch and have its Program under the name `program`. A function under `@program.entry` is
     called from Python. One under `@program.part` calls entries once, with arguments of the types that they are called
@@ -56,7 +56,7 @@ class Program:
 
     def __init__(self, what: str, module: str, file: str, *sources: str) -> None:
         self._what, self._module = what, module
-        self._folder = _find_folder([Path(file).parent / source for source in sources])
+        self._folder = _find_folder(module, [Path(file).parent / source for source in sources])
         self._entries: list[Any] = []
         self.parts: dict[str, Callable[[], None]] = {}
         self._workers: list[_Worker] | None = None
@@ -143,13 +143,13 @@ class _Worker(threading.Thread):
             self._process.kill()
 
 
-def _find_folder(sources: Sequence[Path]) -> Path | None:
-    """Return the folder for what these sources compile to with this Python, numba and processor; None: there is none.
+def _find_folder(module: str, sources: Sequence[Path]) -> Path | None:
+    """Return the folder for what a module compiles to with this Python, numba and processor; None: there is none.
 
     numba's own choice goes by the path of the sources, and looks at one file to tell whether they have changed.
     """
     processor = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
-    known = sys.implementation.cache_tag, numba.__version__, llvmlite.__version__, *processor
+    known = module, sys.implementation.cache_tag, numba.__version__, llvmlite.__version__, *processor
     digest = hashlib.sha256(repr(known).encode())
     for source in (Path(__file__), *sources):
         digest.update(source.read_bytes())

@@ -14,9 +14,9 @@ from torch import Tensor
 from kcgs._check import check_count
 from kcgs._progress import Progress
 from kcgs._repr import brief
-from kcgs.fit import FitConfig, FitResult, HistoryEntry, fit
-from kcgs.fit.loop import check_problem
-from kcgs.fit.region_report import report_regions
+from kcgs.fitting import FitConfig, FitResult, HistoryEntry, fit
+from kcgs.fitting.loop import check_problem
+from kcgs.fitting.region_report import report_regions
 from kcgs.functional import RegionMap, merge_regions
 from kcgs.functional.labels import contour_edges
 from kcgs.functional.merging import pairs_to_merge
@@ -70,7 +70,7 @@ def fit_bytes(
     with Gaussians for its bytes, say so, within 0.1 dB. ``result.regions`` says what became of it.
 
     Args:
-        image: as in :func:`kcgs.fit.fit`.
+        image: as in :func:`kcgs.fit`.
         regions: as there.
         num_bytes: the file is not larger.
         recipe: as there.
@@ -85,7 +85,7 @@ def fit_bytes(
         The file, what it decodes to, and the fit.
 
     Raises:
-        TypeError, ValueError: as :func:`kcgs.fit.fit`; a budget too small for a Gaussian and the map.
+        TypeError, ValueError: as :func:`kcgs.fit`; a budget too small for a Gaussian and the map.
 
     Example:
         >>> import torch

@@ -16,8 +16,8 @@ from kcgs._repr import brief
 from kcgs.codec import QUALITIES, decode
 from kcgs.codec.gaussians.quantize import Codes, Quantizer
 from kcgs.codec.scenes import SceneWriter
-from kcgs.fit.config import Objective
-from kcgs.fit.objective import make_objective
+from kcgs.fitting.config import Objective
+from kcgs.fitting.objective import make_objective
 from kcgs.functional import psnr
 from kcgs.kernels import threads_for_kernels
 from kcgs.scene import Scene
@@ -73,7 +73,7 @@ def compress(
 
     Args:
         scene: N Gaussians of one image; opacities are merged into the colours, and notes are not kept.
-        image: what :func:`kcgs.fit.fit` takes, of the scene's size and channels.
+        image: what :func:`kcgs.fit` takes, of the scene's size and channels.
         quality: as in :func:`kcgs.codec.encode`, before the others make up for it.
         target_bytes: the finest file that is not larger, in place of `quality`.
         target_psnr: dB against the image, in place of both: the first of ever finer files that shows it, or where the
@@ -81,7 +81,7 @@ def compress(
         iterations: renders that the descent may take, at least 1.
         max_seconds: wall time, above 0; what it has no time for is rounded at once. None: as long as it takes.
         seed: of the order in which Gaussians are rounded.
-        objective: of the descent, as in :class:`kcgs.fit.FitConfig`: psnr, visual, ms-ssim, or progressive, which ends
+        objective: of the descent, as in :class:`kcgs.FitConfig`: psnr, visual, ms-ssim, or progressive, which ends
             layers just before a quarter, a half and three quarters of the file.
 
     Returns:

@@ -19,9 +19,9 @@ from torch import Tensor
 from kcgs.codec.clips.differences import CURVATURE
 from kcgs.codec.exact import Integers
 from kcgs.codec.gaussians.quantize import Classes, Codes, Parameters, Quantizer
-from kcgs.fit.frame import local_gradient, move
-from kcgs.fit.objective import VisualObjective
-from kcgs.fit.prefixes import energies, strongest
+from kcgs.fitting.frame import local_gradient, move
+from kcgs.fitting.objective import VisualObjective
+from kcgs.fitting.prefixes import energies, strongest
 from kcgs.functional import RegionMap, region_splat
 
 from .bits import soft_bits

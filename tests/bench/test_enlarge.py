@@ -18,7 +18,7 @@ from kcgs.bench.core.rows import read_rows
 from kcgs.bench.core.store import Row, Store
 from kcgs.bench.enlarge import FACTORS, METHODS, OWN, PHOTO, SCENE, chosen, compare, enlarge, gains_table, missing, plan
 from kcgs.data import save_image
-from kcgs.fit import FitConfig, FitResult, HistoryEntry
+from kcgs.fitting import FitConfig, FitResult, HistoryEntry
 from kcgs.functional import RegionMap, ef_psnr, psnr
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene

@@ -16,7 +16,7 @@ from kcgs.bench.core.cases import BASELINE, CLAMPED, PAPER, PAPER_CLAMPED, UNCLA
 from kcgs.bench.core.images import load
 from kcgs.bench.core.options import Options
 from kcgs.bench.core.store import Row
-from kcgs.fit import HistoryEntry
+from kcgs.fitting import HistoryEntry
 
 
 def row(image: str = "a", n: int = 1_250, method: str = "best", psnr: float = 30.0, **values: Any) -> Row:

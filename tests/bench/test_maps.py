@@ -36,7 +36,7 @@ from kcgs.bench.maps import (
 from kcgs.cli import main
 from kcgs.codec import decode, encode
 from kcgs.data import load_image, save_image
-from kcgs.fit import FitConfig, FitResult, HistoryEntry
+from kcgs.fitting import FitConfig, FitResult, HistoryEntry
 from kcgs.functional import RegionMap, ef_psnr, psnr
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
@@ -119,7 +119,7 @@ class TestPlan:
             taken.update(options)
             raise ValueError("that is all")
 
-        monkeypatch.setattr(import_module("kcgs.fit"), "fit", refuse)  # kcgs.fit is the function too
+        monkeypatch.setattr(import_module("kcgs.fitting"), "fit", refuse)  # kcgs.fit is the function too
         photo = str(data / "bsds/7/image.jpg")
         monkeypatch.setattr(
             sys, "argv", ["kcgs", "fit", photo, "--recipe", "best-refined", "-o", str(data / "scene.safetensors")]

@@ -37,7 +37,7 @@ from kcgs.bench.core.rows import write_rows
 from kcgs.bench.rate import GROUPS, QUICK_BYTES, QUICK_IMAGE, TARGETS, choose, names, report, steps
 from kcgs.codec import encode
 from kcgs.data import save_image, save_labels
-from kcgs.fit import FitConfig, FitResult, HistoryEntry
+from kcgs.fitting import FitConfig, FitResult, HistoryEntry
 from kcgs.functional import RegionMap, ef_psnr, psnr
 from kcgs.nn import GaussianField
 from kcgs.rate import Compressed, FitBytesResult

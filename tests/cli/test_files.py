@@ -15,7 +15,7 @@ from kcgs.cli import app
 from kcgs.cli.options import Objective
 from kcgs.codec import decode
 from kcgs.data import load_image, save_image
-from kcgs.fit import FitConfig
+from kcgs.fitting import FitConfig
 from tests.codec.conftest import make_scene
 
 runner = CliRunner()

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcgs.cli import main
 from kcgs.data import load_image, load_labels, overlay_labels, save_image, save_labels
-from kcgs.fit.kmeans import kmeans_field
+from kcgs.fitting.kmeans import kmeans_field
 from kcgs.functional import RegionMap
 from kcgs.segment import Prediction, available_methods, register
 from kcgs.segment.registry import _methods

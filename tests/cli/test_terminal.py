@@ -56,20 +56,12 @@ def press(*_: object, **__: object) -> NoReturn:
 
 
 class TestCtrlC:
-    @pytest.mark.parametrize("seconds", [0.1, 0.5])
-    def test_while_libraries_are_loaded(self, seconds: float) -> None:
-        process = start(sys.executable, "-m", "kcgs.cli", "models")
-        time.sleep(seconds)
-        process.send_signal(signal.SIGINT)
-        assert process.communicate(timeout=60)[1] == b"kcgs: interrupted\n"
-        assert process.returncode == 130
-
     @pytest.mark.parametrize(
         ("name", "arguments"),
         [
             ("kcgs.segment.segment", ("fit", "photo.png", "-n", "5")),
             ("kcgs.segment.segment_with_scores", ("segment", "photo.png", "-o", "map.png")),
-            ("kcgs.fit.fit", ("fit", "photo.png", "-n", "5", "--regions", "none")),
+            ("kcgs.fitting.fit", ("fit", "photo.png", "-n", "5", "--regions", "none")),
             ("kcgs.codec.encode", ("encode", "scene.safetensors", "-o", "scene.kcgs")),
             ("kcgs.view.serve", ("view", "scene.safetensors")),
         ],

@@ -65,7 +65,7 @@ def test_every_public_name_is_in_the_reference(site: Path, generate: ModuleType)
 
 def test_every_page_has_commands_recipes_and_figures(site: Path, generate: ModuleType) -> None:
     """What is generated from the code is in the pages that include it."""
-    from kcgs.fit import FitConfig, available_recipes
+    from kcgs.fitting import FitConfig, available_recipes
 
     commands, recipes = ((site / f"{name}.html").read_text(encoding="utf-8") for name in ("command-line", "recipes"))
     shown = "fit", "render", "eval", "segment", "info", "encode", "decode", "export", "view", "bench"

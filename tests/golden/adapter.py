@@ -20,11 +20,11 @@ import kcgs
 from kcgs import GaussianField, RegionMap, Scene, editing, segment
 from kcgs import functional as F
 from kcgs.codec import decode, encode
-from kcgs.fit import fit
-from kcgs.fit.colors import solve_colors
-from kcgs.fit.contour_moves import refine_contours
-from kcgs.fit.levenberg_marquardt import levenberg_marquardt
-from kcgs.fit.pursuit import propose
+from kcgs.fitting import fit
+from kcgs.fitting.colors import solve_colors
+from kcgs.fitting.contour_moves import refine_contours
+from kcgs.fitting.levenberg_marquardt import levenberg_marquardt
+from kcgs.fitting.pursuit import propose
 from kcgs.onnx import generic_decoder, scene_decoder
 from kcgs.pruning import prune
 from kcgs.rate import compress, fit_bytes

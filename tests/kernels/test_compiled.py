@@ -79,13 +79,13 @@ def test_folder_goes_by_the_text_not_by_the_place(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(compiled._config, "CACHE_DIR", str(tmp_path / "cache"))
     source = Path(compiled.__file__).parent / "cpu" / "simd.py"
     copy = Path(shutil.copy(source, tmp_path / "other.py"))
-    folder = compiled._find_folder([source])
+    folder = compiled._find_folder("module", [source])
     assert folder is not None and folder.parent == tmp_path / "cache"
-    assert folder == compiled._find_folder([copy])
+    assert folder == compiled._find_folder("module", [copy]) != compiled._find_folder("other", [source])
     copy.write_text(copy.read_text() + "\n")
-    assert folder != compiled._find_folder([copy])
+    assert folder != compiled._find_folder("module", [copy])
     monkeypatch.setattr(compiled.binding, "get_host_cpu_name", lambda: "other")
-    assert folder != compiled._find_folder([source])
+    assert folder != compiled._find_folder("module", [source])
 
 
 @pytest.mark.parametrize("user", [{"XDG_CACHE_HOME": "cache"}, {"HOME": ".", "XDG_CACHE_HOME": ""}])
@@ -97,7 +97,7 @@ def test_folder_is_the_user_s(user: dict[str, str], tmp_path: Path, monkeypatch:
         monkeypatch.setenv(name, str(tmp_path / place) if place else "")
         if not place:
             monkeypatch.delenv(name)
-    folder = compiled._find_folder([])
+    folder = compiled._find_folder("module", [])
     assert folder is not None and folder.is_relative_to(tmp_path)
 
 

@@ -15,7 +15,7 @@ import kcgs
 from kcgs.bench import run
 from kcgs.bench.core import images
 from kcgs.bench.zoo import PLANS
-from kcgs.fit import FitConfig
+from kcgs.fitting import FitConfig
 from kcgs.functional import psnr
 from kcgs.scene import load
 from kcgs.zoo import Entry, entries, find

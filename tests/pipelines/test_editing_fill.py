@@ -9,8 +9,8 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, Scene, fit
 from kcgs.editing import delete_region, move_region
-from kcgs.fit.inpaint import grow, inpaint
-from kcgs.fit.texture import texture
+from kcgs.fitting.inpaint import grow, inpaint
+from kcgs.fitting.texture import texture
 
 SIZE = (48, 72)
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from kcgs.data import chart_pie
-from kcgs.fit import FitConfig
+from kcgs.fitting import FitConfig
 from kcgs.functional import RegionMap
 
 from . import images

@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeVar
 from torch import Tensor
 
 from kcgs._repr import png
-from kcgs.evaluate import ssimulacra2
+from kcgs.evaluation import ssimulacra2
 
 Record = TypeVar("Record", bound=NamedTuple)
 PROGRAM = "butteraugli_main"

@@ -18,8 +18,8 @@ from torch import Tensor
 from kcgs._atomic import write_file
 from kcgs.codec import decode, encode
 from kcgs.codec.labels import encode_map
-from kcgs.evaluate import measure
-from kcgs.fit import FitResult, HistoryEntry, fit, warm_up
+from kcgs.evaluation import measure
+from kcgs.fitting import FitResult, HistoryEntry, fit, warm_up
 from kcgs.rate import quality_for
 from kcgs.scene import Scene, load
 from kcgs.segment import segment

@@ -39,7 +39,7 @@ _MEMORY = (300.0, 600.0)
 class Differences:
     """The whole numbers of Gaussians that differ from given ones, in float64, and back.
 
-    A Gaussian moves by (d1, d2, k11, k21, k22) in its own frame, as :func:`kcgs.fit.frame.move` has it to first order
+    A Gaussian moves by (d1, d2, k11, k21, k22) in its own frame, as `kcgs.fitting.frame.move` has it to first order
     in k21, and by its colours, rotated. All steps add the distortion.
     """
 

@@ -14,11 +14,11 @@ from kcgs.codec.clips.differences import Differences
 from kcgs.codec.exact import Integers
 from kcgs.codec.gaussians.quantize import Codes, Parameters, Quantizer
 from kcgs.codec.labels.settling import settle_labels
-from kcgs.fit import FitConfig
-from kcgs.fit.contour_moves import accept_moves, refine_contours
-from kcgs.fit.objective import make_objective, propose_by
-from kcgs.fit.prefixes import energies
-from kcgs.fit.redundancy import least_missed
+from kcgs.fitting import FitConfig
+from kcgs.fitting.contour_moves import accept_moves, refine_contours
+from kcgs.fitting.objective import make_objective, propose_by
+from kcgs.fitting.prefixes import energies
+from kcgs.fitting.redundancy import least_missed
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene

@@ -19,7 +19,7 @@ from kcgs.codec.clips.motion import quantize_motion
 from kcgs.codec.exact import Integers
 from kcgs.codec.file import unpack
 from kcgs.codec.gaussians.quantize import QPS
-from kcgs.fit import FitConfig, fit
+from kcgs.fitting import FitConfig, fit
 from kcgs.functional import psnr
 from kcgs.kernels import threads_for_kernels
 from kcgs.rate.budget import count_for

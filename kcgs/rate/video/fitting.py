@@ -17,8 +17,8 @@ from kcgs._check import check_count, check_number
 from kcgs._progress import Progress
 from kcgs.clip import Clip
 from kcgs.codec.clips.file import ClipHeader, Record
-from kcgs.fit import FitConfig
-from kcgs.fit.loop import check_problem
+from kcgs.fitting import FitConfig
+from kcgs.fitting.loop import check_problem
 
 from .budget import Budget
 from .journal import Journal

@@ -12,8 +12,8 @@ from kcgs.codec.clips.carried import LEAST_FACTOR, MOST_FACTOR, are_sound
 from kcgs.codec.clips.differences import CURVATURE, Differences
 from kcgs.codec.exact import Integers
 from kcgs.codec.gaussians.quantize import OPPONENT, Parameters
-from kcgs.fit.frame import local_gradient, move
-from kcgs.fit.objective import VisualObjective
+from kcgs.fitting.frame import local_gradient, move
+from kcgs.fitting.objective import VisualObjective
 from kcgs.functional import RegionMap, region_splat
 
 # of a descent's step: share of Newton's, what is kept of the step before; bounds in the Gaussian's frame

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from kcgs.fit.state import FitState
+from kcgs.fitting.state import FitState
 
 from .densify import Densify, DensifyAtLargestError
 from .finish import EndDrafts, Finish

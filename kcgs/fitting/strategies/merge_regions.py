@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs.fit.colors import solve_colors
-from kcgs.fit.descent import descend, render, squared_error
-from kcgs.fit.start import begin
-from kcgs.fit.state import FitState
+from kcgs.fitting.colors import solve_colors
+from kcgs.fitting.descent import descend, render, squared_error
+from kcgs.fitting.start import begin
+from kcgs.fitting.state import FitState
 
 from .densify import Densify
 

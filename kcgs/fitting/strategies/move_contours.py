@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import torch
 
-from kcgs.fit.contour_moves import accept_moves, refine_contours
-from kcgs.fit.descent import squared_error
-from kcgs.fit.state import FitState
+from kcgs.fitting.contour_moves import accept_moves, refine_contours
+from kcgs.fitting.descent import squared_error
+from kcgs.fitting.state import FitState
 from kcgs.functional import RegionMap, choose_widths
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcgs import FitConfig, RegionMap, fit
 from kcgs.data import chart_2x3, chart_pie
-from kcgs.fit import FitResult, RegionReport
+from kcgs.fitting import FitResult, RegionReport
 from kcgs.functional import edge_band, psnr
 
 

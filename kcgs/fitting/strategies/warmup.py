@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from kcgs.fit.state import FitState
+from kcgs.fitting.state import FitState
 from kcgs.functional import lookup_regions
 
 

@@ -33,7 +33,7 @@ _LEAST_SIGMA = 0.5
 def start(
     image: Tensor, regions: RegionMap | None, num_gaussians: int, config: FitConfig, seed: int, started: float
 ) -> FitState:
-    """Return the state of a fit at its start; see :func:`kcgs.fit.fit`."""
+    """Return the state of a fit at its start; see :func:`kcgs.fit`."""
     band = None if regions is None else edge_band(regions.labels).flatten().nonzero().flatten()
     fitting = _as_many_as_gaussians(image, regions, num_gaussians, config)
     saturated = float(((image == 0.0) | (image == 1.0)).float().mean())

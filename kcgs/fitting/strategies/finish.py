@@ -8,10 +8,10 @@ from typing import Literal
 
 import torch
 
-from kcgs.fit.descent import log, render
-from kcgs.fit.levenberg_marquardt import is_flat, levenberg_marquardt
-from kcgs.fit.region_report import report_regions
-from kcgs.fit.state import FitResult, FitState, Gaussians, StopReason
+from kcgs.fitting.descent import log, render
+from kcgs.fitting.levenberg_marquardt import is_flat, levenberg_marquardt
+from kcgs.fitting.region_report import report_regions
+from kcgs.fitting.state import FitResult, FitState, Gaussians, StopReason
 from kcgs.pruning import prune
 from kcgs.scene import Scene
 

@@ -6,8 +6,8 @@ import torch
 from skimage import data
 
 from kcgs import Scene, fit
-from kcgs.fit import FitConfig
-from kcgs.fit.prefixes import strongest
+from kcgs.fitting import FitConfig
+from kcgs.fitting.prefixes import strongest
 from kcgs.functional import psnr, region_splat
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs.fit.pursuit import Proposal, _search, propose
+from kcgs.fitting.pursuit import Proposal, _search, propose
 from kcgs.functional import RegionMap, lookup_regions, region_splat
 
 SIGMAS = (0.7, 1.13, 1.8, 2.9, 4.6, 7.5)

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, Scene
 from kcgs.data import chart_2x3, chart_pie
-from kcgs.fit.colors import solve_colors
-from kcgs.fit.frame import move
-from kcgs.fit.levenberg_marquardt import _bounded, _measure, _patches, is_flat, levenberg_marquardt
+from kcgs.fitting.colors import solve_colors
+from kcgs.fitting.frame import move
+from kcgs.fitting.levenberg_marquardt import _bounded, _measure, _patches, is_flat, levenberg_marquardt
 from kcgs.functional import psnr, region_splat
 
 SIZE = (18, 26)

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d
 
 from kcgs import fit
-from kcgs.fit.objective import MsSsimObjective, VisualObjective
+from kcgs.fitting.objective import MsSsimObjective, VisualObjective
 from kcgs.functional import ms_ssim
 
 

@@ -23,7 +23,7 @@ while True: a @ a
 """
 _FIT = """
 import sys, time, torch
-from kcgs.fit import fit
+from kcgs.fitting import fit
 image = torch.rand(3, 200, 300, generator=torch.Generator().manual_seed(0))
 fit(image, None, 300, iterations=150)
 for _ in sys.stdin:

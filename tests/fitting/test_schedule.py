@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from kcgs import FitConfig, RegionMap
-from kcgs.fit.contour_moves import accept_moves
-from kcgs.fit.optimizers import FrameAdam, GaussianImageAdan
-from kcgs.fit.start import start
-from kcgs.fit.state import FitState, HistoryEntry
-from kcgs.fit.strategies import Densify, MoveContours, Strategy, make_strategies
-from kcgs.fit.strategies.merge_regions import nearest_contour
+from kcgs.fitting.contour_moves import accept_moves
+from kcgs.fitting.optimizers import FrameAdam, GaussianImageAdan
+from kcgs.fitting.start import start
+from kcgs.fitting.state import FitState, HistoryEntry
+from kcgs.fitting.strategies import Densify, MoveContours, Strategy, make_strategies
+from kcgs.fitting.strategies.merge_regions import nearest_contour
 from kcgs.nn import GaussianField
 
 

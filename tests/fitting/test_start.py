@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from kcgs import RegionMap
-from kcgs.fit.kmeans import kmeans_field
-from kcgs.fit.start import gradient_field, random_field
+from kcgs.fitting.kmeans import kmeans_field
+from kcgs.fitting.start import gradient_field, random_field
 from kcgs.functional import lookup_regions, psnr, region_splat
 from kcgs.nn import GaussianField
 

@@ -14,7 +14,7 @@ from PIL import Image
 
 from kcgs import GaussianField, RegionMap, Scene, evaluate
 from kcgs.data import load_image, save_image
-from kcgs.evaluate import ssimulacra2
+from kcgs.evaluation import ssimulacra2
 from kcgs.functional import ef_psnr, psnr, ssim
 
 SIZE = (40, 60)

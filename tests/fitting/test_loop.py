@@ -13,8 +13,8 @@ from torch import Tensor
 
 from kcgs import FitConfig, GaussianField, RegionMap, fit
 from kcgs.data import chart_2x3, chart_pie
-from kcgs.fit import available_recipes
-from kcgs.fit.optimizers import ImageGSAdam
+from kcgs.fitting import available_recipes
+from kcgs.fitting.optimizers import ImageGSAdam
 from kcgs.functional import ef_psnr, psnr
 
 
@@ -213,7 +213,7 @@ class TestStopping:
         """The baseline of the demo began at 8 s: the first fit of a process bore the compilation."""
         image = torch.rand(3, 16, 24)
         fit(image, None, 3, iterations=2)  # what this process loads at first
-        monkeypatch.setattr(sys.modules["kcgs.fit.loop"], "prepare", lambda *_: time.sleep(0.5))
+        monkeypatch.setattr(sys.modules["kcgs.fitting.loop"], "prepare", lambda *_: time.sleep(0.5))
         whole, timed = (fit(image, None, 3, **{"iterations": 2, **more}) for more in ({}, {"target_psnr": 1.0}))
         assert whole.seconds < 0.5 and timed.history[0].seconds < 0.5
         assert fit(image, None, 3, max_seconds=0.2).history[-1].iteration > 2

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from skimage import data
 
 from kcgs import fit
-from kcgs.fit.greedy import pick
-from kcgs.fit.redundancy import NEIGHBORS, least_missed
+from kcgs.fitting.greedy import pick
+from kcgs.fitting.redundancy import NEIGHBORS, least_missed
 from kcgs.functional import psnr
 
 

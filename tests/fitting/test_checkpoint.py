@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcgs import FitConfig, fit
-from kcgs.fit import FitResult
+from kcgs.fitting import FitResult
 
 
 def scene(size: tuple[int, int] = (48, 64), seed: int = 0) -> tuple[Tensor, Tensor]:

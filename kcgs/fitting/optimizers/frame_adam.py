@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from kcgs.fit.frame import local_gradient, move, widen
+from kcgs.fitting.frame import local_gradient, move, widen
 from kcgs.nn import GaussianField
 
 from .base import LEAST_SIGMA, GaussianOptimizer

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs.fit import FitConfig, fit
-from kcgs.fit.frame import widen
+from kcgs.fitting import FitConfig, fit
+from kcgs.fitting.frame import widen
 
 
 def covariance(cholesky: Tensor) -> Tensor:

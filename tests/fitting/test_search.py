@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcgs import fit
-from kcgs.fit import FitConfig
+from kcgs.fitting import FitConfig
 from kcgs.functional import psnr
 from kcgs.rate import compress, fit_bytes
 

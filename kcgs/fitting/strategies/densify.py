@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from kcgs.fit.descent import render, squared_error
-from kcgs.fit.objective import propose_by
-from kcgs.fit.pursuit import Proposal
-from kcgs.fit.sampling import sample_pixels
-from kcgs.fit.state import FitState
+from kcgs.fitting.descent import render, squared_error
+from kcgs.fitting.objective import propose_by
+from kcgs.fitting.pursuit import Proposal
+from kcgs.fitting.sampling import sample_pixels
+from kcgs.fitting.state import FitState
 from kcgs.functional import lookup_regions
 
 from .move_contours import MoveContours
@@ -111,7 +111,7 @@ class Densify:
 
 def leave_out(state: FitState, count: int) -> None:
     """Leave out so many Gaussians, if any, those that are missed least; their neighbours make up for them."""
-    from kcgs.fit.redundancy import least_missed
+    from kcgs.fitting.redundancy import least_missed
 
     while count > 0:
         means, cholesky, colors, ids, regions = state.gaussians()

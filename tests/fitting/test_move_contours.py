@@ -14,8 +14,8 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, Scene, fit
 from kcgs.data import load_image, load_labels
-from kcgs.fit.contour_energy import RegionCosts, bounding_boxes, index_map, unequal
-from kcgs.fit.contour_moves import refine_contours
+from kcgs.fitting.contour_energy import RegionCosts, bounding_boxes, index_map, unequal
+from kcgs.fitting.contour_moves import refine_contours
 from kcgs.functional import edge_band, psnr, region_splat
 
 WIDE = 1e4  # standard deviation in pixels: a Gaussian that is constant over the image
