@@ -33,7 +33,6 @@ TOLERANCES = {
 COMPILER_WARNINGS = (
     ("The .grad attribute of a Tensor that is not a leaf", UserWarning),
     (".*torch.autograd.function.Function.* should not be instantiated", DeprecationWarning),
-    ("`torch.jit.script.*` is deprecated", DeprecationWarning),
 )
 
 

@@ -163,9 +163,9 @@ def largest_share(index: Tensor, factor: int) -> Tensor:
 
 
 def compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return the sorted ids, each pixel's position among them, and for small ids a table from id to position.
+    """Return the sorted ids, each pixel's position among them, and for small ids a table from id + 1 to position.
 
-    The table ends with -1, for ids beyond it and for -1.
+    The table begins and ends with -1, for ids below and beyond it.
     """
     highest = int(labels.max())
     if highest < 1 << 16:  # a table is ten times faster than sorting every pixel
@@ -173,7 +173,7 @@ def compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         ids = present.nonzero().flatten()
         table = torch.where(present, present.cumsum(0) - 1, -1)
         index = table.to(torch.int32).index_select(0, labels.flatten()).view(labels.shape)
-        return ids, index, torch.nn.functional.pad(table, (0, 1), value=-1)
+        return ids, index, torch.nn.functional.pad(table, (1, 1), value=-1)
     ids, index = torch.unique(labels, return_inverse=True)
     return ids, index.to(torch.int32), None
 

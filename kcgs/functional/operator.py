@@ -1,7 +1,8 @@
 """`kcgs::region_splat`, the operator that tools see: shapes, gradient, vmap, and which kernel evaluates it.
 
-All enters as tensors and numbers. What is derived from a label map, and what a forward leaves for its backward, is kept
-beside the tensors that it belongs to, and never traced. Values are checked here, shapes by the public function.
+All enters as tensors and numbers. What is derived from the labels of a RegionMap is kept on their tensor; other labels
+are converted at each call. A forward's plan for its backward is kept on autograd's context. Neither is traced. Values
+are checked here, shapes by the public function.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from kcgs._check import check_labels
 from kcgs.kernels import OutOfRangeError, SplatInputs, Steps, resolve, with_autograd
 
 from .arguments import Arguments, KeptPlan, plans
-from .map_tables import MapTables, find_index, find_tables, keep_tables
+from .map_tables import MapTables, keep_tables, tables_by_size
 from .regions import RegionMap
 from .softness import is_crisp, softness_of
 from .values import check_id_values, check_values
@@ -111,7 +112,9 @@ def _prepare(given: Arguments, checked: bool = False) -> tuple[SplatInputs, Step
     size, membership, index = (given.height, given.width), None, None
     if given.labels is not None and given.region_ids is not None:
         tables = _tables(given.labels, given.widths, given.supersample, size)
-        index, least = find_index(tables, given.region_ids)
+        index = tables.index_of(given.region_ids if given.region_ids.ndim == 2 else given.region_ids.unsqueeze(0))
+        # CUDA is not waited for
+        least = -1 if index.device.type != "cpu" else int(index.min()) if index.numel() else 0
         membership = tables.membership
         if not checked:
             check_id_values(given.region_ids, index, least, tables.whole)
@@ -126,16 +129,16 @@ def _prepare(given: Arguments, checked: bool = False) -> tuple[SplatInputs, Step
 
 
 def _tables(labels: Tensor, widths: Tensor | None, supersample: int, size: tuple[int, int]) -> MapTables:
-    found = find_tables(labels, widths, supersample, size)
-    if found is None:
+    crisp, kept = is_crisp(widths), tables_by_size(labels)
+    tables = None if kept is None else kept.get((*size, crisp))
+    if tables is None:
         check_labels("regions", labels)
-        softness, contours = (0.0, "crisp") if is_crisp(widths) else (softness_of(widths), "scaled")
-        # of a tensor of its own: tables of the map itself stay where they are
-        own = labels.view_as(labels) if contours == "crisp" else labels
-        regions = RegionMap.from_labels(own, softness, supersample=supersample).resize(size, contours)
-        found = regions.tables
-        keep_tables(labels, widths, supersample, size, found)
-    return found
+        softness, contours = (0.0, "crisp") if crisp else (softness_of(widths), "scaled")
+        regions = RegionMap.from_labels(labels, softness, supersample=supersample).resize(size, contours)
+        tables = regions.tables
+        if kept is not None:
+            keep_tables(labels, size, crisp, tables)
+    return tables
 
 
 _LIBRARY.impl("region_splat", _render, "CompositeExplicitAutograd")

@@ -40,7 +40,8 @@ class RegionMap:
     width for each pair of regions a pixel is blurred by the width of its nearest contour. With ``supersample`` k the
     map has k x k labels per pixel, and a pixel's membership is the mean over them; ``labels`` is then the label with
     the largest share (the smallest on a tie), and regions too small to have any such pixel are regions still.
-    ``fine_labels`` is the map at its own resolution: ``labels`` itself where k is 1.
+    ``fine_labels`` is the map at its own resolution: ``labels`` itself where k is 1. A map never changes: it has a copy
+    of the labels it was made from, and both attributes give copies of that.
 
     Example:
         >>> regions = RegionMap.from_labels(torch.tensor([[3, 3, 7], [3, 7, 7]]))
@@ -48,19 +49,18 @@ class RegionMap:
         (2, (2, 3), 0.0)
     """
 
-    labels: Tensor  # (H, W) or (B, H, W) int64
     ids: Tensor  # (R,) int64, sorted
     softness: float | PairWidths = 0.0
     supersample: int = 1  # k
-    fine_labels: Tensor = field(repr=False, kw_only=True)  # (k * H, k * W) or (B, k * H, k * W) int64
+    _labels: Tensor = field(repr=False, kw_only=True)
+    _fine_labels: Tensor = field(repr=False, kw_only=True)
     tables: MapTables = field(repr=False, kw_only=True)
     widths: Tensor | None = field(repr=False, kw_only=True)  # softness, as the operator takes it
     _origin: RegionMap | None = field(default=None, repr=False, kw_only=True)  # what this was resized from
 
     def __post_init__(self) -> None:
         """Keep the tables where the operator finds them."""
-        given = self.given
-        keep_tables(given.fine_labels, self.widths, given.supersample, self.size, self.tables)
+        keep_tables(self.operator_labels, self.size, is_crisp(self.widths), self.tables)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Keep the tables of a copy where the operator finds them, too."""
@@ -101,7 +101,7 @@ class RegionMap:
             >>> half.labels, half.num_regions
             (tensor([[1, 1]]), 2)
         """
-        labels = check_labels("labels", labels)
+        labels = check_labels("labels", labels).clone()
         supersample = check_count("supersample", supersample)
         if labels.shape[-2] % supersample or labels.shape[-1] % supersample:
             raise ValueError(
@@ -119,7 +119,7 @@ class RegionMap:
         shown = labels if supersample == 1 else ids[coarse if labels.ndim == 3 else coarse[0]]
         tables = MapTables(ids, table, membership)
         widths = widths_of(width, supersample, labels.device)
-        return cls(shown, ids, width, supersample, fine_labels=labels, tables=tables, widths=widths)
+        return cls(ids, width, supersample, _labels=shown, _fine_labels=labels, tables=tables, widths=widths)
 
     @classmethod
     def coerce(cls, value: object, name: str = "regions") -> RegionMap | None:
@@ -131,6 +131,26 @@ class RegionMap:
         raise TypeError(f"{name} must be a RegionMap, a label map or None; got {type(value).__name__}")
 
     @property
+    def labels(self) -> Tensor:
+        """Label of each pixel, (H, W) or (B, H, W) int64, a copy."""
+        return self._labels.clone()
+
+    @property
+    def fine_labels(self) -> Tensor:
+        """Label of each sub-pixel, (k * H, k * W) or (B, k * H, k * W) int64, a copy."""
+        return self._fine_labels.clone()
+
+    @property
+    def operator_labels(self) -> Tensor:
+        """The map's own labels at its own resolution, which the operator takes and nobody writes to."""
+        return self.given._fine_labels
+
+    @property
+    def num_maps(self) -> int | None:
+        """Number of maps of a batch, B; None: one map without a batch."""
+        return self._labels.shape[0] if self._labels.ndim == 3 else None
+
+    @property
     def num_regions(self) -> int:
         """Number of distinct ids."""
         return len(self.ids)
@@ -138,7 +158,7 @@ class RegionMap:
     @property
     def size(self) -> tuple[int, int]:
         """(height, width) in pixels."""
-        return self.labels.shape[-2], self.labels.shape[-1]
+        return self._labels.shape[-2], self._labels.shape[-1]
 
     @property
     def given(self) -> RegionMap:
@@ -182,12 +202,12 @@ class RegionMap:
             >>> regions.weights([3, 9])
             tensor([[1., 1., 0., 1.]], dtype=torch.float64)
         """
-        if self.labels.ndim != 2:
-            raise ValueError(f"weights needs one map; got labels of shape {tuple(self.labels.shape)}")
+        if self.num_maps is not None:
+            raise ValueError(f"weights needs one map; got a batch of {self.num_maps}")
         chosen = [region_ids] if isinstance(region_ids, int) else sorted(set(region_ids))
         places = self.index_of(torch.tensor(chosen, dtype=torch.int64, device=self.ids.device)).tolist()
         found = [self.membership.whole(0, place) for place in places if place >= 0]
-        total = torch.zeros(self.size, dtype=torch.float64, device=self.labels.device)
+        total = torch.zeros(self.size, dtype=torch.float64, device=self.ids.device)
         return (sum(found[1:], found[0]) if found else total).to(dtype)
 
     def relabel(
@@ -210,8 +230,8 @@ class RegionMap:
             >>> regions.relabel(torch.tensor([[1, 5, 5, 2]]), "mean").softness
             PairWidths({(1, 2): 0.7, (1, 5): 0.7})
         """
-        if labels.shape != self.fine_labels.shape:
-            raise ValueError(f"labels must have shape {tuple(self.fine_labels.shape)}; got {tuple(labels.shape)}")
+        if labels.shape != self._fine_labels.shape:
+            raise ValueError(f"labels must have shape {tuple(self._fine_labels.shape)}; got {tuple(labels.shape)}")
         softness: float | Mapping[tuple[int, int], float] = self.softness
         if isinstance(softness, PairWidths):
             softness = {**self._new_widths(labels, new_width), **softness}
@@ -225,7 +245,7 @@ class RegionMap:
             return width if isinstance(width, Mapping) else {}
         if width == "mean":
             width = sum(self.softness.values()) / len(self.softness)
-        return dict.fromkeys(touching_pairs(labels) - touching_pairs(self.fine_labels), width)
+        return dict.fromkeys(touching_pairs(labels) - touching_pairs(self._fine_labels), width)
 
     def merge(self, pairs: Iterable[tuple[int, int]]) -> tuple[RegionMap | None, Tensor]:
         """Merge pairs of regions: to the least of their ids, and contours to the mean of the widths they are made of.
@@ -248,18 +268,18 @@ class RegionMap:
         new_ids = torch.tensor([find(region) for region in self.ids.tolist()], device=self.ids.device)
         if len(new_ids.unique()) == 1:
             return None, new_ids
-        labels = new_ids[self.index_of(self.fine_labels)]
+        labels = new_ids[self.index_of(self._fine_labels)]
         softness = merged_widths(self.softness, find)
         return RegionMap.from_labels(labels, softness, supersample=self.supersample), new_ids
 
     def to(self, device: torch.device | str) -> RegionMap:
         """Return the map on another device."""
         device = torch.device(device)
-        if device == self.labels.device:
+        if device == self.ids.device:
             return self
         moved = {name: part.to(device) for name, part in vars(self).items() if hasattr(part, "to")}
         if self.supersample == 1:
-            moved["fine_labels"] = moved["labels"]
+            moved["_fine_labels"] = moved["_labels"]
         return replace(self, **moved)
 
     def unbind(self) -> tuple[RegionMap, ...]:
@@ -269,11 +289,11 @@ class RegionMap:
             >>> [one.labels.tolist() for one in RegionMap.from_labels(torch.tensor([[[1, 4]], [[1, 1]]])).unbind()]
             [[[1, 4]], [[1, 1]]]
         """
-        if self.labels.ndim == 2:
+        if self.num_maps is None:
             return (self,)
         if self._origin is not None:
             return tuple(one.resize(self.size, self.contours) for one in self._origin.unbind())
-        return tuple(self._with_labels(labels, self.softness) for labels in self.fine_labels)
+        return tuple(self._with_labels(labels, self.softness) for labels in self._fine_labels)
 
     def _with_labels(self, labels: Tensor, widths: float | Mapping[tuple[int, int], float]) -> RegionMap:
         """Make the map of these labels, without the widths of pairs that they do not have."""
@@ -337,14 +357,14 @@ class RegionMap:
             return self._origin.resize((height, width), contours)
         if not crisp and self.softness == 0.0:
             k = self.supersample
-            sampled = RegionMap.from_labels(sample_labels(self.fine_labels, height, width, k), supersample=k)
+            sampled = RegionMap.from_labels(sample_labels(self._fine_labels, height, width, k), supersample=k)
             return replace(sampled, tables=sampled.tables._replace(whole=False))
-        labels = sample_labels(self.labels, height, width, 1)
+        labels = sample_labels(self._labels, height, width, 1)
         index = self.index_of(labels).to(torch.int32)
         membership = (Crisp if crisp else Resampled)(index if index.ndim == 3 else index[None], self.membership)
         widened = scaled_widths(self.softness, math.sqrt(height * width / (self.size[0] * self.size[1])))
         return RegionMap(
-            labels, self.ids, CRISP_WIDTH if crisp else widened, fine_labels=labels, _origin=self,
+            self.ids, CRISP_WIDTH if crisp else widened, _labels=labels, _fine_labels=labels, _origin=self,
             widths=crisp_widths(labels.device) if crisp else self.widths,
             tables=self.tables._replace(membership=membership),
         )  # fmt: skip
