@@ -41,11 +41,12 @@ class Scene(nn.Module):
     Args:
         field: N Gaussians, or a batch of them.
         regions: a RegionMap, or a label map, integer or bool, Tensor or numpy array, :math:`(H, W)` or
-            :math:`(B, H, W)`, with hard contours; None: nothing is confined.
+            :math:`(B, H, W)`, with hard contours, of the field's size; None: nothing is confined.
         metadata: notes, str to str, which files keep.
 
     Raises:
-        TypeError, ValueError: an argument of the wrong type; no label map.
+        TypeError, ValueError: an argument of the wrong type; no label map; a map of another size, or a batch of maps
+            that are not one for each image.
 
     Example:
         >>> labels = (torch.arange(48) >= 24).long().expand(32, 48)
@@ -64,7 +65,7 @@ class Scene(nn.Module):
         if not isinstance(field, GaussianField):
             raise TypeError(f"field must be a GaussianField; got {type(field).__name__}")
         self.field = field
-        self.regions = RegionMap.coerce(regions)
+        self.regions = _check_regions(field, RegionMap.coerce(regions))
         self.metadata = _check_metadata(metadata)
 
     @property
@@ -287,14 +288,25 @@ def check_unbatched(scene: object) -> Scene:
 
 
 def check_scene(scene: object) -> Scene:
-    """Return `scene` if it is a Scene of one image, with one map of its size and region ids, or without a map."""
+    """Return `scene` if it is a Scene of one image, with one map and region ids, or without a map."""
     scene = check_unbatched(scene)
     field, regions = scene.field, scene.regions
-    if regions is not None and (regions.labels.ndim != 2 or regions.size != field.size):
-        raise ValueError(f"scene must have one map of its size {field.size}; got {tuple(regions.labels.shape)}")
+    if regions is not None and regions.num_maps is not None:
+        raise ValueError(f"scene must have one map; got a batch of {regions.num_maps}")
     if regions is not None and field.region_ids is None:
         raise ValueError("scene must have region ids for its map; call scene.field.assign_regions(scene.regions)")
     return scene
+
+
+def _check_regions(field: GaussianField, regions: RegionMap | None) -> RegionMap | None:
+    if regions is None:
+        return None
+    if regions.size != field.size:
+        raise ValueError(f"regions must have the size {field.size} of the field; got {regions.size}")
+    images = field.means.shape[0] if field.means.ndim == 3 else 1
+    if regions.num_maps not in (None, 1, images):
+        raise ValueError(f"regions must hold 1 map or one for each of {images} images; got {regions.num_maps} maps")
+    return regions
 
 
 def _check_metadata(metadata: object) -> dict[str, str]:

@@ -173,22 +173,16 @@ def _assemble(tensors: dict[str, Tensor], notes: Mapping[str, str]) -> Scene:
         size=size,
     )
     labels = integers.get("labels")
-    regions = None if labels is None else _assemble_regions(field, labels, notes)
+    regions = None if labels is None else _assemble_regions(labels, notes)
     user = {key.removeprefix(_USER): value for key, value in notes.items() if key.startswith(_USER)}
     return Scene(field, regions, dict(sorted(user.items())))
 
 
-def _assemble_regions(field: GaussianField, labels: Tensor, notes: Mapping[str, str]) -> RegionMap:
+def _assemble_regions(labels: Tensor, notes: Mapping[str, str]) -> RegionMap:
     supersample = 1
     if notes["format_version"] != FORMAT_VERSIONS[0] and "supersample" in notes:
         supersample = _read_side("supersample", notes)
-    regions = RegionMap.from_labels(labels, _read_softness(notes), supersample=supersample)
-    if max(labels.shape[-2:]) > MAX_SIDE:
-        raise ValueError(f"labels must be at most {MAX_SIDE} pixels a side; got {tuple(labels.shape[-2:])}")
-    images = field.means.shape[0] if field.means.ndim == 3 else 1
-    if labels.ndim == 3 and labels.shape[0] not in (1, images):
-        raise ValueError(f"labels must hold 1 map or one for each of {images} images; got {labels.shape[0]}")
-    return regions
+    return RegionMap.from_labels(labels, _read_softness(notes), supersample=supersample)
 
 
 def _read_softness(notes: Mapping[str, str]) -> float | dict[tuple[int, int], float]:

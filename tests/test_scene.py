@@ -260,3 +260,16 @@ class TestFiles:
         path.write_bytes(path.read_bytes()[:-3])
         with pytest.raises(ValueError, match=rf"cannot load {path}: .*ends early"):
             load(path)
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ((16, 8), r"regions must have the size \(8, 8\) of the field; got \(16, 8\)"),
+        ((2, 8, 8), "regions must hold 1 map or one for each of 3 images; got 2 maps"),
+    ],
+)
+def test_a_map_that_does_not_fit_is_refused(shape: tuple[int, ...], words: str) -> None:
+    field = GaussianField(torch.rand(3, 4, 2), torch.ones(3, 4, 3), torch.rand(3, 4, 3), size=(8, 8))
+    with pytest.raises(ValueError, match=words):
+        Scene(field, torch.zeros(shape).long())

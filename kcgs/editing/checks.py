@@ -26,15 +26,14 @@ def check_field(scene: Scene) -> GaussianField:
     return scene.field
 
 
-def check_scene(scene: Scene, region_ids: object, target: tuple[int, int] | None = None) -> tuple[RegionMap, Tensor]:
-    """Return the map, of the scene's size or the target's, and the ids as a tensor on its device."""
-    size, regions = check_field(scene).size, scene.regions
-    target = size if target is None else target
+def check_scene(scene: Scene, region_ids: object) -> tuple[RegionMap, Tensor]:
+    """Return the map and the ids as a tensor on its device."""
+    check_field(scene)
+    regions = scene.regions
     if regions is None:
         raise ValueError("scene must have a label map; got regions None")
-    if regions.labels.ndim != 2 or regions.size not in (size, target):
-        allowed = f"{size}" if target == size else f"{size} or {target}"
-        raise ValueError(f"scene must have one map of the size {allowed}; got {tuple(regions.labels.shape)}")
+    if regions.num_maps is not None:
+        raise ValueError(f"scene must have one map; got a batch of {regions.num_maps}")
     wanted = check_ids(region_ids, regions.ids, "map")
     return regions, torch.tensor(wanted, device=regions.ids.device)
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_image, check_size
-from kcgs.functional import RegionMap, region_splat
+from kcgs.functional import region_splat
 from kcgs.nn import GaussianField, RegionSplatRenderer
 from kcgs.nn.field import scaled
 from kcgs.nn.renderer import area_mean, rendered_size
@@ -27,7 +27,7 @@ def render_region(
     `clamp` the sum of alpha times colour over all of them is the image. Differentiable, as the renderer is.
 
     Args:
-        scene: unbatched, with a map of its own size or of `size`.
+        scene: unbatched, with a map.
         region_ids: an id in the map, or several.
         size: (height, width) of the result; None: the scene's.
         clamp: clip colours to [0, 1], as image files hold them.
@@ -36,7 +36,7 @@ def render_region(
         RGBA, :math:`(4, H, W)`; :math:`(C + 1, H, W)` for C channels.
 
     Raises:
-        TypeError, ValueError: wrong types; a batch, no map or one of another size, an unknown id.
+        TypeError, ValueError: wrong types; a batch, no map, an unknown id.
 
     Example:
         >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])
@@ -45,8 +45,8 @@ def render_region(
         [[0.0, 0.0, 1.0, 1.0, 1.0, 0.0]]
     """
     target = check_field(scene).size if size is None else check_size("size", size)
-    regions, chosen = check_scene(scene, region_ids, target)
-    finer = _rendered_size(scene, regions, target)
+    regions, chosen = check_scene(scene, region_ids)
+    finer = rendered_size(scene.size, target)
     regions = regions.resize(finer)
     weights = {region: regions.weights(region) for region in chosen.tolist()}
     total = torch.stack([*weights.values()]).sum(0)
@@ -72,7 +72,7 @@ def render_over(scene: Scene, region_ids: int | Iterable[int], image: Tensor) ->
     they did with them. Not clipped. Differentiable in the scene and in the image.
 
     Args:
-        scene: unbatched, with a map of its own size or of the image's.
+        scene: unbatched, with a map.
         region_ids: the regions that make the background now: an id in the map, or several.
         image: :math:`(C, H, W)`, as many channels as the scene has; any size.
 
@@ -93,18 +93,13 @@ def render_over(scene: Scene, region_ids: int | Iterable[int], image: Tensor) ->
     if image.ndim != 3 or image.shape[0] != channels:
         raise ValueError(f"image must have shape ({channels}, H, W); got {tuple(image.shape)}")
     target = (image.shape[-2], image.shape[-1])
-    regions, gone = check_scene(scene, region_ids, target)
+    regions, gone = check_scene(scene, region_ids)
     stays = _part(scene.field, ~torch.isin(ids_of(scene.field), gone))
     rendered: Tensor = RegionSplatRenderer()(stays, regions, target)
-    finer = _rendered_size(scene, regions, target)
+    finer = rendered_size(scene.size, target)
     share = regions.resize(finer).weights(gone.tolist()).clamp_max(1.0).to(rendered.dtype)
     share = area_mean(share, target)
     return rendered + share * image.to(rendered)
-
-
-def _rendered_size(scene: Scene, regions: RegionMap, target: tuple[int, int]) -> tuple[int, int]:
-    """Return the size of the image that the renderer shrinks to `target`."""
-    return rendered_size(scene.size, target) if regions.size == scene.size else target
 
 
 def _part(field: GaussianField, mask: Tensor) -> GaussianField:

@@ -191,9 +191,9 @@ def check_problem(image: Any, regions: object) -> tuple[Tensor, RegionMap | None
     image = as_image("image", image)
     regions = RegionMap.coerce(regions)
     if regions is not None:
-        if regions.labels.shape[:-2] == (1,):
+        if regions.num_maps == 1:
             (regions,) = regions.unbind()
-        if regions.size != tuple(image.shape[1:]) or regions.labels.ndim != 2:
+        if regions.size != tuple(image.shape[1:]) or regions.num_maps is not None:
             raise ValueError(
                 f"regions must be one map of the image's size {tuple(image.shape[1:])}; got "
                 f"{tuple(regions.labels.shape)}"

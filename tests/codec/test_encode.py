@@ -165,7 +165,7 @@ class TestRefusals:
             (lambda: encode(scene, quality=True), "quality must be a number"),
             (lambda: encode(scene, quality=40, target_bytes=900), "exclude each other"),
             (lambda: encode(scene, target_bytes=1.5), "target_bytes must be an integer"),
-            (lambda: encode(Scene(field, regions.resize((9, 9)))), "regions must be one map of size"),
+            (lambda: encode(Scene(field, regions.resize((9, 9)))), "regions must have the size"),
             (lambda: encode(other), "region_ids must be ids"),
             (lambda: encode(Scene(field.subset(slice(0, 0)))), "must"),
             (lambda: decode("x"), "data must be bytes"),  # type: ignore[arg-type]

@@ -196,7 +196,7 @@ class _Escapes:
 
 def encode_map(regions: RegionMap) -> bytes:
     """Write a map with two regions or more; contour widths are rounded to fortieths of a pixel."""
-    if regions.labels.ndim != 2 or regions.resized:
+    if regions.num_maps is not None or regions.resized:
         raise ValueError("regions must be one map of its own pixels, not a batch and not resized")
     check_count("supersample", regions.supersample, 1, _MOST_SUPERSAMPLE)
     check_count("number of labels", regions.fine_labels.numel(), 1, MOST_LABELS)
