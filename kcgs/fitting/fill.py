@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap, region_splat
+from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join
 from kcgs.scene import Scene
@@ -91,6 +92,11 @@ def fill_hole(scene: Scene, hole: Tensor, seen: Tensor) -> Scene:
         return scene
     if unknown.all():
         raise ValueError('fill must be None where the hole reaches into every pixel; got "inpaint"')
+    with threads_for_kernels(unknown.numel()):
+        return _fill(scene, ids, regions, unknown, wanted)
+
+
+def _fill(scene: Scene, ids: Tensor, regions: RegionMap, unknown: Tensor, wanted: Tensor) -> Scene:
     with torch.no_grad():
         rendered = scene()
     window = _Window.around(unknown)

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Concatenate, ParamSpec, TypeVar
 
 import torch
+from torch import Tensor
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 _kernels: ContextVar[int | None] = ContextVar("threads of the kernels", default=None)
 
@@ -34,3 +40,14 @@ def threads_for_kernels(pixels: int, most: int = 1 << 21) -> Iterator[None]:
     finally:
         torch.set_num_threads(before)
         _kernels.reset(token)
+
+
+def image_threads_for_kernels(function: Callable[Concatenate[Tensor, P], R]) -> Callable[Concatenate[Tensor, P], R]:
+    """Decorate a function of an image, (..., H, W), to run as :func:`threads_for_kernels` has it."""
+
+    @functools.wraps(function)
+    def run(image: Tensor, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        with threads_for_kernels(image.shape[-2] * image.shape[-1]):
+            return function(image, *args, **kwargs)
+
+    return run

@@ -20,6 +20,7 @@ from kcgs.fitting.region_report import report_regions
 from kcgs.functional import RegionMap, merge_regions
 from kcgs.functional.labels import contour_edges
 from kcgs.functional.merging import pairs_to_merge
+from kcgs.kernels import image_threads_for_kernels
 from kcgs.scene import Scene
 
 from .compress import compress
@@ -137,6 +138,7 @@ def count_for(num_bytes: float, pixels: int, objective: str = "psnr") -> int:
     return min(max(1, round(count)), pixels)
 
 
+@image_threads_for_kernels
 def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: FitConfig, seed: int) -> _Choice:
     """Choose the regions that pay for their bytes; return what a pixel of contour must save, and what went, too."""
     if regions is None or regions.num_regions == 1:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from kcgs._check import check_count
 from kcgs._repr import brief
+from kcgs.kernels import threads_for_kernels
 from kcgs.segment.cleanup import check_segment_image, connected_regions, merge_similar, merge_small, order_by_area
 from kcgs.segment.snapping import snap_contours
 
@@ -148,7 +149,8 @@ class _Method:
                 raise
             line = f"pip install {_PACKAGES.get(module, module)}"
             raise ImportError(f"segmentation method {self.name!r} needs {module}: {line} ({error})") from error
-        return cleanup.apply(pixels, self._checked(found, tuple(pixels.shape[1:])))
+        with threads_for_kernels(pixels[0].numel()):
+            return cleanup.apply(pixels, self._checked(found, tuple(pixels.shape[1:])))
 
     def _checked(self, found: Any, size: tuple[int, ...]) -> Prediction:
         """Return what the function gave with int64 labels; refuse what says no region for every pixel."""

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcgs._check import check_count, check_number
 from kcgs.functional import merge_regions
+from kcgs.kernels import image_threads_for_kernels
 from kcgs.segment.cleanup import (
     check_segment_image,
     clean,
@@ -36,6 +37,7 @@ _LARGE = 2 * 1920 * 1080
 
 
 @register("auto", Cleanup(max_regions=30))
+@image_threads_for_kernels
 def auto(image: Tensor, *, min_size: int, max_regions: int | None) -> Tensor:
     """Segment a photo into up to 30 clean connected regions, fewer where contours would save too little.
 
@@ -78,6 +80,7 @@ def _auto_regions(image: Tensor, min_size: int) -> Tensor:
 
 
 @register("felzenszwalb")
+@image_threads_for_kernels
 def felzenszwalb(image: Tensor, *, scale: float = 300.0, sigma: float = 1.0, min_size: int) -> Tensor:
     """Segment by the graph-based method of Felzenszwalb and Huttenlocher (IJCV 2004), in CIE Lab.
 
@@ -107,6 +110,7 @@ def _graph_regions(image: Tensor, scale: float, sigma: float, min_size: int) -> 
 
 
 @register("slic", Cleanup(snap=2, max_regions=20))
+@image_threads_for_kernels
 def slic(image: Tensor, *, num_segments: int = 400, compactness: float = 10.0, max_regions: int | None) -> Tensor:
     """Segment into SLIC superpixels (Achanta et al., TPAMI 2012) and merge the most similar neighbours.
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcgs._check import check_count, check_number
 from kcgs.functional.merging import Labels
+from kcgs.kernels import image_threads_for_kernels
 from kcgs.segment.cleanup import clean, merge_similar, rgb_to_lab
 from kcgs.segment.registry import Cleanup, register
 
@@ -20,6 +21,7 @@ _HALVINGS = 20
 
 
 @register("watershed", Cleanup(snap=2, max_regions=20))
+@image_threads_for_kernels
 def watershed(
     image: Tensor,
     *,

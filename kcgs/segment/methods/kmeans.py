@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_count, check_number
+from kcgs.kernels import image_threads_for_kernels
 from kcgs.segment.cleanup import clean, connected_regions, rgb_to_lab
 from kcgs.segment.registry import Cleanup, register
 
@@ -22,6 +23,7 @@ _SAMPLE = 100_000
 
 
 @register("kmeans", Cleanup(snap=2, max_regions=20))
+@image_threads_for_kernels
 def kmeans(image: Tensor, *, num_clusters: int | None = None, sigma: float = 1.0, min_size: int) -> Tensor:
     """Cluster the colours by k-means in CIE Lab, take the connected pieces, and merge the most similar neighbours.
 
