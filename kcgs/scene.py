@@ -138,7 +138,7 @@ class Scene(nn.Module):
 
         Takes what Kornia's ``to_onnx`` takes, such as ``save=False``, and returns the `onnx.ModelProto`: no input, and
         one output, :math:`(B, C, H, W)`. `kornia.onnx.ONNXSequential` chains it. :func:`kcgs.onnx.scene_decoder` is
-        faster, smaller, and renders at any size.
+        faster, smaller, and renders at any size. Needs the extra: ``pip install "kcgs[onnx]"``.
         """
         from kcgs.nn.onnx_export import SceneExport
 

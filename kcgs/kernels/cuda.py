@@ -19,7 +19,7 @@ from .tiles import TILE, expand_runs, grid_of, join_tiles, split_into_tiles, sum
 try:
     import triton
     import triton.language as tl
-except ImportError:  # splat says so
+except ImportError:  # steps() raises
     triton = None
 
 _MOMENTS = 5

@@ -32,6 +32,10 @@ class SceneExport(nn.Module, ONNXExportMixin):
         self, onnx_name: str, *, save: bool = True, **settings: Any
     ) -> onnx.ModelProto:
         """Export, by the mixin's arguments."""
+        try:
+            import onnxscript  # noqa: F401
+        except ImportError as error:
+            raise ImportError('to_onnx needs the package onnxscript: pip install "kcgs[onnx]"') from error
         settings = {"input_names": self.INPUTS, "verbose": False, **settings}
         model: onnx.ModelProto = super().to_onnx(onnx_name, save=False, **settings)
         # ONNXSequential gives constants new names, but not where loops read them; it does so with results of nodes

@@ -25,8 +25,8 @@ class SceneLike(Protocol):
 class RegionSplatRenderer(nn.Module):
     r"""Render a field, at its own size or any other.
 
-    Convention: at another size the Gaussians are scaled and the label map is sampled again, so that contours stay
-    sharp. A smaller image is the area mean of the one at the field's size. The module holds no state.
+    Convention: at another size the Gaussians are scaled and the label map is sampled again. A smaller image is the
+    area mean of the one at the field's size. The module holds no state.
 
     Args:
         cutoff: weights below it are skipped, in [0, 1); see :func:`kcgs.functional.region_splat`.
@@ -122,7 +122,8 @@ class RegionSplatRenderer(nn.Module):
         """Export for any Gaussians and label maps, by Kornia's `ONNXExportMixin`.
 
         Takes what Kornia's ``to_onnx`` takes; ``input_shape`` and ``pseudo_shape`` are those of the image. Returns the
-        `onnx.ModelProto`: batches of means, cholesky, colors, region_ids and labels in, the image out.
+        `onnx.ModelProto`: batches of means, cholesky, colors, region_ids and labels in, the image out. Needs the extra:
+        ``pip install "kcgs[onnx]"``.
         """
         from .onnx_export import RendererExport
 

@@ -17,6 +17,7 @@ import torch
 from PIL import Image
 
 from kcgs import GaussianField, Scene, fit, load
+from kcgs.bench.demo import QUICK_BYTES
 from kcgs.cli import main
 from kcgs.data import load_image, load_labels, save_image, save_labels
 from kcgs.functional import psnr
@@ -358,6 +359,7 @@ def test_bench_demo_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     code, out, err = kcgs("bench", "demo", "-o", str(tmp_path / "demo"), "--quick", capsys=capsys)
     assert code == 0, err
     written = {p.name for p in (tmp_path / "demo").iterdir()}
-    images = {"original.png", "regions.png", "baseline.png", "contour-aware.png", "error-against-time.png"}
-    assert images <= written
+    assert {"original.png", "regions.png", "baseline.png", "contour-aware.png", "comparison.png"} <= written
+    for name in ("baseline", "contour-aware"):
+        assert (tmp_path / "demo" / f"{name}.kcgs").stat().st_size <= QUICK_BYTES
     assert "contour-aware" in out and "EF-PSNR" in out

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from kcgs.kernels import SplatInputs, cuda
+from kcgs.kernels import SplatInputs, cuda, registry
 
 CASES = Path(__file__).with_name("triton_cases.py")
 
@@ -85,6 +85,15 @@ def test_float64_is_refused() -> None:
 def test_cpu_is_refused() -> None:
     with pytest.raises(ValueError, match="backend 'cuda' needs tensors on a CUDA device; got cpu"):
         cuda.steps(inputs())
+
+
+def test_auto_takes_tiled_and_warns_once() -> None:
+    registry._warn_about_cuda.cache_clear()
+    devices = torch.device("cuda", 0), torch.device("cuda", 1)
+    with pytest.warns(UserWarning, match="backend 'auto' takes 'tiled' on CUDA; backend='cuda' names") as warned:
+        assert {registry._choose("auto", device, torch.float32) for device in devices} == {"tiled"}
+    assert len(warned) == 1
+    assert registry._choose("cuda", devices[0], torch.float32) == "cuda"
 
 
 def test_missing_triton_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import onnxruntime
@@ -238,3 +239,11 @@ class TestMixin:
         labels = torch.stack([labels_of((61, 35)).roll(k, 1) for k in range(3)])
         want = region_splat(*given, labels, cutoff=1e-3).clamp(0, 1)
         assert_close(run(onnx.load(path), *given, labels), want)
+
+    def test_missing_onnxscript_is_told(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+        scene = Scene(GaussianField.random(5, SIZE, seed=0))
+        monkeypatch.setitem(sys.modules, "onnxscript", None)
+        for export in (scene.to_onnx, RegionSplatRenderer().to_onnx):
+            with pytest.raises(ImportError, match=r'needs the package onnxscript: pip install "kcgs\[onnx\]"'):
+                export(str(tmp_path / "model.onnx"))
+        assert not list(tmp_path.iterdir())
