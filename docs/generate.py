@@ -58,7 +58,8 @@ def public_objects(package: str) -> dict[str, Any]:
     """Return what a package lists in `__all__`, by name, in the order of its imports, less its version."""
     module = importlib.import_module(package)
     public = {name for name in module.__all__ if not name.startswith("__")}
-    return {name: thing for name, thing in vars(module).items() if name in public}
+    # the top package imports a name when it is used
+    return {name: getattr(module, name) for name in (*vars(module), *module.__all__) if name in public}
 
 
 def identity(name: str, thing: Any) -> str:

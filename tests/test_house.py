@@ -91,14 +91,6 @@ def test_no_circle_of_imports() -> None:
     assert not left, f"circles among {sorted(left)}"
 
 
-def test_files_are_short() -> None:
-    lengths = {path: len(path.read_text().splitlines()) for path in modules().values()}
-    assert not {str(path): count for path, count in lengths.items() if count > 350}
-    bench = sum(count for path, count in lengths.items() if "bench" in path.relative_to(ROOT).parts)
-    assert sum(lengths.values()) <= 33_800 and bench <= 6_150
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 160
-
-
 def test_private_names_of_maps_stay_below() -> None:
     """What a RegionMap keeps to itself is read in functional and kernels only."""
     for name, path in modules().items():
