@@ -114,7 +114,7 @@ def _prepare(given: Arguments, checked: bool = False) -> tuple[SplatInputs, Step
         tables = _tables(given.labels, given.widths, given.supersample, size)
         index = tables.index_of(given.region_ids if given.region_ids.ndim == 2 else given.region_ids.unsqueeze(0))
         # CUDA is not waited for
-        least = -1 if index.device.type != "cpu" else int(index.min()) if index.numel() else 0
+        least = int(index.numpy().min(initial=0)) if index.device.type == "cpu" else -1
         membership = tables.membership
         if not checked:
             check_id_values(given.region_ids, index, least, tables.whole)
