@@ -83,6 +83,7 @@ class TestTable:
             assert "the target was missed by a.png, b.png, c.png" in err
         assert {row["target_reached"] for row in rows().values()} == {"False"}
 
+    @pytest.mark.usefixtures("clock")
     def test_the_clock_is_for_each_image(self, files: Path, kcgs: Any) -> None:
         code, out, err = kcgs("photos", *SETTINGS, "--workers", "1", "--json", "--max-seconds", "0.001")
         assert code == 1 and json.loads(out)["missed"] == 3 and "missed by a.png" in err
