@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 from torch import Tensor
 
 from kcgs.kernels import BACKENDS
@@ -19,6 +20,10 @@ if "OMP_NUM_THREADS" not in os.environ:
 
 ROOT = Path(__file__).resolve().parent.parent
 
+# The same examples in each run, however long they take.
+_UNCHECKED = (HealthCheck.too_slow, HealthCheck.function_scoped_fixture)
+settings.register_profile("kcgs", derandomize=True, deadline=None, suppress_health_check=_UNCHECKED)
+settings.load_profile("kcgs")
 
 # Files that take longest, 12 seconds of a processor and more: workers begin with them, so that none is left with one at
 # the end. (By itself pytest-xdist begins with the files of most tests, and these have few.)
@@ -98,6 +103,35 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
                     parts = {"backend": backend, "device": device, "dtype": dtype}
                     rows.append(pytest.param(*(row[n] for n in names), id="-".join(parts[n] for n in names)))
     metafunc.parametrize(names, rows)
+
+
+def pytest_runtest_setup() -> None:
+    """Seed torch's global generator, from which tests and their fixtures draw."""
+    torch.manual_seed(0)
+
+
+class Clock:
+    """A clock that moves on by a tick each time it is read."""
+
+    TICK = 0.005  # seconds
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def __call__(self) -> float:
+        self.advance(self.TICK)
+        return self.seconds
+
+    def advance(self, seconds: float) -> None:
+        self.seconds += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Replace `time.perf_counter`, so that time limits do not depend on how busy the machine is."""
+    clock = Clock()
+    monkeypatch.setattr("time.perf_counter", clock)
+    return clock
 
 
 @pytest.fixture(scope="session")

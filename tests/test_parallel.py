@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from datetime import timedelta
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 
 SIZE = (20, 30)
 TARGETS = (0.2, 0.8)
-SECONDS = 60
+PATIENCE = timedelta(minutes=5)  # of processes that wait for one another
 
 
 class Toned(nn.Module):
@@ -49,9 +48,8 @@ def train_as(rank: int, processes: int, folder: Path) -> None:
     """Train as one process of a group and save what came out. A process that cannot reach the others says so by 77."""
     os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
     try:
-        patience = timedelta(seconds=SECONDS / 3)
         torch.distributed.init_process_group(
-            "gloo", init_method=f"file://{folder}/group", rank=rank, world_size=processes, timeout=patience
+            "gloo", init_method=f"file://{folder}/group", rank=rank, world_size=processes, timeout=PATIENCE
         )
         torch.distributed.all_reduce(torch.ones(1))
     except RuntimeError as error:
@@ -74,11 +72,6 @@ def test_trains_as_one_process_does(processes: int, tmp_path: Path) -> None:
         subprocess.Popen([sys.executable, __file__, str(rank), *given], stderr=subprocess.PIPE, text=True)
         for rank in range(processes)
     ]
-    end = time.monotonic() + SECONDS
-    while time.monotonic() < end and any(process.poll() is None for process in group):
-        time.sleep(0.05)
-    for process in group:
-        process.kill()
     said = "\n".join(process.communicate()[1] for process in group)
     if len(list(tmp_path.glob("*.met"))) < processes:
         pytest.skip(f"processes of torch.distributed cannot reach each other here: {said.strip() or 'no answer'}")

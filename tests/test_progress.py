@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-import time
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,52 +12,61 @@ import torch
 
 from kcgs import _progress, fit
 from kcgs._progress import Progress
+from tests.conftest import Clock
 
 IMAGE = torch.linspace(0.0, 1.0, 48).expand(3, 32, 48)
+Work = Callable[..., None]
 
 
 @pytest.fixture
-def often(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have a line every twentieth of a second."""
-    monkeypatch.setattr(_progress, "_LINE_SECONDS", 0.05)
+def work(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> Work:
+    """Do nothing for so many seconds of the fake clock, in which the thread of a Progress writes its lines."""
+
+    def work(name: str, seconds: float, **settings: Any) -> None:
+        end = clock.seconds + seconds
+
+        def wait(timeout: float) -> bool:
+            clock.advance(min(timeout, end - clock.seconds))
+            return clock.seconds >= end
+
+        threads = SimpleNamespace(
+            Event=lambda: SimpleNamespace(wait=wait, set=lambda: None),
+            Thread=lambda target, args, **_: SimpleNamespace(start=lambda: target(*args)),
+        )
+        monkeypatch.setattr(_progress, "threading", threads)
+        with Progress(name, known=False, **settings):
+            pass
+
     Progress.forget()
+    return work
 
 
-def test_lines_elsewhere(often: None, capsys: pytest.CaptureFixture[str]) -> None:
-    fit(IMAGE, num_gaussians=8, iterations=60, progress=True, on_step=lambda *_: time.sleep(0.005))
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("kcgs: fit, ")]
-    assert len(lines) >= 3
-    assert " %, iteration " in lines[-1] and "8 Gaussians, " in lines[-1] and lines[-1].endswith(" s")
+def test_a_line_every_ten_seconds(work: Work, capsys: pytest.CaptureFixture[str]) -> None:
+    work("long", 35.0)
+    assert capsys.readouterr().err == "kcgs: long, 10 s\nkcgs: long, 20 s\nkcgs: long, 30 s\n"
 
 
-def test_many_short_pieces_are_long_together(often: None, capsys: pytest.CaptureFixture[str]) -> None:
-    for index in range(10):
-        with Progress(f"piece {index}", known=False):
-            time.sleep(0.02)
-    lines = capsys.readouterr().err.splitlines()
-    assert 2 <= len(lines) <= 5 and all(line.startswith("kcgs: piece ") and "%" not in line for line in lines)
+def test_many_short_pieces_are_long_together(work: Work, capsys: pytest.CaptureFixture[str]) -> None:
+    for index in range(8):
+        work(f"piece {index}", 4.5)
+    assert capsys.readouterr().err == "kcgs: piece 2, 1 s\nkcgs: piece 4, 2 s\nkcgs: piece 6, 3 s\n"
 
 
-def test_what_was_long_ago_is_not_the_same_work(
-    often: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with Progress("long"):
-        time.sleep(0.12)
-    monkeypatch.setattr(_progress, "_LINE_SECONDS", 0.2)
-    for wait in (time.sleep, lambda _: Progress.forget()):
-        wait(0.45)
-        with Progress("quick"):
-            time.sleep(0.05)
-    assert "long" in (err := capsys.readouterr().err) and "quick" not in err
+def test_what_was_long_ago_is_not_the_same_work(work: Work, clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    for pause in (lambda: clock.advance(20.0), Progress.forget):
+        Progress.forget()
+        work("long", 15.0)
+        pause()
+        work("quick", 9.0)
+    assert capsys.readouterr().err == 2 * "kcgs: long, 10 s\n"
 
 
-def test_not_shown(often: None, capsys: pytest.CaptureFixture[str]) -> None:
-    with Progress("fit", shown=False):
-        time.sleep(0.1)
-    fit(IMAGE, num_gaussians=8, iterations=3)
-    assert "fit" not in capsys.readouterr().err
+def test_not_shown(work: Work, capsys: pytest.CaptureFixture[str]) -> None:
+    work("long", 35.0, shown=False)
+    assert capsys.readouterr().err == ""
 
 
+@pytest.mark.usefixtures("clock")
 @pytest.mark.parametrize("settings", [{}, {"target_psnr": 90.0}, {"max_seconds": 5.0}], ids=lambda s: "".join(s))
 def test_bar_on_a_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], settings: dict[str, Any]

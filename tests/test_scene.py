@@ -117,7 +117,7 @@ class TestProcesses:
         """Scenes with their maps, from two workers; they are rendered before, and render alike on both sides."""
         scenes = [make_scene(name) for name in MAPS]
         images = [scene().detach() for scene in scenes]
-        loader = DataLoader(scenes, 2, num_workers=2, collate_fn=as_they_are, multiprocessing_context=start, timeout=60)  # type: ignore[arg-type]
+        loader = DataLoader(scenes, 2, num_workers=2, collate_fn=as_they_are, multiprocessing_context=start)  # type: ignore[arg-type]
         got = [scene for batch in loader for scene in batch]
         for scene, sent, image in zip(got, scenes, images, strict=True):
             assert torch.equal(scene(), image) and torch.equal(sent(), image) and scene.metadata == sent.metadata

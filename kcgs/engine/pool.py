@@ -10,7 +10,7 @@ import pickle
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any
@@ -31,7 +31,7 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, threads), daemon=True)
-        with environment(dict.fromkeys(_THREAD_VARIABLES, str(threads))), _interrupts_held():
+        with environment(dict.fromkeys(_THREAD_VARIABLES, str(threads))):
             self.process.start()
         theirs.close()
         self.index: int | None = None
@@ -61,19 +61,6 @@ class _Worker:
             self.process.kill()
             self.process.join()
         self.process.close()
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C back, also from processes that are started meanwhile and load libraries before they can ignore it."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def run(function: Callable[[Any], Any], jobs: Sequence[Any], workers: int, threads: int) -> Iterator[Done[Any]]:

@@ -104,7 +104,7 @@ def fit(
         _load()
     with threads_for_kernels(image[0].numel()):
         if config.target_psnr is not None:
-            return Search(image, regions, num_gaussians, config, seed, _run, on_step).search()
+            return Search(image, regions, num_gaussians, config, seed, _run, on_step, time.perf_counter()).search()
         state = start(image, regions, num_gaussians, config, seed, time.perf_counter())
         keeper = None if checkpoint is None else Checkpoint(checkpoint, state, regions)
         if not (keeper is not None and resume and keeper.read_into(state)) and config.merge_regions:

@@ -7,7 +7,6 @@ Gaussians it is taken up again with some more, or without those that are missed 
 from __future__ import annotations
 
 import copy
-import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -63,7 +62,7 @@ class Search:
     seed: int
     run: Callable[[FitState, OnStep | None], StopReason]
     on_step: OnStep | None
-    started: float = dataclasses.field(default_factory=time.perf_counter)
+    started: float
     iterations: int = 0
     """Of all fits so far."""
 

@@ -101,11 +101,3 @@ def test_quick(tmp_path: Path, module: Any) -> None:
     assert {m.name for m in module.METHODS} <= {line["method"] for line in lines}
     kcgs.bench.run(name, tmp_path, redraw=True)
     assert (tmp_path / "report.md").read_text() == text
-
-
-@pytest.mark.slow
-def test_davis_quick_on_data(tmp_path: Path, data_root: Path) -> None:
-    if not (data_root / "DAVIS").is_dir():
-        pytest.skip(f"no DAVIS in {data_root}")
-    kcgs.bench.run("davis", tmp_path, data=data_root, quick=True, budget_seconds=300)
-    assert "- Images: blackswan" in (tmp_path / "report.md").read_text()

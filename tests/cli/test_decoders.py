@@ -6,6 +6,7 @@ import base64
 import hashlib
 import http.client
 import json
+import queue
 import re
 import threading
 import urllib.error
@@ -136,15 +137,10 @@ class TestZoo:
 
 def start(target: Any, source: object, **settings: Any) -> str:
     """Serve in a thread; return the address."""
-    said: list[str] = []
-    arguments = {"browser": False, "say": said.append, **settings}
-    serving = threading.Thread(target=target, args=(source,), kwargs=arguments, daemon=True)
-    serving.start()
-    for _ in range(1000):
-        if said:
-            break
-        serving.join(0.02)
-    return said[0].split(" ")[0]
+    said: queue.Queue[str] = queue.Queue()
+    arguments = {"browser": False, "say": said.put, **settings}
+    threading.Thread(target=target, args=(source,), kwargs=arguments, daemon=True).start()
+    return said.get().split(" ")[0]
 
 
 class TestPage:

@@ -154,7 +154,7 @@ def test_differences_go_there_and_back() -> None:
     assert all((mine == theirs.astype(np.float32)).all() for mine, theirs in zip(same, base, strict=True))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 300), st.integers(1, 4), st.integers(0, 2**32 - 1))
 def test_any_whole_numbers_are_coded(count: int, channels: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -214,7 +214,7 @@ def test_frames_in_another_order_are_found() -> None:
         unpack(b"".join([pack_header(header), parts[0], parts[2], parts[1], parts[3], pack_end(4)]))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.binary(max_size=60), st.booleans())
 def test_frames_of_any_bytes_are_read_or_refused(content: bytes, mapped: bool) -> None:
     records = [key_record(encode(still(mapped=mapped), quality=40)), Record(CARRIED, content)]

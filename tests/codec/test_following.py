@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from contextlib import suppress
 from typing import Any
 
@@ -72,7 +71,7 @@ def moved_plainly(index: Any, motions: Any) -> Any:
 
 
 class TestMove:
-    @settings(max_examples=80, deadline=None)
+    @settings(max_examples=80)
     @given(st.data())
     def test_as_written_down(self, data: st.DataObject) -> None:
         rng = np.random.default_rng(data.draw(st.integers(0, 1 << 20)))
@@ -124,7 +123,7 @@ class TestMove:
 
 
 class TestCoder:
-    @settings(max_examples=80, deadline=None)
+    @settings(max_examples=80)
     @given(st.data())
     def test_any_maps_come_back(self, data: st.DataObject) -> None:
         rng = np.random.default_rng(data.draw(st.integers(0, 1 << 20)))
@@ -185,7 +184,7 @@ class TestCoder:
 
 
 class TestHostile:
-    @settings(max_examples=150, deadline=None)
+    @settings(max_examples=150)
     @given(st.binary(max_size=60), st.integers(2, 9), st.integers(0, 3))
     def test_any_bytes(self, data: bytes, regions: int, seed: int) -> None:
         predicted = shapes(seed, (30, 40), min(regions, 6)).astype(np.int32)
@@ -199,13 +198,11 @@ class TestHostile:
     def test_bytes_that_changed(self, regions: int) -> None:
         index = shapes(3, (120, 160)).astype(np.int32) % regions
         data, rng = write(regions, [(index, np.roll(index, 2, 1))]), np.random.default_rng(0)
-        start = time.perf_counter()
         for _ in range(40):
             damaged = bytearray(data)
             damaged[rng.integers(len(data))] ^= 1 << rng.integers(8)
             with suppress(CodecError):
                 FollowingLabels(regions).code(Reader(bytes(damaged)), index)
-        assert time.perf_counter() - start < 30
 
     def test_too_much_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
         index = shapes(3).astype(np.int32)
@@ -240,7 +237,7 @@ class TestSettle:
         assert np.array_equal(settle_labels(given, predicted, 0), given)
         assert np.array_equal(settle_labels(predicted, predicted, 3), predicted)
 
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     @given(st.data())
     def test_the_regions_of_the_given_map(self, data: st.DataObject) -> None:
         rng = np.random.default_rng(data.draw(st.integers(0, 1 << 20)))

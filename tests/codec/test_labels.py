@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from io import BytesIO
 from pathlib import Path
 
@@ -49,7 +48,7 @@ def webp_bytes(labels: Labels) -> int:
 
 
 class TestLossless:
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     @given(st.data())
     def test_any_map_comes_back(self, data: st.DataObject) -> None:
         height, width = data.draw(st.integers(1, 24)), data.draw(st.integers(1, 24))
@@ -109,7 +108,6 @@ class TestStream:
     def test_broken_streams(self) -> None:
         rng = np.random.default_rng(0)
         whole = [encode_labels(shapes(seed, (48, 64), 5) * 7) for seed in range(3)]
-        start = time.perf_counter()
         for trial in range(300):
             data = bytearray(whole[trial % 3])
             if trial % 2:
@@ -122,7 +120,6 @@ class TestStream:
             except CodecError:
                 continue
             assert labels.shape == (48, 64) and labels.min() >= 0
-        assert time.perf_counter() - start < 120
 
     @pytest.mark.parametrize("data", [b"\xff" * 50, bytes(range(200)), b"\xaa" * 31])
     def test_garbage(self, data: bytes) -> None:
@@ -131,7 +128,7 @@ class TestStream:
         except CodecError as error:
             assert "data must" in str(error)
 
-    @settings(max_examples=100, deadline=None)
+    @settings(max_examples=100)
     @given(st.lists(st.tuples(st.integers(1, 65535), st.booleans()), max_size=200))
     def test_end_of_stream(self, symbols: list[tuple[int, bool]]) -> None:
         chances = np.array([chance / 65536 for chance, _ in symbols])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageOps
 
@@ -356,7 +356,7 @@ class TestBadFiles:
             load_image(path)
 
     @pytest.mark.parametrize("suffix", ["png", "jpg", "webp", "tif", "gif", "16.png", "16.tif"])
-    @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @settings(max_examples=30)
     @given(data=st.data())
     def test_damaged_bytes_give_an_image_or_value_error(self, tmp_path: Path, suffix: str, data: st.DataObject) -> None:
         damaged = bytearray(encoded(suffix))

@@ -9,7 +9,7 @@ import pytest
 import skimage.data
 import tifffile
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
@@ -196,7 +196,7 @@ class TestNpy:
 
 
 class TestSave:
-    @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @settings(max_examples=40)
     @given(
         values=st.sampled_from([(".png", 255), (".png", 65535), (".npy", 2**62)]).flatmap(
             lambda kind: st.tuples(

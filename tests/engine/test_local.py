@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -36,7 +37,6 @@ class TestBoth:
         before = torch.get_num_threads()
         found = list(run_jobs(function("fail_at_one"), tasks(6, tmp_path), workers=workers, threads=3))
         assert torch.get_num_threads() == before
-        assert all(0 <= done.seconds < 5 for done in found)
         found = by_index(found)
         results, processes, threads = zip(*(done.result for done in found if done.result), strict=True)
         assert results == (0, 4, 6, 8, 10) and set(threads) == {3}
@@ -68,36 +68,29 @@ class TestProcesses:
         assert [(tmp_path / str(i)).read_text() for i in range(5)] == ["x", "xx", "xx", "x", "x"]
 
     def test_left_early(self, tmp_path: Path) -> None:
-        start = time.monotonic()
-        iterator = run_jobs(function("slow_then_mark"), tasks(3, tmp_path), workers=2)
+        iterator = run_jobs(function("first_alone_ends"), tasks(3, tmp_path), workers=2)
         assert next(iterator).index == 0
         iterator.close()  # type: ignore[attr-defined]
-        assert time.monotonic() - start < 30 and not (tmp_path / "finished").exists()
+        assert not multiprocessing.active_children()
 
     def test_caller_killed(self, tmp_path: Path) -> None:
         code = (
-            "import os, sys; sys.path.insert(0, sys.argv[1])\n"
+            "import os, signal, sys; sys.path.insert(0, sys.argv[1])\n"
             "from pathlib import Path\n"
             "from engine_tasks import Task, process_and_threads\n"
             "from kcgs.engine import run_jobs\n"
             "if __name__ == '__main__':\n"
-            "    tasks, seen = [Task(i, Path()) for i in range(200_000)], set()\n"
-            "    for done in run_jobs(process_and_threads, tasks, workers=2):\n"
-            "        if done.result[0] not in seen: print(done.result[0], flush=True)\n"
-            "        seen.add(done.result[0])\n"
-            "        if len(seen) == 2: os.kill(os.getpid(), 9)  # either may start seconds after the other\n"
+            "    tasks = [Task(i, Path()) for i in range(3)]\n"
+            "    jobs = run_jobs(process_and_threads, tasks, workers=2)\n"
+            "    print(next(jobs).result[0], flush=True)\n"
+            "    os.kill(os.getpid(), signal.SIGKILL)\n"
         )
         script = tmp_path / "script.py"
         script.write_text(code)
         command = [sys.executable, str(script), str(Path(__file__).parent)]
-        ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-        assert ended.returncode == -9
-        workers = {int(line) for line in ended.stdout.split()}
-        assert len(workers) == 2
-        until = time.monotonic() + 20
-        while any(_is_alive(process) for process in workers):
-            assert time.monotonic() < until
-            time.sleep(0.05)
+        # the workers have the standard output, too: it is read until they have ended
+        ended = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert ended.returncode == -signal.SIGKILL and int(ended.stdout) > 0, ended.stderr
 
 
 class TestArguments:
@@ -113,10 +106,3 @@ class TestArguments:
         monkeypatch.setitem(sys.modules, "ray", None)
         with pytest.raises(ImportError, match=r"pip install 'kcgs\[ray\]'"):
             run_jobs(str, [], engine="ray")
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False

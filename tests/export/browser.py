@@ -6,10 +6,8 @@ import base64
 import functools
 import http.server
 import json
-import queue
 import subprocess
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 WEB = Path(__file__).resolve().parents[2] / "export" / "web"
-SECONDS = 120
 
 
 class Pipe:
@@ -31,21 +28,12 @@ class Pipe:
         self._process = subprocess.Popen(
             ["node", *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True
         )
-        self._lines: queue.Queue[str] = queue.Queue()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
 
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            self._lines.put(line)
-        self._lines.put("")
-
-    def ask(self, action: str, *, seconds: float, **arguments: Any) -> dict[str, Any]:
-        assert self._process.stdin is not None
+    def ask(self, action: str, **arguments: Any) -> dict[str, Any]:
+        assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.write(json.dumps({"do": action, **arguments}) + "\n")
         self._process.stdin.flush()
-        line = self._lines.get(timeout=seconds)
+        line = self._process.stdout.readline()
         assert line, f"the program ended: {self.errors.read_text()[-2000:]}"
         answer: dict[str, Any] = json.loads(line)
         return answer
@@ -53,14 +41,9 @@ class Pipe:
     def close(self) -> None:
         assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.close()
-        try:
-            self._process.wait(timeout=30)
-        finally:
-            self._process.kill()
-            self._process.wait()
-            self._reader.join(timeout=10)
-            self._process.stdout.close()
-            self._log.close()
+        self._process.wait()
+        self._process.stdout.close()
+        self._log.close()
 
 
 class Browser(Pipe):
@@ -70,7 +53,7 @@ class Browser(Pipe):
         super().__init__(str(WEB / "test" / "drive.mjs"), chromium, errors=errors)
 
     def do(self, action: str, **arguments: Any) -> Any:
-        answer = self.ask(action, seconds=SECONDS, **arguments)
+        answer = self.ask(action, **arguments)
         assert "error" not in answer, answer["error"]
         return answer["value"]
 
@@ -84,7 +67,12 @@ def array(packed: dict[str, Any]) -> NDArray[np.float32]:
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """A plain static server; below /isolated/ with the two headers that allow threads, below /slow/ in two halves."""
+    """A plain static server.
+
+    Below /isolated/ with the two headers that allow threads; below /slow/ the second half waits for `rest`.
+    """
+
+    rest = threading.Event()
 
     def translate_path(self, path: str) -> str:
         return super().translate_path(path.removeprefix("/isolated").removeprefix("/slow"))
@@ -95,7 +83,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
         outputfile.write(data[:half])
         outputfile.flush()
         if half < len(data):
-            time.sleep(0.5)
+            self.rest.wait()
             outputfile.write(data[half:])
 
     def end_headers(self) -> None:
@@ -123,7 +111,7 @@ def serving(folder: Path) -> Iterator[str]:
 
 
 def npm(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(["npm", *arguments], cwd=WEB, capture_output=True, text=True, timeout=600)
+    return subprocess.run(["npm", *arguments], cwd=WEB, capture_output=True, text=True)
 
 
 def build(script: str, *arguments: str) -> None:

@@ -15,8 +15,6 @@ from kcgs.codec.clips.file import unpack as unpack_clip
 
 from .browser import WEB, Browser, Pipe
 
-SECONDS = 20  # within which any file must be decoded or refused
-
 
 class Reader(Protocol):
     """The web's decoder, wherever it runs."""
@@ -26,7 +24,7 @@ class Reader(Protocol):
 
 
 class Node(Pipe):
-    """The built decoder in node: one command at a time, each within a time limit."""
+    """The built decoder in node: one command at a time."""
 
     def __init__(self, bundle: Path, scratch: Path) -> None:
         super().__init__("--expose-gc", str(WEB / "test" / "decode.mjs"), str(bundle), errors=scratch / "errors.txt")
@@ -34,7 +32,7 @@ class Node(Pipe):
 
     def do(self, action: str, data: bytes, **arguments: Any) -> dict[str, Any]:
         self._file.write_bytes(data)
-        return self.ask(action, seconds=SECONDS, path=str(self._file), **arguments)
+        return self.ask(action, path=str(self._file), **arguments)
 
 
 class Page:

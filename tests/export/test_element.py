@@ -22,7 +22,7 @@ from kcgs.editing import move_region, recolor_region
 from kcgs.page import scene_page
 from kcgs.page.html import page_html
 
-from .browser import WEB, Browser, array, build, npm, serving
+from .browser import WEB, Browser, Handler, array, build, npm, serving
 
 MODELS = WEB.parents[1] / "models"
 PAGE = WEB.parents[1] / "kcgs" / "page"
@@ -137,6 +137,12 @@ def show(page: Browser, site: tuple[Path, str], scene: Scene | bytes, attributes
     return load(path) if not isinstance(scene, bytes) else Scene(GaussianField.random(1, (1, 1)))
 
 
+def widen(page: Browser, width: int) -> None:
+    """Set the element's width; wait until its canvas has it, too."""
+    page.evaluate(f"(image.style.setProperty('width', '{width}px'), 1)")
+    page.do("wait", expression=f"image.shadowRoot.querySelector('canvas').width === {width}")
+
+
 def pixels(page: Browser, size: tuple[int, int]) -> NDArray[np.float32]:
     """Render in the element at a size: (4, H, W) in [0, 1]."""
     return array(page.evaluate(f"kcgs.pixels({size[1]}, {size[0]})")).transpose(2, 0, 1) / 255
@@ -240,9 +246,8 @@ class TestElement:
         show(page, site, random_scene("soft"), 'alt="Cells"', '<img src="grey.png" alt="instead">')
         facts = "[image.offsetWidth, image.offsetHeight, image.querySelector('img').offsetWidth, image.tabIndex]"
         assert page.evaluate(facts) == [90, 60, 0, -1]
-        page.evaluate("(image.style.setProperty('width', '300px'), new Promise((r) => setTimeout(r, 100)))")
-        canvas = "image.shadowRoot.querySelector('canvas')"
-        assert page.evaluate(f"[image.offsetHeight, {canvas}.width, {canvas}.height]") == [200, 300, 200]
+        widen(page, 300)
+        assert page.evaluate("[image.offsetHeight, image.shadowRoot.querySelector('canvas').height]") == [200, 200]
         assert page.evaluate("document.querySelector('kcgs-image').matches(':focus')") is False
 
     def test_pixels_of_a_dense_screen(self, page: Browser, site: tuple[Path, str]) -> None:
@@ -262,17 +267,23 @@ class TestElement:
 
     def test_layers_as_they_arrive(self, page: Browser, site: tuple[Path, str]) -> None:
         show(page, site, load(MODELS / "chelsea-500" / "scene.safetensors"))
-        page.evaluate("kcgs.show('<kcgs-image src=slow/scene.kcgs></kcgs-image>')")
+        Handler.rest.clear()
+        page.evaluate("(window.shown = kcgs.show('<kcgs-image src=slow/scene.kcgs></kcgs-image>'), 1)")
+        page.do("wait", expression="kcgs.events.length > 0")
+        Handler.rest.set()
+        page.evaluate("shown")
         first, *_, last = page.evaluate("kcgs.events")
         assert first == ["progress", False] and last == ["load", True]
 
     def test_leaves_the_page_and_comes_back(self, page: Browser, site: tuple[Path, str]) -> None:
         show(page, site, load(MODELS / "chelsea-500" / "scene.safetensors"))
+        Handler.rest.clear()
         page.evaluate(
             "(async () => { const here = document.querySelector('#here'), slow = document.createElement('kcgs-image');"
             "let next = new Promise((r) => (slow.onprogress = r)); slow.setAttribute('src', 'slow/scene.kcgs');"
             "here.replaceChildren(slow); await next; slow.remove(); here.append(slow); window.image = slow; })()"
         )
+        Handler.rest.set()
         page.do("wait", expression="image.scene?.complete === true")
         page.evaluate("(image.remove(), image.setAttribute('src', 'none.kcgs'), document.body.append(image), 1)")
         page.do("wait", expression="image.scene === null")
@@ -299,9 +310,7 @@ class TestElement:
 
     def test_keyboard_wheel_and_touch(self, page: Browser, site: tuple[Path, str]) -> None:
         show(page, site, random_scene("soft"), 'zoom regions alt="Cells"')
-        assert (
-            page.evaluate("(image.style.setProperty('width', '600px'), new Promise((r) => setTimeout(r, 100)))") is None
-        )
+        widen(page, 600)
         whole = page.evaluate("image.view.scale")
         page.evaluate("(image.focus(), 1)")
         for key, larger in (("+", True), ("0", False)):

@@ -49,6 +49,7 @@ def uninterrupted() -> dict[str, FitResult]:
 
 
 class TestCheckpoint:
+    @pytest.mark.usefixtures("clock")  # it says when the file is written
     @pytest.mark.parametrize("recipe", RECIPES)
     @pytest.mark.parametrize("killed_at", [1, 47, 75, 119])
     def test_resumed_is_uninterrupted(

@@ -122,10 +122,10 @@ class TestFit:
         assert set(counts) == {50}
 
     @pytest.mark.slow
+    @pytest.mark.usefixtures("clock")
     def test_more_time_is_never_worse(self) -> None:
         image = torch.from_numpy(data.astronaut()[:192, 120:376] / 255).permute(2, 0, 1).float()
-        fit(image, None, 300, max_seconds=0.2)  # what loads once
-        found = [fit(image, None, 300, max_seconds=seconds) for seconds in (0.1, 0.5, 1.0, 2.5, 6.0, 15.0)]
+        found = [fit(image, None, 300, max_seconds=seconds) for seconds in (0.1, 0.5, 1.0, 2.5, 6.0, 25.0)]
         quality = [float(psnr(result.scene.render().clamp(0, 1), image)) for result in found]
         # fits of other lengths end in other minima, up to 0.15 dB apart, as fits of other seeds do
         assert all(after > before - 0.2 for before, after in pairwise(quality)), quality

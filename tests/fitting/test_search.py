@@ -73,6 +73,7 @@ class TestStopping:
         result = fit(*photo, 10, recipe=quick())
         assert result.target_reached is None and result.seconds >= result.history[-1].seconds
 
+    @pytest.mark.usefixtures("clock")
     def test_clock(self, photo: tuple[Tensor, Tensor]) -> None:
         result = fit(*photo, 500, recipe=FitConfig(iterations=10**6, max_seconds=1.0, target_psnr=150.0))
         assert result.stop_reason == "seconds" and result.target_reached is False

@@ -22,7 +22,7 @@ def test_480x854_with_7500_gaussians_in_2_gib() -> None:
         "RegionSplatRenderer(backend='reference')(field).sum().backward()\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, float(field.colors.grad.min()))\n"
     )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=600)
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     peak, least = (float(v) for v in out.stdout.split())
     assert peak < 2.0
     assert least > 0

@@ -313,7 +313,9 @@ class TestMove:
 
 class TestRecolor:
     @pytest.mark.parametrize("opacities", [False, True])
-    @pytest.mark.parametrize("gain", [0.5, torch.tensor([1.5, 0.0, 1.0]), torch.rand(3, 3)], ids=["1", "C", "CxC"])
+    @pytest.mark.parametrize(
+        "gain", [0.5, torch.tensor([1.5, 0.0, 1.0]), torch.linspace(0, 1, 9).view(3, 3)], ids=["1", "C", "CxC"]
+    )
     def test_image_changes_by_the_formula(self, regions: RegionMap, gain: Tensor | float, opacities: bool) -> None:
         scene, bias = scene_of(regions, opacities), torch.tensor([0.2, 0.0, -0.1])
         changed = recolor_region(scene, DISC, gain, bias)

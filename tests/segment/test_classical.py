@@ -1,7 +1,6 @@
 """Segmenters by name: what every method promises, and that ``auto`` follows real objects."""
 
 import functools
-import time
 from pathlib import Path
 from typing import Any
 
@@ -282,15 +281,8 @@ class TestAuto:
         assert edge_alignment(image, labels) > 0.85  # sharp at full size
         assert (auto(torch.full((3, 120, 80), 0.5)) == 0).all()
 
-    def test_takes_seconds_at_most(self) -> None:
-        image = torch.nn.functional.interpolate(photo("coffee")[None], (480, 854), mode="area")[0]
-        auto(image[:, :50, :50])  # imports
-        start = time.process_time()
-        auto(image)
-        assert time.process_time() - start < 6  # about 1 s on one core; the margin is for busy machines
-
     @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32), st.sampled_from([0.02, 0.3, 1.0]))
-    @settings(max_examples=40, deadline=None)
+    @settings(max_examples=40)
     def test_any_small_image(self, height: int, width: int, seed: int, contrast: float) -> None:
         noise = torch.rand(3, height, width, generator=torch.Generator().manual_seed(seed))
         assert_clean(auto(noise * contrast), (height, width))

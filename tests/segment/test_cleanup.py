@@ -50,7 +50,7 @@ BAD_LABELS: list[tuple[Any, type[Exception]]] = [
 
 class TestConnectedRegions:
     @given(MAPS)
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     def test_equals_flooding(self, labels: Tensor) -> None:
         result = connected_regions(labels)
         assert result.dtype == torch.int64
@@ -79,7 +79,7 @@ class TestConnectedRegions:
 
 class TestOrderByArea:
     @given(MAPS)
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     def test_areas_decrease_and_regions_stay(self, labels: Tensor) -> None:
         result = order_by_area(labels)
         areas = result.flatten().bincount()
@@ -126,7 +126,7 @@ class TestMergeSmall:
         assert merge_small(torch.full((2, 2), 6), 100).tolist() == [[6, 6], [6, 6]]
 
     @given(MAPS, st.integers(1, 20))
-    @settings(max_examples=80, deadline=None)
+    @settings(max_examples=80)
     def test_no_speck_is_left(self, labels: Tensor, min_size: int) -> None:
         result = merge_small(labels, min_size)
         areas = connected_regions(result).flatten().bincount()
@@ -138,13 +138,9 @@ class TestMergeSmall:
         if large.any():
             assert torch.equal(result.flatten()[large], labels.flatten()[large])
 
-    def test_many_specks_take_little_time(self) -> None:
-        import time
-
+    def test_many_specks(self) -> None:
         noise = torch.randint(0, 2, (480, 854), generator=torch.Generator().manual_seed(0))
-        start = time.process_time()
         result = merge_small(noise, 50)
-        assert time.process_time() - start < 10
         assert connected_regions(result).flatten().bincount().min() >= 50
 
     @pytest.mark.parametrize(("labels", "error"), BAD_LABELS)
@@ -191,7 +187,7 @@ class TestMergeSimilar:
         assert torch.equal(merge_similar(torch.zeros(1, 1, 2), labels, 2), labels)
 
     @given(MAPS, st.integers(1, 8), st.integers(0, 2**32))
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     def test_count_and_connectedness(self, labels: Tensor, most: int, seed: int) -> None:
         regions = connected_regions(labels)
         image = torch.rand(3, *labels.shape, generator=torch.Generator().manual_seed(seed))
@@ -250,7 +246,7 @@ class TestSnapContours:
         assert torch.equal(snap_contours(image, labels), labels)
 
     @given(MAPS, st.integers(0, 2**32), st.integers(1, 3))
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     def test_ids_come_from_the_map(self, labels: Tensor, seed: int, reach: int) -> None:
         image = torch.rand(3, *labels.shape, generator=torch.Generator().manual_seed(seed))
         result = snap_contours(image, labels, reach=reach)

@@ -24,7 +24,7 @@ const FLAGS = [
   "--disable-component-update",
   "--disable-sync",
 ];
-const TIMEOUT = 30_000;
+const TIMEOUT = 300_000;
 
 const profile = mkdtempSync(join(tmpdir(), "kcgs-web-"));
 const context = await chromium.launchPersistentContext(profile, {
