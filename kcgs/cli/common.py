@@ -23,24 +23,39 @@ _INTERRUPTED = 128 + signal.SIGINT
 _PIPE_CLOSED = 128 + 13
 
 
+class _InterruptHandler:
+    """What Ctrl-C calls: it raises KeyboardInterrupt, of which libraries that are being loaded make other errors."""
+
+    called = False
+
+    def __call__(self, number: int, frame: Any) -> None:
+        self.called = True
+        raise KeyboardInterrupt
+
+
 class _Commands(typer.core.TyperGroup):
     """The commands, ended in one way by Ctrl-C and by a reader of standard output who leaves."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command."""
         Progress.forget()
+        handler, before = _InterruptHandler(), signal.getsignal(signal.SIGINT)
+        if before is signal.default_int_handler:
+            signal.signal(signal.SIGINT, handler)
         try:
             return super().invoke(ctx)
-        except KeyboardInterrupt as error:
-            raise interrupted(str(error)) from None
-        except BrokenPipeError as error:
-            # what is left in the buffer has nowhere to go
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            raise typer.Exit(_PIPE_CLOSED) from error
-        except _UsageError as error:
-            if "unexpected extra argument" in error.message and error.ctx and error.ctx.info_name == "fit":
+        except BaseException as error:
+            if handler.called or isinstance(error, KeyboardInterrupt):
+                raise interrupted(str(error) if isinstance(error, KeyboardInterrupt) else "") from None
+            if isinstance(error, BrokenPipeError):
+                # what is left in the buffer has nowhere to go
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                raise typer.Exit(_PIPE_CLOSED) from error
+            if isinstance(error, _UsageError) and ctx.invoked_subcommand == "fit" and "extra arg" in error.message:
                 raise _UsageError(f"{error.message}: kcgs fit-many fits several images", error.ctx) from None
             raise
+        finally:
+            signal.signal(signal.SIGINT, before)
 
 
 def interrupted(detail: str = "") -> typer.Exit:
@@ -177,7 +192,7 @@ class Stop:
         self.wanted = self._began = False
 
     def __enter__(self) -> Stop:
-        self._before = signal.signal(signal.SIGINT, self._interrupt)
+        self._before: Any = signal.signal(signal.SIGINT, self._interrupt)
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -185,7 +200,7 @@ class Stop:
 
     def _interrupt(self, number: int, frame: Any) -> None:
         if self.wanted or not self._began:
-            raise KeyboardInterrupt
+            self._before(number, frame)
         self.wanted = True
 
     def step(self, iteration: int, entry: Any) -> bool:
