@@ -110,6 +110,12 @@ def pytest_runtest_setup() -> None:
     torch.manual_seed(0)
 
 
+@pytest.fixture(autouse=True)
+def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write no line of progress every ten seconds: how many there are depends on how busy the machine is."""
+    monkeypatch.setattr("kcgs._progress._LINE_SECONDS", 1e6)
+
+
 class Clock:
     """A clock that moves on by a tick each time it is read."""
 

@@ -37,6 +37,7 @@ def work(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> Work:
         with Progress(name, known=False, **settings):
             pass
 
+    monkeypatch.setattr(_progress, "_LINE_SECONDS", 10.0)
     Progress.forget()
     return work
 
