@@ -291,6 +291,7 @@ def check_scene(scene: object) -> Scene:
     """Return `scene` if it is a Scene of one image, with one map and region ids, or without a map."""
     scene = check_unbatched(scene)
     field, regions = scene.field, scene.regions
+    _check_regions(field, regions)  # again: both may have been assigned since the scene was made
     if regions is not None and regions.num_maps is not None:
         raise ValueError(f"scene must have one map; got a batch of {regions.num_maps}")
     if regions is not None and field.region_ids is None:

@@ -8,6 +8,7 @@ import math
 import os
 import signal
 import sys
+import threading
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -40,10 +41,12 @@ class _Commands(typer.core.TyperGroup):
         """Run a command."""
         Progress.forget()
         handler, before = _InterruptHandler(), signal.getsignal(signal.SIGINT)
-        if before is signal.default_int_handler:
+        # not where Ctrl-C is ignored, as in the background, nor in a thread, where Python sets no handler
+        listens = before is signal.default_int_handler and threading.current_thread() is threading.main_thread()
+        if listens:
             signal.signal(signal.SIGINT, handler)
         try:
-            return super().invoke(ctx)
+            result = super().invoke(ctx)
         except BaseException as error:
             if handler.called or isinstance(error, KeyboardInterrupt):
                 raise interrupted(str(error) if isinstance(error, KeyboardInterrupt) else "") from None
@@ -55,7 +58,11 @@ class _Commands(typer.core.TyperGroup):
                 raise _UsageError(f"{error.message}: kcgs fit-many fits several images", error.ctx) from None
             raise
         finally:
-            signal.signal(signal.SIGINT, before)
+            if listens:
+                signal.signal(signal.SIGINT, before)
+        if handler.called:  # where Python cannot raise, in a destructor
+            raise interrupted()
+        return result
 
 
 def interrupted(detail: str = "") -> typer.Exit:
@@ -192,11 +199,14 @@ class Stop:
         self.wanted = self._began = False
 
     def __enter__(self) -> Stop:
-        self._before: Any = signal.signal(signal.SIGINT, self._interrupt)
+        self._before: Any = signal.getsignal(signal.SIGINT)
+        if callable(self._before):  # it is not where Ctrl-C is ignored, as in the background
+            signal.signal(signal.SIGINT, self._interrupt)
         return self
 
     def __exit__(self, *error: object) -> None:
-        signal.signal(signal.SIGINT, self._before)
+        if callable(self._before):
+            signal.signal(signal.SIGINT, self._before)
 
     def _interrupt(self, number: int, frame: Any) -> None:
         if self.wanted or not self._began:

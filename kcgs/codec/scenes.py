@@ -245,8 +245,9 @@ def _black(field: GaussianField, regions: RegionMap | None) -> GaussianField:
 
 def _positions(field: GaussianField, regions: RegionMap) -> Integers:
     """Return the position of each Gaussian's region among the map's ids."""
-    if regions.num_maps is not None:
-        raise ValueError(f"regions must be one map; got a batch of {regions.num_maps}")
+    if regions.num_maps is not None or regions.size != field.size:
+        maps = "one map" if regions.num_maps is None else f"a batch of {regions.num_maps} maps"
+        raise ValueError(f"regions must be one map of size {field.size}; got {maps} of size {regions.size}")
     if field.region_ids is None:
         raise ValueError("scene must have region_ids for its regions; call scene.field.assign_regions(scene.regions)")
     region_ids = field.region_ids.cpu()

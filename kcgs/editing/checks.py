@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+import kcgs.scene
 from kcgs._check import check_count, check_floating, check_number
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
@@ -29,11 +30,9 @@ def check_field(scene: Scene) -> GaussianField:
 def check_scene(scene: Scene, region_ids: object) -> tuple[RegionMap, Tensor]:
     """Return the map and the ids as a tensor on its device."""
     check_field(scene)
-    regions = scene.regions
+    regions = kcgs.scene.check_scene(scene).regions
     if regions is None:
         raise ValueError("scene must have a label map; got regions None")
-    if regions.num_maps is not None:
-        raise ValueError(f"scene must have one map; got a batch of {regions.num_maps}")
     wanted = check_ids(region_ids, regions.ids, "map")
     return regions, torch.tensor(wanted, device=regions.ids.device)
 

@@ -28,11 +28,11 @@ class MapTables(NamedTuple):
 
     def index_of(self, region_ids: Tensor) -> Tensor:
         """Return the position of each id among `ids`, -1 where the map does not hold it."""
-        if self.table is not None and self.table.device.type == "cpu":
+        if self.table is not None and self.table.device.type == "cpu" and not torch.compiler.is_compiling():
             # numpy takes a third of the time, and wakes no threads of torch's, which would spin beside the kernel's
-            return torch.from_numpy(self.table.numpy().take(region_ids.numpy() + 1, mode="clip"))
+            return torch.from_numpy(self.table.numpy().take(region_ids.long().numpy() + 1, mode="clip"))
         if self.table is not None:
-            return self.table[(region_ids + 1).clamp(0, len(self.table) - 1)]
+            return self.table[(region_ids.long() + 1).clamp(0, len(self.table) - 1)]
         places = torch.searchsorted(self.ids, region_ids.contiguous()).clamp_max(len(self.ids) - 1)
         return torch.where(self.ids[places] == region_ids, places, -1)
 

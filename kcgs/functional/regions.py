@@ -40,8 +40,8 @@ class RegionMap:
     width for each pair of regions a pixel is blurred by the width of its nearest contour. With ``supersample`` k the
     map has k x k labels per pixel, and a pixel's membership is the mean over them; ``labels`` is then the label with
     the largest share (the smallest on a tie), and regions too small to have any such pixel are regions still.
-    ``fine_labels`` is the map at its own resolution: ``labels`` itself where k is 1. A map never changes: it has a copy
-    of the labels it was made from, and both attributes give copies of that.
+    ``fine_labels`` is the map at its own resolution: ``labels`` itself where k is 1. A map has a copy of the
+    labels it was made from, and both attributes give copies of that: whatever writes to them changes no render.
 
     Example:
         >>> regions = RegionMap.from_labels(torch.tensor([[3, 3, 7], [3, 7, 7]]))
@@ -60,7 +60,14 @@ class RegionMap:
 
     def __post_init__(self) -> None:
         """Keep the tables where the operator finds them."""
-        keep_tables(self.operator_labels, self.size, is_crisp(self.widths), self.tables)
+        keep_tables(self._operator_labels, self.size, is_crisp(self.widths), self.tables)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the tables of other sizes, which labels carry along, behind."""
+        state = dict(vars(self))
+        fine = state["_fine_labels"] = self._fine_labels.detach()
+        state["_labels"] = fine if self._labels is self._fine_labels else self._labels
+        return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Keep the tables of a copy where the operator finds them, too."""
@@ -101,7 +108,8 @@ class RegionMap:
             >>> half.labels, half.num_regions
             (tensor([[1, 1]]), 2)
         """
-        labels = check_labels("labels", labels).clone()
+        with torch.inference_mode(False):  # a graph of autograd keeps no tensor of that mode
+            labels = check_labels("labels", labels).clone()
         supersample = check_count("supersample", supersample)
         if labels.shape[-2] % supersample or labels.shape[-1] % supersample:
             raise ValueError(
@@ -141,7 +149,7 @@ class RegionMap:
         return self._fine_labels.clone()
 
     @property
-    def operator_labels(self) -> Tensor:
+    def _operator_labels(self) -> Tensor:
         """The map's own labels at its own resolution, which the operator takes and nobody writes to."""
         return self.given._fine_labels
 

@@ -155,7 +155,7 @@ def _resolve_regions(
     check_tensor("region_ids", region_ids)
     assert region_ids is not None
     if isinstance(regions, RegionMap):
-        labels, widths, supersample = regions.operator_labels, regions.widths, regions.given.supersample
+        labels, widths, supersample = regions._operator_labels, regions.widths, regions.given.supersample
     else:
         labels, widths, supersample = regions, None, 1
     if labels.device != means.device:

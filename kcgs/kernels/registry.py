@@ -43,7 +43,7 @@ def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
 @functools.cache
 def _warn_about_cuda() -> None:
     # until a report of a GPU shows that the Triton kernel is right
-    warnings.warn("backend 'auto' takes 'tiled' on CUDA; backend='cuda' names the Triton kernel", stacklevel=2)
+    warnings.warn("backend 'auto' takes 'tiled' on CUDA; pass backend='cuda' for the Triton kernel", stacklevel=2)
 
 
 def compile_ahead(backend: str) -> list[Program]:

@@ -68,6 +68,17 @@ class TestCtrlC:
         assert run(*arguments) == (130, "", "kcgs: interrupted\n")
         assert set(files.iterdir()) == before
 
+    def test_libraries_that_make_another_error_of_it(self, run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+        def half_loaded(*_: object) -> NoReturn:
+            try:
+                signal.raise_signal(signal.SIGINT)
+            except KeyboardInterrupt:
+                raise ImportError("a module is half loaded") from None
+            raise AssertionError
+
+        monkeypatch.setattr(kcgs.scene, "load", half_loaded)
+        assert run("encode", "scene.safetensors", "-o", "scene.kcgs") == (130, "", "kcgs: interrupted\n")
+
     def test_after_the_fit_what_is_saved_is_said(self, run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         measure = kcgs.cli.fit.report_fit
 

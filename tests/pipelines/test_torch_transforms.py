@@ -370,6 +370,22 @@ class TestOperator:
         regions.labels.zero_(), regions.fine_labels.zero_()
         assert torch.equal(region_splat(*gaussians, regions), before) and int(regions.labels.max()) == 3
 
+    @compiler_warnings
+    def test_a_compiled_graph_has_the_tables_of_a_map(
+        self, field: GaussianField, regions: RegionMap, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        compiled = torch.compile(RegionSplatRenderer(), backend="aot_eager")
+        before = compiled(field, regions)
+        monkeypatch.setattr(RegionMap, "from_labels", None)  # nothing is converted any more
+        assert torch.equal(compiled(field, regions), before)
+
+    def test_a_pickle_has_no_tables_of_other_sizes(self, field: GaussianField, regions: RegionMap) -> None:
+        scene = Scene(field, regions)
+        fresh = len(pickle.dumps(scene))
+        scene.render((4 * SIZE[0], 4 * SIZE[1]))
+        assert len(pickle.dumps(scene)) == fresh
+        assert torch.equal(pickle.loads(pickle.dumps(scene))(), scene())
+
     def test_ids_that_change_in_place(self, field: GaussianField, regions: RegionMap) -> None:
         gaussians, ids = (field.means, field.cholesky, field.colors), field.region_ids.clone()
         before = region_splat(*gaussians, ids, regions)
