@@ -52,16 +52,12 @@ def fit_command(
     as_json: Json = False,
 ) -> None:
     """Fit Gaussians to an image and save the scene."""
-    from kcgs.data import load_image
-
     if image.suffix.lower() in VIDEOS:
         raise typer.BadParameter(f"IMAGE must be an image; got {str(image)!r}: kcgs fit-video fits videos")
     suffixes = (".safetensors", ".kcgs") if request.target_bytes is None else (".kcgs",)
     output = Path(f"{image.stem}{suffixes[0]}") if output is None else output
     check_output(output, *suffixes)
     if plot is not None:
-        from kcgs.plots import history_figure, save_figure
-
         check_output(plot, ".png", option="--plot")
     if resume and checkpoint is None:
         raise typer.BadParameter("--resume needs --checkpoint")
@@ -72,6 +68,8 @@ def fit_command(
     if request.config.target_psnr is not None:
         options.exclude("--target-psnr", checkpoint=checkpoint)
     compile_ahead(request.config, output.suffix == ".kcgs" and regions != "none")
+    from kcgs.data import load_image
+
     target = load_image(image)
     labels = read_regions(regions, target, progress=not quiet)
     with Stop() as stop:
@@ -81,6 +79,8 @@ def fit_command(
         )  # fmt: skip
         result = fitted.result
         if plot is not None:
+            from kcgs.plots import history_figure, save_figure
+
             save_figure(history_figure({request.recipe: result.history}), plot)
         report = report_fit(fitted, target, labels, output, request)
     reason = report["stop_reason"]

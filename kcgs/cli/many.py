@@ -59,12 +59,13 @@ def fit_many_command(
     The same command again goes on where an earlier one was stopped: what is there from the same image, mask
     and settings is kept. One image's failure stops no other; with any, the exit status is 1.
     """
-    from kcgs.engine import run_jobs
-
     if request.target_bytes is not None and suffix == ".safetensors":
         options.exclude("--target-bytes", suffix=suffix)
     images = _expand(patterns)
     masks = {} if regions in ("auto", "none") else _masks(Path(regions))
+    from kcgs.engine import run_jobs
+
+    config = request.config
     # absolute: a worker on a cluster has a working folder of its own
     output.mkdir(parents=True, exist_ok=True)
     folder, table = output.absolute(), Table(output / "results.csv")
@@ -81,7 +82,7 @@ def fit_many_command(
     workers = None if workers is None else min(workers, len(orders))
     if engine == "local" and len(orders) > 1:
         # before there are workers, each of which would compile for itself
-        for program in compile_ahead(request.config, ending == ".kcgs" and regions != "none"):
+        for program in compile_ahead(config, ending == ".kcgs" and regions != "none"):
             program.wait()
     done = run_jobs(fit_one, orders, engine=engine, workers=workers, threads=threads)
     try:

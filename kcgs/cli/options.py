@@ -45,9 +45,17 @@ class FitRequest(NamedTuple):
     target_bytes: int | None
     """Of a `.kcgs` file, which then chooses the number of Gaussians; None: as many as said."""
     recipe: str
-    config: FitConfig
+    settings: dict[str, Any]
+    """In place of the recipe's."""
     seed: int
     clock: Clock = Clock()
+
+    @property
+    def config(self) -> FitConfig:
+        """The recipe with these settings; ValueError says which is wrong."""
+        from kcgs.fitting import FitConfig
+
+        return FitConfig.from_recipe(self.recipe, **self.settings)
 
 
 def fit_request(
@@ -76,16 +84,14 @@ def fit_request(
     """Return what the options ask for; None where one was not given."""
     if target_bytes is not None:
         exclude("--target-bytes", num_gaussians=num_gaussians, target_psnr=target_psnr)
-    from kcgs.fitting import FitConfig
-
     settings: dict[str, Any] = {
         "iterations": iterations, "objective": objective, "max_seconds": max_seconds, "target_psnr": target_psnr,
     }  # fmt: skip
     given = {key: value for key, value in settings.items() if value is not None}
     if keep_contours:
         given |= {"move_contours": False, "merge_regions": False}
-    config = FitConfig.from_recipe(recipe, backend=backend, **given)
-    return FitRequest(num_gaussians, target_bytes, recipe, config, seed, Clock(max_seconds, process_began()))
+    given["backend"] = backend
+    return FitRequest(num_gaussians, target_bytes, recipe, given, seed, Clock(max_seconds, process_began()))
 
 
 def with_fit_options(command: Callable[..., None], *, without: tuple[str, ...] = ()) -> Callable[..., None]:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcgs.functional.operator import splat_operator
 from kcgs.kernels import Membership, SplatInputs, cuda, reference, tiled
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -178,7 +179,7 @@ def test_operator() -> None:
     ids = torch.tensor([[0, 1, 0, 1]], device=DEVICE)
     settings = ids, labels, None, 1, 8, 16, 0.0
     leaves = [t.clone().requires_grad_() for t in inputs[:3]]
-    operators = torch.ops.kcgs.region_splat.default, torch.ops.kcgs.region_splat_backward.default
+    operators = splat_operator, torch.ops.kcgs.region_splat_backward.default
     torch.library.opcheck(operators[0], (*leaves, *settings, "cuda"))
     grad = torch.rand(1, 3, 8, 16, device=DEVICE)
     torch.library.opcheck(operators[1], (grad, *inputs[:3], *settings, "cuda", True))
