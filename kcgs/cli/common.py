@@ -96,6 +96,7 @@ def _options(
     """Take options that come before a command."""
 
 
+# the keys of `kcgs.scene.FORMATS`, whose module loads torch
 SCENES = (".safetensors", ".kcgs")
 OUTPUT_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 # the files of a folder that are images; a file that is named is tried whatever it is called

@@ -12,7 +12,7 @@ from kcgs._atomic import write_file
 from kcgs._progress import Progress
 
 from .clips import describe_clip, is_clip, measure_clip, read_clip, render_clip, show_clip
-from .common import OUTPUT_IMAGES, Json, Quiet, SceneFile, SceneOrMap, app, check_output, print_report
+from .common import OUTPUT_IMAGES, SCENES, Json, Quiet, SceneFile, SceneOrMap, app, check_output, print_report
 from .fit import describe_size, measure_scene
 from .options import Contours, Objective, Scale, Size, exclude, target_size
 
@@ -172,10 +172,9 @@ def encode(
     from kcgs import codec, load
     from kcgs.data import load_labels
     from kcgs.functional import psnr
-    from kcgs.scene import FORMATS
 
     check_output(output, ".kcgs")
-    if scene.suffix not in FORMATS:
+    if scene.suffix not in SCENES:
         exclude("a label map", target_bytes=target_bytes, quality=quality, image=image, objective=objective)
         labels = load_labels(scene, rgb_ids=True)
         ids = labels.unique()
