@@ -152,20 +152,3 @@ class AdaptiveAngle:
         found = low + coder.uniform(sizes, None if turned is None else turned - low)
         np.add.at(self._weights, bins, 1.0)
         return (found - shift) % turns
-
-
-class AdaptiveSymbols:
-    """Symbols of several contexts, each with a table of its own, [contexts, symbols]; what is long ago is forgotten."""
-
-    def __init__(self, weights: Floats, memory: float) -> None:
-        self._weights, self._memory = weights.copy(), memory
-
-    def code(self, coder: Coder, context: Integers, values: Integers | None) -> Integers:
-        """Code one symbol for each context [n]; tables learn from all of them at once."""
-        if not len(context):
-            return np.zeros(0, np.int64)
-        found = coder.choose(self._weights, context, values)
-        np.add.at(self._weights, (context, found), 1.0)
-        full = np.cumsum(self._weights, 1)[:, -1] > self._memory  # from left to right, as `sum` does not add
-        self._weights[full] *= 0.5
-        return found

@@ -13,8 +13,6 @@ from .rangecoder import CodecError
 MAGIC, VERSIONS = b"kcgs", (1, 2, 3)
 MAP_MAGIC = b"kcgm"
 """What a file begins with that is a label map and no scene."""
-CLIP_VERSION = 4
-"""Of files that hold frames, which `clips/file.py` reads."""
 # a decoder's memory: pixels of a map; Gaussians in all, and numbers of their colours
 MOST_LABELS = 1 << 26
 MOST_GAUSSIANS, MOST_COLORS = (1 << 21) - 1, 1 << 27
@@ -24,10 +22,6 @@ _MOST_LAYERS = ENERGIES[1] - ENERGIES[0] + 1, 128
 # Gaussians that a layer of no bytes may hold
 SPARE = 64
 _HEADER_CRC, LAYER_CRC = 4, 2  # bytes
-
-
-class EndsEarly(CodecError):
-    """A file that ends before it should."""
 
 
 class Header(NamedTuple):
@@ -50,7 +44,7 @@ class ByteReader:
     def take(self, count: int) -> bytes:
         """Return the next bytes."""
         if count > len(self.data) - self.position:
-            raise EndsEarly(f"the file ends early: it has {len(self.data)} bytes")
+            raise CodecError(f"the file ends early: it has {len(self.data)} bytes")
         self.position += count
         return self.data[self.position - count : self.position]
 
@@ -128,9 +122,7 @@ def _read_header(stream: ByteReader) -> tuple[Header, int]:
         )
     if magic != MAGIC:
         raise CodecError(f"it must start with {MAGIC!r}; got {stream.data[:4]!r}")
-    if (version := stream.take(1)[0]) == CLIP_VERSION:
-        raise CodecError("it is a clip, no scene: kcgs render writes it as a video, kcgs.Clip.load reads it")
-    if version not in VERSIONS:
+    if (version := stream.take(1)[0]) not in VERSIONS:
         raise CodecError(f"its version must be 1, 2 or 3; got {version}")
     split = version > VERSIONS[0]
     size = stream.varint("height", 1, MOST_SIDE), stream.varint("width", 1, MOST_SIDE)

@@ -82,14 +82,14 @@ class SceneWriter:
         if not isinstance(scene, Scene):
             raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
         field, regions = scene.field, scene.regions
-        if field.means.ndim == 2 and not len(field):
+        if field.means.ndim == 2 and not field.num_gaussians:
             field = _black(field, regions)
         _check_field(field)
         self.size, self.channels = field.size, field.colors.shape[-1]
         tensors = field.means, field.cholesky, field.merged_colors()
         self.gaussians = Parameters(*(t.detach().cpu().double().numpy() for t in tensors))
         self.regions = None if regions is None or regions.num_regions == 1 else regions.to("cpu")
-        self.ids = np.zeros(len(field), np.int64)  # as positions among the map's ids
+        self.ids = np.zeros(field.num_gaussians, np.int64)  # as positions among the map's ids
         self.region_map = b""
         if self.regions is not None:
             from .labels import encode_map  # loads numba
@@ -225,14 +225,14 @@ def _divide(codes: Codes, header: Header, num_bytes: int, marks: tuple[float, ..
 def _check_field(field: GaussianField) -> None:
     """Refuse what no file can hold; a parameter may have been changed since the field was made."""
     if field.means.ndim != 2:
-        raise ValueError(f"scene must hold the Gaussians of one image; got means of shape {tuple(field.means.shape)}")
+        raise ValueError(f"scene must be of one image; got a batch of {len(field.means)}: scene[t] is one of them")
     check_floating("means", field.means.detach().float())
     check_cholesky("cholesky", field.cholesky.detach().float())
     check_floating("colors", field.merged_colors().detach().float())
     channels = field.colors.shape[-1]
     check_count("pixels per side", max(field.size), 1, MOST_SIDE)
     check_count("channels", channels, 1, MOST_CHANNELS)
-    check_count("number of Gaussians", len(field), 1, most_gaussians(channels))
+    check_count("number of Gaussians", field.num_gaussians, 1, most_gaussians(channels))
 
 
 def _black(field: GaussianField, regions: RegionMap | None) -> GaussianField:
@@ -284,8 +284,8 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
         >>> from kcgs.codec import encode
         >>> data = encode(Scene(GaussianField.random(200, (32, 48), seed=0)))
         >>> whole, part = decode(data), decode(data, max_bytes=len(data) // 2)
-        >>> whole.layers == whole.num_layers, part.layers < part.num_layers, len(part.scene) < len(whole.scene)
-        (True, True, True)
+        >>> whole.layers == whole.num_layers, part.scene.num_gaussians < whole.scene.num_gaussians
+        (True, True)
     """
     if not isinstance(data, bytes | bytearray | memoryview):
         raise TypeError(f"data must be bytes; got {type(data).__name__}")

@@ -7,9 +7,7 @@ import hashlib
 import html
 from pathlib import Path
 
-from kcgs.clip import Clip
-from kcgs.codec import CodecError, decode, encode
-from kcgs.codec.clips.file import is_clip, unpack
+from kcgs.codec import decode, encode
 from kcgs.functional.softness import check_contours
 from kcgs.scene import Scene, check_scene
 
@@ -18,20 +16,18 @@ _FOLDER = Path(__file__).resolve().parent
 _QUALITY = 60.0
 
 
-def scene_page(scene: Scene | Clip | bytes, *, title: str = "scene", contours: str = "scaled") -> str:
+def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "scaled") -> str:
     r"""Write a scene as one HTML page that opens from disk, offline.
 
-    Convention: the page zooms, pans, and hides regions; a clip it plays. It holds the scene as a `.kcgs` file and loads
-    nothing.
+    Convention: the page zooms, pans, and hides regions. It holds the scene as a `.kcgs` file and loads nothing.
 
     Args:
-        scene: a scene of one image, or a clip, with 1, 3 or 4 channels; or the bytes of a `.kcgs` file of either, which
-            are kept as they are.
+        scene: of one image, with 1, 3 or 4 channels; or the bytes of its `.kcgs` file, which are kept as they are.
         title: of the page, and what it calls the image for who does not see it.
         contours: "scaled" or "crisp", as :meth:`kcgs.Scene.render` has them.
 
     Returns:
-        The page, about 100 kB, of a clip 130, and 4/3 of the file.
+        The page, about 100 kB and 4/3 of the scene's file.
 
     Raises:
         TypeError, ValueError: as :func:`kcgs.codec.encode` and :func:`kcgs.codec.decode`; other contours, another
@@ -43,35 +39,22 @@ def scene_page(scene: Scene | Clip | bytes, *, title: str = "scene", contours: s
         >>> page[:15], "<title>Blobs &amp; more</title>" in page
         ('<!doctype html>', True)
     """
-    data = web_bytes(scene)
-    source = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
-    return page_html(source, title=title, contours=contours, clip=is_clip(data))
+    source = "data:application/octet-stream;base64," + base64.b64encode(web_bytes(scene)).decode()
+    return page_html(source, title=title, contours=contours)
 
 
-def web_bytes(scene: Scene | Clip | bytes) -> bytes:
-    """Write a scene as a `.kcgs` file whose render is within a level of 255 of the scene's own; files are kept."""
-    if isinstance(scene, Clip):
-        scene = scene.to_bytes()
-    if isinstance(scene, Scene):
-        channels = check_scene(scene).field.colors.shape[-1]
-    elif isinstance(scene, bytes) and is_clip(scene):
-        header, _, ended = unpack(scene)
-        if not ended:
-            raise CodecError("the clip ends early")
-        channels = header.channels
-    else:
-        channels = decode(scene).scene.field.colors.shape[-1]
+def web_bytes(scene: Scene | bytes) -> bytes:
+    """Write a scene as a `.kcgs` file whose render is within a level of 255 of the scene's own; a file is kept."""
+    loaded = check_scene(scene) if isinstance(scene, Scene) else decode(scene).scene
+    channels = loaded.field.colors.shape[-1]
     if channels not in (1, 3, 4):
         raise ValueError(f"scene must have 1, 3 or 4 channels for a page to show it; got {channels}")
     return encode(scene, quality=_QUALITY) if isinstance(scene, Scene) else scene
 
 
-def page_html(
-    source: str, *, title: str, contours: str = "scaled", original: str | None = None, clip: bool = False
-) -> str:
-    """Return the page of a scene or a clip at an address, maybe with an original beside it; see :func:`scene_page`."""
-    names = "page.css", "clip.js" if clip else "page.js", "page.html"
-    style, script, page = ((_FOLDER / name).read_text(encoding="utf-8") for name in names)
+def page_html(source: str, *, title: str, contours: str = "scaled", original: str | None = None) -> str:
+    """Return the page of a scene at an address, and maybe of an original to compare with; see :func:`scene_page`."""
+    style, script, page = ((_FOLDER / f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html"))
     script = script.strip()
     hashes = {name: _policy_hash(text) for name, text in (("style", style), ("script", script))}
     # a page of an address asks its own server; one that holds its scene asks nobody
@@ -83,8 +66,7 @@ def page_html(
     beside = "" if original is None else f' data-original="{html.escape(original)}"'
     return page.format(
         policy=policy, title=html.escape(title), style=style, script=script,
-        contours=check_contours(contours), attribute="data-clip" if clip else "src", src=html.escape(source),
-        original=beside,
+        contours=check_contours(contours), src=html.escape(source), original=beside,
     )  # fmt: skip
 
 

@@ -122,8 +122,7 @@ def build(script: str, *arguments: str) -> None:
 
 def compile_decoder() -> None:
     """Make the decoder's WebAssembly, where it is missing or older than its sources."""
-    programs = [WEB / "decoder" / name for name in ("program.wasm", "clips.wasm")]
-    made = min(program.stat().st_mtime if program.exists() else 0.0 for program in programs)
-    if made < max(source.stat().st_mtime for source in (WEB / "decoder" / "assembly").glob("*.ts")):
+    program, sources = WEB / "decoder" / "program.wasm", (WEB / "decoder" / "assembly").glob("*.ts")
+    if not program.exists() or program.stat().st_mtime < max(source.stat().st_mtime for source in sources):
         done = npm("run", "wasm")
         assert done.returncode == 0, done.stdout + done.stderr

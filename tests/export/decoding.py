@@ -9,9 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from kcgs import Clip
 from kcgs.codec import CodecError, decode, decode_labels
-from kcgs.codec.clips.file import unpack as unpack_clip
 
 from .browser import WEB, Browser, Pipe
 
@@ -60,7 +58,7 @@ def scene_of(data: bytes) -> dict[str, Any]:
     numbers = {name: getattr(field, name).detach().numpy() for name in ("means", "cholesky", "colors")}
     described: dict[str, Any] = {name: digest(array) for name, array in numbers.items()}
     described |= {"height": field.size[0], "width": field.size[1], "channels": field.colors.shape[-1]}
-    described |= {"count": len(field), "layers": found.layers, "complete": found.layers == found.num_layers}
+    described |= {"count": field.num_gaussians, "layers": found.layers, "complete": found.layers == found.num_layers}
     described |= {"regions": None, "regionIds": None, "positions": None, "exactIds": None}
     if regions is None or field.region_ids is None:
         return described
@@ -81,54 +79,6 @@ def labels_of(data: bytes) -> dict[str, Any]:
     labels = decode_labels(data).numpy()
     described = digest(labels, labels.dtype.str)
     return {"height": labels.shape[0], "width": labels.shape[1], "type": str(labels.dtype), "labels": described}
-
-
-def frame_of(clip: Clip, number: int) -> dict[str, Any]:
-    """Decode a frame in Python; describe it as describe.mjs does, but for what is the same in all frames."""
-    scene = clip[number]
-    field, regions, keys = scene.field, scene.regions, clip._frame(number)[1].key
-    numbers = {name: getattr(field, name).detach().numpy() for name in ("means", "cholesky", "colors")}
-    described: dict[str, Any] = {name: digest(array) for name, array in numbers.items()}
-    described |= {"count": len(field), "keys": digest(keys, "<i4"), "regionIds": None, "regions": None}
-    if regions is None or field.region_ids is None:
-        return described
-    pairs = {} if isinstance(regions.softness, float) else regions.softness
-    widths = {regions.softness} if isinstance(regions.softness, float) else set(pairs.values())
-    one = len(widths) == 1  # whether it is said once, or for each pair
-    described["regionIds"] = digest(field.region_ids.numpy(), "<f8")
-    described["regions"] = {
-        "labels": digest(regions.labels.numpy(), "<f8"), "softness": widths.pop() if one else None,
-        "pairs": [] if one else sorted([*pair, width] for pair, width in pairs.items()),
-    }  # fmt: skip
-    return described
-
-
-def check_clip(reader: Node, data: bytes) -> int:
-    """Both give the same frames, up to the same one that both refuse; return how many they gave."""
-    try:
-        clip = Clip.from_bytes(data, whole=False)
-    except CodecError as error:
-        assert reader.do("clip", data)["error"] == "DecodeError", str(error)
-        return 0
-    wanted = []
-    try:
-        wanted.extend(frame_of(clip, number) for number in range(len(clip)))
-    except CodecError as error:
-        answer = reader.do("clip", data, numbers=[len(wanted)])
-        assert answer.get("error") == "DecodeError", (str(error), answer)
-    answer = reader.do("clip", data, numbers=[*range(len(wanted))])
-    for found, frame in zip(answer.pop("described"), wanted, strict=True):
-        if found["regions"] is not None:
-            found["regions"] = {name: found["regions"][name] for name in ("labels", "softness", "pairs")}
-        assert {name: found[name] for name in frame} == frame
-    answer.pop("memory")
-    height, width = clip.size
-    assert answer == {
-        "size": {"height": height, "width": width}, "channels": clip[0].field.colors.shape[-1] if wanted else 3,
-        "frameRate": float(clip.frame_rate), "frames": len(clip), "keyFrames": list(clip.key_frames),
-        "complete": unpack_clip(data)[2],
-    }  # fmt: skip
-    return len(wanted)
 
 
 def check_same(reader: Reader, data: bytes, *, labels: bool = False) -> bool:

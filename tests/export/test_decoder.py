@@ -18,12 +18,26 @@ from kcgs.codec import encode
 from kcgs.codec.file import pack, unpack
 from kcgs.functional.labels import touching_pairs
 
-from .browser import WEB, Browser, serving
+from .browser import WEB, Browser, compile_decoder, npm, serving
 from .decoding import Node, Page, Reader, check_same
 
 MODELS = WEB.parents[1] / "models"
 GOLDEN = WEB.parents[1] / "tests" / "codec" / "golden.kcgs"
 MEMORY = 1 << 30  # that node, which has about 50 MB at first, may take at most
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The decoder, built as `npm run build` builds it."""
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed")
+    if not (WEB / "node_modules" / "vite").exists():
+        pytest.skip("export/web has no node_modules, with which its decoder is built: npm --prefix export/web ci")
+    compile_decoder()
+    folder = tmp_path_factory.mktemp("decoder")
+    done = npm("exec", "--", "vite", "build", "--config", "decoder/vite.config.ts", "--outDir", str(folder))
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
 
 
 PAGE = """<!doctype html>
@@ -54,6 +68,13 @@ def browser(chromium: str, site: tuple[Path, str], tmp_path_factory: pytest.Temp
     driven.do("goto", url=site[1])
     yield driven
     driven.close()
+
+
+@pytest.fixture(scope="module")
+def node(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
+    running = Node(bundle, tmp_path_factory.mktemp("node"))
+    yield running
+    running.close()
 
 
 def random_labels(generator: np.random.Generator, size: tuple[int, int], regions: int) -> np.ndarray:
@@ -234,7 +255,7 @@ class TestDamage:
         assert f"the checksum of its layer {layers} is another" in answer["message"]
         assert answer["partial"]["layers"] == layers - 1
         for content, message in [
-            (b"kcgs\4" + data[5:], "its version must be 1 to 3 (4: a clip); got 4"),
+            (b"kcgs\4" + data[5:], "its version must be 1, 2 or 3; got 4"),
             (b"GIF89a", 'it must start with "kcgs"; got "GIF8"'),
             (data[:9], "the file ends early"),
             (data + b"\0", f"the file must end after {len(data)} bytes; got {len(data) + 1}"),

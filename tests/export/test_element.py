@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import gzip
 import json
 from collections.abc import Iterator
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +13,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from kcgs import Clip, GaussianField, RegionMap, Scene, load
+from kcgs import GaussianField, RegionMap, Scene, load
 from kcgs.codec import encode
-from kcgs.codec.clips.file import KEY, ClipHeader, Record, pack_end, pack_header, pack_record
 from kcgs.editing import move_region, recolor_region
 from kcgs.page import scene_page
-from kcgs.page.html import page_html
 
 from .browser import WEB, Browser, Handler, array, build, npm, serving
 
@@ -28,14 +24,6 @@ MODELS = WEB.parents[1] / "models"
 PAGE = WEB.parents[1] / "kcgs" / "page"
 MOST_BYTES = 40_000
 LEVELS = 2 / 255
-CLIP = WEB.parents[1] / "tests" / "codec" / "golden4.kcgs"
-CLIP_PIXELS = """(async () => {
-  const image = document.querySelector("kcgs-image");
-  const bitmap = await createImageBitmap(await image.toBlob({ width: 120, height: 80 }));
-  const context = Object.assign(document.createElement("canvas"), { width: 120, height: 80 }).getContext("2d");
-  context.drawImage(bitmap, 0, 0);
-  return { data: Float32Array.from(context.getImageData(0, 0, 120, 80).data), dims: [80, 120, 4] };
-})()"""
 HTML = """<!doctype html><meta charset="utf-8">
 <meta http-equiv="Content-Security-Policy" content="default-src 'none'; connect-src 'self'; img-src blob: 'self';
  script-src 'self' 'wasm-unsafe-eval' 'nonce-test'">
@@ -367,97 +355,14 @@ class TestPage:
         assert browser.do("requests") == [path.as_uri()] and browser.do("problems") == []
 
 
-def open_clip(browser: Browser, folder: Path, data: bytes) -> None:
-    source = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
-    path = folder / "page.html"
-    path.write_text(page_html(source, title="a", clip=True), encoding="utf-8")
-    browser.do("open", url=path.as_uri())
-
-
-def halves(first: int) -> RegionMap:
-    """A left half and a right one, whose ids are `first` and the next."""
-    return RegionMap.from_labels(first + (torch.arange(60) >= 30).long().expand(40, 60), 0.0)
-
-
-class TestClipPage:
-    def test_plays_and_shows_any_frame(self, browser: Browser, node_modules: Path, tmp_path: Path) -> None:
-        clip = Clip.load(CLIP)
-        path = tmp_path / "page.html"
-        path.write_text(scene_page(clip.to_bytes(), title="Moving"), encoding="utf-8")
-        browser.do("look", motion="no-preference", width=1000, height=700)
-        browser.do("open", url=path.as_uri())
-        browser.do("wait", expression="document.querySelector('#note').textContent.includes('5 frames, 24 per second')")
-        # it plays to its end by itself
-        browser.do("wait", expression="document.querySelector('input[type=range]').value === '4'")
-        browser.do("wait", expression="document.querySelector('#bar button').title === 'Play'")
-        for number in (1, 4, 2):
-            slider = "document.querySelector('input[type=range]')"
-            browser.evaluate(f"({slider}.value = '{number}', {slider}.oninput(), 0)")
-            assert browser.do("text", on="#bar output") == f"{number / 24:.2f} s"
-            got = array(browser.evaluate(CLIP_PIXELS))
-            want = clip.render(number, (80, 120)).permute(1, 2, 0).numpy()
-            np.testing.assert_allclose(got[..., :3] / 255, want, atol=LEVELS, rtol=0)
-        browser.do("click", on="#bar button")
-        browser.do("wait", expression="document.querySelector('input[type=range]').value === '4'")
-        assert browser.do("requests") == [path.as_uri()] and browser.do("problems") == []
-
-    def test_a_clip_that_ends_early_says_so(self, browser: Browser, node_modules: Path, tmp_path: Path) -> None:
-        open_clip(browser, tmp_path, CLIP.read_bytes()[:-60])
-        browser.do("wait", expression="document.querySelector('#note').textContent.includes('after 4 whole frames')")
-        assert "ends early" in browser.do("text", on="#note")
-
-    def test_regions_of_a_later_part(self, browser: Browser, node_modules: Path, tmp_path: Path) -> None:
-        scenes = [Scene(GaussianField.random(90, (40, 60), regions=r), r) for r in map(halves, (1, 2))]
-        header = ClipHeader((40, 60), 3, Fraction(24))
-        records = [pack_record(Record(KEY, encode(scene)), number) for number, scene in enumerate(scenes)]
-        browser.do("look", motion="reduce", width=1000, height=700)
-        open_clip(browser, tmp_path, b"".join([pack_header(header), *records, pack_end(2)]))
-        browser.do("wait", expression="document.querySelector('#note').textContent.includes('2 regions')")
-        browser.do("click", on="#bar button:last-of-type")
-
-        def hidden(number: int) -> float:
-            slider = "document.querySelector('input[type=range]')"
-            browser.evaluate(f"({slider}.value = '{number}', {slider}.oninput(), 0)")
-            return float((array(browser.evaluate(CLIP_PIXELS))[..., 3] == 0).mean())
-
-        def tick(region: int) -> None:
-            rows = "[...document.querySelectorAll('#regions label')]"
-            browser.evaluate(
-                f"({rows}.find((row) => row.textContent.startsWith('Region {region} ')).firstChild.click(), 0)"
-            )
-
-        assert browser.do("text", on="#regions").count("Region") == 2 and hidden(1) == 0
-        assert browser.do("text", on="#regions").count("Region") == 3
-        tick(3)  # which the second part alone has
-        assert hidden(1) == pytest.approx(1 / 2, abs=0.02) and hidden(0) == 0
-        tick(3)
-        assert hidden(1) == 0
-        tick(1)  # which the first part alone has
-        assert hidden(1) == 0 and hidden(0) == pytest.approx(1 / 2, abs=0.02)
-        assert hidden(1) == 0
-        tick(1)
-        tick(2)  # both
-        assert hidden(0) == hidden(1) == pytest.approx(1 / 2, abs=0.02)
-        assert browser.do("problems") == []
-
-    def test_damage_is_named(self, browser: Browser, node_modules: Path, tmp_path: Path) -> None:
-        data = bytearray(CLIP.read_bytes())
-        data[-60] ^= 1
-        open_clip(browser, tmp_path, bytes(data))
-        browser.do("wait", expression="document.querySelector('#note').textContent.includes('checksum of frame 4')")
-
-
 class TestSources:
     def test_small_enough(self, site: tuple[Path, str]) -> None:
         assert len(gzip.compress((site[0] / "kcgs-image.js").read_bytes(), 9)) <= MOST_BYTES
 
-    @pytest.mark.parametrize("name", ["page", "clip"])
-    def test_the_page_that_python_has_is_the_one_that_is_built(
-        self, node_modules: Path, tmp_path: Path, name: str
-    ) -> None:
-        build(f"build:{name}", "--", "--outDir", str(tmp_path))
-        fresh, ours = (folder.joinpath(f"{name}.js").read_text() for folder in (tmp_path, PAGE))
-        assert fresh == ours, f"run npm --prefix export/web run build:{name}, and commit kcgs/page/{name}.js"
+    def test_the_page_that_python_has_is_the_one_that_is_built(self, node_modules: Path, tmp_path: Path) -> None:
+        build("build:page", "--", "--outDir", str(tmp_path))
+        fresh, ours = (folder.joinpath("page.js").read_text() for folder in (tmp_path, PAGE))
+        assert fresh == ours, "run npm --prefix export/web run build:page, and commit kcgs/page/page.js"
 
     def test_the_package(self, node_modules: Path, tmp_path: Path) -> None:
         build("build:element")

@@ -7,14 +7,14 @@ import { DecodeError } from "./scene.ts";
 export const MOST_SIDE = 2 ** 20;
 export const MOST_LABELS = 2 ** 26;
 export const MOST_REGIONS = 2 ** 24 - 1;
-export const MOST_CHANNELS = 1024;
+const MOST_CHANNELS = 1024;
 const MOST_GAUSSIANS = 2 ** 21 - 1;
 const MOST_COLORS = 2 ** 27;
 const MOST_BYTES = 2 ** 32;
 // of version 1, and of those in which several layers may be of one energy
 const MOST_LAYERS = [65, 128, 128];
 export const ENERGIES = { least: -24, most: 40 };
-export const PARAMETERS = { least: -512, most: 1023 };
+const PARAMETERS = { least: -512, most: 1023 };
 
 export interface Header {
   readonly version: number;
@@ -37,7 +37,7 @@ export function readHeader(reader: ByteReader): { header: Header; map: Uint8Arra
   if (magic === "kcgm") throw new DecodeError("it is a label map, no scene: decodeLabels reads it");
   if (magic !== "kcgs") throw new DecodeError(`it must start with "kcgs"; got ${text(reader.data.subarray(0, 4))}`);
   const version = reader.number(1);
-  if (version < 1 || version > 3) throw new DecodeError(`its version must be 1 to 3 (4: a clip); got ${version}`);
+  if (version < 1 || version > 3) throw new DecodeError(`its version must be 1, 2 or 3; got ${version}`);
   const height = reader.varint("height", 1, MOST_SIDE);
   const width = reader.varint("width", 1, MOST_SIDE);
   const channels = reader.varint("channels", 1, MOST_CHANNELS);

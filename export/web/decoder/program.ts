@@ -4,11 +4,12 @@ import { unpack } from "./packed_text.ts";
 import program from "./program.wasm?packed";
 import { DecodeError } from "./scene.ts";
 
-/** What streams of Gaussians need; addresses are in its memory. */
-export interface StreamProgram {
+/** `assembly/index.ts`; addresses are in its memory. */
+export interface Program {
   readonly memory: WebAssembly.Memory;
   readonly weights: WebAssembly.Global<"i32">;
   readonly cells: WebAssembly.Global<"i32">;
+  readonly met: WebAssembly.Global<"i32">;
   allot(bytes: number): number;
   open(stream: number, bytes: number): void;
   uniform(n: number): number;
@@ -18,17 +19,12 @@ export interface StreamProgram {
   readCells(table: number, cells: number, most: number): number;
   openEarlier(count: number): number;
   readNear(rows: number, columns: number, least: number, near: number, most: number): number;
-}
-
-/** `assembly/index.ts`. */
-export interface Program extends StreamProgram {
-  readonly met: WebAssembly.Global<"i32">;
   model(tables: number, a: number, b: number, groups: number, squash: number, stretch: number): void;
   readLabels(height: number, width: number, regions: number, template: number, positions: number): number;
 }
 
 // by the numbers of `assembly/memory.ts`
-export const PROBLEMS = [
+const PROBLEMS = [
   "data must be an encoder's stream; got bytes that no encoder wrote",
   "data must mark at most the pixels of the map; got more",
   "data must mark pixels of the map",
@@ -41,10 +37,9 @@ export const PROBLEMS = [
 
 let compiled: WebAssembly.Module | undefined;
 
-/** Compile a packed program. */
-export function compile(packed: string): WebAssembly.Module {
+function compile(): WebAssembly.Module {
   try {
-    return new WebAssembly.Module(unpack(packed));
+    return new WebAssembly.Module(unpack(program));
   } catch (error) {
     throw new DecodeError(
       `the decoder needs WebAssembly with SIMD, which a Content-Security-Policy allows by 'wasm-unsafe-eval'; ${error}`,
@@ -54,7 +49,7 @@ export function compile(packed: string): WebAssembly.Module {
 
 /** Start the program, with memory of its own, which does not shrink. */
 export function startProgram(): Program {
-  compiled ??= compile(program);
+  compiled ??= compile();
   const fail = (problem: number): never => {
     throw new DecodeError(PROBLEMS[problem]!);
   };
@@ -62,7 +57,7 @@ export function startProgram(): Program {
 }
 
 /** Put numbers into the program's memory; return where. */
-export function put({ memory, allot }: StreamProgram, array: Uint8Array | Int8Array | Int32Array): number {
+export function put({ memory, allot }: Program, array: Uint8Array | Int8Array | Int32Array): number {
   const at = allot(array.byteLength);
   new Uint8Array(memory.buffer, at).set(new Uint8Array(array.buffer, array.byteOffset, array.byteLength));
   return at;

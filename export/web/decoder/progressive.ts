@@ -5,8 +5,6 @@ import { crc16 } from "./checksums.ts";
 import { LayerDecoder } from "./gaussians/layers.ts";
 import { Growing } from "./growing.ts";
 import { type Header, mostGaussians, readHeader } from "./header.ts";
-import { type Program, startProgram } from "./program.ts";
-import { RangeDecoder } from "./range_decoder.ts";
 import { pixelRegions, type ReadMap, readRegionMap } from "./region_map.ts";
 import { DecodeError, type Scene } from "./scene.ts";
 
@@ -23,7 +21,6 @@ interface Opened {
   readonly header: Header;
   readonly regions: ReadMap | null;
   readonly layers: LayerDecoder;
-  readonly program: Program;
 }
 
 export class ProgressiveDecoder {
@@ -71,7 +68,7 @@ export class ProgressiveDecoder {
   /** Read as far as the bytes go. */
   private readOn(): void {
     const data = this.bytes.all();
-    const { header, layers, program } = (this.opened ??= this.open(data));
+    const { header, layers } = (this.opened ??= this.open(data));
     while (this.layers < header.layers.length) {
       const { energy, bytes } = header.layers[this.layers]!;
       const reader = new ByteReader(data.subarray(this.position), EndOfBytes);
@@ -82,7 +79,7 @@ export class ProgressiveDecoder {
       }
       // each Gaussian takes more than a bit, and all must fit into memory
       const most = Math.min(8 * bytes + SPARE, mostGaussians(header.channels) - this.count);
-      for (const group of layers.read(new RangeDecoder(layer, program), energy, most)) {
+      for (const group of layers.read(layer, energy, most)) {
         this.means.add(group.means);
         this.cholesky.add(group.cholesky);
         this.colors.add(group.colors);
@@ -102,7 +99,7 @@ export class ProgressiveDecoder {
     this.position = reader.position;
     const regions = header.regions > 1 ? readRegionMap(map, header) : null;
     const pixels = regions && pixelRegions(regions.map, header.height, header.width);
-    return { header, regions, layers: new LayerDecoder(header, pixels), program: startProgram() };
+    return { header, regions, layers: new LayerDecoder(header, pixels) };
   }
 
   private makeScene(): ExactScene {

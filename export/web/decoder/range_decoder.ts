@@ -1,6 +1,6 @@
 /** The range coder and its symbols with fixed chances (docs/format.md). */
 
-import { put, startProgram, type StreamProgram } from "./program.ts";
+import { type Program, put, startProgram } from "./program.ts";
 
 const ALPHABET = 2 ** 16;
 
@@ -10,7 +10,7 @@ export class RangeDecoder {
 
   constructor(
     data: Uint8Array,
-    readonly program: StreamProgram = startProgram(),
+    readonly program: Program = startProgram(),
   ) {
     program.open(put(program, data), data.length);
   }

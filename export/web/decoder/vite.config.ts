@@ -6,7 +6,7 @@ import { packed } from "./packed.ts";
 
 const path = (name: string): string => fileURLToPath(new URL(name, import.meta.url));
 
-// The decoder alone: decoder.js for scenes, labels.js for label maps, clips.js for clips, and what they share.
+// The decoder alone: decoder.js for scenes, labels.js for label maps, and what both need.
 export default defineConfig({
   root: path("."),
   publicDir: false,
@@ -17,7 +17,7 @@ export default defineConfig({
     emptyOutDir: true,
     modulePreload: false,
     rolldownOptions: {
-      input: { decoder: path("index.ts"), labels: path("labels.ts"), clips: path("clips/index.ts") },
+      input: { decoder: path("index.ts"), labels: path("labels.ts") },
       preserveEntrySignatures: "strict",
       output: { entryFileNames: "[name].js", chunkFileNames: "shared.js" },
     },

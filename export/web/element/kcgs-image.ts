@@ -96,7 +96,7 @@ export class KcgsImage extends HTMLElement {
     this.loading?.abort();
     this.loading = null;
     this.forget();
-    if (scene !== null) this.show(scene);
+    if (scene !== null) this.take(scene);
   }
 
   /** What rendered last: "webgl2 float32", "webgl2 float16", "cpu", or "" before anything did. */
@@ -112,19 +112,6 @@ export class KcgsImage extends HTMLElement {
   /** The point of the scene in the middle of the canvas, and canvas pixels to a pixel of the scene. */
   get view(): Transform {
     return { ...this.stage.transform };
-  }
-
-  /** Show a scene in place of the one before, as a frame follows another: view, edits and hidden regions stay. */
-  show(scene: Scene): void {
-    const edited = this.edits.reduce((before, edit) => edit(before), scene);
-    this.stage.show(edited, this.placesOf(edited, this.hiddenIds));
-    this.loaded = scene;
-    this.current = edited;
-    this.sizes.replaceSync(sizeStyle(scene.width, scene.height));
-    this.stage.canvas.hidden = false;
-    this.fallback.hidden = true;
-    this.describe();
-    this.dispatchEvent(new Event("progress"));
   }
 
   /** Hide regions, or show them again: what they covered is transparent. */
@@ -150,7 +137,7 @@ export class KcgsImage extends HTMLElement {
   reset(): void {
     this.edits = [];
     this.hiddenIds.clear();
-    if (this.loaded !== null) this.show(this.loaded);
+    if (this.loaded !== null) this.take(this.loaded);
   }
 
   /** Zoom about the middle; 0 shows all. */
@@ -208,7 +195,7 @@ export class KcgsImage extends HTMLElement {
       this.loading = null;
       tell();
     };
-    load(src, loading.signal, (scene) => this.show(scene)).then(
+    load(src, loading.signal, (scene) => this.take(scene)).then(
       () => end(() => this.dispatchEvent(new Event("load"))),
       (error: unknown) => end(() => this.fail(error as Error, this.current !== null)),
     );
@@ -221,6 +208,19 @@ export class KcgsImage extends HTMLElement {
     this.stage.show(null, this.hiddenIds);
     this.stage.canvas.hidden = true;
     this.fallback.hidden = false;
+  }
+
+  /** Take a scene, or one of more layers, and edit it as the one before. */
+  private take(scene: Scene): void {
+    const edited = this.edits.reduce((before, edit) => edit(before), scene);
+    this.stage.show(edited, this.placesOf(edited, this.hiddenIds));
+    this.loaded = scene;
+    this.current = edited;
+    this.sizes.replaceSync(sizeStyle(scene.width, scene.height));
+    this.stage.canvas.hidden = false;
+    this.fallback.hidden = true;
+    this.describe();
+    this.dispatchEvent(new Event("progress"));
   }
 
   private edit(edit: Edit): void {

@@ -14,8 +14,7 @@ export async function load(src: string, signal: AbortSignal, found: (scene: Scen
   decoder.finish();
 }
 
-/** The bytes of an address as they arrive. */
-export async function* chunks(src: string, signal: AbortSignal): AsyncGenerator<Uint8Array> {
+async function* chunks(src: string, signal: AbortSignal): AsyncGenerator<Uint8Array> {
   const url = new URL(src, document.baseURI);
   // not fetched, so that a page may forbid all connections
   if (url.protocol === "data:") return yield dataBytes(url.href);

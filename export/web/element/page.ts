@@ -1,17 +1,28 @@
 /** The page that `kcgs export` and `kcgs view` write: the element in a window of its own, with buttons around it. */
 
 import { origin } from "../src/view.ts";
-import { button, make } from "./controls.ts";
 import { KcgsImage } from "./index.ts";
 
-export const image = document.querySelector("kcgs-image") as KcgsImage;
-export const bar = document.querySelector<HTMLElement>("#bar")!;
+const image = document.querySelector("kcgs-image") as KcgsImage;
+const bar = document.querySelector<HTMLElement>("#bar")!;
 const list = document.querySelector<HTMLElement>("#regions")!;
 const note = document.querySelector<HTMLElement>("#note")!;
 const zoom = document.createElement("output");
-const boxes = new Map<number, HTMLInputElement>(); // of the regions that are listed
-const unticked = new Set<number>();
-let listed: Float64Array | undefined; // the ids of the regions that were shown last
+
+/** Make an element with properties and children. */
+function make<K extends keyof HTMLElementTagNameMap>(
+  tag: K,
+  properties: Partial<HTMLElementTagNameMap[K]>,
+  ...children: (Node | string)[]
+): HTMLElementTagNameMap[K] {
+  const made = Object.assign(document.createElement(tag), properties);
+  made.append(...children);
+  return made;
+}
+
+function button(text: string, title: string, press: () => void): HTMLButtonElement {
+  return make("button", { type: "button", title, ariaLabel: title, onclick: press }, text);
+}
 
 // within another page the wheel scrolls that one
 if (window.top !== window) image.setAttribute("zoom", "ctrl");
@@ -29,17 +40,12 @@ image.addEventListener("error", ({ message }) => {
   note.textContent = `The scene could not be shown${image.scene === null ? "" : " in full"}: ${message}`;
 });
 image.addEventListener("load", () => {
-  describe(`${image.scene!.count} Gaussians`);
-  compare(image.dataset["original"]);
-});
-
-/** Say what is shown, and list its regions. */
-export function describe(content: string): void {
   const { scene, regionIds } = image;
   const regions = regionIds.length > 1 ? `, ${regionIds.length} regions` : "";
-  note.textContent = `${scene!.width} × ${scene!.height}, ${content}${regions}`;
-  listRegions();
-}
+  note.textContent = `${scene!.width} × ${scene!.height}, ${scene!.count} Gaussians${regions}`;
+  if (regionIds.length > 1) listRegions(shares());
+  compare(image.dataset["original"]);
+});
 
 /** The share of the image that each region has. */
 function shares(): Map<number, number> {
@@ -49,36 +55,13 @@ function shares(): Map<number, number> {
   return new Map(Array.from(ids, (id, place) => [id, counts[place]! / labels.length]));
 }
 
-/** List regions that are not listed yet, and hide those that are not ticked: each part of a clip has its own. */
-export function listRegions(): void {
-  const ids = image.scene?.regions?.ids;
-  if (ids === listed) return;
-  listed = ids;
-  const first = boxes.size === 0;
-  const fresh = ids && ids.length > 1 ? [...new Set(ids)].filter((id) => !boxes.has(id)) : [];
-  if (fresh.length > 0) {
-    if (first) addToggle();
-    const areas = shares();
-    for (const id of fresh.sort((a, b) => areas.get(b)! - areas.get(a)!)) addBox(id, areas.get(id)!);
+function listRegions(areas: Map<number, number>): void {
+  const boxes = new Map<number, HTMLInputElement>();
+  for (const [id, area] of [...areas].sort((a, b) => b[1] - a[1])) {
+    const box = make("input", { type: "checkbox", checked: true, onchange: () => image.hide(id, !box.checked) });
+    boxes.set(id, box);
+    list.append(make("label", {}, box, `Region ${id} `, make("small", {}, `${(100 * area).toFixed(1)} %`)));
   }
-  if (first) return;
-  image.hide(image.regionIds, false);
-  image.hide(image.regionIds.filter((id) => unticked.has(id)));
-}
-
-function addBox(id: number, area: number): void {
-  const onchange = (): void => {
-    if (box.checked) unticked.delete(id);
-    else unticked.add(id);
-    // the part of a clip that is shown need not have it
-    if (image.regionIds.includes(id)) image.hide(id, !box.checked);
-  };
-  const box = make("input", { type: "checkbox", checked: true, onchange });
-  boxes.set(id, box);
-  list.append(make("label", {}, box, `Region ${id} `, make("small", {}, `${(100 * area).toFixed(1)} %`)));
-}
-
-function addToggle(): void {
   const toggle = button("Regions", "List the regions, to hide some", () => {
     list.hidden = !list.hidden;
     toggle.ariaExpanded = String(!list.hidden);

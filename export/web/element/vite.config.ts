@@ -14,23 +14,21 @@ const shaders: Plugin = {
     id.endsWith("/renderer/shaders.ts") ? code.replace(/^ +| *\/\/ .*$| (?=[)}])| ?([=<>*(,;?&|{]) ?/gm, "$1") : null,
 };
 
-// The element with renderer and decoder: a module of a package, or, with `--mode page` and `--mode clip`, the scripts of
-// the pages of a scene and of a clip that `kcgs export` and `kcgs view` write, which the Python package holds.
-const PAGES = ["page", "clip"];
-
+// The element with renderer and decoder: a module of a package, or, with `--mode page`, the script of the page that
+// `kcgs export` and `kcgs view` write, which the Python package holds.
 export default defineConfig(({ mode }) => ({
   root: path("."),
   publicDir: false,
   plugins: [packed(), shaders],
   build: {
     target: "es2022",
-    outDir: PAGES.includes(mode) ? path("../../../kcgs/page") : path("dist"),
-    emptyOutDir: !PAGES.includes(mode),
+    outDir: mode === "page" ? path("../../../kcgs/page") : path("dist"),
+    emptyOutDir: mode !== "page",
     modulePreload: false,
     rolldownOptions: {
-      input: path(PAGES.includes(mode) ? `${mode}.ts` : "index.ts"),
-      ...(!PAGES.includes(mode) && { preserveEntrySignatures: "strict" as const }),
-      output: { entryFileNames: PAGES.includes(mode) ? `${mode}.js` : "kcgs-image.js" },
+      input: mode === "page" ? path("page.ts") : path("index.ts"),
+      ...(mode !== "page" && { preserveEntrySignatures: "strict" as const }),
+      output: { entryFileNames: mode === "page" ? "page.js" : "kcgs-image.js" },
     },
   },
 }));

@@ -10,17 +10,15 @@ import { join } from "node:path";
 import { createInterface } from "node:readline";
 import { pathToFileURL } from "node:url";
 
-import { attempt, describeClip, describeLabels, describeScene, stream } from "./describe.mjs";
+import { attempt, describeLabels, describeScene, stream } from "./describe.mjs";
 
 const load = (name) => import(pathToFileURL(join(process.argv[2], name)).href);
 const { decode, ProgressiveDecoder } = await load("decoder.js");
 const { decodeLabels } = await load("labels.js");
-const { openClip } = await load("clips.js");
 
 const actions = {
   scene: async (bytes) => describeScene(decode(bytes)),
   labels: async (bytes) => describeLabels(decodeLabels(bytes)),
-  clip: async (bytes, { numbers }) => describeClip(openClip(bytes), numbers),
   stream: async (bytes, { step }) => stream(new ProgressiveDecoder(), bytes, step),
 };
 

@@ -31,7 +31,7 @@ test("varints have the lowest bits first, and limits", () => {
 test("another version is refused", () => {
   assert.throws(() => readHeader(new ByteReader(ascii("kcgs\x04..."))), {
     name: "DecodeError",
-    message: "its version must be 1 to 3 (4: a clip); got 4",
+    message: "its version must be 1, 2 or 3; got 4",
   });
   assert.throws(() => readHeader(new ByteReader(ascii("kcgm"))), DecodeError);
 });

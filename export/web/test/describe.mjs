@@ -31,23 +31,6 @@ export async function describeLabels({ height, width, type, labels }) {
   return { height, width, type, labels: await digest(labels) };
 }
 
-/** A clip and all its frames, or those of some numbers; regions of a frame as ids, since not all need have pixels. */
-export async function describeClip(clip, numbers = [...Array(clip.frames).keys()]) {
-  const { size, channels, frameRate, frames, keyFrames, complete } = clip;
-  const described = [];
-  for (const number of numbers) {
-    const { keys, ...frame } = clip.frame(number);
-    const scene = await describeScene(frame);
-    if (frame.regions) {
-      const { labels, ids, pairs } = frame.regions;
-      scene.regions.pairs = pairs.map(({ a, b, width }) => [ids[a], ids[b], width]);
-      scene.regions.labels = await digest(Float64Array.from(labels, (label) => ids[label]));
-    }
-    described.push({ ...scene, keys: await digest(keys) });
-  }
-  return { size, channels, frameRate, frames, keyFrames, complete, described };
-}
-
 /** What a call gives, or the error that it throws. */
 export async function attempt(call) {
   try {

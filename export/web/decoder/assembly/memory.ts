@@ -7,7 +7,6 @@ export const MANY_ESCAPES = 4;
 export const NO_REGION = 5;
 export const MANY_GAUSSIANS = 6;
 export const NO_MEMORY = 7;
-export const LISTED = 8;
 
 /** Ends with an error: the caller throws it. */
 // @ts-ignore: decorator

@@ -7,7 +7,8 @@ import { AdaptiveSymbol } from "../models/adaptive_symbol.ts";
 import { type Cells, Occupancy } from "../models/occupancy.ts";
 import { exp2 } from "../exact.ts";
 import { ENERGIES, type Header } from "../header.ts";
-import type { RangeDecoder } from "../range_decoder.ts";
+import { startProgram } from "../program.ts";
+import { RangeDecoder } from "../range_decoder.ts";
 import { DecodeError } from "../scene.ts";
 import { angles, LEAST_SIZE, MOST_SIZE, OCTAVES, places, Quantizer, restoreColor, restoreShape, type Steps } from "./quantizer.ts";
 import { ALIKE, ANGLES, APART, COUNTS, STRAYS } from "./weights.ts";
@@ -41,6 +42,7 @@ export class LayerDecoder {
   private readonly angle = new AdaptiveAngle(ANGLES);
   private readonly plain: boolean; // versions 1 and 2
   private readonly strays = new AdaptiveSymbol(STRAYS);
+  private readonly program = startProgram();
 
   constructor(
     private readonly header: Header,
@@ -56,7 +58,8 @@ export class LayerDecoder {
   }
 
   /** Read a layer, whose highest energy is given, of at most so many Gaussians. */
-  read(decoder: RangeDecoder, energy: number, most: number): Group[] {
+  read(bytes: Uint8Array, energy: number, most: number): Group[] {
+    const decoder = new RangeDecoder(bytes, this.program);
     const groups: Group[] = [];
     let left = most;
     for (let follows = HOLDS; follows !== END; energy--) {

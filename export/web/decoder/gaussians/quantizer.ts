@@ -97,7 +97,7 @@ export function restoreColor(
   codes: Int32Array,
   channels: number,
   step: number,
-  into: Float32Array | Float64Array,
+  into: Float32Array,
   at: number,
 ): void {
   if (channels !== 3) {

@@ -1,6 +1,7 @@
 /** The pixels of a label map (docs/format.md, "The wavefront"). */
 
-import { type Program, put } from "../program.ts";
+import { put } from "../program.ts";
+import type { RangeDecoder } from "../range_decoder.ts";
 import { GROUPS, TEMPLATE } from "./template.ts";
 
 const CLIP = 3071; // largest logit, in 1/256
@@ -21,7 +22,7 @@ let functions: { squash: Int32Array; stretch: Int32Array } | undefined;
 
 /** Read a map; `positions` are those of the regions in the order in which the wavefront meets them. */
 export function readPixels(
-  program: Program,
+  { program }: RangeDecoder,
   height: number,
   width: number,
   positions: Int32Array,
@@ -36,7 +37,7 @@ export function readPixels(
 }
 
 /** squash(x) for x from -CLIP to CLIP, and stretch(q) for q from 0 to 4095. */
-export function logistic(): { squash: Int32Array; stretch: Int32Array } {
+function logistic(): { squash: Int32Array; stretch: Int32Array } {
   const squash = new Int32Array(2 * CLIP + 1);
   for (let i = 0; i < squash.length; i++) squash[i] = Math.round(65536 / (1 + Math.exp((CLIP - i) / 256)));
   const stretch = new Int32Array(4096);

@@ -1,6 +1,5 @@
 /** The stream of a label map whose size is known (docs/format.md, "Labels"). */
 
-import { startProgram } from "../program.ts";
 import { RangeDecoder } from "../range_decoder.ts";
 import { type Ids, readIds } from "./ids.ts";
 import { type LabelModel, type Pixels, readPixels } from "./pixels.ts";
@@ -18,9 +17,8 @@ export function readLabels(
   mostRegions: number,
   read: (decoder: RangeDecoder, mostRegions: number) => Ids = readIds,
 ): Labels {
-  const program = startProgram();
-  const decoder = new RangeDecoder(stream, program);
+  const decoder = new RangeDecoder(stream);
   const { ids, positions } = read(decoder, Math.min(mostRegions, height * width));
   if (ids.length === 1) return { ids, labels: new Int32Array(height * width), met: 1 };
-  return { ids, ...readPixels(program, height, width, positions, model()) };
+  return { ids, ...readPixels(decoder, height, width, positions, model()) };
 }

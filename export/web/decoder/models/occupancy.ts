@@ -1,7 +1,7 @@
 /** The number of Gaussians in each cell of a grid over the image (docs/format.md, "Occupancy"). */
 
 import { BEYOND, MARGINS } from "../gaussians/weights.ts";
-import type { StreamProgram } from "../program.ts";
+import type { Program } from "../program.ts";
 import type { RangeDecoder } from "../range_decoder.ts";
 import { DecodeError } from "../scene.ts";
 import { AdaptiveNumber } from "./adaptive_number.ts";
@@ -170,5 +170,5 @@ function readCells(decoder: RangeDecoder, rate: number, cells: number, most: num
 }
 
 /** The cells that the program has found, in no order. */
-const listed = ({ memory, cells }: StreamProgram, count: number): Uint32Array =>
+const listed = ({ memory, cells }: Program, count: number): Uint32Array =>
   new Uint32Array(memory.buffer, cells.value, count).slice();
