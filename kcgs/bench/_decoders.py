@@ -76,7 +76,7 @@ class Subject(NamedTuple):
         """What a reader must know of it."""
         (height, width), regions = self.scene.size, self.scene.regions
         count = 1 if regions is None else regions.num_regions
-        numbers = f"{height} x {width}, N = {len(self.scene):,}, regions: {count}, contours: {self.contours}"
+        numbers = f"{height} x {width}, N = {self.scene.num_gaussians:,}, regions: {count}, contours: {self.contours}"
         return f"{self.source}; {numbers}"
 
 
@@ -212,7 +212,7 @@ def _session(path: Path, feeds: dict[str, Any], threads: int) -> Render:
 
 def _generic_feeds(scene: Scene) -> dict[str, Any]:
     field = scene.field
-    labels, region_ids = torch.zeros(field.size, dtype=torch.int64), torch.zeros(len(field), dtype=torch.int64)
+    labels, region_ids = torch.zeros(field.size, dtype=torch.int64), torch.zeros(field.num_gaussians, dtype=torch.int64)
     if scene.regions is not None and field.region_ids is not None:
         labels, region_ids = scene.regions.labels, field.region_ids
     tensors = {"means": field.means, "cholesky": field.cholesky, "colors": field.colors}

@@ -290,7 +290,7 @@ def codec_digest(but: tuple[str, ...] = ()) -> str:
 
 def _with_counts(point: Point, scene: Scene) -> Point:
     regions = 1 if scene.regions is None else scene.regions.num_regions
-    return point._replace(num_gaussians=len(scene), regions=regions)
+    return point._replace(num_gaussians=scene.num_gaussians, regions=regions)
 
 
 @lru_cache(maxsize=2)

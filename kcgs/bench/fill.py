@@ -128,6 +128,6 @@ def compare(
         there, slope = values[:, uncovered], slopes[uncovered] / slopes[around].quantile(0.999)
         changed = int(((shown[name] - shown["before"]).abs().amax(0)[outside] > 0.05).sum())
         figures: list[Any] = [len(slope), float(there.min()), float(there.max()), int((slope > 1).sum())]
-        figures += [float(slope.max()), changed, spent, len(edited) - len(alone)]
+        figures += [float(slope.max()), changed, spent, edited.num_gaussians - alone.num_gaussians]
         results.append(Result(image, called, name, *figures))
     return results, {name: whole[:, rows][..., cols] for name, whole in shown.items()}

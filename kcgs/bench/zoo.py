@@ -85,7 +85,7 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
     edge = figures["ef_psnr"]
     entry = Entry(
         name=name, title=plan.title, scene=f"{name}/scene.safetensors", sha256=_hash(folder / "scene.safetensors"),
-        bytes=size, recipe=recipe, num_gaussians=len(scene),
+        bytes=size, recipe=recipe, num_gaussians=scene.num_gaussians,
         num_regions=1 if scene.regions is None else scene.regions.num_regions, psnr=round(figures["psnr"], 3),
         ef_psnr=round(edge, 3) if edge == edge else None, licence=plan.licence,
         command=f"kcgs bench zoo -o models --only {name}", decoder=f"{name}/decoder.onnx" if has_decoder else None,

@@ -2,6 +2,5 @@
 
 from .budget import FitBytesResult, fit_bytes
 from .compress import Compressed, compress, quality_for
-from .video import fit_video
 
-__all__ = ["Compressed", "FitBytesResult", "compress", "fit_bytes", "fit_video", "quality_for"]
+__all__ = ["Compressed", "FitBytesResult", "compress", "fit_bytes", "quality_for"]

@@ -16,7 +16,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs.codec.clips.differences import CURVATURE
 from kcgs.codec.exact import Integers
 from kcgs.codec.gaussians.quantize import Classes, Codes, Parameters, Quantizer
 from kcgs.fitting.frame import local_gradient, move
@@ -38,6 +37,8 @@ _STEP, _MOMENTUM = 0.09, 0.9
 _LARGEST, _NEWTON = 0.2, 0.3
 # energies below it have next to no curvature: steps are as if they had this
 _FAINT = 1e-2
+# half the second derivatives of the squared error by a step in a Gaussian's frame, in units of its energy
+_CURVATURE = (0.5, 0.5, 0.75, 0.25, 0.75)
 # pixels: a sum over pixel centres of something narrower is as if it had this standard deviation, where it hits one
 _NARROW = 0.56
 _DRAFT_CUTOFF = 1e-3
@@ -182,7 +183,7 @@ class Tuning:
         narrow = cholesky[:, ::2].clamp_min(_NARROW)
         area = (math.pi * narrow.prod(-1)).clamp_max(size[0] * size[1]) * self._weights(means, cholesky)
         energy = (colors.square().sum(-1) * area).clamp_min(_FAINT)
-        curvature = torch.tensor(CURVATURE).to(energy) * energy[:, None]
+        curvature = torch.tensor(_CURVATURE).to(energy) * energy[:, None]
         shape = (local_gradient(cholesky, *gradients[:2]) / curvature).clamp(-_NEWTON, _NEWTON)
         return -torch.cat([shape, gradients[2] / area[:, None]], -1)
 

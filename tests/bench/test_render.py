@@ -90,7 +90,7 @@ def test_fitted_scenes_and_sizes() -> None:
     soft, hard = (standard(f"{FITTED[1]} {contours}") for contours in ("soft", "hard"))
     assert soft.regions is not None and hard.regions is not None
     assert soft.regions.softness != 0 and hard.regions.softness == 0
-    assert torch.equal(soft.regions.labels, hard.regions.labels) and len(soft) == len(hard) == 1_500
+    assert torch.equal(soft.regions.labels, hard.regions.labels) and soft.num_gaussians == hard.num_gaussians == 1_500
     assert [target_size(soft, size) for size in SIZES] == [(400, 600), (800, 1200), (2560, 3840)]
     (image, _), large = forward("cpu", resized(soft, (600, 900)), 1e-4), soft.render((600, 900))
     assert (image.clamp(0, 1) - large).abs().max() < 1e-6

@@ -179,7 +179,7 @@ def _measure(case: Case, result: FitResult, image: Tensor, labels: Tensor | None
     fields |= {f"decoded_{name}": decoded[name] for name in _FIGURES}
     return Row(
         image=case.image, n=case.n, method=case.method.name, seed=case.seed, iterations=result.config.usual_iterations,
-        **fields, seconds=math.nan, core_seconds=math.nan, num_gaussians=len(scene), pixels=image[0].numel(),
+        **fields, seconds=math.nan, core_seconds=math.nan, num_gaussians=scene.num_gaussians, pixels=image[0].numel(),
         bytes=len(data),
         map_bytes=len(encode_map(scene.regions)) if scene.regions is not None and scene.regions.num_regions > 1 else 0,
     )  # fmt: skip

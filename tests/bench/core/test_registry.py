@@ -12,10 +12,7 @@ import kcgs.bench
 from kcgs.bench.core.options import Options
 
 REPORTS = Path(kcgs.__file__).resolve().parent.parent / "notebooks/reports"
-NAMES = (
-    "ablation", "charts", "convergence", "davis", "decode", "enlarge", "fill", "labels", "maps", "rate", "render",
-    "video",
-)  # fmt: skip
+NAMES = ("ablation", "charts", "convergence", "davis", "decode", "enlarge", "fill", "labels", "maps", "rate", "render")
 
 
 def test_names() -> None:

@@ -39,7 +39,7 @@ class TestStore:
         assert made is not None and made.row.bytes > 0 and made.row.decoded_psnr > made.row.psnr - 1
         assert made.history[-1].iteration == made.row.iterations and made.given_regions == 2
         scene = store.scene(cases[0])
-        assert len(scene) == made.row.num_gaussians
+        assert scene.num_gaussians == made.row.num_gaussians
         # as long as the last one took is more than is left
         store._learn(cases[1], 100.0)
         assert store.obtain(cases, HERE, time.monotonic() + 60) == [] and len(store.rows(cases)) == 1
