@@ -23,6 +23,7 @@ PACKAGES = (
     "kcgs.nn",
     "kcgs.editing",
     "kcgs.fitting",
+    "kcgs.video",
     "kcgs.rate",
     "kcgs.codec",
     "kcgs.segment",

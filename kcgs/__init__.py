@@ -4,33 +4,29 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from . import codec, data, editing, fitting, functional, nn, onnx, rate, segment  # noqa: F401
-    from .clip import Clip
+    from . import codec, data, editing, fitting, functional, nn, onnx, rate, segment, video  # noqa: F401
     from .evaluation import evaluate
     from .fitting import FitConfig, FitResult, fit
     from .functional import RegionMap
     from .nn import GaussianField, RegionSplatRenderer
-    from .rate.video import fit_video
     from .scene import Scene, load, save
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "Clip", "FitConfig", "FitResult", "GaussianField", "RegionMap", "RegionSplatRenderer", "Scene", "__version__",
-    "evaluate", "fit", "fit_video", "load", "save",
+    "FitConfig", "FitResult", "GaussianField", "RegionMap", "RegionSplatRenderer", "Scene", "__version__",
+    "evaluate", "fit", "load", "save",
 ]  # fmt: skip
 
 # Public names by module, which is imported when a name is used: the command's help loads no torch.
 _MODULES = {
-    "clip": ("Clip",),
     "evaluation": ("evaluate",),
     "fitting": ("FitConfig", "FitResult", "fit"),
     "functional": ("RegionMap",),
     "nn": ("GaussianField", "RegionSplatRenderer"),
-    "rate.video": ("fit_video",),
     "scene": ("Scene", "load", "save"),
 }
-_PACKAGES = ("codec", "data", "editing", "fitting", "functional", "nn", "onnx", "rate", "segment")
+_PACKAGES = ("codec", "data", "editing", "fitting", "functional", "nn", "onnx", "rate", "segment", "video")
 
 
 if not TYPE_CHECKING:  # a type checker would take any name

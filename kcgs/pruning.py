@@ -55,14 +55,14 @@ def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backen
         held = scene.regions.index_of(scene.field.region_ids) >= 0
         strangers = int((~held).sum())
         scene = _part(scene, held) if strangers else scene
-    if len(scene) == 0:
+    if scene.num_gaussians == 0:
         return PruneResult(_part(scene, torch.zeros(0, dtype=torch.bool)), strangers, 0.0)
 
     with torch.inference_mode(False), torch.enable_grad():
         order = _painted(scene, render).argsort(stable=True)
     magnitudes = _recolored(scene, scene.field.merged_colors().detach().abs())
     with torch.no_grad():
-        low, high = 0, len(scene)  # the first `low` may go, the first `high + 1` may not
+        low, high = 0, scene.num_gaussians  # the first `low` may go, the first `high + 1` may not
         while low < high:
             middle = (low + high + 1) // 2
             fits = float(render(_part(magnitudes, order[:middle])).max()) <= tolerance

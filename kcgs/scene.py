@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -73,9 +73,10 @@ class Scene(nn.Module):
         """(height, width) in pixels of the image that the Gaussians refer to."""
         return self.field.size
 
-    def __len__(self) -> int:
+    @property
+    def num_gaussians(self) -> int:
         """Number of Gaussians per image."""
-        return len(self.field)
+        return self.field.num_gaussians
 
     def forward(self, size: tuple[int, int] | None = None, contours: str = "scaled") -> Tensor:
         """Render, differentiably and not clipped; other settings: :class:`kcgs.RegionSplatRenderer`.
@@ -113,21 +114,37 @@ class Scene(nn.Module):
             asked = self.size if size is None else check_size(name, size)
             check_memory(name, rendered_size(self.size, asked), per_pixel)
 
-    def unbind(self) -> tuple[Scene, ...]:
-        """Take a batch apart: a scene for each image, without the graph; a scene of one image gives itself.
+    def __len__(self) -> int:
+        """Number of images of a batch; TypeError for a scene of one image."""
+        if self.field.means.ndim == 2:
+            raise TypeError("a scene of one image has no len; num_gaussians is the number of its Gaussians")
+        return len(self.field.means)
+
+    def __bool__(self) -> bool:
+        return True
+
+    def __getitem__(self, index: int | slice) -> Scene:
+        """Copy one image of a batch, or a slice of it, without the graph.
+
+        Raises:
+            TypeError: a scene of one image, or an index that is neither an integer nor a slice.
+            IndexError: there is no such image.
 
         Example:
             >>> means, cholesky, colors = torch.rand(4, 9, 2), torch.ones(4, 9, 3), torch.rand(4, 9, 3)
             >>> batch = Scene(GaussianField(means, cholesky, colors, size=(8, 8)))
-            >>> len(batch.unbind()), batch.unbind()[2]().shape
-            (4, torch.Size([3, 8, 8]))
+            >>> len(batch), batch[2]().shape, [scene.num_gaussians for scene in batch[:2]]
+            (4, torch.Size([3, 8, 8]), [9, 9])
         """
-        if self.field.means.ndim == 2:
-            return (self,)
-        fields = self.field.unbind()
-        maps: tuple[RegionMap | None, ...] = (None,) if self.regions is None else self.regions.unbind()
-        maps = maps * len(fields) if len(maps) == 1 else maps
-        return tuple(Scene(field, one, self.metadata) for field, one in zip(fields, maps, strict=True))
+        rows = range(len(self))[index]
+        regions = self.regions
+        if regions is not None and regions.num_maps is not None:
+            shared = regions.num_maps == 1
+            regions = regions.image(0 if shared else index) if isinstance(rows, int) or not shared else regions
+        return Scene(self.field.image(index), regions, self.metadata)
+
+    def __iter__(self) -> Iterator[Scene]:
+        return (self[k] for k in range(len(self)))
 
     def save(self, path: str | os.PathLike[str]) -> int:
         """Write the scene, as :func:`kcgs.save` does; return the bytes of the file."""
@@ -283,7 +300,7 @@ def check_unbatched(scene: object) -> Scene:
         raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
     if scene.field.means.ndim != 2:
         count = len(scene.field.means)
-        raise ValueError(f"scene must be of one image; got a batch of {count}, which scene.unbind() takes apart")
+        raise ValueError(f"scene must be of one image; got a batch of {count}: scene[t] is one of them")
     return scene
 
 

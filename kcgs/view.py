@@ -14,8 +14,6 @@ from typing import Any, ClassVar
 from urllib.parse import quote, urlencode
 
 from kcgs._shipped import shipped_folder
-from kcgs.clip import Clip
-from kcgs.codec.clips.file import is_clip
 from kcgs.page.html import page_html, web_bytes
 from kcgs.scene import Scene
 
@@ -71,7 +69,7 @@ class _Server(ThreadingHTTPServer):
 
 
 def serve(
-    scene: Scene | Clip | bytes,
+    scene: Scene | bytes,
     *,
     name: str = "scene",
     original: Path | None = None,
@@ -80,7 +78,7 @@ def serve(
     browser: bool = True,
     say: Callable[[str], object] = print,
 ) -> None:
-    """Serve the page of a scene or a clip, or of the bytes of a `.kcgs` file of either, on loopback until Ctrl-C.
+    """Serve the page of a scene, or of the bytes of a `.kcgs` file, on loopback until Ctrl-C.
 
     `name` is the scene's title on the page, `original` an image file to compare with, `contours` scaled or crisp; port
     0 is any that is free; `browser` opens a window, `say` takes the line that says where the page is.
@@ -88,8 +86,8 @@ def serve(
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
         beside = None if original is None else f"scene/{_copy_original(original, folder)}"
-        (folder / "scene.kcgs").write_bytes(data := web_bytes(scene))
-        page = page_html("scene/scene.kcgs", title=name, contours=contours, original=beside, clip=is_clip(data))
+        (folder / "scene.kcgs").write_bytes(web_bytes(scene))
+        page = page_html("scene/scene.kcgs", title=name, contours=contours, original=beside)
         (folder / "index.html").write_text(page, encoding="utf-8")
         _serve(folder, folder, "", port=port, browser=browser, say=say)
 

@@ -39,7 +39,7 @@ class TestPrune(
     def test_cardinality(self, device: torch.device, count: int, channels: int) -> None:
         scene = Scene(GaussianField.random(count, (9, 17), channels=channels, seed=0), metadata={"title": "few"})
         result = prune(scene.to(device), tolerance=0.1)
-        assert len(result.scene) == count - result.removed and result.scene.size == (9, 17)
+        assert result.scene.num_gaussians == count - result.removed and result.scene.size == (9, 17)
         assert result.scene().shape == (channels, 9, 17) and result.scene.metadata == {"title": "few"}
 
     def test_dynamo(self, device: torch.device, scene: Scene) -> None:
@@ -52,7 +52,7 @@ class TestPrune(
         with torch.no_grad():
             change = (scene() - result.scene()).abs().max()
         assert float(change) == result.change <= tolerance + 1e-6
-        assert len(result.scene) == 300 - result.removed
+        assert result.scene.num_gaussians == 300 - result.removed
 
     def test_a_larger_tolerance_removes_more(self, scene: Scene) -> None:
         removed = [prune(scene, tolerance=t).removed for t in (0.0, 1e-3, 1e-1, 1e3)]

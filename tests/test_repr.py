@@ -7,7 +7,6 @@ import inspect
 import io
 import pkgutil
 from collections.abc import Iterator
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +16,15 @@ import torch
 from PIL import Image
 
 import kcgs
-from kcgs import Clip, FitConfig, GaussianField, RegionMap, RegionSplatRenderer, Scene, codec, fit
-from kcgs.codec.clips.file import ClipHeader
-from kcgs.codec.clips.frames import key_record
-from kcgs.data import ChartSample, Davis, DavisFrame, read_label_maps, read_video, save_image, save_labels
+from kcgs import FitConfig, GaussianField, RegionMap, RegionSplatRenderer, Scene, codec, fit
+from kcgs.data import ChartSample, Davis, DavisFrame, save_image, save_labels
 from kcgs.engine import run_jobs
 from kcgs.fitting import FitResult, available_recipes
 from kcgs.functional import BandGain, BoundaryScore, PairWidths
 from kcgs.pruning import prune
 from kcgs.rate import Compressed, FitBytesResult
 from kcgs.segment import Cleanup, Prediction, Segmentation
+from kcgs.video import read_label_maps, read_video
 from kcgs.zoo import entries
 
 SIZE = (64, 96)
@@ -50,7 +48,6 @@ def objects(result: FitResult, folder: Path) -> Iterator[Any]:
     image, data = torch.rand(3, *SIZE), codec.encode(result.scene)
     yield from (result, result.history[0], result.regions, field, regions, regions.resize((128, 192)), scene)
     yield from (PairWidths(WIDTHS), RegionSplatRenderer())
-    yield Clip(ClipHeader(SIZE, 3, Fraction(30000, 1001)), [key_record(data)] * 3)
     yield from (FitConfig.from_recipe(recipe) for recipe in available_recipes())
     yield from (codec.decode(data), Compressed(data, scene), FitBytesResult(data, scene, result), prune(result.scene))
     yield from (Segmentation(LABELS, torch.rand(21), {i: f"name {i}" for i in range(21)}), Cleanup())
@@ -87,7 +84,7 @@ def test_a_line_or_two(result: FitResult, tmp_path: Path) -> None:
 
 
 def test_what_they_say(result: FitResult) -> None:
-    count = len(result.scene)
+    count = result.scene.num_gaussians
     assert repr(result.scene) == f"Scene({count} Gaussians, 3 channels, size=(64, 96), confined, 2 regions)"
     words = f"FitResult({max(e.psnr for e in result.history):.2f} dB, stopped by iterations, "
     assert repr(result).startswith(words) and repr(result).endswith(f" s, {result.scene!r})")

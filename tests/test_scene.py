@@ -144,7 +144,7 @@ class TestScene(BaseTester):
         tensors = [torch.ones(*lead, 5, n, device=device) for n in (2, 3, 4)]
         scene = Scene(GaussianField(*tensors, size=SIZE), metadata={"title": "ones"})
         assert scene(size).shape == scene.render(size).shape == (*lead, 4, *(size or SIZE)) and scene(size).any()
-        assert len(scene) == 5 and scene.size == SIZE and len(scene.unbind()) == (lead or (1,))[0]
+        assert scene.num_gaussians == 5 and scene.size == SIZE and (not lead or len(scene) == lead[0])
 
     def test_feature(self, device: torch.device, dtype: torch.dtype) -> None:
         """Within a hard contour is what the Gaussians of the region render without a map."""
@@ -220,15 +220,20 @@ class TestScene(BaseTester):
         field = GaussianField(*tensors, size=SIZE)
         batch = Scene(field if maps is None else field.assign_regions(maps), maps, {"title": name})
         assert repr(batch).startswith("Scene(3 x 40 Gaussians, 3 channels, ")
-        scenes = batch.unbind()
+        scenes = tuple(batch)
         assert torch.equal(torch.stack([scene() for scene in scenes]), batch())
-        assert scenes[0].unbind() == (scenes[0],) and scenes[2].metadata == {"title": name}
-        with pytest.raises(ValueError, match=r"must be of one image; got a batch of 3, which scene.unbind\(\) takes"):
+        assert len(batch) == 3 and scenes[2].metadata == {"title": name}
+        assert torch.equal(batch[1:](), batch()[1:]) and torch.equal(batch[-1](), batch()[2])
+        with pytest.raises(TypeError, match="a scene of one image has no len; num_gaussians is"):
+            len(scenes[0])
+        with pytest.raises(IndexError):
+            batch[3]
+        with pytest.raises(ValueError, match=r"must be of one image; got a batch of 3: scene\[t\] is one of them"):
             evaluate(batch, torch.rand(3, 3, *SIZE))
 
     def test_repr_is_a_few_lines(self) -> None:
         assert "3 regions" in repr(make_scene()) and len(repr(make_scene()).splitlines()) <= 4
-        assert len(make_scene()) == 40 and make_scene().size == SIZE
+        assert make_scene().num_gaussians == 40 and make_scene().size == SIZE
 
     def test_exception(self) -> None:
         field = GaussianField.random(3, SIZE, seed=0)
@@ -245,7 +250,7 @@ class TestFiles:
         path = tmp_path / "photo.kcgs"
         size = save(path, make_scene("hard"))
         assert size == path.stat().st_size < make_scene("hard").save(tmp_path / "scene.safetensors")
-        assert len(load(path)) <= 40 and load(path).regions is not None
+        assert load(path).num_gaussians <= 40 and load(path).regions is not None
 
     def test_errors_name_the_path_given(self) -> None:
         for name in ("nofile", "nofile.kcgs"):

@@ -99,7 +99,6 @@ def test_holds_kcgs_only(wheel: Path) -> None:
         "models/manifest.json",
         "web/index.html",
         "page/page.js",
-        "page/clip.js",
     ):
         assert f"kcgs/{name}" in names
     assert any(n.endswith("licenses/LICENSE") for n in names)

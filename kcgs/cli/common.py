@@ -126,18 +126,16 @@ def _scene_path(text: str, others: tuple[str, ...] = ()) -> Path:
 
 SceneFile = Annotated[
     Path,
-    typer.Argument(
-        help="Scene (.safetensors or .kcgs), clip (.kcgs), or zoo:NAME.", metavar="SCENE", parser=_scene_path
-    ),
+    typer.Argument(help="Scene (.safetensors or .kcgs), or zoo:NAME.", metavar="SCENE", parser=_scene_path),
 ]
-_EITHER = "Scene or clip, or zoo:NAME; or label map: .png, .npy and others."
+_EITHER = "Scene, or zoo:NAME; or label map: .png, .npy and others."
 SceneOrMap = Annotated[
     Path, typer.Argument(help=_EITHER, metavar="FILE", parser=lambda text: _scene_path(text, _LABEL_MAPS))
 ]
 SceneOrDecoder = Annotated[
     Path,
     typer.Argument(
-        help="Scene or clip, zoo:NAME, or ONNX decoder.",
+        help="Scene, zoo:NAME, or ONNX decoder.",
         metavar="FILE",
         parser=lambda text: _scene_path(text, (".onnx",)),
     ),

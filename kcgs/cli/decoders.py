@@ -7,9 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from .clips import is_clip, read_clip
 from .common import Json, SceneFile, SceneOrDecoder, app, check_output, print_report
-from .options import Contours, EngineName, exclude
+from .options import Contours, EngineName
 
 
 @app.command()
@@ -35,7 +34,7 @@ def export(
     contours: Contours = "scaled",
     as_json: Json = False,
 ) -> None:
-    """Write a scene's decoder as ONNX, or a scene or a clip as one web page: neither needs torch or kcgs."""
+    """Write a scene's decoder as ONNX, or the scene as one web page: neither needs torch or kcgs."""
     from kcgs import Scene, load
     from kcgs.onnx import describe_decoder, generic_decoder, scene_decoder, write_model
 
@@ -70,22 +69,21 @@ def export(
 
 
 def _write_page(path: Path, output: Path, contours: str) -> dict[str, object]:
-    """Write the page of a scene or a clip; a `.kcgs` file is kept as it is."""
+    """Write the page of a scene; a `.kcgs` file is kept as it is."""
     from kcgs import load
     from kcgs._atomic import atomic_path
     from kcgs.page.html import scene_page, web_bytes
+    from kcgs.scene import check_unbatched
 
-    clip = read_clip(path) if is_clip(path) else None
-    shown = load(path) if clip is None else clip[0]
+    shown = check_unbatched(load(path))
     data = web_bytes(path.read_bytes() if path.suffix == ".kcgs" else shown)
     with atomic_path(output) as temporary:
         temporary.write_text(scene_page(data, title=output.stem, contours=contours), encoding="utf-8")
         size = temporary.stat().st_size
     height, width = shown.size
     return {
-        "width": width, "height": height, **({} if clip is None else {"frames": len(clip)}),
-        "num_gaussians": len(shown), "contours": contours,
-        "clip_bytes" if clip is not None else "scene_bytes": len(data), "bytes": size,
+        "width": width, "height": height, "num_gaussians": shown.num_gaussians, "contours": contours,
+        "scene_bytes": len(data), "bytes": size,
     }  # fmt: skip
 
 
@@ -97,8 +95,9 @@ def view(
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 0,
     browser: Annotated[bool, typer.Option(help="Open a browser window.")] = True,
 ) -> None:
-    """Look at a scene in the browser: zoom, compare, hide regions; or play a clip. Ends with Ctrl-C."""
+    """Look at a scene in the browser: zoom, compare, hide regions. Ends with Ctrl-C."""
     from kcgs import load
+    from kcgs.scene import check_unbatched
     from kcgs.view import serve, serve_decoder
 
     if scene.suffix == ".onnx":
@@ -106,9 +105,7 @@ def view(
             raise typer.BadParameter("--contours are those of the decoder; kcgs export has them")
         serve_decoder(scene, original=original, port=port, browser=browser, say=typer.echo)
         return
-    if clip := is_clip(scene):
-        exclude("a clip", original=original)
-    loaded = read_clip(scene) if clip else load(scene)
+    loaded = check_unbatched(load(scene))
     shown = scene.read_bytes() if scene.suffix == ".kcgs" else loaded
     serve(shown, name=scene.stem, original=original, contours=contours, port=port, browser=browser, say=typer.echo)
 

@@ -85,7 +85,7 @@ def fit_command(
         report = report_fit(fitted, target, labels, output, request)
     reason = report["stop_reason"]
     ended = reason if reason == "interrupted" else f"stopped by {reason}"
-    title = f"{output}: {len(fitted.scene)} Gaussians, {ended}"
+    title = f"{output}: {fitted.scene.num_gaussians} Gaussians, {ended}"
     if result.removed:
         title += f"; {result.removed} useless ones removed, which changed no value by more than {result.change:.1g}"
     became = result.regions
@@ -212,7 +212,7 @@ def measure_scene(
         figures["ssimulacra2"] = ssimulacra2(render, image)
     return {
         **figures,
-        "num_gaussians": len(scene),
+        "num_gaussians": scene.num_gaussians,
         "regions": 1 if scene.regions is None else scene.regions.num_regions,
         "seconds": took if seconds is None else seconds,
         **describe_size(path, num_bytes, scene.size),

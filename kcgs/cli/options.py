@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from fractions import Fraction
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
@@ -117,17 +116,6 @@ def exclude(option: str, **others: object) -> None:
     for name, given in others.items():
         if given is not None:
             raise typer.BadParameter(f"{option} excludes --{name.replace('_', '-')}")
-
-
-def frame_rate(text: str) -> Fraction:
-    """Return the frames per second that an option says: 24, 29.97 or 30000/1001."""
-    try:
-        rate = Fraction(text)
-    except (ValueError, ZeroDivisionError):
-        rate = Fraction(0)
-    if not 0 < rate <= 1000:
-        raise typer.BadParameter(f"it must be frames per second, such as 24 or 30000/1001, at most 1000; got {text!r}")
-    return rate
 
 
 def target_size(scene: Scene, scale: float | None, wanted: str | None) -> tuple[int, int]:

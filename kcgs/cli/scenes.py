@@ -1,4 +1,4 @@
-"""Commands that read a scene: render, eval, info, encode, decode; most take clips, the last three label maps, too."""
+"""Commands that read a scene: render, eval, info, encode, decode; the last three take label maps, too."""
 
 from __future__ import annotations
 
@@ -11,15 +11,28 @@ import typer
 from kcgs._atomic import write_file
 from kcgs._progress import Progress
 
-from .clips import describe_clip, is_clip, measure_clip, read_clip, render_clip, show_clip
-from .common import OUTPUT_IMAGES, SCENES, Json, Quiet, SceneFile, SceneOrMap, app, check_output, print_report
+from .common import (
+    OUTPUT_IMAGES,
+    SCENES,
+    VIDEOS,
+    ImageFile,
+    Json,
+    Quiet,
+    SceneFile,
+    SceneOrMap,
+    app,
+    check_output,
+    print_report,
+)
 from .fit import describe_size, measure_scene
 from .options import Contours, Objective, Scale, Size, exclude, target_size
 
 OutputImage = Annotated[
     Path,
     typer.Option(
-        "-o", "--output", help="Image file to write; of a clip a video (.mp4 and others), or a folder: no suffix."
+        "-o",
+        "--output",
+        help="Image file to write; of a batch of scenes a video (.mp4 and others), or a folder: no suffix.",
     ),
 ]
 
@@ -35,30 +48,29 @@ def render(
     rate: Annotated[
         str | None,
         typer.Option(
-            "--frame-rate", metavar="RATE|2x", help="Of a clip: frames per second, or a multiple of the clip's."
+            "--frame-rate", metavar="RATE|2x", help="Of a batch: frames per second, or a multiple of its own."
         ),
     ] = None,
     frame: Annotated[
-        float | None, typer.Option(help="Of a clip: this time alone, in frames from 0; 0.5 is halfway to the next.")
+        float | None, typer.Option(help="Of a batch: this time alone, in frames from 0; 0.5 is halfway to the next.")
     ] = None,
-    quiet: Quiet = False,
 ) -> None:
-    """Render a scene at any size, or a clip, at any frame rate, too."""
+    """Render a scene at any size, or a batch of scenes as a video, at any frame rate."""
+    if output.suffix:  # none: a folder
+        check_output(output, *OUTPUT_IMAGES, *VIDEOS)
     from kcgs import load
     from kcgs.data import save_image
     from kcgs.editing import extract_region
-    from kcgs.scene import check_unbatched
 
-    if is_clip(scene):
-        exclude("a clip", region=region)
-        render_clip(
-            read_clip(scene), output, scale=scale, size=size, contours=contours, rate=rate, frame=frame,
-            progress=not quiet,
-        )  # fmt: skip
+    loaded = load(scene)
+    if loaded.field.means.ndim == 3:
+        from .video import render_batch
+
+        exclude("a batch of scenes", region=region)
+        render_batch(loaded, output, scale=scale, size=size, contours=contours, rate=rate, frame=frame)
         return
-    exclude("a scene", frame_rate=rate, frame=frame)
+    exclude("a scene of one image", frame_rate=rate, frame=frame)
     check_output(output, *OUTPUT_IMAGES)
-    loaded = check_unbatched(load(scene))
     target = target_size(loaded, scale, size)
     if region is not None:
         if loaded.regions is None or loaded.field.region_ids is None:
@@ -70,30 +82,20 @@ def render(
 @app.command("eval")
 def eval_command(
     scene: SceneFile,
-    image: Annotated[
-        Path, typer.Argument(help="Image file; of a clip a video file or a folder of images.", metavar="IMAGE")
-    ],
+    image: ImageFile,
     regions: Annotated[
         Path | None,
         typer.Option(
-            metavar="MASK",
-            help="Label map whose contours EF-PSNR looks at, of a clip a folder of them; default: the scene's.",
+            metavar="MASK", help="Label map whose contours EF-PSNR looks at; default: the scene's.", dir_okay=False
         ),
     ] = None,
-    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Compare a scene with an image, or a clip with a video: means of its frames."""
+    """Compare a scene with an image."""
     from kcgs import load
     from kcgs.data import load_image, load_labels
     from kcgs.scene import check_unbatched
 
-    if is_clip(scene):
-        _eval_clip(scene, image, regions, quiet, as_json)
-        return
-    for name, path in (("IMAGE", image), ("--regions", regions)):
-        if path is not None and path.is_dir():
-            raise typer.BadParameter(f"{name} must be a file; {str(path)!r} is a folder")
     loaded, target = check_unbatched(load(scene)), load_image(image)
     if target.shape[1:] != loaded.size:
         raise ValueError(f"IMAGE must have the size {loaded.size} of SCENE; got {tuple(target.shape[1:])}")
@@ -107,27 +109,11 @@ def eval_command(
     print_report(report, as_json, str(scene), contours)
 
 
-def _eval_clip(file: Path, video: Path, regions: Path | None, quiet: bool, as_json: bool) -> None:
-    from kcgs.data import read_label_maps, read_video
-
-    clip, reader = read_clip(file), read_video(video)
-    if reader.size != clip.size:
-        raise ValueError(f"IMAGE must have the size {clip.size} of SCENE; got {reader.size}")
-    if (reader.num_frames or 0) > len(clip):
-        typer.echo(f"kcgs: IMAGE has {reader.num_frames} frames; the first {len(clip)} are compared", err=True)
-    maps = None if regions is None else read_label_maps(regions)
-    report = measure_clip(clip, reader, maps, progress=not quiet)
-    show_clip(report, as_json, str(file), str(regions or "the clip"))
-
-
 @app.command()
 def info(scene: SceneFile, as_json: Json = False) -> None:
-    """Say what a file holds: a scene, a clip, or a label map."""
+    """Say what a file holds: a scene, a batch of scenes, or a label map."""
     from kcgs import load
 
-    if is_clip(scene):
-        show_clip({"holds": "clip", **describe_clip(read_clip(scene))}, as_json, str(scene))
-        return
     if (found := _read_map(scene)) is not None:
         print_report(_describe_map(scene, *found), as_json, str(scene))
         return
@@ -137,7 +123,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
         softness = sum(softness.values()) / max(1, len(softness))
     report = {
         "images": loaded.field.means.shape[:-2].numel(),
-        "num_gaussians": len(loaded),
+        "num_gaussians": loaded.num_gaussians,
         "channels": loaded.field.colors.shape[-1],
         "height": loaded.size[0],
         "width": loaded.size[1],
@@ -202,11 +188,11 @@ def encode(
     rounded = decoded.scene
     report = {
         "psnr_to_scene": float(psnr(rounded.render(), loaded.render())),
-        "num_gaussians": len(rounded),
+        "num_gaussians": rounded.num_gaussians,
         "regions": 1 if rounded.regions is None else rounded.regions.num_regions,
         "layers": decoded.num_layers,
         **describe_size(output, len(data), loaded.size),
-        "bits_per_gaussian": 8 * len(data) / len(rounded),
+        "bits_per_gaussian": 8 * len(data) / rounded.num_gaussians,
     }
     print_report(report, as_json, str(output))
 
@@ -214,10 +200,7 @@ def encode(
 @app.command()
 def decode(
     file: Annotated[Path, typer.Argument(help="Compressed file (.kcgs).", metavar="FILE", dir_okay=False)],
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", help="Image file; of a label map .png or .npy; of a clip a video or a folder."),
-    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Image file; of a label map .png or .npy.")],
     num_bytes: Annotated[int | None, typer.Option("--bytes", min=1, help="Read only the first bytes.")] = None,
     scale: Scale = None,
     size: Size = None,
@@ -225,7 +208,6 @@ def decode(
 ) -> None:
     """Render a compressed file, or the coarser image that its first bytes hold; or write its label map.
 
-    Of a clip, the first bytes hold the first frames, as a video or a folder of PNGs; kcgs render can do more with it.
     A PNG has ids as palette indices, above 255 as 16-bit grey, above 65,535 as colours R + 256 G + 65536 B.
     """
     from kcgs import codec
@@ -237,9 +219,6 @@ def decode(
         check_output(output, ".png", ".npy")
         save_labels(output, labels, rgb_ids=output.suffix.lower() != ".npy" and int(ids.max()) > 65535)
         return
-    if is_clip(file):
-        render_clip(read_clip(file, num_bytes), output, scale=scale, size=size, contours=contours)
-        return
     check_output(output, *OUTPUT_IMAGES)
     try:
         decoded = codec.decode(file.read_bytes(), max_bytes=num_bytes)
@@ -247,7 +226,7 @@ def decode(
         raise codec.CodecError(f"cannot decode {file}: {error}") from error
     scene = decoded.scene
     if decoded.layers < decoded.num_layers:
-        part = f"{decoded.layers} of {decoded.num_layers} layers, {len(scene)} Gaussians"
+        part = f"{decoded.layers} of {decoded.num_layers} layers, {scene.num_gaussians} Gaussians"
         typer.echo(f"{file}: a coarser image, {part}", err=True)
     save_image(output, scene.render(target_size(scene, scale, size), contours))
 

@@ -21,15 +21,17 @@ Fill = Literal["inpaint"]
 
 
 def check_field(scene: Scene) -> GaussianField:
-    """Return the field of an unbatched scene whose Gaussians have region ids."""
-    if check_unbatched(scene).field.region_ids is None:
+    """Return the field of a scene whose Gaussians have region ids."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
+    if scene.field.region_ids is None:
         raise ValueError("scene must have region ids; call scene.field.assign_regions(regions)")
     return scene.field
 
 
 def check_scene(scene: Scene, region_ids: object) -> tuple[RegionMap, Tensor]:
     """Return the map and the ids as a tensor on its device."""
-    check_field(scene)
+    check_field(check_unbatched(scene))
     regions = kcgs.scene.check_scene(scene).regions
     if regions is None:
         raise ValueError("scene must have a label map; got regions None")
@@ -53,7 +55,7 @@ def check_ids(region_ids: object, known: Tensor, owner: str) -> list[int]:
     wanted = sorted({check_count("region_ids", region, 0) for region in several})
     if not wanted:
         raise ValueError("region_ids must hold an id; got none")
-    ids = sorted(set(known.tolist()))
+    ids = known.unique().tolist()
     for region in wanted:
         if region not in ids:
             shown = ", ".join(map(str, ids[:20])) + (" ..." if len(ids) > 20 else "")

@@ -1,11 +1,10 @@
-"""Move, recolour, delete and extract regions, and put other scenes behind them: a new scene each, or a new clip."""
+"""Move, recolour, delete and extract regions, and put other scenes behind them: a new scene each."""
 
 from __future__ import annotations
 
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -29,7 +28,6 @@ from .checks import (
     color_tensor,
     ids_of,
 )
-from .clips import takes_clips
 
 # standard deviation of a Gaussian that is flat over the image, in its longer sides: 1 to 3 in 10^7
 _FLAT = 1e3
@@ -37,7 +35,6 @@ _FLAT = 1e3
 _CONTOUR_SIGMAS = 4.0
 
 
-@takes_clips
 def move_region(
     scene: Scene, region_ids: int | Iterable[int], offset: Sequence[float], *, fill: Fill | None = "inpaint"
 ) -> Scene:
@@ -50,8 +47,7 @@ def move_region(
     width of those it had.
 
     Args:
-        scene: unbatched, with a map of its own size, not a resized one; or a :class:`kcgs.Clip`, of which every frame
-            that has any of the regions is edited, by itself: a fill may flicker.
+        scene: unbatched, with a map of its own size, not a resized one.
         region_ids: an id in the map, or several, which move together.
         offset: (dx, dy) in pixels, whole; with ``supersample`` k, whole multiples of 1/k.
         fill: "inpaint": what is uncovered continues its surroundings, colours and texture, by Gaussians that are fitted
@@ -60,7 +56,7 @@ def move_region(
             streaks, or black.
 
     Returns:
-        A new scene, without a graph; of a clip a new clip.
+        A new scene, without a graph.
 
     Raises:
         TypeError: wrong types.
@@ -104,7 +100,6 @@ def move_region(
     return Scene(moved, regions.relabel(labels, _new_widths(regions, chosen.tolist())), scene.metadata)
 
 
-@partial(takes_clips, by_gaussians=True)
 def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers, bias: Numbers | None = None) -> Scene:
     r"""Change the colours of regions, c' = gain c + bias, exactly so in the image.
 
@@ -112,16 +107,16 @@ def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers,
     it is one more Gaussian per region, flat over the whole image.
 
     Args:
-        scene: unbatched, with region ids; or a clip, see :func:`move_region`.
+        scene: with region ids; of a batch, all images.
         region_ids: an id that some of its Gaussians have, or several.
         gain: a number, one for each channel :math:`(C)`, or a matrix :math:`(C, C)`: tensors, arrays or lists.
         bias: a number, or one for each channel :math:`(C)`; None: none, and no Gaussian more.
 
     Returns:
-        A new scene, without a graph; of a clip a new clip.
+        A new scene, without a graph.
 
     Raises:
-        TypeError, ValueError: a batch, an id that no Gaussian has, wrong types or shapes, values that are not finite.
+        TypeError, ValueError: an id that no Gaussian has, wrong types or shapes, values that are not finite.
 
     Example:
         >>> labels = torch.zeros(4, 6, dtype=torch.long)
@@ -135,7 +130,7 @@ def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers,
     chosen = torch.isin(ids_of(field), torch.tensor(wanted, device=field.means.device))
     channels = field.colors.shape[-1]
     matrix = color_tensor("gain", gain, field.colors, [(), (channels,), (channels, channels)])
-    result = field.subset(torch.ones_like(chosen))
+    result = field.subset(torch.ones_like(chosen)) if field.means.ndim == 2 else field.image(slice(None))
     with torch.no_grad():
         colors = result.colors[chosen]
         result.colors[chosen] = colors @ matrix.T if matrix.ndim == 2 else colors * matrix
@@ -146,7 +141,6 @@ def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers,
     return Scene(result, scene.regions, scene.metadata)
 
 
-@takes_clips
 def delete_region(scene: Scene, region_ids: int | Iterable[int], *, fill: Fill | None = "inpaint") -> Scene:
     """Delete regions: their Gaussians go, their pixels fall to their neighbours. Arguments: see :func:`move_region`.
 
@@ -185,7 +179,6 @@ def extract_region(scene: Scene, region_ids: int | Iterable[int]) -> Scene:
     return Scene(scene.field.subset(torch.isin(ids_of(scene.field), chosen)), regions, scene.metadata)
 
 
-@takes_clips
 def replace_background(scene: Scene, region_ids: int | Iterable[int], background: Scene) -> Scene:
     """Put another scene in place of some regions, stretched to the size of this one.
 
@@ -193,12 +186,12 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
     regions of the scene have widths, contours that are new take their mean.
 
     Args:
-        scene: unbatched, with a map of its own size, not a resized one; or a clip, see :func:`move_region`.
+        scene: unbatched, with a map of its own size, not a resized one.
         region_ids: the regions that make the background now: an id in the map, or several.
         background: unbatched, with as many channels.
 
     Returns:
-        A new scene, without a graph; of a clip a new clip.
+        A new scene, without a graph.
 
     Raises:
         TypeError, ValueError: as :func:`extract_region`; another number of channels.
@@ -222,7 +215,7 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
     first = int(regions.ids.max()) + 1
     inside = torch.isin(regions.fine_labels, chosen)
     behind = torch.full_like(regions.fine_labels, first)
-    ids = torch.full_like(ids_of(field), first)[:1].expand(len(other))
+    ids = torch.full_like(ids_of(field), first)[:1].expand(other.num_gaussians)
     if background.regions is not None and other.region_ids is not None:
         fine = RegionMap.from_labels(background.regions.fine_labels).resize((inside.shape[0], inside.shape[1]))
         behind, ids = fine.labels.to(behind.device) + first, other.region_ids.to(behind.device) + first
@@ -240,8 +233,9 @@ def _with_flat(field: GaussianField, region_id: int, color: Tensor) -> GaussianF
     height, width = field.size
     sigma = _FLAT * max(height, width)
     rows = [(field.means, [width / 2, height / 2]), (field.cholesky, [sigma, 0.0, sigma]), (field.colors, color)]
-    means, cholesky, colors = (torch.as_tensor(row).to(t)[None] for t, row in rows)
-    flat = GaussianField(means, cholesky, colors, ids_of(field).new_tensor([region_id]), size=field.size)
+    lead = (*field.means.shape[:-2], 1)
+    means, cholesky, colors = (torch.as_tensor(row).to(t).expand(*lead, -1) for t, row in rows)
+    flat = GaussianField(means, cholesky, colors, ids_of(field).new_tensor(region_id).expand(lead), size=field.size)
     return join(field, flat)
 
 

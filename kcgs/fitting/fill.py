@@ -143,7 +143,7 @@ def _crop(regions: RegionMap, window: _Window) -> RegionMap:
 def _reaching_in(scene: Scene, ids: Tensor, unknown: Tensor, window: _Window) -> Tensor:
     """Say which Gaussians the fit may move, (N) bool: they have weight in the hole and hardly any out of sight."""
     field = scene.field
-    ones = field.colors.detach().new_ones(len(field), 1).requires_grad_()
+    ones = field.colors.detach().new_ones(field.num_gaussians, 1).requires_grad_()
     total = region_splat(field.means.detach(), field.cholesky.detach(), ones, ids, scene.regions)[0]
     sight = torch.zeros_like(unknown)
     sight[window.rows, window.cols] = True

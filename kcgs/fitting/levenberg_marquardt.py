@@ -62,7 +62,7 @@ def levenberg_marquardt(
     before = render(*whole)
     kept = _bounded(whole[0].double(), whole[1].double(), field.size)
     flat = _sheets(*kept, field, regions)
-    groups = _groups(_patches(field, image, regions), len(field))
+    groups = _groups(_patches(field, image, regions), field.num_gaussians)
     for done, (members, patches) in enumerate(groups):
         deadline = time.perf_counter() + (start + max_seconds - time.perf_counter()) / (len(groups) - done)
         colors = whole[2][members].double()
@@ -125,7 +125,7 @@ def _patches(field: GaussianField, image: Tensor, regions: RegionMap | None) -> 
     places = torch.arange(target.shape[1], device=image.device)
     points = torch.stack([places % image.shape[2] + 0.5, places // image.shape[2] + 0.5]).double()
     if regions is None or field.region_ids is None:
-        return [_Patch(torch.arange(len(field), device=image.device), points, target, None)]
+        return [_Patch(torch.arange(field.num_gaussians, device=image.device), points, target, None)]
     index = regions.index_of(field.region_ids)
     pattern = torch.zeros_like(places)
     supports = []

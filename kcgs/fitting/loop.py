@@ -192,7 +192,7 @@ def check_problem(image: Any, regions: object) -> tuple[Tensor, RegionMap | None
     regions = RegionMap.coerce(regions)
     if regions is not None:
         if regions.num_maps == 1:
-            (regions,) = regions.unbind()
+            regions = regions.image(0)
         if regions.size != tuple(image.shape[1:]) or regions.num_maps is not None:
             raise ValueError(
                 f"regions must be one map of the image's size {tuple(image.shape[1:])}; got "

@@ -121,7 +121,6 @@ def least_missed(
     region: NDArray[Any],
     count: int,
     weight: NDArray[Any],
-    saved: NDArray[Any] | None = None,
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     r"""Choose Gaussians to leave out, and hand their colours to their neighbours.
 
@@ -136,7 +135,6 @@ def least_missed(
         region: (N,), number of each one's region.
         count: how many should go; fewer do where too many are neighbours.
         weight: (N,), what the squared error about each one counts.
-        saved: (N,), what is saved otherwise where one goes; those that save more than they cost go in any case.
 
     Returns:
         Which go, (N,), and the colours of all, (N, C).
@@ -156,9 +154,8 @@ def least_missed(
     goes, stays = np.zeros(len(rows), np.bool_), np.zeros(len(rows), np.bool_)
     handed = colors.copy()
     costs = rests * np.square(colors).sum(1) * weight[order]
-    costs -= 0.0 if saved is None else saved[order]
     for i in np.argsort(costs, kind="stable"):
-        if count <= 0 and (saved is None or costs[i] >= 0):
+        if count <= 0:
             break
         others = neighbors[i, : np.count_nonzero(neighbors[i] >= 0)]
         if stays[i] or goes[others].any():

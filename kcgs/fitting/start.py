@@ -71,7 +71,7 @@ def begin(state: FitState, regions: RegionMap | None) -> None:
     state.regions, state.region_ids = regions, field.region_ids
     state.anchor = None if regions is None else regions.labels
     state.optimizer = make_optimizer(config, field, sigma)
-    state.first = state.wanted = len(field)
+    state.first = state.wanted = field.num_gaussians
     state.iteration = 0
 
 

@@ -290,18 +290,22 @@ class RegionMap:
             moved["_fine_labels"] = moved["_labels"]
         return replace(self, **moved)
 
-    def unbind(self) -> tuple[RegionMap, ...]:
-        """Take a batch apart: a map for each image, with the regions that it has; one map gives itself.
+    def image(self, index: int | slice) -> RegionMap:
+        """Copy one map of a batch, or a slice of it, with the regions that it has.
+
+        Raises:
+            ValueError: the map is not batched.
+            IndexError: there is no such map.
 
         Example:
-            >>> [one.labels.tolist() for one in RegionMap.from_labels(torch.tensor([[[1, 4]], [[1, 1]]])).unbind()]
-            [[[1, 4]], [[1, 1]]]
+            >>> RegionMap.from_labels(torch.tensor([[[1, 4]], [[1, 1]]])).image(0).labels
+            tensor([[1, 4]])
         """
         if self.num_maps is None:
-            return (self,)
+            raise ValueError("image needs a batch of maps; got one map")
         if self._origin is not None:
-            return tuple(one.resize(self.size, self.contours) for one in self._origin.unbind())
-        return tuple(self._with_labels(labels, self.softness) for labels in self._fine_labels)
+            return self._origin.image(index).resize(self.size, self.contours)
+        return self._with_labels(self._fine_labels[index], self.softness)
 
     def _with_labels(self, labels: Tensor, widths: float | Mapping[tuple[int, int], float]) -> RegionMap:
         """Make the map of these labels, without the widths of pairs that they do not have."""

@@ -38,7 +38,7 @@ class GaussianField(nn.Module):
 
     Example:
         >>> field = GaussianField.random(10, (32, 48), seed=0)
-        >>> len(field), field.size, field.colors.shape
+        >>> field.num_gaussians, field.size, field.colors.shape
         (10, (32, 48), torch.Size([10, 3]))
 
     Source: the paper's tuple (mu, Sigma, c, alpha, r).
@@ -90,7 +90,8 @@ class GaussianField(nn.Module):
             region_ids = region_ids.to(self.means.device)
         return check_ids("region_ids", region_ids, self.means).clone()
 
-    def __len__(self) -> int:
+    @property
+    def num_gaussians(self) -> int:
         """Number of Gaussians per image."""
         return self.means.shape[-2]
 
@@ -161,19 +162,19 @@ class GaussianField(nn.Module):
 
         Example:
             >>> field = GaussianField.random(10, (32, 48), seed=0)
-            >>> len(field.subset(field.means[:, 0] < 24)) < 10
+            >>> field.subset(field.means[:, 0] < 24).num_gaussians < 10
             True
         """
         if self.means.ndim != 2:
             raise ValueError(f"subset needs an unbatched field; got means of shape {tuple(self.means.shape)}")
         if check_tensor("mask", mask).dtype == torch.bool:
-            if mask.shape != (len(self),):
-                raise ValueError(f"mask must have shape ({len(self)},); got {tuple(mask.shape)}")
+            if mask.shape != (self.num_gaussians,):
+                raise ValueError(f"mask must have shape ({self.num_gaussians},); got {tuple(mask.shape)}")
         else:
             check_integer("mask", mask, dims=(1,))
-            if mask.numel() and not (0 <= int(mask.min()) and int(mask.max()) < len(self)):
+            if mask.numel() and not (0 <= int(mask.min()) and int(mask.max()) < self.num_gaussians):
                 raise ValueError(
-                    f"mask must hold indices in [0, {len(self)}); got {int(mask.min())}, {int(mask.max())}"
+                    f"mask must hold indices in [0, {self.num_gaussians}); got {int(mask.min())}, {int(mask.max())}"
                 )
 
         def pick(tensor: Tensor | None) -> Tensor | None:
@@ -183,19 +184,22 @@ class GaussianField(nn.Module):
         ids, opacities = pick(self.region_ids), pick(self.opacities)
         return GaussianField(means, cholesky, colors, ids, opacities, size=self.size)
 
-    def unbind(self) -> tuple[GaussianField, ...]:
-        """Take a batch apart: a field of parameters for each image, without the graph; an unbatched one gives itself.
+    def image(self, index: int | slice) -> GaussianField:
+        """Copy one image of a batch, or a slice of it, into a field of parameters, without the graph.
+
+        Raises:
+            ValueError: the field is not batched.
+            IndexError: there is no such image.
 
         Example:
             >>> means, cholesky, colors = torch.rand(4, 9, 2), torch.ones(4, 9, 3), torch.rand(4, 9, 3)
-            >>> len(GaussianField(means, cholesky, colors, size=(8, 8)).unbind())
-            4
+            >>> GaussianField(means, cholesky, colors, size=(8, 8)).image(-1).means.shape
+            torch.Size([9, 2])
         """
         if self.means.ndim == 2:
-            return (self,)
+            raise ValueError(f"image needs a batched field; got means of shape {tuple(self.means.shape)}")
         parts = (self.means, self.cholesky, self.colors, self.region_ids, self.opacities)
-        rows = ([None if part is None else part.detach()[k] for part in parts] for k in range(len(self.means)))
-        return tuple(GaussianField(*row, size=self.size) for row in rows)  # type: ignore[arg-type]
+        return GaussianField(*(None if part is None else part.detach()[index] for part in parts), size=self.size)  # type: ignore[arg-type]
 
     def merged_colors(self) -> Tensor:
         """Colours with the opacities multiplied in, (N, C) or (B, N, C)."""
@@ -233,7 +237,7 @@ class GaussianField(nn.Module):
         """Show the numbers that matter."""
         confined = "confined" if self.region_ids is not None else "not confined"
         images = f"{len(self.means)} x " if self.means.ndim == 3 else ""
-        return f"{images}{len(self)} Gaussians, {self.colors.shape[-1]} channels, size={self.size}, {confined}"
+        return f"{images}{self.num_gaussians} Gaussians, {self.colors.shape[-1]} channels, size={self.size}, {confined}"
 
 
 def scaled(field: GaussianField, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -256,16 +260,19 @@ def scaled(field: GaussianField, size: tuple[int, int]) -> tuple[Tensor, Tensor]
 
 
 def join(first: GaussianField, second: GaussianField) -> GaussianField:
-    """Put two fields of one image, both with region ids or neither, into one without the graph; no opacity is 1."""
+    """Put two fields, both with region ids or neither, into one without the graph; no opacity is 1."""
+    rows = first.means.ndim - 2
 
     def both(one: Tensor, other: Tensor) -> Tensor:
-        return torch.cat([one.detach(), other.detach()])
+        return torch.cat([one.detach(), other.detach()], rows)
 
     ids = opacities = None
     if first.region_ids is not None and second.region_ids is not None:
         ids = both(first.region_ids, second.region_ids)
     if first.opacities is not None or second.opacities is not None:
-        one, other = (f.means.new_ones(len(f)) if f.opacities is None else f.opacities for f in (first, second))
+        one, other = (
+            f.means.new_ones(f.means.shape[:-1]) if f.opacities is None else f.opacities for f in (first, second)
+        )
         opacities = both(one, other)
     means, cholesky = both(first.means, second.means), both(first.cholesky, second.cholesky)
     return GaussianField(means, cholesky, both(first.colors, second.colors), ids, opacities, size=first.size)

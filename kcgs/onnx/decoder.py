@@ -124,7 +124,7 @@ class _Plan(NamedTuple):
         if self.clamp:
             image = g("Clip", image, np.float32(0), np.float32(1))
         shape = [1, stored.channels, "height", "width"]
-        docs = f"Renders one image at any size: {len(self.scene)} Gaussians of a kcgs scene."
+        docs = f"Renders one image at any size: {self.scene.num_gaussians} Gaussians of a kcgs scene."
         output = image_doc(stored.channels, self.clamp)
         return g.finish("image", image, np.float32, shape, {**facts, "precision": precision}, (docs, output))
 

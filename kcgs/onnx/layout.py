@@ -89,7 +89,7 @@ def lay_out(field: GaussianField, regions: RegionMap | None, cutoff: float) -> L
     """Find what is rendered where, and group it."""
     tiles = find_tiles(regions, field.size)
     count = 1 if regions is None else regions.num_regions
-    region = torch.zeros(len(field), dtype=torch.int64)
+    region = torch.zeros(field.num_gaussians, dtype=torch.int64)
     if regions is not None and field.region_ids is not None:
         region = regions.index_of(field.region_ids).cpu()
     keys = [number * count + r for number, found in enumerate(tiles.regions) for r in found]
@@ -102,7 +102,7 @@ def lay_out(field: GaussianField, regions: RegionMap | None, cutoff: float) -> L
     column, row = (placed.means[used] / TILE).floor().unbind(-1)
     rank = torch.argsort(row * (1 + 2 * column.abs().amax()) + column, stable=True) if len(used) else used
     used = used[rank[torch.argsort(placed.level[used][rank], stable=True)]]
-    entry = torch.full((len(field),), -1)
+    entry = torch.full((field.num_gaussians,), -1)
     entry[used] = torch.arange(len(used))
     entry = entry[gaussian]
     merged = field.merged_colors().detach().double().cpu() * placed.factor[:, None]

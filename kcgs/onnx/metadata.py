@@ -48,7 +48,7 @@ def describe(scene: Scene, layout: Layout, *, cutoff: float, clamp: bool, crisp:
         "height": str(field.size[0]),
         "width": str(field.size[1]),
         "channels": str(field.colors.shape[-1]),
-        "num_gaussians": str(len(field)),
+        "num_gaussians": str(field.num_gaussians),
         "num_regions": str(count),
         "region_ids": json.dumps([0] if regions is None else regions.ids.tolist()),
         "contours": contours,
@@ -59,7 +59,7 @@ def describe(scene: Scene, layout: Layout, *, cutoff: float, clamp: bool, crisp:
 def _left_out(scene: Scene, contours: str, layout: Layout, clamp: bool) -> list[str]:
     total, windows = len(layout.tiles.regions), len(layout.tiles.windows)
     touched = sum(len(group.tiles) for group in layout.groups)
-    unseen = len(scene) - len(layout.gaussians.means)
+    unseen = scene.num_gaussians - len(layout.gaussians.means)
     pairs = sum(int(group.lengths.sum()) for group in layout.groups)
     one_region = f"memberships in {total - windows} of {total} tiles, which have one region"
     facts = {
@@ -71,7 +71,7 @@ def _left_out(scene: Scene, contours: str, layout: Layout, clamp: bool) -> list[
         "opacities: merged into the colours": scene.field.opacities is not None,
         f"{unseen} Gaussians that touch no pixel": unseen > 0,
         f"{total - touched} tiles that nothing touches": touched < total,
-        f"all but {100 * pairs / max(1, total * len(scene)):.2g} % of the pairs of Gaussian and tile": True,
+        f"all but {100 * pairs / max(1, total * scene.num_gaussians):.2g} % of the pairs of Gaussian and tile": True,
     }
     return [fact for fact, holds in facts.items() if holds]
 

@@ -17,8 +17,8 @@ from typer.main import get_command
 
 import kcgs
 from kcgs.cli import app
-from kcgs.data import read_video, write_video
 from kcgs.segment import registry
+from kcgs.video import read_video, write_video
 
 ROOT = Path(kcgs.__file__).resolve().parent.parent
 if not (ROOT / "docs/conf.py").is_file():

@@ -166,7 +166,7 @@ class TestEnd:
         image, labels = torch.full((3, 24, 32), 0.5), torch.zeros(24, 32, dtype=torch.long)
         result = fit(image, labels, 50, recipe=quick(prune=0.05))
         assert result.removed > 0
-        assert len(result.scene.field) == 50 - result.removed or len(result.scene.field) < 50
+        assert result.scene.field.num_gaussians == 50 - result.removed or result.scene.field.num_gaussians < 50
         assert result.change <= 0.05
 
     @pytest.mark.parametrize(("chart", "least"), [(chart_2x3, 70.0), (chart_pie, 38.0)])
@@ -211,7 +211,7 @@ class TestHardCases:
         reached = float(psnr(picture, image))
         assert reached >= max(h.psnr for h in exact) - 0.1 or reached > 60
         assert reached > 5
-        if not len(result.scene.field):
+        if not result.scene.field.num_gaussians:
             return
         # a polished Gaussian may be as wide as 100 diagonals, any other as one
         limit = (1.01 if reached < 60 and name != "saturated" else 101) * math.hypot(*image.shape[1:])
@@ -229,7 +229,7 @@ class TestHardCases:
         labels = torch.arange(48)[:, None] // 12 * 4 + torch.arange(64) // 16
         with pytest.warns(UserWarning, match="11 of 16 regions get no Gaussian and stay black"):
             result = fit(image, labels, 5, recipe=quick(iterations=10, move_contours=False, merge_regions=False))
-        assert len(result.scene.field) <= 5
+        assert result.scene.field.num_gaussians <= 5
         assert result.regions == RegionReport(16, 16, empty=11, empty_pixels=11 * 12 * 16)
         assert str(result.regions) == "16 of 16 regions kept; 11 without a Gaussian, black: 2112 pixels"
         assert repr(result.scene).endswith("confined, 16 regions, 11 of them without a Gaussian)")

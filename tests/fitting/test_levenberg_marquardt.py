@@ -74,7 +74,7 @@ class TestSolveColors:
                 size=SIZE,
                 cutoff=0.0,
             ).detach()
-            for i in range(len(field))
+            for i in range(field.num_gaussians)
         ]
         matrix = torch.stack(units).flatten(1).T
         best = torch.linalg.lstsq(matrix, image.flatten(1).T).solution
@@ -110,7 +110,7 @@ class TestSolveColors:
         ids[0] = 99
         with torch.no_grad():
             start.means[1] = 5000.0
-        opacities = torch.linspace(0.1, 1, len(start), dtype=torch.float64)
+        opacities = torch.linspace(0.1, 1, start.num_gaussians, dtype=torch.float64)
         field = GaussianField(start.means, start.cholesky, start.colors, ids, opacities, size=SIZE)
         for solved in (solved_colors(field, an_image(), regions), refined_all(field, an_image(), regions, max_steps=5)):
             assert solved is not field and solved.opacities is None
@@ -123,7 +123,7 @@ class TestLevenbergMarquardt:
         field, image = a_field(regions, 2), an_image(2)
         start = [t.detach() for t in (field.means, field.cholesky, field.colors)]
         state = _measure(_patches(field, image, regions), *start, 0.0)
-        count = len(field)
+        count = field.num_gaussians
 
         def render(step: Tensor, colors: Tensor) -> Tensor:
             means, cholesky = move(state.means, state.cholesky, step.view(5, count).T, exact=False)

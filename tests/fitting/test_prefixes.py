@@ -32,7 +32,7 @@ def psnr_of(scene: Scene, image: torch.Tensor, share: float) -> float:
     field = scene.field
     means, cholesky, colors = (t.detach() for t in (field.means, field.cholesky, field.colors))
     energy = colors.square().sum(-1) * cholesky[:, 0] * cholesky[:, 2]
-    index = energy.argsort(descending=True)[: round(share * len(field))]
+    index = energy.argsort(descending=True)[: round(share * field.num_gaussians)]
     ids = None if field.region_ids is None else field.region_ids[index]
     render = region_splat(means[index], cholesky[index], colors[index], ids, scene.regions, size=scene.size)
     return float(psnr(render.clamp(0, 1), image))

@@ -111,9 +111,9 @@ class TestFit:
     def test_no_state_has_more_than_n(self, stop: int) -> None:
         """Wherever a fit is stopped, there are no more Gaussians than asked for, and what is logged is what is kept."""
         result = fit(self.image, None, 50, iterations=60, on_step=lambda iteration, entry: iteration == stop, prune=0.0)
-        assert len(result.scene) <= 50
+        assert result.scene.num_gaussians <= 50
         assert all(entry.num_gaussians <= 50 for entry in result.history)
-        best = max(entry.psnr for entry in result.history if entry.num_gaussians == len(result.scene))
+        best = max(entry.psnr for entry in result.history if entry.num_gaussians == result.scene.num_gaussians)
         assert float(psnr(result.scene.render(), self.image)) >= best - 0.05
 
     def test_all_from_the_start_means_no_cycles(self) -> None:

@@ -47,7 +47,7 @@ class TestFewest:
             middle = min(max(round((low * high) ** 0.5), low + 1), high - 1)
             enough = measured(fit(image, labels, middle, recipe=quick()), image) >= target
             low, high = (low, middle) if enough else (middle, high)
-        assert len(result.scene) <= max(1.05 * high, high + 1)
+        assert result.scene.num_gaussians <= max(1.05 * high, high + 1)
 
     def test_out_of_reach_is_the_best_with_as_many(self, photo: tuple[Tensor, Tensor]) -> None:
         result = fit(*photo, 30, recipe=quick(target_psnr=60.0))
@@ -57,7 +57,7 @@ class TestFewest:
 
     def test_one_is_enough(self) -> None:
         result = fit(torch.full((3, 24, 32), 0.5), None, 100, recipe=quick(target_psnr=20.0))
-        assert result.target_reached and len(result.scene) == 1
+        assert result.target_reached and result.scene.num_gaussians == 1
 
     def test_same_result_again(self, photo: tuple[Tensor, Tensor]) -> None:
         first, second = (fit(*photo, 200, recipe=quick(target_psnr=20.0)) for _ in range(2))

@@ -48,7 +48,7 @@ class TestRegionMap(
         assert regions.size == (height, width) and regions.labels.shape == (*lead, height, width)
         assert regions.fine_labels.shape == labels.shape and regions.ids.shape == (4,)
         assert regions.index.shape == (*(lead or (1,)), height, width)
-        assert len(regions.unbind()) == (lead or (1,))[0]
+        assert not lead or regions.image(0).labels.shape == (height, width)
         assert regions.resize((7, 9)).labels.shape == (*lead, 7, 9)
 
     @pytest.mark.parametrize("softness", [0.0, 0.7])
@@ -442,7 +442,7 @@ class TestCrisp:
                 other.membership.tiles(16).masks, crisp.membership.tiles(16).masks
             )
         want = crisp.membership.weights(1, 2, torch.float64)
-        torch.testing.assert_close(crisp.unbind()[1].weights(2), want, rtol=0, atol=1e-9)
+        torch.testing.assert_close(crisp.image(1).weights(2), want, rtol=0, atol=1e-9)
         assert crisp.resize((45, 70)) is regions and crisp.resize((90, 140), "crisp") is crisp
         assert RegionMap.from_labels(torch.zeros(4, 5).long()).resize((4, 5), "crisp").num_regions == 1
 

@@ -38,7 +38,7 @@ def test_entry(entry: Entry) -> None:
     path = find(f"zoo:{entry.name}")
     assert path.stat().st_size == entry.bytes
     scene = load(path)
-    assert len(scene) == entry.num_gaussians
+    assert scene.num_gaussians == entry.num_gaussians
     image = images.load(PLANS[entry.name].image, None).image
     assert float(psnr(scene.render(), image)) == pytest.approx(entry.psnr, abs=0.02)
     folder = path.parent

@@ -49,14 +49,12 @@ class TestGaussianField(BaseTester):
     ) -> None:
         tensors = [torch.ones(*lead, count, n, device=device, dtype=dtype) for n in (2, 3, channels)]
         field = GaussianField(*tensors, opacities=tensors[0][..., 0], size=SIZE)
-        assert len(field) == count and field.merged_colors().shape == (*lead, count, channels)
+        assert field.num_gaussians == count and field.merged_colors().shape == (*lead, count, channels)
         assert field.means.dtype == whole(dtype) and field.size == SIZE
         labels = torch.zeros(*lead, *SIZE, device=device, dtype=torch.long)
         assert field.assign_regions(labels).region_ids.shape == (*lead, count)  # type: ignore[union-attr]
-        assert len(field.unbind()) == (lead or (1,))[0]
-        assert all(
-            one.means.shape == (count, 2) and len(one.subset(torch.arange(count))) == count for one in field.unbind()
-        )
+        one = field.image(0) if lead else field
+        assert one.means.shape == (count, 2) and one.subset(torch.arange(count)).num_gaussians == count
 
     def test_gradcheck(self, device: torch.device, labels: Tensor) -> None:
         """Tensors of a graph stay in it: gradients pass a field, its opacities too."""
@@ -85,7 +83,7 @@ class TestGaussianField(BaseTester):
     def test_module(self, field: GaussianField) -> None:
         assert {n for n, _ in field.named_parameters()} == {"means", "cholesky", "colors"}
         assert dict(field.named_buffers())["region_ids"].dtype == torch.int64
-        assert len(field) == 60
+        assert field.num_gaussians == 60
 
     def test_random_is_seeded(self) -> None:
         a, b = (GaussianField.random(10, SIZE, seed=3) for _ in range(2))
@@ -135,7 +133,7 @@ class TestGaussianField(BaseTester):
         assert field.region_ids is not None
         inside = field.region_ids == 4
         part, rest = field.subset(inside), field.subset((~inside).nonzero().flatten())
-        assert len(part) + len(rest) == 60 and 0 < len(part) < 60
+        assert part.num_gaussians + rest.num_gaussians == 60 and 0 < part.num_gaussians < 60
         total = RegionSplatRenderer()(part, labels) + RegionSplatRenderer()(rest, labels)
         torch.testing.assert_close(total, RegionSplatRenderer()(field, labels))
 
@@ -274,13 +272,14 @@ class TestRegionSplatRenderer(BaseTester):
     def test_a_map_that_lacks_ids(self, field: GaussianField, labels: Tensor) -> None:
         other = torch.where(labels == 4, 99, labels)
         count = int((field.region_ids == 4).sum())
-        with pytest.warns(UserWarning, match=f"^{count} of {len(field)} Gaussians paint nothing: .* such as 4;"):
+        words = f"^{count} of {field.num_gaussians} Gaussians paint nothing: .* such as 4;"
+        with pytest.warns(UserWarning, match=words):
             image = Scene(field, other).render()
         assert (image[:, labels == 4] == 0).all() and (image[:, labels != 4] > 0).any()
         # a small map may lose regions: that is no mistake
         dot = torch.zeros(SIZE, dtype=torch.long)
         dot[5, 5] = 1
-        field.region_ids = torch.ones(len(field), dtype=torch.long)
+        field.region_ids = torch.ones(field.num_gaussians, dtype=torch.long)
         assert RegionSplatRenderer()(field, RegionMap.from_labels(dot).resize((2, 3)), (2, 3)).eq(0).all()
         assert RegionSplatRenderer()(GaussianField.random(0, SIZE, regions=dot), dot).eq(0).all()
 
@@ -362,7 +361,7 @@ class TestBatch:
         render = RegionSplatRenderer(backend=backend)
         images = render(batch, regions, size)
         images.square().sum().backward()
-        singles = regions if isinstance(regions, Tensor) else regions.unbind()
+        singles = regions if isinstance(regions, Tensor) else [regions.image(k) for k in range(len(maps))]
         for k, (part, one) in enumerate(zip(parts, singles, strict=True)):
             image = render(part, one, size)
             image.square().sum().backward()

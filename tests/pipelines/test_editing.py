@@ -53,7 +53,7 @@ def scene_of(regions: RegionMap | Tensor, opacities: bool = False) -> Scene:
     size = regions.size if isinstance(regions, RegionMap) else (regions.shape[0], regions.shape[1])
     field = GaussianField.random(150, size, regions=regions, seed=0)
     if opacities:
-        alpha = torch.linspace(0.2, 1.0, len(field))
+        alpha = torch.linspace(0.2, 1.0, field.num_gaussians)
         field = GaussianField(field.means, field.cholesky, field.colors, field.region_ids, alpha, size=size)
     return Scene(field, regions, {"title": "shapes"})
 
@@ -142,8 +142,10 @@ class TestEditing(BaseTester):
     def test_exception_batched(self) -> None:
         two = [torch.ones(2, 5, n) for n in (2, 3, 3)]
         field = GaussianField(*two, torch.zeros(2, 5, dtype=torch.long), size=SIZE)
-        with pytest.raises(ValueError, match="scene must be of one image; got a batch of"):
-            recolor_region(Scene(field), 0, 0.5)
+        batch = Scene(field, torch.zeros(2, *SIZE, dtype=torch.long))
+        for edit in (extract_region, delete_region, render_region, lambda s, i: move_region(s, i, (1, 0))):
+            with pytest.raises(ValueError, match="scene must be of one image; got a batch of 2"):
+                edit(batch, 0)
 
     def test_exception_resized_soft_map(self) -> None:
         with pytest.raises(ValueError, match="must not have a resized map"):
@@ -177,7 +179,7 @@ class TestEditing(BaseTester):
     def test_module(self, edit: Edit, regions: RegionMap) -> None:
         """An edited scene is a module as any: its state holds all of it, and its Gaussians can be trained."""
         edited = edit(scene_of(regions))
-        other = Scene(GaussianField.random(len(edited), SIZE, seed=1))
+        other = Scene(GaussianField.random(edited.num_gaussians, SIZE, seed=1))
         other.load_state_dict(edited.state_dict())
         assert torch.equal(other(), edited())
         other().square().sum().backward()
@@ -319,7 +321,7 @@ class TestRecolor:
     def test_image_changes_by_the_formula(self, regions: RegionMap, gain: Tensor | float, opacities: bool) -> None:
         scene, bias = scene_of(regions, opacities), torch.tensor([0.2, 0.0, -0.1])
         changed = recolor_region(scene, DISC, gain, bias)
-        assert len(changed) == len(scene) + 1
+        assert changed.num_gaussians == scene.num_gaussians + 1
         before, after = cut(scene, DISC), cut(changed, DISC)
         matrix = gain if isinstance(gain, Tensor) and gain.ndim == 2 else torch.eye(3) * gain
         want = torch.einsum("ij,jhw->ihw", matrix, before[:3]) + bias[:, None, None]
@@ -343,7 +345,7 @@ class TestRecolor:
     def test_without_bias_no_gaussian_is_added(self) -> None:
         scene = scene_of(MAPS["hard"]())
         again = recolor_region(scene, BOX, 1.0)
-        assert len(again) == len(scene) and torch.equal(again.field.colors, scene.field.colors)
+        assert again.num_gaussians == scene.num_gaussians and torch.equal(again.field.colors, scene.field.colors)
 
 
 class TestDelete:

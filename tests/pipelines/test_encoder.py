@@ -142,7 +142,7 @@ def test_a_batch_is_its_images(backend: str) -> None:
     render = RegionSplatRenderer(backend=backend)
     together = render(field, labels)
     assert together.shape == images.shape
-    for b, scene in enumerate(Scene(field, labels).unbind()):
+    for b, scene in enumerate(Scene(field, labels)):
         assert scene.regions is not None and scene.regions.num_regions == (3, 2)[b % 2]
         torch.testing.assert_close(together[b], render(scene), rtol=1e-5, atol=1e-5)
 

@@ -56,7 +56,7 @@ class Finish:
                 log(state, render(state))
         assert state.best is not None
         scene = state.best.scene(state.size)
-        if config.refine_flat and reason == "iterations" and is_flat(state.image, scene.regions, len(scene)):
+        if config.refine_flat and reason == "iterations" and is_flat(state.image, scene.regions, scene.num_gaussians):
             scene = self._refined(state, scene)
         removed, change = 0, 0.0
         if config.prune > 0:

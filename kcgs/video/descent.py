@@ -1,0 +1,196 @@
+"""A short descent from Gaussians that are nearly right, in which no row changes its place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from kcgs.fitting import FitConfig
+from kcgs.fitting.contour_moves import accept_moves, refine_contours
+from kcgs.fitting.frame import local_gradient, move, widen
+from kcgs.fitting.objective import make_objective, propose_by
+from kcgs.fitting.redundancy import least_missed
+from kcgs.fitting.state import Gaussians
+from kcgs.functional import region_splat
+
+_ITERATIONS = 120
+# standard deviations in pixels that are tried for a relocated Gaussian
+_SIGMAS = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
+# iteration before which contours move
+_CONTOUR_MOVE = 30
+# iterations at the end, of half the rate
+_LAST_ITERATIONS = 24
+# share of a Newton step in a step, and of the step before
+_RATE = 0.12
+_MOMENTUM = 0.9
+# bounds of a Newton step and of a step, in the Gaussian's frame
+_LARGEST_NEWTON_STEP = 0.3
+_LARGEST_STEP = 0.2
+# what relocating a row of a region that stands still costs
+_HELD = 1e9
+# Gaussians at one place, as most places have them at most
+_USUAL_OVERLAP = 12.0
+# half the second derivatives of the squared error by a step in a Gaussian's frame, in units of its energy
+_CURVATURE = (0.5, 0.5, 0.75, 0.25, 0.75)
+# energies below it have next to no curvature
+_LEAST_ENERGY = 1e-2
+# pixels: on pixel centres a narrower Gaussian weighs as if it had this standard deviation
+_NARROW = 0.56
+# pixels: bounds of l11 and l22
+_LEAST_FACTOR = 0.1
+_LARGEST_FACTOR = 1e4
+_LEAST_SIGMA = 0.5
+
+
+class Descent:
+    """Gaussians on their way to an image: Newton steps of every number alone, with momentum.
+
+    What has a small gradient hardly moves, so that what stands still in a video stays where it is; Adam, whose steps
+    are as long for small gradients as for large ones, moves it six times as far.
+
+    Args:
+        image: (C, H, W).
+        gaussians: where the descent begins.
+        config: of the fit: its objective, its contour settings and its backend.
+        still: positions in the map's ids of regions that stay as they are, bool (R,); without regions (1,).
+    """
+
+    def __init__(self, image: Tensor, gaussians: Gaussians, config: FitConfig, still: Tensor) -> None:
+        self.image, self.gaussians, self.config = image, gaussians.detached(), config
+        self.objective = make_objective(config.objective, image)
+        self.velocity = torch.zeros_like(torch.cat([gaussians.means, gaussians.cholesky, gaussians.colors], -1))
+        rows, pixels = region_positions(gaussians, image)
+        self.free, self.free_pixels = ~still[rows], ~still[pixels]
+        self.crowding = torch.ones_like(gaussians.means[:, 0])
+
+    def run(self, relocations: Mapping[int, float], given: Tensor | None = None) -> Gaussians:
+        """Descend.
+
+        Args:
+            relocations: what share of the rows that may move is relocated before which iterations.
+            given: labels that contours may move from, as far as the config says; None: they stay.
+        """
+        start, error = self.gaussians, self.squared_error().mean()
+        for iteration in range(_ITERATIONS):
+            if iteration in relocations:
+                self.relocate(round(relocations[iteration] * int(self.free.sum())))
+            if iteration == _CONTOUR_MOVE and given is not None and self.config.move_contours:
+                self.move_contours(given)
+            self.step(_RATE if iteration < _ITERATIONS - _LAST_ITERATIONS else 0.5 * _RATE)
+        # also where steps were too long and the error is not finite
+        return self.gaussians if bool(self.squared_error().mean() <= error) else start
+
+    def render(self, gaussians: Gaussians | None = None) -> Tensor:
+        """Render (C, H, W) with the cutoff of a draft."""
+        return render_draft(gaussians or self.gaussians, self.image, self.config)
+
+    def squared_error(self) -> Tensor:
+        """Squared error of each pixel, (H, W), channels averaged."""
+        return (self.render() - self.image).square().mean(0)
+
+    def step(self, rate: float) -> None:
+        """Move all Gaussians once."""
+        means, cholesky, colors = (t.detach().requires_grad_() for t in self.gaussians[:3])
+        with torch.enable_grad():
+            rendered = self.render(self.gaussians._replace(means=means, cholesky=cholesky, colors=colors))
+        difference = rendered.detach() - self.image
+        if self.objective is not None:
+            difference = self.objective.apply(difference)
+        slopes = torch.autograd.grad(rendered, (means, cholesky, colors), difference)
+        means, cholesky, colors = self.gaussians[:3]
+        area = math.pi * cholesky[:, ::2].clamp_min(_NARROW).prod(-1) * self._weights() * self.crowding
+        energy = (colors.square().sum(-1) * area).clamp_min(_LEAST_ENERGY)
+        newton = local_gradient(cholesky, *slopes[:2]) / (energy[:, None] * energy.new_tensor(_CURVATURE))
+        newton = torch.cat([newton.clamp(-_LARGEST_NEWTON_STEP, _LARGEST_NEWTON_STEP), slopes[2] / area[:, None]], -1)
+        self.velocity = _MOMENTUM * self.velocity - newton
+        change = rate * self.velocity * self.free[:, None]
+        means, cholesky = move(means, cholesky, change[:, :5].clamp(-_LARGEST_STEP, _LARGEST_STEP))
+        l11, l21, l22 = cholesky.clamp(-_LARGEST_FACTOR, _LARGEST_FACTOR).unbind(-1)
+        cholesky = torch.stack([l11.clamp_min(_LEAST_FACTOR), l21, l22.clamp_min(_LEAST_FACTOR)], -1)
+        self.gaussians = self.gaussians._replace(
+            means=means, cholesky=widen(cholesky, _LEAST_SIGMA), colors=colors + change[:, 5:]
+        )
+
+    def relocate(self, count: int) -> None:
+        """Put so many rows, those that are missed least, where they lower the error most; neighbours make up for them.
+
+        Rows for which there is no use get the colour 0.
+        """
+        means, cholesky, colors, ids, regions = self.gaussians
+        index = region_positions(self.gaussians, self.image)[0]
+        table = torch.cat([means, cholesky, colors], -1).cpu().numpy()
+        visible, self.crowding = self._visibility()
+        weight = torch.where(self.free, self._weights() * visible, _HELD).cpu().numpy()
+        goes, handed = least_missed(table[:, :2], table[:, 2:5], table[:, 5:], index.cpu().numpy(), count, weight)
+        relocated = torch.from_numpy(goes).to(means.device)
+        colors = torch.from_numpy(handed).to(colors).masked_fill(relocated[:, None], 0.0)
+        self.gaussians = self.gaussians._replace(colors=colors)
+        self.velocity[relocated], self.free = 0.0, self.free | relocated
+        residual, wanted = (self.image - self.render()) * self.free_pixels, int(relocated.sum())
+        added = propose_by(self.objective, residual, regions, wanted, sigmas=_SIGMAS, backend=self.config.backend)
+        rows = relocated.nonzero()[: len(added.means), 0]
+        means, cholesky = means.index_copy(0, rows, added.means), cholesky.index_copy(0, rows, added.cholesky)
+        if ids is not None and added.region_ids is not None:
+            ids = ids.index_copy(0, rows, added.region_ids)
+        self.gaussians = Gaussians(means, cholesky, colors.index_copy(0, rows, added.colors), ids, regions)
+
+    def move_contours(self, given: Tensor) -> None:
+        """Move contours where the image is explained better, or nearly as well: Gaussians will adapt to them."""
+        before, config = self.gaussians.regions, self.config
+        if before is None or before.num_regions == 1:
+            return
+        moved = refine_contours(
+            self.gaussians.scene(before.size), self.image, given=given,
+            max_distance=None if config.max_move == "any" else config.max_move, length_weight=config.contour_cost,
+            backend=config.backend,
+        )  # fmt: skip
+        if moved is before:
+            return
+        error = self.squared_error()
+        self.gaussians = self.gaussians._replace(regions=moved)
+        gain = config.contour_rise * error - self.squared_error()
+        self.gaussians = self.gaussians._replace(regions=accept_moves(before, moved, gain))
+
+    def _visibility(self) -> tuple[Tensor, Tensor]:
+        """Return what share of each Gaussian is painted, (N,), and the factor of its curvature, (N,).
+
+        Many Gaussians at one place move together: with the curvature of one alone, their steps would be too long.
+        """
+        _, cholesky, colors = self.gaussians[:3]
+        ones = torch.ones_like(colors[:, :1]).requires_grad_()
+        with torch.enable_grad():
+            total = self.render(self.gaussians._replace(colors=ones))
+        area = math.pi * cholesky[:, ::2].clamp_min(_NARROW).prod(-1)
+        (mass,) = torch.autograd.grad(total, ones, torch.ones_like(total), retain_graph=True)
+        (overlap,) = torch.autograd.grad(total, ones, total.detach())
+        return (mass[:, 0] / (2 * area)).clamp_max(1.0), (overlap[:, 0] / area / _USUAL_OVERLAP).clamp_min(1.0)
+
+    def _weights(self) -> Tensor:
+        """Return what the squared error of Gaussians counts in the objective, (N,)."""
+        means, cholesky = self.gaussians[:2]
+        return torch.ones_like(means[:, 0]) if self.objective is None else self.objective.weigh(means, cholesky)
+
+
+def render_draft(gaussians: Gaussians, image: Tensor, config: FitConfig) -> Tensor:
+    """Render (C, H, W), of the size of the image, with the cutoff of a draft."""
+    means, cholesky, colors, region_ids, regions = gaussians
+    size, cutoff = (image.shape[1], image.shape[2]), max(config.cutoff, config.draft_cutoff)
+    return region_splat(means, cholesky, colors, region_ids, regions, size=size, cutoff=cutoff, backend=config.backend)
+
+
+def region_errors(image: Tensor, gaussians: Gaussians, config: FitConfig) -> Tensor:
+    """Mean squared error of each region, (R,); without regions (1,)."""
+    error = (render_draft(gaussians, image, config) - image).square().mean(0).flatten()
+    pixels = region_positions(gaussians, image)[1].flatten()
+    return pixels.bincount(error) / pixels.bincount()
+
+
+def region_positions(gaussians: Gaussians, image: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the region of each Gaussian, (N,), and of each pixel, (H, W), as positions in the map's ids."""
+    ids, regions = gaussians.region_ids, gaussians.regions
+    if regions is None or ids is None:
+        return torch.zeros_like(gaussians.means[:, 0], dtype=torch.int64), torch.zeros_like(image[0], dtype=torch.int64)
+    return regions.index_of(ids), regions.index_of(regions.labels)

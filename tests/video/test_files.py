@@ -1,0 +1,181 @@
+"""Videos and folders of frames, written and read back."""
+
+from __future__ import annotations
+
+import os
+import struct
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs.data import save_image, save_labels
+from kcgs.video import read_label_maps, read_video, write_video
+
+COLORS = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [0, 0, 0], [0.5, 0.5, 0.5]])
+
+
+def color_bars(count: int = 4, height: int = 32, width: int = 192) -> Tensor:
+    """Saturated colours side by side, shifted by one bar per frame; (T, 3, H, W)."""
+    columns = torch.arange(width) * len(COLORS) // width
+    frames = [COLORS[(columns + k) % len(COLORS)].T[:, None].expand(3, height, width) for k in range(count)]
+    return torch.stack(frames)
+
+
+class TestVideoFiles:
+    @pytest.fixture(autouse=True)
+    def av(self) -> Any:
+        return pytest.importorskip("av", reason="video files need PyAV: pip install 'kcgs[video]'")
+
+    @pytest.mark.parametrize(("name", "height", "width"), [("a.mp4", 32, 192), ("a.mkv", 32, 192), ("a.mp4", 33, 191)])
+    def test_round_trip(self, tmp_path: Path, name: str, height: int, width: int) -> None:
+        frames = color_bars(height=height, width=width)
+        write_video(tmp_path / name, iter(frames), 30000 / 1001)
+        video = read_video(tmp_path / name)
+        assert video.size == (height, width)
+        assert video.frame_rate == pytest.approx(30000 / 1001, abs=0.01)
+        assert read_video(tmp_path / name, frame_rate=12.5).frame_rate == 12.5
+        middles = [(2 * k + 1) * width // 12 for k in range(6)]
+        for _ in range(2):
+            copies = list(video)
+            assert len(copies) == 4
+            for copy, frame in zip(copies, frames, strict=True):
+                assert copy.shape == frame.shape and copy.dtype == torch.float32
+                assert (copy - frame).abs().mean() < 0.01
+                assert (copy - frame)[:, ::8, middles].abs().max() < 2.5 / 255
+        assert os.listdir(tmp_path) == [name]
+
+    def test_the_file_is_tagged_and_plays_while_it_loads(self, tmp_path: Path, av: Any) -> None:
+        write_video(tmp_path / "a.mp4", color_bars(), 24)
+        with av.open(str(tmp_path / "a.mp4")) as container:
+            context = container.streams.video[0].codec_context
+            tags = (context.colorspace, context.color_primaries, context.color_trc, context.color_range)
+            assert (context.name, context.pix_fmt, tags) == ("h264", "yuv420p", (1, 1, 1, 1))
+        data = (tmp_path / "a.mp4").read_bytes()
+        assert data.index(b"moov") < data.index(b"mdat")
+
+    def test_same_frames_same_bytes(self, tmp_path: Path) -> None:
+        frames = torch.rand(5, 3, 48, 64)
+        write_video(tmp_path / "a.mp4", frames, 24)
+        write_video(tmp_path / "b.mp4", list(frames), 24.0)
+        assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+
+    @pytest.mark.parametrize(("turns", "cosine", "sine"), [(1, 0, 1), (2, -1, 0), (3, 0, -1)])
+    def test_rotation(self, tmp_path: Path, turns: int, cosine: int, sine: int) -> None:
+        """The track header holds a rotation, clockwise, as telephones write it; the frames come upright."""
+        frames = color_bars(2)
+        write_video(tmp_path / "a.mp4", frames, 24)
+        data = (tmp_path / "a.mp4").read_bytes()
+        start = data.index(b"tkhd") + 44
+        matrix = struct.pack(">9i", *(65536 * value for value in (cosine, sine, 0, -sine, cosine, 0, 0, 0, 16384)))
+        (tmp_path / "a.mp4").write_bytes(data[:start] + matrix + data[start + 36 :])
+        video = read_video(tmp_path / "a.mp4")
+        upright = torch.rot90(frames, -turns, (2, 3))
+        assert video.size == tuple(upright.shape[2:])
+        assert (torch.stack(list(video)) - upright).abs().mean() < 0.01
+
+    @pytest.mark.parametrize("share", [0.0, 0.3, 0.95])
+    def test_damaged(self, tmp_path: Path, share: float) -> None:
+        write_video(tmp_path / "a.mp4", torch.rand(30, 3, 32, 48), 24)
+        data = (tmp_path / "a.mp4").read_bytes()
+        (tmp_path / "a.mp4").write_bytes(data[: int(share * len(data))])
+        with pytest.raises(ValueError, match=r"cannot read .*a\.mp4"):
+            list(read_video(tmp_path / "a.mp4"))
+
+    def test_sound_only(self, tmp_path: Path, av: Any) -> None:
+        with av.open(str(tmp_path / "a.wav"), "w") as container:
+            stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
+            sound = av.AudioFrame(format="s16", layout="mono", samples=800)
+            sound.sample_rate = 8000
+            container.mux(stream.encode(sound))
+        with pytest.raises(ValueError, match=r"a\.wav has no video stream"):
+            read_video(tmp_path / "a.wav")
+
+
+class TestFolders:
+    def test_round_trip(self, tmp_path: Path) -> None:
+        frames = (color_bars() * 255).round() / 255
+        (tmp_path / "clip").mkdir()  # an empty folder is filled
+        write_video(tmp_path / "clip", 3 * frames - 1, 24)  # values are clipped
+        (tmp_path / "clip" / "notes.txt").touch()
+        video = read_video(tmp_path / "clip")
+        assert (video.size, video.frame_rate) == ((32, 192), 24)
+        assert torch.equal(torch.stack(list(video)), (3 * frames - 1).clamp(0, 1).mul(255).add(0.5).floor() / 255)
+
+    def test_natural_order(self, tmp_path: Path) -> None:
+        for number in (10, 9, 100):
+            save_image(tmp_path / f"{number}.png", torch.full((3, 4, 4), number / 255))
+        assert [round(float(frame.max()) * 255) for frame in read_video(tmp_path)] == [9, 10, 100]
+
+    def test_label_maps(self, tmp_path: Path) -> None:
+        """Ids are the same in every map, as colours and as values; each pass reads anew."""
+        save_labels(tmp_path / "10.png", torch.tensor([[70000, 70000]]), rgb_ids=True)
+        save_labels(tmp_path / "9.npy", torch.tensor([[0, 70000]]))
+        maps = read_label_maps(tmp_path)
+        assert len(maps) == 2
+        for _ in range(2):
+            assert [labels.tolist() for labels in maps] == [[[0, 70000]], [[70000, 70000]]]
+            assert all(labels.dtype == torch.int64 for labels in maps)
+
+
+class TestErrors:
+    @pytest.mark.parametrize("read", [read_video, read_label_maps])
+    def test_missing_and_empty(self, tmp_path: Path, read: Any) -> None:
+        with pytest.raises(FileNotFoundError, match="nothing"):
+            read(tmp_path / "nothing")
+        with pytest.raises(ValueError, match="has no"):
+            read(tmp_path)
+
+    def test_sizes_differ(self, tmp_path: Path) -> None:
+        for name, width in (("0.png", 4), ("1.png", 5)):
+            save_image(tmp_path / name, torch.zeros(3, 3, width))
+        with pytest.raises(ValueError, match=r"frame 1 of .* must have size \(3, 4\); got \(3, 5\)"):
+            list(read_video(tmp_path))
+
+    @pytest.mark.parametrize(
+        ("frames", "frame_rate", "words"),
+        [
+            ([], 24, "frames must hold at least one frame"),
+            ([torch.zeros(1, 8, 8)], 24, r"frame 0 must have shape \(3, 8, 8\); got \(1, 8, 8\)"),
+            ([torch.zeros(3, 8, 8), torch.zeros(3, 8, 6)], 24, "frame 1 must have shape"),
+            ([torch.full((3, 8, 8), float("nan"))], 24, "frame 0 must be finite"),
+            ([torch.zeros(3, 8, 8)], 0, "frame_rate must be finite and above 0"),
+        ],
+    )
+    def test_arguments(self, tmp_path: Path, frames: list[Tensor], frame_rate: float, words: str) -> None:
+        with pytest.raises(ValueError, match=words):
+            write_video(tmp_path / "clip", frames, frame_rate)
+        assert not os.listdir(tmp_path)
+
+    @pytest.mark.parametrize("path", ["clip", "a.mp4"])
+    def test_an_error_between_frames_leaves_nothing(self, tmp_path: Path, path: str) -> None:
+        def broken() -> Iterator[Tensor]:
+            yield from color_bars(2)
+            raise KeyboardInterrupt
+
+        if path == "a.mp4":
+            pytest.importorskip("av")
+        with pytest.raises(KeyboardInterrupt):
+            write_video(tmp_path / path, broken(), 24)
+        assert not os.listdir(tmp_path)
+
+    def test_folders_of_the_output(self, tmp_path: Path) -> None:
+        (tmp_path / "notes.txt").touch()
+        with pytest.raises(FileExistsError, match="expected a new or an empty folder"):
+            write_video(tmp_path, color_bars(), 24)
+        for name in ("none/clip", "none/a.mp4"):
+            with pytest.raises(FileNotFoundError, match="none"):
+                write_video(tmp_path / name, color_bars(), 24)
+
+    def test_without_pyav(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(sys.modules, "av", None)
+        (tmp_path / "a.mp4").touch()
+        with pytest.raises(ImportError, match=r"pip install 'kcgs\[video\]'"):
+            read_video(tmp_path / "a.mp4")
+        with pytest.raises(ImportError, match=r"pip install 'kcgs\[video\]'"):
+            write_video(tmp_path / "b.mp4", color_bars(), 24)
+        assert os.listdir(tmp_path) == ["a.mp4"]
