@@ -304,6 +304,14 @@ def check_unbatched(scene: object) -> Scene:
     return scene
 
 
+def check_batch(scenes: object) -> Scene:
+    """Return `scenes` if it is a batch of scenes."""
+    if not isinstance(scenes, Scene) or scenes.field.means.ndim != 3:
+        given = "a scene of one image" if isinstance(scenes, Scene) else type(scenes).__name__
+        raise TypeError(f"scenes must be a batch of scenes; got {given}")
+    return scenes
+
+
 def check_scene(scene: object) -> Scene:
     """Return `scene` if it is a Scene of one image, with one map and region ids, or without a map."""
     scene = check_unbatched(scene)

@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcgs._atomic import check_writable
-
 from . import options
 from .common import IMAGES, OUTPUT_IMAGES, Json, Quiet, Stop, app, check_output, interrupted, print_report
 from .fit import compile_ahead, read_regions
@@ -64,7 +62,7 @@ def fit_video_command(
     if resume and checkpoint is None:
         raise typer.BadParameter("--resume needs --checkpoint")
     if checkpoint is not None:
-        check_writable("--checkpoint", checkpoint)
+        check_output(checkpoint, ".safetensors", option="--checkpoint")
     compile_ahead(request.config, False)
     from kcgs.data import load_labels
     from kcgs.functional import psnr

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
@@ -55,30 +55,30 @@ class Descent:
         image: (C, H, W).
         gaussians: where the descent begins.
         config: of the fit: its objective, its contour settings and its backend.
-        still: positions in the map's ids of regions that stay as they are, bool (R,); without regions (1,).
+        free: the rows that may move, bool (N,).
+        changed: where the error counts, bool (H, W): there rows are relocated to, and contours move.
     """
 
-    def __init__(self, image: Tensor, gaussians: Gaussians, config: FitConfig, still: Tensor) -> None:
+    def __init__(self, image: Tensor, gaussians: Gaussians, config: FitConfig, free: Tensor, changed: Tensor) -> None:
         self.image, self.gaussians, self.config = image, gaussians.detached(), config
         self.objective = make_objective(config.objective, image)
         self.velocity = torch.zeros_like(torch.cat([gaussians.means, gaussians.cholesky, gaussians.colors], -1))
-        rows, pixels = region_positions(gaussians, image)
-        self.free, self.free_pixels = ~still[rows], ~still[pixels]
+        self.free, self.changed = free, changed
         self.crowding = torch.ones_like(gaussians.means[:, 0])
 
-    def run(self, relocations: Mapping[int, float], given: Tensor | None = None) -> Gaussians:
+    def run(self, relocations: Mapping[int, float], anchor: Tensor | None = None) -> Gaussians:
         """Descend.
 
         Args:
             relocations: what share of the rows that may move is relocated before which iterations.
-            given: labels that contours may move from, as far as the config says; None: they stay.
+            anchor: labels that contours may move from, as far as the config says; None: they stay.
         """
         start, error = self.gaussians, self.squared_error().mean()
         for iteration in range(_ITERATIONS):
             if iteration in relocations:
                 self.relocate(round(relocations[iteration] * int(self.free.sum())))
-            if iteration == _CONTOUR_MOVE and given is not None and self.config.move_contours:
-                self.move_contours(given)
+            if iteration == _CONTOUR_MOVE and anchor is not None and self.config.move_contours:
+                self.move_contours(anchor)
             self.step(_RATE if iteration < _ITERATIONS - _LAST_ITERATIONS else 0.5 * _RATE)
         # also where steps were too long and the error is not finite
         return self.gaussians if bool(self.squared_error().mean() <= error) else start
@@ -129,7 +129,7 @@ class Descent:
         colors = torch.from_numpy(handed).to(colors).masked_fill(relocated[:, None], 0.0)
         self.gaussians = self.gaussians._replace(colors=colors)
         self.velocity[relocated], self.free = 0.0, self.free | relocated
-        residual, wanted = (self.image - self.render()) * self.free_pixels, int(relocated.sum())
+        residual, wanted = (self.image - self.render()) * self.changed, int(relocated.sum())
         added = propose_by(self.objective, residual, regions, wanted, sigmas=_SIGMAS, backend=self.config.backend)
         rows = relocated.nonzero()[: len(added.means), 0]
         means, cholesky = means.index_copy(0, rows, added.means), cholesky.index_copy(0, rows, added.cholesky)
@@ -137,13 +137,13 @@ class Descent:
             ids = ids.index_copy(0, rows, added.region_ids)
         self.gaussians = Gaussians(means, cholesky, colors.index_copy(0, rows, added.colors), ids, regions)
 
-    def move_contours(self, given: Tensor) -> None:
+    def move_contours(self, anchor: Tensor) -> None:
         """Move contours where the image is explained better, or nearly as well: Gaussians will adapt to them."""
         before, config = self.gaussians.regions, self.config
         if before is None or before.num_regions == 1:
             return
         moved = refine_contours(
-            self.gaussians.scene(before.size), self.image, given=given,
+            self.gaussians.scene(before.size), self.image, given=anchor,
             max_distance=None if config.max_move == "any" else config.max_move, length_weight=config.contour_cost,
             backend=config.backend,
         )  # fmt: skip
@@ -151,7 +151,7 @@ class Descent:
             return
         error = self.squared_error()
         self.gaussians = self.gaussians._replace(regions=moved)
-        gain = config.contour_rise * error - self.squared_error()
+        gain = (config.contour_rise * error - self.squared_error()).masked_fill(~self.changed, -1.0)
         self.gaussians = self.gaussians._replace(regions=accept_moves(before, moved, gain))
 
     def _visibility(self) -> tuple[Tensor, Tensor]:
@@ -159,14 +159,10 @@ class Descent:
 
         Many Gaussians at one place move together: with the curvature of one alone, their steps would be too long.
         """
-        _, cholesky, colors = self.gaussians[:3]
-        ones = torch.ones_like(colors[:, :1]).requires_grad_()
-        with torch.enable_grad():
-            total = self.render(self.gaussians._replace(colors=ones))
-        area = math.pi * cholesky[:, ::2].clamp_min(_NARROW).prod(-1)
-        (mass,) = torch.autograd.grad(total, ones, torch.ones_like(total), retain_graph=True)
-        (overlap,) = torch.autograd.grad(total, ones, total.detach())
-        return (mass[:, 0] / (2 * area)).clamp_max(1.0), (overlap[:, 0] / area / _USUAL_OVERLAP).clamp_min(1.0)
+        total, sums = sum_over_pixels(self.gaussians, self.image, self.config)
+        mass, overlap = sums(torch.ones_like(total)), sums(total)
+        area = math.pi * self.gaussians.cholesky[:, ::2].clamp_min(_NARROW).prod(-1)
+        return (mass / (2 * area)).clamp_max(1.0), (overlap / area / _USUAL_OVERLAP).clamp_min(1.0)
 
     def _weights(self) -> Tensor:
         """Return what the squared error of Gaussians counts in the objective, (N,)."""
@@ -181,11 +177,15 @@ def render_draft(gaussians: Gaussians, image: Tensor, config: FitConfig) -> Tens
     return region_splat(means, cholesky, colors, region_ids, regions, size=size, cutoff=cutoff, backend=config.backend)
 
 
-def region_errors(image: Tensor, gaussians: Gaussians, config: FitConfig) -> Tensor:
-    """Mean squared error of each region, (R,); without regions (1,)."""
-    error = (render_draft(gaussians, image, config) - image).square().mean(0).flatten()
-    pixels = region_positions(gaussians, image)[1].flatten()
-    return pixels.bincount(error) / pixels.bincount()
+def sum_over_pixels(
+    gaussians: Gaussians, image: Tensor, config: FitConfig
+) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    """Return the sum of all Gaussians at each pixel, (1, H, W), and what sums such a map under each Gaussian, (N,)."""
+    ones = torch.ones_like(gaussians.colors[:, :1]).requires_grad_()
+    with torch.enable_grad():
+        total = render_draft(gaussians._replace(colors=ones), image, config)
+    # the render is linear in the colours: its gradient has the sums
+    return total.detach(), lambda weights: torch.autograd.grad(total, ones, weights, retain_graph=True)[0][:, 0]
 
 
 def region_positions(gaussians: Gaussians, image: Tensor) -> tuple[Tensor, Tensor]:

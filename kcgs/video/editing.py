@@ -9,15 +9,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from kcgs._check import check_number
-from kcgs.editing.checks import check_ids
+from kcgs.editing.checks import check_ids, check_offset
 from kcgs.fitting import FitConfig
 from kcgs.fitting.inpaint import grow, inpaint
 from kcgs.fitting.state import Gaussians
 from kcgs.functional import RegionMap
 from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
-from kcgs.scene import Scene
+from kcgs.scene import Scene, check_batch
 
 from .descent import Descent
 
@@ -83,7 +82,8 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
                     row_ids[again] = before.region_ids[again]
             filled = filled_map.image(t)
             start = Gaussians(means, cholesky, colors, row_ids, filled)
-            descent = Descent(targets[t], start, FitConfig(), torch.zeros_like(filled.ids, dtype=torch.bool))
+            everything = torch.ones_like(blank), torch.ones_like(is_deleted[t])
+            descent = Descent(targets[t], start, FitConfig(), *everything)
             edited.append(descent.run({0: float((blank & (colors == 0).all(-1)).float().mean())}))
     means, cholesky, colors = (torch.stack(parts) for parts in zip(*(g[:3] for g in edited), strict=True))
     row_ids = torch.stack([g.region_ids for g in edited if g.region_ids is not None])
@@ -107,7 +107,7 @@ def move_region(scenes: Scene, region_ids: int | Iterable[int], offset: Sequence
         TypeError, ValueError: as :func:`delete_region`; an offset that is not two whole numbers.
     """
     regions, ids, moved = _check(scenes, region_ids)
-    dx, dy = (round(check_number("offset", step)) for step in offset)
+    dx, dy = check_offset(offset, 1)
     behind = delete_region(scenes, region_ids)
     assert behind.regions is not None and behind.field.region_ids is not None
     inside = torch.isin(ids, moved)
@@ -117,7 +117,8 @@ def move_region(scenes: Scene, region_ids: int | Iterable[int], offset: Sequence
     cholesky = torch.cat([behind.field.cholesky, field.cholesky[:, rows]], 1)
     colors = torch.where(inside[..., None], field.merged_colors(), 0.0)[:, rows]
     height, width = scenes.size
-    y, x = torch.meshgrid(torch.arange(height) - dy, torch.arange(width) - dx, indexing="ij")
+    y, x = (torch.arange(length, device=regions.ids.device) - step for length, step in ((height, dy), (width, dx)))
+    y, x = torch.meshgrid(y, x, indexing="ij")
     source = regions.labels[:, y.clamp(0, height - 1), x.clamp(0, width - 1)]
     landed = torch.isin(source, moved) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
     labels = torch.where(landed, source, behind.regions.labels)
@@ -130,12 +131,10 @@ def move_region(scenes: Scene, region_ids: int | Iterable[int], offset: Sequence
 
 def _check(scenes: Scene, region_ids: int | Iterable[int]) -> tuple[RegionMap, Tensor, Tensor]:
     """Return the maps, the ids of the rows (T, N), and the chosen ids."""
-    if not isinstance(scenes, Scene):
-        raise TypeError(f"scenes must be a Scene; got {type(scenes).__name__}")
-    count, regions, ids = len(scenes), scenes.regions, scenes.field.region_ids
+    count, regions, ids = len(check_batch(scenes)), scenes.regions, scenes.field.region_ids
     if regions is None or ids is None or regions.num_maps != count:
         raise ValueError("scenes must have a label map for each frame, and region ids")
-    chosen = torch.tensor(check_ids(region_ids, regions.ids, "maps"))
+    chosen = torch.tensor(check_ids(region_ids, regions.ids, "maps"), device=regions.ids.device)
     left = (~torch.isin(regions.labels, chosen)).flatten(1).any(1)
     if not left.all():
         raise ValueError(

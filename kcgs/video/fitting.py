@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from kcgs._check import check_count
 from kcgs._progress import Progress
@@ -24,7 +25,7 @@ from kcgs.kernels import prepare, threads_for_kernels
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene, load, save
 
-from .descent import Descent, region_errors, region_positions
+from .descent import Descent, region_positions, render_draft, sum_over_pixels
 from .motion import estimate_motion, move_labels, move_points
 
 OnFrame = Callable[[int, Scene], bool | None]
@@ -36,8 +37,13 @@ _FRAME_RATE = 24.0
 _CUT = 0.5
 # iterations before which the least useful rows are relocated, and the share that is
 _RELOCATIONS = dict.fromkeys((0, 20, 40, 60, 80), 0.05)
-# a region stands still if its error without motion is at most so many times that of its fit
-_STILL = 1.05
+# pixels change where the error about them, in a square of so many pixels, is this many times that of their fit, and a
+# level of 255 more
+_STILL = 1.02
+_SURROUNDINGS = 15
+_LEVEL = 255.0**-2
+# share of a Gaussian on pixels that changed from which on it may move
+_FREE_SHARE = 0.1
 # frames between two writes of a checkpoint
 _CHECKPOINT_FRAMES = 8
 
@@ -74,10 +80,11 @@ def fit_video(
         num_gaussians: N, of every frame.
         recipe: of the first frame, and of what follows a scene cut.
         seed: of the random start.
-        on_frame: called after every frame with its number, from 0, and its scene; returning True stops.
+        on_frame: called with the number of every frame, from 0, and its scene; returning True stops.
         progress: show how many frames are done.
         checkpoint: a .safetensors file to write the frames to, every eighth and the last, whole or not at all.
         resume: go on after the last frame of `checkpoint`, where it exists; the result is that of an uninterrupted fit.
+            Frames, label maps and settings must be the same; only N and the shape of the frames are compared.
         settings: fields of :class:`kcgs.FitConfig`, in place of the recipe's.
 
     Returns:
@@ -87,7 +94,7 @@ def fit_video(
     Raises:
         TypeError: wrong types.
         ValueError: as :func:`kcgs.fit`; no frames; a frame of another size, or without a label map; a checkpoint of
-            other frames or another N.
+            another shape or N.
 
     Example:
         >>> frames = [torch.zeros(3, 16, 24) for _ in range(3)]
@@ -102,6 +109,8 @@ def fit_video(
     if resume and checkpoint is None:
         raise ValueError("resume needs checkpoint, a file to go on from; got None")
     path = None if checkpoint is None else Path(checkpoint)
+    if path is not None and path.suffix != ".safetensors":
+        raise ValueError(f"checkpoint must end in .safetensors; got {str(path)!r}")
     done = _read_checkpoint(path, count) if path is not None and resume else []
     metadata = {"frame_rate": f"{float(getattr(frames, 'frame_rate', _FRAME_RATE)):.10g}"}
     length = len(frames) if isinstance(frames, Sized) else None
@@ -113,12 +122,12 @@ def fit_video(
             bar.update((number + 1) / (length or math.inf), f"frame {number + 1}")
             if is_new and path is not None and (number + 1) % _CHECKPOINT_FRAMES == 0:
                 save(path, video.batch(metadata))
-            if is_new and on_frame is not None and on_frame(number, video.scenes[-1]):
+            if on_frame is not None and on_frame(number, video.scenes[-1]):
                 break
     if not video.scenes:
         raise ValueError("frames must hold at least one frame; got none")
     scenes = video.batch(metadata)
-    if path is not None:
+    if path is not None and len(scenes) > len(done):
         save(path, scenes)
     return scenes
 
@@ -130,7 +139,7 @@ class _Video:
         self.config, self.num_gaussians, self.seed = config, num_gaussians, seed
         self.scenes: list[Scene] = []
         self.image: Tensor | None = None
-        self.errors: dict[int, float] = {}  # of each region, when its Gaussians were last fitted
+        self.error = torch.zeros(())  # of each pixel, (H, W), when it was last fitted
 
     def add(self, frame: Any, labels: Labels | None, done: Scene | None) -> None:
         """Fit a frame, unless it is done; labels None: the map before is carried on, where there is one."""
@@ -138,18 +147,20 @@ class _Video:
         self.image, regions = check_problem(frame, labels)
         if before is not None and before.shape != self.image.shape:
             raise ValueError(f"frame {number} must have shape {tuple(before.shape)}; got {tuple(self.image.shape)}")
-        if done is not None:
-            if (*done.size, done.field.colors.shape[-1]) != (*self.image.shape[1:], len(self.image)):
-                raise ValueError(f"checkpoint must be of these frames; frame {number} has another shape there")
-            scene = done
-        elif before is None:
-            scene = self._fit_anew(self.image, regions)
+        if done is not None and (*done.size, done.field.colors.shape[-1]) != (*self.image.shape[1:], len(self.image)):
+            raise ValueError(f"checkpoint must be of these frames; frame {number} has another shape there")
+        changed = torch.ones_like(self.image[0], dtype=torch.bool)
+        if before is None:
+            scene = self._fit_anew(self.image, regions) if done is None else done
         else:
             prepare(self.config.backend, before.device, before.dtype, len(before))
             with threads_for_kernels(before[0].numel()):
-                scene = self._follow(before, self.image, regions)
+                scene, changed = self._follow(before, self.image, regions, done)
         self.scenes.append(scene)
-        self._remember_errors()
+        field = scene.field
+        tensors = field.means.detach(), field.cholesky.detach(), field.colors.detach()
+        error = self._squared_error(self.image, Gaussians(*tensors, field.region_ids, scene.regions))
+        self.error = torch.where(changed, error, self.error)
 
     def batch(self, metadata: Mapping[str, str]) -> Scene:
         """Return all frames as one scene."""
@@ -172,7 +183,12 @@ class _Video:
 
     def _fit_anew(self, image: Tensor, regions: RegionMap | None) -> Scene:
         """Fit a frame by itself; rows that it leaves unused have colour 0."""
-        scene = fit(image, regions, self.num_gaussians, recipe=self.config, seed=self.seed).scene
+        config = self.config
+        if self.scenes and regions is not None:  # contours have the widths of the first frame
+            assert self.scenes[0].regions is not None
+            regions = self.scenes[0].regions.relabel(regions.labels, "mean")
+            config = config.model_copy(update={"softness": 0.0})
+        scene = fit(image, regions, self.num_gaussians, recipe=config, seed=self.seed).scene
         field, missing = scene.field, self.num_gaussians - scene.num_gaussians
         unused = torch.tensor([field.size[1] / 2, field.size[0] / 2]), torch.tensor([1.0, 0.0, 1.0]), torch.zeros(1)
         means, cholesky, colors = (
@@ -187,71 +203,59 @@ class _Video:
             ids[: field.num_gaussians] = field.region_ids
         return Scene(GaussianField(means, cholesky, colors, ids, size=field.size), regions)
 
-    def _follow(self, previous: Tensor, image: Tensor, regions: RegionMap | None) -> Scene:
-        """Fit a frame from the one before."""
+    def _follow(
+        self, previous: Tensor, image: Tensor, regions: RegionMap | None, done: Scene | None
+    ) -> tuple[Scene, Tensor]:
+        """Return a frame, fitted from the one before unless it is done, and which pixels changed."""
         scene, first = self.scenes[-1], self.scenes[0].regions
         motion, is_carried = estimate_motion(previous, image), regions is None
         if first is not None and scene.regions is not None:
             labels = move_labels(motion, scene.regions.labels) if regions is None else regions.labels
             regions = first.relabel(labels, "mean")
-        start, still = self._choose_start(image, motion, regions)
-        descent = Descent(image, start, self.config, still)
+        start, free, changed = self._choose_start(image, motion, regions)
+        if done is not None:
+            return done, changed
+        descent = Descent(image, start, self.config, free, changed)
         if bool(descent.squared_error().mean() > _CUT * image.var((1, 2)).mean()):
             if is_carried and regions is not None:
                 largest = regions.index_of(regions.labels).flatten().bincount().argmax()
-                regions = RegionMap.from_labels(torch.full_like(regions.labels, int(regions.ids[largest])))
-            return self._fit_anew(image, regions)
-        if not still.all():
+                regions = regions.relabel(torch.full_like(regions.labels, int(regions.ids[largest])))
+            return self._fit_anew(image, regions), torch.ones_like(changed)
+        if changed.any():
             start = descent.run(_RELOCATIONS, None if regions is None else regions.labels)
-        return start.scene(scene.size)
+        return start.scene(scene.size), changed
 
-    def _choose_start(self, image: Tensor, motion: Tensor, regions: RegionMap | None) -> tuple[Gaussians, Tensor]:
-        """Return the Gaussians before, moved where that explains a region better, and which regions stand still.
+    def _choose_start(
+        self, image: Tensor, motion: Tensor, regions: RegionMap | None
+    ) -> tuple[Gaussians, Tensor, Tensor]:
+        """Return the Gaussians before, moved where that helps, which of them may move on, and which pixels changed.
 
-        These are explained, without motion, as well as when their Gaussians were last fitted.
+        A pixel changed if the Gaussians, without motion, explain its surroundings less well than when they were fitted.
+        A region moves if it is explained better with motion.
         """
-        before = _gaussians(self.scenes[-1])
-        unmoved = before._replace(regions=regions)
-        if regions is not None and before.region_ids is not None:  # rows of a region that is no longer there are free
-            present = torch.isin(before.region_ids, regions.ids)
-            unmoved = unmoved._replace(
-                region_ids=torch.where(present, before.region_ids, regions.ids[0]),
-                colors=torch.where(present[:, None], before.colors, 0.0),
-            )
+        field = self.scenes[-1].field
+        means, cholesky, colors = (t.detach() for t in (field.means, field.cholesky, field.colors))
+        ids = field.region_ids
+        if regions is not None and ids is not None:  # rows of a region that is no longer there have no use
+            present = torch.isin(ids, regions.ids)
+            ids, colors = torch.where(present, ids, regions.ids[0]), torch.where(present[:, None], colors, 0.0)
+        unmoved = Gaussians(means, cholesky, colors, ids, regions)
         moved = unmoved._replace(means=_move_by_region(motion, unmoved))
-        errors = [region_errors(image, gaussians, self.config) for gaussians in (unmoved, moved)]
-        moves = (errors[1] < errors[0])[region_positions(unmoved, image)[0]]
-        start = unmoved._replace(means=torch.where(moves[:, None], moved.means, unmoved.means))
-        fitted = [self.errors.get(region, 0.0) for region in _ids(regions)]
-        return start, errors[0] <= _STILL * errors[0].new_tensor(fitted)
+        errors = [self._squared_error(image, gaussians) for gaussians in (unmoved, moved)]
+        changed = _blur(errors[0]) > _STILL * _blur(self.error) + _LEVEL
+        _, sums = sum_over_pixels(unmoved, image, self.config)
+        free = sums(changed[None].to(image)) >= _FREE_SHARE * sums(torch.ones_like(image[:1]))
+        rows, pixels = region_positions(unmoved, image)
+        moves = pixels.flatten().bincount((errors[1] - errors[0]).flatten()) < 0
+        means = torch.where((free & moves[rows])[:, None], moved.means, means)
+        return unmoved._replace(means=means), free, changed
 
-    def _remember_errors(self) -> None:
-        """Keep the errors of the regions whose Gaussians are not those of the frame before."""
-        assert self.image is not None
-        now = _gaussians(self.scenes[-1])
-        ids = _ids(now.regions)
-        changed = torch.ones(len(ids), dtype=torch.bool)
-        if len(self.scenes) > 1:
-            before = _gaussians(self.scenes[-2])
-            rows = torch.zeros_like(now.means[:, 0], dtype=torch.bool)
-            for old, new in zip(before[:3], now[:3], strict=True):
-                rows |= (old != new).any(-1)
-            changed = region_positions(now, self.image)[0][rows].bincount(minlength=len(ids)) > 0
-        errors = region_errors(self.image, now, self.config).tolist()
-        for region, error, is_new in zip(ids, errors, changed.tolist(), strict=True):
-            if is_new or region not in self.errors:
-                self.errors[region] = error
+    def _squared_error(self, image: Tensor, gaussians: Gaussians) -> Tensor:
+        return (render_draft(gaussians, image, self.config) - image).square().mean(0)
 
 
-def _gaussians(scene: Scene) -> Gaussians:
-    field = scene.field
-    return Gaussians(
-        field.means.detach(), field.cholesky.detach(), field.colors.detach(), field.region_ids, scene.regions
-    )
-
-
-def _ids(regions: RegionMap | None) -> list[int]:
-    return [0] if regions is None else regions.ids.tolist()
+def _blur(error: Tensor) -> Tensor:
+    return avg_pool2d(error[None], _SURROUNDINGS, 1, _SURROUNDINGS // 2, count_include_pad=False)[0]
 
 
 def _move_by_region(motion: Tensor, gaussians: Gaussians) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from kcgs._check import check_number
 from kcgs.editing.checks import ids_of
 from kcgs.nn import GaussianField
-from kcgs.scene import Scene
+from kcgs.scene import Scene, check_batch
 
 from .motion import estimate_motion, motion_at, move_labels, move_points
 
@@ -27,7 +27,7 @@ def interpolate(scenes: Scene, time: float) -> Scene:
         time: in frames, 0 to T - 1.
 
     Returns:
-        The frame itself for a whole `time`; otherwise a scene of 2 N Gaussians.
+        The frame itself for a whole `time`; otherwise a scene of up to 2 N Gaussians.
 
     Raises:
         TypeError: a scene of one image.
@@ -39,7 +39,7 @@ def interpolate(scenes: Scene, time: float) -> Scene:
         >>> interpolate(Scene(field), 0.5).num_gaussians
         2
     """
-    time = check_number("time", time, 0.0, len(scenes) - 1.0, unit="frames")
+    time = check_number("time", time, 0.0, len(check_batch(scenes)) - 1.0, unit="frames")
     number, share = int(time), math.fmod(time, 1.0)
     if share == 0.0:
         return scenes[number]

@@ -76,9 +76,23 @@ class TestFitVideo:
         done = fit_video(
             FRAMES, MAPS, checkpoint=path, resume=True, on_frame=lambda number, _: numbers.append(number), **SETTINGS
         )
-        assert numbers == [3, 4] and torch.equal(done.field.means, scenes.field.means)
+        assert numbers == [0, 1, 2, 3, 4] and torch.equal(done.field.means, scenes.field.means)
         with pytest.raises(ValueError, match="checkpoint must hold frames of 81 Gaussians"):
             fit_video(FRAMES, MAPS, 81, checkpoint=path, resume=True)
+
+    def test_resume_after_a_cut(self, tmp_path: Path) -> None:
+        """Contours have the widths of the first frame before and after a cut, in the batch and in each frame."""
+        path, halves = tmp_path / "a.safetensors", torch.arange(SIZE[1]) // 22
+        other = torch.stack([0.9 * (halves == k) for k in range(3)])[:, None].expand(3, *SIZE).contiguous()
+        frames, maps = [*FRAMES[:2], other, other], [*MAPS[:2], halves.expand(SIZE), halves.expand(SIZE)]
+        rendered: list[Tensor] = []
+        whole = fit_video(frames, maps, on_frame=lambda _, scene: rendered.append(scene.render()), **SETTINGS)
+        assert torch.allclose(whole.render(), torch.stack(rendered), atol=1e-5)
+        fit_video(frames, maps, checkpoint=path, on_frame=lambda number, _: number == 2, **SETTINGS)
+        resumed = fit_video(frames, maps, checkpoint=path, resume=True, **SETTINGS)
+        assert torch.equal(resumed.field.means, whole.field.means)
+        fit_video(frames, maps, checkpoint=path, resume=True, on_frame=lambda number, _: number == 0, **SETTINGS)
+        assert len(load(path)) == 4
 
     def test_the_map_of_the_first_frame_is_carried_on(self) -> None:
         scenes = fit_video(FRAMES, MAPS[0], **SETTINGS)
@@ -117,6 +131,8 @@ class TestFitVideo:
             fit_video([FRAMES[0], FRAMES[0][:, :24]], None, 8, iterations=2)
         with pytest.raises(ValueError, match="resume needs checkpoint"):
             fit_video(FRAMES, resume=True)
+        with pytest.raises(ValueError, match="checkpoint must end in .safetensors"):
+            fit_video(FRAMES, checkpoint=tmp_path / "a.state")
 
 
 class TestInterpolate:
@@ -139,7 +155,7 @@ class TestInterpolate:
     def test_exceptions(self, scenes: Scene) -> None:
         with pytest.raises(ValueError, match=r"time must be in \[0, 4\] frames; got 4.5"):
             interpolate(scenes, 4.5)
-        with pytest.raises(TypeError, match="a scene of one image has no len"):
+        with pytest.raises(TypeError, match="scenes must be a batch of scenes; got a scene of one image"):
             interpolate(scenes[0], 0)
 
 
@@ -177,7 +193,9 @@ class TestEdits:
             delete_region(scenes, 3)
         with pytest.raises(ValueError, match="region_ids must leave a region in every frame"):
             delete_region(scenes, [0, 7])
-        with pytest.raises(TypeError, match="a scene of one image has no len"):
+        with pytest.raises(TypeError, match="scenes must be a batch of scenes; got a scene of one image"):
             delete_region(scenes[0], 7)
+        with pytest.raises(ValueError, match="offset must"):
+            move_region(scenes, 7, (8.4, 0.4))
         with pytest.raises(ValueError, match="scenes must have a label map for each frame"):
             delete_region(Scene(scenes.field), 7)
