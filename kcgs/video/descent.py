@@ -16,7 +16,7 @@ from kcgs.fitting.redundancy import least_missed
 from kcgs.fitting.state import Gaussians
 from kcgs.functional import region_splat
 
-_ITERATIONS = 120
+_ITERATIONS = 110
 # standard deviations in pixels that are tried for a relocated Gaussian
 _SIGMAS = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
 # iteration before which contours move
@@ -56,7 +56,7 @@ class Descent:
         gaussians: where the descent begins.
         config: of the fit: its objective, its contour settings and its backend.
         free: the rows that may move, bool (N,).
-        changed: where the error counts, bool (H, W): there rows are relocated to, and contours move.
+        changed: where rows may be relocated to, bool (H, W).
     """
 
     def __init__(self, image: Tensor, gaussians: Gaussians, config: FitConfig, free: Tensor, changed: Tensor) -> None:
@@ -151,7 +151,7 @@ class Descent:
             return
         error = self.squared_error()
         self.gaussians = self.gaussians._replace(regions=moved)
-        gain = (config.contour_rise * error - self.squared_error()).masked_fill(~self.changed, -1.0)
+        gain = config.contour_rise * error - self.squared_error()
         self.gaussians = self.gaussians._replace(regions=accept_moves(before, moved, gain))
 
     def _visibility(self) -> tuple[Tensor, Tensor]:

@@ -67,7 +67,7 @@ def fit_video(
 
     Convention: row i is the same Gaussian in every frame until it is relocated. The first frame is fitted by
     :func:`kcgs.fit`. Every other starts from the Gaussians of the one before, which move with the image; then contours
-    move, the least useful 5 % are relocated five times, and all descend a little. A region that is explained as well as
+    move, the least useful 5 % are relocated five times, and all descend a little. What is explained as well as
     before stands still. A row without use has colour 0. A scene cut is fitted anew, into the same rows. Regions are not
     merged. Contours have the widths of the first frame.
     The same arguments, device and number of threads give the same scenes, bit for bit.
