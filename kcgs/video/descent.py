@@ -16,13 +16,13 @@ from kcgs.fitting.redundancy import least_missed
 from kcgs.fitting.state import Gaussians
 from kcgs.functional import region_splat
 
-_ITERATIONS = 110
+_ITERATIONS = 85
 # standard deviations in pixels that are tried for a relocated Gaussian
 _SIGMAS = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
 # iteration before which contours move
 _CONTOUR_MOVE = 30
 # iterations at the end, of half the rate
-_LAST_ITERATIONS = 24
+_LAST_ITERATIONS = 20
 # share of a Newton step in a step, and of the step before
 _RATE = 0.12
 _MOMENTUM = 0.9

@@ -36,7 +36,7 @@ _FRAME_RATE = 24.0
 # a start whose squared error is more than this share of the frame's variance is a scene cut
 _CUT = 0.5
 # iterations before which the least useful rows are relocated, and the share that is
-_RELOCATIONS = dict.fromkeys((0, 20, 40, 60, 80), 0.05)
+_RELOCATIONS = dict.fromkeys((0, 20, 40, 60), 0.05)
 # pixels change where the error about them, in a square of so many pixels, is this many times that of their fit, and a
 # level of 255 more
 _STILL = 1.02
@@ -67,7 +67,7 @@ def fit_video(
 
     Convention: row i is the same Gaussian in every frame until it is relocated. The first frame is fitted by
     :func:`kcgs.fit`. Every other starts from the Gaussians of the one before, which move with the image; then contours
-    move, the least useful 5 % are relocated five times, and all descend a little. What is explained as well as
+    move, the least useful 5 % are relocated four times, and all descend a little. What is explained as well as
     before stands still. A row without use has colour 0. A scene cut is fitted anew, into the same rows. Regions are not
     merged. Contours have the widths of the first frame.
     The same arguments, device and number of threads give the same scenes, bit for bit.
