@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from kcgs.editing import delete_region, move_region
-from kcgs.fitting.inpaint import grow
+from kcgs.editing.inpaint import grow
 from kcgs.scene import Scene
 
 from .core.cases import BEST, plan

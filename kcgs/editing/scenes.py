@@ -9,8 +9,6 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from kcgs.fitting.fill import fill_hole
-from kcgs.fitting.inpaint import grow
 from kcgs.functional import PairWidths, RegionMap, touching_pairs
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join, scaled
@@ -28,6 +26,8 @@ from .checks import (
     color_tensor,
     ids_of,
 )
+from .fill import fill_hole
+from .inpaint import grow
 
 # standard deviation of a Gaussian that is flat over the image, in its longer sides: 1 to 3 in 10^7
 _FLAT = 1e3

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, Scene, fit
 from kcgs.editing import delete_region, move_region
-from kcgs.fitting.inpaint import grow, inpaint
-from kcgs.fitting.texture import texture
+from kcgs.editing.inpaint import grow, inpaint
+from kcgs.editing.texture import texture
 
 SIZE = (48, 72)
 

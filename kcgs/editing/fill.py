@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcgs.fitting.optimizers import FrameAdam
 from kcgs.functional import RegionMap, region_splat
 from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
@@ -15,7 +16,6 @@ from kcgs.nn.field import join
 from kcgs.scene import Scene
 
 from .inpaint import grow, inpaint
-from .optimizers import FrameAdam
 
 # so many pixels around the hole still have colours of what was there: they are filled too
 _FRINGE = 3
