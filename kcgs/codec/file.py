@@ -10,15 +10,15 @@ from typing import NamedTuple
 from .gaussians.quantize import ENERGIES, QPS
 from .rangecoder import CodecError
 
-MAGIC, VERSIONS = b"kcgs", (1, 2, 3)
+MAGIC = b"kcgs"
+VERSION = 1
 MAP_MAGIC = b"kcgm"
 """What a file begins with that is a label map and no scene."""
 # a decoder's memory: pixels of a map; Gaussians in all, and numbers of their colours
 MOST_LABELS = 1 << 26
 MOST_GAUSSIANS, MOST_COLORS = (1 << 21) - 1, 1 << 27
 MOST_SIDE, MOST_CHANNELS, MOST_REGIONS = 1 << 20, 1 << 10, (1 << 24) - 1
-# of version 1, and of those in which several layers may hold one energy
-_MOST_LAYERS = ENERGIES[1] - ENERGIES[0] + 1, 128
+_MOST_LAYERS = 128
 # Gaussians that a layer of no bytes may hold
 SPARE = 64
 _HEADER_CRC, LAYER_CRC = 4, 2  # bytes
@@ -32,7 +32,6 @@ class Header(NamedTuple):
     qp: int
     regions: int = 1
     layers: tuple[tuple[int, int], ...] = ()  # highest energy, bytes
-    version: int = VERSIONS[-1]
 
 
 class ByteReader:
@@ -72,7 +71,7 @@ def most_gaussians(channels: int) -> int:
 def pack(header: Header, region_map: bytes, layers: list[bytes]) -> bytes:
     """Put a file together."""
     numbers = [*header.size, header.channels, header.qp - QPS[0], header.regions]
-    head = bytearray(MAGIC + bytes([header.version]) + b"".join(map(varint, numbers)))
+    head = bytearray(MAGIC + bytes([VERSION]) + b"".join(map(varint, numbers)))
     if header.regions > 1:
         head += varint(len(region_map))
     head += varint(len(layers))
@@ -122,9 +121,8 @@ def _read_header(stream: ByteReader) -> tuple[Header, int]:
         )
     if magic != MAGIC:
         raise CodecError(f"it must start with {MAGIC!r}; got {stream.data[:4]!r}")
-    if (version := stream.take(1)[0]) not in VERSIONS:
-        raise CodecError(f"its version must be 1, 2 or 3; got {version}")
-    split = version > VERSIONS[0]
+    if (version := stream.take(1)[0]) != VERSION:
+        raise CodecError(f"its version must be {VERSION}; got {version}")
     size = stream.varint("height", 1, MOST_SIDE), stream.varint("width", 1, MOST_SIDE)
     channels = stream.varint("channels", 1, MOST_CHANNELS)
     qp = stream.varint("quantization parameter", 0, QPS[1] - QPS[0]) + QPS[0]
@@ -134,12 +132,12 @@ def _read_header(stream: ByteReader) -> tuple[Header, int]:
         if size[0] * size[1] > MOST_LABELS:
             raise CodecError(f"an image with regions must have at most {MOST_LABELS} pixels; got {size}")
         length = stream.varint("length of the map", 1, 1 << 32)  # bytes that are not there end the file early
-    count = stream.varint("layers", 1, _MOST_LAYERS[split])
+    count = stream.varint("layers", 1, _MOST_LAYERS)
     layers, energy = [], ENERGIES[1]
-    for i in range(count):
-        energy -= stream.varint("energy", 0 if split else min(i, 1), energy - ENERGIES[0])
+    for _ in range(count):
+        energy -= stream.varint("energy", 0, energy - ENERGIES[0])
         layers.append((energy, stream.varint("length of a layer", 1, 1 << 32)))
-    return Header(size, channels, qp, regions, tuple(layers), version), length
+    return Header(size, channels, qp, regions, tuple(layers)), length
 
 
 def varint(value: int) -> bytes:

@@ -19,7 +19,7 @@ from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
 from .exact import Integers
-from .file import LAYER_CRC, MOST_CHANNELS, MOST_SIDE, SPARE, VERSIONS, Header, most_gaussians, pack, unpack
+from .file import MOST_CHANNELS, MOST_SIDE, SPARE, Header, most_gaussians, pack, unpack
 from .gaussians.layers import LayerCoder
 from .gaussians.quantize import QPS, Classes, Codes, Parameters, Quantizer
 from .rangecoder import CodecError, Reader, Writer
@@ -27,8 +27,6 @@ from .rangecoder import CodecError, Reader, Writer
 # of the decoded image against the scene's own, in dB
 QUALITIES = (10.0, 90.0)
 DEFAULT_QUALITY = 46.0
-# of a mark's bytes, filled by what is estimated; and bytes that a layer more takes
-_FILLED, _LAYER_BYTES = 0.985, 8
 # of the Gaussians of a file, which a layer holds at least
 _LEAST_SHARE = 1 / 16
 
@@ -146,39 +144,23 @@ class SceneWriter:
         codes = quantizer.quantize(gaussians, Classes(*(numbers[kept] for numbers in classes)))
         return self.write(quantizer, codes, self.ids[kept])
 
-    def write(self, quantizer: Quantizer, codes: Codes, ids: Integers, *, marks: tuple[float, ...] = ()) -> bytes:
-        """Write the file of Gaussians that are whole numbers already, with the positions of their regions' ids.
-
-        With `marks`, rising shares of the file's bytes, a layer ends just before each.
-        """
-        whole = np.zeros(len(ids), np.int64)
-        if not marks:
-            header, layers = self._code(quantizer, codes, ids, whole, joined=True)
-            return pack(header, self.region_map, layers)
-        header, layers = self._code(quantizer, codes, ids, whole)
-        parts = _divide(codes, header, len(pack(header, self.region_map, layers)), marks)
-        header, layers = self._code(quantizer, codes, ids, parts)
-        return pack(header, self.region_map, layers)
-
-    def _code(
-        self, quantizer: Quantizer, codes: Codes, ids: Integers, parts: Integers, *, joined: bool = False
-    ) -> tuple[Header, list[bytes]]:
-        """Code a layer for each energy, or each part of the Gaussians of one energy, from 0; `joined`: or several."""
-        # by energy, falling, and part, then by size, falling; then by cell, row by row
-        key = parts - codes.energy * (parts.max() + 1)
-        order = np.lexsort((codes.cell[:, 0], codes.cell[:, 1], -codes.size, key))
+    def write(self, quantizer: Quantizer, codes: Codes, ids: Integers) -> bytes:
+        """Write the file of Gaussians that are whole numbers already, with the positions of their regions' ids."""
+        # by energy, then by size, both falling; then by cell, row by row
+        order = np.lexsort((codes.cell[:, 0], codes.cell[:, 1], -codes.size, -codes.energy))
         codes, ids = codes.pick(order), ids[order]
         model, layers, listed = LayerCoder(quantizer, self.channels, self.regions), [], []
-        starts = [*np.unique(key[order], return_index=True)[1].tolist(), len(ids)]
+        starts = [*np.unique(-codes.energy, return_index=True)[1].tolist(), len(ids)]
         groups = [slice(*ends) for ends in itertools.pairwise(starts)]
-        for layer in _join(groups, len(ids)) if joined else [[group] for group in groups]:
+        for layer in _join(groups, len(ids)):
             writer, energy = Writer(), int(codes.energy[layer[0].start])
             model.code(writer, energy, [(codes.pick(group), ids[group]) for group in layer], len(ids))
             # each Gaussian takes more than a bit, but zeros at the end are left out
             count = layer[-1].stop - layer[0].start
             layers.append(writer.finish().ljust(-(-(count - SPARE) // 8), b"\0"))
             listed.append((energy, len(layers[-1])))
-        return Header(self.size, self.channels, quantizer.qp, model.num_regions, tuple(listed)), layers
+        header = Header(self.size, self.channels, quantizer.qp, model.num_regions, tuple(listed))
+        return pack(header, self.region_map, layers)
 
     def _count_numbers(self) -> int:
         return len(self.ids) * (5 + self.channels)
@@ -194,32 +176,6 @@ def _join(groups: list[slice], count: int) -> list[list[slice]]:
         else:
             layers.append([group])
     return layers
-
-
-def _divide(codes: Codes, header: Header, num_bytes: int, marks: tuple[float, ...]) -> Integers:
-    """Return parts of the Gaussians of each energy, whole sizes, so that layers end just before shares of a file."""
-    parts, left = np.zeros(len(codes.energy), np.int64), [_FILLED * mark * num_bytes for mark in marks]
-    start = num_bytes - sum(length + LAYER_CRC for _, length in header.layers)
-    for energy, length in header.layers:
-        end, part = start + length + LAYER_CRC, 0
-        rest = codes.energy == energy
-        while left and left[0] < end:
-            sizes, counts = np.unique(codes.size[rest], return_counts=True)
-            costs = np.ceil((end - start) * counts / counts.sum()).astype(np.int64)
-            filled: dict[int, list[int]] = {0: []}  # sizes, by the bytes that they take
-            for size, cost in zip(sizes.tolist(), costs.tolist(), strict=True):
-                for total, chosen in list(filled.items()):
-                    if total + cost <= left[0] - start - _LAYER_BYTES:
-                        filled.setdefault(total + cost, [*chosen, size])
-            left.pop(0)
-            if most := max(filled):
-                first = rest & np.isin(codes.size, filled[most])
-                rest &= ~first
-                parts[first], start, part = part, start + most + _LAYER_BYTES, part + 1
-                end += _LAYER_BYTES
-        parts[rest] = part
-        start = end
-    return parts
 
 
 def _check_field(field: GaussianField) -> None:
@@ -297,8 +253,7 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
         from .labels import decode_map  # loads numba
 
         regions = decode_map(region_map, header.size, header.regions)
-    plain = header.version < VERSIONS[-1]
-    model = LayerCoder(Quantizer(header.qp, header.size), header.channels, regions, plain=plain)
+    model = LayerCoder(Quantizer(header.qp, header.size), header.channels, regions)
     parts, ids, left = [], [], most_gaussians(header.channels)
     for (energy, _), layer in zip(header.layers, layers, strict=False):
         # each Gaussian takes more than a bit, and all must fit into memory

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple, get_args
 
 import torch
@@ -27,8 +26,6 @@ from .tuning import Tuning
 # dB of a file's image against the scene's own above the scene's PSNR: the error grows by about a 28th, 0.15 dB,
 # and by more where so few Gaussians are rounded that errors do not average out
 _MARGIN = 14.5
-# shares of the bytes before which a layer of a progressive file ends
-_MARKS = (0.25, 0.5, 0.75)
 # dB by which files are finer that are tried until one is good enough
 _FINER = (0.0, 2.0, 5.0, 9.0, 14.0, 20.0, 30.0, 50.0)
 # share of the iterations before anything is rounded, and how many go by between two looks at the distortion
@@ -190,17 +187,18 @@ class _Press:
     def _round(self, writer: SceneWriter, qp: int, rounds: int, share: float = 1.0, most: float = math.inf) -> bytes:
         tuning = self._tuning(writer, Quantizer(qp, writer.size))
         tuning.drop()
-        write = partial(writer.write, tuning.quantizer, marks=_MARKS if self.progressive else ())
         data = b""
 
         def excess(codes: Codes) -> int:
             nonlocal data
-            data = write(codes, tuning.ids)
+            data = writer.write(tuning.quantizer, codes, tuning.ids)
             return max(0, math.ceil((len(data) - most) * len(tuning.ids) / len(data)))
 
         seconds = share * (self.end - time.perf_counter())
         codes = tuning.round(rounds, self.seed, seconds, None if math.isinf(most) else excess)
-        return data or write(codes, tuning.ids)  # the codes are those that `excess` was asked last
+        return data or writer.write(
+            tuning.quantizer, codes, tuning.ids
+        )  # the codes are those that `excess` was asked last
 
     def _tuning(self, writer: SceneWriter, quantizer: Quantizer) -> Tuning:
         given = writer.gaussians, writer.ids, self.image, writer.regions, quantizer, self.objective

@@ -17,7 +17,7 @@ from kcgs.codec import Decoded, decode, encode
 from kcgs.codec.exact import exp2, turn
 from kcgs.codec.file import Header, unpack
 from kcgs.codec.gaussians.quantize import opponent
-from kcgs.codec.gaussians.shapes import ALIKE, ANGLE, APART
+from kcgs.codec.gaussians.shapes import ANGLE, SHAPES
 
 from .conftest import make_scene
 from .symbols import Bits, Choices, Symbols
@@ -165,54 +165,20 @@ class Occupancy:
             yield len(cells)
 
 
-class PlainOccupancy(Occupancy):
-    """Of versions 1 and 2."""
-
-    def __init__(self, size: tuple[int, int]) -> None:
-        super().__init__(size)
-        self.outside, self.seen = 0.5, 20
-
-    def read_cells(self, symbols: Bits, s: int, count: int, rows: int, inside: Any, beyond: Any) -> dict[Any, int]:
-        f = self.outside / self.seen if beyond else 0.0
-        held = self.repeat(symbols, max(count * (1 - f), 0.01) / len(inside), inside)
-        if beyond:
-            told = self.repeat(symbols, max(count * f, 0.01) / len(beyond), beyond)
-            held |= told
-            self.outside += sum(told.values())
-            self.seen += count
-        return held
-
-    def repeat(self, symbols: Symbols, rate: float, cells: Any) -> dict[Any, int]:
-        p = rate / (1 + rate)
-        weights = [1 - p]
-        for _ in range(7):
-            weights.append(weights[-1] * p)
-        weights[7] /= 1 - p
-        held = {at: symbols.categorical(weights) for at in cells}
-        full = [at for at in cells if held[at] == 7]
-        while full:
-            more = {at: symbols.categorical(weights) for at in full}
-            for at, count in more.items():
-                held[at] += count
-            full = [at for at, count in more.items() if count == 7]
-        return held
-
-
 class File:
     """Gaussians."""
 
     def __init__(self, header: Header, index: Any, regions: int) -> None:
         self.size, self.channels, self.index, self.regions = header.size, header.channels, index, regions
-        self.plain = header.version < 3
         self.distortion = power(-header.qp / 32)
         self.lengths = Choices(2.0, *[1.0] * 9, *[0.3] * 12)
         self.strays = Choices(20.0, 0.5)
-        *self.colors, self.ratio = (Magnitudes(shapes) for shapes in (ALIKE if self.plain else APART))
+        *self.colors, self.ratio = (Magnitudes(shapes) for shapes in SHAPES)
         self.angles = Angles()
-        self.occupancy = (PlainOccupancy if self.plain else Occupancy)(header.size)
+        self.occupancy = Occupancy(header.size)
 
     def layer(self, symbols: Bits, e: int) -> list[tuple[list[float], int]]:
-        found, follows = self.group(symbols, e), 0 if self.plain else symbols.number(3)
+        found, follows = self.group(symbols, e), symbols.number(3)
         while follows:
             e -= 1
             assert e >= -24
@@ -231,14 +197,14 @@ class File:
         scales = min(max(math.floor(0.75 / (u * (math.sqrt(0.5) / LN2)) + 0.5), 1), 2**20)
         step = max(u * (1 / LN2), 12 / 2**20)
         scale = [symbols.uniform(scales) for _ in kinds]
-        contexts = [0 if self.plain else min(max(s + 1, 0), 7) for s, _, _ in kinds]
+        contexts = [min(max(s + 1, 0), 7) for s, _, _ in kinds]
         ratio = self.ratio.read(symbols, [2 / step] * len(kinds), contexts)
         stretch = [0.5 * (power(2 * r * step) - power(-2 * r * step)) for r in ratio]
         turns = [
             min(max(math.floor(math.pi * s / u + 0.5), 2), 2**20) if r else 1
             for s, r in zip(stretch, ratio, strict=True)
         ]
-        angle = [symbols.uniform(n) for n in turns] if self.plain else self.angles.read(symbols, turns)
+        angle = self.angles.read(symbols, turns)
         colors = self.read_colors(symbols, e, [(8 * one + 4) // scales for one in scale])
         shapes, parts, sides = [], [], []
         for i, (s, _, _) in enumerate(kinds):
@@ -262,7 +228,7 @@ class File:
 
     def read_colors(self, symbols: Symbols, e: int, levels: list[int]) -> list[list[int]]:
         loud = math.sqrt(math.pi / (12 * self.distortion)) * 2.0**e
-        scales = [loud if self.plain else loud * power(0.75 * (0.5 - (v + 0.5) / 8)) for v in levels]
+        scales = [loud * power(0.75 * (0.5 - (v + 0.5) / 8)) for v in levels]
         colors: list[list[int]] = [[] for _ in levels]
         for channel in range(self.channels):
             contexts = [0] * len(levels)
@@ -302,9 +268,8 @@ def as_the_words_say(data: bytes, known: Decoded) -> None:
         assert [id for _, id in found] == regions.index_of(field.region_ids).tolist()
 
 
-@pytest.mark.parametrize("name", ["golden.kcgs", "golden2.kcgs", "golden3.kcgs"])
-def test_golden(name: str) -> None:
-    data = (Path(__file__).parent / name).read_bytes()
+def test_golden() -> None:
+    data = (Path(__file__).parent / "golden.kcgs").read_bytes()
     as_the_words_say(data, decode(data))
 
 

@@ -75,17 +75,6 @@ class TestCompress:
             assert compress(scene, image.clone(), quality=30, iterations=3)
             assert compress(fitted, image, quality=30, iterations=3).data == expected
 
-    def test_progressive(self, photo: Photo, fitted: Scene) -> None:
-        image, target = photo[0], 1300
-        usual, first = (
-            compress(fitted, image, target_bytes=target, objective=name) for name in ("psnr", "progressive")
-        )
-        assert usual.data[4] == first.data[4] == 3 and 0.97 * target < len(first.data) <= target
-        for mark, gain in ((0.5, 0.5), (0.75, 0.3), (1.0, -1.5)):
-            parts = (decode(data.data, max_bytes=int(mark * target)).scene for data in (usual, first))
-            before, now = (psnr(part, image) for part in parts)
-            assert now > before + gain, mark
-
     def test_refusals(self, photo: Photo, fitted: Scene) -> None:
         image = photo[0]
         for changed, match in (

@@ -18,9 +18,9 @@ from kcgs.codec.rangecoder import CodecError, Coder
 from kcgs.functional import RegionMap
 from kcgs.functional.labels import lookup_regions
 
-from .occupancy import MOST_BITS, Occupancy, PlainOccupancy
+from .occupancy import MOST_BITS, Occupancy
 from .quantize import ENERGIES, MOST_RATIO, OCTAVES, SIZES, Classes, Codes, Parameters, Quantizer
-from .shapes import ALIKE, ANGLE, APART
+from .shapes import ANGLE, SHAPES
 
 _CLASSES = 64  # that a stream may name, of size
 # half the log2 of the ratio of scales is measured in this
@@ -38,19 +38,16 @@ Group = tuple[Codes, Integers]
 
 
 class LayerCoder:
-    """Codes layers one after another; what was learned in one helps the next. The map is on the CPU.
+    """Codes layers one after another; what was learned in one helps the next. The map is on the CPU."""
 
-    `plain`: as versions 1 and 2 of the format have it, with fewer contexts.
-    """
-
-    def __init__(self, quantizer: Quantizer, channels: int, regions: RegionMap | None, *, plain: bool = False) -> None:
-        self.quantizer, self.channels, self.regions, self._plain = quantizer, channels, regions, plain
+    def __init__(self, quantizer: Quantizer, channels: int, regions: RegionMap | None) -> None:
+        self.quantizer, self.channels, self.regions = quantizer, channels, regions
         self.num_regions = 1 if regions is None else regions.num_regions
-        self._magnitudes = [AdaptiveMagnitude(shapes) for shapes in (ALIKE if plain else APART)]
+        self._magnitudes = [AdaptiveMagnitude(shapes) for shapes in SHAPES]
         self._angle = AdaptiveAngle(ANGLE)
         self._strays = AdaptiveSymbol(np.array([20.0, 0.5]))
         self._count = AdaptiveNumber(np.array([2.0, *[1.0] * 9, *[0.3] * (MOST_BITS - 9)]))
-        self._occupancy = (PlainOccupancy if plain else Occupancy)(quantizer.size)
+        self._occupancy = Occupancy(quantizer.size)
 
     def code(
         self, coder: Coder, energy: int, groups: list[Group] | None, most: int
@@ -60,8 +57,6 @@ class LayerCoder:
         Returns the Gaussians of each group and the positions of their regions' ids. `groups` are in the order of
         a file; None: to read.
         """
-        if self._plain:
-            return [self._code_group(coder, energy, None, most)]
         found, waiting = [], None if groups is None else list(groups)
         following = _HOLDS
         while following != _END:
@@ -113,23 +108,19 @@ class LayerCoder:
         return found
 
     def _code_numbers(self, coder: Coder, classes: Classes, cell: Integers, codes: Codes | None) -> Parameters:
-        steps, zero = self.quantizer.steps(classes), np.zeros(len(cell), np.int64)
+        steps = self.quantizer.steps(classes)
         scale = coder.uniform(steps.scales, None if codes is None else codes.scale)
-        last = len(APART.ratio) - 1
-        about = zero if self._plain else np.clip(classes.size - _LEAST_SIZE, 0, last)
+        context = np.clip(classes.size - _LEAST_SIZE, 0, len(SHAPES.ratio) - 1)
         given = None if codes is None else codes.ratio
-        ratio = self._magnitudes[-1].code(coder, _RATIO_SCALE / steps.ratio[:1], zero, about, given)
+        ratio = self._magnitudes[-1].code(coder, _RATIO_SCALE / steps.ratio[:1], np.zeros_like(context), context, given)
         if (ratio > (most := math.floor(MOST_RATIO / steps.ratio[0] + 0.5))).any():
             raise CodecError(f"a ratio must be at most {most} steps; got {ratio.max()}")
         turns = steps.turns(ratio)
-        given = None if codes is None else codes.angle
-        angle = coder.uniform(turns, given) if self._plain else self._angle.code(coder, turns, given)
+        angle = self._angle.code(coder, turns, None if codes is None else codes.angle)
         # how many steps the amplitude of a Gaussian of this energy has, where it is as large as the middle of its class
         loud = math.ldexp(math.sqrt(math.pi / (12.0 * self.quantizer.distortion)), int(classes.energy[0]))
-        level, scales = zero, np.array([loud])
-        if not self._plain:
-            level = (_LEVELS * scale + _LEVELS // 2) // steps.scales
-            scales = loud * exp2(OCTAVES * (0.5 - (np.arange(_LEVELS) + 0.5) / _LEVELS))
+        level = (_LEVELS * scale + _LEVELS // 2) // steps.scales
+        scales = loud * exp2(OCTAVES * (0.5 - (np.arange(_LEVELS) + 0.5) / _LEVELS))
         colors = self._code_colors(coder, scales, level, None if codes is None else codes.colors)
         shape = steps.shape(scale, ratio, angle / turns)
         parts = steps.places(shape)

@@ -21,8 +21,6 @@ _CELLS_OUTSIDE = 1 << 17
 # encoder has 65 * 37 at most
 _ALL_OUTSIDE, _EACH_OUTSIDE, _ALL_CLASSES = 1 << 26, 1 << 10, 1 << 12
 _MARGINS = np.array([3.0, *[1.0] * 4, *[0.3] * 4])  # weights at first
-# larger counts of a cell are coded by repeating this
-_FULL = 7
 # cells that are coded together
 _TOGETHER = 1 << 16
 # classes of size above their own whose Gaussians others are near to; within so many cells, with weights of this sum
@@ -200,32 +198,6 @@ def _code_band(coder: Coder, chances: Floats, most: int, places: Integers | None
     return np.sort(np.concatenate(found), kind="stable")
 
 
-class PlainOccupancy:
-    """The same as versions 1 and 2 of the format have it: every cell is as likely."""
-
-    def __init__(self, size: tuple[int, int]) -> None:
-        self._size = size
-        self._margin = AdaptiveNumber(_MARGINS)
-        self._outside = 0.5, 20.0
-
-    def code(self, coder: Coder, size: int, count: int, cell: Integers | None) -> Integers:
-        """Code the cells (N, 2) of `count` Gaussians of a class of size, sorted row by row; None: to read."""
-        grid = Grid.over(self._size, count)
-        grid = grid._replace(margin=_code_margin(coder, self._margin, grid, cell))
-        places = (None, None) if cell is None else grid.split(cell)
-        out, seen = self._outside
-        share = out / seen if grid.margin else 0.0
-        cells = grid.rows * grid.columns, grid.num_outside
-        rates = [max(count * part, 0.01) / max(n, 1) for part, n in zip((1.0 - share, share), cells, strict=True)]
-        inside = _code_counts(coder, rates[0], cells[0], places[0], count)
-        outside = _code_counts(coder, rates[1], cells[1], places[1], count - len(inside))
-        if len(inside) + len(outside) != count:
-            raise CodecError(f"cells must hold {count} Gaussians; got {len(inside) + len(outside)}")
-        if grid.margin:
-            self._outside = out + float(len(outside)), seen + count
-        return grid.join(inside, outside)
-
-
 def _code_margin(coder: Coder, model: AdaptiveNumber, grid: Grid, cell: Integers | None) -> int:
     margin = None
     if cell is not None:
@@ -235,36 +207,3 @@ def _code_margin(coder: Coder, model: AdaptiveNumber, grid: Grid, cell: Integers
     if margin > grid.most_margin:
         raise CodecError(f"a margin must be at most {grid.most_margin} cells; got {margin}")
     return margin
-
-
-def _code_counts(coder: Coder, rate: float, cells: int, places: Integers | None, most: int) -> Integers:
-    """Code which cell each Gaussian lies in, in order: one more with the probability rate / (1 + rate) each."""
-    more, left = rate / (1.0 + rate), most
-    weights = np.multiply.accumulate([1.0 - more, *[more] * _FULL])
-    weights[_FULL] /= 1.0 - more
-
-    def code(count: int, wanted: Integers | None) -> Integers:
-        nonlocal left
-        found = coder.repeat(weights, count, None if wanted is None else np.minimum(wanted, _FULL))
-        left -= int(found.sum())
-        if left < 0:
-            raise CodecError(f"cells must hold {most} Gaussians; got more")
-        return found
-
-    occupied, counts = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for start in range(0, cells, _TOGETHER):
-        together, wanted = min(_TOGETHER, cells - start), None
-        if places is not None:
-            first, last = np.searchsorted(places, [start, start + together])
-            wanted = np.bincount(places[first:last] - start, minlength=together)
-        found = code(together, wanted)
-        occupied.append(np.flatnonzero(found) + start)
-        counts.append(found[found > 0])
-    where, count = np.concatenate(occupied), np.concatenate(counts)
-    true = None if places is None else np.searchsorted(places, where, "right") - np.searchsorted(places, where)
-    full = np.flatnonzero(count == _FULL)
-    while len(full):
-        found = code(len(full), None if true is None else (true - count)[full])
-        count[full] += found
-        full = full[found == _FULL]
-    return np.repeat(where, count)

@@ -1,7 +1,4 @@
-"""Where the models of Gaussians begin: shapes found on photos that no report measures, in parts of a thousand.
-
-`ALIKE` are those of versions 1 and 2 of the format, in which all contexts begin alike, `APART` those of version 3.
-"""
+"""Where the models of Gaussians begin: shapes found on photos that no report measures, in parts of a thousand."""
 
 from __future__ import annotations
 
@@ -30,12 +27,7 @@ def _shapes(*tables: Sequence[Sequence[float]]) -> Shapes:
 
 
 # fmt: off
-_GREY = [1, 1, 2, 3, 12, 22, 49, 80, 102, 110, 110, 103, 88, 74, 62, 46, 34, 27, 22, 17, 12, 6, 6, 12]
-_HUE = [382, 247, 144, 96, 51, 30, 21, 12, 7, 3, 2, 2, 1, 1, *[0.5] * 10]
-_HUE2 = [547, 224, 98, 63, 27, 13, 12, 9, 5, 1, 1, *[0.5] * 13]
-_RATIO = [102, 159, 168, 150, 125, 98, 69, 46, 30, 21, 14, 8, 5, 3, 2, 1, *[0.5] * 8]
-ALIKE = _shapes([_GREY], [_HUE] * 3, [_HUE2] * 3, [_RATIO])
-APART = _shapes(
+SHAPES = _shapes(
     [
         [5, 4, 3, 5, 7, 11, 24, 58, 115, 132, 129, 118, 106, 92, 76, 56, 33, 17, 9, 5, 3, 2, 1, 1],
     ],
