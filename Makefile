@@ -23,13 +23,13 @@ wheel: page $(VENV)/.installed
 	$(BIN)/python -m build --no-isolation
 
 demo: $(VENV)/.installed
-	$(BIN)/kcgs bench demo -o demo
+	$(BIN)/kcgs demo
 
 # The charts, a few minutes, and the tables of docs/results.md from all committed results.csv. Sequences of DAVIS take
-# hours: see `kcgs bench davis`, which goes on where it was stopped.
+# hours: see `python -m benchmarks davis`, which goes on where it was stopped.
 report: $(VENV)/.installed
-	runs=$$(mktemp -d) && $(BIN)/kcgs bench charts -o notebooks/reports/charts --runs $$runs && rm -r $$runs
-	$(BIN)/python -m kcgs.bench.core.pages
+	runs=$$(mktemp -d) && $(BIN)/python -m benchmarks charts -o benchmarks/reports/charts --runs $$runs && rm -r $$runs
+	$(BIN)/python -m benchmarks.core.pages
 
 test: $(VENV)/.installed
 	$(PYTEST) -m "not slow"
@@ -50,4 +50,4 @@ lint: $(VENV)/.installed
 	$(BIN)/mypy
 
 clean:
-	rm -rf demo dist build docs/_build docs/generated docs/notebooks .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf demo dist build docs/_build docs/generated docs/notebooks docs/benchmarks .pytest_cache .mypy_cache .ruff_cache .hypothesis

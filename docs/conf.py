@@ -57,16 +57,17 @@ napoleon_custom_sections = [("Convention", "notes_style"), ("Source", "notes_sty
 attributes: dict[str, list[str]] = {}
 
 
-def copy_notebooks() -> None:
+def copy_pages() -> None:
     """Put the tutorials and the reports where Sphinx looks for pages; a file that is the same keeps its date."""
-    folder = HERE / "notebooks"
-    originals = {path.relative_to(ROOT / "notebooks") for path in (ROOT / "notebooks").rglob("*") if path.is_file()}
-    kept = {path for path in originals if path.suffix in (".ipynb", ".md", ".png", ".jpg", ".csv")}
-    for stale in {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()} - kept:
-        (folder / stale).unlink()
-    for path in kept:
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(ROOT / "notebooks" / path, folder / path)
+    for name in ("notebooks", "benchmarks/reports"):
+        folder, source = HERE / name, ROOT / name
+        originals = {path.relative_to(source) for path in source.rglob("*") if path.is_file()}
+        kept = {path for path in originals if path.suffix in (".ipynb", ".md", ".png", ".jpg", ".csv")}
+        for stale in {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()} - kept:
+            (folder / stale).unlink()
+        for path in kept:
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(source / path, folder / path)
 
 
 def mark_paragraphs(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
@@ -99,8 +100,8 @@ def hide_private(
 
 
 def link_repository(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Let links to ../notebooks, which work where the repository is read, lead to the copies that the site has."""
-    source[0] = source[0].replace("](../notebooks/", "](notebooks/")
+    """Let links that work where the repository is read lead to the copies that the site has."""
+    source[0] = re.sub(r"\]\(\.\./(notebooks|benchmarks)/", r"](\1/", source[0])
 
 
 def visit_inline_math(self: HTML5Translator, node: nodes.math) -> None:
@@ -118,7 +119,7 @@ def visit_block_math(self: HTML5Translator, node: nodes.math_block) -> None:
 def setup(app: Sphinx) -> None:
     """Write the generated pages, and tell Sphinx of the functions above."""
     generate.write(HERE / "generated")
-    copy_notebooks()
+    copy_pages()
     app.add_html_math_renderer("mathml", (visit_inline_math, None), (visit_block_math, None))
     app.connect("autodoc-process-docstring", save_colons, priority=400)  # napoleon has 500
     app.connect("autodoc-process-docstring", restore_colons, priority=600)

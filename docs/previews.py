@@ -11,7 +11,7 @@ from skimage import data as photos
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from kcgs.bench._codecs import AVIF, WEBP, largest, open_file
+from benchmarks._codecs import AVIF, WEBP, largest, open_file
 from kcgs.codec import CodecError, decode
 from kcgs.functional import psnr
 from kcgs.rate import fit_bytes

@@ -16,7 +16,6 @@ ROOT = PACKAGE.parent
 # a room imports itself and what is below it
 LAYERS = [
     {"cli"},
-    {"bench"},
     {"view", "zoo"},
     {"page"},
     {"rate", "video"},

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 import kcgs
-from kcgs.bench.core.pages import BEGIN, END, put, results
-from kcgs.bench.core.rows import read_rows, write_rows
-from kcgs.bench.core.store import Row
+from benchmarks.core.pages import BEGIN, END, put, results
+from benchmarks.core.rows import read_rows, write_rows
+from benchmarks.core.store import Row
 
 ROOT = Path(kcgs.__file__).resolve().parent.parent
-REPORTS = ROOT / "notebooks/reports"
+REPORTS = ROOT / "benchmarks/reports"
 
 
 def row(method: str, psnr: float, image: str = "pie") -> Row:
@@ -29,7 +29,7 @@ def test_results_are_those_of_the_reports() -> None:
     if not REPORTS.is_dir():
         pytest.skip("not a source checkout")
     page = (ROOT / "docs/results.md").read_text(encoding="utf-8")
-    assert put(page, results(REPORTS)) == page, "make report, or python -m kcgs.bench.core.pages"
+    assert put(page, results(REPORTS)) == page, "make report, or python -m benchmarks.core.pages"
 
 
 def test_a_changed_figure_shows(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from kcgs.video import read_label_maps, read_video
 from kcgs.zoo import entries
 
 SIZE = (64, 96)
-PRIVATE = {"kcgs.cli", "kcgs.bench", "kcgs.kernels"}
+PRIVATE = {"kcgs.cli", "kcgs.kernels"}
 LABELS = torch.arange(64 * 96).reshape(SIZE) // 300
 WIDTHS = {(region, region + 1): 0.3 + 0.1 * region for region in range(20)}
 

@@ -9,10 +9,10 @@ import warnings
 import typer
 
 # each puts its commands into `app`, in the order of `kcgs --help`
-from . import fit, many, video, scenes, segmentation, decoders  # isort: skip
+from . import fit, many, video, scenes, segmentation, decoders, demo  # isort: skip
 from .common import app
 
-__all__ = ["app", "decoders", "fit", "main", "many", "scenes", "segmentation", "video"]
+__all__ = ["app", "decoders", "demo", "fit", "main", "many", "scenes", "segmentation", "video"]
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Commands around scenes: export, view, models, bench."""
+"""Commands around scenes: export, view, models."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from .common import Json, SceneFile, SceneOrDecoder, app, check_output, print_report
-from .options import Contours, EngineName
+from .options import Contours
 
 
 @app.command()
@@ -117,35 +117,3 @@ def models(as_json: Json = False) -> None:
 
     for_people = {e.name: f"{e.title}; {e.psnr:.2f} dB, {e.bytes} bytes" for e in entries()}
     print_report({e.name: e._asdict() for e in entries()} if as_json else for_people, as_json, "zoo")
-
-
-@app.command()
-def bench(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Experiment; a wrong name is answered with all of them.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the report.")],
-    data: Annotated[Path | None, typer.Option(help="Folder with images, where the experiment needs them.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="A short form of the same.")] = False,
-    only: Annotated[str | None, typer.Option(help="Parts to run, with commas between, where it has parts.")] = None,
-    engine: EngineName = "local",
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Fits at a time; seconds that are compared want one, the default.")
-    ] = None,
-    sequences: Annotated[str | None, typer.Option(help="Of DAVIS, with commas between; default: all.")] = None,
-    budget_seconds: Annotated[
-        float | None, typer.Option(help="As many fits as this time allows; the same call again goes on.")
-    ] = None,
-    seeds: Annotated[int | None, typer.Option(min=1, help="Fits with so many seeds each.")] = None,
-    iterations: Annotated[int | None, typer.Option(min=1, help="Of the published recipes.")] = None,
-    redraw: Annotated[
-        bool, typer.Option("--redraw", help="Measure nothing: write the report again from the results in the folder.")
-    ] = False,
-    runs: Annotated[Path | None, typer.Option(help="Folder of the fits, which experiments may share.")] = None,
-) -> None:
-    """Run an experiment and write its report. An option that the experiment does not take is refused."""
-    from kcgs.bench import run
-
-    run(
-        name, output, data=data, quick=quick, only=only, engine=engine, workers=workers,
-        sequences=sequences, budget_seconds=budget_seconds, seeds=seeds, iterations=iterations, runs=runs,
-        redraw=redraw,
-    )  # fmt: skip

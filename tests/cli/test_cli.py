@@ -15,8 +15,7 @@ import torch
 from PIL import Image
 
 from kcgs import GaussianField, Scene, fit, load
-from kcgs.bench.demo import QUICK_BYTES
-from kcgs.cli import main
+from kcgs.cli import demo, main
 from kcgs.cli.common import Stop
 from kcgs.data import load_image, load_labels, save_image, save_labels
 from kcgs.functional import psnr
@@ -306,7 +305,6 @@ class TestFailures:
             (("fit", "photo.png", "--recipe", "none-such"), 2, "--recipe must be one of"),
             (("fit", "photo.png", "--resume"), 2, "--resume needs --checkpoint"),
             (("fit", "photo.png", "--plot", "plot.txt"), 2, "--plot must end in .png"),
-            (("bench", "render", "-o", "out", "--only", "speed"), 2, "--only must not be given to render"),
             (("fit", "photo.png", "--regions", "nothing.png"), 1, "--regions must be auto, none or the file of a"),
             (("fit", "photo.png", "--regions", "small.png"), 2, "--regions must be one map of the image's size"),
             (("fit", "photo.png", "-o", "scene.pt"), 2, "must end in .safetensors"),
@@ -319,7 +317,6 @@ class TestFailures:
             (("info", "nothing.kcgs"), 1, "kcgs: no such file: nothing.kcgs"),
             (("decode", "nothing.kcgs", "-o", "a.png"), 1, "kcgs: no such file: nothing.kcgs"),
             (("encode", "zoo:chart-pie", "-o", "a.kcgs", "--quality", "500"), 2, "--quality must be in [10, 90]"),
-            (("bench", "none-such", "-o", "out"), 2, "NAME must be one of "),
             (("segment", "photo.png", "-o", "a.png", "--method", "magic"), 2, "--method must be one of"),
         ],
     )
@@ -338,11 +335,15 @@ class TestFailures:
         assert sorted(p.name for p in files.iterdir()) == before
 
 
-def test_bench_demo_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, err = kcgs("bench", "demo", "-o", str(tmp_path / "demo"), "--quick", capsys=capsys)
+def test_demo(
+    tmp_path: Path, astronaut: torch.Tensor, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small, make = torch.nn.functional.avg_pool2d(astronaut, 4), demo.run
+    monkeypatch.setattr(demo, "run", lambda output, image, size, **_: make(output, small, 600, iterations=20))
+    code, out, err = kcgs("demo", "-o", str(tmp_path / "demo"), capsys=capsys)
     assert code == 0, err
     written = {p.name for p in (tmp_path / "demo").iterdir()}
     assert {"original.png", "regions.png", "baseline.png", "contour-aware.png", "comparison.png"} <= written
     for name in ("baseline", "contour-aware"):
-        assert (tmp_path / "demo" / f"{name}.kcgs").stat().st_size <= QUICK_BYTES
+        assert (tmp_path / "demo" / f"{name}.kcgs").stat().st_size <= 600
     assert "contour-aware" in out and "EF-PSNR" in out

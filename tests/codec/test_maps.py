@@ -297,7 +297,7 @@ class TestCommands:
 @pytest.mark.parametrize("every", [6, pytest.param(1, marks=pytest.mark.slow)])
 def test_size(data_root: Path, every: int) -> None:
     """Of the bytes of lossless WebP; the network was trained on other maps, of other images."""
-    from kcgs.bench._codecs import lossless_bytes
+    from benchmarks._codecs import lossless_bytes
 
     for pattern, most in {"DAVIS/Annotations/480p/*/00000.png": 0.285, "bsds/*/mask.png": 0.3}.items():
         maps = [load_labels(path) for path in sorted(data_root.glob(pattern))[::every]]

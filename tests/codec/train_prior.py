@@ -35,7 +35,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 import kcgs
-from kcgs.bench.core.images import photo
+from benchmarks.core.images import photo
 from kcgs.codec.labels.contexts import (
     CODED,
     FEATURE,

@@ -25,7 +25,7 @@ if not (ROOT / "docs/conf.py").is_file():
     pytest.skip("not a source checkout", allow_module_level=True)
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 # of README, what is neither a matter of seconds nor ends by itself
-NOT_RUN = {"bench", "view", "fit-many"}
+NOT_RUN = {"demo", "view", "fit-many"}
 
 
 def blocks(page: Path, language: str) -> list[str]:

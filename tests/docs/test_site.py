@@ -68,7 +68,7 @@ def test_every_page_has_commands_recipes_and_figures(site: Path, generate: Modul
     from kcgs.fitting import FitConfig, available_recipes
 
     commands, recipes = ((site / f"{name}.html").read_text(encoding="utf-8") for name in ("command-line", "recipes"))
-    shown = "fit", "render", "eval", "segment", "info", "encode", "decode", "export", "view", "bench"
+    shown = "fit", "render", "eval", "segment", "info", "encode", "decode", "export", "view", "demo"
     for name in (*shown, "fit-many", "fit-video"):
         assert f'id="kcgs-{name}"' in commands
     for name in (*FitConfig.model_fields, *available_recipes()):

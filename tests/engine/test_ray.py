@@ -12,9 +12,6 @@ from typing import Any
 import pytest
 import torch
 
-from kcgs.bench.core.cases import BEST, Case
-from kcgs.bench.core.jobs import Place, check_made
-from kcgs.bench.core.store import Store
 from kcgs.cli import main
 from kcgs.data import save_image
 from kcgs.engine import Done, run_jobs
@@ -83,20 +80,3 @@ class TestCluster:
             assert json.loads(out)["fitted"] == 2
             scenes.append([(tmp_path / engine / f"{name}.safetensors").read_bytes() for name in ("a", "b")])
         assert scenes[0] == scenes[1]
-
-    def test_bench_fits(self, tmp_path: Path) -> None:
-        # as many Gaussians and steps as show how many threads there were
-        cases = [Case("disc", 300, BEST, seed, iterations=30, stride=3) for seed in (0, 1)]
-        before = torch.get_num_threads()
-        torch.set_num_threads(2)
-        try:
-            stores = [Store(tmp_path / engine, None) for engine in ("local", "ray")]
-            for store in stores:
-                check_made(store.obtain(cases, Place(store.folder.name)))
-        finally:
-            torch.set_num_threads(before)
-        for case in cases:
-            one, two = (store.scene(case) for store in stores)
-            assert torch.equal(one.field.means, two.field.means)
-            rows = [store.row(case) for store in stores]
-            assert rows[0] is not None and rows[1] is not None and rows[0].psnr == rows[1].psnr

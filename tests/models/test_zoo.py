@@ -12,9 +12,9 @@ import pytest
 import torch
 
 import kcgs
-from kcgs.bench import run
-from kcgs.bench.core import images
-from kcgs.bench.zoo import PLANS
+from benchmarks import run
+from benchmarks.core import images
+from benchmarks.zoo import PLANS
 from kcgs.fitting import FitConfig
 from kcgs.functional import psnr
 from kcgs.scene import load

@@ -47,7 +47,7 @@ def auto(image: Tensor, *, min_size: int, max_regions: int | None) -> Tensor:
     neighbours until ``max_regions`` are left. A scene that needs no contour gives one region. On 21 photos of
     BSDS500 some three fifths of the contours lie within 3 pixels of human ones, and of the human ones are
     found; borders of texture alone are not seen. With 400 Gaussians a fit gains 0.76 dB by these maps, and
-    loses 0.65 dB to Gaussians of as many bytes where a map is stored as lossless WebP (`kcgs bench maps`).
+    loses 0.65 dB to Gaussians of as many bytes where a map is stored as lossless WebP (`python -m benchmarks maps`).
 
     Args:
         image: as `segment` takes it, any size; result and errors are those of `segment` too.

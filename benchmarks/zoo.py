@@ -1,0 +1,118 @@
+"""Make the zoo: small scenes of images that anybody may use, each with its decoder, recipe and card."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+from kcgs._atomic import write_file
+from kcgs.data import save_image
+from kcgs.evaluation import evaluate
+from kcgs.fitting import FitConfig, fit
+from kcgs.onnx import scene_decoder, write_model
+from kcgs.scene import Scene
+from kcgs.zoo import Entry, entries
+
+from .core import images
+from .core.options import Options
+from .core.registry import experiment
+
+_PREVIEW = 384  # pixels of its longer side
+_LARGEST_DECODER = 600_000
+_CHART = "Apache-2.0, made by kcgs"
+_NASA = "public domain (NASA), from scikit-image"
+_CC0 = "CC0, from scikit-image"
+
+
+class Plan(NamedTuple):
+    """One scene to be: an image, how many Gaussians, what it shows and on what terms."""
+
+    image: str
+    n: int
+    title: str
+    licence: str
+
+
+PLANS: dict[str, Plan] = {
+    "chart-2x3": Plan("2x3", 20, "chart of six colours, 20 Gaussians", _CHART),
+    "chart-pie": Plan("pie", 20, "chart of eight sectors, 20 Gaussians", _CHART),
+    "astronaut-400": Plan("astronaut", 400, "portrait, few Gaussians", _NASA),
+    "astronaut-3000": Plan("astronaut", 3_000, "portrait, many Gaussians", _NASA),
+    "chelsea-500": Plan("chelsea", 500, "cat, few Gaussians", _CC0),
+    "coffee-1500": Plan("coffee", 1_500, "cup of coffee", _CC0),
+    "rocket-1000": Plan("rocket", 1_000, "rocket launch", _NASA),
+}
+
+
+@experiment("only")
+def run(output: Path, options: Options) -> None:
+    """Fit the scenes and write them with their manifest; `only`: names with commas between them."""
+    names = list(PLANS) if options.only is None else options.only.split(",")
+    unknown = [name for name in names if name not in PLANS]
+    if unknown:
+        raise ValueError(f"only must name scenes of the zoo, {', '.join(PLANS)}; got {unknown[0]!r}")
+    known = {entry.name: entry for entry in entries(output)} if (output / "manifest.json").is_file() else {}
+    for name in names:
+        known[name] = _make(name, PLANS[name], output, options.quick)
+        listed = [known[name]._asdict() for name in PLANS if name in known]
+        write_file(output / "manifest.json", json.dumps({"format": "kcgs.zoo", "entries": listed}, indent=1) + "\n")
+
+
+def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
+    image, labels = images.load(plan.image, None)
+    recipe = "best" if plan.image in images.CHARTS else "best-refined"  # contours that were found may move freely
+    config = FitConfig.from_recipe(recipe, **({"iterations": 20} if quick else {}))
+    folder = output / name
+    folder.mkdir(parents=True, exist_ok=True)
+    fitted = fit(image, labels, plan.n, recipe=config).scene
+    scene = Scene(fitted.field, fitted.regions, {"recipe": recipe, "title": plan.title})
+    size = scene.save(folder / "scene.safetensors")
+    write_file(folder / "recipe.json", config.model_dump_json(indent=1) + "\n")
+    model, decoder = scene_decoder(scene, interactive=True), folder / "decoder.onnx"  # with views and regions
+    has_decoder = model.ByteSize() <= _LARGEST_DECODER
+    if has_decoder:
+        write_model(model, decoder)
+        # to compare with in the viewer
+        save_image(folder / ("original.webp" if recipe == "best" else "original.jpg"), image)
+    else:
+        decoder.unlink(missing_ok=True)
+    height, width = scene.size
+    shrink = _PREVIEW / max(height, width)
+    save_image(folder / "preview.jpg", scene.render((max(1, round(height * shrink)), max(1, round(width * shrink)))))
+    figures = evaluate(scene, image, labels)
+    edge = figures["ef_psnr"]
+    entry = Entry(
+        name=name, title=plan.title, scene=f"{name}/scene.safetensors", sha256=_hash(folder / "scene.safetensors"),
+        bytes=size, recipe=recipe, num_gaussians=scene.num_gaussians,
+        num_regions=1 if scene.regions is None else scene.regions.num_regions, psnr=round(figures["psnr"], 3),
+        ef_psnr=round(edge, 3) if edge == edge else None, licence=plan.licence,
+        command=f"python -m benchmarks zoo -o models --only {name}",
+        decoder=f"{name}/decoder.onnx" if has_decoder else None,
+        decoder_sha256=_hash(decoder) if has_decoder else None,
+    )  # fmt: skip
+    write_file(folder / "card.md", _card(entry, scene.size, figures["ms_ssim"]))
+    return entry
+
+
+def _hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _card(entry: Entry, size: tuple[int, int], ms_ssim: float) -> str:
+    rows = {
+        "image": f"{entry.title}, {size[1]} x {size[0]}",
+        "licence of the image": entry.licence,
+        "made by": f"`{entry.command}`",
+        "recipe": f"`{entry.recipe}`, all settings in `recipe.json`",
+        "Gaussians": str(entry.num_gaussians),
+        "regions": str(entry.num_regions),
+        "PSNR": f"{entry.psnr:.2f} dB",
+        "EF-PSNR": "not defined: one region" if entry.ef_psnr is None else f"{entry.ef_psnr:.2f} dB",
+        "MS-SSIM": f"{ms_ssim:.4f}",
+        "bytes": f"{entry.bytes} (label map deflated)",
+        "decoder": "`decoder.onnx`, with `view` and `visible`" if entry.decoder else "left out: large",
+    }
+    table = "\n".join(f"| {key} | {value} |" for key, value in rows.items())
+    return f"# {entry.name}\n\n![{entry.title}](preview.jpg)\n\n| | |\n|---|---|\n{table}\n"
