@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from . import codec, data, editing, fitting, functional, nn, onnx, rate, segment, video  # noqa: F401
+    from .errors import InvalidArgument, InvalidArgumentType
     from .evaluation import evaluate
     from .fitting import FitConfig, FitResult, fit
     from .functional import RegionMap
@@ -14,12 +15,13 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "FitConfig", "FitResult", "GaussianField", "RegionMap", "RegionSplatRenderer", "Scene", "__version__",
-    "evaluate", "fit", "load", "save",
+    "FitConfig", "FitResult", "GaussianField", "InvalidArgument", "InvalidArgumentType", "RegionMap",
+    "RegionSplatRenderer", "Scene", "__version__", "evaluate", "fit", "load", "save",
 ]  # fmt: skip
 
 # Public names by module, which is imported when a name is used: the command's help loads no torch.
 _MODULES = {
+    "errors": ("InvalidArgument", "InvalidArgumentType"),
     "evaluation": ("evaluate",),
     "fitting": ("FitConfig", "FitResult", "fit"),
     "functional": ("RegionMap",),

@@ -16,6 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kcgs.errors import InvalidArgument, InvalidArgumentType
+
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32)
 # bytes that every machine has
@@ -25,11 +27,12 @@ _LITTLE = 1 << 26
 def check_tensor(name: str, value: object, dims: Sequence[int] = ()) -> Tensor:
     """Return `value` if it is a dense tensor of an allowed rank."""
     if not isinstance(value, Tensor):
-        raise TypeError(f"{name} must be a Tensor; got {type(value).__name__}")
+        raise InvalidArgumentType(name, "a Tensor", type(value).__name__)
     if value.layout != torch.strided or value.is_quantized:
-        raise TypeError(f"{name} must be a dense tensor; got layout {value.layout}")
+        raise InvalidArgumentType(name, "a dense tensor", f"layout {value.layout}")
     if dims and value.ndim not in dims:
-        raise ValueError(f"{name} must have {' or '.join(map(str, dims))} dimensions; got shape {tuple(value.shape)}")
+        allowed = f"{' or '.join(map(str, dims))} dimensions"
+        raise InvalidArgument(name, allowed, f"shape {tuple(value.shape)}", verb="have")
     return value
 
 
@@ -39,11 +42,11 @@ def check_floating(
     """Return `value` if it is a real floating tensor of an allowed rank and last dimension, and finite if asked."""
     tensor = check_tensor(name, value, dims)
     if tensor.dtype not in _FLOATS:
-        raise TypeError(f"{name} must have a real floating dtype; got {tensor.dtype}")
+        raise InvalidArgumentType(name, "a real floating dtype", tensor.dtype, verb="have")
     if last is not None and (tensor.ndim == 0 or tensor.shape[-1] != last):
-        raise ValueError(f"{name} must have shape (..., {last}); got {tuple(tensor.shape)}")
+        raise InvalidArgument(name, f"shape (..., {last})", tuple(tensor.shape), verb="have")
     if finite and not holds(torch.isfinite(tensor).all(), f"{name} must be finite"):
-        raise ValueError(f"{name} must be finite; got {int((~torch.isfinite(tensor)).sum())} NaN or infinite values")
+        raise InvalidArgument(name, "finite", f"{int((~torch.isfinite(tensor)).sum())} NaN or infinite values")
     return tensor
 
 
@@ -65,7 +68,7 @@ def check_integer(name: str, value: object, dims: Sequence[int] = ()) -> Tensor:
     """Return `value` if it is an integer tensor of an allowed rank."""
     tensor = check_tensor(name, value, dims)
     if tensor.dtype not in _INTEGERS:
-        raise TypeError(f"{name} must have an integer dtype; got {tensor.dtype}")
+        raise InvalidArgumentType(name, "an integer dtype", tensor.dtype, verb="have")
     return tensor
 
 
@@ -73,32 +76,32 @@ def check_rows(name: str, value: Tensor, like: Tensor, last: int | str) -> None:
     """Refuse what has not one row for each of `like`; `last` is the length of a row, or its letter."""
     if value.shape[:-1] != like.shape[:-1]:
         wanted = ", ".join(map(str, (*like.shape[:-1], last)))
-        raise ValueError(f"{name} must have shape ({wanted}); got {tuple(value.shape)}")
+        raise InvalidArgument(name, f"shape ({wanted})", tuple(value.shape), verb="have")
     if value.shape[-1] == 0:
-        raise ValueError(f"{name} must have at least one channel; got shape {tuple(value.shape)}")
+        raise InvalidArgument(name, "at least one channel", f"shape {tuple(value.shape)}", verb="have")
 
 
 def check_ids(name: str, value: object, like: Tensor, values: bool = True) -> Tensor:
     """Return region ids as int64: integer, one for each centre of `like` (..., 2), with `values` none negative."""
     tensor = check_integer(name, value)
     if tensor.shape != like.shape[:-1]:
-        raise ValueError(f"{name} must have shape {tuple(like.shape[:-1])}; got {tuple(tensor.shape)}")
+        raise InvalidArgument(name, f"shape {tuple(like.shape[:-1])}", tuple(tensor.shape), verb="have")
     if tensor.device != like.device:
-        raise ValueError(f"{name} must be on {like.device} with means; got {tensor.device}")
+        raise InvalidArgument(name, f"on {like.device} with means", tensor.device)
     tensor = tensor.long()
     if values and not holds((tensor >= 0).all(), f"{name} must be non-negative"):
-        raise ValueError(f"{name} must be non-negative; got {int(tensor.min())}")
+        raise InvalidArgument(name, "non-negative", int(tensor.min()))
     return tensor
 
 
 def check_count(name: str, value: object, least: int = 1, most: int | None = None) -> int:
     """Return `value` if it is an integer (not a bool) of at least `least` and at most `most`."""
     if isinstance(value, bool) or not hasattr(value, "__index__"):
-        raise TypeError(f"{name} must be an integer; got {value!r}")
+        raise InvalidArgumentType(name, "an integer", repr(value))
     count = operator.index(value)
     if count < least or (most is not None and count > most):
         allowed = f"at least {least}" if most is None else f"in [{least}, {most}]"
-        raise ValueError(f"{name} must be {allowed}; got {count}")
+        raise InvalidArgument(name, allowed, count)
     return count
 
 
@@ -107,11 +110,11 @@ def check_number(
 ) -> float:
     """Return `value` if it is a finite number (not a bool) in [low, high]; with `above`, in (low, high]."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise TypeError(f"{name} must be a number{unit and ' of ' + unit}; got {value!r}")
+        raise InvalidArgumentType(name, f"a number{unit and ' of ' + unit}", repr(value))
     number = float(value)
     inside = low < number <= high if above else low <= number <= high
     if not (inside and math.isfinite(number)):
-        raise ValueError(f"{name} must be {_range(low, high, above)}{unit and ' ' + unit}; got {value!r}")
+        raise InvalidArgument(name, f"{_range(low, high, above)}{unit and ' ' + unit}", repr(value))
     return number
 
 
@@ -120,9 +123,9 @@ def check_numbers(
 ) -> tuple[float, ...]:
     """Return `value` if it is a sequence of `count` numbers, each as `check_number` takes it."""
     if isinstance(value, str) or not isinstance(value, Sequence):
-        raise TypeError(f"{name} must be {count} numbers; got {value!r}")
+        raise InvalidArgumentType(name, f"{count} numbers", repr(value))
     if len(value) != count:
-        raise ValueError(f"{name} must be {count} numbers; got {value!r}")
+        raise InvalidArgument(name, f"{count} numbers", repr(value))
     return tuple(check_number(name, number, low, high, above=above) for number in value)
 
 
@@ -137,9 +140,9 @@ def _range(low: float, high: float, above: bool) -> str:
 def check_cutoff(value: object) -> float:
     """Return the cutoff if it is a number in [0, 1)."""
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"cutoff must be a number in [0, 1); got {value!r}")
+        raise InvalidArgumentType("cutoff", "a number in [0, 1)", repr(value))
     if not 0.0 <= value < 1.0:
-        raise ValueError(f"cutoff must be in [0, 1); got {value!r}")
+        raise InvalidArgument("cutoff", "in [0, 1)", repr(value))
     return float(value)
 
 
@@ -150,32 +153,32 @@ def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values:
     """
     if isinstance(value, np.ndarray):
         if value.dtype.kind not in "biu":
-            raise TypeError(f"{name} must have an integer dtype; got {value.dtype}")
+            raise InvalidArgumentType(name, "an integer dtype", value.dtype, verb="have")
         if values and value.dtype == np.uint64 and value.size and value.max() >= 1 << 63:
-            raise ValueError(f"{name} must hold ids below 2**63; got {value.max()}")
+            raise InvalidArgument(name, "ids below 2**63", value.max(), verb="hold")
         value = torch.from_numpy(np.array(value, np.int64, order="C"))
     elif isinstance(value, Tensor) and value.dtype == torch.bool:
         value = value.long()
     tensor = check_integer(name, value, dims=dims)
     if tensor.numel() == 0:
-        raise ValueError(f"{name} must have at least one pixel; got shape {tuple(tensor.shape)}")
+        raise InvalidArgument(name, "at least one pixel", f"shape {tuple(tensor.shape)}", verb="have")
     tensor = tensor.long()
     if values and not holds(tensor.min() >= 0, f"{name} must hold non-negative ids"):
-        raise ValueError(f"{name} must hold non-negative ids; got {int(tensor.min())}")
+        raise InvalidArgument(name, "non-negative ids", int(tensor.min()), verb="hold")
     return tensor
 
 
 def check_size(name: str, value: object) -> tuple[int, int]:
     """Return (height, width) if both are whole numbers of at least 1."""
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
-        raise TypeError(f"{name} must be a pair (height, width); got {value!r}")
+        raise InvalidArgumentType(name, "a pair (height, width)", repr(value))
     # operator.index would make a constant of the size that a graph leaves open
     whole = [isinstance(side, int | torch.SymInt) and not isinstance(side, bool) for side in value]
     if not all(known or hasattr(side, "__index__") for known, side in zip(whole, value, strict=True)):
-        raise TypeError(f"{name} must hold two integers (height, width); got {value!r}")
+        raise InvalidArgumentType(name, "two integers (height, width)", repr(value), verb="hold")
     height, width = (side if known else operator.index(side) for known, side in zip(whole, value, strict=True))
     if height < 1 or width < 1:
-        raise ValueError(f"{name} must be at least 1 x 1; got {value!r}")
+        raise InvalidArgument(name, "at least 1 x 1", repr(value))
     return height, width
 
 
@@ -206,7 +209,7 @@ def check_image(name: str, value: object) -> Tensor:
     """Return a finite floating image (C, H, W) or (B, C, H, W) with no empty dimension."""
     tensor = check_floating(name, value, dims=(3, 4))
     if tensor.numel() == 0:
-        raise ValueError(f"{name} must not be empty; got shape {tuple(tensor.shape)}")
+        raise InvalidArgument(name, "empty", f"shape {tuple(tensor.shape)}", verb="not be")
     return tensor
 
 
@@ -226,20 +229,18 @@ def as_image(name: str, value: object, tolerance: float = 0.0) -> Tensor:
         image = check_floating(name, value, dims=(3, 4), finite=False)  # looked for below, once
     else:
         hint = ": read it with kcgs.data.load_image" if isinstance(value, str | os.PathLike) else ""
-        raise TypeError(f"{name} must be a Tensor, a numpy array or a PIL image; got {type(value).__name__}{hint}")
+        raise InvalidArgumentType(name, "a Tensor, a numpy array or a PIL image", f"{type(value).__name__}{hint}")
     if image.ndim == 4:
         if image.shape[0] != 1:
-            raise ValueError(f"{name} must be one image, (C, H, W) or (1, C, H, W); got {tuple(image.shape)}")
+            raise InvalidArgument(name, "one image, (C, H, W) or (1, C, H, W)", tuple(image.shape))
         image = image[0]
     check_image(name, image)
     if image.shape[-1] in (1, 3, 4) and min(image.shape[:2]) > 4:
-        raise ValueError(
-            f"{name} must be (C, H, W); got {tuple(image.shape)}, which looks like (H, W, C): pass "
-            f"{name}.permute(2, 0, 1), or a numpy array (H, W, C)"
-        )
+        advice = f"pass {name}.permute(2, 0, 1), or a numpy array (H, W, C)"
+        raise InvalidArgument(name, "(C, H, W)", f"{tuple(image.shape)}, which looks like (H, W, C): {advice}")
     low, high = float(image.detach().min()), float(image.detach().max())
     if low < -tolerance or high > 1 + tolerance:
-        raise ValueError(f"{name} must be in [0, 1]; got [{low:g}, {high:g}]")
+        raise InvalidArgument(name, "in [0, 1]", f"[{low:g}, {high:g}]")
     return image
 
 
@@ -247,11 +248,11 @@ def _from_array(name: str, array: NDArray[Any]) -> Tensor:
     if array.ndim == 2:
         array = array[..., None]
     if array.ndim != 3 or array.shape[-1] > 4:
-        raise ValueError(f"{name} must be an array (H, W) or (H, W, C) with 1 to 4 channels; got shape {array.shape}")
+        raise InvalidArgument(name, "an array (H, W) or (H, W, C) with 1 to 4 channels", f"shape {array.shape}")
     if array.dtype in (np.uint8, np.uint16):
         array = array.astype(np.float32) / np.float32(np.iinfo(array.dtype).max)
     elif array.dtype not in (np.float32, np.float64):
-        raise TypeError(f"{name} must hold uint8, uint16, float32 or float64; got {array.dtype}")
+        raise InvalidArgumentType(name, "uint8, uint16, float32 or float64", array.dtype, verb="hold")
     return torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))
 
 

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from kcgs._atomic import atomic_path
 from kcgs._check import check_memory, check_size
 from kcgs._repr import png, shorten
+from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.functional.softness import CONTOURS, check_contours
 from kcgs.nn import GaussianField, RegionSplatRenderer
@@ -300,7 +301,7 @@ def check_unbatched(scene: object) -> Scene:
         raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
     if scene.field.means.ndim != 2:
         count = len(scene.field.means)
-        raise ValueError(f"scene must be of one image; got a batch of {count}: scene[t] is one of them")
+        raise InvalidArgument("scene", "of one image", f"a batch of {count}: scene[t] is one of them")
     return scene
 
 

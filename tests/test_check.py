@@ -2,12 +2,33 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from kcgs._check import as_image, check_count, check_labels, check_number, check_numbers
+from kcgs import InvalidArgument, InvalidArgumentType
+from kcgs._check import as_image, check_count, check_floating, check_labels, check_number, check_numbers
+
+
+class TestErrors:
+    @pytest.mark.parametrize("kind", [InvalidArgument, InvalidArgumentType])
+    def test_survive_pickling_and_copies(self, kind: type[InvalidArgument] | type[InvalidArgumentType]) -> None:
+        error = kind("means", "shape (..., 2)", (2, 3), verb="have")
+        for twin in (error, pickle.loads(pickle.dumps(error)), copy.copy(error), copy.deepcopy(error)):
+            assert type(twin) is kind and str(twin) == "means must have shape (..., 2); got (2, 3)"
+            assert (twin.name, twin.expected, twin.received) == ("means", "shape (..., 2)", (2, 3))
+
+    def test_of_checks_are_built_in_errors_with_a_name(self) -> None:
+        with pytest.raises(ValueError, match="count must be at least 1; got 0") as caught:
+            check_count("count", 0)
+        assert isinstance(caught.value, InvalidArgument) and caught.value.received == 0
+        with pytest.raises(TypeError, match="means must have a real floating dtype; got torch.int64") as wrong:
+            check_floating("means", torch.zeros(2, dtype=torch.int64))
+        assert isinstance(wrong.value, InvalidArgumentType) and wrong.value.name == "means"
 
 
 class TestCheckCount:

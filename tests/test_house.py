@@ -27,6 +27,7 @@ LAYERS = [
     {"functional"},
     {"kernels", "engine", "plots"},
     {"_check", "_atomic", "_shipped", "_progress", "_repr"},
+    {"errors"},
 ]
 GONE = {
     "image, render": r"\bpictures?\b|\bdraw(s|n|ing|ings)?\b",

@@ -159,7 +159,7 @@ def check_output(path: Path, *suffixes: str, option: str = "--output") -> None:
     # scenes are written by their exact suffix, images in any case
     suffix = path.suffix.lower() if path.suffix.lower() in (*OUTPUT_IMAGES, ".npy") else path.suffix
     if suffix not in suffixes:
-        raise ValueError(f"{option} must end in {' or '.join(suffixes)}; got {str(path)!r}")
+        raise typer.BadParameter(f"{option} must end in {' or '.join(suffixes)}; got {str(path)!r}")
     check_writable(option, path)
 
 

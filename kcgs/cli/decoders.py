@@ -53,7 +53,7 @@ def export(
         regions = loaded.regions
         if regions is not None and regions.num_regions > 1 and (regions.softness != 0.0 or regions.supersample > 1):
             why = "a generic decoder renders hard contours, and this scene's are soft or finer"
-            raise ValueError(f"--kind must be scene, or come with --hard-contours: {why}")
+            raise typer.BadParameter(f"--kind must be scene, or come with --hard-contours: {why}")
         model = generic_decoder(cutoff=cutoff, clamp=clamp)
     else:
         model = scene_decoder(

@@ -163,7 +163,7 @@ def _expand(patterns: list[str]) -> list[Path]:
     for image in images:
         by_stem.setdefault(image.stem, []).append(str(image))
     if clashes := [" and ".join(paths) for paths in by_stem.values() if len(paths) > 1]:
-        raise ValueError(
+        raise typer.BadParameter(
             f"PATTERN must name images of different stems, after which scenes are named; got {'; '.join(clashes)}"
         )
     if others:
@@ -173,7 +173,7 @@ def _expand(patterns: list[str]) -> list[Path]:
 
 def _masks(folder: Path) -> dict[str, tuple[Path, ...]]:
     if not folder.is_dir():
-        raise ValueError(f"--regions must be auto, none or a folder of masks; got {str(folder)!r}")
+        raise typer.BadParameter(f"--regions must be auto, none or a folder of masks; got {str(folder)!r}")
     found: dict[str, tuple[Path, ...]] = {}
     for path in sorted(folder.absolute().iterdir()):
         if path.suffix.lower() in (*IMAGES, ".npy"):

@@ -10,6 +10,7 @@ import typer
 
 from kcgs._atomic import write_file
 from kcgs._progress import Progress
+from kcgs.errors import InvalidArgument
 
 from .common import (
     OUTPUT_IMAGES,
@@ -44,7 +45,9 @@ def render(
     scale: Scale = None,
     size: Size = None,
     contours: Contours = "scaled",
-    region: Annotated[int | None, typer.Option(help="Render only this region; the rest is black.")] = None,
+    region_ids: Annotated[
+        int | None, typer.Option("--region", metavar="ID", help="Render only this region; the rest is black.")
+    ] = None,
     rate: Annotated[
         str | None,
         typer.Option(
@@ -66,16 +69,16 @@ def render(
     if loaded.field.means.ndim == 3:
         from .video import render_batch
 
-        exclude("a batch of scenes", region=region)
+        exclude("a batch of scenes", region=region_ids)
         render_batch(loaded, output, scale=scale, size=size, contours=contours, rate=rate, frame=frame)
         return
     exclude("a scene of one image", frame_rate=rate, frame=frame)
     check_output(output, *OUTPUT_IMAGES)
     target = target_size(loaded, scale, size)
-    if region is not None:
+    if region_ids is not None:
         if loaded.regions is None or loaded.field.region_ids is None:
-            raise ValueError(f"--region must not be given: {scene} has no regions")
-        loaded = extract_region(loaded, region)
+            raise InvalidArgument("region_ids", "given", f"{region_ids}: {scene} has no regions", verb="not be")
+        loaded = extract_region(loaded, region_ids)
     save_image(output, loaded.render(target, contours))
 
 
@@ -98,7 +101,8 @@ def eval_command(
 
     loaded, target = check_unbatched(load(scene)), load_image(image)
     if target.shape[1:] != loaded.size:
-        raise ValueError(f"IMAGE must have the size {loaded.size} of SCENE; got {tuple(target.shape[1:])}")
+        expected = f"the size {loaded.size} of SCENE"
+        raise InvalidArgument("image", expected, tuple(target.shape[1:]), verb="have")
     labels = loaded.regions.labels if loaded.regions is not None else None
     if regions is not None:
         labels = load_labels(regions)

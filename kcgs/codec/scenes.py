@@ -13,6 +13,7 @@ import torch
 
 from kcgs._check import check_count, check_floating, check_number
 from kcgs._repr import brief
+from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.functional.covariance import check_cholesky
 from kcgs.nn import GaussianField
@@ -98,7 +99,7 @@ class SceneWriter:
     def qp_for(self, quality: float | None, target_bytes: int | None = None) -> int:
         """Return the quantization parameter at which rounding costs this PSNR, in dB, against the unrounded scene."""
         if quality is not None and target_bytes is not None:
-            raise ValueError(f"quality and target_bytes exclude each other; got {quality!r} and {target_bytes!r}")
+            raise InvalidArgument("quality", "None with target_bytes", quality)
         decibels = check_number("quality", DEFAULT_QUALITY if quality is None else quality, *QUALITIES, unit="dB")
         samples = self.channels * self.size[0] * self.size[1]
         distortion = samples * 10 ** (-decibels / 10) / self._count_numbers()
@@ -120,7 +121,7 @@ class SceneWriter:
                 least, high = len(data), qp - 1
             qp = min(max(self.next_qp(qp, len(data), most), low), high)
         if best is None:
-            raise ValueError(f"target_bytes must be at least {least} for this scene; got {target_bytes}")
+            raise InvalidArgument("target_bytes", f"at least {least} for this scene", target_bytes)
         return best
 
     def next_qp(self, qp: int, num_bytes: int, target_bytes: int) -> int:
@@ -181,7 +182,7 @@ def _join(groups: list[slice], count: int) -> list[list[slice]]:
 def _check_field(field: GaussianField) -> None:
     """Refuse what no file can hold; a parameter may have been changed since the field was made."""
     if field.means.ndim != 2:
-        raise ValueError(f"scene must be of one image; got a batch of {len(field.means)}: scene[t] is one of them")
+        raise InvalidArgument("scene", "of one image", f"a batch of {len(field.means)}: scene[t] is one of them")
     check_floating("means", field.means.detach().float())
     check_cholesky("cholesky", field.cholesky.detach().float())
     check_floating("colors", field.merged_colors().detach().float())

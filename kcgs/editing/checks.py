@@ -12,6 +12,7 @@ from torch import Tensor
 
 import kcgs.scene
 from kcgs._check import check_count, check_floating, check_number
+from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene, check_unbatched
@@ -34,7 +35,7 @@ def check_scene(scene: Scene, region_ids: object) -> tuple[RegionMap, Tensor]:
     check_field(check_unbatched(scene))
     regions = kcgs.scene.check_scene(scene).regions
     if regions is None:
-        raise ValueError("scene must have a label map; got regions None")
+        raise InvalidArgument("scene", "a label map", "regions None", verb="have")
     wanted = check_ids(region_ids, regions.ids, "map")
     return regions, torch.tensor(wanted, device=regions.ids.device)
 
@@ -59,7 +60,7 @@ def check_ids(region_ids: object, known: Tensor, owner: str) -> list[int]:
     for region in wanted:
         if region not in ids:
             shown = ", ".join(map(str, ids[:20])) + (" ..." if len(ids) > 20 else "")
-            raise ValueError(f"region_ids must be among the {len(ids)} ids of the {owner}, {shown}; got {region}")
+            raise InvalidArgument("region_ids", f"among the {len(ids)} ids of the {owner}, {shown}", region)
     return wanted
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import tomllib
 from difflib import get_close_matches
 from importlib.resources import files
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from kcgs._repr import shorten
+from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.functional import MAX_SOFTNESS
 from kcgs.kernels import BACKENDS
 
@@ -116,7 +117,7 @@ class FitConfig(BaseModel):
     def model_post_init(self, context: Any) -> None:
         """Check what a type cannot say."""
         if self.backend not in BACKENDS:
-            raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {self.backend!r}")
+            raise InvalidArgument("backend", f"one of {', '.join(BACKENDS)}", repr(self.backend))
         if self.objective != "psnr" and self.loss != "l2":
             raise ValueError(f"objective {self.objective!r} needs loss 'l2'; got {self.loss!r}")
         if self.least_sigma is not None and self.optimizer != "frame":
@@ -150,15 +151,15 @@ class FitConfig(BaseModel):
         if isinstance(recipe, FitConfig):
             values = recipe.model_dump()
         elif not isinstance(recipe, str):
-            raise TypeError(f"recipe must be a name or a FitConfig; got {type(recipe).__name__}")
+            raise InvalidArgumentType("recipe", "a name or a FitConfig", type(recipe).__name__)
         elif recipe not in available_recipes():
-            raise ValueError(f"recipe must be one of {', '.join(available_recipes())}; got {recipe!r}")
+            raise InvalidArgument("recipe", f"one of {', '.join(available_recipes())}", repr(recipe))
         else:
             values = tomllib.loads((files("kcgs.recipes") / f"{recipe}.toml").read_text(encoding="utf-8"))
         try:
             return cls(**{**values, **settings})
         except ValidationError as error:
-            raise ValueError(_one_line(error)) from error
+            raise _first(error) from error
 
 
 def available_recipes() -> list[str]:
@@ -171,16 +172,14 @@ def available_recipes() -> list[str]:
     return sorted(f.name.removesuffix(".toml") for f in files("kcgs.recipes").iterdir() if f.name.endswith(".toml"))
 
 
-def _one_line(error: ValidationError) -> str:
-    parts = []
-    for found in error.errors():
-        name = ".".join(map(str, found["loc"]))
-        if found["type"] == "extra_forbidden":
-            near = get_close_matches(name, FitConfig.model_fields, 1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(FitConfig.model_fields)}"
-            parts.append(f"unknown setting {name!r}: {hint}")
-        elif found["type"] == "value_error":  # one of our own, which says it all
-            parts.append(str(found["ctx"]["error"]))
-        else:
-            parts.append(f"{name}: {found['msg']}; got {found['input']!r}")
-    return "; ".join(parts)
+def _first(error: ValidationError) -> Exception:
+    """Return the first of pydantic's findings as an error of ours."""
+    found = error.errors()[0]
+    name = ".".join(map(str, found["loc"]))
+    if found["type"] == "extra_forbidden":
+        near = get_close_matches(name, FitConfig.model_fields, 1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(FitConfig.model_fields)}"
+        return ValueError(f"unknown setting {name!r}: {hint}")
+    if found["type"] == "value_error":
+        return cast(Exception, found["ctx"]["error"])
+    return InvalidArgument(name, found["msg"].removeprefix("Input should be "), repr(found["input"]))

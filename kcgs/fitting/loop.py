@@ -15,6 +15,7 @@ from torch import Tensor
 
 from kcgs._check import as_image, check_count
 from kcgs._progress import Progress
+from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.kernels import prepare, threads_for_kernels
 
@@ -96,9 +97,9 @@ def fit(
     num_gaussians = check_num_gaussians(num_gaussians, image)
     seed = check_count("seed", seed, 0, 2**63 - 1)
     if resume and checkpoint is None:
-        raise ValueError("resume needs checkpoint, a file to go on from; got None")
+        raise InvalidArgument("checkpoint", "a file to go on from, with resume", None)
     if config.target_psnr is not None and checkpoint is not None:
-        raise ValueError(f"checkpoint must be None with target_psnr, which takes several fits; got {checkpoint!r}")
+        raise InvalidArgument("checkpoint", "None with target_psnr, which takes several fits", repr(checkpoint))
     prepare(config.backend, image.device, image.dtype, len(image))  # no fit's clock counts what compiles or loads once
     if config.densify_from < 1.0:
         _load()
@@ -170,7 +171,7 @@ def check_num_gaussians(value: object, image: Tensor) -> int:
     count, pixels = check_count("num_gaussians", value), image.shape[1] * image.shape[2]
     if count > pixels:
         size = f"{image.shape[2]} x {image.shape[1]}"
-        raise ValueError(f"num_gaussians must be at most {pixels}, the pixels of the {size} image; got {count}")
+        raise InvalidArgument("num_gaussians", f"at most {pixels}, the pixels of the {size} image", count)
     return count
 
 
@@ -194,10 +195,8 @@ def check_problem(image: Any, regions: object) -> tuple[Tensor, RegionMap | None
         if regions.num_maps == 1:
             regions = regions.image(0)
         if regions.size != tuple(image.shape[1:]) or regions.num_maps is not None:
-            raise ValueError(
-                f"regions must be one map of the image's size {tuple(image.shape[1:])}; got "
-                f"{tuple(regions.labels.shape)}"
-            )
+            expected = f"one map of the image's size {tuple(image.shape[1:])}"
+            raise InvalidArgument("regions", expected, tuple(regions.labels.shape))
         regions = regions.to(image.device)
     dtype = torch.float64 if image.dtype == torch.float64 else torch.float32
     # a copy: an inference tensor cannot take part in a graph

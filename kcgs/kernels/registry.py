@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from kcgs.errors import InvalidArgument
+
 from .inputs import SplatInputs, Steps
 
 if TYPE_CHECKING:  # loads numba
@@ -68,5 +70,5 @@ def prepare(backend: str, device: torch.device, dtype: torch.dtype, channels: in
 def check_backend(backend: str) -> str:
     """Return `backend` if it is a name of one."""
     if backend not in BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
+        raise InvalidArgument("backend", f"one of {', '.join(BACKENDS)}", repr(backend))
     return backend

@@ -8,6 +8,7 @@ import html
 from pathlib import Path
 
 from kcgs.codec import decode, encode
+from kcgs.errors import InvalidArgument
 from kcgs.functional.softness import check_contours
 from kcgs.scene import Scene, check_scene
 
@@ -48,7 +49,7 @@ def web_bytes(scene: Scene | bytes) -> bytes:
     loaded = check_scene(scene) if isinstance(scene, Scene) else decode(scene).scene
     channels = loaded.field.colors.shape[-1]
     if channels not in (1, 3, 4):
-        raise ValueError(f"scene must have 1, 3 or 4 channels for a page to show it; got {channels}")
+        raise InvalidArgument("scene", "1, 3 or 4 channels for a page to show it", channels, verb="have")
     return encode(scene, quality=_QUALITY) if isinstance(scene, Scene) else scene
 
 

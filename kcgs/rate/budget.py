@@ -14,6 +14,7 @@ from torch import Tensor
 from kcgs._check import check_count
 from kcgs._progress import Progress
 from kcgs._repr import brief
+from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, FitResult, HistoryEntry, fit
 from kcgs.fitting.loop import check_problem
 from kcgs.fitting.region_report import report_regions
@@ -99,7 +100,7 @@ def fit_bytes(
     image, regions = check_problem(image, regions)
     check_count("num_bytes", num_bytes)
     if config.target_psnr is not None:
-        raise ValueError(f"target_psnr must be None where bytes are the target; got {config.target_psnr}")
+        raise InvalidArgument("target_psnr", "None where bytes are the target", config.target_psnr)
     end = math.inf if config.max_seconds is None else time.perf_counter() + config.max_seconds
     with Progress("trial fits", known=False, shown=progress):
         chosen, cost, changes = _choose(image, regions, num_bytes, config, seed)

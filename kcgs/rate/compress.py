@@ -15,6 +15,7 @@ from kcgs._repr import brief
 from kcgs.codec import QUALITIES, decode
 from kcgs.codec.gaussians.quantize import Codes, Quantizer
 from kcgs.codec.scenes import SceneWriter
+from kcgs.errors import InvalidArgument
 from kcgs.fitting.config import Objective
 from kcgs.fitting.objective import make_objective
 from kcgs.functional import psnr
@@ -98,15 +99,15 @@ def compress(
     writer = SceneWriter(scene)
     target = as_image("image", image)
     if tuple(target.shape) != (writer.channels, *writer.size):
-        raise ValueError(f"image must have shape {(writer.channels, *writer.size)}; got {tuple(target.shape)}")
+        raise InvalidArgument("image", f"shape {(writer.channels, *writer.size)}", tuple(target.shape), verb="have")
     # a copy: an inference tensor cannot take part in a graph
     target = target.detach().to("cpu", torch.float32, copy=True)
     if target_psnr is not None and (quality is not None or target_bytes is not None):
-        raise ValueError(f"target_psnr excludes quality and target_bytes; got {quality!r} and {target_bytes!r}")
+        raise InvalidArgument("target_psnr", "None with quality or target_bytes", target_psnr)
     qp = writer.qp_for(quality, target_bytes)
     check_count("iterations", iterations)
     if objective not in get_args(Objective):
-        raise ValueError(f"objective must be one of {', '.join(get_args(Objective))}; got {objective!r}")
+        raise InvalidArgument("objective", f"one of {', '.join(get_args(Objective))}", repr(objective))
     seconds = math.inf
     if max_seconds is not None:
         seconds = check_number("max_seconds", max_seconds, 0.0, unit="seconds", above=True)

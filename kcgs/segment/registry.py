@@ -13,6 +13,7 @@ from torch import Tensor
 
 from kcgs._check import check_count
 from kcgs._repr import brief
+from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.kernels import threads_for_kernels
 from kcgs.segment.cleanup import check_segment_image, connected_regions, merge_similar, merge_small, order_by_area
 from kcgs.segment.snapping import snap_contours
@@ -137,7 +138,7 @@ class _Method:
         for option in options:
             if option not in self.signature.parameters:
                 known = describe_options(self.name)
-                raise TypeError(f"option must be one of the method {self.name!r}, {known}; got {option!r}")
+                raise InvalidArgumentType("option", f"one of the method {self.name!r}, {known}", repr(option))
         cleanup = replace(self.cleanup, **{key: options.pop(key) for key in _CLEANUP if key in options})
         pixels = check_segment_image(image)
         cleanup = replace(cleanup, min_size=cleanup.smallest(pixels[0].numel()))
@@ -284,5 +285,5 @@ def segment_with_scores(image: Any, method: str = "auto", **options: Any) -> Seg
         ([1, 0, 0], None, None)
     """
     if method not in _methods:
-        raise ValueError(f"method must be one of {', '.join(available_methods())}; got {method!r}")
+        raise InvalidArgument("method", f"one of {', '.join(available_methods())}", repr(method))
     return _methods[method](image, **options)

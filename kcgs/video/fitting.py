@@ -17,6 +17,7 @@ from torch.nn.functional import avg_pool2d
 
 from kcgs._check import check_count
 from kcgs._progress import Progress
+from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, fit
 from kcgs.fitting.loop import check_problem
 from kcgs.fitting.state import Gaussians
@@ -107,10 +108,10 @@ def fit_video(
     config = FitConfig.from_recipe(recipe, **({"merge_regions": False} | settings))
     count = check_count("num_gaussians", num_gaussians)
     if resume and checkpoint is None:
-        raise ValueError("resume needs checkpoint, a file to go on from; got None")
+        raise InvalidArgument("checkpoint", "a file to go on from, with resume", None)
     path = None if checkpoint is None else Path(checkpoint)
     if path is not None and path.suffix != ".safetensors":
-        raise ValueError(f"checkpoint must end in .safetensors; got {str(path)!r}")
+        raise InvalidArgument("checkpoint", ".safetensors", repr(str(path)), verb="end in")
     done = _read_checkpoint(path, count) if path is not None and resume else []
     metadata = {"frame_rate": f"{float(getattr(frames, 'frame_rate', _FRAME_RATE)):.10g}"}
     length = len(frames) if isinstance(frames, Sized) else None

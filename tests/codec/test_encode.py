@@ -155,7 +155,7 @@ class TestRefusals:
             (lambda: encode(None), "scene must be a Scene"),
             (lambda: encode(scene, quality=5), "quality must be in"),
             (lambda: encode(scene, quality=True), "quality must be a number"),
-            (lambda: encode(scene, quality=40, target_bytes=900), "exclude each other"),
+            (lambda: encode(scene, quality=40, target_bytes=900), "quality must be None with target_bytes; got 40"),
             (lambda: encode(scene, target_bytes=1.5), "target_bytes must be an integer"),
             (lambda: encode(Scene(field, regions.resize((9, 9)))), "regions must have the size"),
             (lambda: encode(other), "region_ids must be ids"),

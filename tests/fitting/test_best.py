@@ -317,5 +317,5 @@ class TestReviewed:
 
     def test_resume_needs_a_checkpoint(self) -> None:
         image, labels = scene()
-        with pytest.raises(ValueError, match="resume needs checkpoint"):
+        with pytest.raises(ValueError, match="checkpoint must be a file to go on from, with resume; got None"):
             fit(image, labels, 5, recipe=quick(iterations=2), resume=True)

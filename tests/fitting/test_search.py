@@ -107,5 +107,5 @@ def test_a_file_that_shows_it(photo: tuple[Tensor, Tensor]) -> None:
     tight, loose = (compress(scene, image, target_psnr=own - less, iterations=5) for less in (0.01, 3.0))
     assert float(psnr(tight.scene.render(), image)) >= own - 0.01
     assert len(loose.data) <= len(tight.data)
-    with pytest.raises(ValueError, match="excludes quality"):
+    with pytest.raises(ValueError, match="target_psnr must be None with quality or target_bytes"):
         compress(scene, image, target_psnr=20.0, quality=40.0)

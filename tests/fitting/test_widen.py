@@ -49,7 +49,7 @@ class TestFit:
         assert self.least(least_sigma=0.1) < 0.4
 
     def test_bad_values(self) -> None:
-        with pytest.raises(ValueError, match="least_sigma: Input should be greater than or equal to 0.1; got 0.01"):
+        with pytest.raises(ValueError, match="least_sigma must be greater than or equal to 0.1; got 0.01"):
             FitConfig.from_recipe("best", least_sigma=0.01)
         with pytest.raises(ValueError, match="least_sigma needs optimizer 'frame'; got 'adan', which has its own"):
             FitConfig.from_recipe("paper", least_sigma=0.5)

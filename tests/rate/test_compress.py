@@ -81,7 +81,7 @@ class TestCompress:
             ({"image": image[:, :50]}, "image must have shape"),
             ({"objective": "l1"}, "objective must be one of psnr, visual, ms-ssim, progressive; got 'l1'"),
             ({"iterations": 0}, "iterations must be at least 1; got 0"),
-            ({"quality": 40, "target_bytes": 900}, "exclude each other"),
+            ({"quality": 40, "target_bytes": 900}, "quality must be None with target_bytes; got 40"),
             ({"target_bytes": 40}, "target_bytes must be at least [0-9]+ for this scene; got 40"),
         ):
             with pytest.raises(ValueError, match=match):

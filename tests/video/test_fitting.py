@@ -129,7 +129,7 @@ class TestFitVideo:
             fit_video(FRAMES, MAPS[:1], 8, iterations=2)
         with pytest.raises(ValueError, match=r"frame 1 must have shape \(3, 48, 64\); got \(3, 24, 64\)"):
             fit_video([FRAMES[0], FRAMES[0][:, :24]], None, 8, iterations=2)
-        with pytest.raises(ValueError, match="resume needs checkpoint"):
+        with pytest.raises(ValueError, match="checkpoint must be a file to go on from, with resume; got None"):
             fit_video(FRAMES, resume=True)
         with pytest.raises(ValueError, match="checkpoint must end in .safetensors"):
             fit_video(FRAMES, checkpoint=tmp_path / "a.state")

@@ -1,0 +1,37 @@
+"""Errors that name the argument; they survive pickling, so that worker processes can raise them."""
+
+from __future__ import annotations
+
+
+class _ArgumentError(Exception):
+    """Names an argument, what it must be, and what it was.
+
+    Args:
+        name: of the argument.
+        expected: what it must be; with another verb, what it must have or hold.
+        received: what it was, as the message shows it.
+        verb: of the sentence.
+    """
+
+    def __init__(self, name: str, expected: str, received: object, verb: str = "be") -> None:
+        super().__init__(name, expected, received, verb)
+        self.name = name
+        self.expected = expected
+        self.received = received
+        self.verb = verb
+
+    def __str__(self) -> str:
+        return f"{self.name} must {self.verb} {self.expected}; got {self.received}"
+
+
+class InvalidArgument(_ArgumentError, ValueError):
+    """A ValueError with the name of an argument, what it must be, and what it was.
+
+    Example:
+        >>> str(InvalidArgument("count", "at least 1", 0))
+        'count must be at least 1; got 0'
+    """
+
+
+class InvalidArgumentType(_ArgumentError, TypeError):
+    """A TypeError with the name of an argument, what it must be, and what it was."""
