@@ -33,9 +33,9 @@ from .core.store import Store, find_labels
 MAPS = "maps"
 # codecs of label maps
 LABELS, LOSSLESS_WEBP = "kcgs.codec.labels", "WebP, lossless"
-KCGS, NO_REGIONS, VISUAL, FLOAT = "kcgs", "kcgs, no regions", "kcgs, visual", "float scene"
+KCGS, NO_REGIONS, FLOAT = "kcgs", "kcgs, no regions", "float scene"
 MS_SSIM = "kcgs, ms-ssim"
-OBJECTIVES = {KCGS: "psnr", NO_REGIONS: "psnr", VISUAL: "visual", MS_SSIM: "ms-ssim"}
+OBJECTIVES = {KCGS: "psnr", NO_REGIONS: "psnr", MS_SSIM: "ms-ssim"}
 # of `compress`
 ITERATIONS, QUICK_TUNING = inspect.signature(compress).parameters["iterations"].default, 10
 # a fit's file is rounded until it costs so many dB; the dB above its PSNR at which that is tried first

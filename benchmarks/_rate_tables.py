@@ -9,7 +9,7 @@ from itertools import product
 from typing import NamedTuple
 
 from ._codecs import AVIF, AVIF_FAST, CODECS
-from ._rate_files import FLOAT, KCGS, LABELS, LOSSLESS_WEBP, MAPS, MS_SSIM, NO_REGIONS, VISUAL, Point
+from ._rate_files import FLOAT, KCGS, LABELS, LOSSLESS_WEBP, MAPS, MS_SSIM, NO_REGIONS, Point
 from .core.statistics import Delta, Summary, delta, summarize
 from .core.tables import count, db, markdown, seconds, signed, similarity, table
 
@@ -21,7 +21,7 @@ QUALITIES = {PSNR: ("PSNR", "dB"), EF_PSNR: ("EF-PSNR", "dB"), "ms_ssim": ("MS-S
 QUALITIES |= {"ssimulacra2": ("SSIMULACRA2", "points"), "butteraugli": ("butteraugli", "norm")}
 RIVALS = (*CODECS, NO_REGIONS)
 # whose files meet which others at the same bytes
-_CONTESTS = (*((KCGS, rival) for rival in RIVALS), (VISUAL, AVIF), (MS_SSIM, AVIF))
+_CONTESTS = (*((KCGS, rival) for rival in RIVALS), (MS_SSIM, AVIF))
 # a smaller difference is neither a win nor a loss
 TIE = {"dB": 0.005, "1": 0.0005, "%": 0.05, "points": 0.05, "norm": 0.005}
 MOST_BYTES = 7_950

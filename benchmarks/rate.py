@@ -14,7 +14,7 @@ from kcgs.plots import COLORS, figure, save_figure
 
 from . import _rate_tables as tables
 from ._codecs import AVIF, AVIF_FAST, AVIF_PSNR, JPEG, WEBP, present, versions
-from ._rate_files import KCGS, MAPS, MOST_LOSS, MS_SSIM, NO_REGIONS, VISUAL, Files, Point
+from ._rate_files import KCGS, MAPS, MOST_LOSS, MS_SSIM, NO_REGIONS, Files, Point
 from ._rate_tables import MOST_BYTES, PRECISION
 from .core import images
 from .core.figures import CROPS, add_legend, plot_crops, save_sheet, show_crops
@@ -34,7 +34,7 @@ QUICK_IMAGE, QUICK_BYTES = "disc", 700
 TARGETS, QUICK_TARGETS = (2_000, 4_000, 8_000, 16_000, 32_000), (450, 900)
 COUNTS, QUICK_COUNTS = (1_250, 7_500), (40,)
 _SHEET = "frames.jpg"
-_SHEET_TEXT = f"[All frames at full size]({_SHEET}). From left to right: photo, {KCGS}, {VISUAL}, {AVIF}."
+_SHEET_TEXT = f"[All frames at full size]({_SHEET}). From left to right: photo, {KCGS}, {MS_SSIM}, {AVIF}."
 # share of another file's bytes that is nearly as many
 _NEAR = 0.98
 # colour, line and marker of each codec, the same everywhere
@@ -48,7 +48,7 @@ _STYLES = {
 }
 _INTRODUCTION = f"""Bytes are those of real files, everything in them included. `{KCGS}` is `kcgs.rate.fit_bytes` with
 the map that is given on DAVIS, and with the one that `kcgs.segment.segment` finds on Kodak; `{NO_REGIONS}` is the same
-without a map, `{VISUAL}` and `{MS_SSIM}` with those objectives. Gained is what kcgs has over the other. The other
+without a map, `{MS_SSIM}` with that objective. Gained is what kcgs has over the other. The other
 codecs, and how curves are compared: docs/results.md. Seconds are medians, of kcgs those of the whole fit. Each file by
 itself: results.csv."""
 _MATCHED_TEXT = f"""Every codec made its largest file of at most {MOST_BYTES:,} bytes, or its smallest if it cannot go
@@ -155,7 +155,7 @@ def steps(group: str, files: Files) -> Iterator[tuple[str, Step]]:
     if group == tables.MATCHED:
         # first what all frames need, for a run that is stopped
         yield from ((image, partial(_matched, files, image)) for image in found)
-        others = [(image, codec) for codec in (NO_REGIONS, MS_SSIM, VISUAL) for image in found]
+        others = [(image, codec) for codec in (NO_REGIONS, MS_SSIM) for image in found]
         yield from ((f"{image}, {codec}", partial(_matched_other, files, image, codec)) for image, codec in others)
     elif group == tables.KODAK:
         # whole means first, for a run that is stopped
@@ -225,11 +225,11 @@ def _matched_other(files: Files, image: str, codec: str) -> list[Point]:
 
 def _frames(kept: Files, points: Sequence[Point]) -> Iterator[tuple[str, dict[str, Tensor]]]:
     """Show each matched photo beside its files of no more bytes than AVIF's, and that."""
-    visual = {pair.other.image: pair.ours for pair in tables.pairs(points, AVIF, VISUAL)}
+    similar = {pair.other.image: pair.ours for pair in tables.pairs(points, AVIF, MS_SSIM)}
     for pair in tables.pairs(points, AVIF):
         image = pair.other.image
-        if image in visual:
-            shown = {p.codec: kept.shown(p) for p in (pair.ours, visual[image], pair.other)}
+        if image in similar:
+            shown = {p.codec: kept.shown(p) for p in (pair.ours, similar[image], pair.other)}
             yield image, {"photo": kept.sample(image)[0].image, **shown}
 
 

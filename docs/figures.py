@@ -59,12 +59,12 @@ def objectives(path: Path) -> None:
     image = torch.from_numpy(coffee() / 255).permute(2, 0, 1).float()
     labels = segment(image)
     shown = {"photo": image}
-    for name in ("psnr", "visual", "ms-ssim"):
+    for name in ("psnr", "ms-ssim"):
         done = fit_bytes(image, labels, NUM_BYTES, objective=name)
         found = evaluate(done.scene, image, labels)
         figures = f"PSNR {found['psnr']:.1f}, EF-PSNR {found['ef_psnr']:.1f}, SSIMULACRA2 {found['ssimulacra2']:.0f}"
         shown[f'objective="{name}": {figures}'] = done.scene.render()
-    figure, axes = plt.subplots(2, 2, figsize=(13, 9), layout="constrained")
+    figure, axes = plt.subplots(1, 3, figsize=(16, 4), layout="constrained")
     for axis, (title, render) in zip(axes.flat, shown.items(), strict=True):
         axis.imshow(render.clamp(0, 1).permute(1, 2, 0), interpolation="lanczos")
         axis.set_title(title, fontsize=9)

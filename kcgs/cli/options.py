@@ -31,8 +31,8 @@ Contours = Annotated[
 Size = Annotated[str | None, typer.Option(metavar="WxH", help="Width and height in pixels.")]
 
 Objective = Annotated[
-    Literal["psnr", "visual", "ms-ssim", "progressive"] | None,
-    typer.Option("--objective", "--metric", help="What to maximize; progressive: PSNR, of the first bytes, too."),
+    Literal["psnr", "ms-ssim"] | None,
+    typer.Option("--objective", "--metric", help="What to maximize."),
 ]
 
 

@@ -14,8 +14,8 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.functional import MAX_SOFTNESS
 from kcgs.kernels import BACKENDS
 
-Objective = Literal["psnr", "visual", "ms-ssim", "progressive"]
-_USUAL_ITERATIONS, _PROGRESSIVE_ITERATIONS = 700, 900
+Objective = Literal["psnr", "ms-ssim"]
+_USUAL_ITERATIONS = 700
 
 
 class FitConfig(BaseModel):
@@ -78,9 +78,7 @@ class FitConfig(BaseModel):
     # The descent
     objective: Objective = Field(
         "psnr",
-        description="visual: an error on several scales, less where the image is busy; ms-ssim: that measure; "
-        "progressive: the error of the strongest Gaussians alone counts, too, so that the first bytes of a file are an "
-        "image; they need loss l2",
+        description="psnr: lower what `loss` says; ms-ssim: raise MS-SSIM, which needs loss l2",
     )
     loss: Literal["l1", "l2", "l1+ssim"] = Field("l2", description="l1+ssim: L1 + 0.1 (1 - SSIM), as Image-GS")
     optimizer: Literal["frame", "adan", "adam"] = Field(
@@ -105,7 +103,7 @@ class FitConfig(BaseModel):
     iterations: int | None = Field(
         None,
         ge=1,
-        description="None: 700 (900 with objective progressive), or with `max_seconds` as many as there is time for",
+        description="None: 700, or with `max_seconds` as many as there is time for",
     )
     max_seconds: float | None = Field(
         None, gt=0.0, description="stop after this wall time; the schedule adapts to it, and uses all of it"
@@ -130,7 +128,7 @@ class FitConfig(BaseModel):
     @property
     def usual_iterations(self) -> int:
         """Iterations of a fit without a clock."""
-        return self.iterations or (_PROGRESSIVE_ITERATIONS if self.objective == "progressive" else _USUAL_ITERATIONS)
+        return self.iterations or _USUAL_ITERATIONS
 
     def __repr__(self) -> str:
         changed = self.model_dump(exclude_defaults=True)

@@ -30,20 +30,18 @@ def squared_error(state: FitState, gaussians: Gaussians | None = None) -> Tensor
     return (render(state, gaussians).detach() - state.image).square().mean(0)
 
 
-def descend(state: FitState, rendered: Tensor, progress: float, weight: float = 1.0) -> None:
-    """Move the Gaussians downhill from a render of them; a weight other than 1 is for the loss l2."""
-    _backward(state, rendered, weight)
+def descend(state: FitState, rendered: Tensor, progress: float) -> None:
+    """Move the Gaussians downhill from a render of them."""
+    _backward(state, rendered)
     state.optimizer.step(state.optimizer.decay(progress))
     state.iteration += 1
 
 
-def _backward(state: FitState, rendered: Tensor, weight: float) -> None:
+def _backward(state: FitState, rendered: Tensor) -> None:
     """Leave the gradient of the loss at the Gaussians, but for a constant, which no optimizer here feels."""
     if state.config.loss == "l2":
         # in the render's own memory, which nothing needs again: new memory would take as long as the sum
         difference = rendered.data.sub_(state.image)
-        if weight != 1.0:
-            difference *= weight
         rendered.backward(difference if state.objective is None else state.objective.apply(difference))
         return
     difference = torch.sub(rendered.detach(), state.image).sign_()

@@ -22,7 +22,6 @@ from kcgs.kernels import prepare, threads_for_kernels
 from .checkpoint import Checkpoint
 from .config import FitConfig
 from .descent import descend, log, log_is_due, render
-from .prefixes import PREFIX_WEIGHT, choose_prefix
 from .search import OnStep, Search
 from .start import start
 from .state import FitResult, FitState, HistoryEntry, StopReason
@@ -136,11 +135,10 @@ def _run(state: FitState, on_step: OnStep | None = None, keeper: Checkpoint | No
         for strategy in strategies:
             if strategy.due(share):
                 strategy.apply(state)
-        prefix = choose_prefix(state, share)
-        rendered = render(state, prefix)
-        if prefix is None and log_is_due(state):
+        rendered = render(state)
+        if log_is_due(state):
             log(state, rendered)
-        descend(state, rendered, share, 1.0 if prefix is None else PREFIX_WEIGHT)
+        descend(state, rendered, share)
 
         if keeper is not None and (keeper.due() or state.iteration == state.limit):
             keeper.write(state)

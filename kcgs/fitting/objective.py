@@ -1,4 +1,4 @@
-"""What a fit lowers: the squared error, or one that is nearer to what the eye sees."""
+"""What a fit lowers besides the squared error: what MS-SSIM lacks."""
 
 from __future__ import annotations
 
@@ -14,101 +14,11 @@ from kcgs.functional.metrics import K1, K2, SCALE_WEIGHTS, SSIM_SIGMA, SSIM_WIND
 
 from .pursuit import Proposal, halve, propose
 
-# weight of the error in averages of 1, 2, 4 and 8 pixels a side
-_WEIGHTS = (1.0, 4.0, 16.0, 32.0)
-# the error counts by the local variance, with this added, to this power
-_LEAST_VARIANCE, _POWER = 0.03**2, -0.45
-# standard deviation of the window of the local variance, and its side, in pixels of the level
-_WINDOW, _SIDE = 4.0, 33
-# with MS-SSIM: weight of the squared error; and the least mean of a scale, for the logarithm has no end there
+# weight of the squared error; and the least mean of a scale, for the logarithm has no end there
 _SQUARED, _LEAST_SCORE = 0.003, 0.2
 
 
-class VisualObjective:
-    r"""The squared error on several scales, counted less where the image is busy.
-
-    .. math:: E(r) = \sum_k \sum_p m_k(p)\, |(P_k r)(p)|^2, \quad
-        m_k = w_k (v_k + 0.03^2)^{-0.45} / Z
-
-    :math:`P_k` averages blocks of :math:`2^k \times 2^k` pixels, :math:`v_k` is the local variance of :math:`P_k`
-    image, channels averaged, and Z makes the mean of all :math:`m_k` together 1. It is quadratic: its gradient is 2 H
-    r, H linear, so that growth and colours work by it as by the squared error. Averages weigh more than their share, so
-    texture that Gaussians are too few for keeps its mean rather than single strokes; busy places hide errors.
-
-    Args:
-        image: (C, H, W) in [0, 1].
-
-    Example:
-        >>> objective = VisualObjective(torch.rand(3, 32, 48, generator=torch.Generator().manual_seed(0)))
-        >>> residual = torch.full((3, 32, 48), 0.1)
-        >>> objective.apply(residual).shape, objective.value(residual) > 0
-        (torch.Size([3, 32, 48]), True)
-    """
-
-    def __init__(self, image: Tensor) -> None:
-        from kornia.filters import gaussian_blur2d
-
-        masks: list[Tensor] = []
-        plane = image
-        for weight in _WEIGHTS:
-            if masks:
-                if min(plane.shape[1:]) < 2:
-                    break
-                plane = halve(plane)
-            # the variance does not change with a constant, and rounding does less harm to small numbers
-            centred = (plane - plane.mean((1, 2), keepdim=True))[None]
-            mean, square = (
-                gaussian_blur2d(t, (_SIDE, _SIDE), (_WINDOW, _WINDOW), "replicate") for t in (centred, centred**2)
-            )
-            variance = (square - mean**2).clamp_min(0.0).mean((0, 1))
-            masks.append(weight * (variance + _LEAST_VARIANCE) ** _POWER)
-        total = sum(float(mask.mean()) for mask in masks)
-        self.masks = [mask / total for mask in masks]
-        self._bands = [(level, (4**level - 1) / 12, math.inf, mask) for level, mask in enumerate(self.masks)]
-        self.importance = self.apply(torch.ones_like(image[:1]))[0]
-        """What an error that is the same all around counts at each pixel, (H, W)."""
-
-    @staticmethod
-    def _sum_up(planes: list[Tensor]) -> Tensor:
-        """Add to each plane what the blocks of the coarser ones have; the planes are written to."""
-        for fine, coarse in zip(planes[-2::-1], planes[:0:-1], strict=True):
-            height, width = coarse.shape[1:]
-            blocks = fine[:, : 2 * height, : 2 * width].unflatten(2, (width, 2)).unflatten(1, (height, 2))
-            blocks.add_(coarse[:, :, None, :, None])
-        return planes[0]
-
-    def apply(self, residual: Tensor) -> Tensor:
-        """Return H r, (C, H, W): half the gradient at a residual r, render - image."""
-        planes = [residual]
-        for _ in self.masks[1:]:
-            planes.append(halve(planes[-1]))
-        levels = enumerate(zip(planes, self.masks, strict=True))
-        return self._sum_up([plane * (mask * 0.25**level) for level, (plane, mask) in levels])
-
-    def value(self, residual: Tensor) -> float:
-        """Return E, as a mean over pixels and channels."""
-        return float((residual * self.apply(residual)).mean())
-
-    def weigh(self, means: Tensor, cholesky: Tensor) -> Tensor:
-        """Return about what the squared error of Gaussians counts in E, by their places and sizes, (N,)."""
-        l11, l21, l22 = cholesky.detach().unbind(-1)
-        xx, xy, yy = l11**2, l11 * l21, l21**2 + l22**2
-        x, y = means.detach().floor().long().unbind(-1)
-        total = torch.zeros_like(xx)
-
-        def kept(added: float) -> Tensor:
-            return l11 * l22 / ((xx + added) * (yy + added) - xy**2).sqrt()
-
-        for level, fine, coarse, mask in self._bands:
-            row, column = (
-                (place >> level).clamp(0, length - 1) for place, length in zip((y, x), mask.shape, strict=True)
-            )
-            # an average is a convolution, which adds its variance, and loses as much energy
-            total += 0.25**level * mask[row, column] * (kept(fine) - kept(coarse))
-        return total
-
-
-class MsSsimObjective(VisualObjective):
+class MsSsimObjective:
     r"""What MS-SSIM lacks, as its logarithm, and a little of the squared error.
 
     .. math:: E(r) = -\sum_k w_k \log \overline{s_k} / Z + 0.003 |r|^2, \quad
@@ -144,10 +54,10 @@ class MsSsimObjective(VisualObjective):
             self._scales.append((plane, inside, mean, variance, weight))
             masks.append(_blur(inside * weight / (2.0 * variance + K2**2)).mean(0))
         self._norm = sum(float(mask.mean()) for mask in masks)
-        self.masks = [torch.full_like(image[0], _SQUARED), *(mask / self._norm for mask in masks)]
-        self.importance = self._sum_up([mask[None] * 0.25**level for level, mask in enumerate(self.masks)])[0]
-        self._bands = [(0, 0.0, math.inf, self.masks[0])]
-        for level, mask in enumerate(self.masks[1:], 1):
+        masks = [torch.full_like(image[0], _SQUARED), *(mask / self._norm for mask in masks)]
+        self.importance = self._sum_up([mask[None] * 0.25**level for level, mask in enumerate(masks)])[0]
+        self._bands = [(0, 0.0, math.inf, masks[0])]
+        for level, mask in enumerate(masks[1:], 1):
             # the mean under the window is no part of contrast and structure
             blocks, window = (4**level - 1) / 12, SSIM_SIGMA**2 * 4**level
             self._bands.append((level, blocks, blocks + window, mask))
@@ -166,6 +76,24 @@ class MsSsimObjective(VisualObjective):
     def value(self, residual: Tensor) -> float:
         """Return E, as a mean over pixels and channels."""
         return float(self._measure(residual)[0]) / residual[0].numel() + _SQUARED * float(residual.square().mean())
+
+    def weigh(self, means: Tensor, cholesky: Tensor) -> Tensor:
+        """Return about what the squared error of Gaussians counts in E, by their places and sizes, (N,)."""
+        l11, l21, l22 = cholesky.detach().unbind(-1)
+        xx, xy, yy = l11**2, l11 * l21, l21**2 + l22**2
+        x, y = means.detach().floor().long().unbind(-1)
+        total = torch.zeros_like(xx)
+
+        def kept(added: float) -> Tensor:
+            return l11 * l22 / ((xx + added) * (yy + added) - xy**2).sqrt()
+
+        for level, fine, coarse, mask in self._bands:
+            row, column = (
+                (place >> level).clamp(0, length - 1) for place, length in zip((y, x), mask.shape, strict=True)
+            )
+            # an average is a convolution, which adds its variance, and loses as much energy
+            total += 0.25**level * mask[row, column] * (kept(fine) - kept(coarse))
+        return total
 
     def _measure(self, residual: Tensor) -> tuple[Tensor, Tensor]:
         """Return E without the squared error, as a sum over pixels, and half the gradient of all of E."""
@@ -191,15 +119,23 @@ class MsSsimObjective(VisualObjective):
             slopes.append(_blur(hold) * shown - _blur(pull) * image + _blur(rest))
         return total, self._sum_up(slopes)
 
+    @staticmethod
+    def _sum_up(planes: list[Tensor]) -> Tensor:
+        """Add to each plane what the blocks of the coarser ones have; the planes are written to."""
+        for fine, coarse in zip(planes[-2::-1], planes[:0:-1], strict=True):
+            height, width = coarse.shape[1:]
+            blocks = fine[:, : 2 * height, : 2 * width].unflatten(2, (width, 2)).unflatten(1, (height, 2))
+            blocks.add_(coarse[:, :, None, :, None])
+        return planes[0]
 
-def make_objective(name: str, image: Tensor) -> VisualObjective | None:
+
+def make_objective(name: str, image: Tensor) -> MsSsimObjective | None:
     """Return the objective of a name, None where it is the squared error."""
-    kinds = {"visual": VisualObjective, "ms-ssim": MsSsimObjective}
-    return kinds[name](image) if name in kinds else None
+    return MsSsimObjective(image) if name == "ms-ssim" else None
 
 
 def propose_by(
-    objective: VisualObjective | None,
+    objective: MsSsimObjective | None,
     residual: Tensor,
     regions: RegionMap | None,
     count: int,

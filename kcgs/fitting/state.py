@@ -16,7 +16,7 @@ from kcgs.plots import history_figure
 from kcgs.scene import Scene
 
 from .config import FitConfig
-from .objective import VisualObjective
+from .objective import MsSsimObjective
 from .optimizers import GaussianOptimizer
 from .region_report import RegionReport
 
@@ -88,11 +88,6 @@ class Gaussians(NamedTuple):
         means, cholesky, colors = (t.detach().clone() for t in self[:3])
         return Gaussians(means, cholesky, colors, self.region_ids, self.regions)
 
-    def pick(self, index: Tensor) -> Gaussians:
-        """Return some of them."""
-        region_ids = None if self.region_ids is None else self.region_ids[index]
-        return Gaussians(self.means[index], self.cholesky[index], self.colors[index], region_ids, self.regions)
-
     def scene(self, size: tuple[int, int]) -> Scene:
         """Make a scene of them."""
         means, cholesky, colors = (t.detach() for t in self[:3])
@@ -113,7 +108,7 @@ class FitState:
     band: Tensor | None  # pixels near a contour of the given map, where EF-PSNR is measured
     chooses_widths: bool  # the map came without widths, and the config asks for some
     given: RegionMap | None  # the map as it came
-    objective: VisualObjective | None  # what the descent lowers; None: what `loss` says
+    objective: MsSsimObjective | None  # what the descent lowers; None: what `loss` says
     limit: float  # of iterations; infinite where the clock alone ends the fit
     merged_for_count: int  # regions that were merged before the fit, for they were more than Gaussians
 

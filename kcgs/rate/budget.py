@@ -28,7 +28,7 @@ from .compress import compress
 
 # bits per Gaussian that is fitted, some of which are left out, at `_COUNT` of them, and for each doubling; what was
 # lost to rounding shows more to the eye than Gaussians that are left out
-_BITS = {"psnr": 25.2, "visual": 31.4, "ms-ssim": 28.5, "progressive": 25.2}
+_BITS = {"psnr": 25.2, "ms-ssim": 28.5}
 _COUNT, _BITS_PER_OCTAVE = 2100, 1.9
 _HEADER_BYTES = 60
 # squared error falls with the power of the bytes
@@ -150,8 +150,7 @@ def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: Fi
     iterations = min(_TRIAL_ITERATIONS, config.usual_iterations)
     clock = None if config.max_seconds is None else _TRIAL_SHARE * config.max_seconds
     shorter: dict[str, Any] = {"iterations": iterations, "max_seconds": clock, "refine_flat": False}
-    seen = "psnr" if config.objective == "progressive" else config.objective  # the whole decides
-    trial = FitConfig.from_recipe(config, merge_regions=False, objective=seen, **shorter)
+    trial = FitConfig.from_recipe(config, merge_regions=False, **shorter)
 
     def error(regions: RegionMap | None, left: int) -> float:
         end = math.ceil(_FIT_END * iterations)

@@ -79,8 +79,7 @@ def compress(
         iterations: renders that the descent may take, at least 1.
         max_seconds: wall time, above 0; what it has no time for is rounded at once. None: as long as it takes.
         seed: of the order in which Gaussians are rounded.
-        objective: of the descent, as in :class:`kcgs.FitConfig`: psnr, visual, ms-ssim, or progressive, which ends
-            layers just before a quarter, a half and three quarters of the file.
+        objective: of the descent, psnr or ms-ssim, as in :class:`kcgs.FitConfig`.
 
     Returns:
         The file, and the scene that it decodes to.
@@ -128,8 +127,7 @@ class _Press:
     def __init__(
         self, writer: SceneWriter, image: Tensor, objective: str, iterations: int, seed: int, end: float
     ) -> None:
-        self.writer, self.image, self.progressive = writer, image, objective == "progressive"
-        self.objective = make_objective(objective, image)
+        self.writer, self.image, self.objective = writer, image, make_objective(objective, image)
         self.seed, self.end = seed, end
         self.free = int(_FREE * iterations)
         self.rounds = iterations - self.free
@@ -202,8 +200,7 @@ class _Press:
         )  # the codes are those that `excess` was asked last
 
     def _tuning(self, writer: SceneWriter, quantizer: Quantizer) -> Tuning:
-        given = writer.gaussians, writer.ids, self.image, writer.regions, quantizer, self.objective
-        return Tuning(*given, self.progressive)
+        return Tuning(writer.gaussians, writer.ids, self.image, writer.regions, quantizer, self.objective)
 
 
 def quality_for(decibels: float) -> float:

@@ -19,8 +19,7 @@ from torch import Tensor
 from kcgs.codec.exact import Integers
 from kcgs.codec.gaussians.quantize import Classes, Codes, Parameters, Quantizer
 from kcgs.fitting.frame import local_gradient, move
-from kcgs.fitting.objective import VisualObjective
-from kcgs.fitting.prefixes import energies, strongest
+from kcgs.fitting.objective import MsSsimObjective
 from kcgs.functional import RegionMap, region_splat
 
 from .bits import soft_bits
@@ -56,13 +55,11 @@ class Tuning:
         image: Tensor,
         regions: RegionMap | None,
         quantizer: Quantizer,
-        objective: VisualObjective | None,
-        progressive: bool = False,
+        objective: MsSsimObjective | None,
     ) -> None:
         self.ids, self.image, self.regions, self.objective = ids, image, regions, objective
-        self.quantizer, self.progressive, self._steps = quantizer, progressive, 0
+        self.quantizer, self._steps = quantizer, 0
         self._charge: Tensor | None = None  # [N, 3 + C] slopes of the bits' price, by factors and colours
-        self._still: Tensor | None = None  # [N, 1] Gaussians that this step leaves as they are
         self._free = [torch.from_numpy(numbers).to(image) for numbers in gaussians]
         self._speed = torch.zeros(len(ids), 5 + gaussians.colors.shape[1]).to(image)
         # what the distortion counts in the error
@@ -86,7 +83,7 @@ class Tuning:
         for _ in range(iterations):
             if time.perf_counter() >= end:
                 break
-            self._speed = self._faster(self._downhill(*self._free))
+            self._speed = _MOMENTUM * self._speed + self._downhill(*self._free)
             self._free = self._moved(self._free)
 
     def round(
@@ -138,43 +135,27 @@ class Tuning:
         current = [torch.where(fix, r, f) for fix, r, f in zip(fixed, restored, self._free, strict=True)]
         downhill = self._downhill(*current)
         stopped = torch.cat([shaped.expand(-1, 5), colored.expand(-1, downhill.shape[1] - 5)], -1)
-        self._speed = torch.where(stopped, 0.0, self._faster(downhill))
+        self._speed = torch.where(stopped, 0.0, _MOMENTUM * self._speed + downhill)
         moved = self._moved(current)
         self._free = [torch.where(fix, f, m) for fix, f, m in zip(fixed, self._free, moved, strict=True)]
 
-    def _faster(self, downhill: Tensor) -> Tensor:
-        speed = _MOMENTUM * self._speed + downhill
-        return speed if self._still is None else torch.where(self._still, self._speed, speed)
-
     def _moved(self, current: list[Tensor]) -> list[Tensor]:
-        step = _STEP * (self._speed if self._still is None else self._speed.masked_fill(self._still, 0.0))
+        step = _STEP * self._speed
         means, cholesky = move(current[0], current[1], step[:, :5].clamp(-_LARGEST, _LARGEST), exact=False)
         return [means, cholesky, current[2] + step[:, 5:]]
 
     def _downhill(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
-        """Return Newton's steps; in a progressive descent now and then those of the strongest Gaussians alone."""
-        self._still, ids = None, self._region_ids
+        """Return Newton's steps of each number alone: of centre and factor in the Gaussian's frame, of colours."""
         if self._charge is None or self._steps % _CHARGED == 0:
             factors, c = (t.detach().requires_grad_() for t in (cholesky, colors))
             # half the squared error, as its gradient is the difference
             price = 0.5 * _BIT * self._counts * self.quantizer.distortion
             bits = price * soft_bits(factors, c, self.quantizer).sum()
             self._charge = torch.cat(torch.autograd.grad(bits, (factors, c)), -1)
-        index = strongest(cholesky, colors, self.quantizer.size, 0, self._steps) if self.progressive else None
         self._steps += 1
-        if index is None:
-            return self._newton(means, cholesky, colors, ids, self._charge)
-        ids = None if ids is None else ids[index]
-        steps = self._newton(means[index], cholesky[index], colors[index], ids, self._charge[index])
-        # the others stand still: momentum that misses every third gradient swings ever wider
-        self._still = torch.ones(len(means), 1, dtype=torch.bool).index_fill(0, index, False)
-        return torch.zeros_like(self._speed).index_copy(0, index, steps)
-
-    def _newton(self, means: Tensor, cholesky: Tensor, colors: Tensor, ids: Tensor | None, charge: Tensor) -> Tensor:
-        """Return Newton's steps of each number alone: of centre and factor in the Gaussian's frame, of colours."""
-        size = self.quantizer.size
+        charge, size = self._charge, self.quantizer.size
         x, factors, c = (t.detach().requires_grad_() for t in (means, cholesky, colors))
-        render = region_splat(x, factors, c, ids, self.regions, size=size, cutoff=_DRAFT_CUTOFF)
+        render = region_splat(x, factors, c, self._region_ids, self.regions, size=size, cutoff=_DRAFT_CUTOFF)
         difference = render.detach() - self.image
         if self.objective is not None:
             difference = self.objective.apply(difference)
@@ -190,7 +171,8 @@ class Tuning:
     def _energy(self) -> Tensor:
         """Return what the objective loses without each Gaussian, (N,)."""
         means, cholesky, colors = (numbers.double() for numbers in self._free)
-        return self._weights(means, cholesky) * energies(cholesky, colors, self.quantizer.size)
+        area = (math.pi * cholesky[:, 0] * cholesky[:, 2]).clamp_max(math.prod(self.quantizer.size))
+        return self._weights(means, cholesky) * (colors.square().sum(-1) * area)
 
     def _weights(self, means: Tensor, cholesky: Tensor) -> Tensor:
         """Return what the squared error of Gaussians counts in the objective, (N,)."""

@@ -1,19 +1,17 @@
-"""The visual objective and that of MS-SSIM, against autograd of their formulas in float64."""
+"""The objective of MS-SSIM, against autograd of its formula in float64."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from scipy.ndimage import gaussian_filter
 from skimage import data
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d
 
 from kcgs import fit
-from kcgs.fitting.objective import MsSsimObjective, VisualObjective
+from kcgs.fitting.objective import MsSsimObjective
 from kcgs.functional import ms_ssim
 
 
@@ -23,55 +21,6 @@ def photo(height: int, width: int, seed: int = 0) -> Tensor:
     ramp = torch.linspace(0.2, 0.8, width).expand(3, height, width).clone()
     ramp[:, :, width // 2 :] += 0.2 * (torch.rand(3, height, width - width // 2, generator=generator) - 0.5)
     return ramp.clamp(0, 1).double()
-
-
-def energy(image: Tensor, residual: Tensor) -> Tensor:
-    """E by its formula; the window of the variance is scipy's."""
-    total, norm = torch.zeros((), dtype=torch.float64), 0.0
-    for level, weight in enumerate((1.0, 4.0, 16.0, 32.0)):
-        if level:
-            image, residual = (avg_pool2d(t[None], 2)[0] for t in (image, residual))
-        planes = image.numpy()
-        mean, square = (
-            np.stack([gaussian_filter(p, 4.0, mode="nearest") for p in t]) for t in (planes, planes * planes)
-        )
-        mask = weight * (torch.from_numpy(square - mean**2).mean(0) + 0.03**2) ** -0.45
-        total = total + (mask * residual.square()).sum()
-        norm += float(mask.mean())
-    return total / norm
-
-
-@pytest.mark.parametrize("size", [(32, 48), (37, 51), (129, 200)])
-def test_is_the_gradient_of_its_formula(size: tuple[int, int]) -> None:
-    image, residual = photo(*size), 0.1 * photo(*size, seed=1)
-    leaf = residual.clone().requires_grad_()
-    expected = energy(image, leaf)
-    (slope,) = torch.autograd.grad(expected, leaf)
-    objective = VisualObjective(image)
-    torch.testing.assert_close(2 * objective.apply(residual), slope, rtol=2e-3, atol=1e-6)
-    assert objective.value(residual) == pytest.approx(float(expected.detach()) / residual.numel(), rel=1e-3)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 9), (3, 2), (8, 8)])
-def test_tiny_images(size: tuple[int, int]) -> None:
-    objective = VisualObjective(torch.full((1, *size), 0.5))
-    assert objective.apply(torch.ones(1, *size)).isfinite().all()
-    assert objective.value(torch.ones(1, *size)) > 0
-
-
-def test_narrow_and_busy_count_less() -> None:
-    objective = VisualObjective(photo(64, 96))
-    means = torch.tensor([[20.5, 30.5], [20.5, 30.5], [80.5, 30.5]], dtype=torch.float64)
-    cholesky = torch.tensor([[8.0, 0.0, 8.0], [0.5, 0.0, 0.5], [8.0, 0.0, 8.0]], dtype=torch.float64)
-    wide, narrow, busy = objective.weigh(means, cholesky).tolist()
-    assert narrow < 0.7 * wide
-    assert busy < wide
-    # against renders of the two on the grid
-    y, x = torch.meshgrid(torch.arange(64.0) + 0.5, torch.arange(96.0) + 0.5, indexing="ij")
-    for weight, k in ((wide, 0), (narrow, 1)):
-        sigma = float(cholesky[k, 0])
-        g = torch.exp(-0.5 * ((x - means[k, 0]) ** 2 + (y - means[k, 1]) ** 2) / sigma**2)[None].double()
-        assert weight == pytest.approx(objective.value(g) / float(g.square().mean()), rel=0.35)
 
 
 def lacking(image: Tensor, residual: Tensor) -> Tensor:
@@ -136,15 +85,14 @@ class TestMsSsim:
 class TestFit:
     def test_lowers_its_own_error_more(self) -> None:
         image = torch.from_numpy(data.astronaut()[:96, 160:288] / 255).permute(2, 0, 1).float()
-        objective = VisualObjective(image)
+        objective = MsSsimObjective(image)
         value: dict[str, float] = {}
-        for name in ("psnr", "visual"):
+        for name in ("psnr", "ms-ssim"):
             render = fit(image, None, 80, iterations=200, objective=name).scene.render().clamp(0, 1)
             value[name] = objective.value(render - image)
-        assert value["visual"] < value["psnr"]
+        assert value["ms-ssim"] < value["psnr"]
 
     @pytest.mark.parametrize("loss", ["l1", "l1+ssim"])
-    @pytest.mark.parametrize("name", ["visual", "ms-ssim", "progressive"])
-    def test_other_losses_are_refused(self, loss: Any, name: Any) -> None:
-        with pytest.raises(ValueError, match=f"objective {name!r} needs loss 'l2'"):
-            fit(torch.rand(3, 16, 16), None, 4, objective=name, loss=loss)
+    def test_other_losses_are_refused(self, loss: Any) -> None:
+        with pytest.raises(ValueError, match="objective 'ms-ssim' needs loss 'l2'"):
+            fit(torch.rand(3, 16, 16), None, 4, objective="ms-ssim", loss=loss)
