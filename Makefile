@@ -15,11 +15,11 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS)]'
 	touch $@
 
-# The viewer's page, which a wheel then holds.
+# The script of the pages that `kcgs view` and `kcgs export` write, anew from export/web; it is committed.
 page:
-	npm --prefix export/web ci && npm --prefix export/web run build
+	npm --prefix export/web ci && npm --prefix export/web run build:page
 
-wheel: page $(VENV)/.installed
+wheel: $(VENV)/.installed
 	$(BIN)/python -m build --no-isolation
 
 demo: $(VENV)/.installed

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from kcgs._repr import brief
-from kcgs._shipped import shipped_folder
 
-_FOLDER = shipped_folder("models", checkout="models")
+_PACKAGE = Path(__file__).resolve().parent
+# within the package in a wheel, beside it in a checkout
+_FOLDER = _PACKAGE / "models" if (_PACKAGE / "models").is_dir() else _PACKAGE.parent / "models"
 PREFIX = "zoo:"
 
 

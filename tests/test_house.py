@@ -16,7 +16,7 @@ ROOT = PACKAGE.parent
 # a room imports itself and what is below it
 LAYERS = [
     {"cli"},
-    {"view", "zoo"},
+    {"zoo"},
     {"page"},
     {"rate", "video"},
     {"editing"},
@@ -26,7 +26,7 @@ LAYERS = [
     {"nn"},
     {"functional"},
     {"kernels", "engine", "plots"},
-    {"_check", "_atomic", "_shipped", "_progress", "_repr"},
+    {"_check", "_atomic", "_progress", "_repr"},
     {"errors"},
 ]
 GONE = {

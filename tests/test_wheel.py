@@ -39,16 +39,13 @@ for line in sys.stdin:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build from a copy of the tree, with a page that is quick to build."""
+    """Build from a copy of the tree."""
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
     for name in ("kcgs", "models"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE", ".gitignore"):
         shutil.copy(ROOT / name, source / name)
-    page = source / "export" / "web" / "dist"
-    page.mkdir(parents=True)
-    (page / "index.html").write_text("<p>the page</p>")
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "-o", str(folder), str(source)]
     built = subprocess.run(command, capture_output=True, text=True)
     assert built.returncode == 0, built.stderr
@@ -93,13 +90,7 @@ def call(environment: Path, folder: Path, command: list[str], text: str = "") ->
 def test_holds_kcgs_only(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     assert {n.split("/")[0] for n in names} == {"kcgs", f"kcgs-{kcgs.__version__}.dist-info"}
-    for name in (
-        "recipes/paper.toml",
-        "py.typed",
-        "models/manifest.json",
-        "web/index.html",
-        "page/page.js",
-    ):
+    for name in ("recipes/paper.toml", "py.typed", "models/manifest.json", "page/page.js"):
         assert f"kcgs/{name}" in names
     assert any(n.endswith("licenses/LICENSE") for n in names)
     data = [n for n in names if n.startswith("kcgs/models/")]
@@ -126,12 +117,14 @@ def test_every_command(environment: Path, folder: Path) -> None:
         ("encode", "plain.safetensors", "-o", "plain.kcgs"),
         ("decode", "plain.kcgs", "-o", "plain.png"),
         ("export", "photo.safetensors", "-o", "photo.onnx"),
+        ("export", "photo.safetensors", "-o", "photo.html"),
         ("fit-many", "photos", *few, "-o", "many", "--regions", "none"),
     ]
     out = call(environment, folder, ["python", "-c", RUN_COMMANDS], "\n".join(map(json.dumps, commands)))
     assert "chart-2x3" in out
     written = {path.name for path in folder.iterdir()}
-    assert written >= {"chart.png", "photo.safetensors", "plot.png", "regions.png", "plain.png", "photo.onnx"}
+    assert written >= {"chart.png", "plot.png", "regions.png", "plain.png"}
+    assert written >= {"photo.safetensors", "photo.onnx", "photo.html"}
     assert (folder / "many" / "a.safetensors").is_file()
 
 

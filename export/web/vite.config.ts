@@ -1,22 +1,43 @@
-import { defineConfig } from "vite";
+import { fileURLToPath } from "node:url";
 
-// Some static servers know no type for .mjs, and a browser refuses a module without one.
-const assetName = (names: string[]): string =>
-  names.some((name) => name.endsWith(".mjs")) ? "assets/[name]-[hash].js" : "assets/[name]-[hash][extname]";
+import { defineConfig, type Plugin } from "vite";
 
-export default defineConfig({
-  base: "./",
-  // The builds of onnxruntime-web whose glue and .wasm are files of their own: threads start from the glue's URL,
-  // which must not be that of our worker.
-  resolve: { conditions: ["onnxruntime-web-use-extern-wasm", "module", "browser", "development|production"] },
-  worker: {
-    format: "es",
-    rolldownOptions: { output: { assetFileNames: (asset) => assetName(asset.names) } },
-  },
-  build: {
-    target: "es2022",
-    assetsInlineLimit: 0,
-    chunkSizeWarningLimit: 1000,
-    rolldownOptions: { output: { assetFileNames: (asset) => assetName(asset.names) } },
-  },
+import { packed } from "./decoder/packed.ts";
+
+const path = (name: string): string => fileURLToPath(new URL(name, import.meta.url));
+
+/** Shaders are text, which no minifier shortens: leaves out indents, comments and spaces about operators. */
+const shaders: Plugin = {
+  name: "shaders",
+  enforce: "pre",
+  transform: (code, id) =>
+    id.endsWith("/renderer/shaders.ts") ? code.replace(/^ +| *\/\/ .*$| (?=[)}])| ?([=<>*(,;?&|{]) ?/gm, "$1") : null,
+};
+
+// for each mode the module that is built, its folder and its name: the decoder alone, the element with renderer and
+// decoder, or the script of the page that `kcgs export` and `kcgs view` write, which the Python package holds
+const BUNDLES: Record<string, readonly [input: string, folder: string, name: string]> = {
+  decoder: ["decoder/index.ts", "build", "decoder"],
+  element: ["element/index.ts", "element/dist", "kcgs-image"],
+  page: ["element/page.ts", "../../kcgs/page", "page"],
+};
+
+export default defineConfig(({ mode }) => {
+  const [input, folder, name] = BUNDLES[mode]!;
+  return {
+    root: path("."),
+    publicDir: false,
+    plugins: [packed(), shaders],
+    build: {
+      target: "es2022",
+      outDir: path(folder),
+      emptyOutDir: mode !== "page",
+      modulePreload: false,
+      rolldownOptions: {
+        input: path(input),
+        ...(mode !== "page" && { preserveEntrySignatures: "strict" as const }),
+        output: { entryFileNames: `${name}.js` },
+      },
+    },
+  };
 });

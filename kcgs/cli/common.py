@@ -132,14 +132,6 @@ _EITHER = "Scene, or zoo:NAME; or label map: .png, .npy and others."
 SceneOrMap = Annotated[
     Path, typer.Argument(help=_EITHER, metavar="FILE", parser=lambda text: _scene_path(text, _LABEL_MAPS))
 ]
-SceneOrDecoder = Annotated[
-    Path,
-    typer.Argument(
-        help="Scene, zoo:NAME, or ONNX decoder.",
-        metavar="FILE",
-        parser=lambda text: _scene_path(text, (".onnx",)),
-    ),
-]
 ImageFile = Annotated[Path, typer.Argument(help="Image file: PNG, JPEG, WebP, TIFF.", metavar="IMAGE", dir_okay=False)]
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from .common import Json, SceneFile, SceneOrDecoder, app, check_output, print_report
+from .common import Json, SceneFile, app, check_output, print_report
 from .options import Contours
 
 
@@ -89,25 +89,21 @@ def _write_page(path: Path, output: Path, contours: str) -> dict[str, object]:
 
 @app.command()
 def view(
-    scene: SceneOrDecoder,
-    original: Annotated[Path | None, typer.Option(help="Image to compare with.")] = None,
+    scene: SceneFile,
     contours: Contours = "scaled",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 0,
     browser: Annotated[bool, typer.Option(help="Open a browser window.")] = True,
 ) -> None:
-    """Look at a scene in the browser: zoom, compare, hide regions. Ends with Ctrl-C."""
+    """Look at a scene in the browser: zoom, hide regions. Ends with Ctrl-C."""
     from kcgs import load
+    from kcgs.page import scene_page
+    from kcgs.page.server import serve
     from kcgs.scene import check_unbatched
-    from kcgs.view import serve, serve_decoder
 
-    if scene.suffix == ".onnx":
-        if contours == "crisp":
-            raise typer.BadParameter("--contours are those of the decoder; kcgs export has them")
-        serve_decoder(scene, original=original, port=port, browser=browser, say=typer.echo)
-        return
     loaded = check_unbatched(load(scene))
     shown = scene.read_bytes() if scene.suffix == ".kcgs" else loaded
-    serve(shown, name=scene.stem, original=original, contours=contours, port=port, browser=browser, say=typer.echo)
+    page = scene_page(shown, title=scene.stem, contours=contours)
+    serve(page, port=port, browser=browser, say=typer.echo)
 
 
 @app.command()

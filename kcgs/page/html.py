@@ -40,8 +40,16 @@ def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "s
         >>> page[:15], "<title>Blobs &amp; more</title>" in page
         ('<!doctype html>', True)
     """
-    source = "data:application/octet-stream;base64," + base64.b64encode(web_bytes(scene)).decode()
-    return page_html(source, title=title, contours=contours)
+    style, script, page = ((_FOLDER / f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html"))
+    script = script.strip()
+    policy = (
+        f"default-src 'none'; script-src '{_policy_hash(script)}' 'wasm-unsafe-eval'; "
+        f"style-src '{_policy_hash(style)}'; img-src data:; base-uri 'none'; form-action 'none'"
+    )
+    return page.format(
+        policy=policy, title=html.escape(title), style=style, script=script,
+        contours=check_contours(contours), scene=base64.b64encode(web_bytes(scene)).decode(),
+    )  # fmt: skip
 
 
 def web_bytes(scene: Scene | bytes) -> bytes:
@@ -51,24 +59,6 @@ def web_bytes(scene: Scene | bytes) -> bytes:
     if channels not in (1, 3, 4):
         raise InvalidArgument("scene", "1, 3 or 4 channels for a page to show it", channels, verb="have")
     return encode(scene, quality=_QUALITY) if isinstance(scene, Scene) else scene
-
-
-def page_html(source: str, *, title: str, contours: str = "scaled", original: str | None = None) -> str:
-    """Return the page of a scene at an address, and maybe of an original to compare with; see :func:`scene_page`."""
-    style, script, page = ((_FOLDER / f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html"))
-    script = script.strip()
-    hashes = {name: _policy_hash(text) for name, text in (("style", style), ("script", script))}
-    # a page of an address asks its own server; one that holds its scene asks nobody
-    images, asked = ("", "'none'") if source.startswith("data:") else (" 'self'", "'self'")
-    policy = (
-        f"default-src 'none'; script-src '{hashes['script']}' 'wasm-unsafe-eval'; style-src '{hashes['style']}'; "
-        f"img-src blob: data:{images}; connect-src {asked}; base-uri 'none'; form-action 'none'"
-    )
-    beside = "" if original is None else f' data-original="{html.escape(original)}"'
-    return page.format(
-        policy=policy, title=html.escape(title), style=style, script=script,
-        contours=check_contours(contours), src=html.escape(source), original=beside,
-    )  # fmt: skip
 
 
 def _policy_hash(text: str) -> str:

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import http.client
 import json
 import queue
 import re
 import threading
 import urllib.error
-import urllib.parse
 import urllib.request
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -26,7 +22,7 @@ from kcgs.cli import main
 from kcgs.codec import CodecError, decode, encode
 from kcgs.data import load_image
 from kcgs.page import scene_page
-from kcgs.view import _Handler, _Server, serve, serve_decoder
+from kcgs.page.server import serve
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -135,14 +131,6 @@ class TestZoo:
         assert "zoo entry must be one of" in " ".join(capsys.readouterr().err.split())
 
 
-def start(target: Any, source: object, **settings: Any) -> str:
-    """Serve in a thread; return the address."""
-    said: queue.Queue[str] = queue.Queue()
-    arguments = {"browser": False, "say": said.put, **settings}
-    threading.Thread(target=target, args=(source,), kwargs=arguments, daemon=True).start()
-    return said.get().split(" ")[0]
-
-
 class TestPage:
     """What it does in a browser is tested in tests/export/test_element.py."""
 
@@ -189,46 +177,35 @@ class TestPage:
 
 
 class TestView:
-    def test_serves_a_scene_on_loopback(self, tmp_path: Path) -> None:
-        (tmp_path / "photo.PNG").write_bytes(b"png")
-        scene = Scene(GaussianField.random(5, (8, 9), seed=0))
-        root = start(serve, scene, name="five", original=tmp_path / "photo.PNG")
-        page = urllib.request.urlopen(root).read().decode()
-        assert "<title>five</title>" in page and 'data-original="scene/original.png"' in page
-        assert "connect-src 'self';" in page
-        shown = decode(urllib.request.urlopen(root + "scene/scene.kcgs").read()).scene
-        assert (shown.render() - scene.render()).abs().max() < 1 / 255
-        assert urllib.request.urlopen(root + "scene/original.png").read() == b"png"
-
-    def test_serves_a_decoder_on_loopback(self, tmp_path: Path) -> None:
-        (tmp_path / "page").mkdir()
-        (tmp_path / "page" / "index.html").write_text("<p>page</p>")
-        (tmp_path / "photo.PNG").write_bytes(b"png")
-        (tmp_path / "small.onnx").write_bytes(b"onnx")
-        url = start(serve_decoder, tmp_path / "small.onnx", page=tmp_path / "page", original=tmp_path / "photo.PNG")
-        assert url.startswith("http://127.0.0.1:") and "original=scene/original.png" in url
-        root = url.partition("?")[0]
-        assert urllib.request.urlopen(root).read() == b"<p>page</p>"
-        answer = urllib.request.urlopen(root + "scene/decoder.onnx")
-        assert answer.headers["Cross-Origin-Embedder-Policy"] == "require-corp" and answer.read() == b"onnx"
-        for hidden in ("scene/..", "scene/../", "scene/", "scene/page", "page"):
-            connection = http.client.HTTPConnection("127.0.0.1", urllib.parse.urlsplit(root).port)
-            connection.request("GET", f"/{hidden}")
-            assert connection.getresponse().status == 404, hidden
-            connection.close()
+    def test_serves_a_page_on_loopback_alone(self) -> None:
+        said: queue.Queue[str] = queue.Queue()
+        settings = {"browser": False, "say": said.put}
+        threading.Thread(target=serve, args=("<p>\u00e9</p>",), kwargs=settings, daemon=True).start()
+        url = said.get().removesuffix(" (Ctrl-C ends)")
+        assert url.startswith("http://127.0.0.1:")
+        answer = urllib.request.urlopen(url)
+        assert answer.read().decode() == "<p>\u00e9</p>" and answer.headers["Cache-Control"] == "no-store"
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(url + "page.js")
         with pytest.raises(urllib.error.HTTPError, match="403"):
-            urllib.request.urlopen(urllib.request.Request(root, headers={"Host": "elsewhere.example"}))
+            urllib.request.urlopen(urllib.request.Request(url, headers={"Host": "elsewhere.example"}))
 
-    def test_a_browser_that_leaves_is_no_error(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        with _Server(("127.0.0.1", 0), partial(_Handler, directory=str(tmp_path), extra=tmp_path)) as server:
-            for error in (BrokenPipeError(), ConnectionResetError(), ValueError("ours")):
-                try:
-                    raise error
-                except Exception:
-                    server.handle_error(None, ("127.0.0.1", 1))
-        err = capsys.readouterr().err
-        assert "ours" in err and "Pipe" not in err and "Reset" not in err
+    @pytest.mark.parametrize("suffix", [".safetensors", ".kcgs"])
+    def test_opens_the_page_of_a_scene(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: Path, suffix: str
+    ) -> None:
+        opened: list[str] = []
 
-    def test_page_that_is_not_built(self, tmp_path: Path) -> None:
-        with pytest.raises(FileNotFoundError, match="make page"):
-            serve_decoder(tmp_path / "decoder.onnx", page=tmp_path)
+        def interrupt(self: object) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("webbrowser.open", opened.append)
+        monkeypatch.setattr("socketserver.BaseServer.serve_forever", interrupt)
+        file = scene.with_suffix(suffix)
+        save(file, load(scene))
+        assert run(monkeypatch, "view", str(file), "--contours", "crisp") == 130
+        assert capsys.readouterr().out == f"{opened[0]} (Ctrl-C ends)\n"
+
+    def test_a_decoder_is_no_scene(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        assert run(monkeypatch, "view", "decoder.onnx") == 2
+        assert ".safetensors or .kcgs" in capsys.readouterr().err

@@ -16,8 +16,8 @@ import pytest
 import torch
 
 import kcgs.cli
+import kcgs.page.server
 import kcgs.rate  # modules that take functions of others take them before one is replaced
-import kcgs.view
 from kcgs import GaussianField, Scene
 from kcgs.data import save_image
 
@@ -56,7 +56,7 @@ class TestCtrlC:
             ("kcgs.segment.segment_with_scores", ("segment", "photo.png", "-o", "map.png")),
             ("kcgs.fitting.fit", ("fit", "photo.png", "-n", "5", "--regions", "none")),
             ("kcgs.codec.encode", ("encode", "scene.safetensors", "-o", "scene.kcgs")),
-            ("kcgs.view.serve", ("view", "scene.safetensors")),
+            ("kcgs.page.server.serve", ("view", "scene.safetensors")),
         ],
     )
     def test_one_line(

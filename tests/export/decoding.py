@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from kcgs.codec import CodecError, decode, decode_labels
+from kcgs.codec import CodecError, decode
 
 from .browser import WEB, Browser, Pipe
 
@@ -18,7 +18,7 @@ class Reader(Protocol):
     """The web's decoder, wherever it runs."""
 
     def do(self, action: str, data: bytes) -> dict[str, Any]:
-        """Describe a scene or labels, or the error."""
+        """Describe a scene, or the error."""
 
 
 class Node(Pipe):
@@ -34,7 +34,7 @@ class Node(Pipe):
 
 
 class Page:
-    """The built decoder in a browser; scenes only."""
+    """The built decoder in a browser."""
 
     def __init__(self, browser: Browser, folder: Path) -> None:
         self._browser, self._file = browser, folder / "scene.kcgs"
@@ -59,34 +59,26 @@ def scene_of(data: bytes) -> dict[str, Any]:
     described: dict[str, Any] = {name: digest(array) for name, array in numbers.items()}
     described |= {"height": field.size[0], "width": field.size[1], "channels": field.colors.shape[-1]}
     described |= {"count": field.num_gaussians, "layers": found.layers, "complete": found.layers == found.num_layers}
-    described |= {"regions": None, "regionIds": None, "positions": None, "exactIds": None}
+    described |= {"regions": None, "positions": None}
     if regions is None or field.region_ids is None:
         return described
-    labels, ids = regions.index_of(regions.fine_labels).numpy(), regions.ids.numpy()
-    described["regionIds"] = digest(field.region_ids.numpy(), "<f8")
+    labels, ids = regions.index_of(regions.labels).numpy(), regions.ids.numpy()
     described["positions"] = digest(regions.index_of(field.region_ids).numpy(), "<i4")
-    described["exactIds"] = digest(ids, "<i8")
     one = isinstance(regions.softness, float)
     described["regions"] = {
-        "supersample": regions.supersample, "labels": digest(labels, "<i4"), "ids": digest(ids, "<f8"),
+        "labels": digest(labels, "<i4"), "ids": digest(ids, "<f8"),
         "softness": regions.softness if one else None,
         "pairs": [] if one else [[*np.searchsorted(ids, pair).tolist(), w] for pair, w in regions.softness.items()],
     }  # fmt: skip
     return described
 
 
-def labels_of(data: bytes) -> dict[str, Any]:
-    labels = decode_labels(data).numpy()
-    described = digest(labels, labels.dtype.str)
-    return {"height": labels.shape[0], "width": labels.shape[1], "type": str(labels.dtype), "labels": described}
-
-
-def check_same(reader: Reader, data: bytes, *, labels: bool = False) -> bool:
+def check_same(reader: Reader, data: bytes) -> bool:
     """Both give the same bits, or both refuse; return whether they gave any."""
-    answer = reader.do("labels" if labels else "scene", data)
+    answer = reader.do("scene", data)
     answer.pop("memory", None)
     try:
-        expected = (labels_of if labels else scene_of)(data)
+        expected = scene_of(data)
     except CodecError as error:
         assert answer.get("error") == "DecodeError", (str(error), answer)
         return False

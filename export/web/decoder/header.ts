@@ -4,20 +4,19 @@ import type { ByteReader } from "./bytes.ts";
 import { crc32 } from "./checksums.ts";
 import { DecodeError } from "./scene.ts";
 
-export const MOST_SIDE = 2 ** 20;
+const MOST_SIDE = 2 ** 20;
 export const MOST_LABELS = 2 ** 26;
-export const MOST_REGIONS = 2 ** 24 - 1;
+const MOST_REGIONS = 2 ** 24 - 1;
 const MOST_CHANNELS = 1024;
 const MOST_GAUSSIANS = 2 ** 21 - 1;
 const MOST_COLORS = 2 ** 27;
 const MOST_BYTES = 2 ** 32;
-// of version 1, and of those in which several layers may be of one energy
-const MOST_LAYERS = [65, 128, 128];
+const MOST_LAYERS = 128;
+const VERSION = 1;
 export const ENERGIES = { least: -24, most: 40 };
 const PARAMETERS = { least: -512, most: 1023 };
 
 export interface Header {
-  readonly version: number;
   readonly height: number;
   readonly width: number;
   readonly channels: number;
@@ -34,10 +33,10 @@ const text = (bytes: Uint8Array): string => JSON.stringify(String.fromCharCode(.
 /** Read the header, its checksum and the bytes of the map (none with one region). */
 export function readHeader(reader: ByteReader): { header: Header; map: Uint8Array } {
   const magic = String.fromCharCode(...reader.take(4));
-  if (magic === "kcgm") throw new DecodeError("it is a label map, no scene: decodeLabels reads it");
+  if (magic === "kcgm") throw new DecodeError("it is a label map, no scene");
   if (magic !== "kcgs") throw new DecodeError(`it must start with "kcgs"; got ${text(reader.data.subarray(0, 4))}`);
   const version = reader.number(1);
-  if (version < 1 || version > 3) throw new DecodeError(`its version must be 1, 2 or 3; got ${version}`);
+  if (version !== VERSION) throw new DecodeError(`its version must be ${VERSION}; got ${version}`);
   const height = reader.varint("height", 1, MOST_SIDE);
   const width = reader.varint("width", 1, MOST_SIDE);
   const channels = reader.varint("channels", 1, MOST_CHANNELS);
@@ -47,20 +46,20 @@ export function readHeader(reader: ByteReader): { header: Header; map: Uint8Arra
   if (regions > 1 && height * width > MOST_LABELS)
     throw new DecodeError(`an image with regions must have at most ${MOST_LABELS} pixels; got ${height} x ${width}`);
   const length = regions > 1 ? reader.varint("length of the map", 1, MOST_BYTES) : 0;
-  const layers = readLayers(reader, version);
+  const layers = readLayers(reader);
   const above = reader.data.subarray(0, reader.position);
   const checksum = reader.number(4);
   const map = reader.take(length);
   if (crc32(map, crc32(above)) !== checksum)
     throw new DecodeError("the file is damaged: the checksum of its header and map is another");
-  return { header: { version, height, width, channels, quantizationParameter, regions, layers }, map };
+  return { header: { height, width, channels, quantizationParameter, regions, layers }, map };
 }
 
-function readLayers(reader: ByteReader, version: number): { energy: number; bytes: number }[] {
+function readLayers(reader: ByteReader): { energy: number; bytes: number }[] {
   let energy = ENERGIES.most;
-  const count = reader.varint("layers", 1, MOST_LAYERS[version - 1]!);
-  return Array.from({ length: count }, (_, i) => {
-    energy -= reader.varint("energy", version === 1 ? Math.min(i, 1) : 0, energy - ENERGIES.least);
+  const count = reader.varint("layers", 1, MOST_LAYERS);
+  return Array.from({ length: count }, () => {
+    energy -= reader.varint("energy", 0, energy - ENERGIES.least);
     return { energy, bytes: reader.varint("length of a layer", 1, MOST_BYTES) };
   });
 }

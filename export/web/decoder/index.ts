@@ -1,4 +1,4 @@
-/** Scenes from `.kcgs` files; `labels.ts` beside it reads those that are label maps. */
+/** Scenes from `.kcgs` files. */
 
-export { decode, type ExactScene, ProgressiveDecoder } from "./progressive.ts";
+export { decode, ProgressiveDecoder } from "./progressive.ts";
 export { type ContourWidth, DecodeError, type RegionMap, type Scene } from "./scene.ts";

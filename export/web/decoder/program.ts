@@ -16,10 +16,9 @@ export interface Program {
   prepare(table: number, values: number): void;
   categorical(table: number, values: number): number;
   angleBin(turns: number): number;
-  readCells(table: number, cells: number, most: number): number;
   openEarlier(count: number): number;
   readNear(rows: number, columns: number, least: number, near: number, most: number): number;
-  model(tables: number, a: number, b: number, groups: number, squash: number, stretch: number): void;
+  model(tables: number, groups: number, squash: number, stretch: number): void;
   readLabels(height: number, width: number, regions: number, template: number, positions: number): number;
 }
 

@@ -5,21 +5,15 @@ import { crc16 } from "./checksums.ts";
 import { LayerDecoder } from "./gaussians/layers.ts";
 import { Growing } from "./growing.ts";
 import { type Header, mostGaussians, readHeader } from "./header.ts";
-import { pixelRegions, type ReadMap, readRegionMap } from "./region_map.ts";
-import { DecodeError, type Scene } from "./scene.ts";
+import { readRegionMap } from "./region_map.ts";
+import { DecodeError, type RegionMap, type Scene } from "./scene.ts";
 
 const SPARE = 64; // Gaussians that a layer of no bytes may hold
-
-/** A scene with the ids of regions above 2**53 too, which a Float64Array rounds. */
-export interface ExactScene extends Scene {
-  readonly positions: Int32Array | null; // N: the region of each Gaussian, a position among the ids
-  readonly exactIds: BigInt64Array | null; // rising
-}
 
 /** What the first bytes of a file have given. */
 interface Opened {
   readonly header: Header;
-  readonly regions: ReadMap | null;
+  readonly regions: RegionMap | null;
   readonly layers: LayerDecoder;
 }
 
@@ -33,12 +27,12 @@ export class ProgressiveDecoder {
   private readonly cholesky = new Growing<Float32Array>(new Float32Array(0));
   private readonly colors = new Growing<Float32Array>(new Float32Array(0));
   private readonly regions = new Growing<Int32Array>(new Int32Array(0));
-  private scene: ExactScene | null = null;
+  private scene: Scene | null = null;
   /** What was wrong with the bytes so far; what follows is not read. */
   error: DecodeError | null = null;
 
   /** Take the next bytes; return the scene of all whole layers if new ones became whole. */
-  push(bytes: Uint8Array): ExactScene | null {
+  push(bytes: Uint8Array): Scene | null {
     if (this.error) return null;
     this.bytes.add(bytes);
     const before = this.layers;
@@ -55,7 +49,7 @@ export class ProgressiveDecoder {
   }
 
   /** End the file; a DecodeError if it was damaged, or too short to be whole. */
-  finish(): ExactScene {
+  finish(): Scene {
     if (this.error) throw this.error;
     if (!this.scene) throw new EndOfBytes(`the file ends early: ${this.bytes.length} bytes hold no layer`);
     if (!this.scene.complete) {
@@ -98,14 +92,12 @@ export class ProgressiveDecoder {
     const { header, map } = readHeader(reader);
     this.position = reader.position;
     const regions = header.regions > 1 ? readRegionMap(map, header) : null;
-    const pixels = regions && pixelRegions(regions.map, header.height, header.width);
-    return { header, regions, layers: new LayerDecoder(header, pixels) };
+    return { header, regions, layers: new LayerDecoder(header, regions && regions.labels) };
   }
 
-  private makeScene(): ExactScene {
+  private makeScene(): Scene {
     const { header, regions } = this.opened!;
     const { height, width, channels } = header;
-    const positions = regions && this.regions.all().slice();
     return {
       height,
       width,
@@ -114,12 +106,10 @@ export class ProgressiveDecoder {
       means: this.means.all().slice(),
       cholesky: this.cholesky.all().slice(),
       colors: this.colors.all().slice(),
-      regionIds: positions && Float64Array.from(positions, (position) => regions!.map.ids[position]!),
-      regions: regions && regions.map,
+      positions: regions && this.regions.all().slice(),
+      regions,
       layers: this.layers,
       complete: this.layers === header.layers.length,
-      positions,
-      exactIds: regions && regions.ids,
     };
   }
 }
@@ -133,7 +123,7 @@ function damageOf(error: unknown): DecodeError | null {
 }
 
 /** Read a file, or the coarser scene that its first bytes hold; a DecodeError on damage. */
-export function decode(bytes: Uint8Array): ExactScene {
+export function decode(bytes: Uint8Array): Scene {
   const decoder = new ProgressiveDecoder();
   const scene = decoder.push(bytes);
   return scene && !decoder.error ? scene : decoder.finish();

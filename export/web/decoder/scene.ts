@@ -8,16 +8,15 @@ export interface Scene {
   readonly means: Float32Array; // N x 2, x then y; pixel centres are at +0.5
   readonly cholesky: Float32Array; // N x 3: l11, l21, l22
   readonly colors: Float32Array; // N x channels
-  readonly regionIds: Float64Array | null; // N, the ids of the file; null: no map
+  readonly positions: Int32Array | null; // N: the region of each Gaussian, a position among `regions.ids`; null: no map
   readonly regions: RegionMap | null;
   readonly layers: number; // whole layers that were read
   readonly complete: boolean; // whether these are all layers of the file
 }
 
 export interface RegionMap {
-  readonly supersample: number; // k: labels along a side of a pixel
-  readonly labels: Int32Array; // kH x kW, row by row: positions among `ids`, not ids
-  readonly ids: Float64Array; // of the regions, rising
+  readonly labels: Int32Array; // H x W, row by row: positions among `ids`, not ids
+  readonly ids: Float64Array; // of the regions, rising; those above 2**53 are rounded
   readonly softness: number | null; // the one width of all contours in pixels; null where pairs differ
   readonly pairs: ContourWidth[]; // [] with one width
 }

@@ -1,4 +1,7 @@
-/** Changes of regions: each takes a scene and gives another, as `kcgs.editing` does, without its filling of holes. */
+/**
+ * Changes of regions, which are positions among the map's ids: each takes a scene and gives another, as `kcgs.editing`
+ * does, without its filling of holes.
+ */
 
 import type { ContourWidth, RegionMap, Scene } from "../decoder/scene.ts";
 
@@ -8,17 +11,17 @@ const FLAT = 1e3; // standard deviation of a flat Gaussian, in sides of the imag
 const FAR = 1e20;
 
 /** Colours times `gain`, a number or one for each channel, plus `bias`, exactly so in the image. */
-export function recolour(ids: ReadonlySet<number>, gain: Channels, bias: Channels | null): Edit {
+export function recolour(regions: ReadonlySet<number>, gain: Channels, bias: Channels | null): Edit {
   return (scene) => {
-    const { channels, count, regionIds } = scene;
+    const { channels, count, positions } = scene;
     const factors = spread("gain", gain, channels);
     const colors = scene.colors.slice();
     for (let i = 0; i < count; i++) {
-      if (regionIds !== null && !ids.has(regionIds[i]!)) continue;
+      if (positions !== null && !regions.has(positions[i]!)) continue;
       for (let c = 0; c < channels; c++) colors[i * channels + c]! *= factors[c]!;
     }
     const changed = { ...scene, colors };
-    return bias === null ? changed : withFlat(changed, [...ids], spread("bias", bias, channels));
+    return bias === null ? changed : withFlat(changed, [...regions], spread("bias", bias, channels));
   };
 }
 
@@ -33,47 +36,50 @@ function spread(name: string, value: Channels, channels: number): readonly numbe
 }
 
 /** Add a colour to regions: one Gaussian for each, flat over the whole image. */
-function withFlat(scene: Scene, ids: readonly number[], color: readonly number[]): Scene {
+function withFlat(scene: Scene, regions: readonly number[], color: readonly number[]): Scene {
   const sigma = FLAT * Math.max(scene.width, scene.height);
   const add = (numbers: Float32Array, row: readonly number[]): Float32Array =>
-    Float32Array.from([...numbers, ...ids.flatMap(() => row)]);
+    Float32Array.from([...numbers, ...regions.flatMap(() => row)]);
   return {
     ...scene,
-    count: scene.count + ids.length,
+    count: scene.count + regions.length,
     means: add(scene.means, [scene.width / 2, scene.height / 2]),
     cholesky: add(scene.cholesky, [sigma, 0, sigma]),
     colors: add(scene.colors, color),
-    regionIds: scene.regionIds === null ? null : Float64Array.from([...scene.regionIds, ...ids]),
+    positions: scene.positions === null ? null : Int32Array.from([...scene.positions, ...regions]),
   };
 }
 
 /** Move regions over whatever lies there; what they leave falls to the nearest other region. */
-export function move(ids: ReadonlySet<number>, dx: number, dy: number): Edit {
+export function move(moved: ReadonlySet<number>, dx: number, dy: number): Edit {
   return (scene) => {
-    const { regions, regionIds } = scene;
-    if (regions === null || regionIds === null) throw new RangeError("a scene without regions has none to move");
-    const places = new Set(Array.from(regions.ids.keys()).filter((place) => ids.has(regions.ids[place]!)));
-    if (places.size === regions.ids.length) throw new RangeError("ids must leave a region that does not move");
-    const labels = movedLabels(regions, scene.width, places, dx, dy);
-    const means = scene.means.map((value, i) => (ids.has(regionIds[i >> 1]!) ? value + (i % 2 ? dy : dx) : value));
-    return { ...scene, means, regions: { ...regions, labels, pairs: movedPairs(regions, scene.width, places) } };
+    const { regions, positions } = scene;
+    if (regions === null || positions === null) throw new RangeError("a scene without regions has none to move");
+    if (moved.size === regions.ids.length) throw new RangeError("ids must leave a region that does not move");
+    if (!Number.isInteger(dx) || !Number.isInteger(dy)) {
+      throw new RangeError(`dx and dy must be whole; got ${dx}, ${dy}`);
+    }
+    const labels = movedLabels(regions.labels, scene.width, moved, dx, dy);
+    const means = scene.means.map((value, i) => (moved.has(positions[i >> 1]!) ? value + (i % 2 ? dy : dx) : value));
+    return { ...scene, means, regions: { ...regions, labels, pairs: movedPairs(regions, scene.width, moved) } };
   };
 }
 
-function movedLabels(map: RegionMap, width: number, moved: ReadonlySet<number>, dx: number, dy: number): Int32Array {
-  const k = map.supersample;
-  const [across, stepX, stepY] = [width * k, dx * k, dy * k];
-  if (!Number.isInteger(stepX) || !Number.isInteger(stepY)) {
-    throw new RangeError(`dx and dy must be ${k === 1 ? "whole" : `multiples of 1/${k}`}; got ${dx}, ${dy}`);
-  }
-  const down = map.labels.length / across;
-  const labels = nearestOthers(map.labels, across, down, moved);
-  map.labels.forEach((label, i) => {
+function movedLabels(
+  labels: Int32Array,
+  width: number,
+  moved: ReadonlySet<number>,
+  dx: number,
+  dy: number,
+): Int32Array {
+  const height = labels.length / width;
+  const result = nearestOthers(labels, width, height, moved);
+  labels.forEach((label, i) => {
     if (!moved.has(label)) return;
-    const [x, y] = [(i % across) + stepX, Math.floor(i / across) + stepY];
-    if (x >= 0 && y >= 0 && x < across && y < down) labels[y * across + x] = label;
+    const [x, y] = [(i % width) + dx, Math.floor(i / width) + dy];
+    if (x >= 0 && y >= 0 && x < width && y < height) result[y * width + x] = label;
   });
-  return labels;
+  return result;
 }
 
 /** Give each label of a hole the nearest other one, of several the lowest: along columns, then along rows. */
@@ -124,7 +130,7 @@ function movedPairs(map: RegionMap, width: number, moved: ReadonlySet<number>): 
   if (map.softness !== null) return map.pairs;
   const widths = new Map(map.pairs.map(({ a, b, width }) => [`${a} ${b}`, width]));
   const key = (a: number, b: number): string => `${Math.min(a, b)} ${Math.max(a, b)}`;
-  const touching = touchingRegions(map.labels, width * map.supersample, moved);
+  const touching = touchingRegions(map.labels, width, moved);
   for (const region of moved) {
     const others = touching.get(region) ?? new Set<number>();
     const sum = [...others].reduce((total, other) => total + (widths.get(key(region, other)) ?? 0), 0);

@@ -3,9 +3,9 @@
 import type { Scene } from "../decoder/scene.ts";
 import type { Contours } from "../renderer/membership.ts";
 import type { Device } from "../renderer/painter.ts";
-import { listen, zoomAtMiddle } from "../src/gestures.ts";
-import type { Glide } from "../src/gestures.ts";
-import type { Transform } from "../src/view.ts";
+import { listen, zoomAtMiddle } from "./gestures.ts";
+import type { Glide } from "./gestures.ts";
+import type { Transform } from "./view.ts";
 import { oneOf } from "./attribute.ts";
 import { move, recolour } from "./edits.ts";
 import type { Channels, Edit } from "./edits.ts";
@@ -38,7 +38,7 @@ export class KcgsImage extends HTMLElement {
   private loaded: Scene | null = null; // as it came
   private current: Scene | null = null; // as it was edited
   private edits: Edit[] = [];
-  private readonly hiddenIds = new Set<number>();
+  private readonly hiddenRegions = new Set<number>(); // positions among the ids of regions
   private unread = true; // whether `src` is to be read when the element is part of a page
   private loading: AbortController | null = null;
   private gestures: AbortController | null = null;
@@ -116,27 +116,27 @@ export class KcgsImage extends HTMLElement {
 
   /** Hide regions, or show them again: what they covered is transparent. */
   hide(ids: Ids, hidden = true): void {
-    for (const id of this.known(ids)) {
-      if (hidden) this.hiddenIds.add(id);
-      else this.hiddenIds.delete(id);
+    for (const region of this.positionsOf(ids)) {
+      if (hidden) this.hiddenRegions.add(region);
+      else this.hiddenRegions.delete(region);
     }
-    this.stage.hide(this.hiddenPlaces());
+    this.stage.hide(this.hiddenRegions);
   }
 
   /** Move regions by pixels of the scene, whole ones; what they leave falls to the nearest other region. */
   move(ids: Ids, dx: number, dy: number): void {
-    this.edit(move(this.known(ids), dx, dy));
+    this.edit(move(this.positionsOf(ids), dx, dy));
   }
 
   /** Multiply the colours of regions by `gain`, a number or one for each channel, and add `bias`. */
   recolour(ids: Ids, gain: Channels, bias: Channels | null = null): void {
-    this.edit(recolour(this.known(ids), gain, bias));
+    this.edit(recolour(this.positionsOf(ids), gain, bias));
   }
 
   /** Show the scene as it came: nothing hidden, moved or recoloured. */
   reset(): void {
     this.edits = [];
-    this.hiddenIds.clear();
+    this.hiddenRegions.clear();
     if (this.loaded !== null) this.take(this.loaded);
   }
 
@@ -153,8 +153,8 @@ export class KcgsImage extends HTMLElement {
     const scene = this.current;
     if (scene === null || scene.regions === null) return null;
     if (!(x >= 0 && y >= 0 && x < scene.width && y < scene.height)) return null;
-    const { supersample: k, labels, ids } = scene.regions;
-    return ids[labels[Math.floor(y * k) * scene.width * k + Math.floor(x * k)]!]!;
+    const { labels, ids } = scene.regions;
+    return ids[labels[Math.floor(y) * scene.width + Math.floor(x)]!]!;
   }
 
   /** The whole image as a file, at its own size or another. */
@@ -204,8 +204,8 @@ export class KcgsImage extends HTMLElement {
   private forget(): void {
     this.loaded = this.current = null;
     this.edits = [];
-    this.hiddenIds.clear();
-    this.stage.show(null, this.hiddenIds);
+    this.hiddenRegions.clear();
+    this.stage.show(null, this.hiddenRegions);
     this.stage.canvas.hidden = true;
     this.fallback.hidden = false;
   }
@@ -213,7 +213,7 @@ export class KcgsImage extends HTMLElement {
   /** Take a scene, or one of more layers, and edit it as the one before. */
   private take(scene: Scene): void {
     const edited = this.edits.reduce((before, edit) => edit(before), scene);
-    this.stage.show(edited, this.placesOf(edited, this.hiddenIds));
+    this.stage.show(edited, this.hiddenRegions);
     this.loaded = scene;
     this.current = edited;
     this.sizes.replaceSync(sizeStyle(scene.width, scene.height));
@@ -226,29 +226,25 @@ export class KcgsImage extends HTMLElement {
   private edit(edit: Edit): void {
     if (this.current === null) throw new Error("there is no scene yet");
     const edited = edit(this.current);
-    this.stage.show(edited, this.placesOf(edited, this.hiddenIds));
+    this.stage.show(edited, this.hiddenRegions);
     this.current = edited;
     this.edits.push(edit);
   }
 
-  private known(ids: Ids): Set<number> {
-    const wanted = new Set(typeof ids === "number" ? [ids] : ids);
-    const all = new Set(this.regionIds);
-    for (const id of wanted) if (!all.has(id)) throw new RangeError(`ids must be of the scene's regions; got ${id}`);
-    return wanted;
-  }
-
-  private hiddenPlaces(): Set<number> {
-    return this.placesOf(this.current, this.hiddenIds);
-  }
-
-  private placesOf(scene: Scene | null, ids: ReadonlySet<number>): Set<number> {
-    return new Set([...(scene?.regions?.ids.keys() ?? [])].filter((place) => ids.has(scene!.regions!.ids[place]!)));
+  /** Where ids are among those of the scene. */
+  private positionsOf(ids: Ids): Set<number> {
+    const positions = new Map(this.regionIds.map((id, position) => [id, position]));
+    const find = (id: number): number => {
+      const position = positions.get(id);
+      if (position === undefined) throw new RangeError(`ids must be of the scene's regions; got ${id}`);
+      return position;
+    };
+    return new Set(Array.from(typeof ids === "number" ? [ids] : ids, find));
   }
 
   private setContours(value: string): void {
     this.stage.contours = oneOf("contours", value, ["scaled", "crisp"] satisfies Contours[]);
-    if (this.current !== null) this.stage.show(this.current, this.hiddenPlaces());
+    if (this.current !== null) this.stage.show(this.current, this.hiddenRegions);
   }
 
   private setDevice(value: string): void {

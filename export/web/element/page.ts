@@ -1,6 +1,5 @@
 /** The page that `kcgs export` and `kcgs view` write: the element in a window of its own, with buttons around it. */
 
-import { origin } from "../src/view.ts";
 import { KcgsImage } from "./index.ts";
 
 const image = document.querySelector("kcgs-image") as KcgsImage;
@@ -44,7 +43,6 @@ image.addEventListener("load", () => {
   const regions = regionIds.length > 1 ? `, ${regionIds.length} regions` : "";
   note.textContent = `${scene!.width} × ${scene!.height}, ${scene!.count} Gaussians${regions}`;
   if (regionIds.length > 1) listRegions(shares());
-  compare(image.dataset["original"]);
 });
 
 /** The share of the image that each region has. */
@@ -72,29 +70,4 @@ function listRegions(areas: Map<number, number>): void {
     if (list.hidden) toggle.click();
     boxes.get(detail.id)?.focus();
   });
-}
-
-/** Lay the original over the left of the image; a slider says how far. */
-function compare(address: string | undefined): void {
-  if (address === undefined) return;
-  const { width } = image.scene!;
-  const original = make("img", { src: address, alt: "" });
-  const shade = make("div", { id: "original" }, original);
-  const slider = make("input", { type: "range", max: "1000", value: "500", ariaLabel: "How far the original reaches" });
-  const place = (): void => {
-    const ratio = devicePixelRatio;
-    const canvas = { width: Math.round(image.clientWidth * ratio), height: Math.round(image.clientHeight * ratio) };
-    const [x, y] = origin(image.view, canvas);
-    const scale = image.view.scale / ratio;
-    original.style.transform = `translate(${x / ratio}px, ${y / ratio}px) scale(${scale})`;
-    original.style.imageRendering = scale < 3 ? "auto" : "pixelated";
-    shade.style.clipPath = `inset(0 ${100 - Number(slider.value) / 10}% 0 0)`;
-  };
-  original.style.width = `${width}px`;
-  original.onerror = () => (note.textContent = `${address} is no image`);
-  slider.oninput = place;
-  image.addEventListener("viewchange", place);
-  image.after(shade);
-  bar.append("Original", slider);
-  place();
 }

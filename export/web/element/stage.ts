@@ -6,15 +6,16 @@ import { paint } from "../renderer/painter.ts";
 import type { Device } from "../renderer/painter.ts";
 import { prepare } from "../renderer/prepare.ts";
 import type { Prepared } from "../renderer/software.ts";
-import { FrameTimes } from "../src/frames.ts";
-import type { Hands } from "../src/gestures.ts";
-import { anchorAt, clamp, fit, pan, visiblePart, zoomAbout } from "../src/view.ts";
-import type { Anchor, Size, Transform } from "../src/view.ts";
+import type { Hands } from "./gestures.ts";
+import { anchorAt, clamp, fit, pan, visiblePart, zoomAbout } from "./view.ts";
+import type { Anchor, Size, Transform } from "./view.ts";
 
 // a view rests when it has not moved for so many milliseconds
 const SETTLE = 150;
-// frames of a moving picture: a GPU's are as long as those of the screen
+// the longest that a frame may take while the view moves, in milliseconds; a GPU's are as long as those of the screen
+const CPU_BUDGET = 40;
 const GPU_BUDGET = 20;
+const MOST_DIVISOR = 8; // of the resolution
 
 export class Stage implements Hands {
   transform: Transform = { x: 0, y: 0, scale: 1 };
@@ -30,7 +31,8 @@ export class Stage implements Hands {
   private settling = 0;
   private frame = 0;
   private lastFrame = 0;
-  private times = new FrameTimes();
+  private divisor = 1; // of the resolution of the last frame
+  private cost = 0; // milliseconds per pixel; 0: not known
   private scratch: HTMLCanvasElement | null = null;
   private readonly context: CanvasRenderingContext2D;
 
@@ -124,18 +126,23 @@ export class Stage implements Hands {
     if (this.frame !== 0 || !this.measured) return;
     this.frame = requestAnimationFrame((now) => {
       this.frame = 0;
-      if (this.moving && this.renderer !== "cpu" && now - this.lastFrame < 1000) this.note(now - this.lastFrame);
+      const elapsed = now - this.lastFrame;
+      const pixels = (this.canvas.width * this.canvas.height) / this.divisor ** 2;
+      if (this.moving && this.renderer !== "cpu" && elapsed < 1000) this.note(elapsed / pixels);
       this.lastFrame = now;
       this.render();
     });
   }
 
-  private note(milliseconds: number): void {
-    const { width, height } = this.canvas;
-    this.times.add(milliseconds, (width * height) / this.divisor ** 2);
+  private note(cost: number): void {
+    this.cost = this.cost === 0 ? cost : (this.cost + cost) / 2;
   }
 
-  private divisor = 1;
+  /** By how much to divide the resolution of so many pixels while the view moves. */
+  private divisorFor(pixels: number): number {
+    const most = Math.sqrt((pixels * this.cost) / (this.renderer === "cpu" ? CPU_BUDGET : GPU_BUDGET));
+    return Math.min(Math.max(Math.ceil(most), 1), MOST_DIVISOR);
+  }
 
   private move(next: (scene: Size, canvas: Size) => Transform): void {
     if (this.scene === null) return;
@@ -156,7 +163,7 @@ export class Stage implements Hands {
     context.clearRect(0, 0, canvas.width, canvas.height);
     if (scene === null) return;
     const part = visiblePart(this.transform, scene, this.size);
-    this.divisor = this.moving ? this.times.divisorFor(part.width * part.height) : 1;
+    this.divisor = this.moving ? this.divisorFor(part.width * part.height) : 1;
     const [width, height] = [Math.ceil(part.width / this.divisor), Math.ceil(part.height / this.divisor)];
     const view = { rect: part.rect, width, height, draft: this.divisor > 1 };
     const start = performance.now();
@@ -173,7 +180,7 @@ export class Stage implements Hands {
       this.failed(error as Error);
       return;
     }
-    if (before !== this.renderer) this.times = new FrameTimes(this.renderer === "cpu" ? undefined : GPU_BUDGET);
-    if (this.renderer === "cpu") this.times.add(performance.now() - start, width * height);
+    if (before !== this.renderer) this.cost = 0;
+    if (this.renderer === "cpu") this.note((performance.now() - start) / (width * height));
   }
 }

@@ -34,10 +34,10 @@ class Tally {
     this.sums[region]! += weight + Number.MIN_VALUE;
   }
 
-  /** The sums times a factor; what follows begins at none. */
-  take(factor: number): Shares {
+  /** The sums; what follows begins at none. */
+  take(): Shares {
     const { regions, sums } = this;
-    const weights = regions.map((region) => sums[region]! * factor);
+    const weights = regions.map((region) => sums[region]!);
     for (const region of regions) sums[region] = 0;
     this.regions = [];
     return { regions, weights };
@@ -59,9 +59,8 @@ export class Blur {
     private readonly height: number,
     regions: number,
     private readonly levels: Levels,
-    private readonly perPixel: number,
   ) {
-    this.kernels = levels.widths.map((sigma) => kernelOf(sigma * perPixel));
+    this.kernels = levels.widths.map(kernelOf);
     this.widest = Math.max(...this.kernels.map((kernel) => kernel.reach));
     this.pixel = new Tally(regions);
     this.node = new Tally(regions);
@@ -90,25 +89,20 @@ export class Blur {
 
   /** Whether no contour reaches into a pixel. */
   alone(x: number, y: number): boolean {
-    const { width, height, perPixel, widest, across, down } = this;
-    const [x0, x1] = [Math.max(0, x * perPixel - widest), Math.min(width, (x + 1) * perPixel + widest)];
-    const [y0, y1] = [Math.max(0, y * perPixel - widest), Math.min(height, (y + 1) * perPixel + widest)];
+    const { width, height, widest, across, down } = this;
+    const [x0, x1] = [Math.max(0, x - widest), Math.min(width, x + 1 + widest)];
+    const [y0, y1] = [Math.max(0, y - widest), Math.min(height, y + 1 + widest)];
     const [above, below] = [y0 * (width + 1), y1 * (width + 1)];
     const changes = across[below + x1]! - across[below + x0 + 1]! - across[above + x1]! + across[above + x0 + 1]!;
     return changes === 0 && down[(y1 - 1) * width + x0] === down[y0 * width + x0];
   }
 
-  /** The weights of the regions around a pixel: means over its labels. */
+  /** The weights of the regions around a pixel. */
   weigh(x: number, y: number): Shares {
-    const { perPixel, width, levels } = this;
-    for (let row = y * perPixel; row < (y + 1) * perPixel; row++) {
-      for (let column = x * perPixel; column < (x + 1) * perPixel; column++) {
-        const kernel = this.kernels[levels.of === null ? 0 : levels.of[row * width + column]!]!;
-        if (kernel.spacing === 1) this.spread(this.pixel, column, row, kernel);
-        else this.interpolate(column, row, kernel);
-      }
-    }
-    return this.pixel.take(1 / (perPixel * perPixel));
+    const kernel = this.kernels[this.levels.of?.[y * this.width + x] ?? 0]!;
+    if (kernel.spacing === 1) this.spread(this.pixel, x, y, kernel);
+    else this.interpolate(x, y, kernel);
+    return this.pixel.take();
   }
 
   private spread(into: Tally, x: number, y: number, { reach, weights, sums }: Kernel): void {
@@ -152,7 +146,7 @@ export class Blur {
     let shares = nodes.get(key);
     if (shares === undefined) {
       this.spread(this.node, column * spacing, row * spacing, kernel);
-      shares = this.node.take(1);
+      shares = this.node.take();
       nodes.set(key, shares);
     }
     return shares;

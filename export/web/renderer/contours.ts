@@ -30,24 +30,15 @@ type Weigh = (x: number, y: number, writer: RunWriter) => void;
 
 /** A point has the label with the largest share among its four neighbours. */
 function hardPixels(membership: Membership, across: FineAxis, down: FineAxis): Weigh {
-  const { width, height, perPixel, heads } = membership;
-  if (perPixel === 0) return (x, _, writer) => writer.pure(0, x);
-  const columns = hardAxis(across.start, across.step, across.count, width, perPixel);
-  const rows = hardAxis(down.start, down.step, down.count, height, perPixel);
-  const label = (i: number, j: number): number => {
-    const [above, below] = [rows.low[j]! * width, rows.high[j]! * width];
-    const [left, right] = [columns.low[i]!, columns.high[i]!];
-    const four = [heads[above + left]!, heads[above + right]!, heads[below + left]!, heads[below + right]!] as const;
-    if (four[0] === four[1] && four[0] === four[2] && four[0] === four[3]) return four[0];
-    return largest(four, columns.share[i]!, rows.share[j]!);
-  };
-  if (perPixel === 1) return (x, y, writer) => writer.pure(label(x, y), x);
-  const share = 1 / (perPixel * perPixel);
+  const { width, height, heads } = membership;
+  const columns = hardAxis(across, width);
+  const rows = hardAxis(down, height);
   return (x, y, writer) => {
-    for (let j = 0; j < perPixel; j++) {
-      for (let i = 0; i < perPixel; i++) writer.add(label(x * perPixel + i, y * perPixel + j), share);
-    }
-    writer.place(x, null);
+    const [above, below] = [rows.low[y]! * width, rows.high[y]! * width];
+    const [left, right] = [columns.low[x]!, columns.high[x]!];
+    const four = [heads[above + left]!, heads[above + right]!, heads[below + left]!, heads[below + right]!] as const;
+    const alike = four[0] === four[1] && four[0] === four[2] && four[0] === four[3];
+    writer.pure(alike ? four[0] : largest(four, columns.share[x]!, rows.share[y]!), x);
   };
 }
 
@@ -65,8 +56,8 @@ function largest(labels: readonly [number, number, number, number], across: numb
 /** A point has the bilinear mean of its four neighbours, raised to the power that takes their blur out. */
 function softPixels(membership: Membership, across: FineAxis, down: FineAxis): Weigh {
   const { width, height, heads, lists, whole, variances } = membership;
-  const columns = softAxis(across.start, across.step, across.count, width);
-  const rows = softAxis(down.start, down.step, down.count, height);
+  const columns = softAxis(across, width);
+  const rows = softAxis(down, height);
   const exponent = exponentOf(membership, across, down);
   const add = (writer: RunWriter, head: number, share: number): void => {
     if (head < SHARED) return writer.add(head, share);

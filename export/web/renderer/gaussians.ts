@@ -19,16 +19,15 @@ export interface Gaussians {
 
 export function gaussiansOf(scene: Scene): Gaussians {
   const { count, channels } = scene;
-  const places = regionPlaces(scene);
+  const places = scene.positions ?? new Int32Array(count);
   const numRegions = scene.regions?.ids.length ?? 1;
   const starts = new Uint32Array(numRegions + 1);
   const radii = Float32Array.from({ length: count }, (_, i) => radius(scene.colors, i * channels, channels));
-  const kept = radii.map((value, i) => Number(value > 0 && places[i]! >= 0));
-  for (let i = 0; i < count; i++) if (kept[i]) starts[places[i]! + 1]!++;
+  for (let i = 0; i < count; i++) if (radii[i]! > 0) starts[places[i]! + 1]!++;
   for (let r = 0; r < numRegions; r++) starts[r + 1]! += starts[r]!;
   const next = starts.slice();
   const order = new Uint32Array(starts[numRegions]!);
-  for (let i = 0; i < count; i++) if (kept[i]) order[next[places[i]!]!++] = i;
+  for (let i = 0; i < count; i++) if (radii[i]! > 0) order[next[places[i]!]!++] = i;
   return {
     count: order.length,
     channels,
@@ -39,15 +38,6 @@ export function gaussiansOf(scene: Scene): Gaussians {
     radii: pick(radii, order, 1),
     starts,
   };
-}
-
-/** Where each Gaussian's region is among the map's ids; -1 where it is not, and the Gaussian paints nothing. */
-function regionPlaces(scene: Scene): Int32Array {
-  const { regions, regionIds, count } = scene;
-  const places = new Int32Array(count);
-  if (regions === null || regionIds === null) return places;
-  const placeOf = new Map(Array.from(regions.ids, (id, place) => [id, place]));
-  return places.map((_, i) => placeOf.get(regionIds[i]!) ?? -1);
 }
 
 function radius(colors: Float32Array, from: number, channels: number): number {

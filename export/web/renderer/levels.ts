@@ -22,7 +22,7 @@ export function contourLevels(map: RegionMap, width: number, height: number): Le
   const widths = [...found.keys()];
   if (widths.length < 2) return { widths: [widths[0] ?? 0], of: null };
   // farther labels are of one region alone, and so are those beside them
-  const search = Math.ceil(SEARCH_SIGMAS * Math.max(...widths) * map.supersample) + 2 * map.supersample;
+  const search = Math.ceil(SEARCH_SIGMAS * Math.max(...widths)) + 2;
   return { widths, of: nearest(touching, width, height, search) };
 }
 

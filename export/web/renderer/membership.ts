@@ -1,6 +1,6 @@
 /**
- * Which regions each cell of a label map belongs to, and how much: what renderers interpolate. Cells are the labels
- * themselves where contours are hard, and the scene's pixels where they are soft or crisp. See docs/concepts.md.
+ * Which regions each cell of a label map belongs to, and how much: what renderers interpolate. Cells are the
+ * scene's pixels. See docs/concepts.md.
  */
 
 import type { RegionMap } from "../decoder/scene.ts";
@@ -19,12 +19,13 @@ const WHOLE = 0xffff;
 const CRISP_WHOLE = 0x7fff;
 const MAX_REGIONS = 0xfffe;
 const CRISP_MARGIN = 0.25;
+const CRISP_WIDTH = 1; // pixels of the scene
+const CRISPNESS = 2; // the exponent at the scene's own size
 const LEAST_VARIANCE = 1e-6;
 
 export interface Membership {
   readonly width: number; // cells
   readonly height: number;
-  readonly perPixel: number; // cells along a side of a pixel of the scene
   readonly hard: boolean;
   readonly heads: Uint32Array<ArrayBuffer>; // a region, or SHARED + place in `lists`
   readonly lists: Uint32Array<ArrayBuffer>;
@@ -37,75 +38,55 @@ export interface Membership {
 
 /** No map: one region everywhere. */
 export function uniform(): Membership {
-  return hardMembership(new Uint32Array(1), 1, 1, 0);
+  return hardMembership(new Uint32Array(1), 1, 1);
 }
 
 /** Make the tables of a map whose scene has this width in pixels. */
-export function membershipOf(map: RegionMap, sceneWidth: number, contours: Contours): Membership {
+export function membershipOf(map: RegionMap, width: number, contours: Contours): Membership {
   const regions = map.ids.length;
   if (regions > MAX_REGIONS) throw new Error(`a map may have ${MAX_REGIONS} regions to be shown; it has ${regions}.`);
-  const k = map.supersample;
-  const width = sceneWidth * k;
   const height = map.labels.length / width;
-  if (contours === "crisp" && regions > 1) return crispOf(map, width, height);
-  if (map.softness === 0 || regions === 1) {
-    return hardMembership(Uint32Array.from(map.labels), width, height, k);
+  if (contours === "crisp" && regions > 1) {
+    const tables = blurred(map, width, height, { widths: [CRISP_WIDTH], of: null }, CRISP_WHOLE);
+    return { ...tables, hard: false, variances: null, variance: 0, crisp: CRISPNESS };
   }
+  if (map.softness === 0 || regions === 1) return hardMembership(Uint32Array.from(map.labels), width, height);
   const levels = contourLevels(map, width, height);
-  const variances = levels.of === null ? null : meanSquares(levels, width, height, k);
+  const variances = levels.of && Float32Array.from(levels.of, (level) => levels.widths[level]! ** 2);
   const tables = blurred(map, width, height, levels, WHOLE);
   return { ...tables, hard: false, variances, variance: levels.widths[0]! ** 2, crisp: null };
 }
 
-function hardMembership(heads: Uint32Array<ArrayBuffer>, width: number, height: number, perPixel: number): Membership {
+function hardMembership(heads: Uint32Array<ArrayBuffer>, width: number, height: number): Membership {
   const lists = new Uint32Array(1);
-  return { width, height, perPixel, hard: true, heads, lists, whole: WHOLE, variances: null, variance: 0, crisp: null };
+  return { width, height, hard: true, heads, lists, whole: WHOLE, variances: null, variance: 0, crisp: null };
 }
 
-function crispOf(map: RegionMap, width: number, height: number): Membership {
-  const k = map.supersample;
-  const tables = blurred(map, width, height, { widths: [1 / k], of: null }, CRISP_WHOLE);
-  return { ...tables, hard: false, variances: null, variance: 0, crisp: 2 * k };
-}
+type Tables = Pick<Membership, "width" | "height" | "heads" | "lists" | "whole">;
 
-type Tables = Pick<Membership, "width" | "height" | "perPixel" | "heads" | "lists" | "whole">;
-
-/** Blur the labels to weights of pixels; crisp ones keep the centre of each pixel with its own label. */
+/** Blur the labels to weights; crisp ones keep the centre of each pixel with its own label. */
 function blurred(map: RegionMap, width: number, height: number, levels: Levels, whole: number): Tables {
-  const k = map.supersample;
-  const [across, down] = [width / k, height / k];
-  const blur = new Blur(map.labels, width, height, map.ids.length, levels, k);
-  const heads = new Uint32Array(across * down);
+  const blur = new Blur(map.labels, width, height, map.ids.length, levels);
+  const heads = new Uint32Array(width * height);
   const lists = new Lists();
-  for (let y = 0, at = 0; y < down; y++) {
-    for (let x = 0; x < across; x++, at++) {
+  for (let y = 0, at = 0; y < height; y++) {
+    for (let x = 0; x < width; x++, at++) {
       if (blur.alone(x, y)) {
-        heads[at] = map.labels[y * k * width + x * k]!;
+        heads[at] = map.labels[at]!;
         continue;
       }
       const shares = blur.weigh(x, y);
-      if (whole === CRISP_WHOLE && k === 1) keepOwn(shares, map.labels[at]!);
+      if (whole === CRISP_WHOLE) keepOwn(shares, map.labels[at]!);
       heads[at] = lists.add(shares, whole);
     }
   }
-  return { width: across, height: down, perPixel: 1, heads, lists: lists.finish(), whole };
+  return { width, height, heads, lists: lists.finish(), whole };
 }
 
 function keepOwn({ regions, weights }: Shares, own: number): void {
   const most = Math.max(...weights);
   const place = regions.indexOf(own);
   if (weights[place]! < most) weights[place] = most + CRISP_MARGIN;
-}
-
-function meanSquares(levels: Levels, width: number, height: number, k: number): Float32Array<ArrayBuffer> {
-  const [across, of] = [width / k, levels.of!];
-  const means = new Float32Array(across * (height / k));
-  for (let y = 0, at = 0; y < height; y++) {
-    for (let x = 0; x < width; x++, at++) {
-      means[((y / k) | 0) * across + ((x / k) | 0)]! += levels.widths[of[at]!]! ** 2 / (k * k);
-    }
-  }
-  return means;
 }
 
 /** Lists of weights, one after the other. */

@@ -1,6 +1,7 @@
 /** Where the pixels of an output lie: between which cells of a label map, and over which pixels of a finer render. */
 
-import type { Rect } from "../src/view.ts";
+/** (left, top, right, bottom) in pixels of the scene. */
+export type Rect = [left: number, top: number, right: number, bottom: number];
 
 /** A part of the scene, in its pixels, and the size in pixels to render it at. */
 export interface View {
@@ -23,33 +24,24 @@ const OFFSETS = 1024;
 // rounding errors of positions in float64
 const NOISE = 1e-9;
 
-/** Place the centres of `count` pixels, `step` scene pixels apart from `start` on, between `cells` cells. */
-export function softAxis(start: number, step: number, count: number, cells: number): Axis {
-  return axis(count, cells, (i) => {
-    const at = start + (i + 0.5) * step - 0.5;
-    const low = Math.floor(at + NOISE);
-    return [low, Math.max(0, at - low)];
-  });
+/** Place the centres of a render's pixels between `cells` cells. */
+export function softAxis(fine: FineAxis, cells: number): Axis {
+  return axis(fine, cells, (part) => Math.max(0, part));
 }
 
-/** The same for hard contours: `perPixel` points for each pixel, between labels. */
-export function hardAxis(start: number, step: number, count: number, cells: number, perPixel: number): Axis {
-  return axis(count * perPixel, cells, (i) => {
-    const pixel = Math.floor(i / perPixel);
-    const place = (i % perPixel) - (perPixel - 1) / 2;
-    const at = perPixel * (start + (pixel + 0.5) * step) + place * Math.min(1, step) - 0.5;
-    const low = Math.floor(at + NOISE);
-    return [low, (Math.floor((at - low + NOISE) * OFFSETS) + 0.5) / OFFSETS];
-  });
+/** The same for hard contours. */
+export function hardAxis(fine: FineAxis, cells: number): Axis {
+  return axis(fine, cells, (part) => (Math.floor((part + NOISE) * OFFSETS) + 0.5) / OFFSETS);
 }
 
-function axis(count: number, cells: number, place: (i: number) => [low: number, share: number]): Axis {
+function axis({ start, step, count }: FineAxis, cells: number, shareOf: (part: number) => number): Axis {
   const [low, high, share] = [new Int32Array(count), new Int32Array(count), new Float32Array(count)];
   for (let i = 0; i < count; i++) {
-    const [first, part] = place(i);
+    const at = start + (i + 0.5) * step - 0.5;
+    const first = Math.floor(at + NOISE);
     low[i] = Math.min(Math.max(first, 0), cells - 1);
     high[i] = Math.min(Math.max(first + 1, 0), cells - 1);
-    share[i] = part;
+    share[i] = shareOf(at - first);
   }
   return { low, high, share };
 }

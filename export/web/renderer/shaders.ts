@@ -18,7 +18,7 @@ void main() {
 }`;
 
 /** Finds the regions of a pixel and their shares, as `contours.ts` does; columns and rows say where cells lie. */
-export function contourShader(layers: number, hard: boolean, perPixel: number, pairs: boolean): string {
+export function contourShader(layers: number, hard: boolean, pairs: boolean): string {
   const slots = layers * SLOTS_OF_A_LAYER;
   const outputs = Array.from({ length: layers }, (_, i) => `layout(location = ${i}) out uvec4 slots${i};`).join("\n");
   const written = Array.from({ length: layers }, (_, i) => `slots${i} = pack(${i * SLOTS_OF_A_LAYER});`).join("\n  ");
@@ -60,7 +60,7 @@ uvec4 pack(int first) {
 
 uint read(vec2 cell) { return texelFetch(heads, ivec2(cell), 0).r; }
 
-${hard ? hardPart(perPixel) : softPart(pairs)}
+${hard ? HARD : softPart(pairs)}
 
 void main() {
   weigh(ivec2(gl_FragCoord.xy));
@@ -68,15 +68,12 @@ void main() {
 }`;
 }
 
-function hardPart(perPixel: number): string {
-  if (perPixel === 0) return "void weigh(ivec2 pixel) { add(0u, 1.0); }";
-  return `
-uint label(ivec2 point) {
-  vec3 column = texelFetch(columns, ivec2(point.x, 0), 0).xyz;
-  vec3 row = texelFetch(rows, ivec2(point.y, 0), 0).xyz;
+const HARD = `
+void weigh(ivec2 pixel) {
+  vec3 column = texelFetch(columns, ivec2(pixel.x, 0), 0).xyz;
+  vec3 row = texelFetch(rows, ivec2(pixel.y, 0), 0).xyz;
   uvec4 four = uvec4(read(vec2(column.x, row.x)), read(vec2(column.y, row.x)),
                      read(vec2(column.x, row.y)), read(vec2(column.y, row.y)));
-  if (all(equal(four, four.xxxx))) return four.x;
   float i = column.z, j = row.z;
   vec4 share = vec4((1.0 - j) * (1.0 - i), (1.0 - j) * i, j * (1.0 - i), j * i);
   uint best = four.x;
@@ -85,14 +82,8 @@ uint label(ivec2 point) {
     float sum = dot(share, vec4(equal(four, uvec4(four[k]))));
     if (sum > most) { most = sum; best = four[k]; }
   }
-  return best;
-}
-void weigh(ivec2 pixel) {
-  for (int j = 0; j < ${perPixel}; j++)
-    for (int i = 0; i < ${perPixel}; i++)
-      add(label(pixel * ${perPixel} + ivec2(i, j)), ${(1 / (perPixel * perPixel)).toFixed(9)});
+  add(best, 1.0);
 }`;
-}
 
 function softPart(pairs: boolean): string {
   const power = pairs

@@ -64,9 +64,8 @@ export function uploadMembership(gl: WebGL2RenderingContext, membership: Members
 }
 
 /** The boxes outside of which regions have no weight. */
-function boundsOf({ width, height, perPixel, heads, lists }: Membership, regions: number): Float32Array {
+function boundsOf({ width, height, heads, lists }: Membership, regions: number): Float32Array {
   const bounds = new Float32Array(4 * regions);
-  if (perPixel === 0) return bounds.map((_, i) => (i % 4 < 2 ? -Infinity : Infinity));
   for (let r = 0; r < regions; r++) bounds.set([Infinity, Infinity, -Infinity, -Infinity], 4 * r);
   const note = (region: number, x: number, y: number): void => {
     const at = 4 * region;
@@ -87,7 +86,7 @@ function boundsOf({ width, height, perPixel, heads, lists }: Membership, regions
   return bounds.map((value, i) => {
     const low = i % 4 < 2;
     if (low ? value === 0 : value === ends[i % 2]!) return low ? -Infinity : Infinity;
-    return low ? (value - 1) / perPixel - 0.5 : (value + 2) / perPixel + 0.5;
+    return low ? value - 1.5 : value + 2.5;
   });
 }
 

@@ -97,7 +97,7 @@ export class WebGl {
   private *parts(scene: Prepared, view: View): Generator<Part> {
     const [left, top, right, bottom] = view.rect;
     const [dx, dy] = [(right - left) / view.width, (bottom - top) / view.height];
-    const tile = Math.min(TILE, Math.floor(this.limit / Math.max(1, scene.membership.perPixel)));
+    const tile = Math.min(TILE, this.limit);
     const finer = (step: number): number => (view.draft === true ? 1 : Math.max(1, step));
     const along = (step: number): number => Math.max(1, Math.floor(tile / finer(step) - 2));
     const [across, down] = [along(dx), along(dy)];
@@ -125,17 +125,12 @@ export class WebGl {
 
   private findContours({ membership }: Prepared, { across, down }: Part, map: MapTextures, target: Target): void {
     const { gl } = this;
-    const { hard, perPixel, width, height, variances, variance, crisp, whole } = membership;
-    const kind = `contours ${map.layers} ${hard} ${perPixel} ${variances !== null}`;
-    const program = this.program(kind, FULLSCREEN, () => contourShader(map.layers, hard, perPixel, variances !== null));
+    const { hard, width, height, variances, variance, crisp, whole } = membership;
+    const kind = `contours ${map.layers} ${hard} ${variances !== null}`;
+    const program = this.program(kind, FULLSCREEN, () => contourShader(map.layers, hard, variances !== null));
     gl.useProgram(program.program);
-    if (perPixel > 0) {
-      const place = (fine: FineAxis, cells: number): Axis =>
-        hard
-          ? hardAxis(fine.start, fine.step, fine.count, cells, perPixel)
-          : softAxis(fine.start, fine.step, fine.count, cells);
-      [place(across, width), place(down, height)].forEach((axis, i) => this.uploadAxis(this.axes[i]!, axis));
-    }
+    const place = hard ? hardAxis : softAxis;
+    [place(across, width), place(down, height)].forEach((axis, i) => this.uploadAxis(this.axes[i]!, axis));
     const lost = lostOf(across, down);
     const ratio = 1 / (across.step * down.step);
     program.textures({

@@ -10,15 +10,12 @@ import { join } from "node:path";
 import { createInterface } from "node:readline";
 import { pathToFileURL } from "node:url";
 
-import { attempt, describeLabels, describeScene, stream } from "./describe.mjs";
+import { attempt, describeScene, stream } from "./describe.mjs";
 
-const load = (name) => import(pathToFileURL(join(process.argv[2], name)).href);
-const { decode, ProgressiveDecoder } = await load("decoder.js");
-const { decodeLabels } = await load("labels.js");
+const { decode, ProgressiveDecoder } = await import(pathToFileURL(join(process.argv[2], "decoder.js")).href);
 
 const actions = {
   scene: async (bytes) => describeScene(decode(bytes)),
-  labels: async (bytes) => describeLabels(decodeLabels(bytes)),
   stream: async (bytes, { step }) => stream(new ProgressiveDecoder(), bytes, step),
 };
 

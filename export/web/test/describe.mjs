@@ -1,4 +1,4 @@
-/** What a decoded scene or label map holds, bit for bit, as JSON: numbers, and the SHA-256 of each array. */
+/** What a decoded scene holds, bit for bit, as JSON: numbers, and the SHA-256 of each array. */
 
 const digest = async (array) => {
   if (array === null) return null;
@@ -8,27 +8,20 @@ const digest = async (array) => {
 
 export async function describeScene(scene) {
   const { height, width, channels, count, layers, complete, regions } = scene;
-  const { means, cholesky, colors, regionIds, positions, exactIds } = scene;
+  const { means, cholesky, colors, positions } = scene;
   return {
     ...{ height, width, channels, count, layers, complete },
     means: await digest(means),
     cholesky: await digest(cholesky),
     colors: await digest(colors),
-    regionIds: await digest(regionIds),
     positions: await digest(positions),
-    exactIds: await digest(exactIds),
     regions: regions && {
-      supersample: regions.supersample,
       labels: await digest(regions.labels),
       ids: await digest(regions.ids),
       softness: regions.softness,
       pairs: regions.pairs.map(({ a, b, width }) => [a, b, width]),
     },
   };
-}
-
-export async function describeLabels({ height, width, type, labels }) {
-  return { height, width, type, labels: await digest(labels) };
 }
 
 /** What a call gives, or the error that it throws. */

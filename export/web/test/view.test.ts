@@ -1,8 +1,8 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { anchorAt, clamp, fit, MAX_SCALE, origin, pan, visiblePart, wholeSize, zoomAbout } from "../src/view.ts";
-import type { Transform } from "../src/view.ts";
+import { anchorAt, clamp, fit, MAX_SCALE, origin, pan, visiblePart, zoomAbout } from "../element/view.ts";
+import type { Transform } from "../element/view.ts";
 
 const SCENE = { width: 854, height: 480 };
 const CANVAS = { width: 1001, height: 700 };
@@ -41,12 +41,4 @@ test("scale and centre stay within their limits", () => {
   assert.ok(Math.abs(rect[0]) < 0.1 && Math.abs(rect[3] - SCENE.height) < 0.1);
   const small = clamp({ x: 0, y: 0, scale: 1e-9 }, { width: 8, height: 8 }, CANVAS);
   assert.deepEqual(small, { x: 4, y: 4, scale: 1 });
-});
-
-test("whole pictures grow by powers of two up to the limit", () => {
-  assert.deepEqual(wholeSize(SCENE, 0.3, 16e6), SCENE);
-  assert.deepEqual(wholeSize(SCENE, 2, 16e6), { width: 1708, height: 960 });
-  assert.deepEqual(wholeSize(SCENE, 2.1, 16e6), { width: 3416, height: 1920 });
-  const most = wholeSize(SCENE, 200, 16e6);
-  assert.ok(most.width * most.height <= 16e6 && most.width * most.height > 15.9e6);
 });

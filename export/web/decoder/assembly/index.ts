@@ -8,14 +8,14 @@ import { readSeeds } from "./seeds";
 import { readWavefronts } from "./wavefront";
 
 export { allot } from "./memory";
-export { cells, openEarlier, readCells, readNear } from "./occupancy";
+export { cells, openEarlier, readNear } from "./occupancy";
 export { angleBin, categorical, open, prepare, uniform, weights } from "./range_decoder";
 
 const NOISE: i32 = 64; // chance
 
-/** Take a label model of A and B units; `groups` and `template` are places, `squash` and `stretch` functions. */
-export function model(tables: usize, a: usize, b: usize, groups: usize, squash: usize, stretch: usize): void {
-  openNetwork(tables, a, b, groups);
+/** Take the label model; `groups` and `template` are places, `squash` and `stretch` functions. */
+export function model(tables: usize, groups: usize, squash: usize, stretch: usize): void {
+  openNetwork(tables, groups);
   openTables(squash, stretch);
 }
 

@@ -8,6 +8,8 @@ const PLACES: usize = 80; // of the template
 const GROUPS: usize = 21; // of up to four neighbours: most are of one label, which says nothing
 const KINDS: usize = 81; // of the features of a group
 const MOST: i32 = 4095; // of a unit
+const A: usize = 48; // units
+const B: usize = 16;
 
 /** The features of the pixel, by place in the template. */
 export let features: usize = 0;
@@ -19,8 +21,6 @@ export let mixer: usize = 0;
 
 let hidden: usize = 0; // [A] i16
 let latent: usize = 0; // [B] i32
-let hiddenBytes: usize = 0;
-let latents: usize = 0;
 let members: usize = 0; // [GROUPS, 4] u8: places in the template
 let groups: usize = 0; // [GROUPS, KINDS, A] i16: what all features of a group add
 let bias1: usize = 0; // [A] i16
@@ -29,31 +29,28 @@ let bias2: usize = 0; // [B] i32
 let layer3: usize = 0; // [B, 2] i8
 let bias3: usize = 0; // [2] i32
 
-/** Prepare a network of A and B units: its tables, and the places of each group, 255 for none. */
-export function openNetwork(tables: usize, a: usize, b: usize, groupPlaces: usize): void {
+/** Prepare the network: its tables, and the places of each group, 255 for none. */
+export function openNetwork(tables: usize, groupPlaces: usize): void {
   features = allot(256); // at 255 it stays 0
   members = groupPlaces;
-  hiddenBytes = 2 * a;
-  latents = b;
-  hidden = allot(hiddenBytes);
-  latent = allot(4 * b);
-  const layer1 = tables;
-  bias1 = layer1 + PLACES * 2 * a;
-  const weights2 = bias1 + 2 * a;
-  bias2 = weights2 + a * b;
-  layer3 = bias2 + 4 * b;
-  bias3 = layer3 + 2 * b;
+  hidden = allot(2 * A);
+  latent = allot(4 * B);
+  bias1 = tables + PLACES * 2 * A;
+  const weights2 = bias1 + 2 * A;
+  bias2 = weights2 + A * B;
+  layer3 = bias2 + 4 * B;
+  bias3 = layer3 + 2 * B;
   mixer = bias3 + 8;
-  layer2 = allot(2 * a * b);
-  for (let j: usize = 0; j < a; j++)
-    for (let k: usize = 0; k < b; k++)
-      store<i16>(layer2 + (((j >> 1) * b + k) * 2 + (j & 1)) * 2, load<i8>(weights2 + j * b + k));
-  sumGroups(layer1, a);
+  layer2 = allot(2 * A * B);
+  for (let j: usize = 0; j < A; j++)
+    for (let k: usize = 0; k < B; k++)
+      store<i16>(layer2 + (((j >> 1) * B + k) * 2 + (j & 1)) * 2, load<i8>(weights2 + j * B + k));
+  sumGroups(tables);
 }
 
 /** What each kind of each group adds to the first layer. */
-function sumGroups(layer1: usize, a: usize): void {
-  groups = allot(GROUPS * KINDS * hiddenBytes);
+function sumGroups(layer1: usize): void {
+  groups = allot(GROUPS * KINDS * 2 * A);
   for (let group: usize = 0; group < GROUPS; group++)
     for (let kind: usize = 1; kind < KINDS; kind++) {
       // the first feature that is not 0, and the kind without it
@@ -63,10 +60,10 @@ function sumGroups(layer1: usize, a: usize): void {
       const place = <usize>load<u8>(members + 4 * group + i);
       if (place === 255) continue;
       const feature = kind / weight;
-      const sum = groups + (group * KINDS + kind) * hiddenBytes;
-      const rest = sum - feature * weight * hiddenBytes;
-      const added = layer1 + (2 * place + feature - 1) * a;
-      for (let j: usize = 0; j < a; j += 8)
+      const sum = groups + (group * KINDS + kind) * 2 * A;
+      const rest = sum - feature * weight * 2 * A;
+      const added = layer1 + (2 * place + feature - 1) * A;
+      for (let j: usize = 0; j < A; j += 8)
         v128.store(sum + 2 * j, i16x8.add(v128.load(rest + 2 * j), v128.load_ext<i8>(added + j)));
     }
 }
@@ -76,20 +73,20 @@ export function evaluate(): void {
   sumFeatures();
   const zero = i16x8.splat(0);
   const most = i16x8.splat(<i16>MOST);
-  for (let j: usize = 0; j < hiddenBytes; j += 16)
+  for (let j: usize = 0; j < 2 * A; j += 16)
     v128.store(hidden + j, i16x8.min_s(i16x8.max_s(v128.load(hidden + j), zero), most));
-  for (let k: usize = 0; k < latents; k += 4) {
+  for (let k: usize = 0; k < B; k += 4) {
     let sums = v128.load(bias2 + 4 * k);
     let weights = layer2 + 4 * k;
-    for (let j: usize = 0; j < hiddenBytes; j += 4) {
+    for (let j: usize = 0; j < 2 * A; j += 4) {
       sums = i32x4.add(sums, i32x4.dot_i16x8_s(v128.load_splat<i32>(hidden + j), v128.load(weights)));
-      weights += 4 * latents;
+      weights += 4 * B;
     }
     v128.store(latent + 4 * k, sums);
   }
   let first = load<i32>(bias3);
   let second = load<i32>(bias3 + 4);
-  for (let k: usize = 0; k < latents; k++) {
+  for (let k: usize = 0; k < B; k++) {
     const value = min(max(load<i32>(latent + 4 * k) >> 6, 0), MOST);
     first += value * load<i8>(layer3 + 2 * k);
     second += value * load<i8>(layer3 + 2 * k + 1);
@@ -100,13 +97,13 @@ export function evaluate(): void {
 
 /** The sums of the first layer. */
 function sumFeatures(): void {
-  memory.copy(hidden, bias1, hiddenBytes);
+  memory.copy(hidden, bias1, 2 * A);
   for (let group: usize = 0; group < GROUPS; group++) {
     let kind: usize = 0;
     for (let i: usize = 0; i < 4; i++) kind = kind * 3 + load<u8>(features + load<u8>(members + 4 * group + i));
     if (kind === 0) continue;
-    const row = groups + (group * KINDS + kind) * hiddenBytes;
-    for (let j: usize = 0; j < hiddenBytes; j += 16)
+    const row = groups + (group * KINDS + kind) * 2 * A;
+    for (let j: usize = 0; j < 2 * A; j += 16)
       v128.store(hidden + j, i16x8.add(v128.load(hidden + j), v128.load(row + j)));
   }
 }

@@ -1,15 +1,13 @@
 // The number of Gaussians in each cell (docs/format.md, "Occupancy"); most cells are empty, and there are many.
 
 import { allot, fail, MANY_GAUSSIANS } from "./memory";
-import { bit, categorical } from "./range_decoder";
+import { bit } from "./range_decoder";
 
 const BANDS: u32 = 8;
 const TOGETHER: u32 = 1 << 16; // cells of a band, about
 const REACH: i32 = 4; // cells
 const PARTS: f64 = 64; // of a weight
 const MASS: f64 = 625; // of a Gaussian, over all cells
-const FULL: u32 = 7; // of versions 1 and 2: a cell with this many has another symbol
-const VALUES: u32 = 8;
 
 let most: u32 = 0;
 let found: u32 = 0;
@@ -140,18 +138,4 @@ function window(at: usize): f64 {
     4 * (load<u32>(at, 12) + load<u32>(at, 20)) +
     5 * load<u32>(at, 16)
   );
-}
-
-/** As versions 1 and 2 have it: read which of the cells each Gaussian lies in, by a table. */
-export function readCells(table: u32, all: u32, count: u32): u32 {
-  begin(count);
-  for (let cell: u32 = 0; cell < all; cell++) readOne(table, cell);
-  // add to full cells until none is: the seventh is marked
-  for (let i: u32 = 0; i < found; i++) if (load<i32>(chances + 4 * i)) readOne(table, load<u32>(cells + 4 * i));
-  return found;
-}
-
-function readOne(table: u32, cell: u32): void {
-  const held = categorical(table, VALUES);
-  for (let i: u32 = 1; i <= held; i++) add(cell, i === FULL ? 1 : 0);
 }

@@ -11,7 +11,7 @@ import { startProgram } from "../program.ts";
 import { RangeDecoder } from "../range_decoder.ts";
 import { DecodeError } from "../scene.ts";
 import { angles, LEAST_SIZE, MOST_SIZE, OCTAVES, places, Quantizer, restoreColor, restoreShape, type Steps } from "./quantizer.ts";
-import { ALIKE, ANGLES, APART, COUNTS, STRAYS } from "./weights.ts";
+import { ANGLES, COUNTS, SHAPES, STRAYS } from "./weights.ts";
 
 const CLASSES = 64; // of size, that a stream may name
 const FAINT = 0.35;
@@ -30,31 +30,23 @@ export interface Group {
   readonly regions: Int32Array | null;
 }
 
-/** The position of the region of each pixel of the image, row by row. */
-export type PixelRegions = Int32Array;
-
 export class LayerDecoder {
   private readonly quantizer: Quantizer;
   private readonly counts = new AdaptiveNumber(COUNTS);
   private readonly occupancy: Occupancy;
-  private readonly ratio: AdaptiveMagnitude;
-  private readonly colors: readonly AdaptiveMagnitude[];
+  private readonly ratio = new AdaptiveMagnitude(SHAPES.ratio);
+  private readonly colors = [SHAPES.grey, SHAPES.hue, SHAPES.hue2].map((shapes) => new AdaptiveMagnitude(shapes));
   private readonly angle = new AdaptiveAngle(ANGLES);
-  private readonly plain: boolean; // versions 1 and 2
   private readonly strays = new AdaptiveSymbol(STRAYS);
   private readonly program = startProgram();
 
   constructor(
     private readonly header: Header,
-    private readonly pixels: PixelRegions | null,
+    private readonly labels: Int32Array | null, // the region of each pixel, row by row
   ) {
-    const { version, quantizationParameter, height, width } = header;
-    this.plain = version < 3;
-    const { grey, hue, hue2, ratio } = this.plain ? ALIKE : APART;
-    this.colors = [grey, hue, hue2].map((shapes) => new AdaptiveMagnitude(shapes));
-    this.ratio = new AdaptiveMagnitude(ratio);
+    const { quantizationParameter, height, width } = header;
     this.quantizer = new Quantizer(quantizationParameter, height, width);
-    this.occupancy = new Occupancy(height, width, this.plain);
+    this.occupancy = new Occupancy(height, width);
   }
 
   /** Read a layer, whose highest energy is given, of at most so many Gaussians. */
@@ -70,7 +62,7 @@ export class LayerDecoder {
         groups.push(group);
         left -= group.count;
       }
-      follows = this.plain ? END : decoder.uniform(3);
+      follows = decoder.uniform(3);
     }
     return groups;
   }
@@ -84,7 +76,7 @@ export class LayerDecoder {
     const beyond = ratio.find((steep) => steep > steps.mostRatio);
     if (beyond !== undefined) throw new DecodeError(`a ratio must be at most ${steps.mostRatio} steps; got ${beyond}`);
     const turns = ratio.map((steep) => angles(steps, steep));
-    const angle = this.plain ? turns.map((all) => decoder.uniform(all)) : this.angle.read(decoder, turns);
+    const angle = this.angle.read(decoder, turns);
     const codes = this.readColors(decoder, steps, scale);
     const shape = new Float64Array(3 * count);
     const colors = new Float32Array(codes.length);
@@ -98,7 +90,7 @@ export class LayerDecoder {
     }
     const means = new Float32Array(2 * count);
     for (const axis of [0, 1] as const) readMeans(decoder, steps, classes, shape, axis, means);
-    const regions = this.pixels && this.readRegions(decoder, means, this.pixels);
+    const regions = this.labels && this.readRegions(decoder, means, this.labels);
     return { count, means, cholesky: Float32Array.from(shape), colors, regions };
   }
 
@@ -126,7 +118,7 @@ export class LayerDecoder {
     let n = 0;
     for (const { size, cells } of classes) {
       const end = n + cells.row.length;
-      contexts.fill(this.plain ? 0 : Math.min(Math.max(size + 1, 0), 7), n, end);
+      contexts.fill(Math.min(Math.max(size + 1, 0), 7), n, end);
       n = end;
     }
     return contexts;
@@ -135,12 +127,8 @@ export class LayerDecoder {
   private readColors(decoder: RangeDecoder, { loud, scales }: Steps, scale: Int32Array): Int32Array {
     const { channels } = this.header;
     const count = scale.length;
-    const levels = new Uint8Array(count);
-    let measures = [loud];
-    if (!this.plain) {
-      levels.set(scale.map((place) => Math.floor((LEVELS * place + LEVELS / 2) / scales)));
-      measures = Array.from({ length: LEVELS }, (_, v) => loud * exp2(OCTAVES * (0.5 - (v + 0.5) / LEVELS)));
-    }
+    const levels = Uint8Array.from(scale, (place) => Math.floor((LEVELS * place + LEVELS / 2) / scales));
+    const measures = Array.from({ length: LEVELS }, (_, v) => loud * exp2(OCTAVES * (0.5 - (v + 0.5) / LEVELS)));
     const codes = new Int32Array(channels * count);
     const contexts = new Uint8Array(count);
     for (let channel = 0; channel < channels; channel++) {
@@ -156,13 +144,13 @@ export class LayerDecoder {
   }
 
   /** Read the region of each Gaussian: that under its centre, or another. */
-  private readRegions(decoder: RangeDecoder, means: Float32Array, pixels: PixelRegions): Int32Array {
+  private readRegions(decoder: RangeDecoder, means: Float32Array, labels: Int32Array): Int32Array {
     const { height, width, regions } = this.header;
     const strays = this.strays.read(decoder, means.length / 2);
     return strays.map((stray, n) => {
       const x = Math.min(Math.max(Math.floor(means[2 * n]!), 0), width - 1);
       const y = Math.min(Math.max(Math.floor(means[2 * n + 1]!), 0), height - 1);
-      const under = pixels[y * width + x]!;
+      const under = labels[y * width + x]!;
       return stray ? (under + 1 + decoder.uniform(regions - 1)) % regions : under;
     });
   }

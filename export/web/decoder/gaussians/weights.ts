@@ -2,10 +2,9 @@
 
 const WEIGHT = 0.05; // of a start against what is seen, in Gaussians
 const repeat = <T>(count: number, value: T): T[] => Array<T>(count).fill(value);
-const bins = (...values: number[]): number[] => values.map((value) => WEIGHT * value);
 // shapes of contexts, whose last bins weigh 1
 const shapes = (...contexts: number[][]): number[][] =>
-  contexts.map((values) => bins(...values, ...repeat(24 - values.length, 1)));
+  contexts.map((values) => [...values, ...repeat(24 - values.length, 1)].map((value) => WEIGHT * value));
 
 export const COUNTS = [2, ...repeat(9, 1), ...repeat(12, 0.3)];
 export const MARGINS = [3, ...repeat(4, 1), ...repeat(4, 0.3)];
@@ -13,14 +12,8 @@ export const STRAYS = [20, 0.5];
 export const ANGLES = repeat(2, [4.5, 3.5, 2.7, 2.5, 2.4, 2.5, 2.7, 3.5]).flat();
 export const BEYOND = [0.3, ...repeat(4, 1), ...repeat(17, 0.3)];
 
-/** The bins of the adaptive magnitudes, for each context: of versions 1 and 2, and of version 3. */
-export const ALIKE = {
-  grey: [bins(1, 1, 2, 3, 12, 22, 49, 80, 102, 110, 110, 103, 88, 74, 62, 46, 34, 27, 22, 17, 12, 6, 6, 12)],
-  hue: repeat(3, bins(382, 247, 144, 96, 51, 30, 21, 12, 7, 3, 2, 2, 1, 1, ...repeat(10, 0.5))),
-  hue2: repeat(3, bins(547, 224, 98, 63, 27, 13, 12, 9, 5, 1, 1, ...repeat(13, 0.5))),
-  ratio: [bins(102, 159, 168, 150, 125, 98, 69, 46, 30, 21, 14, 8, 5, 3, 2, 1, ...repeat(8, 0.5))],
-};
-export const APART = {
+/** The bins of the adaptive magnitudes, for each context. */
+export const SHAPES = {
   grey: shapes(
     [5, 4, 3, 5, 7, 11, 24, 58, 115, 132, 129, 118, 106, 92, 76, 56, 33, 17, 9, 5, 3, 2],
   ),

@@ -12,40 +12,30 @@ export interface Ids {
   readonly positions: Int32Array;
 }
 
-export const countingUp = (count: number): Ids => ({
-  ids: new BigInt64Array(count).map((_, i) => BigInt(i)),
-  positions: new Int32Array(count).map((_, i) => i),
-});
-
-export function readIds(decoder: RangeDecoder, mostRegions: number): Ids {
-  const count = readRegions(decoder, mostRegions);
-  if (!decoder.fair()) return countingUp(count);
-  const ids = readGaps(count, () => decoder.unbounded());
-  return { ids, positions: readOrder(decoder, count) };
-}
-
-export function readRegions(decoder: RangeDecoder, most: number): number {
-  let bits = 0;
-  while (decoder.fair())
-    if (++bits === MOST_BITS) throw new DecodeError(`data must hold at most ${most} regions; got ${2 ** bits} or more`);
-  const count = Number(decoder.ofLength(bits + 1));
-  if (count > most) throw new DecodeError(`data must hold at most ${most} regions; got ${count}`);
-  return count;
-}
-
-/** Ids that rise, by the distance of each from the one before, less 1. */
-export function readGaps(count: number, gap: () => bigint): BigInt64Array {
+/** Read the ids of a map of so many regions. */
+export function readIds(decoder: RangeDecoder, regions: number): Ids {
+  const count = readCount(decoder);
+  if (count !== regions) throw new DecodeError(`the map must have ${regions} regions; got ${count}`);
+  const counting = Int32Array.from({ length: count }, (_, i) => i);
+  if (!decoder.fair()) return { ids: BigInt64Array.from(counting, BigInt), positions: counting };
   const ids = new BigInt64Array(count);
   let last = -1n;
   for (let i = 0; i < count; i++) {
-    last += 1n + gap();
+    last += 1n + decoder.unbounded();
     if (last >= 1n << 63n) throw new DecodeError(`data must hold ids below 2**63; got ${last}`);
     ids[i] = last;
   }
-  return ids;
+  return { ids, positions: readOrder(decoder, count) };
 }
 
-export function readOrder(decoder: RangeDecoder, count: number): Int32Array {
+function readCount(decoder: RangeDecoder): number {
+  let bits = 1;
+  while (decoder.fair())
+    if (++bits > MOST_BITS) throw new DecodeError(`a map must have fewer than 2**${MOST_BITS} regions; got more`);
+  return Number(decoder.ofLength(bits));
+}
+
+function readOrder(decoder: RangeDecoder, count: number): Int32Array {
   const remaining = new Remaining(count);
   return new Int32Array(count).map((_, i) => {
     const left = count - i;

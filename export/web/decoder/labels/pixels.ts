@@ -1,16 +1,12 @@
 /** The pixels of a label map (docs/format.md, "The wavefront"). */
 
+import tables from "../../../../kcgs/codec/labels/prior.bin?packed";
+import { unpack } from "../packed_text.ts";
 import { put } from "../program.ts";
 import type { RangeDecoder } from "../range_decoder.ts";
 import { GROUPS, TEMPLATE } from "./template.ts";
 
 const CLIP = 3071; // largest logit, in 1/256
-
-/** The tables of the label model, and the units of its layers. */
-export interface LabelModel {
-  readonly tables: Uint8Array;
-  readonly units: readonly [number, number];
-}
 
 /** The positions of two or more regions, row by row, and how many regions there are. */
 export interface Pixels {
@@ -18,19 +14,13 @@ export interface Pixels {
   readonly met: number;
 }
 
-let functions: { squash: Int32Array; stretch: Int32Array } | undefined;
+let model: { tables: Uint8Array; squash: Int32Array; stretch: Int32Array } | undefined;
 
 /** Read a map; `positions` are those of the regions in the order in which the wavefront meets them. */
-export function readPixels(
-  { program }: RangeDecoder,
-  height: number,
-  width: number,
-  positions: Int32Array,
-  { tables, units }: LabelModel,
-): Pixels {
-  functions ??= logistic();
+export function readPixels({ program }: RangeDecoder, height: number, width: number, positions: Int32Array): Pixels {
+  model ??= { tables: unpack(tables), ...logistic() };
   const groups = put(program, Uint8Array.from(GROUPS.flat()));
-  program.model(put(program, tables), ...units, groups, put(program, functions.squash), put(program, functions.stretch));
+  program.model(put(program, model.tables), groups, put(program, model.squash), put(program, model.stretch));
   const template = put(program, Int8Array.from(TEMPLATE.flat()));
   const at = program.readLabels(height, width, positions.length, template, put(program, positions));
   return { labels: new Int32Array(program.memory.buffer, at, height * width).slice(), met: program.met.value };

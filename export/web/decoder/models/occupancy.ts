@@ -38,14 +38,12 @@ export class Occupancy {
   private readonly beyond = new AdaptiveNumber(BEYOND);
   private readonly earlier = new Map<number, Cells[]>(); // by class of size
   private classes = 0;
-  private all = 0; // Gaussians so far; in versions 1 and 2 those of grids with a margin
-  private outside = 0; // cells there, so far; in versions 1 and 2 Gaussians there
+  private gaussians = 0; // so far
+  private outside = 0; // cells there, so far
 
-  /** `plain`: as versions 1 and 2 have it. */
   constructor(
     private readonly height: number,
     private readonly width: number,
-    private readonly plain: boolean,
   ) {}
 
   /** Read the cells of `count` Gaussians of a class of size. */
@@ -58,7 +56,7 @@ export class Occupancy {
     if (margin > most) throw new DecodeError(`a margin must be at most ${most} cells; got ${margin}`);
     const wide = columns + 2 * margin;
     const grid = { rows, columns, side, ring: (rows + 2 * margin) * wide - rows * columns };
-    const [inside, outside] = this.plain ? this.readAlike(decoder, grid, count) : this.readNear(decoder, grid, size, count);
+    const [inside, outside] = this.readNear(decoder, grid, size, count);
     if (inside.length + outside.length < count)
       throw new DecodeError(`cells must hold ${count} Gaussians; got ${inside.length + outside.length}`);
     const column = new Int32Array(count);
@@ -78,9 +76,9 @@ export class Occupancy {
     const { program } = decoder;
     const beyond = ring ? this.beyond.read(decoder) : 0;
     if (beyond > count) throw new DecodeError(`at most ${count} Gaussians may lie outside; got ${beyond}`);
-    this.all += count;
+    this.gaussians += count;
     if (beyond) this.outside += ring;
-    if (this.classes++ === MOST_CLASSES || this.outside > MOST_OUTSIDE + EACH_OUTSIDE * this.all)
+    if (this.classes++ === MOST_CLASSES || this.outside > MOST_OUTSIDE + EACH_OUTSIDE * this.gaussians)
       throw new DecodeError("a file must have fewer grids of cells");
     const near: number[] = [];
     const shift = 32 - Math.clz32(side); // of half pixels
@@ -96,20 +94,6 @@ export class Occupancy {
     const least = Math.max(Math.floor(EVERYWHERE / (rows * columns)), 1);
     const inside = listed(program, program.readNear(rows, columns, least, near.length / 2, count - beyond));
     return [inside, listed(program, program.readNear(ring, 1, 1, 0, beyond))];
-  }
-
-  /** Read cells that are all as likely. */
-  private readAlike(decoder: RangeDecoder, { rows, columns, ring }: Grid, count: number): Places {
-    const share = ring ? (this.outside + 0.5) / (this.all + 20) : 0;
-    const cells = rows * columns;
-    const inside = readCells(decoder, Math.max(count * (1 - share), 0.01) / cells, cells, count);
-    const left = count - inside.length;
-    const outside = readCells(decoder, Math.max(count * share, 0.01) / Math.max(ring, 1), ring, left);
-    if (ring) {
-      this.outside += outside.length;
-      this.all += count;
-    }
-    return [inside, outside];
   }
 }
 
@@ -155,18 +139,6 @@ function placeOutside(cell: number, rows: number, columns: number, margin: numbe
   if (row >= rows) return cell + rows * columns;
   const beside = (cell - top) % (2 * margin);
   return cell + (row + (beside < margin ? 0 : 1)) * columns;
-}
-
-/** Read which of the cells each Gaussian lies in; there are at most so many. */
-function readCells(decoder: RangeDecoder, rate: number, cells: number, most: number): Uint32Array {
-  const p = rate / (1 + rate);
-  const weights = new Float64Array(8);
-  weights[0] = 1 - p;
-  for (let i = 1; i < 8; i++) weights[i] = weights[i - 1]! * p;
-  weights[7]! /= 1 - p;
-  decoder.prepare(0, weights);
-  const { program } = decoder;
-  return listed(program, program.readCells(0, cells, most));
 }
 
 /** The cells that the program has found, in no order. */

@@ -2,13 +2,12 @@
  * Where the scene lies on the canvas. Scene and canvas are measured in their own pixels, pixel i sampled at i + 0.5.
  */
 
+import type { Rect } from "../renderer/sampling.ts";
+
 export interface Size {
   width: number;
   height: number;
 }
-
-/** (left, top, right, bottom) in pixels of the scene, as the decoder's input `view` takes it. */
-export type Rect = [left: number, top: number, right: number, bottom: number];
 
 export interface Transform {
   /** The point of the scene in the middle of the canvas. */
@@ -107,20 +106,6 @@ export function visiblePart(transform: Transform, scene: Size, canvas: Size): Pa
     width: x1 - x0,
     height: y1 - y0,
     rect: [(x0 - ox) / scale, (y0 - oy) / scale, (x1 - ox) / scale, (y1 - oy) / scale],
-  };
-}
-
-/**
- * Size at which to draw a whole scene for a scale: its own size or a power of two times it, so that a zoom does not
- * draw anew at every step, and never more pixels than the limit.
- */
-export function wholeSize(scene: Size, scale: number, maxPixels: number): Size {
-  const wanted = 2 ** Math.max(0, Math.ceil(Math.log2(scale) - 1e-6));
-  const most = Math.sqrt(maxPixels / (scene.width * scene.height));
-  const factor = Math.min(wanted, most);
-  return {
-    width: Math.max(1, Math.floor(scene.width * factor)),
-    height: Math.max(1, Math.floor(scene.height * factor)),
   };
 }
 

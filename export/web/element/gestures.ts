@@ -1,4 +1,4 @@
-/** Wheel, drag, pinch and keys on the picture, as zooms about a point and pans, in canvas pixels. */
+/** Wheel, drag, pinch and keys on the image, as zooms about a point and pans, in canvas pixels. */
 
 import type { Anchor } from "./view.ts";
 
@@ -55,36 +55,30 @@ export class Glide {
   }
 }
 
-/** Where keys that zoom are listened to, whether a wheel zooms with Ctrl held only, and what ends it all. */
-export interface Listening {
-  keyboard: EventTarget;
-  wheelNeedsCtrl?: boolean;
-  signal?: AbortSignal;
+/** Where gestures are made, and what they move. */
+interface Surface {
+  readonly canvas: HTMLCanvasElement;
+  readonly place: Place;
+  readonly hands: Hands;
+  readonly glide: Glide;
+  readonly until: AddEventListenerOptions;
 }
 
+/** Listen until the signal: for keys where `keyboard` has the focus; `wheelNeedsCtrl`: a wheel alone scrolls the page. */
 export function listen(
   canvas: HTMLCanvasElement,
   place: Place,
   hands: Hands,
-  { keyboard, wheelNeedsCtrl = false, signal }: Listening = { keyboard: window },
+  { keyboard, wheelNeedsCtrl, signal }: { keyboard: EventTarget; wheelNeedsCtrl: boolean; signal: AbortSignal },
 ): Glide {
-  const glide = new Glide(hands);
-  const until = signal === undefined ? {} : { signal };
-  listenToWheel(canvas, place, hands, glide, wheelNeedsCtrl, until);
-  listenToPointers(canvas, place, hands, glide, until);
-  // arrows pan where the focus is: on the canvas, or on what holds the keyboard
-  listenToKeys(canvas, hands, glide, keyboard === window ? [canvas, window] : [keyboard, keyboard], until);
-  return glide;
+  const surface = { canvas, place, hands, glide: new Glide(hands), until: { signal } };
+  listenToWheel(surface, wheelNeedsCtrl);
+  listenToPointers(surface);
+  listenToKeys(surface, keyboard);
+  return surface.glide;
 }
 
-function listenToWheel(
-  canvas: HTMLCanvasElement,
-  place: Place,
-  hands: Hands,
-  glide: Glide,
-  needsCtrl: boolean,
-  until: AddEventListenerOptions,
-): void {
+function listenToWheel({ canvas, place, hands, glide, until }: Surface, needsCtrl: boolean): void {
   const turn = (event: WheelEvent): void => {
     if (needsCtrl && !event.ctrlKey && !event.metaKey) return;
     event.preventDefault();
@@ -97,85 +91,61 @@ function listenToWheel(
   canvas.addEventListener("wheel", turn, { passive: false, ...until });
 }
 
-function listenToPointers(
-  canvas: HTMLCanvasElement,
-  place: Place,
-  hands: Hands,
-  glide: Glide,
-  until: AddEventListenerOptions,
-): void {
+function listenToPointers({ canvas, place, hands, glide, until }: Surface): void {
   const pointers = new Map<number, [x: number, y: number]>();
-  canvas.addEventListener(
-    "pointerdown",
-    (event) => {
-      if (event.button !== 0) return;
-      canvas.setPointerCapture(event.pointerId);
-      pointers.set(event.pointerId, place(event));
-      canvas.classList.add("held");
-    },
-    until,
-  );
-  canvas.addEventListener(
-    "pointermove",
-    (event) => {
-      const before = pointers.get(event.pointerId);
-      if (before === undefined) return;
-      const now = place(event);
-      pointers.set(event.pointerId, now);
-      const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
-      if (other === undefined) {
-        hands.pan(now[0] - before[0], now[1] - before[1]);
-        return;
-      }
-      const spread = (point: [number, number]): number => Math.hypot(point[0] - other[0], point[1] - other[1]);
-      hands.pan((now[0] - before[0]) / 2, (now[1] - before[1]) / 2);
-      const middle = hands.anchorAt((now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
-      hands.zoom(spread(now) / Math.max(spread(before), 1), middle);
-    },
-    until,
-  );
+  const press = (event: PointerEvent): void => {
+    if (event.button !== 0) return;
+    canvas.setPointerCapture(event.pointerId);
+    pointers.set(event.pointerId, place(event));
+    canvas.classList.add("held");
+  };
+  const drag = (event: PointerEvent): void => {
+    const before = pointers.get(event.pointerId);
+    if (before === undefined) return;
+    const now = place(event);
+    pointers.set(event.pointerId, now);
+    const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
+    if (other === undefined) {
+      hands.pan(now[0] - before[0], now[1] - before[1]);
+      return;
+    }
+    const spread = (point: [number, number]): number => Math.hypot(point[0] - other[0], point[1] - other[1]);
+    hands.pan((now[0] - before[0]) / 2, (now[1] - before[1]) / 2);
+    const middle = hands.anchorAt((now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
+    hands.zoom(spread(now) / Math.max(spread(before), 1), middle);
+  };
   const lift = (event: PointerEvent): void => {
     pointers.delete(event.pointerId);
     canvas.classList.toggle("held", pointers.size > 0);
   };
+  canvas.addEventListener("pointerdown", press, until);
+  canvas.addEventListener("pointermove", drag, until);
   canvas.addEventListener("pointerup", lift, until);
   canvas.addEventListener("pointercancel", lift, until);
   canvas.addEventListener("dblclick", (event) => glide.add(event.shiftKey ? 0.5 : 2, ...place(event)), until);
 }
 
-function listenToKeys(
-  canvas: HTMLCanvasElement,
-  hands: Hands,
-  glide: Glide,
-  [panned, zoomed]: [EventTarget, EventTarget],
-  until: AddEventListenerOptions,
-): void {
-  const pans: Record<string, [number, number]> = {
-    ArrowLeft: [1, 0],
-    ArrowRight: [-1, 0],
-    ArrowUp: [0, 1],
-    ArrowDown: [0, -1],
-  };
-  const panKey = (event: KeyboardEvent): void => {
-    const direction = pans[event.key];
-    if (direction === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
-    event.preventDefault();
+const PANS: Record<string, [number, number]> = {
+  ArrowLeft: [1, 0],
+  ArrowRight: [-1, 0],
+  ArrowUp: [0, 1],
+  ArrowDown: [0, -1],
+};
+
+function listenToKeys({ canvas, hands, glide, until }: Surface, keyboard: EventTarget): void {
+  const press = (event: KeyboardEvent): void => {
+    if (event.target !== keyboard || event.ctrlKey || event.metaKey || event.altKey) return;
     const step = KEY_PAN * Math.min(canvas.width, canvas.height);
-    hands.pan(direction[0] * step, direction[1] * step);
-  };
-  panned.addEventListener("keydown", panKey as EventListener, until);
-  // Zooming works from anywhere on the page, except where the key already means something.
-  const zoomKey = (event: KeyboardEvent): void => {
-    const target = event.target as HTMLElement;
-    if (event.ctrlKey || event.metaKey || event.altKey || target.matches("select, input:not([type=checkbox])")) return;
-    if (event.key === "+" || event.key === "=") zoomAtMiddle(canvas, glide, KEY_FACTOR);
+    const pan = PANS[event.key];
+    if (pan !== undefined) hands.pan(pan[0] * step, pan[1] * step);
+    else if (event.key === "+" || event.key === "=") zoomAtMiddle(canvas, glide, KEY_FACTOR);
     else if (event.key === "-") zoomAtMiddle(canvas, glide, 1 / KEY_FACTOR);
     else if (event.key === "0") hands.fit();
     else if (event.key === "1") hands.native();
     else return;
     event.preventDefault();
   };
-  zoomed.addEventListener("keydown", zoomKey as EventListener, until);
+  keyboard.addEventListener("keydown", press as EventListener, until);
 }
 
 export function zoomAtMiddle(canvas: HTMLCanvasElement, glide: Glide, factor: number): void {
