@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import max_pool2d, pad
 
 from kcgs.editing import delete_region, move_region
-from kcgs.editing.inpaint import grow
 from kcgs.scene import Scene
 
 from .core.cases import BEST, plan
@@ -131,3 +130,8 @@ def compare(
         figures += [float(slope.max()), changed, spent, edited.num_gaussians - alone.num_gaussians]
         results.append(Result(image, called, name, *figures))
     return results, {name: whole[:, rows][..., cols] for name, whole in shown.items()}
+
+
+def grow(mask: Tensor, reach: int) -> Tensor:
+    """Add the pixels within so many of a mask (H, W)."""
+    return max_pool2d(mask[None].float(), 2 * reach + 1, 1, reach)[0] > 0

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import kcgs.scene
 from kcgs._check import check_count, check_floating, check_number
-from kcgs.errors import InvalidArgument
+from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene, check_unbatched
@@ -68,9 +68,9 @@ def check_offset(offset: Sequence[float], supersample: int) -> tuple[int, int]:
     """Return the offset in labels."""
     pair = offset.tolist() if isinstance(offset, Tensor | np.ndarray) else offset
     if not isinstance(pair, Sequence) or isinstance(pair, str):
-        raise TypeError(f"offset must be (dx, dy) in pixels; got {offset!r}")
+        raise InvalidArgumentType("offset", "(dx, dy) in pixels", repr(offset))
     if len(pair) != 2:
-        raise ValueError(f"offset must be (dx, dy); got {offset!r}")
+        raise InvalidArgument("offset", "(dx, dy)", repr(offset))
     steps = [check_number("offset", d) * supersample for d in pair]
     if any(abs(step) > 1e8 or abs(step - round(step)) > 1e-6 for step in steps):
         unit = "1 pixel" if supersample == 1 else f"1/{supersample} pixel, the spacing of the labels"
@@ -81,7 +81,7 @@ def check_offset(offset: Sequence[float], supersample: int) -> tuple[int, int]:
 def check_fill(fill: object) -> None:
     """Refuse what is no way to fill a hole."""
     if fill is not None and fill != "inpaint":
-        raise ValueError(f'fill must be "inpaint" or None; got {fill!r}')
+        raise InvalidArgument("fill", '"inpaint" or None', repr(fill))
 
 
 def color_tensor(name: str, value: Numbers, colors: Tensor, shapes: list[tuple[int, ...]]) -> Tensor:

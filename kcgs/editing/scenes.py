@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
 
-from kcgs.functional import PairWidths, RegionMap, touching_pairs
+from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join, scaled
 from kcgs.scene import Scene
@@ -26,8 +26,7 @@ from .checks import (
     color_tensor,
     ids_of,
 )
-from .fill import fill_hole
-from .inpaint import grow
+from .fill import fill_hole, grow
 
 # standard deviation of a Gaussian that is flat over the image, in its longer sides: 1 to 3 in 10^7
 _FLAT = 1e3
@@ -40,20 +39,18 @@ def move_region(
 ) -> Scene:
     """Move regions: their Gaussians and their labels, over whatever lies there.
 
-    Convention: pixels that they leave take the label of the nearest pixel of another region (Euclidean; of equal
-    distances, the smallest id), and are filled, see `fill`; pixels that leave the image are lost. A region that is
-    covered whole, or leaves the image, is no region any more: its Gaussians are lost too.
-    Where pairs of regions have widths, the contour with a region that a moved one did not touch before takes the mean
-    width of those it had.
+    Convention: pixels that they leave take the label of the nearest pixel of another region, and are filled, see
+    `fill`; pixels that leave the image are lost. A region that is covered whole, or leaves the image, is no region any
+    more: its Gaussians are lost too. Where pairs of regions have widths, contours that are new take their mean.
 
     Args:
         scene: unbatched, with a map of its own size, not a resized one.
         region_ids: an id in the map, or several, which move together.
         offset: (dx, dy) in pixels, whole; with ``supersample`` k, whole multiples of 1/k.
-        fill: "inpaint": what is uncovered continues its surroundings, colours and texture, by Gaussians that are fitted
-            there, some of them new, and so do 3 pixels around it, which have colours of the object; others change by a
-            few hundredths. None: no fit; what is uncovered shows what the Gaussians of its new region paint there,
-            streaks, or black.
+        fill: "inpaint": what is uncovered continues its surroundings smoothly, by Gaussians that are fitted there, some
+            of them new, and so do 3 pixels around it, which have colours of the object; others change by a few
+            hundredths. None: no fit; what is uncovered shows what the Gaussians of its new region paint there, streaks,
+            or black.
 
     Returns:
         A new scene, without a graph.
@@ -75,16 +72,9 @@ def move_region(
     check_fill(fill)
     regions, chosen = check_editable(scene, region_ids)
     steps = check_offset(offset, regions.supersample)
-    before = regions.fine_labels
-    inside = torch.isin(before, chosen)
-    labels = _nearest_labels(before, inside)
-    behind = labels.clone()
-    rows, cols = (_overlap(n, step) for n, step in zip(before.shape, steps[::-1], strict=True))
-    landed = torch.zeros_like(inside)
-    landed[rows[1], cols[1]] = inside[rows[0], cols[0]]
-    source = torch.zeros_like(before)
-    source[rows[1], cols[1]] = before[rows[0], cols[0]]
-    labels[landed] = source[landed]
+    inside = torch.isin(regions.fine_labels, chosen)
+    behind = nearest_labels(regions.fine_labels, inside)
+    landed, labels = shift_labels(regions.fine_labels, inside, steps, behind)
 
     lost = regions.ids[~torch.isin(regions.ids, labels)].tolist()
     if lost:
@@ -97,7 +87,7 @@ def move_region(
     with torch.no_grad():
         shift = moved.means.new_tensor(steps) / regions.supersample
         moved.means += torch.where(torch.isin(ids_of(moved), chosen)[:, None], shift, 0.0)
-    return Scene(moved, regions.relabel(labels, _new_widths(regions, chosen.tolist())), scene.metadata)
+    return Scene(moved, regions.relabel(labels, "mean"), scene.metadata)
 
 
 def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers, bias: Numbers | None = None) -> Scene:
@@ -144,8 +134,7 @@ def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers,
 def delete_region(scene: Scene, region_ids: int | Iterable[int], *, fill: Fill | None = "inpaint") -> Scene:
     """Delete regions: their Gaussians go, their pixels fall to their neighbours. Arguments: see :func:`move_region`.
 
-    Convention: each of their pixels takes the label of the nearest pixel that stays (Euclidean; of equal distances, the
-    smallest id), and is filled, see `fill` there.
+    Convention: each of their pixels takes the label of the nearest pixel that stays, and is filled, see `fill` there.
     Where pairs of regions have widths, contours between regions that did not touch before are hard.
 
     Example:
@@ -158,7 +147,7 @@ def delete_region(scene: Scene, region_ids: int | Iterable[int], *, fill: Fill |
     regions, chosen = check_editable(scene, region_ids)
     hole = torch.isin(regions.fine_labels, chosen)
     field = scene.field.subset(~torch.isin(ids_of(scene.field), chosen))
-    rest = Scene(field, regions.relabel(_nearest_labels(regions.fine_labels, hole)), scene.metadata)
+    rest = Scene(field, regions.relabel(nearest_labels(regions.fine_labels, hole)), scene.metadata)
     return rest if fill is None else fill_hole(rest, hole, hole)
 
 
@@ -220,12 +209,10 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
         fine = RegionMap.from_labels(background.regions.fine_labels).resize((inside.shape[0], inside.shape[1]))
         behind, ids = fine.labels.to(behind.device) + first, other.region_ids.to(behind.device) + first
     labels = torch.where(inside, behind, regions.fine_labels)
-    stretched = *scaled(other, scene.size), other.merged_colors()
+    means, cholesky, colors = (t.to(field.means) for t in (*scaled(other, scene.size), other.merged_colors()))
     stays = field.subset(~torch.isin(ids_of(field), chosen))
-    ours = stays.means, stays.cholesky, stays.merged_colors()
-    means, cholesky, colors = (torch.cat([a, b.to(a)]).detach() for a, b in zip(ours, stretched, strict=True))
-    both = torch.cat([ids_of(stays), ids])
-    joined = GaussianField(means, cholesky, colors, both, size=scene.size).subset(torch.isin(both, labels))
+    joined = join(stays, GaussianField(means, cholesky, colors, ids, size=scene.size))
+    joined = joined.subset(torch.isin(ids_of(joined), labels))
     return Scene(joined, regions.relabel(labels, "mean"), scene.metadata)
 
 
@@ -239,24 +226,19 @@ def _with_flat(field: GaussianField, region_id: int, color: Tensor) -> GaussianF
     return join(field, flat)
 
 
-def _nearest_labels(labels: Tensor, hole: Tensor) -> Tensor:
-    """Give pixels of the hole the label of the nearest other pixel, of equals the smallest."""
+def nearest_labels(labels: Tensor, hole: Tensor) -> Tensor:
+    """Give pixels of the hole, (H, W) bool, the label of the nearest other pixel."""
     from scipy.ndimage import distance_transform_edt
 
-    # the nearest pixel touches the hole: one step from it towards any pixel of the hole is nearer
-    lines = [hole.any(axis).nonzero().flatten() for axis in (1, 0)]
-    rows, cols = (slice(max(0, int(line[0]) - 1), int(line[-1]) + 2) for line in lines)
-    part, inside = labels[rows, cols], hole[rows, cols]
-    touching = grow(inside, 1)
-    best = torch.full(part.shape, torch.inf, dtype=torch.float64)
-    filled = part.cpu().clone()
-    for region in part[touching & ~inside].unique().tolist():
-        distance = torch.from_numpy(distance_transform_edt((part != region).cpu().numpy()))
-        nearer = inside.cpu() & (distance < best)
-        best[nearer], filled[nearer] = distance[nearer], region
-    result = labels.clone()
-    result[rows, cols] = filled.to(labels.device)
-    return result
+    rows, cols = distance_transform_edt(hole.cpu().numpy(), return_distances=False, return_indices=True)
+    return labels[torch.from_numpy(rows).long(), torch.from_numpy(cols).long()]
+
+
+def shift_labels(labels: Tensor, inside: Tensor, offset: tuple[int, int], behind: Tensor) -> tuple[Tensor, Tensor]:
+    """Move the labels inside a mask over those behind, (..., H, W); return where they land, and all labels."""
+    dx, dy = (max(-length, min(step, length)) for length, step in zip(labels.shape[:-3:-1], offset, strict=True))
+    landed = torch.nn.functional.pad(inside, (dx, -dx, dy, -dy))
+    return landed, torch.where(landed, labels.roll((dy, dx), (-2, -1)), behind)
 
 
 def _filled_behind(scene: Scene, behind: RegionMap, hole: Tensor, landed: Tensor) -> GaussianField:
@@ -272,25 +254,3 @@ def _filled_behind(scene: Scene, behind: RegionMap, hole: Tensor, landed: Tensor
     stays = ~torch.isin(ids_of(scene.field), before.fine_labels[hole].unique())
     filled = fill_hole(Scene(scene.field.subset(stays), behind), hole, hole & uncovered).field
     return join(filled, scene.field.subset(~stays))
-
-
-def _overlap(length: int, step: int) -> tuple[slice, slice]:
-    """Which places of an axis stay on it, before and after a step."""
-    step = max(-length, min(length, step))
-    return slice(max(0, -step), length - max(0, step)), slice(max(0, step), length - max(0, -step))
-
-
-def _new_widths(regions: RegionMap, moved: list[int]) -> Mapping[tuple[int, int], float]:
-    """Give a moved region and those that it did not touch the mean width of the contours that it had."""
-    widths = regions.softness
-    new: dict[tuple[int, int], float] = {}
-    if not isinstance(widths, PairWidths):
-        return new
-    touching = touching_pairs(regions.fine_labels)
-    for region in moved:
-        touched = {other for pair in touching if region in pair for other in pair} - {region}
-        had = [widths.get((region, neighbour), 0.0) for neighbour in touched]
-        usual = sum(had) / max(1, len(had))
-        for far in {*regions.ids.tolist()} - {region} - touched - set(moved):
-            new[min(region, far), max(region, far)] = usual
-    return new

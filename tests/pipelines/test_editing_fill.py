@@ -9,8 +9,7 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, Scene, fit
 from kcgs.editing import delete_region, move_region
-from kcgs.editing.inpaint import grow, inpaint
-from kcgs.editing.texture import texture
+from kcgs.editing.fill import grow, inpaint
 
 SIZE = (48, 72)
 
@@ -50,8 +49,7 @@ def test_hole_is_in_range_and_about_as_steep_as_around(scene: Scene) -> None:
     hole = object_mask()
     before, after = (delete_region(scene, 1, fill=f)().detach() for f in (None, "inpaint"))
     assert after[:, hole].min() > -0.02 and after[:, hole].max() < 1.02
-    # waves are copied out of step with those in the hole: it can be steeper than around, a little
-    assert slope(after)[hole].max() <= 1.5 * slope(after)[~hole].quantile(0.999)
+    assert slope(after)[hole].max() <= 1.0 * slope(after)[~hole].quantile(0.999)
     assert (after - before)[:, ~grow(hole, 3)].abs().max() < 0.03
     # the ground goes on: what was bright is not, nor is it black
     assert 0.2 < after[:, hole].min() and after[:, hole].max() < 0.75
@@ -141,29 +139,19 @@ def test_scene_without_regions_is_refused() -> None:
         delete_region(Scene(GaussianField.random(5, (8, 8), seed=0)), 0)
 
 
-def test_membrane_is_the_mean_of_its_neighbours() -> None:
-    """A ramp stays a ramp, and a constant a constant."""
-    ramp = torch.linspace(0, 1, 60).expand(2, 40, 60).double()
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_inpaint_is_a_mean_of_what_is_around(dtype: torch.dtype) -> None:
+    """A constant stays a constant, a ramp about a ramp, and what is known stays."""
+    ramp = torch.linspace(0, 1, 60, dtype=dtype).expand(2, 40, 60)
     hole = torch.zeros(40, 60).bool()
     hole[12:28, 20:40] = True
-    torch.testing.assert_close(inpaint(ramp, hole), ramp, rtol=0, atol=0.04)
+    filled = inpaint(torch.where(hole, 9.0, ramp), hole)
+    torch.testing.assert_close(filled, ramp, rtol=0, atol=0.12)
+    assert torch.equal(filled[:, ~hole], ramp[:, ~hole])
     torch.testing.assert_close(inpaint(torch.full_like(ramp, 0.3), hole), torch.full_like(ramp, 0.3))
 
 
-def test_texture_is_that_of_places_of_the_same_colour() -> None:
-    """Dark and smooth on the left, bright and noisy on the right, and so is the hole."""
-    noise = torch.randn(3, 80, 120, generator=torch.Generator().manual_seed(0)).double()
-    right = torch.arange(120) >= 60
-    ground = torch.where(right, 0.7, 0.2).expand(3, 80, 120).double()
-    hole = torch.zeros(80, 120).bool()
-    hole[30:50, 30:90] = True
-    added = texture(ground + noise * right * ~hole * 0.05, hole)
-    assert not added[:, ~hole].any()
-    assert added[:, 34:46, 34:42].abs().max() < 0.02
-    assert 0.02 < added[:, 34:46, 78:88].std() < 0.06
-
-
-def test_texture_where_no_whole_cell_is_known() -> None:
-    hole = torch.ones(4, 5).bool()
-    hole[0, 0] = False
-    assert texture(torch.rand(1, 4, 5).double(), hole).isfinite().all()
+def test_inpaint_from_one_pixel() -> None:
+    hole = torch.ones(5, 7).bool()
+    hole[4, 6] = False
+    torch.testing.assert_close(inpaint(torch.where(hole, 0.0, 0.4)[None], hole), torch.full((1, 5, 7), 0.4))
