@@ -24,7 +24,7 @@ from kcgs.functional import BandGain, BoundaryScore, PairWidths
 from kcgs.pruning import prune
 from kcgs.rate import Compressed, FitBytesResult
 from kcgs.segment import Cleanup, Prediction, Segmentation
-from kcgs.video import read_label_maps, read_video
+from kcgs.video import read_video
 from kcgs.zoo import entries
 
 SIZE = (64, 96)
@@ -59,7 +59,7 @@ def objects(result: FitResult, folder: Path) -> Iterator[Any]:
     save_image(folder / "JPEGImages/480p/bear/00000.jpg", image)
     save_labels(folder / "Annotations/480p/bear/00000.png", LABELS)
     yield from (Davis(folder), Davis(folder).sequence("bear"))
-    yield from (read_video(folder / "JPEGImages/480p/bear"), read_label_maps(folder / "Annotations/480p/bear"))
+    yield read_video(folder / "JPEGImages/480p/bear")
     for done in run_jobs(fail, [image, image]):
         yield from (done, done.error)
 

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from kcgs.scene import Scene
-    from kcgs.video import LabelMaps
 
 # videos that H.264 is written into
 _OUTPUT_VIDEOS = (".mp4", ".mov", ".mkv")
@@ -69,7 +68,7 @@ def fit_video_command(
     from kcgs.video import fit_video, read_label_maps, read_video
 
     source = read_video(video, frame_rate=frame_rate)
-    maps: LabelMaps | Tensor | None
+    maps: list[Tensor] | Tensor | None
     if Path(regions).is_dir():
         maps = read_label_maps(regions)
     elif regions in ("auto", "none"):

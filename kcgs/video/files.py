@@ -3,7 +3,6 @@
 import math
 import os
 import re
-import tempfile
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from itertools import chain
@@ -38,30 +37,12 @@ class Frames:
         self.frame_rate = frame_rate or stored_rate
 
     def __iter__(self) -> Iterator[Tensor]:
-        for number, (frame, _) in enumerate(self._read()):
-            if (size := tuple(frame.shape[1:])) != self.size:
-                raise ValueError(f"frame {number} of {self._path} must have size {self.size}; got {size}")
-            yield frame
+        return (frame for frame, _ in self._read())
 
     def _read(self) -> Iterator[tuple[Tensor, float]]:
         if self._path.is_dir():
             return ((load_image(file), 24.0) for file in _list_files(self._path, _IMAGES))
         return _decode(self._path)
-
-
-class LabelMaps:
-    """Label maps :math:`(H, W)` int64 of a folder; every ``for`` reads them anew."""
-
-    def __init__(self, folder: Path) -> None:
-        self._files = _list_files(folder, _LABEL_MAPS)
-        if not self._files:
-            raise ValueError(f"{folder} has no label maps ({', '.join(_LABEL_MAPS)})")
-
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def __iter__(self) -> Iterator[Tensor]:
-        return (load_labels(file, rgb_ids=True) for file in self._files)
 
 
 def read_video(path: str | os.PathLike[str], *, frame_rate: float | None = None) -> Frames:
@@ -82,7 +63,7 @@ def read_video(path: str | os.PathLike[str], *, frame_rate: float | None = None)
         FileNotFoundError: ``path`` does not exist.
         ImportError: ``path`` is a file and PyAV is not installed.
         ValueError: there is no frame or no video stream. While reading: the file is damaged (a Matroska file that was
-            cut short just ends early), or a frame has another size than the first.
+            cut short just ends early).
 
     Example:
         >>> import tempfile, torch
@@ -98,8 +79,8 @@ def read_video(path: str | os.PathLike[str], *, frame_rate: float | None = None)
     return Frames(Path(path), rate)
 
 
-def read_label_maps(folder: str | os.PathLike[str]) -> LabelMaps:
-    """Open a folder of label maps, one per frame in natural order, as an iterable with a length.
+def read_label_maps(folder: str | os.PathLike[str]) -> list[Tensor]:
+    """Read a folder of label maps, one per frame in natural order.
 
     Args:
         folder: files as `load_labels` reads them; a colour has the same id, R + 256 G + 65536 B, in every frame.
@@ -109,7 +90,7 @@ def read_label_maps(folder: str | os.PathLike[str]) -> LabelMaps:
 
     Raises:
         FileNotFoundError: ``folder`` does not exist.
-        ValueError: it has no label maps. While reading: a file is damaged.
+        ValueError: it has no label maps, or a file is damaged.
 
     Example:
         >>> import tempfile, torch
@@ -118,11 +99,14 @@ def read_label_maps(folder: str | os.PathLike[str]) -> LabelMaps:
         ...     [(tuple(labels.shape), int(labels.max())) for labels in read_label_maps(f"{folder}/maps")]
         [((4, 6), 0), ((4, 6), 0)]
     """
-    return LabelMaps(Path(folder))
+    files = _list_files(Path(folder), _LABEL_MAPS)
+    if not files:
+        raise ValueError(f"{folder} has no label maps ({', '.join(_LABEL_MAPS)})")
+    return [load_labels(file, rgb_ids=True) for file in files]
 
 
 def write_video(path: str | os.PathLike[str], frames: Iterable[Any], frame_rate: float) -> None:
-    """Write frames as a video file or as a folder of PNG images, whole or not at all.
+    """Write frames as a video file, whole or not at all, or as a folder of PNG images.
 
     A file is visually lossless H.264 in BT.709; the same frames give the same bytes. Even sizes are yuv420p, which
     everything plays; odd sizes are yuv444p, which many browsers and telephones do not play.
@@ -148,10 +132,12 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[Any], frame_rate:
     """
     rate = check_number("frame_rate", frame_rate, 0, above=True)
     images = _check_frames(frames)
+    first = next(images)  # before anything is written
+    images = chain([first], images)
     if not Path(path).suffix:
         return _write_folder(Path(path), images)
     with atomic_path(path) as temporary:
-        _encode(temporary, images, Fraction(rate).limit_denominator(65535))
+        _encode(temporary, images, (first.shape[1], first.shape[2]), Fraction(rate).limit_denominator(65535))
 
 
 def _list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
@@ -197,18 +183,17 @@ def _check_frames(frames: Iterable[Any]) -> Iterator[Tensor]:
         raise ValueError("frames must hold at least one frame; got none")
 
 
-def _encode(path: Path, images: Iterator[Tensor], rate: Fraction) -> None:
-    av, first = _import_av(), next(images)
-    muxer_options = {"movflags": "+faststart"} if path.suffix.lower() in (".mp4", ".mov") else {}
-    with av.open(os.fspath(path), "w", options=muxer_options) as container:
+def _encode(path: Path, images: Iterator[Tensor], size: tuple[int, int], rate: Fraction) -> None:
+    av = _import_av()
+    with av.open(os.fspath(path), "w", options={"movflags": "+faststart"}) as container:
         stream = container.add_stream("libx264", rate=rate, options={"crf": "14"})
-        stream.height, stream.width = first.shape[1:]
+        stream.height, stream.width = size
         stream.pix_fmt = "yuv444p" if stream.height % 2 or stream.width % 2 else "yuv420p"
         context = stream.codec_context
         context.thread_count = 1  # the same bytes however many processors there are
         context.colorspace = context.color_primaries = context.color_trc = _BT709
         context.color_range = _LIMITED
-        for number, image in enumerate(chain([first], images)):
+        for number, image in enumerate(images):
             levels = (image.detach().float().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).contiguous()
             frame = av.VideoFrame.from_ndarray(levels.cpu().numpy(), "rgb24").reformat(
                 format=stream.pix_fmt, dst_colorspace=_BT709, dst_color_range=_LIMITED, interpolation=_SCALING
@@ -219,13 +204,8 @@ def _encode(path: Path, images: Iterator[Tensor], rate: Fraction) -> None:
 
 
 def _write_folder(folder: Path, images: Iterator[Tensor]) -> None:
-    if folder.exists() and any(folder.iterdir()):
+    folder.mkdir(exist_ok=True)
+    if any(folder.iterdir()):
         raise FileExistsError(f"cannot write {folder}: it exists, expected a new or an empty folder")
-    with tempfile.TemporaryDirectory(prefix=".tmp-", dir=folder.parent) as temporary:
-        complete = Path(temporary, "frames")
-        complete.mkdir()
-        for number, image in enumerate(images):
-            save_image(complete / f"{number:05d}.png", image)
-        if folder.exists():
-            folder.rmdir()
-        complete.rename(folder)
+    for number, image in enumerate(images):
+        save_image(folder / f"{number:05d}.png", image)
