@@ -48,8 +48,6 @@ def fit_video_command(
         float | None, typer.Option(help="Frames per second; default: the file's, of a folder 24.")
     ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Fit so many frames only.")] = None,
-    checkpoint: Annotated[Path | None, typer.Option(help="Keep the frames that are done in this file.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from --checkpoint, where it exists.")] = False,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -58,10 +56,6 @@ def fit_video_command(
     check_output(output, ".safetensors")
     if video.suffix.lower() in IMAGES and video.is_file():
         raise typer.BadParameter(f"VIDEO must be a video or a folder of images; got {str(video)!r}: kcgs fit fits it")
-    if resume and checkpoint is None:
-        raise typer.BadParameter("--resume needs --checkpoint")
-    if checkpoint is not None:
-        check_output(checkpoint, ".safetensors", option="--checkpoint")
     compile_ahead(request.config, False)
     from kcgs.data import load_labels
     from kcgs.functional import psnr
@@ -79,7 +73,7 @@ def fit_video_command(
     with Stop() as stop:
         scenes = fit_video(
             source, maps, options.DEFAULT_GAUSSIANS if request.num_gaussians is None else request.num_gaussians,
-            recipe=request.config, seed=request.seed, checkpoint=checkpoint, resume=resume, progress=not quiet,
+            recipe=request.config, seed=request.seed, progress=not quiet,
             on_frame=lambda number, scene: stop.step(number, scene) or number + 1 == frames,
         )  # fmt: skip
         seconds = time.perf_counter() - start
