@@ -150,11 +150,8 @@ def write_files(folder: Path, scene: Scene, cutoff: float) -> Files:
 
 
 def decoders_of(scene: Scene, size: str = "native") -> list[str]:
-    """List the decoders that render this scene: the generic one has hard contours only, one label per pixel."""
-    regions = scene.regions
-    is_plain = regions is None or (regions.softness == 0.0 and regions.supersample == 1)
-    names = FAST if size == WIDE else DECODERS
-    return [name for name in names if name != GENERIC or is_plain]
+    """List the decoders to time at a size."""
+    return list(FAST if size == WIDE else DECODERS)
 
 
 def open_decoder(name: str, files: Files, size: tuple[int, int], threads: int) -> Render:
@@ -212,9 +209,10 @@ def _session(path: Path, feeds: dict[str, Any], threads: int) -> Render:
 
 def _generic_feeds(scene: Scene) -> dict[str, Any]:
     field = scene.field
-    labels, region_ids = torch.zeros(field.size, dtype=torch.int64), torch.zeros(field.num_gaussians, dtype=torch.int64)
-    if scene.regions is not None and field.region_ids is not None:
-        labels, region_ids = scene.regions.labels, field.region_ids
+    memberships, region_ids = torch.ones(1, *field.size), torch.zeros(field.num_gaussians, dtype=torch.int64)
+    if (regions := scene.regions) is not None and field.region_ids is not None:
+        memberships = torch.stack([regions.weights(region).float() for region in regions.ids.tolist()])
+        region_ids = regions.index_of(field.region_ids)
     tensors = {"means": field.means, "cholesky": field.cholesky, "colors": field.colors}
-    tensors |= {"region_ids": region_ids, "labels": labels}
+    tensors |= {"region_ids": region_ids, "memberships": memberships}
     return {name: tensor.detach().numpy() for name, tensor in tensors.items()}

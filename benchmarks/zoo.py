@@ -1,4 +1,4 @@
-"""Make the zoo: small scenes of images that anybody may use, each with its decoder, recipe and card."""
+"""Make the zoo: small scenes of images that anybody may use, each with its recipe and card."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from kcgs._atomic import write_file
 from kcgs.data import save_image
 from kcgs.evaluation import evaluate
 from kcgs.fitting import FitConfig, fit
-from kcgs.onnx import scene_decoder, write_model
 from kcgs.scene import Scene
 from kcgs.zoo import Entry, entries
 
@@ -20,7 +19,6 @@ from .core.options import Options
 from .core.registry import experiment
 
 _PREVIEW = 384  # pixels of its longer side
-_LARGEST_DECODER = 600_000
 _CHART = "Apache-2.0, made by kcgs"
 _NASA = "public domain (NASA), from scikit-image"
 _CC0 = "CC0, from scikit-image"
@@ -70,14 +68,6 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
     scene = Scene(fitted.field, fitted.regions, {"recipe": recipe, "title": plan.title})
     size = scene.save(folder / "scene.safetensors")
     write_file(folder / "recipe.json", config.model_dump_json(indent=1) + "\n")
-    model, decoder = scene_decoder(scene, interactive=True), folder / "decoder.onnx"  # with views and regions
-    has_decoder = model.ByteSize() <= _LARGEST_DECODER
-    if has_decoder:
-        write_model(model, decoder)
-        # to compare with in the viewer
-        save_image(folder / ("original.webp" if recipe == "best" else "original.jpg"), image)
-    else:
-        decoder.unlink(missing_ok=True)
     height, width = scene.size
     shrink = _PREVIEW / max(height, width)
     save_image(folder / "preview.jpg", scene.render((max(1, round(height * shrink)), max(1, round(width * shrink)))))
@@ -89,8 +79,6 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
         num_regions=1 if scene.regions is None else scene.regions.num_regions, psnr=round(figures["psnr"], 3),
         ef_psnr=round(edge, 3) if edge == edge else None, licence=plan.licence,
         command=f"python -m benchmarks zoo -o models --only {name}",
-        decoder=f"{name}/decoder.onnx" if has_decoder else None,
-        decoder_sha256=_hash(decoder) if has_decoder else None,
     )  # fmt: skip
     write_file(folder / "card.md", _card(entry, scene.size, figures["ms_ssim"]))
     return entry
@@ -112,7 +100,6 @@ def _card(entry: Entry, size: tuple[int, int], ms_ssim: float) -> str:
         "EF-PSNR": "not defined: one region" if entry.ef_psnr is None else f"{entry.ef_psnr:.2f} dB",
         "MS-SSIM": f"{ms_ssim:.4f}",
         "bytes": f"{entry.bytes} (label map deflated)",
-        "decoder": "`decoder.onnx`, with `view` and `visible`" if entry.decoder else "left out: large",
     }
     table = "\n".join(f"| {key} | {value} |" for key, value in rows.items())
     return f"# {entry.name}\n\n![{entry.title}](preview.jpg)\n\n| | |\n|---|---|\n{table}\n"

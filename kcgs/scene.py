@@ -151,17 +151,6 @@ class Scene(nn.Module):
         """Write the scene, as :func:`kcgs.save` does; return the bytes of the file."""
         return save(path, self)
 
-    def to_onnx(self, onnx_name: str = "Kornia-Scene.onnx", **settings: Any) -> Any:
-        """Export the render at the scene's own size, by Kornia's `ONNXExportMixin`.
-
-        Takes what Kornia's ``to_onnx`` takes, such as ``save=False``, and returns the `onnx.ModelProto`: no input, and
-        one output, :math:`(B, C, H, W)`. `kornia.onnx.ONNXSequential` chains it. :func:`kcgs.onnx.scene_decoder` is
-        faster, smaller, and renders at any size. Needs the extra: ``pip install "kcgs[onnx]"``.
-        """
-        from kcgs.nn.onnx_export import SceneExport
-
-        return SceneExport(self).to_onnx(onnx_name, **settings)
-
     def __repr__(self) -> str:
         regions = "no regions" if self.regions is None else f"{self.regions.num_regions} regions"
         if count := len(empty_regions(self)):

@@ -31,8 +31,6 @@ class Entry(NamedTuple):
     ef_psnr: float | None
     licence: str
     command: str
-    decoder: str | None = None
-    decoder_sha256: str | None = None
 
 
 def entries(folder: Path | None = None) -> list[Entry]:

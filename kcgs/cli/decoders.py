@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -15,56 +15,26 @@ from .options import Contours
 def export(
     scene: SceneFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="ONNX file to write, or .html: one web page.")],
-    kind: Annotated[
-        Literal["scene", "generic"],
-        typer.Option(help="scene: this scene's decoder; generic: one that takes any scene's numbers."),
-    ] = "scene",
-    precision: Annotated[
-        Literal["fp32", "fp16"],
-        typer.Option(help="fp16 stores factors and colours in 16 bits, where no value of the render changes by 1/255."),
-    ] = "fp32",
     cutoff: Annotated[float, typer.Option(help="Weights below it are skipped.")] = 1e-4,
     clamp: Annotated[bool, typer.Option("--clamp/--no-clamp", help="Clip the image to [0, 1].")] = True,
     interactive: Annotated[
         bool, typer.Option("--interactive", help="With inputs for the part that is rendered and for regions to hide.")
     ] = False,
-    hard_contours: Annotated[
-        bool, typer.Option("--hard-contours", help="Give each pixel to its label alone, whatever the contours' widths.")
-    ] = False,
     contours: Contours = "scaled",
     as_json: Json = False,
 ) -> None:
     """Write a scene's decoder as ONNX, or the scene as one web page: neither needs torch or kcgs."""
-    from kcgs import Scene, load
-    from kcgs.onnx import describe_decoder, generic_decoder, scene_decoder, write_model
+    from kcgs import load
+    from kcgs.onnx import describe_decoder, scene_decoder, write_model
 
     check_output(output, ".onnx", ".html")
     if output.suffix == ".html":
-        if kind == "generic" or precision == "fp16" or cutoff != 1e-4 or not clamp or interactive or hard_contours:
+        if cutoff != 1e-4 or not clamp or interactive:
             raise typer.BadParameter("a page takes --contours only; the other options are for .onnx")
         print_report(_write_page(scene, output, contours), as_json, str(output))
         return
-    loaded = load(scene)
-    if hard_contours and loaded.regions is not None:
-        loaded = Scene(loaded.field, loaded.regions.labels, loaded.metadata)
-    if kind == "generic":
-        if interactive or precision == "fp16" or contours == "crisp":
-            raise typer.BadParameter("--interactive, --precision and --contours are for --kind scene")
-        regions = loaded.regions
-        if regions is not None and regions.num_regions > 1 and (regions.softness != 0.0 or regions.supersample > 1):
-            why = "a generic decoder renders hard contours, and this scene's are soft or finer"
-            raise typer.BadParameter(f"--kind must be scene, or come with --hard-contours: {why}")
-        model = generic_decoder(cutoff=cutoff, clamp=clamp)
-    else:
-        model = scene_decoder(
-            loaded, cutoff=cutoff, clamp=clamp, precision=precision, interactive=interactive, contours=contours
-        )
+    model = scene_decoder(load(scene), cutoff=cutoff, clamp=clamp, interactive=interactive, contours=contours)
     report = {**describe_decoder(model), "bytes": write_model(model, output)}
-    if not as_json:
-        left_out = report["left_out"]
-        assert isinstance(left_out, list)
-        report = {key: value for key, value in report.items() if not isinstance(value, list)}
-        report["left out"] = "\n".join(left_out)
     print_report(report, as_json, str(output))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -117,17 +117,6 @@ class RegionSplatRenderer(nn.Module):
         if not self.keepdim and image.ndim == 3:
             image = image[None]
         return image.clamp(0.0, 1.0) if self.clamp else image
-
-    def to_onnx(self, onnx_name: str = "Kornia-RegionSplatRenderer.onnx", **settings: Any) -> Any:
-        """Export for any Gaussians and label maps, by Kornia's `ONNXExportMixin`.
-
-        Takes what Kornia's ``to_onnx`` takes; ``input_shape`` and ``pseudo_shape`` are those of the image. Returns the
-        `onnx.ModelProto`: batches of means, cholesky, colors, region_ids and labels in, the image out. Needs the extra:
-        ``pip install "kcgs[onnx]"``.
-        """
-        from .onnx_export import RendererExport
-
-        return RendererExport(self).to_onnx(onnx_name, **settings)
 
     def extra_repr(self) -> str:
         """Show the settings."""

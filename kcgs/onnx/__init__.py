@@ -1,8 +1,8 @@
 """Scenes as ONNX: decoders that run wherever ONNX does."""
 
-from .decoder import PRECISIONS, scene_decoder
+from .decoder import scene_decoder
 from .generic import generic_decoder
 from .graph import write_model
 from .metadata import describe_decoder
 
-__all__ = ["PRECISIONS", "describe_decoder", "generic_decoder", "scene_decoder", "write_model"]
+__all__ = ["describe_decoder", "generic_decoder", "scene_decoder", "write_model"]

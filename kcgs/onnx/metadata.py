@@ -9,11 +9,8 @@ import onnx
 
 from kcgs.scene import Scene
 
-from .layout import Layout
-
 FORMAT = "kcgs.decoder"
 FORMAT_VERSION = "1"
-_LISTS = ("region_ids", "left_out")
 _CHANNELS = {1: "grey", 3: "red, green, blue"}
 
 
@@ -36,8 +33,8 @@ def header(kind: str, cutoff: float, clamp: bool) -> dict[str, str]:
     }
 
 
-def describe(scene: Scene, layout: Layout, *, cutoff: float, clamp: bool, crisp: bool) -> dict[str, str]:
-    """Collect the facts, what was left out among them."""
+def describe(scene: Scene, *, cutoff: float, clamp: bool, crisp: bool) -> dict[str, str]:
+    """Collect the facts of a scene's decoder."""
     field, regions = scene.field, scene.regions
     count = 1 if regions is None else regions.num_regions
     contours = "none" if count == 1 else "hard" if regions is None or regions.softness == 0.0 else "soft"
@@ -52,28 +49,7 @@ def describe(scene: Scene, layout: Layout, *, cutoff: float, clamp: bool, crisp:
         "num_regions": str(count),
         "region_ids": json.dumps([0] if regions is None else regions.ids.tolist()),
         "contours": contours,
-        "left_out": json.dumps(_left_out(scene, contours, layout, clamp)),
     }
-
-
-def _left_out(scene: Scene, contours: str, layout: Layout, clamp: bool) -> list[str]:
-    total, windows = len(layout.tiles.regions), len(layout.tiles.windows)
-    touched = sum(len(group.tiles) for group in layout.groups)
-    unseen = scene.num_gaussians - len(layout.gaussians.means)
-    pairs = sum(int(group.lengths.sum()) for group in layout.groups)
-    one_region = f"memberships in {total - windows} of {total} tiles, which have one region"
-    facts = {
-        "regions: the scene has one": contours == "none",
-        one_region: contours != "none",
-        "soft weights: contours are hard": contours == "hard",
-        "coarse grids: too few Gaussians are wide": layout.nodes is None,
-        "the clip to [0, 1]": not clamp,
-        "opacities: merged into the colours": scene.field.opacities is not None,
-        f"{unseen} Gaussians that touch no pixel": unseen > 0,
-        f"{total - touched} tiles that nothing touches": touched < total,
-        f"all but {100 * pairs / max(1, total * scene.num_gaussians):.2g} % of the pairs of Gaussian and tile": True,
-    }
-    return [fact for fact, holds in facts.items() if holds]
 
 
 def describe_decoder(model: onnx.ModelProto) -> dict[str, object]:
@@ -83,7 +59,7 @@ def describe_decoder(model: onnx.ModelProto) -> dict[str, object]:
         model: made by :func:`kcgs.onnx.scene_decoder` or :func:`kcgs.onnx.generic_decoder`.
 
     Returns:
-        The metadata; lists as lists.
+        The metadata; the list of region ids as a list.
 
     Example:
         >>> from kcgs import GaussianField
@@ -92,5 +68,7 @@ def describe_decoder(model: onnx.ModelProto) -> dict[str, object]:
         >>> describe_decoder(model)["num_gaussians"]
         '10'
     """
-    entries = {entry.key: entry.value for entry in model.metadata_props}
-    return {key: json.loads(value) if key in _LISTS else value for key, value in entries.items()}
+    facts: dict[str, object] = {entry.key: entry.value for entry in model.metadata_props}
+    if "region_ids" in facts:
+        facts["region_ids"] = json.loads(str(facts["region_ids"]))
+    return facts

@@ -41,10 +41,10 @@ class Stored:
 
     Whitened coordinates z are scaled by sqrt(1/2): log w is minus their sum of squares. All that does not depend on the
     size of the image is computed for all groups at once, since the time to load grows with the number of operators.
-    `visible` is a factor on each region's Gaussians, (R,); `half` stores Cholesky factors and colours in 16 bits.
+    `visible` is a factor on each region's Gaussians, (R,).
     """
 
-    def __init__(self, graph: Graph, layout: Layout, visible: Value | None, half: bool) -> None:
+    def __init__(self, graph: Graph, layout: Layout, visible: Value | None) -> None:
         g = self.g = graph
         self.layout, self.gaussians, groups = layout, layout.gaussians, layout.groups
         self.visible = visible
@@ -65,12 +65,9 @@ class Stored:
         self._sizes = [len(group.tiles) * group.longest for group in groups]
         tile = self._tile_of_entries()
         entries, real = self._entries(tile)
-        with np.errstate(over="ignore"):  # what is too large for 16 bits shows in the image
-            stored = [a.astype(np.float16 if half else F32) for a in (self.gaussians.cholesky, self.gaussians.colors)]
-        cholesky, colors = (g("Cast", a, to=FLOAT) if half else a for a in [g.constant(a) for a in stored])
-        squares, polynomials = self._whiten(entries, tile, cholesky)
+        squares, polynomials = self._whiten(entries, tile)
         self._squares, self._polynomials = (g.split(part, self._sizes) for part in (squares, polynomials))
-        self._colors = g.split(g("Mul", g("Gather", colors, entries), real), self._sizes)
+        self._colors = g.split(g("Mul", g("Gather", g.constant(self.gaussians.colors), entries), real), self._sizes)
         if visible is not None or any(group.regions > 1 for group in groups):
             self._regions = g.split(g("Gather", g.whole(self.gaussians.region), entries), self._sizes)
 
@@ -169,13 +166,14 @@ class Stored:
             place = g("Div", place, np.int32(length))
         self.nodes.insert(0, place)
 
-    def _whiten(self, entries: Value, tile: Value, cholesky: Value) -> tuple[Value, Value]:
+    def _whiten(self, entries: Value, tile: Value) -> tuple[Value, Value]:
         g = self.g
         place = g("Cast", g("Gather", self._places(), g("Concat", *self.tiles, axis=0)), to=FLOAT)
         centre = g("Mul", g("Add", place, F32(0.5)), F32(TILE))
         offset = g("Sub", g("Gather", centre, tile), g("Gather", g.constant(self.gaussians.means), entries))
         x, y = g.apply("Split", [offset], 2, axis=1, num_outputs=2)
-        l11, l21, l22 = g.apply("Split", [g("Gather", cholesky, entries)], 3, axis=1, num_outputs=3)
+        cholesky = g("Gather", g.constant(self.gaussians.cholesky), entries)
+        l11, l21, l22 = g.apply("Split", [cholesky], 3, axis=1, num_outputs=3)
         slope = g("Div", l21, l11)
         e1, k1, k4 = g("Div", x, l11), g("Reciprocal", l11), g("Reciprocal", l22)
         e2 = g("Div", g("Sub", y, g("Mul", slope, x)), l22)

@@ -48,7 +48,7 @@ class TestExport:
         out = scene.with_name("decoder.onnx")
         assert run(monkeypatch, "export", str(scene), "-o", str(out), "--interactive", "--json") == 0
         facts = json.loads(capsys.readouterr().out)
-        assert facts["recipe"] == "best" and facts["bytes"] == out.stat().st_size and facts["left_out"]
+        assert facts["recipe"] == "best" and facts["bytes"] == out.stat().st_size
         names = [i.name for i in onnxruntime.InferenceSession(str(out)).get_inputs()]
         assert names == ["size", "view", "visible"]
 
@@ -61,20 +61,12 @@ class TestExport:
         png = scene.with_name("crisp.png")
         assert run(monkeypatch, "render", str(scene), "-o", str(png), "--scale", "2", "--contours", "crisp") == 0
         assert (load_image(png) - load(scene).render((64, 96), "crisp")).abs().max() <= 0.5 / 255 + 1e-6
-        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic", "--contours", "crisp") == 2
-        assert "--contours are for" in capsys.readouterr().err
 
-    def test_generic_and_half(self, monkeypatch: pytest.MonkeyPatch, scene: Path) -> None:
-        out = scene.with_name("generic.onnx")
-        soft = load(scene)
-        save(scene, Scene(soft.field, soft.regions.labels))
-        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic") == 0
-        assert len(onnxruntime.InferenceSession(str(out)).get_inputs()) == 5
-        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic", "--interactive") == 2
-        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--precision", "fp16", "--no-clamp") == 0
+    def test_no_clamp(self, monkeypatch: pytest.MonkeyPatch, scene: Path) -> None:
+        out = scene.with_name("decoder.onnx")
+        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--no-clamp") == 0
         (image,) = onnxruntime.InferenceSession(str(out)).run(None, {"size": np.array([32, 48])})
-        want = load(scene)().detach().numpy()
-        assert np.abs(image[0] - want).max() < 1 / 255
+        assert np.abs(image[0] - load(scene)().detach().numpy()).max() < 1e-3
 
     @pytest.mark.parametrize(
         ("arguments", "words"),
@@ -96,19 +88,6 @@ class TestExport:
         assert run(monkeypatch, "export", str(scene), *arguments) == 2
         assert words in capsys.readouterr().err
         assert not list(scene.parent.glob("decoder*"))
-
-    def test_generic_for_a_soft_scene(
-        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: Path
-    ) -> None:
-        out = scene.with_name("g.onnx")
-        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic") == 2
-        said = capsys.readouterr().err
-        assert "soft or finer" in said and "--hard-contours" in said and not out.exists()
-        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--kind", "generic", "--hard-contours") == 0
-        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--hard-contours") == 0
-        (image,) = onnxruntime.InferenceSession(str(out)).run(None, {"size": np.array([32, 48])})
-        soft = load(scene)
-        assert np.abs(image[0] - Scene(soft.field, soft.regions.labels).render().numpy()).max() < 1e-4
 
     def test_truncated_scene(
         self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: Path

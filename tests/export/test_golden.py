@@ -25,7 +25,6 @@ if not FOLDER.is_dir():
     pytest.skip("not a source checkout: there is no export/golden", allow_module_level=True)
 
 NAMES = ("plain", "hard", "soft", "pairs", "fine", "needle")
-HARD = ("plain", "hard", "needle")
 MOST = 1e-3
 Arrays = dict[str, np.ndarray]
 
@@ -265,15 +264,16 @@ class TestOnnx:
         model = scene_decoder(Scene(field, regions), cutoff=float(case["cutoff"]), clamp=False, interactive=True)
         assert_decodes(onnxruntime.InferenceSession(model.SerializeToString()), case)
 
-    @pytest.mark.parametrize("name", HARD)
-    def test_generic_decoder(self, name: str) -> None:
-        case = read(name)
+    def test_generic_decoder(self, case: Arrays) -> None:
+        field, regions = scene_of(case)
         model = generic_decoder(cutoff=float(case["cutoff"]), clamp=False)
         session = onnxruntime.InferenceSession(model.SerializeToString())
         size = size_of(case)
         feeds = {name: case[name] for name in ("means", "cholesky", "colors")}
         if "opacities" in case:
             feeds["colors"] = feeds["colors"] * case["opacities"][:, None]
-        feeds["region_ids"] = case.get("region_ids", np.zeros(len(case["means"]))).astype(np.int64)
-        feeds["labels"] = case.get("labels", np.zeros(size)).astype(np.int64)
+        feeds |= {"region_ids": np.zeros(len(case["means"]), np.int64), "memberships": np.ones((1, *size), np.float32)}
+        if regions is not None and field.region_ids is not None:
+            feeds["region_ids"] = regions.index_of(field.region_ids).numpy()
+            feeds["memberships"] = torch.stack([regions.weights(i) for i in regions.ids.tolist()]).float().numpy()
         assert_same(session.run(["image"], feeds)[0][0], case[f"image_{size[0]}x{size[1]}"])

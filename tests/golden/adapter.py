@@ -133,18 +133,16 @@ def run_onnx(model: onnx.ModelProto, feeds: dict[str, Any]) -> Tensor:
     return torch.from_numpy(session.run(["image"], {k: np.asarray(v) for k, v in feeds.items()})[0])
 
 
-def run_decode_script(files: list[bytes], options: list[str]) -> Tensor:
-    """Run export/decode.py on a decoder and, for a generic one, a scene; return what it writes."""
+def run_decode_script(decoder: bytes, options: list[str]) -> Tensor:
+    """Run export/decode.py on a decoder; return what it writes."""
     spec = importlib.util.spec_from_file_location("kcgs_golden_decode", ROOT / "export" / "decode.py")
     assert spec is not None and spec.loader is not None
     script: ModuleType = sys.modules.setdefault(spec.name, importlib.util.module_from_spec(spec))
     spec.loader.exec_module(script)
     with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(folder) / name for name in ("decoder.onnx", "scene.safetensors")[: len(files)]]
-        for path, data in zip(paths, files, strict=True):
-            path.write_bytes(data)
-        output = Path(folder) / "out.npy"
-        args: argparse.Namespace = script.parse([*map(str, paths), "-o", str(output), "--threads", "1", *options])
+        path, output = Path(folder) / "decoder.onnx", Path(folder) / "out.npy"
+        path.write_bytes(decoder)
+        args: argparse.Namespace = script.parse([str(path), "-o", str(output), "--threads", "1", *options])
         script.decode(args)
         return torch.from_numpy(np.load(output))
 

@@ -157,7 +157,6 @@ def _decoder(scene: dict[str, Any], **settings: Any) -> dict[str, Any]:
 for name, settings in MAPS.items():
     CASES[f"onnx/scene-{name}"] = partial(_decoder, settings)
     CASES[f"onnx/interactive-{name}"] = partial(_decoder, settings, interactive=True, recipe="best")
-CASES["onnx/fp16"] = partial(_decoder, {"count": 40, "seed": 5}, precision="fp16", clamp=True)
 CASES["onnx/cutoff-0"] = partial(_decoder, {"count": 40}, cutoff=0.0)
 CASES["onnx/large-ids"] = partial(_decoder, {"ids": (5, 300, 70_000, 9)}, interactive=True)
 
@@ -165,19 +164,19 @@ CASES["onnx/large-ids"] = partial(_decoder, {"ids": (5, 300, 70_000, 9)}, intera
 @case("onnx/generic")
 def _generic() -> Any:
     p = gaussians()
-    feeds = {"means": p.means, "cholesky": p.cholesky, "colors": p.colors, "region_ids": p.ids, "labels": p.labels}
+    ids = p.labels.unique()
+    memberships = (p.labels == ids[:, None, None]).float()
+    feeds = {"means": p.means, "cholesky": p.cholesky, "colors": p.colors, "memberships": memberships}
+    feeds["region_ids"] = torch.searchsorted(ids, p.ids)
     free = _model(adapter.decoder_of_any(), **feeds)
-    return {"free": free, "fixed": _model(adapter.decoder_of_any(cutoff=1e-3, clamp=True, channels=3), **feeds)}
+    return {"free": free, "coarse": _model(adapter.decoder_of_any(cutoff=1e-3, clamp=True), **feeds)}
 
 
 @case("onnx/decode-script")
 def _decode_script() -> Any:
     own = adapter.decoder_of(gaussians(softness=0.8), interactive=True).SerializeToString()
-    generic = adapter.decoder_of_any().SerializeToString()
     views = ([], ["--scale", "1.7"], ["--size", "70x50", "--view=-3,2,40.5,30"], ["--region", "7", "11"])
-    results = {f"scene-{i}": adapter.run_decode_script([own], options) for i, options in enumerate(views)}
-    scene = adapter.saved(gaussians(opacities=True))[0]
-    return results | {"generic": adapter.run_decode_script([generic, scene], ["--scale", "2"])}
+    return {f"scene-{i}": adapter.run_decode_script(own, options) for i, options in enumerate(views)}
 
 
 # Renders and gradients

@@ -1,8 +1,7 @@
-"""`torch.onnx.export` of modules that hold the renderer, and `to_onnx` as Kornia's modules have it."""
+"""`torch.onnx.export` of modules that hold the renderer."""
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import onnxruntime
@@ -212,38 +211,3 @@ class TestTorchExport:
         while cause is not None and not isinstance(cause, ValueError):
             cause = cause.__cause__
         assert "contours must be scaled in graphs of torch.onnx.export; got crisp" in str(cause)
-
-
-@exporter_warnings
-class TestMixin:
-    def test_a_scene_chains_with_a_filter(self) -> None:
-        from kornia.core import ImageSequential
-        from kornia.filters import GaussianBlur2d
-        from kornia.onnx import ONNXSequential
-
-        regions = RegionMap.from_labels(labels_of(SIZE), 0.7)
-        scene = Scene(GaussianField.random(40, SIZE, seed=0, regions=regions), regions)
-        blur = ImageSequential(GaussianBlur2d((3, 3), (1.0, 1.0)))
-        chain = ONNXSequential(scene.to_onnx(save=False), blur.to_onnx(save=False, verbose=False))
-        assert_close(torch.from_numpy(chain()[0]), blur(scene()[None]))
-
-    def test_the_renderer(self, tmp_path: Any) -> None:
-        import onnx
-
-        from kcgs import RegionSplatRenderer
-
-        path = str(tmp_path / "renderer.onnx")
-        RegionSplatRenderer(cutoff=1e-3, clamp=True).to_onnx(path, pseudo_shape=[2, 1, 20, 30])
-        given = gaussians(3, 50, (61, 35))
-        given[2] = given[2][..., :1]
-        labels = torch.stack([labels_of((61, 35)).roll(k, 1) for k in range(3)])
-        want = region_splat(*given, labels, cutoff=1e-3).clamp(0, 1)
-        assert_close(run(onnx.load(path), *given, labels), want)
-
-    def test_missing_onnxscript_is_told(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
-        scene = Scene(GaussianField.random(5, SIZE, seed=0))
-        monkeypatch.setitem(sys.modules, "onnxscript", None)
-        for export in (scene.to_onnx, RegionSplatRenderer().to_onnx):
-            with pytest.raises(ImportError, match=r'needs the package onnxscript: pip install "kcgs\[onnx\]"'):
-                export(str(tmp_path / "model.onnx"))
-        assert not list(tmp_path.iterdir())
