@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import as_image
+from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, ef_psnr, ef_ssim, ms_ssim, psnr, ssim
 from kcgs.scene import Scene, check_scene
 
@@ -47,7 +48,7 @@ def evaluate(
     """
     render, target = check_scene(scene).render(), as_image("image", image)
     if tuple(target.shape) != tuple(render.shape):
-        raise ValueError(f"image must have the scene's shape {tuple(render.shape)}; got {tuple(target.shape)}")
+        raise InvalidArgument("image", f"the scene's shape {tuple(render.shape)}", tuple(target.shape), verb="have")
     regions = scene.regions if labels is None else RegionMap.coerce(labels, "labels")
     figures = measure(render, target.to(render.device), None if regions is None else regions.labels)
     return {**figures, "ssimulacra2": ssimulacra2(render, target)} if visual else figures

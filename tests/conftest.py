@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 
 import pytest
@@ -111,12 +110,6 @@ def pytest_runtest_setup() -> None:
     torch.manual_seed(0)
 
 
-@pytest.fixture(autouse=True)
-def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write no line of progress every ten seconds: how many there are depends on how busy the machine is."""
-    monkeypatch.setattr("kcgs._progress._LINE_SECONDS", 1e6)
-
-
 class Clock:
     """A clock that moves on by a tick each time it is read."""
 
@@ -136,8 +129,6 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """Replace `time.perf_counter`, so that time limits do not depend on how busy the machine is."""
-    if "kcgs.cli.clock" in sys.modules:
-        sys.modules["kcgs.cli.clock"]._seconds_per_pixel.cache_clear()  # it was measured by another clock
     clock = Clock()
     monkeypatch.setattr("time.perf_counter", clock)
     return clock

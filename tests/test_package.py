@@ -59,8 +59,6 @@ assert before == (dict(os.environ), signal.getsignal(signal.SIGINT), sys.unraisa
         ("fit", "photo.png", "--seed", "x"),
         ("fit", "photo.png", "-n", "5", "--target-bytes", "900"),
         ("fit", "photo.png", "-o", "scene.txt"),
-        ("fit", "photo.png", "--resume"),
-        ("fit", "clip.mp4"),
         ("fit-many", "photos", "-o", "out", "--target-bytes", "900", "--suffix", ".safetensors"),
         ("render", "scene.png", "-o", "large.png"),
     ],

@@ -18,7 +18,6 @@ from PIL import Image
 import kcgs
 from kcgs import FitConfig, GaussianField, RegionMap, RegionSplatRenderer, Scene, codec, fit
 from kcgs.data import ChartSample, Davis, DavisFrame, save_image, save_labels
-from kcgs.engine import run_jobs
 from kcgs.fitting import FitResult, available_recipes
 from kcgs.functional import BandGain, BoundaryScore, PairWidths
 from kcgs.pruning import prune
@@ -60,12 +59,6 @@ def objects(result: FitResult, folder: Path) -> Iterator[Any]:
     save_labels(folder / "Annotations/480p/bear/00000.png", LABELS)
     yield from (Davis(folder), Davis(folder).sequence("bear"))
     yield read_video(folder / "JPEGImages/480p/bear")
-    for done in run_jobs(fail, [image, image]):
-        yield from (done, done.error)
-
-
-def fail(image: torch.Tensor) -> None:
-    raise ValueError(f"a message as long as {image}")
 
 
 def public_classes() -> set[type]:

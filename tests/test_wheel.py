@@ -110,7 +110,7 @@ def test_every_command(environment: Path, folder: Path) -> None:
         ("models",),
         ("info", "zoo:chart-2x3"),
         ("render", "zoo:chart-2x3", "-o", "chart.png", "--size", "60x40"),
-        ("fit", "photo.png", *few, "--plot", "plot.png"),
+        ("fit", "photo.png", *few),
         ("segment", "photo.png", "-o", "regions.png"),
         ("fit", "photo.png", *few, "--regions", "none", "-o", "plain.safetensors"),
         ("eval", "photo.safetensors", "photo.png"),
@@ -123,7 +123,7 @@ def test_every_command(environment: Path, folder: Path) -> None:
     out = call(environment, folder, ["python", "-c", RUN_COMMANDS], "\n".join(map(json.dumps, commands)))
     assert "chart-2x3" in out
     written = {path.name for path in folder.iterdir()}
-    assert written >= {"chart.png", "plot.png", "regions.png", "plain.png"}
+    assert written >= {"chart.png", "regions.png", "plain.png"}
     assert written >= {"photo.safetensors", "photo.onnx", "photo.html"}
     assert (folder / "many" / "a.safetensors").is_file()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple, TypeVar
 
 from kcgs._progress import Progress
@@ -33,13 +34,21 @@ def make_all(function: Callable[[Job], object], jobs: Sequence[Job], place: Plac
     """Do jobs that keep what they make on disk themselves; return what failed, one line each."""
     failed: list[str] = []
     with Progress("bench") as progress:
-        for number, ended in enumerate(run_jobs(function, jobs, engine=place.engine, workers=place.workers), 1):
-            if ended.error is not None:
-                failed.append(f"{jobs[ended.index]}: {ended.error}")
-            # in this process the next job is the one that runs
-            shown = min(number, len(jobs) - 1) if place.is_local else ended.index
-            progress.update(number / len(jobs), str(jobs[shown]))
+        done = run_jobs(partial(_attempt, function), jobs, engine=place.engine, workers=place.workers)
+        for number, (index, error) in enumerate(done, 1):
+            if error:
+                failed.append(f"{jobs[index]}: {error}")
+            progress.update(number / len(jobs), str(jobs[index]))
     return failed
+
+
+def _attempt(function: Callable[[Job], object], job: Job) -> str:
+    """Do a job and return its error, empty where there is none."""
+    try:
+        function(job)
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return ""
 
 
 def check_made(failed: Sequence[str]) -> None:

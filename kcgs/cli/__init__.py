@@ -26,19 +26,18 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     logging.basicConfig(format="%(message)s")
     logging.getLogger("kcgs").setLevel(logging.INFO)
+    option = None
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _say
             app(prog_name="kcgs")
     except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
-        option = None
         if isinstance(error, InvalidArgument | InvalidArgumentType) and (option := _option(error.name, sys.argv[1])):
             error.name = option
+        message = str(error)
         if isinstance(error, OSError) and error.filename is not None:
-            message = f"{(error.strerror or 'no').lower().removesuffix(' or directory')}: {error.filename}"
-        else:
-            message = " ".join(str(error).split()) or type(error).__name__
-        typer.echo(f"kcgs: {message}", err=True)
+            message = f"{error.strerror}: {error.filename}"
+        typer.echo(f"kcgs: {' '.join(message.split()) or type(error).__name__}", err=True)
         sys.exit(2 if option else 1)
 
 

@@ -7,7 +7,10 @@ from typing import Annotated
 
 import typer
 
+from kcgs._atomic import write_file
+
 from .common import Json, SceneFile, app, check_output, print_report
+from .fit import describe_scene
 from .options import Contours
 
 
@@ -15,8 +18,6 @@ from .options import Contours
 def export(
     scene: SceneFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="ONNX file to write, or .html: one web page.")],
-    cutoff: Annotated[float, typer.Option(help="Weights below it are skipped.")] = 1e-4,
-    clamp: Annotated[bool, typer.Option("--clamp/--no-clamp", help="Clip the image to [0, 1].")] = True,
     interactive: Annotated[
         bool, typer.Option("--interactive", help="With inputs for the part that is rendered and for regions to hide.")
     ] = False,
@@ -24,37 +25,24 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write a scene's decoder as ONNX, or the scene as one web page: neither needs torch or kcgs."""
+    check_output(output, ".onnx", ".html")
     from kcgs import load
     from kcgs.onnx import describe_decoder, scene_decoder, write_model
 
-    check_output(output, ".onnx", ".html")
+    loaded = load(scene)
     if output.suffix == ".html":
-        if cutoff != 1e-4 or not clamp or interactive:
-            raise typer.BadParameter("a page takes --contours only; the other options are for .onnx")
-        print_report(_write_page(scene, output, contours), as_json, str(output))
+        from kcgs.page.html import scene_page, web_bytes
+
+        if interactive:
+            raise typer.BadParameter("a page takes --contours only; --interactive is for .onnx")
+        # a compressed file is kept as it is
+        data = web_bytes(scene.read_bytes() if scene.suffix == ".kcgs" else loaded)
+        size = write_file(output, scene_page(data, title=output.stem, contours=contours))
+        print_report({**describe_scene(loaded), "scene_bytes": len(data), "bytes": size}, as_json, str(output))
         return
-    model = scene_decoder(load(scene), cutoff=cutoff, clamp=clamp, interactive=interactive, contours=contours)
+    model = scene_decoder(loaded, interactive=interactive, contours=contours)
     report = {**describe_decoder(model), "bytes": write_model(model, output)}
     print_report(report, as_json, str(output))
-
-
-def _write_page(path: Path, output: Path, contours: str) -> dict[str, object]:
-    """Write the page of a scene; a `.kcgs` file is kept as it is."""
-    from kcgs import load
-    from kcgs._atomic import atomic_path
-    from kcgs.page.html import scene_page, web_bytes
-    from kcgs.scene import check_unbatched
-
-    shown = check_unbatched(load(path))
-    data = web_bytes(path.read_bytes() if path.suffix == ".kcgs" else shown)
-    with atomic_path(output) as temporary:
-        temporary.write_text(scene_page(data, title=output.stem, contours=contours), encoding="utf-8")
-        size = temporary.stat().st_size
-    height, width = shown.size
-    return {
-        "width": width, "height": height, "num_gaussians": shown.num_gaussians, "contours": contours,
-        "scene_bytes": len(data), "bytes": size,
-    }  # fmt: skip
 
 
 @app.command()

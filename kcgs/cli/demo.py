@@ -46,14 +46,13 @@ def demo(
 
 def run(output: Path, image: Tensor, num_bytes: int, **settings: Any) -> None:
     """Fit a square image to so many bytes, twice; `settings` are those of `fit_bytes`."""
+    from rich.console import Console
     from rich.table import Table
 
     from kcgs import evaluate
     from kcgs.data import colorize_labels, save_image, save_labels
     from kcgs.rate import fit_bytes
     from kcgs.segment import segment
-
-    from .common import print_table
 
     output.mkdir(parents=True, exist_ok=True)
     labels = segment(image)
@@ -74,7 +73,7 @@ def run(output: Path, image: Tensor, num_bytes: int, **settings: Any) -> None:
         lines = f"{size} bytes", f"PSNR {psnr} dB, EF-PSNR {ef_psnr} dB"
         panels.append(Panel(title, lines, result.scene.render()))
     compose(panels).save(output / "comparison.png")
-    print_table(table)
+    Console().print(table)
     typer.echo(f"images and files in {output}/")
 
 

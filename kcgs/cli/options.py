@@ -8,46 +8,31 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
-from .clock import Clock, process_began
-
 if TYPE_CHECKING:
     from kcgs.fitting import FitConfig
     from kcgs.scene import Scene
 
 DEFAULT_GAUSSIANS = 1000
-# pixels per side, which no memory holds
-_FAR = 1e12
 
-Backend = Literal["auto", "reference", "tiled", "cpu", "cuda"]
-Engine = Literal["local", "ray"]
-EngineName = Annotated[
-    Engine, typer.Option(help="local: processes of this machine; ray: the cluster at RAY_ADDRESS, or one started here.")
-]
 Scale = Annotated[float | None, typer.Option(help="Magnification.")]
+Size = Annotated[str | None, typer.Option(metavar="WxH", help="Width and height in pixels.")]
 Contours = Annotated[
     Literal["scaled", "crisp"],
     typer.Option(help="Width of contours: scaled with the image, or crisp, about a pixel of the image."),
 ]
-Size = Annotated[str | None, typer.Option(metavar="WxH", help="Width and height in pixels.")]
-
-Objective = Annotated[
-    Literal["psnr", "ms-ssim"] | None,
-    typer.Option("--objective", "--metric", help="What to maximize."),
-]
+Objective = Annotated[Literal["psnr", "ms-ssim"] | None, typer.Option(help="What to maximize; default: psnr.")]
 
 
 class FitRequest(NamedTuple):
     """What is asked of a fit besides the image and its regions."""
 
-    num_gaussians: int | None
-    """None: the default number, or one for each pixel of a smaller image."""
+    num_gaussians: int
     target_bytes: int | None
-    """Of a `.kcgs` file, which then chooses the number of Gaussians; None: as many as said."""
+    """Of a `.kcgs` file, which then chooses the number of Gaussians."""
     recipe: str
     settings: dict[str, Any]
     """In place of the recipe's."""
     seed: int
-    clock: Clock = Clock()
 
     @property
     def config(self) -> FitConfig:
@@ -67,9 +52,7 @@ def fit_request(
         int | None, typer.Option(min=1, help="Default: the recipe's, or as many as --max-seconds has time for.")
     ] = None,
     objective: Objective = None,
-    max_seconds: Annotated[
-        float | None, typer.Option(help="Wall time of the whole command; of fit-many, for each image.")
-    ] = None,
+    max_seconds: Annotated[float | None, typer.Option(help="Wall time of the fit.")] = None,
     target_psnr: Annotated[
         float | None, typer.Option(help="As few Gaussians as reach this PSNR in dB, at most --num-gaussians.")
     ] = None,
@@ -78,19 +61,17 @@ def fit_request(
     ] = None,
     keep_contours: Annotated[bool, typer.Option("--keep-contours", help="Take the label map as exact.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of the random start.")] = 0,
-    backend: Annotated[Backend, typer.Option(help="Kernel.")] = "auto",
 ) -> FitRequest:
-    """Return what the options ask for; None where one was not given."""
+    """Return what the options ask for."""
     if target_bytes is not None:
         exclude("--target-bytes", num_gaussians=num_gaussians, target_psnr=target_psnr)
     settings: dict[str, Any] = {
         "iterations": iterations, "objective": objective, "max_seconds": max_seconds, "target_psnr": target_psnr,
     }  # fmt: skip
-    given = {key: value for key, value in settings.items() if value is not None}
+    settings = {key: value for key, value in settings.items() if value is not None}
     if keep_contours:
-        given |= {"move_contours": False, "merge_regions": False}
-    given["backend"] = backend
-    return FitRequest(num_gaussians, target_bytes, recipe, given, seed, Clock(max_seconds, process_began()))
+        settings |= {"move_contours": False, "merge_regions": False}
+    return FitRequest(num_gaussians or DEFAULT_GAUSSIANS, target_bytes, recipe, settings, seed)
 
 
 def with_fit_options(command: Callable[..., None], *, without: tuple[str, ...] = ()) -> Callable[..., None]:
@@ -113,25 +94,23 @@ def with_fit_options(command: Callable[..., None], *, without: tuple[str, ...] =
 
 def exclude(option: str, **others: object) -> None:
     """Refuse options beside another one; None where one was not given."""
-    for name, given in others.items():
-        if given is not None:
+    for name, value in others.items():
+        if value is not None:
             raise typer.BadParameter(f"{option} excludes --{name.replace('_', '-')}")
 
 
-def target_size(scene: Scene, scale: float | None, wanted: str | None) -> tuple[int, int]:
+def target_size(scene: Scene, scale: float | None, size: str | None) -> tuple[int, int]:
     """Return the (height, width) that the options --scale and --size ask for, if memory has room for it."""
-    if scale is not None and wanted is not None:
-        raise typer.BadParameter("give --scale or --size, not both")
-    if wanted is not None:
-        width, _, height = wanted.lower().partition("x")
-        if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
-            raise typer.BadParameter(f"--size must be WxH, such as 640x480; got {wanted!r}")
-        sides = float(height), float(width)
+    if size is not None:
+        exclude("--size", scale=scale)
+        width, _, height = size.partition("x")
+        if not (width.isdigit() and height.isdigit()):
+            raise typer.BadParameter(f"--size must be WxH, such as 640x480; got {size!r}")
+        sides = int(height), int(width)
     else:
-        factor = 1.0 if scale is None else scale
-        if not 0 < factor < float("inf"):
-            raise typer.BadParameter(f"--scale must be positive; got {scale!r}")
-        sides = scene.size[0] * factor, scene.size[1] * factor
-    size = max(1, round(min(sides[0], _FAR))), max(1, round(min(sides[1], _FAR)))
-    scene.check_size("--size" if wanted else "SCENE" if scale is None else f"--scale {scale:g}", size)
-    return size
+        from kcgs._check import check_number
+
+        factor = check_number("scale", 1.0 if scale is None else scale, 0.0, 1e6, above=True)
+        sides = max(1, round(scene.size[0] * factor)), max(1, round(scene.size[1] * factor))
+    scene.check_size("size", sides)
+    return sides

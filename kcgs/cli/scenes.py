@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
+import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from kcgs._atomic import write_file
 from kcgs._progress import Progress
-from kcgs.errors import InvalidArgument
 
 from .common import (
     OUTPUT_IMAGES,
@@ -25,35 +24,26 @@ from .common import (
     check_output,
     print_report,
 )
-from .fit import describe_size, measure_scene
+from .fit import describe_scene, describe_size
 from .options import Contours, Objective, Scale, Size, exclude, target_size
 
-OutputImage = Annotated[
-    Path,
-    typer.Option(
-        "-o",
-        "--output",
-        help="Image file to write; of a batch of scenes a video (.mp4 and others), or a folder: no suffix.",
-    ),
-]
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @app.command()
 def render(
     scene: SceneFile,
-    output: OutputImage,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--output", help="Image to write; of a batch of scenes a video (.mp4 and others), or a folder."
+        ),
+    ],
     scale: Scale = None,
     size: Size = None,
     contours: Contours = "scaled",
-    region_ids: Annotated[
-        int | None, typer.Option("--region", metavar="ID", help="Render only this region; the rest is black.")
-    ] = None,
-    rate: Annotated[
-        str | None,
-        typer.Option(
-            "--frame-rate", metavar="RATE|2x", help="Of a batch: frames per second, or a multiple of its own."
-        ),
-    ] = None,
+    frame_rate: Annotated[float | None, typer.Option(help="Of a batch: frames per second; default: its own.")] = None,
     frame: Annotated[
         float | None, typer.Option(help="Of a batch: this time alone, in frames from 0; 0.5 is halfway to the next.")
     ] = None,
@@ -63,23 +53,16 @@ def render(
         check_output(output, *OUTPUT_IMAGES, *VIDEOS)
     from kcgs import load
     from kcgs.data import save_image
-    from kcgs.editing import extract_region
 
     loaded = load(scene)
     if loaded.field.means.ndim == 3:
         from .video import render_batch
 
-        exclude("a batch of scenes", region=region_ids)
-        render_batch(loaded, output, scale=scale, size=size, contours=contours, rate=rate, frame=frame)
+        render_batch(loaded, output, target_size(loaded[0], scale, size), contours, frame_rate, frame)
         return
-    exclude("a scene of one image", frame_rate=rate, frame=frame)
+    exclude("a scene of one image", frame_rate=frame_rate, frame=frame)
     check_output(output, *OUTPUT_IMAGES)
-    target = target_size(loaded, scale, size)
-    if region_ids is not None:
-        if loaded.regions is None or loaded.field.region_ids is None:
-            raise InvalidArgument("region_ids", "given", f"{region_ids}: {scene} has no regions", verb="not be")
-        loaded = extract_region(loaded, region_ids)
-    save_image(output, loaded.render(target, contours))
+    save_image(output, loaded.render(target_size(loaded, scale, size), contours))
 
 
 @app.command("eval")
@@ -94,44 +77,38 @@ def eval_command(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Compare a scene with an image."""
-    from kcgs import load
+    """Compare a scene with an image; the seconds are those of a render."""
+    from kcgs import evaluate, load
     from kcgs.data import load_image, load_labels
     from kcgs.scene import check_unbatched
 
-    loaded, target = check_unbatched(load(scene)), load_image(image)
-    if target.shape[1:] != loaded.size:
-        expected = f"the size {loaded.size} of SCENE"
-        raise InvalidArgument("image", expected, tuple(target.shape[1:]), verb="have")
-    labels = loaded.regions.labels if loaded.regions is not None else None
-    if regions is not None:
-        labels = load_labels(regions)
-    contours = "" if labels is None else str(regions or "the scene")
-    if find_spec("ssimulacra2") is None:
-        typer.echo('kcgs: ssimulacra2 is not measured without its package: pip install "kcgs[visual]"', err=True)
-    report = measure_scene(loaded, target, labels, scene, scene.stat().st_size)
-    print_report(report, as_json, str(scene), contours)
+    loaded = check_unbatched(load(scene))
+    figures: dict[str, Any] = evaluate(loaded, load_image(image), None if regions is None else load_labels(regions))
+    start = time.perf_counter()
+    loaded.render()
+    figures |= {**describe_scene(loaded), "seconds": time.perf_counter() - start}
+    print_report(figures | describe_size(scene, scene.stat().st_size, loaded.size), as_json, str(scene))
 
 
 @app.command()
 def info(scene: SceneFile, as_json: Json = False) -> None:
-    """Say what a file holds: a scene, a batch of scenes, or a label map."""
+    """Describe a scene, a batch of scenes, or a compressed label map."""
     from kcgs import load
 
-    if (found := _read_map(scene)) is not None:
-        print_report(_describe_map(scene, *found), as_json, str(scene))
+    if (labels := _read_map(scene)) is not None:
+        print_report(_describe_map(scene, labels), as_json, str(scene))
         return
+
     loaded = load(scene)
     softness = 0.0 if loaded.regions is None else loaded.regions.softness
     if not isinstance(softness, float):
         softness = sum(softness.values()) / max(1, len(softness))
     report = {
         "images": loaded.field.means.shape[:-2].numel(),
-        "num_gaussians": loaded.num_gaussians,
+        **describe_scene(loaded),
         "channels": loaded.field.colors.shape[-1],
         "height": loaded.size[0],
         "width": loaded.size[1],
-        "regions": 1 if loaded.regions is None else loaded.regions.num_regions,
         "softness": softness,
         **describe_size(scene, scene.stat().st_size, loaded.size),
         **{f"metadata.{key}": value for key, value in loaded.metadata.items()},
@@ -159,44 +136,36 @@ def encode(
     as_json: Json = False,
 ) -> None:
     """Compress a scene, or a label map without loss."""
-    from kcgs import codec, load
-    from kcgs.data import load_labels
-    from kcgs.functional import psnr
-
     check_output(output, ".kcgs")
     if scene.suffix not in SCENES:
         exclude("a label map", target_bytes=target_bytes, quality=quality, image=image, objective=objective)
+        from kcgs.codec import encode_labels
+        from kcgs.data import load_labels
+
         labels = load_labels(scene, rgb_ids=True)
-        ids = labels.unique()
-        if len(ids) > max(256, labels.numel() / 64):
-            typer.echo(f"kcgs: {scene} has {len(ids)} ids, as photos have, which kcgs fit takes", err=True)
-        write_file(output, codec.encode_labels(labels))
-        print_report(_describe_map(output, labels, ids), as_json, str(output))
+        write_file(output, encode_labels(labels))
+        print_report(_describe_map(output, labels), as_json, str(output))
         return
-    if target_bytes is not None:
-        exclude("--target-bytes", quality=quality)
     if image is None:
         exclude("a scene without --image", objective=objective)
+    from kcgs import codec, load
+    from kcgs.data import load_image
+    from kcgs.functional import psnr
+    from kcgs.rate import compress
+
     loaded = load(scene)
     goal: dict[str, Any] = {"quality": quality, "target_bytes": target_bytes}
     with Progress("writing the file", known=False, shown=not quiet):
         if image is None:
             data = codec.encode(loaded, **goal)
         else:
-            from kcgs.data import load_image
-            from kcgs.rate import compress
-
             data = compress(loaded, load_image(image), **goal, objective=objective or "psnr").data
     write_file(output, data)
-    decoded = codec.decode(data)
-    rounded = decoded.scene
+    rounded = codec.decode(data).scene
     report = {
         "psnr_to_scene": float(psnr(rounded.render(), loaded.render())),
-        "num_gaussians": rounded.num_gaussians,
-        "regions": 1 if rounded.regions is None else rounded.regions.num_regions,
-        "layers": decoded.num_layers,
+        **describe_scene(rounded),
         **describe_size(output, len(data), loaded.size),
-        "bits_per_gaussian": 8 * len(data) / rounded.num_gaussians,
     }
     print_report(report, as_json, str(output))
 
@@ -205,7 +174,7 @@ def encode(
 def decode(
     file: Annotated[Path, typer.Argument(help="Compressed file (.kcgs).", metavar="FILE", dir_okay=False)],
     output: Annotated[Path, typer.Option("-o", "--output", help="Image file; of a label map .png or .npy.")],
-    num_bytes: Annotated[int | None, typer.Option("--bytes", min=1, help="Read only the first bytes.")] = None,
+    max_bytes: Annotated[int | None, typer.Option("--bytes", min=1, help="Read only the first bytes.")] = None,
     scale: Scale = None,
     size: Size = None,
     contours: Contours = "scaled",
@@ -217,38 +186,25 @@ def decode(
     from kcgs import codec
     from kcgs.data import save_image, save_labels
 
-    if (found := _read_map(file)) is not None:
-        labels, ids = found
-        exclude("a label map", bytes=num_bytes, scale=scale, size=size)
+    if (labels := _read_map(file)) is not None:
+        exclude("a label map", bytes=max_bytes, scale=scale, size=size)
         check_output(output, ".png", ".npy")
-        save_labels(output, labels, rgb_ids=output.suffix.lower() != ".npy" and int(ids.max()) > 65535)
+        save_labels(output, labels, rgb_ids=output.suffix.lower() == ".png" and int(labels.max()) > 65535)
         return
     check_output(output, *OUTPUT_IMAGES)
-    try:
-        decoded = codec.decode(file.read_bytes(), max_bytes=num_bytes)
-    except codec.CodecError as error:
-        raise codec.CodecError(f"cannot decode {file}: {error}") from error
-    scene = decoded.scene
-    if decoded.layers < decoded.num_layers:
-        part = f"{decoded.layers} of {decoded.num_layers} layers, {scene.num_gaussians} Gaussians"
-        typer.echo(f"{file}: a coarser image, {part}", err=True)
+    scene = codec.decode(file.read_bytes(), max_bytes=max_bytes).scene
     save_image(output, scene.render(target_size(scene, scale, size), contours))
 
 
-def _read_map(file: Path) -> Any:
-    """Return the label map of a file that is one, with its ids, and None of any other."""
+def _read_map(file: Path) -> Tensor | None:
+    """Return the label map of a compressed file that holds one."""
     from kcgs import codec
-    from kcgs.codec.maps import decode_with_ids
 
-    if not file.is_file() or not (data := file.read_bytes()).startswith(codec.MAP_MAGIC):
-        return None
-    try:
-        return decode_with_ids(data)
-    except codec.CodecError as error:
-        raise codec.CodecError(f"cannot decode {file}: {error}") from error
+    data = file.read_bytes()
+    return codec.decode_labels(data) if data.startswith(codec.MAP_MAGIC) else None
 
 
-def _describe_map(file: Path, labels: Any, ids: Any) -> dict[str, Any]:
-    report = {"holds": "label map", "height": labels.shape[0], "width": labels.shape[1], "regions": len(ids)}
-    report |= {"largest_id": int(ids.max()), "dtype": str(labels.dtype).removeprefix("torch.")}
-    return report | describe_size(file, file.stat().st_size, tuple(labels.shape))
+def _describe_map(file: Path, labels: Tensor) -> dict[str, Any]:
+    report = {"holds": "label map", "height": labels.shape[0], "width": labels.shape[1]}
+    report |= {"regions": len(labels.unique()), "largest_id": int(labels.max())}
+    return report | describe_size(file, file.stat().st_size, (labels.shape[0], labels.shape[1]))

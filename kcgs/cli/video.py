@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from . import options
-from .common import IMAGES, OUTPUT_IMAGES, Json, Quiet, Stop, app, check_output, interrupted, print_report
-from .fit import compile_ahead, read_regions
+from .common import OUTPUT_IMAGES, VIDEOS, Json, Quiet, Stop, app, check_output, exit_interrupted, print_report
+from .fit import describe_scene, read_regions
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from kcgs.scene import Scene
 
-# videos that H.264 is written into
-_OUTPUT_VIDEOS = (".mp4", ".mov", ".mkv")
 # options of a fit that mean one image
 _OF_ONE_IMAGE = ("max_seconds", "target_psnr", "target_bytes")
 
@@ -52,17 +47,14 @@ def fit_video_command(
     as_json: Json = False,
 ) -> None:
     """Fit Gaussians to a video, each frame from the one before, and save a batch of scenes."""
-    output = Path(f"{video.stem}.safetensors") if output is None else output
+    output = output or Path(f"{video.stem}.safetensors")
     check_output(output, ".safetensors")
-    if video.suffix.lower() in IMAGES and video.is_file():
-        raise typer.BadParameter(f"VIDEO must be a video or a folder of images; got {str(video)!r}: kcgs fit fits it")
-    compile_ahead(request.config, False)
     from kcgs.data import load_labels
     from kcgs.functional import psnr
     from kcgs.video import fit_video, read_label_maps, read_video
 
     source = read_video(video, frame_rate=frame_rate)
-    maps: list[Tensor] | Tensor | None
+    maps: Any
     if Path(regions).is_dir():
         maps = read_label_maps(regions)
     elif regions in ("auto", "none"):
@@ -72,8 +64,7 @@ def fit_video_command(
     start = time.perf_counter()
     with Stop() as stop:
         scenes = fit_video(
-            source, maps, options.DEFAULT_GAUSSIANS if request.num_gaussians is None else request.num_gaussians,
-            recipe=request.config, seed=request.seed, progress=not quiet,
+            source, maps, request.num_gaussians, recipe=request.config, seed=request.seed, progress=not quiet,
             on_frame=lambda number, scene: stop.step(number, scene) or number + 1 == frames,
         )  # fmt: skip
         seconds = time.perf_counter() - start
@@ -81,61 +72,32 @@ def fit_video_command(
     errors = [float(psnr(scene.render(), frame)) for scene, frame in zip(scenes, source, strict=False)]
     report = {
         "frames": len(scenes), "width": scenes.size[1], "height": scenes.size[0],
-        "frame_rate": float(scenes.metadata["frame_rate"]), "num_gaussians": scenes.num_gaussians,
-        "regions": 1 if scenes.regions is None else scenes.regions.num_regions,
+        "frame_rate": float(scenes.metadata["frame_rate"]), **describe_scene(scenes),
         "psnr": sum(errors) / len(errors), "psnr_least": min(errors), "seconds": seconds, "bytes": size,
     }  # fmt: skip
     print_report(report, as_json, str(output))
     if stop.wanted:
-        raise interrupted(f"saved the {len(scenes)} frames that are done to {output}")
+        raise exit_interrupted(f"the {len(scenes)} frames that are done to {output}")
 
 
 def render_batch(
-    scenes: Scene,
-    output: Path,
-    *,
-    scale: float | None,
-    size: str | None,
-    contours: str,
-    rate: str | None,
-    frame: float | None,
+    scenes: Scene, output: Path, size: tuple[int, int], contours: str, frame_rate: float | None, frame: float | None
 ) -> None:
     """Write a batch as a video, as a folder of PNGs, or one time of it as an image."""
     from kcgs._check import check_number
     from kcgs.data import save_image
     from kcgs.video import interpolate, write_video
 
-    target = options.target_size(scenes[0], scale, size)
     if frame is not None:
-        options.exclude("--frame", frame_rate=rate)
+        options.exclude("--frame", frame_rate=frame_rate)
         check_output(output, *OUTPUT_IMAGES)
         check_number("frame", frame, 0.0, len(scenes) - 1.0, unit="frames")
-        save_image(output, interpolate(scenes, frame).render(target, contours))
+        save_image(output, interpolate(scenes, frame).render(size, contours))
         return
-    if output.suffix.lower() in OUTPUT_IMAGES:
-        raise typer.BadParameter(f"--output must be a video or a folder, or come with --frame; got {str(output)!r}")
-    if output.suffix:
-        check_output(output, *_OUTPUT_VIDEOS)
+    if output.suffix:  # none: a folder
+        check_output(output, *VIDEOS)
     own = float(scenes.metadata.get("frame_rate", 24))
-    wanted = _frame_rate(rate, own)
-    count = 1 + math.floor((len(scenes) - 1) * wanted / own + 1e-6)
-    times = (min(number * own / wanted, len(scenes) - 1.0) for number in range(count))
-
-    def frames() -> Iterator[Tensor]:
-        for moment in times:
-            yield interpolate(scenes, moment).render(target, contours)
-
-    write_video(output, frames(), wanted)
-
-
-def _frame_rate(text: str | None, own: float) -> float:
-    """Return the frames per second that the option --frame-rate says: a number, or a multiple of the batch's own."""
-    if text is None:
-        return own
-    try:
-        rate = own * float(text[:-1]) if text.endswith("x") else float(text)
-    except ValueError:
-        rate = 0.0
-    if not 0.0 < rate <= 1000.0:
-        raise typer.BadParameter(f"--frame-rate must be frames per second, or 2x for twice the own; got {text!r}")
-    return rate
+    rate = own if frame_rate is None else check_number("frame_rate", frame_rate, 0.0, 1000.0, above=True)
+    count = 1 + math.floor((len(scenes) - 1) * rate / own + 1e-6)
+    times = (min(number * own / rate, len(scenes) - 1.0) for number in range(count))
+    write_video(output, (interpolate(scenes, moment).render(size, contours) for moment in times), rate)

@@ -1,6 +1,5 @@
 """Independent jobs: one after another, in worker processes, or on a Ray cluster."""
 
-from .jobs import ENGINES, Done, Failure
-from .run import run_jobs
+from .jobs import ENGINES, run_jobs
 
-__all__ = ["ENGINES", "Done", "Failure", "run_jobs"]
+__all__ = ["ENGINES", "run_jobs"]

@@ -1,103 +1,170 @@
-"""Jobs, what became of them, and the one function that callers use."""
+"""The one way to do jobs. Importing this loads no torch, so that a worker process can choose its threads first."""
 
 from __future__ import annotations
 
+import logging
+import multiprocessing
 import os
-import time
-import traceback
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from itertools import islice
+from typing import Any, TypeVar
 
-import torch
-
-from kcgs._repr import brief
+from kcgs.errors import InvalidArgument
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 ENGINES = ("local", "ray")
+# libraries that read their number of threads once, as they are loaded
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+_KILLED = "a worker process was killed, perhaps because memory ran out: the same command goes on where it stopped"
 
 
-@brief
-class Failure(NamedTuple):
-    """Why there is no result: WorkerDied, without a traceback, where the process itself ended."""
+def run_jobs(
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    *,
+    engine: str = "local",
+    workers: int | None = None,
+    threads: int = 1,
+) -> Iterator[tuple[int, Result]]:
+    """Do independent jobs, and yield the index and result of each as it ends.
 
-    type: str
-    message: str
-    traceback: str
+    Convention: a job keeps what it makes on disk, and returns its error as a part of its result; what it raises ends
+    the iteration. Every job runs on `threads` threads, so that it has the same result on either engine. With more than
+    one worker, and on Ray, functions, jobs and results are pickled, and a script must guard its main part by
+    ``if __name__ == "__main__":``.
 
-    def __str__(self) -> str:
-        return f"{self.type}: {' '.join(self.message.split())}" if self.message else self.type
+    Args:
+        function: called with one job; importable by name where there are worker processes.
+        jobs: what it is called with.
+        engine: ``local``, or ``ray``: on the cluster at RAY_ADDRESS, or one on this machine that is shut down again.
+        workers: jobs at a time. None: 1 locally, on Ray what its processors allow. With 1, ``local`` is this process.
+        threads: of each job.
 
+    Returns:
+        An iterator over all jobs in the order in which they end; nothing runs before the first is asked for.
 
-@brief
-@dataclass(frozen=True)
-class Done(Generic[Result]):
-    """A job that has ended: its index, its result or error, and its wall time, measured where it ran."""
+    Raises:
+        ValueError: unknown engine, workers or threads below 1.
+        ImportError: engine ``ray`` without the package ray.
+        RuntimeError: while iterating, a worker process was killed.
 
-    index: int
-    result: Result | None
-    error: Failure | None
-    seconds: float
-
-
-def perform(index: int, call: Callable[[], Result], threads: int) -> Done[Result]:
-    """Do a job on so many threads; what it raises becomes a Failure."""
-    # the CPU kernel goes by torch's number too; numba is told none of its own, since no loop is parallel by itself
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    start = time.perf_counter()
-    result, error = None, None
-    try:
-        result = call()
-    except Exception as raised:
-        error = describe(raised)
-    finally:
-        seconds = time.perf_counter() - start
-        torch.set_num_threads(before)
-    return Done(index, result, error, seconds)
-
-
-def describe(raised: BaseException) -> Failure:
-    """Put an exception into words, which travel between processes where exceptions may not."""
-    return Failure(type(raised).__name__, str(raised), "".join(traceback.format_exception(raised)))
-
-
-@contextmanager
-def environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Set variables that processes started meanwhile inherit."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def take_turns(
-    count: int, room: int, start: Callable[[int], object], wait: Callable[[], Iterable[tuple[Done[Any], bool]]]
-) -> Iterator[Done[Any]]:
-    """Keep up to `room` jobs running and yield each that has ended; where its process died, it is tried once more.
-
-    `wait` says which have ended since, and whether their processes died.
+    Example:
+        >>> list(run_jobs(str.upper, ["a", "b"]))
+        [(0, 'A'), (1, 'B')]
     """
-    waiting, running = deque(range(count)), 0
-    again: set[int] = set()
-    while waiting or running:
-        while waiting and running < room:
-            start(waiting.popleft())
-            running += 1
-        for done, died in wait():
-            running -= 1
-            if died and done.index not in again:
-                again.add(done.index)
-                waiting.appendleft(done.index)
-            else:
+    if engine not in ENGINES:
+        raise InvalidArgument("engine", f"one of {', '.join(ENGINES)}", repr(engine))
+    for name, count in (("workers", workers), ("threads", threads)):
+        if count is not None and count < 1:
+            raise InvalidArgument(name, "at least 1", count)
+    if engine == "ray":
+        try:
+            from ray.util.multiprocessing import Pool
+        except ImportError as error:
+            raise ImportError("engine 'ray' needs the package ray: pip install 'kcgs[ray]'") from error
+        return _on_cluster(Pool, function, jobs, workers, threads)
+    if workers is None or workers == 1:
+        return _here(function, jobs, threads)
+    return _in_processes(function, jobs, workers, threads)
+
+
+def _here(function: Callable[[Job], Result], jobs: Sequence[Job], threads: int) -> Iterator[tuple[int, Result]]:
+    import torch
+
+    before = torch.get_num_threads()
+    for index, job in enumerate(jobs):
+        torch.set_num_threads(threads)
+        try:
+            result = function(job)
+        finally:
+            torch.set_num_threads(before)
+        yield index, result
+
+
+def _in_processes(
+    function: Callable[[Job], Result], jobs: Sequence[Job], workers: int, threads: int
+) -> Iterator[tuple[int, Result]]:
+    # spawn: a fork would copy torch's threads half alive
+    context = multiprocessing.get_context("spawn")
+    waiting, running = enumerate(jobs), dict[Future[Result], int]()
+    with ProcessPoolExecutor(workers, context, _start_process, (threads,)) as pool:
+        try:
+            while True:
+                # no more than can run: what is in the queue of a pool cannot be cancelled
+                for index, job in islice(waiting, workers - len(running)):
+                    running[pool.submit(function, job)] = index
+                if not running:
+                    return
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    yield running.pop(future), future.result()
+        except BrokenProcessPool as error:
+            raise RuntimeError(_KILLED) from error
+
+
+def _start_process(threads: int) -> None:
+    # Ctrl-C reaches every process of a terminal: a worker ends without a word
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, str(threads)))
+    _use_threads(threads)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _use_threads(threads: int) -> None:
+    import torch
+
+    torch.set_num_threads(threads)
+
+
+def _on_cluster(
+    pool_type: Any, function: Callable[[Job], Result], jobs: Sequence[Job], workers: int | None, threads: int
+) -> Iterator[tuple[int, Result]]:
+    import ray
+    from ray.util.multiprocessing.pool import PoolTaskError
+
+    is_ours = not ray.is_initialized()
+    if is_ours:
+        options: dict[str, Any] = {"address": os.environ.get("RAY_ADDRESS", "local")}
+        if options["address"] == "local":
+            # Ray's makers need no report of it
+            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+            options |= {"num_cpus": workers and workers * threads, "include_dashboard": False}
+            # what can be imported here can be imported there, as in worker processes of the engine local
+            options["runtime_env"] = {"env_vars": {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}}
+        ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
+    try:
+        nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
+        room = sum([int(node["Resources"].get("CPU", 0)) // threads for node in nodes if node["Alive"]])
+        if room == 0:
+            raise InvalidArgument("threads", "at most the processors of a node of the cluster", threads)
+        size, resources = min(workers or room, room), {"num_cpus": threads}
+        with pool_type(size, _use_threads, (threads,), ray_remote_args=resources) as pool:
+            for done in pool.imap_unordered(partial(_numbered, function), list(enumerate(jobs)), 1):
+                if isinstance(done, PoolTaskError):
+                    raise done.underlying
+                if isinstance(done, ray.exceptions.RayTaskError):
+                    raise done
+                if isinstance(done, ray.exceptions.RayError):
+                    raise RuntimeError(_KILLED) from done
                 yield done
+    finally:
+        if is_ours:
+            ray.shutdown()
+
+
+def _numbered(function: Callable[[Job], Result], job: tuple[int, Job]) -> tuple[int, Result]:
+    return job[0], function(job[1])

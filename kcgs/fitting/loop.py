@@ -62,7 +62,7 @@ def fit(
         seed: of the random start.
         on_step: called after every iteration with its number (from 1) and the last history entry; returning True
             stops the fit.
-        progress: show a bar, in a terminal or a notebook; elsewhere a line on standard error every ten seconds.
+        progress: show a bar, on a terminal or in a notebook.
         checkpoint: a file to write the state to from time to time, whole or not at all.
         resume: go on from `checkpoint` where it exists; the result is that of an uninterrupted fit.
         settings: fields of :class:`FitConfig`, in place of the recipe's.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import logging
 import signal
@@ -19,7 +18,6 @@ from kcgs.cli import demo, main
 from kcgs.cli.common import Stop
 from kcgs.data import load_image, load_labels, save_image, save_labels
 from kcgs.functional import psnr
-from kcgs.kernels.compiled import Program
 from kcgs.segment import segment
 
 KEYS = {
@@ -62,30 +60,41 @@ FIT = ("fit", "photo.png", "-n", "12", "--iterations", "40", "-o", "scene.safete
 
 
 class TestFit:
-    def test_plot_and_kept_contours(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        code, out, err = kcgs(*FIT, "--regions", "mask.png", "--keep-contours", "--plot", "plot.png", capsys=capsys)
+    def test_kept_contours(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        code, out, err = kcgs(*FIT, "--regions", "mask.png", "--keep-contours", capsys=capsys)
         assert code == 0, err
-        with Image.open("plot.png") as plot:
-            assert plot.width > 500
         assert "\nregions: 2 of 2 regions kept\n" in out
-        assert "│ ef_psnr, ef_ssim │ along the contours of mask.png, as given" in out
-        for option, which in (((), "the scene"), (("--regions", "mask.png"), "mask.png")):
-            out = kcgs("eval", "scene.safetensors", "photo.png", *option, capsys=capsys)[1]
-            assert f"│ ef_psnr, ef_ssim │ along the contours of {which} " in out
         regions = load("scene.safetensors").regions
         assert regions is not None
         assert torch.equal(regions.labels, load_labels(Path("mask.png")))
 
-    def test_checkpoint_and_resume(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        scenes = []
-        for _ in range(2):
-            code, _, err = kcgs(*FIT, "--checkpoint", "state", "--resume", "--regions", "none", capsys=capsys)
-            assert code == 0, err
-            scenes.append((files / "scene.safetensors").read_bytes())
-        assert scenes[0] == scenes[1]
-        code, _, err = kcgs(*FIT, "--checkpoint", "state", "--resume", "--seed", "1", capsys=capsys)
-        assert code == 1
-        assert "belongs to another fit" in err
+    @pytest.mark.usefixtures("clock")
+    def test_max_seconds(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        arguments = ("--regions", "none", "--iterations", "1000000", "--max-seconds", "4", "--json")
+        code, out, err = kcgs(*FIT, *arguments, capsys=capsys)
+        report = json.loads(out)
+        assert (code, report["target_reached"], report["stop_reason"]) == (0, None, "seconds"), err
+
+    def test_interrupt_saves_the_best_so_far(
+        self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def interrupted_step(stop: Stop, iteration: int, entry: Any) -> bool:
+            if iteration == 3:
+                signal.raise_signal(signal.SIGINT)
+            return stop.wanted
+
+        monkeypatch.setattr(Stop, "step", interrupted_step)
+        code, out, err = kcgs(*FIT, "--regions", "mask.png", "--json", capsys=capsys)
+        assert code == 130 and err == "kcgs: interrupted: saved the best so far to scene.safetensors\n"
+        report = json.loads(out)
+        assert 1 <= report["num_gaussians"] <= 12 and report["stop_reason"] == "interrupted"
+        assert 1 <= load("scene.safetensors").num_gaussians <= 12
+
+    def test_a_second_interrupt_ends_the_command(self) -> None:
+        with Stop():
+            signal.raise_signal(signal.SIGINT)
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
 
     def test_target_psnr(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
         arguments = ("--iterations", "300", "--target-psnr", "25", "-n", "500", "--regions", "mask.png", "--json")
@@ -102,22 +111,13 @@ class TestFit:
         )
         report = json.loads(out)
         assert code == 1 and report["target_reached"] is False and report["stop_reason"] == "iterations"
-        assert f"--target-psnr 90 was not reached: {report['psnr']:.2f} dB is the best; 12 Gaussians do not" in err
+        assert f"--target-psnr 90 was not reached: {report['psnr']:.2f} dB is the best\n" in err
         assert float(psnr(load(f"s.{suffix}").render(), load_image("photo.png"))) == pytest.approx(report["psnr"])
 
     def test_target_psnr_of_a_file(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
         code, _, err = kcgs(*FIT[:-1], "photo.kcgs", "-n", "60", "--target-psnr", "24", capsys=capsys)
         assert code == 0, err
         assert float(psnr(load("photo.kcgs").render(), load_image("photo.png"))) >= 24
-
-    @pytest.mark.usefixtures("clock")
-    @pytest.mark.parametrize("name", ["s.safetensors", "s.kcgs"])
-    def test_max_seconds(self, files: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
-        arguments = ("--regions", "none", "--iterations", "1000000", "--max-seconds", "4", "--json")
-        code, out, err = kcgs(*FIT[:-1], name, *arguments, capsys=capsys)
-        report = json.loads(out)
-        assert (code, report["target_reached"], report["stop_reason"]) == (0, True, "seconds"), err
-        assert 0.5 < report["seconds"] < report["total_seconds"] < 4
 
     @pytest.mark.filterwarnings("default")
     def test_warnings_are_lines_and_what_is_not_defined_is_no_number(
@@ -135,7 +135,7 @@ class TestFit:
         code, out, err = kcgs(*FIT, "--regions", regions, "--json", capsys=capsys)
         assert code == 0, err
         report = json.loads(out)
-        assert set(report) == KEYS | {"region_report", "stop_reason", "target_reached", "total_seconds"}
+        assert set(report) == KEYS | {"region_report", "stop_reason", "target_reached"}
         assert (report["region_report"] is None) == (regions == "none")
         assert report["stop_reason"] == "iterations" and report["target_reached"] is None
         assert 1 <= report["num_gaussians"] <= 12
@@ -155,22 +155,6 @@ class TestFit:
 
         assert kcgs("render", "scene.safetensors", "-o", "large.png", "--scale", "2", capsys=capsys)[0] == 0
         assert load_image("large.png").shape == (3, 80, 120)
-
-    def test_eval_says_what_it_lacks(
-        self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        Scene(GaussianField.random(5, (40, 60), seed=0)).save("scene.safetensors")
-        code, out, err = kcgs("eval", "scene.safetensors", "photo.png", capsys=capsys)
-        has_it = importlib.util.find_spec("ssimulacra2") is not None
-        assert (
-            code == 0 and "│ ssimulacra2 " in out and ("not defined" not in out.split("ssimulacra2")[1][:30]) == has_it
-        )
-        assert ('pip install "kcgs[visual]"' in err) != has_it
-        monkeypatch.setattr("kcgs.cli.scenes.find_spec", lambda name: None)
-        monkeypatch.setitem(sys.modules, "ssimulacra2", None)
-        code, out, err = kcgs("eval", "scene.safetensors", "photo.png", "--json", capsys=capsys)
-        assert code == 0 and json.loads(out)["ssimulacra2"] is None
-        assert err == 'kcgs: ssimulacra2 is not measured without its package: pip install "kcgs[visual]"\n'
 
     def test_the_same_scene_as_in_python(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
         image = load_image("photo.png")
@@ -198,43 +182,11 @@ class TestFit:
         kcgs("fit", "photo.png", "-n", "3", "--iterations", "2", *options, capsys=capsys)
         assert logging.getLogger("kcgs").isEnabledFor(logging.INFO) is not bool(options)
 
-    def test_compiles_ahead(
-        self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        events: list[str] = []
-
-        def start(program: Program) -> Program:
-            events.append(program._what)
-            return program
-
-        monkeypatch.setattr(Program, "start", start)
-        monkeypatch.setattr("kcgs.data.load_image", lambda path: [load_image(path), events.append("image")][0])
-        assert kcgs(*FIT[:-1], "scene.kcgs", capsys=capsys)[0] == 0
-        assert events[:3] == ["CPU kernel", "label coder", "image"]
-
     def test_recipe_is_recorded(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
         kcgs(*FIT, "--recipe", "gaussian-image", capsys=capsys)
         scene = load("scene.safetensors")
         assert scene.metadata["recipe"] == "gaussian-image"
         assert scene.regions is None
-
-    def test_interrupt_saves_the_best_so_far(
-        self, files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        step = Stop.step
-
-        def interrupted_step(stop: Stop, iteration: int, entry: Any) -> bool:
-            step(stop, iteration, entry)
-            if iteration == 3:
-                signal.raise_signal(signal.SIGINT)
-            return step(stop, iteration, entry)
-
-        monkeypatch.setattr(Stop, "step", interrupted_step)
-        code, out, err = kcgs(*FIT, "--regions", "mask.png", "--json", capsys=capsys)
-        assert code == 130 and "kcgs: interrupted: saved the best so far to scene.safetensors" in err
-        report = json.loads(out)
-        assert 1 <= report["num_gaussians"] <= 12 and report["stop_reason"] == "interrupted"
-        assert 1 <= load("scene.safetensors").num_gaussians <= 12
 
 
 class TestRender:
@@ -248,12 +200,6 @@ class TestRender:
         with Image.open("a.png") as render:
             assert render.size == (90, 50)
 
-    def test_region(self, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert kcgs("render", str(scene), "-o", "a.png", "--region", "1", capsys=capsys)[0] == 0
-        render = load_image("a.png")
-        outside = load_labels("mask.png") == 0
-        assert render[:, outside].max() == 0 and render.max() > 0
-
     def test_a_batch_is_refused_by_its_name(self, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
         one = load(scene).field
         means, cholesky, colors = (torch.stack([t.detach(), t.detach()]) for t in one.parameters())
@@ -266,11 +212,10 @@ class TestRender:
     @pytest.mark.parametrize(
         ("arguments", "code", "words"),
         [
-            (("--region", "9"), 2, "--region must be among the 2 ids of the map, 0, 1; got 9"),
             (("--size", "90"), 2, "--size must be WxH"),
-            (("--size", "0x5"), 2, "--size must be WxH"),
-            (("--scale", "-1"), 2, "--scale must be positive"),
-            (("--scale", "2", "--size", "4x4"), 2, "not both"),
+            (("--size", "0x5"), 2, "--size must be at least 1 x 1"),
+            (("--scale", "-1"), 2, "--scale must be in (0, 1e+06]; got -1.0"),
+            (("--scale", "2", "--size", "4x4"), 2, "--size excludes --scale"),
         ],
     )
     def test_wrong_usage(
@@ -297,15 +242,13 @@ class TestFailures:
         [
             ((), 2, "Usage"),
             (("fit",), 2, "Missing argument"),
-            (("fit", "photo.png", "b.png"), 2, "extra argument(s) (b.png): kcgs fit-many fits several images"),
+            (("fit", "photo.png", "b.png"), 2, "extra argument(s) (b.png)"),
             (("fit", "photo.png", "-n", "0"), 2, "greater than or equal to 1"),
-            (("fit", "photo.png", "--backend", "gpu"), 2, "'gpu' is not one of"),
+            (("fit", "photo.png", "--objective", "visual"), 2, "'visual' is not one of"),
             (("fit", "nothing.png"), 1, "nothing.png"),
             (("fit", "text.png"), 1, "text.png"),
             (("fit", "photo.png", "--recipe", "none-such"), 2, "--recipe must be one of"),
-            (("fit", "photo.png", "--resume"), 2, "--resume needs --checkpoint"),
-            (("fit", "photo.png", "--plot", "plot.txt"), 2, "--plot must end in .png"),
-            (("fit", "photo.png", "--regions", "nothing.png"), 1, "--regions must be auto, none or the file of a"),
+            (("fit", "photo.png", "--regions", "nothing.png"), 1, "no such file: nothing.png"),
             (("fit", "photo.png", "--regions", "small.png"), 2, "--regions must be one map of the image's size"),
             (("fit", "photo.png", "-o", "scene.pt"), 2, "must end in .safetensors"),
             (("fit", "photo.png", "-o", "scene.KCGS"), 2, "must end in .safetensors"),
@@ -314,8 +257,8 @@ class TestFailures:
             (("fit", "photo.png", "--target-psnr", "-3"), 2, "--target-psnr must be greater than 0; got -3.0"),
             (("fit", "folder"), 2, "'IMAGE': file 'folder' is a directory"),
             (("info", "text.png"), 2, "'SCENE': it must end in .safetensors or .kcgs, or be zoo:NAME; got 'text.png'"),
-            (("info", "nothing.kcgs"), 1, "kcgs: no such file: nothing.kcgs"),
-            (("decode", "nothing.kcgs", "-o", "a.png"), 1, "kcgs: no such file: nothing.kcgs"),
+            (("info", "nothing.kcgs"), 1, "kcgs: No such file or directory: nothing.kcgs"),
+            (("decode", "nothing.kcgs", "-o", "a.png"), 1, "kcgs: No such file or directory: nothing.kcgs"),
             (("encode", "zoo:chart-pie", "-o", "a.kcgs", "--quality", "500"), 2, "--quality must be in [10, 90]"),
             (("segment", "photo.png", "-o", "a.png", "--method", "magic"), 2, "--method must be one of"),
         ],

@@ -62,18 +62,11 @@ class TestExport:
         assert run(monkeypatch, "render", str(scene), "-o", str(png), "--scale", "2", "--contours", "crisp") == 0
         assert (load_image(png) - load(scene).render((64, 96), "crisp")).abs().max() <= 0.5 / 255 + 1e-6
 
-    def test_no_clamp(self, monkeypatch: pytest.MonkeyPatch, scene: Path) -> None:
-        out = scene.with_name("decoder.onnx")
-        assert run(monkeypatch, "export", str(scene), "-o", str(out), "--no-clamp") == 0
-        (image,) = onnxruntime.InferenceSession(str(out)).run(None, {"size": np.array([32, 48])})
-        assert np.abs(image[0] - load(scene)().detach().numpy()).max() < 1e-3
-
     @pytest.mark.parametrize(
         ("arguments", "words"),
         [
             (["-o", "decoder.txt"], "--output must end in .onnx or .html"),
             (["-o", "decoder.html", "--interactive"], "a page takes --contours only"),
-            (["-o", "decoder.onnx", "--cutoff", "3"], "--cutoff must"),
         ],
     )
     def test_errors(

@@ -278,20 +278,13 @@ class TestCommands:
         assert "excludes --quality" in run("encode", "mask.png", "-o", "b.kcgs", "--quality", "40", code=2)
         assert "excludes --scale" in run("decode", "mask.kcgs", "-o", "b.png", "--scale", "2", code=2)
         assert ".png or .npy" in run("decode", "mask.kcgs", "-o", "b.jpg", code=2)
-        assert "kcgs fit" in run("encode", "photo.jpg", "-o", "b.kcgs", code=2)
         assert "kcgs decode writes it" in run("encode", "mask.kcgs", "-o", "b.kcgs", code=1)
         assert "it is a label map, no scene" in run("render", "mask.kcgs", "-o", "b.png", code=1)
         assert "no such file" in run("encode", "none.png", "-o", "b.kcgs", code=1)
         Path("mask.kcgs").write_bytes(Path("mask.kcgs").read_bytes()[:-1])
         for command in (["info", "mask.kcgs"], ["decode", "mask.kcgs", "-o", "b.png"]):
-            assert "cannot decode mask.kcgs: the file is damaged" in run(*command, code=1)
+            assert "the file is damaged" in run(*command, code=1)
         assert not Path("b.png").exists() and not Path("b.kcgs").exists()
-
-    def test_photo(self, run: Any) -> None:
-        Image.fromarray(np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)).save("photo.png")
-        assert "kcgs fit" in run("encode", "photo.png", "-o", "photo.kcgs", err=True)
-        save_labels("mask.png", torch.arange(200).view(10, 20))
-        assert run("encode", "mask.png", "-o", "mask.kcgs", err=True) == ""
 
 
 @pytest.mark.parametrize("every", [6, pytest.param(1, marks=pytest.mark.slow)])

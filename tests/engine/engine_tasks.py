@@ -15,31 +15,25 @@ class Task(NamedTuple):
     folder: Path
 
 
-def fail_at_one(task: Task) -> tuple[int, int, int]:
+def double(task: Task) -> tuple[int, int, int]:
     """Return a result, the process and its threads."""
-    if task.number == 1:
-        raise ValueError(f"no {task.number}\nplease")
     return 2 * task.number, os.getpid(), torch.get_num_threads()
 
 
-def misbehave(task: Task) -> object:
-    """Write down each attempt; kill the worker, or stump it, as the number says."""
+def fail_at_one(task: Task) -> int:
+    if task.number == 1:
+        raise ValueError("no 1")
+    return task.number
+
+
+def die_at_one(task: Task) -> int:
+    """Write down that the job is done; the job 1 kills its process, the first time."""
     mark = task.folder / str(task.number)
     first = not mark.exists()
-    with mark.open("a") as file:
-        file.write("x")
-    if task.number == 1 or (task.number == 2 and first):
+    mark.touch()
+    if task.number == 1 and first:
         os.kill(os.getpid(), signal.SIGKILL)
-    return (lambda: 1) if task.number == 3 else 2 * task.number
-
-
-def process_and_threads(task: Task) -> tuple[int, int]:
-    return os.getpid(), torch.get_num_threads()
-
-
-def first_alone_ends(task: Task) -> None:
-    while task.number:
-        signal.pause()
+    return task.number
 
 
 def fitted_bytes(task: Task) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -15,7 +14,7 @@ from typing import Any
 import pytest
 import torch
 
-from kcgs.engine import Done, run_jobs
+from kcgs.engine import run_jobs
 
 
 def function(name: str) -> Callable[[Any], Any]:
@@ -26,71 +25,52 @@ def tasks(count: int, folder: Path) -> list[Any]:
     return [import_module("engine_tasks").Task(number, folder) for number in range(count)]
 
 
-def by_index(found: list[Done[Any]]) -> list[Done[Any]]:
-    assert sorted(done.index for done in found) == list(range(len(found)))  # each job once
-    return sorted(found, key=lambda done: done.index)
-
-
 @pytest.mark.parametrize("workers", [None, 1, 2])
 class TestBoth:
-    def test_results_threads_and_a_job_that_raises(self, tmp_path: Path, workers: int | None) -> None:
+    def test_results_and_threads(self, tmp_path: Path, workers: int | None) -> None:
         before = torch.get_num_threads()
-        found = list(run_jobs(function("fail_at_one"), tasks(6, tmp_path), workers=workers, threads=3))
+        done = dict(run_jobs(function("double"), tasks(6, tmp_path), workers=workers, threads=3))
         assert torch.get_num_threads() == before
-        found = by_index(found)
-        results, processes, threads = zip(*(done.result for done in found if done.result), strict=True)
-        assert results == (0, 4, 6, 8, 10) and set(threads) == {3}
+        results, processes, threads = zip(*(done[index] for index in range(6)), strict=True)
+        assert results == (0, 2, 4, 6, 8, 10) and set(threads) == {3}
         # while one process starts, the other may do all
         assert len(set(processes)) <= (workers or 1) and (os.getpid() in processes) == (workers != 2)
-        assert [done.error is None for done in found] == [True, False, True, True, True, True]
-        error = found[1].error
-        assert error is not None and (error.type, error.message) == ("ValueError", "no 1\nplease")
-        assert "fail_at_one" in error.traceback and str(error) == "ValueError: no 1 please"
+
+    def test_a_job_that_raises_ends_the_iteration(self, tmp_path: Path, workers: int | None) -> None:
+        with pytest.raises(ValueError, match="no 1"):
+            list(run_jobs(function("fail_at_one"), tasks(3, tmp_path), workers=workers))
 
     def test_no_jobs(self, workers: int | None) -> None:
-        assert list(run_jobs(function("process_and_threads"), [], workers=workers)) == []
+        assert list(run_jobs(function("double"), [], workers=workers)) == []
 
 
 def test_one_thread_by_default(tmp_path: Path) -> None:
-    (done,) = run_jobs(function("process_and_threads"), tasks(1, tmp_path))
-    assert done.result == (os.getpid(), 1)
+    assert list(run_jobs(function("double"), tasks(1, tmp_path))) == [(0, (0, os.getpid(), 1))]
 
 
-class TestProcesses:
-    def test_killed(self, tmp_path: Path) -> None:
-        """One job kills every worker, another its first one, a third has a result that cannot be sent."""
-        found = by_index(list(run_jobs(function("misbehave"), tasks(5, tmp_path), workers=2)))
-        assert [done.result for done in found] == [0, None, 4, None, 8]
-        error = found[1].error
-        assert error is not None and error.type == "WorkerDied"
-        assert error.message == "the worker process was ended by SIGKILL, memory may have run out, twice"
-        assert "lambda" in str(found[3].error)
-        assert [(tmp_path / str(i)).read_text() for i in range(5)] == ["x", "xx", "xx", "x", "x"]
+def test_a_killed_worker_ends_the_iteration_and_the_same_call_goes_on(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="a worker process was killed, perhaps because memory ran out"):
+        list(run_jobs(function("die_at_one"), tasks(4, tmp_path), workers=2))
+    assert sorted(dict(run_jobs(function("die_at_one"), tasks(4, tmp_path), workers=2))) == [0, 1, 2, 3]
 
-    def test_left_early(self, tmp_path: Path) -> None:
-        iterator = run_jobs(function("first_alone_ends"), tasks(3, tmp_path), workers=2)
-        assert next(iterator).index == 0
-        iterator.close()  # type: ignore[attr-defined]
-        assert not multiprocessing.active_children()
 
-    def test_caller_killed(self, tmp_path: Path) -> None:
-        code = (
-            "import os, signal, sys; sys.path.insert(0, sys.argv[1])\n"
-            "from pathlib import Path\n"
-            "from engine_tasks import Task, process_and_threads\n"
-            "from kcgs.engine import run_jobs\n"
-            "if __name__ == '__main__':\n"
-            "    tasks = [Task(i, Path()) for i in range(3)]\n"
-            "    jobs = run_jobs(process_and_threads, tasks, workers=2)\n"
-            "    print(next(jobs).result[0], flush=True)\n"
-            "    os.kill(os.getpid(), signal.SIGKILL)\n"
-        )
-        script = tmp_path / "script.py"
-        script.write_text(code)
-        command = [sys.executable, str(script), str(Path(__file__).parent)]
-        # the workers have the standard output, too: it is read until they have ended
-        ended = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert ended.returncode == -signal.SIGKILL and int(ended.stdout) > 0, ended.stderr
+def test_workers_end_with_their_caller(tmp_path: Path) -> None:
+    code = (
+        "import os, signal, sys; sys.path.insert(0, sys.argv[1])\n"
+        "from pathlib import Path\n"
+        "from engine_tasks import Task, double\n"
+        "from kcgs.engine import run_jobs\n"
+        "if __name__ == '__main__':\n"
+        "    jobs = run_jobs(double, [Task(i, Path()) for i in range(3)], workers=2)\n"
+        "    print(next(jobs)[1][1], flush=True)\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    script = tmp_path / "script.py"
+    script.write_text(code)
+    command = [sys.executable, str(script), str(Path(__file__).parent)]
+    # the workers have the standard output, too: it is read until they have ended
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == -signal.SIGKILL and int(ended.stdout) > 0, ended.stderr
 
 
 class TestArguments:

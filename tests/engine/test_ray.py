@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+import os
 import sys
 from collections.abc import Iterator
 from importlib import import_module
@@ -14,53 +16,52 @@ import torch
 
 from kcgs.cli import main
 from kcgs.data import save_image
-from kcgs.engine import Done, run_jobs
-from kcgs.engine.cluster import connected
+from kcgs.engine import run_jobs
 
 ray = pytest.importorskip("ray", reason="needs the package ray: pip install 'kcgs[ray]'")
 
 
 @pytest.fixture(scope="session")
 def cluster(importable: None) -> Iterator[None]:
-    patch = pytest.MonkeyPatch()
-    patch.delenv("RAY_ADDRESS", raising=False)
-    with patch.context(), connected(2, 1):
-        yield
-    assert not ray.is_initialized()  # what was started here is shut down
+    path = os.pathsep.join(filter(None, sys.path))
+    ray.init(
+        "local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR,
+        runtime_env={"env_vars": {"PYTHONPATH": path}},
+    )  # fmt: skip
+    yield
+    ray.shutdown()
 
 
-def run(name: str, count: int, folder: Path, **options: Any) -> list[Done[Any]]:
+def run(name: str, count: int, folder: Path, **options: Any) -> dict[int, Any]:
     module = import_module("engine_tasks")
     tasks = [module.Task(number, folder) for number in range(count)]
-    found = list(run_jobs(getattr(module, name), tasks, **{"engine": "ray", **options}))
-    assert sorted(done.index for done in found) == list(range(count))
-    return sorted(found, key=lambda done: done.index)
+    return dict(run_jobs(getattr(module, name), tasks, **{"engine": "ray", **options}))
 
 
 @pytest.mark.usefixtures("cluster")
 class TestCluster:
-    def test_results_and_a_job_that_raises(self, tmp_path: Path) -> None:
-        found = run("fail_at_one", 4, tmp_path)
-        assert [done.result and done.result[0] for done in found] == [0, None, 4, 6]
-        error = found[1].error
-        assert error is not None and (error.type, error.message) == ("ValueError", "no 1\nplease")
-        assert "fail_at_one" in error.traceback
+    def test_results_and_threads(self, tmp_path: Path) -> None:
+        done = run("double", 4, tmp_path, threads=2)
+        assert [done[index][0] for index in range(4)] == [0, 2, 4, 6]
+        assert {threads for _, _, threads in done.values()} == {2}
 
-    def test_killed(self, tmp_path: Path) -> None:
-        found = run("misbehave", 3, tmp_path)
-        assert [done.result for done in found] == [0, None, 4]
-        assert found[1].error is not None and found[1].error.type == "WorkerDied"
-        assert [(tmp_path / str(i)).read_text() for i in range(3)] == ["x", "xx", "xx"]
+    def test_a_job_that_raises(self, tmp_path: Path) -> None:
+        with pytest.raises(ValueError, match="no 1"):
+            run("fail_at_one", 3, tmp_path)
+
+    def test_killed_and_the_same_call_again(self, tmp_path: Path) -> None:
+        with pytest.raises(RuntimeError, match="a worker process was killed"):
+            run("die_at_one", 3, tmp_path)
+        assert sorted(run("die_at_one", 3, tmp_path)) == [0, 1, 2]
 
     def test_same_bytes_as_local(self, tmp_path: Path) -> None:
         # on two threads; test_fit_many is on one
         here, there = (run("fitted_bytes", 1, tmp_path, engine=engine, threads=2) for engine in ("local", "ray"))
-        assert here[0].error is None and here[0].result == there[0].result
+        assert here == there
 
-    def test_threads(self, tmp_path: Path) -> None:
-        assert {done.result[1] for done in run("process_and_threads", 3, tmp_path, threads=2)} == {2}
-        with pytest.raises(ValueError, match="threads must be at most 2, what a node of the cluster has; got 3"):
-            run("fail_at_one", 1, tmp_path, threads=3)
+    def test_more_threads_than_a_node_has(self, tmp_path: Path) -> None:
+        with pytest.raises(ValueError, match="threads must be at most the processors of a node of the cluster; got 3"):
+            run("double", 1, tmp_path, threads=3)
 
     def test_fit_many(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -80,3 +81,12 @@ class TestCluster:
             assert json.loads(out)["fitted"] == 2
             scenes.append([(tmp_path / engine / f"{name}.safetensors").read_bytes() for name in ("a", "b")])
         assert scenes[0] == scenes[1]
+
+
+def test_a_cluster_of_its_own(importable: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without one to join, a cluster is started and shut down again."""
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    if ray.is_initialized():
+        ray.shutdown()
+    assert run("double", 1, tmp_path, workers=1)[0][0] == 0
+    assert not ray.is_initialized()
