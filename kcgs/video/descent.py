@@ -39,9 +39,7 @@ _CURVATURE = (0.5, 0.5, 0.75, 0.25, 0.75)
 _LEAST_ENERGY = 1e-2
 # pixels: on pixel centres a narrower Gaussian weighs as if it had this standard deviation
 _NARROW = 0.56
-# pixels: bounds of l11 and l22
-_LEAST_FACTOR = 0.1
-_LARGEST_FACTOR = 1e4
+# pixels: no Gaussian gets thinner
 _LEAST_SIGMA = 0.5
 
 
@@ -73,7 +71,7 @@ class Descent:
             relocations: what share of the rows that may move is relocated before which iterations.
             anchor: labels that contours may move from, as far as the config says; None: they stay.
         """
-        start, error = self.gaussians, self.squared_error().mean()
+        start, error = self.gaussians, self.error()
         for iteration in range(_ITERATIONS):
             if iteration in relocations:
                 self.relocate(round(relocations[iteration] * int(self.free.sum())))
@@ -81,38 +79,30 @@ class Descent:
                 self.move_contours(anchor)
             self.step(_RATE if iteration < _ITERATIONS - _LAST_ITERATIONS else 0.5 * _RATE)
         # also where steps were too long and the error is not finite
-        return self.gaussians if bool(self.squared_error().mean() <= error) else start
+        return self.gaussians if self.error() <= error else start
 
-    def render(self, gaussians: Gaussians | None = None) -> Tensor:
-        """Render (C, H, W) with the cutoff of a draft."""
-        return render_draft(gaussians or self.gaussians, self.image, self.config)
-
-    def squared_error(self) -> Tensor:
-        """Squared error of each pixel, (H, W), channels averaged."""
-        return (self.render() - self.image).square().mean(0)
+    def error(self) -> float:
+        """Mean squared error."""
+        return float(squared_error(self.gaussians, self.image, self.config).mean())
 
     def step(self, rate: float) -> None:
         """Move all Gaussians once."""
-        means, cholesky, colors = (t.detach().requires_grad_() for t in self.gaussians[:3])
+        means, cholesky, colors, ids, regions = self.gaussians
+        leaves = x, factors, c = [t.detach().requires_grad_() for t in (means, cholesky, colors)]
         with torch.enable_grad():
-            rendered = self.render(self.gaussians._replace(means=means, cholesky=cholesky, colors=colors))
+            rendered = render_draft(Gaussians(x, factors, c, ids, regions), self.image, self.config)
         difference = rendered.detach() - self.image
         if self.objective is not None:
             difference = self.objective.apply(difference)
-        slopes = torch.autograd.grad(rendered, (means, cholesky, colors), difference)
-        means, cholesky, colors = self.gaussians[:3]
-        area = math.pi * cholesky[:, ::2].clamp_min(_NARROW).prod(-1) * self._weights() * self.crowding
+        slopes = torch.autograd.grad(rendered, leaves, difference)
+        area = _area(cholesky) * self._weights() * self.crowding
         energy = (colors.square().sum(-1) * area).clamp_min(_LEAST_ENERGY)
         newton = local_gradient(cholesky, *slopes[:2]) / (energy[:, None] * energy.new_tensor(_CURVATURE))
         newton = torch.cat([newton.clamp(-_LARGEST_NEWTON_STEP, _LARGEST_NEWTON_STEP), slopes[2] / area[:, None]], -1)
         self.velocity = _MOMENTUM * self.velocity - newton
         change = rate * self.velocity * self.free[:, None]
         means, cholesky = move(means, cholesky, change[:, :5].clamp(-_LARGEST_STEP, _LARGEST_STEP))
-        l11, l21, l22 = cholesky.clamp(-_LARGEST_FACTOR, _LARGEST_FACTOR).unbind(-1)
-        cholesky = torch.stack([l11.clamp_min(_LEAST_FACTOR), l21, l22.clamp_min(_LEAST_FACTOR)], -1)
-        self.gaussians = self.gaussians._replace(
-            means=means, cholesky=widen(cholesky, _LEAST_SIGMA), colors=colors + change[:, 5:]
-        )
+        self.gaussians = Gaussians(means, widen(cholesky, _LEAST_SIGMA), colors + change[:, 5:], ids, regions)
 
     def relocate(self, count: int) -> None:
         """Put so many rows, those that are missed least, where they lower the error most; neighbours make up for them.
@@ -120,22 +110,26 @@ class Descent:
         Rows for which there is no use get the colour 0.
         """
         means, cholesky, colors, ids, regions = self.gaussians
-        index = region_positions(self.gaussians, self.image)[0]
-        table = torch.cat([means, cholesky, colors], -1).cpu().numpy()
+        rows = means, cholesky, colors, region_positions(self.gaussians, self.image)[0]
         visible, self.crowding = self._visibility()
         weight = torch.where(self.free, self._weights() * visible, _HELD).cpu().numpy()
-        goes, handed = least_missed(table[:, :2], table[:, 2:5], table[:, 5:], index.cpu().numpy(), count, weight)
+        x, factors, c, index = (t.cpu().numpy() for t in rows)
+        goes, handed = least_missed(x, factors, c, index, count, weight)
         relocated = torch.from_numpy(goes).to(means.device)
         colors = torch.from_numpy(handed).to(colors).masked_fill(relocated[:, None], 0.0)
         self.gaussians = self.gaussians._replace(colors=colors)
         self.velocity[relocated], self.free = 0.0, self.free | relocated
-        residual, wanted = (self.image - self.render()) * self.changed, int(relocated.sum())
-        added = propose_by(self.objective, residual, regions, wanted, sigmas=_SIGMAS, backend=self.config.backend)
-        rows = relocated.nonzero()[: len(added.means), 0]
-        means, cholesky = means.index_copy(0, rows, added.means), cholesky.index_copy(0, rows, added.cholesky)
+        residual = (self.image - render_draft(self.gaussians, self.image, self.config)) * self.changed
+        count = int(relocated.sum())
+        added = propose_by(self.objective, residual, regions, count, sigmas=_SIGMAS, backend=self.config.backend)
+        places = relocated.nonzero()[: len(added.means), 0]
         if ids is not None and added.region_ids is not None:
-            ids = ids.index_copy(0, rows, added.region_ids)
-        self.gaussians = Gaussians(means, cholesky, colors.index_copy(0, rows, added.colors), ids, regions)
+            ids = ids.index_copy(0, places, added.region_ids)
+        means, cholesky, colors = (
+            old.index_copy(0, places, new)
+            for old, new in zip((means, cholesky, colors), (added.means, added.cholesky, added.colors), strict=True)
+        )
+        self.gaussians = Gaussians(means, cholesky, colors, ids, regions)
 
     def move_contours(self, anchor: Tensor) -> None:
         """Move contours where the image is explained better, or nearly as well: Gaussians will adapt to them."""
@@ -149,10 +143,11 @@ class Descent:
         )  # fmt: skip
         if moved is before:
             return
-        error = self.squared_error()
-        self.gaussians = self.gaussians._replace(regions=moved)
-        gain = config.contour_rise * error - self.squared_error()
-        self.gaussians = self.gaussians._replace(regions=accept_moves(before, moved, gain))
+        errors = [
+            squared_error(self.gaussians._replace(regions=regions), self.image, config) for regions in (before, moved)
+        ]
+        accepted = accept_moves(before, moved, config.contour_rise * errors[0] - errors[1])
+        self.gaussians = self.gaussians._replace(regions=accepted)
 
     def _visibility(self) -> tuple[Tensor, Tensor]:
         """Return what share of each Gaussian is painted, (N,), and the factor of its curvature, (N,).
@@ -161,7 +156,7 @@ class Descent:
         """
         total, sums = sum_over_pixels(self.gaussians, self.image, self.config)
         mass, overlap = sums(torch.ones_like(total)), sums(total)
-        area = math.pi * self.gaussians.cholesky[:, ::2].clamp_min(_NARROW).prod(-1)
+        area = _area(self.gaussians.cholesky)
         return (mass / (2 * area)).clamp_max(1.0), (overlap / area / _USUAL_OVERLAP).clamp_min(1.0)
 
     def _weights(self) -> Tensor:
@@ -175,6 +170,11 @@ def render_draft(gaussians: Gaussians, image: Tensor, config: FitConfig) -> Tens
     means, cholesky, colors, region_ids, regions = gaussians
     size, cutoff = (image.shape[1], image.shape[2]), max(config.cutoff, config.draft_cutoff)
     return region_splat(means, cholesky, colors, region_ids, regions, size=size, cutoff=cutoff, backend=config.backend)
+
+
+def squared_error(gaussians: Gaussians, image: Tensor, config: FitConfig) -> Tensor:
+    """Squared error of each pixel, (H, W), channels averaged."""
+    return (render_draft(gaussians, image, config) - image).square().mean(0)
 
 
 def sum_over_pixels(
@@ -194,3 +194,8 @@ def region_positions(gaussians: Gaussians, image: Tensor) -> tuple[Tensor, Tenso
     if regions is None or ids is None:
         return torch.zeros_like(gaussians.means[:, 0], dtype=torch.int64), torch.zeros_like(image[0], dtype=torch.int64)
     return regions.index_of(ids), regions.index_of(regions.labels)
+
+
+def _area(cholesky: Tensor) -> Tensor:
+    """Return the integral of the squares of Gaussians of weight 1, (N,), as sums over pixel centres have it."""
+    return math.pi * cholesky[:, ::2].clamp_min(_NARROW).prod(-1)

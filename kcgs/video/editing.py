@@ -4,21 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from kcgs.editing.checks import check_ids, check_offset
 from kcgs.editing.fill import grow, inpaint
+from kcgs.editing.scenes import nearest_labels, shift_labels
 from kcgs.fitting import FitConfig
 from kcgs.fitting.state import Gaussians
 from kcgs.functional import RegionMap
 from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
+from kcgs.nn.field import join
 from kcgs.scene import Scene, check_batch
 
 from .descent import Descent
+from .fitting import stack
+from .motion import motion_at
+
+# image (C, H, W), labels (H, W), and which pixels are not known (H, W)
+Frame = tuple[Tensor, Tensor, Tensor]
 
 # pixels around a region that still have colours of it
 _FRINGE = 3
@@ -58,36 +63,30 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
         >>> delete_region(Scene(field, labels), 7).regions.ids
         tensor([0])
     """
-    regions, ids, deleted = _check(scenes, region_ids)
-    frames = list(scenes)
-    background = ~torch.isin(ids, deleted)
+    regions, ids, chosen = _check(scenes, region_ids)
+    is_deleted, blank = torch.isin(regions.labels, chosen), torch.isin(ids, chosen)
+    edited: list[Gaussians] = []
     with threads_for_kernels(scenes.size[0] * scenes.size[1]):
-        motions = _background_motions(scenes.field.means.detach(), background)
-        is_deleted = torch.isin(regions.labels, deleted)
-        targets, labels = _fill_targets([frame.render() for frame in frames], regions.labels, is_deleted, motions)
-        edited: list[Gaussians] = []
-        filled_map = regions.relabel(torch.stack(labels), "mean")
-        for t, frame in enumerate(frames):
-            field = frame.field
+        motions = _background_motions(scenes.field.means.detach(), ~blank)
+        targets, labels = _fill_targets(scenes.render(), regions.labels, is_deleted, motions)
+        filled = regions.relabel(labels, "mean")
+        for t, frame in enumerate(scenes):
+            field, regions = frame.field, filled.image(t)
             means, cholesky, colors = (x.detach().clone() for x in (field.means, field.cholesky, field.merged_colors()))
-            blank, row_ids = ~background[t], ids[t].clone()
-            colors[blank] = 0.0
-            row_ids[blank] = filled_map.image(t).ids[0]
-            if t:
-                again = blank & ~background[t - 1]
-                before = edited[-1]
-                means[again] = _move(motions[t - 1], before.means[again])
-                cholesky[again], colors[again] = before.cholesky[again], before.colors[again]
+            row_ids = torch.where(blank[t], regions.ids[0], ids[t])
+            colors[blank[t]] = 0.0
+            if t:  # rows that filled the frame before go on
+                rows, before = blank[t] & blank[t - 1], edited[-1]
+                means[rows] = _move(motions[t] @ motions[t - 1].inverse(), before.means[rows])
+                cholesky[rows], colors[rows] = before.cholesky[rows], before.colors[rows]
                 if before.region_ids is not None:
-                    row_ids[again] = before.region_ids[again]
-            filled = filled_map.image(t)
-            start = Gaussians(means, cholesky, colors, row_ids, filled)
-            everything = torch.ones_like(blank), torch.ones_like(is_deleted[t])
-            descent = Descent(targets[t], start, FitConfig(), *everything)
-            edited.append(descent.run({0: float((blank & (colors == 0).all(-1)).float().mean())}))
-    means, cholesky, colors = (torch.stack(parts) for parts in zip(*(g[:3] for g in edited), strict=True))
-    row_ids = torch.stack([g.region_ids for g in edited if g.region_ids is not None])
-    return Scene(GaussianField(means, cholesky, colors, row_ids, size=scenes.size), filled_map, scenes.metadata)
+                    row_ids[rows] = before.region_ids[rows]
+            start = Gaussians(means, cholesky, colors, row_ids, regions)
+            free, changed = torch.ones_like(blank[t]), torch.ones_like(is_deleted[t])
+            unused = blank[t] & (colors == 0).all(-1)
+            descent = Descent(targets[t], start, FitConfig(), free, changed)
+            edited.append(descent.run({0: float(unused.float().mean())}))
+    return stack(edited, scenes.size, scenes.metadata)
 
 
 @torch.inference_mode(False)
@@ -106,27 +105,17 @@ def move_region(scenes: Scene, region_ids: int | Iterable[int], offset: Sequence
     Raises:
         TypeError, ValueError: as :func:`delete_region`; an offset that is not two whole numbers.
     """
-    regions, ids, moved = _check(scenes, region_ids)
-    dx, dy = check_offset(offset, 1)
+    regions, ids, chosen = _check(scenes, region_ids)
+    steps = check_offset(offset, 1)
     behind = delete_region(scenes, region_ids)
-    assert behind.regions is not None and behind.field.region_ids is not None
-    inside = torch.isin(ids, moved)
-    rows = inside.any(0)
-    field = scenes.field
-    means = torch.cat([behind.field.means, field.means[:, rows] + field.means.new_tensor([dx, dy])], 1)
-    cholesky = torch.cat([behind.field.cholesky, field.cholesky[:, rows]], 1)
-    colors = torch.where(inside[..., None], field.merged_colors(), 0.0)[:, rows]
-    height, width = scenes.size
-    y, x = (torch.arange(length, device=regions.ids.device) - step for length, step in ((height, dy), (width, dx)))
-    y, x = torch.meshgrid(y, x, indexing="ij")
-    source = regions.labels[:, y.clamp(0, height - 1), x.clamp(0, width - 1)]
-    landed = torch.isin(source, moved) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    labels = torch.where(landed, source, behind.regions.labels)
-    field = GaussianField(
-        means, cholesky, torch.cat([behind.field.colors, colors], 1),
-        torch.cat([behind.field.region_ids, ids[:, rows]], 1), size=scenes.size,
-    )  # fmt: skip
-    return Scene(field, regions.relabel(labels, "mean"), scenes.metadata)
+    assert behind.regions is not None
+    inside = torch.isin(ids, chosen)
+    rows, field = inside.any(0), scenes.field
+    means = field.means[:, rows] + field.means.new_tensor(steps)
+    colors = (field.merged_colors() * inside[..., None])[:, rows]
+    moved = GaussianField(means, field.cholesky[:, rows], colors, ids[:, rows], size=scenes.size)
+    labels = shift_labels(regions.labels, torch.isin(regions.labels, chosen), steps, behind.regions.labels)[1]
+    return Scene(join(behind.field, moved), regions.relabel(labels, "mean"), scenes.metadata)
 
 
 def _check(scenes: Scene, region_ids: int | Iterable[int]) -> tuple[RegionMap, Tensor, Tensor]:
@@ -143,87 +132,61 @@ def _check(scenes: Scene, region_ids: int | Iterable[int]) -> tuple[RegionMap, T
     return regions, ids, chosen
 
 
-def _background_motions(means: Tensor, background: Tensor) -> list[np.ndarray]:
-    """Return the affine motion (3, 3) from each frame to the next that most rows of the background (T, N) have."""
+def _background_motions(means: Tensor, background: Tensor) -> Tensor:
+    """Return the affine motion (T, 3, 3) from the first frame to each that most rows of the background (T, N) have."""
     from skimage.measure import ransac
     from skimage.transform import AffineTransform
 
-    motions = []
-    for t in range(len(means) - 1):
-        rows = background[t] & background[t + 1]
-        points = [means[k][rows].double().cpu().numpy() for k in (t, t + 1)]
+    motions = [torch.eye(3, dtype=torch.float64)]
+    for t in range(1, len(means)):
+        rows = background[t - 1] & background[t]
+        points = [means[k][rows].double().cpu().numpy() for k in (t - 1, t)]
         model = None
         if len(points[0]) >= _LEAST_ROWS:
             model, _ = ransac(
                 points, AffineTransform, min_samples=3, residual_threshold=_LARGEST_RESIDUAL,
                 max_trials=_RANSAC_TRIALS, rng=0,
             )  # fmt: skip
-        motions.append(np.eye(3) if model is None else np.asarray(model.params))
-    return motions
+        motions.append(motions[-1] if model is None else torch.from_numpy(model.params) @ motions[-1])
+    return torch.stack(motions)
 
 
-def _move(motion: np.ndarray, points: Tensor) -> Tensor:
-    """Apply an affine motion to points (..., 2)."""
-    matrix = torch.from_numpy(motion).to(points)
+def _move(motion: Tensor, points: Tensor) -> Tensor:
+    """Apply an affine motion (3, 3) to points (N, 2)."""
+    matrix = motion.to(points)
     return points @ matrix[:2, :2].T + matrix[:2, 2]
 
 
-def _fill_targets(
-    renders: list[Tensor], labels: Tensor, deleted: Tensor, motions: list[np.ndarray]
-) -> tuple[list[Tensor], list[Tensor]]:
-    """Return each frame with what is deleted (T, H, W) filled, and its labels."""
-    targets: list[Tensor] = []
-    filled: list[Tensor] = []
-    holes = [grow(mask, _FRINGE) for mask in deleted]
-    for t, (render, hole) in enumerate(zip(renders, holes, strict=True)):
-        image, known, unknown = render.clone(), labels[t].clone(), hole.clone()
-        for s in sorted((s for s in range(len(renders)) if s != t), key=lambda s: abs(s - t)):
+def _fill_targets(renders: Tensor, labels: Tensor, deleted: Tensor, motions: Tensor) -> tuple[Tensor, Tensor]:
+    """Return all frames with what is deleted (T, H, W) filled, and their labels."""
+    targets, filled = renders.clone(), labels.clone()
+    holes = torch.stack([grow(mask, _FRINGE) for mask in deleted])
+    for t in range(len(renders)):
+        unknown = holes[t].clone()
+        sources = [
+            (s, (renders[s], labels[s], holes[s])) for s in sorted(range(len(renders)), key=lambda s: abs(s - t))
+        ]
+        if t:  # as the frame before was continued
+            sources.append((t - 1, (targets[t - 1], filled[t - 1], torch.zeros_like(unknown))))
+        for s, source in sources[1:]:
             if not unknown.any():
                 break
-            _copy(image, known, unknown, renders[s], labels[s], ~holes[s], _between(motions, t, s))
-        if t and unknown.any():  # as the frame before was continued
-            _copy(image, known, unknown, targets[-1], filled[-1], torch.ones_like(hole), _between(motions, t, t - 1))
+            _copy((targets[t], filled[t], unknown), source, motions[s] @ motions[t].inverse())
         if unknown.any():
-            image, known = inpaint(image, unknown), _nearest(known, unknown)
-        targets.append(image)
-        filled.append(torch.where(deleted[t], known, labels[t]))  # the fringe keeps its labels
+            targets[t], filled[t] = inpaint(targets[t], unknown), nearest_labels(filled[t], unknown)
+        filled[t] = torch.where(deleted[t], filled[t], labels[t])  # the fringe keeps its labels
     return targets, filled
 
 
-def _between(motions: list[np.ndarray], first: int, last: int) -> np.ndarray:
-    """Return the motion from one frame to another."""
-    total = np.eye(3)
-    for step in range(min(first, last), max(first, last)):
-        total = motions[step] @ total
-    return total if first <= last else np.linalg.inv(total)
-
-
-def _copy(
-    image: Tensor,
-    labels: Tensor,
-    unknown: Tensor,
-    source: Tensor,
-    source_labels: Tensor,
-    shown: Tensor,
-    motion: np.ndarray,
-) -> None:
-    """Take unknown pixels, in place, from where they are in another image, if it shows them there."""
-    height, width = unknown.shape
-    y, x = unknown.nonzero().T
-    points = _move(motion, torch.stack([x, y], -1).to(image) + 0.5)
+def _copy(frame: Frame, source: Frame, motion: Tensor) -> None:
+    """Take what is unknown in a frame, in place, from where the motion puts it in another, if that is known there."""
+    y, x = frame[2].nonzero().T
+    points = _move(motion, torch.stack([x, y], -1).to(frame[0]) + 0.5)
     cols, rows = points.floor().long().unbind(-1)
-    inside = (cols >= 0) & (cols < width) & (rows >= 0) & (rows < height)
-    inside &= shown[rows.clamp(0, height - 1), cols.clamp(0, width - 1)]
-    y, x, rows, cols, points = y[inside], x[inside], rows[inside], cols[inside], points[inside]
-    grid = points / points.new_tensor([width, height]) * 2 - 1
-    image[:, y, x] = grid_sample(source[None], grid[None, None], padding_mode="border", align_corners=False)[0, :, 0]
-    labels[y, x] = source_labels[rows, cols]
-    unknown[y, x] = False
-
-
-def _nearest(labels: Tensor, unknown: Tensor) -> Tensor:
-    """Give unknown pixels the label of the nearest other one."""
-    from scipy.ndimage import distance_transform_edt
-
-    rows, cols = distance_transform_edt(unknown.cpu().numpy(), return_distances=False, return_indices=True)
-    return labels[torch.from_numpy(rows).long(), torch.from_numpy(cols).long()]
+    height, width = frame[2].shape
+    known = (cols >= 0) & (cols < width) & (rows >= 0) & (rows < height)
+    known &= ~source[2][rows.clamp(0, height - 1), cols.clamp(0, width - 1)]
+    y, x, rows, cols = y[known], x[known], rows[known], cols[known]
+    frame[0][:, y, x] = motion_at(source[0], points[known]).T
+    frame[1][y, x] = source[1][rows, cols]
+    frame[2][y, x] = False

@@ -24,7 +24,7 @@ from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
-from .descent import Descent, region_positions, render_draft, sum_over_pixels
+from .descent import Descent, region_positions, squared_error, sum_over_pixels
 from .motion import estimate_motion, move_labels, move_points
 
 OnFrame = Callable[[int, Scene], bool | None]
@@ -133,7 +133,7 @@ class _Video:
             with threads_for_kernels(before[0].numel()):
                 gaussians, changed = self._follow(before, regions)
         self.frames.append(gaussians)
-        self.error = torch.where(changed, self._squared_error(gaussians), self.error)
+        self.error = torch.where(changed, squared_error(gaussians, self.image, self.config), self.error)
         return gaussians.scene((self.image.shape[1], self.image.shape[2]))
 
     def _fit_anew(self, regions: RegionMap | None) -> Gaussians:
@@ -162,7 +162,7 @@ class _Video:
             regions = first.relabel(labels, "mean")
         start, free, changed = self._choose_start(motion, regions)
         descent = Descent(image, start, self.config, free, changed)
-        if bool(descent.squared_error().mean() > _CUT * image.var((1, 2)).mean()):
+        if descent.error() > _CUT * float(image.var((1, 2)).mean()):
             if is_carried and regions is not None:
                 regions = regions.relabel(regions.labels.flatten().mode()[0].expand(regions.size))
             return self._fit_anew(regions), torch.ones_like(changed)
@@ -182,7 +182,7 @@ class _Video:
             ids, colors = torch.where(present, ids, regions.ids[0]), torch.where(present[:, None], colors, 0.0)
         unmoved = Gaussians(means, cholesky, colors, ids, regions)
         moved = unmoved._replace(means=_move_by_region(motion, unmoved))
-        errors = [self._squared_error(gaussians) for gaussians in (unmoved, moved)]
+        errors = [squared_error(gaussians, self.image, self.config) for gaussians in (unmoved, moved)]
         changed = _blur(errors[0]) > _STILL * _blur(self.error) + _LEVEL
         _, sums = sum_over_pixels(unmoved, self.image, self.config)
         free = sums(changed[None].to(motion)) >= _FREE_SHARE * sums(torch.ones_like(motion[:1]))
@@ -190,9 +190,6 @@ class _Video:
         moves = pixels.flatten().bincount((errors[1] - errors[0]).flatten()) < 0
         means = torch.where((free & moves[rows])[:, None], moved.means, means)
         return unmoved._replace(means=means), free, changed
-
-    def _squared_error(self, gaussians: Gaussians) -> Tensor:
-        return (render_draft(gaussians, self.image, self.config) - self.image).square().mean(0)
 
 
 def stack(frames: list[Gaussians], size: tuple[int, int], metadata: Mapping[str, str]) -> Scene:
