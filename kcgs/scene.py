@@ -211,20 +211,13 @@ def save(path: str | os.PathLike[str], scene: Scene) -> int:
         (True, None, {'title': 'ten blobs'})
     """
     path = Path(path)
-    content = _serialized(scene, _format(path))
+    file_format = _format(path)
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
+    content: bytes = file_format.serialize(scene)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return len(content)
-
-
-def scene_bytes(scene: Scene, suffix: str = ".safetensors") -> int:
-    """Return the size in bytes of the file that :func:`save` would write to a path with this suffix.
-
-    Example:
-        >>> scene_bytes(Scene(GaussianField.random(1000, (32, 48), seed=0))) > 1000 * 8 * 4
-        True
-    """
-    return len(_serialized(scene, _format(Path(f"scene{suffix}"))))
 
 
 def load(path: str | os.PathLike[str]) -> Scene:
@@ -267,13 +260,6 @@ def _format(path: Path) -> Any:
     if path.suffix not in FORMATS:
         raise ValueError(f"path must end in {' or '.join(FORMATS)}; got {str(path)!r}")
     return import_module(FORMATS[path.suffix])
-
-
-def _serialized(scene: Scene, format: Any) -> bytes:
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
-    content: bytes = format.serialize(scene)
-    return content
 
 
 def empty_regions(scene: Scene) -> Tensor:

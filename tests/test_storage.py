@@ -17,7 +17,6 @@ from torch import Tensor
 
 import kcgs
 from kcgs import GaussianField, RegionMap, Scene, load, save
-from kcgs.scene import scene_bytes
 from kcgs.storage import FORMAT, MAX_SIDE
 
 SIZE = (9, 11)
@@ -266,14 +265,6 @@ class TestFormat:
         code = "import sys; from kcgs import load, save; save(sys.argv[2], load(sys.argv[1]))"
         subprocess.run([sys.executable, "-c", code, str(saved), str(again)], check=True)
         assert again.read_bytes() == saved.read_bytes()
-
-    def test_scene_bytes(self, path: Path) -> None:
-        field, labels = make_field(), labels_with(7)
-        assert scene_bytes(Scene(field)) == save(path, Scene(field))
-        assert scene_bytes(Scene(field, labels, metadata={"a": "b"})) == save(
-            path, Scene(field, labels, metadata={"a": "b"})
-        )
-        assert scene_bytes(Scene(field)) < scene_bytes(Scene(field, labels))
 
 
 class TestSaveRefuses:

@@ -17,7 +17,7 @@ from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.functional.covariance import check_cholesky
 from kcgs.nn import GaussianField
-from kcgs.scene import Scene
+from kcgs.scene import Scene, check_scene
 
 from .exact import Integers
 from .file import MOST_CHANNELS, MOST_SIDE, SPARE, Header, most_gaussians, pack, unpack
@@ -78,10 +78,8 @@ class SceneWriter:
     """A scene that files are written of, at any quantization parameter; its map is coded once."""
 
     def __init__(self, scene: Scene) -> None:
-        if not isinstance(scene, Scene):
-            raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
-        field, regions = scene.field, scene.regions
-        if field.means.ndim == 2 and not field.num_gaussians:
+        field, regions = check_scene(scene).field, scene.regions
+        if not field.num_gaussians:
             field = _black(field, regions)
         _check_field(field)
         self.size, self.channels = field.size, field.colors.shape[-1]
@@ -93,7 +91,11 @@ class SceneWriter:
         if self.regions is not None:
             from .labels import encode_map  # loads numba
 
-            self.ids = _positions(field, self.regions)
+            assert field.region_ids is not None
+            ids = field.region_ids.cpu()
+            self.ids = self.regions.index_of(ids).numpy()
+            if (self.ids < 0).any():
+                raise ValueError(f"region_ids must be ids of the map; got {int(ids[self.ids < 0][0])}")
             self.region_map = encode_map(self.regions)
 
     def qp_for(self, quality: float | None, target_bytes: int | None = None) -> int:
@@ -181,8 +183,6 @@ def _join(groups: list[slice], count: int) -> list[list[slice]]:
 
 def _check_field(field: GaussianField) -> None:
     """Refuse what no file can hold; a parameter may have been changed since the field was made."""
-    if field.means.ndim != 2:
-        raise InvalidArgument("scene", "of one image", f"a batch of {len(field.means)}: scene[t] is one of them")
     check_floating("means", field.means.detach().float())
     check_cholesky("cholesky", field.cholesky.detach().float())
     check_floating("colors", field.merged_colors().detach().float())
@@ -198,20 +198,6 @@ def _black(field: GaussianField, regions: RegionMap | None) -> GaussianField:
     region = None if regions is None else regions.labels[height // 2, width // 2][None]
     centre, color = torch.tensor([[0.5 * width, 0.5 * height]]), torch.zeros(1, field.colors.shape[-1])
     return GaussianField(centre, torch.tensor([[1.0, 0.0, 1.0]]), color, region, size=field.size)
-
-
-def _positions(field: GaussianField, regions: RegionMap) -> Integers:
-    """Return the position of each Gaussian's region among the map's ids."""
-    if regions.num_maps is not None or regions.size != field.size:
-        maps = "one map" if regions.num_maps is None else f"a batch of {regions.num_maps} maps"
-        raise ValueError(f"regions must be one map of size {field.size}; got {maps} of size {regions.size}")
-    if field.region_ids is None:
-        raise ValueError("scene must have region_ids for its regions; call scene.field.assign_regions(scene.regions)")
-    region_ids = field.region_ids.cpu()
-    index = regions.index_of(region_ids)
-    if (index < 0).any():
-        raise ValueError(f"region_ids must be ids of the map; got {int(region_ids[index < 0][0])}")
-    return index.numpy()
 
 
 @brief

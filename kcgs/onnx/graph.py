@@ -38,8 +38,7 @@ class Graph:
         ['ReduceProd']
     """
 
-    def __init__(self, outer: Graph | None = None, opset: int = OPSET) -> None:
-        self.opset = opset
+    def __init__(self, outer: Graph | None = None) -> None:
         self._tape = Tape()
         self._inputs: list[Value] = []
         self._constants: dict[tuple[str, tuple[int, ...], bytes], Value] = {}
@@ -149,7 +148,7 @@ class Graph:
             outputs,
             nodes=self._tape.nodes,
             initializers=self._tape.initializers,
-            opset_imports={"": self.opset} if self._outer is None else {},
+            opset_imports={"": OPSET} if self._outer is None else {},
             name=name,
         )
 

@@ -369,14 +369,12 @@ class TestFile:
         assert len({scene_decoder(Scene(field)).SerializeToString(deterministic=True) for _ in range(2)}) == 1
 
     def test_bytes_of_a_scene_with_regions(self, tmp_path: object) -> None:
-        from kcgs.scene import scene_bytes
-
         size = (480, 854)
         regions = RegionMap.from_labels(blobs(size, 6), 0.7)
         field = scattered(1250, size, regions)
         field.cholesky.data *= 0.2
         scene = Scene(field, regions)
-        assert write_model(scene_decoder(scene), f"{tmp_path}/d.onnx") < 2.2 * scene_bytes(scene)
+        assert write_model(scene_decoder(scene), f"{tmp_path}/d.onnx") < 2.2 * scene.save(f"{tmp_path}/s.safetensors")
 
 
 class TestBadInput:
