@@ -224,7 +224,7 @@ def as_image(name: str, value: object, tolerance: float = 0.0) -> Tensor:
     if isinstance(value, np.ndarray):
         image = _from_array(name, value)
     elif hasattr(value, "getbands") and hasattr(value, "convert"):  # PIL, which need not be imported for this
-        image = _from_array(name, _pil_array(value))
+        image = on_white(_from_array(name, pil_samples(value)))
     elif isinstance(value, Tensor):
         image = check_floating(name, value, dims=(3, 4), finite=False)  # looked for below, once
     else:
@@ -256,14 +256,23 @@ def _from_array(name: str, array: NDArray[Any]) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))
 
 
-def _pil_array(image: Any) -> NDArray[Any]:
-    if image.mode.startswith("I;16"):
-        return np.asarray(image, dtype=np.uint16)
-    if image.mode in ("1", "L"):
-        return np.asarray(image.convert("L"))
-    if "A" not in image.mode and "transparency" not in image.info:
-        return np.asarray(image.convert("RGB"))
-    pixels = np.asarray(image.convert("RGBA"), dtype=np.float32) / np.float32(255)
-    color, alpha = pixels[..., :3], pixels[..., 3:]
-    composed: NDArray[Any] = np.clip(color * alpha + (1 - alpha), 0, 1)
-    return composed
+def pil_samples(image: Any) -> NDArray[Any]:
+    """Return what a PIL image shows, (H, W, C): grey, grey and alpha, RGB or RGBA, of uint8, uint16 or float32."""
+    if image.mode == "F":
+        values = np.asarray(image)
+    elif image.mode.startswith("I"):  # 16-bit grey, which Pillow has in 32 bits for some formats
+        values = np.asarray(image).astype(np.uint16)
+    else:
+        mode = "L" if image.mode in ("1", "L") else "RGB"
+        if image.has_transparency_data:
+            mode = "LA" if image.mode in ("LA", "La") else "RGBA"
+        values = np.asarray(image.convert(mode))
+    return values if values.ndim == 3 else values[..., None]
+
+
+def on_white(image: Tensor) -> Tensor:
+    """Compose an image with alpha, (2, H, W) or (4, H, W), on white; return others as they are."""
+    if len(image) not in (2, 4):
+        return image
+    color, alpha = image[:-1], image[-1:]
+    return (color * alpha + (1 - alpha)).clamp(0, 1)

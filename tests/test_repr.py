@@ -57,7 +57,7 @@ def objects(result: FitResult, folder: Path) -> Iterator[Any]:
         (folder / kind / "480p" / "bear").mkdir(parents=True)
     save_image(folder / "JPEGImages/480p/bear/00000.jpg", image)
     save_labels(folder / "Annotations/480p/bear/00000.png", LABELS)
-    yield from (Davis(folder), Davis(folder).sequence("bear"))
+    yield Davis(folder)
     yield read_video(folder / "JPEGImages/480p/bear")
 
 

@@ -1,12 +1,12 @@
 """Images, label maps and data sets."""
 
 from kcgs.data.charts import ChartSample, chart_2x3, chart_pie
-from kcgs.data.davis import Davis, DavisFrame, DavisSequence
+from kcgs.data.davis import Davis, DavisFrame
 from kcgs.data.images import load_image, save_image
 from kcgs.data.labels import colorize_labels, label_colors, load_labels, overlay_labels, save_labels
 
 __all__ = [
-    "ChartSample", "Davis", "DavisFrame", "DavisSequence", "chart_2x3", "chart_pie",
+    "ChartSample", "Davis", "DavisFrame", "chart_2x3", "chart_pie",
     "colorize_labels", "label_colors", "load_image", "load_labels", "overlay_labels",
     "save_image", "save_labels",
 ]  # fmt: skip

@@ -3,7 +3,6 @@
 import math
 import os
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,10 +12,10 @@ from PIL import Image
 from torch import Tensor
 
 from kcgs._atomic import atomic_path
-from kcgs._check import as_image, check_numbers
-from kcgs.data._decode import decode, read_file
+from kcgs._check import as_image, on_white
+from kcgs.data._decode import decode
 
-_LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+_LUMA = (0.299, 0.587, 0.114)
 _MODES = {1: "L", 3: "RGB", 4: "RGBA"}
 _WRITERS: dict[str, tuple[str, dict[str, object]]] = {
     ".png": ("PNG", {}),
@@ -33,27 +32,24 @@ def load_image(
     path: str | os.PathLike[str],
     *,
     channels: Literal["RGB", "L", "RGBA"] = "RGB",
-    background: Sequence[float] | None = None,
 ) -> Tensor:
     """Read an image as a tensor.
 
     PNG, JPEG, WebP, TIFF, GIF, BMP and whatever else Pillow reads; of several frames, the first. EXIF orientation is
     applied. PNG and TIFF with 16 bits per channel keep them; float TIFF must lie in [0, 1]. CMYK becomes RGB by
-    Pillow's plain formula; colour profiles are not applied.
+    Pillow's plain formula; colour profiles are not applied. "RGB" and "L" compose transparent pixels on white, and a
+    UserWarning says so, as one does of an animation.
 
     Args:
         path: the file.
         channels: what to return. "RGB" repeats grey three times; "L" is Rec. 601 luma, 0.299 R + 0.587 G + 0.114 B;
             "RGBA" adds an alpha of 1 to opaque images.
-        background: the colour (R, G, B) in [0, 1] under transparent pixels, for "RGB" and "L"; None: white, and a
-            UserWarning says so, as one does of an animation.
 
     Returns:
         :math:`(C, H, W)` float32 in [0, 1], C = 3, 1 or 4.
 
     Raises:
-        FileNotFoundError: ``path`` does not exist.
-        TypeError: ``background`` holds no numbers.
+        OSError: ``path`` does not exist, or is a folder.
         ValueError: the file is truncated or no image, its samples have no defined white (32-bit integers, floats
             outside [0, 1]), or an argument is not one of the above.
 
@@ -67,28 +63,23 @@ def load_image(
     """
     if channels not in _MODES.values():
         raise ValueError(f'channels must be "RGB", "L" or "RGBA"; got {channels!r}')
-    under = np.asarray(check_numbers("background", background or (1.0, 1.0, 1.0), 3, 0, 1), dtype=np.float32)
-    samples = decode(read_file(path), path)
+    samples = decode(path)
     if samples.white is None:
         raise ValueError(f"cannot read {path}: {samples.values.dtype} samples have no stated white")
-    pixels = samples.values.astype(np.float32) / np.float32(samples.white)
-    has_alpha = pixels.shape[-1] in (2, 4)
-    alpha = pixels[..., -1:] if has_alpha else np.ones_like(pixels[..., :1])
-    color = pixels[..., :-1] if has_alpha else pixels
     if samples.frames > 1:
         warnings.warn(f"{path} holds {samples.frames} images: the first is read", stacklevel=2)
-    if has_alpha and channels != "RGBA":
-        if background is None and (alpha < 1).any():
-            warnings.warn(f"{path} has transparent pixels: they are composed on white", stacklevel=2)
-        color = color * alpha + under * (1 - alpha)
-    if channels == "L":
-        color = color @ _LUMA[:, None] if color.shape[-1] == 3 else color
-    else:
-        color = np.broadcast_to(color, (*color.shape[:2], 3))
+    pixels = samples.values.astype(np.float32) / np.float32(samples.white)
+    image = as_image(str(path), torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))))
+    has_alpha = len(image) in (2, 4)
     if channels == "RGBA":
-        color = np.concatenate([color, alpha], axis=-1)
-    # Sums of weights that add up to 1 can pass it by a rounding error.
-    return torch.from_numpy(np.clip(color, 0, 1).transpose(2, 0, 1).copy())
+        color, alpha = (image[:-1], image[-1:]) if has_alpha else (image, torch.ones_like(image[:1]))
+        return torch.cat([color.expand(3, -1, -1), alpha])
+    if has_alpha and image[-1].min() < 1:
+        warnings.warn(f"{path} has transparent pixels: they are composed on white", stacklevel=2)
+    image = on_white(image)
+    if channels == "RGB":
+        return image.expand(3, -1, -1).contiguous()
+    return image if len(image) == 1 else torch.einsum("chw,c->hw", image, torch.tensor(_LUMA))[None].clamp(0, 1)
 
 
 def save_image(path: str | os.PathLike[str], image: Any) -> None:

@@ -2,7 +2,6 @@
 
 import math
 import os
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from kcgs._atomic import atomic_path
 from kcgs._check import as_image, check_count, check_labels
-from kcgs.data._decode import Array, decode, read_file
+from kcgs.data._decode import Array, decode
 from kcgs.functional import touching_pairs
 
 MAX_COLORS = 4096
@@ -42,22 +41,23 @@ def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False) -> Tenso
     What counts as the label depends on what the file stores:
 
     - palette images such as DAVIS 2017: the palette index, whatever its colour;
-    - grey of 1 to 16 bits, and integer TIFF: the stored value, so a 0/255 mask has the labels 0 and 255;
+    - grey of 1, 8 or 16 bits, and integer TIFF: the stored value, so a 0/255 mask has the labels 0 and 255;
     - RGB and RGBA: every distinct colour is a region, numbered from 0 in the order of R, then G, B and A; all
       fully transparent pixels count as one colour;
     - .npy: an integer or boolean array of two dimensions.
 
     Args:
-        path: PNG, TIFF, GIF, BMP, lossless WebP or .npy. Formats that change pixel values are refused.
-        rgb_ids: colours are ids, R + 256 G + 65536 B, as in COCO's panoptic maps; any number of them, all opaque.
+        path: PNG, TIFF, GIF, BMP or .npy. Formats that change pixel values are refused.
+        rgb_ids: colours are ids, R + 256 G + 65536 B, as in COCO's panoptic maps; any number of them.
 
     Returns:
         :math:`(H, W)` int64, non-negative; ids need not be consecutive.
 
     Raises:
-        FileNotFoundError: ``path`` does not exist.
-        ValueError: the file cannot be read, is lossy or a photo (more than 4,096 colours), or holds floats,
-            negative values or another number of dimensions.
+        OSError: ``path`` does not exist, or is a folder.
+        TypeError: the file holds floats.
+        ValueError: the file cannot be read, is lossy or a photo (more than 4,096 colours), or holds negative values or
+            another number of dimensions.
 
     Example:
         >>> import tempfile
@@ -66,21 +66,22 @@ def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False) -> Tenso
         ...     load_labels(f"{folder}/map.png").tolist()
         [[0, 0, 7], [3, 3, 7]]
     """
-    data = read_file(path)
     if Path(path).suffix.lower() == ".npy":
-        return _from_npy(data, path)
-    samples = decode(data, path, indices=True)
+        try:
+            # an archive becomes one object, which is no map
+            values = np.asarray(np.load(path, allow_pickle=False))
+        except (ValueError, EOFError) as error:
+            raise ValueError(f"cannot read {path} as an .npy array: {error}") from error
+        return check_labels(str(path), values, dims=(2,))
+    samples = decode(path, indices=True)
     if not samples.lossless:
         raise ValueError(
-            f"path must be a label map in a lossless format (PNG, TIFF, GIF, BMP, lossless WebP, .npy); "
+            "path must be a label map in a lossless format (PNG, TIFF, GIF, BMP, .npy); "
             f"got {samples.format} at {path}, whose compression can change labels"
         )
-    values = samples.values
-    if values.shape[-1] == 2 and (values[..., 1] != values[0, 0, 1]).any():
-        raise ValueError(f"grey label maps must have no varying transparency; got {path}")
-    if values.shape[-1] >= 3:
-        return _from_ids(values, path) if rgb_ids else _from_colors(values, path)
-    return _checked(values[..., 0], path)
+    if samples.values.shape[-1] == 1:
+        return check_labels(str(path), samples.values[..., 0], dims=(2,))
+    return _from_ids(samples.values, path) if rgb_ids else _from_colors(samples.values, path)
 
 
 def save_labels(path: str | os.PathLike[str], labels: Tensor, *, rgb_ids: bool = False) -> None:
@@ -224,42 +225,17 @@ def _neighbour_colors(regions: Tensor) -> Tensor:
     return torch.tensor(colors)
 
 
-def _from_npy(data: bytes, path: str | os.PathLike[str]) -> Tensor:
-    try:
-        values = np.load(BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise ValueError(f"cannot read {path} as an .npy array: {error}") from error
-    if not isinstance(values, np.ndarray):
-        values.close()
-        raise ValueError(f"{path} must hold one array; got an .npz archive")
-    return _checked(values, path)
-
-
-def _checked(values: Array, path: str | os.PathLike[str]) -> Tensor:
-    if values.dtype.kind not in "uib":
-        raise ValueError(f"label maps hold integers; got {values.dtype} in {path}")
-    if values.ndim != 2 or values.size == 0:
-        raise ValueError(f"label maps have shape (H, W); got {values.shape} in {path}")
-    low, high = int(values.min()), int(values.max())
-    if low < 0 or high > np.iinfo(np.int64).max:
-        raise ValueError(f"labels must lie in 0 ... 2^63 - 1; got {low} ... {high} in {path}")
-    return torch.from_numpy(values.astype(np.int64))
-
-
 def _from_ids(values: Array, path: str | os.PathLike[str]) -> Tensor:
-    if values.dtype != np.uint8 or (values[..., 3:] != 255).any():
-        got = "transparent pixels" if values.dtype == np.uint8 else values.dtype
-        raise ValueError(f"colours that are ids must be opaque RGB of 8 bits; got {got} in {path}")
-    return torch.from_numpy((values[..., 2].astype(np.int64) << 8 | values[..., 1]) << 8 | values[..., 0])
+    if values.dtype != np.uint8 or values.shape[-1] != 3:
+        got = f"{values.shape[-1]} channels of {values.dtype}"
+        raise ValueError(f"colours that are ids must be RGB of 8 bits; got {got} in {path}")
+    return torch.from_numpy(values @ np.array([1, 1 << 8, 1 << 16]))
 
 
 def _from_colors(values: Array, path: str | os.PathLike[str]) -> Tensor:
-    if values.dtype.kind != "u":
-        raise ValueError(f"label images hold unsigned integers; got {values.dtype} in {path}")
-    bits = np.uint64(values.dtype.itemsize * 8)
     packed = np.zeros(values.shape[:2], dtype=np.uint64)
     for channel in range(values.shape[-1]):
-        packed = (packed << bits) | values[..., channel].astype(np.uint64)
+        packed = (packed << np.uint64(16)) | values[..., channel].astype(np.uint64)
     if values.shape[-1] == 4:
         packed[values[..., 3] == 0] = 0
     colors, ids = np.unique(packed, return_inverse=True)

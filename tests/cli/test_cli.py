@@ -248,7 +248,7 @@ class TestFailures:
             (("fit", "nothing.png"), 1, "nothing.png"),
             (("fit", "text.png"), 1, "text.png"),
             (("fit", "photo.png", "--recipe", "none-such"), 2, "--recipe must be one of"),
-            (("fit", "photo.png", "--regions", "nothing.png"), 1, "no such file: nothing.png"),
+            (("fit", "photo.png", "--regions", "nothing.png"), 1, "No such file or directory: nothing.png"),
             (("fit", "photo.png", "--regions", "small.png"), 2, "--regions must be one map of the image's size"),
             (("fit", "photo.png", "-o", "scene.pt"), 2, "must end in .safetensors"),
             (("fit", "photo.png", "-o", "scene.KCGS"), 2, "must end in .safetensors"),

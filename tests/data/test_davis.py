@@ -69,29 +69,8 @@ class TestDavis:
     def test_selection(self, root: Path) -> None:
         davis = Davis(root, sequences=["dog", "bear", "dog"])
         assert davis.sequences == ["bear", "dog"]
-        with pytest.raises(ValueError, match="no sequence 'cows'; there are 2: bear, dog"):
-            davis["cows"]
-
-    def test_the_list_is_a_copy(self, root: Path) -> None:
-        davis = Davis(root)
-        davis.sequences.clear()
-        assert len(davis) == 3
-
-    def test_sequence(self, root: Path) -> None:
-        add_frame(root, "dog", frame=12)
-        dog = Davis(root).sequence("dog")
-        assert (dog.name, len(dog), repr(dog)) == ("dog", 3, "DavisSequence('dog', 3 frames)")
-        for _ in range(2):
-            frames = list(dog)
-            assert all(isinstance(frame, DavisFrame) and frame.sequence == "dog" for frame in frames)
-            assert [round(float(frame.image[0].mean()) * 25.5) for frame in frames] == [0, 7, 12]
-        assert torch.equal(dog[-1].image, frames[2].image)
-        assert len(dog[1:]) == 2 and torch.equal(dog[1:][0].image, frames[1].image)
-        with pytest.raises(ValueError, match="no sequence 'cat'"):
-            Davis(root).sequence("cat")
-        (root / "Annotations" / "480p" / "dog" / "00007.png").unlink()
-        with pytest.raises(FileNotFoundError, match="frame 7 of sequence 'dog' lacks"):
-            list(dog)
+        with pytest.raises(ValueError, match="sequences must be among bear, cows, dog; got 'cat'"):
+            Davis(root, sequences=["cat"])
 
     def test_another_frame(self, root: Path) -> None:
         first, later = Davis(root)[0].image, Davis(root, frame=7)[0].image
@@ -109,48 +88,17 @@ class TestDavis:
         (root / tree / "480p" / "cows" / f"00000.{suffix}").unlink()
         davis = Davis(root)
         assert "cows" in davis.sequences
-        with pytest.raises(FileNotFoundError, match=rf"sequence 'cows' lacks .*{tree}.*cows.00000\.{suffix}"):
+        with pytest.raises(FileNotFoundError, match=rf"{tree}.*cows.00000\.{suffix}"):
             davis["cows"]
 
     def test_missing_frame(self, root: Path) -> None:
-        with pytest.raises(FileNotFoundError, match=r"frame 3 of sequence 'bear' lacks .*00003\.jpg"):
+        with pytest.raises(FileNotFoundError, match=r"bear.00003\.jpg"):
             Davis(root, frame=3)[0]
-
-    def test_sizes_differ(self, root: Path) -> None:
-        Image.new("L", (6, 4)).save(root / "Annotations" / "480p" / "dog" / "00000.png")
-        with pytest.raises(ValueError, match=r"sequence 'dog'.*got \(8, 12\).*and \(4, 6\)"):
-            Davis(root)["dog"]
 
     def test_wrong_root(self, tmp_path: Path) -> None:
         for root in (tmp_path, tmp_path / "nowhere"):
             with pytest.raises(FileNotFoundError, match=r"root must hold JPEGImages.*Annotations"):
                 Davis(root)
-
-    def test_no_common_sequence(self, tmp_path: Path) -> None:
-        (tmp_path / "JPEGImages" / "480p" / "dog").mkdir(parents=True)
-        (tmp_path / "Annotations" / "480p" / "cat").mkdir(parents=True)
-        with pytest.raises(FileNotFoundError, match="no sequence has a folder in both"):
-            Davis(tmp_path)
-
-    def test_unknown_sequence_lists_a_few(self, root: Path) -> None:
-        for k in range(9):
-            add_frame(root, f"s{k}")
-        with pytest.raises(ValueError, match=r"no sequence 'cat'; there are 12: bear, cows, dog, s0, s1, \.\.\."):
-            Davis(root, sequences=["cat"])
-
-    def test_one_name_is_no_list(self, root: Path) -> None:
-        with pytest.raises(TypeError, match="sequences must be a list of names; got the string 'dog'"):
-            Davis(root, sequences="dog")
-
-    @pytest.mark.parametrize("position", [3, -4])
-    def test_position_out_of_range(self, root: Path, position: int) -> None:
-        with pytest.raises(IndexError, match=f"there are 3 sequences; got position {position}"):
-            Davis(root)[position]
-
-    @pytest.mark.parametrize("key", [1.0, None, True])
-    def test_key_type(self, root: Path, key: Any) -> None:
-        with pytest.raises(TypeError, match="by position or sequence name"):
-            Davis(root)[key]
 
     def test_frame_argument(self, root: Path) -> None:
         with pytest.raises(ValueError, match="frame must be at least 0; got -1"):

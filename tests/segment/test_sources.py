@@ -287,7 +287,7 @@ class TestDavis:
 
     def test_errors(self, tmp_path: Path) -> None:
         self.make(tmp_path)
-        with pytest.raises(ValueError, match="no sequence 'dogs'"):
+        with pytest.raises(ValueError, match="sequences must be among cows; got 'dogs'"):
             segment(two_colors(), "davis", root=tmp_path, sequence="dogs")
         with pytest.raises(ValueError, match=r"'davis' must have the image's size \(21, 30\); got \(20, 30\)"):
             segment(two_colors(21), "davis", root=tmp_path, sequence="cows")
