@@ -18,8 +18,8 @@ from .state import FitState, Gaussians, HistoryEntry
 
 # a checkpoint is written when the fit has run this many times as long as the last one took to write
 _PATIENCE = 100.0
-_VERSION = 4
-_KEPT = ("cutoff", "region_ids", "anchor", "iteration", "first", "wanted", "densifications", "late_moves", "merged")
+_VERSION = 5
+_KEPT = ("cutoff", "region_ids", "anchor", "iteration", "first", "wanted", "densifications", "late_moves")
 
 
 class Checkpoint:
@@ -39,33 +39,32 @@ class Checkpoint:
         """Put the state in the file's place."""
         start = time.perf_counter()
         with atomic_path(self.path) as temporary, temporary.open("wb") as file:
-            torch.save({"version": _VERSION, "problem": self.problem, **_plain(state)}, file)
+            torch.save({"problem": self.problem, **_plain(state)}, file)
         end = time.perf_counter()
         self._next = end + _PATIENCE * (end - start)
 
-    def read_into(self, state: FitState) -> bool:
-        """Take up the state of the file, and say whether there is one; refuse what is damaged or another problem's."""
+    def read_into(self, state: FitState) -> None:
+        """Take up the state of the file, if there is one; refuse what is damaged or another problem's."""
         if not self.path.exists():
-            return False
+            return
         try:
             kept = torch.load(self.path, weights_only=True)
-            version, problem = kept["version"], kept["problem"]
+            problem = kept["problem"]
         except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"checkpoint {str(self.path)!r} is damaged, or no checkpoint of a fit") from error
-        if version != _VERSION or problem != self.problem:
+        if problem != self.problem:
             raise ValueError(
                 f"checkpoint {str(self.path)!r} belongs to another fit: image, regions, settings, num_gaussians and "
                 "seed must be those it was written with"
             )
         _take_up(state, kept)
-        return True
 
 
 def _fingerprint(state: FitState, given: RegionMap | None) -> str:
     size = tuple(state.image.shape)
     # a fit that goes on may be granted more time
     settings = state.config.model_dump_json(exclude={"max_seconds"})
-    digest = hashlib.sha256(f"{settings} {state.num_gaussians} {state.seed} {size}".encode())
+    digest = hashlib.sha256(f"{_VERSION} {settings} {state.num_gaussians} {state.seed} {size}".encode())
     digest.update(state.image.cpu().numpy().tobytes())
     if given is not None:
         digest.update(repr((given.softness, given.supersample)).encode())

@@ -45,18 +45,19 @@ class FitConfig(BaseModel):
         "regions",
     )
     cutoff: float = Field(1e-4, ge=0.0, lt=1.0, description="weights below it are skipped")
-    draft_cutoff: float = Field(
-        1e-3, ge=0.0, lt=1.0, description="cutoff of the first 85 % of a fit, where it is above `cutoff`; 0: none"
-    )
     backend: str = Field("auto", description="kernel, as in region_splat")
 
     # The Gaussians
-    initializer: Literal["random", "gradient", "kmeans"] = Field("kmeans", description="where the first centres are")
+    initializer: Literal["uniform", "random", "gradient"] = Field(
+        "uniform",
+        description="where the first centres are; uniform: anywhere, in the colours of the image; random: anywhere, in "
+        "any colours; gradient: where the image changes, as Image-GS",
+    )
     densify: Literal["matching-pursuit", "largest-error"] = Field(
         "matching-pursuit", description="where Gaussians are added; largest-error: as Image-GS"
     )
     densify_from: float = Field(
-        0.05, gt=0.0, le=1.0, description="fraction of N at the start, the others are added; 1: all"
+        0.02, gt=0.0, le=1.0, description="fraction of N at the start, the others are added; 1: all"
     )
     warmup: bool = Field(False, description="read the region ids again under the moving centres for half of the fit")
     prune: float = Field(1e-3, ge=0.0, description="remove Gaussians that change no value by more, at the end; 0: none")
@@ -67,13 +68,7 @@ class FitConfig(BaseModel):
         3.0, description="how far a contour may move from the given map, in pixels, at least 1; any: as far as it likes"
     )
     contour_cost: float = Field(0.003, ge=0.0, description="squared error that a pixel of contour must save")
-    contour_rise: float = Field(
-        1.5,
-        ge=1.0,
-        description="factor by which a moved contour may raise the squared error about it, for Gaussians adapt to it; "
-        "while they are added: later moves must lower it",
-    )
-    merge_regions: bool = Field(True, description="merge regions where a trial says that their contour does not help")
+    merge_regions: bool = Field(True, description="merge those most alike where there are more regions than Gaussians")
 
     # The descent
     objective: Objective = Field(
@@ -87,18 +82,6 @@ class FitConfig(BaseModel):
         "own parameters and learning rates",
     )
     learning_rate_factor: float = Field(1.0, gt=0.0, description="factor on all learning rates of the optimizer")
-    least_sigma: float | None = Field(
-        None,
-        ge=0.1,
-        description="least standard deviation of a Gaussian, in pixels, with the optimizer frame; None: 0.5. Thinner "
-        "ones fit the pixels' centres better, and are dots and needles between them when a scene is enlarged",
-    )
-    refine_flat: bool = Field(
-        True,
-        description="flat scenes of few Gaussians: sub-pixel contours, where contours may move, and "
-        "Levenberg-Marquardt refinement of all numbers at the end",
-    )
-
     # The length
     iterations: int | None = Field(
         None,
@@ -106,7 +89,9 @@ class FitConfig(BaseModel):
         description="None: 700, or with `max_seconds` as many as there is time for",
     )
     max_seconds: float | None = Field(
-        None, gt=0.0, description="stop after this wall time; the schedule adapts to it, and uses all of it"
+        None,
+        gt=0.0,
+        description="about how long a fit may take; progress is the share of it, or of the iterations, that is over",
     )
     target_psnr: float | None = Field(
         None, gt=0.0, description="the fewest Gaussians that reach this PSNR (dB), by a search over several fits"
@@ -118,8 +103,6 @@ class FitConfig(BaseModel):
             raise InvalidArgument("backend", f"one of {', '.join(BACKENDS)}", repr(self.backend))
         if self.objective != "psnr" and self.loss != "l2":
             raise ValueError(f"objective {self.objective!r} needs loss 'l2'; got {self.loss!r}")
-        if self.least_sigma is not None and self.optimizer != "frame":
-            raise ValueError(f"least_sigma needs optimizer 'frame'; got {self.optimizer!r}, which has its own")
         if self.softness != "auto" and not 0.0 <= self.softness <= MAX_SOFTNESS:
             raise ValueError(f"softness must be 'auto' or in [0, {MAX_SOFTNESS:g}] pixels; got {self.softness!r}")
         if self.max_move != "any" and self.max_move < 1.0:

@@ -6,7 +6,7 @@ import math
 import os
 import time
 import warnings
-from importlib import import_module
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -22,10 +22,12 @@ from kcgs.kernels import prepare, threads_for_kernels
 from .checkpoint import Checkpoint
 from .config import FitConfig
 from .descent import descend, log, log_is_due, render
-from .search import OnStep, Search
+from .search import Search
 from .start import start
 from .state import FitResult, FitState, HistoryEntry, StopReason
-from .strategies import Finish, MergeRegions, make_strategies
+from .strategies import finish, make_strategies
+
+OnStep = Callable[[int, HistoryEntry], bool | None]
 
 
 @torch.inference_mode(False)
@@ -48,7 +50,8 @@ def fit(
     Convention: the same arguments, device and number of threads give the same scene, bit for bit (unless it is stopped
     by the clock). The best state that was logged is returned, not the last; with a draft cutoff, the best of those that
     were rendered without. The scene holds fewer than N Gaussians where the recipe prunes, or its target takes fewer.
-    With `target_psnr` several fits search for the fewest Gaussians that reach it, and the one found is returned.
+    With `target_psnr` several fits search for the fewest Gaussians that reach it, and the one found is returned;
+    `on_step` counts the iterations of each.
 
     Args:
         image: Tensor :math:`(C, H, W)` or :math:`(1, C, H, W)`, floating, values in [0, 1]; a numpy array
@@ -85,13 +88,6 @@ def fit(
         (True, 2)
     """
     config = FitConfig.from_recipe(recipe, **settings)
-    if progress:
-        # a search for a target has no known length
-        with Progress("fit", known=config.target_psnr is None) as bar:
-            return fit(
-                image, regions, num_gaussians, recipe=config, seed=seed, on_step=_shown(bar, config, on_step),
-                checkpoint=checkpoint, resume=resume,
-            )  # fmt: skip
     image, regions = check_problem(image, regions)
     num_gaussians = check_num_gaussians(num_gaussians, image)
     seed = check_count("seed", seed, 0, 2**63 - 1)
@@ -99,32 +95,20 @@ def fit(
         raise InvalidArgument("checkpoint", "a file to go on from, with resume", None)
     if config.target_psnr is not None and checkpoint is not None:
         raise InvalidArgument("checkpoint", "None with target_psnr, which takes several fits", repr(checkpoint))
-    prepare(config.backend, image.device, image.dtype, len(image))  # no fit's clock counts what compiles or loads once
-    if config.densify_from < 1.0:
-        _load()
-    with threads_for_kernels(image[0].numel()):
-        if config.target_psnr is not None:
-            return Search(image, regions, num_gaussians, config, seed, _run, on_step, time.perf_counter()).search()
+    prepare(config.backend, image.device, image.dtype, len(image))
+    known = config.target_psnr is None
+    with Progress("fit", known=known, shown=progress) as bar, threads_for_kernels(image[0].numel()):
+        if not known:
+            return Search(image, regions, num_gaussians, config, seed, lambda s: _run(s, bar, on_step)).search()
         state = start(image, regions, num_gaussians, config, seed, time.perf_counter())
         keeper = None if checkpoint is None else Checkpoint(checkpoint, state, regions)
-        if not (keeper is not None and resume and keeper.read_into(state)) and config.merge_regions:
-            MergeRegions(state).before(state)
+        if keeper is not None and resume:
+            keeper.read_into(state)
         _warn_of_regions(state)
-        return Finish().apply(state, _run(state, on_step, keeper))
+        return finish(state, _run(state, bar, on_step, keeper))
 
 
-def _load() -> None:
-    """Compile or load what adding and leaving out Gaussians needs."""
-    from . import greedy, redundancy
-
-    redundancy.program.start()
-    greedy.program.ready()
-    redundancy.program.ready()
-    for module in ("scipy.ndimage", "scipy.spatial"):
-        import_module(module)
-
-
-def _run(state: FitState, on_step: OnStep | None = None, keeper: Checkpoint | None = None) -> StopReason:
+def _run(state: FitState, bar: Progress, on_step: OnStep | None, keeper: Checkpoint | None = None) -> StopReason:
     """Descend, with what the strategies do meanwhile, until something says stop; return what did."""
     config, strategies = state.config, make_strategies(state)
     while state.iteration < state.limit:
@@ -140,28 +124,15 @@ def _run(state: FitState, on_step: OnStep | None = None, keeper: Checkpoint | No
             log(state, rendered)
         descend(state, rendered, share)
 
+        entry = state.history[-1]
+        bar.update(share, f"iteration {state.iteration}, {entry.num_gaussians} Gaussians, {entry.psnr:.2f} dB")
         if keeper is not None and (keeper.due() or state.iteration == state.limit):
             keeper.write(state)
-        if on_step is not None and on_step(state.iteration, state.history[-1]):
+        if on_step is not None and on_step(state.iteration, entry):
             return "callback"
         if state.seconds() >= (config.max_seconds or math.inf):
             return "seconds"
     return "iterations"
-
-
-def _shown(bar: Progress, config: FitConfig, on_step: OnStep | None) -> OnStep:
-    """Return a callback that shows how far a fit is, and calls `on_step`."""
-    start = time.perf_counter()
-
-    def step(iteration: int, entry: HistoryEntry) -> bool | None:
-        # the clock alone may end it
-        share = 0.0 if config.iterations is None and config.max_seconds else iteration / config.usual_iterations
-        if config.max_seconds is not None:
-            share = max(share, (time.perf_counter() - start) / config.max_seconds)
-        bar.update(share, f"iteration {iteration}, {entry.num_gaussians} Gaussians, {entry.psnr:.2f} dB")
-        return None if on_step is None else on_step(iteration, entry)
-
-    return step
 
 
 def check_num_gaussians(value: object, image: Tensor) -> int:

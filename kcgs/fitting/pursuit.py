@@ -12,11 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from kcgs.functional import RegionMap
-from kcgs.nn import GaussianField
-
-from .colors import ColorOperator
-from .conjugate_gradients import conjugate_gradients
+from kcgs.functional import RegionMap, region_splat
 
 # reach of the discrete Gaussians, in standard deviations
 _REACH = 3.0
@@ -26,8 +22,6 @@ _SIGMA_PER_BLOCK = 0.9
 _CANDIDATES = (16, 4096)
 # two Gaussians whose normalised inner product is above this explain the same error: 2.5 sigma apart, at one scale
 _OVERLAP = 0.2
-# steps towards the joint solution for the colours: more follow the approximation, not the error
-_COLOR_STEPS = 3
 _CUTOFF = 1e-4
 
 Array = NDArray[Any]
@@ -79,7 +73,7 @@ def propose(
         chosen = _pursue(_search(error, labels, sigmas, wanted), wanted, floor)
         if not len(chosen.x):
             break
-        part, rendered = _solve(chosen, error, labels, regions, backend)
+        part, rendered = _place(chosen, error, labels, regions, backend)
         if not bool(part.colors.any()):
             break
         parts.append(part)
@@ -201,24 +195,21 @@ def _pursue(candidates: _Candidates, count: int, floor: float) -> _Candidates:
     return candidates.take(picked)
 
 
-def _solve(
+def _place(
     chosen: _Candidates, residual: Tensor, labels: NDArray[np.int32], regions: RegionMap | None, backend: str
 ) -> tuple[Proposal, Tensor]:
-    """Snap the centres to pixels of their region, solve for the colours, and render."""
-    centres = _pixel_of_region(chosen, labels)
-    means, sigma = torch.from_numpy(centres).to(residual), torch.from_numpy(chosen.sigma).to(residual)
+    """Snap the centres to pixels of their region, and render in the colours of steepest descent."""
+    means = torch.from_numpy(_pixel_of_region(chosen, labels)).to(residual)
+    sigma = torch.from_numpy(chosen.sigma).to(residual)
     cholesky = torch.stack([sigma, torch.zeros_like(sigma), sigma], -1)
     ids = None
     if regions is not None:
         ids = regions.ids[torch.from_numpy(chosen.region).to(residual.device)]
-    black = torch.zeros(len(sigma), len(residual)).to(residual)
-    field = GaussianField(means, cholesky, black, ids, size=(residual.shape[1], residual.shape[2]))
-    operator = ColorOperator(field, regions, black, _CUTOFF, backend)
-    inner = operator.adjoint(residual)
-    colors = _joint_colors(chosen, centres, inner.cpu().double().numpy()).to(residual)
+    colors = torch.from_numpy(chosen.inner / chosen.norm[:, None]).to(residual)
+    size = residual.shape[1], residual.shape[2]
     with torch.no_grad():
-        rendered = operator.render(colors)
-        # the products above are approximate: steps of the best length make the fall of the error certain
+        rendered = region_splat(means, cholesky, colors, ids, regions, size=size, cutoff=_CUTOFF, backend=backend)
+        # Gaussians overlap: steps of the best length make the fall of the error certain
         hard = regions is None or regions.softness == 0
         # under a soft contour regions mix: one length for all
         index = torch.from_numpy(labels if hard else np.zeros_like(labels)).to(residual.device, torch.int64)
@@ -249,20 +240,3 @@ def _pixel_of_region(chosen: _Candidates, labels: NDArray[np.int32]) -> NDArray[
         nearest = ((down + 0.5 - block / 2) ** 2 + (across + 0.5 - block / 2) ** 2).argmin()
         rows[i], cols[i] = top + down[nearest], left + across[nearest]
     return np.stack([cols + 0.5, rows + 0.5], -1)
-
-
-def _joint_colors(chosen: _Candidates, centres: NDArray[np.float64], inner: NDArray[np.float64]) -> Tensor:
-    """Solve (overlaps) c = <g, residual> by conjugate gradients, (K, C); overlaps are those of the plane."""
-    root = np.sqrt(chosen.norm.astype(np.float64))[:, None]
-    # single precision: the step that follows makes up for it, at a third of the time
-    x, y, square = (values.astype(np.float32) for values in (centres[:, 0], centres[:, 1], chosen.sigma**2))
-    both = square[:, None] + square
-    distance = np.square(x[:, None] - x) + np.square(y[:, None] - y)
-    overlap = 2 * np.sqrt(square[:, None] * square) / both * np.exp(distance / both * -0.5)
-    overlap *= chosen.region[:, None] == chosen.region
-    products = torch.from_numpy((inner / root).astype(np.float32))
-    solved = conjugate_gradients(
-        torch.zeros_like(products), products, lambda p: torch.from_numpy(overlap @ p.numpy()), _COLOR_STEPS,
-        dot=lambda a, b: torch.from_numpy((a.numpy() * b.numpy()).sum(0)),
-    )  # fmt: skip
-    return torch.from_numpy(solved.numpy() / root)

@@ -18,8 +18,8 @@ class RegionReport:
     `given` is the sum of `kept` and of what was merged, unless the map was dropped as a whole.
 
     Example:
-        >>> print(RegionReport(given=40, kept=28, merged_for_count=10, merged_by_trial=2))
-        28 of 40 regions kept; 10 merged: more than Gaussians; 2 merged: their contours do not help
+        >>> print(RegionReport(given=40, kept=28, merged_for_count=10, merged_for_bytes=2))
+        28 of 40 regions kept; 10 merged: more than Gaussians; 2 merged: their contours save less than their bytes
     """
 
     given: int
@@ -30,8 +30,6 @@ class RegionReport:
     """Regions that went into others since there were more than Gaussians."""
     merged_for_bytes: int = 0
     """Those whose contours save less error than Gaussians for their bytes."""
-    merged_by_trial: int = 0
-    """Those whose contours do not help."""
     dropped: Literal["recipe", "bytes"] | None = None
     """Why the map is not used: the recipe confines nothing, or the map's bytes do more as Gaussians."""
     moved_pixels: int = 0
@@ -50,7 +48,6 @@ class RegionReport:
         merged = {
             "more than Gaussians": self.merged_for_count,
             "their contours save less than their bytes": self.merged_for_bytes,
-            "their contours do not help": self.merged_by_trial,
         }
         parts += [f"{number} merged: {why}" for why, number in merged.items() if number]
         if self.moved_pixels:
@@ -68,7 +65,7 @@ def report_regions(
     merged_for_bytes: int = 0,
     dropped: Literal["recipe", "bytes"] | None = None,
 ) -> RegionReport | None:
-    """Compare the map that was given with the scene's; what was merged and not counted here a trial has merged."""
+    """Compare the map that was given with the scene's."""
     if given is None:
         return None
     if dropped is not None:
@@ -77,7 +74,6 @@ def report_regions(
     kept = 1 if regions is None else regions.num_regions
     return RegionReport(
         given.num_regions, kept, merged_for_count, merged_for_bytes,
-        given.num_regions - kept - merged_for_count - merged_for_bytes,
         moved_pixels=0 if regions is None else _moved_pixels(given, regions),
         empty=len(empty),
         empty_pixels=int(torch.isin(regions.labels, empty).sum()) if regions is not None and len(empty) else 0,
@@ -87,13 +83,8 @@ def report_regions(
 def _moved_pixels(given: RegionMap, regions: RegionMap) -> int:
     """Count the pixels that are not where their region went: under its own id, or where most of its pixels are."""
     before, after, count = given.index.flatten().long(), regions.index.flatten().long(), regions.num_regions
-    codes, into = before * count + after, regions.index_of(given.ids)
-    if given.num_regions * count < 1 << 24:  # without sorting every pixel
-        shared = codes.bincount()
-        pairs = shared.nonzero().flatten()
-        shared = shared[pairs]
-    else:
-        pairs, shared = codes.unique(return_counts=True)
+    into = regions.index_of(given.ids)
+    pairs, shared = (before * count + after).unique(return_counts=True)
     most = torch.zeros_like(into).scatter_reduce_(0, pairs // count, shared, "amax")
     largest = pairs[(shared == most[pairs // count]) & (into[pairs // count] < 0)]
     into[largest // count] = largest % count

@@ -8,24 +8,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs.functional import RegionMap, choose_widths, edge_band, smooth_contours
+from kcgs.functional import RegionMap, choose_widths, edge_band
 from kcgs.functional.merging import pairs_to_merge
 from kcgs.nn import GaussianField
 
 from .config import FitConfig
-from .kmeans import kmeans_field
-from .levenberg_marquardt import is_flat
 from .objective import make_objective
 from .optimizers import FrameAdam, GaussianImageAdan, GaussianOptimizer, ImageGSAdam
 from .sampling import sample_pixels, spread_repeats
 from .state import FitState
 
-# share of its pixels that a region must keep when contours are smoothed, and the supersampling of smooth contours
-_LEAST_AREA, _SUPERSAMPLE = 0.7, 4
 # share of an image's values that are 0 or 1, from which on Gaussians that overshoot them are of use
 _SATURATED = 0.25
 # share of the gradient in the density of Image-GS's centres; the rest is uniform
 _GRADIENT_SHARE = 0.7
+# Gaussians of half the spacing add up to this
+_OVERLAP = math.pi / 2
+# cutoff of most of a fit, where it is above the config's, for our optimizer
+_DRAFT_CUTOFF = 1e-3
 # thinner than this, in pixels, a Gaussian would fall between the pixel centres
 _LEAST_SIGMA = 0.5
 
@@ -37,7 +37,9 @@ def start(
     band = None if regions is None else edge_band(regions.labels).flatten().nonzero().flatten()
     fitting = _as_many_as_gaussians(image, regions, num_gaussians, config)
     saturated = float(((image == 0.0) | (image == 1.0)).float().mean())
-    state = FitState(
+    rendered = _regions_to_render(image, fitting, config)
+    field, sigma = first_field(image, num_gaussians, rendered, config, seed)
+    return FitState(
         image,
         config,
         num_gaussians,
@@ -49,30 +51,21 @@ def start(
         chooses_widths=config.softness == "auto" and regions is not None and regions.softness == 0.0,
         given=regions,
         objective=make_objective(config.objective, image),
-        limit=_limit(image, fitting, num_gaussians, config),
+        limit=math.inf if config.iterations is None and config.max_seconds is not None else config.usual_iterations,
         merged_for_count=0 if regions is None else regions.num_regions - (fitting.num_regions if fitting else 1),
-        cutoff=max(config.cutoff, config.draft_cutoff),
+        cutoff=draft_cutoff(config),
+        regions=rendered,
+        region_ids=field.region_ids,
+        optimizer=make_optimizer(config, field, sigma),
+        anchor=None if rendered is None else rendered.labels,
+        first=field.num_gaussians,
+        wanted=field.num_gaussians,
     )
-    begin(state, _regions_to_render(image, fitting, num_gaussians, config))
-    return state
 
 
-def _limit(image: Tensor, regions: RegionMap | None, num_gaussians: int, config: FitConfig) -> float:
-    """Return how many iterations there may be: with a clock as many as it allows, but for what ends otherwise."""
-    refined = config.refine_flat and is_flat(image, regions, num_gaussians)
-    free = config.iterations is None and config.max_seconds is not None and not refined
-    return math.inf if free else config.usual_iterations
-
-
-def begin(state: FitState, regions: RegionMap | None) -> None:
-    """Put the first Gaussians into a state, confined to these regions, and forget what it did before."""
-    config = state.config
-    field, sigma = _first_field(state, regions)
-    state.regions, state.region_ids = regions, field.region_ids
-    state.anchor = None if regions is None else regions.labels
-    state.optimizer = make_optimizer(config, field, sigma)
-    state.first = state.wanted = field.num_gaussians
-    state.iteration = 0
+def draft_cutoff(config: FitConfig) -> float:
+    """Return the cutoff of the first 85 % of a fit."""
+    return max(config.cutoff, _DRAFT_CUTOFF) if config.optimizer == "frame" else config.cutoff
 
 
 def _as_many_as_gaussians(
@@ -89,14 +82,11 @@ def make_optimizer(config: FitConfig, field: GaussianField, sigma: float) -> Gau
     if config.optimizer == "adan":
         return GaussianImageAdan(field, sigma, config.usual_iterations, config.learning_rate_factor)
     if config.optimizer == "frame":
-        least_sigma = _LEAST_SIGMA if config.least_sigma is None else config.least_sigma
-        return FrameAdam(field, config.learning_rate_factor, least_sigma)
+        return FrameAdam(field, config.learning_rate_factor)
     return ImageGSAdam(field, config.learning_rate_factor)
 
 
-def _regions_to_render(
-    image: Tensor, regions: RegionMap | None, num_gaussians: int, config: FitConfig
-) -> RegionMap | None:
+def _regions_to_render(image: Tensor, regions: RegionMap | None, config: FitConfig) -> RegionMap | None:
     if regions is None or not config.guidance or regions.num_regions == 1:
         return None
     # a map that comes with widths, or with sub-pixel coverage, says how sharp it is
@@ -104,36 +94,23 @@ def _regions_to_render(
         return regions
     if config.softness != "auto":
         return RegionMap.from_labels(regions.labels, config.softness)
-    widths = choose_widths(image, regions.labels)
-    if config.refine_flat and config.move_contours and any(widths.values()) and is_flat(image, regions, num_gaussians):
-        # a chart's edges are smooth curves: their coverage says more than a blur
-        smooth = RegionMap.from_labels(smooth_contours(regions.labels, _SUPERSAMPLE), supersample=_SUPERSAMPLE)
-        if _keeps_areas(regions, smooth):
-            return smooth
-    return RegionMap.from_labels(regions.labels, widths)
+    return RegionMap.from_labels(regions.labels, choose_widths(image, regions.labels))
 
 
-def _keeps_areas(regions: RegionMap, smooth: RegionMap) -> bool:
-    """Say whether smooth contours leave every region, thin ones too, most of its pixels."""
-    count = regions.num_regions
-    before, after = (
-        regions.index_of(labels).flatten().bincount(minlength=count) for labels in (regions.labels, smooth.labels)
-    )
-    return bool((after >= _LEAST_AREA * before).all())
-
-
-def _first_field(state: FitState, regions: RegionMap | None) -> tuple[GaussianField, float]:
-    """Return the first Gaussians and about how wide they are."""
-    image, config, seed = state.image, state.config, state.seed
-    pixels = image.shape[1] * image.shape[2]
-    first = math.ceil(config.densify_from * state.num_gaussians)
-    count = min(state.num_gaussians, max(1 if regions is None else regions.num_regions, first))
-    sigma = max(1.0, 0.5 * math.sqrt(pixels / count))
-    if config.initializer == "random":
-        return random_field(image, count, sigma, regions, seed), sigma
+def first_field(
+    image: Tensor, num_gaussians: int, regions: RegionMap | None, config: FitConfig, seed: int
+) -> tuple[GaussianField, float]:
+    """Return the first of N Gaussians and about how wide they are; every region has one, where there are enough."""
+    first = math.ceil(config.densify_from * num_gaussians)
+    count = min(num_gaussians, max(1 if regions is None else regions.num_regions, first))
+    sigma = max(1.0, 0.5 * math.sqrt(image[0].numel() / count))
     if config.initializer == "gradient":
         return gradient_field(image, count, regions, seed), sigma
-    return kmeans_field(image, count, regions, seed, config.backend), sigma
+    field = random_field(image, count, sigma, regions, seed)
+    if config.initializer == "uniform":
+        x, y = field.means.detach().long().unbind(-1)
+        field.colors.data = image[:, y, x].T / _OVERLAP
+    return field, sigma
 
 
 def random_field(
@@ -187,8 +164,7 @@ def gradient_field(image: Tensor, num_gaussians: int, regions: RegionMap | None,
     places = np.stack([pixels % planes.shape[2], pixels // planes.shape[2]], -1) + 0.5
     centres = spread_repeats(places, pixels, rng)
     sigma = np.maximum(0.5 / np.sqrt(num_gaussians * chance[pixels]), _LEAST_SIGMA)
-    # Gaussians of half the spacing add up to pi / 2
-    colors = planes.reshape(len(planes), -1).T[pixels] / (math.pi / 2)
+    colors = planes.reshape(len(planes), -1).T[pixels] / _OVERLAP
     cholesky = np.stack([sigma, np.zeros_like(sigma), sigma], -1)
     tensors = (torch.from_numpy(values).to(image) for values in (centres, cholesky, colors))
     field = GaussianField(*tensors, size=(image.shape[1], image.shape[2]))

@@ -57,9 +57,7 @@ class FitResult(NamedTuple):
     regions: RegionReport | None = None
     """What became of the label map; None: none was given."""
     seconds: float = 0.0
-    """Wall time of all that was done, which the history of a search does not tell."""
-    target_reached: bool | None = None
-    """None: there was no `target_psnr`."""
+    """Wall time of all that was done; the history of a search is that of one fit."""
 
     def __repr__(self) -> str:
         psnr = max((entry.psnr for entry in self.history), default=math.nan)
@@ -114,21 +112,17 @@ class FitState:
 
     # What is rendered
     cutoff: float
-    regions: RegionMap | None = None
-    region_ids: Tensor | None = None  # of the Gaussians
-    optimizer: GaussianOptimizer = dataclasses.field(init=False)  # holds the Gaussians
-    anchor: Tensor | None = None  # labels that contours may not move far from
+    regions: RegionMap | None
+    region_ids: Tensor | None  # of the Gaussians
+    optimizer: GaussianOptimizer  # holds the Gaussians
+    anchor: Tensor | None  # labels that contours may not move far from
 
     # What has happened
+    first: int  # Gaussians at the start
+    wanted: int  # Gaussians that were asked for so far
     iteration: int = 0
-    first: int = 0  # Gaussians at the start
-    wanted: int = 0  # Gaussians that were asked for so far
     densifications: int = 0
     late_moves: int = 0  # of contours, after densification
-    merged: bool = False  # the trial that merges regions is over
-    moving_seconds: float = 0.0  # spent on moving contours
-    densify_after: float = 0.0  # seconds
-    addition_seconds: float = 0.0  # of the last addition of Gaussians
 
     # What was measured
     history: list[HistoryEntry] = dataclasses.field(default_factory=list)
@@ -143,10 +137,6 @@ class FitState:
     def seconds(self) -> float:
         """Wall time since the fit began."""
         return time.perf_counter() - self.started
-
-    def has_time(self, seconds: float) -> bool:
-        """Say whether the clock allows so many seconds more."""
-        return self.config.max_seconds is None or self.seconds() + seconds < self.config.max_seconds
 
     def progress(self) -> float:
         """Share of the fit that is done: of its iterations or of its seconds, whichever is more.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -79,9 +78,8 @@ def fit_bytes(
         seed: as there.
         on_step: as there, for the fit itself, not the trials.
         progress: as there.
-        settings: as there; `contour_cost` is replaced by the coder's, and `max_seconds` counts the trials, the fit and
-            the rounding. Without a clock, and with more than 64 Gaussians, the descent on bits replaces the last
-            iterations, 11 or 15 %. Whether a map of two regions stays, the trials say in place of `merge_regions`.
+        settings: as there; `contour_cost` is replaced by the coder's, and `max_seconds` is for the fit alone. Without
+            it the descent on bits replaces the last iterations, 11 or 15 %.
 
     Returns:
         The file, what it decodes to, and the fit.
@@ -101,20 +99,13 @@ def fit_bytes(
     check_count("num_bytes", num_bytes)
     if config.target_psnr is not None:
         raise InvalidArgument("target_psnr", "None where bytes are the target", config.target_psnr)
-    end = math.inf if config.max_seconds is None else time.perf_counter() + config.max_seconds
     with Progress("trial fits", known=False, shown=progress):
         chosen, cost, changes = _choose(image, regions, num_bytes, config, seed)
     count = count_for(num_bytes - _map_bytes(chosen), image.shape[1] * image.shape[2], config.objective)
 
-    def left(share: float = 1.0) -> float | None:
-        return None if math.isinf(end) else max(share * (end - time.perf_counter()), 1e-3)
-
-    settings = {"contour_cost": cost, "max_seconds": left(_FIT_SHARE)}
-    if chosen is not None and chosen.num_regions == 2:
-        settings["merge_regions"] = False  # the trials said so
-    config = config.model_copy(update=settings)
+    config = config.model_copy(update={"contour_cost": cost})
     share = _FIT_END if chosen is None else _CONTOURS_END
-    last = math.inf if config.max_seconds or count <= _FEW else math.ceil(share * config.usual_iterations)
+    last = math.inf if config.max_seconds else math.ceil(share * config.usual_iterations)
 
     def step(iteration: int, entry: HistoryEntry) -> bool:
         return (on_step is not None and bool(on_step(iteration, entry))) or iteration >= last
@@ -125,8 +116,7 @@ def fit_bytes(
     if result.history[-1].iteration >= last:
         result = result._replace(stop_reason="iterations")
     with Progress("writing the file", known=False, shown=progress):
-        how: Any = {"max_seconds": left(), "seed": seed, "objective": config.objective}
-        data, scene = compress(result.scene, image, target_bytes=num_bytes, **how)
+        data, scene = compress(result.scene, image, target_bytes=num_bytes, seed=seed, objective=config.objective)
     return FitBytesResult(data, scene, result)
 
 
@@ -148,9 +138,7 @@ def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: Fi
     count_of = partial(count_for, pixels=image.shape[1] * image.shape[2], objective=config.objective)
     # by iterations, so that without a clock the same arguments give the same file
     iterations = min(_TRIAL_ITERATIONS, config.usual_iterations)
-    clock = None if config.max_seconds is None else _TRIAL_SHARE * config.max_seconds
-    shorter: dict[str, Any] = {"iterations": iterations, "max_seconds": clock, "refine_flat": False}
-    trial = FitConfig.from_recipe(config, merge_regions=False, **shorter)
+    trial = FitConfig.from_recipe(config, merge_regions=False, iterations=iterations, max_seconds=None)
 
     def error(regions: RegionMap | None, left: int) -> float:
         end = math.ceil(_FIT_END * iterations)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple, get_args
 
@@ -37,8 +36,6 @@ _DROP = 0.8
 _TUNED, _AIM, _NEAR, _TRIES = 1.006, 1.01, 0.995, 3
 # many numbers are small, and take no more bits where all are finer: a step for more bytes is longer by this factor
 _GAIN = 1.3
-# of the seconds that are left: for the first of several files, and what comes before; for rounding a single file
-_SHARE, _ALONE = 0.5, 0.8
 
 
 @brief
@@ -59,7 +56,6 @@ def compress(
     target_bytes: int | None = None,
     target_psnr: float | None = None,
     iterations: int = 600,
-    max_seconds: float | None = None,
     seed: int = 0,
     objective: str = "psnr",
 ) -> Compressed:
@@ -77,7 +73,6 @@ def compress(
         target_psnr: dB against the image, in place of both: the first of ever finer files that shows it, or where the
             scene itself does not, one that is nearly as good.
         iterations: renders that the descent may take, at least 1.
-        max_seconds: wall time, above 0; what it has no time for is rounded at once. None: as long as it takes.
         seed: of the order in which Gaussians are rounded.
         objective: of the descent, psnr or ms-ssim, as in :class:`kcgs.FitConfig`.
 
@@ -107,10 +102,7 @@ def compress(
     check_count("iterations", iterations)
     if objective not in get_args(Objective):
         raise InvalidArgument("objective", f"one of {', '.join(get_args(Objective))}", repr(objective))
-    seconds = math.inf
-    if max_seconds is not None:
-        seconds = check_number("max_seconds", max_seconds, 0.0, unit="seconds", above=True)
-    press = _Press(writer, target, objective, iterations, seed, time.perf_counter() + seconds)
+    press = _Press(writer, target, objective, iterations, seed)
     with threads_for_kernels(target[0].numel()):
         if target_bytes is not None:
             data = press.largest(target_bytes)
@@ -122,25 +114,22 @@ def compress(
 
 
 class _Press:
-    """Writes a scene with an eye on its image, until a time of the clock."""
+    """Writes a scene with an eye on its image."""
 
-    def __init__(
-        self, writer: SceneWriter, image: Tensor, objective: str, iterations: int, seed: int, end: float
-    ) -> None:
+    def __init__(self, writer: SceneWriter, image: Tensor, objective: str, iterations: int, seed: int) -> None:
         self.writer, self.image, self.objective = writer, image, make_objective(objective, image)
-        self.seed, self.end = seed, end
-        self.free = int(_FREE * iterations)
+        self.seed, self.free = seed, int(_FREE * iterations)
         self.rounds = iterations - self.free
 
-    def write(self, qp: int, share: float = _ALONE) -> bytes:
+    def write(self, qp: int) -> bytes:
         """Return the file at a quantization parameter."""
-        return self._round(self._spare(lambda _: qp), qp, self.rounds, share)
+        return self._round(self._spare(lambda _: qp), qp, self.rounds)
 
     def first_that_shows(self, decibels: float, scene: Scene) -> bytes:
         """Return the first of ever finer files that shows so much; where the scene does not, one nearly as good."""
         reached = float(psnr(scene.render().to(self.image), self.image))
         for finer in _FINER if reached >= decibels else _FINER[:1]:
-            data = self.write(self.writer.qp_for(quality_for(reached + finer)), _SHARE)
+            data = self.write(self.writer.qp_for(quality_for(reached + finer)))
             if float(psnr(decode(data).scene.render(), self.image)) >= decibels:
                 break
         return data
@@ -161,7 +150,7 @@ class _Press:
         best, plain, most = b"", data, self.writer.qp_for(QUALITIES[1])
         for _ in range(_TRIES):
             qp = min(writer.next_qp(qp, len(data), round(_AIM * target_bytes)), most)
-            data = self._round(writer, qp, self.rounds, _SHARE, target_bytes)
+            data = self._round(writer, qp, self.rounds, target_bytes)
             best = max(best, data if len(data) <= target_bytes else b"", key=len)
             if len(data) >= _NEAR * target_bytes or qp == most:
                 break
@@ -169,21 +158,19 @@ class _Press:
 
     def _spare(self, follow: Callable[[SceneWriter], int]) -> SceneWriter:
         """Descend with nothing rounded, at the quantization parameter that `follow` says now and then."""
-        writer, end = self.writer, time.perf_counter() + _SHARE * (self.end - time.perf_counter())
+        writer = self.writer
         tuning: Tuning | None = None
         for done in range(0, self.free, _LOOK):
-            if time.perf_counter() >= end:
-                break
             quantizer = Quantizer(follow(writer), writer.size)
             tuning = tuning or self._tuning(writer, quantizer)
             tuning.quantizer = quantizer
             if done >= _DROP * self.free:
                 tuning.drop()
-            tuning.descend(min(_LOOK, self.free - done), end - time.perf_counter())
+            tuning.descend(min(_LOOK, self.free - done))
             writer = writer.of(tuning.gaussians, tuning.ids)
         return writer
 
-    def _round(self, writer: SceneWriter, qp: int, rounds: int, share: float = 1.0, most: float = math.inf) -> bytes:
+    def _round(self, writer: SceneWriter, qp: int, rounds: int, most: float = math.inf) -> bytes:
         tuning = self._tuning(writer, Quantizer(qp, writer.size))
         tuning.drop()
         data = b""
@@ -193,8 +180,7 @@ class _Press:
             data = writer.write(tuning.quantizer, codes, tuning.ids)
             return max(0, math.ceil((len(data) - most) * len(tuning.ids) / len(data)))
 
-        seconds = share * (self.end - time.perf_counter())
-        codes = tuning.round(rounds, self.seed, seconds, None if math.isinf(most) else excess)
+        codes = tuning.round(rounds, self.seed, None if math.isinf(most) else excess)
         return data or writer.write(
             tuning.quantizer, codes, tuning.ids
         )  # the codes are those that `excess` was asked last

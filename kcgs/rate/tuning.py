@@ -8,7 +8,6 @@ meanwhile. A step is a gradient divided by the known curvature of the squared er
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -77,32 +76,23 @@ class Tuning:
         kept[energy.argmax()] = True
         self._keep(kept.numpy())
 
-    def descend(self, iterations: int, seconds: float = math.inf) -> None:
-        """Move all Gaussians downhill, so many steps, or so many seconds."""
-        end = time.perf_counter() + seconds
+    def descend(self, iterations: int) -> None:
+        """Move all Gaussians downhill, so many steps."""
         for _ in range(iterations):
-            if time.perf_counter() >= end:
-                break
             self._speed = _MOMENTUM * self._speed + self._downhill(*self._free)
             self._free = self._moved(self._free)
 
-    def round(
-        self, iterations: int, seed: int, seconds: float = math.inf, excess: Callable[[Codes], int] | None = None
-    ) -> Codes:
-        """Round everything in so many iterations and seconds, in an order of the seed; return the whole numbers.
+    def round(self, iterations: int, seed: int, excess: Callable[[Codes], int] | None = None) -> Codes:
+        """Round everything in so many iterations, in an order of the seed; return the whole numbers.
 
         `excess` says how many Gaussians are too many; the weakest go, early enough for others to make up for them.
         """
         generator = torch.Generator().manual_seed(seed)
         turn = torch.rand(2, len(self.ids), generator=generator).to(self.image)
         classes = self.quantizer.classify(self.gaussians)
-        start, share, looks = time.perf_counter(), 0.0, [*_LOOKS, math.inf]
+        looks = [*_LOOKS, math.inf]
         for iteration in range(iterations):
-            share = max(share, iteration / iterations)
-            if seconds < math.inf:
-                share = max(share, (time.perf_counter() - start) / max(seconds, 1e-9))
-            if share >= 1:
-                break
+            share = iteration / iterations
             if iteration % _GROUP == 0:
                 if excess is not None and share >= looks[0]:
                     looks.pop(0)

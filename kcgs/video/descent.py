@@ -13,7 +13,9 @@ from kcgs.fitting.contour_moves import accept_moves, refine_contours
 from kcgs.fitting.frame import local_gradient, move, widen
 from kcgs.fitting.objective import make_objective, propose_by
 from kcgs.fitting.redundancy import least_missed
+from kcgs.fitting.start import draft_cutoff
 from kcgs.fitting.state import Gaussians
+from kcgs.fitting.strategies import MoveContours
 from kcgs.functional import region_splat
 
 _ITERATIONS = 85
@@ -146,7 +148,7 @@ class Descent:
         errors = [
             squared_error(self.gaussians._replace(regions=regions), self.image, config) for regions in (before, moved)
         ]
-        accepted = accept_moves(before, moved, config.contour_rise * errors[0] - errors[1])
+        accepted = accept_moves(before, moved, MoveContours.rise * errors[0] - errors[1])
         self.gaussians = self.gaussians._replace(regions=accepted)
 
     def _visibility(self) -> tuple[Tensor, Tensor]:
@@ -168,7 +170,7 @@ class Descent:
 def render_draft(gaussians: Gaussians, image: Tensor, config: FitConfig) -> Tensor:
     """Render (C, H, W), of the size of the image, with the cutoff of a draft."""
     means, cholesky, colors, region_ids, regions = gaussians
-    size, cutoff = (image.shape[1], image.shape[2]), max(config.cutoff, config.draft_cutoff)
+    size, cutoff = (image.shape[1], image.shape[2]), draft_cutoff(config)
     return region_splat(means, cholesky, colors, region_ids, regions, size=size, cutoff=cutoff, backend=config.backend)
 
 

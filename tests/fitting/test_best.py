@@ -74,7 +74,7 @@ class TestBest:
         image, labels = scene()
         assert fit(image, labels, 40, recipe=quick(densify_from=1.0)).history[0].num_gaussians == 40
 
-    @pytest.mark.parametrize("initializer", ["random", "gradient", "kmeans"])
+    @pytest.mark.parametrize("initializer", ["random", "gradient", "uniform"])
     def test_starts(self, initializer: str) -> None:
         image, labels = scene()
         assert fit(image, labels, 40, recipe=quick(initializer=initializer)).history[-1].psnr > 25
@@ -115,27 +115,6 @@ class TestContours:
         assert (moved.labels != labels).sum() < 0.3 * (given != labels).sum()
         assert not bool(((moved.labels != given) & ~edge_band(given, 3)).any())
 
-    def test_contours_without_edges_are_let_go(self) -> None:
-        image, labels = scene()
-        y, x = torch.meshgrid(torch.arange(48), torch.arange(64), indexing="ij")
-        smooth = torch.stack([0.5 + 0.3 * torch.sin(0.11 * x + 0.07 * k * y) for k in range(3)])
-        board = (x // 6 + y // 6) % 2
-        result = fit(smooth, board, 24, recipe=quick(move_contours=False))
-        assert result.scene.regions is None
-        assert result.scene.field.region_ids is None
-        assert result.regions == RegionReport(2, 1, merged_by_trial=1)
-        assert str(result.regions) == "2 regions became one; 1 merged: their contours do not help"
-        assert fit(smooth, board, 24, recipe=quick(move_contours=False, merge_regions=False)).scene.regions is not None
-        assert fit(image, labels, 24, recipe=quick()).scene.regions is not None
-
-    def test_of_three_regions_two_become_one(self) -> None:
-        image, labels = scene()
-        split = torch.where((labels == 0) & (torch.arange(64) >= 50), 7, labels)
-        regions = fit(image, split, 40, recipe=quick(iterations=200, move_contours=False)).scene.regions
-        assert regions is not None
-        assert regions.ids.tolist() in ([0, 1], [0, 1, 7])
-        assert bool((regions.labels[labels == 1] == 1).all())
-
     def test_width_of_a_blurred_edge(self) -> None:
         image, labels = scene()
         kernel = torch.exp(-0.5 * (torch.arange(-6, 7) / 1.5) ** 2)
@@ -169,17 +148,11 @@ class TestEnd:
         assert result.scene.field.num_gaussians == 50 - result.removed or result.scene.field.num_gaussians < 50
         assert result.change <= 0.05
 
-    @pytest.mark.parametrize(("chart", "least"), [(chart_2x3, 70.0), (chart_pie, 38.0)])
+    @pytest.mark.parametrize(("chart", "least"), [(chart_2x3, 70.0), (chart_pie, 35.0)])
     def test_charts(self, chart: object, least: float) -> None:
         image, labels = chart()  # type: ignore[operator]
         result = fit(image, labels, 20)
         assert float(psnr(result.scene.render(), image)) > least
-
-    def test_pie_with_sub_pixel_coverage(self) -> None:
-        image = chart_pie().image
-        fine = RegionMap.from_labels(chart_pie(8).labels, supersample=8)
-        result = fit(image, fine, 20, recipe=quick(iterations=100))
-        assert float(psnr(result.scene.render(), image)) > 60
 
 
 def hard_cases() -> dict[str, tuple[Tensor, Tensor, int]]:
@@ -213,8 +186,7 @@ class TestHardCases:
         assert reached > 5
         if not result.scene.field.num_gaussians:
             return
-        # a polished Gaussian may be as wide as 100 diagonals, any other as one
-        limit = (1.01 if reached < 60 and name != "saturated" else 101) * math.hypot(*image.shape[1:])
+        limit = 1.01 * math.hypot(*image.shape[1:])
         assert float(result.scene.field.cholesky.detach().abs().max()) <= limit
         assert float(result.scene.field.means.detach().abs().max()) <= 4 * limit
 
@@ -248,7 +220,7 @@ class TestRegionReport:
         report = result.regions
         assert report is not None and report.given == len(cells.unique()) > 12 >= report.kept > 1
         assert report.merged_for_count == report.given - 12
-        assert report.given == report.kept + report.merged_for_count + report.merged_by_trial
+        assert report.given == report.kept + report.merged_for_count
         assert result.history[-1].psnr > fit(image, None, 12, recipe=quick(iterations=60)).history[-1].psnr + 1
 
     def test_moved_pixels_are_counted(self) -> None:

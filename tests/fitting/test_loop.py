@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from itertools import pairwise
 
 import pytest
@@ -15,7 +14,6 @@ from kcgs.data import chart_2x3, chart_pie
 from kcgs.fitting import available_recipes
 from kcgs.fitting.optimizers import ImageGSAdam
 from kcgs.functional import ef_psnr, psnr
-from tests.conftest import Clock
 
 
 def disc(size: tuple[int, int] = (32, 40)) -> tuple[Tensor, Tensor]:
@@ -95,7 +93,7 @@ class TestSettings:
 
     def test_the_defaults_are_the_recipe_best(self) -> None:
         assert FitConfig() == FitConfig.from_recipe("best")
-        assert len(FitConfig.model_fields) <= 25
+        assert len(FitConfig.model_fields) <= 22
 
     def test_a_recipe_by_name_or_whole_and_settings_over_it(self) -> None:
         image, labels = disc()
@@ -209,14 +207,6 @@ class TestSwitches:
 
 
 class TestStopping:
-    def test_no_clock_counts_what_compiles_once(self, monkeypatch: pytest.MonkeyPatch, clock: Clock) -> None:
-        """The baseline of the demo began at 8 s: the first fit of a process bore the compilation."""
-        image = torch.rand(3, 16, 24)
-        monkeypatch.setattr(sys.modules["kcgs.fitting.loop"], "prepare", lambda *_: clock.advance(100.0))
-        whole, timed = (fit(image, None, 3, **{"iterations": 2, **more}) for more in ({}, {"target_psnr": 1.0}))
-        assert whole.seconds < 100 and timed.history[0].seconds < 100
-        assert fit(image, None, 3, max_seconds=0.2).history[-1].iteration > 2
-
     @pytest.mark.usefixtures("clock")
     def test_seconds(self) -> None:
         image, labels = disc()
@@ -288,9 +278,9 @@ class TestErrors:
         ("settings", "words"),
         [
             ({"speed": 5}, "^unknown setting 'speed': there are guidance, .*, target_psnr$"),
-            ({"iterations": 0}, "iterations: .* greater than or equal to 1; got 0"),
-            ({"loss": "l3"}, "loss: .*'l1', 'l2' or .*; got 'l3'"),
-            ({"max_seconds": math.inf}, "max_seconds: .*finite"),
+            ({"iterations": 0}, "iterations must be greater than or equal to 1; got 0"),
+            ({"loss": "l3"}, "loss must be 'l1', 'l2' or .*; got 'l3'"),
+            ({"max_seconds": math.inf}, "max_seconds must be a finite number"),
             ({"backend": "gpu"}, "^backend must be one of auto, [^;]*; got 'gpu'$"),
         ],
     )

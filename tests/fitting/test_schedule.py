@@ -14,7 +14,6 @@ from kcgs.fitting.optimizers import FrameAdam, GaussianImageAdan
 from kcgs.fitting.start import start
 from kcgs.fitting.state import FitState, HistoryEntry
 from kcgs.fitting.strategies import Densify, MoveContours, Strategy, make_strategies
-from kcgs.fitting.strategies.merge_regions import nearest_contour
 from kcgs.nn import GaussianField
 
 
@@ -26,7 +25,7 @@ class TestDensify:
     def test_the_number_grows_and_then_goes_up_and_down(self) -> None:
         densify = Densify(state_of(1000))
         counts = [densify.wanted(p / 1000) for p in range(1001)]
-        assert counts[0] == counts[49] == 50
+        assert counts[0] == counts[49] == 20
         growth, cycles, rest = counts[:401], counts[400:800], counts[800:]
         assert all(b >= a for a, b in pairwise(growth))
         assert len(set(growth)) == densify.steps + 1
@@ -94,13 +93,12 @@ class TestStrategies:
         def names(**settings: Any) -> list[str]:
             return [type(strategy).__name__ for strategy in make_strategies(state_of(10, **settings))]
 
-        assert names() == ["EndDrafts", "Densify", "MoveContours", "MergeRegions"]
-        off = {"move_contours": False, "merge_regions": False}
-        assert names(warmup=True, **off) == ["EndDrafts", "RefreshIds", "Densify"]
+        assert names() == ["EndDrafts", "Densify", "MoveContours"]
+        assert names(warmup=True, move_contours=False) == ["EndDrafts", "RefreshIds", "Densify"]
 
     def test_late_moves_are_even(self) -> None:
         state, due = state_of(10), []
-        strategy: Strategy = MoveContours(state, rise=1.5, after=0.5)
+        strategy: Strategy = MoveContours(state, after=0.5)
         for p in range(101):
             if strategy.due(p / 100):
                 state.late_moves += 1
@@ -129,9 +127,3 @@ class TestMaps:
         gain[:3, :3] = -1.0
         before = RegionMap.from_labels(labels)
         assert accept_moves(before, RegionMap.from_labels(after), gain) is before
-
-    def test_nearest_contour(self) -> None:
-        labels, across, distance = nearest_contour(torch.tensor([[4, 4, 4, 7, 7]]))
-        assert labels.tolist() == [[4, 4, 4, 7, 7]]
-        assert across.tolist() == [[7, 7, 7, 4, 4]]
-        assert distance.tolist() == [[2, 1, 0, 0, 1]]

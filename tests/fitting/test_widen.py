@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs.fitting import FitConfig, fit
+from kcgs.fitting import fit
 from kcgs.fitting.frame import widen
 
 
@@ -39,17 +39,9 @@ class TestFit:
     def image(self) -> Tensor:
         return torch.rand(3, 24, 36, generator=torch.Generator().manual_seed(0))
 
-    def least(self, **settings: float) -> float:
-        field = fit(self.image(), None, 60, iterations=60, **settings).scene.field
+    def least(self) -> float:
+        field = fit(self.image(), None, 60, iterations=60).scene.field
         return float(torch.linalg.eigvalsh(covariance(field.cholesky.detach())).min().sqrt())
 
     def test_none_is_thinner(self) -> None:
         assert self.least() >= 0.4999
-        assert self.least(least_sigma=0.8) >= 0.7999
-        assert self.least(least_sigma=0.1) < 0.4
-
-    def test_bad_values(self) -> None:
-        with pytest.raises(ValueError, match="least_sigma must be greater than or equal to 0.1; got 0.01"):
-            FitConfig.from_recipe("best", least_sigma=0.01)
-        with pytest.raises(ValueError, match="least_sigma needs optimizer 'frame'; got 'adan', which has its own"):
-            FitConfig.from_recipe("paper", least_sigma=0.5)

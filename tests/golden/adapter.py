@@ -21,9 +21,7 @@ from kcgs import GaussianField, RegionMap, Scene, editing, segment
 from kcgs import functional as F
 from kcgs.codec import decode, encode
 from kcgs.fitting import fit
-from kcgs.fitting.colors import solve_colors
 from kcgs.fitting.contour_moves import refine_contours
-from kcgs.fitting.levenberg_marquardt import levenberg_marquardt
 from kcgs.fitting.pursuit import propose
 from kcgs.onnx import generic_decoder, scene_decoder
 from kcgs.pruning import prune
@@ -236,14 +234,3 @@ def run_propose(p: Parts, residual: Tensor, count: int) -> tuple[Any, ...]:
 def run_refine_contours(p: Parts, image: Tensor, **settings: Any) -> dict[str, Any]:
     """Move contours."""
     return _of_map(refine_contours(_scene(p), image, **settings))
-
-
-def run_solve_colors(p: Parts, image: Tensor, **settings: Any) -> Tensor:
-    """Solve for the colours."""
-    return solve_colors(_scene(p), image, **settings).field.colors
-
-
-def run_polish(p: Parts, image: Tensor, **settings: Any) -> dict[str, Any]:
-    """Refine all parameters by Levenberg-Marquardt, with no limit of time."""
-    refined = levenberg_marquardt(_scene(p), image, max_seconds=1e9, **settings)
-    return _of_scene(refined.field, None)

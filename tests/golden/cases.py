@@ -234,12 +234,6 @@ for name, settings in MAPS.items():
     CASES[f"scene/propose-{name}"] = partial(
         lambda s: adapter.run_propose(gaussians(**s), textured() - 0.4, 25), settings
     )
-    CASES[f"scene/solve-colors-{name}"] = partial(
-        lambda s: adapter.run_solve_colors(gaussians(60, **s), textured()), settings
-    )
-    CASES[f"scene/refine-parameters-{name}"] = partial(
-        lambda s: adapter.run_polish(gaussians(8, **s), textured(), max_steps=6), settings
-    )
 for name in ("hard", "soft", "pairs"):
     CASES[f"scene/refine-contours-{name}"] = partial(
         lambda s: adapter.run_refine_contours(gaussians(**s), textured().roll(1, 2)), MAPS[name]

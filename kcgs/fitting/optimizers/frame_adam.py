@@ -32,9 +32,11 @@ class FrameAdam(GaussianOptimizer):
     outside = 2.0
     """How far outside the image a centre may lie, in its own standard deviations."""
 
-    def __init__(self, field: GaussianField, rate_factor: float, least_sigma: float = LEAST_SIGMA) -> None:
+    least_sigma = 0.5
+    """Thinner Gaussians fit the pixels' centres better, and are dots and needles when a scene is enlarged."""
+
+    def __init__(self, field: GaussianField, rate_factor: float) -> None:
         super().__init__(field)
-        self.least_sigma = least_sigma
         colors = self.raw[-1]
         rates = [self.learning_rate] * 5 + [self.color_rate] * colors.shape[1]
         self.rates = colors.detach().new_tensor(rates) * rate_factor

@@ -10,12 +10,11 @@ from typing import Protocol
 from kcgs.fitting.state import FitState
 
 from .densify import Densify, DensifyAtLargestError
-from .finish import EndDrafts, Finish
-from .merge_regions import MergeRegions
+from .finish import EndDrafts, finish
 from .move_contours import MoveContours
 from .warmup import RefreshIds
 
-__all__ = ["Densify", "Finish", "MergeRegions", "MoveContours", "Strategy", "make_strategies"]
+__all__ = ["Densify", "MoveContours", "Strategy", "finish", "make_strategies"]
 
 
 class Strategy(Protocol):
@@ -35,10 +34,8 @@ def make_strategies(state: FitState) -> list[Strategy]:
     if config.warmup:
         strategies.append(RefreshIds(state))
     kind = DensifyAtLargestError if config.densify == "largest-error" else Densify
-    contours = MoveContours(state, rise=config.contour_rise, after=kind.end) if config.move_contours else None
+    contours = MoveContours(state, kind.end) if config.move_contours else None
     strategies.append(kind(state, contours))
     if contours is not None:
         strategies.append(contours)
-    if config.merge_regions:
-        strategies.append(MergeRegions(state, after=kind.end))
     return strategies

@@ -44,10 +44,6 @@ class Densify:
     """About how many iterations a cycle takes."""
     removals: int = 4
     """How often Gaussians are left out in a cycle."""
-    patience: float = 2.0
-    """Where the clock ends the fit, descent gets this many times the seconds of the addition before it."""
-    first_share: float = 0.8
-    """About what the first addition takes, as a share of the seconds before it, most of which made the start."""
     sigmas: tuple[float, ...] = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
     """Standard deviations in pixels that are tried."""
 
@@ -68,21 +64,13 @@ class Densify:
         return most - round((most - final) * int(share * (self.removals + 1)) / self.removals)
 
     def due(self, progress: float) -> bool:
-        """Say whether another number of Gaussians is wanted, and the clock has time for more."""
-        state, wanted = self.state, self.wanted(progress)
-        if not state.history:  # where the clock is far on already: first one state that may be kept
-            return False
-        if wanted <= state.wanted:
-            return wanted < state.wanted
-        # against the clock, additions must end before the fit does, and leave time for the descent
-        hurried = state.config.max_seconds is not None and progress < 0.9 * self.end
-        in_time = state.has_time(state.addition_seconds or self.first_share * state.seconds())
-        return in_time and not (hurried and state.seconds() < state.densify_after)
+        """Say whether another number of Gaussians is wanted, once one state was measured that may be kept."""
+        return bool(self.state.history) and self.wanted(progress) != self.state.wanted
 
     @torch.no_grad()
     def apply(self, state: FitState) -> None:
         """Add Gaussians, after moving the contours, if that is due; or leave some out."""
-        start, progress = state.seconds(), state.progress()
+        progress = state.progress()
         before, state.wanted = state.wanted, self.wanted(progress)
         if state.wanted < before:
             leave_out(state, state.count() - state.wanted)
@@ -91,8 +79,6 @@ class Densify:
         if self.contours is not None and progress < self.end:
             self.contours.before_addition(state)
         self.add(state, state.wanted - state.count())
-        state.addition_seconds = state.seconds() - start
-        state.densify_after = state.seconds() + self.patience * state.addition_seconds
 
     def add(self, state: FitState, count: int) -> None:
         """Add so many Gaussians, if any."""

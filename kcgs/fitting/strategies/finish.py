@@ -1,19 +1,16 @@
-"""The end of a fit: no more drafts, then the best state, refined and pruned."""
+"""The end of a fit: no more drafts, then the best state, pruned."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 
 from kcgs.fitting.descent import log, render
-from kcgs.fitting.levenberg_marquardt import is_flat, levenberg_marquardt
 from kcgs.fitting.region_report import report_regions
-from kcgs.fitting.state import FitResult, FitState, Gaussians, StopReason
+from kcgs.fitting.state import FitResult, FitState, StopReason
 from kcgs.pruning import prune
-from kcgs.scene import Scene
 
 from .densify import leave_out
 
@@ -36,44 +33,22 @@ class EndDrafts:
             state.best_score = float("-inf")
 
 
-@dataclass(frozen=True)
-class Finish:
-    """Measure the last state, take the best, refine it where it is flat, and remove what it does not need."""
-
-    least_seconds: float = 0.01
-    """What the refinement gets, though the clock be run down."""
-
-    def apply(self, state: FitState, reason: StopReason) -> FitResult:
-        """Return the result of a fit that ended for this reason."""
-        config = state.config
-        drafted = None if state.cutoff == config.cutoff else state.best
-        EndDrafts().apply(state)
-        with torch.no_grad():
-            if drafted is not None:
-                log(state, render(state, drafted), drafted)
-            if reason != "diverged" and state.optimizer.is_finite():
-                leave_out(state, state.count() - state.num_gaussians)
-                log(state, render(state))
-        assert state.best is not None
-        scene = state.best.scene(state.size)
-        if config.refine_flat and reason == "iterations" and is_flat(state.image, scene.regions, scene.num_gaussians):
-            scene = self._refined(state, scene)
-        removed, change = 0, 0.0
-        if config.prune > 0:
-            scene, removed, change = prune(scene, config.prune, cutoff=config.cutoff, backend=config.backend)
-        dropped: Literal["recipe"] | None = None if config.guidance else "recipe"
-        regions = report_regions(state.given, scene, merged_for_count=state.merged_for_count, dropped=dropped)
-        return FitResult(scene, state.history, reason, config, removed, change, regions, state.seconds())
-
-    def _refined(self, state: FitState, scene: Scene) -> Scene:
-        """Refine a flat scene to its last digits, and write them down."""
-        config, seconds = state.config, math.inf
-        if config.max_seconds is not None:
-            seconds = max(self.least_seconds, config.max_seconds - state.seconds())
-        settings = {"max_seconds": seconds, "cutoff": config.cutoff, "backend": config.backend}
-        scene = levenberg_marquardt(scene, state.image, **settings)  # type: ignore[arg-type]
-        means, cholesky, colors = (t.detach() for t in (scene.field.means, scene.field.cholesky, scene.field.colors))
-        gaussians = Gaussians(means, cholesky, colors, scene.field.region_ids, scene.regions)
-        with torch.no_grad():
-            log(state, render(state, gaussians), gaussians)
-        return scene
+def finish(state: FitState, reason: StopReason) -> FitResult:
+    """Measure the last state, take the best, and remove what it does not need; return a fit that ended for a reason."""
+    config = state.config
+    drafted = None if state.cutoff == config.cutoff else state.best
+    EndDrafts().apply(state)
+    with torch.no_grad():
+        if drafted is not None:
+            log(state, render(state, drafted), drafted)
+        if reason != "diverged" and state.optimizer.is_finite():
+            leave_out(state, state.count() - state.num_gaussians)
+            log(state, render(state))
+    assert state.best is not None
+    scene = state.best.scene(state.size)
+    removed, change = 0, 0.0
+    if config.prune > 0:
+        scene, removed, change = prune(scene, config.prune, cutoff=config.cutoff, backend=config.backend)
+    dropped: Literal["recipe"] | None = None if config.guidance else "recipe"
+    regions = report_regions(state.given, scene, merged_for_count=state.merged_for_count, dropped=dropped)
+    return FitResult(scene, state.history, reason, config, removed, change, regions, state.seconds())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -22,20 +21,16 @@ class MoveContours:
     """
 
     state: FitState
-    rise: float
-    """Factor by which a move may raise the squared error about it while Gaussians are added."""
     after: float
     """Share of the fit after which moves must lower the error: the end of densification."""
+    rise: float = 1.5
+    """Factor by which a move may raise the squared error about it while Gaussians are added."""
     times: int = 4
     """How often contours move then, evenly over the rest."""
     additions_per_move: int = 2
     """Contours move before every second addition."""
     additions_per_choice: int = 4
     """Before every fourth addition their widths are chosen anew."""
-    time_share: float = 0.1
-    """Share of the seconds that a fit may spend on moves."""
-    pixel_seconds: float = 5e-7
-    """About what a move takes, for each pixel."""
 
     def due(self, progress: float) -> bool:
         """Say whether it is time for a move that must lower the error."""
@@ -56,11 +51,8 @@ class MoveContours:
     @torch.no_grad()
     def move(self, state: FitState, rise: float, choose_anew: bool = False) -> None:
         """Move the contours where that raises the squared error about them by no more than this factor."""
-        config, before, start = state.config, state.regions, state.seconds()
-        takes = state.moving_seconds or self.pixel_seconds * state.image[0].numel()
-        if before is None or before.supersample > 1 or not state.has_time(takes):
-            return
-        if state.moving_seconds > self.time_share * (config.max_seconds or math.inf):
+        config, before = state.config, state.regions
+        if before is None or before.supersample > 1:
             return
         moved = refine_contours(
             state.gaussians().scene(state.size), state.image, given=state.anchor,
@@ -73,4 +65,3 @@ class MoveContours:
         if choose_anew:
             moved = RegionMap.from_labels(moved.labels, choose_widths(state.image, moved.labels))
         state.regions = moved
-        state.moving_seconds += state.seconds() - start
