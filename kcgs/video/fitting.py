@@ -19,7 +19,7 @@ from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, fit
 from kcgs.fitting.loop import check_problem
 from kcgs.fitting.state import Gaussians
-from kcgs.functional import RegionMap, lookup_regions
+from kcgs.functional import RegionMap
 from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
@@ -181,7 +181,7 @@ class _Video:
             present = torch.isin(ids, regions.ids)
             ids, colors = torch.where(present, ids, regions.ids[0]), torch.where(present[:, None], colors, 0.0)
         unmoved = Gaussians(means, cholesky, colors, ids, regions)
-        moved = unmoved._replace(means=_move_by_region(motion, unmoved))
+        moved = unmoved._replace(means=move_points(motion, means))
         errors = [squared_error(gaussians, self.image, self.config) for gaussians in (unmoved, moved)]
         changed = _blur(errors[0]) > _STILL * _blur(self.error) + _LEVEL
         _, sums = sum_over_pixels(unmoved, self.image, self.config)
@@ -210,19 +210,6 @@ def stack(frames: list[Gaussians], size: tuple[int, int], metadata: Mapping[str,
 
 def _blur(error: Tensor) -> Tensor:
     return avg_pool2d(error[None], _SURROUNDINGS, 1, _SURROUNDINGS // 2, count_include_pad=False)[0]
-
-
-def _move_by_region(motion: Tensor, gaussians: Gaussians) -> Tensor:
-    """Move centres along a motion; those that would leave their region go as the region does on the mean."""
-    means, _, _, ids, regions = gaussians
-    moved = move_points(motion, means)
-    if regions is None or ids is None:
-        return moved
-    rows, pixels = region_positions(gaussians, motion)
-    sums = [pixels.flatten().bincount(part.flatten()) for part in motion]
-    mean = torch.stack(sums, -1) / pixels.flatten().bincount()[:, None]
-    inside = lookup_regions(moved, regions.labels) == ids
-    return torch.where(inside[:, None], moved, means - mean[rows].to(means))
 
 
 def _pairs(frames: Iterable[Any], label_maps: Labels | Iterable[Labels] | None) -> Iterator[tuple[Any, Labels | None]]:
