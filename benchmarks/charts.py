@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from .core import figures, images, summaries
-from .core.cases import BASELINE, BEST, CLAMPED, COVERAGE, PAPER, PAPER_CLAMPED, UNCLAMPED, Case, plan
+from .core.cases import BASELINE, BEST, CLAMPED, PAPER, PAPER_CLAMPED, UNCLAMPED, Case, plan
 from .core.compare import Contest
 from .core.images import CHARTS
 from .core.options import Options
@@ -21,7 +21,7 @@ ITERATIONS = 5_000
 QUICK_STRIDE = 2
 # the paper's four conditions, and ours
 METHODS = (CLAMPED, UNCLAMPED, PAPER_CLAMPED, PAPER, BASELINE, BEST)
-NAMES = tuple(m.name for m in (*METHODS, COVERAGE))
+NAMES = tuple(m.name for m in METHODS)
 CONTESTS = (
     *(Contest(PAPER.name, other.name) for other in (UNCLAMPED, CLAMPED, PAPER_CLAMPED)),
     Contest(PAPER_CLAMPED.name, CLAMPED.name),
@@ -33,8 +33,7 @@ _BITS_TEXT = """Of both baselines files are made until one has as many bytes as 
 other methods have one size."""
 _TEXT = """Flat colours, straight edges in the 2x3 chart (200 x 300) and curved, slightly blurred ones in the pie (300
 x 300), 20 Gaussians. The maps are exact. A mean over two charts is not a claim about images: each chart has its
-table. `best, sub-pixel coverage` is given 8 x 8 labels per pixel, the grid that the pie's own edges were sampled on,
-which no photo has; its map costs more bytes."""
+table."""
 
 
 def report(output: Path, made: Made) -> list[str]:
@@ -61,10 +60,7 @@ def run(output: Path, options: Options) -> None:
 
 def cases(options: Options) -> list[Case]:
     """List the fits."""
-    found = plan(CHARTS, (NUM_GAUSSIANS,), METHODS, options, ITERATIONS, QUICK_STRIDE)
-    if not options.quick:
-        found += [c._replace(method=COVERAGE) for c in found if c.image == "pie" and c.method == BEST]
-    return found
+    return plan(CHARTS, (NUM_GAUSSIANS,), METHODS, options, ITERATIONS, QUICK_STRIDE)
 
 
 def _finish(output: Path, store: Store, wanted: Sequence[Case]) -> list[Row]:

@@ -110,8 +110,7 @@ class Scene(nn.Module):
         """Refuse a size (height, width) whose render does not fit into memory; the message begins with `name`."""
         if self.field.means.device.type == "cpu":
             numbers = self.field.colors.shape[-1] * self.field.means.shape[:-2].numel()
-            finer = 0 if self.regions is None else self.regions.supersample**2
-            per_pixel = max(_IMAGE_BYTES * numbers, 4 * numbers + _MAP_BYTES * finer)
+            per_pixel = max(_IMAGE_BYTES * numbers, 4 * numbers + (0 if self.regions is None else _MAP_BYTES))
             asked = self.size if size is None else check_size(name, size)
             check_memory(name, rendered_size(self.size, asked), per_pixel)
 

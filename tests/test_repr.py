@@ -19,7 +19,7 @@ import kcgs
 from kcgs import FitConfig, GaussianField, RegionMap, RegionSplatRenderer, Scene, codec, fit
 from kcgs.data import ChartSample, Davis, DavisFrame, save_image, save_labels
 from kcgs.fitting import FitResult, available_recipes
-from kcgs.functional import BandGain, BoundaryScore, PairWidths
+from kcgs.functional import BandGain, PairWidths
 from kcgs.pruning import prune
 from kcgs.rate import Compressed, FitBytesResult
 from kcgs.segment import Cleanup, Prediction, Segmentation
@@ -52,7 +52,6 @@ def objects(result: FitResult, folder: Path) -> Iterator[Any]:
     yield from (Segmentation(LABELS, torch.rand(21), {i: f"name {i}" for i in range(21)}), Cleanup())
     yield from (Prediction(LABELS.numpy(), torch.rand(SIZE), [f"name {i}" for i in range(21)]), *entries())
     yield from (ChartSample(image, LABELS), DavisFrame("bear", image, LABELS), BandGain(0.1, 0.2))
-    yield BoundaryScore(*torch.rand(3, 2))
     for kind in ("JPEGImages", "Annotations"):
         (folder / kind / "480p" / "bear").mkdir(parents=True)
     save_image(folder / "JPEGImages/480p/bear/00000.jpg", image)

@@ -20,7 +20,6 @@ MAPS = {
     "hard": RegionMap.from_labels((torch.arange(30) // 11).expand(SIZE)),
     "soft": RegionMap.from_labels((torch.arange(30) // 11).expand(SIZE), 0.8),
     "pairs": RegionMap.from_labels((torch.arange(30) // 11).expand(SIZE), {(0, 1): 0.5, (1, 2): 1.5}),
-    "fine": RegionMap.from_labels((torch.arange(60) // 23).expand(40, 60), supersample=2),
     "resized": RegionMap.from_labels((torch.arange(60) // 23).expand(40, 60), 1.0).resize(SIZE),
 }
 
@@ -29,8 +28,8 @@ def batch_of(one: RegionMap) -> RegionMap:
     """Make a batch of three maps, the last of one region."""
     if one._origin is not None:
         return batch_of(one._origin).resize(one.size)
-    labels = torch.stack([one.fine_labels, one.fine_labels.flip(-1), torch.ones_like(one.fine_labels)])
-    return RegionMap.from_labels(labels, one.softness, supersample=one.supersample)
+    labels = torch.stack([one.labels, one.labels.flip(-1), torch.ones_like(one.labels)])
+    return RegionMap.from_labels(labels, one.softness)
 
 
 def make_scene(name: str = "soft") -> Scene:
@@ -168,7 +167,7 @@ class TestScene(BaseTester):
 
         self.gradcheck(draw, list(scene.parameters()))
 
-    @pytest.mark.parametrize("name", ["none", "hard", "fine", "resized"])
+    @pytest.mark.parametrize("name", ["none", "hard", "resized"])
     def test_dynamo(self, device: torch.device, dtype: torch.dtype, name: str) -> None:
         compiler = "inductor" if name == "hard" else "eager"
         self.assert_compiles(scene_on(device, dtype, name), backend=compiler, rtol=1e-4, atol=1e-5)
@@ -188,7 +187,7 @@ class TestScene(BaseTester):
         image = scene.render()
         assert not image.requires_grad and 0.0 <= float(image.min()) and float(image.max()) == 1.0
 
-    @pytest.mark.parametrize(("name", "needed"), [("none", "1.2"), ("soft", "1.8"), ("fine", "6.0")])
+    @pytest.mark.parametrize(("name", "needed"), [("none", "1.2"), ("soft", "1.8")])
     def test_renders_that_do_not_fit(self, monkeypatch: pytest.MonkeyPatch, name: str, needed: str) -> None:
         monkeypatch.setattr("kcgs._check._free_memory", lambda: 1e9)
         with pytest.raises(ValueError, match=f"size asks for 8192 x 4096 pixels, which need about {needed} GB of mem"):

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from kcgs.data import chart_pie
 from kcgs.fitting import FitConfig
 from kcgs.functional import RegionMap
 
@@ -58,9 +57,6 @@ PAPER = method("paper")
 BASELINE = method("best-baseline")
 BEST = method("best")
 REFINED = method("best-refined")
-# hard contours with many labels per pixel; a pixel of the pie is the mean of 8 x 8 samples: with so many they are exact
-COVERAGE_LABELS = 8
-COVERAGE = method("best, sub-pixel coverage", "best", move_contours=False, softness=0.0)
 
 
 class Case(NamedTuple):
@@ -85,8 +81,6 @@ class Case(NamedTuple):
 
     def regions(self, labels: Tensor | None) -> RegionMap | None:
         """Return the map that the fit is given, from the image's labels."""
-        if self.method == COVERAGE and self.stride == 1:
-            return RegionMap.from_labels(chart_pie(COVERAGE_LABELS).labels, supersample=COVERAGE_LABELS)
         return None if labels is None else RegionMap.from_labels(labels)
 
     def settings(self) -> str:

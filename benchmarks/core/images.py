@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from kcgs.data import Davis, chart_2x3, chart_pie, load_image
-from kcgs.functional.labels import largest_share
 from kcgs.segment import segment
 
 CHARTS = ("2x3", "pie")
@@ -65,7 +64,8 @@ def load(name: str, data: Path | None, stride: int = 1, factor: int = 1) -> Samp
         labels = None if labels is None else labels[::stride, ::stride].contiguous()
     if factor > 1:
         image, labels = whole_blocks(Sample(image, labels), factor)
-        labels = None if labels is None else largest_share(labels[None], factor)[0]
+        if labels is not None:
+            labels = labels.unfold(0, factor, factor).unfold(1, factor, factor).flatten(2).mode(-1).values
         image = avg_pool2d(image, factor)
     return Sample(image, labels)
 

@@ -34,7 +34,6 @@ class Case(NamedTuple):
 
     ids: tuple[int, ...] = ()
     softness: float | Mapping[tuple[int, int], float] = 0.0
-    supersample: int = 1
     channels: int = 3
     opacities: bool = False
     needle: bool = False
@@ -47,7 +46,6 @@ CASES = {
     "hard": Case((2, 5, 300)),
     "soft": Case((0, 1, 7), 0.8, hidden=2),
     "pairs": Case((2, 5, 9, 11), {(2, 5): 0.0, (5, 9): 1.7, (2, 9): 0.6, (2, 11): 1.0, (9, 11): 0.4}, hidden=0),
-    "fine": Case((1, 2, 600), supersample=2, cutoff=1e-6),
     "needle": Case((3, 4), channels=4, opacities=True, needle=True),
 }
 
@@ -59,9 +57,9 @@ def uniform(count: int, columns: int, seed: int) -> Tensor:
     return (steps * roots) % 1
 
 
-def make_labels(ids: tuple[int, ...], supersample: int) -> Tensor:
+def make_labels(ids: tuple[int, ...]) -> Tensor:
     """Label a disc, a diagonal and a bar, as many as there are ids."""
-    y, x = torch.meshgrid(*((torch.arange(supersample * n) + 0.5) / supersample for n in SIZE), indexing="ij")
+    y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in SIZE), indexing="ij")
     index = (x + 0.6 * y > 21.3).long() * (len(ids) > 2)
     index[(x - 12.2) ** 2 + (y - 9.1) ** 2 < 37] = len(ids) - 1
     if len(ids) > 3:
@@ -71,11 +69,7 @@ def make_labels(ids: tuple[int, ...], supersample: int) -> Tensor:
 
 def make_scene(case: Case) -> Scene:
     """Spread Gaussians of all shapes over the image and beyond its border."""
-    regions = None
-    if case.ids:
-        regions = RegionMap.from_labels(
-            make_labels(case.ids, case.supersample), case.softness, supersample=case.supersample
-        )
+    regions = RegionMap.from_labels(make_labels(case.ids), case.softness) if case.ids else None
     count, height, width = 40, *SIZE
     means = uniform(count, 2, 0) * torch.tensor([width + 6.0, height + 6.0]) - 3
     shapes = uniform(count, 3, 2)
@@ -124,9 +118,8 @@ def make_arrays(case: Case) -> dict[str, Array]:
     arrays["image_view"] = np.ascontiguousarray(large[:, top:bottom, left:right])
     if regions is None or field.region_ids is None:
         return arrays
-    for name, tensor in (("region_ids", field.region_ids), ("labels", regions.fine_labels)):
+    for name, tensor in (("region_ids", field.region_ids), ("labels", regions.labels)):
         arrays[name] = tensor.numpy().astype(np.min_scalar_type(int(regions.ids.max())))
-    arrays["supersample"] = np.array(case.supersample)
     pairs = case.softness
     arrays["softness"] = np.array([(*k, v) for k, v in pairs.items()] if isinstance(pairs, Mapping) else pairs)
     widths, level = regions.membership.levels

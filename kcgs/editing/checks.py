@@ -64,17 +64,16 @@ def check_ids(region_ids: object, known: Tensor, owner: str) -> list[int]:
     return wanted
 
 
-def check_offset(offset: Sequence[float], supersample: int) -> tuple[int, int]:
-    """Return the offset in labels."""
+def check_offset(offset: Sequence[float]) -> tuple[int, int]:
+    """Return the offset in whole pixels."""
     pair = offset.tolist() if isinstance(offset, Tensor | np.ndarray) else offset
     if not isinstance(pair, Sequence) or isinstance(pair, str):
         raise InvalidArgumentType("offset", "(dx, dy) in pixels", repr(offset))
     if len(pair) != 2:
         raise InvalidArgument("offset", "(dx, dy)", repr(offset))
-    steps = [check_number("offset", d) * supersample for d in pair]
+    steps = [check_number("offset", d) for d in pair]
     if any(abs(step) > 1e8 or abs(step - round(step)) > 1e-6 for step in steps):
-        unit = "1 pixel" if supersample == 1 else f"1/{supersample} pixel, the spacing of the labels"
-        raise ValueError(f"offset must be whole multiples of {unit}; got {offset!r}")
+        raise InvalidArgument("offset", "whole multiples of 1 pixel", repr(offset))
     return round(steps[0]), round(steps[1])
 
 

@@ -46,7 +46,6 @@ def fill_hole(scene: Scene, hole: Tensor, seen: Tensor) -> Scene:
     """
     regions, ids = scene.regions, scene.field.region_ids
     assert regions is not None and ids is not None
-    hole, seen = (max_pool2d(mask[None].float(), regions.supersample)[0] > 0 for mask in (hole, seen))
     wanted = seen | _fringe(seen, regions.labels)
     unknown = hole | wanted
     if not wanted.any():

@@ -46,7 +46,7 @@ def move_region(
     Args:
         scene: unbatched, with a map of its own size, not a resized one.
         region_ids: an id in the map, or several, which move together.
-        offset: (dx, dy) in pixels, whole; with ``supersample`` k, whole multiples of 1/k.
+        offset: (dx, dy) in pixels, whole.
         fill: "inpaint": what is uncovered continues its surroundings smoothly, by Gaussians that are fitted there, some
             of them new, and so do 3 pixels around it, which have colours of the object; others change by a few
             hundredths. None: no fit; what is uncovered shows what the Gaussians of its new region paint there, streaks,
@@ -57,7 +57,7 @@ def move_region(
 
     Raises:
         TypeError: wrong types.
-        ValueError: a batch, no map or one of another size, an unknown id, all regions, an offset between labels;
+        ValueError: a batch, no map or one of another size, an unknown id, all regions, an offset between pixels;
             another `fill`, or "inpaint" where the regions reach into every pixel.
 
     Warns:
@@ -71,10 +71,10 @@ def move_region(
     """
     check_fill(fill)
     regions, chosen = check_editable(scene, region_ids)
-    steps = check_offset(offset, regions.supersample)
-    inside = torch.isin(regions.fine_labels, chosen)
-    behind = nearest_labels(regions.fine_labels, inside)
-    landed, labels = shift_labels(regions.fine_labels, inside, steps, behind)
+    steps = check_offset(offset)
+    inside = torch.isin(regions.labels, chosen)
+    behind = nearest_labels(regions.labels, inside)
+    landed, labels = shift_labels(regions.labels, inside, steps, behind)
 
     lost = regions.ids[~torch.isin(regions.ids, labels)].tolist()
     if lost:
@@ -85,7 +85,7 @@ def move_region(
         field = _filled_behind(scene, regions.relabel(behind), inside, landed)
     moved = field.subset(torch.isin(ids_of(field), labels))
     with torch.no_grad():
-        shift = moved.means.new_tensor(steps) / regions.supersample
+        shift = moved.means.new_tensor(steps)
         moved.means += torch.where(torch.isin(ids_of(moved), chosen)[:, None], shift, 0.0)
     return Scene(moved, regions.relabel(labels, "mean"), scene.metadata)
 
@@ -145,9 +145,9 @@ def delete_region(scene: Scene, region_ids: int | Iterable[int], *, fill: Fill |
     """
     check_fill(fill)
     regions, chosen = check_editable(scene, region_ids)
-    hole = torch.isin(regions.fine_labels, chosen)
+    hole = torch.isin(regions.labels, chosen)
     field = scene.field.subset(~torch.isin(ids_of(scene.field), chosen))
-    rest = Scene(field, regions.relabel(nearest_labels(regions.fine_labels, hole)), scene.metadata)
+    rest = Scene(field, regions.relabel(nearest_labels(regions.labels, hole)), scene.metadata)
     return rest if fill is None else fill_hole(rest, hole, hole)
 
 
@@ -202,13 +202,13 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
             f"{tuple(other.colors.shape)}"
         )
     first = int(regions.ids.max()) + 1
-    inside = torch.isin(regions.fine_labels, chosen)
-    behind = torch.full_like(regions.fine_labels, first)
+    inside = torch.isin(regions.labels, chosen)
+    behind = torch.full_like(regions.labels, first)
     ids = torch.full_like(ids_of(field), first)[:1].expand(other.num_gaussians)
     if background.regions is not None and other.region_ids is not None:
-        fine = RegionMap.from_labels(background.regions.fine_labels).resize((inside.shape[0], inside.shape[1]))
-        behind, ids = fine.labels.to(behind.device) + first, other.region_ids.to(behind.device) + first
-    labels = torch.where(inside, behind, regions.fine_labels)
+        sampled = RegionMap.from_labels(background.regions.labels).resize(scene.size)
+        behind, ids = sampled.labels.to(behind.device) + first, other.region_ids.to(behind.device) + first
+    labels = torch.where(inside, behind, regions.labels)
     means, cholesky, colors = (t.to(field.means) for t in (*scaled(other, scene.size), other.merged_colors()))
     stays = field.subset(~torch.isin(ids_of(field), chosen))
     joined = join(stays, GaussianField(means, cholesky, colors, ids, size=scene.size))
@@ -250,7 +250,7 @@ def _filled_behind(scene: Scene, behind: RegionMap, hole: Tensor, landed: Tensor
     widths = before.softness
     width = widths if isinstance(widths, float) else max(widths.values(), default=0.0)
     # through a soft contour one sees what is behind
-    uncovered = grow(~landed, math.ceil((1.0 + _CONTOUR_SIGMAS * width) * before.supersample))
-    stays = ~torch.isin(ids_of(scene.field), before.fine_labels[hole].unique())
+    uncovered = grow(~landed, math.ceil(1.0 + _CONTOUR_SIGMAS * width))
+    stays = ~torch.isin(ids_of(scene.field), before.labels[hole].unique())
     filled = fill_hole(Scene(scene.field.subset(stays), behind), hole, hole & uncovered).field
     return join(filled, scene.field.subset(~stays))

@@ -67,8 +67,8 @@ def _fingerprint(state: FitState, given: RegionMap | None) -> str:
     digest = hashlib.sha256(f"{_VERSION} {settings} {state.num_gaussians} {state.seed} {size}".encode())
     digest.update(state.image.cpu().numpy().tobytes())
     if given is not None:
-        digest.update(repr((given.softness, given.supersample)).encode())
-        digest.update(given.fine_labels.cpu().numpy().tobytes())
+        digest.update(repr(given.softness).encode())
+        digest.update(given.labels.cpu().numpy().tobytes())
     return digest.hexdigest()
 
 

@@ -36,7 +36,7 @@ def refine_contours(
     Source: Mumford and Shah's functional of 1989; Besag's iterated conditional modes of 1986.
     """
     regions = scene.regions
-    assert regions is not None and regions.supersample == 1
+    assert regions is not None
     given = regions.labels if given is None else given
     if regions.num_regions == 1:
         return regions

@@ -89,8 +89,8 @@ def make_optimizer(config: FitConfig, field: GaussianField, sigma: float) -> Gau
 def _regions_to_render(image: Tensor, regions: RegionMap | None, config: FitConfig) -> RegionMap | None:
     if regions is None or not config.guidance or regions.num_regions == 1:
         return None
-    # a map that comes with widths, or with sub-pixel coverage, says how sharp it is
-    if regions.softness != 0.0 or regions.supersample > 1 or config.softness == 0.0:
+    # a map that comes with widths says how sharp it is
+    if regions.softness != 0.0 or config.softness == 0.0:
         return regions
     if config.softness != "auto":
         return RegionMap.from_labels(regions.labels, config.softness)
@@ -136,8 +136,7 @@ def _fill_empty_regions(field: GaussianField, regions: RegionMap, seed: int) -> 
     index = regions.index_of(field.region_ids)
     counts = index.bincount(minlength=regions.num_regions)
     areas = regions.index_of(regions.labels.flatten()).bincount(minlength=regions.num_regions)
-    # a region may have no pixel of its own, with a map finer than the image
-    empty = [r for r in areas.argsort(descending=True, stable=True).tolist() if counts[r] == 0 and areas[r] > 0]
+    empty = [r for r in areas.argsort(descending=True, stable=True).tolist() if counts[r] == 0]
     for region in empty:
         donor = int(counts.argmax())
         if counts[donor] < 2:

@@ -20,9 +20,8 @@ class Arguments(NamedTuple):
     cholesky: Tensor  # [B, N, 3]
     colors: Tensor  # [B, N, C]
     region_ids: Tensor | None  # [B, N] int64
-    labels: Tensor | None  # [k * H, k * W] or [B, ...] int64; of the map at its own size, if that is another
+    labels: Tensor | None  # [H, W] or [B, H, W] int64; of the map at its own size, if that is another
     widths: Tensor | None  # float64, as of `widths_of`; None: all contours are hard
-    supersample: int  # k
     height: int
     width: int
     cutoff: float

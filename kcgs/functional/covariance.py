@@ -9,8 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcgs._check import check_cutoff, check_floating, holds
-from kcgs.kernels.whitened import support_radius
+from kcgs._check import check_floating, holds
 
 
 def check_cholesky(name: str, value: object) -> Tensor:
@@ -72,24 +71,6 @@ def covariance_to_cholesky(covariance: Tensor) -> Tensor:
     return torch.stack([l11, s_xy / l11, rest.sqrt()], -1)
 
 
-def cholesky_to_conic(cholesky: Tensor) -> Tensor:
-    r"""Invert the covariance: the conic :math:`\Sigma^{-1} = L^{-T} L^{-1}`, formed from L without subtraction.
-
-    Args:
-        cholesky: factors in pixels, :math:`(..., 3)`, as :func:`cholesky_to_covariance` takes them.
-
-    Returns:
-        Conics (A, B, C) with :math:`q = A\,dx^2 + 2 B\,dx\,dy + C\,dy^2`, :math:`(..., 3)`.
-
-    Example:
-        >>> cholesky_to_conic(torch.tensor([2.0, 0.0, 4.0]))
-        tensor([0.2500, -0.0000, 0.0625])
-    """
-    l11, l21, l22 = check_cholesky("cholesky", cholesky).unbind(-1)
-    slope = l21 / (l11 * l22)
-    return torch.stack([l11**-2 + slope * slope, -slope / l22, l22**-2], -1)
-
-
 def scale_rotation_to_cholesky(scales: Tensor, angle: Tensor) -> Tensor:
     r"""Factor the covariance :math:`R(\theta)\,\mathrm{diag}(s_1^2, s_2^2)\,R(\theta)^T`.
 
@@ -142,23 +123,3 @@ def cholesky_to_scale_rotation(cholesky: Tensor) -> tuple[Tensor, Tensor]:
     large = 0.5 * (total + spread)
     angle = 0.5 * torch.atan2(2 * l11 * l21, l11 * l11 - l21 * l21 - l22 * l22)
     return torch.stack([large, l11 * l22 / large], -1), angle
-
-
-def support_extent(cholesky: Tensor, cutoff: float = 1e-4) -> Tensor:
-    r"""Half the width and height of the box outside which a Gaussian's weight is below `cutoff`.
-
-    Args:
-        cholesky: factors in pixels, :math:`(..., 3)`, as :func:`cholesky_to_covariance` takes them.
-        cutoff: weight in [0, 1); 0: where the weight is zero in the dtype.
-
-    Returns:
-        Extents along x and y in pixels, :math:`(..., 2)`.
-
-    Example:
-        >>> support_extent(torch.tensor([1.0, 3.0, 4.0]), cutoff=0.01).round(decimals=3)
-        tensor([ 3.0350, 15.1740])
-    """
-    l11, l21, l22 = check_cholesky("cholesky", cholesky).unbind(-1)
-    cutoff = check_cutoff(cutoff)
-    dtype = torch.float64 if cholesky.dtype == torch.float64 else torch.float32
-    return torch.stack([l11, torch.hypot(l21, l22)], -1) * support_radius(cutoff, dtype)

@@ -36,7 +36,7 @@ def decompose(*arguments: Any) -> Tensor:
         return decompose(*(None if t is None else t[None] for t in given[:4]), *given[4:]).squeeze(0)
     # a graph that renders only: loops cannot all be differentiated
     means, cholesky, colors = (t.detach() for t in given[:3])
-    device, (batch, count, channels), (height, width) = means.device, colors.shape, given[7:9]
+    device, (batch, count, channels), (height, width) = means.device, colors.shape, (given.height, given.width)
     l11, l21, l22 = cholesky.unbind(-1)
     frame = torch.stack([*means.unbind(-1), 1 / l11, l21 / l11, 1 / l22], -1)
     # one Gaussian more, of no colour and no region

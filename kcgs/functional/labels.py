@@ -151,17 +151,6 @@ def union(ids: Iterable[int], pairs: Iterable[tuple[int, int]]) -> Callable[[int
     return find
 
 
-def largest_share(index: Tensor, factor: int) -> Tensor:
-    """Give each block of factor x factor its most frequent label, the smallest on a tie."""
-    maps, height, width = index.shape
-    split = index.reshape(maps, height // factor, factor, width // factor, factor)
-    blocks = split.transpose(2, 3).flatten(-2)  # [B, H, W, factor**2]
-    best = blocks.amin(-1)
-    mixed = best != blocks.amax(-1)
-    best[mixed] = blocks[mixed].cpu().mode(-1).values.to(best.device)  # on the CPU, the smallest on a tie
-    return best
-
-
 def compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     """Return the sorted ids, each pixel's position among them, and for small ids a table from id + 1 to position.
 
@@ -178,26 +167,20 @@ def compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     return ids, index.to(torch.int32), None
 
 
-def sample_places(new: int, old: int, factor: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Place `new` pixels of `factor` sub-pixels on a line of labels: both neighbours, (2, n), and their shares."""
+def sample_places(new: int, old: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Place `new` pixels on a line of `old` labels: both neighbours, (2, n), and their shares."""
     # in integers, so that any program that renders the map puts a pixel on the same side
-    pixels = old // factor
-    i = torch.arange(new, device=device)[:, None]
-    j = torch.arange(factor, device=device)
-    # sub-pixels spread over a new pixel, or over an old one where that is smaller
-    points = factor * (2 * i + 1) * pixels + (2 * j + 1 - factor) * torch.sym_min(pixels, new) - new
-    points = points.flatten() + 2 * new  # from one label before the first: never negative
+    points = (2 * torch.arange(new, device=device) + 1) * old + new  # from one label before the first: never negative
     low = torch.div(points, 2 * new, rounding_mode="floor")
     offset = (torch.div((points - 2 * new * low) * _OFFSETS, 2 * new, rounding_mode="floor") + 0.5) / _OFFSETS
     ends = torch.stack([low - 1, low]).clamp(0, old - 1)
     return ends, torch.stack([1 - offset, offset]).double()
 
 
-def sample_labels(labels: Tensor, height: int, width: int, factor: int) -> Tensor:
+def sample_labels(labels: Tensor, height: int, width: int) -> Tensor:
     """Sample a label map at another size: the label with the largest share among four neighbours; see `resize`."""
     (rows, down), (cols, across) = (
-        sample_places(new, old, factor, labels.device)
-        for new, old in zip((height, width), labels.shape[-2:], strict=True)
+        sample_places(new, old, labels.device) for new, old in zip((height, width), labels.shape[-2:], strict=True)
     )
     corners = [labels.index_select(-2, r).index_select(-1, c) for r in rows for c in cols]
     sampled = corners[0].clone()

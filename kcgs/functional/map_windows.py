@@ -29,20 +29,20 @@ class MapWindows:
 
         labels, widths = given.labels, given.widths
         assert labels is not None
-        self.side, self.factor, self.dtype = side, given.supersample, given.means.dtype
+        self.side, self.dtype = side, given.means.dtype
         self.soft, self.pairs = widths is not None, widths is not None and widths.ndim == 2
         self.reach = 0 if widths is None else widths.shape[-1] - (4 if self.pairs else 2)
         # the nearest contour of a pixel that is not of one region alone is within
         self.search = math.ceil(math.sqrt(2) * self.reach)
         self.halo = self.search + 1 if self.pairs else self.reach
         axes = tuple(zip((given.height, given.width), labels.shape[-2:], strict=True))
-        self.resized = not all(statically_known_true(old == self.factor * new) for new, old in axes)
+        self.resized = not all(statically_known_true(old == new) for new, old in axes)
         sizes = (labels.shape[0] if labels.ndim == 3 else 1, *labels.shape[-2:])
         counts = [
             torch.full((), n, dtype=torch.float64, device=labels.device)
             for n in (*labels.shape[-2:], given.height, given.width)
         ]
-        lost = (1 - counts[0] * counts[1] / (self.factor**2 * counts[2] * counts[3])).clamp_min(0).to(self.dtype)
+        lost = (1 - counts[0] * counts[1] / (counts[2] * counts[3])).clamp_min(0).to(self.dtype)
         numbers = torch.stack([torch.full((), n, dtype=torch.int64, device=labels.device) for n in sizes])
         down, across = (self._axis(*axis, labels.device) for axis in axes)
         self._per_axis = len(down)
@@ -50,32 +50,30 @@ class MapWindows:
 
     def _axis(self, new: int, length: int, device: torch.device) -> tuple[Tensor, ...]:
         """Return tables of the rows, or columns, of tiles; the last pixel is repeated past the edge."""
-        k, count = self.factor, (new + self.side - 1) // self.side
+        count = (new + self.side - 1) // self.side
         pixels = torch.arange(count * self.side, device=device).clamp_max(new - 1)
         if self.soft and not self.resized:
             return self._windows(torch.arange(count, device=device) * self.side, self.side, length)
         if not self.soft:
-            fine = (pixels[:, None] * k + torch.arange(k, device=device)).flatten()
             if not self.resized:
-                return (fine.reshape(count, -1),)
-            ends, shares = sample_places(new, length, k, device)
+                return (pixels.reshape(count, -1),)
+            ends, shares = sample_places(new, length, device)
             parts = (*ends, *shares.to(self.dtype))
-            return tuple(part.index_select(0, fine).reshape(count, -1) for part in parts)
+            return tuple(part.index_select(0, pixels).reshape(count, -1) for part in parts)
         # between which pixels of the map each pixel lies, and how far
-        old = length // k
-        place = ((2 * pixels + 1).double() * old - new) / (2 * new)
+        place = ((2 * pixels + 1).double() * length - new) / (2 * new)
         low = place.floor().reshape(count, -1, 1)
         weight = (place.reshape(count, -1, 1) - low).to(self.dtype)
-        first = low[:, 0, 0].long().clamp(0, old - 1)
-        span = (self.side * old + new - 1) // new + 2
+        first = low[:, 0, 0].long().clamp(0, length - 1)
+        span = (self.side * length + new - 1) // new + 2
         window = (first[:, None] + torch.arange(span, device=device))[:, None]
-        before, after = ((end.long().clamp(0, old - 1) == window).to(self.dtype) for end in (low, low + 1))
+        before, after = ((end.long().clamp(0, length - 1) == window).to(self.dtype) for end in (low, low + 1))
         return (*self._windows(first, span, length), before * (1 - weight) + after * weight)
 
     def _windows(self, first: Tensor, span: int, length: int) -> tuple[Tensor, Tensor]:
         """Return the lines of windows of `span` pixels with a halo, held at the border, and which are inside."""
-        lines = torch.arange(span * self.factor + 2 * self.halo, device=first.device) - self.halo
-        lines = first[:, None] * self.factor + lines
+        lines = torch.arange(span + 2 * self.halo, device=first.device) - self.halo
+        lines = first[:, None] + lines
         return lines.clamp(0, length - 1), ((lines >= 0) & (lines < length)).to(self.dtype)
 
     # Inside a loop, which hands in the tables
@@ -120,7 +118,7 @@ class MapWindows:
         rest = (*down[2:], *across[2:])
         if self.resized:
             sides = [n - 2 * self.halo for n in window.shape]
-            squares = self._pool(variance.to(self.dtype).expand(sides[0] * sides[1]).reshape(sides))
+            squares = variance.to(self.dtype).expand(sides[0] * sides[1]).reshape(sides)
             rest = (*rest, sharpness(rest[0] @ squares @ rest[1].T, tables[-2]))
         return ids, window, *inside, kernels.to(self.dtype).index_select(1, both), *rest
 
@@ -129,18 +127,14 @@ class MapWindows:
 
         Of a soft map at another size they are to be divided by their sum.
         """
-        window, k = seen[0], self.factor
+        window = seen[0]
         if not self.soft:
-            return (window == region).to(self.dtype).reshape(self.side, k, self.side, k).mean((1, 3))
+            return (window == region).to(self.dtype)
         rows, columns = (slice(self.halo - self.reach, n - self.halo + self.reach) for n in window.shape)
         down, across = seen[1][rows], seen[2][columns]
         marked = (window[rows, columns] == region).to(self.dtype) * down[:, None] * across
-        weights = self._pool(self._blur(marked, seen[3], down, across))
+        weights = self._blur(marked, seen[3], down, across)
         return (seen[4] @ weights @ seen[5].T).clamp_min(0) ** seen[6] if self.resized else weights
-
-    def _pool(self, pixels: Tensor) -> Tensor:
-        k = self.factor
-        return pixels.reshape(pixels.shape[0] // k, k, pixels.shape[1] // k, k).mean((1, 3)) if k > 1 else pixels
 
     def _blur(self, marked: Tensor, kernels: Tensor, down: Tensor, across: Tensor) -> Tensor:
         """Blur a window by one kernel, (1, 2 R + 1), or by one for each pixel inside of its halo of R."""

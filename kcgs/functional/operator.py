@@ -25,7 +25,7 @@ from .values import check_id_values, check_values
 
 _ARGUMENTS = (
     "Tensor means, Tensor cholesky, Tensor colors, Tensor? region_ids, Tensor? labels, Tensor? widths, "
-    "int supersample, SymInt height, SymInt width, float cutoff, str backend"
+    "SymInt height, SymInt width, float cutoff, str backend"
 )
 _LIBRARY = torch.library.Library("kcgs", "DEF")
 _LIBRARY.define(f"region_splat({_ARGUMENTS}) -> Tensor")
@@ -111,7 +111,7 @@ def _prepare(given: Arguments, checked: bool = False) -> tuple[SplatInputs, Step
     """Return what a kernel takes, and the kernel."""
     size, membership, index = (given.height, given.width), None, None
     if given.labels is not None and given.region_ids is not None:
-        tables = _tables(given.labels, given.widths, given.supersample, size)
+        tables = _tables(given.labels, given.widths, size)
         index = tables.index_of(given.region_ids if given.region_ids.ndim == 2 else given.region_ids.unsqueeze(0))
         # CUDA is not waited for
         least = int(index.numpy().min(initial=0)) if index.device.type == "cpu" else -1
@@ -128,13 +128,13 @@ def _prepare(given: Arguments, checked: bool = False) -> tuple[SplatInputs, Step
     return inputs if steps.as_given else inputs.with_batch(), steps
 
 
-def _tables(labels: Tensor, widths: Tensor | None, supersample: int, size: tuple[int, int]) -> MapTables:
+def _tables(labels: Tensor, widths: Tensor | None, size: tuple[int, int]) -> MapTables:
     crisp, kept = is_crisp(widths), tables_by_size(labels)
     tables = None if kept is None else kept.get((*size, crisp))
     if tables is None:
         check_labels("regions", labels)
         softness, contours = (0.0, "crisp") if crisp else (softness_of(widths), "scaled")
-        regions = RegionMap.from_labels(labels, softness, supersample=supersample).resize(size, contours)
+        regions = RegionMap.from_labels(labels, softness).resize(size, contours)
         tables = regions.tables
         if kept is not None:
             keep_tables(labels, size, crisp, tables)
@@ -201,7 +201,7 @@ class _Splat(torch.autograd.Function):
             plans.kept = None
         if not torch._C._autograd._get_current_graph_task_keep_graph():
             ctx.kept = None  # as torch frees what is saved: a loss that is kept holds no plan
-        return found[0] if means else None, found[1] if cholesky else None, found[2] if colors else None, *[None] * 8
+        return found[0] if means else None, found[1] if cholesky else None, found[2] if colors else None, *[None] * 7
 
 
 class _SplatBackward(torch.autograd.Function):
@@ -221,7 +221,7 @@ class _SplatBackward(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         needed = ctx.needs_input_grad[:4]
         second = _second(*grads, *ctx.saved_tensors, *ctx.settings)
-        return (*(g if need else None for g, need in zip(second, needed, strict=True)), *[None] * 9)
+        return (*(g if need else None for g, need in zip(second, needed, strict=True)), *[None] * 8)
 
 
 def _image_with_graph(given: Arguments) -> tuple[Tensor, list[Tensor]]:

@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import check_count, check_labels, check_size
+from kcgs._check import check_labels, check_size
 from kcgs.kernels import Crisp, Membership, Resampled
 
-from .labels import compact, largest_share, sample_labels, touching_pairs, union
+from .labels import compact, sample_labels, touching_pairs, union
 from .map_tables import MapTables, keep_tables
 from .softness import (
     CRISP_WIDTH,
@@ -37,11 +37,8 @@ class RegionMap:
     Convention: ids are any non-negative integers. With ``softness`` 0 a pixel belongs to its label alone (the paper's
     rule). Above 0 the membership of region r is the blur of [M = r] by a Gaussian of that standard deviation, cut at
     4 standard deviations, normalised to sum to one: pixels farther than that from a contour are unchanged. With a
-    width for each pair of regions a pixel is blurred by the width of its nearest contour. With ``supersample`` k the
-    map has k x k labels per pixel, and a pixel's membership is the mean over them; ``labels`` is then the label with
-    the largest share (the smallest on a tie), and regions too small to have any such pixel are regions still.
-    ``fine_labels`` is the map at its own resolution: ``labels`` itself where k is 1. A map has a copy of the
-    labels it was made from, and both attributes give copies of that: whatever writes to them changes no render.
+    width for each pair of regions a pixel is blurred by the width of its nearest contour. A map has a copy of the
+    labels it was made from, and ``labels`` gives copies of that: whatever writes to them changes no render.
 
     Example:
         >>> regions = RegionMap.from_labels(torch.tensor([[3, 3, 7], [3, 7, 7]]))
@@ -51,9 +48,7 @@ class RegionMap:
 
     ids: Tensor  # (R,) int64, sorted
     softness: float | PairWidths = 0.0
-    supersample: int = 1  # k
     _labels: Tensor = field(repr=False, kw_only=True)
-    _fine_labels: Tensor = field(repr=False, kw_only=True)
     tables: MapTables = field(repr=False, kw_only=True)
     widths: Tensor | None = field(repr=False, kw_only=True)  # softness, as the operator takes it
     _origin: RegionMap | None = field(default=None, repr=False, kw_only=True)  # what this was resized from
@@ -64,10 +59,7 @@ class RegionMap:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the tables of other sizes, which labels carry along, behind."""
-        state = dict(vars(self))
-        fine = state["_fine_labels"] = self._fine_labels.detach()
-        state["_labels"] = fine if self._labels is self._fine_labels else self._labels
-        return state
+        return {**vars(self), "_labels": self._labels.detach()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Keep the tables of a copy where the operator finds them, too."""
@@ -75,46 +67,33 @@ class RegionMap:
         self.__post_init__()
 
     def __repr__(self) -> str:
-        finer = "" if self.supersample == 1 else f", supersample={self.supersample}"
-        return f"RegionMap({self.num_regions} regions, size={self.size}, softness={self.softness}{finer})"
+        return f"RegionMap({self.num_regions} regions, size={self.size}, softness={self.softness})"
 
     @classmethod
     def from_labels(
         cls,
         labels: Tensor | NDArray[Any],
         softness: float | Mapping[tuple[int, int], float] = 0.0,
-        *,
-        supersample: int = 1,
     ) -> RegionMap:
         r"""Build from a label map.
 
         Args:
             labels: integer or bool, a Tensor or a numpy array, :math:`(H, W)` or :math:`(B, H, W)`, non-negative; ids
-                need not be consecutive. With ``supersample`` k it has k times the image's height and width.
+                need not be consecutive.
             softness: contour width (standard deviation) in pixels, 0 to 64; or one for each pair of ids in any
                 order, 0 for pairs that are not mentioned.
-            supersample: labels along a side of a pixel, k.
 
         Raises:
-            TypeError: labels are no integers; softness or supersample of another type.
-            ValueError: wrong shape, no pixels, negative ids, softness out of range or of ids that are not in the map,
-                a size that supersample does not divide.
+            TypeError: labels are no integers; softness of another type.
+            ValueError: wrong shape, no pixels, negative ids, softness out of range or of ids that are not in the map.
 
         Example:
             >>> edge = torch.tensor([[1, 1, 1, 2], [1, 1, 1, 2]])
             >>> RegionMap.from_labels(edge, {(2, 1): 0.7}).softness
             0.7
-            >>> half = RegionMap.from_labels(edge, supersample=2)
-            >>> half.labels, half.num_regions
-            (tensor([[1, 1]]), 2)
         """
         with torch.inference_mode(False):  # a graph of autograd keeps no tensor of that mode
             labels = check_labels("labels", labels).clone()
-        supersample = check_count("supersample", supersample)
-        if labels.shape[-2] % supersample or labels.shape[-1] % supersample:
-            raise ValueError(
-                f"labels must have sides that supersample, {supersample}, divides; got {tuple(labels.shape)}"
-            )
         ids, index, table = compact(labels)
         width = check_softness(softness, ids)
         by_index: float | Mapping[tuple[int, int], float] = width
@@ -122,12 +101,8 @@ class RegionMap:
             position = {region: place for place, region in enumerate(ids.tolist())}
             by_index = {(position[a], position[b]): value for (a, b), value in width.items()}
         index = index if index.ndim == 3 else index[None]
-        coarse = index if supersample == 1 else largest_share(index, supersample)
-        membership = Membership(coarse, len(ids), by_index, fine=None if supersample == 1 else index)
-        shown = labels if supersample == 1 else ids[coarse if labels.ndim == 3 else coarse[0]]
-        tables = MapTables(ids, table, membership)
-        widths = widths_of(width, supersample, labels.device)
-        return cls(ids, width, supersample, _labels=shown, _fine_labels=labels, tables=tables, widths=widths)
+        tables = MapTables(ids, table, Membership(index, len(ids), by_index))
+        return cls(ids, width, _labels=labels, tables=tables, widths=widths_of(width, labels.device))
 
     @classmethod
     def coerce(cls, value: object, name: str = "regions") -> RegionMap | None:
@@ -144,14 +119,9 @@ class RegionMap:
         return self._labels.clone()
 
     @property
-    def fine_labels(self) -> Tensor:
-        """Label of each sub-pixel, (k * H, k * W) or (B, k * H, k * W) int64, a copy."""
-        return self._fine_labels.clone()
-
-    @property
     def _operator_labels(self) -> Tensor:
         """The map's own labels at its own resolution, which the operator takes and nobody writes to."""
-        return self.given._fine_labels
+        return self.given._labels
 
     @property
     def num_maps(self) -> int | None:
@@ -221,12 +191,12 @@ class RegionMap:
     def relabel(
         self, labels: Tensor, new_width: float | Literal["mean"] | Mapping[tuple[int, int], float] = 0.0
     ) -> RegionMap:
-        r"""Make the map of other labels, with the supersampling and the contour widths of this one.
+        r"""Make the map of other labels, with the contour widths of this one.
 
         Where pairs of regions have widths, those of pairs whose ids are left stay.
 
         Args:
-            labels: integer, at the map's own resolution, the shape of `fine_labels`.
+            labels: integer, the shape of `labels`.
             new_width: of pairs that touch in the new map, did not before, and have none: a number; "mean", of the
                 widths that there are; or widths by pairs. Not read where one width holds for all.
 
@@ -238,8 +208,8 @@ class RegionMap:
             >>> regions.relabel(torch.tensor([[1, 5, 5, 2]]), "mean").softness
             PairWidths({(1, 2): 0.7, (1, 5): 0.7})
         """
-        if labels.shape != self._fine_labels.shape:
-            raise ValueError(f"labels must have shape {tuple(self._fine_labels.shape)}; got {tuple(labels.shape)}")
+        if labels.shape != self._labels.shape:
+            raise ValueError(f"labels must have shape {tuple(self._labels.shape)}; got {tuple(labels.shape)}")
         softness: float | Mapping[tuple[int, int], float] = self.softness
         if isinstance(softness, PairWidths):
             softness = {**self._new_widths(labels, new_width), **softness}
@@ -253,7 +223,7 @@ class RegionMap:
             return width if isinstance(width, Mapping) else {}
         if width == "mean":
             width = sum(self.softness.values()) / len(self.softness)
-        return dict.fromkeys(touching_pairs(labels) - touching_pairs(self._fine_labels), width)
+        return dict.fromkeys(touching_pairs(labels) - touching_pairs(self._labels), width)
 
     def merge(self, pairs: Iterable[tuple[int, int]]) -> tuple[RegionMap | None, Tensor]:
         """Merge pairs of regions: to the least of their ids, and contours to the mean of the widths they are made of.
@@ -276,9 +246,9 @@ class RegionMap:
         new_ids = torch.tensor([find(region) for region in self.ids.tolist()], device=self.ids.device)
         if len(new_ids.unique()) == 1:
             return None, new_ids
-        labels = new_ids[self.index_of(self._fine_labels)]
+        labels = new_ids[self.index_of(self._labels)]
         softness = merged_widths(self.softness, find)
-        return RegionMap.from_labels(labels, softness, supersample=self.supersample), new_ids
+        return RegionMap.from_labels(labels, softness), new_ids
 
     def to(self, device: torch.device | str) -> RegionMap:
         """Return the map on another device."""
@@ -286,8 +256,6 @@ class RegionMap:
         if device == self.ids.device:
             return self
         moved = {name: part.to(device) for name, part in vars(self).items() if hasattr(part, "to")}
-        if self.supersample == 1:
-            moved["_fine_labels"] = moved["_labels"]
         return replace(self, **moved)
 
     def image(self, index: int | slice) -> RegionMap:
@@ -305,29 +273,28 @@ class RegionMap:
             raise ValueError("image needs a batch of maps; got one map")
         if self._origin is not None:
             return self._origin.image(index).resize(self.size, self.contours)
-        return self._with_labels(self._fine_labels[index], self.softness)
+        return self._with_labels(self._labels[index], self.softness)
 
     def _with_labels(self, labels: Tensor, widths: float | Mapping[tuple[int, int], float]) -> RegionMap:
         """Make the map of these labels, without the widths of pairs that they do not have."""
         if isinstance(widths, Mapping):
             left = set(labels.unique().tolist())
             widths = {pair: width for pair, width in widths.items() if left.issuperset(pair)}
-        return RegionMap.from_labels(labels, widths, supersample=self.supersample)
+        return RegionMap.from_labels(labels, widths)
 
     def state(self) -> dict[str, Any]:
         """Return what :meth:`from_state` makes the same map of: tensors, numbers, tuples and None only."""
         if self._origin is not None:
             return {**self._origin.state(), "size": self.size, "contours": self.contours}
         widths = self.softness if isinstance(self.softness, float) else tuple(self.softness.items())
-        return {"labels": self.fine_labels, "softness": widths, "supersample": self.supersample, "size": self.size}
+        return {"labels": self.labels, "softness": widths, "size": self.size}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> RegionMap:
         """Make the map that :meth:`state` describes."""
         widths = state["softness"]
         softness = widths if isinstance(widths, float) else {tuple(pair): width for pair, width in widths}
-        given = cls.from_labels(state["labels"], softness, supersample=state["supersample"])
-        return given.resize(state["size"], state.get("contours", "scaled"))
+        return cls.from_labels(state["labels"], softness).resize(state["size"], state.get("contours", "scaled"))
 
     @property
     def contours(self) -> str:
@@ -339,9 +306,7 @@ class RegionMap:
 
         Hard contours stay hard: between pixel centres a point has the label with the largest share among its four
         neighbours (bilinear weights, of offsets rounded to odd multiples of 1/2048 pixel, so that no two labels tie).
-        With ``supersample`` k it is the fine map that is sampled: the result has k x k labels per pixel as before,
-        spread over the new pixel, or over one old pixel where that is smaller. Labels that are left with none are no
-        regions.
+        Labels that are left with no pixel are no regions.
 
         Soft contours widen along with the map: a point has the bilinear mean of its four neighbours' memberships. A
         larger map raises them to a power that takes out the blur of pixels, and makes them sum to one. All regions
@@ -368,15 +333,14 @@ class RegionMap:
         if self._origin is not None:
             return self._origin.resize((height, width), contours)
         if not crisp and self.softness == 0.0:
-            k = self.supersample
-            sampled = RegionMap.from_labels(sample_labels(self._fine_labels, height, width, k), supersample=k)
+            sampled = RegionMap.from_labels(sample_labels(self._labels, height, width))
             return replace(sampled, tables=sampled.tables._replace(whole=False))
-        labels = sample_labels(self._labels, height, width, 1)
+        labels = sample_labels(self._labels, height, width)
         index = self.index_of(labels).to(torch.int32)
         membership = (Crisp if crisp else Resampled)(index if index.ndim == 3 else index[None], self.membership)
         widened = scaled_widths(self.softness, math.sqrt(height * width / (self.size[0] * self.size[1])))
         return RegionMap(
-            self.ids, CRISP_WIDTH if crisp else widened, _labels=labels, _fine_labels=labels, _origin=self,
+            self.ids, CRISP_WIDTH if crisp else widened, _labels=labels, _origin=self,
             widths=crisp_widths(labels.device) if crisp else self.widths,
             tables=self.tables._replace(membership=membership),
         )  # fmt: skip

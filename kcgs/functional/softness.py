@@ -88,18 +88,18 @@ def merged_widths(softness: float | PairWidths, find: Callable[[int], int]) -> f
     return {pair: sum(found) / len(found) for pair, found in widths.items()}
 
 
-def widths_of(softness: float | PairWidths, supersample: int, device: torch.device) -> Tensor | None:
+def widths_of(softness: float | PairWidths, device: torch.device) -> Tensor | None:
     """Return widths as the operator takes them, float64; None: all contours are hard.
 
-    One width, then half of its blur, from the middle, at the sub-pixels of the map: (1 + taps,). Or, sorted, a row for
+    One width, then half of its blur, from the middle, at the pixels of the map: (1 + taps,). Or, sorted, a row for
     each pair of ids before width and blur: (P, 3 + taps). So shapes say how far contours reach.
     """
     if softness == 0.0:
         return None
     widths = torch.tensor([softness] if isinstance(softness, float) else list(softness.values()), dtype=torch.float64)
-    reach = (RADIUS_SIGMAS * widths * supersample).ceil()[:, None]
+    reach = (RADIUS_SIGMAS * widths).ceil()[:, None]
     distance = torch.arange(int(reach.max()) + 1, dtype=torch.float64)
-    blurs = torch.exp(-0.5 * (distance / (widths[:, None] * supersample).clamp_min(1e-9)) ** 2)
+    blurs = torch.exp(-0.5 * (distance / widths[:, None].clamp_min(1e-9)) ** 2)
     rows = torch.cat([widths[:, None], torch.where(distance <= reach, blurs, 0.0)], 1)
     if isinstance(softness, float):
         return rows[0].to(device)

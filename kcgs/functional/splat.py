@@ -106,12 +106,10 @@ def splat_at(
     _check_gaussians(means, cholesky, colors)
     dtype = torch.float64 if torch.float64 in (means.dtype, cholesky.dtype, colors.dtype) else torch.float32
     arrays = [t if t.dtype == dtype else t.to(dtype) for t in (means, cholesky, colors)]
-    ids, labels, widths, supersample = _resolve_regions(means, region_ids, regions)
+    ids, labels, widths = _resolve_regions(means, region_ids, regions)
     if labels is not None and contours == "crisp":
         widths = crisp_widths(labels.device)
-    image: Tensor = splat_operator(
-        *arrays, ids, labels, widths, supersample, *size, check_cutoff(cutoff), check_backend(backend)
-    )
+    image: Tensor = splat_operator(*arrays, ids, labels, widths, *size, check_cutoff(cutoff), check_backend(backend))
     return image if colors.dtype == dtype else image.to(colors.dtype)
 
 
@@ -144,24 +142,24 @@ def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
 
 def _resolve_regions(
     means: Tensor, region_ids: Tensor | None, regions: RegionMap | Tensor | None
-) -> tuple[Tensor | None, Tensor | None, Tensor | None, int]:
-    """Return ids, labels, widths and supersampling as the operator takes them."""
+) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    """Return ids, labels and widths as the operator takes them."""
     if region_ids is not None:
         region_ids = check_ids("region_ids", region_ids, means, values=False)
     if regions is None:
         if region_ids is not None:
             raise ValueError(_UNMAPPED)
-        return None, None, None, 1
+        return None, None, None
     check_tensor("region_ids", region_ids)
     assert region_ids is not None
     if isinstance(regions, RegionMap):
-        labels, widths, supersample = regions._operator_labels, regions.widths, regions.given.supersample
+        labels, widths = regions._operator_labels, regions.widths
     else:
-        labels, widths, supersample = regions, None, 1
+        labels, widths = regions, None
     if labels.device != means.device:
         raise ValueError(f"regions must be on {means.device} with means; got {labels.device}")
     maps = labels.shape[0] if labels.ndim == 3 else 1
     images = means.shape[0] if means.ndim == 3 else 1
     if maps not in (1, images):
         raise ValueError(f"regions must hold 1 map or one for each of {images} images; got {maps} maps")
-    return region_ids, labels, widths, supersample
+    return region_ids, labels, widths

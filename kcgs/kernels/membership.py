@@ -27,7 +27,7 @@ class TileMembership(NamedTuple):
 
     keys: Tensor  # [K] int64, sorted: tile * num_regions + region
     mask: Tensor  # [K] int64, row of `masks`, -1 where the region is alone in its tile
-    masks: Tensor  # [P, tile * tile], the weights: bool (hard, one label per pixel) or float64
+    masks: Tensor  # [P, tile * tile], the weights: bool (hard contours) or float64
 
     @classmethod
     def assemble(cls, single: Tensor, keys: Tensor, masks: Tensor) -> TileMembership:
@@ -38,10 +38,10 @@ class TileMembership(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """The widths that occur, and which of them each sub-pixel has."""
+    """The widths that occur, and which of them each pixel has."""
 
     widths: tuple[float, ...]  # pixels, ascending
-    of: Tensor | None  # [B, k * H, k * W] int32, position in `widths`; None: one width everywhere
+    of: Tensor | None  # [B, H, W] int32, position in `widths`; None: one width everywhere
 
 
 class Membership:
@@ -52,18 +52,14 @@ class Membership:
         index: Tensor,
         num_regions: int,
         softness: float | Mapping[tuple[int, int], float] = 0.0,
-        *,
-        fine: Tensor | None = None,
     ) -> None:
         """Take the labels of pixels, (B, H, W), as integers 0 ... num_regions - 1.
 
-        `softness` is the contour width in pixels, or that of each pair (a, b) of labels with a < b, 0 where absent;
-        `fine`, (B, k * H, k * W), are the labels of the k * k sub-pixels of each pixel; None: k is 1.
+        `softness` is the contour width in pixels, or that of each pair (a, b) of labels with a < b, 0 where absent.
         """
         self.index = index
         self.num_regions = num_regions
         self.softness = softness
-        self.fine = fine
         self._derived: dict[object, Any] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -72,18 +68,8 @@ class Membership:
         return {**vars(self), "_derived": {}}
 
     @property
-    def grid(self) -> Tensor:
-        """The map at its own resolution, (B, k * H, k * W)."""
-        return self.index if self.fine is None else self.fine
-
-    @property
-    def supersample(self) -> int:
-        """Sub-pixels along a side of a pixel, k."""
-        return self.grid.shape[-1] // self.index.shape[-1]
-
-    @property
     def levels(self) -> Levels:
-        """Contour widths of the sub-pixels."""
+        """Contour widths of the pixels."""
         return self.derived("levels", _find_levels)
 
     @property
@@ -93,18 +79,17 @@ class Membership:
 
     def to(self, device: torch.device) -> Membership:
         """Return the same membership on `device`, tables not carried along."""
-        fine = None if self.fine is None else self.fine.to(device)
-        return Membership(self.index.to(device), self.num_regions, self.softness, fine=fine)
+        return Membership(self.index.to(device), self.num_regions, self.softness)
 
     def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
         """Evaluate s_r of one region over one whole map, (H, W): the definition, without tables."""
-        inside = (self.grid[batch] == region).to(torch.float64)
+        inside = (self.index[batch] == region).to(torch.float64)
         widths, level = self.levels
         weights = torch.zeros_like(inside)
         for position, width in enumerate(widths):
             blurred = self._blur(inside, width)
             weights = blurred if level is None else torch.where(level[batch] == position, blurred, weights)
-        return _pool(weights, self.supersample).to(dtype)
+        return weights.to(dtype)
 
     def _blur(self, inside: Tensor, width: float) -> Tensor:
         if width == 0.0:
@@ -115,11 +100,11 @@ class Membership:
         return (rows @ inside @ cols.T) / total
 
     def _reach(self, width: float) -> int:
-        return math.ceil(RADIUS_SIGMAS * width * self.supersample)  # sub-pixels
+        return math.ceil(RADIUS_SIGMAS * width)
 
     def _weights_at(self, offset: Tensor, width: float) -> Tensor:
         distance = offset.abs().to(torch.float64)
-        gaussian = torch.exp(-0.5 * (distance / (width * self.supersample)) ** 2)
+        gaussian = torch.exp(-0.5 * (distance / width) ** 2)
         return torch.where(distance <= self._reach(width), gaussian, 0.0)
 
     def tiles(self, tile: int) -> TileMembership:
@@ -147,7 +132,7 @@ class Membership:
         return value
 
     def _build_tiles(self, tile: int) -> TileMembership:
-        k, (widths, level) = self.supersample, self.levels
+        widths, level = self.levels
         maps, height, width = self.index.shape
         counts = (maps, -(-height // tile), -(-width // tile))
         place = torch.cartesian_prod(*[torch.arange(n, device=self.index.device) for n in counts])
@@ -155,30 +140,29 @@ class Membership:
         # what a tile sees is what its widest contour reaches
         widest = torch.zeros(len(place), device=place.device)
         if level is not None:
-            widest = torch.nn.functional.max_pool2d(level.float(), k * tile, ceil_mode=True).flatten()
+            widest = torch.nn.functional.max_pool2d(level.float(), tile, ceil_mode=True).flatten()
         found = []
         for position, contour in enumerate(widths):
             tiles = (widest == position).nonzero().flatten()
             batch, row, col = place[tiles].unbind(1)
-            found.append(self.list_keys(tiles, (batch, k * row, k * col), (k * tile, k * tile), self._reach(contour)))
+            found.append(self.list_keys(tiles, (batch, row, col), (tile, tile), self._reach(contour)))
         single, keys = (torch.cat(parts) for parts in zip(*found, strict=True))
         keys = keys.sort().values
         batch, row, col = place[keys // self.num_regions].unbind(1)
         masks = self.window_weights(batch, keys % self.num_regions, row, col, (tile, tile)).flatten(1)
-        hard = k == 1 and widths == (0.0,)
-        return TileMembership.assemble(single, keys, masks.bool() if hard else masks)
+        return TileMembership.assemble(single, keys, masks.bool() if widths == (0.0,) else masks)
 
     def list_keys(
         self, tiles: Tensor, place: tuple[Tensor, ...], sides: Sequence[int], reach: int
     ) -> tuple[Tensor, Tensor]:
         """List tile * num_regions + region of tiles that see one region, and, sorted, of those that see several.
 
-        Tiles are numbers (T,), `place` their image and first row and column on the grid, `reach` how far they see.
+        Tiles are numbers (T,), `place` their image and first row and column, `reach` how far they see.
         """
         single, several = [], []
         chunks = torch.arange(len(tiles), device=tiles.device)
         for chunk in chunks.split(max(1, _PATCH_ELEMENTS // ((sides[0] + 2 * reach) * (sides[1] + 2 * reach)))):
-            seen = self._read(self.grid, tuple(part[chunk] for part in place), sides, reach)[0].flatten(1)
+            seen = self._read(self.index, tuple(part[chunk] for part in place), sides, reach)[0].flatten(1)
             keys = tiles[chunk, None] * self.num_regions + seen
             low, high = keys.aminmax(dim=1)
             single.append(low[low == high])
@@ -190,23 +174,22 @@ class Membership:
 
         Windows may reach beyond the image, where the weights mean nothing.
         """
-        k, (widths, level) = self.supersample, self.levels
-        sides = (k * span[0], k * span[1])
+        widths, level = self.levels
         weights = torch.zeros(len(region), *span, dtype=torch.float64, device=region.device)
         reach = max(self._reach(width) for width in widths)
         windows = torch.arange(len(region), device=region.device)
-        for chunk in windows.split(max(1, _PATCH_ELEMENTS // ((sides[0] + 2 * reach) * (sides[1] + 2 * reach)))):
-            place, ids = (batch[chunk], k * rows[chunk], k * cols[chunk]), region[chunk]
+        for chunk in windows.split(max(1, _PATCH_ELEMENTS // ((span[0] + 2 * reach) * (span[1] + 2 * reach)))):
+            place, ids = (batch[chunk], rows[chunk], cols[chunk]), region[chunk]
             if level is None:
-                weights[chunk] = _pool(self._blurred(place, ids, sides, widths[0]), k)
+                weights[chunk] = self._blurred(place, ids, span, widths[0])
                 continue
-            levels = self._read(level, place, sides, 0)[0]
+            levels = self._read(level, place, span, 0)[0]
             for position, width in enumerate(widths):
                 inside = levels == position
                 found = inside.flatten(1).any(1).nonzero().flatten()
                 if len(found):
-                    blurred = self._blurred(tuple(part[found] for part in place), ids[found], sides, width)
-                    weights[chunk[found]] += _pool(torch.where(inside[found], blurred, 0.0), k)
+                    blurred = self._blurred(tuple(part[found] for part in place), ids[found], span, width)
+                    weights[chunk[found]] += torch.where(inside[found], blurred, 0.0)
         return weights
 
     def read(self, pixels: Tensor, place: tuple[Tensor, ...], span: Sequence[int]) -> Tensor:
@@ -215,7 +198,7 @@ class Membership:
 
     @property
     def variances(self) -> Tensor:
-        """Squared widths of contours at pixels, (B, H, W) float64: means over their sub-pixels."""
+        """Squared widths of contours at pixels, (B, H, W) float64."""
         return self.derived("variances", _find_variances)
 
     def _read(
@@ -229,10 +212,10 @@ class Membership:
             inside.append((line == lines[-1]).double())
         return grid[place[0][:, None, None], lines[0][:, :, None], lines[1][:, None, :]], inside[0], inside[1]
 
-    def _blurred(self, place: tuple[Tensor, ...], region: Tensor, sides: tuple[int, int], width: float) -> Tensor:
+    def _blurred(self, place: tuple[Tensor, ...], region: Tensor, sides: Sequence[int], width: float) -> Tensor:
         """Blur [M = r] over windows of the grid, of one width."""
         reach = self._reach(width)
-        seen, down, across = self._read(self.grid, place, sides, reach)
+        seen, down, across = self._read(self.index, place, sides, reach)
         inside = (seen == region[:, None, None]).double()
         if width == 0.0:
             return inside
@@ -246,16 +229,16 @@ class Membership:
 
 
 def _find_levels(membership: Membership) -> Levels:
-    """Give each sub-pixel the width of the contour it is nearest to.
+    """Give each pixel the width of the contour it is nearest to.
 
-    The nearest sub-pixel that touches a contour has the same label, since on the way to another label one would touch
+    The nearest pixel that touches a contour has the same label, since on the way to another label one would touch
     the contour earlier; so the pair is this one's, with the first of its neighbours that differs.
     """
     if not isinstance(membership.softness, Mapping):
         return Levels((membership.softness,), None)
     from scipy.ndimage import distance_transform_edt
 
-    maps = membership.grid.cpu().numpy()
+    maps = membership.index.cpu().numpy()
     other = np.stack([_across(labels) for labels in maps])
     touches = other >= 0
     low, high = np.sort([maps[touches], other[touches]], axis=0).astype(np.int64)
@@ -270,15 +253,13 @@ def _find_levels(membership: Membership) -> Levels:
         if touch.any():
             rows, cols = distance_transform_edt(~touch, return_distances=False, return_indices=True)
             one[:] = one[rows, cols]
-    return Levels(tuple(widths.tolist()), torch.from_numpy(level).to(membership.grid.device))
+    return Levels(tuple(widths.tolist()), torch.from_numpy(level).to(membership.index.device))
 
 
 def _find_variances(membership: Membership) -> Tensor:
     widths, level = membership.levels
     squares = torch.tensor(widths, dtype=torch.float64, device=membership.index.device).square()
-    if level is None:
-        return squares.expand(membership.index.shape)
-    return _pool(squares[level.long()], membership.supersample)
+    return squares.expand(membership.index.shape) if level is None else squares[level.long()]
 
 
 def _across(labels: Any) -> Any:
@@ -294,11 +275,3 @@ def _across(labels: Any) -> Any:
         found = (labels[pixel] != labels[neighbour]) & (other[pixel] < 0)
         other[pixel][found] = labels[neighbour][found]
     return other
-
-
-def _pool(weights: Tensor, factor: int) -> Tensor:
-    """Mean over the sub-pixels of each pixel: (..., k * H, k * W) to (..., H, W)."""
-    if factor == 1:
-        return weights
-    height, width = weights.shape[-2:]
-    return weights.reshape(*weights.shape[:-2], height // factor, factor, width // factor, factor).mean((-3, -1))

@@ -109,10 +109,8 @@ class Resampled(Membership):
         place = torch.cartesian_prod(*[torch.arange(n, device=firsts[0].device) for n in (maps, *map(len, firsts))])
         batch, row, col = place.unbind(1)
         source, corners = self.source, (firsts[0][row], firsts[1][col])
-        k = source.supersample
-        corner, sides = (batch, k * corners[0], k * corners[1]), [k * span for span in spans]
         numbers = torch.arange(len(batch), device=batch.device)
-        single, keys = source.list_keys(numbers, corner, sides, source.radius * k)
+        single, keys = source.list_keys(numbers, (batch, *corners), spans, source.radius)
         tiles, region = keys // self.num_regions, keys % self.num_regions
         groups = tiles.unique(return_inverse=True)[1]
         masks = torch.zeros(len(keys), tile * tile, dtype=torch.float64, device=keys.device)
@@ -142,7 +140,7 @@ class Crisp(Resampled):
     Labels are blurred by the width of one label; where that takes the largest share at the centre of a pixel from its
     own label, it is given back, with `MARGIN` more than any other. Interpolated bilinearly to weights u_r, that makes
     the weights s_r = u_r**e / (sum of all u**e): along a straight contour, a step of 1/2 pixel's deviation with
-    e = 2 k sqrt(new pixels / old pixels), 1 at least.
+    e = 2 sqrt(new pixels / old pixels), 1 at least.
     """
 
     def __init__(self, index: Tensor, labels: Membership) -> None:
@@ -150,24 +148,19 @@ class Crisp(Resampled):
         super().__init__(index, labels.derived("smooth", _smooth))
 
     def _exponents(self) -> float:
-        return max(1.0, 2.0 * self.source.supersample * math.sqrt(self.ratio))
+        return max(1.0, 2.0 * math.sqrt(self.ratio))
 
     def _own_weights(self, batch: int, region: int) -> Tensor:
         best = self.derived(("best", batch), lambda _: self._best(batch))
-        own = self._own(self.source.index[batch])
-        return _keep(super()._own_weights(batch, region), best, own == region)
+        return _keep(super()._own_weights(batch, region), best, self.source.index[batch] == region)
 
     def _best(self, batch: int) -> Tensor:
         weights = (self.source.weights(batch, r, torch.float64) for r in range(self.num_regions))
         return functools.reduce(torch.maximum, weights)
 
-    def _own(self, index: Tensor) -> Tensor:
-        """Take the labels that keep their pixels' centres: none of a supersampled map."""
-        return index if self.source.supersample == 1 else torch.full_like(index, -1)
-
     def _windows(self, place: tuple[Tensor, ...], region: Tensor, group: Tensor, spans: Sequence[int]) -> Tensor:
         weights = super()._windows(place, region, group, spans)
-        seen = self._own(self.source.read(self.source.index, place, spans))
+        seen = self.source.read(self.source.index, place, spans)
         best = _most(weights, group)
         return _keep(weights, best, seen == region[:, None, None])
 
@@ -177,7 +170,7 @@ class Crisp(Resampled):
 
 
 def _smooth(labels: Membership) -> Membership:
-    return Membership(labels.index, labels.num_regions, 1.0 / labels.supersample, fine=labels.fine)
+    return Membership(labels.index, labels.num_regions, 1.0)
 
 
 def _keep(weights: Tensor, best: Tensor, own: Tensor) -> Tensor:

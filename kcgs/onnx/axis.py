@@ -78,35 +78,27 @@ class Axis:
         # (blocks,), from the tile's centre
         self.origins = g("Add", g("Sub", begin, np.float32(TILE / 2)), g("Mul", middle, self.step))
 
-    def weights(self, factor: int, halo: int, soft: bool) -> Value:
-        """Weights of a window's labels or pixels at the pixels of each block, (blocks, side * factor, window).
+    def weights(self, soft: bool) -> Value:
+        """Weights of a window, a tile and the pixels around it, at the pixels of each block: (blocks, side, window).
 
-        A window has `factor` labels along a side of a pixel, `halo` around its tile. Where it is hard, offsets are such
-        that no two labels weigh the same.
+        Where contours are hard, offsets are such that no two labels weigh the same.
         """
         g = self.g
         # a view may go beyond the scene, where the border's are held
-        last = factor * TILE + 2 * halo - 1
         if soft:
             position = g("Div", g("Cast", self.local, to=FLOAT), g("Cast", self.parts, to=FLOAT))
-            position = g("Add", position, np.float32(halo - 0.5))
-            first = g("Unsqueeze", g("Sub", np.int64(halo), g("Mul", self.tile, TILE)), g.constant([1]))
+            position = g("Add", position, np.float32(0.5))
+            first = g("Unsqueeze", g("Sub", np.int64(1), g("Mul", self.tile, TILE)), g.constant([1]))
             ends = (g("Cast", g("Add", first, np.int64(n)), to=FLOAT) for n in (0, self.length - 1))
             position = g("Min", g("Max", position, next(ends)), next(ends))
             position = g("Unsqueeze", position, g.constant([2]))
         else:
-            # sub-pixels spread over a pixel of the output, or one of the scene where that is smaller
-            whole = g("Mul", self.extent, 2)
-            spread = g("Where", g("Less", whole, self.parts), whole, self.parts)
-            j = g.constant(2 * np.arange(factor) + 1 - factor)
-            # all in halves of a part of a label; from the first label's centre
-            position = g("Mul", g("Unsqueeze", self.local, g.constant([2])), 2 * factor)
-            position = g("Add", g("Add", position, g("Mul", j, spread)), g("Mul", self.parts, 2 * halo - 1))
+            # in halves of a part; from the first pixel's centre
+            position = g("Add", g("Mul", g("Unsqueeze", self.local, g.constant([2])), 2), self.parts)
             offsets = g("Max", g("Div", g("Mul", position, _OFFSETS // 2), self.parts), 0)
-            offsets = g("Min", offsets, last * _OFFSETS - 1)
+            offsets = g("Min", offsets, (TILE + 1) * _OFFSETS - 1)
             position = g("Div", g("Cast", g("Add", g("Mul", offsets, 2), 1), to=FLOAT), np.float32(2 * _OFFSETS))
-            position = g("Reshape", position, g.constant([0, -1, 1]))
-        window = np.arange(factor * TILE + 2 * halo, dtype=np.float32)
+        window = np.arange(TILE + 2, dtype=np.float32)
         return g("Relu", g("Sub", np.float32(1), g("Abs", g("Sub", position, window))))
 
     def spline(self) -> Value:

@@ -198,22 +198,16 @@ def find_tiles(regions: RegionMap | None, size: tuple[int, int]) -> Tiles:
     return Tiles(rows, cols, *find(regions, rows, cols))
 
 
-def margin(supersample: int) -> int:
-    """Labels around a tile that its pixels may be sampled from: those next to it, and half a pixel of fine ones."""
-    return 1 if supersample == 1 else supersample // 2 + 1
-
-
 def _hard_windows(regions: RegionMap, rows: int, cols: int) -> tuple[list[list[int]], dict[int, Tensor]]:
-    grid, side = regions.membership.grid[0].long().cpu(), TILE * regions.supersample
-    halo = margin(regions.supersample)
+    index = regions.index[0].long().cpu()
     down, across = (
-        (torch.arange(n)[:, None] * side + torch.arange(-halo, side + halo)).clamp(0, length - 1)
-        for n, length in zip((rows, cols), grid.shape, strict=True)
+        (torch.arange(n)[:, None] * TILE + torch.arange(-1, TILE + 1)).clamp(0, length - 1)
+        for n, length in zip((rows, cols), index.shape, strict=True)
     )
     found: list[list[int]] = []
     windows: dict[int, Tensor] = {}
     for y, x in product(down, across):
-        present, window = torch.unique(grid[y[:, None], x], return_inverse=True)
+        present, window = torch.unique(index[y[:, None], x], return_inverse=True)
         if len(present) > 1:
             windows[len(found)] = window
         found.append(present.tolist())

@@ -14,7 +14,7 @@ from kcgs.kernels.tiles import TILE
 
 from .axis import Axis
 from .graph import FLOAT, Graph, Value
-from .layout import Group, Integers, Tiles, margin
+from .layout import Group, Integers, Tiles
 
 F32 = np.float32
 _STEPS, _FINE_STEPS = (1 << 16) - 1, (1 << 24) - 1  # the latter of weights that are raised to high powers
@@ -27,7 +27,7 @@ class Windows:
     """Samples region weights at the pixels of blocks, whose rows and columns are `down` and `across`.
 
     Windows are made when the decoder is loaded: of hard contours they are stored as labels; soft ones are the blur of
-    labels, or stored as weights where contours are very wide or finer than pixels. What is sampled loses the blur of
+    labels, or stored as weights where contours are very wide. What is sampled loses the blur of
     pixels, as :class:`kcgs.kernels.Resampled` has it, or with `crisp`, of labels that are blurred by the width of one,
     becomes as narrow as :class:`kcgs.kernels.Crisp` has it.
     """
@@ -43,11 +43,9 @@ class Windows:
         crisp: bool = False,
     ) -> None:
         g, soft = graph, regions.softness != 0.0
-        factor = self.factor = 1 if soft else regions.supersample  # labels along a side of a pixel
         self.g, self.soft, self.tiles, self.map = graph, soft, tiles, regions
-        self.across = across.weights(factor, margin(factor), soft)
-        self.down = g("Transpose", down.weights(factor, margin(factor), soft), perm=[0, 2, 1])
-        self.sides = across.side, down.side
+        self.across = across.weights(soft)
+        self.down = g("Transpose", down.weights(soft), perm=[0, 2, 1])
         self._is_crisp = crisp
         self._exponent: Value | None = None
         self._levels: Value | None = None
@@ -57,15 +55,15 @@ class Windows:
         self._lost = g("Relu", g("Sub", F32(1), pixel))
         (width, *_), level = regions.membership.levels
         if crisp:
-            self._exponent = g("Max", g("Div", F32(2 * regions.supersample), g("Sqrt", pixel)), F32(1))
+            self._exponent = g("Max", g("Div", F32(2), g("Sqrt", pixel)), F32(1))
         elif soft and level is None:
             self._exponent = self._sharpness(g.constant(np.array([width**2], F32)))
         mixed = [group for group in groups if group.regions > 1]
         self._numbers = {id(group): number for number, group in enumerate(mixed)}
         chosen = np.concatenate([group.tiles for group in mixed])
         self._reach = regions.membership.radius
-        blurs = regions.supersample == 1 and self._reach <= _FARTHEST
-        self._sample = (self._blurred if blurs else self._soft) if soft else self._hard
+        blurred = self._reach <= _FARTHEST
+        self._sample = (self._blurred if blurred else self._soft) if soft else self._hard
         self._store(chosen, [len(group.tiles) for group in mixed], crisp)
 
     def _store(self, chosen: Integers, counts: Sequence[int], crisp: bool) -> None:
@@ -78,7 +76,7 @@ class Windows:
         if self._sample == self._blurred:
             self._blurs = self._blur(chosen)
             if crisp:
-                labels = self._piecewise(self._cut(membership.grid[0].cpu().numpy(), chosen))
+                labels = self._piecewise(self._cut(membership.index[0].cpu().numpy(), chosen))
                 self._owns = g.split(labels, counts)
         if self._exponent is not None:
             return
@@ -115,10 +113,6 @@ class Windows:
             weights = g("Relu", weights)  # the last region's is what is left of one, up to rounding
             powers = g("Pow", g("Div", weights, g("ReduceMax", weights, one, keepdims=1)), exponent)
             weights = g("Div", powers, g("ReduceSum", powers, one, keepdims=1))
-        if self.factor > 1:
-            k = g.constant([self.factor])
-            split = g("Concat", g.constant([0, group.regions]), self.sides[0], k, self.sides[1], k, axis=0)
-            weights = g("ReduceMean", g("Reshape", weights, split), g.constant([3, 5]), keepdims=0)
         return g("Reshape", weights, g.constant([0, 0, 1, -1]))
 
     def _sharpness(self, variance: Value) -> Value:
@@ -227,7 +221,7 @@ class Windows:
         The map is stored in tiles, one beyond it around: those of one label by that label, the others by their pixels.
         """
         g, rows, cols = self.g, self.tiles.rows, self.tiles.cols
-        index = self.map.membership.grid[0].cpu().numpy()
+        index = self.map.membership.index[0].cpu().numpy()
         beyond = self.map.num_regions + 1  # nor is it what lists of regions are filled up with
         wide = -(-(self._reach + 1) // TILE)
         frame = [(wide * TILE, (wide + n) * TILE - length) for n, length in zip((rows, cols), index.shape, strict=True)]

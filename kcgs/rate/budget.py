@@ -149,9 +149,9 @@ def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: Fi
     # what a bit saves, where it is spent on Gaussians
     saved = _POWER * _TRIAL_TO_END * without * image[0].numel() / (8 * num_bytes)
     # a pixel of contour must save what its bits would
-    bits = 8 * _map_bytes(regions) / max(len(contour_edges(regions.fine_labels)[0]), 1)
+    bits = 8 * _map_bytes(regions) / max(len(contour_edges(regions.labels)[0]), 1)
     cost = saved * bits
-    if config.merge_regions and regions.softness == 0.0 and regions.supersample == 1:
+    if config.merge_regions and regions.softness == 0.0:
         regions = RegionMap.from_labels(merge_regions(image, regions.labels, cost))
     paying, count = regions.num_regions, count_of(num_bytes - _map_bytes(regions))
     if config.merge_regions and paying > count:

@@ -164,7 +164,7 @@ class TestFit:
         for name in ("means", "cholesky", "colors", "region_ids"):
             assert torch.equal(getattr(scene.field, name), getattr(result.scene.field, name)), name
         assert scene.regions is not None and result.scene.regions is not None
-        assert torch.equal(scene.regions.fine_labels, result.scene.regions.fine_labels)
+        assert torch.equal(scene.regions.labels, result.scene.regions.labels)
 
     def test_default_output_is_named_after_the_image(self, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
         code, out, err = kcgs("fit", "photo.png", "-n", "3", "--iterations", "2", capsys=capsys)

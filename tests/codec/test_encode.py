@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from kcgs import GaussianField, RegionMap, Scene, fit, load
+from kcgs import GaussianField, Scene, fit, load
 from kcgs.codec import decode, encode
 from kcgs.functional import region_splat
 
@@ -69,15 +69,6 @@ class TestRoundTrip:
         tensors = (field.means, field.cholesky, field.colors, field.region_ids, regions.labels)
         bits = b"".join(t.detach().numpy().tobytes() for t in tensors)
         assert hashlib.sha256(bits).hexdigest()[:16] == "031047e39cffb0c0"
-
-    def test_sub_pixel_map(self) -> None:
-        field = make_scene(regions=1).field
-        fine = (torch.arange(72) > 31).long().expand(48, 72)
-        regions = RegionMap.from_labels(fine, supersample=2)
-        field = GaussianField(field.means, field.cholesky, field.colors, torch.arange(60) % 2, size=field.size)
-        found = decode(encode(Scene(field, regions))).scene.regions
-        assert found is not None and found.supersample == 2
-        assert torch.equal(found.fine_labels, fine)
 
     def test_opacities_are_merged(self) -> None:
         scene = make_scene(regions=1)
@@ -188,9 +179,6 @@ class TestRefusals:
         scene = make_scene(regions=1)
         with pytest.raises(ValueError, match="channels must be in .1, 1024.; got 1025"):
             encode(changed(scene, colors=torch.ones(60, 1025)))
-        fine = RegionMap.from_labels((torch.arange(65 * 24) >= 99).long()[:, None].expand(-1, 65 * 36), supersample=65)
-        with pytest.raises(ValueError, match="supersample must be in .1, 64.; got 65"):
-            encode(Scene(changed(scene, region_ids=torch.zeros(60, dtype=torch.long)).field, fine))
 
     def test_load_reads_it(self, scene: Scene, tmp_path: object) -> None:
         path = f"{tmp_path}/scene.kcgs"

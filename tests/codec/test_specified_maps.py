@@ -314,15 +314,14 @@ def test_low_maps(seed: int) -> None:
 
 def check_map(regions: RegionMap, data: bytes) -> None:
     k, rows, widths = read_map(data, *regions.size)
-    labels = regions.fine_labels
-    assert k == regions.supersample and np.array_equal(rows, labels.numpy())
+    assert k == 1 and np.array_equal(rows, regions.labels.numpy())
     soft = regions.softness
     assert widths == {pair: soft if isinstance(soft, float) else soft.get(pair, 0.0) for pair in widths}
 
 
 @pytest.mark.parametrize("softness", [0.0, 0.75])
 def test_map(softness: float) -> None:
-    regions = RegionMap.from_labels(torch.from_numpy(cells(20, 30, 3)), softness, supersample=2)
+    regions = RegionMap.from_labels(torch.from_numpy(cells(20, 30, 3)), softness)
     check_map(regions, encode_map(regions))
 
 

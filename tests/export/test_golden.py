@@ -55,7 +55,7 @@ def scene_of(case: Arrays) -> tuple[GaussianField, RegionMap | None]:
     labels, ids = (torch.from_numpy(case[name].astype(np.int64)) for name in ("labels", "region_ids"))
     pairs: Any = case["softness"]
     softness = {(int(a), int(b)): float(w) for a, b, w in pairs} if pairs.ndim else float(pairs)
-    regions = RegionMap.from_labels(labels, softness, supersample=int(case["supersample"]))
+    regions = RegionMap.from_labels(labels, softness)
     return GaussianField(*numbers, ids, opacities, size=size_of(case)), regions
 
 
@@ -194,27 +194,23 @@ class Described:
         weight[weight < self.case["cutoff"]] = 0
         if "labels" in self.case:
             soft = self.case["softness"].ndim or self.case["softness"] > 0
-            weight *= (self.soft(x, y, max(0.0, 1 - across * down)) if soft else self.hard(x, y, across, down))[self.of]
+            weight *= (self.soft(x, y, max(0.0, 1 - across * down)) if soft else self.hard(x, y))[self.of]
         colors = self.colors if factors is None else self.colors * factors[self.of][:, None]
         return np.einsum("nhw,nc->chw", weight, colors)
 
-    def hard(self, x: np.ndarray, y: np.ndarray, across: float, down: float) -> np.ndarray:
-        k = int(self.case["supersample"])
-        spread = (np.arange(k) + 0.5) / k - 0.5
+    def hard(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         corners = []
-        for at, step, length in ((y, down, self.size[0]), (x, across, self.size[1])):
-            fine = (at[:, None] + spread * min(step, 1)).ravel() * k - 0.5
-            low = np.floor(fine)
-            offset = np.floor((fine - low) * 1024) / 1024 + 1 / 2048
-            places = [(low + i).astype(int).clip(0, k * length - 1) for i in (0, 1)]
+        for at, length in ((y, self.size[0]), (x, self.size[1])):
+            low = np.floor(at - 0.5)
+            offset = np.floor((at - 0.5 - low) * 1024) / 1024 + 1 / 2048
+            places = [(low + i).astype(int).clip(0, length - 1) for i in (0, 1)]
             corners.append(list(zip(places, (1 - offset, offset), strict=True)))
         scores = sum(
             u[:, None] * v * (self.case["labels"][r[:, None], c] == self.ids[:, None, None])
             for r, u in corners[0]
             for c, v in corners[1]
         )
-        best = scores.argmax(0) == np.arange(len(self.ids))[:, None, None]
-        return best.reshape(-1, len(y), k, len(x), k).mean((2, 4))
+        return scores.argmax(0) == np.arange(len(self.ids))[:, None, None]
 
     def soft(self, x: np.ndarray, y: np.ndarray, lost: float) -> np.ndarray:
         widths = self.case.get("contour_width")

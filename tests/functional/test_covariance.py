@@ -9,13 +9,10 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import (
-    cholesky_to_conic,
     cholesky_to_covariance,
     cholesky_to_scale_rotation,
     covariance_to_cholesky,
-    region_splat,
     scale_rotation_to_cholesky,
-    support_extent,
 )
 
 
@@ -39,11 +36,6 @@ class TestForms:
     def test_round_trip(self, factors: Tensor) -> None:
         torch.testing.assert_close(covariance_to_cholesky(cholesky_to_covariance(factors)), factors)
 
-    def test_conic(self, factors: Tensor) -> None:
-        inverse = torch.linalg.inv(cholesky_to_covariance(factors))
-        want = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], -1)
-        torch.testing.assert_close(cholesky_to_conic(factors), want)
-
     def test_scale_rotation(self, factors: Tensor) -> None:
         scales, angle = cholesky_to_scale_rotation(factors)
         want = torch.linalg.svdvals(triangle(factors))
@@ -59,18 +51,9 @@ class TestForms:
         back, _ = cholesky_to_scale_rotation(cholesky)
         torch.testing.assert_close(back, scales, rtol=1e-4, atol=1e-6)
 
-    def test_extent_is_where_the_weight_falls_below(self) -> None:
-        cholesky = torch.tensor([[2.0, 3.0, 1.0]], dtype=torch.float64)
-        x, y = support_extent(cholesky, cutoff=0.01)[0].tolist()
-        means = torch.tensor([[60.0, 60.0]], dtype=torch.float64)
-        image = region_splat(means, cholesky, torch.ones(1, 1).double(), size=(120, 120), cutoff=0.01)[0]
-        rows, cols = image.nonzero().unbind(1)
-        assert 0 <= x - (cols - 59.5).abs().max() < 1
-        assert 0 <= y - (rows - 59.5).abs().max() < 1
-
 
 class TestErrors:
-    @pytest.mark.parametrize("function", [cholesky_to_covariance, cholesky_to_conic, support_extent])
+    @pytest.mark.parametrize("function", [cholesky_to_covariance, cholesky_to_scale_rotation])
     @pytest.mark.parametrize(
         ("value", "error", "words"),
         [
@@ -94,7 +77,3 @@ class TestErrors:
             scale_rotation_to_cholesky(torch.tensor([1.0, 0.0]), torch.tensor(0.0))
         with pytest.raises(ValueError, match="angle must have shape"):
             scale_rotation_to_cholesky(torch.ones(2, 2), torch.zeros(3))
-
-    def test_cutoff(self) -> None:
-        with pytest.raises(ValueError, match="cutoff must be in"):
-            support_extent(torch.ones(3), cutoff=1.0)

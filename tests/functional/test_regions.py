@@ -39,16 +39,12 @@ class TestRegionMap(
         weights = regions.weights(0, dtype)
         assert weights.dtype == dtype and weights.isfinite().all() and weights.any()
 
-    @pytest.mark.parametrize("factor", [1, 3])
     @pytest.mark.parametrize("lead", [(), (1,), (2,)])
-    def test_cardinality(self, device: torch.device, lead: tuple[int, ...], factor: int) -> None:
-        labels = blobs((45, 69)).to(device).expand(*lead, 45, 69)
-        regions = RegionMap.from_labels(labels, supersample=factor)
-        height, width = 45 // factor, 69 // factor
-        assert regions.size == (height, width) and regions.labels.shape == (*lead, height, width)
-        assert regions.fine_labels.shape == labels.shape and regions.ids.shape == (4,)
-        assert regions.index.shape == (*(lead or (1,)), height, width)
-        assert not lead or regions.image(0).labels.shape == (height, width)
+    def test_cardinality(self, device: torch.device, lead: tuple[int, ...]) -> None:
+        regions = RegionMap.from_labels(blobs((45, 69)).to(device).expand(*lead, 45, 69))
+        assert regions.size == (45, 69) and regions.labels.shape == (*lead, 45, 69) and regions.ids.shape == (4,)
+        assert regions.index.shape == (*(lead or (1,)), 45, 69)
+        assert not lead or regions.image(0).labels.shape == (45, 69)
         assert regions.resize((7, 9)).labels.shape == (*lead, 7, 9)
 
     @pytest.mark.parametrize("softness", [0.0, 0.7])
@@ -159,15 +155,13 @@ class TestPairWidths:
             softness[3, 9] = 1.0  # type: ignore[index]
 
     def test_pickle_copy_and_move(self) -> None:
-        regions = RegionMap.from_labels(blobs((44, 70)), {(0, 1): 0.7, (2, 3): 1.0}, supersample=2)
+        regions = RegionMap.from_labels(blobs((44, 70)), {(0, 1): 0.7, (2, 3): 1.0})
         regions.membership.tiles(TILE)
         others = (pickle.loads(pickle.dumps(regions)), copy.deepcopy(regions), regions.to("meta"))
         for other in others:
             assert other.softness == regions.softness
-            assert (other.supersample, other.size) == (2, (22, 35))
-            assert other.fine_labels.shape == (44, 70)
-            assert other.membership.grid.shape == (1, 44, 70)
-        assert others[2].fine_labels.device.type == "meta"
+            assert other.size == other.labels.shape == (44, 70) and other.index.shape == (1, 44, 70)
+        assert others[2].labels.device.type == "meta"
         assert torch.equal(others[0].membership.tiles(TILE).masks, regions.membership.tiles(TILE).masks)
 
     @pytest.mark.parametrize(
@@ -188,52 +182,6 @@ class TestPairWidths:
     def test_bad_widths(self, softness: object, error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):
             RegionMap.from_labels(blobs(), softness)  # type: ignore[arg-type]
-
-
-class TestSupersample:
-    def test_one_is_the_plain_map(self) -> None:
-        regions = RegionMap.from_labels(blobs(), supersample=1)
-        assert torch.equal(regions.fine_labels, regions.labels) and regions.supersample == 1
-        assert regions.membership.fine is None
-
-    @pytest.mark.parametrize("factor", [2, 3, 4])
-    def test_labels_have_the_largest_share(self, factor: int) -> None:
-        fine = torch.randint(0, 3, (2, 6 * factor, 9 * factor), generator=torch.Generator().manual_seed(0)) * 7
-        regions = RegionMap.from_labels(fine, supersample=factor)
-        for b, y, x in [(b, y, x) for b in range(2) for y in range(6) for x in range(9)]:
-            block = fine[b, factor * y : factor * (y + 1), factor * x : factor * (x + 1)].flatten().tolist()
-            assert regions.labels[b, y, x] == max(sorted(set(block)), key=block.count)
-        assert regions.size == (6, 9)
-        assert torch.equal(regions.fine_labels, fine)
-        assert RegionMap.from_labels(fine[0], supersample=factor).labels.shape == (6, 9)
-
-    def test_a_region_without_a_pixel_is_a_region(self) -> None:
-        fine = torch.ones(4, 4).long()
-        fine[1, 2] = 5
-        regions = RegionMap.from_labels(fine, supersample=2)
-        assert regions.labels.unique().tolist() == [1]
-        assert regions.ids.tolist() == [1, 5]
-        assert regions.membership.weights(0, 1, torch.float64).tolist() == [[0.0, 0.25], [0.0, 0.0]]
-
-    def test_edges_at_sub_pixels_keep_their_place(self) -> None:
-        fine = (torch.arange(80) >= 41).long().expand(8, 80)
-        for softness in (0.0, 0.7):
-            share = RegionMap.from_labels(fine, softness, supersample=4).membership.weights(0, 0, torch.float64)
-            assert share.sum(1).tolist() == pytest.approx([41 / 4] * 2, abs=1e-12)
-
-    @pytest.mark.parametrize(
-        ("supersample", "error", "words"),
-        [
-            (0, ValueError, "supersample must be at least 1; got 0"),
-            (True, TypeError, "supersample must be an integer; got True"),
-            (2.0, TypeError, "supersample must be an integer; got 2.0"),
-            (2, ValueError, r"labels must have sides that supersample, 2, divides; got \(45, 70\)"),
-            (100, ValueError, "labels must have sides"),
-        ],
-    )
-    def test_bad_input(self, supersample: object, error: type[Exception], words: str) -> None:
-        with pytest.raises(error, match=words):
-            RegionMap.from_labels(blobs(), supersample=supersample)  # type: ignore[arg-type]
 
 
 class TestResize:
@@ -273,20 +221,18 @@ class TestResize:
 
     @pytest.mark.parametrize("size", [(45, 71), (23, 31), (91, 140), (300, 70), (7, 500), (1, 1)])
     @pytest.mark.parametrize("softness", [0.8, {(0, 1): 0.0, (0, 2): 1.1, (1, 2): 2.3}])
-    @pytest.mark.parametrize("factor", [1, 2])
-    def test_soft_memberships_are_interpolated(self, size: tuple[int, int], softness: object, factor: int) -> None:
-        fine = blobs((45 * factor, 70 * factor)) % 3
-        regions = RegionMap.from_labels(fine, softness, supersample=factor)  # type: ignore[arg-type]
+    def test_soft_memberships_are_interpolated(self, size: tuple[int, int], softness: object) -> None:
+        regions = RegionMap.from_labels(blobs() % 3, softness)  # type: ignore[arg-type]
         resized = regions.resize(size)
         assert resized.resize((45, 70)) is regions
         table = resized.membership.tiles(16)
         tiles_x = -(-size[1] // 16)
         widths, level = regions.membership.levels
-        squares = torch.full((45 * factor, 70 * factor), widths[0] ** 2, dtype=torch.float64)
+        squares = torch.full((45, 70), widths[0] ** 2, dtype=torch.float64)
         for position, width in enumerate(widths):
             squares = squares if level is None else torch.where(level[0] == position, width**2, squares)
         own = [regions.membership.weights(0, region, torch.float64) for region in range(3)]
-        stacked = torch.stack([*own, torch.nn.functional.avg_pool2d(squares[None], factor)[0]])
+        stacked = torch.stack([*own, squares])
         # torch's own bilinear resampling holds the border and puts pixels at their centres, as we do
         *means, variance = torch.nn.functional.interpolate(stacked[None], size, mode="bilinear", align_corners=False)[0]
         variance = variance.clamp_min(1e-6)
@@ -328,22 +274,6 @@ class TestResize:
                     assert not others or best > others[0], "no two labels tie"
                     assert shares[int(got[i, j])] == best
 
-    @pytest.mark.parametrize("factor", [2, 4])
-    def test_fine_map_is_sampled(self, factor: int) -> None:
-        y, x = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
-        fine = ((x - 30.3) ** 2 + (y - 33.1) ** 2 < 400).long()
-        regions = RegionMap.from_labels(fine, supersample=factor)
-        side = 64 // factor
-        large = regions.resize((2 * side, 2 * side))
-        assert (large.supersample, large.size, large.softness) == (factor, (2 * side, 2 * side), 0.0)
-        assert torch.equal(large.fine_labels, RegionMap.from_labels(fine).resize((128, 128)).labels)
-        assert regions.resize((side, side)) is regions
-        small = RegionMap.from_labels(fine, supersample=factor).resize((side // 2, side // 2))
-        shares = small.membership.weights(0, 1, torch.float64)
-        exact = torch.nn.functional.avg_pool2d(fine[None].double(), 2 * factor)[0]
-        # sampled over one pixel of the old map, not averaged over two: as the Gaussians are
-        assert (shares - exact).abs().max() <= 0.5 and (shares.mean() - exact.mean()).abs() < 1e-2
-
     def test_batch(self) -> None:
         maps = torch.stack([blobs(seed=0), blobs(seed=1)])
         large = RegionMap.from_labels(maps).resize((60, 100)).labels
@@ -355,33 +285,30 @@ class TestResize:
             RegionMap.from_labels(blobs()).resize(size)  # type: ignore[arg-type]
 
 
-def stated_crisp(labels: Tensor, factor: int, size: tuple[int, int]) -> Tensor:
+def stated_crisp(labels: Tensor, size: tuple[int, int]) -> Tensor:
     """Weights of crisp contours by their definition, from whole maps: (R, H, W)."""
     shares = []
     for region in labels.unique().tolist():
         inside = (labels == region).double().numpy()
         blurred, ones = (ndimage.gaussian_filter(a, 1.0, mode="constant", radius=4) for a in (inside, 0 * inside + 1))
-        shares.append(torch.nn.functional.avg_pool2d(torch.from_numpy(blurred / ones)[None], factor)[0])
+        shares.append(torch.from_numpy(blurred / ones))
     stacked = torch.stack(shares)
-    if factor == 1:
-        most, own = stacked.amax(0), torch.nn.functional.one_hot(labels).movedim(-1, 0).bool()
-        stacked = torch.where(own & (stacked < most), most + 0.25, stacked)
+    most, own = stacked.amax(0), torch.nn.functional.one_hot(labels).movedim(-1, 0).bool()
+    stacked = torch.where(own & (stacked < most), most + 0.25, stacked)
     large = torch.nn.functional.interpolate(stacked[None], size, mode="bilinear", align_corners=False)[0]
-    height, width = (n // factor for n in labels.shape)
-    powers = large ** max(1.0, 2 * factor * math.sqrt(size[0] * size[1] / (height * width)))
+    powers = large ** max(1.0, 2 * math.sqrt(size[0] * size[1] / labels.numel()))
     return powers / powers.sum(0)
 
 
 class TestCrisp:
     @pytest.mark.parametrize("size", [(45, 70), (45, 71), (180, 280), (100, 70), (23, 31)])
-    @pytest.mark.parametrize("factor", [1, 2])
     @pytest.mark.parametrize("softness", [0.0, 1.7])
-    def test_weights_are_the_stated_ones(self, size: tuple[int, int], factor: int, softness: float) -> None:
+    def test_weights_are_the_stated_ones(self, size: tuple[int, int], softness: float) -> None:
         """For whole maps and in tiles, whatever the contours' own widths."""
-        fine = blobs((45 * factor, 70 * factor))
-        crisp = RegionMap.from_labels(fine, softness, supersample=factor).resize(size, "crisp")
+        labels = blobs()
+        crisp = RegionMap.from_labels(labels, softness).resize(size, "crisp")
         assert crisp.contours == "crisp" and crisp.softness == 0.5 and crisp.size == size
-        want, table, tiles_x = stated_crisp(fine, factor, size), crisp.membership.tiles(16), -(-size[1] // 16)
+        want, table, tiles_x = stated_crisp(labels, size), crisp.membership.tiles(16), -(-size[1] // 16)
         found = torch.zeros(4, -(-size[0] // 16) * 16, tiles_x * 16, dtype=torch.float64)
         for key, mask in zip(table.keys.tolist(), table.mask.tolist(), strict=True):
             y, x = key // 4 // tiles_x * 16, key // 4 % tiles_x * 16

@@ -41,7 +41,6 @@ class Parts(NamedTuple):
     labels: Tensor | None = None
     size: tuple[int, int] = (0, 0)
     softness: Softness = 0.0
-    supersample: int = 1
     opacities: Tensor | None = None
 
 
@@ -50,7 +49,7 @@ def _field(p: Parts) -> GaussianField:
 
 
 def _regions(p: Parts) -> RegionMap | None:
-    return None if p.labels is None else RegionMap.from_labels(p.labels, p.softness, supersample=p.supersample)
+    return None if p.labels is None else RegionMap.from_labels(p.labels, p.softness)
 
 
 def _scene(p: Parts) -> kcgs.Scene:
@@ -61,7 +60,7 @@ def _of_map(regions: RegionMap | None) -> dict[str, Any]:
     if regions is None:
         return {"labels": None}
     softness = regions.softness if isinstance(regions.softness, float) else sorted(regions.softness.items())
-    return {"labels": regions.fine_labels, "softness": softness, "supersample": regions.supersample}
+    return {"labels": regions.labels, "softness": softness}
 
 
 def _of_scene(field: GaussianField, regions: RegionMap | None) -> dict[str, Any]:
@@ -181,16 +180,13 @@ def cleanups(image: Tensor, labels: Tensor) -> dict[str, Tensor]:
     }
 
 
-def contour_functions(image: Tensor, labels: Tensor, other: Tensor) -> dict[str, Any]:
+def contour_functions(image: Tensor, labels: Tensor) -> dict[str, Any]:
     """What is measured on and done to contours."""
     return {
-        "smooth": F.smooth_contours(labels, 4),
-        "smooth-wide": F.smooth_contours(labels, 2, sigma=3.0),
         "widths": sorted(F.choose_widths(image, labels).items()),
         "gain": sorted((pair, tuple(gain)) for pair, gain in F.band_gain(image, labels).items()),
         "merge": F.merge_regions(image, labels),
         "merge-dear": F.merge_regions(image, labels, 0.05),
-        "f-score": tuple(map(float, F.boundary_f_score(labels, other))),
         "alignment": F.edge_alignment(image, labels),
         "band": F.edge_band(labels),
     }

@@ -19,7 +19,6 @@ MAPS: dict[str, dict[str, Any]] = {
     "hard": {},
     "soft": {"softness": 0.8},
     "pairs": {"softness": PAIRS},
-    "supersampled": {"supersample": 3},
 }
 
 
@@ -51,7 +50,6 @@ FITS: dict[str, Case] = {
     "best-softness-1": lambda: adapter.run_fit(textured(), only_map(), 90, "best", iterations=60, softness=1.0),
     "best-soft": lambda: adapter.run_fit(textured(), only_map(0.7), 90, "best", iterations=60),
     "best-pairs": lambda: adapter.run_fit(textured(), only_map(PAIRS), 90, "best", iterations=60),
-    "best-supersampled": lambda: adapter.run_fit(textured(), only_map(0.0, 3), 90, "best", iterations=60),
     "best-photo": lambda: adapter.run_fit(photo(), only_map(labels=photo_map()), 160, "best", iterations=100),
     "best-merged": lambda: adapter.run_fit(blurred()[0], only_map(labels=blurred()[1]), 60, "best", iterations=60),
     "best-merged-soft": lambda: adapter.run_fit(
@@ -76,9 +74,6 @@ FITS: dict[str, Case] = {
     "chart-hard": lambda: adapter.run_fit(flat_chart()[0], only_map(labels=flat_chart()[1]), 6, "best", iterations=60),
     "chart-softness-0": lambda: adapter.run_fit(
         flat_chart()[0], only_map(labels=flat_chart()[1]), 6, "best", iterations=60, softness=0.0
-    ),
-    "chart-supersampled": lambda: adapter.run_fit(
-        flat_chart()[0], only_map(0.0, 4, flat_chart(4)[1]), 6, "best", iterations=40
     ),
     "target-psnr": lambda: adapter.run_fit(photo(), None, 400, "best", iterations=150, target_psnr=22.0),
     "target-psnr-regions": lambda: adapter.run_fit(
@@ -122,7 +117,7 @@ def _compress(**scene: Any) -> dict[str, Any]:
     return {"data": fine, "target": target, "quality": adapter.run_compress(gaussians(60), image, quality=30)}
 
 
-for name in ("none", "hard", "pairs", "supersampled"):
+for name in ("none", "hard", "pairs"):
     CASES[f"codec/compress-{name}"] = partial(_compress, **MAPS[name])
 BYTES: dict[str, Case] = {
     "none": lambda: adapter.run_fit_bytes(photo(), None, 700, "best", iterations=40),
@@ -219,15 +214,15 @@ CASES["segment/felzenszwalb-options"] = lambda: adapter.run_segment(
     photo(), "felzenszwalb", scale=80.0, snap=True, max_regions=9, min_size=15
 )
 CASES["segment/cleanup"] = lambda: adapter.cleanups(photo(), photo_map())
-CASES["functional/contours"] = lambda: adapter.contour_functions(photo(), photo_map(), photo_map().roll(2, 1))
-CASES["functional/contours-textured"] = lambda: adapter.contour_functions(textured(), map_of(), map_of().roll(1, 0))
+CASES["functional/contours"] = lambda: adapter.contour_functions(photo(), photo_map())
+CASES["functional/contours-textured"] = lambda: adapter.contour_functions(textured(), map_of())
 CASES["functional/metrics"] = lambda: adapter.metrics(
     textured((180, 200)), (textured((180, 200)) + 0.1 * textured((180, 200)).roll(3, 2)).clamp(0, 1), map_of((180, 200))
 )
 
 # Scenes
 BACKGROUND = textured((50, 60))
-for name in ("hard", "soft", "pairs", "supersampled"):
+for name in ("hard", "soft", "pairs"):
     CASES[f"scene/edits-{name}"] = partial(lambda s: adapter.edits(gaussians(**s), 7, BACKGROUND), MAPS[name])
 for name, settings in MAPS.items():
     CASES[f"scene/prune-{name}"] = partial(lambda s: adapter.run_prune(gaussians(**s), 0.05), settings)

@@ -45,12 +45,12 @@ def textured(size: tuple[int, int] = SIZE, channels: int = 3) -> Tensor:
 
 
 @functools.cache
-def flat_chart(factor: int = 1) -> tuple[Tensor, Tensor]:
+def flat_chart() -> tuple[Tensor, Tensor]:
     """A flat image of three colours, anti-aliased, and its map."""
     size, ids = (24, 36), (0, 1, 2, 1)
     colors = torch.tensor([[1.0, 0.9, 0.2], [0.1, 0.4, 0.8], [0.9, 0.1, 0.1]], dtype=torch.float64)
     image = torch.nn.functional.avg_pool2d(colors[map_of(size, 8, ids)].permute(2, 0, 1)[None], 8)[0]
-    return image.float(), map_of(size, factor, ids)
+    return image.float(), map_of(size, ids=ids)
 
 
 @functools.cache
@@ -78,11 +78,11 @@ def photo_map() -> Tensor:
     return (smooth * 4).long()
 
 
-def only_map(softness: Softness = 0.0, supersample: int = 1, labels: Tensor | None = None) -> Parts:
+def only_map(softness: Softness = 0.0, labels: Tensor | None = None) -> Parts:
     """A map alone, for a fit."""
     empty = torch.zeros(0, 0)
-    labels = map_of(SIZE, supersample) if labels is None else labels
-    return Parts(empty, empty, empty, labels=labels, softness=softness, supersample=supersample)
+    labels = map_of() if labels is None else labels
+    return Parts(empty, empty, empty, labels=labels, softness=softness)
 
 
 def gaussians(
@@ -90,7 +90,6 @@ def gaussians(
     size: tuple[int, int] = SIZE,
     *,
     softness: Softness = 0.0,
-    supersample: int = 1,
     regions: bool = True,
     ids: tuple[int, ...] = IDS,
     channels: int = 3,
@@ -114,11 +113,11 @@ def gaussians(
     l11 = xx.sqrt()
     cholesky = torch.stack([l11, (a**2 - b**2) * angle.cos() * angle.sin() / l11, a * b / l11], -1)
     colors = 0.8 * uniform(channels) - 0.15
-    labels = map_of(size, supersample, ids) if regions else None
+    labels = map_of(size, ids=ids) if regions else None
     region_ids = None
     if labels is not None:
-        column, row = (means * supersample).floor().long().unbind(-1)
+        column, row = means.floor().long().unbind(-1)
         region_ids = labels[row.clamp(0, labels.shape[0] - 1), column.clamp(0, labels.shape[1] - 1)]
     alpha = uniform().to(dtype) if opacities else None
     tensors = (t.to(dtype) for t in (means, cholesky, colors))
-    return Parts(*tensors, region_ids, labels, size, softness, supersample, alpha)
+    return Parts(*tensors, region_ids, labels, size, softness, alpha)

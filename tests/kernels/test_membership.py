@@ -1,4 +1,4 @@
-"""Widths of their own for pairs of regions, and maps finer than the image: the definition, its tables, the kernels."""
+"""Memberships of hard and soft contours: the definition, its tables, the kernels."""
 
 from __future__ import annotations
 
@@ -74,57 +74,55 @@ def width_of_pixels(labels: Any, widths: dict[tuple[int, int], float]) -> Any:
     return sigma
 
 
-def stated(labels: Tensor, sigma: Any, region: int, factor: int = 1) -> Tensor:
-    """Blur of [M = region] with the width of each pixel, averaged over sub-pixels."""
+def stated(labels: Tensor, sigma: Any, region: int) -> Tensor:
+    """Blur of [M = region] with the width of each pixel."""
     inside = (labels == region).double().numpy()
     share = inside.copy()
     for width in set(np.unique(sigma)) - {0.0}:
-        radius = math.ceil(4 * width * factor)
+        radius = math.ceil(4 * width)
         blurred, ones = (
-            ndimage.gaussian_filter(a, width * factor, mode="constant", radius=radius) for a in (inside, 0 * inside + 1)
+            ndimage.gaussian_filter(a, width, mode="constant", radius=radius) for a in (inside, 0 * inside + 1)
         )
         share = np.where(sigma == width, blurred / ones, share)
-    return torch.nn.functional.avg_pool2d(torch.from_numpy(share)[None], factor)[0]
+    return torch.from_numpy(share)
 
 
-@pytest.mark.parametrize("factor", [1, 2, 3])
 @pytest.mark.parametrize("seed", [0, 1])
 class TestDefinition:
-    def test_pairs(self, seed: int, factor: int) -> None:
+    def test_pairs(self, seed: int) -> None:
         labels = blobs(seed=seed)
-        membership = RegionMap.from_labels(labels, PAIRS, supersample=factor).membership
+        membership = RegionMap.from_labels(labels, PAIRS).membership
         sigma = width_of_pixels(labels.numpy(), PAIRS)
         assert set(np.unique(sigma)) == {0.0, 0.7, 1.1, 2.0}
         for region in range(4):
-            want = stated(labels, sigma, region, factor)
+            want = stated(labels, sigma, region)
             assert (membership.weights(0, region, torch.float64) - want).abs().max() < 1e-12
 
-    def test_one_width(self, seed: int, factor: int) -> None:
+    def test_one_width(self, seed: int) -> None:
         labels = blobs(seed=seed)
-        membership = RegionMap.from_labels(labels, 0.9, supersample=factor).membership
+        membership = RegionMap.from_labels(labels, 0.9).membership
         for region in range(4):
-            want = stated(labels, np.full(labels.shape, 0.9), region, factor)
+            want = stated(labels, np.full(labels.shape, 0.9), region)
             assert (membership.weights(0, region, torch.float64) - want).abs().max() < 1e-12
 
 
-@pytest.mark.parametrize("factor", [1, 2, 4])
 @pytest.mark.parametrize("softness", [0.0, 0.7, 5.0, PAIRS, {(0, 1): 0.3}])
 class TestTables:
-    def test_hold_the_dense_weights(self, softness: Widths, factor: int) -> None:
-        maps = torch.stack([blobs((factor * 37, factor * 53), seed=s, grain=8 * factor + 1) for s in (0, 1)])
-        maps[0, : factor * 20, : factor * 18] = 3  # tiles with a region of their own
-        membership = RegionMap.from_labels(maps, softness, supersample=factor).membership
+    def test_hold_the_dense_weights(self, softness: Widths) -> None:
+        maps = torch.stack([blobs((37, 53), seed=s) for s in (0, 1)])
+        maps[0, :20, :18] = 3  # tiles with a region of their own
+        membership = RegionMap.from_labels(maps, softness).membership
         for tile in (TILE, 5):
             for batch in (0, 1):
                 dense = [membership.weights(batch, r, torch.float64) for r in range(4)]
                 assert (from_tiles(membership, tile, batch) - torch.stack(dense)).abs().max() < 1e-12
 
-    def test_sum_to_one(self, softness: Widths, factor: int) -> None:
-        membership = RegionMap.from_labels(blobs(), softness, supersample=factor).membership
+    def test_sum_to_one(self, softness: Widths) -> None:
+        membership = RegionMap.from_labels(blobs(), softness).membership
         shares = weights_of(membership)
         assert (shares.sum(0) - 1).abs().max() < 1e-12
         assert shares.min() >= 0
-        assert ((shares > 0) & (shares < 1)).any() == (softness != 0.0 or factor > 1)
+        assert ((shares > 0) & (shares < 1)).any() == (softness != 0.0)
 
 
 class TestPairWidths:
@@ -174,44 +172,14 @@ class TestPairWidths:
         assert (table.mask < 0).sum() == 80
 
 
-class TestCoverage:
-    @pytest.mark.parametrize("factor", [2, 4])
-    def test_is_the_average_of_the_mask(self, factor: int) -> None:
-        fine = blobs((factor * 37, factor * 53))
-        membership = RegionMap.from_labels(fine, supersample=factor).membership
-        one_hot = torch.stack([fine == r for r in range(4)]).double()
-        want = torch.nn.functional.avg_pool2d(one_hot, factor)
-        assert torch.equal(weights_of(membership), want)
-        assert torch.equal(from_tiles(membership, TILE), want)
-
-    def test_interior_tiles_store_no_weights(self) -> None:
-        fine = torch.zeros(320, 320, dtype=torch.long)
-        fine[:, 161:] = 1
-        for softness, mixed in ((0.0, 10), (0.7, 20)):
-            table = RegionMap.from_labels(fine, softness, supersample=2).membership.tiles(TILE)
-            assert len(table.masks) == 2 * mixed
-            assert (table.mask < 0).sum() == 100 - mixed
-
-    def test_copies_of_pixels_change_nothing(self) -> None:
-        labels = blobs()
-        fine = labels.repeat_interleave(2, 0).repeat_interleave(2, 1)
-        regions = RegionMap.from_labels(fine, supersample=2)
-        assert torch.equal(regions.labels, labels)
-        plain = RegionMap.from_labels(labels)
-        assert torch.equal(weights_of(regions.membership), weights_of(plain.membership))
-
-
 def test_to_keeps_everything(device: torch.device) -> None:
-    membership = RegionMap.from_labels(blobs(), PAIRS, supersample=2).membership
+    membership = RegionMap.from_labels(blobs(), PAIRS).membership
     moved = membership.to(device)
-    assert moved.grid.device.type == device.type
+    assert moved.index.device.type == device.type
     assert (from_tiles(moved, TILE) - from_tiles(membership, TILE)).abs().max() < 1e-12
 
 
-MAPS = [(1, PAIRS), (2, 0.0), (2, 0.7), (4, 0.0), (2, PAIRS)]
-
-
-@pytest.mark.parametrize(("factor", "softness"), MAPS)
+@pytest.mark.parametrize("softness", [0.0, 0.7, PAIRS])
 class TestKernels:
     def gaussians(self, count: int, size: tuple[int, int], dtype: torch.dtype) -> tuple[Tensor, ...]:
         generator = torch.Generator().manual_seed(3)
@@ -221,10 +189,8 @@ class TestKernels:
         ids = torch.arange(count) % 4
         return means.to(dtype), factors.to(dtype), unit[:, 5:8].to(dtype), ids
 
-    def test_agree(self, factor: int, softness: Widths) -> None:
-        regions = RegionMap.from_labels(
-            blobs((factor * 40, factor * 70), grain=4 * factor + 1), softness, supersample=factor
-        )
+    def test_agree(self, softness: Widths) -> None:
+        regions = RegionMap.from_labels(blobs((40, 70), grain=5), softness)
         results = []
         for backend in ("reference", "tiled", "cpu"):
             *leaves, ids = self.gaussians(60, (40, 70), torch.float32)
@@ -239,8 +205,8 @@ class TestKernels:
                 assert (value - want).abs().max() < 1e-5 * max(1.0, float(want.abs().max()))
 
     @pytest.mark.parametrize("backend", ["reference", "tiled"])
-    def test_gradcheck(self, backend: str, factor: int, softness: Widths) -> None:
-        regions = RegionMap.from_labels(blobs((factor * 6, factor * 7), grain=3), softness, supersample=factor)
+    def test_gradcheck(self, backend: str, softness: Widths) -> None:
+        regions = RegionMap.from_labels(blobs((6, 7), grain=3), softness)
         *leaves, ids = self.gaussians(5, (6, 7), torch.float64)
 
         def render(*gaussians: Tensor) -> Tensor:

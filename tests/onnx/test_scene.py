@@ -85,7 +85,7 @@ def test_every_constant_is_read(interactive: bool) -> None:
 class TestImage:
     @pytest.mark.parametrize("contours", ["scaled", "crisp"])
     @pytest.mark.parametrize("cutoff", [1e-4, 1e-6, 0.0])
-    @pytest.mark.parametrize("kind", ["none", "hard", "soft", "pairs", "fine"])
+    @pytest.mark.parametrize("kind", ["none", "hard", "soft", "pairs"])
     def test_any_size(self, kind: str, cutoff: float, contours: str) -> None:
         size = (37, 53)
         labels = blobs(size, 7)
@@ -94,7 +94,6 @@ class TestImage:
             "hard": RegionMap.from_labels(labels),
             "soft": RegionMap.from_labels(labels, 0.8),
             "pairs": RegionMap.from_labels(labels, {(2, 5): 0.0, (5, 8): 1.7, (2, 11): 0.6}),
-            "fine": RegionMap.from_labels(blobs((37 * 3, 53 * 3), 7), supersample=3),
         }[kind]
         assert_same(scattered(80, size, regions), regions, [size, *SIZES], cutoff, contours=contours)
 
@@ -192,7 +191,7 @@ class TestCoarseGrids:
         """However small the image is."""
         monkeypatch.setattr(layout, "_GRIDS_COST", -(10**9))
 
-    @pytest.mark.parametrize("kind", ["none", "hard", "soft", "wide", "pairs", "fine"])
+    @pytest.mark.parametrize("kind", ["none", "hard", "soft", "wide", "pairs"])
     def test_any_size(self, kind: str) -> None:
         size = (75, 101)
         labels = blobs(size, 7)
@@ -202,7 +201,6 @@ class TestCoarseGrids:
             "soft": RegionMap.from_labels(labels, 0.8),
             "wide": RegionMap.from_labels(labels, 6.0),
             "pairs": RegionMap.from_labels(labels, {(2, 5): 0.0, (5, 8): 1.7, (2, 11): 0.6}),
-            "fine": RegionMap.from_labels(blobs((225, 303), 7), supersample=3),
         }[kind]
         field = scattered(60, size, regions)
         assert layout.lay_out(field, regions, 1e-4).nodes is not None

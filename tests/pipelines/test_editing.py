@@ -27,10 +27,10 @@ SIZE = (48, 64)
 BOX, DISC, GROUND = 4, 9, 1
 
 
-def shapes(scale: int = 1) -> Tensor:
-    """Make a box and a disc on a ground, `scale` labels along a side of a pixel."""
-    y, x = ((torch.arange(n * scale) + 0.5) / scale for n in SIZE)
-    labels = torch.full((SIZE[0] * scale, SIZE[1] * scale), GROUND)
+def shapes() -> Tensor:
+    """Make a box and a disc on a ground."""
+    y, x = (torch.arange(n) + 0.5 for n in SIZE)
+    labels = torch.full(SIZE, GROUND)
     labels[((y > 18) & (y < 30))[:, None] & ((x > 16) & (x < 28))[None, :]] = BOX
     labels[(y[:, None] - 24) ** 2 + (x[None, :] - 46) ** 2 < 49] = DISC
     return labels
@@ -40,7 +40,6 @@ MAPS = {
     "hard": lambda: RegionMap.from_labels(shapes()),
     "soft": lambda: RegionMap.from_labels(shapes(), 0.8),
     "pairs": lambda: RegionMap.from_labels(shapes(), {(GROUND, BOX): 1.0, (GROUND, DISC): 0.5}),
-    "fine": lambda: RegionMap.from_labels(shapes(2), 0.6, supersample=2),
 }
 
 
@@ -101,7 +100,7 @@ class TestEditing(BaseTester):
         scene = scene_of(regions, opacities).to(device)
         edited = edit(scene)
         assert edited.size == SIZE and edited().shape == (3, *SIZE) and edited.metadata == {"title": "shapes"}
-        assert map_of(edited).size == SIZE and map_of(edited).supersample == regions.supersample
+        assert map_of(edited).size == SIZE
         assert set(ids_of(edited).tolist()) <= set(map_of(edited).ids.tolist())
         for region in map_of(edited).ids.tolist():
             assert render_region(edited, region).shape == (4, *SIZE)
@@ -154,13 +153,13 @@ class TestEditing(BaseTester):
     def test_feature(self, edit: Edit, regions: RegionMap) -> None:
         """An edit makes a new scene: nothing of the one given changes, nor is shared with it."""
         scene = scene_of(regions)
-        before = scene().detach(), [t.detach().clone() for t in scene.field.parameters()], regions.fine_labels.clone()
+        before = scene().detach(), [t.detach().clone() for t in scene.field.parameters()], regions.labels.clone()
         edited = edit(scene)
         with torch.no_grad():
             for tensor in edited.field.parameters():
                 tensor.fill_(1.0)
         assert all(torch.equal(a, b) for a, b in zip(scene.field.parameters(), before[1], strict=True))
-        assert torch.equal(scene(), before[0]) and torch.equal(regions.fine_labels, before[2])
+        assert torch.equal(scene(), before[0]) and torch.equal(regions.labels, before[2])
 
     @pytest.mark.parametrize("name", MAPS)
     def test_gradcheck(self, name: str) -> None:
@@ -268,12 +267,6 @@ class TestMove:
         after = cut(moved, BOX)
         torch.testing.assert_close(after, before.roll((offset[1], offset[0]), (1, 2)), rtol=0, atol=1e-5)
 
-    def test_by_half_a_pixel_of_a_finer_map(self) -> None:
-        regions = MAPS["fine"]()
-        moved = move_region(scene_of(regions), DISC, (-0.5, 1), fill=None)
-        disc = (regions.fine_labels == DISC).roll((2, -1), (0, 1))
-        assert torch.equal(map_of(moved).fine_labels == DISC, disc)
-
     def test_two_regions_move_together(self) -> None:
         scene = scene_of(MAPS["hard"]())
         moved = map_of(move_region(scene, [BOX, DISC], (-4, 2), fill=None)).labels
@@ -358,7 +351,6 @@ class TestDelete:
         rest = delete_region(scene, BOX, fill=None)
         assert rest().detach()[0].abs().max() == 0.0
         assert map_of(rest).ids.tolist() == [GROUND, DISC] and not (ids_of(rest) == BOX).any()
-        assert map_of(rest).supersample == regions.supersample
         assert map_of(delete_region(scene, [BOX, DISC], fill=None)).ids.tolist() == [GROUND]
 
     def test_pixels_go_to_the_nearest(self) -> None:

@@ -272,7 +272,7 @@ class TestOperator:
     @pytest.mark.parametrize("kernel", ["cpu", "tiled", "reference"])
     def test_opcheck(self, field: GaussianField, regions: RegionMap, kernel: str) -> None:
         gaussians = [t.detach()[None].clone().requires_grad_() for t in (field.means, field.cholesky, field.colors)]
-        settings = (field.region_ids[None], regions.fine_labels, regions.widths, 1, *SIZE, 1e-4, kernel)
+        settings = (field.region_ids[None], regions.labels, regions.widths, *SIZE, 1e-4, kernel)
         torch.library.opcheck(torch.ops.kcgs.region_splat.default, (*gaussians, *settings))
         grad = torch.rand(1, 3, *SIZE, requires_grad=kernel == "reference")
         gaussians = gaussians if kernel == "reference" else [t.detach() for t in gaussians]
@@ -367,7 +367,7 @@ class TestOperator:
         regions = RegionMap.from_labels((torch.arange(SIZE[1]) >= 16).long().expand(SIZE) * 3)
         gaussians = field.means, field.cholesky, field.colors, torch.zeros_like(field.region_ids)
         before = region_splat(*gaussians, regions)
-        regions.labels.zero_(), regions.fine_labels.zero_()
+        regions.labels.zero_()
         assert torch.equal(region_splat(*gaussians, regions), before) and int(regions.labels.max()) == 3
 
     @compiler_warnings

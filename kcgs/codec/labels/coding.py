@@ -26,7 +26,6 @@ _MOST_ASKED, MOST_ESCAPES = 1 << 23, 1 << 18
 _NOISY = np.array([2.0**-10])  # chance of a map that the model makes larger
 _FORTIETHS = 40  # of a pixel
 _MOST_WIDTH = int(MAX_SOFTNESS) * _FORTIETHS
-_MOST_SUPERSAMPLE = 64
 _TOGETHER = 32  # pairs that are coded before their model learns
 # ways to turn a map and to mirror it; how many are tried, and with how many seeds more than the fewest
 TURNS, _TRIED, _NEAR = 8, 2, 3
@@ -198,17 +197,16 @@ def encode_map(regions: RegionMap) -> bytes:
     """Write a map with two regions or more; contour widths are rounded to fortieths of a pixel."""
     if regions.num_maps is not None or regions.resized:
         raise ValueError("regions must be one map of its own pixels, not a batch and not resized")
-    check_count("supersample", regions.supersample, 1, _MOST_SUPERSAMPLE)
-    check_count("number of labels", regions.fine_labels.numel(), 1, MOST_LABELS)
+    check_count("number of labels", regions.labels.numel(), 1, MOST_LABELS)
     check_count("number of regions", regions.num_regions, 1, MOST_REGIONS)
-    labels = encode_labels(regions.fine_labels.cpu().numpy())
+    labels = encode_labels(regions.labels.cpu().numpy())
     softness = regions.softness
     if isinstance(softness, PairWidths):
-        widths = [_round(softness.get(pair, 0.0)) for pair in sorted(touching_pairs(regions.fine_labels))]
+        widths = [_round(softness.get(pair, 0.0)) for pair in sorted(touching_pairs(regions.labels))]
     else:
         widths = [_round(softness)]
     distinct = sorted(set(widths))
-    head = varint(regions.supersample) + varint(len(labels)) + labels
+    head = varint(1) + varint(len(labels)) + labels
     head += b"".join(map(varint, [len(distinct), *distinct]))
     if len(distinct) == 1:
         return head
@@ -220,11 +218,11 @@ def encode_map(regions: RegionMap) -> bytes:
 def decode_map(data: bytes, size: tuple[int, int], num_regions: int) -> RegionMap:
     """Read a map of `num_regions` regions for an image of `size`."""
     stream = ByteReader(data)
-    k = stream.varint("labels along a side of a pixel", 1, _MOST_SUPERSAMPLE)
-    if size[0] * size[1] * k * k > MOST_LABELS:
-        raise CodecError(f"a map must have at most {MOST_LABELS} labels; got {size} times {k} squared")
+    stream.varint("labels along a side of a pixel", 1, 1)
+    if size[0] * size[1] > MOST_LABELS:
+        raise CodecError(f"a map must have at most {MOST_LABELS} labels; got {size}")
     coded = stream.take(stream.varint("length of the labels", 1, len(data)))
-    labels = torch.from_numpy(decode_labels(coded, k * size[0], k * size[1], max_regions=num_regions))
+    labels = torch.from_numpy(decode_labels(coded, size[0], size[1], max_regions=num_regions))
     count = stream.varint("contour widths", 1, min(_MOST_WIDTH + 1, len(data)))
     distinct = [stream.varint("a contour width", 0, _MOST_WIDTH) / _FORTIETHS for _ in range(count)]
     softness: float | dict[tuple[int, int], float] = distinct[0]
@@ -234,7 +232,7 @@ def decode_map(data: bytes, size: tuple[int, int], num_regions: int) -> RegionMa
         softness = {pair: distinct[place] for pair, place in zip(pairs, places, strict=True)}
     elif stream.position != len(data):
         raise CodecError(f"the map must end after {stream.position} bytes; got {len(data)}")
-    regions = RegionMap.from_labels(labels, softness, supersample=k)
+    regions = RegionMap.from_labels(labels, softness)
     if regions.num_regions != num_regions:
         raise CodecError(f"the map must have {num_regions} regions; got {regions.num_regions}")
     return regions

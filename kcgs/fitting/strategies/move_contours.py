@@ -52,7 +52,7 @@ class MoveContours:
     def move(self, state: FitState, rise: float, choose_anew: bool = False) -> None:
         """Move the contours where that raises the squared error about them by no more than this factor."""
         config, before = state.config, state.regions
-        if before is None or before.supersample > 1:
+        if before is None:
             return
         moved = refine_contours(
             state.gaussians().scene(state.size), state.image, given=state.anchor,
