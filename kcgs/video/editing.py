@@ -106,7 +106,7 @@ def move_region(scenes: Scene, region_ids: int | Iterable[int], offset: Sequence
         TypeError, ValueError: as :func:`delete_region`; an offset that is not two whole numbers.
     """
     regions, ids, chosen = _check(scenes, region_ids)
-    steps = check_offset(offset, 1)
+    steps = check_offset(offset)
     behind = delete_region(scenes, region_ids)
     assert behind.regions is not None
     inside = torch.isin(ids, chosen)
