@@ -5,16 +5,13 @@ from __future__ import annotations
 import functools
 import warnings
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from kcgs.errors import InvalidArgument
 
 from .inputs import SplatInputs, Steps
-
-if TYPE_CHECKING:  # loads numba
-    from .compiled import Program
 
 BACKENDS = ("auto", "reference", "tiled", "cpu", "cuda")
 
@@ -46,12 +43,6 @@ def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
 def _warn_about_cuda() -> None:
     # until a report of a GPU shows that the Triton kernel is right
     warnings.warn("backend 'auto' takes 'tiled' on CUDA; pass backend='cuda' for the Triton kernel", stacklevel=2)
-
-
-def compile_ahead(backend: str) -> list[Program]:
-    """Begin to compile, in other processes, what float32 images on the CPU need of a backend."""
-    name = _choose(backend, torch.device("cpu"), torch.float32)
-    return [import_module(f"{__package__}.cpu.loops").program.start()] if name == "cpu" else []
 
 
 @functools.cache
