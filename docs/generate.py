@@ -181,15 +181,16 @@ def gallery() -> dict[str, str]:
 
 def segmenters() -> str:
     """Return a table of the methods of `kcgs.segment`: the first sentence of each, and its own options."""
-    import kcgs.segment
+    from kcgs.segment import Cleanup, available_methods, method_options
+    from kcgs.segment.registry import _methods
 
-    shared = inspect.signature(kcgs.segment.Cleanup).parameters
+    shared = inspect.signature(Cleanup).parameters
     rows = ["| method | how | its options |", "|---|---|---|"]
-    for name in kcgs.segment.available_methods():
-        function = getattr(kcgs.segment, name)
-        own = [f"`{key}`" for key in list(inspect.signature(function).parameters)[1:] if key not in shared]
-        sentence = inspect.cleandoc(function.__doc__ or "").split("\n\n")[0]
-        rows.append(f"| {{py:func}}`~kcgs.segment.{name}` | {_cell(sentence)} | {', '.join(own)} |")
+    for name in available_methods():
+        own = [f"`{key}`" for key in method_options(name) if key not in shared]
+        sentence = inspect.cleandoc(_methods[name].function.__doc__ or "").split("\n\n")[0]
+        sentence = re.sub(r":func:`([^`]+)`", r"`\1`", sentence)
+        rows.append(f"| `{name}` | {_cell(sentence)} | {', '.join(own)} |")
     return "\n".join(rows) + "\n"
 
 

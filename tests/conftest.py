@@ -41,7 +41,6 @@ LONGEST = (
     "fitting/test_best.py",
     "benchmarks/test_decode.py",
     "test_wheel.py",
-    "segment/test_classical.py",
     "benchmarks/test_experiments.py",
     "export/test_decode.py",
     "fitting/test_loop.py",

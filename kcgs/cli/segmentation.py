@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,10 +16,14 @@ from .common import OUTPUT_IMAGES, ImageFile, Json, Quiet, app, check_output, cl
 
 def _list_methods(wanted: bool) -> None:
     if wanted:
-        from kcgs.segment.registry import available_methods, describe_options
+        from kcgs.segment import available_methods, method_options
 
         for method in available_methods():
-            typer.echo(f"{method}: {describe_options(method)}")
+            options = [
+                name if default is inspect.Parameter.empty else f"{name}={default!r}"
+                for name, default in method_options(method).items()
+            ]
+            typer.echo(f"{method}: {', '.join(options)}")
         raise typer.Exit
 
 

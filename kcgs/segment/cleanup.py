@@ -1,87 +1,160 @@
-"""Turning raw label maps into few, clean, connected regions."""
+"""Turning the labels of every method into few, clean, connected regions."""
 
 import heapq
-from typing import Any
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import as_image, check_count, check_labels
+from kcgs._check import check_count, check_labels
+from kcgs._repr import brief
 from kcgs.functional.labels import compact
 from kcgs.functional.merging import Labels, RegionGraph, merge_nearest
+from kcgs.kernels import threads_for_kernels
+from kcgs.segment.images import check_segment_image, lab_sums, rgb_to_lab
+from kcgs.segment.snapping import snap_contours
 
-# By how much values may pass [0, 1], as resizing and colour conversion leave them.
-_TOLERANCE = 1e-3
-_BLOCK = 1 << 16  # pixels that change their colour space at a time
-
-Colors = NDArray[np.float64]
+# The smallest region as a share of the image: 600 pixels of 481 x 321. Below 250 x 250 pixels, where that is
+# less than a line across the image, it is the length of such a line.
+_MIN_SHARE = 0.004
 
 
-def connected_regions(labels: Tensor) -> Tensor:
-    """Split a label map so that every region is one piece, its pixels touching along their sides.
+@brief
+class Segmentation(NamedTuple):
+    """A label map, how sure its method is of every region, and what each is called."""
+
+    labels: Tensor
+    """:math:`(H, W)` int64, ids 0 to R - 1 by decreasing area."""
+    scores: Tensor | None = None
+    """:math:`(R,)` float32 in [0, 1], NaN for a region that the method says nothing about; None: no scores."""
+    names: dict[int, str] | None = None
+    """By id; several regions may have one name. None: the method knows no names."""
+
+
+@brief
+class Prediction(NamedTuple):
+    """What a method says of every pixel, before clean-up; tensors or numpy arrays."""
+
+    labels: Any
+    """:math:`(H, W)`, integer or bool, non-negative."""
+    scores: Any = None
+    """:math:`(H, W)` in [0, 1], NaN where the method says nothing; None: no scores."""
+    names: Sequence[str] | None = None
+    """What the labels are called, from 0 on; None: the method knows no names."""
+
+
+@dataclass(frozen=True)
+class Cleanup:
+    """What is done to the labels of every method, in this order.
 
     Args:
-        labels: :math:`(H, W)` integer, any non-negative ids.
-
-    Returns:
-        :math:`(H, W)` int64 with ids 0 to R - 1 in raster order of each piece's first pixel.
+        snap: contours move by up to so many pixels onto the image's edges; 0 leaves them.
+        min_size: 4-connected pieces of fewer pixels join the neighbour that they have most border with, the smallest
+            piece first; at least 1, which leaves all; None: 0.4 % of the image, at least sqrt(H W).
+        connected: every 4-connected piece is a region of its own.
+        max_regions: the two neighbours nearest in mean colour (CIE Lab) merge until so many regions are left; None
+            leaves all.
 
     Raises:
-        TypeError, ValueError: ``labels`` is no integer map (H, W) of non-negative ids, or is empty.
-
-    Example:
-        >>> connected_regions(torch.tensor([[5, 2, 5], [5, 2, 2]])).tolist()
-        [[0, 1, 2], [0, 1, 1]]
+        TypeError, ValueError: an option has another type or is out of its range.
     """
-    labels = check_labels("labels", labels, dims=(2,))
-    return torch.from_numpy(_components(to_regions(labels)[1])).to(labels.device)
+
+    snap: int = 0
+    min_size: int | None = None
+    connected: bool = True
+    max_regions: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check the options before anything is loaded."""
+        check_count("snap", self.snap, least=0)
+        for name in ("min_size", "max_regions"):
+            if getattr(self, name) is not None:
+                check_count(name, getattr(self, name))
+        if not isinstance(self.connected, bool):
+            raise TypeError(f"connected must be True or False; got {self.connected!r}")
+
+    def smallest(self, num_pixels: int) -> int:
+        """Return how many pixels the smallest region of an image of so many has."""
+        return self.min_size or max(round(_MIN_SHARE * num_pixels), round(math.sqrt(num_pixels)))
+
+    def apply(self, image: Any, labels: Any) -> Segmentation:
+        """Clean the labels of an image, or a `Prediction`.
+
+        A region scores the mean of its pixels' scores, and is called as most of its pixels were labelled.
+
+        Raises:
+            TypeError, ValueError: no image; no labels or scores of its size; more labels than names.
+
+        Example:
+            >>> labels = torch.tensor([[3, 3, 3, 8], [3, 1, 3, 8]])
+            >>> Cleanup(min_size=2).apply(torch.zeros(3, 2, 4), labels).labels.tolist()
+            [[0, 0, 0, 1], [0, 0, 0, 1]]
+        """
+        pixels = check_segment_image(image)
+        found = labels if isinstance(labels, Prediction) else Prediction(labels)
+        classes = check_labels("labels", found.labels, dims=(2,)).cpu()
+        scores = None if found.scores is None else torch.as_tensor(found.scores).double().cpu()
+        for name, values in (("labels", classes), ("scores", scores)):
+            if values is not None and values.shape != pixels.shape[1:]:
+                raise ValueError(
+                    f"{name} must have the image's size {tuple(pixels.shape[1:])}; got {tuple(values.shape)}"
+                )
+        if found.names is not None and int(classes.max()) >= len(found.names):
+            raise ValueError(f"names must say what label {int(classes.max())} is; got {len(found.names)} names")
+        with threads_for_kernels(classes.numel()):
+            regions = self._clean(pixels, to_regions(classes.numpy()))
+        cleaned = torch.from_numpy(regions).to(pixels.device)
+        if scores is not None:
+            scores = _region_means(regions, scores.numpy()).to(pixels.device)
+        names = None if found.names is None else _region_names(regions, classes.numpy(), found.names)
+        return Segmentation(cleaned, scores, names)
+
+    def _clean(self, image: Tensor, regions: Labels) -> Labels:
+        if self.snap:
+            regions = snap_contours(rgb_to_lab(image), regions, self.snap)
+        regions = merge_small(regions, self.smallest(regions.size))
+        # Pieces of one region become one piece where what lay between them joins it: connect after merging.
+        regions = order_by_area(connect(regions) if self.connected else regions)
+        if self.max_regions is not None and regions.max() >= self.max_regions:
+            regions = order_by_area(merge_similar(rgb_to_lab(image), regions, self.max_regions))
+        return regions
 
 
-def order_by_area(labels: Tensor) -> Tensor:
-    """Renumber regions by decreasing area; of equal ones, the one with the earlier first pixel comes first.
+def connect(labels: Labels) -> Labels:
+    """Return the 4-connected pieces, numbered from 0 in raster order of their first pixels."""
+    from skimage.measure import label
 
-    Takes, returns and raises what :func:`connected_regions` does.
+    return np.asarray(label(labels, background=-1, connectivity=1), dtype=np.int64) - 1
 
-    Example:
-        >>> order_by_area(torch.tensor([[9, 4, 4], [9, 4, 7]])).tolist()
-        [[1, 0, 0], [1, 0, 2]]
-    """
-    labels = check_labels("labels", labels, dims=(2,))
-    _, regions = to_regions(labels)
+
+def to_regions(labels: Labels) -> Labels:
+    """Renumber labels as 0 to R - 1, in their order."""
+    return compact(torch.from_numpy(labels))[1].numpy().astype(np.int64)
+
+
+def order_by_area(labels: Labels) -> Labels:
+    """Renumber regions by decreasing area; of equal ones, the one with the earlier first pixel comes first."""
+    regions = to_regions(labels)
     areas = np.bincount(regions.ravel())
     first = np.empty_like(areas)
     first[regions.ravel()[::-1]] = np.arange(regions.size)[::-1]  # Of repeated indices the last one counts.
     rank = np.empty_like(areas)
     rank[np.lexsort((first, -areas))] = np.arange(len(areas))
-    return torch.from_numpy(rank[regions]).to(labels.device)
+    return rank[regions]
 
 
-def merge_small(labels: Tensor, min_size: int) -> Tensor:
+def merge_small(labels: Labels, min_size: int) -> Labels:
     """Give every 4-connected piece under ``min_size`` pixels to the neighbour it has most border with.
 
     The smallest piece goes first, and a piece that reaches ``min_size`` by merging stays. Of neighbours with equal
-    borders the larger takes it, then the one whose first pixel comes earlier.
-
-    Args:
-        labels: :math:`(H, W)` integer, any non-negative ids.
-        min_size: pixels a piece must have to stay, at least 1.
-
-    Returns:
-        :math:`(H, W)` int64; remaining pieces keep their ids.
-
-    Raises:
-        TypeError, ValueError: as `connected_regions`; ``min_size`` is no integer of at least 1.
-
-    Example:
-        >>> merge_small(torch.tensor([[3, 3, 3, 8], [3, 1, 3, 8]]), min_size=2).tolist()
-        [[3, 3, 3, 8], [3, 3, 3, 8]]
+    borders the larger takes it, then the one whose first pixel comes earlier. Remaining pieces keep their label.
     """
-    labels = check_labels("labels", labels, dims=(2,))
-    ids, regions = to_regions(labels)
-    check_count("min_size", min_size)
-    pieces = _components(regions)
+    pieces = connect(labels)
     graph = RegionGraph(pieces)
     queue = [(int(area), piece) for piece, area in enumerate(graph.areas) if area < min_size]
     heapq.heapify(queue)
@@ -94,95 +167,37 @@ def merge_small(labels: Tensor, min_size: int) -> Tensor:
         graph.merge(piece, target)
         if graph.areas[target] < min_size:
             heapq.heappush(queue, (int(graph.areas[target]), target))
-    region_of_piece = np.empty(len(graph.areas), dtype=np.int64)
-    region_of_piece[pieces.ravel()] = regions.ravel()
-    return torch.from_numpy(ids[region_of_piece[graph.roots()]][pieces]).to(labels.device)
+    label_of_piece = np.empty(len(graph.areas), dtype=np.int64)
+    label_of_piece[pieces.ravel()] = labels.ravel()
+    return label_of_piece[graph.roots()][pieces]
 
 
-def merge_similar(image: Any, labels: Tensor, max_regions: int | None) -> Tensor:
-    """Merge the two adjacent regions nearest in mean colour until at most ``max_regions`` are left.
+def merge_similar(lab: NDArray[np.float32], regions: Labels, max_regions: int) -> Labels:
+    """Merge the two neighbours nearest in mean colour until at most ``max_regions`` of regions 0 to R - 1 are left.
 
-    Colours are compared as CIE Lab (D65); a merged region has the mean of all its pixels.
-
-    Args:
-        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].
-        labels: :math:`(H, W)` integer, any non-negative ids.
-        max_regions: how many regions may stay, at least 1; None: all.
-
-    Returns:
-        :math:`(H, W)` int64; a merged region has the id of its largest part.
-
-    Raises:
-        TypeError, ValueError: as `connected_regions`; ``image`` is none, of another size, or a number out of its range.
-
-    Example:
-        >>> image = torch.tensor([[[0.0, 0.1, 0.9]]])
-        >>> merge_similar(image, torch.tensor([[4, 5, 6]]), max_regions=2).tolist()
-        [[4, 4, 6]]
+    A merged region has the mean of all its pixels and the id of its largest part.
     """
-    labels = check_labels("labels", labels, dims=(2,))
-    if max_regions is None:
-        return labels
-    check_count("max_regions", max_regions)
-    lab, ids, regions = lab_and_regions(image, labels)
     graph = RegionGraph(regions)
     merge_nearest(graph, lab_sums(lab, regions), max_regions)
-    return torch.from_numpy(ids[graph.roots()][regions]).to(labels.device)
+    return graph.roots()[regions]
 
 
-def clean(labels: Tensor, min_size: int) -> Tensor:
+def clean(labels: Labels, min_size: int) -> Labels:
     """Return 4-connected regions of at least ``min_size`` pixels, by decreasing area."""
-    # Pieces of one region become one piece where what lay between them joins it: connect after merging.
-    return order_by_area(connected_regions(merge_small(labels, min_size)))
+    return order_by_area(connect(merge_small(labels, min_size)))
 
 
-def to_pixels(image: Tensor) -> NDArray[np.float32]:
-    """Return a checked image as (H, W, 3)."""
-    return image.permute(1, 2, 0).cpu().numpy()
+def _region_means(regions: Labels, scores: NDArray[np.float64]) -> Tensor:
+    known = np.isfinite(scores)
+    count = int(regions.max()) + 1
+    sums = np.bincount(regions[known], weights=scores[known], minlength=count)
+    with np.errstate(invalid="ignore"):
+        means = sums / np.bincount(regions[known], minlength=count)
+    return torch.from_numpy(means).clamp(0, 1).float()
 
 
-def rgb_to_lab(image: Tensor) -> NDArray[np.float32]:
-    """Return a checked image (3, H, W) as CIE Lab (D65), (H, W, 3) with L in [0, 100]."""
-    from skimage.color import rgb2lab
-
-    pixels = to_pixels(image)
-    lab = np.empty(pixels.shape, dtype=np.float32)
-    rows = max(1, _BLOCK // pixels.shape[1])  # its intermediates are six images
-    for top in range(0, len(pixels), rows):
-        lab[top : top + rows] = rgb2lab(pixels[top : top + rows])
-    return lab
-
-
-def lab_sums(lab: NDArray[np.float32], regions: Labels) -> Colors:
-    """Return (R, 3), the colours of every region's pixels added up."""
-    flat = regions.ravel()
-    return np.stack([np.bincount(flat, weights=lab[..., k].ravel()) for k in range(3)], axis=1)
-
-
-def _components(regions: Labels) -> Labels:
-    """Return the 4-connected pieces, numbered from 0 in raster order."""
-    from skimage.measure import label
-
-    return np.asarray(label(regions, background=-1, connectivity=1), dtype=np.int64) - 1
-
-
-def to_regions(labels: Tensor) -> tuple[Labels, Labels]:
-    """Return the ids of a checked label map, sorted, and the position of every pixel's id among them, (H, W)."""
-    ids, index, _ = compact(check_labels("labels", labels, dims=(2,)).cpu())
-    return ids.numpy(), index.numpy().astype(np.int64)
-
-
-def check_segment_image(image: Any) -> Tensor:
-    """Return a checked image as (3, H, W) float32 in [0, 1], grey repeated, in memory pixel by pixel."""
-    tensor = as_image("image", image, tolerance=_TOLERANCE).detach()
-    if tensor.shape[0] not in (1, 3):
-        raise ValueError(f"image must have shape (3, H, W) or (1, H, W); got {tuple(tensor.shape)}")
-    return tensor.float().clamp(0, 1).expand(3, -1, -1).permute(1, 2, 0).contiguous().permute(2, 0, 1)
-
-
-def lab_and_regions(image: Any, labels: Tensor) -> tuple[NDArray[np.float32], Labels, Labels]:
-    """Return a checked image as CIE Lab (H, W, 3), and a checked label map of its size as `to_regions` does."""
-    image, (ids, regions) = check_segment_image(image), to_regions(labels)
-    if image.shape[1:] != regions.shape:
-        raise ValueError(f"labels must have the image's size; got {regions.shape} and {tuple(image.shape[1:])}")
-    return rgb_to_lab(image), ids, regions
+def _region_names(regions: Labels, classes: Labels, names: Sequence[str]) -> dict[int, str]:
+    """Return what every region is called: as the class that most of its pixels have."""
+    pairs = (regions * len(names) + classes).ravel()
+    counts = np.bincount(pairs, minlength=(int(regions.max()) + 1) * len(names)).reshape(-1, len(names))
+    return {region: names[kind] for region, kind in enumerate(counts.argmax(axis=1).tolist())}

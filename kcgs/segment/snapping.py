@@ -1,15 +1,10 @@
 """Putting the contours of a label map where the image has its edges."""
 
-from typing import Any
-
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from kcgs._check import check_count, check_labels
 from kcgs.functional.merging import Labels, RegionGraph
-from kcgs.segment.cleanup import lab_and_regions, lab_sums
+from kcgs.segment.images import lab_sums
 
 # A region with a smaller share of its pixels further than `reach` inside is a ribbon.
 _CORE_SHARE = 0.1
@@ -19,44 +14,24 @@ _JUST_NOTICEABLE = 2.3  # A distance in Lab.
 _GRADIENT_SIGMA = 0.7
 
 
-def snap_contours(image: Any, labels: Tensor, *, reach: int = 2) -> Tensor:
-    """Move contours by up to some pixels onto the image's strongest edge.
+def snap_contours(lab: NDArray[np.float32], regions: Labels, reach: int) -> Labels:
+    """Move contours of regions 0 to R - 1 by up to ``reach`` pixels onto the strongest edge of (H, W, 3).
 
     Segmenters that smooth the image leave contours a pixel or two beside its edges, put whiskers along them and make
     ribbons of blurred edges. Here every region keeps what lies further than ``reach`` inside it, and the rest goes by
     watershed on the gradient in CIE Lab. Ribbons whose colour is a mixture of the regions on their two sides, or hardly
-    another than one of them, are dissolved; other regions too thin to have an inside stay as they are.
-
-    Args:
-        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1].
-        labels: :math:`(H, W)` integer, any non-negative ids.
-        reach: pixels, at least 1.
-
-    Returns:
-        :math:`(H, W)` int64 with the ids of ``labels``; a region can come out in several pieces.
-
-    Raises:
-        TypeError, ValueError: as `merge_similar`; ``reach`` is no integer of at least 1.
-
-    Example:
-        >>> image = torch.zeros(3, 8, 16)
-        >>> image[..., 8:] = 1.0
-        >>> labels = (torch.arange(16) >= 7).long().expand(8, 16)
-        >>> snap_contours(image, labels)[0].tolist()
-        [0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1]
+    another than one of them, are dissolved; other regions too thin to have an inside stay as they are. A region can
+    come out in several pieces.
     """
     from scipy.ndimage import binary_dilation
     from skimage.segmentation import watershed
 
-    check_count("reach", reach)
-    labels = check_labels("labels", labels, dims=(2,))
-    lab, ids, regions = lab_and_regions(image, labels)
     fixed = _fixed(lab, regions, reach)
     # The watershed runs in the band that is open and on its rim: the inside of regions has no say in it.
     seeds = np.where(fixed, regions + 1, 0)
     band = binary_dilation(~fixed, np.ones((3, 3)))
     flooded = watershed(_gradient(lab), seeds, mask=band)
-    return torch.from_numpy(ids[np.where(fixed, regions, flooded - 1)]).to(labels.device)
+    return np.where(fixed, regions, flooded - 1)
 
 
 def _fixed(lab: NDArray[np.float32], regions: Labels, reach: int) -> NDArray[np.bool_]:

@@ -134,7 +134,7 @@ def test_methods_and_their_options_are_listed(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     code, out, _ = kcgs("segment", "--methods", capsys=capsys, monkeypatch=monkeypatch)
-    assert code == 0 and "\nfelzenszwalb: scale=300.0, sigma=1.0, snap=0, min_size=None, connected=True" in out
+    assert code == 0 and "\nfelzenszwalb: scale=300.0, sigma=1.0, channel_axis=-1, snap=0, min_size=None" in out
     assert [line.partition(":")[0] for line in out.splitlines()] == available_methods()
 
 

@@ -170,13 +170,16 @@ def run_segment(image: Tensor, method: str, **options: Any) -> Tensor:
 
 
 def cleanups(image: Tensor, labels: Tensor) -> dict[str, Tensor]:
-    """Every function that cleans a label map."""
+    """What cleans a label map, each by itself."""
     return {
-        "connected": segment.connected_regions(labels),
-        "by-area": segment.order_by_area(labels),
-        "specks": segment.merge_small(labels, 20),
-        "similar": segment.merge_similar(image, segment.connected_regions(labels), 3),
-        "snap": segment.snap_contours(image, labels, reach=2),
+        name: segment.Cleanup(**{"min_size": 1, "connected": False, **options}).apply(image, labels).labels
+        for name, options in {
+            "connected": {"connected": True},
+            "by-area": {},
+            "specks": {"min_size": 20},
+            "similar": {"connected": True, "max_regions": 3},
+            "snap": {"snap": 2},
+        }.items()
     }
 
 

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
@@ -56,19 +55,16 @@ LEFT = (torch.arange(40) >= 25).long().expand(24, 40)  # The larger left side is
 
 class TestKinds:
     @pytest.mark.parametrize(
-        ("tail", "kind", "score"),
+        ("tail", "score"),
         [
-            ("", "logits", np.exp(4) / (np.exp(4) + 2)),
-            ("", "auto", np.exp(4) / (np.exp(4) + 2)),
-            ("Softmax", "probability", np.exp(4) / (np.exp(4) + 2)),
-            ("Softmax", "auto", np.exp(4) / (np.exp(4) + 2)),
-            ("ArgMax", "label", None),
-            ("ArgMax", "auto", None),
+            ("", np.exp(4) / (np.exp(4) + 2)),
+            ("Softmax", np.exp(4) / (np.exp(4) + 2)),
+            ("ArgMax", None),
         ],
     )
-    def test_several_classes(self, tmp_path: Path, tail: str, kind: str, score: float | None) -> None:
+    def test_several_classes(self, tmp_path: Path, tail: str, score: float | None) -> None:
         path = mixing(tmp_path / "net.onnx", EYE, tail=tail)
-        labels, scores, _ = segment_with_scores(two_colors(), "onnx", model=path, kind=kind, **PLAIN)
+        labels, scores, _ = segment_with_scores(two_colors(), "onnx", model=path, **PLAIN)
         assert torch.equal(labels, LEFT)
         if score is None:
             assert scores is None
@@ -77,28 +73,22 @@ class TestKinds:
             assert scores.tolist() == pytest.approx([score, score], rel=1e-5)
 
     @pytest.mark.parametrize(
-        ("weights", "tail", "kind", "scores"),
+        ("weights", "tail", "scores"),
         [
-            ([[0.8, 0.0, 0.1]], "", "auto", [1.0, 1.0]),
-            ([[0.8, 0.0, 0.1]], "", "saliency", [1.0, 1.0]),
-            ([[0.8, 0.0, 0.1]], "", "probability", [0.8, 0.9]),
-            ([[2.0, 0.0, -2.0]], "", "auto", [0.8808, 0.8808]),
-            ([[2.0, 0.0, -2.0]], "", "logits", [0.8808, 0.8808]),
-            ([[2.0, 0.0, -2.0]], "Sigmoid", "probability", [0.8808, 0.8808]),
+            ([[0.8, 0.0, 0.1]], "", [1.0, 1.0]),
+            ([[2.0, 0.0, -2.0]], "", [0.8808, 0.8808]),
         ],
     )
-    def test_one_channel(
-        self, tmp_path: Path, weights: list[list[float]], tail: str, kind: str, scores: list[float]
-    ) -> None:
+    def test_one_channel(self, tmp_path: Path, weights: list[list[float]], tail: str, scores: list[float]) -> None:
         path = mixing(tmp_path / "net.onnx", weights, tail=tail)
-        labels, found, _ = segment_with_scores(two_colors(), "onnx", model=path, kind=kind, **PLAIN)
+        labels, found, _ = segment_with_scores(two_colors(), "onnx", model=path, **PLAIN)
         assert torch.equal(labels, LEFT)
         assert found is not None
         assert found.tolist() == pytest.approx(scores, abs=1e-4)
 
     def test_constant_saliency_is_one_region(self, tmp_path: Path) -> None:
         path = mixing(tmp_path / "net.onnx", [[0.3, 0.3, 0.3]])
-        assert int(segment(two_colors(), "onnx", model=path, kind="saliency", **PLAIN).max()) == 0
+        assert int(segment(two_colors(), "onnx", model=path, **PLAIN).max()) == 0
 
     def test_pieces_and_budget(self, tmp_path: Path) -> None:
         image = two_colors()
@@ -119,9 +109,6 @@ class TestNames:
         path = mixing(tmp_path / "net.onnx", EYE, tail=tail)
         found = segment_with_scores(two_colors(), "onnx", model=path, names=self.NAMES, **PLAIN)
         assert found.names == {0: "red", 1: "blue"}
-        (tmp_path / "names.txt").write_text("\n".join(self.NAMES))
-        again = segment_with_scores(two_colors(), "onnx", model=path, names=tmp_path / "names.txt", **PLAIN)
-        assert again.names == found.names
         assert segment_with_scores(two_colors(), "onnx", model=path, **PLAIN).names is None
 
     def test_foreground(self, tmp_path: Path) -> None:
@@ -133,7 +120,7 @@ class TestNames:
         ("tail", "names", "message"),
         [
             ("", ["red", "green"], "names must be 3, one for each class, class 0 first; got 2"),
-            ("ArgMax", ["red", "green"], "names must be at least 3, one for each class; got 2"),
+            ("ArgMax", ["red", "green"], "names must say what label 2 is; got 2 names"),
         ],
     )
     def test_of_another_number(self, tmp_path: Path, tail: str, names: list[str], message: str) -> None:
@@ -143,56 +130,39 @@ class TestNames:
 
 
 class TestPreprocessing:
-    def test_mean_std_white(self, tmp_path: Path) -> None:
-        # Of 255 times red less 100, over 50, less 2: above 0 where red is above 200 / 255.
+    def test_mean_and_std(self, tmp_path: Path) -> None:
+        # Red above 200 / 255 is above 0.
         path = mixing(tmp_path / "net.onnx", [[1.0, 0.0, 0.0]])
         image = torch.full((3, 20, 20), 195 / 255)
         image[0, :, 12:] = 205 / 255
-        options: dict[str, Any] = {"mean": (200.0, 0.0, 0.0), "std": (5.0, 1.0, 1.0), "max_value": 255.0}
-        labels, scores, _ = segment_with_scores(image, "onnx", model=path, kind="logits", **options)
+        options: dict[str, Any] = {"mean": (200 / 255, 0.0, 0.0), "std": (5 / 255, 1.0, 1.0)}
+        labels, scores, _ = segment_with_scores(image, "onnx", model=path, **options)
         assert torch.equal(labels, (torch.arange(20) >= 12).long().expand(20, 20))
         assert scores is not None
         assert scores.tolist() == pytest.approx([0.7311, 0.7311], abs=1e-3)
 
-    def test_fixed_size_is_taken_and_the_result_enlarged(self, tmp_path: Path) -> None:
-        path = mixing(tmp_path / "net.onnx", EYE, size=(12, 20))
-        assert torch.equal(segment(two_colors(), "onnx", model=path, **PLAIN), LEFT)
-        with pytest.raises(ValueError, match=r"size must be the 12 x 20 that .*net.onnx is made for; got \(8, 8\)"):
-            segment(two_colors(), "onnx", model=path, size=(8, 8))
-
-    def test_chosen_size_and_bytes(self, tmp_path: Path) -> None:
-        path = mixing(tmp_path / "net.onnx", EYE, source=TensorProto.UINT8)
-        labels = segment(two_colors(), "onnx", model=path, size=(48, 80), max_value=255.0, kind="logits", **PLAIN)
-        assert torch.equal(labels, LEFT)
-
-    def test_gray_image_and_session(self, tmp_path: Path) -> None:
-        path = mixing(tmp_path / "net.onnx", [[1.0, 0.0, 0.0]])
-        session = onnxruntime.InferenceSession(str(path))
-        image = two_colors()[:1]
-        assert torch.equal(segment(image, "onnx", model=session, output="out", **PLAIN), LEFT)
+    @pytest.mark.parametrize("size", [(12, 20), ("h", "w")])
+    def test_results_are_enlarged(self, tmp_path: Path, size: Any) -> None:
+        path = mixing(tmp_path / "net.onnx", EYE, size=size)
+        assert torch.equal(segment(two_colors(), "onnx", model=path, size=(12, 20), **PLAIN), LEFT)
+        if size == (12, 20):
+            assert torch.equal(segment(two_colors(), "onnx", model=path, **PLAIN), LEFT)
 
 
 class TestErrors:
     def test_files(self, tmp_path: Path) -> None:
-        with pytest.raises(FileNotFoundError, match="no ONNX network at .*gone.onnx"):
-            segment(two_colors(), "onnx", model=tmp_path / "gone.onnx")
         path = mixing(tmp_path / "net.onnx", EYE)
         path.write_bytes(path.read_bytes()[:60])
-        with pytest.raises(ValueError, match="cannot read .*net.onnx as an ONNX network"):
-            segment(two_colors(), "onnx", model=path)
+        for model in (path, tmp_path / "gone.onnx"):
+            with pytest.raises(ValueError, match="cannot read .*onnx as an ONNX network"):
+                segment(two_colors(), "onnx", model=model)
 
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"kind": "mask"}, "kind must be one of"),
             ({"threshold": 2.0}, "threshold must be in"),
-            ({"output": 3}, r"output must be a position or one of the outputs \['out'\]"),
-            ({"output": "in"}, "output must be"),
             ({"mean": (0.0,)}, "mean must be 3 numbers"),
             ({"std": (0.0, 1.0, 1.0)}, "std must be finite and above 0"),
-            ({"max_value": 0.0}, "max_value must be"),
-            ({"kind": "saliency"}, "saliency output must have one channel"),
-            ({"kind": "label"}, "labels must be whole numbers"),
             ({"min_size": 0}, "min_size must be"),
         ],
     )
@@ -201,7 +171,7 @@ class TestErrors:
         with pytest.raises(ValueError, match=message):
             segment(two_colors(), "onnx", model=path, **options)
 
-    @pytest.mark.parametrize("options", [{"mean": "half"}, {"std": (1.0, "one", 1.0)}, {"max_value": "255"}])
+    @pytest.mark.parametrize("options", [{"mean": "half"}, {"std": (1.0, "one", 1.0)}])
     def test_numbers(self, tmp_path: Path, options: dict[str, Any]) -> None:
         with pytest.raises(TypeError, match=f"{next(iter(options))} must be .*number.*; got"):
             segment(two_colors(), "onnx", model=mixing(tmp_path / "net.onnx", EYE), **options)
@@ -215,7 +185,7 @@ class TestErrors:
         )
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
         (tmp_path / "net.onnx").write_bytes(model.SerializeToString())
-        with pytest.raises(ValueError, match=r"must be \(1, 3, h, w\); got \[1, 224, 224, 3\]"):
+        with pytest.raises(ValueError, match="does not run on"):
             segment(two_colors(), "onnx", model=tmp_path / "net.onnx")
 
 
@@ -235,14 +205,12 @@ class TestLseg:
 
     def test_errors(self, tmp_path: Path) -> None:
         path = mixing(tmp_path / "encoder.onnx", EYE)
-        with pytest.raises(ValueError, match=r"features must have shape \(1, 5, h, w\)"):
+        with pytest.raises(ValueError, match=r"embeddings must have shape \(K, 3\)"):
             segment(two_colors(), "lseg", model=path, embeddings=np.ones((2, 5), dtype=np.float32))
         with pytest.raises(ValueError, match="names must be 2, one for each class"):
             segment(two_colors(), "lseg", model=path, embeddings=np.ones((2, 3), dtype=np.float32), names=["sea"])
-        with pytest.raises(ValueError, match="floating array"):
+        with pytest.raises(TypeError, match="embeddings must have a real floating dtype"):
             segment(two_colors(), "lseg", model=path, embeddings=np.ones((2, 3), dtype=int))
-        with pytest.raises(FileNotFoundError, match="no text embeddings at"):
-            segment(two_colors(), "lseg", model=path, embeddings=tmp_path / "gone.npy")
         (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY")
         with pytest.raises(ValueError, match=r"cannot read .*bad.npy"):
             segment(two_colors(), "lseg", model=path, embeddings=tmp_path / "bad.npy")

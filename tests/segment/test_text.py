@@ -67,41 +67,21 @@ def assert_map(labels: Tensor, scores: Tensor | None) -> None:
 
 class TestText:
     def test_prompts(self, folder: Path) -> None:
-        labels, scores, names = segment_with_scores(two_colors(), "text", prompts=PROMPTS, model=folder, side=64)
+        labels, scores, names = segment_with_scores(two_colors(), "text", prompts=PROMPTS, model=folder)
         assert_map(labels, scores)
         assert names is not None
         assert list(names) == labels.unique().tolist()
         assert set(names.values()) <= set(PROMPTS)
-        assert torch.equal(labels, segment(two_colors(), "text", prompts=PROMPTS, model=str(folder), side=64))
-
-    def test_equals_the_model_itself(self, folder: Path) -> None:
-        model = transformers.CLIPSegForImageSegmentation.from_pretrained(folder)
-        tokenizer = transformers.AutoTokenizer.from_pretrained(folder)
-        tokens = tokenizer(PROMPTS, padding=True, return_tensors="pt")
-        image = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(0))
-        mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
-        shown = ((image - mean[:, None, None]) / std[:, None, None]).expand(3, -1, -1, -1)
-        with torch.no_grad():
-            truth = model(pixel_values=shown, input_ids=tokens["input_ids"]).logits.argmax(dim=0)
-        options: dict[str, Any] = {"prompts": PROMPTS, "side": 64, "min_size": 1, "connected": False}
-        labels = segment(image, "text", model=model, tokenizer=tokenizer, **options)
-        found = segment_with_scores(image, "text", model=model, tokenizer=tokenizer, **options)
-        assert torch.equal(found.labels, labels)
-        assert found.names == {int(labels[truth == k][0]): PROMPTS[k] for k in truth.unique().tolist()}
-        pairs = (truth * 3 + labels).unique()  # Each class is one region: the numbers alone differ.
-        assert len(pairs) == len(truth.unique()) == len(labels.unique())
+        assert torch.equal(labels, segment(two_colors(), "text", prompts=PROMPTS, model=str(folder)))
 
     @pytest.mark.parametrize("threshold", [0.0, 0.5, 1.0])
     def test_background(self, folder: Path, threshold: float) -> None:
-        options: dict[str, Any] = {"prompts": ["a dog"], "threshold": threshold, "model": folder, "side": 64}
+        options: dict[str, Any] = {"prompts": ["a dog"], "threshold": threshold, "model": folder}
         labels, scores, names = segment_with_scores(two_colors(), "text", connected=False, **options)
         assert_map(labels, scores)
         if threshold in (0.0, 1.0):
             assert int(labels.max()) == 0
             assert names == {0: "background" if threshold else "a dog"}
-
-    def test_long_prompts_are_cut(self, folder: Path) -> None:
-        assert segment(two_colors(), "text", prompts=["dog " * 40, "cat"], model=folder, side=64).shape == (60, 90)
 
 
 class TestErrors:
@@ -110,32 +90,22 @@ class TestErrors:
         [
             ({"prompts": "dog"}, TypeError, "prompts must be a list of strings"),
             ({"prompts": ["dog", 3]}, TypeError, "prompts must be a list of strings"),
-            ({"prompts": ["dog"]}, ValueError, "prompts must be at least 2 non-empty"),
-            ({"prompts": [], "threshold": 0.5}, ValueError, "prompts must be at least 1 non-empty"),
-            ({"prompts": ["dog", " "]}, ValueError, "prompts must be"),
+            ({"prompts": ["dog"]}, ValueError, "prompts must be at least 2"),
+            ({"prompts": [], "threshold": 0.5}, ValueError, "prompts must be at least 2"),
             ({"prompts": ["dog", "cat"], "threshold": 2.0}, ValueError, "threshold must be in"),
-            ({"prompts": ["dog", "cat"], "side": 0}, ValueError, "side must be at least 1"),
         ],
     )
     def test_options(self, folder: Path, options: dict[str, Any], error: type[Exception], message: str) -> None:
         with pytest.raises(error, match=message):
             segment(two_colors(), "text", model=folder, **options)
 
-    @pytest.mark.parametrize("damage", ["no weights", "truncated", "no tokenizer"])
+    @pytest.mark.parametrize("damage", ["no weights", "truncated"])
     def test_folder(self, tmp_path: Path, folder: Path, damage: str) -> None:
         path = tmp_path / "model"
         shutil.copytree(folder, path)
-        if damage == "no tokenizer":
-            for file in path.glob("*token*"):
-                file.unlink()
-        elif damage == "truncated":
+        if damage == "truncated":
             (path / "model.safetensors").write_bytes((folder / "model.safetensors").read_bytes()[:200])
         else:
             (path / "model.safetensors").unlink()
-        with pytest.raises(ValueError, match=f"(cannot load|the tokenizer of) .*{path}"):
+        with pytest.raises(ValueError, match=f"cannot load .*{path}"):
             segment(two_colors(), "text", prompts=PROMPTS, model=path)
-
-    def test_loaded_model_needs_its_tokenizer(self, folder: Path) -> None:
-        model = transformers.CLIPSegForImageSegmentation.from_pretrained(folder)
-        with pytest.raises(ValueError, match="tokenizer must be given"):
-            segment(two_colors(), "text", prompts=PROMPTS, model=model)

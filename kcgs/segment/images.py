@@ -1,0 +1,42 @@
+"""Images as segmenters see them: checked, and in CIE Lab."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcgs._check import as_image
+from kcgs.functional.merging import Labels
+
+# By how much values may pass [0, 1], as resizing and colour conversion leave them.
+_TOLERANCE = 1e-3
+_BLOCK = 1 << 16  # pixels that change their colour space at a time, since the conversion takes six images
+
+
+def check_segment_image(image: Any) -> Tensor:
+    """Return a checked image as (3, H, W) float32 in [0, 1], grey repeated, in memory pixel by pixel."""
+    tensor = as_image("image", image, tolerance=_TOLERANCE).detach()
+    if tensor.shape[0] not in (1, 3):
+        raise ValueError(f"image must have shape (3, H, W) or (1, H, W); got {tuple(tensor.shape)}")
+    return tensor.float().clamp(0, 1).expand(3, -1, -1).permute(1, 2, 0).contiguous().permute(2, 0, 1)
+
+
+def to_pixels(image: Tensor) -> NDArray[np.float32]:
+    """Return a checked image as (H, W, 3)."""
+    return image.permute(1, 2, 0).cpu().numpy()
+
+
+def rgb_to_lab(image: Tensor) -> NDArray[np.float32]:
+    """Return a checked image (3, H, W) as CIE Lab (D65), (H, W, 3) with L in [0, 100]."""
+    from skimage.color import rgb2lab
+
+    parts = np.array_split(to_pixels(image), math.ceil(image[0].numel() / _BLOCK))
+    return np.concatenate([rgb2lab(part) for part in parts if len(part)])
+
+
+def lab_sums(lab: NDArray[np.float32], regions: Labels) -> NDArray[np.float64]:
+    """Return (R, 3), the colours of every region's pixels added up."""
+    flat = regions.ravel()
+    return np.stack([np.bincount(flat, weights=lab[..., k].ravel()) for k in range(3)], axis=1)

@@ -1,0 +1,165 @@
+"""What every method promises, the registry, and that ``auto`` follows real objects."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import skimage.data
+import torch
+from torch import Tensor
+
+from kcgs.data import chart_2x3, load_image, load_labels, save_labels
+from kcgs.errors import InvalidArgument, InvalidArgumentType
+from kcgs.segment import Prediction, available_methods, method_options, register, segment, segment_with_scores
+from kcgs.segment.methods import auto
+from kcgs.segment.registry import _methods
+
+METHODS = ["auto", "chan_vese", "felzenszwalb", "kmeans", "quickshift", "slic", "watershed"]
+
+
+def photo(name: str, step: int = 1) -> Tensor:
+    return torch.from_numpy(getattr(skimage.data, name)()).permute(2, 0, 1).float()[:, ::step, ::step] / 255
+
+
+def assert_clean(labels: Tensor, size: tuple[int, ...]) -> None:
+    """Check what every segmenter promises: int64, ids without gaps by decreasing area."""
+    assert labels.dtype == torch.int64 and labels.shape == size
+    areas = labels.flatten().bincount()
+    assert (areas > 0).all() and (areas[:-1] >= areas[1:]).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+class TestEveryMethod:
+    @pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (2, 2), (17, 31)])
+    @pytest.mark.parametrize("channels", [1, 3])
+    def test_small_images(self, method: str, size: tuple[int, int], channels: int) -> None:
+        image = torch.rand(channels, *size, generator=torch.Generator().manual_seed(0))
+        before = image.clone()
+        labels = segment(image, method)
+        assert_clean(labels, size)
+        assert torch.equal(image, before) and torch.equal(labels, segment(image.double(), method))
+
+    def test_photo_and_options(self, method: str) -> None:
+        image = photo("coffee", 4)
+        labels = segment(image, method, min_size=500, max_regions=3)
+        areas = labels.flatten().bincount()
+        assert_clean(labels, (100, 150))
+        assert len(areas) <= 3 and areas.min() >= 500
+
+    @pytest.mark.parametrize(
+        ("image", "error", "message"),
+        [
+            ([0.5], TypeError, "image must be a Tensor, a numpy array or a PIL image; got list"),
+            (torch.zeros(2, 4, 4), ValueError, "image must have shape"),
+            (torch.full((3, 4, 4), 255.0), ValueError, r"image must be in \[0, 1\]"),
+        ],
+    )
+    def test_bad_image(self, method: str, image: Any, error: type[Exception], message: str) -> None:
+        with pytest.raises(error, match=message):
+            segment(image, method)
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "error"),
+    [
+        ("auto", {"max_regions": 0}, ValueError),
+        ("auto", {"min_size": 2.5}, TypeError),
+        ("auto", {"snap": -1}, ValueError),
+        ("auto", {"connected": 1}, TypeError),
+        ("felzenszwalb", {"scale": -1.0}, ValueError),
+        ("felzenszwalb", {"sigma": "wide"}, TypeError),
+        ("slic", {"n_segments": 2.5}, TypeError),
+        ("slic", {"n_segments": 0}, ValueError),
+        ("kmeans", {"num_clusters": 0}, ValueError),
+        ("text", {"prompts": ["a"]}, ValueError),
+    ],
+)
+def test_bad_option(method: str, options: dict[str, Any], error: type[Exception]) -> None:
+    with pytest.raises(error, match=next(iter(options))):
+        segment(torch.zeros(3, 4, 4), method, **options)
+
+
+class TestRegistry:
+    @pytest.fixture(autouse=True)
+    def methods(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("kcgs.segment.registry._methods", dict(_methods))
+
+    def test_names(self) -> None:
+        assert {*METHODS, "dino", "file", "lseg", "onnx", "sam", "text"} <= set(available_methods())
+        assert method_options("slic")["n_segments"] == 400
+
+    def test_a_function_gets_the_image_and_the_values_of_its_cleanup(self) -> None:
+        seen = []
+
+        @register("test")
+        def halves(image: Tensor, *, power: float = 1.0, min_size: int) -> Prediction:
+            seen.append((image.dtype, tuple(image.shape), power, min_size))
+            labels = np.broadcast_to(np.arange(30) >= 10, (20, 30))
+            return Prediction(labels, labels * 0.5 + 0.25, ["sky", "dog"])
+
+        found = segment_with_scores(torch.zeros(1, 20, 30), "test", power=2.0)
+        assert seen == [(torch.float32, (3, 20, 30), 2.0, 24)]
+        assert found.scores is not None and found.scores.tolist() == [0.75, 0.25]
+        assert found.names == {0: "dog", 1: "sky"}
+
+    @pytest.mark.parametrize(
+        ("result", "error", "message"),
+        [
+            (torch.full((4, 4), -1), ValueError, "labels must hold non-negative ids"),
+            (torch.zeros(4, 4), TypeError, "labels must have an integer dtype"),
+            (torch.zeros(2, 2).long(), ValueError, "labels must have the image's size"),
+            (Prediction(np.ones((4, 4), int), np.ones(3)), ValueError, "scores must have the image's size"),
+            (Prediction(np.ones((4, 4), int), names=["sky"]), ValueError, "names must say what label 1 is"),
+        ],
+    )
+    def test_bad_results(self, result: Any, error: type[Exception], message: str) -> None:
+        register("test")(lambda image: result)
+        with pytest.raises(error, match=message):
+            segment(torch.zeros(3, 4, 4), "test")
+
+    def test_errors(self) -> None:
+        with pytest.raises(InvalidArgument, match="method must be one of auto, .*; got 'magic'"):
+            segment(torch.zeros(3, 4, 4), "magic")
+        with pytest.raises(InvalidArgumentType, match="option must be one of the method 'auto', .*; got 'colour'"):
+            segment(torch.zeros(3, 4, 4), colour=3)
+        for name in ("auto", ""):
+            with pytest.raises(InvalidArgument, match="name must be a new name"):
+                register(name)
+
+
+class TestAuto:
+    def test_flat_image_and_chart(self) -> None:
+        assert (segment(torch.full((3, 60, 80), 0.4)) == 0).all()
+        chart = chart_2x3()
+        labels = segment(chart.image)
+        shared = (chart.labels * 6 + labels).flatten().bincount(minlength=36).reshape(6, 6)
+        assert int(labels.max()) == 5 and shared.amax(1).sum() > 0.999 * labels.numel()
+
+    def test_photo(self) -> None:
+        labels = segment(photo("coffee"))
+        assert_clean(labels, (400, 600))
+        assert 4 <= int(labels.max()) + 1 <= 30
+        assert len({int(labels[point]) for point in ((30, 40), (130, 290), (50, 300), (330, 420), (200, 560))}) == 5
+
+    @pytest.mark.parametrize("large", [1000, 10**9])
+    def test_large_images_are_segmented_at_a_smaller_size(self, monkeypatch: pytest.MonkeyPatch, large: int) -> None:
+        monkeypatch.setattr(auto, "_LARGE", large)
+        monkeypatch.setattr(auto, "_MAX_PIXELS", 20_000)
+        assert_clean(segment(photo("coffee", 2)), (200, 300))
+        assert_clean(segment(photo("coffee", 2), max_regions=None), (200, 300))
+
+    def test_human_regions_are_covered(self, data_root: Path) -> None:
+        folder = data_root / "bsds" / "42049"
+        if not folder.is_dir():
+            pytest.skip(f"no BSDS photos in {data_root}")
+        labels, truth = segment(load_image(folder / "image.jpg")), load_labels(folder / "mask.png")
+        pairs = (truth * (int(labels.max()) + 1) + labels).flatten().bincount()
+        assert pairs.max() > 0.3 * truth.numel()
+
+
+def test_file_stays_as_it_is(tmp_path: Path) -> None:
+    mask = (torch.arange(30) >= 12).long().repeat(20, 1) * 255
+    mask[3, 2] = 255
+    save_labels(tmp_path / "mask.png", mask)
+    assert torch.equal(segment(torch.zeros(3, 20, 30), "file", path=tmp_path / "mask.png"), (mask == 0).long())
