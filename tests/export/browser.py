@@ -67,15 +67,12 @@ def array(packed: dict[str, Any]) -> NDArray[np.float32]:
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """A plain static server.
-
-    Below /isolated/ with the two headers that allow threads; below /slow/ the second half waits for `rest`.
-    """
+    """A plain static server; below /slow/ the second half of a file waits for `rest`."""
 
     rest = threading.Event()
 
     def translate_path(self, path: str) -> str:
-        return super().translate_path(path.removeprefix("/isolated").removeprefix("/slow"))
+        return super().translate_path(path.removeprefix("/slow"))
 
     def copyfile(self, source: Any, outputfile: Any) -> None:
         data = source.read()
@@ -87,9 +84,6 @@ class Handler(http.server.SimpleHTTPRequestHandler):
             outputfile.write(data[half:])
 
     def end_headers(self) -> None:
-        if getattr(self, "path", "").startswith("/isolated/"):
-            self.send_header("Cross-Origin-Opener-Policy", "same-origin")
-            self.send_header("Cross-Origin-Embedder-Policy", "require-corp")
         # a test may rewrite a file within the second that dates count in: what was read before must not come again
         self.send_header("Cache-Control", "no-store")
         super().end_headers()

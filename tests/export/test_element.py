@@ -199,9 +199,12 @@ class TestPixels:
 
 class TestEdits:
     def test_as_python_edits(self, page: Browser, site: tuple[Path, str]) -> None:
-        scene = show(page, site, random_scene("pairs"))
-        assert scene.regions is not None
-        first, second = scene.regions.ids[3:5].tolist()
+        # no pixel of the regions that move is as far from one neighbour as from another
+        labels = torch.bucketize(torch.arange(90), torch.tensor([19, 43, 67])).expand(60, -1)
+        widths = {(0, 1): 0.5, (1, 2): 0.0, (2, 3): 2.5}
+        regions = RegionMap.from_labels(labels, widths)
+        scene = show(page, site, Scene(GaussianField.random(150, (60, 90), regions=regions, seed=1), regions))
+        first, second = 1, 2
         page.evaluate(f"(image.move([{first}, {second}], 11, -7), 1)")
         moved = move_region(scene, [first, second], (11, -7), fill=None)
         check(page, moved.render())

@@ -48,8 +48,8 @@ function touchingLevels(
   return levels;
 }
 
-/** Give each place the level of the nearest that has one; of several the leftmost, then the topmost. */
-function nearest(levels: Int32Array, width: number, height: number, search: number): Uint16Array {
+/** Give each place the level, not -1, of the nearest that has one; of several the leftmost, then the topmost. */
+export function nearest(levels: Int32Array, width: number, height: number, search: number): Uint16Array {
   const rows = nearestRows(levels, width, height);
   const result = new Uint16Array(levels.length);
   for (let y = 0; y < height; y++) {

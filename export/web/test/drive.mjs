@@ -71,7 +71,6 @@ const actions = {
   evaluate: ({ expression }) => page.evaluate(encode(expression)),
   press: ({ key, on }) => (on ? page.press(on, key) : page.keyboard.press(key)),
   click: ({ on }) => page.click(on),
-  files: ({ on, paths }) => page.setInputFiles(on, paths),
   text: ({ on }) => page.innerText(on),
   // Not page.waitForFunction, which evaluates in a way that the page's Content-Security-Policy forbids.
   wait: async ({ expression }) => {
@@ -123,7 +122,6 @@ const actions = {
     await session.detach();
     return nodes.filter((node) => !node.ignored).map((node) => [node.role?.value, node.name?.value ?? ""]);
   },
-  screenshot: ({ path }) => page.screenshot({ path }).then(() => null),
   requests: () => requests,
   problems: () => problems,
 };
