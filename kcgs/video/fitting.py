@@ -19,7 +19,7 @@ from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, fit
 from kcgs.fitting.loop import check_problem
 from kcgs.fitting.state import Gaussians
-from kcgs.functional import RegionMap
+from kcgs.functional import RegionMap, lookup_regions
 from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
@@ -171,24 +171,20 @@ class _Video:
         return start, changed
 
     def _choose_start(self, motion: Tensor, regions: RegionMap | None) -> tuple[Gaussians, Tensor, Tensor]:
-        """Return the Gaussians before, moved where that helps, which of them may move on, and which pixels changed.
+        """Return the Gaussians before, moved, which of them may move, and which pixels changed.
 
         A pixel changed if the Gaussians, without motion, explain its surroundings less well than when they were fitted.
-        A region moves if it is explained better with motion.
         """
         means, cholesky, colors, ids, _ = self.frames[-1]
         if regions is not None and ids is not None:  # rows of a region that is no longer there have no use
             present = torch.isin(ids, regions.ids)
             ids, colors = torch.where(present, ids, regions.ids[0]), torch.where(present[:, None], colors, 0.0)
         unmoved = Gaussians(means, cholesky, colors, ids, regions)
-        moved = unmoved._replace(means=move_points(motion, means))
-        errors = [squared_error(gaussians, self.image, self.config) for gaussians in (unmoved, moved)]
-        changed = _blur(errors[0]) > _STILL * _blur(self.error) + _LEVEL
+        error = squared_error(unmoved, self.image, self.config)
+        changed = _blur(error) > _STILL * _blur(self.error) + _LEVEL
         _, sums = sum_over_pixels(unmoved, self.image, self.config)
         free = sums(changed[None].to(motion)) >= _FREE_SHARE * sums(torch.ones_like(motion[:1]))
-        rows, pixels = region_positions(unmoved, self.image)
-        moves = pixels.flatten().bincount((errors[1] - errors[0]).flatten()) < 0
-        means = torch.where((free & moves[rows])[:, None], moved.means, means)
+        means = torch.where(free[:, None], _move_by_region(motion, unmoved), means)
         return unmoved._replace(means=means), free, changed
 
 
@@ -210,6 +206,19 @@ def stack(frames: list[Gaussians], size: tuple[int, int], metadata: Mapping[str,
 
 def _blur(error: Tensor) -> Tensor:
     return avg_pool2d(error[None], _SURROUNDINGS, 1, _SURROUNDINGS // 2, count_include_pad=False)[0]
+
+
+def _move_by_region(motion: Tensor, gaussians: Gaussians) -> Tensor:
+    """Move centres along a motion; those that would leave their region go as the region does on the mean."""
+    means, _, _, ids, regions = gaussians
+    moved = move_points(motion, means)
+    if regions is None or ids is None:
+        return moved
+    rows, pixels = region_positions(gaussians, motion)
+    sums = [pixels.flatten().bincount(part.flatten()) for part in motion]
+    mean = torch.stack(sums, -1) / pixels.flatten().bincount()[:, None]
+    inside = lookup_regions(moved, regions.labels) == ids
+    return torch.where(inside[:, None], moved, means - mean[rows].to(means))
 
 
 def _pairs(frames: Iterable[Any], label_maps: Labels | Iterable[Labels] | None) -> Iterator[tuple[Any, Labels | None]]:

@@ -9,6 +9,7 @@ import torch
 from kcgs._check import check_number
 from kcgs.editing.checks import ids_of
 from kcgs.nn import GaussianField
+from kcgs.nn.field import join
 from kcgs.scene import Scene, check_batch
 
 from .motion import estimate_motion, motion_at, move_labels, move_points
@@ -45,14 +46,14 @@ def interpolate(scenes: Scene, time: float) -> Scene:
         return scenes[number]
     first, second = scenes[number], scenes[number + 1]
     motion = estimate_motion(first.render(), second.render())
-    one, other = first.field.means, second.field.means
-    means = torch.cat([one.lerp(move_points(motion, one), share), other + (1 - share) * motion_at(motion, other)])
-    cholesky = torch.cat([first.field.cholesky, second.field.cholesky])
-    colors = torch.cat([(1 - share) * first.field.merged_colors(), share * second.field.merged_colors()])
-    if first.regions is None or first.field.region_ids is None or second.field.region_ids is None:
-        return Scene(GaussianField(means, cholesky, colors, size=scenes.size), None, scenes.metadata)
-    regions = first.regions.relabel(move_labels(share * motion, first.regions.labels))
-    field = GaussianField(
-        means, cholesky, colors, torch.cat([first.field.region_ids, second.field.region_ids]), size=scenes.size
+    one, other = first.field, second.field
+    earlier = one.means.lerp(move_points(motion, one.means), share)
+    later = other.means + (1 - share) * motion_at(motion, other.means)
+    field = join(
+        GaussianField(earlier, one.cholesky, (1 - share) * one.merged_colors(), one.region_ids, size=scenes.size),
+        GaussianField(later, other.cholesky, share * other.merged_colors(), other.region_ids, size=scenes.size),
     )
+    if first.regions is None:
+        return Scene(field, None, scenes.metadata)
+    regions = first.regions.relabel(move_labels(share * motion, first.regions.labels))
     return Scene(field.subset(torch.isin(ids_of(field), regions.ids)), regions, scenes.metadata)
