@@ -102,7 +102,7 @@ class FitConfig(BaseModel):
         if self.backend not in BACKENDS:
             raise InvalidArgument("backend", f"one of {', '.join(BACKENDS)}", repr(self.backend))
         if self.objective != "psnr" and self.loss != "l2":
-            raise ValueError(f"objective {self.objective!r} needs loss 'l2'; got {self.loss!r}")
+            raise InvalidArgument("objective", f"psnr with loss {self.loss!r}", repr(self.objective))
         if self.softness != "auto" and not 0.0 <= self.softness <= MAX_SOFTNESS:
             raise ValueError(f"softness must be 'auto' or in [0, {MAX_SOFTNESS:g}] pixels; got {self.softness!r}")
         if self.max_move != "any" and self.max_move < 1.0:

@@ -94,5 +94,5 @@ class TestFit:
 
     @pytest.mark.parametrize("loss", ["l1", "l1+ssim"])
     def test_other_losses_are_refused(self, loss: Any) -> None:
-        with pytest.raises(ValueError, match="objective 'ms-ssim' needs loss 'l2'"):
+        with pytest.raises(ValueError, match=r"objective must be psnr with loss 'l1.*'; got 'ms-ssim'"):
             fit(torch.rand(3, 16, 16), None, 4, objective="ms-ssim", loss=loss)
