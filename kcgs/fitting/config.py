@@ -57,7 +57,7 @@ class FitConfig(BaseModel):
         "matching-pursuit", description="where Gaussians are added; largest-error: as Image-GS"
     )
     densify_from: float = Field(
-        0.02, gt=0.0, le=1.0, description="fraction of N at the start, the others are added; 1: all"
+        0.01, gt=0.0, le=1.0, description="fraction of N at the start, the others are added; 1: all"
     )
     warmup: bool = Field(False, description="read the region ids again under the moving centres for half of the fit")
     prune: float = Field(1e-3, ge=0.0, description="remove Gaussians that change no value by more, at the end; 0: none")

@@ -146,13 +146,12 @@ def check_num_gaussians(value: object, image: Tensor) -> int:
 
 def _warn_of_regions(state: FitState) -> None:
     """Say where there are more regions than Gaussians."""
-    most, merged = state.num_gaussians, state.merged_for_count
-    if state.regions is not None and (count := state.regions.num_regions) > most:
-        lost = f"{count - most} of {count} regions get no Gaussian and stay black"
-    elif merged:
-        lost = f"{merged} of {merged + most} regions were merged with others"
-    else:
+    most, count = state.num_gaussians, 0 if state.given is None else state.given.num_regions
+    if count <= most or not state.config.guidance:
         return
+    lost = f"{count - most} of {count} regions get no Gaussian and stay black"
+    if state.config.merge_regions:
+        lost = f"{count - most} of {count} regions were merged with others"
     warnings.warn(f"{lost}: there are more than num_gaussians, {most}", stacklevel=5)  # past the decorators
 
 

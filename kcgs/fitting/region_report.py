@@ -61,7 +61,6 @@ def report_regions(
     given: RegionMap | None,
     scene: Scene,
     *,
-    merged_for_count: int = 0,
     merged_for_bytes: int = 0,
     dropped: Literal["recipe", "bytes"] | None = None,
 ) -> RegionReport | None:
@@ -73,7 +72,7 @@ def report_regions(
     regions, empty = scene.regions, empty_regions(scene)
     kept = 1 if regions is None else regions.num_regions
     return RegionReport(
-        given.num_regions, kept, merged_for_count, merged_for_bytes,
+        given.num_regions, kept, given.num_regions - kept - merged_for_bytes, merged_for_bytes,
         moved_pixels=0 if regions is None else _moved_pixels(given, regions),
         empty=len(empty),
         empty_pixels=int(torch.isin(regions.labels, empty).sum()) if regions is not None and len(empty) else 0,

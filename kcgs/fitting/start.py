@@ -47,12 +47,8 @@ def start(
         started,
         clamp=saturated >= _SATURATED if config.clamp == "auto" else config.clamp,
         band=None if band is None or not len(band) else band,
-        # a map that comes with widths keeps them
-        chooses_widths=config.softness == "auto" and regions is not None and regions.softness == 0.0,
         given=regions,
         objective=make_objective(config.objective, image),
-        limit=math.inf if config.iterations is None and config.max_seconds is not None else config.usual_iterations,
-        merged_for_count=0 if regions is None else regions.num_regions - (fitting.num_regions if fitting else 1),
         cutoff=draft_cutoff(config),
         regions=rendered,
         region_ids=field.region_ids,

@@ -104,11 +104,8 @@ class FitState:
     started: float  # reading of the clock
     clamp: bool  # clip the render to [0, 1] in training
     band: Tensor | None  # pixels near a contour of the given map, where EF-PSNR is measured
-    chooses_widths: bool  # the map came without widths, and the config asks for some
     given: RegionMap | None  # the map as it came
     objective: MsSsimObjective | None  # what the descent lowers; None: what `loss` says
-    limit: float  # of iterations; infinite where the clock alone ends the fit
-    merged_for_count: int  # regions that were merged before the fit, for they were more than Gaussians
 
     # What is rendered
     cutoff: float
@@ -133,6 +130,17 @@ class FitState:
     def size(self) -> tuple[int, int]:
         """(height, width) of the image."""
         return self.image.shape[1], self.image.shape[2]
+
+    @property
+    def limit(self) -> float:
+        """How many iterations there are; infinite where the clock alone ends the fit."""
+        timed = self.config.iterations is None and self.config.max_seconds is not None
+        return math.inf if timed else self.config.usual_iterations
+
+    @property
+    def chooses_widths(self) -> bool:
+        """Whether the config asks for widths, and the map came without."""
+        return self.config.softness == "auto" and self.given is not None and self.given.softness == 0.0
 
     def seconds(self) -> float:
         """Wall time since the fit began."""

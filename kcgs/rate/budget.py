@@ -157,7 +157,7 @@ def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: Fi
     if config.merge_regions and paying > count:
         regions = regions.merge(pairs_to_merge(image, regions.labels, count))[0]
     kept = 1 if regions is None else regions.num_regions
-    merged = {"merged_for_bytes": given - paying, "merged_for_count": paying - kept}
+    merged = {"merged_for_bytes": given - paying}
     if regions is None or kept == 1:
         return None, cost, merged
     left = num_bytes - _map_bytes(regions)

@@ -138,6 +138,7 @@ class TestClock:
         assert result.history[-1].num_gaussians == 40
         assert result.history[-1].psnr > 25
         assert len(result.history) < 250
+        assert 1.35 < result.seconds < 1.65
 
 
 class TestEnd:

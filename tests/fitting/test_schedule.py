@@ -25,7 +25,7 @@ class TestDensify:
     def test_the_number_grows_and_then_goes_up_and_down(self) -> None:
         densify = Densify(state_of(1000))
         counts = [densify.wanted(p / 1000) for p in range(1001)]
-        assert counts[0] == counts[49] == 20
+        assert counts[0] == counts[49] == 10
         growth, cycles, rest = counts[:401], counts[400:800], counts[800:]
         assert all(b >= a for a, b in pairwise(growth))
         assert len(set(growth)) == densify.steps + 1

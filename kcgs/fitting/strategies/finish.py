@@ -50,5 +50,5 @@ def finish(state: FitState, reason: StopReason) -> FitResult:
     if config.prune > 0:
         scene, removed, change = prune(scene, config.prune, cutoff=config.cutoff, backend=config.backend)
     dropped: Literal["recipe"] | None = None if config.guidance else "recipe"
-    regions = report_regions(state.given, scene, merged_for_count=state.merged_for_count, dropped=dropped)
+    regions = report_regions(state.given, scene, dropped=dropped)
     return FitResult(scene, state.history, reason, config, removed, change, regions, state.seconds())
