@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kcgs.codec.exact import Integers
 from kcgs.codec.gaussians.quantize import Classes, Codes, Parameters, Quantizer
-from kcgs.fitting.frame import local_gradient, move
+from kcgs.fitting.frame import area, move, newton_steps
 from kcgs.fitting.objective import MsSsimObjective
 from kcgs.functional import RegionMap, region_splat
 
@@ -31,14 +31,8 @@ _BIT = 0.9
 # share of the iterations in which shapes are rounded; colours are in the rest; and when surplus Gaussians are left out
 _SHAPES, _LOOKS = 0.65, (0.3, 0.65, 0.9)
 _STEP, _MOMENTUM = 0.09, 0.9
-# the largest step, in standard deviations and in log scale; and the largest share of Newton's
-_LARGEST, _NEWTON = 0.2, 0.3
-# energies below it have next to no curvature: steps are as if they had this
-_FAINT = 1e-2
-# half the second derivatives of the squared error by a step in a Gaussian's frame, in units of its energy
-_CURVATURE = (0.5, 0.5, 0.75, 0.25, 0.75)
-# pixels: a sum over pixel centres of something narrower is as if it had this standard deviation, where it hits one
-_NARROW = 0.56
+# the largest step, in standard deviations and in log scale
+_LARGEST = 0.2
 _DRAFT_CUTOFF = 1e-3
 # steps for which the slope of the bits is kept, and those between two times of rounding
 _CHARGED, _GROUP = 4, 3
@@ -150,13 +144,9 @@ class Tuning:
         if self.objective is not None:
             difference = self.objective.apply(difference)
         slopes = torch.autograd.grad(render, (x, factors, c), difference)
-        gradients = slopes[0], slopes[1] + charge[:, :3], slopes[2] + charge[:, 3:]
-        narrow = cholesky[:, ::2].clamp_min(_NARROW)
-        area = (math.pi * narrow.prod(-1)).clamp_max(size[0] * size[1]) * self._weights(means, cholesky)
-        energy = (colors.square().sum(-1) * area).clamp_min(_FAINT)
-        curvature = torch.tensor(_CURVATURE).to(energy) * energy[:, None]
-        shape = (local_gradient(cholesky, *gradients[:2]) / curvature).clamp(-_NEWTON, _NEWTON)
-        return -torch.cat([shape, gradients[2] / area[:, None]], -1)
+        slopes = slopes[0], slopes[1] + charge[:, :3], slopes[2] + charge[:, 3:]
+        areas = area(cholesky).clamp_max(size[0] * size[1]) * self._weights(means, cholesky)
+        return newton_steps(cholesky, colors, slopes, areas)
 
     def _energy(self) -> Tensor:
         """Return what the objective loses without each Gaussian, (N,)."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from kcgs.fitting import FitConfig
 from kcgs.fitting.contour_moves import accept_moves, refine_contours
-from kcgs.fitting.frame import local_gradient, move, widen
+from kcgs.fitting.frame import area, move, newton_steps, widen
 from kcgs.fitting.objective import make_objective, propose_by
 from kcgs.fitting.redundancy import least_missed
 from kcgs.fitting.start import draft_cutoff
@@ -28,19 +27,12 @@ _LAST_ITERATIONS = 20
 # share of a Newton step in a step, and of the step before
 _RATE = 0.12
 _MOMENTUM = 0.9
-# bounds of a Newton step and of a step, in the Gaussian's frame
-_LARGEST_NEWTON_STEP = 0.3
+# bound of a step, in the Gaussian's frame
 _LARGEST_STEP = 0.2
 # what relocating a row of a region that stands still costs
 _HELD = 1e9
 # Gaussians at one place, as most places have them at most
 _USUAL_OVERLAP = 12.0
-# half the second derivatives of the squared error by a step in a Gaussian's frame, in units of its energy
-_CURVATURE = (0.5, 0.5, 0.75, 0.25, 0.75)
-# energies below it have next to no curvature
-_LEAST_ENERGY = 1e-2
-# pixels: on pixel centres a narrower Gaussian weighs as if it had this standard deviation
-_NARROW = 0.56
 # pixels: no Gaussian gets thinner
 _LEAST_SIGMA = 0.5
 
@@ -97,11 +89,8 @@ class Descent:
         if self.objective is not None:
             difference = self.objective.apply(difference)
         slopes = torch.autograd.grad(rendered, leaves, difference)
-        area = _area(cholesky) * self._weights() * self.crowding
-        energy = (colors.square().sum(-1) * area).clamp_min(_LEAST_ENERGY)
-        newton = local_gradient(cholesky, *slopes[:2]) / (energy[:, None] * energy.new_tensor(_CURVATURE))
-        newton = torch.cat([newton.clamp(-_LARGEST_NEWTON_STEP, _LARGEST_NEWTON_STEP), slopes[2] / area[:, None]], -1)
-        self.velocity = _MOMENTUM * self.velocity - newton
+        areas = area(cholesky) * self._weights() * self.crowding
+        self.velocity = _MOMENTUM * self.velocity + newton_steps(cholesky, colors, slopes, areas)
         change = rate * self.velocity * self.free[:, None]
         means, cholesky = move(means, cholesky, change[:, :5].clamp(-_LARGEST_STEP, _LARGEST_STEP))
         self.gaussians = Gaussians(means, widen(cholesky, _LEAST_SIGMA), colors + change[:, 5:], ids, regions)
@@ -158,8 +147,8 @@ class Descent:
         """
         total, sums = sum_over_pixels(self.gaussians, self.image, self.config)
         mass, overlap = sums(torch.ones_like(total)), sums(total)
-        area = _area(self.gaussians.cholesky)
-        return (mass / (2 * area)).clamp_max(1.0), (overlap / area / _USUAL_OVERLAP).clamp_min(1.0)
+        areas = area(self.gaussians.cholesky)
+        return (mass / (2 * areas)).clamp_max(1.0), (overlap / areas / _USUAL_OVERLAP).clamp_min(1.0)
 
     def _weights(self) -> Tensor:
         """Return what the squared error of Gaussians counts in the objective, (N,)."""
@@ -196,8 +185,3 @@ def region_positions(gaussians: Gaussians, image: Tensor) -> tuple[Tensor, Tenso
     if regions is None or ids is None:
         return torch.zeros_like(gaussians.means[:, 0], dtype=torch.int64), torch.zeros_like(image[0], dtype=torch.int64)
     return regions.index_of(ids), regions.index_of(regions.labels)
-
-
-def _area(cholesky: Tensor) -> Tensor:
-    """Return the integral of the squares of Gaussians of weight 1, (N,), as sums over pixel centres have it."""
-    return math.pi * cholesky[:, ::2].clamp_min(_NARROW).prod(-1)
