@@ -195,22 +195,21 @@ def read_ids(bits: Bits, regions: int) -> list[int]:
     return [left.pop(bits.number(len(left))) for _ in range(regions)] if bits.number(2) else left
 
 
-def read_map(data: bytes, height: int, width: int) -> tuple[int, Rows, dict[tuple[int, int], float]]:
-    """`maps`: labels along a side of a pixel, the labels, and the width of each two that are side by side."""
+def read_map(data: bytes, height: int, width: int) -> tuple[Rows, dict[tuple[int, int], float]]:
+    """`maps`: the labels, and the width of each two that are side by side."""
     stream = Bytes(data)
-    k = stream.varint()
-    rows = read_labels(stream.take(stream.varint()), k * height, k * width)
+    rows = read_labels(stream.take(stream.varint()), height, width)
     widths = [stream.varint() / 40 for _ in range(stream.varint())]
     beside = [pair for row in rows for pair in pairwise(row)]
     beside += [pair for row, other in pairwise(rows) for pair in zip(row, other, strict=True)]
     pairs = sorted({(min(pair), max(pair)) for pair in beside if pair[0] != pair[1]})
     if len(widths) == 1:
-        return k, rows, dict.fromkeys(pairs, widths[0])
+        return rows, dict.fromkeys(pairs, widths[0])
     symbols, counts = Symbols(stream.data), Choices(*[1.0] * len(widths))
     places: list[int] = []
     while len(places) < len(pairs):
         places += counts.read(symbols, min(32, len(pairs) - len(places)))
-    return k, rows, {pair: widths[place] for pair, place in zip(pairs, places, strict=True)}
+    return rows, {pair: widths[place] for pair, place in zip(pairs, places, strict=True)}
 
 
 def map_of(data: bytes) -> tuple[bytes, int, int]:
@@ -313,8 +312,8 @@ def test_low_maps(seed: int) -> None:
 
 
 def check_map(regions: RegionMap, data: bytes) -> None:
-    k, rows, widths = read_map(data, *regions.size)
-    assert k == 1 and np.array_equal(rows, regions.labels.numpy())
+    rows, widths = read_map(data, *regions.size)
+    assert np.array_equal(rows, regions.labels.numpy())
     soft = regions.softness
     assert widths == {pair: soft if isinstance(soft, float) else soft.get(pair, 0.0) for pair in widths}
 

@@ -15,7 +15,6 @@ const TOGETHER = 32; // pairs that are coded before their model learns
 
 export function readRegionMap(bytes: Uint8Array, { height, width, regions }: Header): RegionMap {
   const reader = new ByteReader(bytes);
-  reader.varint("labels along a side of a pixel", 1, 1);
   const decoder = new RangeDecoder(reader.take(reader.varint("length of the labels", 1, bytes.length)));
   if (regions > height * width) throw new DecodeError(`${height} x ${width} pixels must have fewer regions; got ${regions}`);
   const { ids, positions } = readIds(decoder, regions);

@@ -206,8 +206,7 @@ def encode_map(regions: RegionMap) -> bytes:
     else:
         widths = [_round(softness)]
     distinct = sorted(set(widths))
-    head = varint(1) + varint(len(labels)) + labels
-    head += b"".join(map(varint, [len(distinct), *distinct]))
+    head = varint(len(labels)) + labels + b"".join(map(varint, [len(distinct), *distinct]))
     if len(distinct) == 1:
         return head
     writer = Writer()
@@ -218,9 +217,6 @@ def encode_map(regions: RegionMap) -> bytes:
 def decode_map(data: bytes, size: tuple[int, int], num_regions: int) -> RegionMap:
     """Read a map of `num_regions` regions for an image of `size`."""
     stream = ByteReader(data)
-    stream.varint("labels along a side of a pixel", 1, 1)
-    if size[0] * size[1] > MOST_LABELS:
-        raise CodecError(f"a map must have at most {MOST_LABELS} labels; got {size}")
     coded = stream.take(stream.varint("length of the labels", 1, len(data)))
     labels = torch.from_numpy(decode_labels(coded, size[0], size[1], max_regions=num_regions))
     count = stream.varint("contour widths", 1, min(_MOST_WIDTH + 1, len(data)))
