@@ -1,4 +1,4 @@
-"""Make the zoo: small scenes of images that anybody may use, each with its recipe and card."""
+"""Make the zoo: small scenes of images that anybody may use, each with its card."""
 
 from __future__ import annotations
 
@@ -67,7 +67,6 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
     fitted = fit(image, labels, plan.n, recipe=config).scene
     scene = Scene(fitted.field, fitted.regions, {"recipe": recipe, "title": plan.title})
     size = scene.save(folder / "scene.safetensors")
-    write_file(folder / "recipe.json", config.model_dump_json(indent=1) + "\n")
     height, width = scene.size
     shrink = _PREVIEW / max(height, width)
     save_image(folder / "preview.jpg", scene.render((max(1, round(height * shrink)), max(1, round(width * shrink)))))
@@ -93,7 +92,7 @@ def _card(entry: Entry, size: tuple[int, int], ms_ssim: float) -> str:
         "image": f"{entry.title}, {size[1]} x {size[0]}",
         "licence of the image": entry.licence,
         "made by": f"`{entry.command}`",
-        "recipe": f"`{entry.recipe}`, all settings in `recipe.json`",
+        "recipe": f"`{entry.recipe}`",
         "Gaussians": str(entry.num_gaussians),
         "regions": str(entry.num_regions),
         "PSNR": f"{entry.psnr:.2f} dB",
