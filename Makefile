@@ -25,11 +25,9 @@ wheel: $(VENV)/.installed
 demo: $(VENV)/.installed
 	$(BIN)/kcgs demo
 
-# The charts, a few minutes, and the tables of docs/results.md from all committed results.csv. Sequences of DAVIS take
-# hours: see `python -m benchmarks davis`, which goes on where it was stopped.
+# What contours gain on the two charts, in a few minutes. Photos need data and hours: docs/results.md.
 report: $(VENV)/.installed
-	runs=$$(mktemp -d) && $(BIN)/python -m benchmarks charts -o benchmarks/reports/charts --runs $$runs && rm -r $$runs
-	$(BIN)/python -m benchmarks.core.pages
+	$(BIN)/python -m benchmarks quality -o report
 
 test: $(VENV)/.installed
 	$(PYTEST) -m "not slow"
@@ -50,4 +48,4 @@ lint: $(VENV)/.installed
 	$(BIN)/mypy
 
 clean:
-	rm -rf demo dist build docs/_build docs/generated docs/notebooks docs/benchmarks .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf demo report dist build docs/_build docs/generated docs/notebooks docs/benchmarks .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,5 +1,1 @@
-"""The experiments and their reports."""
-
-from .core.registry import available_experiments, run
-
-__all__ = ["available_experiments", "run"]
+"""Experiments with public names of kcgs, a module for each question: `python -m benchmarks NAME -o DIR`."""

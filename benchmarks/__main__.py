@@ -1,23 +1,35 @@
-"""`python -m benchmarks NAME -o DIR`."""
+"""The command `python -m benchmarks`."""
 
 import argparse
+from importlib import import_module
 from pathlib import Path
 
-from . import available_experiments, run
+from .core.run import Options
 
-parser = argparse.ArgumentParser("python -m benchmarks", description="Run an experiment and write its report.")
-parser.add_argument("name", choices=available_experiments())
-parser.add_argument("-o", "--output", type=Path, required=True, help="folder for the report")
-parser.add_argument("--data", type=Path, help="folder with images, where the experiment needs them")
-parser.add_argument("--quick", action="store_true", help="a short form of the same")
-parser.add_argument("--only", help="parts to run, with commas between, where it has parts")
-parser.add_argument("--workers", type=int, help="fits at a time; default: 1")
-parser.add_argument("--sequences", help="of DAVIS, with commas between; default: all")
-parser.add_argument("--budget-seconds", type=float, help="as many fits as this time allows")
-parser.add_argument("--seeds", type=int, help="fits with so many seeds each")
-parser.add_argument("--iterations", type=int, help="of the published recipes")
-parser.add_argument("--redraw", action="store_true", help="write the report again from the results in the folder")
-parser.add_argument("--runs", type=Path, help="folder of the fits, which experiments may share")
+NAMES = (
+    *("quality", "ablation", "convergence", "maps", "rate", "labels", "render", "decode", "enlarge", "fill"),
+    "zoo",
+)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run an experiment."""
+    parser = argparse.ArgumentParser("python -m benchmarks", description="Run an experiment and write its report.")
+    parser.add_argument("name", choices=NAMES)
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder; the same command goes on in it")
+    parser.add_argument("--data", type=Path, help="folder with DAVIS, bsds, kodak or cocostuff in it")
+    parser.add_argument("--quick", action="store_true", help="a short form, which shows only that all of it runs")
+    parser.add_argument("--only", type=lambda text: tuple(text.split(",")), default=(), help="images: a,b")
+    parser.add_argument("--workers", type=int, default=1, help="processes; seconds that are compared want one")
+    parser.add_argument("--seeds", type=int, default=1, help="fits of each image, in quality and ablation")
+    parser.add_argument("--redraw", action="store_true", help="only write the report, from the results in the folder")
+    values = vars(parser.parse_args(arguments))
+    name, options = values.pop("name"), Options(**values)
+    try:
+        import_module(f"benchmarks.{name}").run(options)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+
 
 if __name__ == "__main__":
-    run(**vars(parser.parse_args()))
+    main()

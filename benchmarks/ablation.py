@@ -1,105 +1,76 @@
-"""The paper's ablation, and ours below it: `python -m benchmarks ablation`."""
+"""What does each part of the paper's method, and of ours, gain?"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from .core import summaries
-from .core.cases import BASELINE, BEST, CLAMPED, PAPER, PUBLISHED_ITERATIONS, UNCLAMPED, Case, method, plan
-from .core.compare import Contest, mean_over, select, shared
-from .core.images import sequences
-from .core.options import Options
-from .core.registry import experiment
-from .core.report import Made
-from .core.rows import read_rows
-from .core.stages import run_stages
-from .core.store import Row
-from .core.tables import count, db, markdown, signed
+from .core.compare import Contest, answer, differences, losses, means
+from .core.figures import Panel, save_lines
+from .core.fits import Method, measure_fit, plan
+from .core.images import names
+from .core.run import Job, Options, Page, Row, experiment
 
 COUNTS = (1_250, 7_500)
-QUICK_COUNTS = (40,)
-QUICK_STRIDE = 4
-
-GUIDED = method("guidance, clamp", "paper", warmup=False, clamp=True)
-GUIDED_UNCLAMPED = method("guidance + no clamp", "paper", warmup=False)
-WARMED = method("guidance + warm-up, clamp", "paper", clamp=True)
-PAPER_ROWS = (CLAMPED, UNCLAMPED, GUIDED, GUIDED_UNCLAMPED, WARMED, PAPER)
-OUR_ROWS = (
-    BEST,
-    method("best without k-means start", "best", initializer="random"),
-    method("best without densification", "best", densify_from=1.0),
-    method("best without soft contours", "best", softness=0.0),
-    method("best with L1 loss", "best", loss="l1"),
-    method("best with contours as given", "best", move_contours=False, merge_regions=False),
-    BASELINE,
-)
-METHODS = (*PAPER_ROWS, *OUR_ROWS)
-CONTESTS = (
-    *(Contest(m.name, CLAMPED.name) for m in PAPER_ROWS[1:]),
-    *(Contest(BEST.name, m.name) for m in OUR_ROWS[1:]),
-)
-# what the paper prints, PSNR and EF-PSNR by N: over all of DAVIS, 50,000 iterations
-PRINTED = {
-    CLAMPED.name: {1_250: (27.10, 22.73), 7_500: (33.41, 30.33)},
-    UNCLAMPED.name: {1_250: (27.29, 22.92), 7_500: (33.57, 30.48)},
-    GUIDED.name: {1_250: (26.98, 22.72), 7_500: (33.25, 29.36)},
-    GUIDED_UNCLAMPED.name: {1_250: (27.15, 22.92), 7_500: (33.20, 29.31)},
-    WARMED.name: {1_250: (27.06, 23.09), 7_500: (33.28, 29.44)},
-    PAPER.name: {1_250: (27.31, 23.41), 7_500: (33.44, 29.18)},
+PAPER_METHODS: dict[str, Method] = {
+    "gaussian-image-clamp": ("gaussian-image-clamp", {}),
+    "gaussian-image": ("gaussian-image", {}),
+    "guidance, clamp": ("paper", {"warmup": False, "clamp": True}),
+    "guidance + no clamp": ("paper", {"warmup": False}),
+    "guidance + warm-up, clamp": ("paper", {"clamp": True}),
+    "paper": ("paper", {}),
 }
-_PAPER_TEXT = """Columns marked *theirs* are what the paper prints, means over all of DAVIS at 50,000 iterations;
-nobody measured them here. Changes are to the first row."""
-_OUR_TEXT = (
-    "Parts of the paper's method against its clamped baseline, then `best` against `best` with a part taken away."
+METHODS: dict[str, Method] = {
+    "best": ("best", {}),
+    "best without k-means start": ("best", {"initializer": "random"}),
+    "best without densification": ("best", {"densify_from": 1.0}),
+    "best without soft contours": ("best", {"softness": 0.0}),
+    "best with L1 loss": ("best", {"loss": "l1"}),
+    "best with contours as given": ("best", {"move_contours": False, "merge_regions": False}),
+    "best-baseline": ("best-baseline", {}),
+}
+# what the paper prints over all of DAVIS at 50,000 iterations: PSNR and EF-PSNR by N
+PRINTED = {
+    "gaussian-image-clamp": {1_250: (27.10, 22.73), 7_500: (33.41, 30.33)},
+    "gaussian-image": {1_250: (27.29, 22.92), 7_500: (33.57, 30.48)},
+    "guidance, clamp": {1_250: (26.98, 22.72), 7_500: (33.25, 29.36)},
+    "guidance + no clamp": {1_250: (27.15, 22.92), 7_500: (33.20, 29.31)},
+    "guidance + warm-up, clamp": {1_250: (27.06, 23.09), 7_500: (33.28, 29.44)},
+    "paper": {1_250: (27.31, 23.41), 7_500: (33.44, 29.18)},
+}
+QUANTITIES = ("psnr", "ef_psnr")
+FIRST = next(iter(PAPER_METHODS))
+CONTESTS = (
+    *(Contest("best", name) for name in list(METHODS)[1:]),
+    *(Contest(name, FIRST) for name in list(PAPER_METHODS)[1:]),
 )
+METHOD = """First frames of DAVIS with the given masks. Parts of `best` are taken away one by one; the paper's six rows
+differ from its clamped baseline. *Printed* figures are those of the paper, over all of DAVIS at 50,000 iterations;
+nobody measured them here. What the figures are: the report of `quality`."""
 
 
-def report(output: Path, made: Made) -> list[str]:
-    """Write the report's parts."""
-    rows = read_rows(output / "results.csv", Row)
-    parts = ["# Ablation", summaries.what_was_run(rows)]
-    if not rows:
-        return parts
-    parts += ["## Where a part does harm", summaries.losses(rows, CONTESTS)]
-    parts += ["## The paper's rows", _PAPER_TEXT, paper_table(rows)]
-    parts += ["## Differences", _OUR_TEXT, summaries.differences(rows, CONTESTS)]
-    return [*parts, "## Means", summaries.means(rows, [m.name for m in METHODS])]
+def jobs(options: Options) -> list[Job]:
+    """Fit every row, all images at the smaller N first."""
+    methods, images, counts = {**METHODS, **PAPER_METHODS}, ["disc"], (40,)
+    if not options.quick:
+        images, counts = list(options.only) or names(options.folder(), "davis"), COUNTS
+    listed = [job for n in counts for job in plan(images, (n,), methods, options)]
+    return listed
 
 
-@experiment("engine", "workers", "sequences", "budget_seconds", "seeds", "iterations", "runs", report=report)
-def run(output: Path, options: Options) -> None:
-    """Fit every row on first frames; with a budget, a sequence has all rows at 1,250 before the next."""
-    names = sequences(options.data, options.sequences, quick=options.quick)
-    run_stages("ablation", report, output, options, [cases(names, options)])
+def run(options: Options) -> None:
+    """Measure, and write the report."""
+    experiment(__name__, options, jobs, measure_fit, page)
 
 
-def cases(names: list[str], options: Options) -> list[Case]:
-    """List the fits, all sequences at the smaller N first."""
-    names, counts = (names[:1], QUICK_COUNTS) if options.quick else (names, COUNTS)
-    # a budget sees those first that are done soonest
-    methods = (*OUR_ROWS, *PAPER_ROWS)
-    return [c for n in counts for c in plan(names, (n,), methods, options, PUBLISHED_ITERATIONS, QUICK_STRIDE)]
-
-
-def paper_table(rows: list[Row]) -> str:
-    """Our means beside the printed ones."""
-    header = ["N", "row", "images", "PSNR", "change", "EF-PSNR", "change"]
-    header += ["theirs: PSNR", "theirs: change", "theirs: EF-PSNR", "theirs: change"]
-    lines = []
-    for n, present, images in shared(rows, [m.name for m in PAPER_ROWS]):
-        first = select(rows, CLAMPED.name, n, images)
-        for name in present:
-            found = select(rows, name, n, images)
-            line = [count(n), f"`{name}`", str(len(images))]
-            for quantity in ("psnr", "ef_psnr"):
-                value = mean_over(found, quantity)
-                line += [db(value), signed(value - mean_over(first, quantity))]
-            lines.append([*line, *_printed(name, n)])
-    return markdown(header, lines)
-
-
-def _printed(name: str, n: int) -> list[str]:
-    if n not in PRINTED[name]:
-        return [""] * 4
-    pairs = zip(PRINTED[name][n], PRINTED[CLAMPED.name][n], strict=True)
-    return [cell for value, base in pairs for cell in (db(value), signed(value - base))]
+def page(folder: Path, rows: list[Row]) -> Page:
+    """Write the report."""
+    for row in rows:
+        printed = PRINTED.get(row["method"], {}).get(row["n"])
+        row |= dict(zip(("printed PSNR", "printed EF-PSNR"), printed, strict=True)) if printed else {}
+    ours = [row for row in rows if row["method"] in METHODS]
+    save_lines(folder / "ablation.png", [Panel("", ours, "n", quantity) for quantity in QUANTITIES], "method", "n")
+    columns = ("iterations", *QUANTITIES, "printed PSNR", "printed EF-PSNR", "bytes", "core_seconds")
+    tables = [differences(rows, CONTESTS, QUANTITIES, ["n"]), means(rows, ["n", "method"], columns)]
+    sentences = "\n".join(f"- {answer(rows, contest, QUANTITIES, [])}" for contest in CONTESTS)
+    question = "What does each part of the method gain?"
+    return Page(question, METHOD, sentences, "ablation.png", tables, losses(rows, CONTESTS, QUANTITIES, ["n"]))

@@ -1,137 +1,101 @@
-"""What deleted and moved objects uncover, filled and not: `python -m benchmarks fill`."""
+"""How well are the holes filled that deleted and moved objects leave?"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
-from torch.nn.functional import max_pool2d, pad
+from torch.nn.functional import pad
 
+from kcgs import fit
+from kcgs.data import load_image, save_image
 from kcgs.editing import delete_region, move_region
-from kcgs.scene import Scene
 
-from .core.cases import BEST, plan
-from .core.clocks import threads
-from .core.figures import save_sheet
-from .core.images import FRAMES, sequences
-from .core.jobs import check_made
-from .core.options import Options
-from .core.registry import experiment
-from .core.report import Made, conclude
-from .core.rows import read_rows, write_rows
-from .core.store import Store
-from .core.tables import count, markdown, number, seconds
+from .core.compare import Contest, answer, losses, means
+from .core.figures import save_rows
+from .core.fits import QUICK_ITERATIONS
+from .core.images import load, names
+from .core.run import Job, Options, Page, Row, experiment
 
-COUNT, QUICK_COUNT, QUICK_STRIDE = 3_000, 60, 4
-FILLS = {"before": None, "filled": "inpaint"}
-# around the hole, in pixels: what is compared with it, what is filled with it, the contour of a moved object, a crop
-_AROUND, _FRINGE, _CONTOUR, _SHOWN = 40, 3, 2, 45
-_INTRODUCTION = f"""The object of each frame is deleted, and moved to the side by a third of its width, away from the
-nearer border; `before` is with `fill=None`, `filled` with `fill="inpaint"`. All figures are of the pixels that are
-uncovered; those within {_CONTOUR} pixels of a moved object are left out. A pixel is steep whose gradient is above the
-99.9th percentile of the {_AROUND} pixels around; the steepest is given as its multiple. Changed are pixels more than
-{_FRINGE} from the hole, by more than 0.05. Seconds are those of one core."""
+NUM_GAUSSIANS, QUICK_GAUSSIANS = 3_000, 60
+FILLS = {"not filled": None, "filled": "inpaint"}
+# in pixels: what is compared with the hole, the contour of a moved object, and what is shown around
+AROUND, CONTOUR, SHOWN = 40, 2, 45
+QUANTITIES = ("steep", "beyond [0, 1]")
+CONTEST = Contest("filled", "not filled")
+METHOD = f"""The object of each frame of DAVIS is deleted, and moved to the side by a third of its width, away from the
+nearer border. Figures are of the pixels that are uncovered; those within {CONTOUR} pixels of a moved object are left
+out. A pixel is steep whose gradient is above the 99.9th percentile of the {AROUND} pixels around; *steepest* is a
+multiple of that. The figure shows, for each edit, the scene, the edit without filling, and filled."""
 
 
-class Result(NamedTuple):
-    """An edit with a fill."""
-
-    image: str
-    edit: str
-    fill: str
-    pixels: int  # that are uncovered
-    low: float  # least value there
-    high: float
-    steep: int  # pixels there
-    ratio: float  # of the steepest to the percentile around
-    changed: int  # pixels outside
-    core_seconds: float
-    added: int  # Gaussians more than with the edit alone
-
-
-def report(output: Path, made: Made) -> list[str]:
-    """Write the report's parts."""
-    results = read_rows(output / "results.csv", Result)
-    parts = ["# Holes of deleted and moved objects", _INTRODUCTION]
-    for edit in dict.fromkeys(r.edit for r in results):
-        before, filled = ([r for r in results if (r.edit, r.fill) == (edit, fill)] for fill in FILLS)
-        low, high, steep = min(r.low for r in filled), max(r.high for r in filled), sum(r.steep for r in filled)
-        longest, lines = max(r.core_seconds for r in filled), []
-        for both in zip(before, filled, strict=True):
-            line = [both[0].image, count(both[0].pixels), *(f"{r.low:.2f} to {r.high:.2f}" for r in both)]
-            line += [count(r.steep) for r in both] + [number(r.ratio) for r in both]
-            lines.append([*line, count(both[1].changed), count(both[1].added), seconds(both[1].core_seconds)])
-        pairs = [f"{what}, {when}" for what in ("values", "steep", "steepest") for when in FILLS]
-        table = markdown(["image", "pixels", *pairs, "changed", "added", "s"], lines)
-        text = f"Filled: values from {low:.3f} to {high:.3f}; steep pixels: {steep}; {longest:.1f} s at most."
-        sheet = f"[All frames around the hole, at full size]({edit}.jpg): the scene, before, filled."
-        parts += [f"## {edit}", text, table, sheet]
-    return parts
-
-
-@experiment("engine", "workers", "runs", report=report)
-def run(output: Path, options: Options) -> None:
-    """Fit frames, then delete and move their objects, here and on one thread."""
-    names = ["disc"] if options.quick else sequences(options.data, ",".join(FRAMES), quick=False)
-    wanted = plan(names, [QUICK_COUNT if options.quick else COUNT], [BEST], options, 0, QUICK_STRIDE)
-    store = Store.open(output, options)
-    failed = store.obtain(wanted, options.place)
-    results, sheets = list[Result](), dict[str, list[tuple[str, dict[str, Tensor]]]]()
-    with threads(1):
-        for case in (case for case in wanted if store.row(case) is not None):
-            for edit in edits(scene := store.scene(case)):
-                found, images = compare(case.image, scene, *edit)
-                results += found
-                sheets.setdefault(edit[0], []).append((case.image, images))
-    write_rows(output / "results.csv", Result, results)
-    for name, frames in sheets.items():
-        save_sheet(output / f"{name}.jpg", frames)
-    conclude(report, output, options.made("fill"))
-    check_made(failed)
-
-
-def edits(scene: Scene) -> list[tuple[str, Callable[..., Scene], Tensor, Tensor]]:
-    """List edits of what is not region 0: name, function of `fill`, where it was or is, what is uncovered, (H, W)."""
+def measure(image: str, edit: str, n: int, folder: str, data: str, quick: bool) -> list[Row]:
+    """Edit a scene with each fill; their images are written beside each other."""
+    pixels, labels = load(image, data, quick)
+    assert labels is not None
+    scene = fit(pixels, labels, n, **({"iterations": QUICK_ITERATIONS, "merge_regions": False} if quick else {})).scene
     assert scene.regions is not None
     ids = [region for region in scene.regions.ids.tolist() if region != 0]
     hole = torch.isin(scene.regions.labels, torch.tensor(ids))
-    if not ids or hole.all():
-        return []
-    columns = hole.any(0).nonzero().flatten().tolist()
-    left, width = columns[0], columns[-1] + 1 - columns[0]
-    step = max(1, round(width / 3)) * (1 if 2 * left + width <= hole.shape[1] else -1)
-    landed = pad(hole, (step, -step))
-    apply = partial(delete_region, scene, ids), partial(move_region, scene, ids, (step, 0))
-    return [("delete", apply[0], hole, hole), ("move", apply[1], hole | landed, hole & ~grow(landed, _CONTOUR))]
-
-
-def compare(
-    image: str, scene: Scene, called: str, apply: Callable[..., Scene], hole: Tensor, uncovered: Tensor
-) -> tuple[list[Result], dict[str, Tensor]]:
-    """Measure an edit with each fill; return crops of the scene and of both, too."""
-    around, outside = grow(hole, _AROUND) & ~hole, ~grow(hole, _FRINGE)
-    rows, cols = (grow(hole, _SHOWN).any(axis) for axis in (1, 0))
-    shown, results, alone = {"scene": scene.render()}, list[Result](), scene
-    for name, fill in FILLS.items():
+    apply, covered, uncovered = partial(delete_region, scene, ids), hole, hole
+    if edit == "move":
+        columns = hole.any(0).nonzero().flatten().tolist()
+        left, width = columns[0], columns[-1] + 1 - columns[0]
+        step = max(1, round(width / 3)) * (1 if 2 * left + width <= hole.shape[1] else -1)
+        landed = pad(hole, (step, -step))
+        apply, covered = partial(move_region, scene, ids, (step, 0)), hole | landed
+        uncovered = hole & ~grown(landed, CONTOUR)
+    around, shown, rows = grown(covered, AROUND) & ~covered, [scene.render()], []
+    for method, fill in FILLS.items():
         start = time.process_time()
         edited = apply(fill=fill)
-        spent = time.process_time() - start
-        alone = edited if fill is None else alone
-        values, shown[name] = edited().detach(), edited.render()
+        seconds, values = time.process_time() - start, edited().detach()
         slopes = torch.stack(torch.gradient(values.double(), dim=(1, 2))).norm(dim=0).amax(0)
-        there, slope = values[:, uncovered], slopes[uncovered] / slopes[around].quantile(0.999)
-        changed = int(((shown[name] - shown["before"]).abs().amax(0)[outside] > 0.05).sum())
-        figures: list[Any] = [len(slope), float(there.min()), float(there.max()), int((slope > 1).sum())]
-        figures += [float(slope.max()), changed, spent, edited.num_gaussians - alone.num_gaussians]
-        results.append(Result(image, called, name, *figures))
-    return results, {name: whole[:, rows][..., cols] for name, whole in shown.items()}
+        slope, there = slopes[uncovered] / slopes[around].quantile(0.999), values[:, uncovered]
+        rows.append({
+            "image": image, "edit": edit, "method": method, "pixels": len(slope), "steep": int((slope > 1).sum()),
+            "steepest": float(slope.max()), "beyond [0, 1]": float(torch.maximum(-there, there - 1).clamp_min(0).max()),
+            "core_seconds": seconds, "added": edited.num_gaussians - scene.num_gaussians,
+        })  # fmt: skip
+        shown.append(edited.render())
+    area = grown(covered, SHOWN)
+    part = [image[:, area.any(1)][..., area.any(0)] for image in shown]
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    save_image(Path(folder, f"{image}-{edit}.png"), torch.cat(part, 2))
+    return rows
 
 
-def grow(mask: Tensor, reach: int) -> Tensor:
-    """Add the pixels within so many of a mask (H, W)."""
-    return max_pool2d(mask[None].float(), 2 * reach + 1, 1, reach)[0] > 0
+def grown(mask: Tensor, pixels: int) -> Tensor:
+    """Return what is within so many pixels of a mask."""
+    return torch.from_numpy(distance_transform_edt(~mask.numpy()) <= pixels)
+
+
+def jobs(options: Options) -> list[Job]:
+    """Edit frames of DAVIS."""
+    images = ["disc"] if options.quick else list(options.only) or names(options.folder(), "davis")
+    n = QUICK_GAUSSIANS if options.quick else NUM_GAUSSIANS
+    fixed = {"n": n, "folder": str(options.output / "runs"), "data": str(options.data or ""), "quick": options.quick}
+    listed = [{"image": image, "edit": edit, **fixed} for edit in ("delete", "move") for image in images]
+    return listed
+
+
+def run(options: Options) -> None:
+    """Measure, and write the report."""
+    experiment(__name__, options, jobs, measure, page)
+
+
+def page(folder: Path, rows: list[Row]) -> Page:
+    """Write the report; without the images of the run the figure stays."""
+    paths = {folder / "runs" / f"{row['image']}-{row['edit']}.png": 0 for row in rows}
+    sheet = [[load_image(path)] for path in paths if path.is_file()]
+    if sheet:
+        save_rows(folder / "fill.jpg", sheet)
+    columns = ("pixels", *QUANTITIES, "steepest", "core_seconds", "added")
+    tables = [means(rows, ["edit", "method"], columns), means(rows, ["edit", "image", "method"], columns)]
+    sentence = answer(rows, CONTEST, QUANTITIES, ["edit"])
+    question = "How well are the holes filled that deleted and moved objects leave?"
+    return Page(question, METHOD, sentence, "fill.jpg", tables, losses(rows, [CONTEST], QUANTITIES, ["edit"]))

@@ -1,4 +1,4 @@
-"""Make the zoo: small scenes of images that anybody may use, each with its card."""
+"""Make the zoo: small scenes of images that anybody may use, each with its recipe and card."""
 
 from __future__ import annotations
 
@@ -7,25 +7,22 @@ import json
 from pathlib import Path
 from typing import NamedTuple
 
-from kcgs._atomic import write_file
+from kcgs import FitConfig, Scene, evaluate, fit
 from kcgs.data import save_image
-from kcgs.evaluation import evaluate
-from kcgs.fitting import FitConfig, fit
-from kcgs.scene import Scene
 from kcgs.zoo import Entry, entries
 
-from .core import images
-from .core.options import Options
-from .core.registry import experiment
+from .core.fits import QUICK_ITERATIONS
+from .core.images import CHARTS, load_mapped
+from .core.run import Options
 
-_PREVIEW = 384  # pixels of its longer side
+PREVIEW = 384  # pixels of its longer side
 _CHART = "Apache-2.0, made by kcgs"
 _NASA = "public domain (NASA), from scikit-image"
 _CC0 = "CC0, from scikit-image"
 
 
 class Plan(NamedTuple):
-    """One scene to be: an image, how many Gaussians, what it shows and on what terms."""
+    """An image, how many Gaussians, what it shows, and on what terms."""
 
     image: str
     n: int
@@ -44,31 +41,31 @@ PLANS: dict[str, Plan] = {
 }
 
 
-@experiment("only")
-def run(output: Path, options: Options) -> None:
-    """Fit the scenes and write them with their manifest; `only`: names with commas between them."""
-    names = list(PLANS) if options.only is None else options.only.split(",")
-    unknown = [name for name in names if name not in PLANS]
+def run(options: Options) -> None:
+    """Fit the scenes, or those that `only` names, and write them with their manifest."""
+    unknown = [name for name in options.only if name not in PLANS]
     if unknown:
         raise ValueError(f"only must name scenes of the zoo, {', '.join(PLANS)}; got {unknown[0]!r}")
-    known = {entry.name: entry for entry in entries(output)} if (output / "manifest.json").is_file() else {}
-    for name in names:
-        known[name] = _make(name, PLANS[name], output, options.quick)
+    manifest = options.output / "manifest.json"
+    known = {entry.name: entry for entry in entries(options.output)} if manifest.is_file() else {}
+    for name in options.only or PLANS:
+        known[name] = make(name, PLANS[name], options.output / name, options.quick)
         listed = [known[name]._asdict() for name in PLANS if name in known]
-        write_file(output / "manifest.json", json.dumps({"format": "kcgs.zoo", "entries": listed}, indent=1) + "\n")
+        manifest.write_text(json.dumps({"format": "kcgs.zoo", "entries": listed}, indent=1) + "\n", encoding="utf-8")
 
 
-def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
-    image, labels = images.load(plan.image, None)
-    recipe = "best" if plan.image in images.CHARTS else "best-refined"  # contours that were found may move freely
-    config = FitConfig.from_recipe(recipe, **({"iterations": 20} if quick else {}))
-    folder = output / name
+def make(name: str, plan: Plan, folder: Path, quick: bool) -> Entry:
+    """Fit a scene and write its files."""
+    image, labels = load_mapped(plan.image)
+    recipe = "best" if plan.image in CHARTS else "best-refined"  # contours that were found may move freely
+    config = FitConfig.from_recipe(recipe, **({"iterations": QUICK_ITERATIONS} if quick else {}))
     folder.mkdir(parents=True, exist_ok=True)
     fitted = fit(image, labels, plan.n, recipe=config).scene
     scene = Scene(fitted.field, fitted.regions, {"recipe": recipe, "title": plan.title})
     size = scene.save(folder / "scene.safetensors")
+    (folder / "recipe.json").write_text(config.model_dump_json(indent=1) + "\n", encoding="utf-8")
     height, width = scene.size
-    shrink = _PREVIEW / max(height, width)
+    shrink = PREVIEW / max(height, width)
     save_image(folder / "preview.jpg", scene.render((max(1, round(height * shrink)), max(1, round(width * shrink)))))
     figures = evaluate(scene, image, labels)
     edge = figures["ef_psnr"]
@@ -79,7 +76,7 @@ def _make(name: str, plan: Plan, output: Path, quick: bool) -> Entry:
         ef_psnr=round(edge, 3) if edge == edge else None, licence=plan.licence,
         command=f"python -m benchmarks zoo -o models --only {name}",
     )  # fmt: skip
-    write_file(folder / "card.md", _card(entry, scene.size, figures["ms_ssim"]))
+    (folder / "card.md").write_text(_card(entry, scene.size, figures["ms_ssim"]), encoding="utf-8")
     return entry
 
 
@@ -92,7 +89,7 @@ def _card(entry: Entry, size: tuple[int, int], ms_ssim: float) -> str:
         "image": f"{entry.title}, {size[1]} x {size[0]}",
         "licence of the image": entry.licence,
         "made by": f"`{entry.command}`",
-        "recipe": f"`{entry.recipe}`",
+        "recipe": f"`{entry.recipe}`, all settings in `recipe.json`",
         "Gaussians": str(entry.num_gaussians),
         "regions": str(entry.num_regions),
         "PSNR": f"{entry.psnr:.2f} dB",

@@ -11,7 +11,7 @@ from skimage import data as photos
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from benchmarks._codecs import AVIF, WEBP, largest, open_file
+from benchmarks.core.codecs import decode_file, largest_file
 from kcgs.codec import CodecError, decode
 from kcgs.functional import psnr
 from kcgs.rate import fit_bytes
@@ -36,9 +36,9 @@ def other(codec: str, image: Tensor, most: int) -> Preview | None:
     size, found = (image.shape[1], image.shape[2]), []
     for factor in FACTORS:
         small = resized(image, (max(1, round(size[0] / factor)), max(1, round(size[1] / factor))))
-        coded = largest(codec, small, most).data
+        coded = largest_file(codec, small, most)
         if len(coded) <= most:
-            found.append((len(coded), resized(open_file(coded), size)))
+            found.append((len(coded), resized(decode_file(coded), size)))
     return max(found, key=lambda preview: float(psnr(preview[1], image)), default=None)
 
 
@@ -86,12 +86,12 @@ def previews(image: Tensor) -> dict[str, dict[int, Preview | None]]:
     """Make all previews of an image, by codec and bytes."""
     labels = segment(image)
     whole = fit_bytes(image, labels, WHOLE).data
-    found: dict[str, dict[int, Preview | None]] = {PREFIX: {}, FILE: {}, WEBP: {}, AVIF: {}}
+    found: dict[str, dict[int, Preview | None]] = {PREFIX: {}, FILE: {}, "WebP": {}, "AVIF": {}}
     for most in BYTES:
         made = fit_bytes(image, labels, most).data
         found[PREFIX][most] = beginning(whole, most)
         found[FILE][most] = len(made), decode(made).scene.render()
-        for codec in (WEBP, AVIF):
+        for codec in ("WebP", "AVIF"):
             found[codec][most] = other(codec, image, most)
     return found
 

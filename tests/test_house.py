@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -89,6 +90,21 @@ def test_no_circle_of_imports() -> None:
         for name in free:
             del left[name]
     assert not left, f"circles among {sorted(left)}"
+
+
+def test_benchmarks_use_public_names() -> None:
+    """What a package lists in its `__all__`, and the zoo; kcgs knows nothing of benchmarks."""
+    for path in sorted((ROOT / "benchmarks").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found = {alias.name for alias in node.names}
+                assert not any(name.startswith(("kcgs.", "unittest")) for name in found), f"{path.name}: {found}"
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                source, found = node.module or "", {alias.name for alias in node.names}
+                assert not source.startswith("unittest"), path.name
+                if source.split(".")[0] == "kcgs" and source != "kcgs.zoo":
+                    assert found <= {*import_module(source).__all__}, f"{path.name}: {source} {found}"
+    assert not [name for name, path in modules().items() if re.search(r"(import|from) benchmarks", path.read_text())]
 
 
 def test_private_names_of_maps_stay_below() -> None:

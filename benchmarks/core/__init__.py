@@ -1,1 +1,1 @@
-"""What experiments are made of: cases, a store of fits, rows, statistics, tables, reports."""
+"""What experiments have in common: jobs on disk, images, comparisons, figures."""

@@ -1,4 +1,4 @@
-"""The images that fits are made of, by name, with the label maps that they are given."""
+"""The images of experiments, by name, with the label maps that they come with."""
 
 from __future__ import annotations
 
@@ -8,96 +8,69 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from kcgs.data import Davis, chart_2x3, chart_pie, load_image
 from kcgs.segment import segment
 
 CHARTS = ("2x3", "pie")
-# stand in where there is no data
-QUICK = ("astronaut", "disc")
-FRAMES = (
-    *("blackswan", "dog", "train", "breakdance", "car-turn", "dance-jump", "mallard-water", "rollerblade"),
-    *("bmx-trees", "cows", "kite-surf", "paragliding-launch"),
-)
+# first frames of DAVIS
+FRAMES = ("blackswan", "breakdance", "car-turn", "dance-jump", "dog", "train")
 PHOTOS = ("astronaut", "chelsea", "coffee", "rocket")
+QUICK_STRIDE = 4
 
 
 class Sample(NamedTuple):
-    """An image and the label map whose contours the edge-focused figures look at."""
+    """An image and its label map."""
 
     image: Tensor  # (3, H, W)
-    labels: Tensor | None  # (H, W); None: the image has none
-
-
-def davis(data: Path | None) -> Davis:
-    """Open DAVIS in the folder, or in its sub-folder DAVIS; a FileNotFoundError where the layout is another."""
-    if data is None:
-        raise ValueError("data must name a folder with DAVIS in it, --data DIR; got None")
-    return Davis(data / "DAVIS" if (data / "DAVIS").is_dir() else data)
-
-
-def sequences(data: Path | None, wanted: str | None, *, quick: bool) -> list[str]:
-    """List the sequences named, with commas between them, or all; the quick form has two, or two images of its own."""
-    names = None if wanted is None else list(dict.fromkeys(wanted.replace(" ", "").split(",")))
-    if data is None and quick:
-        if not set(names or ()) <= set(QUICK):
-            raise ValueError(f"sequences must name some of {', '.join(QUICK)}; got {wanted!r}")
-        return names or list(QUICK)
-    frames = davis(data)
-    if names is None:
-        return frames.sequences[:2] if quick else frames.sequences
-    for name in names:
-        frames[name]
-    return names
+    labels: Tensor | None  # (H, W); None: it comes with none
 
 
 @lru_cache(maxsize=4)
-def load(name: str, data: Path | None, stride: int = 1, factor: int = 1) -> Sample:
-    """Read a chart, a photo of scikit-image, BSDS (a number) or Kodak (kodimN), a disc, or a sequence's first frame.
+def load(name: str, data: str | None = None, quick: bool = False) -> Sample:
+    """Read a chart, "disc", a photo of scikit-image, BSDS (a number), Kodak (kodimN), or a sequence's first frame.
 
-    One of `stride` pixels is taken a side; a `factor` reduces by area, whole blocks of the middle, labels by majority.
+    The quick form has one of four pixels a side.
     """
-    image, labels = _read(name, data)
-    if stride > 1:
-        image = image[:, ::stride, ::stride].contiguous()
-        labels = None if labels is None else labels[::stride, ::stride].contiguous()
-    if factor > 1:
-        image, labels = whole_blocks(Sample(image, labels), factor)
-        if labels is not None:
-            labels = labels.unfold(0, factor, factor).unfold(1, factor, factor).flatten(2).mode(-1).values
-        image = avg_pool2d(image, factor)
-    return Sample(image, labels)
+    stride = QUICK_STRIDE if quick else 1
+    image, labels = _read(name, Path(data or ""))
+    image = image[:, ::stride, ::stride].contiguous()
+    return Sample(image, None if labels is None else labels[::stride, ::stride].contiguous())
 
 
-def whole_blocks(sample: Sample, factor: int) -> Sample:
-    """Cut the middle whose sides are multiples of a factor."""
-    starts = [(side % factor // 2, side // factor * factor) for side in sample.image.shape[1:]]
-    rows, columns = (slice(start, start + length) for start, length in starts)
-    labels = None if sample.labels is None else sample.labels[rows, columns].contiguous()
-    return Sample(sample.image[:, rows, columns].contiguous(), labels)
+def load_mapped(name: str, data: str | None = None, quick: bool = False) -> tuple[Tensor, Tensor]:
+    """Read an image and its label map; one that comes with none has the map that `segment` finds."""
+    image, labels = load(name, data, quick)
+    return image, segment(image) if labels is None else labels
 
 
-def photo(name: str) -> Tensor:
-    """Return a photo of scikit-image."""
-    from skimage import data
+def names(data: Path, group: str) -> list[str]:
+    """List the images of "davis" (six frames), "kodak" or "bsds" that are in the data; a ValueError: there are none."""
+    found = {
+        "davis": [name for name in FRAMES if (data / "DAVIS" / "JPEGImages" / "480p" / name).is_dir()],
+        "kodak": sorted(path.stem for path in (data / "kodak").glob("kodim*.png")),
+        "bsds": sorted((path.parent.name for path in (data / "bsds").glob("*/image.jpg")), key=int),
+    }[group]
+    if not found:
+        raise ValueError(f"data must have a folder with {group} in it; got {str(data)!r}")
+    return found
 
-    return torch.from_numpy(getattr(data, name)()).permute(2, 0, 1).float() / 255
 
-
-def _read(name: str, data: Path | None) -> tuple[Tensor, Tensor | None]:
+def _read(name: str, data: Path) -> tuple[Tensor, Tensor | None]:
     if name in CHARTS:
         chart = chart_2x3() if name == "2x3" else chart_pie()
         return chart.image, chart.labels
     if name == "disc":
         return _disc()
     if name in PHOTOS:
-        return photo(name), segment(photo(name))
-    if data is not None and name.isdigit():
+        from skimage import data as photos
+
+        return torch.from_numpy(getattr(photos, name)()).permute(2, 0, 1).float() / 255, None
+    if name.isdigit():
         return load_image(data / "bsds" / name / "image.jpg"), None
-    if data is not None and name.startswith("kodim"):
+    if name.startswith("kodim"):
         return load_image(data / "kodak" / f"{name}.png"), None
-    frame = davis(data)[name]
+    frame = Davis(data / "DAVIS")[name]
     return frame.image, frame.labels
 
 

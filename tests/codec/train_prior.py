@@ -35,7 +35,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 import kcgs
-from benchmarks.core.images import photo
+from benchmarks.core.images import load
 from kcgs.codec.labels.contexts import (
     CODED,
     FEATURE,
@@ -86,7 +86,7 @@ def main(arguments: list[str] | None = None) -> None:
     maps = [load_labels(path).numpy() for path in options.maps]
     if options.photos:
         photos = [load_image(path) for path in options.photos]
-        maps += segmentations([*photos, *(photo(name) for name in PHOTOS)], options.seed)
+        maps += segmentations([*photos, *(load(name).image for name in PHOTOS)], options.seed)
     options.output.write_bytes(pack(train(maps, options.steps, options.seed, tuple(options.units))))
 
 

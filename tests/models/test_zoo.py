@@ -11,9 +11,10 @@ import pytest
 import torch
 
 import kcgs
-from benchmarks import run
 from benchmarks.core import images
-from benchmarks.zoo import PLANS
+from benchmarks.core.run import Options
+from benchmarks.zoo import PLANS, run
+from kcgs.fitting import FitConfig
 from kcgs.functional import psnr
 from kcgs.onnx import scene_decoder
 from kcgs.scene import load
@@ -38,9 +39,10 @@ def test_entry(entry: Entry) -> None:
     assert path.stat().st_size == entry.bytes
     scene = load(path)
     assert scene.num_gaussians == entry.num_gaussians
-    image = images.load(PLANS[entry.name].image, None).image
+    image = images.load(PLANS[entry.name].image).image
     assert float(psnr(scene.render(), image)) == pytest.approx(entry.psnr, abs=0.02)
     folder = path.parent
+    FitConfig(**json.loads((folder / "recipe.json").read_text()))
     assert entry.licence in (folder / "card.md").read_text() and (folder / "preview.jpg").is_file()
     model = scene_decoder(scene)
     session = onnxruntime.InferenceSession(model.SerializeToString())
@@ -75,8 +77,8 @@ class TestErrors:
 
 
 def test_zoo_can_be_made(tmp_path: Path) -> None:
-    run("zoo", tmp_path, quick=True, only="chart-2x3")
+    run(Options(tmp_path, quick=True, only=("chart-2x3",)))
     (made,) = entries(tmp_path)
     assert made.name == "chart-2x3" and find("chart-2x3", tmp_path).is_file()
     with pytest.raises(ValueError, match="only must name scenes"):
-        run("zoo", tmp_path, only="chart-3x2")
+        run(Options(tmp_path, only=("chart-3x2",)))

@@ -1,0 +1,192 @@
+"""An experiment: jobs are measured, their rows are kept, and a report of one page is written."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import inspect
+import json
+import os
+import platform
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache, partial
+from importlib.metadata import version
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from rich.progress import track
+
+import kcgs
+
+Row = dict[str, Any]
+Job = dict[str, Any]
+Measure = Callable[..., list[Row]]
+QUICK_TEXT = "This is the short form, with small images and few iterations: it only shows that all of it runs."
+
+
+class Options(NamedTuple):
+    """The options of the command."""
+
+    output: Path
+    data: Path | None = None
+    quick: bool = False
+    only: tuple[str, ...] = ()  # images, or scenes of the zoo
+    workers: int = 1
+    seeds: int = 1
+    redraw: bool = False
+
+    def folder(self) -> Path:
+        """Return the folder of the data; a ValueError: none was given."""
+        if self.data is None:
+            raise ValueError("data must be a folder with images; got None")
+        return self.data
+
+
+class Page(NamedTuple):
+    """A report."""
+
+    question: str
+    method: str  # what is measured, and how
+    answer: str
+    figure: str  # file beside the report
+    tables: Sequence[str]
+    losses: str
+
+
+def experiment(
+    name: str,
+    options: Options,
+    jobs: Callable[[Options], list[Job]],
+    measure: Measure,
+    page: Callable[[Path, list[Row]], Page],
+) -> None:
+    """Measure what is missing, then write results.csv, made.json and report.md.
+
+    `measure`, a function of a module, returns the rows of a job, whose values are those of JSON. What it returned is in
+    OUTPUT/runs, under a hash of the job, the text of `measure` and the code of kcgs; remove the folder to measure anew.
+    An interruption leaves the results so far: `--redraw` reports them, and the same command goes on.
+    """
+    if not options.redraw:
+        listed = jobs(options)
+        chosen = [job for job in listed if not options.only or job["image"] in options.only]
+        if not chosen:
+            raise ValueError(f"only must name some of {', '.join({job['image']: 0 for job in listed})}")
+        options.output.mkdir(parents=True, exist_ok=True)
+        paths = {_path(options.output / "runs", measure, job): job for job in chosen}
+        try:
+            _measure_missing(measure, paths, options.workers)
+        finally:
+            present = [path for path in paths if path.is_file()]
+            rows = [row for path in present for row in json.loads(path.read_text())]
+            write_rows(options.output / "results.csv", rows)
+            made = {"command": _command(name, options), "quick": options.quick, "machine": _machine()}
+            stopped = f"Stopped: {len(present)} of {len(paths)} jobs are done."
+            made["note"] = stopped if len(present) < len(paths) else ""
+            (options.output / "made.json").write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
+    made = json.loads((options.output / "made.json").read_text(encoding="utf-8"))
+    written = page(options.output, read_rows(options.output / "results.csv"))
+    (options.output / "report.md").write_text(_text(written, made), encoding="utf-8")
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows as CSV, floats with six digits."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)))
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Read what `write_rows` wrote: numbers where they are numbers, names of images always as text."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return [
+            {name: text if name == "image" else _number(text) for name, text in row.items() if text}
+            for row in csv.DictReader(file)
+        ]
+
+
+def _number(text: str) -> float | int | str:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def _path(folder: Path, measure: Measure, job: Job) -> Path:
+    parts = [measure.__module__, inspect.getsource(measure), job, _sources()]
+    key = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
+    return folder / f"{job['image']}-{key[:20]}.json"
+
+
+@cache
+def _sources() -> str:
+    """Hash what kcgs computes with."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(kcgs.__file__).parent.rglob("*")):
+        if path.suffix in (".py", ".toml", ".bin"):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _measure_missing(measure: Measure, paths: dict[Path, Job], workers: int) -> None:
+    todo = {path: job for path, job in paths.items() if not path.is_file()}
+    for _ in track(_ended(partial(_work, measure), todo, workers), "benchmark", total=len(todo)):
+        pass
+
+
+def _ended(work: Callable[[Path, Job], None], todo: dict[Path, Job], workers: int) -> Iterator[None]:
+    if workers == 1:
+        yield from map(work, todo, todo.values())
+        return
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(work, todo, todo.values())
+
+
+def _work(measure: Measure, path: Path, job: Job) -> None:
+    """Measure a job on one thread; its file appears whole or not at all."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        rows = measure(**job)
+    finally:
+        torch.set_num_threads(before)
+    path.parent.mkdir(exist_ok=True)
+    path.with_suffix(".part").write_text(json.dumps(rows))
+    path.with_suffix(".part").replace(path)
+
+
+def _command(name: str, options: Options) -> str:
+    parts = [f"python -m {name} -o DIR".replace("benchmarks.", "benchmarks ")]
+    parts += ["--data DIR"] if options.data else []
+    parts += ["--quick"] if options.quick else []
+    parts += [f"--only {','.join(options.only)}"] if options.only else []
+    parts += [f"--{key} {getattr(options, key)}" for key in ("workers", "seeds") if getattr(options, key) > 1]
+    return " ".join(parts)
+
+
+def _machine() -> str:
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.is_file() else []
+    names = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
+    versions = ", ".join(f"{name} {version(name)}" for name in ("torch", "numba", "numpy", "kornia", "onnxruntime"))
+    processor = names[0] if names else platform.processor()
+    python = f"Python {platform.python_version()}"
+    return f"{processor}, {os.cpu_count()} cores; {python}; kcgs {kcgs.__version__}, {versions}"
+
+
+def _text(page: Page, made: dict[str, Any]) -> str:
+    parts = [f"# {page.question}", QUICK_TEXT if made["quick"] else "", made["note"], page.answer]
+    parts += [f"![]({page.figure})", *page.tables, "## Losses", page.losses or "None.", "## How", page.method]
+    facts = [
+        f"- Command: `{made['command']}`",
+        f"- Machine: {made['machine']}",
+        "- Every number: [results.csv](results.csv)",
+    ]
+    parts.append("\n".join(facts))
+    return "\n\n".join(filter(None, parts)) + "\n"

@@ -1,0 +1,219 @@
+"""Jobs that are kept, rows as CSV, comparisons, codecs, clocks."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from benchmarks.core.clocks import milliseconds, peak_megabytes, threads
+from benchmarks.core.codecs import available_codecs, decode_file, largest_file
+from benchmarks.core.compare import Contest, Gain, answer, at_equal_bits, differences, grouped, losses, means, write
+from benchmarks.core.fits import plan
+from benchmarks.core.images import load, load_mapped, names
+from benchmarks.core.run import Job, Options, Page, Row, experiment, read_rows, write_rows
+from benchmarks.core.scenes import scene_of, size_of
+from benchmarks.labels import CODECS, region_numbers
+from benchmarks.rate import bd_rate
+from kcgs.functional import psnr
+
+
+def measure_square(image: str, number: int, folder: str) -> list[Row]:
+    """Square a number, and leave a trace; of a negative one there is none."""
+    if number < 0 and not Path(folder, "repaired").exists():
+        raise ValueError("number must not be negative")
+    trace = Path(folder, f"{number}.{os.getpid()}.{time.perf_counter_ns()}")
+    trace.touch()
+    return [{"image": image, "method": "square", "value": float(number**2), "threads": torch.get_num_threads()}]
+
+
+def square_page(folder: Path, rows: list[Row]) -> Page:
+    return Page("How large?", "Multiplied.", f"Sum: {sum(r['value'] for r in rows):g}", "a.png", ["table"], "")
+
+
+class TestExperiment:
+    def run(self, folder: Path, numbers: tuple[int, ...] = (1, 2, 3), **settings: Any) -> str:
+        traces = folder / "traces"
+        traces.mkdir(exist_ok=True)
+
+        def jobs(options: Options) -> list[Job]:
+            return [{"image": f"image{n}", "number": n, "folder": str(traces)} for n in numbers]
+
+        options = Options(folder / "out", **settings)
+        experiment("benchmarks.square", options, jobs, measure_square, square_page)
+        return (folder / "out/report.md").read_text()
+
+    def traces(self, folder: Path) -> list[str]:
+        return sorted(path.name.partition(".")[0] for path in (folder / "traces").iterdir())
+
+    def test_goes_on(self, tmp_path: Path) -> None:
+        assert "Sum: 14" in self.run(tmp_path)
+        assert {row["threads"] for row in read_rows(tmp_path / "out/results.csv")} == {1}
+        report = self.run(tmp_path, (1, 2, 3, 4))
+        assert self.traces(tmp_path) == ["1", "2", "3", "4"]
+        assert "Sum: 30" in report and "## Losses\n\nNone." in report
+        assert "- Command: `python -m benchmarks square -o DIR`" in report
+        # names of images choose
+        assert "Sum: 4" in self.run(tmp_path, only=("image2",))
+        with pytest.raises(ValueError, match="only must name some of image1, image2, image3"):
+            self.run(tmp_path, only=("image9",))
+
+    def test_stopped(self, tmp_path: Path) -> None:
+        with pytest.raises(ValueError, match="number must not be negative"):
+            self.run(tmp_path, (1, 2, -3, 4))
+        report = self.run(tmp_path, redraw=True)
+        assert "Sum: 5" in report and "Stopped: 2 of 4 jobs are done." in report
+        (tmp_path / "traces/repaired").touch()
+        report = self.run(tmp_path, (1, 2, -3, 4))
+        assert "Sum: 30" in report and "Stopped" not in report
+        assert self.traces(tmp_path) == ["-3", "1", "2", "4", "repaired"]
+
+    def test_redraw_measures_nothing(self, tmp_path: Path) -> None:
+        report = self.run(tmp_path, quick=True, seeds=2)
+        assert "--quick --seeds 2`" in report and "short form" in report
+        assert self.run(tmp_path, (7,), redraw=True) == report
+
+    def test_rows(self, tmp_path: Path) -> None:
+        rows = [{"image": "3096", "n": 5, "psnr": 30.123456789, "note": "a, b"}, {"image": "b", "other": 1.5}]
+        write_rows(tmp_path / "r.csv", rows)
+        assert read_rows(tmp_path / "r.csv") == [{**rows[0], "psnr": 30.1235}, rows[1]]
+
+
+def rows_of(ours: dict[str, float], other: dict[str, float]) -> list[Row]:
+    pairs = (("ours", ours), ("other", other))
+    return [{"image": i, "n": 5, "method": m, "psnr": v} for m, values in pairs for i, v in values.items()]
+
+
+class TestCompare:
+    contest = Contest("ours", "other")
+
+    def test_paired(self) -> None:
+        ours = {"a": 31.0, "b": 30.2, "c": 30.0, "d": 29.9, "e": 30.001, "alone": 50.0, "undefined": math.nan}
+        rows = rows_of(ours, dict.fromkeys([*"abcde", "undefined"], 30.0))
+        (gain,) = self.contest.gains(rows, "psnr", ["n"]).values()
+        assert gain.mean == pytest.approx(0.2202) and gain.won == 2 and gain.lost == ["d"]
+        assert gain.interval is not None and gain.interval[0] < 0 < gain.mean < gain.interval[1]
+        assert "| ours - other | 5 | +0.22 | " in differences(rows, [self.contest], ["psnr"], ["n"])
+        assert "| ours - other | 5 | PSNR | 1 of 5 | d -0.10 |" in losses(rows, [self.contest], ["psnr"], ["n"])
+        text = "`ours` beside `other`: PSNR +0.22 on average, better in 2 of 5 pairs."
+        assert answer(rows, self.contest, ["psnr"], ["n"]) == text
+        assert answer(rows, Contest("ours", "nobody"), ["psnr"], ["n"]) == ""
+        assert losses(rows, [Contest("other", "nobody")], ["psnr"], ["n"]) == ""
+
+    def test_seeds_are_averaged_and_less_may_be_better(self) -> None:
+        rows = [{"image": "a", "method": m, "bytes": v} for m, v in (("ours", 90), ("ours", 110), ("other", 120))]
+        (gain,) = self.contest.gains(rows, "bytes", []).values()
+        assert gain.values == {"a": -20} and gain.won == 1 and gain.lost == []
+        assert Gain({"a": 1.0}, 0.0, 1).interval is None
+
+    def test_interval_covers(self) -> None:
+        """Of normal samples of six, about 95 % of the intervals hold the mean."""
+        generator = torch.Generator().manual_seed(0)
+        inside = 0
+        for _ in range(60):
+            values = torch.randn(6, generator=generator).tolist()
+            low, high = Gain(dict(zip("abcdef", values, strict=True)), 0.0, 1).interval or (1.0, 0.0)
+            inside += low <= 0 <= high
+        assert inside >= 54
+
+    def test_means(self) -> None:
+        rows = [{"image": i, "n": 1_250, "psnr": v, "speed": 10 * v} for i, v in (("a", 30.0), ("b", 31.0))]
+        assert means(rows, ["n"], ["psnr", "speed", "none"]).splitlines()[-1] == "| 1,250 | 2 | 30.50 | 305 |  |"
+        assert means(rows, ["image"], ["psnr"]).splitlines()[-1] == "| b | 31.00 |"
+        assert (write("psnr", 1.0, "+"), write("", 0.01234), write("", None)) == ("+1.00", "0.0123", "")
+        assert list(grouped(rows, ["n"])) == [(1_250,)]
+
+    def test_equal_bits(self) -> None:
+        sizes = {1_000: 30.0, 2_000: 33.0, 4_000: 36.0}
+        rows = [{"image": "a", "method": "other", "bytes": b, "psnr": v} for b, v in sizes.items()]
+        ours = {"image": "a", "method": "ours", "psnr": 34.0}
+        rows += [{**ours, "bytes": size, "n": size} for size in (1_414, 4_100, 9_000)]
+        first, beyond, far = at_equal_bits(rows, self.contest, ["psnr"], [])
+        assert first["psnr"] == pytest.approx(31.5, abs=0.01) and first["method"] == "other, equal bits"
+        assert beyond["psnr"] == pytest.approx(36.1, abs=0.02) and "psnr" not in far
+        assert first["n"] == 1_414
+
+    def test_bd_rate(self) -> None:
+        other = [{"bytes": b, "psnr": 10 * math.log10(b)} for b in (1_000, 2_000, 3_000, 4_000)]
+        ours = [{**row, "bytes": 0.9 * row["bytes"]} for row in other]
+        assert bd_rate(ours, other) == pytest.approx(-10.0) and bd_rate(other, ours) == pytest.approx(100 / 9)
+        # a file that a smaller one beats changes nothing
+        assert bd_rate([*ours, {"bytes": 5_000, "psnr": 20.0}], other) == pytest.approx(-10.0)
+        assert bd_rate(ours[:1], other) is None
+        assert bd_rate(ours, [{**row, "psnr": row["psnr"] + 50} for row in other]) is None
+
+
+class TestImages:
+    def test_without_data(self) -> None:
+        for name, size in {"2x3": (200, 300), "pie": (300, 300), "disc": (320, 400)}.items():
+            image, labels = load(name)
+            assert labels is not None and image.shape == (3, *size) and labels.shape == size
+        image, labels = load_mapped("astronaut", quick=True)
+        assert image.shape == (3, 128, 128) and labels.shape == (128, 128) and load("astronaut").labels is None
+
+    def test_with_data(self, data_root: Path) -> None:
+        for group in ("davis", "kodak", "bsds"):
+            name = names(data_root, group)[0]
+            image, labels = load(name, str(data_root))
+            assert (labels is not None) == (group == "davis") and image.shape[0] == 3
+
+    def test_plan(self) -> None:
+        methods: Any = {"best": ("best", {}), "paper": ("paper", {"clamp": True})}
+        jobs = plan(["a"], (5, 6), methods, Options(Path(), seeds=2))
+        assert len(jobs) == 8 and [job["seed"] for job in jobs[:3]] == [0, 1, 0]
+        assert jobs[0]["settings"] == {} and jobs[2]["settings"] == {"clamp": True, "iterations": 2_000}
+        assert {job["settings"]["iterations"] for job in plan(["a"], (5,), methods, Options(Path(), quick=True))} == {
+            20
+        }
+
+
+class TestCodecs:
+    @pytest.mark.parametrize("codec", available_codecs())
+    def test_largest_file(self, codec: str, astronaut: Tensor) -> None:
+        image = astronaut[:, 128:256, 128:256].contiguous()
+        files = [largest_file(codec, image, most) for most in (1_500, 3_000)]
+        assert all(0.7 * most < len(file) <= most for file, most in zip(files, (1_500, 3_000), strict=True))
+        assert psnr(decode_file(files[0]), image) < psnr(decode_file(files[1]), image)
+        # no file is as small
+        assert len(largest_file(codec, image, 10)) > 10
+
+    @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools
+    @pytest.mark.parametrize("codec", CODECS)
+    @pytest.mark.parametrize("most", [1, 5, 400, 70_000])
+    def test_label_maps(self, codec: str, most: int) -> None:
+        pytest.importorskip(CODECS[codec].package, reason="needs pip install 'kcgs[bench]'")
+        if codec == "RLE" and most > 5:
+            pytest.skip("a mask for each region")
+        if codec in ("PNG", "JPEG XL") and most > 65_535:
+            pytest.skip("16 bits hold no more")
+        ids = torch.arange(most + 1).repeat_interleave(max(1, 6_000 // (most + 1)))
+        index = region_numbers(ids[: len(ids) // 60 * 60].reshape(60, -1).numpy())
+        decoded = CODECS[codec].decode(CODECS[codec].encode(index))
+        assert (torch.as_tensor(decoded).reshape(index.shape).long() == torch.from_numpy(index).long()).all()
+
+
+def test_clocks() -> None:
+    calls: list[str] = []
+    times = milliseconds({name: lambda name=name: calls.append(name) for name in "ab"}, 2)
+    assert calls == ["a", "b"] * 3 and set(times) == {"a", "b"} and min(times.values()) >= 0
+    with threads(1):
+        assert torch.get_num_threads() == 1
+    assert 150 < peak_megabytes(torch.ones, 50_000_000, warm_up=(10,)) < 300
+
+
+def test_scenes() -> None:
+    kinds = {"none": (1, 0.0), "hard": (6, 0.0), "soft": (6, 0.7)}
+    for contours, (count, softness) in kinds.items():
+        regions = scene_of(f"W3 {contours}").regions
+        assert (1 if regions is None else regions.num_regions) == count
+        assert regions is None or regions.softness == softness
+    fitted = scene_of("rocket-1000")
+    assert size_of(fitted, "native") == fitted.size and size_of(fitted, "3840 wide")[1] == 3840
+    assert json.dumps(size_of(fitted, "native"))
