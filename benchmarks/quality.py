@@ -57,7 +57,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
     frames = [row for row in rows if row["image"] not in CHARTS] or rows
     charts = [row for row in rows if row["image"] in CHARTS]
     counts = {row["n"] for row in frames if row["method"] == PAIR.ours}
-    swept = [row for row in frames if row["n"] in counts]
+    swept = sorted([row for row in frames if row["n"] in counts], key=lambda row: row["n"])
     equal = [*swept, *at_equal_bits(frames, PAIR, DECODED, ())]
     bits = Contest(PAIR.ours, f"{PAIR.other}, equal bits")
     panels = [Panel("", swept, "n", quantity) for quantity in ("psnr", "ef_psnr", "ms_ssim")]

@@ -43,15 +43,17 @@ def save_lines(path: Path, panels: Sequence[Panel], line: str, along: str, marke
     for panel, axes in zip(panels, all_axes, strict=False):
         present = [row for row in panel.rows if not (missing(row.get(panel.x)) or missing(row.get(panel.y)))]
         for (name,), rows in grouped(present, [line]).items():
-            points = [[fmean(row[q] for row in r) for q in (panel.x, panel.y)] for r in grouped(rows, [along]).values()]
+            groups = [group for _, group in sorted(grouped(rows, [along]).items())]
+            points = [[fmean(row[quantity] for row in group) for quantity in (panel.x, panel.y)] for group in groups]
             index = names.index(name)
             style = {"marker": MARKERS[index % len(MARKERS)] if marker else None, "markersize": 4}
-            x, y = zip(*sorted(points) if along == panel.x else points, strict=True)
+            x, y = zip(*points, strict=True)
             (shown[name],) = axes.plot(x, y, color=COLORS[index % len(COLORS)], **style)
         axes.set(xlabel=title(panel.x), ylabel=title(panel.y), title=panel.title)
         axes.set(xscale=panel.scales[0], yscale=panel.scales[1])
         axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter("")
+        low, high = axes.get_xlim()
+        axes.xaxis.set_minor_formatter("{x:g}" if panel.scales[0] == "log" and high < 5 * low else "")
     for axes in all_axes[len(panels) :]:
         axes.set_visible(False)
     figure.legend(shown.values(), map(str, shown), loc="outside upper center", ncols=min(5, len(shown) or 1))
