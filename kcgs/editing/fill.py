@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
-from kcgs.errors import InvalidArgument
 from kcgs.fitting.optimizers import FrameAdam
 from kcgs.functional import RegionMap, region_splat
 from kcgs.kernels import threads_for_kernels
@@ -40,9 +39,6 @@ def fill_hole(scene: Scene, hole: Tensor, seen: Tensor) -> Scene:
 
     Returns:
         The scene without the Gaussians of the hole, those that reach into it moved, and others added behind them.
-
-    Raises:
-        ValueError: no pixel is free of the hole.
     """
     regions, ids = scene.regions, scene.field.region_ids
     assert regions is not None and ids is not None
@@ -50,8 +46,6 @@ def fill_hole(scene: Scene, hole: Tensor, seen: Tensor) -> Scene:
     unknown = hole | wanted
     if not wanted.any():
         return scene
-    if unknown.all():
-        raise InvalidArgument("fill", "None where the hole reaches into every pixel", '"inpaint"')
     with threads_for_kernels(unknown.numel()), torch.no_grad():
         rendered = scene()
         target = inpaint(rendered, unknown)

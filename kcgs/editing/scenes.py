@@ -57,8 +57,8 @@ def move_region(
 
     Raises:
         TypeError: wrong types.
-        ValueError: a batch, no map or one of another size, an unknown id, all regions, an offset between pixels;
-            another `fill`, or "inpaint" where the regions reach into every pixel.
+        ValueError: a batch, no map or one of another size, an unknown id, all regions, an offset between pixels,
+            another `fill`.
 
     Warns:
         UserWarning: the ids of regions that are lost.
