@@ -51,7 +51,6 @@ def segment(
     the contours lie on edges of the image; 0.5 is chance.
     """
     from kcgs.data import load_image, overlay_labels, save_image, save_labels
-    from kcgs.functional import edge_alignment
     from kcgs.segment import segment_with_scores
 
     check_output(output, ".png", ".npy")
@@ -70,7 +69,6 @@ def segment(
         score = None if scores is None else float(scores[region])
         table.append(clean({"id": region, "area": area, "name": name, "score": score}))
     report: dict[str, Any] = {"regions": len(table), "method": method}
-    report["edge_alignment"] = float(edge_alignment(target, labels))
     if as_json:
         report["table"] = table
     else:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.functional import RegionMap, edge_band, region_splat
+from kcgs.functional.blur import blur, gaussian_taps
 from kcgs.scene import Scene
 
 Ints = NDArray[np.int64]
@@ -49,12 +50,12 @@ class RegionCosts:
     Pixels are flat indices into the image with a rim of `pad`.
     """
 
-    def __init__(self, scene: Scene, image: Tensor, boxes: Ints, pad: int, blur: float, backend: str) -> None:
+    def __init__(self, scene: Scene, image: Tensor, boxes: Ints, pad: int, sigma: float, backend: str) -> None:
         field, regions = scene.field, scene.regions
         assert regions is not None and field.region_ids is not None
         owners = regions.index_of(field.region_ids)
         colors = field.merged_colors()
-        margin = math.ceil(4 * blur)
+        margin = math.ceil(4 * sigma)
         parts = []
         for region, (top, bottom, left, right) in enumerate(boxes.tolist()):
             y, x = max(0, top - margin), max(0, left - margin)
@@ -64,7 +65,7 @@ class RegionCosts:
                 means = field.means[members] - field.means.new_tensor([x, y])
                 size = (target.shape[1], target.shape[2])
                 rendered = region_splat(means, field.cholesky[members], colors[members], size=size, backend=backend)
-                error = _blur(_blur((rendered - target).square_().mean(0), blur).T, blur).T
+                error = _mean_around((rendered - target).square_().mean(0), sigma)
                 parts.append(error[top - y : bottom - y, left - x : right - x].cpu().numpy().ravel())
         self._values = np.concatenate(parts)
         self._stride = image.shape[2] + 2 * pad
@@ -82,18 +83,13 @@ class RegionCosts:
         return np.where(inside, self._values[np.where(inside, place, 0)].astype(np.float64), np.inf)
 
 
-def _blur(rows: Tensor, sigma: float) -> Tensor:
-    """Blur (h, w) along h, normalised at the borders."""
-    radius, count = math.ceil(4 * sigma), rows.shape[0]
-    if radius == 0:
-        return rows
-    taps = [math.exp(-0.5 * (k / sigma) ** 2) for k in range(-radius, radius + 1)]
-    padded = torch.nn.functional.pad(rows, (0, 0, radius, radius))
-    total = torch.zeros_like(rows, memory_format=torch.contiguous_format)
-    for k, tap in enumerate(taps):
-        total.add_(padded[k : k + count], alpha=tap)
-    within = np.convolve(np.ones(count), taps)[radius : radius + count]
-    return total.div_(torch.from_numpy(within).to(total)[:, None])
+def _mean_around(error: Tensor, sigma: float) -> Tensor:
+    """Blur (h, w), normalised at the borders."""
+    radius = math.ceil(4 * sigma)
+    padded = torch.nn.functional.pad(torch.stack([error, torch.ones_like(error)]), [radius] * 4)
+    total, within = blur(padded, gaussian_taps(sigma, radius))
+    mean: Tensor = total / within
+    return mean
 
 
 class MovingLabels:

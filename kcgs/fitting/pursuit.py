@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from kcgs.functional import RegionMap, region_splat
+from kcgs.functional.blur import blur, gaussian_taps
 
 # reach of the discrete Gaussians, in standard deviations
 _REACH = 3.0
@@ -133,8 +134,8 @@ def _best_of_squares(
     `margin` blocks of zeros around them; `corner` is the first pixel (x, y) inside the margin.
     """
     # <g, e> and <g, g> of the blocks; g^2 is a Gaussian too, narrower by sqrt 2
-    inner = _blur(padded[:-1], sigma / block, margin).mul_(block**2)
-    norm = _blur(padded[-1:], sigma / block / math.sqrt(2), margin)[0].mul_(block**2)
+    inner = _inner_products(padded[:-1], sigma / block, margin).mul_(block**2)
+    norm = _inner_products(padded[-1:], sigma / block / math.sqrt(2), margin)[0].mul_(block**2)
     inside = padded[-1, margin:-margin, margin:-margin] > 0
     gain = inner.square().sum(0).div_(norm).where(inside, -1.0)
     side = 2 if block == 1 or sigma / block >= _SIGMA_PER_BLOCK * math.sqrt(2) else 1
@@ -151,20 +152,10 @@ def _best_of_squares(
     )  # fmt: skip
 
 
-def _blur(padded: Tensor, sigma: float, margin: int) -> Tensor:
-    """Inner products with exp(-0.5 d^2 / sigma^2) at every pixel inside the margin, (N, h, w).
-
-    Sums of shifted copies: ten times faster on one core than torch's convolution of single channels.
-    """
+def _inner_products(padded: Tensor, sigma: float, margin: int) -> Tensor:
+    """Inner products with exp(-0.5 d^2 / sigma^2) at every pixel inside the margin, (N, h, w)."""
     reach = math.ceil(_REACH * sigma)
-    taps = [math.exp(-0.5 * (step / sigma) ** 2) for step in range(-reach, reach + 1)]
-    for dim in (1, 2):
-        length, start = padded.shape[dim] - 2 * margin, margin - reach
-        blurred = padded.narrow(dim, start, length) * taps[0]
-        for step, tap in enumerate(taps[1:], start + 1):
-            blurred.add_(padded.narrow(dim, step, length), alpha=tap)
-        padded = blurred
-    return padded
+    return blur(pad(padded, [reach - margin] * 4), gaussian_taps(sigma, reach))
 
 
 def _strongest(gain: Array, limit: int) -> NDArray[np.int64]:

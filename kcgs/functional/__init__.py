@@ -6,7 +6,6 @@ from .covariance import (
     covariance_to_cholesky,
     scale_rotation_to_cholesky,
 )
-from .edge_alignment import edge_alignment, edge_alignment_map
 from .labels import contour_edges, edge_band, lookup_regions, touching_pairs
 from .merging import merge_regions
 from .metrics import ef_psnr, ef_ssim, ms_ssim, psnr, ssim
@@ -17,7 +16,7 @@ from .widths import BandGain, band_gain, choose_widths
 
 __all__ = [
     "MAX_SOFTNESS", "BandGain", "PairWidths", "RegionMap", "band_gain", "cholesky_to_covariance",
-    "cholesky_to_scale_rotation", "choose_widths", "contour_edges", "covariance_to_cholesky", "edge_alignment",
-    "edge_alignment_map", "edge_band", "ef_psnr", "ef_ssim", "lookup_regions", "merge_regions", "ms_ssim", "psnr",
+    "cholesky_to_scale_rotation", "choose_widths", "contour_edges", "covariance_to_cholesky",
+    "edge_band", "ef_psnr", "ef_ssim", "lookup_regions", "merge_regions", "ms_ssim", "psnr",
     "region_splat", "scale_rotation_to_cholesky", "ssim", "touching_pairs",
 ]  # fmt: skip

@@ -11,6 +11,7 @@ from torch.nn.functional import avg_pool2d, pad
 
 from kcgs._check import check_image, check_labels
 
+from .blur import blur, gaussian_taps
 from .labels import edge_band
 
 SSIM_WINDOW = 11  # pixels
@@ -244,13 +245,7 @@ def _similarity(image: Tensor, target: Tensor, contrast: bool) -> Tensor:
 
 
 def window_mean(maps: Tensor) -> Tensor:
-    """Filter by the Gaussian window along both sides, one after the other, without padding."""
-    weights = [math.exp(-0.5 * (offset / SSIM_SIGMA) ** 2) for offset in range(-_MARGIN, _MARGIN + 1)]
-    for dim in (-2, -1):
-        length = maps.shape[dim] - 2 * _MARGIN
-        blurred = maps.narrow(dim, _MARGIN, length) * (1 / sum(weights))
-        for k in range(_MARGIN):
-            pair = maps.narrow(dim, k, length) + maps.narrow(dim, 2 * _MARGIN - k, length)
-            blurred = blurred.add_(pair, alpha=weights[k] / sum(weights))
-        maps = blurred
-    return maps
+    """Filter by the Gaussian window along both sides, without padding."""
+    taps = gaussian_taps(SSIM_SIGMA, _MARGIN)
+    total = sum([*taps[:0:-1], *taps])
+    return blur(maps, [tap / total for tap in taps])

@@ -190,7 +190,6 @@ def contour_functions(image: Tensor, labels: Tensor) -> dict[str, Any]:
         "gain": sorted((pair, tuple(gain)) for pair, gain in F.band_gain(image, labels).items()),
         "merge": F.merge_regions(image, labels),
         "merge-dear": F.merge_regions(image, labels, 0.05),
-        "alignment": F.edge_alignment(image, labels),
         "band": F.edge_band(labels),
     }
 
