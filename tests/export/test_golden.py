@@ -24,7 +24,7 @@ FOLDER = ROOT / "export" / "golden"
 if not FOLDER.is_dir():
     pytest.skip("not a source checkout: there is no export/golden", allow_module_level=True)
 
-NAMES = ("plain", "hard", "soft", "pairs", "fine", "needle")
+NAMES = ("plain", "hard", "soft", "pairs", "needle")
 MOST = 1e-3
 Arrays = dict[str, np.ndarray]
 
