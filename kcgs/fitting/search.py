@@ -1,7 +1,7 @@
 """The fewest Gaussians that reach a PSNR: bisection over their number, by finished fits.
 
-A fit with nearly as many Gaussians as an earlier one takes that one up again, with some more or without those that are
-missed least.
+Every fit but the first takes up again the one with the nearest number, with some more Gaussians or without those that
+are missed least.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _SPACING = 256
 _SLOPE = 3.0
 # the answer is known where so many times fewer Gaussians are too few, or are expected to be
 _CLOSE, _EXPECTED = 1.04, 1.025
-# an earlier fit is taken up again, from this share of a fit on, where the numbers differ by no more than this factor
-_NEAR, _AGAIN = 1.12, 0.6
+# share of a fit from which on an earlier one is taken up again
+_AGAIN = 0.6
 
 
 class _Probe(NamedTuple):
@@ -80,12 +80,7 @@ class Search:
         changes = {"target_psnr": None, "max_seconds": clock, "iterations": self.config.usual_iterations}
         settings = self.config.model_copy(update=changes)
         near = min(probes, key=lambda p: abs(math.log(p.num_gaussians / count)), default=None)
-        if (
-            near is None
-            or settings.optimizer != "frame"
-            or near.result.stop_reason == "diverged"
-            or abs(math.log(near.num_gaussians / count)) > math.log(_NEAR)
-        ):
+        if near is None or settings.optimizer != "frame" or near.result.stop_reason == "diverged":
             state = start(self.image, self.regions, count, settings, self.seed, time.perf_counter())
         else:
             state = replace(
