@@ -1,4 +1,4 @@
-"""Make the zoo: small scenes of images that anybody may use, each with its recipe and card."""
+"""Make the zoo: small scenes of images that anybody may use, each with its card."""
 
 from __future__ import annotations
 
@@ -63,7 +63,6 @@ def make(name: str, plan: Plan, folder: Path, quick: bool) -> Entry:
     fitted = fit(image, labels, plan.n, recipe=config).scene
     scene = Scene(fitted.field, fitted.regions, {"recipe": recipe, "title": plan.title})
     size = scene.save(folder / "scene.safetensors")
-    (folder / "recipe.json").write_text(config.model_dump_json(indent=1) + "\n", encoding="utf-8")
     height, width = scene.size
     shrink = PREVIEW / max(height, width)
     save_image(folder / "preview.jpg", scene.render((max(1, round(height * shrink)), max(1, round(width * shrink)))))
@@ -89,7 +88,7 @@ def _card(entry: Entry, size: tuple[int, int], ms_ssim: float) -> str:
         "image": f"{entry.title}, {size[1]} x {size[0]}",
         "licence of the image": entry.licence,
         "made by": f"`{entry.command}`",
-        "recipe": f"`{entry.recipe}`, all settings in `recipe.json`",
+        "recipe": f"`{entry.recipe}`",
         "Gaussians": str(entry.num_gaussians),
         "regions": str(entry.num_regions),
         "PSNR": f"{entry.psnr:.2f} dB",
