@@ -52,22 +52,12 @@ def fit_many_command(
     """
     if request.target_bytes is not None and suffix == ".safetensors":
         options.exclude("--target-bytes", suffix=suffix)
-    images = _by_stem(path for given in paths for path in _list_images(given))
-    masks = dict[str, Path]()
-    if regions not in ("auto", "none"):
-        masks = _by_stem(path for path in Path(regions).iterdir() if path.suffix.lower() in LABEL_MAPS)
+    ending = suffix or (".safetensors" if request.target_bytes is None else ".kcgs")
+    orders = _make_orders(paths, regions, output, ending, request)
     from kcgs.engine import run_jobs
 
     _ = request.config  # refuses wrong settings before the work
     output.mkdir(parents=True, exist_ok=True)
-    ending = suffix or (".safetensors" if request.target_bytes is None else ".kcgs")
-    orders = []
-    for stem, image in images.items():
-        source = regions
-        if regions not in ("auto", "none"):
-            source = str(masks.get(stem, Path(regions, f"{stem}.*")).absolute())
-        # absolute: a worker on a cluster has a working folder of its own
-        orders.append(Order(image.absolute(), output.absolute() / f"{stem}{ending}", source, request))
     if workers is None and engine == "local":
         workers = max(1, _count_cores() // threads)
     workers = None if workers is None else min(workers, len(orders))
@@ -85,10 +75,8 @@ def fit_many_command(
         _write_table(output / "results.csv", rows)
     failed = [row for row in rows if "error" in row]
     missed = [row for row in rows if row.get("target_reached") is False]
-    counts = {
-        "images": len(rows), "fitted": sum(outcome.is_new for outcome in outcomes.values()) - len(failed),
-        "failed": len(failed), "missed": len(missed),
-    }  # fmt: skip
+    fitted = sum(outcome.is_new for outcome in outcomes.values()) - len(failed)
+    counts = {"images": len(rows), "fitted": fitted, "failed": len(failed), "missed": len(missed)}
     print_report(counts | _means(rows), as_json, str(output))
     for row in failed:
         typer.echo(f"kcgs: {Path(row['image']).name}: {row['error']}", err=True)
@@ -97,6 +85,22 @@ def fit_many_command(
         typer.echo(f"kcgs: --target-psnr was not reached by {names}", err=True)
     if failed or missed:
         raise typer.Exit(1)
+
+
+def _make_orders(
+    paths: list[Path], regions: str, output: Path, ending: str, request: options.FitRequest
+) -> list[Order]:
+    """Return an order for each image; paths are absolute, for a worker on a cluster has a working folder of its own."""
+    images = _by_stem(image for path in paths for image in _list_images(path))
+    if regions in ("auto", "none"):
+        sources = dict.fromkeys(images, regions)
+    else:
+        masks = _by_stem(path for path in Path(regions).iterdir() if path.suffix.lower() in LABEL_MAPS)
+        sources = {stem: str(masks.get(stem, Path(regions, f"{stem}.*")).absolute()) for stem in images}
+    return [
+        Order(image.absolute(), output.absolute() / f"{stem}{ending}", sources[stem], request)
+        for stem, image in images.items()
+    ]
 
 
 def _list_images(path: Path) -> list[Path]:
