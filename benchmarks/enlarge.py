@@ -45,12 +45,12 @@ def measure(image: str, group: str, factor: int, share: int, data: str, quick: b
     small = avg_pool2d(pixels, factor)
     small_labels = labels[factor // 2 :: factor, factor // 2 :: factor].contiguous()
     n = round(small_labels.numel() / share)
-    scene = fit(small, small_labels, n, recipe="best", **({"iterations": QUICK_ITERATIONS} if quick else {})).scene
+    scene = fit(small, small_labels, n, iterations=QUICK_ITERATIONS if quick else None).scene
     rows = []
-    methods: dict[str, Callable[[], Tensor]] = {SCENE: lambda: scene.render((height, width))}
+    methods: dict[str, Callable[[], Tensor]] = {SCENE: partial(scene.render, (height, width))}
     for how in ("bicubic", "Lanczos"):
-        methods[f"own render, {how}"] = lambda how=how: enlarge(scene.render(), (height, width), how)
-        methods[f"small photo, {how}"] = partial(enlarge, small, (height, width), how)
+        methods[f"own render, {how}"] = partial(enlarge, scene.render, (height, width), how)
+        methods[f"small photo, {how}"] = partial(enlarge, small.clone, (height, width), how)
     times = milliseconds(methods, ROUNDS)
     for method, render in methods.items():
         shown = render()
@@ -62,23 +62,22 @@ def measure(image: str, group: str, factor: int, share: int, data: str, quick: b
     return rows
 
 
-def enlarge(image: Tensor, size: tuple[int, int], how: str) -> Tensor:
-    """Enlarge (C, H, W) by Pillow, in floats."""
-    planes = [Image.fromarray(plane.numpy()).resize(size[::-1], Image.Resampling[how.upper()]) for plane in image]
+def enlarge(image: Callable[[], Tensor], size: tuple[int, int], how: str) -> Tensor:
+    """Make (C, H, W) and enlarge it by Pillow, in floats."""
+    planes = [Image.fromarray(plane.numpy()).resize(size[::-1], Image.Resampling[how.upper()]) for plane in image()]
     return torch.from_numpy(np.stack([np.asarray(plane) for plane in planes])).clamp(0, 1)
 
 
 def jobs(options: Options) -> list[Job]:
     """Fit photos of DAVIS and Kodak at half and a quarter of their size."""
-    images, shares = [("DAVIS", "disc")], SHARES[:1]
+    images = [("DAVIS", "disc")]
     if not options.quick:
         images = [(group, name) for group in ("DAVIS", "Kodak") for name in names(options.folder(), group.lower())]
-        shares = SHARES
     listed = [
         {"image": image, "group": group, "factor": factor, "share": share}
         for group, image in images
         for factor in FACTORS
-        for share in shares
+        for share in (SHARES[:1] if options.quick else SHARES)
     ]
     fixed = {"data": str(options.data or ""), "quick": options.quick}
     return [{**job, **fixed} for job in listed]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any, Literal
 
 import torch
 from scipy.ndimage import distance_transform_edt
@@ -22,7 +23,7 @@ from .core.images import load, names
 from .core.run import Job, Options, Page, Row, experiment
 
 NUM_GAUSSIANS, QUICK_GAUSSIANS = 3_000, 60
-FILLS = {"not filled": None, "filled": "inpaint"}
+FILLS: dict[str, Literal["inpaint"] | None] = {"not filled": None, "filled": "inpaint"}
 # in pixels: what is compared with the hole, the contour of a moved object, and what is shown around
 AROUND, CONTOUR, SHOWN = 40, 2, 45
 QUANTITIES = ("steep", "beyond [0, 1]")
@@ -37,7 +38,8 @@ def measure(image: str, edit: str, n: int, folder: str, data: str, quick: bool) 
     """Edit a scene with each fill; their images are written beside each other."""
     pixels, labels = load(image, data, quick)
     assert labels is not None
-    scene = fit(pixels, labels, n, **({"iterations": QUICK_ITERATIONS, "merge_regions": False} if quick else {})).scene
+    settings: dict[str, Any] = {"iterations": QUICK_ITERATIONS, "merge_regions": False} if quick else {}
+    scene = fit(pixels, labels, n, **settings).scene
     assert scene.regions is not None
     ids = [region for region in scene.regions.ids.tolist() if region != 0]
     hole = torch.isin(scene.regions.labels, torch.tensor(ids))
@@ -79,8 +81,7 @@ def jobs(options: Options) -> list[Job]:
     images = ["disc"] if options.quick else list(options.only) or names(options.folder(), "davis")
     n = QUICK_GAUSSIANS if options.quick else NUM_GAUSSIANS
     fixed = {"n": n, "folder": str(options.output / "runs"), "data": str(options.data or ""), "quick": options.quick}
-    listed = [{"image": image, "edit": edit, **fixed} for edit in ("delete", "move") for image in images]
-    return listed
+    return [{"image": image, "edit": edit, **fixed} for edit in ("delete", "move") for image in images]
 
 
 def run(options: Options) -> None:

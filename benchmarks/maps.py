@@ -6,6 +6,8 @@ import math
 import time
 from pathlib import Path
 
+from torch import Tensor
+
 from kcgs import Scene, fit
 from kcgs.codec import decode, encode
 from kcgs.functional import ef_psnr, psnr
@@ -33,17 +35,17 @@ map without contours has none. Figures at equal bits, and those of the map besid
 def measure(image: str, n: int, sources: list[str], data: str, quick: bool) -> list[Row]:
     """Fit with each source's map and without."""
     pixels = load(image, data, quick).image
-    settings = {"iterations": QUICK_ITERATIONS} if quick else {}
-    alone = fit(pixels, None, n, recipe="best-baseline", **settings).scene
+    iterations = QUICK_ITERATIONS if quick else None
+    alone = fit(pixels, None, n, recipe="best-baseline", iterations=iterations).scene
     size, rows = len(_file(alone, pixels)), []
     for source in sources:
         start = time.process_time()
         labels = segment(pixels, source)
         seconds = time.process_time() - start
-        ours = fit(pixels, labels, n, recipe="best", **settings).scene
+        ours = fit(pixels, labels, n, recipe="best", iterations=iterations).scene
         file = _file(ours, pixels)
         equal_n = max(1, round(n * len(file) / size))
-        equal = fit(pixels, None, equal_n, recipe="best-baseline", **settings).scene
+        equal = fit(pixels, None, equal_n, recipe="best-baseline", iterations=iterations).scene
         equal_file = _file(equal, pixels)
         regions = ours.regions
         band = None if regions is None or regions.num_regions == 1 else regions.labels
@@ -63,19 +65,17 @@ def measure(image: str, n: int, sources: list[str], data: str, quick: bool) -> l
     return rows
 
 
-def _file(scene: Scene, image: object) -> bytes:
+def _file(scene: Scene, image: Tensor) -> bytes:
     return encode(scene, quality=quality_for(float(psnr(scene.render(), image))))
 
 
 def jobs(options: Options) -> list[Job]:
     """Fit the photos of BSDS."""
-    images, counts = ["astronaut"], (60,)
-    if not options.quick:
-        images, counts = names(options.folder(), "bsds"), COUNTS
+    images = ["astronaut"] if options.quick else names(options.folder(), "bsds")
     listed = []
-    for index, image in ((index, image) for index, image in enumerate(images)):
-        for n in counts:
-            others = OTHERS if n == counts[0] and index % OTHERS_STRIDE == 0 else ()
+    for index, image in enumerate(images):
+        for n in (60,) if options.quick else COUNTS:
+            others = OTHERS if n != COUNTS[-1] and index % OTHERS_STRIDE == 0 else ()
             job = {"image": image, "n": n, "sources": ["auto", *others]}
             listed.append({**job, "data": str(options.data or ""), "quick": options.quick})
     return listed

@@ -18,7 +18,7 @@ from .core.codecs import CODECS, available_codecs, decode_file, largest_file
 from .core.compare import Contest, answer, at_equal_bits, column, differences, grouped, losses, markdown, means, write
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS
-from .core.images import load, names
+from .core.images import load, load_mapped, names
 from .core.run import Job, Options, Page, Row, experiment
 
 # map, objective
@@ -56,13 +56,8 @@ def measure(image: str, group: str, method: str, asked: int, data: str, quick: b
     start = time.process_time()
     if method in OURS:
         with_map, objective = OURS[method]
-        regions = ("auto" if labels is None else labels) if with_map else None
-        if isinstance(regions, str):
-            from kcgs.segment import segment
-
-            regions = segment(pixels)
-        settings = {"iterations": QUICK_ITERATIONS} if quick else {}
-        made = fit_bytes(pixels, regions, asked, objective=objective, **settings)
+        regions = load_mapped(image, data, quick)[1] if with_map else None
+        made = fit_bytes(pixels, regions, asked, objective=objective, iterations=QUICK_ITERATIONS if quick else None)
         size, render = len(made.data), made.scene.render()
         seen = evaluate(made.scene, pixels, labels).get("ssimulacra2")
     else:
@@ -91,12 +86,11 @@ def jobs(options: Options) -> list[Job]:
             for image in names(options.folder(), group.lower())
         ]
     fixed = {"data": str(options.data or ""), "quick": options.quick}
-    listed = [
+    return [
         {"group": group, "image": image, "asked": size, "method": method, **fixed}
         for group, image, size in wanted
         for method in methods
     ]
-    return listed
 
 
 def run(options: Options) -> None:

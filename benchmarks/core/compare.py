@@ -188,12 +188,14 @@ def at_equal_bits(
     curves: dict[tuple[object, ...], PchipInterpolator] = {}
     files = grouped([row for row in rows if row["method"] == contest.other], [*cases, "image"])
     for key, group in files.items():
-        sizes = {bytes: members for (bytes,), members in grouped(group, ["bytes"]).items() if bytes}
         for quantity in quantities:
-            points = {s: fmean(n) for s, m in sorted(sizes.items()) if (n := column(m, quantity))}
-            if len(points) > 1:
-                logarithms, values = np.log(list(points)), list(points.values())
-                curves[*key, quantity] = PchipInterpolator(logarithms, values)
+            values: dict[float, list[float]] = defaultdict(list)
+            for row in group:
+                if not missing(row.get(quantity)):
+                    values[math.log(row["bytes"])].append(row[quantity])
+            if len(values) > 1:
+                sizes = sorted(values)
+                curves[*key, quantity] = PchipInterpolator(sizes, [fmean(values[size]) for size in sizes])
     for row in rows:
         key = (*(row.get(name) for name in cases), row["image"])
         if row["method"] == contest.ours and key in files:

@@ -11,6 +11,7 @@ import matplotlib
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from PIL import Image
 from torch import Tensor
 
@@ -20,6 +21,9 @@ from .run import Row
 # of Okabe and Ito
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 MARKERS = "osD^vP"
+# in characters
+_LEGEND_WIDTH = 125
+_LEGEND_MARKER = 7
 
 
 class Panel(NamedTuple):
@@ -52,11 +56,15 @@ def save_lines(path: Path, panels: Sequence[Panel], line: str, along: str, marke
         axes.set(xlabel=title(panel.x), ylabel=title(panel.y), title=panel.title)
         axes.set(xscale=panel.scales[0], yscale=panel.scales[1])
         axes.xaxis.set_major_formatter("{x:g}")
-        low, high = axes.get_xlim()
-        axes.xaxis.set_minor_formatter("{x:g}" if panel.scales[0] == "log" and high < 5 * low else "")
+        if panel.scales[0] == "log":
+            low, high = axes.get_xlim()
+            axes.xaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+            axes.xaxis.set_minor_formatter("{x:g}" if high < 100 * low else "")
     for axes in all_axes[len(panels) :]:
         axes.set_visible(False)
-    figure.legend(shown.values(), map(str, shown), loc="outside upper center", ncols=min(5, len(shown) or 1))
+    labels = [str(name) for name in shown]
+    columns = _LEGEND_WIDTH // (max(map(len, labels), default=0) + _LEGEND_MARKER)
+    figure.legend(shown.values(), labels, loc="outside upper center", ncols=max(1, min(columns, len(labels))))
     figure.savefig(path, dpi=110)
 
 

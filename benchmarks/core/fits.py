@@ -56,11 +56,11 @@ def measure_fit(
     figures = evaluate(scene, pixels, labels)
     file = encode(scene, quality=quality_for(figures["psnr"]))
     decoded = evaluate(decode(file).scene, pixels, labels)
-    has_map = regions is not None and regions.num_regions > 1
+    stored = None if regions is None or regions.num_regions == 1 else regions.labels
     return [{
         "image": image, "n": n, "method": method, "seed": seed, "iterations": result.history[-1].iteration,
         **{name: figures[name] for name in _FIGURES}, "ssimulacra2": figures.get("ssimulacra2", math.nan),
-        "bytes": len(file), "map_bytes": len(encode_labels(regions.labels)) if has_map else 0,
+        "bytes": len(file), "map_bytes": 0 if stored is None else len(encode_labels(stored)),
         "bpp": 8 * len(file) / pixels[0].numel(), "core_seconds": seconds,
         **{f"decoded_{name}": decoded[name] for name in _FIGURES},
     }]  # fmt: skip
