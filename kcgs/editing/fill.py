@@ -105,7 +105,7 @@ def _share_in(field: GaussianField, ids: Tensor, regions: RegionMap, hole: Tenso
 def _spread(missing: Tensor, wanted: Tensor, regions: RegionMap) -> GaussianField:
     """Spread round Gaussians over the hole that together make about what is missing there."""
     distance = max(_LEAST_DISTANCE, float(wanted.sum() / _MOST_SPREAD) ** 0.5)
-    rows, cols = (torch.arange(distance / 2, n, distance, device=wanted.device).long() for n in wanted.shape)
+    rows, cols = (torch.arange(min(distance, n) / 2, n, distance, device=wanted.device).long() for n in wanted.shape)
     places = torch.zeros_like(wanted)
     places[rows[:, None], cols] = True
     y, x = (places & wanted).nonzero().T

@@ -177,7 +177,7 @@ def test_operator() -> None:
     inputs = make_inputs(4, size=(8, 16))
     labels = (torch.arange(16, device=DEVICE) // 9).expand(8, 16).contiguous()
     ids = torch.tensor([[0, 1, 0, 1]], device=DEVICE)
-    settings = ids, labels, None, 1, 8, 16, 0.0
+    settings = ids, labels, None, 8, 16, 0.0
     leaves = [t.clone().requires_grad_() for t in inputs[:3]]
     operators = splat_operator, torch.ops.kcgs.region_splat_backward.default
     torch.library.opcheck(operators[0], (*leaves, *settings, "cuda"))

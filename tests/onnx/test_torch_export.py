@@ -73,11 +73,11 @@ class TestDecomposition:
         labels = torch.stack([labels_of(SIZE), labels_of(SIZE).flip(1)]) << 40
         given = gaussians(2, 30, SIZE)
         given[3] <<= 40
-        args = (*given, labels, None, 1, *SIZE, 1e-4, "reference")
+        args = (*given, labels, None, *SIZE, 1e-4, "reference")
         assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
 
     def test_no_gaussians(self) -> None:
-        args = (*gaussians(1, 0, SIZE), labels_of(SIZE), None, 1, *SIZE, 1e-4, "reference")
+        args = (*gaussians(1, 0, SIZE), labels_of(SIZE), None, *SIZE, 1e-4, "reference")
         assert torch.equal(decompose(*args), torch.zeros(1, 3, *SIZE))
 
     def test_many_pairs(self) -> None:
@@ -95,7 +95,6 @@ class TestDecomposition:
             torch.arange(40)[None],
             labels,
             regions.widths,
-            1,
             24,
             36,
             1e-4,
@@ -119,7 +118,7 @@ class TestDecomposition:
         size, largest = (96, 128), Largest()
         given = gaussians(1, 400, size)
         with largest:
-            decompose(*given, labels_of(size), None, 1, *size, 1e-4, "tiled")
+            decompose(*given, labels_of(size), None, *size, 1e-4, "tiled")
         assert largest.numel == 64 * 32 * 32 > 3 * 96 * 128
 
     def test_compilers_and_torch_export_keep_the_operator(self, monkeypatch: pytest.MonkeyPatch) -> None:
