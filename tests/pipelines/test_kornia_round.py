@@ -51,7 +51,7 @@ def test_augment_segment_fit_draw_measure(photo: Tensor, method: str) -> None:
 def test_labels_follow_a_geometric_augmentation(photo: Tensor) -> None:
     """Image and label map are rotated as one; the fit on the pair beats the fit without labels at the same count."""
     torch.manual_seed(0)
-    labels = segment(photo[0], "felzenszwalb")
+    labels = segment(photo[0])
     both = K.AugmentationSequential(K.RandomRotation((20.0, 20.0), p=1.0), data_keys=["image", "mask"])
     image, turned = both(photo, labels[None, None].float())
     image, turned = K.CenterCrop((40, 48))(image).clamp(0, 1), K.CenterCrop((40, 48), resample="nearest")(turned)
