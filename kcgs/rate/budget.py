@@ -68,7 +68,8 @@ def fit_bytes(
     One trade decides: what the last bit saves. The number of Gaussians is that at which another one, or more digits
     for all, would save as much. A pixel of contour must save what the bits that the coder needs for it would save as
     Gaussians, else it moves or its regions are merged. The map as a whole stays only where two short fits, with it and
-    with Gaussians for its bytes, say so, within 0.1 dB. ``result.regions`` says what became of it.
+    with Gaussians for its bytes, say so, within 0.1 dB. With ``merge_regions=False`` no region goes. ``result.regions``
+    says what became of the map.
 
     Args:
         image: as in :func:`kcgs.fit`.
@@ -132,8 +133,10 @@ def count_for(num_bytes: float, pixels: int, objective: str = "psnr") -> int:
 @image_threads_for_kernels
 def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: FitConfig, seed: int) -> _Choice:
     """Choose the regions that pay for their bytes; return what a pixel of contour must save, and what went, too."""
-    if regions is None or regions.num_regions == 1:
+    if regions is None or regions.num_regions == 1 or not config.guidance:
         return None, config.contour_cost, {}
+    if not config.merge_regions:
+        return regions, config.contour_cost, {}
     given = regions.num_regions
     count_of = partial(count_for, pixels=image.shape[1] * image.shape[2], objective=config.objective)
     # by iterations, so that without a clock the same arguments give the same file
@@ -151,10 +154,10 @@ def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: Fi
     # a pixel of contour must save what its bits would
     bits = 8 * _map_bytes(regions) / max(len(contour_edges(regions.labels)[0]), 1)
     cost = saved * bits
-    if config.merge_regions and regions.softness == 0.0:
+    if regions.softness == 0.0:
         regions = RegionMap.from_labels(merge_regions(image, regions.labels, cost))
     paying, count = regions.num_regions, count_of(num_bytes - _map_bytes(regions))
-    if config.merge_regions and paying > count:
+    if paying > count:
         regions = regions.merge(pairs_to_merge(image, regions.labels, count))[0]
     kept = 1 if regions is None else regions.num_regions
     merged = {"merged_for_bytes": given - paying}

@@ -52,6 +52,12 @@ class TestFitBytes:
         assert done.scene.regions is None and report is not None
         assert (report.given, report.kept) == (2, 1) and (report.dropped == "bytes" or report.merged_for_bytes == 1)
 
+    def test_a_map_that_is_to_stay_stays(self, photo: Photo) -> None:
+        labels = (torch.arange(160) // 20).repeat(120, 1)
+        done = fit_bytes(photo[0], labels, 900, iterations=100, merge_regions=False, move_contours=False)
+        assert len(done.data) <= 900
+        assert torch.equal(decode(done.data).scene.regions.labels, labels)
+
     def test_a_map_that_pays_stays(self) -> None:
         image = torch.full((3, 96, 128), 0.1)
         row, column = torch.meshgrid(torch.arange(96), torch.arange(128), indexing="ij")
