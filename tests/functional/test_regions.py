@@ -142,6 +142,15 @@ class TestPairWidths:
         assert RegionMap.from_labels(labels, {}).softness == 0.0
         assert RegionMap.from_labels(torch.ones(2, 2).long(), {}).softness == 0.0
 
+    def test_merged_regions_have_the_mean_of_the_widths_along_their_contours(self) -> None:
+        regions = RegionMap.from_labels(
+            torch.tensor([[1, 2, 3, 4]]), {(1, 2): 0.6, (1, 3): 1.0, (2, 3): 0.5, (3, 4): 0.3}
+        )
+        merged, new_ids = regions.merge([(2, 3)])
+        assert merged is not None and new_ids.tolist() == [1, 2, 2, 4]
+        assert merged.labels.tolist() == [[1, 2, 2, 4]]
+        assert dict(merged.softness) == {(1, 2): pytest.approx(0.8), (2, 4): 0.3}
+
     def test_read_in_either_order_and_never_written(self) -> None:
         given = {(9, 3): 0.7, (3, 5): 1}
         softness = RegionMap.from_labels(torch.tensor([[3, 5, 9]]), given).softness
