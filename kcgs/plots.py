@@ -1,13 +1,10 @@
-"""Figures that look alike: colours that people with any colour vision tell apart, files written whole or not at all."""
+"""Figures that look alike: colours that people with any colour vision tell apart."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
-
-from kcgs._atomic import atomic_path
 
 # of Okabe and Ito
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
@@ -32,12 +29,6 @@ def figure(rows: int, cols: int, *, width: float, height: float) -> tuple[Any, A
         FigureCanvasAgg(plot)
         axes = plot.subplots(rows, cols, squeeze=rows == 1)
     return plot, axes
-
-
-def save_figure(plot: Any, path: Path) -> None:
-    """Write the figure."""
-    with atomic_path(path) as temporary:
-        plot.savefig(temporary, dpi=130)
 
 
 def history_figure(histories: Mapping[str, Sequence[Any]]) -> Any:

@@ -39,7 +39,7 @@ GONE = {
     "per": r"\b(bits?|labels?|floats?|bytes|Gaussians?|integer) an? (pixel|Gaussian|image|file|core|thread)\b",
 }
 # names of libraries, an input inside decoders whose bytes stay, and English
-ALLOWED = re.compile(r"skimage\.draw|ImageDraw(\.Draw)?|input\(\"picture\"|Gaussians a file may|\.strip\(")
+ALLOWED = re.compile(r"skimage\.draw|ImageDraw(\.Draw)?|Gaussians a file may|\.strip\(")
 
 
 def modules() -> dict[str, Path]:
