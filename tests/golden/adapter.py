@@ -26,6 +26,7 @@ from kcgs.fitting.pursuit import propose
 from kcgs.onnx import generic_decoder, scene_decoder
 from kcgs.pruning import prune
 from kcgs.rate import compress, fit_bytes
+from kcgs.video import fit_video, interpolate
 
 ROOT = Path(kcgs.__file__).resolve().parent.parent
 Softness = float | dict[tuple[int, int], float]
@@ -78,6 +79,25 @@ def run_fit(image: Tensor, p: Parts | None, num_gaussians: int, recipe: str, **s
         "history": torch.tensor(history, dtype=torch.float64),
         **ending,
     }
+
+
+def run_resumed(
+    image: Tensor, p: Parts | None, num_gaussians: int, stop: int, recipe: str, **settings: Any
+) -> dict[str, Any]:
+    """Fit an image, stop after `stop` iterations, and resume from the checkpoint."""
+    with tempfile.TemporaryDirectory() as folder:
+        settings["checkpoint"] = Path(folder) / "fit.pt"
+        run_fit(image, p, num_gaussians, recipe, on_step=lambda iteration, entry: iteration == stop, **settings)
+        return run_fit(image, p, num_gaussians, recipe, resume=True, **settings)
+
+
+def run_fit_video(
+    frames: list[Tensor], p: Parts | None, num_gaussians: int, recipe: str, **settings: Any
+) -> dict[str, Any]:
+    """Fit a video with the map of its first frame, and interpolate between the last two frames."""
+    labels = None if p is None else _regions(p)
+    scenes = fit_video(frames, labels, num_gaussians, recipe=recipe, seed=3, **settings)
+    return {"frames": _of(scenes), "between": _of(interpolate(scenes, len(frames) - 1.5))}
 
 
 def to_file(p: Parts, **settings: Any) -> bytes:

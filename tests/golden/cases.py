@@ -44,6 +44,10 @@ FITS: dict[str, Case] = {
     "paper-no-warmup": lambda: adapter.run_fit(textured(), only_map(), 40, "paper", iterations=40, warmup=False),
     "gaussian-image": lambda: adapter.run_fit(textured(), only_map(), 40, "gaussian-image", iterations=60),
     "gaussian-image-clamp": lambda: adapter.run_fit(textured(), None, 40, "gaussian-image-clamp", iterations=60),
+    "image-gs": lambda: adapter.run_fit(textured(), None, 40, "image-gs", iterations=60),
+    "image-gs-regions": lambda: adapter.run_fit(
+        textured(), only_map(0.7), 40, "image-gs", iterations=40, guidance=True
+    ),
     "best-none": lambda: adapter.run_fit(photo(), None, 120, "best", iterations=60),
     "best-hard": lambda: adapter.run_fit(textured(), only_map(), 90, "best", iterations=90),
     "best-softness-0": lambda: adapter.run_fit(textured(), only_map(), 90, "best", iterations=60, softness=0.0),
@@ -63,6 +67,11 @@ FITS: dict[str, Case] = {
     "best-saturated": lambda: adapter.run_fit(
         ((textured() - 0.5) * 6).clamp(0, 1), only_map(), 60, "best", iterations=40
     ),
+    "best-ms-ssim": lambda: adapter.run_fit(photo(), None, 90, "best", iterations=60, objective="ms-ssim"),
+    "best-adan": lambda: adapter.run_fit(textured(), only_map(), 90, "best", iterations=60, optimizer="adan"),
+    "best-resumed": lambda: adapter.run_resumed(textured(), only_map(), 90, 40, "best", iterations=60),
+    "paper-resumed": lambda: adapter.run_resumed(textured(), only_map(), 40, 20, "paper", iterations=40),
+    "image-gs-resumed": lambda: adapter.run_resumed(textured(), None, 40, 20, "image-gs", iterations=40),
     "best-grey": lambda: adapter.run_fit(textured(channels=1), only_map(), 90, "best", iterations=60),
     "best-double": lambda: adapter.run_fit(textured().double(), only_map(), 30, "best", iterations=30),
     "best-baseline": lambda: adapter.run_fit(textured(), only_map(), 90, "best-baseline", iterations=60),
@@ -82,6 +91,23 @@ FITS: dict[str, Case] = {
     "target-psnr-paper": lambda: adapter.run_fit(textured(), only_map(), 60, "paper", iterations=60, target_psnr=17.0),
 }
 CASES |= {f"fit/{name}": function for name, function in FITS.items()}
+
+# Videos: an image that moves to the right, once up to a cut
+VIDEOS: dict[str, dict[str, Any]] = {
+    "none": {"cut": False},
+    "cut": {"cut": True},
+    "map": {"cut": False, "regions": only_map(0.7)},
+}
+
+
+def _video(cut: bool, regions: adapter.Parts | None = None) -> dict[str, Any]:
+    frames = [textured().roll(2 * t, 2) for t in range(3)]
+    if cut:
+        frames[2] = 1.0 - frames[2].flip(1)
+    return adapter.run_fit_video(frames, regions, 60, "best", iterations=40)
+
+
+CASES |= {f"video/{name}": partial(_video, **settings) for name, settings in VIDEOS.items()}
 
 # Files
 FILES = {f"{name}": partial(gaussians, **settings) for name, settings in MAPS.items()} | {
@@ -119,6 +145,9 @@ def _compress(**scene: Any) -> dict[str, Any]:
 
 for name in ("none", "hard", "pairs"):
     CASES[f"codec/compress-{name}"] = partial(_compress, **MAPS[name])
+CASES["codec/compress-ms-ssim"] = lambda: {
+    "data": adapter.run_compress(gaussians(60), textured(), iterations=8, objective="ms-ssim")
+}
 BYTES: dict[str, Case] = {
     "none": lambda: adapter.run_fit_bytes(photo(), None, 700, "best", iterations=40),
     "map": lambda: adapter.run_fit_bytes(textured(), only_map(), 800, "best", iterations=40),
