@@ -4,7 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from . import codec, data, editing, fitting, functional, nn, onnx, rate, segment, video  # noqa: F401
+    from . import codec, data, editing, engine, fitting, functional, nn, onnx, page, rate, segment, video  # noqa: F401
     from .errors import InvalidArgument, InvalidArgumentType
     from .evaluation import evaluate
     from .fitting import FitConfig, FitResult, fit
@@ -19,7 +19,7 @@ __all__ = [
     "RegionSplatRenderer", "Scene", "__version__", "evaluate", "fit", "load", "save",
 ]  # fmt: skip
 
-# Public names by module, which is imported when a name is used: the command's help loads no torch.
+# Public names by module. A module is imported when one of its names is used, so that `kcgs --help` loads no torch.
 _MODULES = {
     "errors": ("InvalidArgument", "InvalidArgumentType"),
     "evaluation": ("evaluate",),
@@ -28,10 +28,12 @@ _MODULES = {
     "nn": ("GaussianField", "RegionSplatRenderer"),
     "scene": ("Scene", "load", "save"),
 }
-_PACKAGES = ("codec", "data", "editing", "fitting", "functional", "nn", "onnx", "rate", "segment", "video")
+_PACKAGES = (
+    "codec", "data", "editing", "engine", "fitting", "functional", "nn", "onnx", "page", "rate", "segment", "video",
+)  # fmt: skip
 
 
-if not TYPE_CHECKING:  # a type checker would take any name
+if not TYPE_CHECKING:  # for a type checker, any name would exist
 
     def __getattr__(name: str) -> Any:
         if name in _PACKAGES:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def check_writable(name: str, path: str | os.PathLike[str]) -> None:
-    """Refuse, by an OSError that begins with `name`, a path at which no file can be written; nothing appears there."""
+    """Raise an OSError that begins with `name` if no file can be written at `path`; leave nothing there."""
     target = Path(path)
     if target.is_dir():
         raise IsADirectoryError(f"{name} must be a file; {str(target)!r} is a folder")
@@ -25,16 +25,16 @@ def check_writable(name: str, path: str | os.PathLike[str]) -> None:
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a path beside `path`, of the same suffix, at which the block writes a file that takes its place at the end.
+    """Yield a temporary path beside `path`, of the same suffix; the file written there takes its place at the end.
 
-    On any exception, Ctrl-C included, it is removed and whatever stood at `path` stays.
+    On any exception, Ctrl-C included, the temporary file is removed, and a file that stood at `path` stays.
     """
     target = Path(path)
     if not target.parent.is_dir():
         raise FileNotFoundError(f"cannot write {target}: the folder {target.parent} does not exist")
     if target.is_dir():
         raise IsADirectoryError(f"cannot write {target}: it is a folder, expected a file path")
-    # Not created here: the writer creates it, and so the file gets the permissions any new file would.
+    # not created here: the writer creates it, with the permissions of any new file
     temporary = target.with_name(f".tmp-{uuid.uuid4().hex}{target.suffix}")
     try:
         yield temporary
@@ -49,6 +49,6 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_file(path: str | os.PathLike[str], content: bytes | str) -> int:
-    """Write bytes, or a text in UTF-8, whole or not at all; return how many bytes."""
+    """Write bytes, or a text in UTF-8, whole or not at all; return the number of bytes."""
     with atomic_path(path) as temporary:
         return temporary.write_bytes(content.encode() if isinstance(content, str) else content)

@@ -1,27 +1,20 @@
-"""Checks that public functions share; messages are built only when a check fails."""
+"""Checks of arguments that public functions share; a message is built only when its check fails."""
 
 from __future__ import annotations
 
 import math
 import operator
-import os
-import re
 from collections.abc import Sequence
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32)
-# bytes that every machine has
-_LITTLE = 1 << 26
 
 
 def check_tensor(name: str, value: object, dims: Sequence[int] = ()) -> Tensor:
@@ -39,7 +32,7 @@ def check_tensor(name: str, value: object, dims: Sequence[int] = ()) -> Tensor:
 def check_floating(
     name: str, value: object, last: int | None = None, dims: Sequence[int] = (), finite: bool = True
 ) -> Tensor:
-    """Return `value` if it is a real floating tensor of an allowed rank and last dimension, and finite if asked."""
+    """Return `value` if it is a real floating tensor of an allowed rank and last dimension; `finite`: and finite."""
     tensor = check_tensor(name, value, dims)
     if tensor.dtype not in _FLOATS:
         raise InvalidArgumentType(name, "a real floating dtype", tensor.dtype, verb="have")
@@ -50,16 +43,16 @@ def check_floating(
     return tensor
 
 
-def holds(condition: Tensor, words: str) -> bool:
-    """Read a condition on values; in a graph and on CUDA it is an assertion instead, for which nobody waits."""
+def holds(condition: Tensor, message: str) -> bool:
+    """Return whether a condition on values holds; in a graph and on CUDA, assert it without a host sync instead."""
     try:
-        torch._assert_async(condition, words)
+        torch._assert_async(condition, message)
     except RuntimeError:
         inner = condition
-        while torch._C._functorch.is_functorch_wrapped_tensor(inner):  # vmap has no rule for assertions
+        while torch._C._functorch.is_functorch_wrapped_tensor(inner):  # vmap has no rule for assertions,
             inner = torch._C._functorch.get_unwrapped(inner)
-        if inner is not condition and not inner.all():  # nor for a message that shows values
-            raise ValueError(words) from None
+        if inner is not condition and not inner.all():  # nor for reading the values that a message shows
+            raise ValueError(message) from None
         return inner is not condition
     return True
 
@@ -72,22 +65,22 @@ def check_integer(name: str, value: object, dims: Sequence[int] = ()) -> Tensor:
     return tensor
 
 
-def check_rows(name: str, value: Tensor, like: Tensor, last: int | str) -> None:
-    """Refuse what has not one row for each of `like`; `last` is the length of a row, or its letter."""
-    if value.shape[:-1] != like.shape[:-1]:
-        wanted = ", ".join(map(str, (*like.shape[:-1], last)))
-        raise InvalidArgument(name, f"shape ({wanted})", tuple(value.shape), verb="have")
+def check_rows(name: str, value: Tensor, means: Tensor, last: int | str) -> None:
+    """Check that a tensor has one row for each mean; `last` is the length of a row, or its letter."""
+    if value.shape[:-1] != means.shape[:-1]:
+        shape = ", ".join(map(str, (*means.shape[:-1], last)))
+        raise InvalidArgument(name, f"shape ({shape})", tuple(value.shape), verb="have")
     if value.shape[-1] == 0:
         raise InvalidArgument(name, "at least one channel", f"shape {tuple(value.shape)}", verb="have")
 
 
-def check_ids(name: str, value: object, like: Tensor, values: bool = True) -> Tensor:
-    """Return region ids as int64: integer, one for each centre of `like` (..., 2), with `values` none negative."""
+def check_ids(name: str, value: object, means: Tensor, values: bool = True) -> Tensor:
+    """Return region ids as int64 if they are integers, one for each mean; `values`: and none is negative."""
     tensor = check_integer(name, value)
-    if tensor.shape != like.shape[:-1]:
-        raise InvalidArgument(name, f"shape {tuple(like.shape[:-1])}", tuple(tensor.shape), verb="have")
-    if tensor.device != like.device:
-        raise InvalidArgument(name, f"on {like.device} with means", tensor.device)
+    if tensor.shape != means.shape[:-1]:
+        raise InvalidArgument(name, f"shape {tuple(means.shape[:-1])}", tuple(tensor.shape), verb="have")
+    if tensor.device != means.device:
+        raise InvalidArgument(name, f"on {means.device} with means", tensor.device)
     tensor = tensor.long()
     if values and not holds((tensor >= 0).all(), f"{name} must be non-negative"):
         raise InvalidArgument(name, "non-negative", int(tensor.min()))
@@ -147,10 +140,7 @@ def check_cutoff(value: object) -> float:
 
 
 def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values: bool = True) -> Tensor:
-    """Return a label map as int64: integer or bool, (H, W) or (B, H, W), at least one pixel; `values`: no negative id.
-
-    A numpy array is one too; False is 0 and True is 1.
-    """
+    """Return a label map, a tensor or a numpy array of integers or bool, as int64; `values`: and no id is negative."""
     if isinstance(value, np.ndarray):
         if value.dtype.kind not in "biu":
             raise InvalidArgumentType(name, "an integer dtype", value.dtype, verb="have")
@@ -172,37 +162,14 @@ def check_size(name: str, value: object) -> tuple[int, int]:
     """Return (height, width) if both are whole numbers of at least 1."""
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
         raise InvalidArgumentType(name, "a pair (height, width)", repr(value))
-    # operator.index would make a constant of the size that a graph leaves open
-    whole = [isinstance(side, int | torch.SymInt) and not isinstance(side, bool) for side in value]
-    if not all(known or hasattr(side, "__index__") for known, side in zip(whole, value, strict=True)):
+    if any(isinstance(side, bool) or not hasattr(side, "__index__") for side in value):
         raise InvalidArgumentType(name, "two integers (height, width)", repr(value), verb="hold")
-    height, width = (side if known else operator.index(side) for known, side in zip(whole, value, strict=True))
+    # operator.index would make a constant of a side that a graph leaves open
+    sides: list[Any] = [side if isinstance(side, int | torch.SymInt) else operator.index(side) for side in value]
+    height, width = sides
     if height < 1 or width < 1:
         raise InvalidArgument(name, "at least 1 x 1", repr(value))
     return height, width
-
-
-def check_memory(name: str, size: tuple[int, int], per_pixel: float) -> None:
-    """Refuse an image of so many pixels where it needs more memory than is free, at so many bytes per pixel."""
-    needed = float(size[0]) * size[1] * per_pixel
-    if needed > _LITTLE and needed > (free := _free_memory()):
-        memory = f"about {needed / 1e9:,.1f} GB of memory; {free / 1e9:,.1f} GB are free"
-        raise ValueError(f"{name} asks for {size[1]} x {size[0]} pixels, which need {memory}")
-
-
-def _free_memory() -> float:
-    """Bytes that this process may still take, swap included; infinite where the system does not say."""
-    found = [math.inf]
-    with suppress(OSError):
-        facts = dict(re.findall(r"(\w+): +(\d+) kB", Path("/proc/meminfo").read_text()))
-        found.append(1024.0 * sum(int(facts.get(name, 0)) for name in ("MemAvailable", "SwapFree")))
-    for limit in ("memory.max", "memory/memory.limit_in_bytes"):
-        with suppress(OSError, ValueError):
-            found.append(float(Path("/sys/fs/cgroup", limit).read_text()))
-    if found == [math.inf]:
-        with suppress(AttributeError, OSError, ValueError):
-            found.append(float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")))
-    return min(found)
 
 
 def check_image(name: str, value: object) -> Tensor:
@@ -211,68 +178,3 @@ def check_image(name: str, value: object) -> Tensor:
     if tensor.numel() == 0:
         raise InvalidArgument(name, "empty", f"shape {tuple(tensor.shape)}", verb="not be")
     return tensor
-
-
-def as_image(name: str, value: object, tolerance: float = 0.0) -> Tensor:
-    """Return an image as one tensor (C, H, W) in [0, 1]: what a Tensor, an array or a PIL image shows.
-
-    Taken are a Tensor (C, H, W) or (1, C, H, W), a numpy array (H, W, C) or (H, W) of uint8, uint16 or floats in [0,
-    1], and a PIL image, whose palette is resolved and whose transparent pixels are composed on white.
-    Values may pass [0, 1] by `tolerance`. A Tensor that can only be meant as (H, W, C) is refused: more than 4 channels
-    and rows, and 1, 3 or 4 columns.
-    """
-    if isinstance(value, np.ndarray):
-        image = _from_array(name, value)
-    elif hasattr(value, "getbands") and hasattr(value, "convert"):  # PIL, which need not be imported for this
-        image = on_white(_from_array(name, pil_samples(value)))
-    elif isinstance(value, Tensor):
-        image = check_floating(name, value, dims=(3, 4), finite=False)  # looked for below, once
-    else:
-        hint = ": read it with kcgs.data.load_image" if isinstance(value, str | os.PathLike) else ""
-        raise InvalidArgumentType(name, "a Tensor, a numpy array or a PIL image", f"{type(value).__name__}{hint}")
-    if image.ndim == 4:
-        if image.shape[0] != 1:
-            raise InvalidArgument(name, "one image, (C, H, W) or (1, C, H, W)", tuple(image.shape))
-        image = image[0]
-    check_image(name, image)
-    if image.shape[-1] in (1, 3, 4) and min(image.shape[:2]) > 4:
-        advice = f"pass {name}.permute(2, 0, 1), or a numpy array (H, W, C)"
-        raise InvalidArgument(name, "(C, H, W)", f"{tuple(image.shape)}, which looks like (H, W, C): {advice}")
-    low, high = float(image.detach().min()), float(image.detach().max())
-    if low < -tolerance or high > 1 + tolerance:
-        raise InvalidArgument(name, "in [0, 1]", f"[{low:g}, {high:g}]")
-    return image
-
-
-def _from_array(name: str, array: NDArray[Any]) -> Tensor:
-    if array.ndim == 2:
-        array = array[..., None]
-    if array.ndim != 3 or array.shape[-1] > 4:
-        raise InvalidArgument(name, "an array (H, W) or (H, W, C) with 1 to 4 channels", f"shape {array.shape}")
-    if array.dtype in (np.uint8, np.uint16):
-        array = array.astype(np.float32) / np.float32(np.iinfo(array.dtype).max)
-    elif array.dtype not in (np.float32, np.float64):
-        raise InvalidArgumentType(name, "uint8, uint16, float32 or float64", array.dtype, verb="hold")
-    return torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))
-
-
-def pil_samples(image: Any) -> NDArray[Any]:
-    """Return what a PIL image shows, (H, W, C): grey, grey and alpha, RGB or RGBA, of uint8, uint16 or float32."""
-    if image.mode == "F":
-        values = np.asarray(image)
-    elif image.mode.startswith("I"):  # 16-bit grey, which Pillow has in 32 bits for some formats
-        values = np.asarray(image).astype(np.uint16)
-    else:
-        mode = "L" if image.mode in ("1", "L") else "RGB"
-        if image.has_transparency_data:
-            mode = "LA" if image.mode in ("LA", "La") else "RGBA"
-        values = np.asarray(image.convert(mode))
-    return values if values.ndim == 3 else values[..., None]
-
-
-def on_white(image: Tensor) -> Tensor:
-    """Compose an image with alpha, (2, H, W) or (4, H, W), on white; return others as they are."""
-    if len(image) not in (2, 4):
-        return image
-    color, alpha = image[:-1], image[-1:]
-    return (color * alpha + (1 - alpha)).clamp(0, 1)

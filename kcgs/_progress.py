@@ -1,4 +1,4 @@
-"""What long work shows: a bar on standard error, only on a terminal or in a notebook."""
+"""The progress bar of long work: on standard error, only on a terminal or in a notebook."""
 
 from __future__ import annotations
 
@@ -6,26 +6,28 @@ from typing import Any
 
 
 class Progress:
-    """One piece of work, shown while it lasts.
+    """A bar, or without a known length a pulse, while a `with` block runs.
 
     Args:
         name: of the work.
-        known: its length is known: `update` says what share is done. Otherwise only that it goes on is shown.
-        shown: False: show nothing.
+        known: whether the length of the work is known, so that `update` can say which share is done.
+        shown: False: there is no bar.
     """
 
     def __init__(self, name: str, *, known: bool = True, shown: bool = True) -> None:
-        self._name, self._known, self._shown = name, known, shown
+        self._name = name
+        self._known = known
+        self._shown = shown
 
     def __enter__(self) -> Progress:
         from rich import progress
         from rich.console import Console
 
         console = Console(stderr=True)
-        is_seen = self._shown and (console.is_terminal or console.is_jupyter)
+        visible = self._shown and (console.is_terminal or console.is_jupyter)
         note = progress.TextColumn("{task.fields[note]}")
         columns = progress.Progress.get_default_columns()
-        self._bar: Any = progress.Progress(*columns, note, console=console, disable=not is_seen)
+        self._bar: Any = progress.Progress(*columns, note, console=console, disable=not visible)
         self._task = self._bar.add_task(self._name, total=1.0 if self._known else None, note="")
         self._bar.start()
         return self
@@ -34,5 +36,5 @@ class Progress:
         self._bar.stop()
 
     def update(self, share: float, note: str = "") -> None:
-        """Show what share is done, and a note about it."""
+        """Show the share that is done, in [0, 1], and a note."""
         self._bar.update(self._task, completed=share, note=note)

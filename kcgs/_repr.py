@@ -1,4 +1,4 @@
-"""How public objects show themselves: a line at a prompt, an image in a notebook."""
+"""The repr of public objects, one line, and their image in a notebook."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from torch import Tensor
 
 T = TypeVar("T")
 
-_FIELD, _LINE = 60, 200
+# characters of one field, and of a whole repr
+_FIELD_LENGTH = 60
+_LINE_LENGTH = 200
 
 
 def brief(kind: type[T]) -> type[T]:
-    """Have a NamedTuple or a dataclass show itself in a line; of tensors, bytes and long lists only their size."""
+    """Give a NamedTuple or a dataclass a repr of one line, with the sizes of tensors, bytes and long lists."""
     kind.__repr__ = _describe  # type: ignore[method-assign]
     return kind
 
@@ -33,17 +35,17 @@ def _short(value: Any) -> str:
         return f"{len(value):,} bytes"
     if type(value) in (list, tuple, dict) and len(value) > 4:
         return f"{len(value)} entries"
-    return shorten(repr(value), _FIELD)
+    return shorten(repr(value), _FIELD_LENGTH)
 
 
-def shorten(text: str, length: int = _LINE) -> str:
+def shorten(text: str, length: int = _LINE_LENGTH) -> str:
     """Put a text into a line of at most so many characters."""
     text = " ".join(text[: 2 * length].split())
     return text if len(text) <= length else f"{text[: length - 4]}...{text[-1] if text[-1] in ')]}' else ''}"
 
 
 def png(image: Tensor) -> bytes | None:
-    """Return the PNG of an image (C, H, W) in [0, 1]; None: it has channels that nobody can see."""
+    """Return the PNG of an image (C, H, W) in [0, 1]; None if it is not grey, RGB or RGBA."""
     from PIL import Image
 
     if image.ndim != 3 or image.shape[0] not in (1, 3, 4):

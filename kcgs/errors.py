@@ -8,9 +8,9 @@ class _ArgumentError(Exception):
 
     Args:
         name: of the argument.
-        expected: what it must be; with another verb, what it must have or hold.
+        expected: what it must be, or what follows another verb.
         received: what it was, as the message shows it.
-        verb: of the sentence.
+        verb: between name and expectation, "be", "have" or "hold".
     """
 
     def __init__(self, name: str, expected: str, received: object, verb: str = "be") -> None:

@@ -1,4 +1,4 @@
-"""How well a scene shows an image."""
+"""Metrics of a scene against an image."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import as_image
+from kcgs._image import as_image
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, ef_psnr, ef_ssim, ms_ssim, psnr, ssim
 from kcgs.scene import Scene, check_scene
@@ -25,14 +25,14 @@ def evaluate(
         scene: unbatched.
         image: of the scene's size and channels in [0, 1]: :math:`(C, H, W)`, a numpy array (H, W, C) of uint8 or
             floats, or a PIL image.
-        labels: the map whose contours the edge-focused figures look at; None: the scene's own, which a fit may have
-            moved. The history of a fit and `kcgs fit` look at the map that was given: pass it for the same figures.
-        visual: whether :func:`ssimulacra2` is among the figures; it takes about 0.3 s for 480 x 854.
+        labels: the map with the contours of the edge-focused metrics; None: the scene's own, which a fit may have
+            moved. The history of a fit and `kcgs fit` take the map of their input: pass it for the same numbers.
+        visual: whether :func:`ssimulacra2` is among the metrics; it takes about 0.3 s for 480 x 854.
 
     Returns:
         By name: psnr (dB), ssim, ms_ssim, within 5 pixels of the contours ef_psnr (dB) and ef_ssim, and ssimulacra2.
-        What is not defined is NaN: MS-SSIM below 161 pixels a side, the edge-focused figures without contours,
-        SSIMULACRA2 without its package, which `pip install "kcgs[visual]"` brings.
+        A metric that is not defined is NaN: MS-SSIM below 161 pixels per side, the edge-focused metrics without
+        contours, SSIMULACRA2 without its package, which `pip install "kcgs[visual]"` brings.
 
     Raises:
         TypeError: arguments of the wrong type.
@@ -42,24 +42,23 @@ def evaluate(
         >>> import torch
         >>> from kcgs import GaussianField
         >>> scene = Scene(GaussianField.random(10, (32, 48), seed=0))
-        >>> figures = evaluate(scene, scene.render())
-        >>> figures["psnr"], round(figures["ssim"], 4)
+        >>> metrics = evaluate(scene, scene.render())
+        >>> metrics["psnr"], round(metrics["ssim"], 4)
         (inf, 1.0)
     """
     render, target = check_scene(scene).render(), as_image("image", image)
     if tuple(target.shape) != tuple(render.shape):
         raise InvalidArgument("image", f"the scene's shape {tuple(render.shape)}", tuple(target.shape), verb="have")
     regions = scene.regions if labels is None else RegionMap.coerce(labels, "labels")
-    figures = measure(render, target.to(render.device), None if regions is None else regions.labels)
-    return {**figures, "ssimulacra2": ssimulacra2(render, target)} if visual else figures
+    metrics = _compare(render, target.to(render.device), None if regions is None else regions.labels)
+    return {**metrics, "ssimulacra2": ssimulacra2(render, target)} if visual else metrics
 
 
-def measure(render: Tensor, image: Tensor, labels: Tensor | None = None) -> dict[str, float]:
-    """Compare a render with an image, (C, H, W) both, as :func:`evaluate` does, quickly; no labels: no contours."""
+def _compare(render: Tensor, image: Tensor, labels: Tensor | None) -> dict[str, float]:
     with warnings.catch_warnings():
-        # a missing figure is shown as missing
+        # NaN says that a metric is not defined
         warnings.simplefilter("ignore", RuntimeWarning)
-        figures = {
+        metrics = {
             "psnr": float(psnr(render, image)),
             "ssim": float(ssim(render, image)),
             "ms_ssim": float(ms_ssim(render, image)),
@@ -67,17 +66,17 @@ def measure(render: Tensor, image: Tensor, labels: Tensor | None = None) -> dict
             "ef_ssim": math.nan,
         }
         if labels is not None:
-            figures["ef_psnr"] = float(ef_psnr(render, image, labels))
-            figures["ef_ssim"] = float(ef_ssim(render, image, labels))
-    return figures
+            metrics["ef_psnr"] = float(ef_psnr(render, image, labels))
+            metrics["ef_ssim"] = float(ef_ssim(render, image, labels))
+    return metrics
 
 
 def ssimulacra2(render: Tensor, image: Tensor) -> float:
     """Compare a render with an image, (C, H, W) both in [0, 1], by SSIMULACRA2 of their 8-bit values.
 
-    Equal images have 100, those that look equal 90, high, medium and low quality 70, 50 and 30; it may be negative.
-    NaN: the package is missing, a side is below 8 pixels, or the channels are neither grey nor RGB. Below 225 pixels a
-    side it has fewer scales: compare only with images of that size.
+    Equal images have 100, images that look equal 90, high, medium and low quality 70, 50 and 30; it may be negative.
+    NaN: the package is missing, a side is below 8 pixels, or the channels are neither grey nor RGB. Below 225 pixels
+    per side it has fewer scales: compare only with images of that size.
     """
     try:
         from ssimulacra2 import compute_ssimulacra2
@@ -89,6 +88,6 @@ def ssimulacra2(render: Tensor, image: Tensor) -> float:
 
 
 def _ppm(image: Tensor) -> BytesIO:
-    """Write a file that costs no time."""
+    """Return an image as a PPM file in memory, the format that is fastest to write."""
     levels = (image.detach().float().clamp(0, 1) * 255).round().byte().expand(3, -1, -1).permute(1, 2, 0)
     return BytesIO(b"P6 %d %d 255\n" % (image.shape[2], image.shape[1]) + levels.cpu().contiguous().numpy().tobytes())

@@ -1,4 +1,4 @@
-"""Leave out the Gaussians that an image does not need."""
+"""Remove the Gaussians that an image does not need."""
 
 from __future__ import annotations
 
@@ -13,27 +13,29 @@ from kcgs.scene import Scene, check_scene
 
 
 class PruneResult(NamedTuple):
-    """What is left, how many went, and by how much the image changed."""
+    """A scene with fewer Gaussians."""
 
     scene: Scene
     removed: int
+    """Number of Gaussians that it lacks."""
     change: float
+    """Largest change of a value of the image."""
 
 
 def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backend: str = "auto") -> PruneResult:
-    """Remove as many Gaussians as go without changing any value of the image by more than `tolerance`.
+    """Remove as many Gaussians as possible while no value of the image changes by more than `tolerance`.
 
-    Those that paint least go first. The bound holds for all that are removed together, not one by one: the image that
-    they render with the absolute values of their colours stays under it everywhere.
+    Gaussians that paint least go first. The tolerance bounds their sum: the image that all of them render, with the
+    absolute values of their colours, is nowhere above it.
 
     Args:
         scene: unbatched.
-        tolerance: largest change of a value of the image, at least 0; 0 removes what paints nothing.
+        tolerance: largest change of a value of the image, at least 0; 0 removes Gaussians that paint nothing.
         cutoff: of the renderer.
         backend: of the renderer.
 
     Returns:
-        The remaining scene (no graph), the number removed, and the measured largest change.
+        The scene that remains (no graph), the number of Gaussians removed, and the largest change, measured.
 
     Raises:
         TypeError, ValueError: as the renderer; a batched scene; tolerance negative or not finite.
@@ -50,42 +52,40 @@ def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backen
     check_scene(scene)
     tolerance = check_number("tolerance", tolerance, 0.0)
     render = RegionSplatRenderer(cutoff=cutoff, backend=backend)
-    strangers = 0
+    total = scene.num_gaussians
     if scene.regions is not None and scene.field.region_ids is not None:
-        held = scene.regions.index_of(scene.field.region_ids) >= 0
-        strangers = int((~held).sum())
-        scene = _part(scene, held) if strangers else scene
+        scene = _subset(scene, scene.regions.index_of(scene.field.region_ids) >= 0)
     if scene.num_gaussians == 0:
-        return PruneResult(_part(scene, torch.zeros(0, dtype=torch.bool)), strangers, 0.0)
+        return PruneResult(_subset(scene, torch.zeros(0, dtype=torch.bool)), total, 0.0)
 
     with torch.inference_mode(False), torch.enable_grad():
-        order = _painted(scene, render).argsort(stable=True)
-    magnitudes = _recolored(scene, scene.field.merged_colors().detach().abs())
+        order = _effects(scene, render).argsort(stable=True)
+    magnitudes = _recolor(scene, scene.field.merged_colors().detach().abs())
     with torch.no_grad():
         low, high = 0, scene.num_gaussians  # the first `low` may go, the first `high + 1` may not
         while low < high:
             middle = (low + high + 1) // 2
-            fits = float(render(_part(magnitudes, order[:middle])).max()) <= tolerance
-            low, high = (middle, high) if fits else (low, middle - 1)
-        kept = _part(scene, order[low:].sort().values)
-        change = float((render(scene) - render(kept)).abs().max())
-    return PruneResult(kept, strangers + low, change)
+            within = float(render(_subset(magnitudes, order[:middle])).max()) <= tolerance
+            low, high = (middle, high) if within else (low, middle - 1)
+        pruned = _subset(scene, order[low:].sort().values)
+        change = float((render(scene) - render(pruned)).abs().max())
+    return PruneResult(pruned, total - pruned.num_gaussians, change)
 
 
-def _part(scene: Scene, mask: Tensor) -> Scene:
+def _subset(scene: Scene, mask: Tensor) -> Scene:
     return Scene(scene.field.subset(mask), scene.regions, scene.metadata)
 
 
-def _recolored(scene: Scene, colors: Tensor) -> Scene:
+def _recolor(scene: Scene, colors: Tensor) -> Scene:
     field = scene.field
     means, cholesky = field.means.detach(), field.cholesky.detach()
     return Scene(GaussianField(means, cholesky, colors, field.region_ids, size=field.size), scene.regions)
 
 
-def _painted(scene: Scene, render: RegionSplatRenderer) -> Tensor:
-    """Bound each Gaussian's largest effect on a value: no more than its colour, nor than all it paints together."""
+def _effects(scene: Scene, render: RegionSplatRenderer) -> Tensor:
+    """Bound each Gaussian's effect on a value, by its colour and by the sum of all that it paints, (N,)."""
     colors = scene.field.merged_colors().detach().clone()
-    probe = _recolored(scene, torch.ones_like(colors))
+    probe = _recolor(scene, torch.ones_like(colors))
     probe.field.means.requires_grad_(False)
     probe.field.cholesky.requires_grad_(False)
     render(probe).sum().backward()

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from kcgs._atomic import atomic_path
-from kcgs._check import check_memory, check_size
+from kcgs._check import check_size
+from kcgs._memory import check_memory
 from kcgs._repr import png, shorten
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
@@ -24,20 +25,21 @@ from kcgs.nn.renderer import rendered_size
 FORMATS = {".safetensors": "kcgs.storage", ".kcgs": "kcgs.codec"}
 """File formats by suffix: a module, imported on use, with ``serialize(scene)`` and ``deserialize(data)``."""
 
-# as measured: of each number of a render that is saved, of each pixel of a label map, or of what it is made of
-_IMAGE_BYTES, _MAP_BYTES = 12, 42
-# pixels of the longer side in a notebook
-_SHOWN_SIDE = 1024
+# peak memory of a render that is saved: bytes per number of the image, measured
+_IMAGE_BYTES = 12
+# peak memory of resizing a label map: bytes per pixel, measured
+_MAP_BYTES = 42
+# pixels of the longer side of a scene's image in a notebook
+_NOTEBOOK_SIDE = 1024
 
-# without a state: for all scenes
-_renderers = {contours: RegionSplatRenderer(contours=contours) for contours in CONTOURS}
+_RENDERERS = {contours: RegionSplatRenderer(contours=contours) for contours in CONTOURS}
 
 
 class Scene(nn.Module):
     r"""Gaussians, the label map that confines them, and notes.
 
-    Convention: `to`, `state_dict`, `copy.deepcopy` and `pickle` keep the map and the notes too. `load_state_dict` takes
-    the map and the notes of the state in place of its own.
+    Convention: `to`, `state_dict`, `copy.deepcopy` and `pickle` keep the map and the notes too. `load_state_dict`
+    replaces the scene's own map and notes by those of the state.
 
     Args:
         field: N Gaussians, or a batch of them.
@@ -80,7 +82,7 @@ class Scene(nn.Module):
         return self.field.num_gaussians
 
     def forward(self, size: tuple[int, int] | None = None, contours: str = "scaled") -> Tensor:
-        """Render, differentiably and not clipped; other settings: :class:`kcgs.RegionSplatRenderer`.
+        """Render, differentiably and not clipped. :class:`kcgs.RegionSplatRenderer` has more settings.
 
         Args:
             size: (height, width); None: the scene's own.
@@ -93,26 +95,18 @@ class Scene(nn.Module):
         Raises:
             TypeError, ValueError: as :func:`kcgs.functional.region_splat`; a map without region ids; other contours.
         """
-        image: Tensor = _renderers[check_contours(contours)](self.field, self.regions, size)
+        image: Tensor = _RENDERERS[check_contours(contours)](self.field, self.regions, size)
         return image
 
     def render(self, size: tuple[int, int] | None = None, contours: str = "scaled") -> Tensor:
-        """Render what one shows or saves: as :meth:`forward`, but clipped to [0, 1] and without a graph.
+        """Render an image to show or save: as :meth:`forward`, but clipped to [0, 1] and without a graph.
 
-        On the CPU, ValueError says how much memory a size needs that is more than is free.
+        On the CPU, a size that needs more memory than is free is a ValueError, which says how much.
         """
-        self.check_size("size", size)
+        check_render_memory(self, size)
         with torch.no_grad():
             image: Tensor = self(size, contours)
             return image.clamp(0.0, 1.0)
-
-    def check_size(self, name: str, size: tuple[int, int] | None) -> None:
-        """Refuse a size (height, width) whose render does not fit into memory; the message begins with `name`."""
-        if self.field.means.device.type == "cpu":
-            numbers = self.field.colors.shape[-1] * self.field.means.shape[:-2].numel()
-            per_pixel = max(_IMAGE_BYTES * numbers, 4 * numbers + (0 if self.regions is None else _MAP_BYTES))
-            asked = self.size if size is None else check_size(name, size)
-            check_memory(name, rendered_size(self.size, asked), per_pixel)
 
     def __len__(self) -> int:
         """Number of images of a batch; TypeError for a scene of one image."""
@@ -124,7 +118,7 @@ class Scene(nn.Module):
         return True
 
     def __getitem__(self, index: int | slice) -> Scene:
-        """Copy one image of a batch, or a slice of it, without the graph.
+        """Copy one image of a batch, or a slice of the batch, without the graph.
 
         Raises:
             TypeError: a scene of one image, or an index that is neither an integer nor a slice.
@@ -160,7 +154,7 @@ class Scene(nn.Module):
     def _repr_png_(self) -> bytes | None:
         if self.field.means.ndim != 2:
             return None
-        factor = min(1.0, _SHOWN_SIDE / max(self.size))
+        factor = min(1.0, _NOTEBOOK_SIDE / max(self.size))
         return png(self.render((max(1, round(self.size[0] * factor)), max(1, round(self.size[1] * factor)))))
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -171,7 +165,7 @@ class Scene(nn.Module):
         """Map and notes, from `load_state_dict`."""
         regions = state["regions"]
         self.regions = None if regions is None else RegionMap.from_state(regions)
-        # a field on the device meta has yet to get its tensors, and with assign=True the device of theirs
+        # a field on the device "meta" gets its tensors, and their device, later
         if self.regions is not None and not self.field.means.is_meta:
             self.regions = self.regions.to(self.field.means.device)
         self.metadata = _check_metadata(state["metadata"])
@@ -184,11 +178,11 @@ class Scene(nn.Module):
 
 
 def save(path: str | os.PathLike[str], scene: Scene) -> int:
-    """Write a scene; the file appears whole or not at all, and the same scene gives the same bytes.
+    """Write a scene. The file appears whole or not at all, and the same scene gives the same bytes.
 
     Args:
         path: ends in .safetensors, which keeps every bit, or in .kcgs, which rounds as
-            :func:`kcgs.codec.encode` does by default and keeps no notes; its folder must exist.
+            :func:`kcgs.codec.encode` does by default and keeps no metadata; its folder must exist.
         scene: N Gaussians, or (.safetensors only) a batch of them.
 
     Returns:
@@ -262,7 +256,7 @@ def _format(path: Path) -> Any:
 
 
 def empty_regions(scene: Scene) -> Tensor:
-    """Return the ids of the map that no Gaussian has: these regions are black."""
+    """Return the ids of regions without a Gaussian, which are black."""
     regions, ids = scene.regions, scene.field.region_ids
     if regions is None or ids is None or ids.is_meta:
         return torch.empty(0, dtype=torch.int64)
@@ -282,8 +276,8 @@ def check_unbatched(scene: object) -> Scene:
 def check_batch(scenes: object) -> Scene:
     """Return `scenes` if it is a batch of scenes."""
     if not isinstance(scenes, Scene) or scenes.field.means.ndim != 3:
-        given = "a scene of one image" if isinstance(scenes, Scene) else type(scenes).__name__
-        raise TypeError(f"scenes must be a batch of scenes; got {given}")
+        received = "a scene of one image" if isinstance(scenes, Scene) else type(scenes).__name__
+        raise TypeError(f"scenes must be a batch of scenes; got {received}")
     return scenes
 
 
@@ -291,12 +285,22 @@ def check_scene(scene: object) -> Scene:
     """Return `scene` if it is a Scene of one image, with one map and region ids, or without a map."""
     scene = check_unbatched(scene)
     field, regions = scene.field, scene.regions
-    _check_regions(field, regions)  # again: both may have been assigned since the scene was made
+    _check_regions(field, regions)  # again, for either attribute may have been assigned
     if regions is not None and regions.num_maps is not None:
         raise ValueError(f"scene must have one map; got a batch of {regions.num_maps}")
     if regions is not None and field.region_ids is None:
         raise ValueError("scene must have region ids for its map; call scene.field.assign_regions(scene.regions)")
     return scene
+
+
+def check_render_memory(scene: Scene, size: tuple[int, int] | None) -> None:
+    """Raise ValueError if a render at a size (height, width) does not fit into the memory of the CPU."""
+    field = scene.field
+    if field.means.device.type == "cpu":
+        numbers = field.colors.shape[-1] * field.means.shape[:-2].numel()
+        per_pixel = max(_IMAGE_BYTES * numbers, 4 * numbers + (0 if scene.regions is None else _MAP_BYTES))
+        target = scene.size if size is None else check_size("size", size)
+        check_memory("size", rendered_size(scene.size, target), per_pixel)
 
 
 def _check_regions(field: GaussianField, regions: RegionMap | None) -> RegionMap | None:

@@ -21,7 +21,7 @@ from kcgs.scene import Scene
 FORMAT = "kcgs.scene"
 """Name of the one metadata entry, a JSON object."""
 VERSION = 1
-MAX_SIDE = 1 << 20  # pixels; past it float32 centres cannot tell tenths of a pixel apart
+MAX_SIDE = 1 << 20  # pixels; beyond, float32 centres cannot tell tenths of a pixel apart
 _REQUIRED = ("means", "cholesky", "colors")
 _OPTIONAL = ("opacities", "region_ids", "labels")
 _FLOATS = (torch.float32, torch.float64)
@@ -37,31 +37,30 @@ def serialize(scene: Scene) -> bytes:
     field, regions = scene.field, scene.regions
     header: dict[str, Any] = {"version": VERSION, "kcgs_version": __version__, "size": scene.size}
     header["notes"] = scene.metadata
-    tensors = {name: getattr(field, name) for name in (*_REQUIRED, "opacities")}
-    # copies, since safetensors refuses tensors that are views of one storage
     tensors = {
+        # a copy, since safetensors refuses tensors that are views of one storage
         name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
-        for name, tensor in tensors.items()
-        if tensor is not None
+        for name in (*_REQUIRED, "opacities")
+        if (tensor := getattr(field, name)) is not None
     }
     if field.region_ids is not None:
-        tensors["region_ids"] = _narrowed(field.region_ids.cpu())
+        tensors["region_ids"] = _narrow(field.region_ids.cpu())
     if regions is not None:
         if regions.contours == "crisp":
             raise ValueError('regions must have scaled contours; got crisp ones: render(contours="crisp") makes them')
         header["softness"] = softness = regions.softness
         if isinstance(softness, PairWidths):
             header["softness"] = [[*pair, width] for pair, width in softness.items()]
-        labels = _narrowed(regions.labels.cpu()).numpy()
+        labels = _narrow(regions.labels.cpu()).numpy()
         header["labels"] = {"dtype": labels.dtype.name, "shape": labels.shape}
         tensors["labels"] = torch.frombuffer(bytearray(_deflate(labels)), dtype=torch.uint8)
     text = json.dumps(header, sort_keys=True)
-    _assemble(tensors, json.loads(text))  # what could not be loaded is not written
+    _assemble(tensors, json.loads(text))  # raises where `deserialize` would
     return safetensors.torch.save(tensors, {FORMAT: text})
 
 
 def deserialize(data: bytes) -> Scene:
-    """Read the bytes of a .safetensors file; ValueError says what is wrong with them."""
+    """Read the bytes of a .safetensors file; ValueError if they are damaged or no scene."""
     try:
         tensors = safetensors.torch.load(data)
         notes = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__", {})
@@ -75,7 +74,7 @@ def deserialize(data: bytes) -> Scene:
 
 
 def _assemble(tensors: dict[str, Tensor], header: Any) -> Scene:
-    """Validate what a file holds and make it a scene of its own memory."""
+    """Validate the contents of a file and copy them into a scene."""
     if header["version"] != VERSION:
         raise ValueError(f"its version must be {VERSION}; got {header['version']!r}")
     missing, unknown = {*_REQUIRED} - tensors.keys(), tensors.keys() - {*_REQUIRED, *_OPTIONAL}
@@ -99,13 +98,14 @@ def _assemble(tensors: dict[str, Tensor], header: Any) -> Scene:
     return Scene(field, regions, header["notes"])
 
 
-def _narrowed(integers: Tensor) -> Tensor:
+def _narrow(integers: Tensor) -> Tensor:
+    """Return integers in the smallest type that holds them."""
     highest = int(integers.max()) if integers.numel() else 0
     return integers.to(next(dtype for dtype in _INTEGERS.values() if highest <= torch.iinfo(dtype).max))
 
 
 def _deflate(labels: np.ndarray[Any, Any]) -> bytes:
-    """Compress what each row differs by from the row above it, in the labels' own type, which wraps."""
+    """Compress the differences of each row from the row above, in the type of the labels, which wraps around."""
     steps = np.diff(labels, axis=-2, prepend=np.zeros_like(labels[..., :1, :]))
     return zlib.compress(steps.tobytes(), 9)
 
@@ -113,7 +113,7 @@ def _deflate(labels: np.ndarray[Any, Any]) -> bytes:
 def _inflate(data: Tensor, dtype: str, shape: list[int]) -> Tensor:
     if dtype not in _INTEGERS or len(shape) not in (2, 3):
         raise ValueError(f"labels must be of 2 or 3 dimensions, {', '.join(_INTEGERS)}; got {dtype!r} of {shape!r}")
-    size = math.prod(check_count("a side of labels", side, 1, MAX_SIDE) for side in shape) * np.dtype(dtype).itemsize
+    size = math.prod(check_count("sides of labels", side, 1, MAX_SIDE) for side in shape) * np.dtype(dtype).itemsize
     try:
         raw = zlib.decompressobj().decompress(data.numpy().tobytes(), size + 1)
     except zlib.error as error:

@@ -1,4 +1,4 @@
-"""The fitted scenes that come with the package, by name."""
+"""Fitted scenes that come with the package, by name."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from kcgs._repr import brief
 _PACKAGE = Path(__file__).resolve().parent
 # within the package in a wheel, beside it in a checkout
 _FOLDER = _PACKAGE / "models" if (_PACKAGE / "models").is_dir() else _PACKAGE.parent / "models"
-PREFIX = "zoo:"
+_PREFIX = "zoo:"
 
 
 @brief
 class Entry(NamedTuple):
-    """A scene of the zoo, as its manifest has it."""
+    """A scene of the zoo, as the manifest describes it."""
 
     name: str
     title: str
@@ -34,10 +34,10 @@ class Entry(NamedTuple):
 
 
 def entries(folder: Path | None = None) -> list[Entry]:
-    """Read the manifest of a zoo's folder; None: the package's own."""
+    """Read the manifest in the folder of a zoo; None: the zoo of the package."""
     path = (folder or _FOLDER) / "manifest.json"
     if not path.is_file():
-        raise FileNotFoundError(f"there is no zoo of fitted scenes: {path} is not there; install kcgs again")
+        raise FileNotFoundError(f"no zoo of fitted scenes: {path} does not exist; install kcgs again")
     try:
         return [Entry(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))["entries"]]
     except (ValueError, KeyError, TypeError) as error:
@@ -45,12 +45,12 @@ def entries(folder: Path | None = None) -> list[Entry]:
 
 
 def find(name: str, folder: Path | None = None) -> Path:
-    """Return the scene file of an entry, its hash checked; the name may begin with "zoo:"."""
-    wanted = name.removeprefix(PREFIX)
-    known = {entry.name: entry for entry in entries(folder)}
-    if wanted not in known:
-        raise ValueError(f"zoo entry must be one of {', '.join(known)}; got {wanted!r}")
-    path = (folder or _FOLDER) / known[wanted].scene
-    if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != known[wanted].sha256:
+    """Return the file of a scene, its hash checked; the name may begin with "zoo:"."""
+    by_name = {entry.name: entry for entry in entries(folder)}
+    entry = by_name.get(name.removeprefix(_PREFIX))
+    if entry is None:
+        raise ValueError(f"zoo entry must be one of {', '.join(by_name)}; got {name!r}")
+    path = (folder or _FOLDER) / entry.scene
+    if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != entry.sha256:
         raise ValueError(f"{path} must be the file that the manifest names; it is missing or was changed")
     return path

@@ -11,7 +11,8 @@ import torch
 from PIL import Image
 
 from kcgs import InvalidArgument, InvalidArgumentType
-from kcgs._check import as_image, check_count, check_floating, check_labels, check_number, check_numbers
+from kcgs._check import check_count, check_floating, check_labels, check_number, check_numbers
+from kcgs._image import as_image
 
 
 class TestErrors:

@@ -27,7 +27,8 @@ LAYERS = [
     {"nn"},
     {"functional"},
     {"kernels", "engine", "plots"},
-    {"_check", "_atomic", "_progress", "_repr"},
+    {"_image"},
+    {"_check", "_memory", "_atomic", "_progress", "_repr"},
     {"errors"},
 ]
 GONE = {

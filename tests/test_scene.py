@@ -189,7 +189,7 @@ class TestScene(BaseTester):
 
     @pytest.mark.parametrize(("name", "needed"), [("none", "1.2"), ("soft", "1.8")])
     def test_renders_that_do_not_fit(self, monkeypatch: pytest.MonkeyPatch, name: str, needed: str) -> None:
-        monkeypatch.setattr("kcgs._check._free_memory", lambda: 1e9)
+        monkeypatch.setattr("kcgs._memory.free_memory", lambda: 1e9)
         with pytest.raises(ValueError, match=f"size asks for 8192 x 4096 pixels, which need about {needed} GB of mem"):
             make_scene(name).render(size=(4096, 8192))
 

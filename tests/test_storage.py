@@ -381,7 +381,7 @@ class TestLoadRefuses:
             (_note(labels={"shape": [9, 11]}), "missing 1 required positional argument: 'dtype'"),
             (_note(labels={"dtype": "float32", "shape": [9, 11]}), "labels must be of 2 or 3 dimensions, .* 'float32'"),
             (_note(labels={"dtype": "uint8", "shape": [99]}), r"labels must be of 2 or 3 dimensions, .* of \[99\]"),
-            (_note(labels={"dtype": "uint8", "shape": [9, -11]}), "a side of labels must be in"),
+            (_note(labels={"dtype": "uint8", "shape": [9, -11]}), "sides of labels must be in"),
             (_note(labels={"dtype": "uint8", "shape": [9, 12]}), "labels must be a zlib stream of 108 bytes; got 99"),
             (_note(labels={"dtype": "uint8", "shape": [9, 10]}), "labels must be a zlib stream of 90 bytes; got 91"),
             (_note(labels={"dtype": "uint8", "shape": [3, 3, 11]}), "regions must have the size"),

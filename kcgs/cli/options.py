@@ -101,6 +101,8 @@ def exclude(option: str, **others: object) -> None:
 
 def target_size(scene: Scene, scale: float | None, size: str | None) -> tuple[int, int]:
     """Return the (height, width) that the options --scale and --size ask for, if memory has room for it."""
+    from kcgs.scene import check_render_memory
+
     if size is not None:
         exclude("--size", scale=scale)
         width, _, height = size.partition("x")
@@ -112,5 +114,5 @@ def target_size(scene: Scene, scale: float | None, size: str | None) -> tuple[in
 
         factor = check_number("scale", 1.0 if scale is None else scale, 0.0, 1e6, above=True)
         sides = max(1, round(scene.size[0] * factor)), max(1, round(scene.size[1] * factor))
-    scene.check_size("size", sides)
+    check_render_memory(scene, sides)
     return sides

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from kcgs._check import pil_samples
+from kcgs._image import pil_samples
 
 Array = NDArray[Any]
 

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from kcgs._atomic import atomic_path
-from kcgs._check import as_image, on_white
+from kcgs._image import as_image, on_white
 from kcgs.data._decode import decode
 
 _LUMA = (0.299, 0.587, 0.114)

@@ -11,7 +11,8 @@ from PIL import Image
 from torch import Tensor
 
 from kcgs._atomic import atomic_path
-from kcgs._check import as_image, check_count, check_labels
+from kcgs._check import check_count, check_labels
+from kcgs._image import as_image
 from kcgs.data._decode import Array, decode
 from kcgs.functional import touching_pairs
 

@@ -13,7 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import as_image, check_count
+from kcgs._check import check_count
+from kcgs._image import as_image
 from kcgs._progress import Progress
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap

@@ -68,7 +68,7 @@ class FitResult(NamedTuple):
 
     def plot(self) -> Figure:
         """Plot PSNR and EF-PSNR against run time and iterations; save it with its `savefig`."""
-        figure: Figure = history_figure({"fit": self.history})
+        figure: Figure = history_figure(self.history)
         return figure
 
 

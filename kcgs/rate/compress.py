@@ -9,7 +9,8 @@ from typing import Any, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from kcgs._check import as_image, check_count, check_number
+from kcgs._check import check_count, check_number
+from kcgs._image import as_image
 from kcgs._repr import brief
 from kcgs.codec import QUALITIES, decode
 from kcgs.codec.gaussians.quantize import Codes, Quantizer

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import as_image
+from kcgs._image import as_image
 from kcgs.functional.merging import Labels
 
 # By how much values may pass [0, 1], as resizing and colour conversion leave them.

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from kcgs._atomic import atomic_path
-from kcgs._check import as_image, check_number
+from kcgs._check import check_number
+from kcgs._image import as_image
 from kcgs.data.images import load_image, save_image
 from kcgs.data.labels import load_labels
 

@@ -120,7 +120,7 @@ class TestMemory:
     def test_renders_that_do_not_fit(
         self, files: Path, run: Any, monkeypatch: pytest.MonkeyPatch, command: str, asked: tuple[str, str]
     ) -> None:
-        monkeypatch.setattr("kcgs._check._free_memory", lambda: 1e9)
+        monkeypatch.setattr("kcgs._memory.free_memory", lambda: 1e9)
         kcgs.load("scene.safetensors").save("scene.kcgs")
         code, out, err = run(command, "scene.kcgs", "-o", "large.png", *asked)
         assert (code, out) == (1, "") and err.startswith("kcgs: size asks for ") and err.count("\n") == 1
@@ -129,4 +129,4 @@ class TestMemory:
         assert not (files / "large.png").exists()
 
     def test_free_memory(self) -> None:
-        assert 1e7 < kcgs._check._free_memory() < 1e15
+        assert 1e7 < kcgs._memory.free_memory() < 1e15

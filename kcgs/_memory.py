@@ -1,0 +1,35 @@
+"""An error before the work begins, where an image does not fit into memory."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from contextlib import suppress
+from pathlib import Path
+
+# bytes that every machine is taken to have: the free memory is looked up for more only
+_SMALL = 1 << 26
+
+
+def check_memory(name: str, size: tuple[int, int], per_pixel: float) -> None:
+    """Raise ValueError if an image (height, width) of `per_pixel` bytes needs more memory than is free."""
+    needed = float(size[0]) * size[1] * per_pixel
+    if needed > _SMALL and needed > (free := free_memory()):
+        memory = f"about {needed / 1e9:,.1f} GB of memory; {free / 1e9:,.1f} GB are free"
+        raise ValueError(f"{name} asks for {size[1]} x {size[0]} pixels, which need {memory}")
+
+
+def free_memory() -> float:
+    """Return the bytes that this process may still take, swap included; infinite where the system does not say."""
+    limits = [math.inf]
+    with suppress(OSError):
+        facts = dict(re.findall(r"(\w+): +(\d+) kB", Path("/proc/meminfo").read_text()))
+        limits.append(1024.0 * sum(int(facts.get(name, 0)) for name in ("MemAvailable", "SwapFree")))
+    for file in ("memory.max", "memory/memory.limit_in_bytes"):
+        with suppress(OSError, ValueError):
+            limits.append(float(Path("/sys/fs/cgroup", file).read_text()))
+    if limits == [math.inf]:
+        with suppress(AttributeError, OSError, ValueError):
+            limits.append(float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")))
+    return min(limits)
