@@ -6,11 +6,12 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import adapter
 import numpy as np
 import torch
-from inputs import PAIRS, SIZE, blurred, flat_chart, gaussians, map_of, only_map, photo, photo_map, textured
 from torch import Tensor
+
+from . import adapter
+from .inputs import PAIRS, SIZE, blurred, flat_chart, gaussians, map_of, only_map, photo, photo_map, textured
 
 Case = Callable[[], Any]
 CASES: dict[str, Case] = {}

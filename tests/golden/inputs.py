@@ -6,8 +6,9 @@ import functools
 import math
 
 import torch
-from adapter import Parts, Softness
 from torch import Tensor
+
+from .adapter import Parts, Softness
 
 SIZE = (40, 56)
 IDS = (2, 7, 11, 400)
