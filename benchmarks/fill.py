@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from scipy.ndimage import distance_transform_edt
@@ -23,7 +23,7 @@ from .core.images import load, names
 from .core.run import Job, Options, Page, Row, experiment
 
 NUM_GAUSSIANS, QUICK_GAUSSIANS = 3_000, 60
-FILLS: dict[str, Literal["inpaint"] | None] = {"not filled": None, "filled": "inpaint"}
+FILLS = {"not filled": False, "filled": True}
 # in pixels: what is compared with the hole, the contour of a moved object, and what is shown around
 AROUND, CONTOUR, SHOWN = 40, 2, 45
 QUANTITIES = ("steep", "beyond [0, 1]")

@@ -263,13 +263,13 @@ def empty_regions(scene: Scene) -> Tensor:
     return regions.ids[~torch.isin(regions.ids, ids)]
 
 
-def check_unbatched(scene: object) -> Scene:
+def check_unbatched(scene: object, name: str = "scene") -> Scene:
     """Return `scene` if it is a Scene of one image."""
     if not isinstance(scene, Scene):
-        raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
+        raise TypeError(f"{name} must be a Scene; got {type(scene).__name__}")
     if scene.field.means.ndim != 2:
         count = len(scene.field.means)
-        raise InvalidArgument("scene", "of one image", f"a batch of {count}: scene[t] is one of them")
+        raise InvalidArgument(name, "of one image", f"a batch of {count}: scene[t] is one of them")
     return scene
 
 
@@ -281,15 +281,15 @@ def check_batch(scenes: object) -> Scene:
     return scenes
 
 
-def check_scene(scene: object) -> Scene:
+def check_scene(scene: object, name: str = "scene") -> Scene:
     """Return `scene` if it is a Scene of one image, with one map and region ids, or without a map."""
-    scene = check_unbatched(scene)
+    scene = check_unbatched(scene, name)
     field, regions = scene.field, scene.regions
     _check_regions(field, regions)  # again, for either attribute may have been assigned
     if regions is not None and regions.num_maps is not None:
-        raise ValueError(f"scene must have one map; got a batch of {regions.num_maps}")
+        raise ValueError(f"{name} must have one map; got a batch of {regions.num_maps}")
     if regions is not None and field.region_ids is None:
-        raise ValueError("scene must have region ids for its map; call scene.field.assign_regions(scene.regions)")
+        raise ValueError(f"{name} must have region ids for its map; call {name}.field.assign_regions({name}.regions)")
     return scene
 
 

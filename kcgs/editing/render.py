@@ -1,4 +1,4 @@
-"""Images of some regions alone, and of a scene over another image."""
+"""Renders of some regions alone, and of a scene over another image."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from kcgs.nn.field import scaled
 from kcgs.nn.renderer import area_mean, rendered_size
 from kcgs.scene import Scene
 
-from .checks import check_field, check_scene, ids_of
+from .selection import select_regions
 
 
 def render_region(
     scene: Scene, region_ids: int | Iterable[int], size: tuple[int, int] | None = None, *, clamp: bool = True
 ) -> Tensor:
-    r"""Render regions alone, with their share of each pixel as alpha.
+    r"""Render regions alone, with their membership of each pixel as alpha.
 
-    Convention: colours are straight, not multiplied by alpha: what the regions paint where they have the pixel to
-    themselves, also under a soft contour. They are 0 where alpha is. Shares of all regions add up to one; without
-    `clamp` the sum of alpha times colour over all of them is the image. Differentiable, as the renderer is.
+    Convention: colours are straight, not multiplied by alpha: under a soft contour, too, they are what the regions
+    paint where they have the pixel to themselves. They are 0 where alpha is. Without `clamp`, the sum of alpha times
+    colour over all regions is the image. Differentiable, as the renderer is.
 
     Args:
         scene: unbatched, with a map.
@@ -44,20 +44,19 @@ def render_region(
         >>> render_region(scene, 3)[3].tolist()
         [[0.0, 0.0, 1.0, 1.0, 1.0, 0.0]]
     """
-    target = check_field(scene).size if size is None else check_size("size", size)
-    regions, chosen = check_scene(scene, region_ids)
+    selection, field = select_regions(scene, region_ids), scene.field
+    target = scene.size if size is None else check_size("size", size)
     finer = rendered_size(scene.size, target)
-    regions = regions.resize(finer)
-    weights = {region: regions.weights(region) for region in chosen.tolist()}
-    total = torch.stack([*weights.values()]).sum(0)
-    alpha = total.clamp_max(1.0).to(scene.field.colors.dtype)
-    colors = scene.field.colors.new_zeros(scene.field.colors.shape[-1], *finer)
-    for region, weight in weights.items():
-        # rendered alone and not confined, which is the colour itself: nothing is divided by a small alpha
-        members = _part(scene.field, ids_of(scene.field) == region)
-        members.region_ids = None
-        alone = region_splat(*scaled(members, finer), members.merged_colors(), size=finer)
-        share = (weight / torch.where(total > 0, total, 1.0)).to(alone.dtype)
+    regions = selection.regions.resize(finer)
+    memberships = {region: regions.weights(region) for region in selection.ids.tolist()}
+    total = torch.stack([*memberships.values()]).sum(0)
+    alpha = total.clamp_max(1.0).to(field.colors.dtype)
+    colors = field.colors.new_zeros(field.colors.shape[-1], *finer)
+    for region, membership in memberships.items():
+        # rendered without the map, which gives the colour itself: nothing is divided by a small alpha
+        part = _subset(field, field.region_ids == region, None)
+        alone = region_splat(*scaled(part, finer), part.merged_colors(), size=finer)
+        share = (membership / torch.where(total > 0, total, 1.0)).to(alone.dtype)
         colors = colors + torch.where(alpha > 0, alone * share, 0.0)
     if finer != target:
         colors, alpha = area_mean(colors * alpha, target), area_mean(alpha, target)
@@ -68,12 +67,12 @@ def render_region(
 def render_over(scene: Scene, region_ids: int | Iterable[int], image: Tensor) -> Tensor:
     r"""Render the scene with an image in place of some regions, at the size of that image.
 
-    Convention: the image gets the share of each pixel that those regions had, so that soft contours blend with it as
-    they did with them. Not clipped. Differentiable in the scene and in the image.
+    Convention: the image gets the membership that those regions had, so that soft contours blend with it as they did
+    with them. Not clipped. Differentiable in the scene and in the image.
 
     Args:
         scene: unbatched, with a map.
-        region_ids: the regions that make the background now: an id in the map, or several.
+        region_ids: the regions that the image replaces: an id in the map, or several.
         image: :math:`(C, H, W)`, as many channels as the scene has; any size.
 
     Returns:
@@ -89,21 +88,20 @@ def render_over(scene: Scene, region_ids: int | Iterable[int], image: Tensor) ->
         [0.25, 0.25, 0.25]
     """
     image = check_image("image", image)
-    channels = check_field(scene).colors.shape[-1]
+    selection, field = select_regions(scene, region_ids), scene.field
+    channels = field.colors.shape[-1]
     if image.ndim != 3 or image.shape[0] != channels:
         raise ValueError(f"image must have shape ({channels}, H, W); got {tuple(image.shape)}")
     target = (image.shape[-2], image.shape[-1])
-    regions, gone = check_scene(scene, region_ids)
-    stays = _part(scene.field, ~torch.isin(ids_of(scene.field), gone))
-    rendered: Tensor = RegionSplatRenderer()(stays, regions, target)
-    finer = rendered_size(scene.size, target)
-    share = regions.resize(finer).weights(gone.tolist()).clamp_max(1.0).to(rendered.dtype)
-    share = area_mean(share, target)
-    return rendered + share * image.to(rendered)
+    others = _subset(field, ~selection.members, field.region_ids)
+    rendered: Tensor = RegionSplatRenderer()(others, selection.regions, target)
+    regions = selection.regions.resize(rendered_size(scene.size, target))
+    membership = regions.weights(selection.ids.tolist()).clamp_max(1.0).to(rendered.dtype)
+    return rendered + area_mean(membership, target) * image.to(rendered)
 
 
-def _part(field: GaussianField, mask: Tensor) -> GaussianField:
-    """Take the Gaussians that `mask` selects, in the graph."""
-    opacities = None if field.opacities is None else field.opacities[mask]
+def _subset(field: GaussianField, mask: Tensor, region_ids: Tensor | None) -> GaussianField:
+    """Return the Gaussians that a mask selects, in the graph, as `GaussianField.subset` does without it."""
+    ids, opacities = (None if t is None else t[mask] for t in (region_ids, field.opacities))
     means, cholesky, colors = (t[mask] for t in (field.means, field.cholesky, field.colors))
-    return GaussianField(means, cholesky, colors, ids_of(field)[mask], opacities, size=field.size)
+    return GaussianField(means, cholesky, colors, ids, opacities, size=field.size)

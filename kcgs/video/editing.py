@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
-from kcgs.editing.checks import check_ids, check_offset
-from kcgs.editing.fill import grow, inpaint
-from kcgs.editing.scenes import nearest_labels, shift_labels
+from kcgs.editing.inpainting import inpaint
+from kcgs.editing.masks import check_offset, dilate, nearest_labels, shift_labels
+from kcgs.editing.selection import check_region_ids
 from kcgs.fitting import FitConfig
 from kcgs.fitting.state import Gaussians
 from kcgs.functional import RegionMap
@@ -123,7 +123,7 @@ def _check(scenes: Scene, region_ids: int | Iterable[int]) -> tuple[RegionMap, T
     count, regions, ids = len(check_batch(scenes)), scenes.regions, scenes.field.region_ids
     if regions is None or ids is None or regions.num_maps != count:
         raise ValueError("scenes must have a label map for each frame, and region ids")
-    chosen = torch.tensor(check_ids(region_ids, regions.ids, "maps"), device=regions.ids.device)
+    chosen = torch.tensor(check_region_ids(region_ids, regions.ids, "maps"), device=regions.ids.device)
     left = (~torch.isin(regions.labels, chosen)).flatten(1).any(1)
     if not left.all():
         raise ValueError(
@@ -160,7 +160,7 @@ def _move(motion: Tensor, points: Tensor) -> Tensor:
 def _fill_targets(renders: Tensor, labels: Tensor, deleted: Tensor, motions: Tensor) -> tuple[Tensor, Tensor]:
     """Return all frames with what is deleted (T, H, W) filled, and their labels."""
     targets, filled = renders.clone(), labels.clone()
-    holes = torch.stack([grow(mask, _FRINGE) for mask in deleted])
+    holes = torch.stack([dilate(mask, _FRINGE) for mask in deleted])
     for t in range(len(renders)):
         unknown = holes[t].clone()
         sources = [

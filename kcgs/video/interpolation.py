@@ -7,7 +7,7 @@ import math
 import torch
 
 from kcgs._check import check_number
-from kcgs.editing.checks import ids_of
+from kcgs.editing.selection import members_of
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join
 from kcgs.scene import Scene, check_batch
@@ -56,4 +56,4 @@ def interpolate(scenes: Scene, time: float) -> Scene:
     if first.regions is None:
         return Scene(field, None, scenes.metadata)
     regions = first.regions.relabel(move_labels(share * motion, first.regions.labels))
-    return Scene(field.subset(torch.isin(ids_of(field), regions.ids)), regions, scenes.metadata)
+    return Scene(field.subset(members_of(field, regions.ids)), regions, scenes.metadata)

@@ -206,7 +206,7 @@ class TestEdits:
         scene = show(page, site, Scene(GaussianField.random(150, (60, 90), regions=regions, seed=1), regions))
         first, second = 1, 2
         page.evaluate(f"(image.move([{first}, {second}], 11, -7), 1)")
-        moved = move_region(scene, [first, second], (11, -7), fill=None)
+        moved = move_region(scene, [first, second], (11, -7), fill=False)
         check(page, moved.render())
         page.evaluate(f"(image.recolour({first}, [0.5, 1, -1], [0.1, 0, 0.9]), 1)")
         check(page, recolor_region(moved, first, [0.5, 1, -1], [0.1, 0.0, 0.9]).render())

@@ -225,8 +225,8 @@ def edits(p: Parts, region: int, background: Tensor) -> dict[str, Any]:
     scene = Scene(_field(p), _regions(p))
     larger = (2 * p.size[0], 2 * p.size[1])
     return {
-        "move": _of(editing.move_region(scene, region, (3, -2), fill=None)),
-        "delete": _of(editing.delete_region(scene, region, fill=None)),
+        "move": _of(editing.move_region(scene, region, (3, -2), fill=False)),
+        "delete": _of(editing.delete_region(scene, region, fill=False)),
         "recolor": _of(editing.recolor_region(scene, region, torch.tensor([0.5, 1.0, 1.5]), 0.1)),
         "extract": editing.render_region(scene, region, clamp=False),
         "extract-larger": editing.render_region(scene, region, larger, clamp=False),

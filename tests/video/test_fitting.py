@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcgs import Scene, load
 from kcgs.editing import recolor_region
-from kcgs.editing.fill import grow
+from kcgs.editing.masks import dilate
 from kcgs.functional import psnr
 from kcgs.video import delete_region, fit_video, interpolate, move_region
 
@@ -151,7 +151,7 @@ class TestEdits:
         y, x = torch.meshgrid(torch.arange(SIZE[0]) + 0.5, torch.arange(SIZE[1]) + 0.5, indexing="ij")
         ground = (0.4 + 0.2 * torch.sin(x / 5) * torch.cos(y / 7)).expand(3, -1, -1)
         for number, other in ((0, 4), (4, 0)):
-            shown = (MAPS[number] == 7) & ~grow(MAPS[other] == 7, 4)
+            shown = (MAPS[number] == 7) & ~dilate(MAPS[other] == 7, 4)
             scene = edited[number]
             assert (scene.render() - ground)[:, shown].square().mean() < 1e-4
 

@@ -1,0 +1,51 @@
+"""Masks and label maps, pixel by pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d, pad
+
+from kcgs._check import check_number
+from kcgs.errors import InvalidArgument, InvalidArgumentType
+
+# pixels; a larger offset is an error of the caller's
+_LARGEST_OFFSET = 1e8
+# pixels by which an offset may miss a whole number
+_OFFSET_TOLERANCE = 1e-6
+
+
+def dilate(mask: Tensor, reach: int) -> Tensor:
+    """Add the pixels within `reach` rows and columns of a mask (H, W)."""
+    return max_pool2d(mask[None].float(), 2 * reach + 1, 1, reach)[0] > 0
+
+
+def nearest_labels(labels: Tensor, hole: Tensor) -> Tensor:
+    """Give pixels of the hole, (H, W) bool, the label of the nearest other pixel."""
+    from scipy.ndimage import distance_transform_edt
+
+    rows, cols = distance_transform_edt(hole.cpu().numpy(), return_distances=False, return_indices=True)
+    return labels[torch.from_numpy(rows).long(), torch.from_numpy(cols).long()]
+
+
+def shift_labels(labels: Tensor, mask: Tensor, offset: tuple[int, int], behind: Tensor) -> tuple[Tensor, Tensor]:
+    """Move the labels of a mask over those behind, (..., H, W); return the mask where it lands, and all labels."""
+    dx, dy = (max(-length, min(step, length)) for length, step in zip(labels.shape[:-3:-1], offset, strict=True))
+    landing = pad(mask, (dx, -dx, dy, -dy))
+    return landing, torch.where(landing, labels.roll((dy, dx), (-2, -1)), behind)
+
+
+def check_offset(offset: Sequence[float]) -> tuple[int, int]:
+    """Return an offset (dx, dy) in whole pixels."""
+    pair = offset.tolist() if isinstance(offset, Tensor | np.ndarray) else offset
+    if not isinstance(pair, Sequence) or isinstance(pair, str):
+        raise InvalidArgumentType("offset", "(dx, dy) in pixels", repr(offset))
+    if len(pair) != 2:
+        raise InvalidArgument("offset", "(dx, dy)", repr(offset))
+    steps = [check_number("offset", step) for step in pair]
+    if any(abs(step) > _LARGEST_OFFSET or abs(step - round(step)) > _OFFSET_TOLERANCE for step in steps):
+        raise InvalidArgument("offset", "whole multiples of 1 pixel", repr(offset))
+    return round(steps[0]), round(steps[1])

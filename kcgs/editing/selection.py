@@ -1,0 +1,67 @@
+"""The regions of a scene that an edit acts on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcgs._check import check_count
+from kcgs.errors import InvalidArgument
+from kcgs.functional import RegionMap
+from kcgs.nn import GaussianField
+from kcgs.scene import Scene, check_scene
+
+
+class Selection(NamedTuple):
+    """Regions of a scene."""
+
+    regions: RegionMap
+    """The map of the scene."""
+    ids: Tensor
+    """The ids of the selection, each once, sorted."""
+    pixels: Tensor
+    """Which pixels are of the selection, :math:`(H, W)` bool."""
+    members: Tensor
+    """Which Gaussians are, :math:`(N,)` bool."""
+
+
+def select_regions(scene: Scene, region_ids: object) -> Selection:
+    """Select regions of a scene of one image, which must have a map."""
+    regions = check_scene(scene).regions
+    if regions is None:
+        raise InvalidArgument("scene", "a label map", "regions None", verb="have")
+    ids = torch.tensor(check_region_ids(region_ids, regions.ids, "map"), device=regions.ids.device)
+    return Selection(regions, ids, torch.isin(regions.labels, ids), members_of(scene.field, ids))
+
+
+def select_removable_regions(scene: Scene, region_ids: object) -> Selection:
+    """Select regions whose pixels other regions of the map can take over."""
+    selection = select_regions(scene, region_ids)
+    if selection.regions.resized:
+        raise ValueError("scene must not have a resized map: edit the map at its own size, then resize it")
+    if selection.regions.num_regions == len(selection.ids):
+        raise ValueError(f"region_ids must leave a region that takes over pixels; got all {len(selection.ids)} regions")
+    return selection
+
+
+def check_region_ids(region_ids: object, known: Tensor, owner: str) -> list[int]:
+    """Return one id or several as a list, each once, sorted, if all are among the `known` ids of the owner."""
+    sequence = region_ids if isinstance(region_ids, Iterable) else [region_ids]
+    ids = sorted({check_count("region_ids", region, 0) for region in sequence})
+    if not ids:
+        raise ValueError("region_ids must hold an id; got none")
+    known_ids = known.unique().tolist()
+    for region in ids:
+        if region not in known_ids:
+            listed = ", ".join(map(str, known_ids[:20])) + (" ..." if len(known_ids) > 20 else "")
+            raise InvalidArgument("region_ids", f"among the {len(known_ids)} ids of the {owner}, {listed}", region)
+    return ids
+
+
+def members_of(field: GaussianField, ids: Tensor) -> Tensor:
+    """Return which Gaussians of a field with region ids belong to some regions, (..., N) bool."""
+    assert field.region_ids is not None
+    return torch.isin(field.region_ids, ids)
