@@ -22,7 +22,7 @@ from kcgs.functional.softness import CONTOURS, check_contours
 from kcgs.nn import GaussianField, RegionSplatRenderer
 from kcgs.nn.renderer import rendered_size
 
-FORMATS = {".safetensors": "kcgs.storage", ".kcgs": "kcgs.codec"}
+FORMATS = {".safetensors": "kcgs.storage", ".kcgs": "kcgs.codec.scenes"}
 """File formats by suffix: a module, imported on use, with ``serialize(scene)`` and ``deserialize(data)``."""
 
 # peak memory of a render that is saved: bytes per number of the image, measured

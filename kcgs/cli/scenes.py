@@ -198,10 +198,11 @@ def decode(
 
 def _read_map(file: Path) -> Tensor | None:
     """Return the label map of a compressed file that holds one."""
-    from kcgs import codec
+    from kcgs.codec import decode_labels
+    from kcgs.codec.file import MAP_MAGIC
 
     data = file.read_bytes()
-    return codec.decode_labels(data) if data.startswith(codec.MAP_MAGIC) else None
+    return decode_labels(data) if data.startswith(MAP_MAGIC) else None
 
 
 def _describe_map(file: Path, labels: Tensor) -> dict[str, Any]:

@@ -12,9 +12,9 @@ from torch import Tensor
 from kcgs._check import check_count, check_number
 from kcgs._image import as_image
 from kcgs._repr import brief
-from kcgs.codec import QUALITIES, decode
+from kcgs.codec import decode
 from kcgs.codec.gaussians.quantize import Codes, Quantizer
-from kcgs.codec.scenes import SceneWriter
+from kcgs.codec.scenes import QUALITIES, SceneWriter
 from kcgs.errors import InvalidArgument
 from kcgs.fitting.config import Objective
 from kcgs.fitting.objective import make_objective
