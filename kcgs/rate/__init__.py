@@ -1,4 +1,4 @@
-"""Bytes traded for error: a scene and its image in, or an image alone, and a file of so many bytes out."""
+"""Files in which bits are traded for error: from a scene and its image, or from an image alone."""
 
 from .budget import FitBytesResult, fit_bytes
 from .compress import Compressed, compress, quality_for

@@ -1,4 +1,4 @@
-"""An image in, a file of so many bytes out: how many Gaussians, how finely rounded, and whether contours pay."""
+"""A file of at most `target_bytes` from an image: the number of Gaussians, the regions, the fit, the rounding."""
 
 from __future__ import annotations
 
@@ -25,22 +25,33 @@ from kcgs.scene import Scene
 
 from .compress import compress
 
-# bits per Gaussian that is fitted, some of which are left out, at `_COUNT` of them, and for each doubling; what was
-# lost to rounding shows more to the eye than Gaussians that are left out
-_BITS = {"psnr": 25.2, "ms-ssim": 28.5}
-_COUNT, _BITS_PER_OCTAVE = 2100, 1.9
+# Numbers without a derivation are tuned: vary one and compare the files of `python -m benchmarks rate`.
+
+# bits of the file per Gaussian of the fit, at `_REFERENCE_COUNT` of them, by objective: more bits make fewer Gaussians,
+# each rounded less. MS-SSIM suffers more from rounding than from fewer Gaussians.
+_BITS_PER_GAUSSIAN = {"psnr": 25.2, "ms-ssim": 28.5}
+# Gaussians for which the bits above hold
+_REFERENCE_COUNT = 2100
+# more bits per Gaussian for each doubling of their number
+_BITS_PER_DOUBLING = 1.9
+# bits per Gaussian, however few there are
+_MIN_BITS_PER_GAUSSIAN = 8.0
+# bytes of a file beside Gaussians and map
 _HEADER_BYTES = 60
-# squared error falls with the power of the bytes
-_POWER = 0.93
-# contours show: an image with them may have this much more squared error, 0.1 dB
-_FAVOUR = 1.023
-_TRIAL_ITERATIONS, _TRIAL_TO_END = 80, 0.65
-# share of its length that is left of a fit: the rest is for the last digits, which the descent on bits sees to, but for
-# the last move of contours; not where Gaussians are so few that they may be refined
-_FIT_END, _CONTOURS_END, _FEW = 0.845, 0.89, 64
-# shares of the clock: each of two trials, and the fit of what is left then
-_TRIAL_SHARE, _FIT_SHARE = 0.08, 0.75
-_Choice = tuple[RegionMap | None, float, dict[str, Any]]
+# fixed-point iterations of the number of Gaussians, which the bits of one depend on
+_COUNT_ITERATIONS = 4
+# e in "squared error ~ bytes^-e", the slope of the rate-distortion curve
+_RATE_EXPONENT = 0.93
+# squared error after the whole fit, as a share of that after a trial fit
+_FINAL_ERROR_SHARE = 0.65
+# factor of the squared error, 0.1 dB, by which an image with sharp contours may be worse and still look better
+_CONTOUR_ALLOWANCE = 1.023
+# iterations of a trial fit: fewer are faster, more predict the whole fit better
+_TRIAL_ITERATIONS = 80
+# share of a fit's schedule that is run: the rate-distortion descent of `compress` does what the rest would do
+_FIT_SHARE = 0.845
+# the same with a label map, whose contours move for the last time at 0.88
+_FIT_SHARE_WITH_REGIONS = 0.89
 
 
 @brief
@@ -52,10 +63,19 @@ class FitBytesResult(NamedTuple):
     result: FitResult
 
 
+class _RegionChoice(NamedTuple):
+    """The regions that pay for their bytes."""
+
+    regions: RegionMap | None
+    num_gaussians: int  # for the bytes that the regions leave
+    contour_cost: float  # squared error that a pixel of contour must save
+    changes: dict[str, Any]  # for the report on the regions
+
+
 def fit_bytes(
     image: Any,
     regions: RegionMap | Tensor | NDArray[Any] | None = None,
-    num_bytes: int = 8000,
+    target_bytes: int = 8000,
     *,
     recipe: str | FitConfig = "best",
     seed: int = 0,
@@ -63,115 +83,132 @@ def fit_bytes(
     progress: bool = False,
     **settings: Any,
 ) -> FitBytesResult:
-    """Fit an image to a budget of bytes, everything included.
+    """Fit an image to a file of at most `target_bytes`, everything included.
 
-    One trade decides: what the last bit saves. The number of Gaussians is that at which another one, or more digits
-    for all, would save as much. A pixel of contour must save what the bits that the coder needs for it would save as
-    Gaussians, else it moves or its regions are merged. The map as a whole stays only where two short fits, with it and
-    with Gaussians for its bytes, say so, within 0.1 dB. With ``merge_regions=False`` no region goes. ``result.regions``
-    says what became of the map.
+    Convention: all bits save the same error at the margin. The number of Gaussians is that at which another Gaussian
+    and finer rounding of all would save as much. A pixel of contour must save what its bits would save as Gaussians,
+    else it moves or its regions are merged. The map as a whole is used if a short fit with it is at most 0.1 dB worse
+    than one with Gaussians for its bytes. With ``merge_regions=False`` the whole map is used. ``result.regions``
+    reports the changes of the map.
 
     Args:
         image: as in :func:`kcgs.fit`.
         regions: as there.
-        num_bytes: the file is not larger.
+        target_bytes: largest size of the file.
         recipe: as there.
         seed: as there.
         on_step: as there, for the fit itself, not the trials.
         progress: as there.
         settings: as there; `contour_cost` is replaced by the coder's, and `max_seconds` is for the fit alone. Without
-            it the descent on bits replaces the last iterations, 11 or 15 %.
+            it the rate-distortion descent replaces the last iterations, 11 or 15 %.
 
     Returns:
-        The file, what it decodes to, and the fit.
+        The file, the scene that it decodes to, and the fit.
 
     Raises:
-        TypeError, ValueError: as :func:`kcgs.fit`; a budget too small for a Gaussian and the map.
+        TypeError, ValueError: as :func:`kcgs.fit`; `target_bytes` too small for a Gaussian and the map.
 
     Example:
         >>> import torch
         >>> image = torch.linspace(0, 1, 48).expand(3, 32, 48)
-        >>> done = fit_bytes(image, None, 200, iterations=50)
-        >>> len(done.data) <= 200, done.scene.regions
+        >>> data, scene, _ = fit_bytes(image, None, 200, iterations=50)
+        >>> len(data) <= 200, scene.regions
         (True, None)
     """
     config = FitConfig.from_recipe(recipe, **settings)
     image, regions = check_problem(image, regions)
-    check_count("num_bytes", num_bytes)
+    check_count("target_bytes", target_bytes)
     if config.target_psnr is not None:
-        raise InvalidArgument("target_psnr", "None where bytes are the target", config.target_psnr)
+        raise InvalidArgument("target_psnr", "None with target_bytes", config.target_psnr)
     with Progress("trial fits", known=False, shown=progress):
-        chosen, cost, changes = _choose(image, regions, num_bytes, config, seed)
-    count = count_for(num_bytes - _map_bytes(chosen), image.shape[1] * image.shape[2], config.objective)
-
-    config = config.model_copy(update={"contour_cost": cost})
-    share = _FIT_END if chosen is None else _CONTOURS_END
-    last = math.inf if config.max_seconds else math.ceil(share * config.usual_iterations)
-
-    def step(iteration: int, entry: HistoryEntry) -> bool:
-        return (on_step is not None and bool(on_step(iteration, entry))) or iteration >= last
-
-    result = fit(image, chosen, count, recipe=config, seed=seed, on_step=step, progress=progress)
-    changes = changes if config.guidance else {"dropped": "recipe"}
-    result = result._replace(regions=report_regions(regions, result.scene, **changes))
-    if result.history[-1].iteration >= last:
-        result = result._replace(stop_reason="iterations")
+        choice = _choose_regions(image, regions, target_bytes, config, seed)
+    config = config.model_copy(update={"contour_cost": choice.contour_cost})
+    share = _FIT_SHARE if choice.regions is None else _FIT_SHARE_WITH_REGIONS
+    result = _fit_share(
+        share, image, choice.regions, choice.num_gaussians, config, seed=seed, on_step=on_step, progress=progress
+    )
+    report = report_regions(regions, result.scene, **choice.changes)
     with Progress("writing the file", known=False, shown=progress):
-        data, scene = compress(result.scene, image, target_bytes=num_bytes, seed=seed, objective=config.objective)
-    return FitBytesResult(data, scene, result)
-
-
-def count_for(num_bytes: float, pixels: int, objective: str = "psnr") -> int:
-    """Return how many Gaussians make the best of so many bytes, at most one for each pixel."""
-    bits = 8 * max(num_bytes - _HEADER_BYTES, 1)
-    count = bits / _BITS[objective]
-    for _ in range(4):
-        count = bits / max(_BITS[objective] + _BITS_PER_OCTAVE * math.log2(max(count, 1.0) / _COUNT), 8.0)
-    return min(max(1, round(count)), pixels)
+        data, scene = compress(result.scene, image, target_bytes=target_bytes, seed=seed, objective=config.objective)
+    return FitBytesResult(data, scene, result._replace(regions=report))
 
 
 @image_threads_for_kernels
-def _choose(image: Tensor, regions: RegionMap | None, num_bytes: int, config: FitConfig, seed: int) -> _Choice:
-    """Choose the regions that pay for their bytes; return what a pixel of contour must save, and what went, too."""
-    if regions is None or regions.num_regions == 1 or not config.guidance:
-        return None, config.contour_cost, {}
+def _choose_regions(
+    image: Tensor, regions: RegionMap | None, target_bytes: int, config: FitConfig, seed: int
+) -> _RegionChoice:
+    """Merge regions whose contours do not pay for their bytes, then drop the map if it does not pay as a whole."""
+    num_gaussians = partial(gaussian_count, pixels=image.shape[1] * image.shape[2], objective=config.objective)
+    if not config.guidance:
+        return _RegionChoice(None, num_gaussians(target_bytes), config.contour_cost, {"dropped": "recipe"})
+    if regions is None or regions.num_regions == 1:
+        return _RegionChoice(None, num_gaussians(target_bytes), config.contour_cost, {})
+    map_bytes = _map_bytes(regions)
     if not config.merge_regions:
-        return regions, config.contour_cost, {}
-    given = regions.num_regions
-    count_of = partial(count_for, pixels=image.shape[1] * image.shape[2], objective=config.objective)
+        return _RegionChoice(regions, num_gaussians(target_bytes - map_bytes), config.contour_cost, {})
     # by iterations, so that without a clock the same arguments give the same file
     iterations = min(_TRIAL_ITERATIONS, config.usual_iterations)
     trial = FitConfig.from_recipe(config, merge_regions=False, iterations=iterations, max_seconds=None)
 
-    def error(regions: RegionMap | None, left: int) -> float:
-        end = math.ceil(_FIT_END * iterations)
-        result = fit(image, regions, count_of(left), recipe=trial, seed=seed, on_step=lambda i, _: i >= end)
-        return float(10 ** (-max(entry.psnr for entry in result.history) / 10))
+    def trial_error(regions: RegionMap | None, count: int) -> float:
+        history = _fit_share(_FIT_SHARE, image, regions, count, trial, seed=seed).history
+        return float(10 ** (-max(entry.psnr for entry in history) / 10))
 
-    without = error(None, num_bytes)
-    # what a bit saves, where it is spent on Gaussians
-    saved = _POWER * _TRIAL_TO_END * without * image[0].numel() / (8 * num_bytes)
-    # a pixel of contour must save what its bits would
-    bits = 8 * _map_bytes(regions) / max(len(contour_edges(regions.labels)[0]), 1)
-    cost = saved * bits
+    plain_error = trial_error(None, num_gaussians(target_bytes))
+    # squared error, summed over pixels, that one more bit of Gaussians saves: the derivative of the power law
+    bit_value = _RATE_EXPONENT * _FINAL_ERROR_SHARE * plain_error * image[0].numel() / (8 * target_bytes)
+    contour_cost = bit_value * (8 * map_bytes / max(len(contour_edges(regions.labels)[0]), 1))
+    paying = regions
     if regions.softness == 0.0:
-        regions = RegionMap.from_labels(merge_regions(image, regions.labels, cost))
-    paying, count = regions.num_regions, count_of(num_bytes - _map_bytes(regions))
-    if paying > count:
-        regions = regions.merge(pairs_to_merge(image, regions.labels, count))[0]
-    kept = 1 if regions is None else regions.num_regions
-    merged = {"merged_for_bytes": given - paying}
-    if regions is None or kept == 1:
-        return None, cost, merged
-    left = num_bytes - _map_bytes(regions)
-    if count_of(left) < kept or error(regions, left) >= _FAVOUR * without:
-        return None, cost, {"dropped": "bytes"}
-    return regions, cost, merged
+        paying = RegionMap.from_labels(merge_regions(image, regions.labels, contour_cost))
+    changes = {"merged_for_bytes": regions.num_regions - paying.num_regions}
+    max_regions = num_gaussians(target_bytes - _map_bytes(paying))
+    merged = paying.merge(pairs_to_merge(image, paying.labels, max_regions))[0]
+    if merged is None or merged.num_regions == 1:
+        return _RegionChoice(None, num_gaussians(target_bytes), contour_cost, changes)
+    count = num_gaussians(target_bytes - _map_bytes(merged))
+    if count < merged.num_regions or trial_error(merged, count) >= _CONTOUR_ALLOWANCE * plain_error:
+        return _RegionChoice(None, num_gaussians(target_bytes), contour_cost, {"dropped": "bytes"})
+    return _RegionChoice(merged, count, contour_cost, changes)
+
+
+def gaussian_count(num_bytes: float, pixels: int, objective: str = "psnr") -> int:
+    """Return the number of Gaussians that makes the best file of `num_bytes`, from 1 to the number of pixels."""
+    bits = 8 * max(num_bytes - _HEADER_BYTES, 1)
+    count = bits / _BITS_PER_GAUSSIAN[objective]
+    for _ in range(_COUNT_ITERATIONS):
+        doublings = math.log2(max(count, 1.0) / _REFERENCE_COUNT)
+        bits_per_gaussian = _BITS_PER_GAUSSIAN[objective] + _BITS_PER_DOUBLING * doublings
+        count = bits / max(bits_per_gaussian, _MIN_BITS_PER_GAUSSIAN)
+    return min(max(1, round(count)), pixels)
 
 
 def _map_bytes(regions: RegionMap | None) -> int:
+    """Return the bytes that the label map takes in a file."""
     if regions is None or regions.num_regions == 1:
         return 0
     from kcgs.codec.labels import encode_map  # loads numba
 
     return len(encode_map(regions))
+
+
+def _fit_share(
+    share: float,
+    image: Tensor,
+    regions: RegionMap | None,
+    num_gaussians: int,
+    config: FitConfig,
+    *,
+    seed: int,
+    on_step: Callable[[int, HistoryEntry], bool | None] | None = None,
+    progress: bool = False,
+) -> FitResult:
+    """Run the first share of a fit's schedule; all of it where a clock ends the fit."""
+    last = math.inf if config.max_seconds else math.ceil(share * config.usual_iterations)
+
+    def stop(iteration: int, entry: HistoryEntry) -> bool:
+        return (on_step is not None and bool(on_step(iteration, entry))) or iteration >= last
+
+    result = fit(image, regions, num_gaussians, recipe=config, seed=seed, on_step=stop, progress=progress)
+    is_complete = result.history[-1].iteration >= last
+    return result._replace(stop_reason="iterations") if is_complete else result

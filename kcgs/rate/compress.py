@@ -1,9 +1,10 @@
-"""A scene and its image in, a file out: Gaussians that do not pay for their bits go, the others are fine tuned."""
+"""A file from a scene and its image: rate-distortion descent of the Gaussians, then gradual rounding."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple, get_args
 
 import torch
@@ -13,30 +14,43 @@ from kcgs._check import check_count, check_number
 from kcgs._image import as_image
 from kcgs._repr import brief
 from kcgs.codec import decode
-from kcgs.codec.gaussians.quantize import Codes, Quantizer
+from kcgs.codec.gaussians.quantize import Quantizer
 from kcgs.codec.scenes import QUALITIES, SceneWriter
 from kcgs.errors import InvalidArgument
 from kcgs.fitting.config import Objective
-from kcgs.fitting.objective import make_objective
+from kcgs.fitting.objective import MsSsimObjective, make_objective
 from kcgs.functional import psnr
 from kcgs.kernels import threads_for_kernels
 from kcgs.scene import Scene
 
-from .tuning import Tuning
+from .descent import RateDistortionDescent
+from .rounding import round_gradually
 
-# dB of a file's image against the scene's own above the scene's PSNR: the error grows by about a 28th, 0.15 dB,
-# and by more where so few Gaussians are rounded that errors do not average out
-_MARGIN = 14.5
-# dB by which files are finer that are tried until one is good enough
-_FINER = (0.0, 2.0, 5.0, 9.0, 14.0, 20.0, 30.0, 50.0)
-# share of the iterations before anything is rounded, and how many go by between two looks at the distortion
-_FREE, _LOOK = 0.7, 70
-_DROP = 0.8
-# of the bytes: what the descent goes by, for tuned files are smaller; what is aimed at in rounding, where Gaussians too
-# many are left out; and what is near enough not to try again, up to so many times
-_TUNED, _AIM, _NEAR, _TRIES = 1.006, 1.01, 0.995, 3
-# many numbers are small, and take no more bits where all are finer: a step for more bytes is longer by this factor
-_GAIN = 1.3
+# dB of `quality` above the scene's PSNR at which rounding adds about a 28th to the squared error, 0.15 dB; it adds more
+# where Gaussians are so few that rounding errors do not average out
+_QUALITY_MARGIN = 14.5
+# dB added to the quality, one after the other, until a file reaches `target_psnr`
+_QUALITY_STEPS = (0.0, 2.0, 5.0, 9.0, 14.0, 20.0, 30.0, 50.0)
+
+# Numbers without a derivation are tuned: vary one and compare the files of `python -m benchmarks rate`.
+
+# share of the iterations that descend before anything is rounded; the others descend while Gaussians are rounded
+_DESCENT_SHARE = 0.7
+# iterations between two updates of the quantization parameter
+_UPDATE_INTERVAL = 70
+# share of the descent from which on Gaussians are pruned that do not pay for their bits
+_PRUNE_FROM = 0.8
+# bytes that the descent aims at, as a share of `target_bytes`: rounding gradually saves 0.6 %
+_DESCENT_AIM = 1.006
+# bytes that rounding aims at before Gaussians in excess of `target_bytes` are removed
+_ROUNDING_AIM = 1.01
+# share of `target_bytes` that is enough
+_MIN_FILL = 0.995
+# roundings until a file fills so much
+_MAX_ROUNDINGS = 3
+# factor of the bytes that a change of the quantization parameter must aim at in the descent: numbers that round to 0
+# take no more bits when their steps become finer
+_BYTES_GAIN = 1.3
 
 
 @brief
@@ -60,20 +74,21 @@ def compress(
     seed: int = 0,
     objective: str = "psnr",
 ) -> Compressed:
-    """Write a scene as a `.kcgs` file, rounded with an eye on the image that it shows.
+    """Write a scene as a `.kcgs` file with the least error against its image.
 
-    Gaussians descend on the squared error and, at the rate at which bits buy error, on their bits. Then they are
-    rounded a few at a time, and those that are still free make up for it: about a third less error than
-    :func:`kcgs.codec.encode` at the same bytes. Those too faint to pay for their bits are left out.
+    Convention: first a descent lowers the error and, at the rate at which bits buy error, the bits of all Gaussians.
+    Then Gaussians are rounded a few at a time, and those that are not rounded yet correct the error. Gaussians too
+    faint to pay for their bits are removed. The error is about a third less than that of :func:`kcgs.codec.encode` at
+    the same bytes.
 
     Args:
-        scene: N Gaussians of one image; opacities are merged into the colours, and notes are not kept.
+        scene: N Gaussians of one image; opacities are merged into the colours, and metadata are not stored.
         image: what :func:`kcgs.fit` takes, of the scene's size and channels.
-        quality: as in :func:`kcgs.codec.encode`, before the others make up for it.
-        target_bytes: the finest file that is not larger, in place of `quality`.
-        target_psnr: dB against the image, in place of both: the first of ever finer files that shows it, or where the
-            scene itself does not, one that is nearly as good.
-        iterations: renders that the descent may take, at least 1.
+        quality: as in :func:`kcgs.codec.encode`; the error is lower, for Gaussians correct each other.
+        target_bytes: write the finest file of at most `target_bytes`, in place of `quality`.
+        target_psnr: dB against the image, in place of both: the coarsest of a few qualities that reaches it, or where
+            the scene itself does not, a file that is nearly as good as the scene.
+        iterations: renders that descent and rounding may take, at least 1.
         seed: of the order in which Gaussians are rounded.
         objective: of the descent, psnr or ms-ssim, as in :class:`kcgs.FitConfig`.
 
@@ -97,107 +112,109 @@ def compress(
         raise InvalidArgument("image", f"shape {(writer.channels, *writer.size)}", tuple(target.shape), verb="have")
     # a copy: an inference tensor cannot take part in a graph
     target = target.detach().to("cpu", torch.float32, copy=True)
-    if target_psnr is not None and (quality is not None or target_bytes is not None):
-        raise InvalidArgument("target_psnr", "None with quality or target_bytes", target_psnr)
+    if target_psnr is not None:
+        check_number("target_psnr", target_psnr, 0.0, unit="dB")
+        if quality is not None or target_bytes is not None:
+            raise InvalidArgument("target_psnr", "None with quality or target_bytes", target_psnr)
     qp = writer.qp_for(quality, target_bytes)
     check_count("iterations", iterations)
     if objective not in get_args(Objective):
         raise InvalidArgument("objective", f"one of {', '.join(get_args(Objective))}", repr(objective))
-    press = _Press(writer, target, objective, iterations, seed)
+    compressor = _Compressor(writer, target, make_objective(objective, target), iterations, seed)
     with threads_for_kernels(target[0].numel()):
         if target_bytes is not None:
-            data = press.largest(target_bytes)
-        elif target_psnr is None:
-            data = press.write(qp)
+            data = compressor.write_bytes(target_bytes)
+        elif target_psnr is not None:
+            data = compressor.write_psnr(target_psnr, float(psnr(scene.render().to(target), target)))
         else:
-            data = press.first_that_shows(check_number("target_psnr", target_psnr, 0.0, unit="dB"), scene)
+            data = compressor.write(qp)
     return Compressed(data, decode(data).scene)
 
 
-class _Press:
-    """Writes a scene with an eye on its image."""
-
-    def __init__(self, writer: SceneWriter, image: Tensor, objective: str, iterations: int, seed: int) -> None:
-        self.writer, self.image, self.objective = writer, image, make_objective(objective, image)
-        self.seed, self.free = seed, int(_FREE * iterations)
-        self.rounds = iterations - self.free
-
-    def write(self, qp: int) -> bytes:
-        """Return the file at a quantization parameter."""
-        return self._round(self._spare(lambda _: qp), qp, self.rounds)
-
-    def first_that_shows(self, decibels: float, scene: Scene) -> bytes:
-        """Return the first of ever finer files that shows so much; where the scene does not, one nearly as good."""
-        reached = float(psnr(scene.render().to(self.image), self.image))
-        for finer in _FINER if reached >= decibels else _FINER[:1]:
-            data = self.write(self.writer.qp_for(quality_for(reached + finer)))
-            if float(psnr(decode(data).scene.render(), self.image)) >= decibels:
-                break
-        return data
-
-    def largest(self, target_bytes: int) -> bytes:
-        """Return a file that is hardly smaller."""
-        qp = self.writer.qp_for(None)
-
-        def follow(writer: SceneWriter) -> int:
-            nonlocal qp
-            size = len(writer.write_rounded(qp))
-            qp = writer.next_qp(qp, size, size + round(_GAIN * (_TUNED * target_bytes - size)))
-            return qp
-
-        follow(self.writer)
-        writer = self._spare(follow)
-        qp, data = writer.finest(lambda qp: self._round(writer, qp, 0), target_bytes)
-        best, plain, most = b"", data, self.writer.qp_for(QUALITIES[1])
-        for _ in range(_TRIES):
-            qp = min(writer.next_qp(qp, len(data), round(_AIM * target_bytes)), most)
-            data = self._round(writer, qp, self.rounds, target_bytes)
-            best = max(best, data if len(data) <= target_bytes else b"", key=len)
-            if len(data) >= _NEAR * target_bytes or qp == most:
-                break
-        return best or plain
-
-    def _spare(self, follow: Callable[[SceneWriter], int]) -> SceneWriter:
-        """Descend with nothing rounded, at the quantization parameter that `follow` says now and then."""
-        writer = self.writer
-        tuning: Tuning | None = None
-        for done in range(0, self.free, _LOOK):
-            quantizer = Quantizer(follow(writer), writer.size)
-            tuning = tuning or self._tuning(writer, quantizer)
-            tuning.quantizer = quantizer
-            if done >= _DROP * self.free:
-                tuning.drop()
-            tuning.descend(min(_LOOK, self.free - done))
-            writer = writer.of(tuning.gaussians, tuning.ids)
-        return writer
-
-    def _round(self, writer: SceneWriter, qp: int, rounds: int, most: float = math.inf) -> bytes:
-        tuning = self._tuning(writer, Quantizer(qp, writer.size))
-        tuning.drop()
-        data = b""
-
-        def excess(codes: Codes) -> int:
-            nonlocal data
-            data = writer.write(tuning.quantizer, codes, tuning.ids)
-            return max(0, math.ceil((len(data) - most) * len(tuning.ids) / len(data)))
-
-        codes = tuning.round(rounds, self.seed, None if math.isinf(most) else excess)
-        return data or writer.write(
-            tuning.quantizer, codes, tuning.ids
-        )  # the codes are those that `excess` was asked last
-
-    def _tuning(self, writer: SceneWriter, quantizer: Quantizer) -> Tuning:
-        return Tuning(writer.gaussians, writer.ids, self.image, writer.regions, quantizer, self.objective)
-
-
-def quality_for(decibels: float) -> float:
+def quality_for(psnr: float) -> float:
     """Return the `quality` of a file that is nearly as good as its scene.
 
     Args:
-        decibels: PSNR of the scene's render against the image.
+        psnr: of the scene's render against the image, in dB.
 
     Example:
         >>> quality_for(30.0), quality_for(100.0)
         (44.5, 90.0)
     """
-    return min(max(decibels + _MARGIN, QUALITIES[0]), QUALITIES[1])
+    return min(max(psnr + _QUALITY_MARGIN, QUALITIES[0]), QUALITIES[1])
+
+
+@dataclass(frozen=True)
+class _Compressor:
+    """Rate-distortion descent and gradual rounding of one scene, at any quantization parameter (QP)."""
+
+    writer: SceneWriter
+    image: Tensor  # [C, H, W]
+    objective: MsSsimObjective | None
+    iterations: int
+    seed: int
+
+    def write_bytes(self, target_bytes: int) -> bytes:
+        """Return a file of at most `target_bytes` that fills them nearly."""
+
+        def update_qp(writer: SceneWriter, qp: int) -> int:
+            size = len(writer.write_rounded(qp))
+            return writer.next_qp(qp, size, size + round(_BYTES_GAIN * (_DESCENT_AIM * target_bytes - size)))
+
+        writer = self._descend(update_qp(self.writer, self.writer.qp_for(None)), update_qp)
+        qp, fallback = writer.finest(lambda qp: self._round(writer, qp, 0), target_bytes)
+        max_qp = self.writer.qp_for(QUALITIES[1])
+        data, candidates = fallback, []
+        for _ in range(_MAX_ROUNDINGS):
+            qp = min(writer.next_qp(qp, len(data), round(_ROUNDING_AIM * target_bytes)), max_qp)
+            data = self._round(writer, qp, self._rounding_iterations, target_bytes)
+            if len(data) <= target_bytes:
+                candidates.append(data)
+            if len(data) >= _MIN_FILL * target_bytes or qp == max_qp:
+                break
+        return max(candidates, key=len, default=fallback)
+
+    def write_psnr(self, target_psnr: float, scene_psnr: float) -> bytes:
+        """Return the first of ever finer files that reaches `target_psnr`; the first where the scene does not."""
+        for step in _QUALITY_STEPS if scene_psnr >= target_psnr else _QUALITY_STEPS[:1]:
+            data = self.write(self.writer.qp_for(quality_for(scene_psnr + step)))
+            if float(psnr(decode(data).scene.render(), self.image)) >= target_psnr:
+                break
+        return data
+
+    def write(self, qp: int) -> bytes:
+        """Return the file at a QP."""
+        return self._round(self._descend(qp, lambda _, qp: qp), qp, self._rounding_iterations)
+
+    @property
+    def _descent_iterations(self) -> int:
+        return int(_DESCENT_SHARE * self.iterations)
+
+    @property
+    def _rounding_iterations(self) -> int:
+        return self.iterations - self._descent_iterations
+
+    def _descend(self, qp: int, update_qp: Callable[[SceneWriter, int], int]) -> SceneWriter:
+        """Lower error and bits with nothing rounded; `update_qp` is called with the scene and the QP now and then."""
+        writer, iterations = self.writer, self._descent_iterations
+        descent = self._start(writer)
+        for start in range(0, iterations, _UPDATE_INTERVAL):
+            qp = update_qp(writer, qp)
+            quantizer = Quantizer(qp, writer.size)
+            if start >= _PRUNE_FROM * iterations:
+                descent.prune(quantizer)
+            for _ in range(min(_UPDATE_INTERVAL, iterations - start)):
+                descent.step(quantizer)
+            writer = writer.of(descent.parameters(), descent.ids)
+        return writer
+
+    def _round(self, writer: SceneWriter, qp: int, iterations: int, max_bytes: float = math.inf) -> bytes:
+        descent, quantizer = self._start(writer), Quantizer(qp, writer.size)
+        descent.prune(quantizer)
+        return round_gradually(
+            descent, quantizer, lambda codes: writer.write(quantizer, codes, descent.ids), iterations, self.seed,
+            max_bytes,
+        )  # fmt: skip
+
+    def _start(self, writer: SceneWriter) -> RateDistortionDescent:
+        return RateDistortionDescent(writer.gaussians, writer.ids, self.image, writer.regions, self.objective)

@@ -1,91 +1,107 @@
-"""Fits to a budget of bytes."""
+"""Fits to a file of at most so many bytes."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from kcgs.codec import decode
-from kcgs.functional import ms_ssim
 from kcgs.rate import fit_bytes
-from kcgs.rate.budget import count_for
+from kcgs.rate.budget import gaussian_count
 from tests.conftest import Clock
 
 from .conftest import Photo, psnr
 
+COLUMN = torch.arange(160).repeat(120, 1)
+SPECKLES = torch.randint(0, 2, (30, 40), generator=torch.Generator().manual_seed(0))
+
+
+def disc(photo: Tensor) -> Photo:
+    """Return a bright disc on a dark ground, which a contour explains."""
+    row, column = torch.meshgrid(torch.arange(96), torch.arange(128), indexing="ij")
+    labels = ((column - 60) ** 2 + (row - 48) ** 2 < 35**2).long()
+    return torch.where(labels > 0, 0.9, 0.1).expand(3, -1, -1), labels
+
+
+def stripes(photo: Tensor) -> Photo:
+    """Return a photo with eight regions that have nothing to do with it."""
+    return photo, COLUMN // 20
+
+
+def speckles(photo: Tensor) -> Photo:
+    """Return a photo with a label map that takes more bytes than Gaussians in its place."""
+    return photo, SPECKLES.repeat_interleave(4, 0).repeat_interleave(4, 1)
+
 
 class TestFitBytes:
-    @pytest.mark.parametrize("target", [600, 1500])
-    def test_file_fits(self, photo: Photo, target: int) -> None:
+    def test_bytes(self, photo: Photo) -> None:
+        """The file fills its bytes, the scene is the file's, and more bytes have less error."""
         image, labels = photo
-        done = fit_bytes(image, labels, target, iterations=150)
-        assert 0.93 * target < len(done.data) <= target
-        assert torch.equal(decode(done.data).scene.field.means, done.scene.field.means)
-        assert psnr(done.scene, image) > 18
+        psnrs = [10.0]
+        for target in (500, 1200, 2600):
+            done = fit_bytes(image, labels, target, iterations=150)
+            assert 0.93 * target < len(done.data) <= target
+            assert torch.equal(decode(done.data).scene.field.means, done.scene.field.means)
+            assert done.result.stop_reason == "iterations"
+            psnrs.append(psnr(done.scene, image))
+            assert psnrs[-1] > psnrs[-2] + 0.8
 
-    def test_the_clock_is_that_of_the_fit(self, photo: Photo, clock: Clock) -> None:
+    def test_clock(self, photo: Photo, clock: Clock) -> None:
+        """The clock is that of the fit."""
         done = fit_bytes(*photo, 1500, max_seconds=1.0, iterations=10**7)
         assert done.result.stop_reason == "seconds" and 0.9 < done.result.seconds < 1.15
         assert 0.9 * 1500 < len(done.data) <= 1500
 
-    def test_a_fit_ends_early_and_says_what_ended_it(self, photo: Photo) -> None:
-        assert fit_bytes(photo[0], None, 600, iterations=100).result.stop_reason == "iterations"
-        seen: list[int] = []
-        done = fit_bytes(photo[0], None, 600, iterations=100, on_step=lambda i, _: seen.append(i) or i == 60)
-        assert done.result.stop_reason == "callback" and seen[-1] == 60
+    def test_callback(self, photo: Photo) -> None:
+        iterations: list[int] = []
 
-    def test_more_bytes_are_better(self, photo: Photo) -> None:
-        image, labels = photo
-        psnrs = []
-        for target in (500, 1200, 2600):
-            done = fit_bytes(image, labels, target, iterations=150)
-            psnrs.append(psnr(done.scene, image))
-        assert psnrs[0] + 0.8 < psnrs[1] < psnrs[2] - 0.8
+        def stop(iteration: int, _: object) -> bool:
+            iterations.append(iteration)
+            return iteration == 20
 
-    def test_a_map_that_does_not_pay_is_left_out(self, photo: Photo) -> None:
-        image, _ = photo
-        noise = torch.randint(0, 2, (30, 40), generator=torch.Generator().manual_seed(0))
-        speckled = noise.repeat_interleave(4, 0).repeat_interleave(4, 1)
-        done = fit_bytes(image, speckled, 900, iterations=150)
-        report = done.result.regions
-        assert done.scene.regions is None and report is not None
-        assert (report.given, report.kept) == (2, 1) and (report.dropped == "bytes" or report.merged_for_bytes == 1)
+        result = fit_bytes(photo[0], None, 300, iterations=40, on_step=stop).result
+        assert result.stop_reason == "callback" and iterations == list(range(1, 21))
 
-    def test_a_map_that_is_to_stay_stays(self, photo: Photo) -> None:
-        labels = (torch.arange(160) // 20).repeat(120, 1)
-        done = fit_bytes(photo[0], labels, 900, iterations=100, merge_regions=False, move_contours=False)
-        assert len(done.data) <= 900
-        assert torch.equal(decode(done.data).scene.regions.labels, labels)
+    @pytest.mark.parametrize(
+        ("problem", "target", "settings", "num_regions", "min_psnr"),
+        [
+            (disc, 250, {}, 2, 35),
+            (speckles, 900, {}, 1, 18),
+            (stripes, 900, {"merge_regions": False, "move_contours": False}, 8, 15),
+            (stripes, 900, {"guidance": False}, 1, 18),
+        ],
+    )
+    def test_regions(
+        self, photo: Photo, problem: Any, target: int, settings: dict[str, Any], num_regions: int, min_psnr: float
+    ) -> None:
+        """Regions stay that pay for their bytes, or that must not be merged."""
+        image, labels = problem(photo[0])
+        done = fit_bytes(image, labels, target, iterations=100, **settings)
+        regions, report = done.scene.regions, done.result.regions
+        assert len(done.data) <= target and psnr(done.scene, image) > min_psnr
+        assert (1 if regions is None else regions.num_regions) == num_regions
+        assert report is not None and (report.given, report.kept) == (len(labels.unique()), num_regions)
+        if "move_contours" in settings:
+            assert regions is not None and torch.equal(regions.labels, labels)
 
-    def test_a_map_that_pays_stays(self) -> None:
-        image = torch.full((3, 96, 128), 0.1)
-        row, column = torch.meshgrid(torch.arange(96), torch.arange(128), indexing="ij")
-        disc = (column - 60) ** 2 + (row - 48) ** 2 < 35**2
-        image[:, disc] = 0.9
-        done = fit_bytes(image, disc.long(), 250, iterations=150)
-        assert done.scene.regions is not None and psnr(done.scene, image) > 35
-        assert done.result.regions is not None and done.result.regions.kept == done.result.regions.given == 2
+    @pytest.mark.parametrize(
+        ("target", "settings", "error", "match"),
+        [
+            (1.5, {}, TypeError, "target_bytes must be an integer"),
+            (0, {}, ValueError, "target_bytes must be at least 1; got 0"),
+            (12, {"iterations": 20}, ValueError, "target_bytes must be at least"),
+            (900, {"target_psnr": 30.0}, ValueError, "target_psnr must be None with target_bytes; got 30"),
+        ],
+    )
+    def test_exceptions(self, target: Any, settings: dict[str, Any], error: type[Exception], match: str) -> None:
+        with pytest.raises(error, match=match):
+            fit_bytes(torch.rand(3, 16, 16), None, target, **settings)
 
-    def test_ms_ssim(self, astronaut: Tensor) -> None:
-        image = astronaut[:, 20:196, 130:306]
-        shown = {
-            name: fit_bytes(image, None, 900, iterations=150, objective=name).scene.render()
-            for name in ("psnr", "ms-ssim")
-        }
-        assert ms_ssim(shown["psnr"], image) + 0.005 < ms_ssim(shown["ms-ssim"], image)
 
-    def test_count_grows_with_bytes(self) -> None:
-        assert count_for(8000, 10_000, "ms-ssim") < 0.95 * count_for(8000, 10_000)
-        counts = [count_for(size, 10_000) for size in (100, 1000, 8000, 50_000)]
-        assert counts == sorted(counts) and 2200 < counts[2] < 2700
-        assert count_for(1, 10_000) == 1
-
-    def test_refusals(self) -> None:
-        image = torch.zeros(3, 16, 16)
-        with pytest.raises(TypeError, match="num_bytes must be an integer"):
-            fit_bytes(image, None, 1.5)  # type: ignore[arg-type]
-        with pytest.raises(ValueError, match="num_bytes must be at least 1; got 0"):
-            fit_bytes(image, torch.arange(16).expand(16, 16), 0)
-        with pytest.raises(ValueError, match="target_bytes must be at least"):
-            fit_bytes(torch.rand(3, 16, 16), None, 12, iterations=150)
+def test_gaussian_count() -> None:
+    counts = [gaussian_count(size, 10_000) for size in (1, 100, 1000, 8000, 50_000)]
+    assert counts == sorted(counts) and counts[0] == 1 and 2200 < counts[3] < 2700
+    assert gaussian_count(8000, 10_000, "ms-ssim") < 0.95 * counts[3]

@@ -1,10 +1,9 @@
-"""Rounding with an eye on the image."""
+"""Files of scenes whose image is known."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
-from unittest.mock import patch
 
 import pytest
 import torch
@@ -13,95 +12,96 @@ from kcgs import GaussianField, RegionMap, Scene
 from kcgs.codec import decode, encode
 from kcgs.codec.gaussians.quantize import Quantizer
 from kcgs.codec.scenes import SceneWriter
+from kcgs.fitting.objective import MsSsimObjective
 from kcgs.rate import compress, quality_for
 from kcgs.rate.bits import soft_bits
-from kcgs.rate.tuning import Tuning
 
 from .conftest import Photo, psnr
 
 
 class TestCompress:
-    def test_less_error_at_the_same_bytes(self, photo: Photo, fitted: Scene) -> None:
-        image, target = photo[0], 1300
-        plain = encode(fitted, target_bytes=target)
-        tuned = compress(fitted, image, target_bytes=target)
-        for data in (plain, tuned.data):
-            assert 0.97 * target < len(data) <= target
-        assert psnr(decode(plain).scene, image) + 0.1 < psnr(tuned.scene, image)
-
-    @pytest.mark.parametrize(("target", "most"), [(700, 2), (1300, 1)])
-    def test_one_rounding_fills_the_bytes(self, photo: Photo, fitted: Scene, target: int, most: int) -> None:
-        with patch.object(Tuning, "round", autospec=True, side_effect=Tuning.round) as rounded:
-            done = compress(fitted, photo[0], target_bytes=target, iterations=100)
-        assert 0.99 * target <= len(done.data) <= target
-        # the others are of no iterations: they ask for a size
-        assert sum(call.args[1] > 0 for call in rounded.call_args_list) <= most
-
-    def test_scene_is_what_the_file_holds(self, photo: Photo, fitted: Scene) -> None:
-        done = compress(fitted, photo[0], quality=40, iterations=2)
-        assert torch.equal(done.scene.render(), decode(done.data).scene.render())
+    @pytest.mark.parametrize("target", [700, 1300])
+    def test_bytes(self, photo: Photo, fitted: Scene, target: int) -> None:
+        """The file fills its bytes, with less error than one that does not know the image."""
+        compressed = compress(fitted, photo[0], target_bytes=target, iterations=150)
+        assert 0.99 * target <= len(compressed.data) <= target
+        plain = decode(encode(fitted, target_bytes=target)).scene
+        assert psnr(plain, photo[0]) + 0.1 < psnr(compressed.scene, photo[0])
+        assert torch.equal(compressed.scene.render(), decode(compressed.data).scene.render())
 
     def test_quality(self, photo: Photo, fitted: Scene) -> None:
-        before = psnr(fitted, photo[0])
-        done = compress(fitted, photo[0], quality=quality_for(before))
-        assert before - 0.15 < psnr(done.scene, photo[0])
+        """A file of the scene's quality is nearly as good as the scene, and a PSNR that the scene has is reached."""
+        scene_psnr = psnr(fitted, photo[0])
+        quality = compress(fitted, photo[0], iterations=200, quality=quality_for(scene_psnr))
+        assert scene_psnr - 0.3 < psnr(quality.scene, photo[0])
+        exact = compress(fitted, photo[0], iterations=20, target_psnr=scene_psnr - 0.1)
+        assert scene_psnr - 0.1 <= psnr(exact.scene, photo[0])
 
-    def test_same_bytes_each_time(self, photo: Photo, fitted: Scene) -> None:
-        first, second = (compress(fitted, photo[0], quality=40, iterations=20).data for _ in range(2))
-        assert first == second
+    def test_psnr_beyond_the_scene(self, photo: Photo, fitted: Scene) -> None:
+        coarse = compress(fitted, photo[0], iterations=2, quality=quality_for(psnr(fitted, photo[0])))
+        assert compress(fitted, photo[0], iterations=2, target_psnr=99.0).data == coarse.data
 
-    def test_an_array_is_an_image(self, photo: Photo, fitted: Scene) -> None:
+    def test_objective(self, photo: Photo, fitted: Scene) -> None:
+        images = [
+            compress(fitted, photo[0], quality=36, iterations=100, objective=name).scene.render()
+            for name in ("psnr", "ms-ssim")
+        ]
+        error = MsSsimObjective(photo[0])
+        assert error.value(images[1] - photo[0]) < 0.95 * error.value(images[0] - photo[0])
+
+    def test_array(self, photo: Photo, fitted: Scene) -> None:
+        """An array is an image, and gives the same bytes."""
         array = photo[0].permute(1, 2, 0).numpy()
         expected = compress(fitted, photo[0], quality=30, iterations=2)
         assert compress(fitted, array, quality=30, iterations=2).data == expected.data
 
-    def test_faint_ones_do_not_pay(self, photo: Photo, fitted: Scene) -> None:
+    def test_faint_gaussians(self, photo: Photo, fitted: Scene) -> None:
+        """They are removed, unless a descent makes them pay."""
         field = fitted.field
         colors = field.merged_colors().detach().clone()
         colors[::3] *= 1e-4
-        with_faint = GaussianField(field.means, field.cholesky, colors, field.region_ids, size=field.size)
-        # before a descent, which may make them pay
-        done = compress(Scene(with_faint, fitted.regions), photo[0], quality=36, iterations=1)
-        assert done.scene.num_gaussians <= 200
+        faint = GaussianField(field.means, field.cholesky, colors, field.region_ids, size=field.size)
+        assert compress(Scene(faint, fitted.regions), photo[0], quality=36, iterations=1).scene.num_gaussians <= 200
 
     @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
-    def test_where_gradients_are_off(self, photo: Photo, fitted: Scene, mode: Callable[[], Any]) -> None:
+    def test_without_gradients(self, photo: Photo, fitted: Scene, mode: Callable[[], Any]) -> None:
         image, field = photo[0], fitted.field
         assert fitted.regions is not None
         expected = compress(fitted, image, quality=30, iterations=3).data
         with mode():
-            same = GaussianField(field.means, field.cholesky, field.colors, field.region_ids, size=field.size)
-            scene = Scene(same, RegionMap.from_labels(fitted.regions.labels))
+            copy = GaussianField(field.means, field.cholesky, field.colors, field.region_ids, size=field.size)
+            scene = Scene(copy, RegionMap.from_labels(fitted.regions.labels))
             assert compress(scene, image.clone(), quality=30, iterations=3)
             assert compress(fitted, image, quality=30, iterations=3).data == expected
 
-    def test_refusals(self, photo: Photo, fitted: Scene) -> None:
-        image = photo[0]
-        for changed, match in (
-            ({"image": image[:, :50]}, "image must have shape"),
+    @pytest.mark.parametrize(
+        ("changes", "match"),
+        [
+            ({"image": torch.zeros(3, 50, 160)}, "image must have shape"),
             ({"objective": "l1"}, "objective must be one of psnr, ms-ssim; got 'l1'"),
             ({"iterations": 0}, "iterations must be at least 1; got 0"),
             ({"quality": 40, "target_bytes": 900}, "quality must be None with target_bytes; got 40"),
-            ({"target_bytes": 40}, "target_bytes must be at least [0-9]+ for this scene; got 40"),
-        ):
-            with pytest.raises(ValueError, match=match):
-                compress(**{"scene": fitted, "image": image, **changed})
+            ({"quality": 40, "target_psnr": 30.0}, "target_psnr must be None with quality or target_bytes; got 30"),
+            ({"target_bytes": 40, "iterations": 1}, "target_bytes must be at least [0-9]+ for this scene; got 40"),
+        ],
+    )
+    def test_exceptions(self, photo: Photo, fitted: Scene, changes: dict[str, Any], match: str) -> None:
+        with pytest.raises(ValueError, match=match):
+            compress(**{"scene": fitted, "image": photo[0], **changes})
 
 
 class TestSoftBits:
-    def test_they_follow_the_files(self, fitted: Scene) -> None:
-        # weaker and rounder Gaussians make a smaller file, by about as much
+    @pytest.mark.parametrize(("brightness", "slant"), [(0.5, 1.0), (1.0, 0.3)])
+    def test_against_files(self, fitted: Scene, brightness: float, slant: float) -> None:
+        """Weaker and rounder Gaussians make a smaller file, by about as much."""
         field, quantizer = fitted.field, Quantizer(150, fitted.size)
-        means, cholesky, colors = (t.detach() for t in (field.means, field.cholesky, field.merged_colors()))
-        changed = (0.5 * colors, cholesky), (colors, cholesky * torch.tensor([1.0, 0.3, 1.0]))
-        for new_colors, new_cholesky in changed:
-            other = GaussianField(means, new_cholesky, new_colors, field.region_ids, size=field.size)
-            files = [SceneWriter(Scene(f, fitted.regions)).write_rounded(150) for f in (field, other)]
-            saved = 8 * (len(files[0]) - len(files[1]))
-            told = float(
-                (soft_bits(cholesky, colors, quantizer) - soft_bits(new_cholesky, new_colors, quantizer)).sum()
-            )
-            assert saved > 0 and 0.5 * saved < told < 1.6 * saved
+        cholesky, colors = field.cholesky.detach(), field.merged_colors().detach()
+        new_cholesky, new_colors = cholesky * torch.tensor([1.0, slant, 1.0]), brightness * colors
+        changed = GaussianField(field.means, new_cholesky, new_colors, field.region_ids, size=field.size)
+        sizes = [len(SceneWriter(Scene(f, fitted.regions)).write_rounded(150)) for f in (field, changed)]
+        saved = 8 * (sizes[0] - sizes[1])
+        estimate = soft_bits(cholesky, colors, quantizer) - soft_bits(new_cholesky, new_colors, quantizer)
+        assert saved > 0 and 0.5 * saved < float(estimate.sum()) < 1.6 * saved
 
     def test_gradients(self) -> None:
         generator = torch.Generator().manual_seed(0)
@@ -111,14 +111,15 @@ class TestSoftBits:
         inputs = cholesky.requires_grad_(), colors.requires_grad_()
         assert torch.autograd.gradcheck(lambda a, b: soft_bits(a, b, quantizer), inputs)
 
-    def test_tiny_ones_are_no_cheaper(self) -> None:
+    def test_tiny_gaussians_are_no_cheaper(self) -> None:
         cholesky = torch.tensor([[0.1, 0.0, 0.1]], requires_grad=True)
         soft_bits(cholesky, torch.ones(1, 3), Quantizer(150, (48, 64))).sum().backward()
         assert cholesky.grad is not None and not cholesky.grad[:, ::2].any()
 
-    def test_bits_are_spared_at_the_same_error(
-        self, photo: Photo, fitted: Scene, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        spared = compress(fitted, photo[0], target_bytes=1100).scene
-        monkeypatch.setattr("kcgs.rate.tuning._BIT", 0.0)
-        assert psnr(compress(fitted, photo[0], target_bytes=1100).scene, photo[0]) + 0.05 < psnr(spared, photo[0])
+    def test_descent(self, photo: Photo, fitted: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A price of bits lowers the error at equal bytes."""
+        psnrs = []
+        for price in (0.0, 0.9):
+            monkeypatch.setattr("kcgs.rate.descent._BIT_PRICE", price)
+            psnrs.append(psnr(compress(fitted, photo[0], target_bytes=1100, iterations=200).scene, photo[0]))
+        assert psnrs[0] + 0.05 < psnrs[1]

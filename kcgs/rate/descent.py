@@ -1,0 +1,146 @@
+"""Rate-distortion descent: Gaussians lower their error and, at a price, their bits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcgs.codec.exact import Integers
+from kcgs.codec.gaussians.quantize import Parameters, Quantizer
+from kcgs.fitting.newton import Gaussians, NewtonDescent, area, half_gradients
+from kcgs.fitting.objective import MsSsimObjective
+from kcgs.functional import RegionMap, region_splat
+
+from .bits import soft_bits
+
+# Prices are in units of D, the distortion that one rounded number adds. In theory a bit saves 2 ln 2 D = 1.4 D. Here
+# neighbours correct rounding errors, so both numbers are tuned: vary one and compare `python -m benchmarks rate`.
+
+# error that a bit must save
+_BIT_PRICE = 0.9
+# energy of a Gaussian that pays for its bits, about 30
+_GAUSSIAN_PRICE = 20.0
+# share of a Newton step in a step: larger ones oscillate, smaller ones take more iterations
+_RATE = 0.09
+# weights that renders skip
+_CUTOFF = 1e-3
+# steps for which the gradient of the bits is reused, which changes slowly
+_BIT_GRADIENT_STEPS = 4
+
+
+class RateDistortionDescent:
+    """Gaussians on their way to less error and fewer bits.
+
+    Args:
+        gaussians: the start.
+        ids: positions of their regions' ids in the map, (N,).
+        image: (C, H, W), on the CPU.
+        regions: the map, which stays.
+        objective: the error; None: the squared error.
+    """
+
+    def __init__(
+        self,
+        gaussians: Parameters,
+        ids: Integers,
+        image: Tensor,
+        regions: RegionMap | None,
+        objective: MsSsimObjective | None,
+    ) -> None:
+        self.ids, self.image, self.regions, self.objective = ids, image, regions, objective
+        self.gaussians = self._as_tensors(gaussians)
+        self.newton = NewtonDescent(self.gaussians, exact=False)
+        # error of the objective per squared error
+        self._error_scale = float(self._weights(self.gaussians).mean())
+        self._bit_gradient: Gaussians | None = None
+        self._num_steps = 0
+
+    def parameters(self) -> Parameters:
+        """Return the Gaussians in float64."""
+        return Parameters(*(numbers.double().numpy() for numbers in self.gaussians))
+
+    def step(self, quantizer: Quantizer) -> None:
+        """Move all Gaussians once."""
+        self.gaussians = self._step_from(self.gaussians, quantizer)
+
+    def step_around(
+        self, rounded: Parameters, rounded_shapes: Tensor, rounded_colors: Tensor, quantizer: Quantizer
+    ) -> None:
+        """Move all Gaussians once but those that are rounded.
+
+        Args:
+            rounded: all Gaussians, rounded.
+            rounded_shapes: which have their rounded place and shape in this step, and do not move; bool (N,).
+            rounded_colors: which have their rounded colour.
+            quantizer: of the file.
+        """
+        shapes, colors = rounded_shapes[:, None], rounded_colors[:, None]
+        masks = shapes, shapes, colors
+        pairs = zip(masks, self._as_tensors(rounded), self.gaussians, strict=True)
+        current = Gaussians(*(torch.where(mask, fixed, free) for mask, fixed, free in pairs))
+        frozen = torch.cat([shapes.expand(-1, 5), colors.expand(-1, self.image.shape[0])], -1)
+        pairs = zip(masks, self.gaussians, self._step_from(current, quantizer, frozen), strict=True)
+        # rounded numbers keep their finer values: they may be rounded anew, by other steps
+        self.gaussians = Gaussians(*(torch.where(mask, free, moved) for mask, free, moved in pairs))
+
+    def prune(self, quantizer: Quantizer) -> None:
+        """Remove the Gaussians that do not pay for their bits; one stays at least."""
+        energy = self._energy()
+        rows = energy >= _GAUSSIAN_PRICE * self._error_scale * quantizer.distortion
+        rows[energy.argmax()] = True
+        self._select(rows.numpy())
+
+    def remove_weakest(self, count: int) -> NDArray[np.bool_]:
+        """Remove so many of the weakest Gaussians, but one stays at least; return the mask of those that stay."""
+        rank = self._energy().argsort(stable=True).argsort().numpy()
+        rows = rank >= min(count, len(rank) - 1)
+        self._select(rows)
+        return rows
+
+    def _select(self, rows: NDArray[np.bool_]) -> None:
+        index = torch.from_numpy(rows)
+        self.ids, self.newton.velocity = self.ids[rows], self.newton.velocity[index]
+        self.gaussians = Gaussians(*(numbers[index] for numbers in self.gaussians))
+        self._bit_gradient = None
+
+    def _step_from(self, gaussians: Gaussians, quantizer: Quantizer, frozen: Tensor | None = None) -> Gaussians:
+        height, width = quantizer.size
+        if self._bit_gradient is None or self._num_steps % _BIT_GRADIENT_STEPS == 0:
+            self._bit_gradient = self._half_bit_gradient(gaussians, quantizer)
+        self._num_steps += 1
+        gradients = half_gradients(self._render, gaussians, self.image, self.objective)
+        gradients = Gaussians(*(error + bits for error, bits in zip(gradients, self._bit_gradient, strict=True)))
+        masses = area(gaussians.cholesky).clamp_max(height * width) * self._weights(gaussians)
+        return self.newton.step(gaussians, gradients, masses, _RATE, frozen)
+
+    def _half_bit_gradient(self, gaussians: Gaussians, quantizer: Quantizer) -> Gaussians:
+        """Return half the gradient of the price of the bits, which is 0 by means."""
+        cholesky, colors = (t.detach().requires_grad_() for t in gaussians[1:])
+        price = 0.5 * _BIT_PRICE * self._error_scale * quantizer.distortion
+        bits = price * soft_bits(cholesky, colors, quantizer).sum()
+        return Gaussians(torch.zeros_like(gaussians.means), *torch.autograd.grad(bits, (cholesky, colors)))
+
+    def _render(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
+        ids = None if self.regions is None else self.regions.ids[torch.from_numpy(self.ids)]
+        size = self.image.shape[1], self.image.shape[2]
+        return region_splat(means, cholesky, colors, ids, self.regions, size=size, cutoff=_CUTOFF)
+
+    def _energy(self) -> Tensor:
+        """Return the error that each Gaussian saves, (N,), if no other overlaps it."""
+        gaussians = Gaussians(*(numbers.double() for numbers in self.gaussians))
+        l11, _, l22 = gaussians.cholesky.unbind(-1)
+        areas = (math.pi * l11 * l22).clamp_max(self.image[0].numel())
+        return self._weights(gaussians) * (gaussians.colors.square().sum(-1) * areas)
+
+    def _weights(self, gaussians: Gaussians) -> Tensor:
+        """Return what the squared error of each Gaussian weighs in the objective, (N,)."""
+        if self.objective is None:
+            return torch.ones_like(gaussians.means[:, 0])
+        return self.objective.weigh(gaussians.means, gaussians.cholesky)
+
+    def _as_tensors(self, gaussians: Parameters) -> Gaussians:
+        return Gaussians(*(torch.from_numpy(numbers).to(self.image) for numbers in gaussians))
