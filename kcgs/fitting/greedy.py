@@ -13,7 +13,7 @@ from kcgs.kernels.compiled import Program, inner
 # candidates of which the largest gain is kept
 _BLOCK = 128
 
-program = Program("matching pursuit", __name__, __file__, "greedy.py")
+program = Program("matching pursuit", __file__)
 
 
 @inner
@@ -69,13 +69,6 @@ def choose(places, square, norm, share, gain, limits, picked):  # type: ignore[n
     return len(picked)
 
 
-@program.part
-def choices() -> None:
-    """Compile."""
-    one = np.ones(1)
-    choose(np.ones((1, 3)), one, one, np.ones((1, 3)), one, (2.0, 1.0, 1.0, 1.0), np.zeros(1, np.int64))
-
-
 def pick(
     x: NDArray[Any], y: NDArray[Any], order: NDArray[Any], square: NDArray[Any], norm: NDArray[Any],
     share: NDArray[Any], gain: NDArray[Any], count: int, *, floor: float, overlap: float, reach: float, longest: float,
@@ -85,6 +78,5 @@ def pick(
     if not len(picked):
         return picked
     numbers = (np.ascontiguousarray(a, np.float64) for a in (np.stack([x, y, order], -1), square, norm))
-    program.ready()
     share, gain = (np.array(a, np.float64) for a in (share, gain))
     return picked[: choose(*numbers, share, gain, (floor, overlap, reach, longest), picked)]

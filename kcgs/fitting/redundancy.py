@@ -23,7 +23,7 @@ _RIDGE = 1e-3
 # columns of a row: mean, covariance, and the fourth root of its determinant
 _X, _Y, _XX, _XY, _YY, _ROOT, _COLUMNS = range(7)
 
-program = Program("choice of Gaussians to leave out", __name__, __file__, "redundancy.py")
+program = Program("choice of Gaussians to leave out", __file__)
 
 
 @inner
@@ -108,12 +108,6 @@ def score(rows, starts, rests, neighbors, shares):  # type: ignore[no-untyped-de
             rests[i] = max(1.0 - _solve(matrix, count, share), 0.0)
 
 
-@program.part
-def scores() -> None:
-    """Compile."""
-    score(np.ones((1, _COLUMNS)), np.arange(2), np.ones(1), np.zeros((1, NEIGHBORS), np.int64), np.ones((1, NEIGHBORS)))
-
-
 def least_missed(
     means: NDArray[Any],
     cholesky: NDArray[Any],
@@ -147,7 +141,6 @@ def least_missed(
     starts = np.searchsorted(region[order], np.arange(region.max(initial=0) + 2))
     rests, neighbors = np.empty(len(rows)), np.empty((len(rows), NEIGHBORS), np.int64)
     shares = np.zeros(neighbors.shape)
-    program.ready()
     score(rows, starts, rests, neighbors, shares)
     norm = math.sqrt(math.pi) * rows[:, _ROOT]
     colors *= norm[:, None]

@@ -6,13 +6,11 @@ All kernels share this arithmetic; docs/performance.md has the formulas.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # processes that compile the CPU kernel do without torch
-    import torch
-    from torch import Tensor
+import torch
+from torch import Tensor
 
-    from .inputs import Gradients
+from .inputs import Gradients
 
 # |z| is cut here, where every weight is zero: its square is still finite in float32
 Z_LIMIT = 1e15
@@ -42,8 +40,6 @@ def sums_to_gradients(sums: Tensor, channels: int, cholesky: Tensor) -> Gradient
     With g = dLoss/dI and v = w g^T c the sums are of w g, (..., C), and, where geometry is asked for, of
     v (z1, z2, z1 z1, z1 z2, z2 z2), (..., C + 5).
     """
-    import torch
-
     colors = sums[..., :channels]
     if sums.shape[-1] == channels:
         return None, None, colors

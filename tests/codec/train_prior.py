@@ -50,7 +50,7 @@ from kcgs.codec.labels.contexts import (
     load_prior,
     new_tables,
 )
-from kcgs.codec.labels.wavefront import DECIDED, REGIONS, STATE, advance, new_work, program, survey
+from kcgs.codec.labels.wavefront import DECIDED, REGIONS, STATE, advance, new_work, survey
 from kcgs.data import load_image, load_labels
 from kcgs.segment import segment
 
@@ -96,7 +96,6 @@ def examples(labels: Any) -> tuple[Any, Any]:
     That is 0 or 1 for the first or the second candidate, 2 for neither.
     """
     ids, index = np.unique(labels, return_inverse=True)
-    program.ready()
     truth, seeds, _ = survey(index.reshape(labels.shape).astype(np.int32), len(ids))
     height, width = truth.shape
     tables = load_prior()

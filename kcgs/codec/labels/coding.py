@@ -19,7 +19,7 @@ from kcgs.functional.labels import compact, touching_pairs
 from .contexts import CODED, LABEL, LEFT, RIGHT, TOP, load_prior, new_tables
 from .ids import code_ids, code_ids_of_file
 from .seeds import code_seeds
-from .wavefront import DECIDED, RANKS, REGIONS, STATE, WIDE, advance, nearest, new_work, program, survey
+from .wavefront import DECIDED, RANKS, REGIONS, STATE, WIDE, advance, nearest, new_work, survey
 
 # what a reader may be asked to work through: seconds
 _MOST_ASKED, MOST_ESCAPES = 1 << 23, 1 << 18
@@ -47,7 +47,6 @@ def encode_turned(labels: Integers) -> tuple[int, bytes]:
     """Write a map in the form of files, turned as it takes the fewest bytes among the ways with the fewest seeds."""
     ids, index = (found.numpy() for found in compact(torch.from_numpy(labels))[:2])
     check_count("number of regions", len(ids), 1, MOST_REGIONS)
-    program.ready()
     seeds = [int(survey(turned(index, turn), len(ids))[1].sum()) for turn in range(TURNS)]
     tried = [t for t in sorted(range(TURNS), key=seeds.__getitem__)[:_TRIED] if seeds[t] <= min(seeds) + _NEAR]
     found = [(turn, encode_regions(ids, turned(index, turn), alone=True)) for turn in tried]
@@ -79,7 +78,6 @@ def encode_regions(ids: Integers, index: Any, *, alone: bool = False) -> bytes:
         writer = Writer()
         code(writer, ids.tolist(), 1)
         return writer.finish()
-    program.ready()
     truth, seeds, order = survey(index, len(ids))
     numbered = ids[order].tolist()
 
@@ -129,7 +127,6 @@ def _decode_regions(data: bytes, height: int, width: int, max_regions: int, *, a
 
 def _code_pixels(coder: Coder, truth: Any, seeds: Any, regions: int, alone: bool) -> Any:
     """Code a map of numbered regions; a reader has an empty `truth` and fills in `seeds`."""
-    program.ready()
     code_seeds(coder, seeds)
     height, width = seeds.shape
     tables = load_prior("prior2.bin" if alone else "prior.bin")

@@ -26,11 +26,9 @@ from .contexts import (
     contexts,
     describe,
     learn,
-    load_prior,
     mix,
     network,
     network2,
-    new_tables,
     quiet,
 )
 
@@ -162,7 +160,7 @@ def _weigh(truth, answers, state, counters, weights, rows, chances):  # type: ig
             asked += 1
 
 
-program = Program("label coder", __name__, __file__, "contexts.py", "prior.bin", "prior2.bin", "wavefront.py")
+program = Program("label coder", __file__, "contexts.py", "prior.bin", "prior2.bin")
 
 
 @program.entry
@@ -230,18 +228,3 @@ def survey(index, regions):  # type: ignore[no-untyped-def]
             _margins(labels, y, x, truth[j, i])
         labels[y, LEFT + width :] = truth[j, width - 1]
     return truth, seeds, order
-
-
-@program.part
-def fronts() -> None:
-    """Compile what goes from wavefront to wavefront."""
-    prior, bits, state = load_prior(), np.zeros(4, np.int32), np.zeros(STATE, np.int64)
-    labels, index = np.zeros((2 + TOP + 1, 2 + LEFT + RIGHT), np.int32), np.zeros((2, 2), np.int32)
-    advance(bits, index, bits, state, labels, index.astype(np.uint8), *new_tables(prior), *new_work(2, prior))
-
-
-@program.part
-def places() -> None:
-    """Compile what looks for labels."""
-    survey(np.eye(2, dtype=np.int32), 2)
-    nearest(np.zeros((TOP + 1, LEFT + RIGHT), np.int32), np.zeros(UNITS, np.int32), np.zeros(RANKS, np.int32))

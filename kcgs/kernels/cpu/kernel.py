@@ -23,7 +23,7 @@ from ..octaves import blocks_of, most_spacing
 from ..threads import num_threads
 from ..whitened import least_exponent, support_radius
 from . import loops
-from .lists import ROWS, Lists, Table, in_range, list_tiles, order_rows, program
+from .lists import ROWS, Lists, Table, in_range, list_tiles, order_rows
 from .simd import SIDE
 
 # fewer entries of the lists than this are left to the calling thread: waking another costs as much
@@ -44,7 +44,6 @@ def steps(inputs: SplatInputs) -> Steps:
         raise ValueError(f"backend 'cpu' computes in float32; got {inputs.means.dtype}: use 'tiled' or 'reference'")
     if inputs.means.device.type != "cpu":
         raise ValueError(f"backend 'cpu' needs tensors on the CPU; got {inputs.means.device}")
-    program.ready()
     return _STEPS
 
 

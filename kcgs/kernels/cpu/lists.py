@@ -30,8 +30,7 @@ PADDING = 4 * SIDE
 # columns of the grids
 ROWS_OF_NODES, COLS_OF_NODES, ROWS, COLS, FIRST_TILE, FIRST_ROW = range(6)
 
-_SOURCES = ("../whitened.py", "lists.py", "loops.py", "rows.py", "simd.py", "spline.py")
-program = Program("CPU kernel", f"{__package__}.loops", __file__, *_SOURCES)
+program = Program("CPU kernel", __file__, "../whitened.py", "loops.py", "rows.py", "simd.py", "spline.py")
 
 
 class Table(NamedTuple):

@@ -15,7 +15,6 @@ from ..compiled import inner
 from .lists import (
     COLS,
     COLS_OF_NODES,
-    COLUMNS,
     FACTOR,
     L11,
     L21,
@@ -25,15 +24,11 @@ from .lists import (
     REFINEMENT,
     ROWS_OF_NODES,
     SCALE,
-    Lists,
-    Table,
     copy_of,
     enter_rows,
     enter_tile,
     find_block,
     first_tile,
-    in_range,
-    list_tiles,
     program,
 )
 from .rows import add_rows, add_sheared, gather_rows, gather_sheared
@@ -264,35 +259,3 @@ def finish(lists, order, factors, out, moments, means, cholesky, colors):  # typ
                 _uncoarsen(g, factors[to], at, bend, along)
             means[to, 0], means[to, 1] = at[0], at[1]
             cholesky[to, 0], cholesky[to, 1], cholesky[to, 2] = bend[0], bend[1], bend[2]
-
-
-def _example() -> tuple[Lists, Any]:
-    places, numbers = np.zeros(2, np.int64), np.zeros(1, np.float32)
-    grids = np.array([[1, 1, 1, 1, 0, 0]])
-    parents, odd, mask = np.ones((1, 4), np.int64), np.zeros(1, np.uint8), -np.ones(1, np.int64)
-    table = Table(1, 1, grids, places[:1], places, parents, odd, places[:1], mask, numbers)
-    nothing = np.zeros(1, np.bool_)
-    lists = Lists(
-        np.ones((1, COLUMNS)), numbers, places, places, np.zeros((1, 3), np.int32), table, nothing, 4.0, numbers[0]
-    )
-    return lists, np.zeros((1, 8), np.float32)
-
-
-@program.part
-def lists() -> None:
-    """Compile what lists tiles, and what ends the gradient."""
-    example, terms = _example()
-    one, pair, triple = (np.ones((1, n), np.float32) for n in (1, 2, 3))
-    in_range(pair, triple, one)
-    list_tiles(pair, triple, one, example.start[:1], example.start, example.start, 1, example.table, 4.0, 0.5)
-    finish(example, example.start, triple, terms, True, pair, triple, one)
-
-
-@program.part
-def pixels() -> None:
-    """Compile what visits pixels."""
-    example, terms = _example()
-    image = np.zeros((1, 1, 1, 1), np.float32)
-    rows, nodes = np.zeros((1, 4), np.int64), example.colors[:0]
-    render(example, rows, image, nodes)
-    gather(example, rows, image, terms, True, nodes)
