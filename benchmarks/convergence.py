@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from kcgs import fit
-from kcgs.fitting import FitConfig, warm_up
+from kcgs.fitting import FitConfig, precompile
 
 from .core.compare import Contest, grouped, losses, markdown, write
 from .core.figures import Panel, save_lines
@@ -26,7 +26,7 @@ def measure(image: str, recipe: str, n: int, data: str, quick: bool) -> list[Row
     """Return a fit's history."""
     pixels, labels = load_mapped(image, data, quick)
     config = FitConfig.from_recipe(recipe, **({"iterations": QUICK_ITERATIONS} if quick else {}))
-    warm_up(config)
+    precompile(config)
     start, core_start = time.perf_counter(), time.process_time()
     result = fit(pixels, labels, n, recipe=config)
     share = (time.process_time() - core_start) / (time.perf_counter() - start)

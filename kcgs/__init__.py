@@ -4,7 +4,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from . import codec, data, editing, engine, fitting, functional, nn, onnx, page, rate, segment, video  # noqa: F401
+    from . import codec, data, editing, engine, fitting, functional, nn  # noqa: F401, I001
+    from . import onnx, optim, page, rate, segment, video  # noqa: F401
     from .errors import InvalidArgument, InvalidArgumentType
     from .evaluation import evaluate
     from .fitting import FitConfig, FitResult, fit
@@ -29,7 +30,8 @@ _MODULES = {
     "scene": ("Scene", "load", "save"),
 }
 _PACKAGES = (
-    "codec", "data", "editing", "engine", "fitting", "functional", "nn", "onnx", "page", "rate", "segment", "video",
+    "codec", "data", "editing", "engine", "fitting", "functional", "nn", "onnx", "optim", "page", "rate", "segment",
+    "video",
 )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from kcgs import FitConfig, evaluate, fit
 from kcgs.codec import decode, encode, encode_labels
-from kcgs.fitting import warm_up
+from kcgs.fitting import precompile
 from kcgs.rate import quality_for
 
 from .images import load_mapped
@@ -48,7 +48,7 @@ def measure_fit(
     pixels, labels = load_mapped(image, data, quick)
     config = FitConfig.from_recipe(recipe, **settings)
     if not quick:
-        warm_up(config)  # no clock counts compilation
+        precompile(config)  # no clock counts compilation
     start = time.process_time()
     result = fit(pixels, labels, n, recipe=config, seed=seed)
     seconds = time.process_time() - start

@@ -37,9 +37,9 @@ def demo(
     import torch
     from skimage.data import astronaut
 
-    from kcgs.fitting import FitConfig, warm_up
+    from kcgs.fitting import FitConfig, precompile
 
-    warm_up(FitConfig.from_recipe("best"))  # the clock counts no compilation
+    precompile(FitConfig.from_recipe("best"))  # the clock counts no compilation
     image = torch.from_numpy(astronaut()).permute(2, 0, 1).float() / 255
     run(output, image, NUM_BYTES, progress=True)
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.optim.lr_scheduler import LambdaLR
 
-from kcgs.fitting.optimizers import FrameAdam
+from kcgs.fitting.optimizers import cosine_decay
 from kcgs.functional import RegionMap, region_splat
 from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join
+from kcgs.optim import GaussianAdam
 from kcgs.scene import Scene
 
 from .inpainting import inpaint
@@ -97,11 +99,17 @@ def _spread(residual: Tensor, mask: Tensor, regions: RegionMap) -> GaussianField
 
 
 @torch.enable_grad()
-def _fit(start: GaussianField, regions: RegionMap, target: Tensor, weight: Tensor) -> GaussianField:
-    """Fit Gaussians to a target, with a weight per pixel."""
-    optimizer = FrameAdam(start, _RATE)
-    for step in range(_STEPS):
-        rendered = region_splat(*optimizer.gaussians(), start.region_ids, regions)
+def _fit(field: GaussianField, regions: RegionMap, target: Tensor, weight: Tensor) -> GaussianField:
+    """Fit Gaussians to a target, with a weight per pixel; opacities are merged into the colours."""
+    geometry = field.means.detach(), field.cholesky.detach()
+    field = GaussianField(*geometry, field.merged_colors().detach(), field.region_ids, size=field.size)
+    rates = field.means.detach().new_tensor([0.14, 0.03]) * _RATE
+    optimizer = GaussianAdam(field, rates[0], color_lr=rates[1])
+    schedule = LambdaLR(optimizer, lambda step: cosine_decay(step / _STEPS))
+    for _ in range(_STEPS):
+        rendered = region_splat(field.means, field.cholesky, field.colors, field.region_ids, regions)
         rendered.backward((rendered.detach() - target) * weight)
-        optimizer.step(optimizer.decay(step / _STEPS))
-    return GaussianField(*optimizer.gaussians(), start.region_ids, size=start.size)
+        optimizer.step()
+        optimizer.zero_grad()
+        schedule.step()
+    return field

@@ -1,9 +1,12 @@
 """An image in, a scene out."""
 
 from .config import FitConfig, available_recipes
+from .initial import initial_field
 from .loop import fit
+from .precompile import precompile
 from .region_report import RegionReport
-from .state import FitResult, HistoryEntry
-from .warm_up import warm_up
+from .result import FitResult, HistoryEntry
 
-__all__ = ["FitConfig", "FitResult", "HistoryEntry", "RegionReport", "available_recipes", "fit", "warm_up"]
+__all__ = [
+    "FitConfig", "FitResult", "HistoryEntry", "RegionReport", "available_recipes", "fit", "initial_field", "precompile",
+]  # fmt: skip

@@ -13,88 +13,101 @@ import torch
 
 from kcgs._atomic import atomic_path, check_writable
 from kcgs.functional import RegionMap
+from kcgs.nn import GaussianField
+from kcgs.scene import Scene
 
-from .state import FitState, Gaussians, HistoryEntry
+from .initial import initial_sigma
+from .optimizers import make_optimizer
+from .problem import Problem
+from .result import HistoryEntry
+from .state import FitState
 
 # a checkpoint is written when the fit has run this many times as long as the last one took to write
-_PATIENCE = 100.0
-_VERSION = 5
-_KEPT = ("cutoff", "region_ids", "anchor", "iteration", "first", "wanted", "densifications", "late_moves")
+_RUN_PER_WRITE = 100.0
+_VERSION = 6
+_NUMBERS = ("cutoff", "num_initial", "num_requested", "iteration", "num_additions", "num_late_moves", "best_score")
 
 
 class Checkpoint:
-    """A file that holds a fit's state, written whole or not at all, and only by the problem that it belongs to."""
+    """A file that holds a fit's state, written whole or not at all, and read for its own problem only."""
 
-    def __init__(self, path: str | os.PathLike[str], state: FitState, given: RegionMap | None) -> None:
-        self.path = Path(path)
+    def __init__(self, path: str | os.PathLike[str], problem: Problem) -> None:
         check_writable("checkpoint", path)
-        self.problem = _fingerprint(state, given)
-        self._next = 0.0
+        self.path, self.problem = Path(path), problem
+        self._next_write = 0.0
 
     def due(self) -> bool:
-        """Say whether it is time to write; writing costs about a hundredth of the fit."""
-        return time.perf_counter() >= self._next
+        """True when it is time to write, so that writing costs about a hundredth of the fit."""
+        return time.perf_counter() >= self._next_write
 
-    def write(self, state: FitState) -> None:
-        """Put the state in the file's place."""
+    def write(self, state: FitState, seconds: float) -> None:
+        """Put the state, and the seconds of the fit so far, in the file's place."""
         start = time.perf_counter()
         with atomic_path(self.path) as temporary, temporary.open("wb") as file:
-            torch.save({"problem": self.problem, **_plain(state)}, file)
+            torch.save({"problem": _fingerprint(self.problem), "seconds": seconds, **_to_plain(state)}, file)
         end = time.perf_counter()
-        self._next = end + _PATIENCE * (end - start)
+        self._next_write = end + _RUN_PER_WRITE * (end - start)
 
-    def read_into(self, state: FitState) -> None:
-        """Take up the state of the file, if there is one; refuse what is damaged or another problem's."""
-        if not self.path.exists():
-            return
+    def read(self) -> tuple[FitState, float]:
+        """Return the state in the file, and the seconds of its fit; refuse what is damaged or another problem's."""
         try:
-            kept = torch.load(self.path, weights_only=True)
-            problem = kept["problem"]
+            plain = torch.load(self.path, weights_only=True)
+            fingerprint = plain["problem"]
         except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"checkpoint {str(self.path)!r} is damaged, or no checkpoint of a fit") from error
-        if problem != self.problem:
+        if fingerprint != _fingerprint(self.problem):
             raise ValueError(
                 f"checkpoint {str(self.path)!r} belongs to another fit: image, regions, settings, num_gaussians and "
                 "seed must be those it was written with"
             )
-        _take_up(state, kept)
+        return _from_plain(plain, self.problem), plain["seconds"]
 
 
-def _fingerprint(state: FitState, given: RegionMap | None) -> str:
-    size = tuple(state.image.shape)
-    # a fit that goes on may be granted more time
-    settings = state.config.model_dump_json(exclude={"max_seconds"})
-    digest = hashlib.sha256(f"{_VERSION} {settings} {state.num_gaussians} {state.seed} {size}".encode())
-    digest.update(state.image.cpu().numpy().tobytes())
-    if given is not None:
-        digest.update(repr(given.softness).encode())
-        digest.update(given.labels.cpu().numpy().tobytes())
+def _fingerprint(problem: Problem) -> str:
+    # a fit that goes on may get more time
+    settings = problem.config.model_dump_json(exclude={"max_seconds"})
+    numbers = f"{_VERSION} {settings} {problem.num_gaussians} {problem.seed} {tuple(problem.image.shape)}"
+    digest = hashlib.sha256(numbers.encode())
+    digest.update(problem.image.cpu().numpy().tobytes())
+    if problem.regions is not None:
+        digest.update(repr(problem.regions.softness).encode())
+        digest.update(problem.regions.labels.cpu().numpy().tobytes())
     return digest.hexdigest()
 
 
-def _plain(state: FitState) -> dict[str, Any]:
-    """Use nothing but tensors, numbers, strings, lists and dicts, which load without running code."""
+def _to_plain(state: FitState) -> dict[str, Any]:
+    """Return tensors, numbers, strings, lists and dicts, which load without running code."""
     return {
-        **{name: getattr(state, name) for name in _KEPT},
+        **{name: getattr(state, name) for name in _NUMBERS},
+        "scene": _scene_to_plain(state.scene),
+        "best": None if state.best is None else _scene_to_plain(state.best),
+        "anchor": None if state.anchor is None else state.anchor.state(),
         "optimizer": state.optimizer.state_dict(),
-        "regions": None if state.regions is None else state.regions.state(),
-        "seconds": state.seconds(),
         "history": [tuple(entry) for entry in state.history],
-        "best_score": state.best_score,
-        "best": None if state.best is None else state.best[:4],
-        "best_regions": None if state.best is None or state.best.regions is None else state.best.regions.state(),
     }
 
 
-def _take_up(state: FitState, kept: dict[str, Any]) -> None:
-    for name in (*_KEPT, "best_score"):
-        setattr(state, name, kept[name])
-    state.optimizer.load_state_dict(kept["optimizer"])
-    state.regions, best_regions = (
-        None if kept[name] is None else RegionMap.from_state(kept[name]) for name in ("regions", "best_regions")
+def _from_plain(plain: dict[str, Any], problem: Problem) -> FitState:
+    scene = _scene_from_plain(plain["scene"], problem.size)
+    optimizer = make_optimizer(problem.config, scene.field, initial_sigma(problem.size, plain["num_initial"]))
+    optimizer.load_state_dict(plain["optimizer"])
+    return FitState(
+        problem,
+        scene,
+        optimizer,
+        None if plain["anchor"] is None else RegionMap.from_state(plain["anchor"]),
+        history=[HistoryEntry(*entry) for entry in plain["history"]],
+        best=None if plain["best"] is None else _scene_from_plain(plain["best"], problem.size),
+        **{name: plain[name] for name in _NUMBERS},
     )
-    state.started = time.perf_counter() - kept["seconds"]
-    state.history = [HistoryEntry(*entry) for entry in kept["history"]]
-    if kept["best"] is not None:
-        means, cholesky, colors, region_ids = kept["best"]
-        state.best = Gaussians(means, cholesky, colors, region_ids, best_regions)
+
+
+def _scene_to_plain(scene: Scene) -> dict[str, Any]:
+    field = scene.field
+    tensors = [field.means.detach(), field.cholesky.detach(), field.colors.detach(), field.region_ids]
+    return {"tensors": tensors, "regions": None if scene.regions is None else scene.regions.state()}
+
+
+def _scene_from_plain(plain: dict[str, Any], size: tuple[int, int]) -> Scene:
+    regions = None if plain["regions"] is None else RegionMap.from_state(plain["regions"])
+    return Scene(GaussianField(*plain["tensors"], size=size), regions)

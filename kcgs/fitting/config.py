@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from difflib import get_close_matches
 from importlib.resources import files
@@ -76,10 +77,10 @@ class FitConfig(BaseModel):
         description="psnr: lower what `loss` says; ms-ssim: raise MS-SSIM, which needs loss l2",
     )
     loss: Literal["l1", "l2", "l1+ssim"] = Field("l2", description="l1+ssim: L1 + 0.1 (1 - SSIM), as Image-GS")
-    optimizer: Literal["frame", "adan", "adam"] = Field(
-        "frame",
-        description="frame: Adam in each Gaussian's own frame; adan: as GaussianImage; adam: as Image-GS; each has its "
-        "own parameters and learning rates",
+    optimizer: Literal["gaussian-adam", "adan", "adam"] = Field(
+        "gaussian-adam",
+        description="gaussian-adam: Adam in each Gaussian's own frame; adan: as GaussianImage; adam: as Image-GS; each "
+        "has its own parameters and learning rates",
     )
     learning_rate_factor: float = Field(1.0, gt=0.0, description="factor on all learning rates of the optimizer")
     # The length
@@ -112,6 +113,11 @@ class FitConfig(BaseModel):
     def usual_iterations(self) -> int:
         """Iterations of a fit without a clock."""
         return self.iterations or _USUAL_ITERATIONS
+
+    @property
+    def max_iterations(self) -> float:
+        """Iterations of a fit; infinite where the clock alone ends it."""
+        return math.inf if self.iterations is None and self.max_seconds is not None else self.usual_iterations
 
     def __repr__(self) -> str:
         changed = self.model_dump(exclude_defaults=True)
@@ -154,13 +160,13 @@ def available_recipes() -> list[str]:
 
 
 def _first(error: ValidationError) -> Exception:
-    """Return the first of pydantic's findings as an error of ours."""
-    found = error.errors()[0]
-    name = ".".join(map(str, found["loc"]))
-    if found["type"] == "extra_forbidden":
+    """Return the first of pydantic's errors as one of ours."""
+    detail = error.errors()[0]
+    name = ".".join(map(str, detail["loc"]))
+    if detail["type"] == "extra_forbidden":
         near = get_close_matches(name, FitConfig.model_fields, 1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(FitConfig.model_fields)}"
         return ValueError(f"unknown setting {name!r}: {hint}")
-    if found["type"] == "value_error":
-        return cast(Exception, found["ctx"]["error"])
-    return InvalidArgument(name, found["msg"].removeprefix("Input should be "), repr(found["input"]))
+    if detail["type"] == "value_error":
+        return cast(Exception, detail["ctx"]["error"])
+    return InvalidArgument(name, detail["msg"].removeprefix("Input should be "), repr(detail["input"]))

@@ -19,7 +19,7 @@ def refine_contours(
     scene: Scene,
     image: Tensor,
     *,
-    given: Tensor | None = None,
+    anchor: Tensor | None = None,
     max_distance: float | None = 3.0,
     length_weight: float = 0.003,
     reach: int = 2,
@@ -37,7 +37,7 @@ def refine_contours(
     """
     regions = scene.regions
     assert regions is not None
-    given = regions.labels if given is None else given
+    anchor = regions.labels if anchor is None else anchor
     if regions.num_regions == 1:
         return regions
     index = index_map(regions, regions.labels)
@@ -49,7 +49,7 @@ def refine_contours(
     moving = MovingLabels(index, costs, length_weight, pad, smallest)
     moving.fix_cores(rim, reach * sweeps)
     if max_distance is not None:
-        moving.bound(index_map(regions, given), distance)
+        moving.bound(index_map(regions, anchor), distance)
     for _ in range(sweeps):
         if not moving.sweep(reach):
             break
@@ -62,7 +62,7 @@ def refine_contours(
 
 
 def accept_moves(before: RegionMap, after: RegionMap, gain: Tensor) -> RegionMap:
-    """Keep, of the moves between two maps, those whose surroundings are rendered better; lose no region.
+    """Accept, of the moves between two maps, those whose surroundings are rendered better; lose no region.
 
     Moves are judged by the region's Gaussians alone; the render blends them over soft contours. Pixels that changed are
     grouped with all within two pixels, and a group stays changed where its gain, (H, W), is positive in its sum.
@@ -72,8 +72,8 @@ def accept_moves(before: RegionMap, after: RegionMap, gain: Tensor) -> RegionMap
     changed = (before.labels != after.labels).cpu().numpy()
     groups, count = ndimage.label(ndimage.binary_dilation(changed, iterations=2), np.ones((3, 3)))
     sums = ndimage.sum_labels(gain.double().cpu().numpy(), groups, np.arange(1, count + 1))
-    kept = torch.from_numpy(np.concatenate([[False], sums > 0])[groups]).to(before.labels.device)
-    labels = torch.where(kept, after.labels, before.labels)
-    if not bool(kept.any()) or len(torch.unique(labels)) < before.num_regions:
+    accepted = torch.from_numpy(np.concatenate([[False], sums > 0])[groups]).to(before.labels.device)
+    labels = torch.where(accepted, after.labels, before.labels)
+    if not bool(accepted.any()) or len(torch.unique(labels)) < before.num_regions:
         return before
     return after.relabel(labels, "mean")

@@ -1,85 +1,57 @@
-"""What the loop and the trials of strategies do with a state: render, step downhill, measure."""
+"""What the loop and the strategies do with a scene: render it, and take the gradient of the loss."""
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor
 
-from kcgs.functional import region_splat, ssim
+from kcgs.functional import RegionMap, region_splat, ssim
+from kcgs.nn import GaussianField
+from kcgs.scene import Scene
 
-from .state import FitState, Gaussians, HistoryEntry
+from .problem import Problem
+from .state import FitState
 
-# about how many entries the history gets
-_HISTORY_POINTS = 100
-# weight of 1 - SSIM beside the mean absolute error, as Image-GS has it
+# weight of 1 - SSIM beside the mean absolute error, as in Image-GS
 _SSIM_WEIGHT = 0.1
+# colours beyond it are near overflow
+_MAX_COLOR = 1e15
 
 
-def render(state: FitState, gaussians: Gaussians | None = None) -> Tensor:
-    """Render (C, H, W): these Gaussians, or those of the moment."""
-    means, cholesky, colors, region_ids, regions = gaussians or state.gaussians()
-    settings = {"size": state.size, "cutoff": state.cutoff, "backend": state.config.backend}
-    rendered = region_splat(means, cholesky, colors, region_ids, regions, **settings)  # type: ignore[arg-type]
-    return rendered.clamp(0.0, 1.0) if state.clamp else rendered
+def render(state: FitState, scene: Scene | None = None) -> Tensor:
+    """Render (C, H, W): the state's scene, or another."""
+    scene, config = scene or state.scene, state.problem.config
+    field, size = scene.field, state.problem.size
+    rendered = region_splat(
+        field.means, field.cholesky, field.colors, field.region_ids, scene.regions,
+        size=size, cutoff=state.cutoff, backend=config.backend,
+    )  # fmt: skip
+    return rendered.clamp(0.0, 1.0) if state.problem.clamp else rendered
 
 
-def squared_error(state: FitState, gaussians: Gaussians | None = None) -> Tensor:
-    """Squared error of each pixel, (H, W), channels averaged."""
-    return (render(state, gaussians).detach() - state.image).square().mean(0)
+def squared_error(state: FitState, regions: RegionMap | None = None) -> Tensor:
+    """Squared error of each pixel, (H, W), channels averaged; with other contours, where `regions` are given."""
+    scene = state.scene if regions is None else Scene(state.scene.field, regions)
+    return (render(state, scene).detach() - state.problem.image).square().mean(0)
 
 
-def descend(state: FitState, rendered: Tensor, progress: float) -> None:
-    """Move the Gaussians downhill from a render of them."""
-    _backward(state, rendered)
-    state.optimizer.step(state.optimizer.decay(progress))
-    state.iteration += 1
-
-
-def _backward(state: FitState, rendered: Tensor) -> None:
-    """Leave the gradient of the loss at the Gaussians, but for a constant, which no optimizer here feels."""
-    if state.config.loss == "l2":
-        # in the render's own memory, which nothing needs again: new memory would take as long as the sum
-        difference = rendered.data.sub_(state.image)
-        rendered.backward(difference if state.objective is None else state.objective.apply(difference))
+def backward(problem: Problem, rendered: Tensor) -> None:
+    """Leave half the gradient of the loss at the field; no optimizer here depends on the factor."""
+    config, image = problem.config, problem.image
+    if config.loss == "l2":
+        # in the memory of the render, which nothing needs again: new memory would take as long as the sum
+        residual = rendered.data.sub_(image)
+        rendered.backward(residual if problem.objective is None else problem.objective.apply(residual))
         return
-    difference = torch.sub(rendered.detach(), state.image).sign_()
-    if state.config.loss == "l1+ssim":
+    sign = torch.sub(rendered.detach(), image).sign_()
+    if config.loss == "l1+ssim":
         leaf = rendered.detach().requires_grad_()
-        (slope,) = torch.autograd.grad(ssim(leaf, state.image), leaf)
-        difference -= _SSIM_WEIGHT * leaf.numel() * slope
-    rendered.backward(difference)
+        (slope,) = torch.autograd.grad(ssim(leaf, image), leaf)
+        sign -= _SSIM_WEIGHT * leaf.numel() * slope
+    rendered.backward(sign)
 
 
-def log_is_due(state: FitState) -> bool:
-    """Say whether the history wants an entry: about a hundred over the fit, of no more than N Gaussians."""
-    config = state.config
-    if state.count() > state.num_gaussians:
-        return False
-    if config.max_seconds is None:
-        return state.iteration % max(1, config.usual_iterations // _HISTORY_POINTS) == 0
-    due = state.history[-1].seconds + config.max_seconds / _HISTORY_POINTS if state.history else 0.0
-    return state.seconds() >= due
-
-
-def log(state: FitState, rendered: Tensor, gaussians: Gaussians | None = None) -> None:
-    """Measure a render of these Gaussians, or of those of the moment, and keep them if they are the best so far."""
-    gaussians = gaussians or state.gaussians()
-    difference = rendered.detach() - state.image
-    loss = float(difference.square().mean() if state.config.loss == "l2" else difference.abs().mean())
-    difference = rendered.detach().clamp(0.0, 1.0) - state.image
-    seen = None if state.objective is None else state.objective.value(difference)
-    error = difference.square_().flatten(1)
-    psnr = _decibel(float(error.mean()))
-    ef_psnr = math.nan if state.band is None else _decibel(float(error.index_select(1, state.band).mean()))
-    entry = HistoryEntry(state.iteration, state.seconds(), loss, psnr, ef_psnr, len(gaussians.means))
-    state.history.append(entry)
-    score = psnr if seen is None else _decibel(seen)
-    if score > state.best_score:
-        state.best_score, state.best = score, gaussians.detached()
-
-
-def _decibel(mean_square: float) -> float:
-    """PSNR of a mean squared error, for values in [0, 1]."""
-    return math.inf if mean_square == 0 else -10.0 * math.log10(mean_square)
+def is_finite(field: GaussianField) -> bool:
+    """True where every number is finite, and colours are far from overflow."""
+    finite = [torch.isfinite(tensor).all() for tensor in (field.means, field.cholesky)]
+    return bool(torch.stack([*finite, (field.colors.detach().abs() < _MAX_COLOR).all()]).all())

@@ -70,13 +70,22 @@ def choose(places, square, norm, share, gain, limits, picked):  # type: ignore[n
 
 
 def pick(
-    x: NDArray[Any], y: NDArray[Any], order: NDArray[Any], square: NDArray[Any], norm: NDArray[Any],
-    share: NDArray[Any], gain: NDArray[Any], count: int, *, floor: float, overlap: float, reach: float, longest: float,
-) -> NDArray[np.int64]:  # fmt: skip
-    """Return the positions that are picked, at most `count`, the strongest first; arguments as in :func:`choose`."""
+    places: NDArray[Any],
+    square: NDArray[Any],
+    norm: NDArray[Any],
+    share: NDArray[Any],
+    gain: NDArray[Any],
+    count: int,
+    *,
+    floor: float,
+    overlap: float,
+    reach: float,
+    longest: float,
+) -> NDArray[np.int64]:
+    """Return the positions of at most `count` candidates, the strongest first; arguments as in :func:`choose`."""
     picked = np.zeros(min(count, len(gain)), np.int64)
     if not len(picked):
         return picked
-    numbers = (np.ascontiguousarray(a, np.float64) for a in (np.stack([x, y, order], -1), square, norm))
+    columns = (np.ascontiguousarray(a, np.float64) for a in (places, square, norm))
     share, gain = (np.array(a, np.float64) for a in (share, gain))
-    return picked[: choose(*numbers, share, gain, (floor, overlap, reach, longest), picked)]
+    return picked[: choose(*columns, share, gain, (floor, overlap, reach, longest), picked)]

@@ -1,4 +1,4 @@
-"""What a fit lowers besides the squared error: what MS-SSIM lacks."""
+"""The objective `ms-ssim` of a fit."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from torch.nn.functional import pad
 
 from kcgs.functional import RegionMap
 from kcgs.functional.metrics import K1, K2, SCALE_WEIGHTS, SSIM_SIGMA, SSIM_WINDOW, window_mean
+from kcgs.nn import GaussianField
 
-from .pursuit import Proposal, halve, propose
+from .pursuit import halve, propose
 
-# weight of the squared error; and the least mean of a scale, for the logarithm has no end there
-_SQUARED, _LEAST_SCORE = 0.003, 0.2
+# weight of the squared error
+_SQUARED = 0.003
+# least mean of a scale, since the logarithm has no bound at 0
+_MIN_SCORE = 0.2
 
 
 class MsSsimObjective:
@@ -84,15 +87,15 @@ class MsSsimObjective:
         x, y = means.detach().floor().long().unbind(-1)
         total = torch.zeros_like(xx)
 
-        def kept(added: float) -> Tensor:
-            return l11 * l22 / ((xx + added) * (yy + added) - xy**2).sqrt()
+        def energy_after(variance: float) -> Tensor:
+            """Share of a Gaussian's energy that is left after a blur, which adds its variance."""
+            return l11 * l22 / ((xx + variance) * (yy + variance) - xy**2).sqrt()
 
         for level, fine, coarse, mask in self._bands:
             row, column = (
                 (place >> level).clamp(0, length - 1) for place, length in zip((y, x), mask.shape, strict=True)
             )
-            # an average is a convolution, which adds its variance, and loses as much energy
-            total += 0.25**level * mask[row, column] * (kept(fine) - kept(coarse))
+            total += 0.25**level * mask[row, column] * (energy_after(fine) - energy_after(coarse))
         return total
 
     def _measure(self, residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -110,7 +113,7 @@ class MsSsimObjective:
                 bright = mean * mean + of_shown * of_shown + K1**2
                 light = (2.0 * mean * of_shown + K1**2) / bright
                 darker = like * (light * of_shown - mean) / bright
-            score = (like * light).mean((1, 2)).clamp_min(_LEAST_SCORE)
+            score = (like * light).mean((1, 2)).clamp_min(_MIN_SCORE)
             total -= weight / self._norm * mean[0].numel() * score.log().mean()
             share = inside * (weight / self._norm * 0.25**level) / score[:, None, None]
             pull = share * light / both
@@ -134,7 +137,7 @@ def make_objective(name: str, image: Tensor) -> MsSsimObjective | None:
     return MsSsimObjective(image) if name == "ms-ssim" else None
 
 
-def propose_by(
+def propose_for(
     objective: MsSsimObjective | None,
     residual: Tensor,
     regions: RegionMap | None,
@@ -142,7 +145,7 @@ def propose_by(
     *,
     sigmas: Sequence[float],
     backend: str = "auto",
-) -> Proposal:
+) -> GaussianField:
     """Find at most `count` Gaussians that lower the objective most, of a residual, image - render: see `propose`."""
     if objective is None:
         return propose(residual, regions, count, sigmas=sigmas, backend=backend)
@@ -150,8 +153,9 @@ def propose_by(
     root = objective.importance.sqrt()
     added = propose(-objective.apply(-residual) / root, regions, count, sigmas=sigmas, backend=backend)
     # in the filtered residual, what counts more is larger
-    x, y = added.means.long().unbind(-1)
-    return added._replace(colors=added.colors / root[y, x, None])
+    x, y = added.means.detach().long().unbind(-1)
+    added.colors.data = added.colors.detach() / root[y, x, None]
+    return added
 
 
 def _blur(maps: Tensor) -> Tensor:

@@ -14,27 +14,21 @@ from torch.nn.functional import max_pool2d, pad
 
 from kcgs.functional import RegionMap, region_splat
 from kcgs.functional.blur import blur, gaussian_taps
+from kcgs.nn import GaussianField
+from kcgs.nn.field import join
 
 # reach of the discrete Gaussians, in standard deviations
 _REACH = 3.0
 # standard deviation of the search's Gaussians in blocks, at least
 _SIGMA_PER_BLOCK = 0.9
-# candidates for each wanted Gaussian, and at least
-_CANDIDATES = (16, 4096)
+# candidates for each Gaussian to be added
+_CANDIDATES_PER_GAUSSIAN = 16
+_MIN_CANDIDATES = 4096
 # two Gaussians whose normalised inner product is above this explain the same error: 2.5 sigma apart, at one scale
 _OVERLAP = 0.2
 _CUTOFF = 1e-4
 
 Array = NDArray[Any]
-
-
-class Proposal(NamedTuple):
-    """Gaussians to add, strongest first; K of them, in pixels, of the dtype and device of the residual."""
-
-    means: Tensor  # (K, 2)
-    cholesky: Tensor  # (K, 3)
-    colors: Tensor  # (K, C)
-    region_ids: Tensor | None  # (K,) int64
 
 
 class _Candidates(NamedTuple):
@@ -56,41 +50,42 @@ class _Candidates(NamedTuple):
 
 def propose(
     residual: Tensor, regions: RegionMap | None, count: int, *, sigmas: Sequence[float], backend: str = "auto"
-) -> Proposal:
+) -> GaussianField:
     r"""Find at most `count` round Gaussians that lower the squared error most when they are added to the render.
 
     A Gaussian g lowers it by :math:`\sum_c \langle g, e_c \rangle^2 / \langle g, g \rangle`, with products over pixels
-    of its region. Contours are hard in the search, and centres are those of pixels; nothing is sampled at random.
+    of its region. Contours are hard in the search, and centres are those of pixels; nothing is sampled at random. The
+    strongest come first.
     """
-    error = residual.detach()
-    index = torch.zeros_like(error[0], dtype=torch.int32) if regions is None else regions.index[0]
+    residual = residual.detach()
+    index = torch.zeros_like(residual[0], dtype=torch.int32) if regions is None else regions.index[0]
     labels = index.cpu().numpy()
     # below this the gain is rounding error: one pixel's, at the precision of the largest
-    floor = (128 * torch.finfo(error.dtype).eps * float(error.abs().max())) ** 2
-    nothing = error.new_zeros
+    floor = (128 * torch.finfo(residual.dtype).eps * float(residual.abs().max())) ** 2
     ids = None if regions is None else regions.ids[:0]
-    parts = [Proposal(nothing(0, 2), nothing(0, 3), nothing(0, len(error)), ids)]
-    while (wanted := count - sum(len(part.means) for part in parts)) > 0:
-        chosen = _pursue(_search(error, labels, sigmas, wanted), wanted, floor)
+    empty = residual.new_zeros
+    size = (residual.shape[1], residual.shape[2])
+    field = GaussianField(empty(0, 2), empty(0, 3), empty(0, len(residual)), ids, size=size)
+    while (missing := count - field.num_gaussians) > 0:
+        chosen = _pursue(_search(residual, labels, sigmas, missing), missing, floor)
         if not len(chosen.x):
             break
-        part, rendered = _place(chosen, error, labels, regions, backend)
+        part, rendered = _place(chosen, residual, labels, regions, backend)
         if not bool(part.colors.any()):
             break
-        parts.append(part)
-        error = error - rendered
-    columns = zip(*parts, strict=True)
-    return Proposal(*(None if column[0] is None else torch.cat(column) for column in columns))  # type: ignore[arg-type]
+        field = join(field, part)
+        residual = residual - rendered
+    return field
 
 
 def _search(residual: Tensor, labels: NDArray[np.int32], sigmas: Sequence[float], count: int) -> _Candidates:
     """Evaluate every place and scale of every region; keep the best of each square, and of those the strongest."""
     from scipy.ndimage import find_objects
 
-    limit = max(_CANDIDATES[0] * count, _CANDIDATES[1])
+    limit = max(_CANDIDATES_PER_GAUSSIAN * count, _MIN_CANDIDATES)
     scales = {block: [s for s in sigmas if _block(s) == block] for block in sorted(map(_block, sigmas))}
     align = 2 * max(scales)
-    found: list[_Candidates] = []
+    parts: list[_Candidates] = []
     for region, box in enumerate(find_objects(labels + 1)):
         if box is None:
             continue
@@ -108,8 +103,8 @@ def _search(residual: Tensor, labels: NDArray[np.int32], sigmas: Sequence[float]
                 averages, side = halve(averages), 2 * side
             margin = math.ceil(_REACH * max(choices) / block)
             padded = pad(averages, (margin, margin, margin, margin))
-            found += [_best_of_squares(padded, margin, region, sigma, block, (left, top), limit) for sigma in choices]
-    everywhere = _Candidates(*(np.concatenate(values) for values in zip(*found, strict=True)))
+            parts += [_best_of_squares(padded, margin, region, sigma, block, (left, top), limit) for sigma in choices]
+    everywhere = _Candidates(*(np.concatenate(values) for values in zip(*parts, strict=True)))
     strong = everywhere.take(_strongest(everywhere.gain, limit))
     return strong.take(np.lexsort((strong.sigma, strong.x, strong.y, strong.region)))
 
@@ -179,16 +174,17 @@ def _pursue(candidates: _Candidates, count: int, floor: float) -> _Candidates:
     share = candidates.inner / np.sqrt(candidates.norm)[:, None]  # [M, C], of normalised Gaussians
     # sorted by region, then y: those near a place are within one stretch
     stride = 4.0 * (candidates.y.max(initial=0.0) + 1.0)
+    places = np.stack([candidates.x, candidates.y, candidates.region * stride + candidates.y], -1)
     picked = pick(
-        candidates.x, candidates.y, candidates.region * stride + candidates.y, candidates.sigma**2, candidates.norm,
-        share, candidates.gain, count, floor=floor, overlap=_OVERLAP, reach=_REACH, longest=stride / 4,
+        places, candidates.sigma**2, candidates.norm, share, candidates.gain, count,
+        floor=floor, overlap=_OVERLAP, reach=_REACH, longest=stride / 4,
     )  # fmt: skip
     return candidates.take(picked)
 
 
 def _place(
     chosen: _Candidates, residual: Tensor, labels: NDArray[np.int32], regions: RegionMap | None, backend: str
-) -> tuple[Proposal, Tensor]:
+) -> tuple[GaussianField, Tensor]:
     """Snap the centres to pixels of their region, and render in the colours of steepest descent."""
     means = torch.from_numpy(_pixel_of_region(chosen, labels)).to(residual)
     sigma = torch.from_numpy(chosen.sigma).to(residual)
@@ -206,7 +202,8 @@ def _place(
         index = torch.from_numpy(labels if hard else np.zeros_like(labels)).to(residual.device, torch.int64)
         length = _best_lengths(rendered, residual, index)
         part = torch.from_numpy(chosen.region if hard else np.zeros_like(chosen.region)).to(index)
-        return Proposal(means, cholesky, colors * length[part, None], ids), rendered * length[index]
+        field = GaussianField(means, cholesky, colors * length[part, None], ids, size=size)
+        return field, rendered * length[index]
 
 
 def _best_lengths(rendered: Tensor, residual: Tensor, index: Tensor) -> Tensor:

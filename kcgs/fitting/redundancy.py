@@ -1,4 +1,4 @@
-"""Which Gaussians are missed least once their neighbours make up for them."""
+"""Which Gaussians have the lowest impact on the render, once their neighbours have taken over."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kcgs.kernels.compiled import Program, inner
 
-# neighbours that make up for a Gaussian, at most
+# most neighbours that take over from a Gaussian
 NEIGHBORS = 16
 # normalised inner products below it do not count
 LEAST_OVERLAP = 0.05
@@ -21,9 +21,14 @@ _WINDOW = 4.0
 # added to the diagonal of the products of neighbours, of which two may be the same
 _RIDGE = 1e-3
 # columns of a row: mean, covariance, and the fourth root of its determinant
-_X, _Y, _XX, _XY, _YY, _ROOT, _COLUMNS = range(7)
+_X = 0
+_Y = 1
+_XX = 2
+_XY = 3
+_YY = 4
+_ROOT = 5
 
-program = Program("choice of Gaussians to leave out", __file__)
+program = Program("choice of Gaussians to remove", __file__)
 
 
 @inner
@@ -88,8 +93,8 @@ def _solve(matrix, count, x):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def score(rows, starts, rests, neighbors, shares):  # type: ignore[no-untyped-def]
-    """Fill, for every row: the part of its energy that its neighbours can't take, who they are, what each takes.
+def score(rows, starts, residuals, neighbors, shares):  # type: ignore[no-untyped-def]
+    """Fill, for every row: the share of its energy that its neighbours cannot explain, their places, their factors.
 
     Rows are sorted by region, then y; region r has those from starts[r] to starts[r + 1]. All are of norm 1.
     """
@@ -105,10 +110,10 @@ def score(rows, starts, rests, neighbors, shares):  # type: ignore[no-untyped-de
                 for m in range(k):
                     power, det = _exponent(rows[places[k]], rows[places[m]])
                     matrix[k, m] = _overlap(rows[places[k]], rows[places[m]], power, det)
-            rests[i] = max(1.0 - _solve(matrix, count, share), 0.0)
+            residuals[i] = max(1.0 - _solve(matrix, count, share), 0.0)
 
 
-def least_missed(
+def lowest_impact(
     means: NDArray[Any],
     cholesky: NDArray[Any],
     colors: NDArray[Any],
@@ -116,22 +121,22 @@ def least_missed(
     count: int,
     weight: NDArray[Any],
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    r"""Choose Gaussians to leave out, and hand their colours to their neighbours.
+    r"""Choose Gaussians to remove, and give their colours to their neighbours.
 
-    Leaving out Gaussian i costs :math:`|c_i|^2 (g_{ii} - g_{iS} G_{SS}^{-1} g_{Si})`, where g are inner products over
+    The impact of Gaussian i is :math:`|c_i|^2 (g_{ii} - g_{iS} G_{SS}^{-1} g_{Si})`, where g are inner products over
     the plane and S are the Gaussians of its region that overlap it most; they get
-    :math:`G_{SS}^{-1} g_{Si} c_i`. The cheapest go first; the neighbours of one that goes stay.
+    :math:`G_{SS}^{-1} g_{Si} c_i`. The lowest impact goes first; the neighbours of a removed Gaussian stay.
 
     Args:
         means: (N, 2), with the other three.
         cholesky: (N, 3).
         colors: (N, C).
         region: (N,), number of each one's region.
-        count: how many should go; fewer do where too many are neighbours.
-        weight: (N,), what the squared error about each one counts.
+        count: how many to remove; fewer are where too many are neighbours.
+        weight: (N,), the weight of the squared error about each one.
 
     Returns:
-        Which go, (N,), and the colours of all, (N, C).
+        A mask of those to remove, (N,), and the colours of all, (N, C).
     """
     l11, l21, l22 = cholesky.astype(np.float64).T
     yy = l21**2 + l22**2
@@ -139,21 +144,21 @@ def least_missed(
     order = np.lexsort((table[:, _Y], region))
     rows, colors = table[order], colors[order].astype(np.float64)
     starts = np.searchsorted(region[order], np.arange(region.max(initial=0) + 2))
-    rests, neighbors = np.empty(len(rows)), np.empty((len(rows), NEIGHBORS), np.int64)
+    residuals, neighbors = np.empty(len(rows)), np.empty((len(rows), NEIGHBORS), np.int64)
     shares = np.zeros(neighbors.shape)
-    score(rows, starts, rests, neighbors, shares)
+    score(rows, starts, residuals, neighbors, shares)
     norm = math.sqrt(math.pi) * rows[:, _ROOT]
     colors *= norm[:, None]
-    goes, stays = np.zeros(len(rows), np.bool_), np.zeros(len(rows), np.bool_)
-    handed = colors.copy()
-    costs = rests * np.square(colors).sum(1) * weight[order]
-    for i in np.argsort(costs, kind="stable"):
+    removed, needed = np.zeros(len(rows), np.bool_), np.zeros(len(rows), np.bool_)
+    new_colors = colors.copy()
+    impacts = residuals * np.square(colors).sum(1) * weight[order]
+    for i in np.argsort(impacts, kind="stable"):
         if count <= 0:
             break
-        others = neighbors[i, : np.count_nonzero(neighbors[i] >= 0)]
-        if stays[i] or goes[others].any():
+        heirs = neighbors[i, : np.count_nonzero(neighbors[i] >= 0)]
+        if needed[i] or removed[heirs].any():
             continue
-        goes[i], stays[others], count = True, True, count - 1
-        handed[others] += shares[i, : len(others), None] * colors[i]
-    back = np.argsort(order)
-    return goes[back], (handed / norm[:, None])[back]
+        removed[i], needed[heirs], count = True, True, count - 1
+        new_colors[heirs] += shares[i, : len(heirs), None] * colors[i]
+    ranks = np.argsort(order)
+    return removed[ranks], (new_colors / norm[:, None])[ranks]

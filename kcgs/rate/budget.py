@@ -15,7 +15,7 @@ from kcgs._progress import Progress
 from kcgs._repr import brief
 from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, FitResult, HistoryEntry, fit
-from kcgs.fitting.loop import check_problem
+from kcgs.fitting.problem import check_image_and_regions
 from kcgs.fitting.region_report import report_regions
 from kcgs.functional import RegionMap, merge_regions
 from kcgs.functional.labels import contour_edges
@@ -116,7 +116,7 @@ def fit_bytes(
         (True, None)
     """
     config = FitConfig.from_recipe(recipe, **settings)
-    image, regions = check_problem(image, regions)
+    image, regions = check_image_and_regions(image, regions)
     check_count("target_bytes", target_bytes)
     if config.target_psnr is not None:
         raise InvalidArgument("target_psnr", "None with target_bytes", config.target_psnr)

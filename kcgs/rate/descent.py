@@ -11,9 +11,9 @@ from torch import Tensor
 
 from kcgs.codec.exact import Integers
 from kcgs.codec.gaussians.quantize import Parameters, Quantizer
-from kcgs.fitting.newton import Gaussians, NewtonDescent, area, half_gradients
 from kcgs.fitting.objective import MsSsimObjective
 from kcgs.functional import RegionMap, region_splat
+from kcgs.optim.newton import Gaussians, NewtonDescent, area, half_gradients
 
 from .bits import soft_bits
 

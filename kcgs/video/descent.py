@@ -9,13 +9,14 @@ from torch import Tensor
 
 from kcgs.fitting import FitConfig
 from kcgs.fitting.contour_moves import accept_moves, refine_contours
-from kcgs.fitting.frame import area, move, newton_steps, widen
-from kcgs.fitting.objective import make_objective, propose_by
-from kcgs.fitting.redundancy import least_missed
+from kcgs.fitting.objective import make_objective, propose_for
+from kcgs.fitting.redundancy import lowest_impact
 from kcgs.fitting.start import draft_cutoff
-from kcgs.fitting.state import Gaussians
-from kcgs.fitting.strategies import MoveContours
+from kcgs.fitting.strategies import AdaptContours
 from kcgs.functional import region_splat
+from kcgs.optim.frame import area, move, newton_steps, widen
+
+from .gaussians import Gaussians
 
 _ITERATIONS = 85
 # standard deviations in pixels that are tried for a relocated Gaussian
@@ -105,14 +106,14 @@ class Descent:
         visible, self.crowding = self._visibility()
         weight = torch.where(self.free, self._weights() * visible, _HELD).cpu().numpy()
         x, factors, c, index = (t.cpu().numpy() for t in rows)
-        goes, handed = least_missed(x, factors, c, index, count, weight)
+        goes, handed = lowest_impact(x, factors, c, index, count, weight)
         relocated = torch.from_numpy(goes).to(means.device)
         colors = torch.from_numpy(handed).to(colors).masked_fill(relocated[:, None], 0.0)
         self.gaussians = self.gaussians._replace(colors=colors)
         self.velocity[relocated], self.free = 0.0, self.free | relocated
         residual = (self.image - render_draft(self.gaussians, self.image, self.config)) * self.changed
         count = int(relocated.sum())
-        added = propose_by(self.objective, residual, regions, count, sigmas=_SIGMAS, backend=self.config.backend)
+        added = propose_for(self.objective, residual, regions, count, sigmas=_SIGMAS, backend=self.config.backend)
         places = relocated.nonzero()[: len(added.means), 0]
         if ids is not None and added.region_ids is not None:
             ids = ids.index_copy(0, places, added.region_ids)
@@ -128,7 +129,7 @@ class Descent:
         if before is None or before.num_regions == 1:
             return
         moved = refine_contours(
-            self.gaussians.scene(before.size), self.image, given=anchor,
+            self.gaussians.scene(before.size), self.image, anchor=anchor,
             max_distance=None if config.max_move == "any" else config.max_move, length_weight=config.contour_cost,
             backend=config.backend,
         )  # fmt: skip
@@ -137,7 +138,7 @@ class Descent:
         errors = [
             squared_error(self.gaussians._replace(regions=regions), self.image, config) for regions in (before, moved)
         ]
-        accepted = accept_moves(before, moved, MoveContours.rise * errors[0] - errors[1])
+        accepted = accept_moves(before, moved, AdaptContours.max_rise * errors[0] - errors[1])
         self.gaussians = self.gaussians._replace(regions=accepted)
 
     def _visibility(self) -> tuple[Tensor, Tensor]:

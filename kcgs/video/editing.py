@@ -11,7 +11,6 @@ from kcgs.editing.inpainting import inpaint
 from kcgs.editing.masks import check_offset, dilate, nearest_labels, shift_labels
 from kcgs.editing.selection import check_region_ids
 from kcgs.fitting import FitConfig
-from kcgs.fitting.state import Gaussians
 from kcgs.functional import RegionMap
 from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
@@ -20,6 +19,7 @@ from kcgs.scene import Scene, check_batch
 
 from .descent import Descent
 from .fitting import stack
+from .gaussians import Gaussians
 from .motion import motion_at
 
 # image (C, H, W), labels (H, W), and which pixels are not known (H, W)

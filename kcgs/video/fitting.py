@@ -17,14 +17,14 @@ from kcgs._check import check_count
 from kcgs._progress import Progress
 from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, fit
-from kcgs.fitting.loop import check_problem
-from kcgs.fitting.state import Gaussians
+from kcgs.fitting.problem import check_image_and_regions
 from kcgs.functional import RegionMap, lookup_regions
 from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
 from .descent import Descent, region_positions, squared_error, sum_over_pixels
+from .gaussians import Gaussians
 from .motion import estimate_motion, move_labels, move_points
 
 OnFrame = Callable[[int, Scene], bool | None]
@@ -122,7 +122,7 @@ class _Video:
     def add(self, frame: Any, labels: Labels | None) -> Scene:
         """Fit a frame; labels None: the map before is carried on, where there is one."""
         before = self.image
-        self.image, regions = check_problem(frame, labels)
+        self.image, regions = check_image_and_regions(frame, labels)
         changed = torch.ones_like(self.image[0], dtype=torch.bool)
         if not self.frames:
             gaussians = self._fit_anew(regions)

@@ -145,9 +145,9 @@ class TestEnd:
     def test_useless_gaussians_go(self) -> None:
         image, labels = torch.full((3, 24, 32), 0.5), torch.zeros(24, 32, dtype=torch.long)
         result = fit(image, labels, 50, recipe=quick(prune=0.05))
-        assert result.removed > 0
-        assert result.scene.field.num_gaussians == 50 - result.removed or result.scene.field.num_gaussians < 50
-        assert result.change <= 0.05
+        assert result.num_pruned > 0
+        assert result.scene.field.num_gaussians == 50 - result.num_pruned or result.scene.field.num_gaussians < 50
+        assert result.prune_error <= 0.05
 
     @pytest.mark.parametrize(("chart", "least"), [(chart_2x3, 70.0), (chart_pie, 35.0)])
     def test_charts(self, chart: object, least: float) -> None:

@@ -163,7 +163,7 @@ class TestMoves:
         field = flat_field({0: [0.0], 1: [1.0]}, (24, 40))
         regions = RegionMap.from_labels(given)
         for _ in range(4):
-            regions = refine_contours(Scene(field, regions), image, given=given)
+            regions = refine_contours(Scene(field, regions), image, anchor=given)
         assert torch.equal(regions.labels, step(15))
 
     @pytest.mark.parametrize("distance", [1, 2.3, 3.0, 5])
@@ -172,7 +172,7 @@ class TestMoves:
         field, image, start = noisy_problem(seed)
         regions = start
         for _ in range(3):
-            regions = refine_contours(Scene(field, regions), image, given=start.labels, max_distance=distance, reach=3)
+            regions = refine_contours(Scene(field, regions), image, anchor=start.labels, max_distance=distance, reach=3)
             assert_within(regions.labels, start.labels, distance)
             assert set(regions.ids.tolist()) == set(start.ids.tolist())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import pairwise
 from typing import Any
 
@@ -10,100 +11,101 @@ import torch
 
 from kcgs import FitConfig, RegionMap
 from kcgs.fitting.contour_moves import accept_moves
-from kcgs.fitting.optimizers import FrameAdam, GaussianImageAdan
+from kcgs.fitting.optimizers import make_optimizer, set_learning_rates
+from kcgs.fitting.problem import make_problem
+from kcgs.fitting.result import HistoryEntry
 from kcgs.fitting.start import start
-from kcgs.fitting.state import FitState, HistoryEntry
-from kcgs.fitting.strategies import Densify, MoveContours, Strategy, make_strategies
+from kcgs.fitting.state import FitState
+from kcgs.fitting.strategies import Densify, SettleContours, make_strategies
 from kcgs.nn import GaussianField
 
 
-def state_of(num_gaussians: int, started: float = 0.0, **settings: Any) -> FitState:
-    return start(torch.rand(1, 8, 8), None, num_gaussians, FitConfig(**settings), 0, started)
+def state_of(num_gaussians: int, **settings: Any) -> FitState:
+    return start(make_problem(torch.rand(1, 8, 8), None, num_gaussians, FitConfig(**settings), 0))
+
+
+def targets(progress: Iterable[float], **settings: Any) -> list[int]:
+    """How many Gaussians the schedule asks for, of at most 60."""
+    state, counts = state_of(60, **settings), []
+    for state.progress in progress:
+        counts.append(Densify().target(state))
+    return counts
 
 
 class TestDensify:
     def test_the_number_grows_and_then_goes_up_and_down(self) -> None:
-        densify = Densify(state_of(1000))
-        counts = [densify.wanted(p / 1000) for p in range(1001)]
-        assert counts[0] == counts[49] == 10
+        counts = targets(p / 1000 for p in range(1001))
+        assert counts[0] == counts[49] == 1
         growth, cycles, rest = counts[:401], counts[400:800], counts[800:]
         assert all(b >= a for a, b in pairwise(growth))
-        assert len(set(growth)) == densify.steps + 1
-        assert growth[-1] == max(counts) == 1200
+        assert len(set(growth)) == Densify.steps + 1
+        assert growth[-1] == max(counts) == 72
         assert sum(b > a for a, b in pairwise(cycles)) == 2  # three cycles in 700 iterations
-        assert min(cycles) == cycles[-1] == 1000
-        assert set(rest) == {1000}
+        assert min(cycles) == cycles[-1] == 60
+        assert set(rest) == {60}
 
-    def test_longer_fits_have_more_cycles(self) -> None:
-        def cycles(iterations: int) -> int:
-            densify = Densify(state_of(1000, iterations=iterations))
-            return sum(b > a for a, b in pairwise(densify.wanted(p / 10_000) for p in range(4000, 10_000)))
+    @pytest.mark.parametrize(("iterations", "cycles"), [(100, 0), (700, 2), (2800, 10)])
+    def test_longer_fits_have_more_cycles(self, iterations: int, cycles: int) -> None:
+        counts = targets((p / 10_000 for p in range(4000, 10_000)), iterations=iterations)
+        assert sum(b > a for a, b in pairwise(counts)) == cycles
 
-        assert [cycles(n) for n in (100, 700, 2800)] == [0, 2, 10]
-
-    def test_is_due_where_more_are_wanted(self) -> None:
-        state = state_of(100)
-        densify = Densify(state)
-        assert not densify.due(0.05)  # nothing is logged yet
+    def test_is_due_where_the_schedule_asks_for_more(self) -> None:
+        state, densify = state_of(60), Densify()
+        state.progress = 0.05
+        assert not densify.due(state)  # nothing is logged yet
         state.history.append(HistoryEntry(0, 0.0, 1.0, 10.0, 10.0, 5))
-        assert not densify.due(0.04)
-        assert densify.due(0.05)
+        assert densify.due(state) and densify.adds(state)
+        state.progress = 0.04
+        assert not densify.due(state)
 
 
 class TestLearningRates:
-    def test_ours_falls_to_a_tenth(self) -> None:
-        optimizer = FrameAdam(GaussianField.random(3, (8, 8), seed=0), 1.0)
-        rates = [optimizer.decay(p / 10) for p in range(11)]
-        assert rates[0] == 1
-        assert rates[-1] == pytest.approx(optimizer.final_decay)
-        assert all(b < a for a, b in pairwise(rates))
+    def rates(self, progress: float, factor: float = 1.0, iterations: int = 12_500, **settings: Any) -> list[float]:
+        config = FitConfig(learning_rate_factor=factor, iterations=iterations, **settings)
+        optimizer = make_optimizer(config, GaussianField.random(3, (8, 8), seed=0), 2.0)
+        set_learning_rates(optimizer, config, progress)
+        return [float(group["lr"]) for group in optimizer.param_groups]
 
-    def test_the_published_one_halves_and_is_larger_in_short_fits(self) -> None:
-        field = GaussianField.random(3, (8, 8), seed=0)
-        optimizer = GaussianImageAdan(field, 2.0, 12_500, 1.0)
-        assert [optimizer.decay(p) for p in (0.0, 0.39, 0.4, 0.8, 1.0)] == [1, 1, 0.5, 0.25, 0.25]
-        assert optimizer.rates == [2e-3, 4e-3, 2e-3]
-        assert GaussianImageAdan(field, 1.0, 1, 1.0).rates == [2e-2] * 3
+    def test_ours_fall_to_a_tenth(self) -> None:
+        geometry, colors = zip(*(self.rates(p / 10) for p in range(11)), strict=True)
+        assert geometry[0] == pytest.approx(0.14) and geometry[-1] == pytest.approx(0.014)
+        assert colors[0] == pytest.approx(0.03) and colors[-1] == pytest.approx(0.003)
+        assert all(b < a for a, b in pairwise(geometry))
 
-    def test_the_factor_scales_all(self) -> None:
-        field = GaussianField.random(3, (8, 8), seed=0)
-        for make in (lambda f: FrameAdam(field, f).rates, lambda f: GaussianImageAdan(field, 1.0, 50_000, f).rates):
-            torch.testing.assert_close(torch.as_tensor(make(3.0)), 3 * torch.as_tensor(make(1.0)))
+    def test_those_of_gaussian_image_halve_and_are_larger_in_short_fits(self) -> None:
+        rates = [self.rates(p, optimizer="adan") for p in (0.0, 0.39, 0.4, 0.8, 1.0)]
+        assert rates == [[f * 2e-3, f * 4e-3, f * 2e-3] for f in (1, 1, 0.5, 0.25, 0.25)]
+        assert self.rates(0.0, iterations=1, optimizer="adan") == [2e-2, 4e-2, 2e-2]
 
+    def test_those_of_image_gs_stay(self) -> None:
+        assert self.rates(0.0, optimizer="adam") == self.rates(1.0, optimizer="adam")
 
-class TestProgress:
-    def test_the_clock_alone_uses_all_of_its_time(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        state = state_of(10, max_seconds=4.0)
-        monkeypatch.setattr("time.perf_counter", lambda: 1.0)
-        state.iteration = 5000
-        assert state.progress() == 0.25
-        assert state.length() == 20_000
-
-    def test_is_the_scarcer_of_iterations_and_seconds(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        state = state_of(10, max_seconds=4.0, iterations=100)
-        monkeypatch.setattr("time.perf_counter", lambda: 1.0)
-        state.iteration = 50
-        assert state.progress() == 0.5
-        monkeypatch.setattr("time.perf_counter", lambda: 3.0)
-        assert state.progress() == 0.75
+    @pytest.mark.parametrize("optimizer", ["gaussian-adam", "adan", "adam"])
+    def test_the_factor_scales_all(self, optimizer: str) -> None:
+        once, thrice = (self.rates(0.5, factor, optimizer=optimizer) for factor in (1.0, 3.0))
+        assert thrice == pytest.approx([3 * rate for rate in once])
 
 
 class TestStrategies:
-    def test_are_those_that_the_settings_ask_for(self) -> None:
-        def names(**settings: Any) -> list[str]:
-            return [type(strategy).__name__ for strategy in make_strategies(state_of(10, **settings))]
-
-        assert names() == ["EndDrafts", "Densify", "MoveContours"]
-        assert names(warmup=True, move_contours=False) == ["EndDrafts", "RefreshIds", "Densify"]
+    @pytest.mark.parametrize(
+        ("settings", "names"),
+        [
+            ({}, ["EndDrafts", "AdaptContours", "Densify", "SettleContours"]),
+            ({"warmup": True, "move_contours": False}, ["EndDrafts", "RefreshIds", "Densify"]),
+            ({"densify": "largest-error", "move_contours": False}, ["EndDrafts", "DensifyAtLargestError"]),
+        ],
+    )
+    def test_are_those_of_the_settings(self, settings: dict[str, Any], names: list[str]) -> None:
+        assert [type(strategy).__name__ for strategy in make_strategies(FitConfig(**settings))] == names
 
     def test_late_moves_are_even(self) -> None:
-        state, due = state_of(10), []
-        strategy: Strategy = MoveContours(state, after=0.5)
+        state, strategy, times = state_of(10), SettleContours(after=0.5), []
         for p in range(101):
-            if strategy.due(p / 100):
-                state.late_moves += 1
-                due.append(p / 100)
-        assert due == [0.6, 0.7, 0.8, 0.9]
+            state.progress = p / 100
+            if strategy.due(state):
+                state.num_late_moves += 1
+                times.append(p / 100)
+        assert times == [0.6, 0.7, 0.8, 0.9]
 
 
 class TestMaps:
@@ -114,9 +116,9 @@ class TestMaps:
         labels[30:33, 13:15] = 1
         gain = torch.zeros(40, 30)
         gain[:20], gain[20:] = 1.0, -1.0
-        kept = accept_moves(before, RegionMap.from_labels(labels), gain).labels
-        assert torch.equal(kept[:20], labels[:20])
-        assert torch.equal(kept[20:], before.labels[20:])
+        accepted = accept_moves(before, RegionMap.from_labels(labels), gain).labels
+        assert torch.equal(accepted[:20], labels[:20])
+        assert torch.equal(accepted[20:], before.labels[20:])
 
     def test_a_region_is_never_lost(self) -> None:
         labels = torch.zeros(20, 20, dtype=torch.long)

@@ -9,21 +9,12 @@ import torch
 from torch import Tensor
 
 from kcgs import RegionMap
-from kcgs.fitting.config import FitConfig
-from kcgs.fitting.start import first_field, gradient_field
+from kcgs.fitting import initial_field
+from kcgs.fitting.initial import gradient_field, random_field
 from kcgs.functional import lookup_regions, region_splat
 from kcgs.nn import GaussianField
 
-NAMES = ["gradient", "random", "uniform"]
-
-
-def begin(name: str, image: Tensor, count: int, regions: RegionMap | None, seed: int) -> GaussianField:
-    config = FitConfig.from_recipe("best", initializer=name, densify_from=1.0)
-    return first_field(image, count, regions, config, seed)[0]
-
-
-def uniform(image: Tensor, count: int, regions: RegionMap | None, seed: int) -> GaussianField:
-    return begin("uniform", image, count, regions, seed)
+START = {"gradient": gradient_field, "random": random_field, "uniform": initial_field}
 
 
 def scene(size: tuple[int, int] = (48, 64), channels: int = 3) -> tuple[Tensor, Tensor]:
@@ -41,43 +32,43 @@ def draw(field: GaussianField, regions: RegionMap | None) -> Tensor:
     return region_splat(field.means, field.cholesky, field.colors, field.region_ids, regions, size=field.size).detach()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", START)
 class TestEvery:
     @pytest.mark.parametrize("channels", [1, 3, 8])
     @pytest.mark.parametrize("count", [1, 40, 500])
     def test_counts_shapes_and_ids(self, name: str, count: int, channels: int) -> None:
         image, labels = scene(channels=channels)
         regions = RegionMap.from_labels(labels)
-        field = begin(name, image, count, regions, 0)
+        field = START[name](image, count, regions, 0)
         assert field.num_gaussians == count and field.size == (48, 64) and field.colors.shape == (count, channels)
         assert field.region_ids is not None and bool((regions.index_of(field.region_ids) >= 0).all())
         assert all(torch.isfinite(t).all() for t in (field.means, field.cholesky, field.colors))
 
     def test_without_regions(self, name: str) -> None:
-        field = begin(name, scene()[0], 30, None, 0)
+        field = START[name](scene()[0], 30, None, 0)
         assert field.num_gaussians == 30 and field.region_ids is None
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     def test_keeps_the_dtype(self, name: str, dtype: torch.dtype) -> None:
         image, labels = scene()
-        assert begin(name, image.to(dtype), 30, RegionMap.from_labels(labels), 0).colors.dtype == dtype
+        assert START[name](image.to(dtype), 30, RegionMap.from_labels(labels), 0).colors.dtype == dtype
 
     def test_same_seed_same_bits(self, name: str) -> None:
         image, labels = scene()
-        a, b, c = (begin(name, image, 60, RegionMap.from_labels(labels), seed) for seed in (2, 2, 3))
+        a, b, c = (START[name](image, 60, RegionMap.from_labels(labels), seed) for seed in (2, 2, 3))
         for part in ("means", "cholesky", "colors", "region_ids"):
             assert torch.equal(getattr(a, part), getattr(b, part))
         assert not torch.equal(a.means, c.means)
 
-    def test_more_gaussians_than_pixels(self, name: str) -> None:
+    def test_as_many_gaussians_as_pixels(self, name: str) -> None:
         labels = torch.tensor([[0, 0, 5], [0, 9, 9]])
-        field = begin(name, torch.rand(2, 2, 3), 50, RegionMap.from_labels(labels), 0)
-        assert field.num_gaussians == 50 and len(field.means.unique(dim=0)) == 50
+        field = START[name](torch.rand(2, 2, 3), 6, RegionMap.from_labels(labels), 0)
+        assert field.num_gaussians == 6 and len(field.means.unique(dim=0)) == 6
 
     def test_parameters_without_graph_under_any_mode(self, name: str) -> None:
         image, labels = scene()
         with torch.no_grad():
-            field = begin(name, image, 10, RegionMap.from_labels(labels), 0)
+            field = START[name](image, 10, RegionMap.from_labels(labels), 0)
         assert all(p.requires_grad and p.is_leaf for p in field.parameters())
 
 
@@ -97,10 +88,10 @@ class TestGradient:
         assert len(gradient_field(scene()[0], 1000, None, 0).means.floor().unique(dim=0)) == 1000
 
 
-class TestUniform:
+class TestInitialField:
     def test_has_the_colours_of_the_image(self) -> None:
         image, labels = scene()
-        field = uniform(image, 400, RegionMap.from_labels(labels), 0)
+        field = initial_field(image, 400, RegionMap.from_labels(labels), 0)
         x, y = field.means.detach().long().unbind(-1)
         torch.testing.assert_close(field.colors.detach() * (math.pi / 2), image[:, y, x].T)
         assert field.region_ids is not None
@@ -109,10 +100,25 @@ class TestUniform:
     def test_every_region_has_one(self) -> None:
         image, labels = scene()
         labels[0, 0] = 99
-        field = uniform(image, 4, RegionMap.from_labels(labels), 0)
+        field = initial_field(image, 4, RegionMap.from_labels(labels), 0)
         assert field.region_ids is not None and sorted(field.region_ids.tolist()) == [0, 3, 11, 99]
 
     def test_fewer_gaussians_than_regions(self) -> None:
         labels = torch.arange(12).view(3, 4)
-        field = uniform(torch.full((1, 3, 4), 0.5), 5, RegionMap.from_labels(labels), 0)
+        field = initial_field(torch.full((1, 3, 4), 0.5), 5, RegionMap.from_labels(labels), 0)
         assert field.num_gaussians == 5
+
+    @pytest.mark.parametrize(
+        ("change", "error", "words"),
+        [
+            ({"image": "photo.png"}, TypeError, "image must be a Tensor"),
+            ({"num_gaussians": 0}, ValueError, "num_gaussians must be at least 1; got 0"),
+            ({"num_gaussians": 50}, ValueError, "num_gaussians must be at most 16"),
+            ({"regions": torch.zeros(5, 4).long()}, ValueError, "regions must be one map of the image's size"),
+            ({"seed": -1}, ValueError, "seed must be in"),
+        ],
+    )
+    def test_bad_input(self, change: dict[str, object], error: type[Exception], words: str) -> None:
+        arguments = {"image": torch.zeros(3, 4, 4), "num_gaussians": 2, **change}
+        with pytest.raises(error, match=words):
+            initial_field(**arguments)  # type: ignore[arg-type]

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from kcgs.fitting import fit
-from kcgs.fitting.frame import widen
+from kcgs.optim.frame import widen
 
 
 def covariance(cholesky: Tensor) -> Tensor:

@@ -73,7 +73,7 @@ def run_fit(image: Tensor, p: Parts | None, num_gaussians: int, recipe: str, **s
     """Fit an image with the map of `p`."""
     result = fit(image, None if p is None else _regions(p), num_gaussians, recipe=recipe, seed=3, **settings)
     history = [[e.iteration, e.loss, e.psnr, e.ef_psnr, e.num_gaussians] for e in result.history]
-    ending = {"stop": result.stop_reason, "removed": result.removed, "change": result.change}
+    ending = {"stop": result.stop_reason, "removed": result.num_pruned, "change": result.prune_error}
     return {
         **_of_scene(result.scene.field, result.scene.regions),
         "history": torch.tensor(history, dtype=torch.float64),
@@ -246,7 +246,8 @@ def run_prune(p: Parts, tolerance: float) -> dict[str, Any]:
 
 def run_propose(p: Parts, residual: Tensor, count: int) -> tuple[Any, ...]:
     """Find Gaussians to add."""
-    return tuple(propose(residual, _regions(p), count, sigmas=(0.7, 1.8, 4.7)))
+    field = propose(residual, _regions(p), count, sigmas=(0.7, 1.8, 4.7))
+    return field.means.detach(), field.cholesky.detach(), field.colors.detach(), field.region_ids
 
 
 def run_refine_contours(p: Parts, image: Tensor, **settings: Any) -> dict[str, Any]:

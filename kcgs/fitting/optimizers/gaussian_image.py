@@ -10,8 +10,9 @@ from torch import Tensor
 from kcgs.nn import GaussianField
 
 from .adan import Adan
-from .base import LEAST_SIGMA, PublishedOptimizer
+from .published import MIN_SIGMA, PublishedOptimizer
 
+# tanh reaches it
 _EDGE = 1.0 - 1e-6
 
 
@@ -19,7 +20,7 @@ class GaussianImageAdan(PublishedOptimizer):
     """Adan on centres through tanh, and on Cholesky factors and colours as they are.
 
     The learning rate, 1e-3, is that of 50,000 iterations; a shorter fit takes larger steps, by the root of the ratio,
-    up to twentyfold. It halves each 40 % of the fit. Steps of the factors scale with `sigma`, the size of the
+    up to twentyfold. Steps of the factors scale with `sigma`, the size of the
     Gaussians at the start. A factor's columns may change sign in the descent, which leaves the covariance as it is.
 
     Source: Zhang et al., "GaussianImage: 1000 FPS Image Representation and Compression by 2D Gaussian Splatting", 2024.
@@ -27,35 +28,30 @@ class GaussianImageAdan(PublishedOptimizer):
 
     learning_rate = 1e-3
     full_iterations = 50_000
-    largest_factor = 20.0
-    halved_every = 0.4
-    widest = 10.0
-    make = Adan
+    max_rate_factor = 20.0
+    max_sigma = 10.0
+    """The widest that a Gaussian may be, in image diagonals."""
 
     def __init__(self, field: GaussianField, sigma: float, iterations: int, rate_factor: float) -> None:
-        longer = min(self.largest_factor, math.sqrt(max(1.0, self.full_iterations / iterations)))
-        rate = self.learning_rate * longer * rate_factor
-        self.rates = [rate, rate * sigma, rate]
-        super().__init__(field)
+        speedup = min(self.max_rate_factor, math.sqrt(max(1.0, self.full_iterations / iterations)))
+        rate = self.learning_rate * speedup * rate_factor
+        super().__init__(field, [rate, rate * sigma, rate], Adan, self.max_sigma)
 
-    def decay(self, progress: float) -> float:
-        """Halve the learning rates from time to time."""
-        return 0.5 ** int(progress / self.halved_every)
-
-    def encode(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> list[Tensor]:
+    def encode(self, field: GaussianField) -> list[Tensor]:
         """Return the centres before tanh, factors and colours."""
+        means, cholesky, colors = field.means.detach(), field.cholesky.detach(), field.merged_colors().detach()
         return [torch.atanh((2 * means / self.extent - 1).clamp(-_EDGE, _EDGE)), cholesky, colors]
 
-    def gaussians(self) -> tuple[Tensor, Tensor, Tensor]:
+    def decode(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return means, cholesky with positive diagonal, colors."""
-        centres, factors, colors = self.raw
+        centres, factors, colors = self.parameters
         means = 0.5 * (torch.tanh(centres) + 1) * self.extent
         l11, l21, l22 = factors.unbind(-1)
         cholesky = torch.stack(
             [
-                l11.abs().clamp(LEAST_SIGMA, self.limit),
+                l11.abs().clamp(MIN_SIGMA, self.limit),
                 torch.where(l11 < 0, -l21, l21).clamp(-self.limit, self.limit),
-                l22.abs().clamp(LEAST_SIGMA, self.limit),
+                l22.abs().clamp(MIN_SIGMA, self.limit),
             ],
             -1,
         )

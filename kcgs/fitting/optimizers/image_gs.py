@@ -7,7 +7,7 @@ from torch import Tensor
 
 from kcgs.nn import GaussianField
 
-from .base import LEAST_SIGMA, PublishedOptimizer
+from .published import MIN_SIGMA, PublishedOptimizer
 
 
 class ImageGSAdam(PublishedOptimizer):
@@ -20,28 +20,23 @@ class ImageGSAdam(PublishedOptimizer):
     """
 
     learning_rates = (5e-4, 2e-3, 2e-3, 5e-3)
-    make = torch.optim.Adam
 
     def __init__(self, field: GaussianField, rate_factor: float) -> None:
-        self.rates = [rate * rate_factor for rate in self.learning_rates]
-        super().__init__(field)
+        super().__init__(field, [rate * rate_factor for rate in self.learning_rates], torch.optim.Adam)
 
-    def decay(self, progress: float) -> float:
-        """Keep the learning rates."""
-        return 1.0
-
-    def encode(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> list[Tensor]:
+    def encode(self, field: GaussianField) -> list[Tensor]:
         """Return centres, inverse scales, angles and colours; round Gaussians have angle 0."""
+        means, cholesky, colors = field.means.detach(), field.cholesky.detach(), field.merged_colors().detach()
         l11, l21, l22 = cholesky.unbind(-1)
         factor = torch.stack([l11, torch.zeros_like(l11), l21, l22], -1).unflatten(-1, (2, 2))
         axes, scales, _ = torch.linalg.svd(factor)
         angle = torch.atan2(axes[:, 1, 0], axes[:, 0, 0])
         return [means / self.extent, 1 / scales, angle[:, None], colors]
 
-    def gaussians(self) -> tuple[Tensor, Tensor, Tensor]:
+    def decode(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return means, cholesky, colors."""
-        centres, inverse_scales, angles, colors = self.raw
-        s1, s2 = (1 / inverse_scales.abs().clamp(1 / self.limit, 1 / LEAST_SIGMA)).unbind(-1)
+        centres, inverse_scales, angles, colors = self.parameters
+        s1, s2 = (1 / inverse_scales.abs().clamp(1 / self.limit, 1 / MIN_SIGMA)).unbind(-1)
         cos, sin = torch.cos(angles[:, 0]), torch.sin(angles[:, 0])
         # R diag(s1, s2)^2 R^T = L L^T
         l11 = torch.sqrt((cos * s1) ** 2 + (sin * s2) ** 2)

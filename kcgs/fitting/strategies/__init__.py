@@ -1,41 +1,43 @@
-"""What happens to a fit besides the descent: each strategy says when it is due, and changes the state.
+"""What happens to a fit besides the descent.
 
-Thresholds are fields of the strategies' classes; what they count is in the state, which they are made for.
+A strategy is a frozen dataclass whose fields are its thresholds. It holds no state: whatever it counts is in the
+:class:`~kcgs.fitting.state.FitState` that it gets when it is applied.
 """
 
 from __future__ import annotations
 
 from typing import Protocol
 
+from kcgs.fitting.config import FitConfig
 from kcgs.fitting.state import FitState
 
 from .densify import Densify, DensifyAtLargestError
-from .finish import EndDrafts, finish
-from .move_contours import MoveContours
-from .warmup import RefreshIds
+from .end_drafts import EndDrafts
+from .move_contours import AdaptContours, SettleContours
+from .refresh_ids import RefreshIds
 
-__all__ = ["Densify", "MoveContours", "Strategy", "finish", "make_strategies"]
+__all__ = [
+    "AdaptContours", "Densify", "DensifyAtLargestError", "EndDrafts", "RefreshIds", "SettleContours", "Strategy",
+    "make_strategies",
+]  # fmt: skip
 
 
 class Strategy(Protocol):
     """Something that happens to a fit from time to time."""
 
-    def due(self, progress: float) -> bool:
-        """Say whether it is time, when this share of the fit is done."""
+    def due(self, state: FitState) -> bool:
+        """True when the strategy is to be applied before this iteration."""
 
     def apply(self, state: FitState) -> None:
         """Change the state."""
 
 
-def make_strategies(state: FitState) -> list[Strategy]:
-    """Return the strategies that a fit's settings ask for, in the order in which an iteration asks them."""
-    config = state.config
+def make_strategies(config: FitConfig) -> list[Strategy]:
+    """Return the strategies of a fit, in the order in which an iteration applies them."""
+    densify = Densify() if config.densify == "matching-pursuit" else DensifyAtLargestError()
     strategies: list[Strategy] = [EndDrafts()]
     if config.warmup:
-        strategies.append(RefreshIds(state))
-    kind = DensifyAtLargestError if config.densify == "largest-error" else Densify
-    contours = MoveContours(state, kind.end) if config.move_contours else None
-    strategies.append(kind(state, contours))
-    if contours is not None:
-        strategies.append(contours)
-    return strategies
+        strategies.append(RefreshIds())
+    if config.move_contours:
+        return [*strategies, AdaptContours(densify), densify, SettleContours(densify.end)]
+    return [*strategies, densify]

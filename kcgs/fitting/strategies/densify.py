@@ -1,4 +1,4 @@
-"""Gaussians are added where the error is, and left out where they are missed least."""
+"""Gaussians are added where the error is, and removed where that costs least."""
 
 from __future__ import annotations
 
@@ -9,48 +9,44 @@ import numpy as np
 import torch
 
 from kcgs.fitting.descent import render, squared_error
-from kcgs.fitting.objective import propose_by
-from kcgs.fitting.pursuit import Proposal
+from kcgs.fitting.objective import propose_for
+from kcgs.fitting.removal import remove_gaussians
 from kcgs.fitting.sampling import sample_pixels
 from kcgs.fitting.state import FitState
 from kcgs.functional import lookup_regions
-
-from .move_contours import MoveContours
+from kcgs.nn import GaussianField
 
 
 @dataclass(frozen=True)
 class Densify:
     """Add Gaussians where they lower the squared error most, by matching pursuit, region by region.
 
-    First their number grows, to more than N. Then come cycles: in each, those that are missed least are left out, step
-    by step, until there are N, and the next begins with as many again as there were. So N places are chosen several
-    times over, each time knowing what the others do.
+    First their number grows to more than N. Then come cycles: in each, those that cost least are removed, step by step,
+    until there are N, and the next cycle begins with as many again as there were. So N places are chosen several times,
+    each time with knowledge of the others.
     """
 
-    state: FitState
-    contours: MoveContours | None = None
-    """What moves the contours before an addition while the number grows."""
     steps: int = 8
-    """How often Gaussians are added until there are most."""
+    """Number of additions until the number of Gaussians is largest."""
     begin: float = 0.05
     """Share of the fit at the first addition."""
     end: float = 0.4
-    """Share of the fit when there are most for the first time."""
+    """Share of the fit when the number of Gaussians is largest for the first time."""
     surplus: float = 0.2
-    """Most Gaussians that there are, over N, less 1; not where all are there from the start."""
+    """Largest number of Gaussians over N, less 1; 0 where all exist from the start."""
     settled: float = 0.8
     """Share of the fit from which on there are N."""
     cycle: int = 100
     """About how many iterations a cycle takes."""
     removals: int = 4
-    """How often Gaussians are left out in a cycle."""
+    """Number of removals in a cycle."""
     sigmas: tuple[float, ...] = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
     """Standard deviations in pixels that are tried."""
 
-    def wanted(self, progress: float) -> int:
-        """Return how many Gaussians there should be."""
-        first, final = self.state.first, self.state.num_gaussians
-        surplus = self.surplus if self.state.config.densify_from < 1.0 else 0.0
+    def target(self, state: FitState) -> int:
+        """Return the number of Gaussians that the schedule asks for."""
+        first, final, progress = state.num_initial, state.problem.num_gaussians, state.progress
+        surplus = self.surplus if state.problem.config.densify_from < 1.0 else 0.0
         most = round((1 + surplus) * final)
         if progress < self.begin:
             return first
@@ -59,58 +55,40 @@ class Densify:
             return first + round((most - first) * (1 + int(share * (self.steps - 1))) / self.steps)
         if progress >= self.settled:
             return final
-        cycles = max(1, round((self.settled - self.end) * self.state.length() / self.cycle))
-        share = (progress - self.end) / (self.settled - self.end) * cycles % 1.0
-        return most - round((most - final) * int(share * (self.removals + 1)) / self.removals)
+        cycles = max(1, round((self.settled - self.end) * state.expected_iterations / self.cycle))
+        phase = (progress - self.end) / (self.settled - self.end) * cycles % 1.0
+        return most - round((most - final) * int(phase * (self.removals + 1)) / self.removals)
 
-    def due(self, progress: float) -> bool:
-        """Say whether another number of Gaussians is wanted, once one state was measured that may be kept."""
-        return bool(self.state.history) and self.wanted(progress) != self.state.wanted
+    def due(self, state: FitState) -> bool:
+        """True when the schedule asks for another number of Gaussians, and one state was measured."""
+        return bool(state.history) and self.target(state) != state.num_requested
+
+    def adds(self, state: FitState) -> bool:
+        """True when Gaussians are to be added."""
+        return bool(state.history) and self.target(state) > state.num_requested
 
     @torch.no_grad()
     def apply(self, state: FitState) -> None:
-        """Add Gaussians, after moving the contours, if that is due; or leave some out."""
-        progress = state.progress()
-        before, state.wanted = state.wanted, self.wanted(progress)
-        if state.wanted < before:
-            leave_out(state, state.count() - state.wanted)
-            return
-        state.densifications += 1
-        if self.contours is not None and progress < self.end:
-            self.contours.before_addition(state)
-        self.add(state, state.wanted - state.count())
+        """Add or remove Gaussians."""
+        target = self.target(state)
+        if target < state.num_requested:
+            remove_gaussians(state, state.num_gaussians - target)
+        else:
+            state.num_additions += 1
+            self.add(state, target - state.num_gaussians)
+        state.num_requested = target
 
     def add(self, state: FitState, count: int) -> None:
         """Add so many Gaussians, if any."""
-        if count < 1:
-            return
-        added = self.place(state, count)
-        state.optimizer.append(added.means, added.cholesky, added.colors)
-        if state.region_ids is not None and added.region_ids is not None:
-            state.region_ids = torch.cat([state.region_ids, added.region_ids])
+        if count > 0:
+            state.optimizer.append(state.scene.field, self.propose(state, count))
 
-    def place(self, state: FitState, count: int) -> Proposal:
+    def propose(self, state: FitState, count: int) -> GaussianField:
         """Return the Gaussians to add."""
-        residual, backend = state.image - render(state), state.config.backend
-        return propose_by(state.objective, residual, state.regions, count, sigmas=self.sigmas, backend=backend)
-
-
-def leave_out(state: FitState, count: int) -> None:
-    """Leave out so many Gaussians, if any, those that are missed least; their neighbours make up for them."""
-    from kcgs.fitting.redundancy import least_missed
-
-    while count > 0:
-        means, cholesky, colors, ids, regions = state.gaussians()
-        index = torch.zeros(len(means), dtype=torch.int64) if regions is None or ids is None else regions.index_of(ids)
-        table = torch.cat([means, cholesky, colors], -1).detach().cpu().numpy()
-        weight = torch.ones(len(means)) if state.objective is None else state.objective.weigh(means, cholesky)
-        geometry = table[:, :2], table[:, 2:5], table[:, 5:], index.cpu().numpy()
-        goes, handed = least_missed(*geometry, count, weight.cpu().numpy())
-        kept = torch.from_numpy(~goes).to(means.device)
-        state.optimizer.recolor(torch.from_numpy(handed).to(colors))
-        state.optimizer.keep(kept)
-        state.region_ids = None if ids is None else ids[kept]
-        count -= int(goes.sum())
+        problem, residual = state.problem, state.problem.image - render(state)
+        return propose_for(
+            problem.objective, residual, state.scene.regions, count, sigmas=self.sigmas, backend=problem.config.backend
+        )
 
 
 @dataclass(frozen=True)
@@ -121,14 +99,16 @@ class DensifyAtLargestError(Densify):
     end: float = 0.2
     surplus: float = 0.0
 
-    def place(self, state: FitState, count: int) -> Proposal:
-        """Return round Gaussians of half the spacing, of the colour that is missing at their pixel."""
+    def propose(self, state: FitState, count: int) -> GaussianField:
+        """Return round Gaussians of half the spacing, of the colour that their pixel lacks."""
+        problem, regions = state.problem, state.scene.regions
         error = squared_error(state).flatten().double().cpu().numpy() + 1e-12
-        rng = np.random.default_rng((state.seed, state.densifications))
-        pixels = torch.from_numpy(sample_pixels(error, count, rng)).to(state.image.device)
-        width = state.image.shape[2]
-        means = torch.stack([pixels % width, pixels // width], -1).to(state.image.dtype) + 0.5
-        sigma = means.new_full((count,), max(1.0, 0.5 * math.sqrt(len(error) / state.num_gaussians)))
-        colors = (state.image - render(state)).flatten(1)[:, pixels].T
-        ids = None if state.regions is None else lookup_regions(means, state.regions.labels)
-        return Proposal(means, torch.stack([sigma, torch.zeros_like(sigma), sigma], -1), colors, ids)
+        rng = np.random.default_rng((problem.seed, state.num_additions))
+        pixels = torch.from_numpy(sample_pixels(error, count, rng)).to(problem.image.device)
+        width = problem.size[1]
+        means = torch.stack([pixels % width, pixels // width], -1).to(problem.image.dtype) + 0.5
+        sigma = means.new_full((count,), max(1.0, 0.5 * math.sqrt(len(error) / problem.num_gaussians)))
+        colors = (problem.image - render(state)).flatten(1)[:, pixels].T
+        ids = None if regions is None else lookup_regions(means, regions.labels)
+        cholesky = torch.stack([sigma, torch.zeros_like(sigma), sigma], -1)
+        return GaussianField(means, cholesky, colors, ids, size=problem.size)

@@ -1,4 +1,4 @@
-"""Contours follow the image while the Gaussians do."""
+"""Contours that follow the image while the Gaussians do."""
 
 from __future__ import annotations
 
@@ -11,57 +11,75 @@ from kcgs.fitting.descent import squared_error
 from kcgs.fitting.state import FitState
 from kcgs.functional import RegionMap, choose_widths
 
+from .densify import Densify
+
 
 @dataclass(frozen=True)
-class MoveContours:
-    """Move the contours where that explains the image better.
+class AdaptContours:
+    """Move the contours before some of the additions of Gaussians, which adapt to the new contours."""
 
-    Before some of the additions a move may raise the squared error about it, for the Gaussians adapt to it; see
-    :class:`Densify`. Later it must lower it: that is when this strategy is due.
-    """
-
-    state: FitState
-    after: float
-    """Share of the fit after which moves must lower the error: the end of densification."""
-    rise: float = 1.5
-    """Factor by which a move may raise the squared error about it while Gaussians are added."""
-    times: int = 4
-    """How often contours move then, evenly over the rest."""
+    densify: Densify
+    """The strategy that adds Gaussians."""
+    max_rise: float = 1.5
+    """Factor by which a move may raise the squared error about it."""
     additions_per_move: int = 2
     """Contours move before every second addition."""
-    additions_per_choice: int = 4
-    """Before every fourth addition their widths are chosen anew."""
+    additions_per_softness: int = 4
+    """Before every fourth addition their softness is chosen anew, where the settings ask for it."""
 
-    def due(self, progress: float) -> bool:
-        """Say whether it is time for a move that must lower the error."""
-        moves = self.state.late_moves
-        return moves < self.times and progress >= self.after + (1 - self.after) * (moves + 1) / (self.times + 1)
-
-    def apply(self, state: FitState) -> None:
-        """Move the contours where that lowers the error at once."""
-        state.late_moves += 1
-        self.move(state, 1.0)
-
-    def before_addition(self, state: FitState) -> None:
-        """Move the contours, and choose their widths, before those additions that it is due before."""
-        if state.densifications % self.additions_per_move == 0:
-            choose = state.densifications % self.additions_per_choice == self.additions_per_move
-            self.move(state, self.rise, choose and state.chooses_widths)
+    def due(self, state: FitState) -> bool:
+        """True before every second addition while the number of Gaussians grows."""
+        if state.progress >= self.densify.end or not self.densify.adds(state):
+            return False
+        return (state.num_additions + 1) % self.additions_per_move == 0
 
     @torch.no_grad()
-    def move(self, state: FitState, rise: float, choose_anew: bool = False) -> None:
-        """Move the contours where that raises the squared error about them by no more than this factor."""
-        config, before = state.config, state.regions
-        if before is None:
-            return
-        moved = refine_contours(
-            state.gaussians().scene(state.size), state.image, given=state.anchor,
-            max_distance=None if config.max_move == "any" else config.max_move, length_weight=config.contour_cost,
-            backend=config.backend,
-        )  # fmt: skip
-        if moved is not before:
-            gain = rise * squared_error(state) - squared_error(state, state.gaussians()._replace(regions=moved))
-            moved = accept_moves(before, moved, gain)
-        if choose_anew:
-            moved = RegionMap.from_labels(moved.labels, choose_widths(state.image, moved.labels))
-        state.regions = moved
+    def apply(self, state: FitState) -> None:
+        """Move the contours, and at times choose their softness."""
+        move_contours(state, self.max_rise)
+        regions, problem = state.scene.regions, state.problem
+        addition = state.num_additions + 1
+        if (
+            regions is not None
+            and problem.chooses_softness
+            and addition % self.additions_per_softness == self.additions_per_move
+        ):
+            softness = choose_widths(problem.image, regions.labels)
+            state.scene.regions = RegionMap.from_labels(regions.labels, softness)
+
+
+@dataclass(frozen=True)
+class SettleContours:
+    """Move the contours a few times after densification, where that lowers the error at once."""
+
+    after: float
+    """Share of the fit at the end of densification."""
+    num_moves: int = 4
+    """How often contours move, evenly over the rest of the fit."""
+
+    def due(self, state: FitState) -> bool:
+        """True at the time of the next move."""
+        move = state.num_late_moves + 1
+        share = self.after + (1 - self.after) * move / (self.num_moves + 1)
+        return move <= self.num_moves and state.progress >= share
+
+    @torch.no_grad()
+    def apply(self, state: FitState) -> None:
+        """Move the contours."""
+        state.num_late_moves += 1
+        move_contours(state, 1.0)
+
+
+def move_contours(state: FitState, max_rise: float) -> None:
+    """Move the contours where that raises the squared error about them by no more than a factor."""
+    config, regions = state.problem.config, state.scene.regions
+    if regions is None or state.anchor is None:
+        return
+    proposal = refine_contours(
+        state.scene, state.problem.image, anchor=state.anchor.labels,
+        max_distance=None if config.max_move == "any" else config.max_move, length_weight=config.contour_cost,
+        backend=config.backend,
+    )  # fmt: skip
+    if proposal is not regions:
+        gain = max_rise * squared_error(state) - squared_error(state, proposal)
+        state.scene.regions = accept_moves(regions, proposal, gain)

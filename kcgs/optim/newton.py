@@ -44,7 +44,7 @@ class NewtonDescent:
 
     Args:
         gaussians: the start, for its shapes.
-        exact: see :func:`kcgs.fitting.frame.move`.
+        exact: see :func:`kcgs.optim.frame.move`.
     """
 
     def __init__(self, gaussians: Gaussians, *, exact: bool = True) -> None:

@@ -44,7 +44,7 @@ def newton_steps(cholesky: Tensor, colors: Tensor, slopes: Sequence[Tensor], are
 
 
 def widen(cholesky: Tensor, least_sigma: float) -> Tensor:
-    """Make Gaussians (N, 3) no thinner than this, in pixels, in any direction; those that are wide enough stay.
+    """Make Gaussians (..., N, 3) no thinner than this, in pixels, in any direction; those that are wide enough stay.
 
     The variances along the axes of the ellipse are raised, and the axes stay.
     """
@@ -59,7 +59,7 @@ def widen(cholesky: Tensor, least_sigma: float) -> Tensor:
     cos, sin = (torch.where(gap > 0, part / gap, 0.0) for part in (half, xy))
     w11 = (xx + both + 0.5 * more * (1 - cos)).sqrt()
     widened = torch.stack([w11, (xy - 0.5 * more * sin) / w11, (new_long * new_short).sqrt() / w11], -1)
-    return torch.where((short < least_sigma**2)[:, None], widened, cholesky)
+    return torch.where((short < least_sigma**2)[..., None], widened, cholesky)
 
 
 def move(means: Tensor, cholesky: Tensor, step: Tensor, *, exact: bool = True) -> tuple[Tensor, Tensor]:

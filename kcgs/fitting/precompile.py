@@ -1,4 +1,4 @@
-"""What a fit needs once in a process: compiled loops, libraries."""
+"""Compilation before the first fit of a process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .loop import fit
 
 
 @lru_cache(maxsize=64)
-def warm_up(config: FitConfig) -> None:
+def precompile(config: FitConfig) -> None:
     """Compile and load what fits of these settings need, so that no fit's clock counts it."""
     ramp = torch.linspace(0.0, 1.0, 96)
     image = torch.stack([ramp.expand(64, 96), 1 - ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96)])

@@ -1,0 +1,14 @@
+"""The clock of a fit."""
+
+import time
+
+
+class Clock:
+    """Wall time of a fit, in seconds; a fit that goes on after a break starts at what it has used."""
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        self._started = time.perf_counter() - seconds
+
+    def seconds(self) -> float:
+        """Seconds that the fit has used."""
+        return time.perf_counter() - self._started

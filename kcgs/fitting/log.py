@@ -1,0 +1,47 @@
+"""The history of a fit, and its best scene."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+from torch import Tensor
+
+from kcgs.scene import Scene
+
+from .result import HistoryEntry
+from .state import FitState
+
+# about how many entries a history has
+_HISTORY_LENGTH = 100
+
+
+def log_is_due(state: FitState, seconds: float) -> bool:
+    """True about a hundred times per fit, when there are no more than N Gaussians."""
+    config = state.problem.config
+    if state.num_gaussians > state.problem.num_gaussians:
+        return False
+    if config.max_seconds is None:
+        return state.iteration % max(1, config.usual_iterations // _HISTORY_LENGTH) == 0
+    return not state.history or seconds >= state.history[-1].seconds + config.max_seconds / _HISTORY_LENGTH
+
+
+def log(state: FitState, rendered: Tensor, seconds: float, scene: Scene | None = None) -> None:
+    """Measure a render of the state's scene, or of another, and keep a copy of the scene if it is the best so far."""
+    scene, problem = scene or state.scene, state.problem
+    residual = rendered.detach() - problem.image
+    loss = float(residual.square().mean() if problem.config.loss == "l2" else residual.abs().mean())
+    clipped = rendered.detach().clamp(0.0, 1.0) - problem.image
+    value = None if problem.objective is None else problem.objective.value(clipped)
+    error = clipped.square_().flatten(1)
+    psnr = _decibel(float(error.mean()))
+    ef_psnr = math.nan if problem.band is None else _decibel(float(error.index_select(1, problem.band).mean()))
+    state.history.append(HistoryEntry(state.iteration, seconds, loss, psnr, ef_psnr, scene.num_gaussians))
+    score = psnr if value is None else _decibel(value)
+    if score > state.best_score:
+        state.best_score, state.best = score, Scene(copy.deepcopy(scene.field), scene.regions)
+
+
+def _decibel(mean_square: float) -> float:
+    """PSNR of a mean squared error, for values in [0, 1]."""
+    return math.inf if mean_square == 0 else -10.0 * math.log10(mean_square)

@@ -1,0 +1,96 @@
+"""The problem of a fit: an image, its regions, a number of Gaussians, and the settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcgs._check import check_count
+from kcgs._image import as_image
+from kcgs.errors import InvalidArgument
+from kcgs.functional import RegionMap, edge_band
+
+from .config import FitConfig
+from .objective import MsSsimObjective, make_objective
+
+# share of an image's values that are 0 or 1 from which on `clamp="auto"` clips the render: Gaussians may overshoot
+_SATURATED_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is to be fitted; nothing here changes during a fit."""
+
+    image: Tensor
+    """(C, H, W), in [0, 1]."""
+    regions: RegionMap | None
+    """The map as the user gave it."""
+    num_gaussians: int
+    """N, the most that the result may have."""
+    config: FitConfig
+    seed: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the image."""
+        return self.image.shape[1], self.image.shape[2]
+
+    @cached_property
+    def clamp(self) -> bool:
+        """True where the render is clipped to [0, 1] in training."""
+        if self.config.clamp != "auto":
+            return self.config.clamp
+        return float(((self.image == 0.0) | (self.image == 1.0)).float().mean()) >= _SATURATED_SHARE
+
+    @cached_property
+    def band(self) -> Tensor | None:
+        """Positions of the pixels near a contour of the user's map, for EF-PSNR; None without contours."""
+        if self.regions is None:
+            return None
+        pixels = edge_band(self.regions.labels).flatten().nonzero().flatten()
+        return pixels if len(pixels) else None
+
+    @property
+    def chooses_softness(self) -> bool:
+        """True where the softness of contours is to be chosen, and the map came without."""
+        return self.config.softness == "auto" and self.regions is not None and self.regions.softness == 0.0
+
+    @cached_property
+    def objective(self) -> MsSsimObjective | None:
+        """What the descent lowers; None: what the setting `loss` says."""
+        return make_objective(self.config.objective, self.image)
+
+
+def make_problem(image: Any, regions: object, num_gaussians: object, config: FitConfig, seed: object) -> Problem:
+    """Check the arguments of a fit."""
+    image, regions = check_image_and_regions(image, regions)
+    count = check_num_gaussians(num_gaussians, image)
+    return Problem(image, regions, count, config, check_count("seed", seed, 0, 2**63 - 1))
+
+
+def check_image_and_regions(image: Any, regions: object) -> tuple[Tensor, RegionMap | None]:
+    """Return a copy of the image, (C, H, W), that may take part in a graph, and its regions, on its device."""
+    image = as_image("image", image)
+    regions = RegionMap.coerce(regions)
+    if regions is not None:
+        if regions.num_maps == 1:
+            regions = regions.image(0)
+        if regions.size != tuple(image.shape[1:]) or regions.num_maps is not None:
+            expected = f"one map of the image's size {tuple(image.shape[1:])}"
+            raise InvalidArgument("regions", expected, tuple(regions.labels.shape))
+        regions = regions.to(image.device)
+    dtype = torch.float64 if image.dtype == torch.float64 else torch.float32
+    return image.detach().to(dtype, copy=True), regions
+
+
+def check_num_gaussians(value: object, image: Tensor) -> int:
+    """Return N if it is a number of Gaussians that an image (C, H, W) can use."""
+    count, pixels = check_count("num_gaussians", value), image.shape[1] * image.shape[2]
+    if count > pixels:
+        size = f"{image.shape[2]} x {image.shape[1]}"
+        raise InvalidArgument("num_gaussians", f"at most {pixels}, the pixels of the {size} image", count)
+    return count

@@ -1,0 +1,63 @@
+"""What a fit returns."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+from kcgs.plots import history_figure
+from kcgs.scene import Scene
+
+from .config import FitConfig
+from .region_report import RegionReport
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+StopReason = Literal["iterations", "seconds", "target_psnr", "callback", "diverged"]
+
+
+class HistoryEntry(NamedTuple):
+    """One point of the curve of error against run time.
+
+    EF-PSNR is taken along the contours of the user's map, wherever the fit moves them: those of the scene's map are
+    what :func:`kcgs.evaluate` looks at by default. NaN without contours.
+    """
+
+    iteration: int
+    seconds: float
+    loss: float
+    psnr: float
+    ef_psnr: float
+    num_gaussians: int
+
+
+class FitResult(NamedTuple):
+    """What a fit returns."""
+
+    scene: Scene
+    """Without regions where nothing is confined."""
+    history: list[HistoryEntry]
+    """Its EF-PSNR is along the contours of the user's map, not of the scene's; see :class:`HistoryEntry`."""
+    stop_reason: StopReason
+    config: FitConfig
+    num_pruned: int = 0
+    """Gaussians that were removed at the end since they changed the render by next to nothing."""
+    prune_error: float = 0.0
+    """No value of the render changed by more when they were."""
+    regions: RegionReport | None = None
+    """What became of the label map; None without one."""
+    seconds: float = 0.0
+    """Wall time of the whole call; the history of a search is that of one fit."""
+
+    def __repr__(self) -> str:
+        psnr = max((entry.psnr for entry in self.history), default=math.nan)
+        return f"FitResult({psnr:.2f} dB, stopped by {self.stop_reason}, {self.seconds:.1f} s, {self.scene!r})"
+
+    def _repr_png_(self) -> bytes | None:
+        return self.scene._repr_png_()
+
+    def plot(self) -> Figure:
+        """Plot PSNR and EF-PSNR against run time and iterations; save it with its `savefig`."""
+        figure: Figure = history_figure(self.history)
+        return figure

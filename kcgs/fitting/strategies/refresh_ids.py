@@ -1,0 +1,36 @@
+"""Region ids while centres move: the paper's warm-up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from kcgs.fitting.state import FitState
+from kcgs.functional import lookup_regions
+
+
+@dataclass(frozen=True)
+class RefreshIds:
+    """Read the region ids again under the moving centres, as the paper does; by iterations, whatever the clock says."""
+
+    every: float = 0.02
+    """Share of the iterations between refreshes."""
+    until: float = 0.5
+    """Share of the iterations after which the ids are frozen."""
+
+    def due(self, state: FitState) -> bool:
+        """True at the iterations of a refresh."""
+        iteration, iterations = state.iteration, state.problem.config.usual_iterations
+        if state.scene.regions is None or iteration % max(1, round(self.every * iterations)):
+            return False
+        return 0 < iteration <= self.until * iterations
+
+    def apply(self, state: FitState) -> None:
+        """Read the ids, but leave no region without its last Gaussian: nothing else would feel the error there."""
+        field, regions = state.scene.field, state.scene.regions
+        assert regions is not None and field.region_ids is not None
+        ids = lookup_regions(field.means, regions.labels)
+        occupied = torch.zeros(regions.num_regions, dtype=torch.bool, device=ids.device)
+        occupied[regions.index_of(ids)] = True
+        field.region_ids = torch.where(occupied[regions.index_of(field.region_ids)], ids, field.region_ids)

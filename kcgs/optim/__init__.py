@@ -1,0 +1,5 @@
+"""Optimizers of Gaussians."""
+
+from .gaussian_adam import GaussianAdam
+
+__all__ = ["GaussianAdam"]

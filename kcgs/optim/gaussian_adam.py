@@ -1,0 +1,194 @@
+"""Adam in each Gaussian's own frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pad
+from torch.optim import Optimizer
+
+from kcgs.errors import InvalidArgumentType
+from kcgs.nn import GaussianField
+
+from .frame import local_gradient, move, widen
+
+# pixels: factors are at least this before they are widened, so that their squares are far from underflow
+_MIN_FACTOR = 0.1
+# standard deviations by which a centre may lie outside the image
+_MAX_OUTSIDE = 2.0
+
+
+class GaussianAdam(Optimizer):
+    r"""Adam in each Gaussian's own frame, so that one learning rate suits Gaussians of all sizes and all images.
+
+    Convention: a step moves a centre by :math:`L d` and a factor to :math:`L \exp K`, with d and the lower triangular K
+    taken by Adam, and colours as Adam does. Every step leaves a valid field: centres stay within two standard
+    deviations of the image, standard deviations between `min_sigma` and the image's diagonal. A field has two parameter
+    groups, its geometry and its colours, each with its own ``lr``, which torch's schedulers change.
+
+    Args:
+        fields: a GaussianField, or several; batched ones, too.
+        lr: step of place in standard deviations, and of log scale.
+        color_lr: step of colours and opacities.
+        betas: of the averages of gradients and of their squares.
+        eps: added to the root of the latter.
+        min_sigma: least standard deviation, in pixels. Thinner Gaussians fit the pixels' centres better, and are dots
+            and needles when a scene is enlarged.
+        max_step: the largest step of place and of log scale.
+
+    Raises:
+        TypeError: something else than fields, or a field that holds no parameters.
+
+    Example:
+        >>> from kcgs import RegionSplatRenderer
+        >>> field, image = GaussianField.random(20, (16, 24), seed=0), torch.linspace(0, 1, 24).expand(3, 16, 24)
+        >>> optimizer, renderer = GaussianAdam(field), RegionSplatRenderer()
+        >>> losses = []
+        >>> for _ in range(50):
+        ...     optimizer.zero_grad()
+        ...     losses.append((renderer(field) - image).square().mean())
+        ...     losses[-1].backward()
+        ...     optimizer.step()
+        >>> bool(losses[-1] < 0.05 * losses[0])
+        True
+
+    Source: Kingma and Ba, "Adam: A Method for Stochastic Optimization", 2015, in a Gaussian's own coordinates.
+    """
+
+    def __init__(
+        self,
+        fields: GaussianField | Iterable[GaussianField],
+        lr: float | Tensor = 0.14,
+        *,
+        color_lr: float | Tensor = 0.03,
+        betas: tuple[float, float] = (0.9, 0.99),
+        eps: float = 1e-12,
+        min_sigma: float = 0.5,
+        max_step: float = 0.5,
+    ) -> None:
+        groups: list[dict[str, Any]] = []
+        for field in [fields] if isinstance(fields, GaussianField) else fields:
+            if not isinstance(field, GaussianField):
+                raise InvalidArgumentType("fields", "GaussianFields", type(field).__name__)
+            tones = [field.colors] if field.opacities is None else [field.colors, field.opacities]
+            groups.append({"params": [field.means, field.cholesky], "lr": lr, "size": field.size})
+            groups.append({"params": tones, "lr": color_lr, "size": None})
+        super().__init__(groups, {"betas": betas, "eps": eps, "min_sigma": min_sigma, "max_step": max_step})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
+        """Move every Gaussian that has a gradient.
+
+        Args:
+            closure: evaluates the loss anew, and returns it.
+        """
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            if any(parameter.grad is not None for parameter in group["params"]):
+                _step_colors(self, group) if group["size"] is None else _step_geometry(self, group)
+        return loss
+
+    @torch.no_grad()
+    def append(self, field: GaussianField, added: GaussianField) -> None:
+        """Add the Gaussians of another field to one of the optimizer's; the averages of the others stay.
+
+        Args:
+            field: one that the optimizer was made for; it gets new parameters.
+            added: of the same channels, both with region ids and opacities or neither.
+        """
+        means, cholesky = _bounded(added.means, added.cholesky, field.size, self.defaults["min_sigma"])
+        for name, rows in (("means", means), ("cholesky", cholesky), ("colors", added.colors)):
+            self._replace(field, name, torch.cat([getattr(field, name), rows], -2))
+        if field.opacities is not None and added.opacities is not None:
+            self._replace(field, "opacities", torch.cat([field.opacities, added.opacities], -1))
+        if field.region_ids is not None and added.region_ids is not None:
+            field.region_ids = torch.cat([field.region_ids, added.region_ids], -1)
+        for state in self._states(field):
+            state.update({name: pad(average, (0, 0, 0, added.num_gaussians)) for name, average in state.items()})
+
+    @torch.no_grad()
+    def keep(self, field: GaussianField, mask: Tensor) -> None:
+        """Remove all Gaussians but those of a mask from one of the optimizer's fields.
+
+        Args:
+            field: one that the optimizer was made for; it gets new parameters.
+            mask: boolean :math:`(N)`, for all images of a batch.
+        """
+        for name in ("means", "cholesky", "colors"):
+            self._replace(field, name, getattr(field, name)[..., mask, :])
+        if field.opacities is not None:
+            self._replace(field, "opacities", field.opacities[..., mask])
+        if field.region_ids is not None:
+            field.region_ids = field.region_ids[..., mask]
+        for state in self._states(field):
+            state.update({name: average[..., mask, :] for name, average in state.items()})
+
+    def _replace(self, field: GaussianField, name: str, rows: Tensor) -> None:
+        """Put another parameter into the field, its group, and the state."""
+        old = getattr(field, name)
+        new = nn.Parameter(rows, old.requires_grad)
+        setattr(field, name, new)
+        for group in self.param_groups:
+            group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
+        if old in self.state:
+            self.state[new] = self.state.pop(old)
+
+    def _states(self, field: GaussianField) -> Iterator[dict[str, Tensor]]:
+        return (self.state[tensor] for tensor in (field.means, field.colors) if tensor in self.state)
+
+
+def _step_colors(optimizer: GaussianAdam, group: dict[str, Any]) -> None:
+    colors, *opacities = group["params"]
+    gradients = [_gradient(colors), *(_gradient(alpha)[..., None] for alpha in opacities)]
+    change = _adam(optimizer.state[colors], torch.cat(gradients, -1), group)
+    channels = colors.shape[-1]
+    colors.add_(change[..., :channels])
+    for alpha in opacities:
+        alpha.add_(change[..., channels])
+
+
+def _step_geometry(optimizer: GaussianAdam, group: dict[str, Any]) -> None:
+    means, cholesky = group["params"]
+    local = local_gradient(cholesky, _gradient(means), _gradient(cholesky))
+    step = _adam(optimizer.state[means], local, group).clamp(-group["max_step"], group["max_step"])
+    bounded = _bounded(*move(means, cholesky, step), group["size"], group["min_sigma"])
+    means.copy_(bounded[0])
+    cholesky.copy_(bounded[1])
+
+
+def _gradient(parameter: Tensor) -> Tensor:
+    return torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+
+
+def _adam(state: dict[str, Tensor], gradient: Tensor, group: dict[str, Any]) -> Tensor:
+    """Update the averages of a table (..., N, K), and return Adam's step; each row has an age of its own."""
+    if not state:
+        state["age"] = torch.zeros_like(gradient[..., :1])
+        state["average"], state["square"] = torch.zeros_like(gradient), torch.zeros_like(gradient)
+    beta1, beta2 = group["betas"]
+    age, average, square = state["age"], state["average"], state["square"]
+    age += 1
+    average.lerp_(gradient, 1 - beta1)
+    square.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+    scale = (square / (1 - beta2**age)).sqrt_().add_(group["eps"])
+    step: Tensor = average / (1 - beta1**age) / scale * -group["lr"]
+    return step
+
+
+def _bounded(means: Tensor, cholesky: Tensor, size: tuple[int, int], min_sigma: float) -> tuple[Tensor, Tensor]:
+    """Move centres back to about the image, and make Gaussians neither too thin nor larger than the image."""
+    height, width = size
+    diagonal = math.hypot(height, width)
+    l11, l21, l22 = cholesky.unbind(-1)
+    l11, l22 = l11.clamp(_MIN_FACTOR, diagonal), l22.clamp(_MIN_FACTOR, diagonal)
+    l21 = l21.clamp(-diagonal, diagonal)
+    outside = _MAX_OUTSIDE * torch.stack([l11, torch.hypot(l21, l22)], -1)
+    means = torch.minimum(torch.maximum(means, -outside), means.new_tensor([width, height]) + outside)
+    return means, widen(torch.stack([l11, l21, l22], -1), min_sigma)
