@@ -1,4 +1,4 @@
-"""Turning the labels of every method into few, clean, connected regions."""
+"""Clean-up of labels: few connected regions, by decreasing area."""
 
 import heapq
 import math
@@ -19,46 +19,45 @@ from kcgs.kernels import threads_for_kernels
 from kcgs.segment.images import check_segment_image, lab_sums, rgb_to_lab
 from kcgs.segment.snapping import snap_contours
 
-# The smallest region as a share of the image: 600 pixels of 481 x 321. Below 250 x 250 pixels, where that is
-# less than a line across the image, it is the length of such a line.
+# smallest region, as a share of the image: 600 pixels of 481 x 321
 _MIN_SHARE = 0.004
 
 
 @brief
 class Segmentation(NamedTuple):
-    """A label map, how sure its method is of every region, and what each is called."""
+    """A label map, with a score and a name for every region where its method has them."""
 
     labels: Tensor
     """:math:`(H, W)` int64, ids 0 to R - 1 by decreasing area."""
     scores: Tensor | None = None
-    """:math:`(R,)` float32 in [0, 1], NaN for a region that the method says nothing about; None: no scores."""
+    """:math:`(R,)` float32 in [0, 1], NaN for a region without a score; None: the method has no scores."""
     names: dict[int, str] | None = None
-    """By id; several regions may have one name. None: the method knows no names."""
+    """By id; several regions may have one name. None: the method has no names."""
 
 
 @brief
 class Prediction(NamedTuple):
-    """What a method says of every pixel, before clean-up; tensors or numpy arrays."""
+    """Labels of a method before clean-up, and scores per pixel; tensors or numpy arrays."""
 
     labels: Any
     """:math:`(H, W)`, integer or bool, non-negative."""
     scores: Any = None
-    """:math:`(H, W)` in [0, 1], NaN where the method says nothing; None: no scores."""
+    """:math:`(H, W)` in [0, 1], NaN for a pixel without a score; None: the method has no scores."""
     names: Sequence[str] | None = None
-    """What the labels are called, from 0 on; None: the method knows no names."""
+    """Of the labels, from 0 on; None: the method has no names."""
 
 
 @dataclass(frozen=True)
 class Cleanup:
-    """What is done to the labels of every method, in this order.
+    """Options of the clean-up, which does four things, in this order.
 
     Args:
-        snap: contours move by up to so many pixels onto the image's edges; 0 leaves them.
-        min_size: 4-connected pieces of fewer pixels join the neighbour that they have most border with, the smallest
+        snap: pixels by which contours may move onto edges of the image; 0: they stay.
+        min_size: 4-connected pieces of fewer pixels join the neighbour with the longest common border, the smallest
             piece first; at least 1, which leaves all; None: 0.4 % of the image, at least sqrt(H W).
         connected: every 4-connected piece is a region of its own.
-        max_regions: the two neighbours nearest in mean colour (CIE Lab) merge until so many regions are left; None
-            leaves all.
+        max_regions: the two neighbours nearest in mean colour (CIE Lab) merge until at most this number of regions is
+            left; None: all stay.
 
     Raises:
         TypeError, ValueError: an option has another type or is out of its range.
@@ -79,13 +78,13 @@ class Cleanup:
             raise TypeError(f"connected must be True or False; got {self.connected!r}")
 
     def smallest(self, num_pixels: int) -> int:
-        """Return how many pixels the smallest region of an image of so many has."""
+        """Return the least number of pixels of a region, for an image of `num_pixels`."""
         return self.min_size or max(round(_MIN_SHARE * num_pixels), round(math.sqrt(num_pixels)))
 
     def apply(self, image: Any, labels: Any) -> Segmentation:
         """Clean the labels of an image, or a `Prediction`.
 
-        A region scores the mean of its pixels' scores, and is called as most of its pixels were labelled.
+        The score of a region is the mean of its pixels, its name that of the label that most of its pixels have.
 
         Raises:
             TypeError, ValueError: no image; no labels or scores of its size; more labels than names.
@@ -96,29 +95,29 @@ class Cleanup:
             [[0, 0, 0, 1], [0, 0, 0, 1]]
         """
         pixels = check_segment_image(image)
-        found = labels if isinstance(labels, Prediction) else Prediction(labels)
-        classes = check_labels("labels", found.labels, dims=(2,)).cpu()
-        scores = None if found.scores is None else torch.as_tensor(found.scores).double().cpu()
+        labels, scores, names = labels if isinstance(labels, Prediction) else Prediction(labels)
+        classes = check_labels("labels", labels, dims=(2,)).cpu()
+        scores = None if scores is None else torch.as_tensor(scores).double().cpu()
         for name, values in (("labels", classes), ("scores", scores)):
             if values is not None and values.shape != pixels.shape[1:]:
                 raise ValueError(
                     f"{name} must have the image's size {tuple(pixels.shape[1:])}; got {tuple(values.shape)}"
                 )
-        if found.names is not None and int(classes.max()) >= len(found.names):
-            raise ValueError(f"names must say what label {int(classes.max())} is; got {len(found.names)} names")
+        if names is not None and int(classes.max()) >= len(names):
+            raise ValueError(f"names must have one for label {int(classes.max())}; got {len(names)} names")
         with threads_for_kernels(classes.numel()):
             regions = self._clean(pixels, to_regions(classes.numpy()))
-        cleaned = torch.from_numpy(regions).to(pixels.device)
-        if scores is not None:
-            scores = _region_means(regions, scores.numpy()).to(pixels.device)
-        names = None if found.names is None else _region_names(regions, classes.numpy(), found.names)
-        return Segmentation(cleaned, scores, names)
+        return Segmentation(
+            torch.from_numpy(regions).to(pixels.device),
+            None if scores is None else _region_means(regions, scores.numpy()).to(pixels.device),
+            None if names is None else _region_names(regions, classes.numpy(), names),
+        )
 
     def _clean(self, image: Tensor, regions: Labels) -> Labels:
         if self.snap:
             regions = snap_contours(rgb_to_lab(image), regions, self.snap)
         regions = merge_small(regions, self.smallest(regions.size))
-        # Pieces of one region become one piece where what lay between them joins it: connect after merging.
+        # after merging, which can join the pieces of a region by what lay between them
         regions = order_by_area(connect(regions) if self.connected else regions)
         if self.max_regions is not None and regions.max() >= self.max_regions:
             regions = order_by_area(merge_similar(rgb_to_lab(image), regions, self.max_regions))
@@ -138,21 +137,21 @@ def to_regions(labels: Labels) -> Labels:
 
 
 def order_by_area(labels: Labels) -> Labels:
-    """Renumber regions by decreasing area; of equal ones, the one with the earlier first pixel comes first."""
+    """Renumber regions by decreasing area; of equal areas, the region with the earlier first pixel comes first."""
     regions = to_regions(labels)
     areas = np.bincount(regions.ravel())
     first = np.empty_like(areas)
-    first[regions.ravel()[::-1]] = np.arange(regions.size)[::-1]  # Of repeated indices the last one counts.
+    first[regions.ravel()[::-1]] = np.arange(regions.size)[::-1]  # of repeated indices the last one counts
     rank = np.empty_like(areas)
     rank[np.lexsort((first, -areas))] = np.arange(len(areas))
     return rank[regions]
 
 
 def merge_small(labels: Labels, min_size: int) -> Labels:
-    """Give every 4-connected piece under ``min_size`` pixels to the neighbour it has most border with.
+    """Merge every 4-connected piece under ``min_size`` pixels into the neighbour with the longest common border.
 
-    The smallest piece goes first, and a piece that reaches ``min_size`` by merging stays. Of neighbours with equal
-    borders the larger takes it, then the one whose first pixel comes earlier. Remaining pieces keep their label.
+    The smallest piece is merged first, and a piece that reaches ``min_size`` by merging stays. Of neighbours with equal
+    borders the larger takes it, then the one whose first pixel comes earlier. Pieces that stay keep their label.
     """
     pieces = connect(labels)
     graph = RegionGraph(pieces)
@@ -161,7 +160,7 @@ def merge_small(labels: Labels, min_size: int) -> Labels:
     while queue:
         area, piece = heapq.heappop(queue)
         borders = graph.borders[piece]
-        if area != graph.areas[piece] or not borders:  # an entry of before a merge
+        if area != graph.areas[piece] or not borders:  # it has grown since, or is the whole image
             continue
         target = max(borders, key=lambda other: (borders[other], graph.areas[other], -other))
         graph.merge(piece, target)
@@ -173,7 +172,7 @@ def merge_small(labels: Labels, min_size: int) -> Labels:
 
 
 def merge_similar(lab: NDArray[np.float32], regions: Labels, max_regions: int) -> Labels:
-    """Merge the two neighbours nearest in mean colour until at most ``max_regions`` of regions 0 to R - 1 are left.
+    """Merge the two neighbours nearest in mean colour until at most ``max_regions`` of the regions 0 to R - 1 are left.
 
     A merged region has the mean of all its pixels and the id of its largest part.
     """
@@ -188,16 +187,16 @@ def clean(labels: Labels, min_size: int) -> Labels:
 
 
 def _region_means(regions: Labels, scores: NDArray[np.float64]) -> Tensor:
-    known = np.isfinite(scores)
+    has_score = np.isfinite(scores)
     count = int(regions.max()) + 1
-    sums = np.bincount(regions[known], weights=scores[known], minlength=count)
+    sums = np.bincount(regions[has_score], weights=scores[has_score], minlength=count)
     with np.errstate(invalid="ignore"):
-        means = sums / np.bincount(regions[known], minlength=count)
+        means = sums / np.bincount(regions[has_score], minlength=count)
     return torch.from_numpy(means).clamp(0, 1).float()
 
 
 def _region_names(regions: Labels, classes: Labels, names: Sequence[str]) -> dict[int, str]:
-    """Return what every region is called: as the class that most of its pixels have."""
+    """Return the name of every region: that of the class that most of its pixels have."""
     pairs = (regions * len(names) + classes).ravel()
     counts = np.bincount(pairs, minlength=(int(regions.max()) + 1) * len(names)).reshape(-1, len(names))
-    return {region: names[kind] for region, kind in enumerate(counts.argmax(axis=1).tolist())}
+    return {region: names[label] for region, label in enumerate(counts.argmax(axis=1).tolist())}

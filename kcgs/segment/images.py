@@ -1,4 +1,4 @@
-"""Images as segmenters see them: checked, and in CIE Lab."""
+"""Images for segmenters: checked, and in CIE Lab."""
 
 import math
 from typing import Any
@@ -10,13 +10,14 @@ from torch import Tensor
 from kcgs._image import as_image
 from kcgs.functional.merging import Labels
 
-# By how much values may pass [0, 1], as resizing and colour conversion leave them.
+# by which values may pass [0, 1], as they do after resizing or colour conversion
 _TOLERANCE = 1e-3
-_BLOCK = 1 << 16  # pixels that change their colour space at a time, since the conversion takes six images
+# pixels whose colour space is converted at a time, since the conversion needs the memory of six images
+_BLOCK = 1 << 16
 
 
 def check_segment_image(image: Any) -> Tensor:
-    """Return a checked image as (3, H, W) float32 in [0, 1], grey repeated, in memory pixel by pixel."""
+    """Return an image as (3, H, W) float32 in [0, 1], grey repeated, with the channels of a pixel side by side."""
     tensor = as_image("image", image, tolerance=_TOLERANCE).detach()
     if tensor.shape[0] not in (1, 3):
         raise ValueError(f"image must have shape (3, H, W) or (1, H, W); got {tuple(tensor.shape)}")
@@ -37,6 +38,6 @@ def rgb_to_lab(image: Tensor) -> NDArray[np.float32]:
 
 
 def lab_sums(lab: NDArray[np.float32], regions: Labels) -> NDArray[np.float64]:
-    """Return (R, 3), the colours of every region's pixels added up."""
+    """Return the sum of the colours of every region, (R, 3)."""
     flat = regions.ravel()
     return np.stack([np.bincount(flat, weights=lab[..., k].ravel()) for k in range(3)], axis=1)

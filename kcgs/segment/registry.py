@@ -1,4 +1,4 @@
-"""Segmenters by name: an image checked once, the method's own work, one clean-up for all."""
+"""Segmenters by name: a check of the image, the function of the method, one clean-up for all."""
 
 import inspect
 from collections.abc import Callable
@@ -25,13 +25,13 @@ _methods: dict[str, _Method] = {}
 def register(name: str, cleanup: Cleanup | None = None) -> Callable[[Function], Function]:
     """Make a function a segmentation method.
 
-    The function gets the image as a checked tensor :math:`(3, H, W)` float32 in [0, 1] and its own keyword options. It
-    returns labels :math:`(H, W)`, integer or bool, a tensor or a numpy array; or a `Prediction` with scores and names.
-    Where it has a parameter with the name of a clean-up option, it gets the value that the clean-up will use,
-    ``min_size`` in pixels. It imports optional libraries when it runs.
+    The function gets the image, a checked tensor :math:`(3, H, W)` float32 in [0, 1], and the options of its keyword
+    parameters. It returns labels :math:`(H, W)`, integer or bool, a tensor or a numpy array; or a `Prediction` with
+    scores and names. A parameter with the name of a clean-up option gets the value of the clean-up, ``min_size`` in
+    pixels. Optional libraries are imported inside the function.
 
     Args:
-        name: a name not in use.
+        name: for `segment`; no other method has it.
         cleanup: the method's defaults of the clean-up options; None: those of `Cleanup`.
 
     Returns:
@@ -48,7 +48,6 @@ def register(name: str, cleanup: Cleanup | None = None) -> Callable[[Function], 
         ...     return columns.expand(image.shape[-2:])
         >>> segment(torch.zeros(3, 2, 4), method="halves")[0].tolist()
         [0, 0, 1, 1]
-        >>> del _methods["halves"]
     """
     if not name or name in _methods:
         raise InvalidArgument("name", f"a new name, not empty, none of {', '.join(available_methods())}", repr(name))
@@ -66,7 +65,7 @@ def available_methods() -> list[str]:
 
 
 def method_options(method: str) -> dict[str, Any]:
-    """Return the options of a method with their defaults, those of clean-up last; ``Parameter.empty``: no default.
+    """Return the options of a method with their defaults, clean-up last; ``Parameter.empty`` where there is none.
 
     Raises:
         ValueError: no such method.
@@ -86,13 +85,13 @@ def method_options(method: str) -> dict[str, Any]:
 def segment(image: Any, method: str = "auto", **options: Any) -> Tensor:
     """Divide an image into regions by the named method.
 
-    Convention: every method takes four options of clean-up, ``snap``, ``min_size``, ``connected`` and ``max_regions``.
-    `Cleanup` says what they do; `method_options` has each method's defaults.
+    Convention: every method has the four options of `Cleanup`, ``snap``, ``min_size``, ``connected`` and
+    ``max_regions``; `method_options` returns its defaults.
 
     Args:
         image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1]; or a numpy array (H, W, C), or a PIL image.
         method: one of `available_methods`.
-        options: keyword arguments of that method, and of clean-up.
+        options: of the method and of `Cleanup`.
 
     Returns:
         :math:`(H, W)` int64 on the device of ``image``. Ids are 0 to R - 1, each in use, by decreasing area; of equal
@@ -114,11 +113,11 @@ def segment(image: Any, method: str = "auto", **options: Any) -> Tensor:
 
 
 def segment_with_scores(image: Any, method: str = "auto", **options: Any) -> Segmentation:
-    """Divide an image into regions as `segment` does; say how sure the method is of each and what it is called.
+    """Divide an image into regions as `segment` does, and return their scores and names too.
 
     Returns:
-        The label map that `segment` returns; a score in [0, 1] for every region, the mean over its pixels of what the
-        method states as its score; and a name for every region, a prompt or a class. None where a method has none.
+        The label map of `segment`; a score in [0, 1] for every region, the mean over its pixels; and a name for every
+        region, a prompt or a class. None instead of scores or names that a method does not have.
 
     Example:
         >>> import torch
@@ -128,10 +127,10 @@ def segment_with_scores(image: Any, method: str = "auto", **options: Any) -> Seg
         >>> labels[0, ::20].tolist(), scores, names
         ([1, 0, 0], None, None)
     """
-    known = method_options(method)
+    defaults = method_options(method)
     for option in options:
-        if option not in known:
-            raise InvalidArgumentType("option", f"one of the method {method!r}, {', '.join(known)}", repr(option))
+        if option not in defaults:
+            raise InvalidArgumentType("option", f"one of the method {method!r}, {', '.join(defaults)}", repr(option))
     function, cleanup = _methods[method]
     cleanup = replace(cleanup, **{name: options.pop(name) for name in asdict(cleanup) if name in options})
     pixels = check_segment_image(image)

@@ -1,4 +1,4 @@
-"""Putting the contours of a label map where the image has its edges."""
+"""Contours of a label map moved onto the edges of the image."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,54 +6,55 @@ from numpy.typing import NDArray
 from kcgs.functional.merging import Labels, RegionGraph
 from kcgs.segment.images import lab_sums
 
-# A region with a smaller share of its pixels further than `reach` inside is a ribbon.
+# share of the pixels of a region that lie further inside than `reach`, below which the region is a ribbon
 _CORE_SHARE = 0.1
-# How far a ribbon's colour may lie beside the line between its neighbours' colours, in lengths of that line.
+# distance of a mixed colour from the line between the two colours, in lengths of that line
 _MIXTURE_TOLERANCE = 0.25
-_JUST_NOTICEABLE = 2.3  # A distance in Lab.
+# distance of two colours in Lab
+_JUST_NOTICEABLE = 2.3
+# standard deviation of the smoothing before the gradient, in pixels
 _GRADIENT_SIGMA = 0.7
 
 
 def snap_contours(lab: NDArray[np.float32], regions: Labels, reach: int) -> Labels:
     """Move contours of regions 0 to R - 1 by up to ``reach`` pixels onto the strongest edge of (H, W, 3).
 
-    Segmenters that smooth the image leave contours a pixel or two beside its edges, put whiskers along them and make
-    ribbons of blurred edges. Here every region keeps what lies further than ``reach`` inside it, and the rest goes by
-    watershed on the gradient in CIE Lab. Ribbons whose colour is a mixture of the regions on their two sides, or hardly
-    another than one of them, are dissolved; other regions too thin to have an inside stay as they are. A region can
-    come out in several pieces.
+    Segmenters that smooth the image leave contours a pixel or two beside its edges, with whiskers, and make ribbons of
+    blurred edges. Here every region keeps its pixels that lie further inside than ``reach``. The watershed on the
+    gradient in CIE Lab divides the others. A ribbon is dissolved if its colour is a mixture of two neighbours, or
+    hardly differs from one; other regions too thin to have an inside stay. A region may fall into several pieces.
     """
     from scipy.ndimage import binary_dilation
     from skimage.segmentation import watershed
 
-    fixed = _fixed(lab, regions, reach)
-    # The watershed runs in the band that is open and on its rim: the inside of regions has no say in it.
+    fixed = _fixed_pixels(lab, regions, reach)
+    # the watershed needs the open pixels and their rim only
     seeds = np.where(fixed, regions + 1, 0)
     band = binary_dilation(~fixed, np.ones((3, 3)))
     flooded = watershed(_gradient(lab), seeds, mask=band)
     return np.where(fixed, regions, flooded - 1)
 
 
-def _fixed(lab: NDArray[np.float32], regions: Labels, reach: int) -> NDArray[np.bool_]:
-    """Return (H, W), true where the label stays."""
+def _fixed_pixels(lab: NDArray[np.float32], regions: Labels, reach: int) -> NDArray[np.bool_]:
+    """Return which pixels keep their label, (H, W)."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     size = 2 * reach + 1
     core = minimum_filter(regions, size, mode="nearest") == maximum_filter(regions, size, mode="nearest")
     areas = np.bincount(regions.ravel())
     thin = np.bincount(regions[core], minlength=len(areas)) < _CORE_SHARE * areas
-    if thin.all():  # Dissolving them would leave no seed.
+    if thin.all():  # without any there would be no seed
         return np.ones_like(core)
     graph = RegionGraph(regions)
     means = lab_sums(lab, regions) / areas[:, None]
-    stays = np.zeros_like(thin)
+    is_line = np.zeros_like(thin)
     for region in np.flatnonzero(thin):
-        stays[region] = not _is_mixture(means[region], means[list(graph.borders[region])])
-    return np.asarray(core | stays[regions])
+        is_line[region] = not _is_mixture(means[region], means[list(graph.borders[region])])
+    return np.asarray(core | is_line[regions])
 
 
 def _is_mixture(color: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
-    """Say whether ``color`` (3,) is hardly another than one of ``others`` (N, 3) or lies between two."""
+    """Return whether a colour (3,) hardly differs from one of ``others`` (N, 3) or lies between two of them."""
     offsets = color - others
     if np.linalg.norm(offsets, axis=1).min() < _JUST_NOTICEABLE:
         return True

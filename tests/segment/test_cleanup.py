@@ -84,6 +84,6 @@ def test_scores_are_means_and_names_majorities() -> None:
     classes = (torch.arange(30) >= 12).long().repeat(20, 1) * 2
     classes[5, 20] = 1  # a speck
     scores = torch.where(classes > 0, 0.5, float("nan"))
-    found = Cleanup().apply(torch.zeros(3, 20, 30), Prediction(classes, scores, ["sky", "bird", "dog"]))
-    assert found.names == {0: "dog", 1: "sky"}
-    assert found.scores is not None and found.scores.tolist() == pytest.approx([0.5, float("nan")], nan_ok=True)
+    result = Cleanup().apply(torch.zeros(3, 20, 30), Prediction(classes, scores, ["sky", "bird", "dog"]))
+    assert result.names == {0: "dog", 1: "sky"}
+    assert result.scores is not None and result.scores.tolist() == pytest.approx([0.5, float("nan")], nan_ok=True)

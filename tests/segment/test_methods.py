@@ -14,19 +14,13 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.segment import Prediction, available_methods, method_options, register, segment, segment_with_scores
 from kcgs.segment.methods import auto
 from kcgs.segment.registry import _methods
+from tests.segment.checks import assert_segmentation
 
 METHODS = ["auto", "chan_vese", "felzenszwalb", "kmeans", "quickshift", "slic", "watershed"]
 
 
 def photo(name: str, step: int = 1) -> Tensor:
     return torch.from_numpy(getattr(skimage.data, name)()).permute(2, 0, 1).float()[:, ::step, ::step] / 255
-
-
-def assert_clean(labels: Tensor, size: tuple[int, ...]) -> None:
-    """Check what every segmenter promises: int64, ids without gaps by decreasing area."""
-    assert labels.dtype == torch.int64 and labels.shape == size
-    areas = labels.flatten().bincount()
-    assert (areas > 0).all() and (areas[:-1] >= areas[1:]).all()
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -36,28 +30,29 @@ class TestEveryMethod:
     def test_small_images(self, method: str, size: tuple[int, int], channels: int) -> None:
         image = torch.rand(channels, *size, generator=torch.Generator().manual_seed(0))
         before = image.clone()
-        labels = segment(image, method)
-        assert_clean(labels, size)
-        assert torch.equal(image, before) and torch.equal(labels, segment(image.double(), method))
+        result = segment_with_scores(image, method)
+        assert_segmentation(result, size)
+        assert torch.equal(image, before) and torch.equal(result.labels, segment(image.double(), method))
 
     def test_photo_and_options(self, method: str) -> None:
         image = photo("coffee", 4)
-        labels = segment(image, method, min_size=500, max_regions=3)
-        areas = labels.flatten().bincount()
-        assert_clean(labels, (100, 150))
+        result = segment_with_scores(image, method, min_size=500, max_regions=3)
+        areas = result.labels.flatten().bincount()
+        assert_segmentation(result, (100, 150))
         assert len(areas) <= 3 and areas.min() >= 500
 
-    @pytest.mark.parametrize(
-        ("image", "error", "message"),
-        [
-            ([0.5], TypeError, "image must be a Tensor, a numpy array or a PIL image; got list"),
-            (torch.zeros(2, 4, 4), ValueError, "image must have shape"),
-            (torch.full((3, 4, 4), 255.0), ValueError, r"image must be in \[0, 1\]"),
-        ],
-    )
-    def test_bad_image(self, method: str, image: Any, error: type[Exception], message: str) -> None:
-        with pytest.raises(error, match=message):
-            segment(image, method)
+
+@pytest.mark.parametrize(
+    ("image", "error", "message"),
+    [
+        ([0.5], TypeError, "image must be a Tensor, a numpy array or a PIL image; got list"),
+        (torch.zeros(2, 4, 4), ValueError, "image must have shape"),
+        (torch.full((3, 4, 4), 255.0), ValueError, r"image must be in \[0, 1\]"),
+    ],
+)
+def test_bad_image(image: Any, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        segment(image)
 
 
 @pytest.mark.parametrize(
@@ -90,18 +85,18 @@ class TestRegistry:
         assert method_options("slic")["n_segments"] == 400
 
     def test_a_function_gets_the_image_and_the_values_of_its_cleanup(self) -> None:
-        seen = []
+        calls = []
 
         @register("test")
         def halves(image: Tensor, *, power: float = 1.0, min_size: int) -> Prediction:
-            seen.append((image.dtype, tuple(image.shape), power, min_size))
+            calls.append((image.dtype, tuple(image.shape), power, min_size))
             labels = np.broadcast_to(np.arange(30) >= 10, (20, 30))
             return Prediction(labels, labels * 0.5 + 0.25, ["sky", "dog"])
 
-        found = segment_with_scores(torch.zeros(1, 20, 30), "test", power=2.0)
-        assert seen == [(torch.float32, (3, 20, 30), 2.0, 24)]
-        assert found.scores is not None and found.scores.tolist() == [0.75, 0.25]
-        assert found.names == {0: "dog", 1: "sky"}
+        result = segment_with_scores(torch.zeros(1, 20, 30), "test", power=2.0)
+        assert calls == [(torch.float32, (3, 20, 30), 2.0, 24)]
+        assert result.scores is not None and result.scores.tolist() == [0.75, 0.25]
+        assert result.names == {0: "dog", 1: "sky"}
 
     @pytest.mark.parametrize(
         ("result", "error", "message"),
@@ -110,7 +105,7 @@ class TestRegistry:
             (torch.zeros(4, 4), TypeError, "labels must have an integer dtype"),
             (torch.zeros(2, 2).long(), ValueError, "labels must have the image's size"),
             (Prediction(np.ones((4, 4), int), np.ones(3)), ValueError, "scores must have the image's size"),
-            (Prediction(np.ones((4, 4), int), names=["sky"]), ValueError, "names must say what label 1 is"),
+            (Prediction(np.ones((4, 4), int), names=["sky"]), ValueError, "names must have one for label 1"),
         ],
     )
     def test_bad_results(self, result: Any, error: type[Exception], message: str) -> None:
@@ -137,8 +132,9 @@ class TestAuto:
         assert int(labels.max()) == 5 and shared.amax(1).sum() > 0.999 * labels.numel()
 
     def test_photo(self) -> None:
-        labels = segment(photo("coffee"))
-        assert_clean(labels, (400, 600))
+        result = segment_with_scores(photo("coffee"))
+        labels = result.labels
+        assert_segmentation(result, (400, 600))
         assert 4 <= int(labels.max()) + 1 <= 30
         assert len({int(labels[point]) for point in ((30, 40), (130, 290), (50, 300), (330, 420), (200, 560))}) == 5
 
@@ -146,8 +142,9 @@ class TestAuto:
     def test_large_images_are_segmented_at_a_smaller_size(self, monkeypatch: pytest.MonkeyPatch, large: int) -> None:
         monkeypatch.setattr(auto, "_LARGE", large)
         monkeypatch.setattr(auto, "_MAX_PIXELS", 20_000)
-        assert_clean(segment(photo("coffee", 2)), (200, 300))
-        assert_clean(segment(photo("coffee", 2), max_regions=None), (200, 300))
+        for max_regions in (30, None):
+            result = segment_with_scores(photo("coffee", 2), max_regions=max_regions)
+            assert_segmentation(result, (200, 300))
 
     def test_human_regions_are_covered(self, data_root: Path) -> None:
         folder = data_root / "bsds" / "42049"

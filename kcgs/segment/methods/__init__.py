@@ -1,4 +1,4 @@
-"""The methods of segmentation: each module in this folder registers its own, and a new one needs no other file."""
+"""The methods of segmentation. Each module in this folder is imported and registers its own; no list names it."""
 
 from importlib import import_module
 from pkgutil import iter_modules

@@ -1,4 +1,4 @@
-"""What `segment` does by itself: clean regions of photos, without learned weights."""
+"""The default segmenter: clean regions of photos, without learned weights."""
 
 import math
 
@@ -15,17 +15,20 @@ from kcgs.segment.images import check_segment_image, lab_sums, rgb_to_lab
 from kcgs.segment.registry import register
 from kcgs.segment.snapping import snap_contours
 
+# Tuned by how contours agree with those of people on photos of BSDS500, and what a fit gains: see `auto`.
+# standard deviation of the smoothing, in pixels
 _SIGMA = 1.2
-# Tried in turn while a map has few regions and they are not nearly flat (root mean square distance from the
-# mean colour, in Lab, where 2.3 is just noticeable).
+# scales of Felzenszwalb and Huttenlocher: the next one is tried while regions are few and not flat
 _SCALES = (300.0, 150.0, 75.0)
-_FEWEST = 4
+# regions from which on no finer scale is tried
+_MIN_REGIONS = 4
+# root mean square distance from the mean colour of a region that counts as flat, in Lab, where 2.3 is just noticeable
 _FLAT = 3.0
-# The share of a finer region that must lie in one coarser region for the finer one to be part of it.
+# share of a finer region that must lie in one coarser region for the finer one to be a part of it
 _PART_SHARE = 0.9
-# Larger images are segmented at this many pixels; only their contours are set at full size.
+# pixels at which images are segmented, at most; contours are then snapped at full size
 _MAX_PIXELS = 500_000
-# Of images larger than this, regions are also compared and merged at so many pixels: the full size says no more.
+# pixels of an image above which regions are also merged at the smaller size
 _LARGE = 2 * 1920 * 1080
 
 
@@ -34,13 +37,15 @@ _LARGE = 2 * 1920 * 1080
 def auto(image: Tensor, *, min_size: int, max_regions: int | None) -> Tensor:
     """Segment a photo into up to 30 clean connected regions, fewer where contours would save too little.
 
-    The method of Felzenszwalb and Huttenlocher, with its scale halved up to twice while fewer than 4 regions
-    come out that are not nearly flat; contours snap to edges, pieces under ``min_size`` join a neighbour;
-    regions merge whose contour saves less error than it costs (`merge_regions`), and then the most similar
-    neighbours until ``max_regions`` are left. A scene that needs no contour gives one region. On 21 photos of
-    BSDS500 some three fifths of the contours lie within 3 pixels of human ones, and of the human ones are
-    found; borders of texture alone are not seen. With 400 Gaussians a fit gains 0.76 dB by these maps, and
-    loses 0.65 dB to Gaussians of as many bytes where a map is stored as lossless WebP (`python -m benchmarks maps`).
+    The method of Felzenszwalb and Huttenlocher, with its scale halved up to twice while fewer than 4 regions result
+    that are not nearly flat. Contours snap to edges, and pieces under ``min_size`` join a neighbour. Regions merge
+    whose contour saves less error than it costs (`merge_regions`), then the most similar neighbours until
+    ``max_regions`` are left. An image that needs no contour gives one region.
+
+    On 21 photos of BSDS500 some three fifths of the contours lie within 3 pixels of human ones, and as many of the
+    human ones have a contour within 3 pixels; borders of texture alone are not found. With 400 Gaussians a fit gains
+    0.76 dB by these maps, and loses 0.65 dB to Gaussians of as many bytes where a map is stored as lossless WebP
+    (`python -m benchmarks maps`).
 
     Example:
         >>> from kcgs.segment import segment
@@ -53,41 +58,41 @@ def auto(image: Tensor, *, min_size: int, max_regions: int | None) -> Tensor:
     image = image.cpu()
     if image[0].numel() <= _LARGE:
         return torch.from_numpy(_regions(image, min_size))
-    small = _reduced(image)
+    small = _reduce(image)
     smallest = max(1, round(min_size * small[0].numel() / image[0].numel()))
     regions = _regions(small, smallest)
     if max_regions is not None:
         regions = merge_similar(rgb_to_lab(small), regions, max_regions)
-    return torch.from_numpy(_enlarged(image, regions))
+    return torch.from_numpy(_enlarge(image, regions))
 
 
 def _regions(image: Tensor, min_size: int) -> Labels:
     best = np.zeros(image.shape[1:], dtype=np.int64)
     if (image != image[:, :1, :1]).any():
         for scale in _SCALES:
-            best = _cut_out(best, _photo_regions(image, scale, min_size), min_size)
-            if best.max() + 1 >= _FEWEST or _spread(image, best) < _FLAT:
+            best = _refine(best, _felzenszwalb_regions(image, scale, min_size), min_size)
+            if best.max() + 1 >= _MIN_REGIONS or _spread(image, best) < _FLAT:
                 break
     return merge_regions(image, torch.from_numpy(best)).numpy() if best.max() > 0 else best
 
 
-def _photo_regions(image: Tensor, scale: float, min_size: int) -> Labels:
-    """Return 4-connected regions of (3, H, W), none a speck, contours on edges."""
+def _felzenszwalb_regions(image: Tensor, scale: float, min_size: int) -> Labels:
+    """Return 4-connected regions of (3, H, W), of at least ``min_size`` pixels, contours on edges."""
     from skimage.segmentation import felzenszwalb
 
-    small = _reduced(image)
+    small = _reduce(image)
     smallest = max(1, round(min_size * small[0].numel() / image[0].numel()))
-    # Lab over 100 has about the range of RGB in [0, 1], for which the usual scales are known.
+    # Lab over 100 has about the range of RGB in [0, 1], for which scales are usually given
     raw = felzenszwalb(rgb_to_lab(small) / 100, scale=scale, sigma=_SIGMA, min_size=smallest)
-    return clean(_enlarged(image, clean(raw, smallest)), min_size)
+    return clean(_enlarge(image, clean(raw, smallest)), min_size)
 
 
 def _shrink(image: Tensor) -> float:
     return max(1.0, math.sqrt(image[0].numel() / _MAX_PIXELS))
 
 
-def _reduced(image: Tensor) -> Tensor:
-    """Return (3, H, W) at no more pixels than regions are looked for at."""
+def _reduce(image: Tensor) -> Tensor:
+    """Return (3, H, W) at the size at which it is segmented."""
     shrink = _shrink(image)
     if shrink == 1:
         return image
@@ -95,24 +100,24 @@ def _reduced(image: Tensor) -> Tensor:
     return check_segment_image(F.interpolate(image[None], size, mode="area")[0])
 
 
-def _enlarged(image: Tensor, regions: Labels) -> Labels:
-    """Return regions at the size of (3, H, W), contours on its edges."""
+def _enlarge(image: Tensor, regions: Labels) -> Labels:
+    """Return regions at the size of (3, H, W), with contours on its edges."""
     if regions.shape != image.shape[1:]:
         maps = torch.from_numpy(regions)[None, None].double()
         regions = to_regions(F.interpolate(maps, image.shape[1:], mode="nearest")[0, 0].long().numpy())
     return snap_contours(rgb_to_lab(image), regions, math.ceil(2 * _shrink(image)))
 
 
-def _cut_out(coarse: Labels, fine: Labels, min_size: int) -> Labels:
-    """Cut regions of ``fine`` out of the one region of ``coarse`` that they are part of.
+def _refine(coarse: Labels, fine: Labels, min_size: int) -> Labels:
+    """Divide regions of ``coarse`` by the regions of ``fine`` that lie within one of them.
 
-    The coarse map has the better contours: what crosses them in the finer map is left out.
+    The coarse map has the better contours: a region of the finer map that crosses them is left out.
     """
     count = int(coarse.max()) + 1
-    shared = np.bincount((fine * count + coarse).ravel(), minlength=count * (int(fine.max()) + 1)).reshape(-1, count)
-    host = shared.argmax(axis=1)
-    within = shared.max(axis=1) > _PART_SHARE * np.bincount(fine.ravel())
-    return clean(np.where(within[fine] & (host[fine] == coarse), count + fine, coarse), min_size)
+    overlap = np.bincount((fine * count + coarse).ravel(), minlength=count * (int(fine.max()) + 1)).reshape(-1, count)
+    parent = overlap.argmax(axis=1)
+    is_part = overlap.max(axis=1) > _PART_SHARE * np.bincount(fine.ravel())
+    return clean(np.where(is_part[fine] & (parent[fine] == coarse), count + fine, coarse), min_size)
 
 
 def _spread(image: Tensor, regions: Labels) -> float:

@@ -1,4 +1,4 @@
-"""Regions of alike patch features: DINO, DINOv2, DINOv3."""
+"""Regions of alike patch features, by DINO, DINOv2 or DINOv3."""
 
 import inspect
 import os
@@ -10,10 +10,14 @@ from torch import Tensor
 
 from kcgs._check import check_count
 from kcgs.segment.cleanup import Prediction
-from kcgs.segment.networks import k_means, load_pretrained, preprocess
+from kcgs.segment.clustering import k_means
+from kcgs.segment.networks import load_pretrained, preprocess
 from kcgs.segment.registry import register
 
-_GUIDE_EPS = 1e-3  # A variance of colour below which the guided filter smooths.
+# variance of colour below which the guided filter smooths
+_GUIDE_EPS = 1e-3
+# least mean distance of features to the centres of their clusters, one minus a cosine
+_MIN_SPREAD = 1e-3
 
 
 @register("dino")
@@ -47,13 +51,13 @@ def dino(
     features = F.normalize(patch_features(image, model, longer_side), dim=-1)
     rows, columns = features.shape[:2]
     clusters = torch.from_numpy(k_means(features.flatten(0, 1).double().cpu().numpy(), num_clusters)).to(image.device)
-    chosen = F.one_hot(clusters)[:, clusters.bincount() > 0].to(features)  # [N, K]
-    similarity = features @ F.normalize(chosen.T @ features.flatten(0, 1), dim=-1).T
-    # The sharpest the features allow: a patch at a centre belongs to it alone.
-    spread = (1 - similarity.max(dim=-1).values).mean().clamp(min=1e-3)
-    members = (similarity / spread).softmax(dim=-1).permute(2, 0, 1)
+    assignment = F.one_hot(clusters)[:, clusters.bincount() > 0].to(features)  # [N, K]
+    similarity = features @ F.normalize(assignment.T @ features.flatten(0, 1), dim=-1).T
+    # a patch at the centre of a cluster belongs to that cluster alone
+    spread = (1 - similarity.max(dim=-1).values).mean().clamp(min=_MIN_SPREAD)
+    memberships = (similarity / spread).softmax(dim=-1).permute(2, 0, 1)
     patch = max(image.shape[1] / rows, image.shape[2] / columns)
-    best = _to_pixel_edges(image, members, patch).max(dim=0)
+    best = _enlarge_along_edges(image, memberships, patch).max(dim=0)
     return Prediction(best.indices, best.values)
 
 
@@ -65,22 +69,22 @@ def patch_features(image: Tensor, model: str | os.PathLike[str] | Any, longer_si
         raise ValueError(f"model must be a vision transformer with patches; got {type(network).__name__}")
     longer = max(image.shape[1:])
     rows, columns = (max(1, round(side * longer_side / longer / patch)) for side in image.shape[1:])
-    # Later models place patches of any number by themselves.
-    places = {"interpolate_pos_encoding"} & inspect.signature(network.forward).parameters.keys()
+    # DINO has to be asked to take another number of patches; later models do it by themselves
+    options = {"interpolate_pos_encoding"} & inspect.signature(network.forward).parameters.keys()
     with torch.no_grad():
-        shown = preprocess(image, (rows * patch, columns * patch))
-        tokens = network(pixel_values=shown, **dict.fromkeys(places, True)).last_hidden_state[0]
-    # Class and register tokens come first.
+        pixels = preprocess(image, (rows * patch, columns * patch))
+        tokens = network(pixel_values=pixels, **dict.fromkeys(options, True)).last_hidden_state[0]
+    # class and register tokens come first
     return torch.as_tensor(tokens[-rows * columns :].float()).reshape(rows, columns, -1)
 
 
-def _to_pixel_edges(image: Tensor, members: Tensor, patch: float) -> Tensor:
-    """Enlarge memberships (K, rows, columns) to the pixels' size, along the edges of (3, H, W)."""
+def _enlarge_along_edges(image: Tensor, memberships: Tensor, patch: float) -> Tensor:
+    """Enlarge memberships (K, rows, columns) to the size of an image (3, H, W), along its edges."""
     from kornia.filters import guided_blur
 
     size = (image.shape[1], image.shape[2])
-    large = F.interpolate(members[None], size, mode="bilinear", align_corners=False)
-    # Odd, and no window reaches further beyond a border than the image does.
+    large = F.interpolate(memberships[None], size, mode="bilinear", align_corners=False)
+    # odd, and no window reaches beyond a border further than the image is large
     height, width = (min(2 * round(patch) + 1, 2 * side - 1) for side in size)
     guided = guided_blur(image[None], large, (height, width), _GUIDE_EPS, border_type="replicate")
     return torch.as_tensor(guided[0]).clamp(0, 1)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcgs._check import check_number
 from kcgs.segment.cleanup import Prediction
-from kcgs.segment.networks import errors_of, load_pretrained, predict_labels, preprocess
+from kcgs.segment.networks import library_errors, load_pretrained, predict_labels, preprocess
 from kcgs.segment.registry import register
 
 
@@ -24,8 +24,8 @@ def text(
     """Segment by words, through CLIPSeg (Lüddecke and Ecker, CVPR 2022).
 
     Every pixel goes to the prompt with the largest logit; its score is the softmax over the prompts. With a
-    ``threshold``, a pixel goes to a prompt where the best one's sigmoid is above it, else to the background; scores
-    are then that sigmoid, and one less it in the background. Names of regions are prompts, or "background".
+    ``threshold``, a pixel whose largest sigmoid is at most the threshold is background; scores are then that sigmoid,
+    and one minus it in the background. Names of regions are prompts, or "background".
 
     Args:
         image: as `segment` takes it, any size.
@@ -47,7 +47,7 @@ def text(
     if len(prompts) < (2 if threshold is None else 1):
         raise ValueError(f"prompts must be at least 2, or 1 with a threshold; got {list(prompts)!r}")
     network = load_pretrained("CLIPSegForImageSegmentation", model, image.device)
-    with errors_of(f"cannot load the tokenizer of {network.name_or_path!r}"):
+    with library_errors(f"cannot load the tokenizer of {network.name_or_path!r}"):
         from transformers import AutoTokenizer
 
         tokenizer = AutoTokenizer.from_pretrained(network.name_or_path)

@@ -1,4 +1,4 @@
-"""Label maps that exist already: masks on disk."""
+"""Label maps on disk."""
 
 import os
 
@@ -12,7 +12,7 @@ from kcgs.segment.registry import register
 def file(image: Tensor, *, path: str | os.PathLike[str]) -> Tensor:
     """Take the regions of an image from a mask on disk.
 
-    Unless asked, nothing is cleaned: no piece is too small, and a label in several pieces is one region.
+    By default nothing is cleaned: no piece is too small, and a label in several pieces is one region.
 
     Args:
         image: as `segment` takes it.

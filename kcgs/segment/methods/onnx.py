@@ -12,11 +12,15 @@ from torch import Tensor
 
 from kcgs._check import check_floating, check_number, check_numbers, check_size
 from kcgs.segment.cleanup import Prediction
-from kcgs.segment.networks import IMAGENET_MEAN, IMAGENET_STD, errors_of, predict_labels, preprocess
+from kcgs.segment.networks import IMAGENET_MEAN, IMAGENET_STD, library_errors, predict_labels, preprocess
 from kcgs.segment.registry import register
 
-_SUM_TOLERANCE = 1e-2  # Of probabilities over the classes; half precision leaves some 1e-3.
-_LEAST = 1e-6  # Of a probability whose logarithm is taken.
+# by which the sum of probabilities over the classes may miss 1; half precision misses it by some 1e-3
+_SUM_TOLERANCE = 1e-2
+# probabilities are clamped to this before their logarithm
+_MIN_PROBABILITY = 1e-6
+# of LSeg's text encoder, CLIP: cosine similarities over it are logits
+_TEMPERATURE = 0.07
 
 
 @register("onnx")
@@ -33,7 +37,7 @@ def onnx(
     """Segment by a network in ONNX, run by onnxruntime on the CPU.
 
     The image is resized to the network's input (bilinear, antialiased), less ``mean``, over ``std``; the first output
-    is resized to the image. It is read by what it holds:
+    is resized to the image. Its shape and values say what it means:
 
     - integers, (1, h, w) or (1, 1, h, w): class numbers; they have no scores.
     - (1, C, h, w), C > 1: probabilities where they sum to 1, else logits; the largest wins, its softmax is the score.
@@ -53,8 +57,8 @@ def onnx(
         TypeError, ValueError: an argument is out of its range, or ``model`` is no such network or does not run.
 
     Example:
-        ``segment(image, "onnx", model="u2netp.onnx")`` puts the salient object and the rest apart (U-2-Net,
-        Qin et al., Pattern Recognition 2020).
+        ``segment(image, "onnx", model="u2netp.onnx")`` separates the salient object from the rest (U-2-Net, Qin et al.,
+        Pattern Recognition 2020).
     """
     check_number("threshold", threshold, 0, 1)
     raw = _run(image, model, size, mean, std)
@@ -63,13 +67,13 @@ def onnx(
         return Prediction(labels, names=names)
     if len(raw) > 1:
         is_probability = raw.min() >= 0 and (raw.sum(dim=0) - 1).abs().max() < _SUM_TOLERANCE
-        logits = raw.clamp(min=_LEAST).log() if is_probability else raw
+        logits = raw.clamp(min=_MIN_PROBABILITY).log() if is_probability else raw
         _check_names(names, len(raw))
         return predict_labels(logits, image.shape[1:], names)
     _check_names(names, 2)
     low, high = raw.aminmax()
     if low >= 0 and high <= 1:
-        raw = ((raw - low) / (high - low).clamp(min=_LEAST)).logit(_LEAST)
+        raw = ((raw - low) / (high - low).clamp(min=_MIN_PROBABILITY)).logit(_MIN_PROBABILITY)
     return predict_labels(raw, image.shape[1:], None, threshold)._replace(names=names)
 
 
@@ -82,22 +86,30 @@ def lseg(
     size: tuple[int, int] | None = None,
     mean: Sequence[float] = (0.5, 0.5, 0.5),
     std: Sequence[float] = (0.5, 0.5, 0.5),
-    temperature: float = 0.07,
     names: Sequence[str] | None = None,
 ) -> Prediction:
     """Segment by language as LSeg does (Li et al., ICLR 2022): pixel features against text embeddings.
 
-    Arguments and errors are those of `onnx`, but for these. ``model`` is LSeg's image encoder, (1, 3, h, w) to
-    features (1, D, h', w'). ``embeddings`` is an .npy file with a CLIP text embedding for each class, (K, D), or that
-    array; ``names`` has as many. The largest cosine similarity wins; its score is the softmax of the similarities over
-    ``temperature``, above 0.
+    The label of a pixel is the class with the largest cosine similarity, its score the softmax of the similarities over
+    CLIP's temperature, 0.07.
+
+    Args:
+        image: as `segment` takes it, any size.
+        model: LSeg's image encoder, an ONNX file from (1, 3, h, w) to features (1, D, h', w').
+        embeddings: a CLIP text embedding for each class, (K, D): an .npy file or an array.
+        size: as of `onnx`, such as ``mean`` and ``std``.
+        mean: three numbers.
+        std: three numbers above 0.
+        names: of the K classes.
+
+    Raises:
+        TypeError, ValueError: as `onnx`; embeddings of another shape.
 
     Example:
         ``segment(image, "lseg", model="lseg.onnx", embeddings="dog-grass-other.npy")``
     """
-    check_number("temperature", temperature, 0, above=True)
     if isinstance(embeddings, str | os.PathLike):
-        with errors_of(f"cannot read {os.fspath(embeddings)} as an .npy array"):
+        with library_errors(f"cannot read {os.fspath(embeddings)} as an .npy array"):
             embeddings = np.load(embeddings, allow_pickle=False)
     texts = check_floating("embeddings", torch.from_numpy(embeddings), dims=(2,)).float()
     _check_names(names, len(texts))
@@ -105,7 +117,7 @@ def lseg(
     if len(features) != texts.shape[1]:
         raise ValueError(f"embeddings must have shape (K, {len(features)}); got {tuple(texts.shape)}")
     similarity = torch.einsum("dhw,kd->khw", F.normalize(features, dim=0), F.normalize(texts, dim=1))
-    return predict_labels(similarity / temperature, image.shape[1:], names)
+    return predict_labels(similarity / _TEMPERATURE, image.shape[1:], names)
 
 
 def _check_names(names: Sequence[str] | None, classes: int) -> None:
@@ -125,13 +137,13 @@ def _run(
 
     check_numbers("mean", mean, 3)
     check_numbers("std", std, 3, 0, above=True)
-    with errors_of(f"cannot read {model} as an ONNX network"):
+    with library_errors(f"cannot read {model} as an ONNX network"):
         session = onnxruntime.InferenceSession(os.fspath(model), providers=["CPUExecutionProvider"])
     entry = session.get_inputs()[0]
-    fixed = [side for side in entry.shape[2:] if isinstance(side, int)]
-    height, width = check_size("size", size or (fixed if len(fixed) == 2 else image.shape[1:]))
+    sides = [side for side in entry.shape[2:] if isinstance(side, int)]
+    height, width = check_size("size", size or (sides if len(sides) == 2 else image.shape[1:]))
     values = preprocess(image.cpu(), (height, width), mean, std).numpy()
-    with errors_of(f"{model} does not run on {values.shape}"):
+    with library_errors(f"{model} does not run on {values.shape}"):
         values = values.astype(np.float16 if entry.type == "tensor(float16)" else np.float32)
         result = np.asarray(session.run(None, {entry.name: values})[0])
     if result.ndim not in (3, 4) or len(result) != 1 or not np.isfinite(result).all():

@@ -1,0 +1,147 @@
+"""Segment Anything and SAM 2 by transformers, prompted by points, boxes or a grid."""
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from kcgs._check import check_count, check_number
+from kcgs.segment.cleanup import Prediction
+from kcgs.segment.networks import load_pretrained, preprocess
+from kcgs.segment.registry import register
+
+# prompts per pass of the network
+_BATCH = 16
+# of Segment Anything's automatic generator: overlap of the masks at logits above and below 0 by the offset
+_MIN_STABILITY = 0.95
+_STABILITY_OFFSET = 1.0
+# intersection over union of two masks
+_MAX_OVERLAP = 0.7
+
+
+@register("sam")
+def sam(
+    image: Tensor,
+    *,
+    model: str | os.PathLike[str] | Any = "facebook/sam2.1-hiera-tiny",
+    boxes: Tensor | Sequence[Any] | None = None,
+    points: Tensor | Sequence[Any] | None = None,
+    grid: int = 16,
+    min_score: float = 0.88,
+) -> Prediction:
+    """Segment by Segment Anything (Kirillov et al., ICCV 2023) or SAM 2 (Ravi et al., ICLR 2025).
+
+    A box, or a set of points, asks for one object and gets its best mask. Without either, a grid of points asks for
+    everything: of the three masks per point those are taken that the model scores at least ``min_score`` and that
+    hardly depend on the threshold. Of two masks that overlap by more than 0.7 (intersection over union) the better is
+    taken. Smaller masks lie over larger ones. Each connected piece that no mask covers is a region too. The score of a
+    region is the overlap that the model predicts for its mask, NaN without a mask.
+
+    Args:
+        image: as `segment` takes it, any size.
+        model: a hub id such as "facebook/sam2.1-hiera-tiny" or "facebook/sam-vit-base", a local folder, or a loaded
+            ``SamModel`` or ``Sam2Model``.
+        boxes: :math:`(K, 4)` left, top, right, bottom in pixels; a tensor or a list.
+        points: :math:`(K, P, 2)` for K objects of P points each, (x, y) in pixels; a tensor or a list.
+        grid: points along each side where there are neither boxes nor points, at least 1.
+        min_score: of the grid's masks, in [0, 1], against the overlap that the model predicts.
+
+    Raises:
+        ValueError: an argument has another shape or is out of its range, or the weights do not fit the model.
+
+    Example:
+        ``segment(image, "sam", boxes=[[30, 40, 200, 180]])``
+    """
+    check_count("grid", grid)
+    check_number("min_score", min_score, 0, 1)
+    is_grid = boxes is None and points is None
+    prompts = _prompts(boxes, _grid_points(image, grid) if is_grid else points)
+    network = load_pretrained("AutoModelForMaskGeneration", model, image.device)
+    side, (height, width) = network.prompt_encoder.input_image_size, image.shape[1:]
+    size = (side, side)
+    if network.config.model_type == "sam":  # its input keeps the image's shape, in a corner of the square
+        size = (round(height * side / max(height, width)), round(width * side / max(height, width)))
+    square = F.pad(preprocess(image, size), (0, side - size[1], 0, side - size[0]))
+    logits, scores = _predict_masks(network, square, prompts, torch.tensor([size[1] / width, size[0] / height]))
+    if is_grid:
+        logits, scores = logits.flatten(0, 1), scores.flatten()
+        inner, outer = ((logits > offset).flatten(1).sum(dim=1) for offset in (_STABILITY_OFFSET, -_STABILITY_OFFSET))
+        is_good = (scores >= min_score) & (inner >= _MIN_STABILITY * outer)
+        logits, scores = logits[is_good], scores[is_good]
+    else:
+        objects, best = torch.arange(len(scores)), scores.argmax(dim=1)
+        logits, scores = logits[objects, best], scores[objects, best]
+    labels = torch.zeros(height, width, dtype=torch.int64, device=image.device)
+    pixel_scores = torch.full((height, width), float("nan"), device=image.device)
+    for label, mask in enumerate(suppress_duplicates(logits > 0, scores, _MAX_OVERLAP), start=1):
+        large = F.interpolate(logits[mask][None, None], (side, side), mode="bilinear", align_corners=False)
+        corner = large[..., : size[0], : size[1]]
+        inside = F.interpolate(corner, (height, width), mode="bilinear", align_corners=False)[0, 0] > 0
+        labels[inside] = label
+        pixel_scores[inside] = scores[mask]
+    return Prediction(labels, pixel_scores)
+
+
+def _prompts(boxes: Any, points: Any) -> dict[str, Tensor]:
+    """Return boxes or points as the network's inputs, (1, K, ...)."""
+    if boxes is not None:
+        if points is not None:
+            raise ValueError("boxes must be None where there are points; got both")
+        return {"input_boxes": _to_tensor("boxes", boxes, (None, 4))[None]}
+    points = _to_tensor("points", points, (None, None, 2))[None]
+    return {"input_points": points, "input_labels": torch.ones(points.shape[:3]).long()}
+
+
+def _to_tensor(name: str, values: Any, shape: tuple[int | None, ...]) -> Tensor:
+    """Return a tensor, or a list from the command line, as a tensor of a shape; None: any size."""
+    expected = f"{name} must be numbers of shape ({', '.join('any' if n is None else str(n) for n in shape)})"
+    try:
+        tensor = torch.as_tensor(values, dtype=torch.float32)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{expected}; got {values!r}") from error
+    fits = tensor.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, tensor.shape, strict=True))
+    if not fits or not tensor.numel():
+        raise ValueError(f"{expected}; got {tuple(tensor.shape)}")
+    return tensor
+
+
+def _grid_points(image: Tensor, grid: int) -> Tensor:
+    steps = (torch.arange(grid) + 0.5) / grid
+    return torch.cartesian_prod(steps * image.shape[1], steps * image.shape[2]).flip(-1)[:, None]
+
+
+@torch.no_grad()
+def _predict_masks(network: Any, square: Tensor, prompts: dict[str, Tensor], scale: Tensor) -> tuple[Tensor, Tensor]:
+    """Return logits (K, C, h, w) and predicted overlaps (K, C) of the masks of prompts (1, K, ...) in pixels."""
+    embeddings = network.get_image_embeddings(square)
+    logits, scores = [], []
+    for start in range(0, next(iter(prompts.values())).shape[1], _BATCH):
+        batch = {name: values[:, start : start + _BATCH] for name, values in prompts.items()}
+        for name in ("input_boxes", "input_points"):
+            if name in batch:  # the prompt encoder adds half a pixel
+                batch[name] = (batch[name].unflatten(-1, (-1, 2)) * scale - 0.5).flatten(-2)
+        is_ambiguous = "input_points" in batch and batch["input_points"].shape[2] == 1
+        batch = {name: values.to(square.device) for name, values in batch.items()}
+        result = network(image_embeddings=embeddings, multimask_output=is_ambiguous, **batch)
+        logits.append(result.pred_masks[0].float())
+        scores.append(result.iou_scores[0].float())
+    return torch.cat(logits), torch.cat(scores)
+
+
+def suppress_duplicates(masks: Tensor, scores: Tensor, max_overlap: float) -> list[int]:
+    """Return indices of masks (M, h, w) from large to small, without those that overlap a better mask too much.
+
+    Overlap is intersection over union. Of equal scores (M,) the earlier is the better; of equal areas it comes last.
+    """
+    flat = masks.flatten(1).float()
+    areas = flat.sum(dim=1)
+    shared = flat @ flat.T
+    is_duplicate = (shared > max_overlap * (areas[:, None] + areas[None] - shared)).tolist()
+    indices: list[int] = []
+    for mask in scores.argsort(descending=True, stable=True).tolist():
+        if areas[mask] > 0 and not any(is_duplicate[mask][other] for other in indices):
+            indices.append(mask)
+    return sorted(reversed(indices), key=lambda mask: -float(areas[mask]))
