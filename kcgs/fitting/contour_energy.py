@@ -1,4 +1,4 @@
-"""The moves of contour refinement: what a label costs where, and which pixels change their label."""
+"""The energy of a label map in contour refinement, and the moves of labels that lower it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Mask = NDArray[np.bool_]
 
 
 def index_map(regions: RegionMap, labels: Tensor) -> Labels:
-    """Return each label's place among the map's ids, -1 where it has none, (H, W)."""
+    """Return the position of each label among the map's ids, (H, W); -1 for a label that the map lacks."""
     return np.asarray(regions.index_of(labels).cpu().numpy(), dtype=np.int32)
 
 
@@ -36,7 +36,7 @@ def bounding_boxes(index: Labels, count: int, margin: int) -> Ints:
     return boxes.clip(0, np.repeat(index.shape, 2))
 
 
-def unequal(padded: Labels) -> int:
+def count_unequal_pairs(padded: Labels) -> int:
     """Count the unordered pairs of 8-neighbours with different labels; the rim holds -1."""
     width = padded.shape[1]
     flat = padded.ravel()
@@ -74,7 +74,7 @@ class RegionCosts:
         sizes = (self._bottom - self._top) * self._width
         self._start = np.cumsum(sizes) - sizes
 
-    def at(self, pixels: Ints, region: Labels) -> Floats:
+    def of(self, pixels: Ints, region: Labels) -> Floats:
         """Return the costs of pixels in regions, infinite outside a region's box."""
         y, x = np.divmod(pixels, self._stride)
         top, left = self._top[region], self._left[region]
@@ -93,7 +93,7 @@ def _mean_around(error: Tensor, sigma: float) -> Tensor:
 
 
 class MovingLabels:
-    """A label map that changes, flat and with a rim of -1, so that a pixel's neighbours are sums of indices."""
+    """A label map that changes, flat and with a rim of -1, so that the places of a pixel's neighbours are sums."""
 
     def __init__(self, index: Labels, costs: RegionCosts, length_weight: float, pad: int, smallest: int) -> None:
         padded = np.pad(index, pad, constant_values=-1)
@@ -107,9 +107,9 @@ class MovingLabels:
         self._free = np.ones(index.shape, np.bool_)
         specks = np.zeros(padded.shape, np.bool_)
         specks[pad:-pad, pad:-pad].flat[small_pieces(index, smallest)[0]] = True
-        self._specks = specks.reshape(-1)  # pixels of pieces that were small in the map as it came
-        self._given = np.zeros(0, np.int32)
-        self._allowing = disc(0, 0)[1:]
+        self._specks = specks.reshape(-1)  # pixels of pieces that were small before any move
+        self._anchor = np.zeros(0, np.int32)
+        self._anchor_disc: Ints | None = None  # None: a pixel may take any label
 
     def fix_cores(self, rim: Mask, distance: int) -> None:
         """Fix the pixels that each region keeps, unless it has that many beyond the distance that contours move."""
@@ -124,27 +124,28 @@ class MovingLabels:
         fixed = order[rank < self._floor[region[order]]]
         self._free[y[fixed], x[fixed]] = False
 
-    def bound(self, given: Labels, distance: float) -> None:
-        """Allow a pixel only the labels that `given` has within the distance."""
-        # repeated beyond the border: what lies across it is nearer still
-        self._given = np.pad(given, self._pad, mode="edge").reshape(-1)
-        self._allowing = disc(distance, self._stride)
-        self._free &= edge_band(torch.from_numpy(given + 1), distance).numpy()
+    def limit_moves(self, anchor: Labels, distance: float) -> None:
+        """Allow a pixel only the labels that another map has within the distance."""
+        # repeated beyond the border: a label across it is nearer still
+        self._anchor = np.pad(anchor, self._pad, mode="edge").reshape(-1)
+        self._anchor_disc = disc(distance, self._stride)
+        self._free &= edge_band(torch.from_numpy(anchor + 1), distance).numpy()
 
     def sweep(self, reach: int) -> bool:
-        """Give every free pixel near a contour its best label, and say whether one changed."""
+        """Give every free pixel near a contour its best label; True if one changed."""
         y, x = np.nonzero(edge_band(torch.from_numpy(self.map.copy()), reach).numpy() & self._free)
-        pixels, colour = (y + self._pad) * self._stride + x + self._pad, 2 * (y % 2) + x % 2
-        near, present = disc(reach, self._stride), self._labels.copy()
-        for c in range(4):
-            chosen = pixels[colour == c]
-            self._improve(chosen, present[chosen[:, None] + near])
-        return not np.array_equal(present, self._labels)
+        # neighbours differ in parity: pixels of one parity change at the same time
+        pixels, parity = (y + self._pad) * self._stride + x + self._pad, 2 * (y % 2) + x % 2
+        neighborhood, before = disc(reach, self._stride), self._labels.copy()
+        for value in range(4):
+            group = pixels[parity == value]
+            self._improve(group, before[group[:, None] + neighborhood])
+        return not np.array_equal(before, self._labels)
 
     def _improve(self, pixels: Ints, candidates: Labels) -> None:
         around, present = self._labels[pixels[:, None] + self._eight], self._labels[pixels]
         best, least = present.copy(), self._cost(pixels, present, around)
-        for rows, labels in _others(candidates, present):
+        for rows, labels in _alternatives(candidates, present):
             cost = self._cost(pixels[rows], labels, around[rows])
             better = np.flatnonzero(cost < least[rows])
             better = better[self._allowed(pixels[rows[better]], labels[better])]
@@ -152,22 +153,24 @@ class MovingLabels:
         self._labels[pixels] = best
 
     def _cost(self, pixels: Ints, labels: Labels, around: Labels) -> Floats:
-        """Return what of the energy depends on each pixel's label, up to a constant."""
+        """Return the part of the energy that depends on each pixel's label, up to a constant."""
         equal = np.count_nonzero(around == labels[:, None], axis=1)
-        return np.asarray(self._costs.at(pixels, labels) - self._pair * equal)
+        return np.asarray(self._costs.of(pixels, labels) - self._pair * equal)
 
     def _allowed(self, pixels: Ints, labels: Labels) -> Mask:
-        found = np.full(len(pixels), not len(self._allowing))
-        for start in range(0, len(self._allowing), 32):  # the nearest first, since most are found there
-            left = np.flatnonzero(~found)
-            seen = self._given[pixels[left, None] + self._allowing[start : start + 32]]
-            found[left] = (seen == labels[left, None]).any(axis=1)
-        return found
+        if self._anchor_disc is None:
+            return np.ones(len(pixels), np.bool_)
+        allowed = np.zeros(len(pixels), np.bool_)
+        for start in range(0, len(self._anchor_disc), 32):  # the nearest first: most labels are near
+            rows = np.flatnonzero(~allowed)
+            anchors = self._anchor[pixels[rows, None] + self._anchor_disc[start : start + 32]]
+            allowed[rows] = (anchors == labels[rows, None]).any(axis=1)
+        return allowed
 
-    def give_away_pieces(self) -> bool:
-        """Give away the small pieces that came up, the smallest first, and say whether any went.
+    def merge_pieces(self) -> bool:
+        """Merge small pieces that moves have made into their neighbours, the smallest first; True if one was merged.
 
-        Each time there is one piece fewer, so that this comes to an end.
+        Each call that returns True leaves fewer pieces, so that repetition ends.
         """
         small, pieces = small_pieces(self.map, self._smallest)
         y, x = np.divmod(small, self.map.shape[1])
@@ -175,17 +178,17 @@ class MovingLabels:
         areas = np.bincount(self.map.ravel(), minlength=len(self._floor))
         changed = np.zeros(len(self._labels), np.bool_)
         for piece in sorted(np.split(pixels, np.flatnonzero(np.diff(pieces)) + 1), key=len):
-            # beside one that has just gone it may be a piece no more: next time
+            # beside one that was merged it may be larger now: the next call sees it
             if not len(piece) or changed[piece[:, None] + self._sides].any():
                 continue
-            source, target = self._labels[piece[0]], self._taker(piece, areas)
+            source, target = self._labels[piece[0]], self._best_label(piece, areas)
             self._labels[piece], changed[piece] = target, source != target
             areas[source] -= len(piece)
             areas[target] += len(piece)
         return bool(changed.any())
 
-    def _taker(self, piece: Ints, areas: Ints) -> int:
-        """Return the adjacent label under which the piece costs least; its present one where it is to stay."""
+    def _best_label(self, piece: Ints, areas: Ints) -> int:
+        """Return the adjacent label under which a piece costs least; its present one where it must stay."""
         present = int(self._labels[piece[0]])
         was_small = bool((self._specks[piece] & (self._before[piece] == present)).any())
         if was_small or areas[present] - len(piece) < self._floor[present]:
@@ -201,11 +204,11 @@ class MovingLabels:
                 best, least = target, cost
         return best
 
-    def change(self) -> float:
-        """Return the energy that the map has more than it came with."""
-        moved = np.flatnonzero(self._labels != self._before)
-        data = self._costs.at(moved, self._labels[moved]) - self._costs.at(moved, self._before[moved])
-        pairs = [unequal(flat.reshape(-1, self._stride)) for flat in (self._labels, self._before)]
+    def energy_change(self) -> float:
+        """Return the energy of the map, less that before all moves."""
+        changed = np.flatnonzero(self._labels != self._before)
+        data = self._costs.of(changed, self._labels[changed]) - self._costs.of(changed, self._before[changed])
+        pairs = [count_unequal_pairs(flat.reshape(-1, self._stride)) for flat in (self._labels, self._before)]
         return float(data.sum()) + self._pair * (pairs[0] - pairs[1])
 
 
@@ -227,13 +230,13 @@ def small_pieces(labels: Labels, smallest: int) -> tuple[Ints, Ints]:
     return small, pieces[small]
 
 
-def _others(around: Labels, present: Labels) -> Iterator[tuple[Ints, Labels]]:
-    """Yield (rows, labels) until every label in a row of `around` (P, K) but the present one and -1 came up once."""
+def _alternatives(candidates: Labels, present: Labels) -> Iterator[tuple[Ints, Labels]]:
+    """Yield (rows, labels) until each label in a row of candidates (P, K) came once, but not the present one or -1."""
     rows = np.arange(len(present))
-    left = (around != present[:, None]) & (around >= 0)
+    pending = (candidates != present[:, None]) & (candidates >= 0)
     while len(rows):
-        open_rows = left.any(axis=1)
-        rows, around, left = rows[open_rows], around[open_rows], left[open_rows]
-        labels = around[np.arange(len(rows)), left.argmax(axis=1)]
+        has_more = pending.any(axis=1)
+        rows, candidates, pending = rows[has_more], candidates[has_more], pending[has_more]
+        labels = candidates[np.arange(len(rows)), pending.argmax(axis=1)]
         yield rows, labels
-        left &= around != labels[:, None]
+        pending &= candidates != labels[:, None]

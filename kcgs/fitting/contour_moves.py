@@ -28,10 +28,11 @@ def refine_contours(
     smallest: int = 12,
     backend: str = "auto",
 ) -> RegionMap:
-    """Move contours to where the image is explained better, at most `max_distance` from the given map.
+    """Move contours to where the image is explained better, at most `max_distance` from the map `anchor`.
 
     Exact coordinate descent on the energy in docs/fitting.md; no region is lost. Pieces under `smallest` pixels that
-    came up are given to the adjacent label that costs least. The scene's map itself where nothing lowers the energy.
+    moves have made are merged into the adjacent label that costs least. Where no move lowers the energy, the result is
+    the scene's map itself.
 
     Source: Mumford and Shah's functional of 1989; Besag's iterated conditional modes of 1986.
     """
@@ -49,13 +50,13 @@ def refine_contours(
     moving = MovingLabels(index, costs, length_weight, pad, smallest)
     moving.fix_cores(rim, reach * sweeps)
     if max_distance is not None:
-        moving.bound(index_map(regions, anchor), distance)
+        moving.limit_moves(index_map(regions, anchor), distance)
     for _ in range(sweeps):
         if not moving.sweep(reach):
             break
-    while moving.give_away_pieces():
+    while moving.merge_pieces():
         pass
-    if not moving.change() < 0:
+    if not moving.energy_change() < 0:
         return regions
     labels = regions.ids.cpu()[torch.from_numpy(moving.map).long()].to(regions.labels.device)
     return regions.relabel(labels, "mean")

@@ -14,7 +14,7 @@ from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 
 from .problem import check_image_and_regions, check_num_gaussians
-from .sampling import sample_pixels, spread_repeats
+from .sampling import sample_pixels
 
 # sum of the weights of Gaussians of half the spacing at a pixel
 _OVERLAP = math.pi / 2
@@ -110,8 +110,7 @@ def gradient_field(image: Tensor, num_gaussians: int, regions: RegionMap | None,
     share = _GRADIENT_SHARE if slope.any() else 0.0
     density = share * slope / max(slope.sum(), 1e-300) + (1 - share) / slope.size
     pixels = sample_pixels(density, num_gaussians, rng)
-    corners = np.stack([pixels % planes.shape[2], pixels // planes.shape[2]], -1)
-    centres = spread_repeats(corners + 0.5, pixels, rng)
+    centres = np.stack([pixels % planes.shape[2], pixels // planes.shape[2]], -1) + 0.5
     sigma = np.maximum(0.5 / np.sqrt(num_gaussians * density[pixels]), _MIN_SIGMA)
     colors = planes.reshape(len(planes), -1).T[pixels] / _OVERLAP
     cholesky = np.stack([sigma, np.zeros_like(sigma), sigma], -1)

@@ -15,23 +15,23 @@ from kcgs.scene import Scene, empty_regions
 class RegionReport:
     """What became of the regions of a label map; as text, one line.
 
-    `given` is the sum of `kept` and of what was merged, unless the map was dropped as a whole.
+    `num_before` is the sum of `num_after` and of the merged regions, unless the map was dropped as a whole.
 
     Example:
-        >>> print(RegionReport(given=40, kept=28, merged_for_count=10, merged_for_bytes=2))
+        >>> print(RegionReport(num_before=40, num_after=28, merged_for_count=10, merged_for_bytes=2))
         28 of 40 regions kept; 10 merged: more than Gaussians; 2 merged: their contours save less than their bytes
     """
 
-    given: int
-    """Regions of the map that was given."""
-    kept: int
+    num_before: int
+    """Regions of the user's map."""
+    num_after: int
     """Regions of the scene; 1: it has no map."""
     merged_for_count: int = 0
-    """Regions that went into others since there were more than Gaussians."""
+    """Regions that were merged into others since there were more than Gaussians."""
     merged_for_bytes: int = 0
-    """Those whose contours save less error than Gaussians for their bytes."""
+    """Regions that were merged since their contours save less error than Gaussians of the same bytes."""
     dropped: Literal["recipe", "bytes"] | None = None
-    """Why the map is not used: the recipe confines nothing, or the map's bytes do more as Gaussians."""
+    """Why the map is not used: the recipe has no guidance, or Gaussians of the map's bytes save more error."""
     moved_pixels: int = 0
     """Pixels of the image that moved to another region."""
     empty: int = 0
@@ -41,10 +41,12 @@ class RegionReport:
 
     def __str__(self) -> str:
         if self.dropped is not None:
-            why = "the recipe uses none" if self.dropped == "recipe" else "its bytes do more as Gaussians"
-            return f"the map of {self.given} regions was dropped: {why}"
-        one = self.kept == 1 < self.given
-        parts = [f"{self.given} regions became one" if one else f"{self.kept} of {self.given} regions kept"]
+            why = "the recipe uses none" if self.dropped == "recipe" else "Gaussians of its bytes save more error"
+            return f"the map of {self.num_before} regions was dropped: {why}"
+        one = self.num_after == 1 < self.num_before
+        parts = [
+            f"{self.num_before} regions became one" if one else f"{self.num_after} of {self.num_before} regions kept"
+        ]
         merged = {
             "more than Gaussians": self.merged_for_count,
             "their contours save less than their bytes": self.merged_for_bytes,
@@ -58,31 +60,31 @@ class RegionReport:
 
 
 def report_regions(
-    given: RegionMap | None,
+    original: RegionMap | None,
     scene: Scene,
     *,
     merged_for_bytes: int = 0,
     dropped: Literal["recipe", "bytes"] | None = None,
 ) -> RegionReport | None:
-    """Compare the map that was given with the scene's."""
-    if given is None:
+    """Compare the user's map with the scene's."""
+    if original is None:
         return None
     if dropped is not None:
-        return RegionReport(given.num_regions, 1, dropped=dropped)
+        return RegionReport(original.num_regions, 1, dropped=dropped)
     regions, empty = scene.regions, empty_regions(scene)
-    kept = 1 if regions is None else regions.num_regions
+    count = 1 if regions is None else regions.num_regions
     return RegionReport(
-        given.num_regions, kept, given.num_regions - kept - merged_for_bytes, merged_for_bytes,
-        moved_pixels=0 if regions is None else _moved_pixels(given, regions),
+        original.num_regions, count, original.num_regions - count - merged_for_bytes, merged_for_bytes,
+        moved_pixels=0 if regions is None else _moved_pixels(original, regions),
         empty=len(empty),
         empty_pixels=int(torch.isin(regions.labels, empty).sum()) if regions is not None and len(empty) else 0,
     )  # fmt: skip
 
 
-def _moved_pixels(given: RegionMap, regions: RegionMap) -> int:
-    """Count the pixels that are not where their region went: under its own id, or where most of its pixels are."""
-    before, after, count = given.index.flatten().long(), regions.index.flatten().long(), regions.num_regions
-    into = regions.index_of(given.ids)
+def _moved_pixels(original: RegionMap, regions: RegionMap) -> int:
+    """Count the pixels outside the region that theirs became: the one of its id, or that of most of its pixels."""
+    before, after, count = original.index.flatten().long(), regions.index.flatten().long(), regions.num_regions
+    into = regions.index_of(original.ids)
     pairs, shared = (before * count + after).unique(return_counts=True)
     most = torch.zeros_like(into).scatter_reduce_(0, pairs // count, shared, "amax")
     largest = pairs[(shared == most[pairs // count]) & (into[pairs // count] < 0)]

@@ -219,9 +219,9 @@ class TestRegionReport:
         with pytest.warns(UserWarning, match=r"of \d+ regions were merged with others: there are more than"):
             result = fit(image, cells, 12, recipe=quick(iterations=60))
         report = result.regions
-        assert report is not None and report.given == len(cells.unique()) > 12 >= report.kept > 1
-        assert report.merged_for_count == report.given - 12
-        assert report.given == report.kept + report.merged_for_count
+        assert report is not None and report.num_before == len(cells.unique()) > 12 >= report.num_after > 1
+        assert report.merged_for_count == report.num_before - 12
+        assert report.num_before == report.num_after + report.merged_for_count
         assert result.history[-1].psnr > fit(image, None, 12, recipe=quick(iterations=60)).history[-1].psnr + 1
 
     def test_moved_pixels_are_counted(self) -> None:

@@ -83,7 +83,7 @@ class TestFitBytes:
         regions, report = done.scene.regions, done.result.regions
         assert len(done.data) <= target and psnr(done.scene, image) > min_psnr
         assert (1 if regions is None else regions.num_regions) == num_regions
-        assert report is not None and (report.given, report.kept) == (len(labels.unique()), num_regions)
+        assert report is not None and (report.num_before, report.num_after) == (len(labels.unique()), num_regions)
         if "move_contours" in settings:
             assert regions is not None and torch.equal(regions.labels, labels)
 

@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs.fitting import fit
 from kcgs.optim.frame import widen
 
 
@@ -33,15 +32,3 @@ def test_circles_and_needles(sides: tuple[float, float]) -> None:
     cholesky = torch.tensor([[sides[0], 0.0, sides[1]]])
     expected = torch.tensor([[max(sides[0], 0.5), 0.0, max(sides[1], 0.5)]])
     torch.testing.assert_close(widen(cholesky, 0.5), expected)
-
-
-class TestFit:
-    def image(self) -> Tensor:
-        return torch.rand(3, 24, 36, generator=torch.Generator().manual_seed(0))
-
-    def least(self) -> float:
-        field = fit(self.image(), None, 60, iterations=60).scene.field
-        return float(torch.linalg.eigvalsh(covariance(field.cholesky.detach())).min().sqrt())
-
-    def test_none_is_thinner(self) -> None:
-        assert self.least() >= 0.4999

@@ -1,0 +1,206 @@
+"""GaussianAdam: its steps, valid fields at any rate, torch's optimizer protocol, rows that come and go."""
+
+from __future__ import annotations
+
+import copy
+import io
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs import GaussianField, RegionSplatRenderer
+from kcgs.optim import GaussianAdam
+from kcgs.optim.frame import widen
+
+SIZE = (24, 36)
+
+
+def image(channels: int = 3) -> Tensor:
+    return torch.rand(channels, *SIZE, generator=torch.Generator().manual_seed(0))
+
+
+def field_of(kind: str = "plain", num_gaussians: int = 20) -> GaussianField:
+    """A random field: plain, in float64, with opacities and region ids, or of a batch of two."""
+    field = GaussianField.random(num_gaussians, SIZE, seed=1)
+    tensors = [field.means.detach(), field.cholesky.detach(), field.colors.detach()]
+    if kind == "double":
+        tensors = [tensor.double() for tensor in tensors]
+    if kind == "batch":
+        tensors = [torch.stack([tensor, 0.9 * tensor]) for tensor in tensors]
+    if kind != "opacities":
+        return GaussianField(*tensors, size=SIZE)
+    ids = torch.arange(num_gaussians) % 2
+    return GaussianField(*tensors, ids, torch.full((num_gaussians,), 0.7), size=SIZE)
+
+
+def regions_of(kind: str) -> Tensor | None:
+    return (torch.arange(SIZE[1]) > 17).long().expand(SIZE).contiguous() if kind == "opacities" else None
+
+
+def descend(field: GaussianField, optimizer: GaussianAdam, steps: int, regions: Tensor | None = None) -> list[float]:
+    """Descend on the squared error; return the losses."""
+    renderer, losses = RegionSplatRenderer(), []
+    for _ in range(steps):
+        optimizer.zero_grad()
+        loss = (renderer(field, regions) - image()).square().mean()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    return losses
+
+
+def tensors(field: GaussianField) -> list[Tensor]:
+    return [parameter.detach() for parameter in field.parameters()]
+
+
+def same(first: GaussianField, second: GaussianField) -> bool:
+    return all(torch.equal(a, b) for a, b in zip(tensors(first), tensors(second), strict=True))
+
+
+KINDS = ["plain", "double", "opacities", "batch"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+class TestStep:
+    def test_lowers_the_error(self, kind: str) -> None:
+        field = field_of(kind)
+        losses = descend(field, GaussianAdam(field), 40, regions_of(kind))
+        assert losses[-1] < 0.7 * losses[0]
+
+    @pytest.mark.parametrize("factor", [1.0, 4.0, 1e6])
+    def test_leaves_a_valid_field_at_any_rate(self, kind: str, factor: float) -> None:
+        field = field_of(kind)
+        descend(field, GaussianAdam(field, 0.14 * factor, color_lr=0.03 * min(factor, 4.0)), 30, regions_of(kind))
+        GaussianField(field.means, field.cholesky, field.colors, field.region_ids, field.opacities, size=SIZE)
+        l11, l21, l22 = field.cholesky.detach().double().unbind(-1)
+        factors = torch.stack([l11, torch.zeros_like(l11), l21, l22], -1).unflatten(-1, (2, 2))
+        sigma = torch.linalg.svdvals(factors)
+        assert float(sigma.min()) >= 0.4999
+        outside = torch.maximum(-field.means, field.means - torch.tensor([36.0, 24.0])).detach()
+        assert float(outside.max()) <= 2 * float(sigma.max()) + 1e-3
+
+    def test_a_field_without_gradients_stays(self, kind: str) -> None:
+        field = field_of(kind)
+        before = copy.deepcopy(field)
+        GaussianAdam(field).step()
+        assert same(field, before)
+
+
+class TestAlgorithm:
+    def test_is_adam_of_the_steps_in_each_frame(self) -> None:
+        """Against torch's Adam on the numbers of exp K and d, which begin at 0 in each step."""
+        field, steps = field_of("double"), 5
+        means, cholesky, colors = (tensor.clone() for tensor in tensors(field))
+        numbers = torch.zeros(20, 5, dtype=torch.float64, requires_grad=True)
+        tones = colors.clone().requires_grad_()
+        settings: dict[str, Any] = {"betas": (0.9, 0.99), "eps": 1e-12}
+        reference = torch.optim.Adam([{"params": [numbers], "lr": 0.14}, {"params": [tones], "lr": 0.03}], **settings)
+        for _ in range(steps):
+            reference.zero_grad()
+            k = torch.zeros(20, 2, 2, dtype=torch.float64)
+            k[:, 0, 0], k[:, 1, 0], k[:, 1, 1] = numbers[:, 2], numbers[:, 3], numbers[:, 4]
+            matrix = torch.zeros_like(k)
+            matrix[:, 0, 0], matrix[:, 1, 0], matrix[:, 1, 1] = cholesky.T
+            factor = matrix @ torch.linalg.matrix_exp(k)
+            places = means + (matrix @ numbers[:, :2, None])[..., 0]
+            triangle = torch.stack([factor[:, 0, 0], factor[:, 1, 0], factor[:, 1, 1]], -1)
+            rendered = RegionSplatRenderer()(GaussianField(places, triangle, tones * 1.0, size=SIZE))
+            (rendered - image()).square().mean().backward()
+            reference.step()
+            with torch.no_grad():  # the step, applied
+                d1, d2, k11, k21, k22 = numbers.detach().clone().unbind(-1)
+                means = means + torch.stack([cholesky[:, 0] * d1, cholesky[:, 1] * d1 + cholesky[:, 2] * d2], -1)
+                k = torch.zeros(20, 2, 2, dtype=torch.float64)
+                k[:, 0, 0], k[:, 1, 0], k[:, 1, 1] = k11, k21, k22
+                factor = matrix @ torch.linalg.matrix_exp(k)
+                cholesky = widen(torch.stack([factor[:, 0, 0], factor[:, 1, 0], factor[:, 1, 1]], -1), 0.5)
+                numbers.zero_()
+        descend(field, GaussianAdam(field), steps)
+        for value, expected in zip(tensors(field), (means, cholesky, tones.detach()), strict=True):
+            torch.testing.assert_close(value, expected, rtol=1e-6, atol=1e-8)
+
+
+class TestProtocol:
+    def test_schedulers_and_groups(self) -> None:
+        first, second = field_of(), field_of("opacities")
+        optimizer = GaussianAdam([first, second], lr=0.1, color_lr=0.02)
+        schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.5)
+        assert [len(group["params"]) for group in optimizer.param_groups] == [2, 1, 2, 2]
+        descend(first, optimizer, 1)
+        schedule.step()
+        assert [group["lr"] for group in optimizer.param_groups] == [0.05, 0.01] * 2
+
+    def test_closure(self) -> None:
+        field, twin = field_of(), field_of()
+        optimizer = GaussianAdam(field)
+
+        def closure() -> Tensor:
+            optimizer.zero_grad()
+            loss = (RegionSplatRenderer()(field) - image()).square().mean()
+            loss.backward()
+            return loss
+
+        losses = [float(optimizer.step(closure).detach()) for _ in range(3)]
+        assert losses == descend(twin, GaussianAdam(twin), 3) and same(field, twin)
+
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_resumes_bit_for_bit_from_a_file(self, kind: str) -> None:
+        field, regions = field_of(kind), regions_of(kind)
+        optimizer = GaussianAdam(field, 0.2)
+        descend(field, optimizer, 4, regions)
+        torch.save((field.state_dict(), optimizer.state_dict()), file := io.BytesIO())
+        file.seek(0)
+        twin = field_of(kind)
+        resumed = GaussianAdam(twin)
+        for module, state in zip((twin, resumed), torch.load(file, weights_only=True), strict=True):
+            module.load_state_dict(state)
+        assert descend(field, optimizer, 4, regions) == descend(twin, resumed, 4, regions) and same(field, twin)
+
+    @pytest.mark.parametrize(
+        ("fields", "error", "words"),
+        [
+            ([torch.zeros(3)], TypeError, "fields must be GaussianFields; got Tensor"),
+            ([], ValueError, "empty parameter list"),
+        ],
+    )
+    def test_bad_input(self, fields: Any, error: type[Exception], words: str) -> None:
+        with pytest.raises(error, match=words):
+            GaussianAdam(fields)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+class TestRows:
+    def test_keep_leaves_the_averages_of_the_others(self, kind: str) -> None:
+        """Without half of the Gaussians, the others take the step that their own gradients and averages ask for."""
+        field = field_of(kind)
+        optimizer = GaussianAdam(field)
+        descend(field, optimizer, 3, regions_of(kind))
+        mask = torch.arange(20) % 3 > 0
+        states = [
+            {name: value[..., mask, :].clone() for name, value in state.items()} for state in optimizer.state.values()
+        ]
+        rows = field.means.detach()[..., mask, :].clone()
+        optimizer.keep(field, mask)
+        assert field.num_gaussians == int(mask.sum()) and torch.equal(field.means.detach(), rows)
+        for state, expected in zip(optimizer.state.values(), states, strict=True):
+            assert all(torch.equal(state[name], expected[name]) for name in expected)
+        descend(field, optimizer, 3, regions_of(kind))
+
+    def test_append_starts_new_averages(self, kind: str) -> None:
+        field, added = field_of(kind), field_of(kind, 5)
+        optimizer = GaussianAdam(field)
+        descend(field, optimizer, 3, regions_of(kind))
+        before = copy.deepcopy(field)
+        optimizer.append(field, added)
+        assert field.num_gaussians == 25
+        for value, old in zip((field.means, field.colors), (before.means, before.colors), strict=True):
+            assert torch.equal(value[..., :20, :], old)
+        assert torch.equal(field.colors[..., 20:, :], added.colors)
+        for state in optimizer.state.values():
+            assert all(bool((value[..., 20:, :] == 0).all()) for value in state.values())
+            assert bool((state["age"][..., :20, :] == 3).all())
+        losses = descend(field, optimizer, 30, regions_of(kind))
+        assert losses[-1] < losses[0]
+        assert all(parameter in {*field.parameters()} for g in optimizer.param_groups for parameter in g["params"])
