@@ -10,11 +10,12 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
 from torch import Tensor
 
 from kcgs import RegionSplatRenderer, Scene, load
-from kcgs.onnx import scene_decoder, write_model
+from kcgs.onnx import scene_decoder
 
 from .core.clocks import milliseconds, peak_megabytes, threads
 from .core.compare import grouped, markdown, means
@@ -62,7 +63,7 @@ def write_files(scene: Scene, path: str, cutoffs: tuple[float, ...]) -> None:
     """Write a scene and its decoders."""
     scene.save(f"{path}.safetensors")
     for cutoff in cutoffs:
-        write_model(scene_decoder(scene, cutoff=cutoff, clamp=False), f"{path}-{cutoff:g}.onnx")
+        onnx.save(scene_decoder(scene, cutoff=cutoff, clamp=False), f"{path}-{cutoff:g}.onnx")
 
 
 def measure(image: str, size: str, count: int, cutoffs: list[float], rounds: int) -> list[Row]:

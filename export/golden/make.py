@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import onnx
 import torch
 from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
-from kcgs.onnx import scene_decoder, write_model
+from kcgs.onnx import scene_decoder
 
 Array = np.ndarray[Any, Any]
 
@@ -139,7 +140,7 @@ def make(folder: Path) -> None:
     for name, case in CASES.items():
         np.savez_compressed(folder / f"{name}.npz", **make_arrays(case))
         model = scene_decoder(make_scene(case), cutoff=case.cutoff, clamp=False, interactive=True)
-        write_model(model, folder / f"{name}.onnx")
+        onnx.save(model, folder / f"{name}.onnx")
 
 
 if __name__ == "__main__":

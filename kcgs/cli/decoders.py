@@ -27,7 +27,7 @@ def export(
     """Write a scene's decoder as ONNX, or the scene as one web page: neither needs torch or kcgs."""
     check_output(output, ".onnx", ".html")
     from kcgs import load
-    from kcgs.onnx import describe_decoder, scene_decoder, write_model
+    from kcgs.onnx import describe_decoder, scene_decoder
 
     loaded = load(scene)
     if output.suffix == ".html":
@@ -41,7 +41,7 @@ def export(
         print_report({**describe_scene(loaded), "scene_bytes": len(data), "bytes": size}, as_json, str(output))
         return
     model = scene_decoder(loaded, interactive=interactive, contours=contours)
-    report = {**describe_decoder(model), "bytes": write_model(model, output)}
+    report = {**describe_decoder(model), "bytes": write_file(output, model.SerializeToString())}
     print_report(report, as_json, str(output))
 
 

@@ -2,7 +2,6 @@
 
 from .decoder import scene_decoder
 from .generic import generic_decoder
-from .graph import write_model
 from .metadata import describe_decoder
 
-__all__ = ["describe_decoder", "generic_decoder", "scene_decoder", "write_model"]
+__all__ = ["describe_decoder", "generic_decoder", "scene_decoder"]

@@ -1,8 +1,7 @@
-"""From a scene to its decoder: what is asked for, what is checked, how the graph is put together."""
+"""From a scene to its decoder: the plan of its tiles, what the graph stores, the image, the model."""
 
 from __future__ import annotations
 
-import numpy as np
 import onnx
 
 from kcgs._check import check_cutoff
@@ -10,14 +9,14 @@ from kcgs.functional import RegionMap
 from kcgs.functional.softness import check_contours
 from kcgs.scene import Scene, check_scene
 
-from .axis import Axis
+from .axis import Axis, make_axis
 from .blocks import Blocks
-from .graph import Graph, Value
-from .layout import lay_out
-from .metadata import describe, image_doc
-from .planes import Planes
-from .stored import Stored
-from .windows import Windows
+from .entries import store
+from .graph import FLOAT, INT64, Graph, Value
+from .grids import CoarseGrids
+from .membership import make_membership
+from .metadata import image_doc, scene_metadata
+from .plan import plan_decoder
 
 
 def scene_decoder(
@@ -44,8 +43,7 @@ def scene_decoder(
         contours: "scaled" or "crisp", as :class:`kcgs.RegionSplatRenderer` takes them.
 
     Returns:
-        A checked model; its metadata say what it is, and by which recipe the scene was fitted if the scene knows:
-        see :func:`describe_decoder`.
+        A checked model, which `onnx.save` writes; :func:`describe_decoder` reads its metadata.
 
     Raises:
         TypeError: wrong types.
@@ -66,39 +64,45 @@ def scene_decoder(
     crisp = check_contours(contours) == "crisp" and regions is not None
     if crisp and regions is not None:  # what crisp contours are made of is as wide as one label
         regions = RegionMap.from_labels(regions.labels, 1.0)
-    layout = lay_out(scene.field, regions, cutoff)
+    plan = plan_decoder(scene.field, regions, cutoff)
 
     g = Graph()
     down, across, visible = _inputs(g, scene, interactive)
-    stored = Stored(g, layout, visible)
-    blocks, windows = Blocks(g, stored, down, across, cutoff), None
-    if regions is not None and any(group.regions > 1 for group in layout.groups):
-        windows = Windows(g, layout.tiles, layout.groups, down, across, regions, crisp)
-    planes = None if layout.nodes is None else Planes(g, stored, layout.nodes, down, across, cutoff)
-    image = blocks.render(windows, planes)
-    branches = {
-        "then_branch": g.body(lambda inner: [across.shrink(inner, down.shrink(inner, image, 2), 3)], "smaller"),
-        "else_branch": g.body(lambda inner: [inner("Identity", image)], "as_it_is"),
-    }
-    smaller = g("Or", *(g("Less", axis.output, axis.size) for axis in (down, across)))
-    result = g("If", smaller, **branches)
+    stored = store(g, plan, visible)
+    blocks = Blocks(stored, down, across, cutoff)
+    membership = None if regions is None else make_membership(stored, regions, down, across, crisp)
+    grids = None if stored.table is None else CoarseGrids(stored, stored.table, down, across, cutoff)
+    image = _shrink(g, blocks.image(membership, grids), down, across)
     if clamp:
-        result = g("Clip", result, np.float32(0), np.float32(1))
-    shape = [1, stored.channels, "height", "width"]
-    docs = f"Renders one image at any size: {scene.num_gaussians} Gaussians of a kcgs scene."
-    facts = describe(scene, cutoff=cutoff, clamp=clamp, crisp=crisp)
-    return g.finish("image", result, np.float32, shape, facts, (docs, image_doc(stored.channels, clamp)))
+        image = g.Clip(image, 0.0, 1.0)
+    return g.close(
+        image,
+        "image",
+        [1, stored.channels, "height", "width"],
+        image_doc(stored.channels, clamp),
+        graph_doc=f"Renders one image at any size: {scene.num_gaussians} Gaussians of a kcgs scene.",
+        metadata=scene_metadata(scene, cutoff=cutoff, clamp=clamp, crisp=crisp),
+    )
 
 
 def _inputs(g: Graph, scene: Scene, interactive: bool) -> tuple[Axis, Axis, Value | None]:
-    size = g.input("size", np.int64, [2], "height and width of the image in pixels, 1 or more each")
-    rows, cols = g.apply("Split", [size], 2, axis=0, num_outputs=2)
+    """Declare the inputs; return rows and columns of the output, and the factors on regions if there are any."""
+    size = g.input("size", INT64, [2], "height and width of the image in pixels, 1 or more each")
+    rows, cols = g.split(size, 2)
     height, width = scene.size
     if not interactive:
-        return Axis(g, rows, height), Axis(g, cols, width), None
+        return make_axis(g, rows, height), make_axis(g, cols, width), None
     bounds = f"left, top, right, bottom of the part to render; the whole is 0, 0, {width}, {height}, in pixels"
-    view = g.input("view", np.float32, [4], bounds)
-    left, top, right, bottom = g.apply("Split", [view], 4, axis=0, num_outputs=4)
+    view = g.input("view", FLOAT, [4], bounds)
+    left, top, right, bottom = g.split(view, 4)
     factors = "factor on each region, 0 hidden to 1 shown; in the order of the metadata's region_ids"
-    visible = g.input("visible", np.float32, [1 if scene.regions is None else scene.regions.num_regions], factors)
-    return Axis(g, rows, height, (top, bottom)), Axis(g, cols, width, (left, right)), visible
+    visible = g.input("visible", FLOAT, [1 if scene.regions is None else scene.regions.num_regions], factors)
+    return make_axis(g, rows, height, (top, bottom)), make_axis(g, cols, width, (left, right)), visible
+
+
+def _shrink(g: Graph, image: Value, down: Axis, across: Axis) -> Value:
+    """Reduce an image that was rendered larger than the output; leave others as they are."""
+    smaller = g.body("smaller", lambda: [across.shrink(down.shrink(image, 2), 3)])
+    same = g.body("as_it_is", lambda: [g.Identity(image)])
+    condition = g.Or(*(g.Less(axis.output, axis.size) for axis in (down, across)))
+    return g.If(condition, then_branch=smaller, else_branch=same)

@@ -11,13 +11,14 @@ import torch
 from kcgs._check import check_cutoff
 from kcgs.kernels.whitened import support_radius
 
-from .graph import FLOAT, Graph, Value
-from .metadata import header, image_doc
-from .stored import weigh
+from .graph import BOOL, FLOAT, INT64, Graph, Value
+from .metadata import decoder_metadata, image_doc
+from .weights import weigh
 
-F32 = np.float32
-_SIDE = 32  # of a tile, in pixels
-# of the support, so that rounding drops no Gaussian that has a weight
+# side of a tile in pixels: smaller ones take more turns of the loop, larger ones more Gaussians that reach none of
+# their pixels
+_SIDE = 32
+# factor on the support, so that rounding drops no Gaussian that has a weight
 _SLACK = 1.001
 
 
@@ -53,70 +54,59 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = True) -> onnx.ModelPr
     """
     cutoff = check_cutoff(cutoff)
     g = Graph()
-    means = g.input("means", F32, ["N", 2], "centres x, y in pixels of the image, from its top left corner")
+    means = g.input("means", FLOAT, ["N", 2], "centres x, y in pixels of the image, from its top left corner")
     factors = "l11, l21, l22 of the Cholesky factors of the covariances, in pixels; l11, l22 > 0"
-    cholesky = g.input("cholesky", F32, ["N", 3], factors)
-    colors = g.input("colors", F32, ["N", "C"], "colours, 0 black to 1 white, times opacity; any sign")
-    ids = g.input("region_ids", np.int64, ["N"], "region of each Gaussian, 0 to R - 1")
-    memberships = g.input("memberships", F32, ["R", "H", "W"], "how much of each pixel is each region's, 0 to 1")
+    cholesky = g.input("cholesky", FLOAT, ["N", 3], factors)
+    colors = g.input("colors", FLOAT, ["N", "C"], "colours, 0 black to 1 white, times opacity; any sign")
+    ids = g.input("region_ids", INT64, ["N"], "region of each Gaussian, 0 to R - 1")
+    memberships = g.input("memberships", FLOAT, ["R", "H", "W"], "how much of each pixel is each region's, 0 to 1")
 
-    size = g("Shape", memberships, start=1)
-    tiles = g("Div", g("Add", size, _SIDE - 1), _SIDE)  # down, across
-    padded = g("Sub", g("Mul", tiles, _SIDE), size)
-    memberships = g("Pad", memberships, g("Concat", g.constant([0] * 4), padded, axis=0))
-    l11, l21, l22 = g.apply("Split", [cholesky], 3, axis=1, num_outputs=3)
-    spread = g("Concat", l11, g("Sqrt", g("Add", g("Mul", l21, l21), g("Mul", l22, l22))), axis=1)
-    reach = g("Mul", spread, F32(support_radius(cutoff, torch.float32) * _SLACK))
+    size = g.Shape(memberships, start=1)
+    tiles = (size + (_SIDE - 1)) // _SIDE  # down, across
+    memberships = g.Pad(memberships, g.Concat([0] * 4, tiles * _SIDE - size, axis=0))
+    l11, l21, l22 = g.split(cholesky, 3, axis=1)
+    spread = g.Concat(l11, g.Sqrt(l21 * l21 + l22 * l22), axis=1)
+    reach = spread * (support_radius(cutoff, torch.float32) * _SLACK)
     # log w is minus the sum of two squares, each of a difference times one of these
-    inverses = g("Div", F32(math.sqrt(0.5)), g("Concat", l11, l22, axis=1))
-    frame = g("Concat", means, inverses, g("Div", l21, l11), axis=1)  # [N, 5]
+    inverses = math.sqrt(0.5) / g.Concat(l11, l22, axis=1)
+    frame = g.Concat(means, inverses, l21 / l11, axis=1)  # [N, 5]
 
-    def render_tile(g: Graph) -> list[Value]:
-        number, more = g.input("tile", np.int64, []), g.input("more", np.bool_, [])
-        across = g("Gather", tiles, 1)
-        corner = g(
-            "Mul",
-            g("Concat", *(g("Reshape", g(op, number, across), g.constant([1])) for op in ("Mod", "Div")), axis=0),
-            _SIDE,
-        )  # x, y
-        begin = g("Gather", corner, g.constant([1, 0]))
-        window = g("Slice", memberships, begin, g("Add", begin, _SIDE), g.constant([1, 2]))
-        window = g("Reshape", window, g.constant([0, -1]))  # [R, pixels]
-        middle = g("Add", g("Cast", corner, to=FLOAT), F32(_SIDE / 2))
-        distance = g("Abs", g("Sub", means, middle))
-        near = g(
-            "ReduceMin",
-            g("Cast", g("LessOrEqual", distance, g("Add", reach, F32(_SIDE / 2))), to=FLOAT),
-            g.constant([1]),
-            keepdims=0,
-        )
-        shown = g("Gather", g("ReduceMax", window, g.constant([1]), keepdims=0), ids)
-        chosen = g(
-            "Compress",
-            g("Range", 0, g("Squeeze", g("Shape", ids)), 1),
-            g("Greater", g("Mul", near, shown), F32(0)),
-            axis=0,
-        )  # [K]
-        part = g("Unsqueeze", g("Gather", frame, chosen), g.constant([2, 3]))
-        x, y, k1, k2, slope = g.apply("Split", [part], 5, axis=1, num_outputs=5)  # [K, 1, 1, 1]
+    def render_tile() -> list[Value]:
+        number, condition = g.input("tile", INT64, []), g.input("more", BOOL, [])
+        across = g.Gather(tiles, 1)
+        corner = g.Concat(g.Reshape(number % across, [1]), g.Reshape(number // across, [1]), axis=0) * _SIDE  # x, y
+        begin = corner[g.constant([1, 0])]
+        window = g.Slice(memberships, begin, begin + _SIDE, [1, 2])
+        window = g.Reshape(window, [0, -1])  # [R, pixels]
+        middle = corner.astype(FLOAT) + _SIDE / 2
+        near = g.LessOrEqual(g.Abs(means - middle), reach + _SIDE / 2).astype(FLOAT)
+        near = g.ReduceMin(near, [1], keepdims=0)
+        present = g.ReduceMax(window, [1], keepdims=0)[ids]
+        gaussian = g.Compress(g.Range(0, g.Squeeze(g.Shape(ids)), 1), g.Greater(near * present, 0.0), axis=0)  # [K]
+        x, y, k1, k2, slope = g.split(g.Unsqueeze(frame[gaussian], [2, 3]), 5, axis=1)  # [K, 1, 1, 1]
         left, top = g.split(middle, [1, 1])
-        offsets = np.arange(_SIDE, dtype=F32) - F32((_SIDE - 1) / 2)
+        offsets = np.arange(_SIDE, dtype=np.float32) - np.float32((_SIDE - 1) / 2)
         # pixel minus mean before anything is multiplied: nothing cancels where a Gaussian is far below a pixel wide
-        dx, dy = g("Add", g("Sub", left, x), offsets), g("Add", g("Sub", top, y), offsets[:, None])
-        z1, z2 = g("Mul", dx, k1), g("Mul", g("Sub", dy, g("Mul", slope, dx)), k2)
-        exponent = g("Neg", g("Add", g("Mul", z1, z1), g("Mul", z2, z2)))  # [K, 1, side, side]
-        weight = g("Flatten", weigh(g, exponent, cutoff))
-        weight = g("Mul", weight, g("Gather", window, g("Gather", ids, chosen)))
-        return [g("Identity", more), g("MatMul", g("Transpose", g("Gather", colors, chosen), perm=[1, 0]), weight)]
+        dx, dy = (left - x) + offsets, (top - y) + offsets[:, None]
+        z1, z2 = dx * k1, (dy - slope * dx) * k2
+        weight = g.Flatten(weigh(g, -(z1 * z1 + z2 * z2), cutoff))
+        weight = weight * window[ids[gaussian]]
+        return [g.Identity(condition), g.Transpose(colors[gaussian], perm=[1, 0]) @ weight]
 
-    image = g("Loop", g("ReduceProd", tiles, keepdims=0), np.bool_(True), body=g.body(render_tile, "tiles"))
+    image = g.Loop(g.ReduceProd(tiles, keepdims=0), np.bool_(True), body=g.body("tiles", render_tile))
     side = g.constant([_SIDE])
-    channels = g("Shape", colors, start=1)
-    image = g("Reshape", image, g("Concat", tiles, channels, side, side, axis=0))
-    image = g("Transpose", image, perm=[2, 0, 3, 1, 4])
-    image = g("Reshape", image, g("Concat", g.constant([1]), channels, g("Mul", tiles, _SIDE), axis=0))
-    image = g("Slice", image, g.constant([0, 0]), size, g.constant([2, 3]))
+    channels = g.Shape(colors, start=1)
+    image = g.Reshape(image, g.Concat(tiles, channels, side, side, axis=0))
+    image = g.Transpose(image, perm=[2, 0, 3, 1, 4])
+    image = g.Reshape(image, g.Concat(g.constant([1]), channels, tiles * _SIDE, axis=0))
+    image = g.Slice(image, [0, 0], size, [2, 3])
     if clamp:
-        image = g("Clip", image, F32(0), F32(1))
-    docs = "Renders any Gaussians in any regions, at the size of the memberships.", image_doc(None, clamp)
-    return g.finish("image", image, F32, [1, "C", "H", "W"], header("generic", cutoff, clamp), docs)
+        image = g.Clip(image, 0.0, 1.0)
+    return g.close(
+        image,
+        "image",
+        [1, "C", "H", "W"],
+        image_doc(None, clamp),
+        graph_doc="Renders any Gaussians in any regions, at the size of the memberships.",
+        metadata=decoder_metadata("generic", cutoff, clamp),
+    )

@@ -1,10 +1,10 @@
-"""Graphs put together operator by operator, checked and written whole."""
+"""An ONNX graph that is put together by arithmetic on its values, and closed to a checked model."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import onnx
@@ -12,169 +12,210 @@ import onnx_ir as ir
 from numpy.typing import NDArray
 from onnx_ir.tape import Tape
 
-from kcgs._atomic import atomic_path
-
 OPSET = 18  # what torch exports by default, so that graphs of both chain
-INT32, INT64, FLOAT = 6, 7, 1  # ONNX's numbers of its types
 _IR_VERSION = 10
-_SUFFIX = ".onnx"
-_NODES = 500  # bytes that the operators of packed numbers take
 
-Value = ir.Value
+BOOL = ir.DataType.BOOL
+FLOAT = ir.DataType.FLOAT
+INT32 = ir.DataType.INT32
+INT64 = ir.DataType.INT64
+# operators whose results have another type than their first operand; loops and branches return images
+_RESULT_TYPES = {
+    "Equal": BOOL,
+    "Less": BOOL,
+    "LessOrEqual": BOOL,
+    "Greater": BOOL,
+    "Shape": INT64,
+    "Loop": FLOAT,
+    "If": FLOAT,
+}
+
 Array = NDArray[np.generic]
-Operand = Value | Array | np.generic | int
+
+
+class Value:
+    """A tensor of a graph. Arithmetic adds operators to the graph; `x[i]` gathers along the first axis.
+
+    Numbers of Python take the type of the value. Division of integers rounds towards zero.
+    """
+
+    __array_ufunc__ = None  # numpy leaves arithmetic of its arrays and values to this class
+
+    def __init__(self, graph: Graph, value: ir.Value, dtype: ir.DataType) -> None:
+        self.graph = graph
+        self.value = value
+        self.dtype = dtype
+
+    def __add__(self, other: Operand) -> Value:
+        return self._apply("Add", self, other)
+
+    def __sub__(self, other: Operand) -> Value:
+        return self._apply("Sub", self, other)
+
+    def __rsub__(self, other: Operand) -> Value:
+        return self._apply("Sub", other, self)
+
+    def __mul__(self, other: Operand) -> Value:
+        return self._apply("Mul", self, other)
+
+    def __truediv__(self, other: Operand) -> Value:
+        return self._apply("Div", self, other)
+
+    def __rtruediv__(self, other: Operand) -> Value:
+        return self._apply("Div", other, self)
+
+    def __floordiv__(self, other: Operand) -> Value:
+        return self._apply("Div", self, other)
+
+    def __mod__(self, other: Operand) -> Value:
+        return self._apply("Mod", self, other)
+
+    def __matmul__(self, other: Operand) -> Value:
+        return self._apply("MatMul", self, other)
+
+    def __neg__(self) -> Value:
+        return self._apply("Neg", self)
+
+    def __getitem__(self, indices: Value) -> Value:
+        return self._apply("Gather", self, indices)
+
+    def astype(self, dtype: ir.DataType) -> Value:
+        """Cast to a type."""
+        if dtype == self.dtype:
+            return self
+        return Value(self.graph, self.graph.Cast(self, to=dtype).value, dtype)
+
+    def _apply(self, operator: str, *operands: Operand) -> Value:
+        numbers = (np.asarray(x, self.dtype.numpy()) if isinstance(x, int | float) else x for x in operands)
+        return self.graph.results(operator, 1, *numbers)[0]
+
+
+# what an operator takes: lists are int64, and so are Python's integers; its floats are float32
+Operand = Value | Array | np.generic | int | float | Sequence[int]
+
+
+class Scope(NamedTuple):
+    """What belongs to a graph alone, and not to those inside it or around it."""
+
+    tape: Tape
+    inputs: list[ir.Value]
+    constants: dict[tuple[str, tuple[int, ...], bytes], Value]
 
 
 class Graph:
-    """A graph in the making: call it with an operator's name and operands, and get the result.
+    """A graph in the making: `graph.Gather(x, indices, axis=1)` adds an operator and returns its result.
 
-    Arrays become constants, stored once if equal; integers are int64, other numbers need a numpy type.
+    Arrays become constants, stored once if equal.
 
     Example:
         >>> graph = Graph()
-        >>> size = graph.input("size", np.int64, [2])
-        >>> model = graph.finish("area", graph("ReduceProd", size, keepdims=0), np.int64, [], {})
+        >>> size = graph.input("size", INT64, [2])
+        >>> model = graph.close(graph.ReduceProd(size * 2, keepdims=0), "area", [])
         >>> [node.op_type for node in model.graph.node]
-        ['ReduceProd']
+        ['Mul', 'ReduceProd']
     """
 
-    def __init__(self, outer: Graph | None = None) -> None:
-        self._tape = Tape()
-        self._inputs: list[Value] = []
-        self._constants: dict[tuple[str, tuple[int, ...], bytes], Value] = {}
-        self._outer = outer
-        self._names: list[int] = [0] if outer is None else outer._names
+    def __init__(self) -> None:
+        self._scopes = [Scope(Tape(), [], {})]  # the graph, and the bodies that are being built in it
+        self._names = 0
 
-    def input(self, name: str, dtype: type[np.generic], shape: Sequence[int | str], doc: str | None = None) -> Value:
+    def input(self, name: str, dtype: ir.DataType, shape: Sequence[int | str], doc: str | None = None) -> Value:
         """Declare an input; names stand for sizes that vary, `doc` says order, range and units."""
-        value = ir.val(name, dtype=ir.DataType.from_numpy(np.dtype(dtype)), shape=ir.Shape(list(shape)))
+        value = ir.val(name, dtype=dtype, shape=ir.Shape(list(shape)))
         value.doc_string = doc
-        self._inputs.append(value)
-        return value
+        self._scopes[-1].inputs.append(value)
+        return Value(self, value, dtype)
 
-    def constant(self, array: Array | np.generic | int | Sequence[int]) -> Value:
+    def constant(self, array: Operand) -> Value:
         """Store an array."""
-        data = np.asarray(array).copy(order="C")
+        if isinstance(array, Value):
+            return array
+        data = np.asarray(array, np.float32 if isinstance(array, float) else None).copy(order="C")
+        tape, _, constants = self._scopes[-1]
         key = (data.dtype.str, data.shape, data.tobytes())
-        if key not in self._constants:
-            name = self._fresh("c")
-            self._constants[key] = self._tape.initializer(ir.tensor(data, name=name), name=name)
-        return self._constants[key]
+        if key not in constants:
+            name = self._name("c")
+            tensor = ir.tensor(data, name=name)
+            constants[key] = Value(self, tape.initializer(tensor, name=name), tensor.dtype)
+        return constants[key]
 
-    def whole(self, numbers: NDArray[np.int64]) -> Value:
-        """Store whole numbers from 0 on in one, two or four bytes each, and make them int32.
+    def __getattr__(self, operator: str) -> Callable[..., Value]:
+        """Return a function that applies an operator of one result."""
+        if not operator[:1].isupper():
+            raise AttributeError(f"operators begin with a capital letter; got {operator}")
+        return partial(self._result, operator)
 
-        Two bytes are stored as such, low and high: not all runtimes have 16-bit types.
-        """
-        most = int(numbers.max(initial=0))
-        if most >= 1 << 16:
-            return self.constant(numbers.astype(np.int32))
-        low = self("Cast", self.constant((numbers % 256).astype(np.uint8)), to=INT32)
-        if most < 256:
-            return low
-        high = self("Cast", self.constant((numbers // 256).astype(np.uint8)), to=INT32)
-        return self("Add", low, self("Mul", high, np.int32(256)))
+    def _result(self, operator: str, *operands: Operand, **attributes: object) -> Value:
+        return self.results(operator, 1, *operands, **attributes)[0]
 
-    def sparse(self, numbers: NDArray[np.int64]) -> Value:
-        """Store whole numbers (n,) of which most are 0: flags of the others, and those; int32."""
-        used = numbers > 0
-        size = 1 if numbers.max(initial=0) < 256 else 2
-        if size * used.sum() + len(numbers) // 8 + _NODES > size * len(numbers):
-            return self.whole(numbers)
-        flags = self.flags(used)
-        values = self("Concat", np.zeros(1, np.int32), self.whole(numbers[used]), axis=0)
-        return self("Gather", values, self("Mul", flags, self("CumSum", flags, np.int64(0))))
-
-    def flags(self, flags: NDArray[np.bool_]) -> Value:
-        """Store flags (n,), as bits and where few are set sparser; int32."""
-        octets = self.sparse(np.packbits(flags, bitorder="little").astype(np.int64))
-        bits = self("Div", self("Unsqueeze", octets, self.constant([1])), (1 << np.arange(8)).astype(np.int32))
-        bits = self("Reshape", self("Mod", bits, np.int32(2)), self.constant([-1]))
-        return self("Slice", bits, self.constant([0]), self.constant([len(flags)]), self.constant([0]))
-
-    def piecewise(self, numbers: NDArray[np.int64]) -> Value:
-        """Store whole numbers (n,) that are often the same as the one before: where they change, and to what; int32."""
-        changes = np.diff(numbers, prepend=-1) != 0
-        place = self("Sub", self("CumSum", self.flags(changes), np.int64(0)), np.int32(1))
-        return self("Gather", self.whole(numbers[changes]), place)
-
-    def __call__(self, op: str, *operands: Operand, **attributes: object) -> Value:
-        """Apply an operator that has one result."""
-        return self.apply(op, operands, 1, **attributes)[0]
-
-    def apply(self, op: str, operands: Sequence[Operand | None], results: int, **attributes: object) -> Sequence[Value]:
-        """Apply an operator that has several results, or leaves operands out."""
-        values = [None if x is None else x if isinstance(x, Value) else self.constant(x) for x in operands]
-        made = self._tape.op_multi_out(op, values, attributes, num_outputs=results)  # type: ignore[arg-type]
-        for value in made:
-            value.name = self._fresh("v")
-        node = made[0].producer()
+    def results(self, operator: str, count: int, *operands: Operand, **attributes: object) -> list[Value]:
+        """Apply an operator of so many results."""
+        inputs = [self.constant(operand) for operand in operands]
+        results = self._scopes[-1].tape.op_multi_out(
+            operator,
+            [value.value for value in inputs],
+            attributes,  # type: ignore[arg-type]
+            num_outputs=count,
+        )
+        for value in results:
+            value.name = self._name("v")
+        node = results[0].producer()
         assert node is not None
         node.name = ""  # names of nodes are optional, and weigh as much as the nodes
-        return made
+        typed = inputs[-1] if operator == "Where" else inputs[0]
+        dtype = _RESULT_TYPES.get(operator, typed.dtype)
+        return [Value(self, value, dtype) for value in results]
 
-    def split(self, values: Operand, lengths: Sequence[int]) -> Sequence[Value]:
-        """Cut a value along its first axis."""
-        return self.apply("Split", [values, self.constant(lengths)], len(lengths), axis=0)
+    def split(self, value: Operand, parts: int | Sequence[int], axis: int = 0) -> list[Value]:
+        """Cut a value into so many equal parts, or into parts of these lengths."""
+        if isinstance(parts, int):
+            return self.results("Split", parts, value, axis=axis, num_outputs=parts)
+        return self.results("Split", len(parts), value, parts, axis=axis)
 
-    def body(self, build: Callable[[Graph], Sequence[Value]], name: str) -> ir.Graph:
-        """Make the graph inside a Loop or an If; it may use values from outside."""
-        inner = Graph(self)
-        outputs = build(inner)
-        return inner._close(outputs, name)
+    def argsort(self, numbers: Value, count: Operand, largest: int = 0) -> Value:
+        """Find the `count` smallest or largest numbers, int64 indices, in order; of equal ones, the first comes first.
 
-    def finish(
+        So it finds flags, too: onnxruntime would leave Compress for every run.
+        """
+        return self.results("TopK", 2, numbers.astype(INT64), count, largest=largest, axis=0)[1]
+
+    def body(self, name: str, build: Callable[[], Sequence[Value]]) -> ir.Graph:
+        """Make the graph inside a Loop or an If: what `build` adds and returns; it may use values from outside."""
+        self._scopes.append(Scope(Tape(), [], {}))
+        return self._pop(name, build(), {})
+
+    def close(
         self,
+        output: Value,
         name: str,
-        value: Value,
-        dtype: type[np.generic],
         shape: Sequence[int | str],
-        metadata: Mapping[str, str],
-        docs: tuple[str, str] | None = None,
+        doc: str = "",
+        *,
+        graph_doc: str = "",
+        metadata: Mapping[str, str] | None = None,
     ) -> onnx.ModelProto:
-        """Close the graph, with its output, and check it; `docs` are those of the graph and of the output."""
-        value.name, value.dtype, value.shape = name, ir.DataType.from_numpy(np.dtype(dtype)), ir.Shape(list(shape))
-        graph = self._close([value], "decoder")
-        graph.doc_string, value.doc_string = docs or (None, None)
+        """Close the graph with its output, and check it; `doc` says what the output is."""
+        value = output.value
+        value.name, value.dtype, value.shape, value.doc_string = name, output.dtype, ir.Shape(list(shape)), doc
+        graph = self._pop("decoder", [output], {"": OPSET})
+        graph.doc_string = graph_doc
         model = ir.Model(graph, ir_version=_IR_VERSION, producer_name="kcgs")
-        model.metadata_props.update(metadata)
+        model.metadata_props.update(metadata or {})
         proto = ir.to_proto(model)
         onnx.checker.check_model(proto, full_check=True)
         return proto
 
-    def _close(self, outputs: Sequence[Value], name: str) -> ir.Graph:
+    def _pop(self, name: str, outputs: Sequence[Value], opsets: dict[str, int]) -> ir.Graph:
+        tape, inputs, _ = self._scopes.pop()
         return ir.Graph(
-            self._inputs,
-            outputs,
-            nodes=self._tape.nodes,
-            initializers=self._tape.initializers,
-            opset_imports={"": OPSET} if self._outer is None else {},
+            inputs,
+            [output.value for output in outputs],
+            nodes=tape.nodes,
+            initializers=tape.initializers,
+            opset_imports=opsets,
             name=name,
         )
 
-    def _fresh(self, prefix: str) -> str:
-        self._names[0] += 1
-        return f"{prefix}{self._names[0]}"
-
-
-def write_model(model: onnx.ModelProto, path: str | os.PathLike[str]) -> int:
-    """Write a model; the file appears whole or not at all.
-
-    Args:
-        model: checked.
-        path: ends in .onnx.
-
-    Returns:
-        Size of the file in bytes.
-
-    Raises:
-        ValueError: another suffix.
-        FileNotFoundError: the folder does not exist.
-    """
-    path = Path(path)
-    if path.suffix.lower() != _SUFFIX:
-        raise ValueError(f"path must end in {_SUFFIX}; got {str(path)!r}")
-    content = model.SerializeToString(deterministic=True)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
-    return len(content)
+    def _name(self, prefix: str) -> str:
+        self._names += 1
+        return f"{prefix}{self._names}"

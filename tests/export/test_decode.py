@@ -24,8 +24,8 @@ from torch import Tensor
 import kcgs
 from kcgs import GaussianField, RegionMap, Scene
 from kcgs.data import save_image
-from kcgs.onnx import scene_decoder, write_model
-from kcgs.onnx.graph import Graph
+from kcgs.onnx import scene_decoder
+from kcgs.onnx.graph import FLOAT, INT64, Graph, Value
 
 ROOT = Path(kcgs.__file__).resolve().parent.parent
 SCRIPT = ROOT / "export" / "decode.py"
@@ -68,26 +68,19 @@ def make_field(channels: int = 3, opacities: bool = True, dtype: torch.dtype = t
 
 def ramp_decoder(interactive: bool, height: str = "10") -> onnx.ModelProto:
     """Stand-in for a scene decoder: red is x, green is y, blue the sum of `visible`, over 16."""
-    graph = Graph()
-    size = graph.input("size", np.int64, [2])
-    view = graph.constant(np.array([0, 0, 12, 10], np.float32))
-    visible = graph.constant(np.array([1, 2], np.float32))
-    if interactive:
-        view, visible = graph.input("view", np.float32, [4]), graph.input("visible", np.float32, [2])
+    g = Graph()
+    size = g.input("size", INT64, [2])
+    view = g.input("view", FLOAT, [4]) if interactive else g.constant(np.array([0, 0, 12, 10], np.float32))
+    visible = g.input("visible", FLOAT, [2]) if interactive else g.constant(np.array([1, 2], np.float32))
 
-    def along(axis: int) -> Any:
-        side, low, high = graph("Gather", size, axis), graph("Gather", view, 1 - axis), graph("Gather", view, 3 - axis)
-        place = graph("Cast", graph("Range", 0, side, 1), to=onnx.TensorProto.FLOAT)
-        place = graph("Add", place, np.array(0.5, np.float32))
-        step = graph("Div", graph("Sub", high, low), graph("Cast", side, to=onnx.TensorProto.FLOAT))
-        return graph("Add", graph("Mul", place, step), low)
+    def along(axis: int) -> Value:
+        side, low, high = g.Gather(size, axis), g.Gather(view, 1 - axis), g.Gather(view, 3 - axis)
+        return (g.Range(0, side, 1).astype(FLOAT) + 0.5) * ((high - low) / side.astype(FLOAT)) + low
 
-    x, y = along(1), graph("Unsqueeze", along(0), graph.constant([1]))
-    planes = [graph("Expand", v, size) for v in (x, y, graph("ReduceSum", visible, keepdims=0))]
-    stacked = graph("Concat", *(graph("Unsqueeze", v, graph.constant([0, 1])) for v in planes), axis=1)
-    image = graph("Div", stacked, np.array(16, np.float32))
-    notes = {"format": "kcgs.decoder", "format_version": "1", "kind": "scene", "region_ids": "[7, 9]"}
-    return graph.finish("image", image, np.float32, [1, 3, "H", "W"], notes | {"height": height, "width": "12"})
+    planes = along(1), g.Unsqueeze(along(0), [1]), g.ReduceSum(visible, keepdims=0)
+    image = g.Concat(*(g.Unsqueeze(g.Expand(plane, size), [0, 1]) for plane in planes), axis=1) / 16
+    metadata = {"format": "kcgs.decoder", "format_version": "1", "kind": "scene", "region_ids": "[7, 9]"}
+    return g.close(image, "image", [1, 3, "H", "W"], metadata=metadata | {"height": height, "width": "12"})
 
 
 def ramp(size: tuple[int, int], view: tuple[float, ...] = (0, 0, 12, 10), blue: float = 3) -> np.ndarray:
@@ -105,8 +98,8 @@ class Files(NamedTuple):
 def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     folder = tmp_path_factory.mktemp("decoders")
     made = Files(folder / "plain.onnx", folder / "interactive.onnx")
-    write_model(ramp_decoder(interactive=False), made.plain)
-    write_model(ramp_decoder(interactive=True), made.interactive)
+    onnx.save(ramp_decoder(interactive=False), made.plain)
+    onnx.save(ramp_decoder(interactive=True), made.interactive)
     return made
 
 
@@ -168,7 +161,7 @@ class TestSceneDecoders:
     def test_a_scene_of_the_library(self, decode: Any, tmp_path: Path, softness: float) -> None:
         field, regions = make_field(), RegionMap.from_labels(make_labels(), softness)
         decoder, output = tmp_path / "decoder.onnx", tmp_path / "out.png"
-        write_model(scene_decoder(Scene(field, regions), clamp=False, interactive=True), decoder)
+        onnx.save(scene_decoder(Scene(field, regions), clamp=False, interactive=True), decoder)
         assert decode(decoder, "-o", output, "--scale", 2) == Result(0, "", "")
         want = library_levels(tmp_path, field, regions, (74, 106))
         assert np.abs(read(output) - want).max() <= 1
@@ -389,7 +382,7 @@ class TestAlone:
 
         output = folder / "out.png"
         decoder, field, regions = folder / "decoder.onnx", make_field(), RegionMap.from_labels(make_labels())
-        write_model(scene_decoder(Scene(field, regions)), decoder)
+        onnx.save(scene_decoder(Scene(field, regions)), decoder)
         done = run(SCRIPT, decoder, "-o", output, "--scale", 2)
         assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
         assert np.abs(read(output) - library_levels(folder, field, regions, (74, 106))).max() <= 1

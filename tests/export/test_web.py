@@ -9,12 +9,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 from numpy.typing import NDArray
 
 from kcgs import load
-from kcgs.onnx import scene_decoder, write_model
+from kcgs.onnx import scene_decoder
 
 from .browser import WEB, Browser, array, npm, serving
 
@@ -97,7 +98,7 @@ class TestPage:
 
     def test_zoom_drag_and_hide(self, browser: Browser, site: tuple[Path, str], tmp_path: Path) -> None:
         scene, decoder = load(ROOT / "models" / "chelsea-500" / "scene.safetensors"), tmp_path / "decoder.onnx"
-        write_model(scene_decoder(scene, interactive=True), decoder)
+        onnx.save(scene_decoder(scene, interactive=True), decoder)
         open_page(browser, site, decoder, scene.size)
         whole = shown(browser)
         assert browser.evaluate("page.view") == [0, 0, 451, 300] and whole.std() > 0.1

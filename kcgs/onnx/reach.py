@@ -1,4 +1,4 @@
-"""Which Gaussian is evaluated where: in tiles of pixels, or, where it is wide, at the nodes of a coarser grid."""
+"""Which Gaussian reaches which block: tiles of pixels, or, where it is wide, blocks of nodes of a coarser grid."""
 
 from __future__ import annotations
 
@@ -9,41 +9,43 @@ from kcgs.kernels.octaves import Blocks, Coarsened, choose_levels, coarsen, most
 from kcgs.kernels.tiles import TILE, bounding_tiles, find_keys
 from kcgs.kernels.whitened import support_radius
 
+# pairs of a Gaussian and a block whose distances are computed at once: 8 MB for each float64 of a pair
 _CHUNK = 1 << 20
 
 
-def place(means: Tensor, cholesky: Tensor, cutoff: float, levels: int) -> Coarsened:
+def place_gaussians(means: Tensor, cholesky: Tensor, cutoff: float, levels: int) -> Coarsened:
     """Move float64 Gaussians to the coarsest of so many levels whose nodes are close enough; level 0 are the pixels."""
     level = choose_levels(cholesky, most_spacing(cutoff), levels)
     wide = level > 0
     placed = Coarsened(level, means.clone(), cholesky.clone(), torch.ones_like(means[:, 0]))
-    for values, moved in zip(placed[1:], coarsen(level[wide], means[wide], cholesky[wide])[1:], strict=True):
-        values[wide] = moved
+    for values, coarse in zip(placed[1:], coarsen(level[wide], means[wide], cholesky[wide])[1:], strict=True):
+        values[wide] = coarse
     return placed
 
 
-def list_gaussians(
+def pair_with_blocks(
     placed: Coarsened, region: Tensor, num_regions: int, blocks: Blocks, cutoff: float
 ) -> tuple[Tensor, Tensor]:
     """Pair Gaussians, (P,), with the blocks of their level and region, (P,), that they reach, between pixels too."""
     radius = support_radius(cutoff, torch.float32)
-    found = []
-    for number, grid in enumerate(blocks.grids):
-        chosen = (placed.level == number).nonzero()[:, 0]
-        means, cholesky, regions = placed.means[chosen], placed.cholesky[chosen], region[chosen]
+    gaussians, numbers = [], []
+    for level, grid in enumerate(blocks.grids):
+        ids = (placed.level == level).nonzero()[:, 0]
+        means, cholesky, regions = placed.means[ids], placed.cholesky[ids], region[ids]
         size = (grid.height, grid.width)
-        gaussian, at, origin = bounding_tiles(means, cholesky, radius, size, between=number == 0)
-        tile = grid.first_tile + at[:, 1] * grid.cols + at[:, 0]
-        block, keep = find_keys(blocks.keys, tile, regions[gaussian], num_regions)
-        parts = zip(origin[keep].split(_CHUNK), gaussian[keep].split(_CHUNK), strict=True)
-        distance = torch.cat([_nearest(offset, cholesky[part]) for offset, part in parts])
-        keep[keep.clone()] = distance <= radius * radius * (1 + 1e-5) + 1e-6
-        found.append((chosen[gaussian[keep]], block[keep]))
-    gaussians, places = zip(*found, strict=True)
-    return torch.cat(gaussians), torch.cat(places)
+        gaussian, column_row, origin = bounding_tiles(means, cholesky, radius, size, between=level == 0)
+        tile = grid.first_tile + column_row[:, 1] * grid.cols + column_row[:, 0]
+        block, present = find_keys(blocks.keys, tile, regions[gaussian], num_regions)
+        parts = zip(origin[present].split(_CHUNK), gaussian[present].split(_CHUNK), strict=True)
+        distance = torch.cat([_least_distance(offset, cholesky[part]) for offset, part in parts])
+        reached = present.clone()
+        reached[present] = distance <= radius * radius * (1 + 1e-5) + 1e-6  # but for rounding
+        gaussians.append(ids[gaussian[reached]])
+        numbers.append(block[reached])
+    return torch.cat(gaussians), torch.cat(numbers)
 
 
-def _nearest(offset: Tensor, cholesky: Tensor) -> Tensor:
+def _least_distance(offset: Tensor, cholesky: Tensor) -> Tensor:
     """Least squared whitened distance from Gaussians (P, 3) to the points of tiles; `offset`, (P, 2), is to centres."""
     l11, l21, l22 = cholesky.unbind(-1)
     x, y = offset.unbind(-1)
@@ -51,12 +53,12 @@ def _nearest(offset: Tensor, cholesky: Tensor) -> Tensor:
     inside = (x.abs() <= half) & (y.abs() <= half)
     k1, k3, k4 = 1 / l11, -l21 / (l11 * l22), 1 / l22
     least = torch.full_like(x, torch.inf)
-    for sign in (-half, half):
+    for side in (-half, half):
         # along a vertical side z is affine in y, along a horizontal one in x
-        z1, base = (x + sign) * k1, (x + sign) * k3
+        z1, base = (x + side) * k1, (x + side) * k3
         low = (-base / k4).clamp(y - half, y + half)
         least = torch.minimum(least, z1 * z1 + (base + low * k4) ** 2)
-        base = (y + sign) * k4
+        base = (y + side) * k4
         low = (-base * k3 / (k1 * k1 + k3 * k3)).clamp(x - half, x + half)
         least = torch.minimum(least, (low * k1) ** 2 + (base + low * k3) ** 2)
     return torch.where(inside, 0.0, least)

@@ -1,0 +1,158 @@
+"""The lists of Gaussians of all tiles, unfolded from what is stored: once, when the decoder is loaded."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from kcgs.kernels.tiles import TILE
+from kcgs.kernels.whitened import Z_LIMIT
+
+from .graph import FLOAT, Graph, Value
+from .groups import Group
+from .packing import pack_flags, pack_integers, pack_runs, pack_sparse
+from .plan import Plan
+from .tables import NodeTable, Slots, argsort, make_node_table, make_slots
+
+_ROOT = math.sqrt(0.5)
+
+
+class Entries(NamedTuple):
+    """The lists of a group's T tiles, filled up to L Gaussians each: P = T L entries."""
+
+    graph: Graph
+    group: Group
+    channels: int
+    tiles: Value  # (T,)
+    # (P, 6): of 1, x, y, xx, xy, yy in log w around the centre of the tile; or, narrow, of 1, x, y in z1 and z2
+    coefficients: Value
+    colors: Value  # (P, C), zero in what lists are filled up with
+    regions: Value | None  # (P,), position in the map; None where nothing tells regions apart
+    visible: Value | None  # (R,), factor on each region; None: all are shown
+
+    def shaped_coefficients(self) -> Value:
+        """Coefficients, (T, L, 6)."""
+        return self._shape(self.coefficients, 6)
+
+    def shaped_colors(self, tile_regions: Value | None = None) -> Value:
+        """Colours, (T, K * C, L), zero where a Gaussian is of another of the tiles' regions, (T, K)."""
+        g, colors = self.graph, self._shape(self.colors, self.channels)
+        if self.visible is not None and self.regions is not None:
+            colors = colors * self.visible[self._shape(self.regions, 1)]
+        colors = g.Transpose(colors, perm=[0, 2, 1])
+        if tile_regions is None or self.regions is None:
+            return colors
+        region = g.Reshape(self.regions, [len(self.group.tiles), 1, 1, self.group.longest])
+        same = g.Equal(region, g.Unsqueeze(tile_regions, [2, 3])).astype(FLOAT)  # [T, K, 1, L]
+        return g.Reshape(g.Unsqueeze(colors, [1]) * same, [0, self.group.regions * self.channels, -1])
+
+    def _shape(self, values: Value, width: int) -> Value:
+        return self.graph.Reshape(values, [len(self.group.tiles), self.group.longest, width])
+
+
+class Stored(NamedTuple):
+    """All that a graph stores of the Gaussians."""
+
+    graph: Graph
+    plan: Plan
+    slots: Slots
+    table: NodeTable | None  # None: no coarser grids
+    entries: list[Entries]  # of each group
+    visible: Value | None  # (R,) float32, factor on the Gaussians of each region; None: all are shown
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return int(self.plan.gaussians.colors.shape[1])
+
+
+def store(g: Graph, plan: Plan, visible: Value | None) -> Stored:
+    """Store the Gaussians of a plan, and unfold the lists of all groups at once: every operator takes time to load."""
+    slots = make_slots(g, plan)
+    table = None if plan.nodes is None else make_node_table(g, plan.nodes)
+    stored = Stored(g, plan, slots, table, [], visible)
+    if not plan.groups:
+        return stored
+    groups, gaussians = plan.groups, plan.gaussians
+    sizes = [len(group.tiles) * group.longest for group in groups]
+    begins = [np.arange(size) % group.longest == 0 for size, group in zip(sizes, groups, strict=True)]
+    tile = g.CumSum(pack_flags(g, np.concatenate(begins)), 0) - 1  # of each entry, its rank
+    ids, used = _list_gaussians(g, plan, slots, tile, sum(sizes))
+    squares, polynomials = (g.split(part, sizes) for part in _whiten(g, plan, slots, table, ids, tile))
+    colors = g.split(g.constant(gaussians.colors)[ids] * used, sizes)
+    regions: list[Value | None] = [None] * len(groups)
+    if visible is not None or any(group.regions > 1 for group in groups):
+        regions = [*g.split(pack_integers(g, gaussians.region)[ids], sizes)]
+    for number, group in enumerate(groups):
+        coefficients = (squares if group.narrow else polynomials)[number]
+        factors = None if group.nodes else visible  # coarse grids are made when the decoder is loaded
+        values = slots.tiles[number], coefficients, colors[number], regions[number], factors
+        stored.entries.append(Entries(g, group, stored.channels, *values))
+    return stored
+
+
+def _list_gaussians(g: Graph, plan: Plan, slots: Slots, tile: Value, count: int) -> tuple[Value, Value]:
+    """Which Gaussian each of `count` entries is, (P,), and 1, or 0 where it only fills a list up, (P, 1)."""
+    lengths = pack_integers(g, np.concatenate([group.lengths for group in plan.groups]))
+    longest = pack_runs(g, np.concatenate([np.full(len(group.tiles), group.longest) for group in plan.groups]))
+    firsts, begins = (g.CumSum(n, 0, exclusive=1) for n in (lengths, longest))
+    rank = g.Range(np.int32(0), np.int32(count), np.int32(1)) - begins[tile]
+    length = lengths[tile]
+    used = g.Unsqueeze(g.Less(rank, length).astype(FLOAT), [1])
+    pair = firsts[tile] + g.Min(rank, length - 1)
+    return _sorted_pairs(g, plan, slots)[pair], used
+
+
+def _sorted_pairs(g: Graph, plan: Plan, slots: Slots) -> Value:
+    """Which Gaussian each pair of Gaussian and tile is of, sorted by the tile's rank, then by Gaussian.
+
+    They are stored the other way, Gaussian by Gaussian: its first tile, and how many tiles lie between one and the
+    next, which is mostly none.
+    """
+    gaussian, tile = plan.pairs
+    is_first = np.diff(gaussian, prepend=-1) > 0
+    gaps = np.diff(tile, prepend=0) - 1
+    gaps[is_first] = 0
+    flags = pack_flags(g, is_first)
+    owner = g.CumSum(flags, 0) - 1
+    path = g.CumSum((pack_sparse(g, gaps) + 1) * (1 - flags), 0)
+    begin = path[argsort(g, flags, int(is_first.sum()), largest=1)]
+    base = pack_integers(g, tile[is_first]) - begin
+    number = path + base[owner]
+    return owner[argsort(g, slots.rank[number], len(tile))]
+
+
+def _whiten(
+    g: Graph, plan: Plan, slots: Slots, table: NodeTable | None, ids: Value, tile: Value
+) -> tuple[Value, Value]:
+    """Coefficients of all entries, (P, 6): of 1, x, y in whitened coordinates, and of their polynomial log w.
+
+    Whitened coordinates z are scaled by sqrt(1/2): log w is minus their sum of squares.
+    """
+    place = _places(g, plan, table)[g.Concat(*slots.tiles, axis=0)].astype(FLOAT)
+    centre = (place + 0.5) * TILE
+    x, y = g.split(centre[tile] - g.constant(plan.gaussians.means)[ids], 2, axis=1)
+    l11, l21, l22 = g.split(g.constant(plan.gaussians.cholesky)[ids], 3, axis=1)
+    slope = l21 / l11
+    e1, k1, k4 = x / l11, g.Reciprocal(l11), g.Reciprocal(l22)
+    e2 = (y - slope * x) / l22
+    k3 = -(slope / l22)
+    z = g.Concat(e1, k1, e2, k3, k4, axis=1) * _ROOT
+    z = g.Clip(z, float(-Z_LIMIT), float(Z_LIMIT))
+    e1, k1, e2, k3, k4 = g.split(z, 5, axis=1)
+    squares = g.Concat(e1, k1, k1 * 0, e2, k3, k4, axis=1)
+    one, x, xx = e1 * e1 + e2 * e2, e1 * k1 + e2 * k3, k1 * k1 + k3 * k3
+    terms = g.Concat(one, x, e2 * k4, xx, k3 * k4, k4 * k4, axis=1)
+    return squares, terms * np.array([-1, -2, -2, -1, -2, -1], np.float32)
+
+
+def _places(g: Graph, plan: Plan, table: NodeTable | None) -> Value:
+    """Columns and rows of tiles, and of blocks of nodes, (n, 2)."""
+    tiles = plan.tiles
+    tile = g.Range(np.int32(0), np.int32(len(tiles.regions)), np.int32(1))
+    cols, rows = tile % tiles.cols, tile // tiles.cols
+    if table is not None:
+        cols, rows = g.Concat(cols, table.col, axis=0), g.Concat(rows, table.row, axis=0)
+    return g.Concat(g.Unsqueeze(cols, [1]), g.Unsqueeze(rows, [1]), axis=1)

@@ -1,0 +1,144 @@
+"""What wide Gaussians render, carried from coarse grids to the pixels by cubic B-splines.
+
+Grids are of the scene, not of the output: blocks of nodes are evaluated and refined when the decoder is loaded, and the
+output reads the nodes two pixels apart. Blocks lie in memory column by column.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kcgs.kernels.tiles import TILE
+
+from .axis import NODES, Axis
+from .entries import Entries, Stored
+from .graph import FLOAT, INT32, Value
+from .packing import pack_runs
+from .tables import NodeTable
+from .weights import monomials, weigh
+
+_HALF = TILE // 2
+# eighths of the nodes of a coarser grid in a finer one: node 2 i lies between nodes i and i + 1 of a window, node
+# 2 i + 1 at i + 1
+_REFINE = ((4, 4, 0), (1, 6, 1))
+
+
+class CoarseGrids:
+    """Samples the nodes at the pixels of blocks, whose rows and columns are `down` and `across`."""
+
+    def __init__(self, stored: Stored, table: NodeTable, down: Axis, across: Axis, cutoff: float) -> None:
+        self.graph = stored.graph
+        self.stored = stored
+        self.table = table
+        self.down = down
+        self.across = across
+        self.across_spline = across.spline()  # [blocks, side, NODES]
+        self.down_spline = down.spline()
+        self.quarters = self._refine(self._evaluate(cutoff))  # [4 n + 1, C, 8, 8], of the finest grid's blocks
+
+    def image(self) -> Value:
+        """Sample tiles of one region, (blocks, C, side, width); the others are zero."""
+        g, tiles, channels = self.graph, self.stored.plan.tiles, self.stored.channels
+        none = self.table.nodes.no_region
+        of_tile = [none if number in tiles.windows else present[0] for number, present in enumerate(tiles.regions)]
+        region = pack_runs(g, np.array(of_tile))
+        values = self._window(region, g.Range(np.int32(0), np.int32(len(of_tile)), np.int32(1)))
+        values = g.Reshape(values, [tiles.rows, tiles.cols, -1, NODES, NODES])
+        # [tile column, node, (tile row, C, node)]: what is beyond the tile column is multiplied at once
+        values = g.Transpose(values, perm=[1, 3, 0, 2, 4])
+        values = g.Reshape(values, [tiles.cols, NODES, -1])
+        columns = self.across_spline @ values[self.across.tile]  # [blocks, side, (tile row, C, node)]
+        columns = g.Reshape(columns, [-1, tiles.rows * channels * NODES])
+        columns = g.Transpose(columns[self.across.place], perm=[1, 0])
+        shape = g.Concat([tiles.rows, channels, NODES], self.across.size, axis=0)
+        columns = g.Reshape(columns, shape)[self.down.tile]  # [blocks, C, node, width]
+        return g.Unsqueeze(self.down_spline, [1]) @ columns
+
+    def blocks(self, entries: Entries, regions: Value, slots: Value, row: Value, col: Value) -> Value:
+        """Sample blocks (B,) of tiles with several regions, (T, K), to (B, K * C, P), as `Membership.blocks` does."""
+        g, group = self.graph, entries.group
+        tile = g.Reshape(g.Expand(g.Unsqueeze(entries.tiles, [1]), g.Shape(regions)), [-1])
+        region = g.Min(g.Reshape(regions, [-1]), np.int32(self.table.nodes.no_region))
+        count = group.regions * self.stored.channels
+        values = g.Reshape(self._window(region, tile), [len(group.tiles), count * NODES, NODES])
+        rows = values[slots] @ g.Transpose(self.down_spline, perm=[0, 2, 1])[row]
+        rows = g.Reshape(rows, g.Concat([0, count, NODES], self.down.side, axis=0))
+        image = g.Unsqueeze(self.across_spline[col], [1]) @ rows
+        return g.Reshape(image, [0, count, -1])
+
+    def _window(self, region: Value, tile: Value) -> Value:
+        """Return the nodes that tiles (n,) read, (n, C, column, row); those of hidden regions are zero."""
+        g, cols = self.graph, self.stored.plan.tiles.cols
+        quarters = self._find_quarters(np.int32(0), region, tile // cols, tile % cols)
+        nodes = self._join(self.quarters, quarters, 0)
+        nodes = g.Slice(nodes, [0, 0], [NODES, NODES], [2, 3])
+        if self.stored.visible is None:
+            return nodes
+        factors = g.Concat(self.stored.visible, np.zeros(1, np.float32), axis=0)
+        return nodes * g.Unsqueeze(factors[region], [1, 2, 3])
+
+    def _evaluate(self, cutoff: float) -> Value:
+        """Evaluate the Gaussians of every block at its nodes, (n, C, 256)."""
+        g, plan, channels = self.graph, self.stored.plan, self.stored.channels
+        steps = g.constant(np.arange(TILE, dtype=np.float32) - np.float32((TILE - 1) / 2))
+        at_nodes = monomials(g, steps, steps)
+        entries = [part for part in self.stored.entries if part.group.nodes]
+        values = []
+        for part in entries:
+            weights = weigh(g, part.shaped_coefficients() @ at_nodes, cutoff)
+            values.append(part.shaped_colors() @ weights)
+        # the last is for blocks that are only refined
+        values.append(g.Expand(np.float32(0), [1, channels, TILE * TILE]))
+        first = len(plan.tiles.regions)
+        rank = g.Slice(self.stored.slots.rank, [first], [plan.num_blocks])
+        tiles = sum(len(group.tiles) for group in plan.pixel_groups)
+        last = sum(len(part.group.tiles) for part in entries)
+        return g.Concat(*values, axis=0)[g.Min(rank - tiles, np.int32(last))]
+
+    def _refine(self, values: Value) -> Value:
+        """Add to each grid what the next coarser one says there; return the quarters of the finest one's blocks."""
+        g, channels, table = self.graph, self.stored.channels, self.table
+        counts = np.bincount(table.nodes.place[:, 0]).tolist()
+        quarters_of = self._find_quarters(table.level + 1, table.region, table.row, table.col)
+        grids, read = g.split(values, counts), g.split(quarters_of, counts)
+        matrix = np.zeros((TILE, TILE), np.uint8)
+        for node in range(TILE):
+            matrix[node, node // 2 : node // 2 + 3] = _REFINE[node % 2]
+        along = g.constant(matrix).astype(FLOAT) * (1 / 8)
+        back = g.Transpose(along, perm=[1, 0])
+        quarters, first = None, sum(counts)
+        for count, grid, wanted in reversed(list(zip(counts, grids, read, strict=True))):
+            grid = g.Reshape(grid, [0, channels, TILE, TILE])
+            if quarters is not None:
+                grid = grid + along @ self._join(quarters, wanted, first) @ back
+            first -= count
+            grid = g.Reshape(grid, [0, channels, 2, _HALF, 2, _HALF])
+            grid = g.Transpose(grid, perm=[0, 4, 2, 1, 3, 5])
+            grid = g.Reshape(grid, [-1, channels, _HALF, _HALF])
+            quarters = g.Concat(grid, np.zeros((1, channels, _HALF, _HALF), np.float32), axis=0)
+        assert quarters is not None
+        return quarters
+
+    def _find_quarters(self, level: Value | np.int32, region: Value, row: Value, col: Value) -> Value:
+        """Which quarters of blocks of a level blocks (n,) of the finer one lie in, down and across, (n, 2, 2).
+
+        A block is as large as two by two quarters, from the one of its own row and column on.
+        """
+        g, (_, regions, rows, cols) = self.graph, self.table.nodes.shape
+        two = g.constant(np.arange(2, dtype=np.int32))
+        row, col = (g.Unsqueeze(place, [1]) + two for place in (row, col))
+        (row, down), (col, right) = ((place // 2, place % 2) for place in (row, col))
+        line = g.Mul(level, np.int32(regions)) + region
+        line = g.Unsqueeze(line, [1]) * rows + row
+        key, quarter = (
+            g.Unsqueeze(y, [2]) * n + g.Unsqueeze(x, [1]) for y, n, x in ((line, cols, col), (down, 2, right))
+        )
+        return self.table.block[key] * 4 + quarter
+
+    def _join(self, quarters: Value, ids: Value, first: int) -> Value:
+        """Join quarters, (n, 2, 2), of blocks from `first` on, to (n, C, 16, 16); the last quarter is zero."""
+        g = self.graph
+        last = g.Shape(quarters, end=1).astype(INT32) - 1
+        place = g.Min(ids - 4 * first, last)
+        joined = g.Transpose(quarters[place], perm=[0, 3, 2, 4, 1, 5])
+        return g.Reshape(joined, [0, self.stored.channels, TILE, TILE])

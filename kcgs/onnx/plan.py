@@ -1,0 +1,148 @@
+"""The plan of a decoder: what it stores of a scene, and what is rendered where. Nothing here knows ONNX."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcgs.functional import RegionMap
+from kcgs.kernels.octaves import Blocks, Coarsened, make_blocks
+from kcgs.kernels.tiles import TILE
+from kcgs.nn import GaussianField
+
+from .groups import Group, Integers, group_tiles
+from .reach import pair_with_blocks, place_gaussians
+from .tiles import Tiles, find_tiles
+
+# what coarse grids cost, in entries of lists, which they must save. Tune both by the times of
+# `python -m benchmarks decode`
+_GRIDS_COST = 2000  # whatever they hold
+_SPLINE_COST = 7  # for each tile and region
+# deviation in pixels below which the rounding of a polynomial would show in log w, so that squares are summed
+_NARROW = 0.15
+_NARROW_OF_FAINT = 0.4  # where weights below _FAINT are rendered, too
+_FAINT = 1e-5
+
+Floats = NDArray[np.float32]
+
+
+class Gaussians(NamedTuple):
+    """The Gaussians that reach a pixel; those of coarser grids in units of their nodes."""
+
+    means: Floats  # [N, 2]
+    cholesky: Floats  # [N, 3]
+    colors: Floats  # [N, C], opacities merged
+    region: Integers  # [N], position in the map
+
+
+class Nodes(NamedTuple):
+    """The blocks of coarser grids where anything is, and the table of all that there may be."""
+
+    place: Integers  # [n, 4] level - 1, region, row and column, ascending
+    shape: tuple[int, int, int, int]  # one level more than there are, one region more: nothing is there
+
+    @property
+    def no_region(self) -> int:
+        """Position of the region that has no nodes."""
+        return self.shape[1] - 1
+
+
+class Plan(NamedTuple):
+    """All that a decoder stores."""
+
+    tiles: Tiles
+    gaussians: Gaussians
+    groups: list[Group]  # those of nodes last
+    pairs: Integers  # [2, P] Gaussian and tile of every entry, in this order
+    nodes: Nodes | None  # None: no coarser grids
+
+    @property
+    def num_blocks(self) -> int:
+        """Number of tiles and blocks of nodes."""
+        return len(self.tiles.regions) + (0 if self.nodes is None else len(self.nodes.place))
+
+    @property
+    def pixel_groups(self) -> list[Group]:
+        """The groups of tiles."""
+        return [group for group in self.groups if not group.nodes]
+
+
+def plan_decoder(field: GaussianField, regions: RegionMap | None, cutoff: float) -> Plan:
+    """Find what is rendered where, and group it."""
+    tiles = find_tiles(regions, field.size)
+    num_regions = 1 if regions is None else regions.num_regions
+    region = torch.zeros(field.num_gaussians, dtype=torch.int64)
+    if regions is not None and field.region_ids is not None:
+        region = regions.index_of(field.region_ids).cpu()
+    keys = [number * num_regions + r for number, present in enumerate(tiles.regions) for r in present]
+    blocks = make_blocks(torch.tensor(keys), num_regions, (1, *field.size))
+    placed, gaussian, block = _pair(field, region, num_regions, blocks, cutoff)
+    nodes, number = _number_blocks(blocks, num_regions, tiles, block)
+    tile = number[block]
+
+    stored = _in_raster_order(placed, gaussian.unique())
+    entry = torch.full((field.num_gaussians,), -1)
+    entry[stored] = torch.arange(len(stored))
+    entry = entry[gaussian]
+    merged = field.merged_colors().detach().double().cpu() * placed.factor[:, None]
+    means, cholesky, colors = (t[stored].float().numpy() for t in (placed.means, placed.cholesky, merged))
+    gaussians = Gaussians(means, cholesky, colors, region[stored].numpy())
+    narrow = _is_narrow(gaussians.cholesky, _NARROW if cutoff >= _FAINT else _NARROW_OF_FAINT)
+    pairs = torch.stack([entry, tile])[:, torch.argsort(entry * len(number) + tile)].numpy()
+    groups = group_tiles(pairs, narrow, tiles, 0 if nodes is None else len(nodes.place))
+    return Plan(tiles, gaussians, groups, pairs, nodes)
+
+
+def _pair(
+    field: GaussianField, region: Tensor, num_regions: int, blocks: Blocks, cutoff: float
+) -> tuple[Coarsened, Tensor, Tensor]:
+    """Pair Gaussians with blocks of pixels, or, if that saves enough of them, wide ones with blocks of nodes."""
+    means, cholesky = (t.detach().double().cpu() for t in (field.means, field.cholesky))
+    fine = place_gaussians(means, cholesky, cutoff, 1)
+    gaussian, block = pair_with_blocks(fine, region, num_regions, blocks, cutoff)
+    coarse = place_gaussians(means, cholesky, cutoff, len(blocks.grids))
+    saved = int((coarse.level[gaussian] > 0).sum())
+    if saved <= _GRIDS_COST + _SPLINE_COST * blocks.first:
+        return fine, gaussian, block
+    return coarse, *pair_with_blocks(coarse, region, num_regions, blocks, cutoff)
+
+
+def _number_blocks(blocks: Blocks, num_regions: int, tiles: Tiles, reached: Tensor) -> tuple[Nodes | None, Tensor]:
+    """Return the blocks of nodes where anything is, and the numbers of all blocks."""
+    number = blocks.keys // num_regions
+    live = torch.zeros(len(number) + 1, dtype=torch.bool)
+    live[reached] = True
+    if not live[blocks.first :].any():
+        return None, number
+    for first, end in reversed(list(pairwise(blocks.starts[1:]))):
+        live[first:end] |= live[blocks.parents[first:end]].any(1)
+    ids = live[blocks.first : -1].nonzero()[:, 0] + blocks.first
+    level = torch.searchsorted(torch.tensor(blocks.starts[1:]), ids, right=True) - 1
+    cols, first_tile = torch.tensor([[grid.cols, grid.first_tile] for grid in blocks.grids[1:]])[level].T
+    tile = number[ids] - first_tile
+    place = torch.stack([level, blocks.keys[ids] % num_regions, tile // cols, tile % cols], -1).numpy()
+    order = np.lexsort(place.T[::-1])
+    number[ids[order]] = len(tiles.regions) + torch.arange(len(place))
+    shape = (int(level.max()) + 2, num_regions + 1, tiles.rows // 2 + 1, tiles.cols // 2 + 1)
+    return Nodes(place[order], shape), number
+
+
+def _in_raster_order(placed: Coarsened, ids: Tensor) -> Tensor:
+    """Sort ids by level and tile: neighbours get neighbouring numbers, so that lists are stored as small steps."""
+    if len(ids) == 0:
+        return ids
+    column, row = (placed.means[ids] / TILE).floor().unbind(-1)
+    ids = ids[torch.argsort(row * (1 + 2 * column.abs().amax()) + column, stable=True)]
+    return ids[torch.argsort(placed.level[ids], stable=True)]
+
+
+def _is_narrow(cholesky: Floats, width: float) -> NDArray[np.bool_]:
+    """Find Gaussians that are narrower than a width in some direction."""
+    l11, l21, l22 = cholesky.astype(np.float64).T
+    steepest: NDArray[np.float64] = np.hypot(np.hypot(1 / l11, l21 / (l11 * l22)), 1 / l22)
+    return steepest * width > 1

@@ -1,0 +1,66 @@
+"""Tables of a graph: where each tile is rendered, and which blocks of nodes there are."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .graph import INT32, Graph, Value
+from .packing import pack_flags, pack_integers
+from .plan import Nodes, Plan
+
+
+class Slots(NamedTuple):
+    """Where the n tiles and blocks of nodes are rendered, int32; groups and their tiles are numbered one by one."""
+
+    group: Value  # (n,), the number of groups where nothing is rendered
+    slot: Value  # (n,), place among the tiles of the group
+    rank: Value  # (n,), place among the tiles of all groups
+    tiles: list[Value]  # of each group, (T,)
+
+
+def make_slots(g: Graph, plan: Plan) -> Slots:
+    """Sort tiles and blocks of nodes by group."""
+    groups = plan.groups
+    group_of = np.full(plan.num_blocks, len(groups))
+    for number, group in enumerate(groups):
+        group_of[group.tiles] = number
+    table = pack_integers(g, group_of)
+    order = argsort(g, table, plan.num_blocks)
+    rank = argsort(g, order, plan.num_blocks)
+    starts = np.cumsum([0, *(len(group.tiles) for group in groups)])
+    slot = rank - g.constant(starts.astype(np.int32))[table]
+    tiles = g.split(g.Slice(order, [0], starts[-1:]), np.diff(starts).tolist()) if groups else []
+    return Slots(table, slot, rank, tiles)
+
+
+class NodeTable(NamedTuple):
+    """The n blocks of nodes, int32, and which of them lies where."""
+
+    nodes: Nodes
+    block: Value  # of each level, region, row and column; n, a block of zeros, where there is none
+    level: Value  # (n,), from 0 for the finest grid
+    region: Value  # (n,)
+    row: Value  # (n,)
+    col: Value  # (n,)
+
+
+def make_node_table(g: Graph, nodes: Nodes) -> NodeTable:
+    """Store the blocks of nodes as flags, and unfold them."""
+    count = len(nodes.place)
+    flags = np.zeros(nodes.shape, np.bool_)
+    flags[tuple(nodes.place.T)] = True
+    present = pack_flags(g, flags.ravel())
+    number = g.CumSum(present, 0) - 1
+    block = g.Where(g.Equal(present, np.int32(1)), number, np.int32(count))
+    place = argsort(g, present, count, largest=1)
+    _, regions, rows, cols = nodes.shape
+    lines = place // cols
+    columns = lines // rows
+    return NodeTable(nodes, block, columns // regions, columns % regions, lines % rows, place % cols)
+
+
+def argsort(g: Graph, numbers: Value, count: int, largest: int = 0) -> Value:
+    """Find the `count` smallest or largest numbers: int32 indices."""
+    return g.argsort(numbers, [count], largest).astype(INT32)
