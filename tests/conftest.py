@@ -12,8 +12,8 @@ from torch import Tensor
 
 from kcgs.kernels import BACKENDS
 
-# Pictures of tests are small: a second thread costs more in waking and spinning than it saves, and workers that share
-# the processors would wait for one another. Threads have tests of their own, which say how many.
+# Images of tests are small: a second thread costs more in waking and spinning than it saves, and workers that share
+# the processors would wait for one another. Tests of threads set their number.
 if "OMP_NUM_THREADS" not in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"  # of processes that tests start
     torch.set_num_threads(1)
@@ -21,12 +21,16 @@ if "OMP_NUM_THREADS" not in os.environ:
 ROOT = Path(__file__).resolve().parent.parent
 
 # The same examples in each run, however long they take.
-_UNCHECKED = (HealthCheck.too_slow, HealthCheck.function_scoped_fixture)
-settings.register_profile("kcgs", derandomize=True, deadline=None, suppress_health_check=_UNCHECKED)
+settings.register_profile(
+    "kcgs",
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=(HealthCheck.too_slow, HealthCheck.function_scoped_fixture),
+)
 settings.load_profile("kcgs")
 
-# Files that take longest, 12 seconds of a processor and more: workers begin with them, so that none is left with one at
-# the end. (By itself pytest-xdist begins with the files of most tests, and these have few.)
+# The files that take longest, 8 seconds and more: workers begin with them, so that the last file to end is a short one.
+# (By itself pytest-xdist begins with the files of most tests, and these have few.)
 LONGEST = (
     "notebooks/test_notebooks.py",
     "golden/test_golden.py",
@@ -67,12 +71,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--dtype", default="float32", help=f"the same: all, or some of {', '.join(DTYPES)}")
 
 
-def _chosen(config: pytest.Config, option: str, known: tuple[str, ...]) -> tuple[str, ...]:
-    value = config.getoption(option)
-    chosen = known if value == "all" else tuple(value.split(","))
-    if unknown := set(chosen) - set(known):
-        raise pytest.UsageError(f"{option} must be all, or some of {', '.join(known)}; got {', '.join(unknown)}")
-    return chosen
+def _selection(config: pytest.Config, option: str, values: tuple[str, ...]) -> tuple[str, ...]:
+    text = config.getoption(option)
+    selection = values if text == "all" else tuple(text.split(","))
+    if unknown := set(selection) - set(values):
+        raise pytest.UsageError(f"{option} must be all, or some of {', '.join(values)}; got {', '.join(unknown)}")
+    return selection
 
 
 def _backends(device: str) -> list[str]:
@@ -83,23 +87,23 @@ def _backends(device: str) -> list[str]:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run tests that ask for `device`, `dtype` or `backend` with each that the command line chooses.
+    """Run tests that ask for `device`, `dtype` or `backend` with each that the command line selects.
 
     A test without `device` runs on the CPU; kernels of one dtype are left out where `dtype` is another.
     """
-    given = [mark.args[0] for mark in metafunc.definition.iter_markers("parametrize")]
-    own = {name for each in given for name in (each.split(",") if isinstance(each, str) else each)}
-    names = [n for n in ("backend", "device", "dtype") if n in metafunc.fixturenames and n not in own]
+    tables = [mark.args[0] for mark in metafunc.definition.iter_markers("parametrize")]
+    parametrized = {name for table in tables for name in (table.split(",") if isinstance(table, str) else table)}
+    names = [n for n in ("backend", "device", "dtype") if n in metafunc.fixturenames and n not in parametrized]
     if not names:
         return
     rows = []
-    for device in _chosen(metafunc.config, "--device", DEVICES) if "device" in names else ("cpu",):
-        for dtype in _chosen(metafunc.config, "--dtype", DTYPES) if "dtype" in names else ("",):
+    for device in _selection(metafunc.config, "--device", DEVICES) if "device" in names else ("cpu",):
+        for dtype in _selection(metafunc.config, "--dtype", DTYPES) if "dtype" in names else ("",):
             for backend in _backends(device) if "backend" in names else ("",):
                 if dtype != "float64" or backend not in ("cpu", "cuda"):
                     row = {"backend": backend, "device": torch.device(device), "dtype": getattr(torch, dtype, None)}
-                    parts = {"backend": backend, "device": device, "dtype": dtype}
-                    rows.append(pytest.param(*(row[n] for n in names), id="-".join(parts[n] for n in names)))
+                    texts = {"backend": backend, "device": device, "dtype": dtype}
+                    rows.append(pytest.param(*(row[n] for n in names), id="-".join(texts[n] for n in names)))
     metafunc.parametrize(names, rows)
 
 

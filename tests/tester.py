@@ -1,6 +1,6 @@
-"""The form of the tests of an operation: what each of them has to show, and how results are compared.
+"""The form of the tests of an operation: what each has to show, and how results are compared.
 
-A class derives from :class:`BaseTester` and has every case of ``CASES``, or says why it has one not:
+A class derives from :class:`BaseTester` and has every case of ``CASES``, or says why it has not:
 ``class TestBand(BaseTester, without={"test_gradcheck": "labels are integers"})``.
 """
 
@@ -16,8 +16,8 @@ from torch import Tensor, nn
 CASES = {
     "test_smoke": "it runs, and the result is finite and not black",
     "test_cardinality": "shapes of results, for every shape of arguments",
-    "test_exception": "what is refused, and with which words",
-    "test_feature": "values that were found in another way",
+    "test_exception": "arguments that are refused, and the error's message",
+    "test_feature": "values that are computed in another way",
     "test_gradcheck": "gradients against finite differences",
     "test_module": "its twin, or its state, as a torch module",
     "test_dynamo": "compiled, it gives the same",
@@ -29,7 +29,7 @@ TOLERANCES = {
     torch.float32: (1e-5, 2e-6),
     torch.float64: (1e-10, 1e-11),
 }
-# what the compiler itself sets off inside torch, on its first use and as it traces and breaks graphs
+# warnings that the compiler causes inside torch
 COMPILER_WARNINGS = (
     ("The .grad attribute of a Tensor that is not a leaf", UserWarning),
     (".*torch.autograd.function.Function.* should not be instantiated", DeprecationWarning),
@@ -48,10 +48,10 @@ class BaseTester:
         if unknown := set(reasons) - set(CASES):
             raise TypeError(f"{cls.__name__}: without must name cases; got {', '.join(sorted(unknown))}")
         for case, shows in CASES.items():
-            found, excused = callable(getattr(cls, case, None)), bool(reasons.get(case))
-            if not found and not excused:
+            present, excused = callable(getattr(cls, case, None)), bool(reasons.get(case))
+            if not present and not excused:
                 raise TypeError(f"{cls.__name__} must have {case} ({shows}), or say in `without` why it has none")
-            if found and excused:
+            if present and excused:
                 raise TypeError(f"{cls.__name__} has {case}, which `without` says it cannot have")
 
     @staticmethod
@@ -60,26 +60,26 @@ class BaseTester:
     ) -> None:
         """Compare tensors, or sequences of them, by the coarser dtype; zeros must be meant, as `zero` says."""
         if not isinstance(expected, Tensor):
-            for got, want in zip(actual, expected, strict=True):
-                BaseTester.assert_close(got, want, rtol=rtol, atol=atol, zero=zero)
+            for one, other in zip(actual, expected, strict=True):
+                BaseTester.assert_close(one, other, rtol=rtol, atol=atol, zero=zero)
             return
         assert zero or bool(expected.detach().any()), "an all-zero answer would pass"
-        given = [max(TOLERANCES[t.dtype][k] for t in (actual, expected)) for k in (0, 1)]
+        relative, absolute = (max(TOLERANCES[t.dtype][k] for t in (actual, expected)) for k in (0, 1))
         torch.testing.assert_close(
             actual.detach().to(expected.dtype), expected.detach(),
-            rtol=given[0] if rtol is None else rtol, atol=given[1] if atol is None else atol,
+            rtol=relative if rtol is None else rtol, atol=absolute if atol is None else atol,
         )  # fmt: skip
 
     @staticmethod
     def gradcheck(function: Callable[..., Any], inputs: Sequence[Any], *, fast_mode: bool = True) -> None:
         """Compare gradients with finite differences, in float64; tensors of integers stay as they are."""
-        given = [
+        arguments = [
             t.detach().double().requires_grad_() if isinstance(t, Tensor) and t.is_floating_point() else t
             for t in inputs
         ]
-        assert torch.autograd.gradcheck(function, given, fast_mode=fast_mode)
-        floating = [t for t in given if isinstance(t, Tensor) and t.requires_grad]
-        gradients = torch.autograd.grad(function(*given).square().sum(), floating)
+        assert torch.autograd.gradcheck(function, arguments, fast_mode=fast_mode)
+        floating = [t for t in arguments if isinstance(t, Tensor) and t.requires_grad]
+        gradients = torch.autograd.grad(function(*arguments).square().sum(), floating)
         assert all(bool(g.any()) for g in gradients), "an all-zero gradient would pass"
 
     @classmethod
@@ -101,8 +101,8 @@ class BaseTester:
             for words, kind in COMPILER_WARNINGS:
                 warnings.filterwarnings("ignore", words, kind)
             for call in (torch.compile(function, backend=backend, fullgraph=fullgraph), function):
-                found = call(*inputs)
-                gradients = torch.autograd.grad(found.square().sum(), list(leaves)) if leaves else ()
-                results.append([found, *gradients])
+                result = call(*inputs)
+                gradients = torch.autograd.grad(result.square().sum(), list(leaves)) if leaves else ()
+                results.append([result, *gradients])
         torch._dynamo.reset()
         cls.assert_close(*results, **tolerances)
