@@ -2,20 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
-
-# half the second derivatives of the squared error by a step in a Gaussian's frame, in units of its energy
-_CURVATURE = (0.5, 0.5, 0.75, 0.25, 0.75)
-# energies below it have next to no curvature
-_LEAST_ENERGY = 1e-2
-# the largest Newton step of shape or place
-_LARGEST_NEWTON_STEP = 0.3
-# pixels: on pixel centres a narrower Gaussian weighs as if it had this standard deviation
-_NARROW = 0.56
 
 
 def local_gradient(cholesky: Tensor, means_gradient: Tensor, cholesky_gradient: Tensor) -> Tensor:
@@ -24,23 +12,6 @@ def local_gradient(cholesky: Tensor, means_gradient: Tensor, cholesky_gradient: 
     gx, gy = means_gradient.unbind(-1)
     g11, g21, g22 = cholesky_gradient.unbind(-1)
     return torch.stack([l11 * gx + l21 * gy, l22 * gy, l11 * g11 + l21 * g21, l22 * g21, l22 * g22], -1)
-
-
-def area(cholesky: Tensor) -> Tensor:
-    """Return the sum of each Gaussian's squared weights over pixel centres, (N,)."""
-    return math.pi * cholesky[:, ::2].clamp_min(_NARROW).prod(-1)
-
-
-def newton_steps(cholesky: Tensor, colors: Tensor, slopes: Sequence[Tensor], areas: Tensor) -> Tensor:
-    """Return Newton's steps, (N, 5 + C), of each number alone: of centre and factor in the frame, and of the colours.
-
-    `slopes` are half the gradients of the error by means, cholesky and colors; `areas`, (N,), how much a colour's
-    square counts in it.
-    """
-    energy = (colors.square().sum(-1) * areas).clamp_min(_LEAST_ENERGY)
-    shape = local_gradient(cholesky, *slopes[:2]) / (energy[:, None] * energy.new_tensor(_CURVATURE))
-    shape = shape.clamp(-_LARGEST_NEWTON_STEP, _LARGEST_NEWTON_STEP)
-    return -torch.cat([shape, slopes[2] / areas[:, None]], -1)
 
 
 def widen(cholesky: Tensor, least_sigma: float) -> Tensor:

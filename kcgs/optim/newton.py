@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-from .frame import area, move, newton_steps
+from .frame import local_gradient, move
 
-__all__ = ["Gaussians", "NewtonDescent", "Objective", "area", "half_gradients"]
-
+# half the second derivatives of the squared error by a step in a Gaussian's frame, per energy of the Gaussian: two of
+# the centre, three of the factor (docs/format.md has the derivation)
+_CURVATURE = (0.5, 0.5, 0.75, 0.25, 0.75)
+# energies below it count as this one: next to nothing bends the error there
+_MIN_ENERGY = 1e-2
+# pixels: on pixel centres a narrower Gaussian weighs as if it had this standard deviation
+_MIN_SIGMA = 0.56
+# the largest Newton step, in standard deviations and in log scale: farther away the error is not quadratic
+_MAX_NEWTON_STEP = 0.3
+# the largest step with momentum, in the same units
+_MAX_STEP = 0.2
 # share of the last step that is added to a step
 _MOMENTUM = 0.9
-# the largest step, in standard deviations and in log scale: derivatives are those at its start
-_MAX_STEP = 0.2
 
 
 class Gaussians(NamedTuple):
-    """The parameters that a descent moves, or something for each of them."""
+    """The parameters that a descent moves, or a gradient by each of them."""
 
     means: Tensor  # [N, 2]
     cholesky: Tensor  # [N, 3]
@@ -27,7 +35,7 @@ class Gaussians(NamedTuple):
 
 
 class Objective(Protocol):
-    """An error of a render that is about quadratic."""
+    """An error of a render that is about quadratic, such as the fit's for MS-SSIM."""
 
     def apply(self, residual: Tensor) -> Tensor:
         """Return half the gradient at a residual, render - image, (C, H, W)."""
@@ -39,8 +47,7 @@ class Objective(Protocol):
 class NewtonDescent:
     """Newton steps of every number alone, in each Gaussian's frame, with momentum.
 
-    A number with a small gradient hardly moves; Adam, whose steps are as long for small gradients as for large ones,
-    moves it as far as any other.
+    A number with a small gradient hardly moves, while Adam moves all numbers about as far.
 
     Args:
         gaussians: the start, for its shapes.
@@ -59,12 +66,12 @@ class NewtonDescent:
         Args:
             gaussians: before the step.
             gradients: half the gradients of the error.
-            masses: second derivative of the error by a colour, halved, (N,).
+            masses: half the second derivative of the error by a colour, (N,).
             rate: share of a Newton step.
-            frozen: numbers that stay, bool, (N, 5 + C) or what broadcasts to it.
+            frozen: numbers that do not move, bool, (N, 5 + C) or what broadcasts to it.
         """
         means, cholesky, colors = gaussians
-        self.velocity = _MOMENTUM * self.velocity + newton_steps(cholesky, colors, gradients, masses)
+        self.velocity = _MOMENTUM * self.velocity + _newton_step(gaussians, gradients, masses)
         if frozen is not None:
             self.velocity = torch.where(frozen, 0.0, self.velocity)
         step = rate * self.velocity
@@ -72,10 +79,18 @@ class NewtonDescent:
         return Gaussians(means, cholesky, colors + step[:, 5:])
 
 
+def _newton_step(gaussians: Gaussians, gradients: Gaussians, masses: Tensor) -> Tensor:
+    """Return Newton's steps of centre, factor and colours, (N, 5 + C)."""
+    energy = (gaussians.colors.square().sum(-1) * masses).clamp_min(_MIN_ENERGY)
+    local = local_gradient(gaussians.cholesky, gradients.means, gradients.cholesky)
+    geometry = (local / (energy[:, None] * energy.new_tensor(_CURVATURE))).clamp(-_MAX_NEWTON_STEP, _MAX_NEWTON_STEP)
+    return -torch.cat([geometry, gradients.colors / masses[:, None]], -1)
+
+
 def half_gradients(
     render: Callable[[Tensor, Tensor, Tensor], Tensor], gaussians: Gaussians, image: Tensor, objective: Objective | None
 ) -> Gaussians:
-    """Return half the gradients of the error of a render, (C, H, W); without an objective, of the squared error."""
+    """Return half the gradients of the objective of a render, (C, H, W); without one, of the squared error."""
     leaves = [t.detach().requires_grad_() for t in gaussians]
     with torch.enable_grad():
         rendered = render(*leaves)
@@ -83,3 +98,15 @@ def half_gradients(
     if objective is not None:
         residual = objective.apply(residual)
     return Gaussians(*torch.autograd.grad(rendered, leaves, residual))
+
+
+def error_weights(gaussians: Gaussians, objective: Objective | None) -> Tensor:
+    """Return what the squared error of each Gaussian weighs in the objective, (N,)."""
+    if objective is None:
+        return torch.ones_like(gaussians.means[:, 0])
+    return objective.weigh(gaussians.means, gaussians.cholesky)
+
+
+def area(cholesky: Tensor) -> Tensor:
+    """Return the sum of each Gaussian's squared weights over pixel centres, (N,)."""
+    return math.pi * cholesky[:, ::2].clamp_min(_MIN_SIGMA).prod(-1)

@@ -13,7 +13,7 @@ from kcgs.codec.exact import Integers
 from kcgs.codec.gaussians.quantize import Parameters, Quantizer
 from kcgs.fitting.objective import MsSsimObjective
 from kcgs.functional import RegionMap, region_splat
-from kcgs.optim.newton import Gaussians, NewtonDescent, area, half_gradients
+from kcgs.optim.newton import Gaussians, NewtonDescent, area, error_weights, half_gradients
 
 from .bits import soft_bits
 
@@ -55,7 +55,7 @@ class RateDistortionDescent:
         self.gaussians = self._as_tensors(gaussians)
         self.newton = NewtonDescent(self.gaussians, exact=False)
         # error of the objective per squared error
-        self._error_scale = float(self._weights(self.gaussians).mean())
+        self._error_scale = float(error_weights(self.gaussians, objective).mean())
         self._bit_gradient: Gaussians | None = None
         self._num_steps = 0
 
@@ -114,7 +114,7 @@ class RateDistortionDescent:
         self._num_steps += 1
         gradients = half_gradients(self._render, gaussians, self.image, self.objective)
         gradients = Gaussians(*(error + bits for error, bits in zip(gradients, self._bit_gradient, strict=True)))
-        masses = area(gaussians.cholesky).clamp_max(height * width) * self._weights(gaussians)
+        masses = area(gaussians.cholesky).clamp_max(height * width) * error_weights(gaussians, self.objective)
         return self.newton.step(gaussians, gradients, masses, _RATE, frozen)
 
     def _half_bit_gradient(self, gaussians: Gaussians, quantizer: Quantizer) -> Gaussians:
@@ -134,13 +134,7 @@ class RateDistortionDescent:
         gaussians = Gaussians(*(numbers.double() for numbers in self.gaussians))
         l11, _, l22 = gaussians.cholesky.unbind(-1)
         areas = (math.pi * l11 * l22).clamp_max(self.image[0].numel())
-        return self._weights(gaussians) * (gaussians.colors.square().sum(-1) * areas)
-
-    def _weights(self, gaussians: Gaussians) -> Tensor:
-        """Return what the squared error of each Gaussian weighs in the objective, (N,)."""
-        if self.objective is None:
-            return torch.ones_like(gaussians.means[:, 0])
-        return self.objective.weigh(gaussians.means, gaussians.cholesky)
+        return error_weights(gaussians, self.objective) * (gaussians.colors.square().sum(-1) * areas)
 
     def _as_tensors(self, gaussians: Parameters) -> Gaussians:
         return Gaussians(*(torch.from_numpy(numbers).to(self.image) for numbers in gaussians))

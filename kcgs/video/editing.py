@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,21 +18,19 @@ from kcgs.nn import GaussianField
 from kcgs.nn.field import join
 from kcgs.scene import Scene, check_batch
 
-from .descent import Descent
+from .descent import FrameDescent
 from .fitting import stack
-from .gaussians import Gaussians
 from .motion import motion_at
-
-# image (C, H, W), labels (H, W), and which pixels are not known (H, W)
-Frame = tuple[Tensor, Tensor, Tensor]
+from .target import Splats, Target
 
 # pixels around a region that still have colours of it
 _FRINGE = 3
-# pixels: a Gaussian farther than this from where a motion puts it is relocated, or of something that moves by itself
-_LARGEST_RESIDUAL = 1.0
+# pixels between a Gaussian and where a motion puts it, from which on it is an outlier: relocated, or moving by itself
+_MAX_RESIDUAL = 1.0
+# samples of three rows: more find the motion of most rows more surely
 _RANSAC_TRIALS = 200
-# rows that determine a motion well
-_LEAST_ROWS = 12
+# fewer rows do not determine a motion
+_MIN_ROWS = 12
 
 
 @torch.inference_mode(False)
@@ -63,28 +62,27 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
         >>> delete_region(Scene(field, labels), 7).regions.ids
         tensor([0])
     """
-    regions, ids, chosen = _check(scenes, region_ids)
-    is_deleted, blank = torch.isin(regions.labels, chosen), torch.isin(ids, chosen)
-    edited: list[Gaussians] = []
+    regions, row_ids, deleted_ids = _check(scenes, region_ids)
+    deleted_pixels, deleted_rows = torch.isin(regions.labels, deleted_ids), torch.isin(row_ids, deleted_ids)
+    edited: list[Splats] = []
     with threads_for_kernels(scenes.size[0] * scenes.size[1]):
-        motions = _background_motions(scenes.field.means.detach(), ~blank)
-        targets, labels = _fill_targets(scenes.render(), regions.labels, is_deleted, motions)
+        motions = _background_motions(scenes.field.means.detach(), ~deleted_rows)
+        images, labels = _fill_holes(scenes.render(), regions.labels, deleted_pixels, motions)
         filled = regions.relabel(labels, "mean")
-        for t, frame in enumerate(scenes):
-            field, regions = frame.field, filled.image(t)
-            means, cholesky, colors = (x.detach().clone() for x in (field.means, field.cholesky, field.merged_colors()))
-            row_ids = torch.where(blank[t], regions.ids[0], ids[t])
-            colors[blank[t]] = 0.0
+        for t, scene in enumerate(scenes):
+            means, cholesky, colors, _, _ = Splats.of(scene)
+            region_ids = torch.where(deleted_rows[t], filled.image(t).ids[0], row_ids[t])
+            colors[deleted_rows[t]] = 0.0
             if t:  # rows that filled the frame before go on
-                rows, before = blank[t] & blank[t - 1], edited[-1]
-                means[rows] = _move(motions[t] @ motions[t - 1].inverse(), before.means[rows])
+                rows, before = deleted_rows[t] & deleted_rows[t - 1], edited[-1]
+                means[rows] = _apply(motions[t] @ motions[t - 1].inverse(), before.means[rows])
                 cholesky[rows], colors[rows] = before.cholesky[rows], before.colors[rows]
                 if before.region_ids is not None:
-                    row_ids[rows] = before.region_ids[rows]
-            start = Gaussians(means, cholesky, colors, row_ids, regions)
-            free, changed = torch.ones_like(blank[t]), torch.ones_like(is_deleted[t])
-            unused = blank[t] & (colors == 0).all(-1)
-            descent = Descent(targets[t], start, FitConfig(), free, changed)
+                    region_ids[rows] = before.region_ids[rows]
+            start = Splats(means, cholesky, colors, region_ids, filled.image(t))
+            movable, changed = torch.ones_like(deleted_rows[t]), torch.ones_like(deleted_pixels[t])
+            unused = deleted_rows[t] & (colors == 0).all(-1)
+            descent = FrameDescent(Target(images[t], FitConfig()), start, movable, changed)
             edited.append(descent.run({0: float(unused.float().mean())}))
     return stack(edited, scenes.size, scenes.metadata)
 
@@ -105,31 +103,30 @@ def move_region(scenes: Scene, region_ids: int | Iterable[int], offset: Sequence
     Raises:
         TypeError, ValueError: as :func:`delete_region`; an offset that is not two whole numbers.
     """
-    regions, ids, chosen = _check(scenes, region_ids)
+    regions, row_ids, moved_ids = _check(scenes, region_ids)
     steps = check_offset(offset)
     behind = delete_region(scenes, region_ids)
     assert behind.regions is not None
-    inside = torch.isin(ids, chosen)
-    rows, field = inside.any(0), scenes.field
+    is_moved, field = torch.isin(row_ids, moved_ids), scenes.field
+    rows = is_moved.any(0)
     means = field.means[:, rows] + field.means.new_tensor(steps)
-    colors = (field.merged_colors() * inside[..., None])[:, rows]
-    moved = GaussianField(means, field.cholesky[:, rows], colors, ids[:, rows], size=scenes.size)
-    labels = shift_labels(regions.labels, torch.isin(regions.labels, chosen), steps, behind.regions.labels)[1]
+    colors = (field.merged_colors() * is_moved[..., None])[:, rows]
+    moved = GaussianField(means, field.cholesky[:, rows], colors, row_ids[:, rows], size=scenes.size)
+    labels = shift_labels(regions.labels, torch.isin(regions.labels, moved_ids), steps, behind.regions.labels)[1]
     return Scene(join(behind.field, moved), regions.relabel(labels, "mean"), scenes.metadata)
 
 
 def _check(scenes: Scene, region_ids: int | Iterable[int]) -> tuple[RegionMap, Tensor, Tensor]:
-    """Return the maps, the ids of the rows (T, N), and the chosen ids."""
-    count, regions, ids = len(check_batch(scenes)), scenes.regions, scenes.field.region_ids
-    if regions is None or ids is None or regions.num_maps != count:
+    """Return the maps, the ids of the rows (T, N), and the ids of the argument."""
+    count, regions, row_ids = len(check_batch(scenes)), scenes.regions, scenes.field.region_ids
+    if regions is None or row_ids is None or regions.num_maps != count:
         raise ValueError("scenes must have a label map for each frame, and region ids")
-    chosen = torch.tensor(check_region_ids(region_ids, regions.ids, "maps"), device=regions.ids.device)
-    left = (~torch.isin(regions.labels, chosen)).flatten(1).any(1)
-    if not left.all():
-        raise ValueError(
-            f"region_ids must leave a region in every frame; nothing is left of frame {int(left.min(0)[1])}"
-        )
-    return regions, ids, chosen
+    ids = torch.tensor(check_region_ids(region_ids, regions.ids, "maps"), device=regions.ids.device)
+    has_others = (~torch.isin(regions.labels, ids)).flatten(1).any(1)
+    if not has_others.all():
+        frame = int(has_others.min(0)[1])
+        raise ValueError(f"region_ids must leave a region in every frame; got all regions of frame {frame}")
+    return regions, row_ids, ids
 
 
 def _background_motions(means: Tensor, background: Tensor) -> Tensor:
@@ -142,51 +139,60 @@ def _background_motions(means: Tensor, background: Tensor) -> Tensor:
         rows = background[t - 1] & background[t]
         points = [means[k][rows].double().cpu().numpy() for k in (t - 1, t)]
         model = None
-        if len(points[0]) >= _LEAST_ROWS:
+        if len(points[0]) >= _MIN_ROWS:
             model, _ = ransac(
-                points, AffineTransform, min_samples=3, residual_threshold=_LARGEST_RESIDUAL,
-                max_trials=_RANSAC_TRIALS, rng=0,
+                points, AffineTransform, min_samples=3, residual_threshold=_MAX_RESIDUAL, max_trials=_RANSAC_TRIALS,
+                rng=0,
             )  # fmt: skip
         motions.append(motions[-1] if model is None else torch.from_numpy(model.params) @ motions[-1])
     return torch.stack(motions)
 
 
-def _move(motion: Tensor, points: Tensor) -> Tensor:
+def _apply(motion: Tensor, points: Tensor) -> Tensor:
     """Apply an affine motion (3, 3) to points (N, 2)."""
     matrix = motion.to(points)
     return points @ matrix[:2, :2].T + matrix[:2, 2]
 
 
-def _fill_targets(renders: Tensor, labels: Tensor, deleted: Tensor, motions: Tensor) -> tuple[Tensor, Tensor]:
-    """Return all frames with what is deleted (T, H, W) filled, and their labels."""
-    targets, filled = renders.clone(), labels.clone()
-    holes = torch.stack([dilate(mask, _FRINGE) for mask in deleted])
-    for t in range(len(renders)):
-        unknown = holes[t].clone()
-        sources = [
-            (s, (renders[s], labels[s], holes[s])) for s in sorted(range(len(renders)), key=lambda s: abs(s - t))
-        ]
-        if t:  # as the frame before was continued
-            sources.append((t - 1, (targets[t - 1], filled[t - 1], torch.zeros_like(unknown))))
-        for s, source in sources[1:]:
-            if not unknown.any():
-                break
-            _copy((targets[t], filled[t], unknown), source, motions[s] @ motions[t].inverse())
+class _Pixels(NamedTuple):
+    """The pixels of a frame, some of them unknown."""
+
+    image: Tensor  # [C, H, W]
+    labels: Tensor  # [H, W]
+    unknown: Tensor  # [H, W] bool
+
+
+def _fill_holes(renders: Tensor, labels: Tensor, deleted: Tensor, motions: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the images and the labels of all frames with the deleted pixels (T, H, W) filled."""
+    holes = [dilate(mask, _FRINGE) for mask in deleted]
+    originals = [_Pixels(*pixels) for pixels in zip(renders, labels, holes, strict=True)]
+    filled: list[_Pixels] = []
+    for t, original in enumerate(originals):
+        pixels = _Pixels(*(plane.clone() for plane in original))
+        nearest = sorted(range(len(originals)), key=lambda s: abs(s - t))[1:]
+        sources = [(s, originals[s]) for s in nearest]
+        if t:  # pixels that no frame shows continue those of the frame before
+            sources.append((t - 1, filled[-1]))
+        for s, source in sources:
+            if pixels.unknown.any():
+                _copy(source, pixels, motions[s] @ motions[t].inverse())
+        image, new_labels, unknown = pixels
         if unknown.any():
-            targets[t], filled[t] = inpaint(targets[t], unknown), nearest_labels(filled[t], unknown)
-        filled[t] = torch.where(deleted[t], filled[t], labels[t])  # the fringe keeps its labels
-    return targets, filled
+            image, new_labels = inpaint(image, unknown), nearest_labels(new_labels, unknown)
+        new_labels = torch.where(deleted[t], new_labels, original.labels)  # the fringe keeps its labels
+        filled.append(_Pixels(image, new_labels, torch.zeros_like(unknown)))
+    return torch.stack([pixels.image for pixels in filled]), torch.stack([pixels.labels for pixels in filled])
 
 
-def _copy(frame: Frame, source: Frame, motion: Tensor) -> None:
-    """Take what is unknown in a frame, in place, from where the motion puts it in another, if that is known there."""
-    y, x = frame[2].nonzero().T
-    points = _move(motion, torch.stack([x, y], -1).to(frame[0]) + 0.5)
+def _copy(source: _Pixels, target: _Pixels, motion: Tensor) -> None:
+    """Fill unknown pixels of the target, in place, from where a motion puts them in the source, if known there."""
+    y, x = target.unknown.nonzero().T
+    points = _apply(motion, torch.stack([x, y], -1).to(target.image) + 0.5)
     cols, rows = points.floor().long().unbind(-1)
-    height, width = frame[2].shape
+    height, width = target.unknown.shape
     known = (cols >= 0) & (cols < width) & (rows >= 0) & (rows < height)
-    known &= ~source[2][rows.clamp(0, height - 1), cols.clamp(0, width - 1)]
+    known &= ~source.unknown[rows.clamp(0, height - 1), cols.clamp(0, width - 1)]
     y, x, rows, cols = y[known], x[known], rows[known], cols[known]
-    frame[0][:, y, x] = motion_at(source[0], points[known]).T
-    frame[1][y, x] = source[1][rows, cols]
-    frame[2][y, x] = False
+    target.image[:, y, x] = motion_at(source.image, points[known]).T
+    target.labels[y, x] = source.labels[rows, cols]
+    target.unknown[y, x] = False

@@ -23,26 +23,28 @@ from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
-from .descent import Descent, region_positions, squared_error, sum_over_pixels
-from .gaussians import Gaussians
+from .descent import FrameDescent
 from .motion import estimate_motion, move_labels, move_points
+from .target import Splats, Target
 
 OnFrame = Callable[[int, Scene], bool | None]
 Labels = RegionMap | Tensor | NDArray[Any]
 
-# frames per second where nothing says so
+# frames per second where `frames` does not have a rate
 _FRAME_RATE = 24.0
-# a start whose squared error is more than this share of the frame's variance is a scene cut
-_CUT = 0.5
-# iterations before which the least useful rows are relocated, and the share that is
-_RELOCATIONS = dict.fromkeys((0, 20, 40, 60), 0.05)
-# pixels change where the error about them, in a square of so many pixels, is this many times that of their fit, and a
-# level of 255 more
-_STILL = 1.02
-_SURROUNDINGS = 15
+# squared error of a start, as a share of the image's variance, from which on it is a scene cut
+_CUT_SHARE = 0.5
+# share of the movable rows that is relocated, by iteration of the descent
+_RELOCATIONS = {0: 0.05, 20: 0.05, 40: 0.05, 60: 0.05}
+# A pixel changed where the mean error about it is more than `_MAX_GROWTH` times that of its fit, plus `_LEVEL`. Lower
+# values follow faint changes, higher ones flicker less.
+_MAX_GROWTH = 1.02
+# squared error of one level of 8 bits
 _LEVEL = 255.0**-2
-# share of a Gaussian on pixels that changed from which on it may move
-_FREE_SHARE = 0.1
+# pixels: side of the square of that mean
+_WINDOW = 15
+# share of a Gaussian's weights on changed pixels from which on it may move
+_MOVABLE_SHARE = 0.1
 
 
 @torch.inference_mode(False)
@@ -61,22 +63,22 @@ def fit_video(
     r"""Fit Gaussians to the frames of a video: time is the batch.
 
     Convention: row i is the same Gaussian in every frame until it is relocated. The first frame is fitted by
-    :func:`kcgs.fit`. Every other starts from the Gaussians of the one before, which move with the image; then contours
-    move, the least useful 5 % are relocated four times, and all descend a little. What is explained as well as
-    before stands still. A row without use has colour 0. A scene cut is fitted anew, into the same rows. Regions are not
-    merged. Contours have the widths of the first frame.
-    The same arguments, device and number of threads give the same scenes, bit for bit.
+    :func:`kcgs.fit`. Every other frame starts from the Gaussians of the frame before, which move with the image. Then a
+    short descent follows, in which contours move and the least useful 5 % of the rows are relocated four times. Where
+    the error has not grown, Gaussians stand still. A row without use has colour 0. After a scene cut a frame is fitted
+    anew, into the same rows. Regions are not merged. Contours have the softness of the first frame. The same arguments,
+    device and number of threads give the same scenes, bit for bit.
 
     Args:
-        frames: T images of one size, as :func:`kcgs.fit` takes them; two are held at a time. :func:`read_video` gives
-            them, and their rate.
-        label_maps: one for each frame; or the first frame's alone, :math:`(H, W)`, which moves with the image, up to a
-            scene cut: after it there is one region. None: one region.
+        frames: T images of one size, as :func:`kcgs.fit` takes them, such as :func:`read_video` gives; two are in
+            memory at a time.
+        label_maps: one for each frame; or that of the first frame, :math:`(H, W)`, which moves with the image up to a
+            scene cut, and is one region from there. None: one region.
         num_gaussians: N, of every frame.
-        recipe: of the first frame, and of what follows a scene cut.
+        recipe: of the first frame, and of the first after a scene cut.
         seed: of the random start.
-        on_frame: called with the number of every frame, from 0, and its scene; returning True stops.
-        progress: show how many frames are done.
+        on_frame: called with the number of every frame, from 0, and its scene; returning True ends the fit.
+        progress: show the number of frames that are fitted.
         settings: fields of :class:`kcgs.FitConfig`, in place of the recipe's.
 
     Returns:
@@ -96,133 +98,131 @@ def fit_video(
         (3, 8, torch.Size([3, 3, 16, 24]))
     """
     config = FitConfig.from_recipe(recipe, **({"merge_regions": False} | settings))
-    video = _Video(config, check_count("num_gaussians", num_gaussians), seed)
+    video = _VideoFit(config, check_count("num_gaussians", num_gaussians), seed)
     length = len(frames) if isinstance(frames, Sized) else None
     with Progress("fit-video", known=length is not None, shown=progress) as bar:
-        for number, (frame, labels) in enumerate(_pairs(frames, label_maps if config.guidance else None)):
-            scene = video.add(frame, labels)
+        for number, (frame, labels) in enumerate(_pair(frames, label_maps if config.guidance else None)):
+            scene = video.fit_next(frame, labels)
             bar.update((number + 1) / (length or math.inf), f"frame {number + 1}")
             if on_frame is not None and on_frame(number, scene):
                 break
     if not video.frames:
         raise InvalidArgument("frames", "at least one frame", "none", verb="hold")
-    rate = float(getattr(frames, "frame_rate", _FRAME_RATE))
-    return stack(video.frames, scene.size, {"frame_rate": f"{rate:.10g}"})
+    frame_rate = float(getattr(frames, "frame_rate", _FRAME_RATE))
+    return stack(video.frames, scene.size, {"frame_rate": f"{frame_rate:.10g}"})
 
 
-class _Video:
-    """The frames that are done, and what the next one starts from."""
+class _VideoFit:
+    """The frames that are fitted, and the error of the last."""
 
     def __init__(self, config: FitConfig, num_gaussians: int, seed: int) -> None:
         self.config, self.num_gaussians, self.seed = config, num_gaussians, seed
-        self.frames: list[Gaussians] = []
-        self.image = torch.zeros(())
+        self.frames: list[Splats] = []
+        self.image = torch.zeros(())  # of the last frame
         self.error = torch.zeros(())  # of each pixel, (H, W), when it was last fitted
 
-    def add(self, frame: Any, labels: Labels | None) -> Scene:
-        """Fit a frame; labels None: the map before is carried on, where there is one."""
-        before = self.image
+    def fit_next(self, frame: Any, labels: Labels | None) -> Scene:
+        """Fit a frame; without labels the map of the frame before moves along, where there is one."""
+        previous = self.image
         self.image, regions = check_image_and_regions(frame, labels)
-        changed = torch.ones_like(self.image[0], dtype=torch.bool)
+        target, changed = Target(self.image, self.config), torch.ones_like(self.image[0], dtype=torch.bool)
         if not self.frames:
-            gaussians = self._fit_anew(regions)
-        elif before.shape != self.image.shape:
+            splats = self._fit_anew(regions)
+        elif previous.shape != self.image.shape:
             name = f"frame {len(self.frames)}"
-            raise InvalidArgument(name, f"shape {tuple(before.shape)}", tuple(self.image.shape), verb="have")
+            raise InvalidArgument(name, f"shape {tuple(previous.shape)}", tuple(self.image.shape), verb="have")
         else:
-            with threads_for_kernels(before[0].numel()):
-                gaussians, changed = self._follow(before, regions)
-        self.frames.append(gaussians)
-        self.error = torch.where(changed, squared_error(gaussians, self.image, self.config), self.error)
-        return gaussians.scene((self.image.shape[1], self.image.shape[2]))
+            with threads_for_kernels(previous[0].numel()):
+                splats, changed = self._follow(target, estimate_motion(previous, self.image), regions)
+        self.frames.append(splats)
+        self.error = torch.where(changed, target.squared_error(splats), self.error)
+        return splats.scene(target.size)
 
-    def _fit_anew(self, regions: RegionMap | None) -> Gaussians:
+    def _fit_anew(self, regions: RegionMap | None) -> Splats:
         """Fit a frame by itself; rows that it leaves unused have colour 0."""
         config = self.config
-        if self.frames:  # contours have the widths of the first frame
+        if self.frames:  # contours have the softness of the first frame
             config = config.model_copy(update={"softness": 0.0})
         scene = fit(self.image, regions, self.num_gaussians, recipe=config, seed=self.seed).scene
-        field, missing = scene.field, self.num_gaussians - scene.num_gaussians
-        means, cholesky = (pad(t.detach(), (0, 0, 0, missing), value=1.0) for t in (field.means, field.cholesky))
-        colors = pad(field.merged_colors().detach(), (0, 0, 0, missing))
-        regions = scene.regions or regions  # a fit leaves out a map of one region
+        means, cholesky, colors, fitted_ids, _ = Splats.of(scene)
+        unused = (0, 0, 0, self.num_gaussians - scene.num_gaussians)
+        means, cholesky, colors = pad(means, unused, value=1.0), pad(cholesky, unused, value=1.0), pad(colors, unused)
+        regions = scene.regions or regions  # a fit removes a map of one region
         if regions is None:
-            return Gaussians(means, cholesky, colors, None, None)
-        ids = regions.ids[:1].expand(self.num_gaussians).clone()
-        if field.region_ids is not None:
-            ids[: len(field.region_ids)] = field.region_ids
-        return Gaussians(means, cholesky, colors, ids, regions)
+            return Splats(means, cholesky, colors, None, None)
+        region_ids = regions.ids[:1].expand(self.num_gaussians).clone()
+        if fitted_ids is not None:
+            region_ids[: len(fitted_ids)] = fitted_ids
+        return Splats(means, cholesky, colors, region_ids, regions)
 
-    def _follow(self, previous: Tensor, regions: RegionMap | None) -> tuple[Gaussians, Tensor]:
-        """Return a frame, fitted from the one before, and which pixels changed."""
-        image, first, before = self.image, self.frames[0].regions, self.frames[-1].regions
-        motion, is_carried = estimate_motion(previous, image), regions is None
+    def _follow(self, target: Target, motion: Tensor, regions: RegionMap | None) -> tuple[Splats, Tensor]:
+        """Return a frame, fitted from the one before, and the mask of the pixels that changed."""
+        first, before, is_moved = self.frames[0].regions, self.frames[-1].regions, regions is None
         if first is not None and before is not None:
             labels = move_labels(motion, before.labels) if regions is None else regions.labels
             regions = first.relabel(labels, "mean")
-        start, free, changed = self._choose_start(motion, regions)
-        descent = Descent(image, start, self.config, free, changed)
-        if descent.error() > _CUT * float(image.var((1, 2)).mean()):
-            if is_carried and regions is not None:
+        start, movable, changed = self._start(target, motion, regions)
+        if float(target.squared_error(start).mean()) > _CUT_SHARE * float(target.image.var((1, 2)).mean()):
+            if is_moved and regions is not None:
                 regions = regions.relabel(regions.labels.flatten().mode()[0].expand(regions.size))
             return self._fit_anew(regions), torch.ones_like(changed)
         if changed.any():
-            start = descent.run(_RELOCATIONS, None if regions is None else regions.labels)
+            anchor = None if regions is None else regions.labels
+            start = FrameDescent(target, start, movable, changed).run(_RELOCATIONS, anchor)
         return start, changed
 
-    def _choose_start(self, motion: Tensor, regions: RegionMap | None) -> tuple[Gaussians, Tensor, Tensor]:
-        """Return the Gaussians before, moved, which of them may move, and which pixels changed.
+    def _start(self, target: Target, motion: Tensor, regions: RegionMap | None) -> tuple[Splats, Tensor, Tensor]:
+        """Return the Gaussians before, moved, the mask of those that may move, and that of the pixels that changed.
 
         A pixel changed if the Gaussians, without motion, explain its surroundings less well than when they were fitted.
         """
-        means, cholesky, colors, ids, _ = self.frames[-1]
-        if regions is not None and ids is not None:  # rows of a region that is no longer there have no use
-            present = torch.isin(ids, regions.ids)
-            ids, colors = torch.where(present, ids, regions.ids[0]), torch.where(present[:, None], colors, 0.0)
-        unmoved = Gaussians(means, cholesky, colors, ids, regions)
-        error = squared_error(unmoved, self.image, self.config)
-        changed = _blur(error) > _STILL * _blur(self.error) + _LEVEL
-        _, sums = sum_over_pixels(unmoved, self.image, self.config)
-        free = sums(changed[None].to(motion)) >= _FREE_SHARE * sums(torch.ones_like(motion[:1]))
-        means = torch.where(free[:, None], _move_by_region(motion, unmoved), means)
-        return unmoved._replace(means=means), free, changed
+        means, cholesky, colors, region_ids, _ = self.frames[-1]
+        if regions is not None and region_ids is not None:  # rows of a region that is gone have no use
+            is_present = torch.isin(region_ids, regions.ids)
+            region_ids = torch.where(is_present, region_ids, regions.ids[0])
+            colors = torch.where(is_present[:, None], colors, 0.0)
+        still = Splats(means, cholesky, colors, region_ids, regions)
+        changed = _local_mean(target.squared_error(still)) > _MAX_GROWTH * _local_mean(self.error) + _LEVEL
+        _, sums = target.weight_sums(still)
+        movable = sums(changed[None].to(motion)) >= _MOVABLE_SHARE * sums(torch.ones_like(motion[:1]))
+        means = torch.where(movable[:, None], _move_means(motion, still), means)
+        return still._replace(means=means), movable, changed
 
 
-def stack(frames: list[Gaussians], size: tuple[int, int], metadata: Mapping[str, str]) -> Scene:
-    """Put the Gaussians and the maps of all frames into one scene."""
+def _local_mean(error: Tensor) -> Tensor:
+    return avg_pool2d(error[None], _WINDOW, 1, _WINDOW // 2, count_include_pad=False)[0]
+
+
+def _move_means(motion: Tensor, splats: Splats) -> Tensor:
+    """Move centres along a motion; a centre that would leave its region moves as the region does on average."""
+    moved, regions = move_points(motion, splats.means), splats.regions
+    if regions is None or splats.region_ids is None:
+        return moved
+    pixels = regions.index_of(regions.labels).flatten()
+    sums = torch.stack([pixels.bincount(offsets.flatten()) for offsets in motion], -1)
+    mean = sums / pixels.bincount()[:, None]
+    inside = lookup_regions(moved, regions.labels) == splats.region_ids
+    return torch.where(inside[:, None], moved, splats.means - mean[splats.region_index].to(moved))
+
+
+def stack(frames: list[Splats], size: tuple[int, int], metadata: Mapping[str, str]) -> Scene:
+    """Return the Gaussians and the maps of all frames as one scene."""
     means, cholesky, colors = (torch.stack(parts) for parts in zip(*(frame[:3] for frame in frames), strict=True))
     maps = [frame.regions for frame in frames if frame.regions is not None]
     if not maps:
         return Scene(GaussianField(means, cholesky, colors, size=size), None, metadata)
-    ids = torch.stack([frame.region_ids for frame in frames if frame.region_ids is not None])
-    # the same pair has the same width in all frames
-    widths: dict[tuple[int, int], float] = {}
+    region_ids = torch.stack([frame.region_ids for frame in frames if frame.region_ids is not None])
+    # a pair of regions has the same softness in all frames
+    softness: dict[tuple[int, int], float] = {}
     for regions in maps:
-        widths |= regions.softness if isinstance(regions.softness, Mapping) else {}
+        softness |= regions.softness if isinstance(regions.softness, Mapping) else {}
     labels = torch.stack([regions.labels for regions in maps])
-    stacked = RegionMap.from_labels(labels, widths or maps[0].softness)
-    return Scene(GaussianField(means, cholesky, colors, ids, size=size), stacked, metadata)
+    regions = RegionMap.from_labels(labels, softness or maps[0].softness)
+    return Scene(GaussianField(means, cholesky, colors, region_ids, size=size), regions, metadata)
 
 
-def _blur(error: Tensor) -> Tensor:
-    return avg_pool2d(error[None], _SURROUNDINGS, 1, _SURROUNDINGS // 2, count_include_pad=False)[0]
-
-
-def _move_by_region(motion: Tensor, gaussians: Gaussians) -> Tensor:
-    """Move centres along a motion; those that would leave their region go as the region does on the mean."""
-    means, _, _, ids, regions = gaussians
-    moved = move_points(motion, means)
-    if regions is None or ids is None:
-        return moved
-    rows, pixels = region_positions(gaussians, motion)
-    sums = [pixels.flatten().bincount(part.flatten()) for part in motion]
-    mean = torch.stack(sums, -1) / pixels.flatten().bincount()[:, None]
-    inside = lookup_regions(moved, regions.labels) == ids
-    return torch.where(inside[:, None], moved, means - mean[rows].to(means))
-
-
-def _pairs(frames: Iterable[Any], label_maps: Labels | Iterable[Labels] | None) -> Iterator[tuple[Any, Labels | None]]:
-    """Yield each frame with its label map; a map of the first alone, and None, are followed by None."""
+def _pair(frames: Iterable[Any], label_maps: Labels | Iterable[Labels] | None) -> Iterator[tuple[Any, Labels | None]]:
+    """Yield each frame with its label map; with None after a single map, or if there is none."""
     maps: Iterator[Labels | None]
     if label_maps is None:
         maps = repeat(None)

@@ -37,8 +37,8 @@ def motion_at(motion: Tensor, points: Tensor) -> Tensor:
     """Sample a motion (2, H, W) at points (N, 2), bilinearly; beyond the image it is that of the border."""
     height, width = motion.shape[1:]
     grid = points / points.new_tensor([width, height]) * 2 - 1
-    found = grid_sample(motion[None], grid[None, None].to(motion), padding_mode="border", align_corners=False)
-    return found[0, :, 0].T.to(points)
+    sampled = grid_sample(motion[None], grid[None, None].to(motion), padding_mode="border", align_corners=False)
+    return sampled[0, :, 0].T.to(points)
 
 
 def move_points(motion: Tensor, points: Tensor) -> Tensor:

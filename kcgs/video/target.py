@@ -1,0 +1,79 @@
+"""The Gaussians of a frame as plain tensors, and the image that they are to show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcgs.fitting import FitConfig
+from kcgs.functional import RegionMap, region_splat
+from kcgs.nn import GaussianField
+from kcgs.scene import Scene
+
+# weights that renders skip, unless the config skips more
+_CUTOFF = 1e-3
+
+
+class Splats(NamedTuple):
+    """The arguments of :func:`kcgs.functional.region_splat` for one frame."""
+
+    means: Tensor  # [N, 2]
+    cholesky: Tensor  # [N, 3]
+    colors: Tensor  # [N, C]
+    region_ids: Tensor | None  # [N]
+    regions: RegionMap | None
+
+    @classmethod
+    def of(cls, scene: Scene) -> Splats:
+        """Copy a scene, without its graph."""
+        field = scene.field
+        means, cholesky, colors = (t.detach().clone() for t in (field.means, field.cholesky, field.merged_colors()))
+        return cls(means, cholesky, colors, field.region_ids, scene.regions)
+
+    @property
+    def region_index(self) -> Tensor:
+        """The region of each Gaussian, (N,), as a position in the map's ids; 0 without a map."""
+        if self.regions is None or self.region_ids is None:
+            return torch.zeros_like(self.means[:, 0], dtype=torch.int64)
+        return self.regions.index_of(self.region_ids)
+
+    def scene(self, size: tuple[int, int]) -> Scene:
+        """Return a scene of them."""
+        return Scene(GaussianField(*self[:4], size=size), self.regions)
+
+
+@dataclass(frozen=True)
+class Target:
+    """An image that Gaussians are to show, and the settings of the fit."""
+
+    image: Tensor  # [C, H, W]
+    config: FitConfig
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width)."""
+        return self.image.shape[1], self.image.shape[2]
+
+    def render(self, splats: Splats) -> Tensor:
+        """Render (C, H, W), with the cutoff of a draft."""
+        cutoff = max(self.config.cutoff, _CUTOFF)
+        return region_splat(*splats, size=self.size, cutoff=cutoff, backend=self.config.backend)
+
+    def squared_error(self, splats: Splats) -> Tensor:
+        """Return the squared error of each pixel, (H, W), channels averaged."""
+        return (self.render(splats) - self.image).square().mean(0)
+
+    def weight_sums(self, splats: Splats) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+        """Return the sum of all weights at each pixel, (1, H, W), and a function that sums such a map per Gaussian.
+
+        The function weighs each pixel by the weight of the Gaussian there and returns (N,).
+        """
+        ones = torch.ones_like(splats.colors[:, :1]).requires_grad_()
+        with torch.enable_grad():
+            total = self.render(splats._replace(colors=ones))
+        # the render is linear in the colours, so its gradient by them has the sums
+        return total.detach(), lambda values: torch.autograd.grad(total, ones, values, retain_graph=True)[0][:, 0]
