@@ -1,6 +1,17 @@
-"""Ways to evaluate the splat and its gradient; private: call `kcgs.functional.region_splat`."""
+"""Ways to evaluate the splat and its gradient; private: call `kcgs.functional.region_splat`.
 
-from .inputs import OutOfRangeError, SplatInputs, Steps, with_autograd
+From the name of a backend to its innermost loop: `registry`, then one of four kernels.
+
+- `reference`: the sum as it is written.
+- `tiled`: `pairs` of Gaussians and tiles, matrix products.
+- `cuda`: `pairs`, Triton's programs.
+- `cpu`: its own `lists`, numba's loops, vector code.
+
+All take the inputs of `interface`, with a `membership`, perhaps `resampled`, and share `whitened` coordinates. All but
+`reference` share `tiles` and `coarse_grids`; `splines` join these for tiled and cuda.
+"""
+
+from .interface import OutOfRangeError, SplatInputs, Steps, with_autograd
 from .membership import Membership
 from .registry import BACKENDS, check_backend, prepare, resolve
 from .resampled import Crisp, Resampled

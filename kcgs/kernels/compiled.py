@@ -95,18 +95,18 @@ def _make_cache(function: Callable[..., Any], folder: Path | None, announce: Cal
             return "0"
 
     class Implementation(caching.CompileResultCacheImpl):
-        _locator_classes = (Locator,)
+        _locator_classes: Any = (Locator,)
 
     class Cache(caching.FunctionCache):
         _impl_class = Implementation
 
         def load_overload(self, signature: Any, context: Any) -> Any:
-            loaded = super().load_overload(signature, context)
-            if loaded is None:
+            overload = super().load_overload(signature, context)  # type: ignore[no-untyped-call]
+            if overload is None:
                 announce()
-            return loaded
+            return overload
 
-    cache = Cache(function)
+    cache: Any = cast(Any, Cache)(function)
     if folder is None:
         cache.disable()
     return cache

@@ -1,4 +1,4 @@
-"""The splat in Triton, in float32: a program renders a tile of pixels or nodes, or differentiates a piece of its list.
+"""The kernel `cuda`: Triton, float32; a program renders a tile of pixels or nodes, or differentiates part of its list.
 
 Forward, a thread owns pixels and walks the tile's Gaussians; backward, it owns a Gaussian and walks the tile's pixels.
 Every sum has one owner: no atomics, and the same bits every time.
@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .bins import Bins, bin_gaussians, colors_of, to_gradients
-from .inputs import Gradients, SplatInputs, Steps
-from .nodes import gather, sample
+from .interface import Gradients, SplatInputs, Steps
+from .pairs import Pairs, colors_of, gradients_of, list_pairs
+from .splines import gather, sample
 from .tiles import TILE, expand_runs, grid_of, join_tiles, split_into_tiles, sum_runs
 
 try:
@@ -22,20 +22,22 @@ try:
 except ImportError:  # steps() raises
     triton = None
 
+# sums of v (z1, z2, z1 z1, z1 z2, z2 z2), see whitened.sums_to_gradients
 _MOMENTS = 5
-# channels that a thread holds at once
-_MOST_CHANNELS = 8
+# channels that a thread holds at once; more would spill registers
+_MAX_CHANNELS = 8
 # Gaussians of a program of the backward, one for each thread of its one warp
 _PIECE = 32
+# of a program of the forward, 128 threads with two pixels each
 _RENDER_WARPS = 4
-# multiply and add in one: Triton 3.9 warns where it is not said, and 3.10 will leave it out
+# multiply and add in one: Triton 3.9 warns where it is not set, and 3.10 will leave it out
 _OPTIONS = {"enable_fp_fusion": True}
 
 
 class _Plan(NamedTuple):
-    """Pairs in the order of their tiles, and where the list of each tile starts."""
+    """The pairs in the order of their tiles, and where the list of each tile starts."""
 
-    bins: Bins
+    pairs: Pairs
     start: Tensor  # [tiles + 1] int64
     masks: Tensor | None  # [K, 256] float32
     order: Tensor  # [P] int64, the pair's place in the order of the Gaussians
@@ -60,49 +62,49 @@ def _interpreted() -> bool:
 
 
 def _make_plan(inputs: SplatInputs) -> _Plan:
-    bins = bin_gaussians(inputs)
-    order = torch.argsort(bins.tile, stable=True)
-    counts = _starts(bins.gaussian, inputs.means.shape[0] * inputs.means.shape[1]).diff()
+    pairs = list_pairs(inputs)
+    order = torch.argsort(pairs.tile, stable=True)
+    counts = _starts(pairs.gaussian, inputs.means.shape[0] * inputs.means.shape[1]).diff()
     mask, masks = None, None
-    if bins.mask is not None and inputs.membership is not None:
-        mask, masks = bins.mask[order], inputs.membership.derived("cuda", lambda m: m.tiles(TILE).masks.float())
-    gaussian, tile, frame = bins.gaussian[order], bins.tile[order], bins.coefficients[order]
-    bins = bins._replace(gaussian=gaussian, tile=tile, mask=mask, coefficients=frame)
-    return _Plan(bins, _starts(tile, bins.total), masks, order, counts)
+    if pairs.mask is not None and inputs.membership is not None:
+        mask, masks = pairs.mask[order], inputs.membership.derived("cuda", lambda m: m.tiles(TILE).masks.float())
+    gaussian, tile, affine = pairs.gaussian[order], pairs.tile[order], pairs.coefficients[order]
+    pairs = pairs._replace(gaussian=gaussian, tile=tile, mask=mask, coefficients=affine)
+    return _Plan(pairs, _starts(tile, pairs.num_tiles), masks, order, counts)
 
 
-def _starts(values: Tensor, total: int) -> Tensor:
-    """Where each of 0 ... total - 1, and the end, starts in sorted `values`."""
-    return torch.searchsorted(values, torch.arange(total + 1, device=values.device))
+def _starts(values: Tensor, count: int) -> Tensor:
+    """Return where each of 0 ... count - 1 starts in sorted `values`, and the end."""
+    return torch.searchsorted(values, torch.arange(count + 1, device=values.device))
 
 
 def _lists(plan: _Plan, inputs: SplatInputs) -> tuple[Any, ...]:
-    bins = plan.bins
+    pairs = plan.pairs
     # where there are no maps, any address will do: it is not read
-    mask = bins.gaussian if bins.mask is None else bins.mask
-    masks = bins.coefficients if plan.masks is None else plan.masks
-    return plan.start, bins.coefficients, bins.gaussian, mask, masks, inputs.cutoff
+    mask = pairs.gaussian if pairs.mask is None else pairs.mask
+    masks = pairs.coefficients if plan.masks is None else plan.masks
+    return plan.start, pairs.coefficients, pairs.gaussian, mask, masks, inputs.cutoff
 
 
 def _constants(plan: _Plan, inputs: SplatInputs) -> dict[str, Any]:
     channels = inputs.colors.shape[-1]
-    block = min(_MOST_CHANNELS, 1 << (channels - 1).bit_length())
-    return {"SIDE": TILE, "CHANNELS": channels, "BLOCK": block, "MAPPED": plan.bins.mask is not None}
+    block = min(_MAX_CHANNELS, 1 << (channels - 1).bit_length())
+    return {"SIDE": TILE, "CHANNELS": channels, "BLOCK": block, "MAPPED": plan.pairs.mask is not None}
 
 
 def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
-    grid, channels, bins = grid_of(inputs), inputs.colors.shape[-1], plan.bins
+    grid, channels, pairs = grid_of(inputs), inputs.colors.shape[-1], plan.pairs
     image = inputs.colors.new_empty(grid.batch, channels, *inputs.size)
-    nodes = image.new_empty(bins.total - grid.total, channels, TILE, TILE)
-    colors = colors_of(bins, inputs).contiguous()
+    nodes = image.new_empty(pairs.num_tiles - grid.total, channels, TILE, TILE)
+    colors = colors_of(pairs, inputs).contiguous()
     arguments = image, nodes, colors, grid.total, grid.rows, grid.cols, *inputs.size
     constants = _constants(plan, inputs)
-    programs = bins.total, -(-channels // constants["BLOCK"])
+    programs = pairs.num_tiles, -(-channels // constants["BLOCK"])
     with torch.cuda.device_of(image):
         _render_tile[programs](*arguments, *_lists(plan, inputs), **constants, num_warps=_RENDER_WARPS, **_OPTIONS)
-    if bins.wide is not None:
+    if pairs.wide is not None:
         tiles = image.new_zeros(grid.total, channels, TILE, TILE)
-        sample(nodes, bins.wide.nodes, plan.masks, tiles)
+        sample(nodes, pairs.wide.nodes, plan.masks, tiles)
         image += join_tiles(tiles.unflatten(0, grid), inputs.size)
     return image
 
@@ -117,16 +119,16 @@ def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: boo
     tile, piece = expand_runs((plan.start.diff() + _PIECE - 1) // _PIECE)
     first = plan.start[tile] + piece * _PIECE
     by_tile = split_into_tiles(grad).flatten(0, 2)
-    if plan.bins.wide is not None:
-        by_tile = torch.cat([by_tile, gather(by_tile, plan.bins.wide.nodes, plan.masks)])
+    if plan.pairs.wide is not None:
+        by_tile = torch.cat([by_tile, gather(by_tile, plan.pairs.wide.nodes, plan.masks)])
     by_tile = by_tile.permute(0, 2, 3, 1).contiguous()
     # channels first, so that the compiler gives whole Gaussians to threads
-    colors = colors_of(plan.bins, inputs).T.contiguous()
+    colors = colors_of(plan.pairs, inputs).T.contiguous()
     arguments = terms, plan.order, tile, first, by_tile, colors, colors.shape[1]
     constants = {**_constants(plan, inputs), "GEOMETRY": geometry, "PIECE": _PIECE}
     with torch.cuda.device_of(terms):
         _gather_piece[(len(tile),)](*arguments, *_lists(plan, inputs), **constants, num_warps=1, **_OPTIONS)
-    return to_gradients(plan.bins, inputs, sum_runs(terms, plan.counts))
+    return gradients_of(plan.pairs, inputs, sum_runs(terms, plan.counts))
 
 
 def _jit(function: Any) -> Any:
@@ -143,7 +145,8 @@ def _weigh(k0, k1, k2, k3, k4, x, y, cutoff):  # type: ignore[no-untyped-def]
 
 @_jit
 def _render_tile(  # type: ignore[no-untyped-def]
-    image, nodes, colors, pixel_tiles, rows, cols, height, width, start, coefficients, gaussian, mask_of, masks, cutoff,
+    image, nodes, colors, pixel_tiles, rows, cols, height, width,
+    start, coefficients, gaussian, mask_rows, masks, cutoff,
     SIDE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr, MAPPED: tl.constexpr,
 ):  # fmt: skip
     tile = tl.program_id(0).to(tl.int64)
@@ -156,26 +159,26 @@ def _render_tile(  # type: ignore[no-untyped-def]
         k = coefficients + 5 * i
         _, _, weight = _weigh(tl.load(k), tl.load(k + 1), tl.load(k + 2), tl.load(k + 3), tl.load(k + 4), x, y, cutoff)
         if MAPPED:
-            which_mask = tl.load(mask_of + i)
-            if which_mask >= 0:
-                weight *= tl.load(masks + which_mask * (SIDE * SIDE) + pixel)
+            mask_row = tl.load(mask_rows + i)
+            if mask_row >= 0:
+                weight *= tl.load(masks + mask_row * (SIDE * SIDE) + pixel)
         color = tl.load(colors + tl.load(gaussian + i) * CHANNELS + channel, mask=channel < CHANNELS, other=0.0)
         value += color * weight[None, :]
 
     if tile < pixel_tiles:
         batch, local = tile // (rows * cols), tile % (rows * cols)
         down, across = row + local // cols * SIDE, column + local % cols * SIDE
-        at = ((batch * CHANNELS + channel) * height + down[None, :]) * width + across[None, :]
+        address = ((batch * CHANNELS + channel) * height + down[None, :]) * width + across[None, :]
         inside = (down < height) & (across < width)
-        tl.store(image + at, value, mask=(channel < CHANNELS) & inside[None, :])
+        tl.store(image + address, value, mask=(channel < CHANNELS) & inside[None, :])
     else:
-        at = ((tile - pixel_tiles) * CHANNELS + channel) * (SIDE * SIDE) + pixel[None, :]
-        tl.store(nodes + at, value, mask=channel < CHANNELS)
+        address = ((tile - pixel_tiles) * CHANNELS + channel) * (SIDE * SIDE) + pixel[None, :]
+        tl.store(nodes + address, value, mask=channel < CHANNELS)
 
 
 @_jit
 def _gather_piece(  # type: ignore[no-untyped-def]
-    terms, order, tiles, firsts, grad, colors, count, start, coefficients, gaussian, mask_of, masks, cutoff,
+    terms, order, tiles, firsts, grad, colors, count, start, coefficients, gaussian, mask_rows, masks, cutoff,
     SIDE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr, MAPPED: tl.constexpr, GEOMETRY: tl.constexpr,
     PIECE: tl.constexpr,
 ):  # fmt: skip
@@ -186,26 +189,28 @@ def _gather_piece(  # type: ignore[no-untyped-def]
     k0, k1 = tl.load(k, mask=valid, other=0.0), tl.load(k + 1, mask=valid, other=0.0)
     k2, k3 = tl.load(k + 2, mask=valid, other=0.0), tl.load(k + 3, mask=valid, other=0.0)
     k4 = tl.load(k + 4, mask=valid, other=0.0)
-    which = tl.load(gaussian + entry, mask=valid, other=0)
+    member = tl.load(gaussian + entry, mask=valid, other=0)
     if MAPPED:
-        which_mask = tl.load(mask_of + entry, mask=valid, other=-1)
+        mask_row = tl.load(mask_rows + entry, mask=valid, other=-1)
 
     width: tl.constexpr = CHANNELS + (5 if GEOMETRY else 0)
-    at = terms + tl.load(order + entry, mask=valid, other=0) * width
+    target = terms + tl.load(order + entry, mask=valid, other=0) * width
     zero = tl.zeros([PIECE], tl.float32)
     s1, s2, s11, s12, s22 = zero, zero, zero, zero, zero
     for base in range(0, CHANNELS, BLOCK):
         channel = base + tl.arange(0, BLOCK)[:, None]
-        known = channel < CHANNELS
-        color = tl.load(colors + channel.to(tl.int64) * count + which[None, :], mask=known & valid[None, :], other=0.0)
+        in_range = channel < CHANNELS
+        color = tl.load(
+            colors + channel.to(tl.int64) * count + member[None, :], mask=in_range & valid[None, :], other=0.0
+        )
         sums = tl.zeros([BLOCK, PIECE], tl.float32)
         for row in range(SIDE):
             for column in range(SIDE):
                 z1, z2, weight = _weigh(k0, k1, k2, k3, k4, column - (SIDE - 1) / 2, row - (SIDE - 1) / 2, cutoff)
                 pixel = row * SIDE + column
                 if MAPPED:
-                    weight *= tl.load(masks + which_mask * (SIDE * SIDE) + pixel, mask=which_mask >= 0, other=1.0)
-                local = tl.load(grad + (tile * (SIDE * SIDE) + pixel) * CHANNELS + channel, mask=known, other=0.0)
+                    weight *= tl.load(masks + mask_row * (SIDE * SIDE) + pixel, mask=mask_row >= 0, other=1.0)
+                local = tl.load(grad + (tile * (SIDE * SIDE) + pixel) * CHANNELS + channel, mask=in_range, other=0.0)
                 sums += local * weight[None, :]
                 if GEOMETRY:
                     first = tl.sum(local * color, axis=0) * weight
@@ -216,10 +221,10 @@ def _gather_piece(  # type: ignore[no-untyped-def]
                     s11 += first * z1
                     s12 += first * z2
                     s22 += second * z2
-        tl.store(at[None, :] + channel, sums, mask=known & valid[None, :])
+        tl.store(target[None, :] + channel, sums, mask=in_range & valid[None, :])
     if GEOMETRY:
-        tl.store(at + CHANNELS, s1, mask=valid)
-        tl.store(at + CHANNELS + 1, s2, mask=valid)
-        tl.store(at + CHANNELS + 2, s11, mask=valid)
-        tl.store(at + CHANNELS + 3, s12, mask=valid)
-        tl.store(at + CHANNELS + 4, s22, mask=valid)
+        tl.store(target + CHANNELS, s1, mask=valid)
+        tl.store(target + CHANNELS + 1, s2, mask=valid)
+        tl.store(target + CHANNELS + 2, s11, mask=valid)
+        tl.store(target + CHANNELS + 3, s12, mask=valid)
+        tl.store(target + CHANNELS + 4, s22, mask=valid)

@@ -1,6 +1,6 @@
-"""How much of each pixel belongs to each region: the region weights s_r(x, y).
+"""Membership s_r(x, y) of pixels in regions: its definition, and tables of tiles for the kernels.
 
-`RegionMap` defines them. A tile deep inside a region has s_r = 1 everywhere and is stored as nothing but its label.
+`RegionMap` makes it, and documents the blur. A tile deep inside a region has s_r = 1 everywhere: it stores its label.
 """
 
 from __future__ import annotations
@@ -15,19 +15,21 @@ from torch import Tensor
 
 T = TypeVar("T")
 
+# reach of a contour, in widths: the blur's kernel is cut there
 RADIUS_SIGMAS = 4.0
-_PATCH_ELEMENTS = 1 << 22
+# pixels of windows that are blurred at once: 32 MiB in float64
+_CHUNK_PIXELS = 1 << 22
 
 
 class TileMembership(NamedTuple):
-    """Which regions occur in which tile, and their weights where a tile holds several.
+    """Which regions occur in which tile, and the membership of its pixels where a tile holds several.
 
     Tiles are numbered in raster order, batch first: (b * tiles_y + ty) * tiles_x + tx.
     """
 
     keys: Tensor  # [K] int64, sorted: tile * num_regions + region
     mask: Tensor  # [K] int64, row of `masks`, -1 where the region is alone in its tile
-    masks: Tensor  # [P, tile * tile], the weights: bool (hard contours) or float64
+    masks: Tensor  # [P, tile * tile], the membership: bool (hard contours) or float64
 
     @classmethod
     def assemble(cls, single: Tensor, keys: Tensor, masks: Tensor) -> TileMembership:
@@ -38,14 +40,14 @@ class TileMembership(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """The widths that occur, and which of them each pixel has."""
+    """The widths of contours, and the one of each pixel."""
 
     widths: tuple[float, ...]  # pixels, ascending
-    of: Tensor | None  # [B, H, W] int32, position in `widths`; None: one width everywhere
+    level: Tensor | None  # [B, H, W] int32, position in `widths`; None: one width everywhere
 
 
 class Membership:
-    """Compact label map and contour widths, with the tables the kernels need, made once and kept."""
+    """A label map and its contour widths, with tables for the kernels, made once and kept."""
 
     def __init__(
         self,
@@ -63,8 +65,7 @@ class Membership:
         self._derived: dict[object, Any] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        # Tables stay behind: torch moves tensors that it sends to another process, from under the arrays that share
-        # their memory.
+        # without tables: torch moves the memory of tensors that it sends to another process, which arrays may share
         return {**vars(self), "_derived": {}}
 
     @property
@@ -78,7 +79,7 @@ class Membership:
         return math.ceil(RADIUS_SIGMAS * self.levels.widths[-1])
 
     def to(self, device: torch.device) -> Membership:
-        """Return the same membership on `device`, tables not carried along."""
+        """Return the same membership on `device`, without tables."""
         return Membership(self.index.to(device), self.num_regions, self.softness)
 
     def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
@@ -95,37 +96,37 @@ class Membership:
         if width == 0.0:
             return inside
         axes = [torch.arange(n, device=inside.device) for n in inside.shape]
-        rows, cols = (self._weights_at(axis[:, None] - axis[None, :], width) for axis in axes)
+        rows, cols = (self._gaussian(axis[:, None] - axis[None, :], width) for axis in axes)
         total = rows.sum(1)[:, None] * cols.sum(1)[None, :]
         return (rows @ inside @ cols.T) / total
 
     def _reach(self, width: float) -> int:
         return math.ceil(RADIUS_SIGMAS * width)
 
-    def _weights_at(self, offset: Tensor, width: float) -> Tensor:
+    def _gaussian(self, offset: Tensor, width: float) -> Tensor:
         distance = offset.abs().to(torch.float64)
         gaussian = torch.exp(-0.5 * (distance / width) ** 2)
         return torch.where(distance <= self._reach(width), gaussian, 0.0)
 
     def tiles(self, tile: int) -> TileMembership:
-        """Tables for square tiles of `tile` pixels."""
+        """Return the tables for square tiles of `tile` pixels."""
         return self.derived(("tiles", tile), lambda _: self._build_tiles(tile))
 
     def whole(self, batch: int, region: int, tile: int = 16) -> Tensor:
-        """Put s_r of one region together from the tables of tiles, (H, W) float64."""
+        """Assemble s_r of one region from the tables of tiles, (H, W) float64."""
         (maps, height, width), table = self.index.shape, self.tiles(tile)
         rows, cols = -(-height // tile), -(-width // tile)
-        mine = (table.keys % self.num_regions == region).nonzero().flatten()
-        tiles, mask = table.keys[mine] // self.num_regions, table.mask[mine]
-        found = torch.zeros(maps * rows * cols, tile * tile, dtype=torch.float64, device=self.index.device)
-        found[tiles] = 1.0
-        several = mask >= 0
-        found[tiles[several]] = table.masks[mask[several]].double()
-        image = found.view(maps, rows, cols, tile, tile)[batch].transpose(1, 2).reshape(rows * tile, cols * tile)
+        entries = (table.keys % self.num_regions == region).nonzero().flatten()
+        tiles, mask = table.keys[entries] // self.num_regions, table.mask[entries]
+        weights = torch.zeros(maps * rows * cols, tile * tile, dtype=torch.float64, device=self.index.device)
+        weights[tiles] = 1.0
+        is_mixed = mask >= 0
+        weights[tiles[is_mixed]] = table.masks[mask[is_mixed]].double()
+        image = weights.view(maps, rows, cols, tile, tile)[batch].transpose(1, 2).reshape(rows * tile, cols * tile)
         return image[:height, :width]
 
     def derived(self, key: object, build: Callable[[Membership], T]) -> T:
-        """Return what `build` makes of this membership, made once and kept."""
+        """Return build(self), evaluated once for each key."""
         if key not in self._derived:
             self._derived[key] = build(self)
         value: T = self._derived[key]
@@ -137,16 +138,16 @@ class Membership:
         counts = (maps, -(-height // tile), -(-width // tile))
         place = torch.cartesian_prod(*[torch.arange(n, device=self.index.device) for n in counts])
         place[:, 1:] *= tile
-        # what a tile sees is what its widest contour reaches
+        # the widest contour of a tile decides how far its pixels see
         widest = torch.zeros(len(place), device=place.device)
         if level is not None:
             widest = torch.nn.functional.max_pool2d(level.float(), tile, ceil_mode=True).flatten()
-        found = []
+        lists = []
         for position, contour in enumerate(widths):
             tiles = (widest == position).nonzero().flatten()
             batch, row, col = place[tiles].unbind(1)
-            found.append(self.list_keys(tiles, (batch, row, col), (tile, tile), self._reach(contour)))
-        single, keys = (torch.cat(parts) for parts in zip(*found, strict=True))
+            lists.append(self.list_keys(tiles, (batch, row, col), (tile, tile), self._reach(contour)))
+        single, keys = (torch.cat(parts) for parts in zip(*lists, strict=True))
         keys = keys.sort().values
         batch, row, col = place[keys // self.num_regions].unbind(1)
         masks = self.window_weights(batch, keys % self.num_regions, row, col, (tile, tile)).flatten(1)
@@ -155,30 +156,34 @@ class Membership:
     def list_keys(
         self, tiles: Tensor, place: tuple[Tensor, ...], sides: Sequence[int], reach: int
     ) -> tuple[Tensor, Tensor]:
-        """List tile * num_regions + region of tiles that see one region, and, sorted, of those that see several.
+        """List keys, tile * num_regions + region, of tiles with one region, and, in order, of tiles with several.
 
-        Tiles are numbers (T,), `place` their image and first row and column, `reach` how far they see.
+        Args:
+            tiles: numbers, (T,).
+            place: their image, first row and first column, (T,) each.
+            sides: height and width of a tile, in pixels.
+            reach: distance, in pixels, at which a region around a tile belongs to it.
         """
         single, several = [], []
         chunks = torch.arange(len(tiles), device=tiles.device)
-        for chunk in chunks.split(max(1, _PATCH_ELEMENTS // ((sides[0] + 2 * reach) * (sides[1] + 2 * reach)))):
-            seen = self._read(self.index, tuple(part[chunk] for part in place), sides, reach)[0].flatten(1)
-            keys = tiles[chunk, None] * self.num_regions + seen
+        for chunk in chunks.split(max(1, _CHUNK_PIXELS // ((sides[0] + 2 * reach) * (sides[1] + 2 * reach)))):
+            labels = self._read(self.index, tuple(part[chunk] for part in place), sides, reach)[0].flatten(1)
+            keys = tiles[chunk, None] * self.num_regions + labels
             low, high = keys.aminmax(dim=1)
             single.append(low[low == high])
             several.append(keys[low < high].unique())
         return torch.cat(single), torch.cat(several)
 
     def window_weights(self, batch: Tensor, region: Tensor, rows: Tensor, cols: Tensor, span: Sequence[int]) -> Tensor:
-        """Evaluate s_r over windows of pixels: image, region, first row and column (P,) each give float64 (P, *span).
+        """Evaluate s_r over windows of `span` pixels: image, region, first row and first column (P,) give (P, *span).
 
-        Windows may reach beyond the image, where the weights mean nothing.
+        In float64. Windows may reach beyond the image, where s_r has no meaning.
         """
         widths, level = self.levels
         weights = torch.zeros(len(region), *span, dtype=torch.float64, device=region.device)
         reach = max(self._reach(width) for width in widths)
         windows = torch.arange(len(region), device=region.device)
-        for chunk in windows.split(max(1, _PATCH_ELEMENTS // ((span[0] + 2 * reach) * (span[1] + 2 * reach)))):
+        for chunk in windows.split(max(1, _CHUNK_PIXELS // ((span[0] + 2 * reach) * (span[1] + 2 * reach)))):
             place, ids = (batch[chunk], rows[chunk], cols[chunk]), region[chunk]
             if level is None:
                 weights[chunk] = self._blurred(place, ids, span, widths[0])
@@ -186,14 +191,14 @@ class Membership:
             levels = self._read(level, place, span, 0)[0]
             for position, width in enumerate(widths):
                 inside = levels == position
-                found = inside.flatten(1).any(1).nonzero().flatten()
-                if len(found):
-                    blurred = self._blurred(tuple(part[found] for part in place), ids[found], span, width)
-                    weights[chunk[found]] += torch.where(inside[found], blurred, 0.0)
+                members = inside.flatten(1).any(1).nonzero().flatten()
+                if len(members):
+                    blurred = self._blurred(tuple(part[members] for part in place), ids[members], span, width)
+                    weights[chunk[members]] += torch.where(inside[members], blurred, 0.0)
         return weights
 
     def read(self, pixels: Tensor, place: tuple[Tensor, ...], span: Sequence[int]) -> Tensor:
-        """Read (B, H, W) over windows, (P, *span): image, first row and first column (P,) each; the border is held."""
+        """Read (B, H, W) over windows, (P, *span): image, first row and first column, (P,) each; the border repeats."""
         return self._read(pixels, place, span, 0)[0]
 
     @property
@@ -204,7 +209,7 @@ class Membership:
     def _read(
         self, grid: Tensor, place: tuple[Tensor, ...], sides: Sequence[int], reach: int
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return windows of a grid with a halo, held at its border, and which of their rows and columns are inside."""
+        """Return windows of a grid with a halo, its border repeated, and which of their rows and columns are inside."""
         lines, inside = [], []
         for first, side, length in zip(place[1:], sides, grid.shape[1:], strict=True):
             line = first[:, None] + torch.arange(-reach, side + reach, device=grid.device)
@@ -215,44 +220,44 @@ class Membership:
     def _blurred(self, place: tuple[Tensor, ...], region: Tensor, sides: Sequence[int], width: float) -> Tensor:
         """Blur [M = r] over windows of the grid, of one width."""
         reach = self._reach(width)
-        seen, down, across = self._read(self.index, place, sides, reach)
-        inside = (seen == region[:, None, None]).double()
+        labels, down, across = self._read(self.index, place, sides, reach)
+        inside = (labels == region[:, None, None]).double()
         if width == 0.0:
             return inside
         blurs = []
         for side in sides:
             line = torch.arange(side + 2 * reach, device=region.device)
-            blurs.append(self._weights_at(line[reach : reach + side, None] - line, width))
+            blurs.append(self._gaussian(line[reach : reach + side, None] - line, width))
         total = (down @ blurs[0].T)[:, :, None] * (across @ blurs[1].T)[:, None, :]
         inside *= down[:, :, None] * across[:, None, :]
         return (blurs[0] @ inside @ blurs[1].T) / total.clamp_min(1e-300)
 
 
 def _find_levels(membership: Membership) -> Levels:
-    """Give each pixel the width of the contour it is nearest to.
+    """Give each pixel the width of its nearest contour.
 
-    The nearest pixel that touches a contour has the same label, since on the way to another label one would touch
-    the contour earlier; so the pair is this one's, with the first of its neighbours that differs.
+    The nearest pixel that touches a contour has the same label: the way to another label crosses the contour earlier.
+    So the two regions are that pixel's, and that of the first of its neighbours that differs.
     """
     if not isinstance(membership.softness, Mapping):
         return Levels((membership.softness,), None)
     from scipy.ndimage import distance_transform_edt
 
     maps = membership.index.cpu().numpy()
-    other = np.stack([_across(labels) for labels in maps])
+    other = np.stack([_neighbor_labels(labels) for labels in maps])
     touches = other >= 0
     low, high = np.sort([maps[touches], other[touches]], axis=0).astype(np.int64)
-    pairs, place = np.unique(low * membership.num_regions + high, return_inverse=True)
-    of_pair = [membership.softness.get(divmod(pair, membership.num_regions), 0.0) for pair in pairs.tolist()]
-    if len(set(of_pair)) < 2:
-        return Levels((of_pair[0] if of_pair else 0.0,), None)
-    widths, of_pair_level = np.unique(of_pair, return_inverse=True)
+    pairs, pair_index = np.unique(low * membership.num_regions + high, return_inverse=True)
+    pair_widths = [membership.softness.get(divmod(pair, membership.num_regions), 0.0) for pair in pairs.tolist()]
+    if len(set(pair_widths)) < 2:
+        return Levels((pair_widths[0] if pair_widths else 0.0,), None)
+    widths, pair_levels = np.unique(pair_widths, return_inverse=True)
     level = np.zeros(maps.shape, np.int32)
-    level[touches] = of_pair_level[place]
-    for one, touch in zip(level, touches, strict=True):
-        if touch.any():
-            rows, cols = distance_transform_edt(~touch, return_distances=False, return_indices=True)
-            one[:] = one[rows, cols]
+    level[touches] = pair_levels[pair_index]
+    for map_level, contour in zip(level, touches, strict=True):
+        if contour.any():
+            rows, cols = distance_transform_edt(~contour, return_distances=False, return_indices=True)
+            map_level[:] = map_level[rows, cols]
     return Levels(tuple(widths.tolist()), torch.from_numpy(level).to(membership.index.device))
 
 
@@ -262,16 +267,18 @@ def _find_variances(membership: Membership) -> Tensor:
     return squares.expand(membership.index.shape) if level is None else squares[level.long()]
 
 
-def _across(labels: Any) -> Any:
-    """Label on the other side of the contour that a pixel touches (above, left, right, below: the first); else -1."""
+def _neighbor_labels(labels: Any) -> Any:
+    """Return the first label beside each pixel (above, left, right, below) that differs from its own; -1: none."""
     other = np.full_like(labels, -1)
-    later, earlier, every = slice(1, None), slice(None, -1), slice(None)
+    later = slice(1, None)
+    earlier = slice(None, -1)
+    every = slice(None)
     for pixel, neighbour in (
         ((later, every), (earlier, every)),
         ((every, later), (every, earlier)),
         ((every, earlier), (every, later)),
         ((earlier, every), (later, every)),
     ):
-        found = (labels[pixel] != labels[neighbour]) & (other[pixel] < 0)
-        other[pixel][found] = labels[neighbour][found]
+        differs = (labels[pixel] != labels[neighbour]) & (other[pixel] < 0)
+        other[pixel][differs] = labels[neighbour][differs]
     return other

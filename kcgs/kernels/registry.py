@@ -1,4 +1,4 @@
-"""What each backend name means, and what "auto" picks."""
+"""From the name of a backend to its kernel, and what "auto" picks; the operator in functional calls it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 
 from kcgs.errors import InvalidArgument
 
-from .inputs import SplatInputs, Steps
+from .interface import SplatInputs, Steps
 
 BACKENDS = ("auto", "reference", "tiled", "cpu", "cuda")
 
@@ -47,7 +47,7 @@ def _warn_about_cuda() -> None:
 
 @functools.cache
 def prepare(backend: str, device: torch.device, dtype: torch.dtype, channels: int) -> None:
-    """Render and differentiate once, so that no clock counts what compiles or loads at first use."""
+    """Render and differentiate once, before a clock starts, since much is compiled or loaded at first use."""
     means, cholesky, colors = (torch.full((1, 1, n), 8.0, device=device, dtype=dtype) for n in (2, 3, channels))
     inputs = SplatInputs(means, cholesky, colors, None, None, (16, 16), 1e-4)
     steps = resolve(backend, inputs)
@@ -55,7 +55,7 @@ def prepare(backend: str, device: torch.device, dtype: torch.dtype, channels: in
     image = steps.render(plan, inputs)
     steps.differentiate(plan, inputs, torch.ones_like(image), True)
     leaf = image.detach().requires_grad_()
-    torch.autograd.grad(leaf.sum(), leaf)  # torch too loads much at the first gradient
+    torch.autograd.grad(leaf.sum(), leaf)  # torch, too, loads much at its first gradient
 
 
 def check_backend(backend: str) -> str:

@@ -1,4 +1,4 @@
-"""Membership at another size: weights of the map's own pixels, interpolated bilinearly; contours may be made crisp."""
+"""Membership of a map at another size: interpolated bilinearly, with contours as soft as the map's, or crisp."""
 
 from __future__ import annotations
 
@@ -12,27 +12,30 @@ from torch import Tensor
 
 from .membership import Membership, TileMembership
 
-_CHUNK_ELEMENTS = 1 << 21
-TINY = 1e-6  # of variances, which are above 0
-MARGIN = 0.25  # so that a line one pixel wide stays about that wide
+# pixels of windows and tiles that are evaluated at once: 16 MiB in float64
+_CHUNK_PIXELS = 1 << 21
+# least variance of a contour, in square pixels: exponents stay finite
+TINY = 1e-6
+# by which a crisp pixel's own label has a larger share than others: a line one pixel wide stays about that wide
+MARGIN = 0.25
 
 
 class _Axis(NamedTuple):
-    """Where the pixels of one axis lie between those of the map."""
+    """Position of the new pixels along one axis between pixels of the map."""
 
-    low: Tensor  # [n] int64, the neighbour before
-    high: Tensor  # [n] int64, the one after, both clamped to the map
-    weight: Tensor  # [n] float64, of the one after
+    low: Tensor  # [n] int64, the pixel before, clamped to the map
+    high: Tensor  # [n] int64, the pixel after, clamped to the map
+    weight: Tensor  # [n] float64, of the pixel after
 
 
 class Resampled(Membership):
     """Membership of a soft map at another size.
 
     A point between the centres of four pixels has u_r, the bilinear mean of their memberships; beyond the outermost
-    centres those of the border are held. In a larger image that is too soft: where v is the variance of the blur, which
-    the image's own pixels have part in, v - 1/12 is that of the contour alone, and v + 1/6 is what interpolation makes
-    of it. So there s_r = u_r**e / (sum of all u**e), with e**2 = (v + q / 6) / max(v - q / 12, q / 24) and
-    q = 1 - old pixels / new pixels; v is interpolated as u is. At the size of the map that would be the map itself.
+    centres the border repeats. In a larger image that is too soft: 1/12 of v, the variance of the blur, comes from the
+    map's pixels, v - 1/12 from the contour alone, and interpolation makes it v + 1/6. So s_r = u_r**e / (sum of all
+    u**e), with e**2 = (v + q / 6) / max(v - q / 12, q / 24) and q = 1 - old pixels / new pixels; v is interpolated as u
+    is. At the map's own size q = 0 and e = 1, which leaves the map as it is.
     """
 
     def __init__(self, index: Tensor, source: Membership) -> None:
@@ -42,7 +45,7 @@ class Resampled(Membership):
         self.ratio = index.shape[1] * index.shape[2] / (source.index.shape[1] * source.index.shape[2])
 
     def to(self, device: torch.device) -> Resampled:
-        """Return the same membership on `device`, tables not carried along."""
+        """Return the same membership on `device`, without tables."""
         return Resampled(self.index.to(device), self.source.to(device))
 
     def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
@@ -50,50 +53,51 @@ class Resampled(Membership):
         mean = self._interpolated(batch, region)
         if self._exponents() is None:
             return mean.to(dtype)
-        exponent, most, total = self.derived(("sums", batch), lambda _: self._sums(batch))
-        return ((mean / most) ** exponent / total).to(dtype)
+        exponent, largest, total = self.derived(("sums", batch), lambda _: self._sums(batch))
+        return ((mean / largest) ** exponent / total).to(dtype)
 
     def _sums(self, batch: int) -> tuple[float | Tensor, Tensor, Tensor]:
-        """Return the exponents of a map, the largest u, and the sum of powers of what they are to it."""
+        """Return the exponents e of a map, the largest u of each pixel, and the sum of all (u / largest)**e."""
         exponent = self._exponents()
         assert exponent is not None
         if isinstance(exponent, Tensor):
             down, across = self._matrices(exponent.shape[1:])
-            exponent = sharpness(down @ exponent[batch] @ across.T, self._lost)
+            exponent = sharpness(down @ exponent[batch] @ across.T, self._enlargement)
         regions = range(self.num_regions)
-        most = functools.reduce(torch.maximum, (self._interpolated(batch, r) for r in regions))
-        powers = ((self._interpolated(batch, r) / most) ** exponent for r in regions)
-        return exponent, most, functools.reduce(torch.add, powers)
+        largest = functools.reduce(torch.maximum, (self._interpolated(batch, r) for r in regions))
+        powers = ((self._interpolated(batch, r) / largest) ** exponent for r in regions)
+        return exponent, largest, functools.reduce(torch.add, powers)
 
     def _interpolated(self, batch: int, region: int) -> Tensor:
-        weights = self._own_weights(batch, region)
+        weights = self._source_weights(batch, region)
         down, across = self._matrices(weights.shape)
         return down @ weights @ across.T
 
-    def _own_weights(self, batch: int, region: int) -> Tensor:
-        """Evaluate what is interpolated, at the map's own size."""
+    def _source_weights(self, batch: int, region: int) -> Tensor:
+        """Evaluate the weights that are interpolated, at the map's own size."""
         return self.source.weights(batch, region, torch.float64)
 
     @property
-    def _lost(self) -> float:
+    def _enlargement(self) -> float:
+        """The q of the class."""
         return max(0.0, 1.0 - 1.0 / self.ratio)
 
     def _exponents(self) -> float | Tensor | None:
-        """Return the exponent, or, where pixels of the map have several, their variances; None: u are the weights."""
+        """Return the exponent e, or, where contours have several widths, the variances of pixels; None: e is 1."""
         widths, level = self.source.levels
-        if self._lost == 0.0:
+        if self._enlargement == 0.0:
             return None
         if level is not None:
             return self.source.variances
-        return float(sharpness(torch.tensor(widths[0] ** 2, dtype=torch.float64), self._lost))
+        return float(sharpness(torch.tensor(widths[0] ** 2, dtype=torch.float64), self._enlargement))
 
     def _matrices(self, shape: Sequence[int]) -> Iterator[Tensor]:
-        """Make the interpolation of whole columns and rows."""
+        """Yield the matrices that interpolate columns and rows of a map of this shape."""
         first = torch.zeros(1, dtype=torch.int64, device=self.index.device)
         return (_matrix(axis, first, n)[0] for axis, n in zip(self._axes(1), shape, strict=True))
 
     def _axes(self, tile: int) -> tuple[_Axis, _Axis]:
-        """Return rows and columns, filled up with the last one to whole tiles."""
+        """Return the axes of rows and columns, padded to whole tiles with their last pixel."""
         sizes = zip(self.index.shape[1:], self.source.index.shape[1:], strict=True)
         return tuple(_axis(new, old, tile, self.index.device) for new, old in sizes)  # type: ignore[return-value]
 
@@ -114,22 +118,22 @@ class Resampled(Membership):
         tiles, region = keys // self.num_regions, keys % self.num_regions
         groups = tiles.unique(return_inverse=True)[1]
         masks = torch.zeros(len(keys), tile * tile, dtype=torch.float64, device=keys.device)
-        # regions of a tile stay in one chunk where they are weighed against each other
-        most = max(1, _CHUNK_ELEMENTS // (spans[0] * spans[1] + tile * tile))
-        alone = torch.arange(len(keys), device=keys.device).split(most)
-        for chunk in alone if self._exponents() is None else _chunks(groups, most):
+        length = max(1, _CHUNK_PIXELS // (spans[0] * spans[1] + tile * tile))
+        equal_chunks = torch.arange(len(keys), device=keys.device).split(length)
+        # exponents need all regions of a tile in one chunk
+        for chunk in equal_chunks if self._exponents() is None else _chunks(groups, length):
             t, y, x = tiles[chunk], row[tiles[chunk]], col[tiles[chunk]]
-            begins = batch[t], firsts[0][y], firsts[1][x]
-            mean = down[y] @ self._windows(begins, region[chunk], groups[chunk], spans) @ across[x].mT
+            corner = batch[t], firsts[0][y], firsts[1][x]
+            mean = down[y] @ self._windows(corner, region[chunk], groups[chunk], spans) @ across[x].mT
             exponent = self._exponents()
             if isinstance(exponent, Tensor):
-                exponent = sharpness(down[y] @ source.read(exponent, begins, spans) @ across[x].mT, self._lost)
+                exponent = sharpness(down[y] @ source.read(exponent, corner, spans) @ across[x].mT, self._enlargement)
             masks[chunk] = (mean if exponent is None else _sharpen(mean, groups[chunk], exponent)).flatten(1)
-        seen = (masks > 0).any(1)
-        return TileMembership.assemble(single, keys[seen], masks[seen])
+        is_present = (masks > 0).any(1)
+        return TileMembership.assemble(single, keys[is_present], masks[is_present])
 
     def _windows(self, place: tuple[Tensor, ...], region: Tensor, group: Tensor, spans: Sequence[int]) -> Tensor:
-        """Evaluate the weights of the map's own pixels over windows, (P, *spans); those of a group cover one place."""
+        """Evaluate the weights of the map's own pixels over windows, (P, *spans), at the same place within a group."""
         batch, rows, cols = place
         return self.source.window_weights(batch, region, rows, cols, spans)
 
@@ -137,10 +141,10 @@ class Resampled(Membership):
 class Crisp(Resampled):
     """Membership of contours that are about one pixel wide at any size: a smooth curve between the map's pixels.
 
-    Labels are blurred by the width of one label; where that takes the largest share at the centre of a pixel from its
-    own label, it is given back, with `MARGIN` more than any other. Interpolated bilinearly to weights u_r, that makes
-    the weights s_r = u_r**e / (sum of all u**e): along a straight contour, a step of 1/2 pixel's deviation with
-    e = 2 sqrt(new pixels / old pixels), 1 at least.
+    Labels are blurred with a width of one pixel. Where another label then has a larger share of a pixel than its own,
+    its own is set to that share plus `MARGIN`. Interpolated bilinearly, the weights u_r give
+    s_r = u_r**e / (sum of all u**e) with e = 2 sqrt(new pixels / old pixels), 1 at least: across a straight contour, a
+    step with a standard deviation of half a pixel.
     """
 
     def __init__(self, index: Tensor, labels: Membership) -> None:
@@ -150,22 +154,21 @@ class Crisp(Resampled):
     def _exponents(self) -> float:
         return max(1.0, 2.0 * math.sqrt(self.ratio))
 
-    def _own_weights(self, batch: int, region: int) -> Tensor:
-        best = self.derived(("best", batch), lambda _: self._best(batch))
-        return _keep(super()._own_weights(batch, region), best, self.source.index[batch] == region)
+    def _source_weights(self, batch: int, region: int) -> Tensor:
+        largest = self.derived(("largest", batch), lambda _: self._largest(batch))
+        return _restore(super()._source_weights(batch, region), largest, self.source.index[batch] == region)
 
-    def _best(self, batch: int) -> Tensor:
+    def _largest(self, batch: int) -> Tensor:
         weights = (self.source.weights(batch, r, torch.float64) for r in range(self.num_regions))
         return functools.reduce(torch.maximum, weights)
 
     def _windows(self, place: tuple[Tensor, ...], region: Tensor, group: Tensor, spans: Sequence[int]) -> Tensor:
         weights = super()._windows(place, region, group, spans)
-        seen = self.source.read(self.source.index, place, spans)
-        best = _most(weights, group)
-        return _keep(weights, best, seen == region[:, None, None])
+        labels = self.source.read(self.source.index, place, spans)
+        return _restore(weights, _group_max(weights, group), labels == region[:, None, None])
 
     def to(self, device: torch.device) -> Crisp:
-        """Return the same membership on `device`, tables not carried along."""
+        """Return the same membership on `device`, without tables."""
         return Crisp(self.index.to(device), self.source.to(device))
 
 
@@ -173,56 +176,57 @@ def _smooth(labels: Membership) -> Membership:
     return Membership(labels.index, labels.num_regions, 1.0)
 
 
-def _keep(weights: Tensor, best: Tensor, own: Tensor) -> Tensor:
-    return torch.where(own & (weights < best), best + MARGIN, weights)
+def _restore(weights: Tensor, largest: Tensor, inside: Tensor) -> Tensor:
+    """Give pixels inside a region their largest weight there."""
+    return torch.where(inside & (weights < largest), largest + MARGIN, weights)
 
 
-def sharpness(variance: Tensor, lost: float | Tensor) -> Tensor:
-    """Evaluate the exponent of :class:`Resampled` for variances; `lost` is its q."""
-    variance, least = variance.clamp_min(TINY), torch.as_tensor(lost).to(variance) / 24
-    return ((variance + lost / 6) / torch.maximum(variance - lost / 12, least)).sqrt()
+def sharpness(variance: Tensor, enlargement: float | Tensor) -> Tensor:
+    """Evaluate the exponent e of :class:`Resampled` for variances; `enlargement` is its q."""
+    variance, least = variance.clamp_min(TINY), torch.as_tensor(enlargement).to(variance) / 24
+    return ((variance + enlargement / 6) / torch.maximum(variance - enlargement / 12, least)).sqrt()
 
 
 def _sharpen(weights: Tensor, group: Tensor, exponent: float | Tensor) -> Tensor:
     """Raise the weights of each group, (P, n, n), to a power, and let them sum to one."""
-    powers = (weights / _most(weights, group)) ** exponent
+    powers = (weights / _group_max(weights, group)) ** exponent
     first = int(group[0])
     total = torch.zeros(int(group[-1]) - first + 1, *weights.shape[1:], dtype=weights.dtype, device=weights.device)
     return powers / total.index_add_(0, group - first, powers)[group - first]
 
 
-def _most(weights: Tensor, group: Tensor) -> Tensor:
-    """Find the largest weights of each group, whose numbers ascend, for each of its rows."""
-    place = group - group[0]
-    most = weights.new_zeros(int(place[-1]) + 1, *weights.shape[1:])
-    most.scatter_reduce_(0, place.view(-1, 1, 1).expand_as(weights), weights, "amax")
-    return most[place]
+def _group_max(weights: Tensor, group: Tensor) -> Tensor:
+    """Return, for each row, the largest weights of its group; numbers of groups ascend."""
+    position = group - group[0]
+    largest = weights.new_zeros(int(position[-1]) + 1, *weights.shape[1:])
+    largest.scatter_reduce_(0, position.view(-1, 1, 1).expand_as(weights), weights, "amax")
+    return largest[position]
 
 
-def _chunks(groups: Tensor, most: int) -> Iterator[Tensor]:
-    """Cut rows, by ascending group, into chunks of whole groups of about `most` rows."""
+def _chunks(groups: Tensor, length: int) -> Iterator[Tensor]:
+    """Split rows, by ascending group, into chunks of whole groups, of about `length` rows."""
     numbers = torch.arange(len(groups), device=groups.device)
     if len(groups) == 0:
         return
     begins = (groups.diff(prepend=groups[:1] - 1) > 0).nonzero().flatten().tolist()
     start = 0
     for begin, end in zip(begins, [*begins[1:], len(groups)], strict=True):
-        if end - start > most and begin > start:
+        if end - start > length and begin > start:
             yield numbers[start:begin]
             start = begin
     yield numbers[start:]
 
 
 def _axis(new: int, old: int, tile: int, device: torch.device) -> _Axis:
-    at = (torch.arange(new, device=device, dtype=torch.float64) + 0.5) * (old / new) - 0.5
-    at = torch.nn.functional.pad(at, (0, -new % tile), value=float(at[-1]))
-    low = at.floor()
-    return _Axis(low.long().clamp(0, old - 1), (low.long() + 1).clamp(0, old - 1), at - low)
+    position = (torch.arange(new, device=device, dtype=torch.float64) + 0.5) * (old / new) - 0.5
+    position = torch.nn.functional.pad(position, (0, -new % tile), value=float(position[-1]))
+    low = position.floor()
+    return _Axis(low.long().clamp(0, old - 1), (low.long() + 1).clamp(0, old - 1), position - low)
 
 
 def _matrix(axis: _Axis, first: Tensor, span: int) -> Tensor:
-    """Matrix from the pixels of a window to those between them, (tiles, n, span)."""
-    at = torch.arange(span, device=first.device) + first.view(-1, 1, 1)
-    low, high = (side.reshape(len(first), -1, 1) == at for side in axis[:2])
+    """Return the matrix from the pixels of a window to the new ones between them, (tiles, n, span)."""
+    pixel = torch.arange(span, device=first.device) + first.view(-1, 1, 1)
+    low, high = (side.reshape(len(first), -1, 1) == pixel for side in axis[:2])
     weight = axis.weight.reshape(len(first), -1, 1)
     return low * (1 - weight) + high * weight

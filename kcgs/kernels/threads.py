@@ -1,4 +1,4 @@
-"""How many threads the kernels take, which may be more than torch's own operations get."""
+"""Number of threads of the CPU kernel, which may be more than torch's own operations have."""
 
 from __future__ import annotations
 
@@ -11,39 +11,42 @@ from typing import Concatenate, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
+# of an image: above it torch's operations gain more from threads than their waiting costs
+_MAX_PIXELS = 1 << 21
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_kernels: ContextVar[int | None] = ContextVar("threads of the kernels", default=None)
+_num_threads: ContextVar[int | None] = ContextVar("threads of the kernels", default=None)
 
 
 def num_threads() -> int:
-    """Return torch's number of threads, or what it was where the kernels have them to themselves."""
-    return _kernels.get() or torch.get_num_threads()
+    """Return torch's number of threads, or its number outside of `threads_for_kernels`."""
+    return _num_threads.get() or torch.get_num_threads()
 
 
 @contextmanager
-def threads_for_kernels(pixels: int, most: int = 1 << 21) -> Iterator[None]:
-    """Give all threads to the kernels meanwhile, and one to torch; on images above `most` pixels torch keeps its own.
+def threads_for_kernels(pixels: int) -> Iterator[None]:
+    """Give all threads to the kernels and one to torch; on an image of over two million pixels torch keeps its own.
 
-    Torch's threads wait for each other by spinning. Where other programs run beside it, and its operations are short,
-    that takes ten times as long as they do.
+    Torch's threads wait for each other by spinning. Where other programs run beside it, waiting takes ten times as
+    long as short operations themselves.
     """
     before = torch.get_num_threads()
-    if pixels > most or before == 1:
+    if pixels > _MAX_PIXELS or before == 1:
         yield
         return
-    token = _kernels.set(num_threads())
+    token = _num_threads.set(num_threads())
     torch.set_num_threads(1)
     try:
         yield
     finally:
         torch.set_num_threads(before)
-        _kernels.reset(token)
+        _num_threads.reset(token)
 
 
 def image_threads_for_kernels(function: Callable[Concatenate[Tensor, P], R]) -> Callable[Concatenate[Tensor, P], R]:
-    """Decorate a function of an image, (..., H, W), to run as :func:`threads_for_kernels` has it."""
+    """Decorate a function of an image, (..., H, W), to run within :func:`threads_for_kernels`."""
 
     @functools.wraps(function)
     def run(image: Tensor, /, *args: P.args, **kwargs: P.kwargs) -> R:

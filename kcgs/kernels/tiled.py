@@ -1,4 +1,4 @@
-"""The splat as batched matrix products over tiles of 16 x 16 pixels, any device, backward by hand.
+"""The kernel `tiled`: batched matrix products over tiles of 16 x 16 pixels, any device, backward by hand.
 
 Whitened coordinates are affine in the pixel, so for a whole tile they are two small matrix products in tile-centred
 coordinates whose constants are made in float64; the image and the colour gradients are batched products too.
@@ -12,14 +12,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .bins import Bins, bin_gaussians, colors_of, to_gradients
-from .inputs import Gradients, SplatInputs, Steps
-from .nodes import gather, sample
+from .interface import Gradients, SplatInputs, Steps
+from .pairs import Pairs, colors_of, gradients_of, list_pairs
+from .splines import gather, sample
 from .tiles import TILE, expand_runs, grid_of, join_tiles, split_into_tiles, sum_runs
 from .whitened import least_exponent
 
-_CHUNK_ELEMENTS = 1 << 18
-_LONGEST_LIST = 1024
+# weights (pairs times pixels) of a batch: what fits the caches of one core takes the least time
+_CHUNK_WEIGHTS = 1 << 18
+# pairs of a segment: a tile with more has several
+_MAX_SEGMENT = 1024
+# of a tile
 _PIXELS = TILE * TILE
 
 
@@ -27,12 +30,12 @@ class _Batch(NamedTuple):
     """Tile segments of similar list length, padded to the longest."""
 
     segments: Tensor  # [T] int64
-    entries: Tensor  # [T, G] int64 into the pairs; the pad is the number of pairs
-    mixed: bool
+    entries: Tensor  # [T, G] int64 into the pairs, padded with the number of pairs
+    mixed: bool  # whether the tiles hold several regions, and so have masks
 
 
 class _Plan(NamedTuple):
-    bins: Bins
+    pairs: Pairs
     batches: list[_Batch]
     segment_tile: Tensor  # [S] int64, ascending
     coefficients: Tensor  # [P + 1, 5]
@@ -45,56 +48,57 @@ def steps(inputs: SplatInputs) -> Steps:
 
 
 def _make_plan(inputs: SplatInputs) -> _Plan:
-    bins = bin_gaussians(inputs)
+    pairs = list_pairs(inputs)
     masks = None
-    if bins.mask is not None and inputs.membership is not None:
+    if pairs.mask is not None and inputs.membership is not None:
         masks = inputs.membership.tiles(TILE).masks.to(inputs.means.dtype)
 
-    # segments: a tile's list cut into pieces of at most _LONGEST_LIST
-    order = torch.argsort(bins.tile, stable=True)
-    tiles, lengths = torch.unique_consecutive(bins.tile[order], return_counts=True)
-    owner, piece = expand_runs(-(-lengths // _LONGEST_LIST))
-    start = (lengths.cumsum(0) - lengths)[owner] + piece * _LONGEST_LIST
-    length = (lengths[owner] - piece * _LONGEST_LIST).clamp_max(_LONGEST_LIST)
+    # segments: a tile's list cut into pieces of at most _MAX_SEGMENT
+    order = torch.argsort(pairs.tile, stable=True)
+    tiles, lengths = torch.unique_consecutive(pairs.tile[order], return_counts=True)
+    run, piece = expand_runs(-(-lengths // _MAX_SEGMENT))
+    start = (lengths.cumsum(0) - lengths)[run] + piece * _MAX_SEGMENT
+    length = (lengths[run] - piece * _MAX_SEGMENT).clamp_max(_MAX_SEGMENT)
     mixed = torch.zeros_like(length, dtype=torch.bool)
-    if bins.mask is not None:
-        mixed = bins.mask[order][start] >= 0
+    if pairs.mask is not None:
+        mixed = pairs.mask[order][start] >= 0
     batches = [
         batch
         for kind in (False, True)
         for batch in _batches((mixed == kind).nonzero().flatten(), start, length, order, kind)
     ]
-    return _Plan(bins, batches, tiles[owner], _padded(bins.coefficients), masks)
+    return _Plan(pairs, batches, tiles[run], _padded(pairs.coefficients), masks)
 
 
-def _batches(chosen: Tensor, start: Tensor, length: Tensor, order: Tensor, mixed: bool) -> Iterator[_Batch]:
-    chosen = chosen[torch.argsort(length[chosen], descending=True, stable=True)]
-    sizes = length[chosen].tolist()
-    at = 0
-    while at < len(sizes):
-        longest = sizes[at]
-        stop = min(len(sizes), at + max(1, _CHUNK_ELEMENTS // (longest * _PIXELS)))
-        part = chosen[at:stop]
+def _batches(segments: Tensor, start: Tensor, length: Tensor, order: Tensor, mixed: bool) -> Iterator[_Batch]:
+    segments = segments[torch.argsort(length[segments], descending=True, stable=True)]
+    lengths = length[segments].tolist()
+    begin = 0
+    while begin < len(lengths):
+        longest = lengths[begin]
+        end = min(len(lengths), begin + max(1, _CHUNK_WEIGHTS // (longest * _PIXELS)))
+        part = segments[begin:end]
         step = torch.arange(longest, device=order.device)
         valid = step < length[part, None]
         entries = torch.where(valid, order[(start[part, None] + step).clamp_max(len(order) - 1)], len(order))
         yield _Batch(part, entries, mixed)
-        at = stop
+        begin = end
 
 
 def _padded(rows: Tensor) -> Tensor:
     return torch.cat([rows, rows.new_zeros(1, rows.shape[-1])])
 
 
-def _bases(like: Tensor) -> tuple[Tensor, Tensor]:
-    at = torch.arange(TILE, device=like.device, dtype=like.dtype) - (TILE - 1) / 2
-    x, y = at.repeat(TILE), at.repeat_interleave(TILE)
+def _bases(means: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what the coefficients of z1 and of z2 multiply at the pixels of a tile, in the dtype of the means."""
+    offset = torch.arange(TILE, device=means.device, dtype=means.dtype) - (TILE - 1) / 2
+    x, y = offset.repeat(TILE), offset.repeat_interleave(TILE)
     one = torch.ones_like(x)
     return torch.stack([one, x]), torch.stack([one, x, y])  # [2, 256], [3, 256]
 
 
 def _weights(plan: _Plan, batch: _Batch, bases: tuple[Tensor, Tensor], cutoff: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return z1, z2 and the weight, times that of the region, each [T, G, 256]."""
+    """Return z1, z2 and the weight, times the membership of the pixel, each [T, G, 256]."""
     k = plan.coefficients[batch.entries]
     z1 = k[..., :2] @ bases[0]
     z2 = k[..., 2:] @ bases[1]
@@ -102,14 +106,14 @@ def _weights(plan: _Plan, batch: _Batch, bases: tuple[Tensor, Tensor], cutoff: f
     if cutoff > 0.0:
         weight.mul_(weight >= cutoff)
     if batch.mixed:
-        assert plan.masks is not None and plan.bins.mask is not None
-        mask = torch.cat([plan.bins.mask, plan.bins.mask.new_zeros(1)])[batch.entries]
+        assert plan.masks is not None and plan.pairs.mask is not None
+        mask = torch.cat([plan.pairs.mask, plan.pairs.mask.new_zeros(1)])[batch.entries]
         weight.mul_(plan.masks[mask])
     return z1, z2, weight
 
 
 def _padded_colors(plan: _Plan, inputs: SplatInputs) -> Tensor:
-    return _padded(colors_of(plan.bins, inputs)[plan.bins.gaussian])  # [P + 1, C]
+    return _padded(colors_of(plan.pairs, inputs)[plan.pairs.gaussian])  # [P + 1, C]
 
 
 def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
@@ -122,18 +126,18 @@ def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
     touched, counts = torch.unique_consecutive(plan.segment_tile, return_counts=True)
     if len(touched) < len(values):
         values = sum_runs(values.flatten(1), counts).unflatten(1, (channels, _PIXELS))
-    tiles = colors.new_zeros(plan.bins.total, channels, _PIXELS)
+    tiles = colors.new_zeros(plan.pairs.num_tiles, channels, _PIXELS)
     tiles[touched] = values
     tiles, grid = tiles.unflatten(2, (TILE, TILE)), grid_of(inputs)
-    if plan.bins.wide is not None:
-        sample(tiles[grid.total :], plan.bins.wide.nodes, plan.masks, tiles[: grid.total])
+    if plan.pairs.wide is not None:
+        sample(tiles[grid.total :], plan.pairs.wide.nodes, plan.masks, tiles[: grid.total])
     return join_tiles(tiles[: grid.total].unflatten(0, grid), inputs.size)
 
 
 def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
     grad = split_into_tiles(grad).flatten(0, 2)  # [tiles, C, 16, 16]
-    if plan.bins.wide is not None:
-        grad = torch.cat([grad, gather(grad, plan.bins.wide.nodes, plan.masks)])
+    if plan.pairs.wide is not None:
+        grad = torch.cat([grad, gather(grad, plan.pairs.wide.nodes, plan.masks)])
     grad = grad.flatten(2)
     colors, bases = _padded_colors(plan, inputs), _bases(inputs.means)
     sums = colors.new_zeros(len(colors), (5 if geometry else 0) + colors.shape[-1])
@@ -144,8 +148,8 @@ def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: boo
         if geometry:
             parts.append(_moments(z1, z2, weight.mul_(colors[batch.entries] @ local)))
         sums[batch.entries] = torch.cat(parts, -1)
-    counts = torch.bincount(plan.bins.gaussian, minlength=inputs.means.shape[0] * inputs.means.shape[1])
-    return to_gradients(plan.bins, inputs, sum_runs(sums[:-1], counts))
+    counts = torch.bincount(plan.pairs.gaussian, minlength=inputs.means.shape[0] * inputs.means.shape[1])
+    return gradients_of(plan.pairs, inputs, sum_runs(sums[:-1], counts))
 
 
 def _moments(z1: Tensor, z2: Tensor, value: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Which Gaussian touches which tile: the lists that the tiled kernels and the ONNX decoders walk."""
+"""Tiles of 16 x 16 pixels, and which Gaussian touches which; for `tiled`, `cuda` and the ONNX decoders."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .inputs import SplatInputs
+from .interface import SplatInputs
 from .whitened import Z_LIMIT
 
-TILE = 16
+TILE = 16  # pixels along a side
 
 
 class TileGrid(NamedTuple):
@@ -35,12 +35,17 @@ def grid_of(inputs: SplatInputs) -> TileGrid:
 def bounding_tiles(
     means: Tensor, cholesky: Tensor, radius: float, size: tuple[int, int] | Tensor, *, between: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """List the tiles that the bounding box of each float64 Gaussian's support, of so many deviations, touches.
+    """List the tiles that the bounding box of each float64 Gaussian's support touches.
 
-    The size is that of the image, or of the grid of each Gaussian, (N, 2).
+    Args:
+        means: (N, 2) pixels.
+        cholesky: (N, 3) pixels.
+        radius: of the support, in standard deviations.
+        size: of the image, or of each Gaussian's grid, (N, 2).
+        between: whether to touch is to hold any point of a tile, rather than the centre of one of its pixels.
 
-    With `between`, to touch is to hold any point of a tile; else the centre of one of its pixels in the image. Returns,
-    ordered by Gaussian: it (P,), the tile's column and row (P, 2), and the tile's centre minus the mean (P, 2).
+    Returns:
+        Ordered by Gaussian: its index (P,), the tile's column and row (P, 2), the tile's centre minus the mean (P, 2).
     """
     l11, l21, l22 = cholesky.unbind(-1)
     extent = torch.stack([l11, torch.hypot(l21, l22)], -1) * radius * (1 + 1e-5) + 1e-3
@@ -50,17 +55,17 @@ def bounding_tiles(
         low, high = (means - extent).floor(), (means + extent).floor()
     else:
         low, high = (means - extent - 0.5).ceil(), (means + extent - 0.5).floor()
-    seen = ((low <= high) & (high >= 0) & (low <= last)).all(-1)
-    first, final = ((at.clamp_min(0).minimum(last) / TILE).floor().long() for at in (low, high))
+    is_inside = ((low <= high) & (high >= 0) & (low <= last)).all(-1)
+    first, final = ((pixel.clamp_min(0).minimum(last) / TILE).floor().long() for pixel in (low, high))
     across, down = (final - first + 1).unbind(-1)
-    gaussian, rank = expand_runs(torch.where(seen, across * down, 0))
+    gaussian, rank = expand_runs(torch.where(is_inside, across * down, 0))
     across = across[gaussian]
     place = first[gaussian] + torch.stack([rank % across, rank // across], -1)
     return gaussian, place, place * float(TILE) + TILE / 2 - means[gaussian]
 
 
 def reaches(origin: Tensor, cholesky: Tensor, radius: float) -> Tensor:
-    """Say which tiles that a bounding box touches the support may touch too."""
+    """Tell which tiles of a bounding box the support itself may touch."""
     # the bounding box bounds z1; a slanted needle is thin in z2, whose least value over the tile is this
     l11, l21, l22 = cholesky.unbind(-1)
     slope = l21 / l11
@@ -70,14 +75,14 @@ def reaches(origin: Tensor, cholesky: Tensor, radius: float) -> Tensor:
 
 
 def find_keys(keys: Tensor, tile: Tensor, region: Tensor, num_regions: int) -> tuple[Tensor, Tensor]:
-    """Find where tile * num_regions + region lies in sorted keys, and say whether it is there; region -1 is nowhere."""
+    """Return the position of tile * num_regions + region among sorted keys, and whether it is there; not for -1."""
     key = torch.where(region >= 0, tile * num_regions + region, -1)
     position = torch.searchsorted(keys, key).clamp_max(len(keys) - 1)
     return position, keys[position] == key
 
 
 def coefficients(origin: Tensor, cholesky: Tensor) -> Tensor:
-    """Coefficients of z in tile-centred pixels, [P, 5], in float64: z1 = k0 + k1 x, z2 = k2 + k3 x + k4 y."""
+    """Return k, (P, 5), of z1 = k0 + k1 x, z2 = k2 + k3 x + k4 y in pixels from the tile's centre, in float64."""
     l11, l21, l22 = cholesky.unbind(-1)
     x, y = origin.unbind(-1)
     slope = l21 / l11
@@ -101,7 +106,7 @@ def join_tiles(tiles: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def expand_runs(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Return, for each member of consecutive runs of these lengths, which run it is of and its place there."""
+    """Return the number of the run and the position in it of each member of consecutive runs of these lengths."""
     run = torch.repeat_interleave(counts)
     return run, torch.arange(len(run), device=run.device) - (counts.cumsum(0) - counts)[run]
 

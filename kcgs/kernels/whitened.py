@@ -1,6 +1,6 @@
 """Whitened coordinates z = L^-1 (p - mu) by forward substitution, and gradients from their moments.
 
-All kernels share this arithmetic; docs/performance.md has the formulas.
+All kernels, the public checks and the ONNX decoders share these limits; docs/performance.md has the formulas.
 """
 
 from __future__ import annotations
@@ -10,35 +10,36 @@ import math
 import torch
 from torch import Tensor
 
-from .inputs import Gradients
+from .interface import Gradients
 
 # |z| is cut here, where every weight is zero: its square is still finite in float32
 Z_LIMIT = 1e15
 
-# arithmetic in float32 stays finite inside these bounds of means and factors, which are far beyond any image
+# largest coordinate of a mean, in pixels: arithmetic in float32 stays finite
 MEAN_LIMIT = 1e8
+# least and largest l11 and l22, in pixels, for the same reason
 SCALE_LIMITS = (1e-6, 1e8)
 
-# exp() of less is left out: it is zero in the dtype, or nothing beside the smallest colour step
-_LOWEST_EXPONENT = {4: -80.0, 8: -700.0}  # by the bytes of the dtype
+# by the bytes of the dtype; exp() of less is zero there, or nothing beside the smallest colour step
+_LEAST_EXPONENT = {4: -80.0, 8: -700.0}
 
 
 def least_exponent(cutoff: float, dtype: torch.dtype) -> float:
-    """Exponent below which a weight is not evaluated; at cutoff 0 where exp() turns slow, and zero in the dtype."""
-    lowest = _LOWEST_EXPONENT[dtype.itemsize]
-    return max(math.log(cutoff), lowest) if cutoff > 0.0 else lowest
+    """Return the exponent below which a weight is 0; at cutoff 0 where exp() turns slow, and zero in the dtype."""
+    least = _LEAST_EXPONENT[dtype.itemsize]
+    return max(math.log(cutoff), least) if cutoff > 0.0 else least
 
 
 def support_radius(cutoff: float, dtype: torch.dtype) -> float:
-    """Largest |z| at which a weight reaches `cutoff`; at cutoff 0, the largest that the dtype can tell from zero."""
+    """Return the largest |z| at which a weight reaches `cutoff`, or, at cutoff 0, is not zero in the dtype."""
     return math.sqrt(max(-2.0 * least_exponent(cutoff, dtype), 0.0))
 
 
 def sums_to_gradients(sums: Tensor, channels: int, cholesky: Tensor) -> Gradients:
-    """Turn sums over the pixels into gradients of means, factors (None each where not asked for) and colours.
+    """Turn sums over the pixels into gradients of means, factors and colours.
 
-    With g = dLoss/dI and v = w g^T c the sums are of w g, (..., C), and, where geometry is asked for, of
-    v (z1, z2, z1 z1, z1 z2, z2 z2), (..., C + 5).
+    With g = dLoss/dI and v = w g^T c the sums are of w g, (..., C), or of these and of v (z1, z2, z1 z1, z1 z2, z2 z2),
+    (..., C + 5). Without the latter, means and factors have no gradient: None.
     """
     colors = sums[..., :channels]
     if sums.shape[-1] == channels:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcgs.kernels.octaves import Blocks, Coarsened, choose_levels, coarsen, most_spacing
+from kcgs.kernels.coarse_grids import Blocks, Coarsened, choose_levels, coarsen, most_spacing
 from kcgs.kernels.tiles import TILE, bounding_tiles, find_keys
 from kcgs.kernels.whitened import support_radius
 

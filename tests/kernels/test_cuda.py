@@ -37,7 +37,7 @@ def test_agrees_with_the_reference() -> None:
 
 
 TYPES = {
-    **dict.fromkeys(("start", "gaussian", "mask_of", "order", "tiles", "firsts"), "*i64"),
+    **dict.fromkeys(("start", "gaussian", "mask_rows", "order", "tiles", "firsts"), "*i64"),
     **dict.fromkeys(("image", "nodes", "colors", "coefficients", "masks", "terms", "grad"), "*fp32"),
     **dict.fromkeys(("pixel_tiles", "rows", "cols", "height", "width", "count"), "i32"),
     "cutoff": "fp32",
@@ -56,7 +56,7 @@ def test_compiles_without_a_gpu(
     from triton.backends.compiler import GPUTarget
 
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
-    block = min(cuda._MOST_CHANNELS, 1 << (channels - 1).bit_length())
+    block = min(cuda._MAX_CHANNELS, 1 << (channels - 1).bit_length())
     common = {"SIDE": 16, "CHANNELS": channels, "BLOCK": block, "MAPPED": mapped}
     gather = {**common, "GEOMETRY": True, "PIECE": cuda._PIECE}
     for kernel, constants, warps in (

@@ -30,7 +30,7 @@ def test_480x854_with_7500_gaussians_in_2_gib() -> None:
 
 @pytest.mark.parametrize("chunk", [4, 1 << 22])
 def test_chunks_change_nothing(monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
-    monkeypatch.setattr(reference, "_CHUNK_ELEMENTS", chunk)
+    monkeypatch.setattr(reference, "_CHUNK_WEIGHTS", chunk)
     labels = torch.tensor([[0, 0, 1], [0, 1, 1]])
     generator = torch.Generator().manual_seed(0)
     means, colors = (3 * torch.rand(2, k, generator=generator, dtype=torch.float64) for k in (2, 1))

@@ -109,8 +109,8 @@ def test_wide_gaussians_on_coarse_grids(regions: int, batch: int) -> None:
     size = (70, 90) if GPU else (9, 33)
     inputs = make_inputs(5, size, regions=regions, softness=0.7, channels=2, batch=batch, cutoff=1e-4)
     inputs = inputs._replace(cholesky=inputs.cholesky * 3.0 ** torch.arange(5.0, device=DEVICE)[:, None] / 9)
-    wide = cuda.bin_gaussians(inputs).wide
-    assert wide is not None and 0 < len(wide.which) < inputs.colors[..., 0].numel()
+    wide = cuda.list_pairs(inputs).wide
+    assert wide is not None and 0 < len(wide.ids) < inputs.colors[..., 0].numel()
     double = SplatInputs(*(t.double() for t in inputs[:3]), *inputs[3:])
     for a, b in zip(render(cuda, inputs), render(tiled, double), strict=True):
         assert (a - b).abs().max() <= 5e-6 * b.abs().max()

@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..inputs import Gradients, OutOfRangeError, SplatInputs, Steps
+from ..coarse_grids import blocks_of, most_spacing
+from ..interface import Gradients, OutOfRangeError, SplatInputs, Steps
 from ..membership import Membership
-from ..octaves import blocks_of, most_spacing
 from ..threads import num_threads
 from ..whitened import least_exponent, support_radius
 from . import loops

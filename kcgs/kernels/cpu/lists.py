@@ -1,6 +1,6 @@
 """The CPU kernel's lists: the Gaussians as the loops read them, and which tiles and blocks each touches.
 
-Gaussians wider than the nodes of a coarser grid move there: see ..octaves.
+Gaussians wider than the nodes of a coarser grid move there: see ..coarse_grids.
 """
 
 from __future__ import annotations

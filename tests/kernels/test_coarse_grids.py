@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from kcgs.kernels import Membership, SplatInputs, reference, tiled
-from kcgs.kernels.bins import bin_gaussians
+from kcgs.kernels.coarse_grids import choose_levels, coarsen, grids_of, most_spacing, uncoarsen
 from kcgs.kernels.cpu import kernel as cpu
-from kcgs.kernels.nodes import gather, sample
-from kcgs.kernels.octaves import choose_levels, coarsen, grids_of, most_spacing, uncoarsen
+from kcgs.kernels.pairs import list_pairs
+from kcgs.kernels.splines import gather, sample
 
 CUTOFF = 1e-4
 
@@ -61,7 +61,7 @@ def assert_close(got: list[Tensor], want: list[Tensor], tolerance: float) -> Non
 )
 def test_backends_agree(size: tuple[int, int], batch: int, maps: int, softness: float) -> None:
     inputs = make_inputs(size, batch=batch, maps=maps, softness=softness)
-    assert (bin_gaussians(inputs).wide is None) == (max(size) <= 32)
+    assert (list_pairs(inputs).wide is None) == (max(size) <= 32)
     got, exact = render(tiled, inputs), render(tiled, double(inputs))
     assert_close(got, render(cpu, inputs), 2e-6)
     assert_close(got, exact, 2e-6)
@@ -75,16 +75,16 @@ def test_one_gaussian_of_each_level() -> None:
     sigma = 2.0 ** torch.arange(4) / (most_spacing(CUTOFF) / 2**0.25) * 1.01
     cholesky = sigma[:, None] * torch.tensor([[[1.0, 0.0, 1.0]]])
     inputs = inputs._replace(cholesky=cholesky, region_index=torch.tensor([[0, 1, 2, 1]]))
-    bins = bin_gaussians(inputs)
-    assert bins.wide is not None and bins.wide.gaussians.level.tolist() == [1, 2, 3]
-    assert bins.wide.which.tolist() == [1, 2, 3]
+    pairs = list_pairs(inputs)
+    assert pairs.wide is not None and pairs.wide.gaussians.level.tolist() == [1, 2, 3]
+    assert pairs.wide.ids.tolist() == [1, 2, 3]
     assert_close(render(tiled, inputs), render(cpu, inputs), 2e-6)
 
 
 def test_what_is_narrow_costs_nothing() -> None:
     inputs = make_inputs(maps=1)._replace(cholesky=torch.tensor([1.9, 0.0, 1.9]).expand(1, 40, 3))
-    assert bin_gaussians(inputs).wide is None
-    assert bin_gaussians(make_inputs(maps=1)._replace(cutoff=0.0)).wide is None
+    assert list_pairs(inputs).wide is None
+    assert list_pairs(make_inputs(maps=1)._replace(cutoff=0.0)).wide is None
     assert inputs.membership is not None and "blocks" not in inputs.membership._derived
 
 
@@ -102,12 +102,12 @@ def test_same_bits_every_time() -> None:
 
 def test_gather_is_the_transpose_of_sample() -> None:
     inputs = make_inputs((150, 110), batch=2, maps=1, softness=0.7)
-    bins = bin_gaussians(inputs)
-    assert bins.wide is not None and inputs.membership is not None
-    plan, masks = bins.wide.nodes, inputs.membership.tiles(16).masks
+    pairs = list_pairs(inputs)
+    assert pairs.wide is not None and inputs.membership is not None
+    plan, masks = pairs.wide.nodes, inputs.membership.tiles(16).masks
     assert any(step.masks is not None for step in plan.samples)
     nodes, pixels = (
-        torch.randn(k, 2, 16, 16, dtype=torch.float64) for k in (plan.live + 1, bins.total - plan.live - 1)
+        torch.randn(k, 2, 16, 16, dtype=torch.float64) for k in (plan.live + 1, pairs.num_tiles - plan.live - 1)
     )
     nodes[-1] = 0.0
     back, tiles = gather(pixels, plan, masks), torch.zeros_like(pixels)
@@ -118,16 +118,16 @@ def test_gather_is_the_transpose_of_sample() -> None:
 
 def test_splines_of_one_are_one() -> None:
     inputs = make_inputs((150, 110))._replace(cholesky=torch.tensor([1e3, 0.0, 1e3]).expand(1, 40, 3))
-    bins = bin_gaussians(inputs)
-    assert bins.wide is not None
+    pairs = list_pairs(inputs)
+    assert pairs.wide is not None
     # nodes of the coarsest grid alone: each level hands on what it is handed
-    plan, levels = bins.wide.nodes, len(grids_of(inputs.size, 1))
-    assert bins.wide.gaussians.level.unique().tolist() == [levels - 1]
+    plan, levels = pairs.wide.nodes, len(grids_of(inputs.size, 1))
+    assert pairs.wide.gaussians.level.unique().tolist() == [levels - 1]
     nodes = torch.zeros(plan.live + 1, 1, 16, 16, dtype=torch.float64)
     finer = torch.cat([step.blocks for step in plan.refinements])
     coarsest = torch.ones(plan.live, dtype=torch.bool).index_fill(0, finer, False)
     nodes[:-1][coarsest] = 1.0
-    tiles = torch.zeros(bins.total - plan.live - 1, 1, 16, 16, dtype=torch.float64)
+    tiles = torch.zeros(pairs.num_tiles - plan.live - 1, 1, 16, 16, dtype=torch.float64)
     sample(nodes, plan, None, tiles)
     seen = tiles.view(10, 7, 16, 16).transpose(1, 2).reshape(160, 112)[:150, :110]
     torch.testing.assert_close(seen, torch.ones_like(seen), rtol=1e-14, atol=0)

@@ -1,15 +1,12 @@
-"""Coarse grids for wide Gaussians: a Gaussian is evaluated at nodes, and cubic B-splines carry it to the pixels.
+"""Coarse grids for wide Gaussians, which are evaluated at nodes, and carried to the pixels by cubic B-splines.
 
 Level l has nodes 2^l pixels apart, in blocks of 16 x 16 for each region, only where the region has tiles; level 0 are
-the pixels. docs/performance.md has the formulas and the measured errors.
+the pixels. All kernels but `reference` and the ONNX decoders use it; docs/performance.md has the formulas and errors.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from typing import NamedTuple
 
 import torch
@@ -18,12 +15,13 @@ from torch import Tensor
 from .membership import Membership
 from .tiles import TILE
 
-# a grid of no more nodes than this is not coarsened again
-_SMALLEST = 2 * TILE
-# the interpolation is off by 0.0042 (spacing / deviation)^4, which this keeps at 1.7 times the cutoff
+# nodes along the longer side of the coarsest grid
+_COARSEST_SIDE = 2 * TILE
+# spacing of nodes, in standard deviations, at cutoff 1; it grows with cutoff^(1/4), so that the error of interpolation,
+# 0.0042 spacing^4, is 1.7 times the cutoff
 _SPACING = 4.5
-_MOST = 0.7
-_is_direct: ContextVar[bool] = ContextVar("direct", default=False)
+# largest spacing of nodes, in standard deviations: covariances of nodes are positive
+_MAX_SPACING = 0.7
 
 
 class Grid(NamedTuple):
@@ -52,18 +50,8 @@ class Blocks(NamedTuple):
 
 
 def most_spacing(cutoff: float) -> float:
-    """Spacing of nodes over the smaller standard deviation of a Gaussian that may be evaluated there; 0: none may."""
-    return 0.0 if _is_direct.get() else min(_SPACING * float(cutoff**0.25), _MOST)
-
-
-@contextmanager
-def direct() -> Iterator[None]:
-    """Evaluate every Gaussian at the pixels, in this thread: what benches compare with."""
-    token = _is_direct.set(True)
-    try:
-        yield
-    finally:
-        _is_direct.reset(token)
+    """Return the largest spacing of nodes that a Gaussian allows, in its smaller standard deviations; 0: none."""
+    return min(_SPACING * float(cutoff**0.25), _MAX_SPACING)
 
 
 def blocks_of(membership: Membership | None, size: tuple[int, int], device: torch.device) -> Blocks:
@@ -83,7 +71,7 @@ def grids_of(size: tuple[int, int], maps: int) -> tuple[Grid, ...]:
     """Return the grids of images of a size, the pixels first."""
     height, width = size
     grids = [Grid(height, width, -(-height // TILE), -(-width // TILE), 0)]
-    while max(height, width) > _SMALLEST:
+    while max(height, width) > _COARSEST_SIDE:
         last = grids[-1]
         # the last pixel, at n - 1/2, needs two nodes after it; node n - 2 the one at its place, and one more
         pixels = len(grids) == 1
@@ -103,9 +91,9 @@ def make_blocks(keys: Tensor, num_regions: int, shape: tuple[int, ...]) -> Block
         odd.append(2 * (row % 2) + col % 2)
         if coarser is None:
             break
-        wanted = _parent_keys(keys, num_regions, grid, coarser)
-        keys = wanted[wanted >= 0].unique()
-        parents.append(torch.where(wanted < 0, -1, torch.searchsorted(keys, wanted) + starts[-1]))
+        parent_keys = _parent_keys(keys, num_regions, grid, coarser)
+        keys = parent_keys[parent_keys >= 0].unique()
+        parents.append(torch.where(parent_keys < 0, -1, torch.searchsorted(keys, parent_keys) + starts[-1]))
         levels.append(keys)
         starts.append(starts[-1] + len(keys))
     parents.append(keys.new_full((len(keys), 4), -1))
@@ -122,14 +110,14 @@ def _places(keys: Tensor, num_regions: int, grid: Grid) -> tuple[Tensor, Tensor,
 
 def _parent_keys(keys: Tensor, num_regions: int, fine: Grid, coarse: Grid) -> Tensor:
     """Return the keys of the four blocks that each block reads of the coarser grid, -1 where it does not, (K, 4)."""
-    one, row, col, region = _places(keys, num_regions, fine)
-    found = []
+    map_index, row, col, region = _places(keys, num_regions, fine)
+    parents = []
     for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
         y, x = (row + down) // 2, (col + right) // 2
-        needed = (y < coarse.rows) & (x < coarse.cols) & (row % 2 >= down) & (col % 2 >= right)
-        parent = coarse.first_tile + (one * coarse.rows + y) * coarse.cols + x
-        found.append(torch.where(needed, parent * num_regions + region, -1))
-    return torch.stack(found, -1)
+        is_read = (y < coarse.rows) & (x < coarse.cols) & (row % 2 >= down) & (col % 2 >= right)
+        parent = coarse.first_tile + (map_index * coarse.rows + y) * coarse.cols + x
+        parents.append(torch.where(is_read, parent * num_regions + region, -1))
+    return torch.stack(parents, -1)
 
 
 class Coarsened(NamedTuple):
@@ -142,16 +130,16 @@ class Coarsened(NamedTuple):
 
 
 def choose_levels(cholesky: Tensor, spacing: float, levels: int) -> Tensor:
-    """Return the coarsest of so many levels whose nodes are close enough for each Gaussian, given in float64.
+    """Return the coarsest of the `levels` whose nodes are close enough for each Gaussian, (N,), from float64 factors.
 
-    That is where (h / s1)^4 + (h / s2)^4 <= spacing^4, of the standard deviations along the axes of the ellipse.
+    They are where (h / s1)^4 + (h / s2)^4 <= spacing^4, with the standard deviations along the axes of the ellipse.
     """
     l11, l21, l22 = cholesky.unbind(-1)
     # of the variances along the axes: their sum, and their product
     total, product = l11 * l11 + l21 * l21 + l22 * l22, l11 * l22 * l11 * l22
-    most = spacing**4 * product * product / (total * total - 2 * product)
-    bounds = torch.tensor([16.0**n for n in range(1, levels)], dtype=most.dtype, device=most.device)
-    return torch.searchsorted(bounds, most, right=True)
+    bound = spacing**4 * product * product / (total * total - 2 * product)  # of h^4
+    powers = torch.tensor([16.0**n for n in range(1, levels)], dtype=bound.dtype, device=bound.device)
+    return torch.searchsorted(powers, bound, right=True)
 
 
 def coarsen(level: Tensor, means: Tensor, cholesky: Tensor) -> Coarsened:
@@ -159,22 +147,22 @@ def coarsen(level: Tensor, means: Tensor, cholesky: Tensor) -> Coarsened:
     h = (1 << level).double()[:, None]
     l11, l21, l22 = cholesky.unbind(-1)
     variance = h[:, 0] ** 2 / 3
-    rest = l11 * l11 - variance
-    c11 = rest.sqrt()
-    c22 = (l22 * l22 - variance * (1 + l21 * l21 / rest)).sqrt()
+    square = l11 * l11 - variance
+    c11 = square.sqrt()
+    c22 = (l22 * l22 - variance * (1 + l21 * l21 / square)).sqrt()
     factors = torch.stack([c11, l11 * l21 / c11, c22], -1) / h
     return Coarsened(level, means / h + 1.5, factors, l11 * l22 / (c11 * c22))
 
 
 def uncoarsen(
-    given: Tensor, coarse: Coarsened, means: Tensor, cholesky: Tensor, factor: Tensor
+    fine: Tensor, coarse: Coarsened, means: Tensor, cholesky: Tensor, factor: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Turn gradients of what `coarsen` returned into those of the means and factors it was `given`, in float64."""
+    """Turn gradients of what `coarsen` returned, in float64, into those of its means and factors; these were `fine`."""
     h = (1 << coarse.level).double()[:, None]
-    l11, l21, l22 = given.unbind(-1)
+    l11, l21, l22 = fine.unbind(-1)
     (c11, _, c22), (g11, g21, g22) = (coarse.cholesky * h).unbind(-1), (cholesky / h).unbind(-1)
-    scaled, lost = factor * coarse.factor, h[:, 0] ** 2 / 3 * l21 / (c11 * c11)
+    scaled, shift = factor * coarse.factor, h[:, 0] ** 2 / 3 * l21 / (c11 * c11)
     last = (g22 - scaled / c22) / c22
-    first = (g11 - scaled / c11) * l11 - g21 * lost + last * lost * l21 * l11 / c11
-    rows = [scaled / l11 + first / c11, g21 * l11 / c11 - last * lost, scaled / l22 + last * l22]
+    first = (g11 - scaled / c11) * l11 - g21 * shift + last * shift * l21 * l11 / c11
+    rows = [scaled / l11 + first / c11, g21 * l11 / c11 - last * shift, scaled / l22 + last * l22]
     return means / h, torch.stack(rows, -1)

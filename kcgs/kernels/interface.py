@@ -1,4 +1,4 @@
-"""What a kernel is: the inputs that every kernel takes, and the steps that it consists of."""
+"""What a kernel takes and does. Every kernel's module has `steps(inputs)`, which the registry calls."""
 
 from __future__ import annotations
 
@@ -28,6 +28,11 @@ class SplatInputs(NamedTuple):
     size: tuple[int, int]  # (height, width)
     cutoff: float
 
+    @property
+    def gaussians(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Means, Cholesky factors and colours."""
+        return self[:3]
+
     def with_batch(self) -> SplatInputs:
         """Return the same, with B where Gaussians of one image have none."""
         if self.means.ndim == 3:
@@ -40,13 +45,15 @@ class OutOfRangeError(ValueError):
 
 
 class Steps(NamedTuple):
-    """A kernel in three steps, without a graph.
+    """A kernel as three functions, none of which records a graph.
 
-    `plan(inputs)` finds what touches what, `render(plan, inputs)` gives the image (B, C, H, W), and
-    `differentiate(plan, inputs, grad, geometry)` the gradients of means, cholesky (None unless `geometry`) and colors.
-    `image(inputs)` renders with a graph of all orders; None: the kernel is differentiable once.
-    `as_given`: Gaussians of one image may come without B, which results have not either then, and the plan raises
-    OutOfRangeError where values are out of range; else B is there, and values have been checked.
+    plan: from the inputs to which Gaussians touch which pixels, in a form of the kernel's own.
+    render: from (plan, inputs) to the image, (B, C, H, W).
+    differentiate: from (plan, inputs, gradient of the image, geometry) to the gradients of means, cholesky and colors;
+        the first two are None unless `geometry`.
+    image: from the inputs to the image, with a graph of all orders; None: the kernel is differentiable once.
+    as_given: Gaussians of one image may come without B, and so do the results; and `plan` raises OutOfRangeError.
+        Else B is there, and values have been checked.
     """
 
     plan: Callable[[SplatInputs], Any]

@@ -1,4 +1,4 @@
-"""Blocks of nodes in torch: refined from level to level, brought to the pixels, and back; any device.
+"""Cubic B-splines of coarse grids in torch, for `tiled` and `cuda`: blocks of nodes are refined and sampled at pixels.
 
 A block of 16 x 16 is made from a window W of 11 x 11 nodes of the coarser grid: M W M^T, one M for all. The window lies
 in one block, or in two or four neighbours, where the block is in an odd row or column of tiles.
@@ -14,18 +14,20 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .coarse_grids import Blocks
 from .membership import Membership
-from .octaves import Blocks
 from .tiles import TILE
 
+# nodes of the coarser grid within a block, along an axis
 _HALF = TILE // 2
+# nodes of the coarser grid that a block reads, along an axis
 _WINDOW = _HALF + 3
-# of a window along an axis, in even and in odd tiles: which of the two blocks, nodes of it, places in the window
+# of a window along an axis, in even and in odd tiles: (number of the block, its nodes, their places in the window)
 _PARTS = (
     ((0, slice(0, _WINDOW), slice(0, _WINDOW)),),
     ((0, slice(_HALF, TILE), slice(0, _HALF)), (1, slice(0, _WINDOW - _HALF), slice(_HALF, _WINDOW))),
 )
-# blocks made at once
+# blocks of a step, which bounds its memory: 2 MiB per channel in float32
 _CHUNK = 2048
 
 
@@ -42,7 +44,7 @@ class Step(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """The live blocks of nodes, those that are not all zero, and what is made from them."""
+    """The live blocks of nodes, those that are not all zero, and the steps from them to the pixels."""
 
     number: Tensor  # [copies, blocks of nodes + 1] int64, of each live block; of others `live`
     live: int
@@ -51,9 +53,9 @@ class Nodes(NamedTuple):
 
 
 def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, copies: int) -> Nodes:
-    """Find what is live where Gaussians touch blocks, given as positions in Nodes.number, flat.
+    """Find the live blocks from those that Gaussians touch, which are flat positions in Nodes.number.
 
-    Images that share a map have a copy of its blocks each.
+    Images that share a map have one of the `copies` of its blocks each.
     """
     first, starts = blocks.first, blocks.starts
     parents = blocks.parents - first
@@ -73,16 +75,16 @@ def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, c
     tile = copy * blocks.grids[1].first_tile + blocks.keys[block] // regions
     place = torch.where(pixels, tile, number[copy, (block - first).clamp_min(0)])
     # regions that share a tile go one after the other
-    of_pixels = tile[pixels]
-    rank = torch.arange(len(of_pixels), device=block.device) - torch.searchsorted(of_pixels, of_pixels) + 1
+    pixel_tile = tile[pixels]
+    rank = torch.arange(len(pixel_tile), device=block.device) - torch.searchsorted(pixel_tile, pixel_tile) + 1
     group[pixels] += 4 * torch.where(rows[pixels] < 0, 0, rank)
     group += blocks.odd[block]
 
     order = torch.argsort(group, stable=True)
     refinements: list[Step] = []
     samples: list[Step] = []
-    for n, chosen in enumerate(order.split(torch.bincount(group).tolist())):
-        for part in chosen.split(_CHUNK) if len(chosen) else ():
+    for n, members in enumerate(order.split(torch.bincount(group).tolist())):
+        for part in members.split(_CHUNK) if len(members) else ():
             parent = number[copy[part, None], parents[block[part]]]
             step = Step(place[part], parent, n % 4, rows[part] if n >= last + 4 else None)
             (refinements if n < last else samples).append(step)
@@ -92,7 +94,7 @@ def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, c
 def sample(nodes: Tensor, plan: Nodes, masks: Tensor | None, tiles: Tensor) -> None:
     """Refine live blocks in place, (live + 1, C, 16, 16), the last of zeros, and add their splines to the pixels.
 
-    `tiles` are of pixels, (tiles, C, 16, 16). There, splines are multiplied by the region weights.
+    `tiles` are of pixels, (tiles, C, 16, 16). There, splines are multiplied by the membership.
     """
     refinement, sampling = _refinement(nodes.dtype, nodes.device), _sampling(nodes.dtype, nodes.device)
     for step in plan.refinements:
@@ -137,7 +139,7 @@ def _collect(nodes: Tensor, step: Step, matrix: Tensor, grad: Tensor) -> None:
 
 @functools.lru_cache(maxsize=4)
 def _refinement(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Two-scale relation of cubic B-splines, from a window, (16, 11)."""
+    """Return the two-scale relation of cubic B-splines from a window to a block, (16, 11)."""
     weights = {k: math.comb(4, k) / 8 for k in range(5)}
     rows = [[weights.get(p - 2 * n + 3, 0.0) for n in range(_WINDOW)] for p in range(TILE)]
     return torch.tensor(rows, dtype=dtype, device=device)
@@ -145,7 +147,7 @@ def _refinement(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 @functools.lru_cache(maxsize=4)
 def _sampling(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Cubic B-splines at the centres of pixels, from a window, (16, 11)."""
+    """Return cubic B-splines of a window at the centres of pixels, (16, 11)."""
     rows = [[_spline(abs(p / 2 + 1.25 - n)) for n in range(_WINDOW)] for p in range(TILE)]
     return torch.tensor(rows, dtype=dtype, device=device)
 
