@@ -1,9 +1,10 @@
-"""Images, label maps and data sets."""
+"""Images and label maps on disk, label maps in colours, charts, and DAVIS."""
 
 from kcgs.data.charts import ChartSample, chart_2x3, chart_pie
+from kcgs.data.colors import colorize_labels, label_colors, overlay_labels
 from kcgs.data.davis import Davis, DavisFrame
 from kcgs.data.images import load_image, save_image
-from kcgs.data.labels import colorize_labels, label_colors, load_labels, overlay_labels, save_labels
+from kcgs.data.labels import load_labels, save_labels
 
 __all__ = [
     "ChartSample", "Davis", "DavisFrame", "chart_2x3", "chart_pie",

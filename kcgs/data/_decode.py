@@ -1,4 +1,4 @@
-"""Image files as arrays of the samples they store, at full precision; the readers give them a meaning."""
+"""Image files as arrays of the samples that they store, at full precision."""
 
 import logging
 import os
@@ -14,11 +14,12 @@ from kcgs._image import pil_samples
 
 Array = NDArray[Any]
 
-# tifffile logs what ails a file besides raising; the error says it once.
+# tifffile logs the defects of a file, too, which the error names already
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _TIFF = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
+# tag of the orientation in EXIF and TIFF
 _ORIENTATION = 274
 _LOSSLESS_FORMATS = ("PNG", "GIF", "BMP", "TIFF")
 
@@ -30,11 +31,11 @@ class Samples(NamedTuple):
     white: float | None  # the sample value of full intensity; None where the file format does not say
     format: str  # as Pillow spells it
     lossless: bool  # whether the format gives back the very samples that were stored
-    frames: int = 1  # of an animation, or pages
+    frames: int = 1  # number of images in the file: frames of an animation, or pages
 
 
 def decode(path: str | os.PathLike[str], *, indices: bool = False) -> Samples:
-    """Decode the first frame, turned upright as its EXIF orientation says; `indices`: palettes as their indices."""
+    """Decode the first frame, upright by its EXIF orientation; `indices`: palette images as their indices."""
     data = Path(path).read_bytes()
     try:
         samples = _tiff(data) if data.startswith(_TIFF) else None
@@ -49,12 +50,12 @@ def decode(path: str | os.PathLike[str], *, indices: bool = False) -> Samples:
         raise
     except UnidentifiedImageError:
         raise ValueError(f"cannot read {path}: not an image in a known format") from None
-    except Exception as error:  # Decoders raise whatever their corner of the format makes them stumble on.
+    except Exception as error:  # decoders raise errors of many types for damaged files
         raise ValueError(f"cannot read {path} as an image: {error}") from error
 
 
 def _pillow(data: bytes, image: Image.Image, indices: bool) -> Samples:
-    if data.startswith(_PNG) and data[24] == 16 and data[25] in (2, 6):  # 16 bits of colour, which Pillow halves
+    if data.startswith(_PNG) and data[24] == 16 and data[25] in (2, 6):  # 16 bits per channel, of which Pillow reads 8
         from kornia_rs.io import decode_image_png_u16
 
         mode = "rgb" if data[25] == 2 else "rgba"
@@ -63,17 +64,17 @@ def _pillow(data: bytes, image: Image.Image, indices: bool) -> Samples:
         values = np.asarray(image)[..., None].astype(np.uint8)
     else:
         values = pil_samples(image)
-    if image.format != "TIFF":  # Pillow turns those on loading.
+    if image.format != "TIFF":  # which Pillow turns itself
         values = _upright(values, image.getexif().get(_ORIENTATION, 1))
     white = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
-    # photos of telephones hold a second image that is part of the first
+    # the second image in a photo of a telephone is no frame: it belongs to the first
     frames = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)
     lossless = image.format in _LOSSLESS_FORMATS and image.info.get("compression") != "jpeg"
     return Samples(values, white, image.format or "unknown", lossless, frames)
 
 
 def _tiff(data: bytes) -> Samples | None:
-    """Return a grey or RGB TIFF that Pillow would reduce or refuse; None for the others."""
+    """Decode a grey or RGB TIFF that Pillow would reduce to 8 bits or refuse; None: Pillow reads it."""
     import tifffile
 
     with tifffile.TiffFile(BytesIO(data)) as file:
@@ -81,7 +82,7 @@ def _tiff(data: bytes) -> Samples | None:
         is_rgb, is_unsigned = int(page.photometric) == 2, page.sampleformat == 1
         if int(page.photometric) not in (0, 1, 2) or (is_unsigned and page.bitspersample in (1, 8)):
             return None
-        # Refuse what a damaged or hostile header claims, by the limit that Pillow has for its own formats.
+        # a damaged or hostile header can claim any size: the limit is that of Pillow for its own formats
         count, limit = page.imagewidth * page.imagelength, Image.MAX_IMAGE_PIXELS
         if limit is not None and count > 2 * limit:
             raise ValueError(f"its header claims {count} pixels, more than twice the limit of {limit}")
@@ -103,7 +104,7 @@ def _tiff(data: bytes) -> Samples | None:
 
 def _upright(values: Array, orientation: int) -> Array:
     """Apply an EXIF orientation to (H, W, C)."""
-    if orientation >= 5:  # 5 to 8 are 1, 6: 3 flips of the transposed image.
+    if orientation >= 5:  # 5 to 8 are flips of the transposed image
         values = values.swapaxes(0, 1)
     if orientation in (2, 3, 6, 7):
         values = values[:, ::-1]

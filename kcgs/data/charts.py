@@ -9,9 +9,12 @@ from torch import Tensor
 from kcgs._check import check_count
 from kcgs._repr import brief
 
+# RGB, by row and column
 _BLOCKS = (((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), ((0.0, 0.5, 0.0), (1.0, 0.5, 0.0), (0.5, 0.0, 0.5)))
-_BLOCK = 100
+# side of a block in pixels
+_BLOCK_SIDE = 100
 
+# RGB, clockwise from the top
 _SECTORS = (
     (1.0, 0.0, 0.0),
     (1.0, 0.5, 0.0),
@@ -22,16 +25,18 @@ _SECTORS = (
     (0.5, 0.0, 0.5),
     (1.0, 0.0, 1.0),
 )
+# pixels
 _PIE_SIZE = 300
 _PIE_RADIUS = 130.0
-# Half a sector: the first is centred at the top, and no edge runs along a row, a column or a diagonal.
+# half a sector: the first is centred at the top, and no edge runs along a row, a column or a diagonal
 _PIE_START = torch.pi / 8
+# samples of a pixel on an edge, per side
 _SUBSAMPLES = 8
 
 
 @brief
 class ChartSample(NamedTuple):
-    """A chart, :math:`(3, H, W)` float32 RGB in [0, 1], and the regions of pixel centres, :math:`(H, W)` int64."""
+    """A chart, :math:`(3, H, W)` float32 RGB in [0, 1], and the region of every pixel centre, :math:`(H, W)` int64."""
 
     image: Tensor
     labels: Tensor
@@ -58,7 +63,7 @@ def chart_2x3(scale: int = 1) -> ChartSample:
     blocks = torch.tensor(_BLOCKS)
     rows, columns = blocks.shape[:2]
     ids = torch.arange(rows * columns).reshape(rows, columns)
-    side = _BLOCK * scale
+    side = _BLOCK_SIDE * scale
     labels = ids.repeat_interleave(side, 0).repeat_interleave(side, 1)
     return ChartSample(blocks.flatten(0, 1)[labels].permute(2, 0, 1).contiguous(), labels)
 
@@ -88,7 +93,7 @@ def chart_pie(scale: int = 1) -> ChartSample:
     labels = _pie_region(centers[None, :], centers[:, None], scale)
     palette = torch.tensor([(1.0, 1.0, 1.0), *_SECTORS])
     image = palette[labels]
-    # Only pixels that touch another region can be mixed: sampling those alone keeps large scales affordable.
+    # only pixels that touch another region can be mixed; sampling only them saves time at large scales
     ids = labels[None].float()
     rows, columns = (F.max_pool2d(ids, 3, 1, 1) != -F.max_pool2d(-ids, 3, 1, 1))[0].nonzero(as_tuple=True)
     offsets = (torch.arange(_SUBSAMPLES, dtype=torch.float64) + 0.5) / _SUBSAMPLES
@@ -101,6 +106,6 @@ def chart_pie(scale: int = 1) -> ChartSample:
 def _pie_region(x: Tensor, y: Tensor, scale: int) -> Tensor:
     """Return the region of points given in pixels of the scaled chart."""
     x, y = x / scale - _PIE_SIZE / 2, y / scale - _PIE_SIZE / 2
-    turn = torch.atan2(x, -y) + _PIE_START  # Clockwise from the top, where the first sector is centred.
+    turn = torch.atan2(x, -y) + _PIE_START  # clockwise from the top, where the first sector is centred
     sector = (turn / (2 * torch.pi / len(_SECTORS))).floor().long() % len(_SECTORS)
     return torch.where(x**2 + y**2 < _PIE_RADIUS**2, sector + 1, 0)

@@ -1,26 +1,24 @@
-"""Frames and annotations of the DAVIS video segmentation data sets, 2016 and 2017."""
+"""First frames and annotations of the DAVIS video segmentation data sets, 2016 and 2017."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from torch import Tensor
 
-from kcgs._check import check_count
 from kcgs._repr import brief
 from kcgs.data.images import load_image
 from kcgs.data.labels import load_labels
-from kcgs.errors import InvalidArgument
 
 
 @brief
 class DavisFrame(NamedTuple):
-    """One frame of a sequence, :math:`(3, H, W)` float32 RGB in [0, 1], and its labels, :math:`(H, W)` int64.
+    """The first frame of a sequence, :math:`(3, H, W)` float32 RGB in [0, 1], and its labels, :math:`(H, W)` int64.
 
-    They are as annotated: 0 and 255 in DAVIS 2016, object numbers in 2017.
+    The labels are those of the annotation: 0 and 255 in DAVIS 2016, object numbers in 2017.
     """
 
     sequence: str
@@ -29,20 +27,16 @@ class DavisFrame(NamedTuple):
 
 
 class Davis:
-    """A folder of DAVIS in its official layout, one frame of each sequence.
+    """A folder of DAVIS at 480p in its official layout, by the names of its sequences.
 
-    The layout is ``JPEGImages/480p/SEQUENCE/00000.jpg`` and ``Annotations/480p/SEQUENCE/00000.png``.
-    Sequences that have a folder in both trees are listed; files are read on access.
+    The layout is ``JPEGImages/480p/SEQUENCE/00000.jpg`` and ``Annotations/480p/SEQUENCE/00000.png``. A sequence has a
+    folder in both trees; its files are read on access.
 
     Args:
         root: the folder that holds ``JPEGImages`` and ``Annotations``.
-        resolution: the folder below these two, "480p" in the usual download.
-        sequences: names to keep; None keeps all.
-        frame: which frame of every sequence, the number in its file name.
 
     Raises:
         FileNotFoundError: ``root`` does not have this layout.
-        ValueError: ``sequences`` names one that is not there, or ``frame`` is negative.
 
     Example:
         >>> import tempfile, torch
@@ -58,28 +52,16 @@ class Davis:
         (['cows'], (3, 4, 6), (4, 6))
     """
 
-    def __init__(
-        self,
-        root: str | os.PathLike[str],
-        *,
-        resolution: str = "480p",
-        sequences: Iterable[str] | None = None,
-        frame: int = 0,
-    ) -> None:
-        self._images = Path(root) / "JPEGImages" / resolution
-        self._annotations = Path(root) / "Annotations" / resolution
-        self._frame = check_count("frame", frame, least=0)
-        first, second = ({file.name for file in tree.glob("*/")} for tree in (self._images, self._annotations))
-        present = sorted(first & second)
-        if not present:
+    def __init__(self, root: str | os.PathLike[str]) -> None:
+        self._images = Path(root) / "JPEGImages" / "480p"
+        self._annotations = Path(root) / "Annotations" / "480p"
+        first, second = ({folder.name for folder in tree.glob("*/")} for tree in (self._images, self._annotations))
+        self.sequences = sorted(first & second)
+        if not self.sequences:
             raise FileNotFoundError(
-                f"root must hold JPEGImages/{resolution}/SEQUENCE/00000.jpg and "
-                f"Annotations/{resolution}/SEQUENCE/00000.png, as DAVIS is distributed; got {root}"
+                "root must hold JPEGImages/480p/SEQUENCE/00000.jpg and Annotations/480p/SEQUENCE/00000.png, "
+                f"as DAVIS is distributed; got {root}"
             )
-        self.sequences = present if sequences is None else sorted(set(sequences))
-        for name in self.sequences:
-            if name not in present:
-                raise InvalidArgument("sequences", f"among {', '.join(present)}", repr(name))
 
     def __len__(self) -> int:
         """Return the number of sequences."""
@@ -90,8 +72,7 @@ class Davis:
         return (self[name] for name in self.sequences)
 
     def __getitem__(self, key: int | str) -> DavisFrame:
-        """Read a frame by position or by the name of its sequence."""
+        """Read a frame by the position or the name of its sequence."""
         name = self.sequences[key] if isinstance(key, int) else key
-        file = Path(name, f"{self._frame:05d}")
-        image, labels = self._images / file.with_suffix(".jpg"), self._annotations / file.with_suffix(".png")
+        image, labels = self._images / name / "00000.jpg", self._annotations / name / "00000.png"
         return DavisFrame(name, load_image(image), load_labels(labels))

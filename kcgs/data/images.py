@@ -1,4 +1,4 @@
-"""Images on disk and (C, H, W) tensors."""
+"""Images on disk."""
 
 import math
 import os
@@ -15,8 +15,10 @@ from kcgs._atomic import atomic_path
 from kcgs._image import as_image, on_white
 from kcgs.data._decode import decode
 
+# Rec. 601
 _LUMA = (0.299, 0.587, 0.114)
 _MODES = {1: "L", 3: "RGB", 4: "RGBA"}
+# format and options of Pillow by suffix
 _WRITERS: dict[str, tuple[str, dict[str, object]]] = {
     ".png": ("PNG", {}),
     ".jpg": ("JPEG", {"quality": 95, "subsampling": 0}),
@@ -35,10 +37,9 @@ def load_image(
 ) -> Tensor:
     """Read an image as a tensor.
 
-    PNG, JPEG, WebP, TIFF, GIF, BMP and whatever else Pillow reads; of several frames, the first. EXIF orientation is
+    PNG, JPEG, WebP, TIFF, GIF, BMP and other formats of Pillow; of several frames, the first. EXIF orientation is
     applied. PNG and TIFF with 16 bits per channel keep them; float TIFF must lie in [0, 1]. CMYK becomes RGB by
-    Pillow's plain formula; colour profiles are not applied. "RGB" and "L" compose transparent pixels on white, and a
-    UserWarning says so, as one does of an animation.
+    Pillow's plain formula; colour profiles are not applied. "RGB" and "L" compose transparent pixels on white.
 
     Args:
         path: the file.
@@ -51,7 +52,10 @@ def load_image(
     Raises:
         OSError: ``path`` does not exist, or is a folder.
         ValueError: the file is truncated or no image, its samples have no defined white (32-bit integers, floats
-            outside [0, 1]), or an argument is not one of the above.
+            outside [0, 1]), or ``channels`` is another word.
+
+    Warns:
+        UserWarning: the file holds several images; it has transparent pixels, which are composed on white.
 
     Example:
         >>> import tempfile

@@ -1,7 +1,6 @@
 """``Davis`` over a small tree of its layout, and over real frames where they are."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,110 +9,56 @@ from PIL import Image
 
 from kcgs.data import Davis, DavisFrame
 
-
-def add_frame(root: Path, sequence: str, frame: int = 0, *, resolution: str = "480p", year: int = 2016) -> None:
-    images = root / "JPEGImages" / resolution / sequence
-    annotations = root / "Annotations" / resolution / sequence
-    for folder in (images, annotations):
-        folder.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", (12, 8), (10 * frame, 100, 200)).save(images / f"{frame:05d}.jpg", quality=95)
-    mask = np.zeros((8, 12), np.uint8)
-    mask[2:5, 3:9] = 255 if year == 2016 else 1
-    stored = Image.fromarray(mask)
-    if year == 2017:
-        mask[5:7, 3:9] = 2
-        stored = Image.fromarray(mask)
-        stored.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
-    stored.save(annotations / f"{frame:05d}.png")
+MASK = np.zeros((8, 12), np.uint8)
+MASK[2:5, 3:9], MASK[5:7, 3:9] = 1, 2
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
+    """Make two sequences of 2016, one of 2017 with a palette, and what is no sequence."""
+    for tree in ("JPEGImages/480p", "Annotations/480p"):
+        for name in ("dog", "bear", "cows"):
+            (tmp_path / tree / name).mkdir(parents=True)
+        (tmp_path / tree / "readme.txt").touch()
+    (tmp_path / "JPEGImages/480p/lonely").mkdir()
     for name in ("dog", "bear", "cows"):
-        add_frame(tmp_path, name)
-        add_frame(tmp_path, name, frame=7)
+        Image.new("RGB", (12, 8), "teal").save(tmp_path / f"JPEGImages/480p/{name}/00000.jpg")
+        mask = Image.fromarray(MASK if name == "cows" else (MASK > 0).astype(np.uint8) * 255)
+        if name == "cows":
+            mask.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
+        mask.save(tmp_path / f"Annotations/480p/{name}/00000.png")
     return tmp_path
 
 
 class TestDavis:
-    def test_listing(self, root: Path) -> None:
-        (root / "JPEGImages" / "480p" / "lonely").mkdir()
-        (root / "Annotations" / "480p" / "other").mkdir()
-        (root / "Annotations" / "480p" / "readme.txt").touch()
-        (root / "JPEGImages" / "480p" / "readme.txt").touch()
+    def test_sequences(self, root: Path) -> None:
         davis = Davis(str(root))
-        assert davis.sequences == ["bear", "cows", "dog"]
-        assert len(davis) == 3
-
-    def test_item(self, root: Path) -> None:
-        frame = Davis(root)["cows"]
-        assert isinstance(frame, DavisFrame)
-        sequence, image, labels = frame
-        assert sequence == "cows"
-        assert image.shape == (3, 8, 12)
-        assert image.dtype == torch.float32
-        assert labels.dtype == torch.int64
-        assert labels.unique().tolist() == [0, 255]
-        assert (labels[2:5, 3:9] == 255).all()
-
-    def test_indices(self, root: Path) -> None:
-        davis = Davis(root)
+        assert davis.sequences == ["bear", "cows", "dog"] and len(davis) == 3
         assert [davis[k].sequence for k in (0, 1, 2, -1, -3)] == ["bear", "cows", "dog", "dog", "bear"]
-        assert [frame.sequence for frame in davis] == davis.sequences
-        assert [frame.sequence for frame in davis] == davis.sequences  # a second pass starts anew
+        assert [frame.sequence for frame in davis] == [frame.sequence for frame in davis] == davis.sequences
 
-    def test_palette_annotations(self, tmp_path: Path) -> None:
-        add_frame(tmp_path, "dog", year=2017)
-        assert Davis(tmp_path)[0].labels.unique().tolist() == [0, 1, 2]
+    def test_frames(self, root: Path) -> None:
+        bear, cows = Davis(root)["bear"], Davis(root)["cows"]
+        assert isinstance(bear, DavisFrame) and bear.sequence == "bear"
+        assert bear.image.shape == (3, 8, 12) and bear.image.dtype == torch.float32
+        assert torch.equal(bear.labels, torch.from_numpy(MASK > 0).long() * 255)
+        assert torch.equal(cows.labels, torch.from_numpy(MASK).long())
 
-    def test_selection(self, root: Path) -> None:
-        davis = Davis(root, sequences=["dog", "bear", "dog"])
-        assert davis.sequences == ["bear", "dog"]
-        with pytest.raises(ValueError, match="sequences must be among bear, cows, dog; got 'cat'"):
-            Davis(root, sequences=["cat"])
-
-    def test_another_frame(self, root: Path) -> None:
-        first, later = Davis(root)[0].image, Davis(root, frame=7)[0].image
-        assert (later - first).abs().max() > 0.2
-
-    def test_another_resolution(self, tmp_path: Path) -> None:
-        add_frame(tmp_path, "dog", resolution="Full-Resolution")
-        assert Davis(tmp_path, resolution="Full-Resolution").sequences == ["dog"]
-        with pytest.raises(FileNotFoundError, match="480p"):
-            Davis(tmp_path)
-
-    @pytest.mark.parametrize("tree", ["JPEGImages", "Annotations"])
-    def test_missing_file_is_named_on_access(self, root: Path, tree: str) -> None:
-        suffix = {"JPEGImages": "jpg", "Annotations": "png"}[tree]
+    @pytest.mark.parametrize(("tree", "suffix"), [("JPEGImages", "jpg"), ("Annotations", "png")])
+    def test_missing_file_is_named_on_access(self, root: Path, tree: str, suffix: str) -> None:
         (root / tree / "480p" / "cows" / f"00000.{suffix}").unlink()
         davis = Davis(root)
-        assert "cows" in davis.sequences
         with pytest.raises(FileNotFoundError, match=rf"{tree}.*cows.00000\.{suffix}"):
             davis["cows"]
 
-    def test_missing_frame(self, root: Path) -> None:
-        with pytest.raises(FileNotFoundError, match=r"bear.00003\.jpg"):
-            Davis(root, frame=3)[0]
+    @pytest.mark.parametrize("name", ["", "nowhere"])
+    def test_bad_root(self, tmp_path: Path, name: str) -> None:
+        with pytest.raises(FileNotFoundError, match=r"root must hold JPEGImages.*Annotations"):
+            Davis(tmp_path / name)
 
-    def test_wrong_root(self, tmp_path: Path) -> None:
-        for root in (tmp_path, tmp_path / "nowhere"):
-            with pytest.raises(FileNotFoundError, match=r"root must hold JPEGImages.*Annotations"):
-                Davis(root)
-
-    def test_frame_argument(self, root: Path) -> None:
-        with pytest.raises(ValueError, match="frame must be at least 0; got -1"):
-            Davis(root, frame=-1)
-        wrong: Any = "0"
-        with pytest.raises(TypeError, match="frame must be an integer"):
-            Davis(root, frame=wrong)
-
-
-class TestRealData:
-    def test_first_frames(self, data_root: Path) -> None:
+    def test_real_data(self, data_root: Path) -> None:
         if not (data_root / "DAVIS").is_dir():
             pytest.skip(f"no DAVIS folder in {data_root}")
-        davis = Davis(data_root / "DAVIS", sequences=["blackswan", "cows", "train"])
-        for frame in davis:
-            assert frame.image.shape == (3, 480, 854)
-            assert frame.labels.unique().tolist() == [0, 255]
-            assert 0.01 < (frame.labels == 255).float().mean() < 0.5
+        davis = Davis(data_root / "DAVIS")
+        for frame in (davis["blackswan"], davis["train"]):
+            assert frame.image.shape == (3, 480, 854) and frame.labels.unique().tolist() == [0, 255]
