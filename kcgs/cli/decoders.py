@@ -1,4 +1,4 @@
-"""Commands around scenes: export, view, models."""
+"""Commands that show scenes elsewhere: export, view; and the list of scenes that come with kcgs, models."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import typer
 
 from kcgs._atomic import write_file
 
-from .common import Json, SceneFile, app, check_output, print_report
+from .commands import app
+from .common import Json, SceneFile, check_output, print_report
 from .fit import describe_scene
-from .options import Contours
+from .options import Contours, exclude
 
 
 @app.command()
@@ -19,7 +20,8 @@ def export(
     scene: SceneFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="ONNX file to write, or .html: one web page.")],
     interactive: Annotated[
-        bool, typer.Option("--interactive", help="With inputs for the part that is rendered and for regions to hide.")
+        bool,
+        typer.Option("--interactive", help="Of ONNX: add inputs for a view and for the visibility of each region."),
     ] = False,
     contours: Contours = "scaled",
     as_json: Json = False,
@@ -33,9 +35,8 @@ def export(
     if output.suffix == ".html":
         from kcgs.page.html import scene_page, web_bytes
 
-        if interactive:
-            raise typer.BadParameter("a page takes --contours only; --interactive is for .onnx")
-        # a compressed file is kept as it is
+        exclude("a page", interactive=interactive or None)
+        # a compressed file goes into the page as it is
         data = web_bytes(scene.read_bytes() if scene.suffix == ".kcgs" else loaded)
         size = write_file(output, scene_page(data, title=output.stem, contours=contours))
         print_report({**describe_scene(loaded), "scene_bytes": len(data), "bytes": size}, as_json, str(output))
@@ -59,8 +60,8 @@ def view(
     from kcgs.scene import check_unbatched
 
     loaded = check_unbatched(load(scene))
-    shown = scene.read_bytes() if scene.suffix == ".kcgs" else loaded
-    page = scene_page(shown, title=scene.stem, contours=contours)
+    content = scene.read_bytes() if scene.suffix == ".kcgs" else loaded
+    page = scene_page(content, title=scene.stem, contours=contours)
     serve(page, port=port, browser=browser, say=typer.echo)
 
 
@@ -69,5 +70,8 @@ def models(as_json: Json = False) -> None:
     """List the fitted scenes that come with kcgs; every command that reads a scene takes them as zoo:NAME."""
     from kcgs.zoo import entries
 
-    for_people = {e.name: f"{e.title}; {e.psnr:.2f} dB, {e.bytes} bytes" for e in entries()}
-    print_report({e.name: e._asdict() for e in entries()} if as_json else for_people, as_json, "zoo")
+    if as_json:
+        print_report({entry.name: entry._asdict() for entry in entries()}, as_json, "zoo")
+    else:
+        lines = {entry.name: f"{entry.title}; {entry.psnr:.2f} dB, {entry.bytes} bytes" for entry in entries()}
+        print_report(lines, as_json, "zoo")

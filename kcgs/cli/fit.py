@@ -13,7 +13,8 @@ from kcgs._atomic import write_file
 from kcgs._progress import Progress
 
 from . import options
-from .common import SCENES, ImageFile, Json, Quiet, Stop, app, check_output, exit_interrupted, print_report
+from .commands import app
+from .common import SCENES, ImageFile, InterruptHandler, Json, Quiet, check_output, exit_interrupted, print_report
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
     from kcgs.fitting import FitResult
     from kcgs.scene import Scene
 
-# dB that a fit must have to spare where it is then rounded to a file
-_ROUNDING = 0.15
+# dB by which a fit exceeds a target, for the rounding to a file to lose
+_ROUNDING_MARGIN = 0.15
 
 
 @app.command("fit")
@@ -42,43 +43,40 @@ def fit_command(
     as_json: Json = False,
 ) -> None:
     """Fit Gaussians to an image and save the scene. Ctrl-C saves the best so far."""
-    suffixes = SCENES if request.target_bytes is None else (".kcgs",)
-    output = output or Path(f"{image.stem}{suffixes[0]}")
-    check_output(output, *suffixes)
+    output = output or Path(f"{image.stem}{request.default_suffix}")
+    check_output(output, *(SCENES if request.target_bytes is None else (".kcgs",)))
     from kcgs.data import load_image
 
     target = load_image(image)
     labels = read_regions(regions, target, progress=not quiet)
-    with Stop() as stop:
-        fitted = fit_into(output, target, labels, request, on_step=stop.step, progress=not quiet)
-    report, regions_report = report_fit(fitted, target, labels, output, request), fitted.result.regions
-    if stop.wanted:
+    with InterruptHandler() as interrupts:
+        saved_fit = fit_and_save(output, target, labels, request, on_step=interrupts.on_step, progress=not quiet)
+    report, regions_report = report_fit(saved_fit, target, labels, output, request), saved_fit.result.regions
+    if interrupts.count:
         report["stop_reason"] = "interrupted"
     if as_json:
         report["region_report"] = None if regions_report is None else asdict(regions_report)
     print_report(report, as_json, str(output))
     if regions_report is not None and not as_json:
         typer.echo(f"regions: {regions_report}")
-    if stop.wanted:
+    if interrupts.count:
         raise exit_interrupted(f"the best so far to {output}")
     if report["target_reached"] is False:
-        target_psnr = request.config.target_psnr
-        typer.echo(
-            f"kcgs: --target-psnr {target_psnr:g} was not reached: {report['psnr']:.2f} dB is the best", err=True
-        )
+        target_psnr, psnr = request.config.target_psnr, report["psnr"]
+        typer.echo(f"kcgs: --target-psnr {target_psnr:g} was not reached: {psnr:.2f} dB is the best", err=True)
         raise typer.Exit(1)
 
 
-class Fitted(NamedTuple):
-    """A fit, and what was written of it."""
+class SavedFit(NamedTuple):
+    """A fit and its file."""
 
     result: FitResult
     scene: Scene
-    """As it is in the file."""
+    """As a reader of the file has it: rounded, if the file is compressed."""
     num_bytes: int
 
 
-def fit_into(
+def fit_and_save(
     output: Path,
     image: Tensor,
     labels: Tensor | None,
@@ -86,28 +84,28 @@ def fit_into(
     *,
     on_step: Callable[..., bool] | None = None,
     progress: bool = False,
-) -> Fitted:
-    """Fit, and write the scene or the compressed file, as the suffix says."""
+) -> SavedFit:
+    """Fit an image, and write the scene or the compressed file, by the suffix of `output`."""
     from kcgs.fitting import fit
     from kcgs.rate import compress, fit_bytes, quality_for
     from kcgs.scene import Scene
 
-    config, target, is_compressed = request.config, request.config.target_psnr, output.suffix == ".kcgs"
-    if target is not None and is_compressed:
-        config = config.model_copy(update={"target_psnr": target + _ROUNDING})
+    config, target_psnr, is_compressed = request.config, request.config.target_psnr, output.suffix == ".kcgs"
+    if target_psnr is not None and is_compressed:
+        config = config.model_copy(update={"target_psnr": target_psnr + _ROUNDING_MARGIN})
     settings: Any = {"recipe": config, "seed": request.seed, "on_step": on_step, "progress": progress}
     if request.target_bytes is not None:
-        done = fit_bytes(image, labels, request.target_bytes, **settings)
-        return Fitted(done.result, done.scene, write_file(output, done.data))
+        file = fit_bytes(image, labels, request.target_bytes, **settings)
+        return SavedFit(file.result, file.scene, write_file(output, file.data))
     result = fit(image, labels, request.num_gaussians, **settings)
     if not is_compressed:
         scene = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe})
-        return Fitted(result, scene, scene.save(output))
-    quality = quality_for(max(entry.psnr for entry in result.history)) if target is None else None
+        return SavedFit(result, scene, scene.save(output))
+    quality = quality_for(max(entry.psnr for entry in result.history)) if target_psnr is None else None
+    goal: Any = {"quality": quality, "target_psnr": target_psnr, "objective": config.objective}
     with Progress("writing the file", known=False, shown=progress):
-        goal: Any = {"quality": quality, "target_psnr": target, "objective": config.objective}
-        file = compress(result.scene, image, seed=request.seed, **goal)
-    return Fitted(result, file.scene, write_file(output, file.data))
+        compressed = compress(result.scene, image, seed=request.seed, **goal)
+    return SavedFit(result, compressed.scene, write_file(output, compressed.data))
 
 
 def read_regions(regions: str, image: Tensor, *, progress: bool = False) -> Tensor | None:
@@ -125,20 +123,20 @@ def read_regions(regions: str, image: Tensor, *, progress: bool = False) -> Tens
 
 
 def report_fit(
-    fitted: Fitted, image: Tensor, labels: Tensor | None, output: Path, request: options.FitRequest
+    saved_fit: SavedFit, image: Tensor, labels: Tensor | None, output: Path, request: options.FitRequest
 ) -> dict[str, Any]:
-    """Measure what was written of a fit, along the contours of `labels`, and say how the fit ended."""
+    """Return the metrics of the file, those of contours along `labels`, and how the fit ended."""
     from kcgs.evaluation import evaluate
 
-    figures = evaluate(fitted.scene, image, labels, visual=False)
-    target = request.config.target_psnr
+    metrics = evaluate(saved_fit.scene, image, labels, visual=False)
+    target_psnr = request.config.target_psnr
     return {
-        **figures,
-        **describe_scene(fitted.scene),
-        "seconds": fitted.result.seconds,
-        **describe_size(output, fitted.num_bytes, fitted.scene.size),
-        "stop_reason": fitted.result.stop_reason,
-        "target_reached": None if target is None else figures["psnr"] >= target,
+        **metrics,
+        **describe_scene(saved_fit.scene),
+        "seconds": saved_fit.result.seconds,
+        **describe_file(output, saved_fit.num_bytes, saved_fit.scene.size),
+        "stop_reason": saved_fit.result.stop_reason,
+        "target_reached": None if target_psnr is None else metrics["psnr"] >= target_psnr,
     }
 
 
@@ -148,7 +146,7 @@ def describe_scene(scene: Scene) -> dict[str, int]:
     return {"num_gaussians": scene.num_gaussians, "regions": regions}
 
 
-def describe_size(path: Path, num_bytes: int, size: tuple[int, int]) -> dict[str, float | None]:
-    """Return the size of a file and, of a compressed one, that by the pixels of its image."""
+def describe_file(path: Path, num_bytes: int, size: tuple[int, int]) -> dict[str, float | None]:
+    """Return the bytes of a file and, of a compressed one, its bits per pixel."""
     rate = 8 * num_bytes / (size[0] * size[1]) if path.suffix == ".kcgs" else None
     return {"bytes": num_bytes, "bits_per_pixel": rate}

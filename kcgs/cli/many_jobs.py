@@ -1,4 +1,4 @@
-"""What `kcgs fit-many` does with one image, in whichever process that happens."""
+"""The job that `kcgs fit-many` runs for each image, in any process."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 
 from kcgs._atomic import write_file
 
-from .common import clean
-from .fit import fit_into, read_regions, report_fit
+from .common import replace_undefined
+from .fit import fit_and_save, read_regions, report_fit
 from .options import FitRequest
 
 
-class Order(NamedTuple):
+class FitJob(NamedTuple):
     """An image to be fitted, and how."""
 
     image: Path
@@ -27,46 +27,46 @@ class Order(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What became of an image."""
+    """The result of a job."""
 
     row: dict[str, Any]
-    """Of results.csv; with an error, where there is one."""
+    """Of results.csv; its error alone, where the job failed."""
     is_new: bool
     """False: the scene was there from the same image, mask and settings."""
     warnings: tuple[str, ...] = ()
 
 
-def fit_one(order: Order) -> Outcome:
+def fit_one(job: FitJob) -> Outcome:
     """Fit an image, write its scene and its row, unless they are there; an error is returned."""
-    record = order.output.with_suffix(".json")
+    record = job.output.with_suffix(".json")
     try:
-        fit = _fingerprint(order)
-        if order.output.is_file() and record.is_file():
+        fingerprint = _fingerprint(job)
+        if job.output.is_file() and record.is_file():
             row = json.loads(record.read_text(encoding="utf-8"))
-            if row["fit"] == fit:
+            if row.get("fingerprint") == fingerprint:
                 return Outcome(row, False)
         # a warning of one image among many must say which image: the caller does
-        with warnings.catch_warnings(record=True) as caught:
+        with warnings.catch_warnings(record=True) as messages:
             warnings.simplefilter("always", UserWarning)
-            row = {**clean(_fit(order)), "fit": fit}
+            row = {**replace_undefined(_fit(job)), "fingerprint": fingerprint}
         write_file(record, json.dumps(row))
-        return Outcome(row, True, tuple(str(warning.message) for warning in caught))
+        return Outcome(row, True, tuple(str(message.message) for message in messages))
     except Exception as error:
         return Outcome({"error": " ".join(str(error).split()) or type(error).__name__}, True)
 
 
-def _fit(order: Order) -> dict[str, Any]:
+def _fit(job: FitJob) -> dict[str, Any]:
     from kcgs.data import load_image
 
-    image = load_image(order.image)
-    labels = read_regions(order.regions, image)
-    fitted = fit_into(order.output, image, labels, order.request)
-    return report_fit(fitted, image, labels, order.output, order.request)
+    image = load_image(job.image)
+    labels = read_regions(job.regions, image)
+    saved_fit = fit_and_save(job.output, image, labels, job.request)
+    return report_fit(saved_fit, image, labels, job.output, job.request)
 
 
-def _fingerprint(order: Order) -> str:
+def _fingerprint(job: FitJob) -> str:
     """Hash the image, the mask and all settings."""
-    request = order.request
+    request = job.request
     settings = request.config.model_dump_json(), request.num_gaussians, request.target_bytes, request.seed
-    mask = order.regions.encode() if order.regions in ("auto", "none") else Path(order.regions).read_bytes()
-    return hashlib.sha256(b"\0".join((repr(settings).encode(), order.image.read_bytes(), mask))).hexdigest()
+    mask = job.regions.encode() if job.regions in ("auto", "none") else Path(job.regions).read_bytes()
+    return hashlib.sha256(b"\0".join((repr(settings).encode(), job.image.read_bytes(), mask))).hexdigest()

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
+from kcgs.errors import InvalidArgument
+
 if TYPE_CHECKING:
     from kcgs.fitting import FitConfig
     from kcgs.scene import Scene
@@ -24,19 +26,24 @@ Objective = Annotated[Literal["psnr", "ms-ssim"] | None, typer.Option(help="What
 
 
 class FitRequest(NamedTuple):
-    """What is asked of a fit besides the image and its regions."""
+    """The options of a fit besides the image and its regions."""
 
     num_gaussians: int
     target_bytes: int | None
-    """Of a `.kcgs` file, which then chooses the number of Gaussians."""
+    """Of a `.kcgs` file; the number of Gaussians then follows from it."""
     recipe: str
     settings: dict[str, Any]
     """In place of the recipe's."""
     seed: int
 
     @property
+    def default_suffix(self) -> str:
+        """Suffix of the file, where none is given."""
+        return ".safetensors" if self.target_bytes is None else ".kcgs"
+
+    @property
     def config(self) -> FitConfig:
-        """The recipe with these settings; ValueError says which is wrong."""
+        """The recipe with these settings; a ValueError names a wrong one."""
         from kcgs.fitting import FitConfig
 
         return FitConfig.from_recipe(self.recipe, **self.settings)
@@ -62,7 +69,7 @@ def fit_request(
     keep_contours: Annotated[bool, typer.Option("--keep-contours", help="Take the label map as exact.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of the random start.")] = 0,
 ) -> FitRequest:
-    """Return what the options ask for."""
+    """Put the options together."""
     if target_bytes is not None:
         exclude("--target-bytes", num_gaussians=num_gaussians, target_psnr=target_psnr)
     settings: dict[str, Any] = {
@@ -75,16 +82,16 @@ def fit_request(
 
 
 def with_fit_options(command: Callable[..., None], *, without: tuple[str, ...] = ()) -> Callable[..., None]:
-    """Give a command the options of `fit_request`, but for some, in place of its argument `request`."""
-    shared = dict(inspect.signature(fit_request, eval_str=True).parameters)
+    """Give a command the options of `fit_request`, less those of `without`, in place of its argument `request`."""
+    fit_options = dict(inspect.signature(fit_request, eval_str=True).parameters)
     for name in without:
-        del shared[name]
+        del fit_options[name]
     parameters: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
-        parameters.extend(shared.values() if name == "request" else [parameter])
+        parameters.extend(fit_options.values() if name == "request" else [parameter])
 
     def run(**arguments: Any) -> None:
-        command(request=fit_request(**{name: arguments.pop(name) for name in shared}), **arguments)
+        command(request=fit_request(**{name: arguments.pop(name) for name in fit_options}), **arguments)
 
     run.__doc__, run.__annotations__ = command.__doc__, {}
     keywords = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
@@ -92,26 +99,25 @@ def with_fit_options(command: Callable[..., None], *, without: tuple[str, ...] =
     return run
 
 
-def exclude(option: str, **others: object) -> None:
-    """Refuse options beside another one; None where one was not given."""
-    for name, value in others.items():
+def exclude(cause: str, **options: object) -> None:
+    """Refuse options that have a value where `cause`, another option or an argument, leaves them no meaning."""
+    for name, value in options.items():
         if value is not None:
-            raise typer.BadParameter(f"{option} excludes --{name.replace('_', '-')}")
+            raise InvalidArgument(name, f"left out with {cause}", value)
 
 
 def target_size(scene: Scene, scale: float | None, size: str | None) -> tuple[int, int]:
-    """Return the (height, width) that the options --scale and --size ask for, if memory has room for it."""
+    """Return the (height, width) that --scale or --size names, if memory has room for it."""
+    from kcgs._check import check_number
     from kcgs.scene import check_render_memory
 
     if size is not None:
         exclude("--size", scale=scale)
         width, _, height = size.partition("x")
         if not (width.isdigit() and height.isdigit()):
-            raise typer.BadParameter(f"--size must be WxH, such as 640x480; got {size!r}")
+            raise InvalidArgument("size", "WxH, such as 640x480", repr(size))
         sides = int(height), int(width)
     else:
-        from kcgs._check import check_number
-
         factor = check_number("scale", 1.0 if scale is None else scale, 0.0, 1e6, above=True)
         sides = max(1, round(scene.size[0] * factor)), max(1, round(scene.size[1] * factor))
     check_render_memory(scene, sides)

@@ -1,4 +1,4 @@
-"""Commands that read a scene: render, eval, info, encode, decode; the last three take label maps, too."""
+"""Commands that read a scene: render, eval, info, encode, decode; the last three also take label maps."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import typer
 from kcgs._atomic import write_file
 from kcgs._progress import Progress
 
+from .commands import app
 from .common import (
     OUTPUT_IMAGES,
     SCENES,
@@ -20,11 +21,10 @@ from .common import (
     Quiet,
     SceneFile,
     SceneOrMap,
-    app,
     check_output,
     print_report,
 )
-from .fit import describe_scene, describe_size
+from .fit import describe_file, describe_scene
 from .options import Contours, Objective, Scale, Size, exclude, target_size
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ def render(
     frame: Annotated[
         float | None, typer.Option(help="Of a batch: this time alone, in frames from 0; 0.5 is halfway to the next.")
     ] = None,
+    as_json: Json = False,
 ) -> None:
     """Render a scene at any size, or a batch of scenes as a video, at any frame rate."""
     if output.suffix:  # none: a folder
@@ -58,11 +59,15 @@ def render(
     if loaded.field.means.ndim == 3:
         from .video import render_batch
 
-        render_batch(loaded, output, target_size(loaded[0], scale, size), contours, frame_rate, frame)
+        target = target_size(loaded[0], scale, size)
+        num_frames = render_batch(loaded, output, target, contours, frame_rate, frame)
+        print_report({"frames": num_frames, "height": target[0], "width": target[1]}, as_json, str(output))
         return
     exclude("a scene of one image", frame_rate=frame_rate, frame=frame)
     check_output(output, *OUTPUT_IMAGES)
-    save_image(output, loaded.render(target_size(loaded, scale, size), contours))
+    target = target_size(loaded, scale, size)
+    save_image(output, loaded.render(target, contours))
+    print_report(_describe_image(output, target), as_json, str(output))
 
 
 @app.command("eval")
@@ -83,11 +88,11 @@ def eval_command(
     from kcgs.scene import check_unbatched
 
     loaded = check_unbatched(load(scene))
-    figures: dict[str, Any] = evaluate(loaded, load_image(image), None if regions is None else load_labels(regions))
+    report: dict[str, Any] = evaluate(loaded, load_image(image), None if regions is None else load_labels(regions))
     start = time.perf_counter()
     loaded.render()
-    figures |= {**describe_scene(loaded), "seconds": time.perf_counter() - start}
-    print_report(figures | describe_size(scene, scene.stat().st_size, loaded.size), as_json, str(scene))
+    report |= {**describe_scene(loaded), "seconds": time.perf_counter() - start}
+    print_report(report | describe_file(scene, scene.stat().st_size, loaded.size), as_json, str(scene))
 
 
 @app.command()
@@ -110,7 +115,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
         "height": loaded.size[0],
         "width": loaded.size[1],
         "softness": softness,
-        **describe_size(scene, scene.stat().st_size, loaded.size),
+        **describe_file(scene, scene.stat().st_size, loaded.size),
         **{f"metadata.{key}": value for key, value in loaded.metadata.items()},
     }
     print_report(report, as_json, str(scene))
@@ -165,7 +170,7 @@ def encode(
     report = {
         "psnr_to_scene": float(psnr(rounded.render(), loaded.render())),
         **describe_scene(rounded),
-        **describe_size(output, len(data), loaded.size),
+        **describe_file(output, len(data), loaded.size),
     }
     print_report(report, as_json, str(output))
 
@@ -175,25 +180,26 @@ def decode(
     file: Annotated[Path, typer.Argument(help="Compressed file (.kcgs).", metavar="FILE", dir_okay=False)],
     output: Annotated[Path, typer.Option("-o", "--output", help="Image file; of a label map .png or .npy.")],
     max_bytes: Annotated[int | None, typer.Option("--bytes", min=1, help="Read only the first bytes.")] = None,
-    scale: Scale = None,
-    size: Size = None,
-    contours: Contours = "scaled",
+    as_json: Json = False,
 ) -> None:
     """Render a compressed file, or the coarser image that its first bytes hold; or write its label map.
 
-    A PNG has ids as palette indices, above 255 as 16-bit grey, above 65,535 as colours R + 256 G + 65536 B.
+    A PNG has ids as palette indices, above 255 as 16-bit grey, above 65,535 as colours R + 256 G + 65536 B. For other
+    sizes, `render` takes the same files.
     """
     from kcgs import codec
     from kcgs.data import save_image, save_labels
 
     if (labels := _read_map(file)) is not None:
-        exclude("a label map", bytes=max_bytes, scale=scale, size=size)
+        exclude("a label map", max_bytes=max_bytes)
         check_output(output, ".png", ".npy")
         save_labels(output, labels, rgb_ids=output.suffix.lower() == ".png" and int(labels.max()) > 65535)
+        print_report(_describe_map(output, labels), as_json, str(output))
         return
     check_output(output, *OUTPUT_IMAGES)
     scene = codec.decode(file.read_bytes(), max_bytes=max_bytes).scene
-    save_image(output, scene.render(target_size(scene, scale, size), contours))
+    save_image(output, scene.render(target_size(scene, None, None)))
+    print_report(_describe_image(output, scene.size), as_json, str(output))
 
 
 def _read_map(file: Path) -> Tensor | None:
@@ -205,7 +211,12 @@ def _read_map(file: Path) -> Tensor | None:
     return decode_labels(data) if data.startswith(MAP_MAGIC) else None
 
 
+def _describe_image(file: Path, size: tuple[int, int]) -> dict[str, Any]:
+    return {"height": size[0], "width": size[1], "bytes": file.stat().st_size}
+
+
 def _describe_map(file: Path, labels: Tensor) -> dict[str, Any]:
-    report = {"holds": "label map", "height": labels.shape[0], "width": labels.shape[1]}
+    height, width = labels.shape
+    report = {"holds": "label map", "height": height, "width": width}
     report |= {"regions": len(labels.unique()), "largest_id": int(labels.max())}
-    return report | describe_size(file, file.stat().st_size, (labels.shape[0], labels.shape[1]))
+    return report | describe_file(file, file.stat().st_size, (height, width))

@@ -10,12 +10,14 @@ from typing import Annotated, Any
 import typer
 
 from kcgs._progress import Progress
+from kcgs.errors import InvalidArgument
 
-from .common import OUTPUT_IMAGES, ImageFile, Json, Quiet, app, check_output, clean, print_report
+from .commands import app
+from .common import OUTPUT_IMAGES, ImageFile, Json, Quiet, check_output, print_report, replace_undefined
 
 
-def _list_methods(wanted: bool) -> None:
-    if wanted:
+def _list_methods(is_set: bool) -> None:
+    if is_set:
         from kcgs.segment import available_methods, method_options
 
         for method in available_methods():
@@ -47,15 +49,14 @@ def segment(
 ) -> None:
     """Make a label map of an image, and list its regions.
 
-    The list has the area of each region, its name and score where the method knows them. Edge alignment is how well
-    the contours lie on edges of the image; 0.5 is chance.
+    The list has the area of each region, and its name and score where the method knows them.
     """
     from kcgs.data import load_image, overlay_labels, save_image, save_labels
     from kcgs.segment import segment_with_scores
 
     check_output(output, ".png", ".npy")
     if overlay is not None:
-        check_output(overlay, *OUTPUT_IMAGES, option="--overlay")
+        check_output(overlay, *OUTPUT_IMAGES, name="overlay")
     options = _parse_options(option or [])
     target = load_image(image)
     with Progress("finding regions", known=False, shown=not quiet):
@@ -67,14 +68,14 @@ def segment(
     for region, area in enumerate(labels.flatten().bincount().tolist()):
         name = None if names is None else names[region]
         score = None if scores is None else float(scores[region])
-        table.append(clean({"id": region, "area": area, "name": name, "score": score}))
+        table.append(replace_undefined({"id": region, "area": area, "name": name, "score": score}))
     report: dict[str, Any] = {"regions": len(table), "method": method}
     if as_json:
         report["table"] = table
     else:
         for row in table:
-            about = [f"{row['area']} pixels", row["name"], row["score"] is not None and f"score {row['score']:.2f}"]
-            report[f"region {row['id']}"] = ", ".join(filter(None, about))
+            facts = [f"{row['area']} pixels", row["name"], row["score"] is not None and f"score {row['score']:.2f}"]
+            report[f"region {row['id']}"] = ", ".join(filter(None, facts))
     print_report(report, as_json, str(output))
 
 
@@ -83,7 +84,7 @@ def _parse_options(pairs: list[str]) -> dict[str, Any]:
     for pair in pairs:
         key, equals, text = pair.partition("=")
         if not (equals and key.isidentifier()):
-            raise typer.BadParameter(f"--option must be KEY=VALUE; got {pair!r}")
+            raise InvalidArgument("option", "KEY=VALUE", repr(pair))
         try:
             options[key] = json.loads(text)
         except json.JSONDecodeError:

@@ -11,18 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from . import options
-from .common import OUTPUT_IMAGES, VIDEOS, Json, Quiet, Stop, app, check_output, exit_interrupted, print_report
+from .commands import app
+from .common import OUTPUT_IMAGES, VIDEOS, InterruptHandler, Json, Quiet, check_output, exit_interrupted, print_report
 from .fit import describe_scene, read_regions
 
 if TYPE_CHECKING:
     from kcgs.scene import Scene
 
-# options of a fit that mean one image
-_OF_ONE_IMAGE = ("max_seconds", "target_psnr", "target_bytes")
+# options of a fit that only make sense for one image
+_SINGLE_IMAGE_OPTIONS = ("max_seconds", "target_psnr", "target_bytes")
 
 
 @app.command("fit-video")
-@partial(options.with_fit_options, without=_OF_ONE_IMAGE)
+@partial(options.with_fit_options, without=_SINGLE_IMAGE_OPTIONS)
 def fit_video_command(
     video: Annotated[Path, typer.Argument(help="Video file, or folder of images.", metavar="VIDEO")],
     *,
@@ -34,15 +35,15 @@ def fit_video_command(
         str,
         typer.Option(
             metavar="MASKS|auto|none",
-            help="Folder of label maps, one for each frame; or the file of the first frame's, or auto (segment the "
-            "first frame), which are carried on; or none.",
+            help="Folder of label maps, one for each frame; or a label map of the first frame, or auto (segment the "
+            "first frame), which follow the motion; or none.",
         ),
     ] = "auto",
     request: options.FitRequest,
     frame_rate: Annotated[
         float | None, typer.Option(help="Frames per second; default: the file's, of a folder 24.")
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Fit so many frames only.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Number of frames; default: all.")] = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -62,28 +63,28 @@ def fit_video_command(
     else:
         maps = load_labels(regions, rgb_ids=True)
     start = time.perf_counter()
-    with Stop() as stop:
+    with InterruptHandler() as interrupts:
         scenes = fit_video(
             source, maps, request.num_gaussians, recipe=request.config, seed=request.seed, progress=not quiet,
-            on_frame=lambda number, scene: stop.step(number, scene) or number + 1 == frames,
+            on_frame=lambda number, scene: interrupts.on_step(number, scene) or number + 1 == frames,
         )  # fmt: skip
         seconds = time.perf_counter() - start
         size = scenes.save(output)
-    errors = [float(psnr(scene.render(), frame)) for scene, frame in zip(scenes, source, strict=False)]
+    psnrs = [float(psnr(scene.render(), frame)) for scene, frame in zip(scenes, source, strict=False)]
     report = {
         "frames": len(scenes), "width": scenes.size[1], "height": scenes.size[0],
         "frame_rate": float(scenes.metadata["frame_rate"]), **describe_scene(scenes),
-        "psnr": sum(errors) / len(errors), "psnr_least": min(errors), "seconds": seconds, "bytes": size,
+        "psnr": sum(psnrs) / len(psnrs), "psnr_least": min(psnrs), "seconds": seconds, "bytes": size,
     }  # fmt: skip
     print_report(report, as_json, str(output))
-    if stop.wanted:
+    if interrupts.count:
         raise exit_interrupted(f"the {len(scenes)} frames that are done to {output}")
 
 
 def render_batch(
     scenes: Scene, output: Path, size: tuple[int, int], contours: str, frame_rate: float | None, frame: float | None
-) -> None:
-    """Write a batch as a video, as a folder of PNGs, or one time of it as an image."""
+) -> int:
+    """Write a batch as a video, as a folder of PNGs, or one time of it as an image; return the number of images."""
     from kcgs._check import check_number
     from kcgs.data import save_image
     from kcgs.video import interpolate, write_video
@@ -93,11 +94,12 @@ def render_batch(
         check_output(output, *OUTPUT_IMAGES)
         check_number("frame", frame, 0.0, len(scenes) - 1.0, unit="frames")
         save_image(output, interpolate(scenes, frame).render(size, contours))
-        return
+        return 1
     if output.suffix:  # none: a folder
         check_output(output, *VIDEOS)
-    own = float(scenes.metadata.get("frame_rate", 24))
-    rate = own if frame_rate is None else check_number("frame_rate", frame_rate, 0.0, 1000.0, above=True)
-    count = 1 + math.floor((len(scenes) - 1) * rate / own + 1e-6)
-    times = (min(number * own / rate, len(scenes) - 1.0) for number in range(count))
-    write_video(output, (interpolate(scenes, moment).render(size, contours) for moment in times), rate)
+    scene_rate = float(scenes.metadata.get("frame_rate", 24))
+    rate = scene_rate if frame_rate is None else check_number("frame_rate", frame_rate, 0.0, 1000.0, above=True)
+    count = 1 + math.floor((len(scenes) - 1) * rate / scene_rate + 1e-6)
+    times = (min(number * scene_rate / rate, len(scenes) - 1.0) for number in range(count))
+    write_video(output, (interpolate(scenes, time).render(size, contours) for time in times), rate)
+    return count

@@ -1,4 +1,4 @@
-"""Independent jobs: one after another, in worker processes, or on a Ray cluster."""
+"""Independent jobs: one after another in this process, in worker processes, or on a Ray cluster."""
 
 from .jobs import ENGINES, run_jobs
 

@@ -1,4 +1,7 @@
-"""The one way to do jobs. Importing this loads no torch, so that a worker process can choose its threads first."""
+"""Independent jobs on the engines local and ray.
+
+Importing this module loads no torch: a worker process sets its number of threads first.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 ENGINES = ("local", "ray")
-# libraries that read their number of threads once, as they are loaded
+# libraries read these once, when they are loaded
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _KILLED = "a worker process was killed, perhaps because memory ran out: the same command goes on where it stopped"
 
@@ -34,22 +37,22 @@ def run_jobs(
     workers: int | None = None,
     threads: int = 1,
 ) -> Iterator[tuple[int, Result]]:
-    """Do independent jobs, and yield the index and result of each as it ends.
+    """Run independent jobs, and yield the index and the result of each as it ends.
 
-    Convention: a job keeps what it makes on disk, and returns its error as a part of its result; what it raises ends
-    the iteration. Every job runs on `threads` threads, so that it has the same result on either engine. With more than
+    Convention: an exception in a job ends the iteration, so a job that may fail returns its error, and writes what it
+    makes to disk. Every job runs on `threads` threads, so that it has the same result on either engine. With more than
     one worker, and on Ray, functions, jobs and results are pickled, and a script must guard its main part by
     ``if __name__ == "__main__":``.
 
     Args:
         function: called with one job; importable by name where there are worker processes.
-        jobs: what it is called with.
+        jobs: the arguments of the calls.
         engine: ``local``, or ``ray``: on the cluster at RAY_ADDRESS, or one on this machine that is shut down again.
         workers: jobs at a time. None: 1 locally, on Ray what its processors allow. With 1, ``local`` is this process.
         threads: of each job.
 
     Returns:
-        An iterator over all jobs in the order in which they end; nothing runs before the first is asked for.
+        An iterator over all jobs in the order in which they end. The first job starts with the first `next`.
 
     Raises:
         ValueError: unknown engine, workers or threads below 1.
@@ -72,11 +75,13 @@ def run_jobs(
             raise ImportError("engine 'ray' needs the package ray: pip install 'kcgs[ray]'") from error
         return _on_cluster(Pool, function, jobs, workers, threads)
     if workers is None or workers == 1:
-        return _here(function, jobs, threads)
-    return _in_processes(function, jobs, workers, threads)
+        return _in_this_process(function, jobs, threads)
+    return _in_worker_processes(function, jobs, workers, threads)
 
 
-def _here(function: Callable[[Job], Result], jobs: Sequence[Job], threads: int) -> Iterator[tuple[int, Result]]:
+def _in_this_process(
+    function: Callable[[Job], Result], jobs: Sequence[Job], threads: int
+) -> Iterator[tuple[int, Result]]:
     import torch
 
     before = torch.get_num_threads()
@@ -89,17 +94,17 @@ def _here(function: Callable[[Job], Result], jobs: Sequence[Job], threads: int) 
         yield index, result
 
 
-def _in_processes(
+def _in_worker_processes(
     function: Callable[[Job], Result], jobs: Sequence[Job], workers: int, threads: int
 ) -> Iterator[tuple[int, Result]]:
-    # spawn: a fork would copy torch's threads half alive
+    # spawn: torch's threads do not survive a fork
     context = multiprocessing.get_context("spawn")
-    waiting, running = enumerate(jobs), dict[Future[Result], int]()
-    with ProcessPoolExecutor(workers, context, _start_process, (threads,)) as pool:
+    queue, running = enumerate(jobs), dict[Future[Result], int]()
+    with ProcessPoolExecutor(workers, context, _start_worker, (threads,)) as pool:
         try:
             while True:
-                # no more than can run: what is in the queue of a pool cannot be cancelled
-                for index, job in islice(waiting, workers - len(running)):
+                # at most one job per worker is submitted: what waits inside a pool cannot be cancelled
+                for index, job in islice(queue, workers - len(running)):
                     running[pool.submit(function, job)] = index
                 if not running:
                     return
@@ -109,12 +114,12 @@ def _in_processes(
             raise RuntimeError(_KILLED) from error
 
 
-def _start_process(threads: int) -> None:
-    # Ctrl-C reaches every process of a terminal: a worker ends without a word
+def _start_worker(threads: int) -> None:
+    # Ctrl-C reaches every process of a terminal: a worker ends without a traceback
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     os.environ.update(dict.fromkeys(_THREAD_VARIABLES, str(threads)))
-    _use_threads(threads)
+    _set_threads(threads)
 
 
 def _end_with_parent() -> None:
@@ -124,7 +129,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _use_threads(threads: int) -> None:
+def _set_threads(threads: int) -> None:
     import torch
 
     torch.set_num_threads(threads)
@@ -136,35 +141,35 @@ def _on_cluster(
     import ray
     from ray.util.multiprocessing.pool import PoolTaskError
 
-    is_ours = not ray.is_initialized()
-    if is_ours:
+    starts_ray = not ray.is_initialized()
+    if starts_ray:
         options: dict[str, Any] = {"address": os.environ.get("RAY_ADDRESS", "local")}
         if options["address"] == "local":
-            # Ray's makers need no report of it
+            # no usage report to the makers of Ray
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
             options |= {"num_cpus": workers and workers * threads, "include_dashboard": False}
-            # what can be imported here can be imported there, as in worker processes of the engine local
+            # workers import what this process can import, as those of the engine local do
             options["runtime_env"] = {"env_vars": {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}}
         ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
     try:
         nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
-        room = sum([int(node["Resources"].get("CPU", 0)) // threads for node in nodes if node["Alive"]])
-        if room == 0:
+        capacity = sum([int(node["Resources"].get("CPU", 0)) // threads for node in nodes if node["Alive"]])
+        if capacity == 0:
             raise InvalidArgument("threads", "at most the processors of a node of the cluster", threads)
-        size, resources = min(workers or room, room), {"num_cpus": threads}
-        with pool_type(size, _use_threads, (threads,), ray_remote_args=resources) as pool:
-            for done in pool.imap_unordered(partial(_numbered, function), list(enumerate(jobs)), 1):
-                if isinstance(done, PoolTaskError):
-                    raise done.underlying
-                if isinstance(done, ray.exceptions.RayTaskError):
-                    raise done
-                if isinstance(done, ray.exceptions.RayError):
-                    raise RuntimeError(_KILLED) from done
-                yield done
+        size, resources = min(workers or capacity, capacity), {"num_cpus": threads}
+        with pool_type(size, _set_threads, (threads,), ray_remote_args=resources) as pool:
+            for outcome in pool.imap_unordered(partial(_run_numbered, function), list(enumerate(jobs)), 1):
+                if isinstance(outcome, PoolTaskError):
+                    raise outcome.underlying
+                if isinstance(outcome, ray.exceptions.RayTaskError):
+                    raise outcome
+                if isinstance(outcome, ray.exceptions.RayError):
+                    raise RuntimeError(_KILLED) from outcome
+                yield outcome
     finally:
-        if is_ours:
+        if starts_ray:
             ray.shutdown()
 
 
-def _numbered(function: Callable[[Job], Result], job: tuple[int, Job]) -> tuple[int, Result]:
+def _run_numbered(function: Callable[[Job], Result], job: tuple[int, Job]) -> tuple[int, Result]:
     return job[0], function(job[1])

@@ -275,8 +275,10 @@ class TestCommands:
     def test_wrong_use(self, run: Any) -> None:
         save_labels("mask.png", torch.from_numpy(shapes(2)))
         run("encode", "mask.png", "-o", "mask.kcgs")
-        assert "excludes --quality" in run("encode", "mask.png", "-o", "b.kcgs", "--quality", "40", code=2)
-        assert "excludes --scale" in run("decode", "mask.kcgs", "-o", "b.png", "--scale", "2", code=2)
+        assert "'--quality': must be left out with a label map" in run(
+            "encode", "mask.png", "-o", "b.kcgs", "--quality", "40", code=2
+        )
+        assert "'--bytes': must be left out" in run("decode", "mask.kcgs", "-o", "b.png", "--bytes", "5", code=2)
         assert ".png or .npy" in run("decode", "mask.kcgs", "-o", "b.jpg", code=2)
         assert "kcgs decode writes it" in run("encode", "mask.kcgs", "-o", "b.kcgs", code=1)
         assert "it is a label map, no scene" in run("render", "mask.kcgs", "-o", "b.png", code=1)

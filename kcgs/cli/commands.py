@@ -1,0 +1,53 @@
+"""The application `kcgs`, to which the other modules add their commands."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from kcgs.errors import InvalidArgument, InvalidArgumentType
+
+
+class CommandGroup(TyperGroup):
+    """Commands that report an argument which the library refuses as an option with a wrong value."""
+
+    def invoke(self, context: Any) -> Any:
+        """Run the command that the context names."""
+        try:
+            return super().invoke(context)
+        except (InvalidArgument, InvalidArgumentType) as error:
+            name = context.invoked_subcommand
+            command: Any = self.commands[name]
+            for parameter in command.params:
+                if parameter.name == error.name:
+                    message = f"must {error.verb} {error.expected}; got {error.received}"
+                    usage = typer.Context(command, context, name)
+                    raise typer.BadParameter(message, usage, parameter) from error
+            raise
+
+
+app = typer.Typer(
+    cls=CommandGroup,
+    help="Contour-aware 2D Gaussian splatting of images.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+
+
+def _print_version(version: bool) -> None:
+    if version:
+        from kcgs import __version__
+
+        typer.echo(f"kcgs {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Take options that come before a command."""

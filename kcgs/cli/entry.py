@@ -1,0 +1,42 @@
+"""The entry point: set up the process, run a command, turn an error into a line and an exit status."""
+
+import logging
+import os
+import sys
+import warnings
+
+import typer
+
+# each module adds its commands to `app`, in the order of `kcgs --help`
+from . import fit, many, video, scenes, segmentation, decoders, demo  # noqa: F401  # isort: skip
+from .commands import app
+
+
+def main() -> None:
+    """Run a command: exit status 0 done, 1 failed with one line that says why, 2 wrong usage."""
+    # torch reads it when it is loaded, which is later: its threads sleep while they wait, and take no core from
+    # other programs
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("kcgs").setLevel(logging.INFO)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _print_warning
+            app(prog_name="kcgs")
+    except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
+        typer.echo(f"kcgs: {_describe(error)}", err=True)
+        sys.exit(1)
+
+
+def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
+    typer.echo(f"warning: {_one_line(message)}", err=True)
+
+
+def _describe(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.strerror}: {error.filename}"
+    return _one_line(error) or type(error).__name__
+
+
+def _one_line(text: object) -> str:
+    return " ".join(str(text).split())
