@@ -92,12 +92,12 @@ class TestLoadLabels:
         with pytest.raises((ValueError, TypeError), match=message):
             load_labels(write(tmp_path / name, samples, **options))
 
-    @pytest.mark.parametrize("name", ["a.png", "a.npy"])
-    def test_bad_files(self, tmp_path: Path, name: str) -> None:
+    @pytest.mark.parametrize(("name", "cut"), [("a.png", 30), ("a.npy", 3)])
+    def test_bad_files(self, tmp_path: Path, name: str, cut: int) -> None:
         path = tmp_path / name
         with pytest.raises(FileNotFoundError, match=name):
             load_labels(path)
-        for data in (b"text", write(path, MAP).read_bytes()[:-20]):
+        for data in (b"text", write(path, MAP).read_bytes()[:-cut]):
             path.write_bytes(data)
             with pytest.raises(ValueError, match=rf"cannot read .*{name}"):
                 load_labels(path)
