@@ -34,7 +34,7 @@ def execute(path: Path, *, quick: bool, timeout: float = 600.0) -> NotebookNode:
     Args:
         path: the notebook; the file is not changed.
         quick: smaller images and shorter fits, as the tests run it.
-        timeout: seconds that a cell may take.
+        timeout: seconds that a cell, or the kernel's start, may take.
 
     Raises:
         CellExecutionError: a cell raised an error.
@@ -45,6 +45,7 @@ def execute(path: Path, *, quick: bool, timeout: float = 600.0) -> NotebookNode:
         client = NotebookClient(
             notebook,
             timeout=timeout,
+            startup_timeout=timeout,
             kernel_name="python3",
             record_timing=False,
             resources={"metadata": {"path": folder}},

@@ -83,6 +83,6 @@ class TestArguments:
             run_jobs(str, [], threads=-1)
 
     def test_without_ray(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setitem(sys.modules, "ray", None)
+        monkeypatch.setitem(sys.modules, "ray.util.multiprocessing", None)  # which other tests may have imported
         with pytest.raises(ImportError, match=r"pip install 'kcgs\[ray\]'"):
             run_jobs(str, [], engine="ray")

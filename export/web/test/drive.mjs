@@ -33,6 +33,7 @@ const context = await chromium.launchPersistentContext(profile, {
   args: FLAGS,
   viewport: { width: 1000, height: 700 },
   hasTouch: true,
+  timeout: TIMEOUT,
 });
 context.setDefaultTimeout(TIMEOUT);
 const page = context.pages()[0] ?? (await context.newPage());
