@@ -74,11 +74,6 @@ class TestBest:
         image, labels = scene()
         assert fit(image, labels, 40, recipe=quick(densify_from=1.0)).history[0].num_gaussians == 40
 
-    @pytest.mark.parametrize("initializer", ["random", "gradient", "uniform"])
-    def test_starts(self, initializer: str) -> None:
-        image, labels = scene()
-        assert fit(image, labels, 40, recipe=quick(initializer=initializer)).history[-1].psnr > 25
-
     def test_same_seed_same_bits(self, fitted: FitResult) -> None:
         image, labels = scene()
         a, b = fitted, fit(image, labels, 40, recipe=quick(), seed=0)
@@ -166,7 +161,7 @@ def hard_cases() -> dict[str, tuple[Tensor, Tensor, int]]:
         "black": (torch.zeros_like(image), labels, 30),
         "saturated": (image.round(), labels, 30),
         "checkerboard": (image, (x + y) % 2, 30),
-        "blocks": (image, (x // 6 + 16 * (y // 6)), 200),
+        "blocks": (image, (x // 12 + 16 * (y // 12)), 80),
         "one-pixel regions": (image, specks, 30),
         "more gaussians than pixels of a region": (image, specks, 800),
         "one row": (image[:, :1], labels[:1] + (x[:1] > 20).long(), 12),
@@ -178,10 +173,10 @@ class TestHardCases:
     @pytest.mark.parametrize("name", hard_cases())
     def test_no_collapse(self, name: str) -> None:
         image, labels, count = hard_cases()[name]
-        result = fit(image, labels, count, recipe=quick(iterations=80))
+        result = fit(image, labels, count, recipe=quick(iterations=60))
         picture = result.scene.render()
         assert bool(torch.isfinite(picture).all())
-        exact = [h for h in result.history if h.iteration >= 70]  # drawn as the result is
+        exact = [h for h in result.history if h.iteration >= 53]  # drawn as the result is
         reached = float(psnr(picture, image))
         assert reached >= max(h.psnr for h in exact) - 0.1 or reached > 60
         assert reached > 5

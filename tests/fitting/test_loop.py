@@ -72,14 +72,6 @@ class TestResult:
         fit(image, labels, 5, recipe=quick())
         assert torch.equal(image, copies[0]) and torch.equal(labels, copies[1])
 
-    @pytest.mark.parametrize("channels", [1, 4, 9])
-    def test_any_number_of_channels(self, channels: int) -> None:
-        image, labels = disc()
-        picture = image.mean(0, keepdim=True).expand(channels, -1, -1)
-        result = fit(picture, labels, 12, recipe=quick(iterations=300))
-        assert result.scene.field.colors.shape == (12, channels)
-        assert result.history[-1].psnr > 20
-
     @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 3)])
     def test_smaller_than_a_tile(self, size: tuple[int, int]) -> None:
         result = fit(torch.full((3, *size), 0.5), None, min(3, size[0] * size[1]), recipe=quick(iterations=400))
@@ -244,7 +236,7 @@ class TestCharts:
         image, labels = chart()  # type: ignore[operator]
         best = {}
         for recipe in ("paper", "gaussian-image", "gaussian-image-clamp"):
-            history = fit(image, labels, 20, recipe=recipe, iterations=300).history
+            history = fit(image, labels, 20, recipe=recipe, iterations=200).history
             best[recipe] = max(history, key=lambda h: h.psnr)
         for baseline in ("gaussian-image", "gaussian-image-clamp"):
             assert best["paper"].psnr > best[baseline].psnr + lead

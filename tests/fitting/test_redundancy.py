@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from skimage import data
 
 from kcgs import fit
 from kcgs.fitting.greedy import pick
@@ -122,13 +120,3 @@ class TestFit:
         counts = []
         fit(self.image, None, 50, iterations=40, densify_from=1.0, on_step=lambda i, e: counts.append(e.num_gaussians))
         assert set(counts) == {50}
-
-    @pytest.mark.slow
-    @pytest.mark.usefixtures("clock")
-    def test_more_time_is_never_worse(self) -> None:
-        image = torch.from_numpy(data.astronaut()[:192, 120:376] / 255).permute(2, 0, 1).float()
-        results = [fit(image, None, 300, max_seconds=seconds) for seconds in (0.1, 0.5, 1.0, 2.5, 6.0, 25.0)]
-        quality = [float(psnr(result.scene.render().clamp(0, 1), image)) for result in results]
-        # fits of other lengths end in other minima, up to 0.15 dB apart, as fits of other seeds do
-        assert all(after > before - 0.2 for before, after in pairwise(quality)), quality
-        assert results[-1].history[-1].iteration > 2 * 700
