@@ -13,7 +13,7 @@ from kcgs.fitting.redundancy import lowest_impact
 from kcgs.optim.frame import widen
 from kcgs.optim.newton import Gaussians, NewtonDescent, area, error_weights, half_gradients
 
-from .target import Splats, Target
+from .splats import Splats, Target
 
 # Numbers are tuned: more iterations and relocations lower the error, and take longer and flicker more.
 

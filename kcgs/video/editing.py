@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcgs.editing.inpainting import inpaint
-from kcgs.editing.masks import check_offset, dilate, nearest_labels, shift_labels
+from kcgs.editing.masks import check_offset, shift_labels
 from kcgs.editing.selection import check_region_ids
 from kcgs.fitting import FitConfig
 from kcgs.functional import RegionMap
@@ -19,18 +17,8 @@ from kcgs.nn.field import join
 from kcgs.scene import Scene, check_batch
 
 from .descent import FrameDescent
-from .fitting import stack
-from .motion import motion_at
-from .target import Splats, Target
-
-# pixels around a region that still have colours of it
-_FRINGE = 3
-# pixels between a Gaussian and where a motion puts it, from which on it is an outlier: relocated, or moving by itself
-_MAX_RESIDUAL = 1.0
-# samples of three rows: more find the motion of most rows more surely
-_RANSAC_TRIALS = 200
-# fewer rows do not determine a motion
-_MIN_ROWS = 12
+from .inpainting import apply_affine, background_motions, fill_holes
+from .splats import Splats, Target, stack
 
 
 @torch.inference_mode(False)
@@ -38,9 +26,9 @@ _MIN_ROWS = 12
 def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
     """Delete regions from all frames, and show what is behind them.
 
-    Convention: a hidden pixel takes colour and label from the nearest frame that shows it. The Gaussians of the other
-    regions say where it is there: their motion from each frame to the next is taken as affine. What no frame shows
-    continues its surroundings. The rows of the deleted regions are fitted to that.
+    Convention: a hidden pixel takes colour and label from the nearest frame that shows it. Its place there follows from
+    the motion of the Gaussians of the other regions, which is taken as affine. What no frame shows continues its
+    surroundings. The rows of the deleted regions are fitted to these pixels.
 
     Args:
         scenes: T frames with label maps, as :func:`fit_video` gives them.
@@ -66,8 +54,8 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
     deleted_pixels, deleted_rows = torch.isin(regions.labels, deleted_ids), torch.isin(row_ids, deleted_ids)
     edited: list[Splats] = []
     with threads_for_kernels(scenes.size[0] * scenes.size[1]):
-        motions = _background_motions(scenes.field.means.detach(), ~deleted_rows)
-        images, labels = _fill_holes(scenes.render(), regions.labels, deleted_pixels, motions)
+        motions = background_motions(scenes.field.means.detach(), ~deleted_rows)
+        images, labels = fill_holes(scenes.render(), regions.labels, deleted_pixels, motions)
         filled = regions.relabel(labels, "mean")
         for t, scene in enumerate(scenes):
             means, cholesky, colors, _, _ = Splats.of(scene)
@@ -75,7 +63,7 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
             colors[deleted_rows[t]] = 0.0
             if t:  # rows that filled the frame before go on
                 rows, before = deleted_rows[t] & deleted_rows[t - 1], edited[-1]
-                means[rows] = _apply(motions[t] @ motions[t - 1].inverse(), before.means[rows])
+                means[rows] = apply_affine(motions[t] @ motions[t - 1].inverse(), before.means[rows])
                 cholesky[rows], colors[rows] = before.cholesky[rows], before.colors[rows]
                 if before.region_ids is not None:
                     region_ids[rows] = before.region_ids[rows]
@@ -127,72 +115,3 @@ def _check(scenes: Scene, region_ids: int | Iterable[int]) -> tuple[RegionMap, T
         frame = int(has_others.min(0)[1])
         raise ValueError(f"region_ids must leave a region in every frame; got all regions of frame {frame}")
     return regions, row_ids, ids
-
-
-def _background_motions(means: Tensor, background: Tensor) -> Tensor:
-    """Return the affine motion (T, 3, 3) from the first frame to each that most rows of the background (T, N) have."""
-    from skimage.measure import ransac
-    from skimage.transform import AffineTransform
-
-    motions = [torch.eye(3, dtype=torch.float64)]
-    for t in range(1, len(means)):
-        rows = background[t - 1] & background[t]
-        points = [means[k][rows].double().cpu().numpy() for k in (t - 1, t)]
-        model = None
-        if len(points[0]) >= _MIN_ROWS:
-            model, _ = ransac(
-                points, AffineTransform, min_samples=3, residual_threshold=_MAX_RESIDUAL, max_trials=_RANSAC_TRIALS,
-                rng=0,
-            )  # fmt: skip
-        motions.append(motions[-1] if model is None else torch.from_numpy(model.params) @ motions[-1])
-    return torch.stack(motions)
-
-
-def _apply(motion: Tensor, points: Tensor) -> Tensor:
-    """Apply an affine motion (3, 3) to points (N, 2)."""
-    matrix = motion.to(points)
-    return points @ matrix[:2, :2].T + matrix[:2, 2]
-
-
-class _Pixels(NamedTuple):
-    """The pixels of a frame, some of them unknown."""
-
-    image: Tensor  # [C, H, W]
-    labels: Tensor  # [H, W]
-    unknown: Tensor  # [H, W] bool
-
-
-def _fill_holes(renders: Tensor, labels: Tensor, deleted: Tensor, motions: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the images and the labels of all frames with the deleted pixels (T, H, W) filled."""
-    holes = [dilate(mask, _FRINGE) for mask in deleted]
-    originals = [_Pixels(*pixels) for pixels in zip(renders, labels, holes, strict=True)]
-    filled: list[_Pixels] = []
-    for t, original in enumerate(originals):
-        pixels = _Pixels(*(plane.clone() for plane in original))
-        nearest = sorted(range(len(originals)), key=lambda s: abs(s - t))[1:]
-        sources = [(s, originals[s]) for s in nearest]
-        if t:  # pixels that no frame shows continue those of the frame before
-            sources.append((t - 1, filled[-1]))
-        for s, source in sources:
-            if pixels.unknown.any():
-                _copy(source, pixels, motions[s] @ motions[t].inverse())
-        image, new_labels, unknown = pixels
-        if unknown.any():
-            image, new_labels = inpaint(image, unknown), nearest_labels(new_labels, unknown)
-        new_labels = torch.where(deleted[t], new_labels, original.labels)  # the fringe keeps its labels
-        filled.append(_Pixels(image, new_labels, torch.zeros_like(unknown)))
-    return torch.stack([pixels.image for pixels in filled]), torch.stack([pixels.labels for pixels in filled])
-
-
-def _copy(source: _Pixels, target: _Pixels, motion: Tensor) -> None:
-    """Fill unknown pixels of the target, in place, from where a motion puts them in the source, if known there."""
-    y, x = target.unknown.nonzero().T
-    points = _apply(motion, torch.stack([x, y], -1).to(target.image) + 0.5)
-    cols, rows = points.floor().long().unbind(-1)
-    height, width = target.unknown.shape
-    known = (cols >= 0) & (cols < width) & (rows >= 0) & (rows < height)
-    known &= ~source.unknown[rows.clamp(0, height - 1), cols.clamp(0, width - 1)]
-    y, x, rows, cols = y[known], x[known], rows[known], cols[known]
-    target.image[:, y, x] = motion_at(source.image, points[known]).T
-    target.labels[y, x] = source.labels[rows, cols]
-    target.unknown[y, x] = False

@@ -1,4 +1,4 @@
-"""Video files through PyAV, and folders of images and of label maps; one frame is in memory at a time."""
+"""Video files, by PyAV, and folders of images and of label maps; one frame is in memory at a time."""
 
 import math
 import os
@@ -19,15 +19,27 @@ from kcgs._image import as_image
 from kcgs.data.images import load_image, save_image
 from kcgs.data.labels import load_labels
 
-_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-_LABEL_MAPS = (".png", ".npy", ".tif", ".tiff", ".bmp", ".gif", ".webp")
-_BT709 = 1  # matrix, primaries and transfer in H.273
-_LIMITED = 1  # AVCOL_RANGE_MPEG
-_SCALING = 0x4 | 0x2000 | 0x40000  # swscale: bicubic, chroma of every pixel, accurate rounding; 2.8 dB over its default
+# frames per second where a file or an iterable does not have a rate
+DEFAULT_FRAME_RATE = 24.0
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+_LABEL_MAP_SUFFIXES = (".png", ".npy", ".tif", ".tiff", ".bmp", ".gif", ".webp")
+# matrix, primaries and transfer in H.273
+_BT709 = 1
+# AVCOL_RANGE_MPEG
+_LIMITED_RANGE = 1
+# swscale: bicubic, chroma of every pixel, accurate rounding; 2.8 dB over its default
+_SCALING = 0x4 | 0x2000 | 0x40000
+# x264's constant rate factor: visually lossless
+_RATE_FACTOR = 14
+# of a frame rate as a fraction
+_MAX_DENOMINATOR = 65535
 
 
 class Frames:
-    """Frames :math:`(3, H, W)` in [0, 1] with ``size`` (H, W) and ``frame_rate``; every ``for`` reads them anew."""
+    """An iterable of frames :math:`(3, H, W)` in [0, 1] that reads them anew in every loop.
+
+    It has their ``size`` (H, W) and their ``frame_rate``.
+    """
 
     def __init__(self, path: Path, frame_rate: float | None) -> None:
         self._path = path
@@ -42,20 +54,20 @@ class Frames:
 
     def _read(self) -> Iterator[tuple[Tensor, float]]:
         if self._path.is_dir():
-            return ((load_image(file), 24.0) for file in _list_files(self._path, _IMAGES))
+            return ((load_image(file), DEFAULT_FRAME_RATE) for file in _list_files(self._path, _IMAGE_SUFFIXES))
         return _decode(self._path)
 
 
 def read_video(path: str | os.PathLike[str], *, frame_rate: float | None = None) -> Frames:
     """Open a video file or a folder of images as an iterable of frames.
 
-    Of a file, the first video stream is read with 8 bits per channel and turned upright. Colours follow the matrix
-    that the file names, BT.601 where it names none; HDR is not mapped, a variable frame rate not resampled. Images of
-    a folder come in natural order, ``9.png`` before ``10.png``.
+    Of a file, the first video stream is read with 8 bits per channel and turned upright. Colours follow the matrix of
+    the file, BT.601 where it has none. HDR is not mapped, and a variable frame rate is not resampled. Images of a
+    folder come in natural order, ``9.png`` before ``10.png``.
 
     Args:
         path: a video file (``pip install 'kcgs[video]'``), or a folder of images as `load_image` reads them.
-        frame_rate: frames per second, above 0; None: the file's mean rate, 24 where none is stored.
+        frame_rate: frames per second, above 0; None: the mean rate of the file, 24 where it has none.
 
     Returns:
         The frames, :math:`(3, H, W)` float32 in [0, 1], with ``size`` (H, W) and ``frame_rate``.
@@ -63,8 +75,8 @@ def read_video(path: str | os.PathLike[str], *, frame_rate: float | None = None)
     Raises:
         FileNotFoundError: ``path`` does not exist.
         ImportError: ``path`` is a file and PyAV is not installed.
-        ValueError: there is no frame or no video stream. While reading: the file is damaged (a Matroska file that was
-            cut short just ends early).
+        ValueError: there is no frame or no video stream. In a loop: the file is damaged (a truncated Matroska file
+            just ends early).
 
     Example:
         >>> import tempfile, torch
@@ -100,9 +112,9 @@ def read_label_maps(folder: str | os.PathLike[str]) -> list[Tensor]:
         ...     [(tuple(labels.shape), int(labels.max())) for labels in read_label_maps(f"{folder}/maps")]
         [((4, 6), 0), ((4, 6), 0)]
     """
-    files = _list_files(Path(folder), _LABEL_MAPS)
+    files = _list_files(Path(folder), _LABEL_MAP_SUFFIXES)
     if not files:
-        raise ValueError(f"{folder} has no label maps ({', '.join(_LABEL_MAPS)})")
+        raise ValueError(f"{folder} has no label maps ({', '.join(_LABEL_MAP_SUFFIXES)})")
     return [load_labels(file, rgb_ids=True) for file in files]
 
 
@@ -133,12 +145,12 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[Any], frame_rate:
     """
     rate = check_number("frame_rate", frame_rate, 0, above=True)
     images = _check_frames(frames)
-    first = next(images)  # before anything is written
+    first = next(images)  # checked before anything is written
     images = chain([first], images)
     if not Path(path).suffix:
         return _write_folder(Path(path), images)
     with atomic_path(path) as temporary:
-        _encode(temporary, images, (first.shape[1], first.shape[2]), Fraction(rate).limit_denominator(65535))
+        _encode(temporary, images, (first.shape[1], first.shape[2]), Fraction(rate).limit_denominator(_MAX_DENOMINATOR))
 
 
 def _list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
@@ -162,7 +174,7 @@ def _decode(path: Path) -> Iterator[tuple[Tensor, float]]:
         with av.open(os.fspath(path)) as container:
             if not container.streams.video:
                 raise ValueError(f"{path} has no video stream")
-            rate = float(container.streams.video[0].average_rate or 24)
+            rate = float(container.streams.video[0].average_rate or DEFAULT_FRAME_RATE)
             for number, frame in enumerate(container.decode(video=0)):
                 if frame.is_corrupt:
                     raise ValueError(f"frame {number} of {path} is damaged")
@@ -187,17 +199,17 @@ def _check_frames(frames: Iterable[Any]) -> Iterator[Tensor]:
 def _encode(path: Path, images: Iterator[Tensor], size: tuple[int, int], rate: Fraction) -> None:
     av = _import_av()
     with av.open(os.fspath(path), "w", options={"movflags": "+faststart"}) as container:
-        stream = container.add_stream("libx264", rate=rate, options={"crf": "14"})
+        stream = container.add_stream("libx264", rate=rate, options={"crf": str(_RATE_FACTOR)})
         stream.height, stream.width = size
         stream.pix_fmt = "yuv444p" if stream.height % 2 or stream.width % 2 else "yuv420p"
         context = stream.codec_context
-        context.thread_count = 1  # the same bytes however many processors there are
+        context.thread_count = 1  # the same bytes for any number of processors
         context.colorspace = context.color_primaries = context.color_trc = _BT709
-        context.color_range = _LIMITED
+        context.color_range = _LIMITED_RANGE
         for number, image in enumerate(images):
             levels = (image.detach().float().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).contiguous()
             frame = av.VideoFrame.from_ndarray(levels.cpu().numpy(), "rgb24").reformat(
-                format=stream.pix_fmt, dst_colorspace=_BT709, dst_color_range=_LIMITED, interpolation=_SCALING
+                format=stream.pix_fmt, dst_colorspace=_BT709, dst_color_range=_LIMITED_RANGE, interpolation=_SCALING
             )
             frame.pts, frame.time_base = number, 1 / rate
             container.mux(stream.encode(frame))

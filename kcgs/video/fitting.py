@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from collections.abc import Callable, Iterable, Iterator, Sized
 from itertools import chain, repeat
 from typing import Any
 
@@ -20,18 +20,16 @@ from kcgs.fitting import FitConfig, fit
 from kcgs.fitting.problem import check_image_and_regions
 from kcgs.functional import RegionMap, lookup_regions
 from kcgs.kernels import threads_for_kernels
-from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
 from .descent import FrameDescent
+from .files import DEFAULT_FRAME_RATE
 from .motion import estimate_motion, move_labels, move_points
-from .target import Splats, Target
+from .splats import Splats, Target, stack
 
 OnFrame = Callable[[int, Scene], bool | None]
 Labels = RegionMap | Tensor | NDArray[Any]
 
-# frames per second where `frames` does not have a rate
-_FRAME_RATE = 24.0
 # squared error of a start, as a share of the image's variance, from which on it is a scene cut
 _CUT_SHARE = 0.5
 # share of the movable rows that is relocated, by iteration of the descent
@@ -108,7 +106,7 @@ def fit_video(
                 break
     if not video.frames:
         raise InvalidArgument("frames", "at least one frame", "none", verb="hold")
-    frame_rate = float(getattr(frames, "frame_rate", _FRAME_RATE))
+    frame_rate = float(getattr(frames, "frame_rate", DEFAULT_FRAME_RATE))
     return stack(video.frames, scene.size, {"frame_rate": f"{frame_rate:.10g}"})
 
 
@@ -203,22 +201,6 @@ def _move_means(motion: Tensor, splats: Splats) -> Tensor:
     mean = sums / pixels.bincount()[:, None]
     inside = lookup_regions(moved, regions.labels) == splats.region_ids
     return torch.where(inside[:, None], moved, splats.means - mean[splats.region_index].to(moved))
-
-
-def stack(frames: list[Splats], size: tuple[int, int], metadata: Mapping[str, str]) -> Scene:
-    """Return the Gaussians and the maps of all frames as one scene."""
-    means, cholesky, colors = (torch.stack(parts) for parts in zip(*(frame[:3] for frame in frames), strict=True))
-    maps = [frame.regions for frame in frames if frame.regions is not None]
-    if not maps:
-        return Scene(GaussianField(means, cholesky, colors, size=size), None, metadata)
-    region_ids = torch.stack([frame.region_ids for frame in frames if frame.region_ids is not None])
-    # a pair of regions has the same softness in all frames
-    softness: dict[tuple[int, int], float] = {}
-    for regions in maps:
-        softness |= regions.softness if isinstance(regions.softness, Mapping) else {}
-    labels = torch.stack([regions.labels for regions in maps])
-    regions = RegionMap.from_labels(labels, softness or maps[0].softness)
-    return Scene(GaussianField(means, cholesky, colors, region_ids, size=size), regions, metadata)
 
 
 def _pair(frames: Iterable[Any], label_maps: Labels | Iterable[Labels] | None) -> Iterator[tuple[Any, Labels | None]]:

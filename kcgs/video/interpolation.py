@@ -1,4 +1,4 @@
-"""Frames between two frames."""
+"""Scenes between two frames."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from kcgs.nn import GaussianField
 from kcgs.nn.field import join
 from kcgs.scene import Scene, check_batch
 
-from .motion import estimate_motion, motion_at, move_labels, move_points
+from .motion import estimate_motion, move_labels, move_points, sample
 
 
 @torch.no_grad()
 def interpolate(scenes: Scene, time: float) -> Scene:
     """Return the scene at any time of a batch of scenes.
 
-    Convention: between two frames there are the Gaussians of both, moved along the motion between their renders; those
-    of the earlier fade out while those of the later fade in. So a relocated row needs no rule of its own. The label map
-    is that of the earlier frame, moved.
+    Convention: between two frames the scene has the Gaussians of both, moved along the motion between their renders.
+    Those of the earlier frame fade out while those of the later fade in. The label map is that of the earlier frame,
+    moved.
 
     Args:
         scenes: T frames, as :func:`fit_video` gives them.
@@ -41,19 +41,20 @@ def interpolate(scenes: Scene, time: float) -> Scene:
         2
     """
     time = check_number("time", time, 0.0, len(check_batch(scenes)) - 1.0, unit="frames")
-    number, share = int(time), math.fmod(time, 1.0)
-    if share == 0.0:
+    number, fraction = int(time), math.fmod(time, 1.0)
+    if fraction == 0.0:
         return scenes[number]
     first, second = scenes[number], scenes[number + 1]
     motion = estimate_motion(first.render(), second.render())
-    one, other = first.field, second.field
-    earlier = one.means.lerp(move_points(motion, one.means), share)
-    later = other.means + (1 - share) * motion_at(motion, other.means)
+    earlier, later = first.field, second.field
+    earlier_means = earlier.means.lerp(move_points(motion, earlier.means), fraction)
+    later_means = later.means + (1 - fraction) * sample(motion, later.means)
+    fading_out, fading_in = (1 - fraction) * earlier.merged_colors(), fraction * later.merged_colors()
     field = join(
-        GaussianField(earlier, one.cholesky, (1 - share) * one.merged_colors(), one.region_ids, size=scenes.size),
-        GaussianField(later, other.cholesky, share * other.merged_colors(), other.region_ids, size=scenes.size),
+        GaussianField(earlier_means, earlier.cholesky, fading_out, earlier.region_ids, size=scenes.size),
+        GaussianField(later_means, later.cholesky, fading_in, later.region_ids, size=scenes.size),
     )
     if first.regions is None:
         return Scene(field, None, scenes.metadata)
-    regions = first.regions.relabel(move_labels(share * motion, first.regions.labels))
+    regions = first.regions.relabel(move_labels(fraction * motion, first.regions.labels))
     return Scene(field.subset(members_of(field, regions.ids)), regions, scenes.metadata)

@@ -1,4 +1,4 @@
-"""Motion between two frames, and what it does to points and label maps."""
+"""Motion between two frames, and points and label maps that move with it."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-# the shorter side, in pixels, at which motion is estimated
+# pixels: shorter side of the images that motion is estimated on; larger ones take longer and show finer motion
 _SIDE = 160
-# half the side of the window of a pixel's motion, in pixels at that size
+# pixels of these: half the side of the window in which motion is constant; larger ones are more robust
 _RADIUS = 5
-# iterations of the fixed point in `move_points`
+# of the fixed point in `move_points`, which converges where neighbouring motions differ by less than a pixel per pixel
 _ITERATIONS = 5
 
 
 def estimate_motion(previous: Tensor, image: Tensor) -> Tensor:
-    """Return where each pixel of an image was in the previous one: (2, H, W), offsets (x, y) in pixels.
+    """Return the offset (x, y) from each pixel of an image to its place in the previous one, (2, H, W), in pixels.
 
     Source: the iterative Lucas-Kanade solver of scikit-image, `optical_flow_ilk`, on smaller grey images.
     """
@@ -33,24 +33,24 @@ def estimate_motion(previous: Tensor, image: Tensor) -> Tensor:
     return interpolate(motion[None], (height, width), mode="bilinear")[0]
 
 
-def motion_at(motion: Tensor, points: Tensor) -> Tensor:
-    """Sample a motion (2, H, W) at points (N, 2), bilinearly; beyond the image it is that of the border."""
-    height, width = motion.shape[1:]
+def sample(planes: Tensor, points: Tensor) -> Tensor:
+    """Sample a motion or an image (C, H, W) bilinearly at points (N, 2); outside it continues from the border."""
+    height, width = planes.shape[1:]
     grid = points / points.new_tensor([width, height]) * 2 - 1
-    sampled = grid_sample(motion[None], grid[None, None].to(motion), padding_mode="border", align_corners=False)
-    return sampled[0, :, 0].T.to(points)
+    values = grid_sample(planes[None], grid[None, None].to(planes), padding_mode="border", align_corners=False)
+    return values[0, :, 0].T.to(points)
 
 
 def move_points(motion: Tensor, points: Tensor) -> Tensor:
-    """Return where points (N, 2) of the previous image are in the image: q with q + motion(q) = p."""
+    """Return the places in the image of points (N, 2) of the previous one: q with q + motion(q) = p."""
     moved = points
     for _ in range(_ITERATIONS):
-        moved = points - motion_at(motion, moved)
+        moved = points - sample(motion, moved)
     return moved
 
 
 def move_labels(motion: Tensor, labels: Tensor) -> Tensor:
-    """Return the labels (H, W) of the previous image, each pixel's from where it was."""
+    """Return the labels (H, W) for the image, each read at the pixel's place in the previous one."""
     height, width = labels.shape
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     cols = (x.to(motion) + motion[0]).round().long().clamp(0, width - 1)

@@ -1,8 +1,8 @@
-"""The Gaussians of a frame as plain tensors, and the image that they are to show."""
+"""The Gaussians of a frame as plain tensors, and the image that they approximate."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -46,9 +46,25 @@ class Splats(NamedTuple):
         return Scene(GaussianField(*self[:4], size=size), self.regions)
 
 
+def stack(frames: list[Splats], size: tuple[int, int], metadata: Mapping[str, str]) -> Scene:
+    """Return the Gaussians and the maps of all frames as one scene."""
+    means, cholesky, colors = (torch.stack(parts) for parts in zip(*(frame[:3] for frame in frames), strict=True))
+    maps = [frame.regions for frame in frames if frame.regions is not None]
+    if not maps:
+        return Scene(GaussianField(means, cholesky, colors, size=size), None, metadata)
+    region_ids = torch.stack([frame.region_ids for frame in frames if frame.region_ids is not None])
+    # a pair of regions has the same softness in all frames
+    softness: dict[tuple[int, int], float] = {}
+    for regions in maps:
+        softness |= regions.softness if isinstance(regions.softness, Mapping) else {}
+    labels = torch.stack([regions.labels for regions in maps])
+    regions = RegionMap.from_labels(labels, softness or maps[0].softness)
+    return Scene(GaussianField(means, cholesky, colors, region_ids, size=size), regions, metadata)
+
+
 @dataclass(frozen=True)
 class Target:
-    """An image that Gaussians are to show, and the settings of the fit."""
+    """The image of a frame, and the settings of its fit."""
 
     image: Tensor  # [C, H, W]
     config: FitConfig
