@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_count
-from kcgs.functional import PairWidths, RegionMap
+from kcgs.functional import PairSoftness, RegionMap
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
@@ -49,7 +49,7 @@ def serialize(scene: Scene) -> bytes:
         if regions.contours == "crisp":
             raise ValueError('regions must have scaled contours; got crisp ones: render(contours="crisp") makes them')
         header["softness"] = softness = regions.softness
-        if isinstance(softness, PairWidths):
+        if isinstance(softness, PairSoftness):
             header["softness"] = [[*pair, width] for pair, width in softness.items()]
         labels = _narrow(regions.labels.cpu()).numpy()
         header["labels"] = {"dtype": labels.dtype.name, "shape": labels.shape}

@@ -19,7 +19,7 @@ import kcgs
 from kcgs import FitConfig, GaussianField, RegionMap, RegionSplatRenderer, Scene, codec, fit
 from kcgs.data import ChartSample, Davis, DavisFrame, save_image, save_labels
 from kcgs.fitting import FitResult, available_recipes
-from kcgs.functional import BandGain, PairWidths
+from kcgs.functional import PairSoftness
 from kcgs.pruning import prune
 from kcgs.rate import Compressed, FitBytesResult
 from kcgs.segment import Cleanup, Prediction, Segmentation
@@ -46,12 +46,12 @@ def objects(result: FitResult, folder: Path) -> Iterator[Any]:
     scene = Scene(field, regions, {"title": "a long note " * 40})
     image, data = torch.rand(3, *SIZE), codec.encode(result.scene)
     yield from (result, result.history[0], result.regions, field, regions, regions.resize((128, 192)), scene)
-    yield from (PairWidths(WIDTHS), RegionSplatRenderer())
+    yield from (PairSoftness(WIDTHS), RegionSplatRenderer())
     yield from (FitConfig.from_recipe(recipe) for recipe in available_recipes())
     yield from (codec.decode(data), Compressed(data, scene), FitBytesResult(data, scene, result), prune(result.scene))
     yield from (Segmentation(LABELS, torch.rand(21), {i: f"name {i}" for i in range(21)}), Cleanup())
     yield from (Prediction(LABELS.numpy(), torch.rand(SIZE), [f"name {i}" for i in range(21)]), *entries())
-    yield from (ChartSample(image, LABELS), DavisFrame("bear", image, LABELS), BandGain(0.1, 0.2))
+    yield from (ChartSample(image, LABELS), DavisFrame("bear", image, LABELS))
     for kind in ("JPEGImages", "Annotations"):
         (folder / kind / "480p" / "bear").mkdir(parents=True)
     save_image(folder / "JPEGImages/480p/bear/00000.jpg", image)

@@ -26,8 +26,8 @@ MAPS = {
 
 def batch_of(one: RegionMap) -> RegionMap:
     """Make a batch of three maps, the last of one region."""
-    if one._origin is not None:
-        return batch_of(one._origin).resize(one.size)
+    if one._source is not None:
+        return batch_of(one._source).resize(one.size)
     labels = torch.stack([one.labels, one.labels.flip(-1), torch.ones_like(one.labels)])
     return RegionMap.from_labels(labels, one.softness)
 

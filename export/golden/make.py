@@ -123,7 +123,7 @@ def make_arrays(case: Case) -> dict[str, Array]:
         arrays[name] = tensor.numpy().astype(np.min_scalar_type(int(regions.ids.max())))
     pairs = case.softness
     arrays["softness"] = np.array([(*k, v) for k, v in pairs.items()] if isinstance(pairs, Mapping) else pairs)
-    widths, level = regions.membership.levels
+    widths, level = regions.tables.membership.levels
     if level is not None:
         # where contours are equally near, which one a pixel takes is nobody else's to know
         arrays["contour_width"] = torch.tensor(widths)[level[0].long()].float().numpy()

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcgs._check import check_count, check_labels
 from kcgs._image import as_image
-from kcgs.functional import touching_pairs
+from kcgs.functional.labels import touching_pairs
 
 # step of the hue, the golden ratio less 1: any run of hues is spread over the circle
 _HUE_STEP = 0.6180339887498949

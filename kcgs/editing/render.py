@@ -10,7 +10,7 @@ from torch import Tensor
 from kcgs._check import check_image, check_size
 from kcgs.functional import region_splat
 from kcgs.nn import GaussianField, RegionSplatRenderer
-from kcgs.nn.field import scaled
+from kcgs.nn.field import scaled_gaussians
 from kcgs.nn.renderer import area_mean, rendered_size
 from kcgs.scene import Scene
 
@@ -48,14 +48,14 @@ def render_region(
     target = scene.size if size is None else check_size("size", size)
     finer = rendered_size(scene.size, target)
     regions = selection.regions.resize(finer)
-    memberships = {region: regions.weights(region) for region in selection.ids.tolist()}
+    memberships = {region: regions.membership(region) for region in selection.ids.tolist()}
     total = torch.stack([*memberships.values()]).sum(0)
     alpha = total.clamp_max(1.0).to(field.colors.dtype)
     colors = field.colors.new_zeros(field.colors.shape[-1], *finer)
     for region, membership in memberships.items():
         # rendered without the map, which gives the colour itself: nothing is divided by a small alpha
         part = _subset(field, field.region_ids == region, None)
-        alone = region_splat(*scaled(part, finer), part.merged_colors(), size=finer)
+        alone = region_splat(*scaled_gaussians(part, finer), part.merged_colors(), size=finer)
         share = (membership / torch.where(total > 0, total, 1.0)).to(alone.dtype)
         colors = colors + torch.where(alpha > 0, alone * share, 0.0)
     if finer != target:
@@ -96,7 +96,7 @@ def render_over(scene: Scene, region_ids: int | Iterable[int], image: Tensor) ->
     others = _subset(field, ~selection.members, field.region_ids)
     rendered: Tensor = RegionSplatRenderer()(others, selection.regions, target)
     regions = selection.regions.resize(rendered_size(scene.size, target))
-    membership = regions.weights(selection.ids.tolist()).clamp_max(1.0).to(rendered.dtype)
+    membership = regions.membership(selection.ids.tolist()).clamp_max(1.0).to(rendered.dtype)
     return rendered + area_mean(membership, target) * image.to(rendered)
 
 

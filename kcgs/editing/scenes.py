@@ -15,7 +15,7 @@ from torch import Tensor
 from kcgs._check import check_floating, check_number
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
-from kcgs.nn.field import join, scaled
+from kcgs.nn.field import join, scaled_gaussians
 from kcgs.scene import Scene, check_scene
 
 from .fill import fill_hole
@@ -234,7 +234,7 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
         resized = RegionMap.from_labels(background.regions.labels).resize(scene.size)
         behind, ids = resized.labels.to(behind.device) + first_id, other.region_ids.to(behind.device) + first_id
     labels = torch.where(pixels, behind, regions.labels)
-    means, cholesky, colors = (t.to(field.means) for t in (*scaled(other, scene.size), other.merged_colors()))
+    means, cholesky, colors = (t.to(field.means) for t in (*scaled_gaussians(other, scene.size), other.merged_colors()))
     joined = join(field.subset(~members), GaussianField(means, cholesky, colors, ids, size=scene.size))
     joined = joined.subset(members_of(joined, labels))
     return Scene(joined, regions.relabel(labels, "mean"), scene.metadata)

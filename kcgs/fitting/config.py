@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from kcgs._repr import shorten
 from kcgs.errors import InvalidArgument, InvalidArgumentType
-from kcgs.functional import MAX_SOFTNESS
+from kcgs.functional.softness import MAX_SOFTNESS
 from kcgs.kernels import BACKENDS
 
 Objective = Literal["psnr", "ms-ssim"]

@@ -6,7 +6,7 @@ import math
 
 from torch import Tensor
 
-from kcgs.functional import RegionMap, choose_widths
+from kcgs.functional import RegionMap, choose_softness
 from kcgs.functional.merging import pairs_to_merge
 from kcgs.scene import Scene
 
@@ -60,4 +60,4 @@ def _regions_to_render(image: Tensor, regions: RegionMap | None, config: FitConf
         return regions
     if config.softness != "auto":
         return RegionMap.from_labels(regions.labels, config.softness)
-    return RegionMap.from_labels(regions.labels, choose_widths(image, regions.labels))
+    return RegionMap.from_labels(regions.labels, choose_softness(image, regions.labels))

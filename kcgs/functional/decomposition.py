@@ -28,7 +28,7 @@ _SLACK = 1.001
 def decompose(*arguments: Any) -> Tensor:
     """Render as `kcgs::region_splat` does, whose arguments these are; to be traced, and slow in eager mode."""
     given = Arguments(*arguments)
-    if is_crisp(given.widths):
+    if is_crisp(given.softness):
         raise ValueError(
             "contours must be scaled in graphs of torch.onnx.export; got crisp: kcgs.onnx.scene_decoder has both"
         )

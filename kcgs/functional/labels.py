@@ -134,7 +134,7 @@ def unique_pairs(pairs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return ids[rows], place, counts
 
 
-def union(ids: Iterable[int], pairs: Iterable[tuple[int, int]]) -> Callable[[int], int]:
+def union_find(ids: Iterable[int], pairs: Iterable[tuple[int, int]]) -> Callable[[int], int]:
     """Unite pairs of ids; what comes back gives the least id of those that one is united with."""
     root = {region: region for region in ids}
 

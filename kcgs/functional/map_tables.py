@@ -1,55 +1,108 @@
-"""What rendering derives from a label map, kept on the tensor of labels that a RegionMap owns."""
+"""What rendering derives from a label map at one size, cached on the tensor of labels that a RegionMap owns."""
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcgs.kernels import Membership
+from kcgs._check import check_labels
+from kcgs.kernels import Crisp, Membership, Resampled
 
-# of a map, its own among them: a viewer renders at ever new sizes
-_MOST_SIZES = 4
+from .labels import compact, sample_labels
+from .softness import CRISP_SOFTNESS, PairSoftness, check_softness, is_crisp, scaled_softness, softness_of
+
+# sizes that a map is cached at, its own among them: a viewer renders at ever new sizes
+_CACHED_SIZES = 4
+
+
+class MapOperands(NamedTuple):
+    """A map as the operator takes it."""
+
+    labels: Tensor  # [H, W] or [B, H, W] int64, of the map at its own size; nobody writes to those of a RegionMap
+    softness: Tensor | None  # float64, as `softness_tensor` or `crisp_tensor` makes it; None: hard contours
+    size: tuple[int, int]  # (height, width) that the map is sampled at
 
 
 class MapTables(NamedTuple):
-    """The ids of a map, where each is among them, and what the kernels evaluate."""
+    """The regions of a map, and which of them each pixel belongs to."""
 
     ids: Tensor  # [R] int64, sorted
-    table: Tensor | None  # from id + 1 to position, -1 at both ends; None where ids are large
+    positions: Tensor | None  # from id + 1 to its position among `ids`, -1 at both ends; None where ids are large
+    softness: float | PairSoftness
     membership: Membership
-    whole: bool = True  # False: a map sampled at another size, where small regions may be lost
+    complete: bool = True  # False: hard contours at another size, where small regions may be lost
 
     def to(self, device: torch.device) -> MapTables:
         """Return the same tables on `device`."""
-        table = None if self.table is None else self.table.to(device)
-        return self._replace(ids=self.ids.to(device), table=table, membership=self.membership.to(device))
+        positions = None if self.positions is None else self.positions.to(device)
+        return self._replace(ids=self.ids.to(device), positions=positions, membership=self.membership.to(device))
 
     def index_of(self, region_ids: Tensor) -> Tensor:
         """Return the position of each id among `ids`, -1 where the map does not hold it."""
-        if self.table is not None and self.table.device.type == "cpu" and not torch.compiler.is_compiling():
+        if self.positions is None:
+            places = torch.searchsorted(self.ids, region_ids.contiguous()).clamp_max(len(self.ids) - 1)
+            return torch.where(self.ids[places] == region_ids, places, -1)
+        if self.positions.device.type == "cpu" and not torch.compiler.is_compiling():
             # numpy takes a third of the time, and wakes no threads of torch's, which would spin beside the kernel's
-            return torch.from_numpy(self.table.numpy().take(region_ids.long().numpy() + 1, mode="clip"))
-        if self.table is not None:
-            return self.table[(region_ids.long() + 1).clamp(0, len(self.table) - 1)]
-        places = torch.searchsorted(self.ids, region_ids.contiguous()).clamp_max(len(self.ids) - 1)
-        return torch.where(self.ids[places] == region_ids, places, -1)
+            return torch.from_numpy(self.positions.numpy().take(region_ids.long().numpy() + 1, mode="clip"))
+        return self.positions[(region_ids.long() + 1).clamp(0, len(self.positions) - 1)]
 
 
-def tables_by_size(labels: Any) -> dict[tuple[int, int, bool], MapTables] | None:
-    """Return the tables kept on labels, by height, width and whether contours are crisp.
+def tables_at(operands: MapOperands) -> MapTables:
+    """Return the tables of a map at its size: those cached on its labels, or new ones."""
+    labels, softness, size = operands
+    crisp, cache = is_crisp(softness), cached_tables(labels)
+    if (*size, crisp) in cache:
+        return cache[*size, crisp]
+    tables = cache.get((*labels.shape[-2:], False))
+    if tables is None:
+        check_labels("regions", labels)
+        tables = make_tables(labels, 0.0 if crisp else softness_of(softness))
+    sharpened = crisp and len(tables.ids) > 1
+    if sharpened or size != labels.shape[-2:]:
+        tables = resample(tables, labels, size, sharpened)[1]
+    if cache:  # others than a RegionMap may write to their labels
+        cache_tables(labels, size, crisp, tables)
+    return tables
 
-    None where the labels are not those of a RegionMap: whoever else holds them may write to them.
-    """
-    return getattr(labels, "kcgs_tables", None)
+
+def make_tables(labels: Tensor, softness: object) -> MapTables:
+    """Derive the tables of a map at its own size."""
+    ids, index, positions = compact(labels)
+    softness = check_softness(softness, ids)
+    by_index: float | dict[tuple[int, int], float]
+    if isinstance(softness, PairSoftness):
+        position = {region: place for place, region in enumerate(ids.tolist())}
+        by_index = {(position[a], position[b]): value for (a, b), value in softness.items()}
+    else:
+        by_index = softness
+    membership = Membership(index if index.ndim == 3 else index[None], len(ids), by_index)
+    return MapTables(ids, positions, softness, membership)
 
 
-def keep_tables(labels: Any, size: tuple[int, int], crisp: bool, tables: MapTables) -> None:
-    """Keep the tables of a map at a size on its labels, and those of few other sizes."""
-    kept = tables_by_size(labels)
-    if kept is None:
-        kept = labels.kcgs_tables = {}
-    kept[*size, crisp] = tables
-    if len(kept) > _MOST_SIZES:
-        kept.pop(list(kept)[1], None)  # not the first, the map's own; another thread may have been before
+def resample(tables: MapTables, labels: Tensor, size: tuple[int, int], crisp: bool) -> tuple[Tensor, MapTables]:
+    """Return the labels and the tables of a map at another size, or with crisp contours: see `RegionMap.resize`."""
+    sampled = sample_labels(labels, *size)
+    if not crisp and tables.softness == 0.0:
+        return sampled, make_tables(sampled, 0.0)._replace(complete=False)
+    index = tables.index_of(sampled).to(torch.int32)
+    membership = (Crisp if crisp else Resampled)(index if index.ndim == 3 else index[None], tables.membership)
+    scale = math.sqrt(size[0] * size[1] / (labels.shape[-2] * labels.shape[-1]))
+    softness = CRISP_SOFTNESS if crisp else scaled_softness(tables.softness, scale)
+    return sampled, tables._replace(softness=softness, membership=membership)
+
+
+def cached_tables(labels: Any) -> dict[tuple[int, int, bool], MapTables]:
+    """Return the tables cached on labels by height, width and whether contours are crisp; none but of a RegionMap."""
+    return getattr(labels, "kcgs_tables", {})
+
+
+def cache_tables(labels: Any, size: tuple[int, int], crisp: bool, tables: MapTables) -> None:
+    """Cache the tables of a map at a size on its labels, beside those of few other sizes."""
+    labels.kcgs_tables = cache = cached_tables(labels)
+    cache[*size, crisp] = tables
+    if len(cache) > _CACHED_SIZES:
+        cache.pop(list(cache)[1], None)  # not the first, the map's own; another thread may have been before

@@ -27,7 +27,7 @@ class MapWindows:
         """Take the map of these arguments, and the pixels along a side of a tile."""
         from torch.fx.experimental.symbolic_shapes import statically_known_true
 
-        labels, widths = given.labels, given.widths
+        labels, widths = given.labels, given.softness
         assert labels is not None
         self.side, self.dtype = side, given.means.dtype
         self.soft, self.pairs = widths is not None, widths is not None and widths.ndim == 2

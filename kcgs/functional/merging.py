@@ -11,8 +11,8 @@ from torch import Tensor
 
 from kcgs._check import check_labels, check_number
 
+from .contour_fit import check_problem, contour_gain
 from .labels import compact, contour_edges, unique_pairs
-from .widths import band_gain, check_problem
 
 Labels = NDArray[np.int64]
 
@@ -26,10 +26,10 @@ _ROUNDS = 8
 def merge_regions(image: Tensor, labels: Tensor, merge_cost: float = MERGE_COST) -> Tensor:
     """Merge regions whose contour saves less error than its bits would save if Gaussians had them.
 
-    Convention: what a contour saves is predicted from the pixels about it (:func:`kcgs.functional.band_gain`): how much
-    better two linear colours explain them than one quadratic one. The default cost is that of one to two bits per pixel
-    of contour; as lossless WebP the maps of `auto` take 3.5 bits, and lose to Gaussians of as many bytes. The
-    contours that save least go first, and what is left is judged anew, eight times at most.
+    Convention: what a contour saves is predicted from the pixels near it: how much better two linear colours, mixed
+    across the contour, explain them than one quadratic colour. The default cost is that of one to two bits per pixel of
+    contour; as lossless WebP the maps of `auto` take 3.5 bits, and lose to Gaussians of as many bytes. The contours
+    that save least go first, and the new map is judged again, eight times at most.
 
     Args:
         image: :math:`(C, H, W)` floating in [0, 1].
@@ -40,7 +40,7 @@ def merge_regions(image: Tensor, labels: Tensor, merge_cost: float = MERGE_COST)
         :math:`(H, W)` int64; merged regions have the id of one of them; one region where no contour saves its cost.
 
     Raises:
-        TypeError, ValueError: as :func:`kcgs.functional.band_gain`; a negative cost.
+        TypeError, ValueError: as :func:`kcgs.functional.choose_softness`; a negative cost.
 
     Example:
         >>> image = torch.zeros(3, 32, 48)
@@ -54,7 +54,7 @@ def merge_regions(image: Tensor, labels: Tensor, merge_cost: float = MERGE_COST)
     check_problem(image, labels)
     ids, labels = torch.unique(labels, return_inverse=True)
     for _ in range(_ROUNDS):
-        gains = band_gain(image, labels)
+        gains = contour_gain(image, labels)
         saved = {pair: _BAND * (gain.smooth - gain.soft) for pair, gain in gains.items()}
         costly = sorted((value, pair) for pair, value in saved.items() if value < merge_cost)
         if not costly:

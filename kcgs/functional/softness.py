@@ -1,4 +1,4 @@
-"""How wide contours are: one width for a whole map, or one for each pair of regions."""
+"""Softness of contours, in pixels: one number for a whole map, or one for each pair of regions."""
 
 from __future__ import annotations
 
@@ -11,99 +11,83 @@ from torch import Tensor
 from kcgs._check import check_number
 from kcgs.kernels.membership import RADIUS_SIGMAS
 
-MAX_SOFTNESS = 64.0  # pixels
+MAX_SOFTNESS = 64.0  # pixels: a wider blur is no contour
 CONTOURS = ("scaled", "crisp")
-CRISP_WIDTH = 0.5  # pixels, of contours that are crisp
-_FEW = 4
+CRISP_SOFTNESS = 0.5  # pixels of the image, at any size
+_PRINTED_PAIRS = 4  # of a repr
 
 
-class PairWidths(Mapping[tuple[int, int], float]):
-    """Contour width in pixels of pairs of regions: an immutable mapping with ids a < b, read in either order.
+class PairSoftness(Mapping[tuple[int, int], float]):
+    """Softness in pixels of the contour between each two regions: an immutable mapping, read in either order of ids.
 
     Example:
-        >>> widths = PairWidths({(1, 2): 0.7, (1, 5): 0.0})
-        >>> widths[2, 1], widths
-        (0.7, PairWidths({(1, 2): 0.7, (1, 5): 0.0}))
+        >>> softness = PairSoftness({(1, 2): 0.7, (1, 5): 0.0})
+        >>> softness[2, 1], softness
+        (0.7, PairSoftness({(1, 2): 0.7, (1, 5): 0.0}))
     """
 
-    __slots__ = ("_widths",)
+    __slots__ = ("_pixels",)
 
-    def __init__(self, widths: Mapping[tuple[int, int], float]) -> None:
-        self._widths = dict(sorted(((min(pair), max(pair)), width) for pair, width in widths.items()))
+    def __init__(self, softness: Mapping[tuple[int, int], float]) -> None:
+        self._pixels = dict(sorted(((min(pair), max(pair)), value) for pair, value in softness.items()))
 
     def __getitem__(self, pair: tuple[int, int]) -> float:
-        return self._widths[min(pair), max(pair)]
+        return self._pixels[min(pair), max(pair)]
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
-        return iter(self._widths)
+        return iter(self._pixels)
 
     def __len__(self) -> int:
-        return len(self._widths)
+        return len(self._pixels)
 
     def __hash__(self) -> int:
-        return hash(tuple(self._widths.items()))
+        return hash(tuple(self._pixels.items()))
 
     def __repr__(self) -> str:
-        if len(self) <= _FEW:
-            return f"PairWidths({self._widths})"
-        return f"PairWidths({len(self)} pairs, {min(self.values()):.3g} to {max(self.values()):.3g} pixels)"
+        if len(self) <= _PRINTED_PAIRS:
+            return f"PairSoftness({self._pixels})"
+        return f"PairSoftness({len(self)} pairs, {min(self.values()):.3g} to {max(self.values()):.3g} pixels)"
 
 
-def check_softness(softness: object, ids: Tensor) -> float | PairWidths:
-    """Return the width if all pairs have the same, else the widths of pairs."""
+def check_softness(softness: object, ids: Tensor) -> float | PairSoftness:
+    """Return one number where all pairs have the same softness, else that of each pair."""
     if not isinstance(softness, Mapping):
         return check_number("softness", softness, 0.0, MAX_SOFTNESS, unit="pixels")
     known: set[int] = set(ids.tolist())
-    widths: dict[tuple[int, int], float] = {}
+    pixels: dict[tuple[int, int], float] = {}
     for pair, value in softness.items():
         if not isinstance(pair, tuple) or len(pair) != 2 or not all(hasattr(i, "__index__") for i in pair):
-            raise TypeError(f"softness must map pairs of ids to widths; got the key {pair!r}")
+            raise TypeError(f"softness must map pairs of ids to pixels; got the key {pair!r}")
         low, high = sorted(map(operator.index, pair))
         if low == high or not known.issuperset((low, high)):
             raise ValueError(f"softness must map pairs of two different ids in the map; got {pair!r}")
-        if (low, high) in widths:
+        if (low, high) in pixels:
             raise ValueError(f"softness must name a pair once; got {(low, high)} and {(high, low)}")
-        widths[low, high] = check_number(f"softness of {pair}", value, 0.0, MAX_SOFTNESS, unit="pixels")
-    every_pair = len(widths) == len(known) * (len(known) - 1) // 2
-    distinct = {*widths.values()} | (set() if every_pair else {0.0})
-    return PairWidths(widths) if len(distinct) > 1 else distinct.pop() if distinct else 0.0
+        pixels[low, high] = check_number(f"softness of {pair}", value, 0.0, MAX_SOFTNESS, unit="pixels")
+    every_pair = len(pixels) == len(known) * (len(known) - 1) // 2
+    distinct = {*pixels.values()} | (set() if every_pair else {0.0})
+    return PairSoftness(pixels) if len(distinct) > 1 else distinct.pop() if distinct else 0.0
 
 
-def scaled_widths(softness: float | PairWidths, scale: float) -> float | PairWidths:
-    """Return the widths of a map that is scaled, at most `MAX_SOFTNESS`."""
-    if not isinstance(softness, PairWidths):
+def scaled_softness(softness: float | PairSoftness, scale: float) -> float | PairSoftness:
+    """Return the softness of a map that is scaled, at most `MAX_SOFTNESS`."""
+    if not isinstance(softness, PairSoftness):
         return min(softness * scale, MAX_SOFTNESS)
-    return PairWidths({pair: min(width * scale, MAX_SOFTNESS) for pair, width in softness.items()})
+    return PairSoftness({pair: min(value * scale, MAX_SOFTNESS) for pair, value in softness.items()})
 
 
-def merged_widths(softness: float | PairWidths, find: Callable[[int], int]) -> float | Mapping[tuple[int, int], float]:
-    """Return the widths where regions merge, `find` giving the new id: the mean of those that a contour is made of."""
+def merged_softness(
+    softness: float | PairSoftness, merged_id: Callable[[int], int]
+) -> float | Mapping[tuple[int, int], float]:
+    """Return the softness where regions merge: that of a contour is the mean over the pairs it is made of."""
     if isinstance(softness, float):
         return softness
-    widths: dict[tuple[int, int], list[float]] = {}
-    for (one, other), width in softness.items():
-        low, high = sorted((find(one), find(other)))
+    parts: dict[tuple[int, int], list[float]] = {}
+    for (a, b), value in softness.items():
+        low, high = sorted((merged_id(a), merged_id(b)))
         if low != high:
-            widths.setdefault((low, high), []).append(width)
-    return {pair: sum(found) / len(found) for pair, found in widths.items()}
-
-
-def widths_of(softness: float | PairWidths, device: torch.device) -> Tensor | None:
-    """Return widths as the operator takes them, float64; None: all contours are hard.
-
-    One width, then half of its blur, from the middle, at the pixels of the map: (1 + taps,). Or, sorted, a row for
-    each pair of ids before width and blur: (P, 3 + taps). So shapes say how far contours reach.
-    """
-    if softness == 0.0:
-        return None
-    widths = torch.tensor([softness] if isinstance(softness, float) else list(softness.values()), dtype=torch.float64)
-    reach = (RADIUS_SIGMAS * widths).ceil()[:, None]
-    distance = torch.arange(int(reach.max()) + 1, dtype=torch.float64)
-    blurs = torch.exp(-0.5 * (distance / widths[:, None].clamp_min(1e-9)) ** 2)
-    rows = torch.cat([widths[:, None], torch.where(distance <= reach, blurs, 0.0)], 1)
-    if isinstance(softness, float):
-        return rows[0].to(device)
-    return torch.cat([torch.tensor(list(softness), dtype=torch.float64), rows], 1).to(device)
+            parts.setdefault((low, high), []).append(value)
+    return {pair: sum(values) / len(values) for pair, values in parts.items()}
 
 
 def check_contours(contours: str) -> str:
@@ -113,20 +97,41 @@ def check_contours(contours: str) -> str:
     return contours
 
 
-def crisp_widths(device: torch.device) -> Tensor:
-    """Return widths as the operator takes them where contours are crisp: a number below 0."""
+# As a tensor, for the operator
+
+
+def softness_tensor(softness: float | PairSoftness, device: torch.device) -> Tensor | None:
+    """Return softness as the operator takes it, float64; None: all contours are hard.
+
+    One softness, then half of its blur, from the middle, at the pixels of the map: (1 + taps,). Or, sorted, a row for
+    each pair of ids before softness and blur: (P, 3 + taps). So the shape says how far contours reach.
+    """
+    if softness == 0.0:
+        return None
+    pixels = torch.tensor([softness] if isinstance(softness, float) else list(softness.values()), dtype=torch.float64)
+    reach = (RADIUS_SIGMAS * pixels).ceil()[:, None]
+    distance = torch.arange(int(reach.max()) + 1, dtype=torch.float64)
+    blurs = torch.exp(-0.5 * (distance / pixels[:, None].clamp_min(1e-9)) ** 2)
+    rows = torch.cat([pixels[:, None], torch.where(distance <= reach, blurs, 0.0)], 1)
+    if isinstance(softness, float):
+        return rows[0].to(device)
+    return torch.cat([torch.tensor(list(softness), dtype=torch.float64), rows], 1).to(device)
+
+
+def crisp_tensor(device: torch.device) -> Tensor:
+    """Return what the operator takes as softness where contours are crisp: one number below 0."""
     return torch.full((1,), -1.0, dtype=torch.float64, device=device)
 
 
-def is_crisp(widths: Tensor | None) -> bool:
-    """Whether widths are those of :func:`crisp_widths`."""
-    return widths is not None and widths.shape == (1,)
+def is_crisp(softness: Tensor | None) -> bool:
+    """True for what :func:`crisp_tensor` returns."""
+    return softness is not None and softness.shape == (1,)
 
 
-def softness_of(widths: Tensor | None) -> float | dict[tuple[int, int], float]:
-    """Return what :func:`widths_of` was given."""
-    if widths is None:
+def softness_of(tensor: Tensor | None) -> float | PairSoftness:
+    """Return the softness that :func:`softness_tensor` made a tensor of."""
+    if tensor is None:
         return 0.0
-    if widths.ndim == 1:
-        return float(widths[0])
-    return {(int(a), int(b)): width for a, b, width in widths[:, :3].tolist()}
+    if tensor.ndim == 1:
+        return float(tensor[0])
+    return PairSoftness({(int(a), int(b)): value for a, b, value in tensor[:, :3].tolist()})

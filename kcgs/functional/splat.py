@@ -6,21 +6,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs._check import check_cutoff, check_floating, check_ids, check_labels, check_rows, check_size, check_tensor
+from kcgs._check import check_cutoff, check_floating, check_ids, check_labels, check_rows, check_size
 from kcgs.kernels import check_backend
 
 from .decomposition import decompose
+from .map_tables import MapOperands
 from .operator import splat_operator
 from .regions import RegionMap
-from .softness import crisp_widths
+from .softness import crisp_tensor
 
 # what torch.onnx.export puts in place of the operator; compilers and torch.export do not
 torch._decomp.register_decomposition(splat_operator)(decompose)
-
-_UNMAPPED = (
-    "regions must be given with region_ids; got None: pass the label map, or leave region_ids out, too, to render "
-    "Gaussians that are not confined"
-)
 
 
 def region_splat(
@@ -50,7 +46,7 @@ def region_splat(
             :math:`(B, N, 3)`.
         colors: any range, opacity merged, :math:`(B, N, C)`, C at least 1.
         region_ids: integer region of each Gaussian, :math:`(B, N)`; needed where `regions` is given, and None without.
-        regions: label map (a Tensor means hard contours) for all images or :math:`(B, H, W)`; None: one region.
+        regions: a RegionMap, or labels, :math:`(H, W)` or :math:`(B, H, W)`, whose contours are hard; None: one region.
         size: (height, width); needed without `regions`, else it must equal theirs.
         cutoff: weights below it are skipped, in [0, 1), and wide Gaussians are interpolated between coarse nodes as
             closely; 0 evaluates all at all pixels. Skipping a Gaussian is off by cutoff times its absolute colour at
@@ -77,17 +73,29 @@ def region_splat(
     """
     if size is not None:
         size = check_size("size", size)
-    if regions is not None:
-        regions = as_map(regions)
-        found = map_size(regions)
-        if size not in (None, found):
-            raise ValueError(f"size must equal the size of regions, {found}; got {size}")
-        size = found
-    if regions is None and region_ids is not None:
-        raise ValueError(_UNMAPPED)
-    if size is None:
-        raise ValueError("size must be given as (height, width) where regions is None; got None")
-    return splat_at(size, means, cholesky, colors, region_ids, regions, cutoff=cutoff, backend=backend)
+    if regions is None:
+        if region_ids is not None:
+            raise ValueError(
+                "regions must be given with region_ids; got None: pass the label map, or leave region_ids out, too, to "
+                "render Gaussians that are not confined"
+            )
+        if size is None:
+            raise ValueError("size must be given as (height, width) where regions is None; got None")
+        return splat_at(size, means, cholesky, colors, cutoff=cutoff, backend=backend)
+    operands = map_operands(regions)
+    if size not in (None, operands.size):
+        raise ValueError(f"size must equal the size of regions, {operands.size}; got {size}")
+    return splat_at(operands.size, means, cholesky, colors, region_ids, operands, cutoff=cutoff, backend=backend)
+
+
+def map_operands(regions: object) -> MapOperands:
+    """Return a map as the operator takes it, which also checks the values of labels; refuse anything else."""
+    if isinstance(regions, RegionMap):
+        return regions.operands
+    if isinstance(regions, (Tensor, np.ndarray)):  # graphs of torch 2.7 know no other form
+        labels = check_labels("regions", regions, values=False)
+        return MapOperands(labels, None, (labels.shape[-2], labels.shape[-1]))
+    raise TypeError(f"regions must be a RegionMap, a label map or None; got {type(regions).__name__}")
 
 
 def splat_at(
@@ -95,36 +103,26 @@ def splat_at(
     means: Tensor,
     cholesky: Tensor,
     colors: Tensor,
-    region_ids: Tensor | None,
-    regions: RegionMap | Tensor | None,
+    region_ids: Tensor | None = None,
+    regions: MapOperands | None = None,
     *,
     contours: str = "scaled",
     cutoff: float,
     backend: str,
 ) -> Tensor:
-    """Render at a size, at which a map of another one is sampled, as by :meth:`RegionMap.resize`."""
+    """Render at a size, at which the map is sampled, as by :meth:`RegionMap.resize`; ids and map come together."""
     _check_gaussians(means, cholesky, colors)
+    labels = softness = None
+    if regions is not None:
+        region_ids, labels = check_ids("region_ids", region_ids, means, values=False), regions.labels
+        _check_map(labels, means)
+        softness = crisp_tensor(labels.device) if contours == "crisp" else regions.softness
     dtype = torch.float64 if torch.float64 in (means.dtype, cholesky.dtype, colors.dtype) else torch.float32
-    arrays = [t if t.dtype == dtype else t.to(dtype) for t in (means, cholesky, colors)]
-    ids, labels, widths = _resolve_regions(means, region_ids, regions)
-    if labels is not None and contours == "crisp":
-        widths = crisp_widths(labels.device)
-    image: Tensor = splat_operator(*arrays, ids, labels, widths, *size, check_cutoff(cutoff), check_backend(backend))
+    gaussians = [t if t.dtype == dtype else t.to(dtype) for t in (means, cholesky, colors)]
+    image: Tensor = splat_operator(
+        *gaussians, region_ids, labels, softness, *size, check_cutoff(cutoff), check_backend(backend)
+    )
     return image if colors.dtype == dtype else image.to(colors.dtype)
-
-
-def as_map(regions: object) -> RegionMap | Tensor:
-    """Return a RegionMap, or labels, int64, whose values the operator checks; refuse anything else."""
-    if isinstance(regions, RegionMap):
-        return regions
-    if isinstance(regions, (Tensor, np.ndarray)):  # graphs of torch 2.7 know no other form
-        return check_labels("regions", regions, values=False)
-    raise TypeError(f"regions must be a RegionMap, a label map or None; got {type(regions).__name__}")
-
-
-def map_size(regions: RegionMap | Tensor) -> tuple[int, int]:
-    """(height, width) in pixels."""
-    return regions.size if isinstance(regions, RegionMap) else (regions.shape[-2], regions.shape[-1])
 
 
 def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
@@ -140,26 +138,10 @@ def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
         raise ValueError(f"means must hold at least one image; got shape {tuple(means.shape)}")
 
 
-def _resolve_regions(
-    means: Tensor, region_ids: Tensor | None, regions: RegionMap | Tensor | None
-) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    """Return ids, labels and widths as the operator takes them."""
-    if region_ids is not None:
-        region_ids = check_ids("region_ids", region_ids, means, values=False)
-    if regions is None:
-        if region_ids is not None:
-            raise ValueError(_UNMAPPED)
-        return None, None, None
-    check_tensor("region_ids", region_ids)
-    assert region_ids is not None
-    if isinstance(regions, RegionMap):
-        labels, widths = regions._operator_labels, regions.widths
-    else:
-        labels, widths = regions, None
+def _check_map(labels: Tensor, means: Tensor) -> None:
     if labels.device != means.device:
         raise ValueError(f"regions must be on {means.device} with means; got {labels.device}")
     maps = labels.shape[0] if labels.ndim == 3 else 1
     images = means.shape[0] if means.ndim == 3 else 1
     if maps not in (1, images):
         raise ValueError(f"regions must hold 1 map or one for each of {images} images; got {maps} maps")
-    return region_ids, labels, widths

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from kcgs._check import check_floating, check_ids, check_integer, check_labels, check_rows, check_size, check_tensor
 from kcgs.functional import RegionMap, lookup_regions
 from kcgs.functional.covariance import check_cholesky
+from kcgs.functional.sizes import is_equal
 
 _HALF = (torch.float16, torch.bfloat16)
 
@@ -19,9 +20,9 @@ _HALF = (torch.float16, torch.bfloat16)
 class GaussianField(nn.Module):
     r"""Gaussians of an image, or of a batch of images, with the region that each may paint.
 
-    Convention: a tensor that is already part of a graph (say, the output of a network) stays in that graph and is held
-    as a buffer; any other becomes a parameter. Half precision cannot hold a pixel position, so `.half()` and
-    `.bfloat16()` leave the field in float32 and say so; the renderer takes it as it is.
+    Convention: an `nn.Parameter` is registered as it is; another tensor that requires a gradient (say, the output of a
+    network) stays in its graph, as a buffer; a copy of any other becomes a parameter. Half precision cannot hold a
+    pixel position, so `.half()` and `.bfloat16()` leave the field in float32 and warn.
 
     Args:
         means: centres (x, y) in pixels, :math:`(N, 2)` or :math:`(B, N, 2)`.
@@ -70,18 +71,19 @@ class GaussianField(nn.Module):
         check_rows("colors", colors, means, "C")
         if opacities is not None and check_floating("opacities", opacities).shape != lead:
             raise ValueError(f"opacities must have shape {tuple(lead)}; got {tuple(opacities.shape)}")
-        tensors = {"means": means, "cholesky": cholesky, "colors": colors, "opacities": opacities}
-        for name, tensor in tensors.items():
-            self._hold(name, tensor)
+        self._register("means", means)
+        self._register("cholesky", cholesky)
+        self._register("colors", colors)
+        self._register("opacities", opacities)
         self.register_buffer("region_ids", None if region_ids is None else self._checked_ids(region_ids))
 
-    def _hold(self, name: str, value: Tensor | None) -> None:
+    def _register(self, name: str, value: Tensor | None) -> None:
         if value is not None and value.dtype in _HALF:
             value = value.float()
-        if value is not None and not value.is_leaf:
-            self.register_buffer(name, value)
-        elif value is None or isinstance(value, nn.Parameter):
+        if value is None or isinstance(value, nn.Parameter):
             self.register_parameter(name, value)
+        elif value.requires_grad:
+            self.register_buffer(name, value)
         else:
             self.register_parameter(name, nn.Parameter(value.detach().clone()))
 
@@ -240,16 +242,10 @@ class GaussianField(nn.Module):
         return f"{images}{self.num_gaussians} Gaussians, {self.colors.shape[-1]} channels, size={self.size}, {confined}"
 
 
-def scaled(field: GaussianField, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def scaled_gaussians(field: GaussianField, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Return means and Cholesky factors as they are on an image of another size, with the graph."""
     means, cholesky = field.means, field.cholesky
-    if torch.compiler.is_compiling():  # a comparison would become a guard, which graphs in ONNX have not
-        from torch.fx.experimental.symbolic_shapes import statically_known_true
-
-        same = all(statically_known_true(new == old) for new, old in zip(size, field.size, strict=True))
-    else:
-        same = size == field.size
-    if same:
+    if is_equal(size[0], field.size[0]) and is_equal(size[1], field.size[1]):
         return means, cholesky
     if not torch.compiler.is_compiling():
         factors = torch.tensor([size[1] / field.size[1], size[0] / field.size[0]], dtype=torch.float64)
@@ -263,16 +259,15 @@ def join(first: GaussianField, second: GaussianField) -> GaussianField:
     """Put two fields, both with region ids or neither, into one without the graph; no opacity is 1."""
     rows = first.means.ndim - 2
 
-    def both(one: Tensor, other: Tensor) -> Tensor:
-        return torch.cat([one.detach(), other.detach()], rows)
+    def concatenate(a: Tensor, b: Tensor) -> Tensor:
+        return torch.cat([a.detach(), b.detach()], rows)
 
     ids = opacities = None
     if first.region_ids is not None and second.region_ids is not None:
-        ids = both(first.region_ids, second.region_ids)
+        ids = concatenate(first.region_ids, second.region_ids)
     if first.opacities is not None or second.opacities is not None:
-        one, other = (
-            f.means.new_ones(f.means.shape[:-1]) if f.opacities is None else f.opacities for f in (first, second)
-        )
-        opacities = both(one, other)
-    means, cholesky = both(first.means, second.means), both(first.cholesky, second.cholesky)
-    return GaussianField(means, cholesky, both(first.colors, second.colors), ids, opacities, size=first.size)
+        ones = (f.means.new_ones(f.means.shape[:-1]) for f in (first, second))
+        parts = (f.opacities if f.opacities is not None else one for f, one in zip((first, second), ones, strict=True))
+        opacities = concatenate(*parts)
+    means, cholesky = concatenate(first.means, second.means), concatenate(first.cholesky, second.cholesky)
+    return GaussianField(means, cholesky, concatenate(first.colors, second.colors), ids, opacities, size=first.size)

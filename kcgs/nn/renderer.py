@@ -9,10 +9,11 @@ from torch import Tensor, nn
 
 from kcgs._check import check_cutoff, check_size
 from kcgs.functional import RegionMap
+from kcgs.functional.sizes import is_equal
 from kcgs.functional.softness import check_contours
-from kcgs.functional.splat import as_map, map_size, splat_at
+from kcgs.functional.splat import map_operands, splat_at
 
-from .field import GaussianField, scaled
+from .field import GaussianField, scaled_gaussians
 
 
 class SceneLike(Protocol):
@@ -86,34 +87,30 @@ class RegionSplatRenderer(nn.Module):
         """
         if not isinstance(field, GaussianField):
             # not by isinstance of the protocol, which takes as long as the rest of this module
-            scene, inner = field, getattr(field, "field", None)
-            if not isinstance(inner, GaussianField):
+            if not isinstance(getattr(field, "field", None), GaussianField):
                 raise TypeError(f"field must be a GaussianField or a Scene; got {type(field).__name__}")
-            field, regions = inner, scene.regions if regions is None else regions
-        target = field.size if size is None else check_size("size", size)
-        ids, finer = field.region_ids, rendered_size(field.size, target)
-        if regions is not None:
-            if ids is None:
-                raise ValueError(
-                    "field must have region_ids where regions are given; call field.assign_regions(regions)"
-                )
-            regions = as_map(regions)
-            found = map_size(regions)
-            if found != field.size and found != target:
-                raise ValueError(f"regions must have the size {field.size} of the field or {target}; got {found}")
-            if found != field.size:  # it does not say what there is between its pixels
-                finer = target
-        elif ids is not None:
+            regions = field.regions if regions is None else regions
+            field = field.field
+        size = field.size if size is None else check_size("size", size)
+        operands = None if regions is None else map_operands(regions)
+        if operands is None and field.region_ids is not None:
             raise ValueError(
                 "regions must be given for a field that is confined to regions; got None: pass its label map or its "
                 "Scene, or set field.region_ids to None to render it without contours"
             )
-        means, cholesky = scaled(field, finer)
+        if operands is not None and field.region_ids is None:
+            raise ValueError("field must have region_ids where regions are given; call field.assign_regions(regions)")
+        if operands is not None and operands.size not in (field.size, size):
+            raise ValueError(f"regions must have the size {field.size} of the field or {size}; got {operands.size}")
+        # a map of the image's size does not say what there is between its pixels
+        resized = operands is not None and operands.size != field.size
+        fine = size if resized else rendered_size(field.size, size)
+        means, cholesky = scaled_gaussians(field, fine)
         image = splat_at(
-            finer, means, cholesky, field.merged_colors(), ids, regions,
+            fine, means, cholesky, field.merged_colors(), field.region_ids, operands,
             contours=self.contours, cutoff=self.cutoff, backend=self.backend,
         )  # fmt: skip
-        image = area_mean(image, target)
+        image = area_mean(image, size)
         if not self.keepdim and image.ndim == 3:
             image = image[None]
         return image.clamp(0.0, 1.0) if self.clamp else image
@@ -124,9 +121,9 @@ class RegionSplatRenderer(nn.Module):
         return f"cutoff={self.cutoff:g}, clamp={self.clamp}, backend={self.backend!r}, keepdim={self.keepdim}{crisp}"
 
 
-def rendered_size(own: tuple[int, int], size: tuple[int, int]) -> tuple[int, int]:
-    """Return the size at which a field of size `own` is rendered for an image of `size`: neither side below its own."""
-    return torch.sym_max(own[0], size[0]), torch.sym_max(own[1], size[1])
+def rendered_size(field_size: tuple[int, int], size: tuple[int, int]) -> tuple[int, int]:
+    """Return the size at which a field is rendered for an image of `size`: neither side below the field's."""
+    return torch.sym_max(field_size[0], size[0]), torch.sym_max(field_size[1], size[1])
 
 
 def area_mean(image: Tensor, size: tuple[int, int]) -> Tensor:
@@ -142,29 +139,21 @@ def area_mean(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 def _shrink(image: Tensor, dim: int, size: int) -> Tensor:
     length = image.shape[dim]
-    if _is_same(size, length):
+    if is_equal(size, length):
         return image
     begin = torch.arange(size, device=image.device) * length  # in units of 1 / (size * length) of the whole
 
     def share(line: Tensor) -> Tensor:
-        ends = torch.minimum(begin + length, (line + 1) * size) - torch.maximum(begin, line * size)
-        return ends.clamp_min(0).to(image.dtype) / length
+        overlap = torch.minimum(begin + length, (line + 1) * size) - torch.maximum(begin, line * size)
+        return overlap.clamp_min(0).to(image.dtype) / length
 
     if not torch.compiler.is_compiling():  # many times as fast as a matrix, which a graph of any size takes
         total = torch.zeros_like(image.narrow(dim, 0, size))
         for step in range(length // size + 2 * (length % size > 0)):
             line = begin // size + step
-            taken = image.index_select(dim, line.clamp_max(length - 1))
-            total = total + taken * (share(line) if dim == -1 else share(line)[:, None])
+            lines = image.index_select(dim, line.clamp_max(length - 1))
+            total = total + lines * (share(line) if dim == -1 else share(line)[:, None])
         return total
     matrix = share(torch.arange(length, device=image.device)[:, None])  # (length, size)
     with torch.autocast(image.device.type, enabled=False):
         return image @ matrix if dim == -1 else matrix.T @ image
-
-
-def _is_same(size: int, length: int) -> bool:
-    if not torch.compiler.is_compiling():
-        return size == length
-    from torch.fx.experimental.symbolic_shapes import statically_known_true
-
-    return statically_known_true(size == length)

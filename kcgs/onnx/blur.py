@@ -30,7 +30,7 @@ class BlurredWindows:
         self.graph = g
         self.tiles = tiles
         self.groups = groups
-        ids, (_, level) = tile_ids(groups), regions.membership.levels
+        ids, (_, level) = tile_ids(groups), regions.tables.membership.levels
         levels = np.zeros((len(ids), WINDOW, WINDOW), np.int64)
         if level is not None:
             levels = cut_windows(tiles, ids, level[0].cpu().numpy())
@@ -43,7 +43,7 @@ class BlurredWindows:
         axes = g.constant([1, 2])
         window, region, width = (pack_runs(g, np.array(column)) for column in zip(*triples, strict=True))
         inside = g.Equal(_label_windows(g, regions, tiles, ids)[window], g.Unsqueeze(region, axes))
-        kernels = _kernels(g, regions.membership)[width]  # [parts, S, side]
+        kernels = _kernels(g, regions.tables.membership)[width]  # [parts, S, side]
         parts = kernels @ inside.astype(FLOAT) @ g.Transpose(kernels, perm=[0, 2, 1])
         self.levels = None if level is None else pack_windows(g, levels)  # (T, S, S), place among the map's widths
         if self.levels is not None:
@@ -69,7 +69,7 @@ class CrispWindows(BlurredWindows):
 
     def __init__(self, g: Graph, regions: RegionMap, tiles: Tiles, groups: Mapping[int, Group]) -> None:
         super().__init__(g, regions, tiles, groups)
-        index = cut_windows(tiles, tile_ids(groups), regions.membership.index[0].cpu().numpy())
+        index = cut_windows(tiles, tile_ids(groups), regions.tables.membership.index[0].cpu().numpy())
         self.labels = split_groups(g, groups, pack_windows(g, index))
 
     def unfold(self, number: int) -> Value:
@@ -106,8 +106,8 @@ def _label_windows(g: Graph, regions: RegionMap, tiles: Tiles, ids: Integers) ->
 
     The map is stored in tiles, one beyond it around: those of one label by that label, the others by their pixels.
     """
-    rows, cols, radius = tiles.rows, tiles.cols, regions.membership.radius
-    index = regions.membership.index[0].cpu().numpy()
+    rows, cols, radius = tiles.rows, tiles.cols, regions.tables.membership.radius
+    index = regions.tables.membership.index[0].cpu().numpy()
     beyond = regions.num_regions + 1  # nor is it what lists of regions are filled up with
     rim = -(-(radius + 1) // TILE)  # tiles around the map
     frame = [(rim * TILE, (rim + n) * TILE - length) for n, length in zip((rows, cols), index.shape, strict=True)]

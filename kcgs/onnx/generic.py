@@ -47,7 +47,7 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = True) -> onnx.ModelPr
         >>> field = GaussianField.random(10, (32, 48), regions=regions, seed=0)
         >>> feeds = {name: getattr(field, name).detach().numpy() for name in ("means", "cholesky", "colors")}
         >>> feeds["region_ids"] = regions.index_of(field.region_ids).numpy()
-        >>> feeds["memberships"] = torch.stack([regions.weights(i).float() for i in regions.ids.tolist()]).numpy()
+        >>> feeds["memberships"] = torch.stack([regions.membership(i).float() for i in regions.ids.tolist()]).numpy()
         >>> session = onnxruntime.InferenceSession(generic_decoder().SerializeToString())
         >>> session.run(None, feeds)[0].shape
         (1, 3, 32, 48)

@@ -89,7 +89,7 @@ def make_membership(stored: Stored, regions: RegionMap, down: Axis, across: Axis
     What is sampled loses the blur of pixels, as :class:`kcgs.kernels.Resampled` has it, or with `crisp`, of labels that
     are blurred by the width of one, becomes as narrow as :class:`kcgs.kernels.Crisp` has it.
     """
-    g, tiles, membership = stored.graph, stored.plan.tiles, regions.membership
+    g, tiles, membership = stored.graph, stored.plan.tiles, regions.tables.membership
     groups = {number: group for number, group in enumerate(stored.plan.groups) if group.regions > 1}
     if not groups:
         return None

@@ -50,7 +50,7 @@ def _hard_tiles(regions: RegionMap, rows: int, cols: int) -> Tiles:
 
 
 def _soft_tiles(regions: RegionMap, rows: int, cols: int) -> Tiles:
-    membership, count = regions.membership, regions.num_regions
+    membership, count = regions.tables.membership, regions.num_regions
     keys = membership.tiles(TILE).keys.cpu()
     # a window reaches into the tiles around it
     steps = torch.arange(-1, 2)
@@ -75,7 +75,7 @@ def _membership_windows(regions: RegionMap, tile: Tensor, cols: int, region: Ten
     """Evaluate a region over the window of a tile, (P, WINDOW, WINDOW), for P pairs of both."""
     corners = tile // cols * TILE - 1, tile % cols * TILE - 1
     image, r, y, x = (part.to(regions.labels.device) for part in (torch.zeros_like(region), region, *corners))
-    weights = regions.membership.window_weights(image, r, y, x, (WINDOW, WINDOW)).cpu()
+    weights = regions.tables.membership.window_weights(image, r, y, x, (WINDOW, WINDOW)).cpu()
     down, across = (
         (begin[:, None] + torch.arange(WINDOW)).clamp(0, length - 1) - begin[:, None]
         for begin, length in zip(corners, regions.size, strict=True)

@@ -191,7 +191,7 @@ class TestPixels:
         hidden = regions.ids[:3].tolist()
         page.evaluate(f"(image.hide({hidden}), image.hide({hidden[2]}, false), 1)")
         got = pixels(page, scene.size)
-        left = regions.weights(regions.ids[2:].tolist()).numpy()
+        left = regions.membership(regions.ids[2:].tolist()).numpy()
         np.testing.assert_allclose(got[3], left, atol=LEVELS)
         inside = left > 1 - 1e-6
         np.testing.assert_allclose(got[:3, inside], scene.render().numpy()[:, inside], atol=LEVELS)

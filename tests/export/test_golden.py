@@ -271,5 +271,5 @@ class TestOnnx:
         feeds |= {"region_ids": np.zeros(len(case["means"]), np.int64), "memberships": np.ones((1, *size), np.float32)}
         if regions is not None and field.region_ids is not None:
             feeds["region_ids"] = regions.index_of(field.region_ids).numpy()
-            feeds["memberships"] = torch.stack([regions.weights(i) for i in regions.ids.tolist()]).float().numpy()
+            feeds["memberships"] = torch.stack([regions.membership(i) for i in regions.ids.tolist()]).float().numpy()
         assert_same(session.run(["image"], feeds)[0][0], case[f"image_{size[0]}x{size[1]}"])

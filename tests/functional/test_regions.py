@@ -12,7 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
-from kcgs.functional import PairWidths, edge_band, lookup_regions
+from kcgs.functional import PairSoftness, edge_band, lookup_regions
 from kcgs.kernels.tiles import TILE
 from tests.tester import BaseTester
 
@@ -36,7 +36,7 @@ class TestRegionMap(
     ) -> None:
         regions = RegionMap.from_labels(blobs().to(device), softness)
         assert regions.labels.device.type == device.type and "4 regions, size=(45, 70)" in repr(regions)
-        weights = regions.weights(0, dtype)
+        weights = regions.membership(0, dtype)
         assert weights.dtype == dtype and weights.isfinite().all() and weights.any()
 
     @pytest.mark.parametrize("lead", [(), (1,), (2,)])
@@ -72,7 +72,9 @@ class TestRegionMap(
     @pytest.mark.parametrize("softness", [0.3, 0.7, 2.0])
     def test_memberships_sum_to_one(self, softness: float) -> None:
         regions = RegionMap.from_labels(blobs(), softness)
-        shares = torch.stack([regions.membership.weights(0, r, torch.float64) for r in range(regions.num_regions)])
+        shares = torch.stack(
+            [regions.tables.membership.weights(0, r, torch.float64) for r in range(regions.num_regions)]
+        )
         torch.testing.assert_close(shares.sum(0), torch.ones(45, 70, dtype=torch.float64))
         assert ((shares > 0) & (shares < 1)).any()
 
@@ -86,11 +88,11 @@ class TestRegionMap(
                 ndimage.gaussian_filter(a, softness, mode="constant", radius=radius) for a in (inside, inside * 0 + 1)
             )
             want = torch.from_numpy(blurred / ones)
-            assert (regions.membership.weights(0, r, torch.float64) - want).abs().max() < 1e-12
+            assert (regions.tables.membership.weights(0, r, torch.float64) - want).abs().max() < 1e-12
 
     @pytest.mark.parametrize("softness", [0.0, 0.7, 5.0])
     def test_tile_tables_hold_the_same_weights(self, softness: float) -> None:
-        membership = RegionMap.from_labels(blobs(), softness).membership
+        membership = RegionMap.from_labels(blobs(), softness).tables.membership
         table = membership.tiles(TILE)
         cols = -(-70 // TILE)
         found = torch.zeros(membership.num_regions, 3 * TILE, cols * TILE, dtype=torch.float64)
@@ -106,7 +108,7 @@ class TestRegionMap(
         labels = torch.zeros(160, 160, dtype=torch.long)
         labels[:, 80:] = 1
         for softness, mixed in ((0.0, 0), (0.7, 20)):
-            table = RegionMap.from_labels(labels, softness).membership.tiles(TILE)
+            table = RegionMap.from_labels(labels, softness).tables.membership.tiles(TILE)
             assert len(table.masks) == 2 * mixed
             assert (table.mask < 0).sum() == 100 - mixed
 
@@ -154,24 +156,24 @@ class TestPairWidths:
     def test_read_in_either_order_and_never_written(self) -> None:
         given = {(9, 3): 0.7, (3, 5): 1}
         softness = RegionMap.from_labels(torch.tensor([[3, 5, 9]]), given).softness
-        assert isinstance(softness, PairWidths)
+        assert isinstance(softness, PairSoftness)
         assert list(softness.items()) == [((3, 5), 1.0), ((3, 9), 0.7)]
         assert softness[9, 3] == softness[3, 9] == 0.7 and (5, 9) not in softness
         given[9, 3] = 2.0
         assert softness == {(3, 5): 1.0, (3, 9): 0.7}
-        assert hash(softness) == hash(PairWidths(dict(sorted(softness.items(), reverse=True))))
+        assert hash(softness) == hash(PairSoftness(dict(sorted(softness.items(), reverse=True))))
         with pytest.raises(TypeError):
             softness[3, 9] = 1.0  # type: ignore[index]
 
     def test_pickle_copy_and_move(self) -> None:
         regions = RegionMap.from_labels(blobs((44, 70)), {(0, 1): 0.7, (2, 3): 1.0})
-        regions.membership.tiles(TILE)
+        regions.tables.membership.tiles(TILE)
         others = (pickle.loads(pickle.dumps(regions)), copy.deepcopy(regions), regions.to("meta"))
         for other in others:
             assert other.softness == regions.softness
             assert other.size == other.labels.shape == (44, 70) and other.index.shape == (1, 44, 70)
         assert others[2].labels.device.type == "meta"
-        assert torch.equal(others[0].membership.tiles(TILE).masks, regions.membership.tiles(TILE).masks)
+        assert torch.equal(others[0].tables.membership.tiles(TILE).masks, regions.tables.membership.tiles(TILE).masks)
 
     @pytest.mark.parametrize(
         ("softness", "error", "words"),
@@ -234,13 +236,13 @@ class TestResize:
         regions = RegionMap.from_labels(blobs() % 3, softness)  # type: ignore[arg-type]
         resized = regions.resize(size)
         assert resized.resize((45, 70)) is regions
-        table = resized.membership.tiles(16)
+        table = resized.tables.membership.tiles(16)
         tiles_x = -(-size[1] // 16)
-        widths, level = regions.membership.levels
+        widths, level = regions.tables.membership.levels
         squares = torch.full((45, 70), widths[0] ** 2, dtype=torch.float64)
         for position, width in enumerate(widths):
             squares = squares if level is None else torch.where(level[0] == position, width**2, squares)
-        own = [regions.membership.weights(0, region, torch.float64) for region in range(3)]
+        own = [regions.tables.membership.weights(0, region, torch.float64) for region in range(3)]
         stacked = torch.stack([*own, squares])
         # torch's own bilinear resampling holds the border and puts pixels at their centres, as we do
         *means, variance = torch.nn.functional.interpolate(stacked[None], size, mode="bilinear", align_corners=False)[0]
@@ -250,7 +252,7 @@ class TestResize:
             powers = torch.stack(means) ** exponent
             means = [*(powers / powers.sum(0))]
         for region, want in enumerate(means):
-            got = resized.membership.weights(0, region, torch.float64)
+            got = resized.tables.membership.weights(0, region, torch.float64)
             assert (got - want).abs().max() < 1e-8
             for key, mask in zip(table.keys.tolist(), table.mask.tolist(), strict=True):
                 if key % 3 != region:
@@ -317,7 +319,7 @@ class TestCrisp:
         labels = blobs()
         crisp = RegionMap.from_labels(labels, softness).resize(size, "crisp")
         assert crisp.contours == "crisp" and crisp.softness == 0.5 and crisp.size == size
-        want, table, tiles_x = stated_crisp(labels, size), crisp.membership.tiles(16), -(-size[1] // 16)
+        want, table, tiles_x = stated_crisp(labels, size), crisp.tables.membership.tiles(16), -(-size[1] // 16)
         found = torch.zeros(4, -(-size[0] // 16) * 16, tiles_x * 16, dtype=torch.float64)
         for key, mask in zip(table.keys.tolist(), table.mask.tolist(), strict=True):
             y, x = key // 4 // tiles_x * 16, key // 4 % tiles_x * 16
@@ -325,13 +327,13 @@ class TestCrisp:
         # what is beyond the blur's reach of 4 deviations differs by less than its weights there
         assert (found[:, : size[0], : size[1]] - want).abs().max() < 1e-6
         for region in range(4):
-            assert (crisp.membership.weights(0, region, torch.float64) - want[region]).abs().max() < 1e-9
+            assert (crisp.tables.membership.weights(0, region, torch.float64) - want[region]).abs().max() < 1e-9
 
     def test_a_disc_is_round(self) -> None:
         """The half-way line stays within 0.4 pixels of the map from the circle; stairs are 0.7 off."""
         y, x = torch.meshgrid(*[torch.arange(64) + 0.5] * 2, indexing="ij")
         inside = (((x - 32) ** 2 + (y - 32) ** 2).sqrt() < 20.3).long()
-        weights = RegionMap.from_labels(inside).resize((512, 512), "crisp").weights(1)
+        weights = RegionMap.from_labels(inside).resize((512, 512), "crisp").membership(1)
         y, x = torch.meshgrid(*[(torch.arange(512) + 0.5) / 8] * 2, indexing="ij")
         radius = ((x - 32) ** 2 + (y - 32) ** 2).sqrt()
         assert (weights[radius < 20.3 - 0.4] > 0.5).all() and (weights[radius > 20.3 + 0.4] < 0.5).all()
@@ -340,7 +342,7 @@ class TestCrisp:
     def test_one_pixel_wide_at_any_size(self, factor: int) -> None:
         """A straight edge, as steep as that of a blur by half a pixel of the image."""
         labels = (torch.arange(24) > 11).long().expand(24, 24)
-        row = RegionMap.from_labels(labels, 2.0).resize((24 * factor, 24 * factor), "crisp").weights(1)[12 * factor]
+        row = RegionMap.from_labels(labels, 2.0).resize((24 * factor, 24 * factor), "crisp").membership(1)[12 * factor]
         assert 0.9 < float(row.diff().max()) / math.erf(0.5 / (0.5 * math.sqrt(2))) < 1.15
         assert int(((row > 0.01) & (row < 0.99)).sum()) <= 4
 
@@ -348,7 +350,7 @@ class TestCrisp:
         labels = torch.zeros(30, 40, dtype=torch.long)
         labels[12], labels[:, 20], labels[3, 5] = 1, 2, 3
         large = RegionMap.from_labels(labels).resize((150, 200), "crisp")
-        shares = torch.stack([large.weights(k) for k in range(4)])
+        shares = torch.stack([large.membership(k) for k in range(4)])
         assert torch.equal(shares.argmax(0)[2::5, 2::5], labels)
         assert (shares[1].amax(0)[:95] > 0.7).all() and (shares[2].amax(1) > 0.7).all()
         # about as wide as the line, 5 pixels there
@@ -375,10 +377,10 @@ class TestCrisp:
         others = pickle.loads(pickle.dumps(crisp)), copy.deepcopy(crisp), RegionMap.from_state(crisp.state())
         for other in others:
             assert other.contours == "crisp" and torch.equal(
-                other.membership.tiles(16).masks, crisp.membership.tiles(16).masks
+                other.tables.membership.tiles(16).masks, crisp.tables.membership.tiles(16).masks
             )
-        want = crisp.membership.weights(1, 2, torch.float64)
-        torch.testing.assert_close(crisp.image(1).weights(2), want, rtol=0, atol=1e-9)
+        want = crisp.tables.membership.weights(1, 2, torch.float64)
+        torch.testing.assert_close(crisp.image(1).membership(2), want, rtol=0, atol=1e-9)
         assert crisp.resize((45, 70)) is regions and crisp.resize((90, 140), "crisp") is crisp
         assert RegionMap.from_labels(torch.zeros(4, 5).long()).resize((4, 5), "crisp").num_regions == 1
 

@@ -23,6 +23,7 @@ from kcgs.codec import decode, encode
 from kcgs.fitting import fit
 from kcgs.fitting.contour_moves import refine_contours
 from kcgs.fitting.pursuit import propose
+from kcgs.functional.contour_fit import contour_gain
 from kcgs.onnx import generic_decoder, scene_decoder
 from kcgs.pruning import prune
 from kcgs.rate import compress, fit_bytes
@@ -206,8 +207,8 @@ def cleanups(image: Tensor, labels: Tensor) -> dict[str, Tensor]:
 def contour_functions(image: Tensor, labels: Tensor) -> dict[str, Any]:
     """What is measured on and done to contours."""
     return {
-        "widths": sorted(F.choose_widths(image, labels).items()),
-        "gain": sorted((pair, tuple(gain)) for pair, gain in F.band_gain(image, labels).items()),
+        "widths": sorted(F.choose_softness(image, labels).items()),
+        "gain": sorted((pair, tuple(gain)) for pair, gain in contour_gain(image, labels).items()),
         "merge": F.merge_regions(image, labels),
         "merge-dear": F.merge_regions(image, labels, 0.05),
         "band": F.edge_band(labels),

@@ -91,7 +91,7 @@ def stated(labels: Tensor, sigma: Any, region: int) -> Tensor:
 class TestDefinition:
     def test_pairs(self, seed: int) -> None:
         labels = blobs(seed=seed)
-        membership = RegionMap.from_labels(labels, PAIRS).membership
+        membership = RegionMap.from_labels(labels, PAIRS).tables.membership
         sigma = width_of_pixels(labels.numpy(), PAIRS)
         assert set(np.unique(sigma)) == {0.0, 0.7, 1.1, 2.0}
         for region in range(4):
@@ -100,7 +100,7 @@ class TestDefinition:
 
     def test_one_width(self, seed: int) -> None:
         labels = blobs(seed=seed)
-        membership = RegionMap.from_labels(labels, 0.9).membership
+        membership = RegionMap.from_labels(labels, 0.9).tables.membership
         for region in range(4):
             want = stated(labels, np.full(labels.shape, 0.9), region)
             assert (membership.weights(0, region, torch.float64) - want).abs().max() < 1e-12
@@ -111,14 +111,14 @@ class TestTables:
     def test_hold_the_dense_weights(self, softness: Widths) -> None:
         maps = torch.stack([blobs((37, 53), seed=s) for s in (0, 1)])
         maps[0, :20, :18] = 3  # tiles with a region of their own
-        membership = RegionMap.from_labels(maps, softness).membership
+        membership = RegionMap.from_labels(maps, softness).tables.membership
         for tile in (TILE, 5):
             for batch in (0, 1):
                 dense = [membership.weights(batch, r, torch.float64) for r in range(4)]
                 assert (from_tiles(membership, tile, batch) - torch.stack(dense)).abs().max() < 1e-12
 
     def test_sum_to_one(self, softness: Widths) -> None:
-        membership = RegionMap.from_labels(blobs(), softness).membership
+        membership = RegionMap.from_labels(blobs(), softness).tables.membership
         shares = weights_of(membership)
         assert (shares.sum(0) - 1).abs().max() < 1e-12
         assert shares.min() >= 0
@@ -128,8 +128,8 @@ class TestTables:
 class TestPairWidths:
     def test_junction(self) -> None:
         widths = {(0, 1): 0.0, (0, 2): 0.7, (1, 2): 2.0}
-        shares = weights_of(RegionMap.from_labels(junction(), widths).membership)
-        apart = {pair: weights_of(RegionMap.from_labels(junction(), w).membership) for pair, w in widths.items()}
+        shares = weights_of(RegionMap.from_labels(junction(), widths).tables.membership)
+        apart = {pair: weights_of(RegionMap.from_labels(junction(), w).tables.membership) for pair, w in widths.items()}
         # far from the junction each contour is as if it were alone
         assert torch.equal(shares[:, :10, 20:40], apart[0, 1][:, :10, 20:40])
         assert (shares[:, :, :20] - apart[0, 2][:, :, :20]).abs().max() < 1e-12
@@ -138,42 +138,42 @@ class TestPairWidths:
 
     def test_hard_pair_beside_a_soft_pair(self) -> None:
         labels = (torch.arange(60) // 20).expand(20, 60)
-        shares = weights_of(RegionMap.from_labels(labels, {(1, 2): 1.5}).membership)
+        shares = weights_of(RegionMap.from_labels(labels, {(1, 2): 1.5}).tables.membership)
         assert torch.equal(shares[:, :, :30], torch.stack([labels == r for r in range(3)])[:, :, :30].double())
-        soft = weights_of(RegionMap.from_labels(labels, 1.5).membership)
+        soft = weights_of(RegionMap.from_labels(labels, 1.5).tables.membership)
         assert torch.equal(shares[:, :, 31:], soft[:, :, 31:])
         assert (shares[2, :, 39] > 0.3).all()
 
     def test_equal_widths_of_the_contours_are_one_width(self) -> None:
         labels = (torch.arange(60) // 20).expand(20, 60)  # 0 and 2 do not touch
         regions = RegionMap.from_labels(labels, {(0, 1): 0.7, (1, 2): 0.7, (0, 2): 3.0})
-        assert regions.membership.levels.widths == (0.7,)
-        table, plain = (r.membership.tiles(TILE) for r in (regions, RegionMap.from_labels(labels, 0.7)))
+        assert regions.tables.membership.levels.widths == (0.7,)
+        table, plain = (r.tables.membership.tiles(TILE) for r in (regions, RegionMap.from_labels(labels, 0.7)))
         assert all(torch.equal(a, b) for a, b in zip(table, plain, strict=True))
 
     def test_contours_without_a_width_are_hard(self) -> None:
         labels = (torch.arange(60) // 20).expand(20, 60)
         regions = RegionMap.from_labels(labels, {(0, 2): 3.0})
-        assert regions.membership.tiles(TILE).masks.dtype == torch.bool
-        assert regions.membership.radius == 0
+        assert regions.tables.membership.tiles(TILE).masks.dtype == torch.bool
+        assert regions.tables.membership.radius == 0
 
     def test_batch_with_a_map_of_one_region(self) -> None:
         maps = torch.stack([junction(), torch.ones(SIZE).long()])
-        membership = RegionMap.from_labels(maps, {(0, 1): 0.7, (1, 2): 1.0}).membership
+        membership = RegionMap.from_labels(maps, {(0, 1): 0.7, (1, 2): 1.0}).tables.membership
         assert torch.equal(membership.weights(1, 1, torch.float64), torch.ones(SIZE).double())
         assert torch.equal(from_tiles(membership, TILE, 1)[1], torch.ones(SIZE).double())
 
     def test_only_tiles_that_see_a_contour_have_masks(self) -> None:
         labels = torch.zeros(160, 160, dtype=torch.long)
         labels[:, 80:], labels[:, 144:] = 1, 2
-        table = RegionMap.from_labels(labels, {(0, 1): 0.7}).membership.tiles(TILE)
+        table = RegionMap.from_labels(labels, {(0, 1): 0.7}).tables.membership.tiles(TILE)
         assert len(table.masks) == 2 * 20
         # between 1 and 2 no pixel is soft, and their contour is a border of tiles
         assert (table.mask < 0).sum() == 80
 
 
 def test_to_keeps_everything(device: torch.device) -> None:
-    membership = RegionMap.from_labels(blobs(), PAIRS).membership
+    membership = RegionMap.from_labels(blobs(), PAIRS).tables.membership
     moved = membership.to(device)
     assert moved.index.device.type == device.type
     assert (from_tiles(moved, TILE) - from_tiles(membership, TILE)).abs().max() < 1e-12

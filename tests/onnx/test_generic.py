@@ -35,7 +35,7 @@ def session(cutoff: float = 1e-4, clamp: bool = False) -> onnxruntime.InferenceS
 def feeds_of(field: GaussianField, regions: RegionMap) -> dict[str, np.ndarray]:
     assert field.region_ids is not None
     tensors = {"means": field.means, "cholesky": field.cholesky, "colors": field.merged_colors()}
-    tensors["memberships"] = torch.stack([regions.weights(region) for region in regions.ids.tolist()])
+    tensors["memberships"] = torch.stack([regions.membership(region) for region in regions.ids.tolist()])
     return {
         **{name: tensor.detach().float().numpy() for name, tensor in tensors.items()},
         "region_ids": regions.index_of(field.region_ids).numpy(),

@@ -295,7 +295,7 @@ class TestInteractive:
         field = scattered(60, size, regions)
         session = session_of(scene_decoder(Scene(field, regions), clamp=False, interactive=True))
         held = torch.nn.functional.pad(labels[None, None].double(), (pad,) * 4, mode="replicate")[0, 0].long()
-        shares = [regions.membership.weights(0, r, torch.float64) for r in range(5)]
+        shares = [regions.tables.membership.weights(0, r, torch.float64) for r in range(5)]
         shares = [torch.nn.functional.pad(s[None, None], (pad,) * 4, mode="replicate")[0, 0] for s in shares]
         moved = (field.means.detach() + pad, field.cholesky.detach(), field.colors.detach())
         want = torch.zeros(3, *held.shape)

@@ -58,7 +58,7 @@ class TestDecomposition:
     @pytest.mark.parametrize("softness", [0.0, 0.7, PAIRS, {(0, 3): 1.0}])
     def test_maps(self, softness: Any, size: tuple[int, int]) -> None:
         regions = RegionMap.from_labels(labels_of(SIZE), softness)
-        args = (*gaussians(2, 30, size), regions.labels, regions.widths, *size, 1e-4, "reference")
+        args = (*gaussians(2, 30, size), regions.labels, regions.operands.softness, *size, 1e-4, "reference")
         assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
 
     @pytest.mark.parametrize("cutoff", [0.0, 1e-2])
@@ -94,7 +94,7 @@ class TestDecomposition:
             colors,
             torch.arange(40)[None],
             labels,
-            regions.widths,
+            regions.operands.softness,
             24,
             36,
             1e-4,

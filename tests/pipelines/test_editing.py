@@ -20,7 +20,7 @@ from kcgs.editing import (
     replace_background,
 )
 from kcgs.functional import region_splat
-from kcgs.nn.field import scaled
+from kcgs.nn.field import scaled_gaussians
 from tests.tester import BaseTester
 
 SIZE = (48, 64)
@@ -407,7 +407,7 @@ class TestReplaceBackground:
         got = replace_background(scene, GROUND, other)
         image, ground = got().detach(), map_of(scene).labels == GROUND
         torch.testing.assert_close(image[:, ~ground], scene().detach()[:, ~ground], rtol=0, atol=1e-6)
-        want = region_splat(*scaled(other.field, SIZE), other.field.colors, size=SIZE).detach()
+        want = region_splat(*scaled_gaussians(other.field, SIZE), other.field.colors, size=SIZE).detach()
         torch.testing.assert_close(image[:, ground], want[:, ground], rtol=0, atol=1e-5)
         assert got.metadata == scene.metadata
 

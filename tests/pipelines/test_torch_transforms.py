@@ -272,7 +272,7 @@ class TestOperator:
     @pytest.mark.parametrize("kernel", ["cpu", "tiled", "reference"])
     def test_opcheck(self, field: GaussianField, regions: RegionMap, kernel: str) -> None:
         gaussians = [t.detach()[None].clone().requires_grad_() for t in (field.means, field.cholesky, field.colors)]
-        settings = (field.region_ids[None], regions.labels, regions.widths, *SIZE, 1e-4, kernel)
+        settings = (field.region_ids[None], regions.labels, regions.operands.softness, *SIZE, 1e-4, kernel)
         torch.library.opcheck(torch.ops.kcgs.region_splat.default, (*gaussians, *settings))
         grad = torch.rand(1, 3, *SIZE, requires_grad=kernel == "reference")
         gaussians = gaussians if kernel == "reference" else [t.detach() for t in gaussians]
@@ -406,13 +406,13 @@ class TestOperator:
         want = torch.autograd.grad(image.square().sum(), tensors, retain_graph=True)
         labels.fill_(0)
         ids.fill_(3)
-        monkeypatch.setattr("kcgs.functional.operator._prepare", None)
+        monkeypatch.setattr("kcgs.functional.operator.plan_splat", None)
         for _ in range(2):
             got = torch.autograd.grad(image.square().sum(), tensors, retain_graph=True)
             assert all(torch.equal(a, b) for a, b in zip(got, want, strict=True))
-        assert image.grad_fn.kept is not None
+        assert image.grad_fn.plan is not None
         image.sum().backward()
-        assert image.grad_fn.kept is None  # a loss that is kept for its value does not hold megabytes
+        assert image.grad_fn.plan is None  # a loss that is kept for its value does not hold megabytes
 
 
 class TestFunctional:

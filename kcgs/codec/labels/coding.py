@@ -13,8 +13,9 @@ from kcgs.codec.adaptive import AdaptiveBit, AdaptiveSymbol
 from kcgs.codec.exact import Integers
 from kcgs.codec.file import MOST_LABELS, MOST_REGIONS, ByteReader, varint
 from kcgs.codec.rangecoder import CodecError, Coder, Reader, Writer
-from kcgs.functional import MAX_SOFTNESS, PairWidths, RegionMap
+from kcgs.functional import PairSoftness, RegionMap
 from kcgs.functional.labels import compact, touching_pairs
+from kcgs.functional.softness import MAX_SOFTNESS
 
 from .contexts import CODED, LABEL, LEFT, RIGHT, TOP, load_prior, new_tables
 from .ids import code_ids, code_ids_of_file
@@ -198,7 +199,7 @@ def encode_map(regions: RegionMap) -> bytes:
     check_count("number of regions", regions.num_regions, 1, MOST_REGIONS)
     labels = encode_labels(regions.labels.cpu().numpy())
     softness = regions.softness
-    if isinstance(softness, PairWidths):
+    if isinstance(softness, PairSoftness):
         widths = [_round(softness.get(pair, 0.0)) for pair in sorted(touching_pairs(regions.labels))]
     else:
         widths = [_round(softness)]

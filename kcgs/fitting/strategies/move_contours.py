@@ -9,7 +9,7 @@ import torch
 from kcgs.fitting.contour_moves import accept_moves, refine_contours
 from kcgs.fitting.descent import squared_error
 from kcgs.fitting.state import FitState
-from kcgs.functional import RegionMap, choose_widths
+from kcgs.functional import RegionMap, choose_softness
 
 from .densify import Densify
 
@@ -44,7 +44,7 @@ class AdaptContours:
             and problem.chooses_softness
             and addition % self.additions_per_softness == self.additions_per_move
         ):
-            softness = choose_widths(problem.image, regions.labels)
+            softness = choose_softness(problem.image, regions.labels)
             state.scene.regions = RegionMap.from_labels(regions.labels, softness)
 
 

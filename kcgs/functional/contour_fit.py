@@ -35,7 +35,7 @@ _TIE = 1e-7  # mean squared error that counts as none: a tenth of the rounding o
 _STEP = 0.05
 
 
-class BandGain(NamedTuple):
+class ContourGain(NamedTuple):
     """How well the pixels along a contour are explained with it and without it."""
 
     soft: float
@@ -63,7 +63,7 @@ class _Errors(NamedTuple):
 
 
 @torch.no_grad()
-def choose_widths(
+def choose_softness(
     image: Tensor, labels: Tensor, *, candidates: Sequence[float] = CANDIDATES
 ) -> dict[tuple[int, int], float]:
     r"""Choose the width of the contour between each two neighbouring regions that explains the image best.
@@ -90,7 +90,7 @@ def choose_widths(
 
     Example:
         >>> labels = (torch.arange(24) >= 12).long().repeat(24, 1)
-        >>> choose_widths(0.2 + 0.5 * labels[None], labels)
+        >>> choose_softness(0.2 + 0.5 * labels[None], labels)
         {(0, 1): 0.0}
     """
     windows, errors, widths = _measure(image, labels, candidates)
@@ -103,12 +103,12 @@ def choose_widths(
 
 
 @torch.no_grad()
-def band_gain(
+def contour_gain(
     image: Tensor, labels: Tensor, *, candidates: Sequence[float] = CANDIDATES
-) -> dict[tuple[int, int], BandGain]:
+) -> dict[tuple[int, int], ContourGain]:
     r"""Predict whether the contour between each two neighbouring regions is one of the image.
 
-    Convention: arguments and errors are those of :func:`choose_widths`. What is returned are means over the pixels of
+    Convention: arguments and errors are those of :func:`choose_softness`. What is returned are means over the pixels of
     the two regions within about 6 pixels of their contour (more where 2 candidates reach farther), tapered, in squared
     units of the image. Pairs with fewer than 12 pixel edges get the mean of all together.
 
@@ -120,16 +120,18 @@ def band_gain(
 
     Example:
         >>> labels = (torch.arange(24) >= 12).long().repeat(24, 1)
-        >>> band_gain(0.2 + 0.5 * labels[None], labels)[0, 1].share > 0.99
+        >>> contour_gain(0.2 + 0.5 * labels[None], labels)[0, 1].share > 0.99
         True
     """
     windows, errors, _ = _measure(image, labels, candidates)
     soft = errors.soft.amin(1)
     total = float(errors.weight.sum())
-    pooled = BandGain(float(soft.sum()) / total, float(errors.smooth.sum()) / total) if total else BandGain(0.0, 0.0)
+    pooled = (
+        ContourGain(float(soft.sum()) / total, float(errors.smooth.sum()) / total) if total else ContourGain(0.0, 0.0)
+    )
     soft, smooth = soft / errors.weight, errors.smooth / errors.weight
     return {
-        (a, b): BandGain(float(soft[p]), float(smooth[p])) if judged else pooled
+        (a, b): ContourGain(float(soft[p]), float(smooth[p])) if judged else pooled
         for p, (a, b, judged) in enumerate(_judged(windows, errors))
     }
 

@@ -1,0 +1,115 @@
+"""What the operator computes: Gaussians and map are made ready for a kernel, which renders and differentiates them.
+
+Everything here is below autograd. Values are checked here, since only an operator sees them; shapes are checked by the
+public function.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcgs.kernels import OutOfRangeError, SplatInputs, Steps, resolve, with_autograd
+
+from .arguments import Arguments
+from .map_tables import tables_at
+from .values import check_region_ids, check_values
+
+
+class Plan(NamedTuple):
+    """A kernel, its inputs, and what it found about them: a forward leaves it for its backward."""
+
+    steps: Steps
+    inputs: SplatInputs
+    content: Any  # what `steps.plan` returned
+
+
+def plan_splat(arguments: Arguments, check: bool = True) -> Plan:
+    """Prepare Gaussians and map for the kernel that the backend names, with `check` of values."""
+    inputs, steps = _prepare(arguments, check)
+    try:
+        return Plan(steps, inputs, steps.plan(inputs))
+    except OutOfRangeError:
+        check_values(*arguments[:3])
+        raise
+
+
+def render(arguments: Arguments, plan: Plan) -> Tensor:
+    """Return the image, with B where the Gaussians have it."""
+    image = plan.steps.render(plan.content, plan.inputs).contiguous()
+    return image if image.ndim == arguments.means.ndim + 1 else image.squeeze(0)
+
+
+def differentiate(arguments: Arguments, plan: Plan, grad: Tensor, geometry: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the gradients of means, cholesky and colors; without `geometry` the first two are empty."""
+    inputs = plan.inputs
+    if grad.ndim < inputs.means.ndim + 1:
+        grad = grad.unsqueeze(0)
+    gradients = plan.steps.differentiate(plan.content, inputs, grad, geometry)
+    means, cholesky, colors = [gradients[2].new_empty(0) if g is None else g.contiguous() for g in gradients]
+    if colors.ndim == arguments.colors.ndim:
+        return means, cholesky, colors
+    if geometry:
+        means, cholesky = means.squeeze(0), cholesky.squeeze(0)
+    return means, cholesky, colors.squeeze(0)
+
+
+def differentiate_twice(
+    tangents: tuple[Tensor, Tensor, Tensor], grad: Tensor, arguments: Arguments
+) -> tuple[Tensor, ...]:
+    """Differentiate the scalar product of gradients and `tangents` by the image's gradient and by the Gaussians."""
+    with with_autograd():
+        image, leaves = _image_with_graph(arguments)
+        leaves = [grad.detach().requires_grad_(), *leaves]
+        first = torch.autograd.grad(image, leaves[1:], leaves[0], create_graph=True)
+        # without geometry its tangents are empty
+        pairs = [(value, tangent) for value, tangent in zip(first, tangents, strict=True) if len(tangent)]
+        values, weights = zip(*pairs, strict=True)
+        second = torch.autograd.grad(values, leaves, weights, allow_unused=True, materialize_grads=True)
+    return tuple(t.contiguous() for t in second)
+
+
+def differentiate_forward(tangents: tuple[Tensor, Tensor, Tensor], arguments: Arguments) -> Tensor:
+    """Differentiate the image along a change of the Gaussians."""
+    with with_autograd():
+        image, leaves = _image_with_graph(arguments)
+        # gradients are linear in the image's gradient: differentiated by that, they are the derivative forward
+        grad = torch.zeros_like(image, requires_grad=True)
+        first = torch.autograd.grad(image, leaves, grad, create_graph=True)
+        (derivative,) = torch.autograd.grad(first, grad, tangents)
+    return derivative.contiguous()
+
+
+def _image_with_graph(arguments: Arguments) -> tuple[Tensor, list[Tensor]]:
+    """Render with a graph, and return its leaves, too."""
+    inputs, steps = _prepare(arguments, check=False)
+    if steps.image is None:
+        raise RuntimeError(
+            f"backend {arguments.backend!r} has first derivatives by backward only: backend 'reference' has all"
+        )
+    leaves = [t.detach().requires_grad_() for t in arguments[:3]]
+    image = steps.image(SplatInputs(leaves[0], leaves[1], leaves[2], *inputs[3:]).with_batch())
+    return image if arguments.means.ndim == 3 else image.squeeze(0), leaves
+
+
+def _prepare(arguments: Arguments, check: bool) -> tuple[SplatInputs, Steps]:
+    """Return the inputs of the kernel, and the kernel."""
+    region_index = membership = None
+    if arguments.map is not None and arguments.region_ids is not None:
+        tables = tables_at(arguments.map)
+        region_index = tables.index_of(torch.atleast_2d(arguments.region_ids))
+        # on CUDA nothing waits for the answer
+        known = region_index.device.type == "cpu" and int(region_index.numpy().min(initial=0)) >= 0
+        if check and not known:
+            check_region_ids(arguments.region_ids, region_index, tables.complete)
+        membership = tables.membership
+        # one region covers everything: no map, but Gaussians of other ids still paint nothing
+        if membership.num_regions == 1 and known:
+            region_index = membership = None
+    inputs = SplatInputs(*arguments[:3], region_index, membership, arguments.size, arguments.cutoff)
+    steps = resolve(arguments.backend, inputs)
+    if check and not steps.as_given:
+        check_values(*arguments[:3])
+    return inputs if steps.as_given else inputs.with_batch(), steps
