@@ -1,9 +1,9 @@
-"""How wide a contour is, and whether the image has one there: read from the pixels, for each pair of neighbours.
+"""Fit two colours across each contour: how soft the contour is, and how much error it explains.
 
-Along a contour lie square windows. In each the image is explained as sum_r s_r F_r, with s_r the memberships of one
-width and F_r linear in x and y: a least-squares problem with a closed form. Mixed pixels are thereby explained as
-mixtures and spoil no colour, and a thin region needs no pure pixel. The width with the least error summed over the
-windows of a pair is that pair's.
+Along a contour lie square windows. In each the image is explained as sum_r s_r F_r, with s_r the memberships at one
+softness and F_r linear in x and y: a least-squares problem with a closed form. Mixed pixels are thereby explained as
+mixtures and spoil no colour, and a thin region needs no pure pixel. The softness with the least error summed over the
+windows of a pair of regions is that pair's.
 """
 
 from __future__ import annotations
@@ -21,32 +21,33 @@ from kcgs.kernels.membership import RADIUS_SIGMAS
 from .labels import contour_edges, unique_pairs
 from .softness import MAX_SOFTNESS
 
-CANDIDATES = (0.0, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
-_MIN_CONTOUR = 12  # pixel edges that a pair needs to be judged by itself
+CANDIDATES = (0.0, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)  # pixels: from hard to out of focus, by factors of about sqrt(2)
+_STEP = 0.05  # pixels that a softness between two candidates is rounded to
+_MIN_EDGES = 12  # pixel edges that a pair needs to be judged by itself
 
-_HALF = 6  # windows reach that far from their centre, or 2 widths if that is more
-_CELL = 6  # one window for each cell of this side that the contour of a pair crosses
-_PAIR_WINDOWS, _ALL_WINDOWS = 512, 4096
-_CHUNK_ELEMENTS = 1 << 18  # label pixels that a chunk of windows sees: small enough for the cache
+_HALF = 6  # pixels that a window reaches from its centre, or twice the largest candidate if that is more
+_CELL = 6  # pixels: one window for each cell of this side that the contour of a pair crosses
+_PAIR_WINDOWS = 512  # for one pair of regions, evenly spread; bounds the time
+_ALL_WINDOWS = 4096  # for a map
+_CHUNK_ELEMENTS = 1 << 18  # label pixels in a chunk of windows: small enough for the cache
 # Noise of 0.02 against colours and slopes (over half a window) of 0.3: keeps a region that hardly shows from
 # explaining everything with an absurd colour.
 _RIDGE = (0.02 / 0.3) ** 2
 _TIE = 1e-7  # mean squared error that counts as none: a tenth of the rounding of 8-bit images
-_STEP = 0.05
 
 
 class ContourGain(NamedTuple):
-    """How well the pixels along a contour are explained with it and without it."""
+    """Mean squared error along a contour, with it and without it."""
 
-    soft: float
-    """Mean squared error of two linear colours mixed across the contour, at the best width."""
-    smooth: float
-    """Mean squared error of one quadratic colour, which has as many coefficients."""
+    contour_error: float
+    """Of two linear colours mixed across the contour, at the best softness."""
+    smooth_error: float
+    """Of one quadratic colour, which has as many coefficients."""
 
     @property
     def share(self) -> float:
         """The share of the error without the contour that the contour saves, at most 1; below 0 where it costs."""
-        return 1.0 - self.soft / self.smooth if self.smooth > _TIE else 0.0
+        return 1.0 - self.contour_error / self.smooth_error if self.smooth_error > _TIE else 0.0
 
 
 class _Windows(NamedTuple):
@@ -57,7 +58,7 @@ class _Windows(NamedTuple):
 
 
 class _Errors(NamedTuple):
-    soft: Tensor  # [K or P, S] float64, squared error of each width
+    soft: Tensor  # [K or P, S] float64, squared error at each softness
     smooth: Tensor  # [K or P] float64, squared error without the contour
     weight: Tensor  # [K or P] float64, tapered pixels times channels
 
@@ -66,23 +67,23 @@ class _Errors(NamedTuple):
 def choose_softness(
     image: Tensor, labels: Tensor, *, candidates: Sequence[float] = CANDIDATES
 ) -> dict[tuple[int, int], float]:
-    r"""Choose the width of the contour between each two neighbouring regions that explains the image best.
+    r"""Choose the softness of the contour between each two neighbouring regions that explains the image best.
 
-    Convention: the width is the standard deviation of the blur of [M = r], as in `RegionMap`. The least candidate wins
+    Convention: softness is the standard deviation of the blur of [M = r], as in `RegionMap`. The least candidate wins
     where others gain less than a mean square of 1e-7, a tenth of the rounding of 8-bit images. A winner between two
-    positive candidates is refined by a parabola to 0.05 pixels. Pairs with fewer than 12 pixel edges get the width
+    positive candidates is refined by a parabola to 0.05 pixels. Pairs with fewer than 12 pixel edges get the softness
     that is best for all together.
 
-    Known limits: widths near the largest candidate come out low (2.5 as 2.4, and as 2.1 under noise and texture of a
-    sixth of the contrast). Where the two sides do not differ, the width means nothing.
+    Known limits: softness near the largest candidate comes out low (2.5 as 2.4, and as 2.1 under noise and texture of
+    a sixth of the contrast). Where the two sides do not differ, it means nothing.
 
     Args:
         image: floating, :math:`(C, H, W)`, in [0, 1].
         labels: integer label map, :math:`(H, W)`, non-negative.
-        candidates: widths in pixels, 0 to 64.
+        candidates: of softness, in pixels, 0 to 64.
 
     Returns:
-        The width in pixels for every pair (a, b), a < b, of labels that share a pixel edge; empty for one region.
+        Softness in pixels for every pair (a, b), a < b, of labels that share a pixel edge; empty for one region.
 
     Raises:
         TypeError: wrong dtype, or candidates that are not numbers.
@@ -93,24 +94,23 @@ def choose_softness(
         >>> choose_softness(0.2 + 0.5 * labels[None], labels)
         {(0, 1): 0.0}
     """
-    windows, errors, widths = _measure(image, labels, candidates)
+    levels = _check_candidates(candidates)
+    windows, errors = _measure(image, labels, levels)
     tie = _TIE * errors.weight
-    pooled = _best_width(errors.soft.sum(0).tolist(), float(tie.sum()), widths)
+    pooled = _best_softness(errors.soft.sum(0).tolist(), float(tie.sum()), levels)
     return {
-        (a, b): _best_width(errors.soft[p].tolist(), float(tie[p]), widths) if judged else pooled
-        for p, (a, b, judged) in enumerate(_judged(windows, errors))
+        (a, b): _best_softness(errors.soft[p].tolist(), float(tie[p]), levels) if reliable else pooled
+        for p, (a, b, reliable) in enumerate(_pairs(windows, errors))
     }
 
 
 @torch.no_grad()
-def contour_gain(
-    image: Tensor, labels: Tensor, *, candidates: Sequence[float] = CANDIDATES
-) -> dict[tuple[int, int], ContourGain]:
-    r"""Predict whether the contour between each two neighbouring regions is one of the image.
+def contour_gain(image: Tensor, labels: Tensor) -> dict[tuple[int, int], ContourGain]:
+    r"""Measure how much better the image is explained with the contour between each two neighbouring regions.
 
-    Convention: arguments and errors are those of :func:`choose_softness`. What is returned are means over the pixels of
-    the two regions within about 6 pixels of their contour (more where 2 candidates reach farther), tapered, in squared
-    units of the image. Pairs with fewer than 12 pixel edges get the mean of all together.
+    Convention: arguments and exceptions are those of :func:`choose_softness`. Errors are means over the pixels of the
+    two regions within about 6 pixels of their contour, tapered, in squared units of the image. Pairs with fewer than 12
+    pixel edges get the mean of all together.
 
     Known limits: on 21 photos with human label maps, a share above 0.1 holds for 84 % of the pairs with at least 40
     pixel edges, and for 18 % where the map is mirrored.
@@ -123,7 +123,7 @@ def contour_gain(
         >>> contour_gain(0.2 + 0.5 * labels[None], labels)[0, 1].share > 0.99
         True
     """
-    windows, errors, _ = _measure(image, labels, candidates)
+    windows, errors = _measure(image, labels, CANDIDATES)
     soft = errors.soft.amin(1)
     total = float(errors.weight.sum())
     pooled = (
@@ -131,51 +131,50 @@ def contour_gain(
     )
     soft, smooth = soft / errors.weight, errors.smooth / errors.weight
     return {
-        (a, b): ContourGain(float(soft[p]), float(smooth[p])) if judged else pooled
-        for p, (a, b, judged) in enumerate(_judged(windows, errors))
+        (a, b): ContourGain(float(soft[p]), float(smooth[p])) if reliable else pooled
+        for p, (a, b, reliable) in enumerate(_pairs(windows, errors))
     }
 
 
-def _judged(windows: _Windows, errors: _Errors) -> list[tuple[int, int, bool]]:
-    """Return each pair, and whether it has enough contour, and windows, to be judged on its own."""
-    enough = (windows.edges >= _MIN_CONTOUR) & (errors.weight > 0)
-    return [(a, b, judged) for (a, b), judged in zip(windows.pairs.tolist(), enough.tolist(), strict=True)]
+def _pairs(windows: _Windows, errors: _Errors) -> list[tuple[int, int, bool]]:
+    """Return each pair, and whether it has enough contour, and windows, to be judged by itself."""
+    reliable = (windows.edges >= _MIN_EDGES) & (errors.weight > 0)
+    return [(a, b, enough) for (a, b), enough in zip(windows.pairs.tolist(), reliable.tolist(), strict=True)]
 
 
-def _best_width(error: list[float], tie: float, widths: list[float]) -> float:
+def _best_softness(error: list[float], tie: float, levels: Sequence[float]) -> float:
     least = min(error)
     best = next(i for i, e in enumerate(error) if e <= least + tie)
-    if best in (0, len(error) - 1) or error[best] > least or widths[best - 1] == 0.0:
-        return widths[best]
+    if best in (0, len(error) - 1) or error[best] > least or levels[best - 1] == 0.0:
+        return levels[best]
     # Two edges blurred by v and w differ by about (sqrt(v) - sqrt(w))^2, summed over pixels. Nearer to 0 they do not.
-    (x0, x1, x2), (y0, y1, y2) = map(math.sqrt, widths[best - 1 : best + 2]), error[best - 1 : best + 2]
+    (x0, x1, x2), (y0, y1, y2) = map(math.sqrt, levels[best - 1 : best + 2]), error[best - 1 : best + 2]
     left, right = (x1 - x0) * (y2 - y1), (x2 - x1) * (y0 - y1)
     if left + right <= tie:
-        return widths[best]
+        return levels[best]
     vertex = x1 + 0.5 * ((x2 - x1) * right - (x1 - x0) * left) / (left + right)
     return round(round(vertex**2 / _STEP) * _STEP, 6)
 
 
-def _measure(image: Tensor, labels: Tensor, candidates: Sequence[float]) -> tuple[_Windows, _Errors, list[float]]:
-    """Check the arguments; place the windows; return each pair's errors, and the widths they are of, ascending."""
+def _measure(image: Tensor, labels: Tensor, levels: Sequence[float]) -> tuple[_Windows, _Errors]:
+    """Check image and labels, place the windows, and return each pair's errors at each softness, ascending."""
     image, labels = check_problem(image, labels)
-    widths = _check_candidates(candidates)
     windows = _place_windows(labels)
-    half, halo = max(_HALF, math.ceil(2 * widths[-1])), math.ceil(RADIUS_SIGMAS * widths[-1])
+    half, halo = max(_HALF, math.ceil(2 * levels[-1])), math.ceil(RADIUS_SIGMAS * levels[-1])
     side, span = 2 * half + 1, 2 * (half + halo) + 1
     windowed = torch.nn.functional.pad(image, (half,) * 4).unfold(1, side, 1).unfold(2, side, 1)
     ids = torch.nn.functional.pad(labels, (half + halo,) * 4, value=-1).unfold(0, span, 1).unfold(1, span, 1)
-    kernels = [_blur_matrix(w, side, halo) for w in widths]
+    kernels = [_blur_matrix(softness, side, halo) for softness in levels]
     count = len(windows.pairs)
-    total = _Errors(*(torch.zeros(count, *tail, dtype=torch.float64) for tail in ((len(widths),), (), ())))
+    total = _Errors(*(torch.zeros(count, *tail, dtype=torch.float64) for tail in ((len(levels),), (), ())))
     step = max(1, _CHUNK_ELEMENTS // span**2)
     for centers, pair in zip(windows.centers.split(step), windows.pair.split(step), strict=True):
         rows, cols = centers.unbind(1)
         pixels = windowed[:, rows, cols].flatten(2).permute(1, 2, 0)
         part = _window_errors(pixels, ids[rows, cols], windows.pairs[pair], kernels)
-        for into, values in zip(total, part, strict=True):
-            into.index_add_(0, pair, values)
-    return windows, total, widths
+        for sums, values in zip(total, part, strict=True):
+            sums.index_add_(0, pair, values)
+    return windows, total
 
 
 def check_problem(image: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
@@ -191,9 +190,9 @@ def check_problem(image: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
 
 def _check_candidates(candidates: Sequence[float]) -> list[float]:
     if isinstance(candidates, str) or not isinstance(candidates, Sequence):
-        raise TypeError(f"candidates must be a sequence of widths; got {candidates!r}")
+        raise TypeError(f"candidates must be a sequence of numbers; got {candidates!r}")
     if not candidates:
-        raise ValueError("candidates must be one or more widths; got none")
+        raise ValueError("candidates must be one or more numbers; got none")
     return sorted({check_number("each of candidates", c, 0.0, MAX_SOFTNESS, unit="pixels") for c in candidates})
 
 
@@ -204,14 +203,14 @@ def _place_windows(labels: Tensor) -> _Windows:
     pairs, pair, edges = unique_pairs(ends)
     cells_x = math.ceil(width / _CELL)
     cells = cells_x * math.ceil(height / _CELL)
-    key, cell, size = (pair * cells + places[:, 0] // _CELL * cells_x + places[:, 1] // _CELL).unique(
+    codes, cell, size = (pair * cells + places[:, 0] // _CELL * cells_x + places[:, 1] // _CELL).unique(
         return_inverse=True, return_counts=True
     )
-    sums = torch.zeros(len(key), 2, dtype=torch.int64).index_add_(0, cell, places)
-    centers, of = (2 * sums + size[:, None]) // (2 * size[:, None]), key // cells
-    kept = _spread(of, _PAIR_WINDOWS)
-    kept = kept[_spread(torch.zeros_like(kept), _ALL_WINDOWS)]
-    return _Windows(pairs, edges, of[kept], centers[kept])
+    sums = torch.zeros(len(codes), 2, dtype=torch.int64).index_add_(0, cell, places)
+    centers, pair = (2 * sums + size[:, None]) // (2 * size[:, None]), codes // cells
+    sample = _spread(pair, _PAIR_WINDOWS)
+    sample = sample[_spread(torch.zeros_like(sample), _ALL_WINDOWS)]
+    return _Windows(pairs, edges, pair[sample], centers[sample])
 
 
 def _spread(group: Tensor, most: int) -> Tensor:
@@ -221,13 +220,13 @@ def _spread(group: Tensor, most: int) -> Tensor:
     return (rank * most % count[group] < most).nonzero().flatten()
 
 
-def _blur_matrix(width: float, side: int, halo: int) -> Tensor:
-    """Blur of `width` from `side + 2 halo` samples to the inner `side`."""
+def _blur_matrix(softness: float, side: int, halo: int) -> Tensor:
+    """Return the blur from `side + 2 halo` samples to the inner `side`."""
     distance = (torch.arange(side)[:, None] + halo - torch.arange(side + 2 * halo)).abs().float()
-    if width == 0.0:
+    if softness == 0.0:
         return (distance == 0).float()
-    reach = math.ceil(RADIUS_SIGMAS * width)
-    return torch.where(distance <= reach, torch.exp(-0.5 * (distance / width) ** 2), 0.0)
+    reach = math.ceil(RADIUS_SIGMAS * softness)
+    return torch.where(distance <= reach, torch.exp(-0.5 * (distance / softness) ** 2), 0.0)
 
 
 def _window_errors(pixels: Tensor, ids: Tensor, pairs: Tensor, kernels: list[Tensor]) -> _Errors:
@@ -237,7 +236,7 @@ def _window_errors(pixels: Tensor, ids: Tensor, pairs: Tensor, kernels: list[Ten
     inside = ids[:, None] == pairs[:, :, None, None]  # [K, 2, span, span]
     y, x = torch.meshgrid(*[torch.linspace(-1, 1, side)] * 2, indexing="ij")
     one, taper = torch.ones_like(x), torch.exp(-2 * (x * x + y * y))
-    # Other regions' pixels are no matter of this pair; what they lend to its own pixels is one more unknown colour.
+    # Pixels of other regions have no weight; what they blur into the pair's pixels is one more unknown colour.
     weight = (taper * inside[..., halo : halo + side, halo : halo + side].any(1)).flatten(1)  # [K, side^2]
     pixels = pixels - (weight[..., None] * pixels).sum(1, keepdim=True) / weight.sum(1)[:, None, None]
     linear = torch.stack([one, x, y]).flatten(1)
@@ -246,15 +245,16 @@ def _window_errors(pixels: Tensor, ids: Tensor, pairs: Tensor, kernels: list[Ten
     mask, soft = inside.float(), []
     for kernel in kernels:
         total = (down @ kernel.T)[:, :, None] * (across @ kernel.T)[:, None, :]
-        share = (kernel @ mask @ kernel.T / total[:, None].clamp_min(1e-30)).flatten(2)  # [K, 2, side^2]
-        ours = (share[:, :, None] * linear).flatten(1, 2)
-        soft.append(_least_error(torch.cat([ours, 1 - share.sum(1, keepdim=True)], 1), pixels, weight))
+        membership = (kernel @ mask @ kernel.T / total[:, None].clamp_min(1e-30)).flatten(2)  # [K, 2, side^2]
+        features = (membership[:, :, None] * linear).flatten(1, 2)
+        others = 1 - membership.sum(1, keepdim=True)
+        soft.append(_least_error(torch.cat([features, others], 1), pixels, weight))
     smooth = _least_error(quadratic, pixels, weight)
     return _Errors(torch.stack(soft, 1), smooth, weight.sum(1).double() * pixels.shape[2])
 
 
 def _least_error(features: Tensor, pixels: Tensor, weight: Tensor) -> Tensor:
-    """Squared error of the best mix of features (K, F, side^2), with a price on large coefficients."""
+    """Return the squared error of the best mix of features (K, F, side^2), with a ridge on its coefficients."""
     weighted = features * weight[:, None]
     gram, moment = (weighted @ features.mT).double(), (weighted @ pixels).double()
     gram.diagonal(dim1=-2, dim2=-1).add_(_RIDGE * weight.shape[1] / (2 * _HALF + 1) ** 2)

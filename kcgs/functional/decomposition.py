@@ -1,12 +1,12 @@
 """`kcgs::region_splat` in standard operators: what `torch.onnx.export` puts in its place; docs/onnx.md has the whole.
 
-Three loops bound the memory, and no shape depends on values: over tiles, over the regions that a tile sees, and over
-chunks of the Gaussians of a region that reach the tile. Bodies of loops are handed all tensors that they read.
+Three loops bound the memory, and no shape depends on values: over tiles, over the regions in the window of a tile, and
+over chunks of the Gaussians of a region that reach the tile. Bodies of loops are handed all tensors that they read.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,64 +17,73 @@ from .arguments import Arguments
 from .map_windows import MapWindows
 from .softness import is_crisp
 
-_SIDE = 32  # of a tile, in pixels
+_SIDE = 32  # pixels of a tile
+_HALF = (_SIDE - 1) / 2  # pixels from the middle of a tile to its outermost pixel centres
 _CHUNK = 64  # Gaussians evaluated at once
-_HALF = (_SIDE - 1) / 2
 _FRAME = 5  # numbers of a Gaussian before its colour: mean x, mean y, 1 / l11, l21 / l11, 1 / l22
-# of the support, so that rounding drops no Gaussian that has a weight
-_SLACK = 1.001
+_SLACK = 1.001  # factor on the support, so that rounding drops no Gaussian that has a weight
 
 
-def decompose(*arguments: Any) -> Tensor:
+class _TileGaussians(NamedTuple):
+    """The Gaussians of an image, and the tile at which they are evaluated."""
+
+    first: Tensor  # [] int64, row of the image's first Gaussian
+    num_gaussians: Tensor  # [] int64, N; the row after these is of no colour
+    middle: Tensor  # [2] x and y of the middle of the tile
+    rows: Tensor  # [B (N + 1), 5 + C] frames and colours
+
+
+def decompose(*operands: Any) -> Tensor:
     """Render as `kcgs::region_splat` does, whose arguments these are; to be traced, and slow in eager mode."""
-    given = Arguments(*arguments)
-    if is_crisp(given.softness):
+    arguments = Arguments(*operands)
+    if is_crisp(arguments.softness):
         raise ValueError(
             "contours must be scaled in graphs of torch.onnx.export; got crisp: kcgs.onnx.scene_decoder has both"
         )
-    if given.means.ndim == 2:
-        return decompose(*(None if t is None else t[None] for t in given[:4]), *given[4:]).squeeze(0)
+    if arguments.means.ndim == 2:
+        return decompose(*(None if t is None else t[None] for t in operands[:4]), *operands[4:]).squeeze(0)
     # a graph that renders only: loops cannot all be differentiated
-    means, cholesky, colors = (t.detach() for t in given[:3])
-    device, (batch, count, channels), (height, width) = means.device, colors.shape, (given.height, given.width)
+    means, cholesky, colors = (t.detach() for t in arguments[:3])
+    device, (batch, count, channels), (height, width) = means.device, colors.shape, arguments.size
     l11, l21, l22 = cholesky.unbind(-1)
     frame = torch.stack([*means.unbind(-1), 1 / l11, l21 / l11, 1 / l22], -1)
     # one Gaussian more, of no colour and no region
     rows = torch.nn.functional.pad(torch.cat([frame, colors], -1), (0, 0, 0, 1))
-    ids = torch.zeros_like(means[..., 0], dtype=torch.int64) if given.region_ids is None else given.region_ids
+    ids = torch.zeros_like(means[..., 0], dtype=torch.int64) if arguments.region_ids is None else arguments.region_ids
     ids = torch.nn.functional.pad(ids, (0, 1), value=-1)
 
     # not -(-height // _SIDE): division of integers rounds to zero in ONNX
     down, across = (height + _SIDE - 1) // _SIDE, (width + _SIDE - 1) // _SIDE
     counts = torch.stack([torch.full((), n, dtype=torch.int64, device=device) for n in (down, across, count)])
-    maps = None if given.labels is None else MapWindows(given, _SIDE)
+    windows = None if arguments.map is None else MapWindows(arguments.map, _SIDE, means.dtype)
 
     def render_tile(carry: Tensor, number: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor]:
         (down, across, count), columns, rows, ids = tensors[0].unbind(), *tensors[1:4]
         column, row, image = number % across, number // across % down, number // (across * down)
         middle = torch.stack([column, row]).to(rows.dtype) * _SIDE + _SIDE / 2
-        near = _find_near(columns.index_select(0, image.reshape(1)).squeeze(0), middle, given.cutoff)
+        near = _mark_near(columns.index_select(0, image.reshape(1)).squeeze(0), middle, arguments.cutoff)
         black = rows.new_zeros(rows.shape[1] - _FRAME, _SIDE * _SIDE)
-        gaussians = image * (count + 1), count, middle, rows
-        if maps is None:
-            total = _sum_list(near, gaussians, black, given.cutoff)
+        gaussians = _TileGaussians(image * (count + 1), count, middle, rows)
+        if windows is None:
+            total = _sum_gaussians(near, gaussians, black, arguments.cutoff)
         else:
             ids = ids.index_select(0, image.reshape(1)).squeeze(0)
-            seen = maps.look(tensors[4:], image, row, column)
-            total = _sum_regions(maps, seen, (near, ids, *gaussians), black, given.cutoff)
+            window = windows.read_tile(tensors[4:], image, row, column)
+            total = _sum_regions(windows, window, near, ids, gaussians, black, arguments.cutoff)
         return carry + 1, total.reshape(-1, _SIDE, _SIDE)
 
-    tiles = torch.arange(batch * down * across, device=device)
-    tensors = (counts, rows[..., :_FRAME].transpose(1, 2).contiguous(), rows.flatten(0, 1), ids)
-    tensors = tensors if maps is None else (*tensors, *maps.tables)
-    _, found = torch.ops.higher_order.scan(render_tile, [torch.zeros_like(counts[0])], [tiles], tensors)
-    image = found.reshape(batch, down, across, channels, _SIDE, _SIDE).permute(0, 3, 1, 4, 2, 5)
+    numbers = torch.arange(batch * down * across, device=device)
+    tensors: tuple[Tensor, ...] = (counts, rows[..., :_FRAME].transpose(1, 2).contiguous(), rows.flatten(0, 1), ids)
+    if windows is not None:
+        tensors = (*tensors, *windows.tables)
+    _, tiles = torch.ops.higher_order.scan(render_tile, [torch.zeros_like(counts[0])], [numbers], tensors)
+    image = tiles.reshape(batch, down, across, channels, _SIDE, _SIDE).permute(0, 3, 1, 4, 2, 5)
     image = image.reshape(batch, channels, down * _SIDE, across * _SIDE)
     # by less than nothing, since shapes then stay plain: a slice would be of min(height, rows)
     return torch.nn.functional.pad(image, (0, width - across * _SIDE, 0, height - down * _SIDE)).contiguous()
 
 
-def _find_near(columns: Tensor, middle: Tensor, cutoff: float) -> Tensor:
+def _mark_near(columns: Tensor, middle: Tensor, cutoff: float) -> Tensor:
     """Mark the Gaussians whose support reaches a tile, [N + 1]; not the last, which is no Gaussian."""
     x, y, inverse1, slope, inverse2 = columns.unbind()
     radius = support_radius(cutoff, x.dtype) * _SLACK
@@ -85,44 +94,49 @@ def _find_near(columns: Tensor, middle: Tensor, cutoff: float) -> Tensor:
 
 
 def _sum_regions(
-    maps: MapWindows, seen: tuple[Tensor, ...], gaussians: tuple[Tensor, ...], black: Tensor, cutoff: float
+    windows: MapWindows,
+    window: tuple[Tensor, ...],
+    near: Tensor,
+    ids: Tensor,
+    gaussians: _TileGaussians,
+    black: Tensor,
+    cutoff: float,
 ) -> Tensor:
-    """Add up the regions of a tile, in the order of their ids; `seen` begins with these, sorted."""
+    """Add up the regions of a tile, in the order of their ids; `window` begins with these, sorted."""
 
-    def more(place: Tensor, total: Tensor, weight: Tensor, *rest: Tensor) -> Tensor:
-        return place < rest[6].shape[0]
+    def has_region(place: Tensor, total: Tensor, weight: Tensor, *tensors: Tensor) -> Tensor:
+        return place < tensors[6].shape[0]
 
-    def add(
-        place: Tensor, total: Tensor, weight: Tensor, near: Tensor, ids: Tensor, *rest: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        region = rest[4].index_select(0, place.reshape(1))
-        part = _sum_list(near & (ids == region), rest[:4], torch.zeros_like(total), cutoff)
-        share = maps.weigh(rest[5:], region).reshape(1, -1)
-        return (rest[4] <= region).sum(), total + part * share, weight + share
+    def add_region(place: Tensor, total: Tensor, weight: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        near, ids, gaussians, window_ids, operands = *tensors[:2], tensors[2:6], tensors[6], tensors[7:]
+        region = window_ids.index_select(0, place.reshape(1))
+        image = _sum_gaussians(near & (ids == region), _TileGaussians(*gaussians), torch.zeros_like(total), cutoff)
+        membership = windows.membership(operands, region).reshape(1, -1)
+        return (window_ids <= region).sum(), total + image * membership, weight + membership
 
-    start = torch.zeros_like(gaussians[2]), black, torch.zeros_like(black[:1])
-    found = torch.ops.higher_order.while_loop(more, add, start, (*gaussians, *seen))
-    total: Tensor = found[1]
-    return total / found[2] if maps.soft and maps.resized else total
+    start = torch.zeros_like(gaussians.num_gaussians), black, torch.zeros_like(black[:1])
+    loop = torch.ops.higher_order.while_loop
+    _, total, weight = loop(has_region, add_region, start, (near, ids, *gaussians, *window))
+    image: Tensor = total / weight if windows.soft and windows.resized else total
+    return image
 
 
-def _sum_list(near: Tensor, gaussians: tuple[Tensor, ...], black: Tensor, cutoff: float) -> Tensor:
+def _sum_gaussians(near: Tensor, gaussians: _TileGaussians, black: Tensor, cutoff: float) -> Tensor:
     """Add up colour times weight over the Gaussians that are marked, [C, pixels]."""
 
-    def more(start: Tensor, total: Tensor, stop: Tensor, *rest: Tensor) -> Tensor:
+    def has_chunk(start: Tensor, total: Tensor, stop: Tensor, *tensors: Tensor) -> Tensor:
         return start < stop
 
-    def add(start: Tensor, total: Tensor, stop: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
-        order, first, count, middle, rows = rest
+    def add_chunk(start: Tensor, total: Tensor, stop: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+        order, (first, count, middle, rows) = tensors[0], tensors[1:]
         places = start + torch.arange(_CHUNK, device=rows.device)
-        chosen = torch.where(places < stop, order.index_select(0, torch.minimum(places, count)), count)
-        chunk = rows.index_select(0, first + chosen)
+        numbers = torch.where(places < stop, order.index_select(0, torch.minimum(places, count)), count)
+        chunk = rows.index_select(0, first + numbers)
         return start + _CHUNK, total + chunk[:, _FRAME:].T @ _weights(chunk[:, :_FRAME], middle, cutoff)
 
     order = torch.sort(near.to(torch.int32), descending=True)[1]
-    start = torch.zeros_like(order[0])
-    given = (near.sum(), order, *gaussians)
-    total: Tensor = torch.ops.higher_order.while_loop(more, add, (start, black), given)[1]
+    start = torch.zeros_like(order[0]), black
+    total: Tensor = torch.ops.higher_order.while_loop(has_chunk, add_chunk, start, (near.sum(), order, *gaussians))[1]
     return total
 
 

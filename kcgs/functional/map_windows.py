@@ -1,6 +1,6 @@
-"""Region weights of one tile at a time from labels and widths alone: `kcgs.kernels.membership` in standard operators.
+"""Membership of one tile at a time from labels and softness alone: `kcgs.kernels.membership` in standard operators.
 
-Nothing is kept beside a map and no shape depends on values, so that a graph can hold it.
+Nothing is cached beside a map and no shape depends on values, so that a graph can hold it.
 """
 
 from __future__ import annotations
@@ -13,47 +13,48 @@ from torch import Tensor
 
 from kcgs.kernels.resampled import sharpness
 
-from .arguments import Arguments
 from .labels import most_shared, sample_places
+from .map_tables import MapOperands
+from .sizes import is_equal
 
 _FAR = 1e12  # more than any squared distance
-_TINY = 1e-30
+_TINY = 1e-30  # less than any sum of a blur
 
 
 class MapWindows:
-    """A map at the size of an image, by tiles; what it computes once is in `tables`, for loops to hand back."""
+    """A map at the size of an image, by tiles.
 
-    def __init__(self, given: Arguments, side: int) -> None:
-        """Take the map of these arguments, and the pixels along a side of a tile."""
-        from torch.fx.experimental.symbolic_shapes import statically_known_true
+    `tables` is computed once. Loops of a graph are handed all tensors that they read, and hand it to `read_tile`.
+    """
 
-        labels, widths = given.labels, given.softness
-        assert labels is not None
-        self.side, self.dtype = side, given.means.dtype
-        self.soft, self.pairs = widths is not None, widths is not None and widths.ndim == 2
-        self.reach = 0 if widths is None else widths.shape[-1] - (4 if self.pairs else 2)
-        # the nearest contour of a pixel that is not of one region alone is within
+    def __init__(self, regions: MapOperands, side: int, dtype: torch.dtype) -> None:
+        """Prepare tiles of `side` pixels; memberships are computed in `dtype`."""
+        labels, softness, size = regions
+        device = labels.device
+        self.side, self.dtype = side, dtype
+        self.soft = softness is not None
+        self.pairs = softness is not None and softness.ndim == 2
+        self.reach = 0 if softness is None else softness.shape[-1] - (4 if self.pairs else 2)
+        # the nearest contour of a pixel of several regions is no farther away than this
         self.search = math.ceil(math.sqrt(2) * self.reach)
         self.halo = self.search + 1 if self.pairs else self.reach
-        axes = tuple(zip((given.height, given.width), labels.shape[-2:], strict=True))
-        self.resized = not all(statically_known_true(old == new) for new, old in axes)
-        sizes = (labels.shape[0] if labels.ndim == 3 else 1, *labels.shape[-2:])
-        counts = [
-            torch.full((), n, dtype=torch.float64, device=labels.device)
-            for n in (*labels.shape[-2:], given.height, given.width)
-        ]
-        lost = (1 - counts[0] * counts[1] / (counts[2] * counts[3])).clamp_min(0).to(self.dtype)
-        numbers = torch.stack([torch.full((), n, dtype=torch.int64, device=labels.device) for n in sizes])
-        down, across = (self._axis(*axis, labels.device) for axis in axes)
-        self._per_axis = len(down)
-        self.tables = (numbers, labels.flatten(), *down, *across, *(() if widths is None else (lost, widths)))
+        self.resized = not all(is_equal(new, old) for new, old in zip(size, labels.shape[-2:], strict=True))
+        down, across = (self._axis(size[k], labels.shape[k - 2], device) for k in (0, 1))
+        self._tables_per_axis = len(down)
+        shape = (labels.shape[0] if labels.ndim == 3 else 1, *labels.shape[-2:])
+        numbers = torch.stack([torch.full((), n, dtype=torch.int64, device=device) for n in shape])
+        self.tables: tuple[Tensor, ...] = (numbers, labels.flatten(), *down, *across)
+        if softness is not None:
+            sides = [torch.full((), n, dtype=torch.float64, device=device) for n in (*labels.shape[-2:], *size)]
+            enlargement = (1 - sides[0] * sides[1] / (sides[2] * sides[3])).clamp_min(0).to(dtype)
+            self.tables = (*self.tables, enlargement, softness)
 
     def _axis(self, new: int, length: int, device: torch.device) -> tuple[Tensor, ...]:
         """Return tables of the rows, or columns, of tiles; the last pixel is repeated past the edge."""
         count = (new + self.side - 1) // self.side
         pixels = torch.arange(count * self.side, device=device).clamp_max(new - 1)
         if self.soft and not self.resized:
-            return self._windows(torch.arange(count, device=device) * self.side, self.side, length)
+            return self._lines(torch.arange(count, device=device) * self.side, self.side, length)
         if not self.soft:
             if not self.resized:
                 return (pixels.reshape(count, -1),)
@@ -68,114 +69,126 @@ class MapWindows:
         span = (self.side * length + new - 1) // new + 2
         window = (first[:, None] + torch.arange(span, device=device))[:, None]
         before, after = ((end.long().clamp(0, length - 1) == window).to(self.dtype) for end in (low, low + 1))
-        return (*self._windows(first, span, length), before * (1 - weight) + after * weight)
+        return (*self._lines(first, span, length), before * (1 - weight) + after * weight)
 
-    def _windows(self, first: Tensor, span: int, length: int) -> tuple[Tensor, Tensor]:
-        """Return the lines of windows of `span` pixels with a halo, held at the border, and which are inside."""
+    def _lines(self, first: Tensor, span: int, length: int) -> tuple[Tensor, Tensor]:
+        """Return the rows or columns of windows of `span` pixels with a halo, clamped, and which are in the image."""
         lines = torch.arange(span + 2 * self.halo, device=first.device) - self.halo
         lines = first[:, None] + lines
         return lines.clamp(0, length - 1), ((lines >= 0) & (lines < length)).to(self.dtype)
 
     # Inside a loop, which hands in the tables
 
-    def look(self, tables: Sequence[Tensor], image: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, ...]:
-        """Read what tile (row, column) of an image sees: its labels, sorted, and what `weigh` takes."""
+    def read_tile(self, tables: Sequence[Tensor], image: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, ...]:
+        """Read the window of tile (row, column) of an image: its labels, sorted, and what `membership` takes."""
         maps, height, width = tables[0].unbind()
-        labels, first = tables[1], image % maps * height
+        labels, first_row = tables[1], image % maps * height
         down, across = (
-            [table.index_select(0, place.reshape(1)).squeeze(0) for table in tables[begin : begin + self._per_axis]]
-            for place, begin in ((row, 2), (column, 2 + self._per_axis))
+            [
+                table.index_select(0, place.reshape(1)).squeeze(0)
+                for table in tables[start : start + self._tables_per_axis]
+            ]
+            for place, start in ((row, 2), (column, 2 + self._tables_per_axis))
         )
 
         def read(rows: Tensor, columns: Tensor) -> Tensor:
-            places = (first + rows)[:, None] * width + columns
+            places = (first_row + rows)[:, None] * width + columns
             return labels.index_select(0, places.flatten()).reshape(places.shape)
 
         if not self.soft and self.resized:
             shares = torch.stack([d[:, None] * a for d in down[2:] for a in across[2:]])
-            window = most_shared(
-                torch.stack([read(rows, columns) for rows in down[:2] for columns in across[:2]]), shares
-            )
+            corners = torch.stack([read(rows, columns) for rows in down[:2] for columns in across[:2]])
+            window = most_shared(corners, shares)
         else:
             window = read(down[0], across[0])
-        # farther pixels say how wide contours are, but have no weight
-        edge = self.halo - self.reach
-        ids = window[edge : window.shape[0] - edge, edge : window.shape[1] - edge].flatten().sort()[0]
+        # pixels beyond the reach of a blur say which contour is near, but are of no region here
+        ids = self._crop(window, self.halo - self.reach).flatten().sort()[0]
         if not self.soft:
             return ids, window
-        widths, inside = tables[-1], (down[1], across[1])
-        kernels, variances = widths[None, 1:], widths[:1].square() if widths.ndim == 1 else widths[:, 2].square()
-        variance = variances[:1]
-        if self.pairs:
-            hard = (torch.arange(self.reach + 1, device=labels.device) == 0).to(widths.dtype)
-            # where there is one region, any blur is right
-            find, skip = (lambda *t: self._find_levels(*t)), (lambda *t: self._no_levels(*t))
-            given = window, widths, *inside
-            level = torch.ops.higher_order.cond(ids[0] != ids[-1], find, skip, given)[0]
-            kernels = torch.cat([widths[:, 3:], hard[None]]).index_select(0, level)
-            variance = torch.cat([variances, torch.zeros_like(variances[:1])]).index_select(0, level)
-        both = torch.arange(-self.reach, self.reach + 1, device=labels.device).abs()
-        rest = (*down[2:], *across[2:])
-        if self.resized:
-            sides = [n - 2 * self.halo for n in window.shape]
-            squares = variance.to(self.dtype).expand(sides[0] * sides[1]).reshape(sides)
-            rest = (*rest, sharpness(rest[0] @ squares @ rest[1].T, tables[-2]))
-        return ids, window, *inside, kernels.to(self.dtype).index_select(1, both), *rest
+        enlargement, softness = tables[-2:]
+        blurs, variance = self._blurs(softness, ids, window, down[1], across[1])
+        taps = torch.arange(-self.reach, self.reach + 1, device=labels.device).abs()
+        operands = (window, down[1], across[1], blurs.to(self.dtype).index_select(1, taps))
+        if not self.resized:
+            return ids, *operands
+        sides = [n - 2 * self.halo for n in window.shape]
+        variances = variance.to(self.dtype).expand(sides[0] * sides[1]).reshape(sides)
+        exponent = sharpness(down[2] @ variances @ across[2].T, enlargement)
+        return ids, *operands, down[2], across[2], exponent
 
-    def weigh(self, seen: Sequence[Tensor], region: Tensor) -> Tensor:
-        """Evaluate the weights of a region, (1,), at the pixels of a tile, from what `look` found.
+    def membership(self, operands: Sequence[Tensor], region: Tensor) -> Tensor:
+        """Evaluate the membership of a tile's pixels in a region, (1,); `operands` are what `read_tile` found.
 
-        Of a soft map at another size they are to be divided by their sum.
+        Of a soft map at another size they are to be divided by their sum over the regions.
         """
-        window = seen[0]
-        if not self.soft:
+        window, *soft = operands
+        if not soft:
             return (window == region).to(self.dtype)
-        rows, columns = (slice(self.halo - self.reach, n - self.halo + self.reach) for n in window.shape)
-        down, across = seen[1][rows], seen[2][columns]
-        marked = (window[rows, columns] == region).to(self.dtype) * down[:, None] * across
-        weights = self._blur(marked, seen[3], down, across)
-        return (seen[4] @ weights @ seen[5].T).clamp_min(0) ** seen[6] if self.resized else weights
+        rows_inside, columns_inside, blurs, *interpolation = soft
+        margin = self.halo - self.reach
+        down, across = (t[margin : t.shape[0] - margin] for t in (rows_inside, columns_inside))
+        inside = (self._crop(window, margin) == region).to(self.dtype) * down[:, None] * across
+        membership = self._blur(inside, blurs, down, across)
+        if not interpolation:
+            return membership
+        rows, columns, exponent = interpolation
+        return (rows @ membership @ columns.T).clamp_min(0) ** exponent
 
-    def _blur(self, marked: Tensor, kernels: Tensor, down: Tensor, across: Tensor) -> Tensor:
+    def _blurs(
+        self, softness: Tensor, ids: Tensor, window: Tensor, rows_inside: Tensor, columns_inside: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return half of the blur, (1, 1 + R), and its variance (1,); or those of each pixel inside of the halo."""
+        if not self.pairs:
+            return softness[None, 1:], softness[:1].square()
+        # where there is one region, any blur is right
+        level = torch.ops.higher_order.cond(
+            ids[0] != ids[-1],
+            lambda *operands: self._nearest_levels(*operands),
+            lambda *operands: self._no_levels(*operands),
+            (window, softness, rows_inside, columns_inside),
+        )[0]
+        hard = (torch.arange(self.reach + 1, device=window.device) == 0).to(softness.dtype)
+        blurs, variances = torch.cat([softness[:, 3:], hard[None]]), softness[:, 2].square()
+        variances = torch.cat([variances, torch.zeros_like(variances[:1])])
+        return blurs.index_select(0, level), variances.index_select(0, level)
+
+    def _crop(self, window: Tensor, margin: int) -> Tensor:
+        return window[margin : window.shape[0] - margin, margin : window.shape[1] - margin]
+
+    def _blur(self, inside: Tensor, blurs: Tensor, rows_inside: Tensor, columns_inside: Tensor) -> Tensor:
         """Blur a window by one kernel, (1, 2 R + 1), or by one for each pixel inside of its halo of R."""
         taps = 2 * self.reach + 1
-        height, width = (n - taps + 1 for n in marked.shape)
-        steps = torch.arange(taps, device=marked.device)
-        rows, columns = ((torch.arange(n, device=marked.device)[:, None] + steps).flatten() for n in (height, width))
-        of_pixel = kernels.expand(height * width, taps).reshape(height, width, taps)
-        near_rows = down.index_select(0, rows).reshape(height, 1, taps)
-        near_columns = across.index_select(0, columns).reshape(width, taps)
-        total = (of_pixel * near_rows).sum(-1) * (of_pixel * near_columns).sum(-1)
+        height, width = (n - taps + 1 for n in inside.shape)
+        steps = torch.arange(taps, device=inside.device)
+        rows, columns = ((torch.arange(n, device=inside.device)[:, None] + steps).flatten() for n in (height, width))
+        kernels = blurs.expand(height * width, taps).reshape(height, width, taps)
+        near_rows = rows_inside.index_select(0, rows).reshape(height, 1, taps)
+        near_columns = columns_inside.index_select(0, columns).reshape(width, taps)
+        total = (kernels * near_rows).sum(-1) * (kernels * near_columns).sum(-1)
         # along rows, those of the halo too; then along columns
-        spread = marked.T.index_select(0, columns).reshape(width, taps, -1)
-        spread = of_pixel.permute(1, 0, 2) @ spread  # [width, height, height + 2 R]
-        spread = spread.gather(2, rows.reshape(1, height, taps).expand(width, height, taps))
-        return (spread * of_pixel.permute(1, 0, 2)).sum(-1).T / total.clamp_min(_TINY)
+        blurred = inside.T.index_select(0, columns).reshape(width, taps, -1)
+        blurred = kernels.permute(1, 0, 2) @ blurred  # [width, height, height + 2 R]
+        blurred = blurred.gather(2, rows.reshape(1, height, taps).expand(width, height, taps))
+        return (blurred * kernels.permute(1, 0, 2)).sum(-1).T / total.clamp_min(_TINY)
 
     def _no_levels(self, window: Tensor, *_: Tensor) -> tuple[Tensor]:
-        rows, columns = (slice(self.halo, n - self.halo) for n in window.shape)
-        return (torch.zeros_like(window[rows, columns].flatten()),)
+        return (torch.zeros_like(self._crop(window, self.halo).flatten()),)
 
-    def _find_levels(self, window: Tensor, widths: Tensor, down: Tensor, across: Tensor) -> tuple[Tensor]:
-        """Find the row of `widths` that each pixel inside of the halo has; one beyond them where contours are hard."""
+    def _nearest_levels(
+        self, window: Tensor, softness: Tensor, rows_inside: Tensor, columns_inside: Tensor
+    ) -> tuple[Tensor]:
+        """Return for each pixel inside of the halo the row of `softness` that is its nearest contour's.
+
+        A contour between regions that `softness` does not name is hard: one row beyond the last.
+        """
         label = window[1:-1, 1:-1]
         other = label
         # the first of these that differs, so the last comes first
         for neighbour in (window[2:, 1:-1], window[1:-1, 2:], window[1:-1, :-2], window[:-2, 1:-1]):
             other = torch.where(neighbour != label, neighbour, other)
-        touches = (other != label) & (down[1:-1, None] * across[1:-1] > 0)
+        touches = (other != label) & (rows_inside[1:-1, None] * columns_inside[1:-1] > 0)
         low, high = (torch.where(label < other, *ends).flatten() for ends in ((label, other), (other, label)))
-        # a binary search in rows that are sorted
-        count = widths.shape[0]
-        first, second = widths[:, :2].long().unbind(1)
-        begin, end = torch.zeros_like(low), torch.full_like(low, count)
-        for _ in range(count.bit_length()):
-            middle = (begin + end) // 2
-            a, b = (v.index_select(0, middle.clamp_max(count - 1)) for v in (first, second))
-            below = ((a < low) | ((a == low) & (b < high))) & (middle < end)
-            begin, end = torch.where(below, middle + 1, begin), torch.where(below, end, middle)
-        a, b = (v.index_select(0, begin.clamp_max(count - 1)) for v in (first, second))
-        level = torch.where((a == low) & (b == high), begin, count).reshape(label.shape)
+        level = _search_pairs(softness[:, :2].long(), low, high).reshape(label.shape)
         return (self._nearest(touches, level).flatten(),)
 
     def _nearest(self, touches: Tensor, level: Tensor) -> Tensor:
@@ -188,8 +201,22 @@ class MapWindows:
         steps = torch.arange(taps, device=touches.device)
         squares = ((steps - self.search) ** 2).to(self.dtype)
         rows, columns = (torch.arange(n, device=touches.device)[:, None] + steps for n in (height, width))
-        seen = touches.index_select(0, rows.flatten()).reshape(height, taps, -1)
-        square, step = torch.where(seen, squares[:, None], _FAR).min(1)
+        near = touches.index_select(0, rows.flatten()).reshape(height, taps, -1)
+        square, step = torch.where(near, squares[:, None], _FAR).min(1)
         level = level.gather(0, step + rows[:, :1])  # [height, width + halo]
         square = square.T.index_select(0, columns.flatten()).reshape(width, taps, height) + squares[:, None]
         return level.gather(1, square.argmin(1).T + columns[:, 0])
+
+
+def _search_pairs(pairs: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Return the row of sorted pairs, (P, 2), that is (low, high), by a binary search; P where there is none."""
+    count = pairs.shape[0]
+    first, second = pairs.unbind(1)
+    begin, end = torch.zeros_like(low), torch.full_like(low, count)
+    for _ in range(count.bit_length()):
+        middle = (begin + end) // 2
+        a, b = (ids.index_select(0, middle.clamp_max(count - 1)) for ids in (first, second))
+        below = ((a < low) | ((a == low) & (b < high))) & (middle < end)
+        begin, end = torch.where(below, middle + 1, begin), torch.where(below, end, middle)
+    a, b = (ids.index_select(0, begin.clamp_max(count - 1)) for ids in (first, second))
+    return torch.where((a == low) & (b == high), begin, count)

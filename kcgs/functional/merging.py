@@ -16,15 +16,14 @@ from .labels import compact, contour_edges, unique_pairs
 
 Labels = NDArray[np.int64]
 
-# squared error, channels averaged, that a pixel of contour must save: what its bits save where Gaussians spend them
+# Squared error, mean over channels, that a pixel of contour must save: what its bits save where Gaussians spend them.
 MERGE_COST = 0.003
-# pixels on both sides of a contour whose error it bears on
-_BAND = 12.0
-_ROUNDS = 8
+_BAND = 12.0  # pixels across a contour over which its error counts: windows reach 6 to each side
+_ROUNDS = 8  # of merging and judging again, at most
 
 
 def merge_regions(image: Tensor, labels: Tensor, merge_cost: float = MERGE_COST) -> Tensor:
-    """Merge regions whose contour saves less error than its bits would save if Gaussians had them.
+    """Merge regions whose contour saves less error than Gaussians would save with its bits.
 
     Convention: what a contour saves is predicted from the pixels near it: how much better two linear colours, mixed
     across the contour, explain them than one quadratic colour. The default cost is that of one to two bits per pixel of
@@ -55,26 +54,26 @@ def merge_regions(image: Tensor, labels: Tensor, merge_cost: float = MERGE_COST)
     ids, labels = torch.unique(labels, return_inverse=True)
     for _ in range(_ROUNDS):
         gains = contour_gain(image, labels)
-        saved = {pair: _BAND * (gain.smooth - gain.soft) for pair, gain in gains.items()}
+        saved = {pair: _BAND * (gain.smooth_error - gain.contour_error) for pair, gain in gains.items()}
         costly = sorted((value, pair) for pair, value in saved.items() if value < merge_cost)
         if not costly:
             break
-        # a region merges once per round, so that what it has become is judged before it merges again
-        into = torch.arange(int(labels.max()) + 1, device=labels.device)
-        taken: set[int] = set()
+        # a region merges once per round, so that the larger region is judged before it merges again
+        target = torch.arange(int(labels.max()) + 1, device=labels.device)
+        merged: set[int] = set()
         for _value, (a, b) in costly:
-            if not taken & {a, b}:
-                into[b] = a
-                taken |= {a, b}
-        labels = into[labels]
-    merged: Tensor = ids[labels].long()
-    return merged
+            if not merged & {a, b}:
+                target[b] = a
+                merged |= {a, b}
+        labels = target[labels]
+    new_labels: Tensor = ids[labels].long()
+    return new_labels
 
 
 def pairs_to_merge(image: Tensor, labels: Tensor, max_regions: int) -> list[tuple[int, int]]:
-    """Find which regions to merge so that at most `max_regions` are left, as pairs of ids for `RegionMap.merge`.
+    """Return pairs of ids for `RegionMap.merge`, so that at most `max_regions` remain.
 
-    The two neighbours merge, again and again, that raise the squared error of flat colours least (Ward's method).
+    The two neighbours that raise the squared error of flat colours least merge first (Ward's method).
 
     Example:
         >>> labels = torch.tensor([[4, 5, 6, 6]])
@@ -91,7 +90,7 @@ def pairs_to_merge(image: Tensor, labels: Tensor, max_regions: int) -> list[tupl
 
 
 class RegionGraph:
-    """Which of the regions 0 to R - 1 touch and along how many pixel sides, kept up to date while regions merge."""
+    """The regions 0 to R - 1: their areas, and along how many pixel sides they touch; regions merge in place."""
 
     def __init__(self, labels: Labels) -> None:
         """Count areas and shared sides."""
@@ -103,7 +102,7 @@ class RegionGraph:
             self.borders[a][b] = self.borders[b][a] = length
 
     def merge(self, source: int, target: int) -> None:
-        """Let ``target`` take in its neighbour ``source``."""
+        """Add ``source`` to its neighbour ``target``."""
         self._parents[source] = target
         self.areas[target] += self.areas[source]
         for other, length in self.borders[source].items():
@@ -114,7 +113,7 @@ class RegionGraph:
         self.borders[source] = {}
 
     def roots(self) -> Labels:
-        """Return for every region the one it is part of now."""
+        """Return for every region the one that it is now part of."""
         roots = self._parents
         while (roots != roots[roots]).any():
             roots = roots[roots]
@@ -124,15 +123,15 @@ class RegionGraph:
 def merge_nearest(graph: RegionGraph, sums: NDArray[np.float64], max_regions: int, by_error: bool = False) -> None:
     """Merge the nearest pair of neighbours while there are too many regions; `sums` holds colours times areas, (R, C).
 
-    Near is a small distance between mean colours, or with `by_error` a small rise of the squared error of flat colours.
+    The distance is that of mean colours, or with `by_error` the rise of the squared error of flat colours.
     """
 
     def distance(a: int, b: int) -> float:
-        one, other = graph.areas[a], graph.areas[b]
-        difference = float(np.linalg.norm(sums[a] / one - sums[b] / other))
-        return difference**2 * float(one * other / (one + other)) if by_error else difference
+        area_a, area_b = graph.areas[a], graph.areas[b]
+        difference = float(np.linalg.norm(sums[a] / area_a - sums[b] / area_b))
+        return difference**2 * float(area_a * area_b / (area_a + area_b)) if by_error else difference
 
-    # Distances change with every merge; entries of before one are told by the regions' borders and areas.
+    # Distances change with every merge; an entry is out of date where borders or areas differ.
     queue = [
         (distance(a, b), a, b, graph.areas[a], graph.areas[b])
         for a, others in enumerate(graph.borders)

@@ -1,4 +1,4 @@
-"""Contours stay where they save more than they cost."""
+"""merge_regions: contours stay where they save more than they cost."""
 
 from __future__ import annotations
 
@@ -14,37 +14,38 @@ def noise(*size: int, seed: int = 0) -> Tensor:
     return torch.rand(3, *size, generator=torch.Generator().manual_seed(seed))
 
 
-def test_keeps_what_shows_and_unites_what_does_not() -> None:
-    image = 0.3 + 0.02 * noise(64, 96)
-    image[:, :, 60:] += 0.4
-    labels = (torch.arange(96) // 30).expand(64, 96)  # contours at 30, which is nothing, 60 and 90
-    merged = merge_regions(image, labels)
-    assert merged.unique().tolist() == [0, 2]
-    assert (merged[:, :60] == 0).all() and (merged[:, 60:] == 2).all()
+class TestMergeRegions:
+    def test_contours_of_the_image_stay(self) -> None:
+        image = 0.3 + 0.02 * noise(64, 96)
+        image[:, :, 60:] += 0.4
+        labels = (torch.arange(96) // 30).expand(64, 96)  # contours at 30, where nothing is, 60 and 90
+        merged = merge_regions(image, labels)
+        assert merged.unique().tolist() == [0, 2]
+        assert (merged[:, :60] == 0).all() and (merged[:, 60:] == 2).all()
 
+    def test_one_region_where_the_image_needs_none(self) -> None:
+        y, x = torch.meshgrid(torch.linspace(0, 1, 90), torch.linspace(0, 1, 120), indexing="ij")
+        ramp = (0.5 * x + 0.3 * y).expand(3, -1, -1)
+        cells = (torch.arange(90)[:, None] // 30) * 4 + torch.arange(120) // 30
+        assert len(merge_regions(ramp, cells).unique()) == 1
+        assert segment(ramp).max() == 0
+        assert segment((ramp + 0.05 * noise(90, 120)).clamp(0, 1)).max() == 0
 
-def test_one_region_where_the_scene_needs_none() -> None:
-    y, x = torch.meshgrid(torch.linspace(0, 1, 90), torch.linspace(0, 1, 120), indexing="ij")
-    ramp = (0.5 * x + 0.3 * y).expand(3, -1, -1)
-    cells = (torch.arange(90)[:, None] // 30) * 4 + torch.arange(120) // 30
-    assert len(merge_regions(ramp, cells).unique()) == 1
-    assert segment(ramp).max() == 0
-    assert segment((ramp + 0.05 * noise(90, 120)).clamp(0, 1)).max() == 0
+    def test_a_higher_cost_merges_more(self) -> None:
+        image = torch.stack([torch.arange(8.0).repeat_interleave(12) ** 1.5 / 20] * 3)[:, None].expand(3, 64, 96)
+        labels = (torch.arange(96) // 12).expand(64, 96)
+        counts = [len(merge_regions(image, labels, cost).unique()) for cost in (0.0, 0.005, 0.02, 1.0)]
+        assert counts[0] == 8 and counts == sorted(counts, reverse=True) and counts[-1] == 1
 
-
-def test_a_higher_cost_leaves_fewer() -> None:
-    image = torch.stack([torch.arange(8.0).repeat_interleave(12) ** 1.5 / 20] * 3)[:, None].expand(3, 64, 96)
-    labels = (torch.arange(96) // 12).expand(64, 96)
-    counts = [len(merge_regions(image, labels, cost).unique()) for cost in (0.0, 0.005, 0.02, 1.0)]
-    assert counts[0] == 8 and counts == sorted(counts, reverse=True) and counts[-1] == 1
-
-
-def test_bad_cost() -> None:
-    with pytest.raises(ValueError, match="merge_cost must be finite and at least 0"):
-        merge_regions(noise(8, 8), torch.zeros(8, 8).long(), -1.0)
-
-
-@pytest.mark.parametrize("labels", [torch.zeros(8, 8), torch.zeros(8, 9).long(), torch.full((8, 8), -1)])
-def test_bad_labels(labels: Tensor) -> None:
-    with pytest.raises((TypeError, ValueError), match="labels"):
-        merge_regions(noise(8, 8), labels)
+    @pytest.mark.parametrize(
+        ("labels", "cost", "words"),
+        [
+            (torch.zeros(8, 8).long(), -1.0, "merge_cost must be finite and at least 0"),
+            (torch.zeros(8, 8), 0.1, "labels"),
+            (torch.zeros(8, 9).long(), 0.1, "labels"),
+            (torch.full((8, 8), -1), 0.1, "labels"),
+        ],
+    )
+    def test_exception(self, labels: Tensor, cost: float, words: str) -> None:
+        with pytest.raises((TypeError, ValueError), match=words):
+            merge_regions(noise(8, 8), labels, cost)

@@ -185,7 +185,7 @@ class TestPairWidths:
             ({(0, 1): -0.5}, ValueError, "softness of"),
             ({(0, 1): math.nan}, ValueError, "softness of"),
             ({(0, 1): "a"}, TypeError, r"softness of \(0, 1\) must be a number of pixels; got 'a'"),
-            ({0: 0.7}, TypeError, "softness must map pairs of ids to widths; got the key 0"),
+            ({0: 0.7}, TypeError, "softness must map pairs of ids to pixels; got the key 0"),
             ({(0, 1, 2): 0.7}, TypeError, "softness must map pairs"),
             ({(0.0, 1.0): 0.7}, TypeError, "softness must map pairs"),
         ],
