@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -162,11 +161,12 @@ def check_size(name: str, value: object) -> tuple[int, int]:
     """Return (height, width) if both are whole numbers of at least 1."""
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
         raise InvalidArgumentType(name, "a pair (height, width)", repr(value))
-    if any(isinstance(side, bool) or not hasattr(side, "__index__") for side in value):
+    # of a side that a graph leaves open, hasattr cannot be traced and operator.index would make a constant
+    plain = [isinstance(side, int | torch.SymInt) for side in value]
+    integers = [known or hasattr(side, "__index__") for known, side in zip(plain, value, strict=True)]
+    if not all(integers) or any(isinstance(side, bool) for side in value):
         raise InvalidArgumentType(name, "two integers (height, width)", repr(value), verb="hold")
-    # operator.index would make a constant of a side that a graph leaves open
-    sides: list[Any] = [side if isinstance(side, int | torch.SymInt) else operator.index(side) for side in value]
-    height, width = sides
+    height, width = (side if known else operator.index(side) for known, side in zip(plain, value, strict=True))
     if height < 1 or width < 1:
         raise InvalidArgument(name, "at least 1 x 1", repr(value))
     return height, width
