@@ -40,54 +40,43 @@ def run(name: str, count: int, folder: Path, **options: Any) -> dict[int, Any]:
 
 @pytest.mark.usefixtures("cluster")
 class TestCluster:
-    def test_results_and_threads(self, tmp_path: Path) -> None:
-        done = run("double", 4, tmp_path, threads=2)
-        assert [done[index][0] for index in range(4)] == [0, 2, 4, 6]
-        assert {threads for _, _, threads in done.values()} == {2}
+    def test_same_bytes_as_local(self, tmp_path: Path) -> None:
+        local, cluster = (run("fit_image", 2, tmp_path, engine=engine, threads=2) for engine in ("local", "ray"))
+        assert cluster == local
+        assert {threads for threads, _ in cluster.values()} == {2}
 
     def test_a_job_that_raises(self, tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="no 1"):
-            run("fail_at_one", 3, tmp_path)
+            run("fail_at_one", 2, tmp_path, workers=1)
 
-    def test_same_bytes_as_local(self, tmp_path: Path) -> None:
-        # on two threads; test_fit_many is on one
-        here, there = (run("fitted_bytes", 1, tmp_path, engine=engine, threads=2) for engine in ("local", "ray"))
-        assert here == there
+    def test_a_killed_worker(self, tmp_path: Path) -> None:
+        with pytest.raises(RuntimeError, match="a worker process was killed"):
+            run("die_at_one", 2, tmp_path, workers=1)
 
     def test_more_threads_than_a_node_has(self, tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="threads must be at most the processors of a node of the cluster; got 3"):
             run("double", 1, tmp_path, threads=3)
 
-    def test_fit_many(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        monkeypatch.chdir(tmp_path)
-        for name in ("a", "b"):
-            save_image(f"{name}.png", torch.linspace(0, 1, 60 + ord(name)).expand(3, 40, -1))
-        scenes = []
-        for engine in ("local", "ray"):
-            options = ["-n", "12", "--iterations", "5", "--regions", "none", "--json", "--workers", "1"]
-            command = ["kcgs", "fit-many", "a.png", "b.png", "-o", engine, "--engine", engine, *options]
-            monkeypatch.setattr(sys, "argv", command)
-            with pytest.raises(SystemExit) as stop:
-                main()
-            out, err = capsys.readouterr()
-            assert not stop.value.code, err
-            assert json.loads(out)["fitted"] == 2
-            scenes.append([(tmp_path / engine / f"{name}.safetensors").read_bytes() for name in ("a", "b")])
-        assert scenes[0] == scenes[1]
 
-    def test_killed_and_the_same_call_again(self, tmp_path: Path) -> None:
-        # the last on this cluster, which reports the death to standard output, whenever it hears of it
-        with pytest.raises(RuntimeError, match="a worker process was killed"):
-            run("die_at_one", 3, tmp_path)
-        assert sorted(run("die_at_one", 3, tmp_path)) == [0, 1, 2]
-
-
-def test_a_cluster_of_its_own(importable: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without one to join, a cluster is started and shut down again."""
+def test_fit_many_on_a_cluster_of_its_own(
+    importable: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without a cluster to join, one is started and shut down again."""
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    if ray.is_initialized():
-        ray.shutdown()
-    assert run("double", 1, tmp_path, workers=1)[0][0] == 0
+    monkeypatch.chdir(tmp_path)
+    ray.shutdown()
+    for name in ("a", "b"):
+        save_image(f"{name}.png", torch.linspace(0, 1, 60 + ord(name)).expand(3, 40, -1))
+    scenes = []
+    for engine in ("local", "ray"):
+        options = ["-n", "12", "--iterations", "5", "--regions", "none", "--json", "--workers", "1"]
+        command = ["kcgs", "fit-many", "a.png", "b.png", "-o", engine, "--engine", engine, *options]
+        monkeypatch.setattr(sys, "argv", command)
+        with pytest.raises(SystemExit) as stop:
+            main()
+        out, err = capsys.readouterr()
+        assert not stop.value.code, err
+        assert json.loads(out)["fitted"] == 2
+        scenes.append([(tmp_path / engine / f"{name}.safetensors").read_bytes() for name in ("a", "b")])
+    assert scenes[0] == scenes[1]
     assert not ray.is_initialized()
