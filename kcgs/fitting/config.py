@@ -42,7 +42,7 @@ class FitConfig(BaseModel):
     )
     softness: float | Literal["auto"] = Field(
         "auto",
-        description="contour width in pixels, 0 to 64, for maps that come without; auto: chosen for each pair of "
+        description="width of contours in pixels, 0 to 64, for maps without softness; auto: chosen for each pair of "
         "regions",
     )
     cutoff: float = Field(1e-4, ge=0.0, lt=1.0, description="weights below it are skipped")
@@ -64,9 +64,10 @@ class FitConfig(BaseModel):
     prune: float = Field(1e-3, ge=0.0, description="remove Gaussians that change no value by more, at the end; 0: none")
 
     # Contours
-    move_contours: bool = Field(True, description="let contours leave the given map")
+    move_contours: bool = Field(True, description="let contours leave the user's map")
     max_move: float | Literal["any"] = Field(
-        3.0, description="how far a contour may move from the given map, in pixels, at least 1; any: as far as it likes"
+        3.0,
+        description="how far a contour may move from the user's map, in pixels, at least 1; any: as far as it likes",
     )
     contour_cost: float = Field(0.003, ge=0.0, description="squared error that a pixel of contour must save")
     merge_regions: bool = Field(True, description="merge those most alike where there are more regions than Gaussians")

@@ -29,12 +29,12 @@ def _refresh(gain, leaders, first, last):  # type: ignore[no-untyped-def]
 
 @program.entry
 def choose(places, square, norm, share, gain, limits, picked):  # type: ignore[no-untyped-def]
-    """Pick the largest gain, take its share of the error off its neighbours', and again; return how many.
+    """Pick the largest gain, subtract its share of the error from its neighbours', and again; return the count.
 
-    Places are (x, y, order), sorted by the last: those near a place lie within one stretch of it. Limits are the least
-    gain, the largest overlap, the reach in standard deviations, and the longest reach.
+    Places are (x, y, order), sorted by the last: the neighbours of a place lie within one stretch of it. Limits are the
+    least gain, the largest overlap, the reach in standard deviations, and the longest reach.
     """
-    floor, most, reach, longest = limits
+    floor, max_overlap, reach, longest = limits
     widest = square.max()
     leaders = np.empty((len(gain) + _BLOCK - 1) // _BLOCK, np.int64)
     _refresh(gain, leaders, 0, len(gain))
@@ -48,23 +48,25 @@ def choose(places, square, norm, share, gain, limits, picked):  # type: ignore[n
             return count
         picked[count] = best
         x, y, middle = places[best, 0], places[best, 1], order[best]
-        width, mass, taken = square[best], norm[best], share[best].copy()
-        far = min(reach * math.sqrt(width + widest), longest)
+        best_square, best_norm, best_share = square[best], norm[best], share[best].copy()
+        far = min(reach * math.sqrt(best_square + widest), longest)
         low = np.searchsorted(order, middle - far)
         high = np.searchsorted(order, middle + far)
         for i in range(low, high):
-            across = places[i, 0] - x
-            if abs(across) > far or gain[i] < 0.0:
+            dx = places[i, 0] - x
+            if abs(dx) > far or gain[i] < 0.0:
                 continue
-            both, down = square[i] + width, places[i, 1] - y
-            # those inside a small region are alike, whatever their widths
-            like = max(math.sqrt(square[i] * width) / both, math.sqrt(norm[i] * mass) / (norm[i] + mass))
-            overlap = 2.0 * like * math.exp(-0.5 * (across * across + down * down) / both)
+            variance, dy = square[i] + best_square, places[i, 1] - y
+            # in a small region Gaussians of all widths are the same: there their norms are what compares
+            similarity = max(
+                math.sqrt(square[i] * best_square) / variance, math.sqrt(norm[i] * best_norm) / (norm[i] + best_norm)
+            )
+            overlap = 2.0 * similarity * math.exp(-0.5 * (dx * dx + dy * dy) / variance)
             total = 0.0
-            for c in range(len(taken)):
-                share[i, c] -= overlap * taken[c]
+            for c in range(len(best_share)):
+                share[i, c] -= overlap * best_share[c]
                 total += share[i, c] * share[i, c]
-            gain[i] = -1.0 if overlap > most else total
+            gain[i] = -1.0 if overlap > max_overlap else total
         _refresh(gain, leaders, low, high)
     return len(picked)
 

@@ -100,27 +100,27 @@ class MsSsimObjective:
 
     def _measure(self, residual: Tensor) -> tuple[Tensor, Tensor]:
         """Return E without the squared error, as a sum over pixels, and half the gradient of all of E."""
-        total, slopes, plane = residual.new_zeros(()), [_SQUARED * residual], residual
+        total, gradients, plane = residual.new_zeros(()), [_SQUARED * residual], residual
         for level, (image, inside, mean, variance, weight) in enumerate(self._scales, 1):
             plane = halve(plane)
-            shown = image + plane
+            render = image + plane
             # one after the other, which stays in a processor's cache
-            of_shown, square, product = (inside * _blur(t) for t in (shown, shown * shown, image * shown))
-            both = (square - of_shown * of_shown).clamp_min_(0.0).add_(variance).add_(K2**2)
-            like = (product - mean * of_shown).mul_(2.0).add_(K2**2).div_(both)
-            light, darker = like.new_ones(()), like.new_zeros(())
+            render_mean, square, product = (inside * _blur(t) for t in (render, render * render, image * render))
+            variances = (square - render_mean * render_mean).clamp_min_(0.0).add_(variance).add_(K2**2)
+            structure = (product - mean * render_mean).mul_(2.0).add_(K2**2).div_(variances)
+            luminance, luminance_slope = structure.new_ones(()), structure.new_zeros(())
             if level == len(self._scales):
-                bright = mean * mean + of_shown * of_shown + K1**2
-                light = (2.0 * mean * of_shown + K1**2) / bright
-                darker = like * (light * of_shown - mean) / bright
-            score = (like * light).mean((1, 2)).clamp_min(_MIN_SCORE)
+                means = mean * mean + render_mean * render_mean + K1**2
+                luminance = (2.0 * mean * render_mean + K1**2) / means
+                luminance_slope = structure * (luminance * render_mean - mean) / means
+            score = (structure * luminance).mean((1, 2)).clamp_min(_MIN_SCORE)
             total -= weight / self._norm * mean[0].numel() * score.log().mean()
             share = inside * (weight / self._norm * 0.25**level) / score[:, None, None]
-            pull = share * light / both
-            hold = pull * like
-            rest = pull * mean - hold * of_shown + share * darker
-            slopes.append(_blur(hold) * shown - _blur(pull) * image + _blur(rest))
-        return total, self._sum_up(slopes)
+            by_product = share * luminance / variances
+            by_square = by_product * structure
+            by_mean = by_product * mean - by_square * render_mean + share * luminance_slope
+            gradients.append(_blur(by_square) * render - _blur(by_product) * image + _blur(by_mean))
+        return total, self._sum_up(gradients)
 
     @staticmethod
     def _sum_up(planes: list[Tensor]) -> Tensor:

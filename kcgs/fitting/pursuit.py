@@ -67,10 +67,10 @@ def propose(
     size = (residual.shape[1], residual.shape[2])
     field = GaussianField(empty(0, 2), empty(0, 3), empty(0, len(residual)), ids, size=size)
     while (missing := count - field.num_gaussians) > 0:
-        chosen = _pursue(_search(residual, labels, sigmas, missing), missing, floor)
-        if not len(chosen.x):
+        candidates = _pursue(_search(residual, labels, sigmas, missing), missing, floor)
+        if not len(candidates.x):
             break
-        part, rendered = _place(chosen, residual, labels, regions, backend)
+        part, rendered = _place(candidates, residual, labels, regions, backend)
         if not bool(part.colors.any()):
             break
         field = join(field, part)
@@ -136,14 +136,14 @@ def _best_of_squares(
     side = 2 if block == 1 or sigma / block >= _SIGMA_PER_BLOCK * math.sqrt(2) else 1
     best, where = (v.flatten() for v in max_pool2d(gain[None], side, return_indices=True))
     values = best.cpu().numpy()
-    kept = np.flatnonzero(values > 0)
-    kept = kept[_strongest(values[kept], limit)]
-    chosen = where[torch.from_numpy(kept).to(where.device)]
-    places = chosen.cpu().numpy()
+    positive = np.flatnonzero(values > 0)
+    strongest = positive[_strongest(values[positive], limit)]
+    blocks = where[torch.from_numpy(strongest).to(where.device)]
+    places = blocks.cpu().numpy()
     return _Candidates(
         np.full(len(places), region), corner[0] + (places % gain.shape[1] + 0.5) * block,
         corner[1] + (places // gain.shape[1] + 0.5) * block, np.full(len(places), sigma), np.full(len(places), block),
-        inner.flatten(1)[:, chosen].T.cpu().numpy(), norm.flatten()[chosen].cpu().numpy(), values[kept],
+        inner.flatten(1)[:, blocks].T.cpu().numpy(), norm.flatten()[blocks].cpu().numpy(), values[strongest],
     )  # fmt: skip
 
 
@@ -163,11 +163,11 @@ def _strongest(gain: Array, limit: int) -> NDArray[np.int64]:
 
 
 def _pursue(candidates: _Candidates, count: int, floor: float) -> _Candidates:
-    """Take the largest gain, take its share of the error off its neighbours', and again; the strongest first.
+    """Pick the largest gain, subtract its share of the error from its neighbours', and again; the strongest first.
 
     Inner products of two Gaussians are those of the plane, or with the norms inside the region for the squared widths
-    where that is more: in a region of one pixel all scales are the same. Those that overlap too much with one that was
-    taken are out, for that is as far as the approximation carries.
+    where that is more: in a region of one pixel all scales are the same. A candidate that overlaps too much with a
+    picked one is dropped, since there the approximation ends.
     """
     from .greedy import pick
 
@@ -183,16 +183,16 @@ def _pursue(candidates: _Candidates, count: int, floor: float) -> _Candidates:
 
 
 def _place(
-    chosen: _Candidates, residual: Tensor, labels: NDArray[np.int32], regions: RegionMap | None, backend: str
+    candidates: _Candidates, residual: Tensor, labels: NDArray[np.int32], regions: RegionMap | None, backend: str
 ) -> tuple[GaussianField, Tensor]:
     """Snap the centres to pixels of their region, and render in the colours of steepest descent."""
-    means = torch.from_numpy(_pixel_of_region(chosen, labels)).to(residual)
-    sigma = torch.from_numpy(chosen.sigma).to(residual)
+    means = torch.from_numpy(_pixel_of_region(candidates, labels)).to(residual)
+    sigma = torch.from_numpy(candidates.sigma).to(residual)
     cholesky = torch.stack([sigma, torch.zeros_like(sigma), sigma], -1)
     ids = None
     if regions is not None:
-        ids = regions.ids[torch.from_numpy(chosen.region).to(residual.device)]
-    colors = torch.from_numpy(chosen.inner / chosen.norm[:, None]).to(residual)
+        ids = regions.ids[torch.from_numpy(candidates.region).to(residual.device)]
+    colors = torch.from_numpy(candidates.inner / candidates.norm[:, None]).to(residual)
     size = residual.shape[1], residual.shape[2]
     with torch.no_grad():
         rendered = region_splat(means, cholesky, colors, ids, regions, size=size, cutoff=_CUTOFF, backend=backend)
@@ -201,7 +201,7 @@ def _place(
         # under a soft contour regions mix: one length for all
         index = torch.from_numpy(labels if hard else np.zeros_like(labels)).to(residual.device, torch.int64)
         length = _best_lengths(rendered, residual, index)
-        part = torch.from_numpy(chosen.region if hard else np.zeros_like(chosen.region)).to(index)
+        part = torch.from_numpy(candidates.region if hard else np.zeros_like(candidates.region)).to(index)
         field = GaussianField(means, cholesky, colors * length[part, None], ids, size=size)
         return field, rendered * length[index]
 
@@ -214,17 +214,17 @@ def _best_lengths(rendered: Tensor, residual: Tensor, index: Tensor) -> Tensor:
     return (product / square.clamp_min(torch.finfo(rendered.dtype).tiny)).to(rendered.dtype)
 
 
-def _pixel_of_region(chosen: _Candidates, labels: NDArray[np.int32]) -> NDArray[np.float64]:
+def _pixel_of_region(candidates: _Candidates, labels: NDArray[np.int32]) -> NDArray[np.float64]:
     """Centre of the pixel of the region nearest to the middle of each block, (K, 2)."""
     height, width = labels.shape
     # the middle of a block is the middle of a pixel or the corner of four: the upper left one is the first of these
-    rows, cols = (np.floor(values - 0.5).astype(np.int64) for values in (chosen.y, chosen.x))
-    fits = labels[rows.clip(max=height - 1), cols.clip(max=width - 1)] == chosen.region
+    rows, cols = (np.floor(values - 0.5).astype(np.int64) for values in (candidates.y, candidates.x))
+    fits = labels[rows.clip(max=height - 1), cols.clip(max=width - 1)] == candidates.region
     fits &= (rows < height) & (cols < width)
     for i in np.flatnonzero(~fits):
-        block = int(chosen.block[i])
-        top, left = round(chosen.y[i] - block / 2), round(chosen.x[i] - block / 2)
-        down, across = np.nonzero(labels[top : top + block, left : left + block] == chosen.region[i])
+        block = int(candidates.block[i])
+        top, left = round(candidates.y[i] - block / 2), round(candidates.x[i] - block / 2)
+        down, across = np.nonzero(labels[top : top + block, left : left + block] == candidates.region[i])
         nearest = ((down + 0.5 - block / 2) ** 2 + (across + 0.5 - block / 2) ** 2).argmin()
         rows[i], cols[i] = top + down[nearest], left + across[nearest]
     return np.stack([cols + 0.5, rows + 0.5], -1)
