@@ -6,9 +6,11 @@ import copy
 import io
 import pickle
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 from torch.utils.data import DataLoader
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene, evaluate, load, save
@@ -32,61 +34,56 @@ def batch_of(one: RegionMap) -> RegionMap:
     return RegionMap.from_labels(labels, one.softness)
 
 
+def make_field(regions: RegionMap | None = None) -> GaussianField:
+    return GaussianField.random(40, SIZE, regions=regions, seed=0)
+
+
 def make_scene(name: str = "soft") -> Scene:
-    regions = MAPS[name]
-    field = GaussianField.random(40, SIZE, regions=regions, seed=0)
-    return Scene(field, regions, {"title": name})
+    return Scene(make_field(MAPS[name]), MAPS[name], {"title": name})
+
+
+def state_of(scene: torch.nn.Module) -> dict[str, Any]:
+    """Send a state through a file that holds tensors and plain values only."""
+    torch.save(scene.state_dict(), file := io.BytesIO())
+    file.seek(0)
+    state: dict[str, Any] = torch.load(file, weights_only=True)
+    return state
 
 
 @pytest.mark.parametrize("name", MAPS)
-class TestKeepsItsMap:
+class TestCopies:
+    """Copies of a scene keep the map and the notes."""
+
     @pytest.mark.parametrize("rendered", [False, True])
     def test_deepcopy_and_pickle(self, name: str, rendered: bool, monkeypatch: pytest.MonkeyPatch) -> None:
         """The copies render alike, with gradients of their own, and make nothing of the map anew."""
         scene = make_scene(name)
         if rendered:
             scene().sum().backward()
-        others = copy.deepcopy(scene), pickle.loads(pickle.dumps(scene))
+        copies = copy.deepcopy(scene), pickle.loads(pickle.dumps(scene))
         image = scene()
         monkeypatch.setattr(RegionMap, "from_labels", None)
-        for other in others:
+        for other in copies:
             assert torch.equal(other(), image) and other.metadata == {"title": name}
             other().square().sum().backward()
             assert other.field.colors.grad.any() and (scene.field.colors.grad is None) == (not rendered)
 
-    def test_state_dict(self, name: str) -> None:
+    @pytest.mark.parametrize("labels", [None, torch.eye(9).long()])
+    def test_state_dict(self, name: str, labels: Tensor | None) -> None:
+        """Size, ids, map and notes of a scene of another size, with or without a map, become those of the state."""
         scene = make_scene(name)
-        file = io.BytesIO()
-        torch.save(scene.state_dict(), file)
-        file.seek(0)
-        other = Scene(GaussianField.random(40, SIZE, seed=1))
-        other.load_state_dict(torch.load(file, weights_only=True))
-        assert torch.equal(other(), scene()) and other.metadata == {"title": name}
-        assert (other.regions is None) == (name == "none")
+        field = GaussianField.random(40, (9, 9), regions=labels, seed=1)
+        other = Scene(field, labels, {"title": "small", "by": "test"})
+        assert other().shape == (3, 9, 9)
+        other.load_state_dict(state_of(scene))
+        assert torch.equal(other(), scene()) and other.size == SIZE and other.metadata == {"title": name}
+        assert (other.regions is None) == (other.field.region_ids is None) == (name == "none")
 
     def test_state_dict_within_a_module(self, name: str) -> None:
-        """As a part of another module, through a copy of every tensor, over a scene with a map of its own."""
-        whole, other = (
-            torch.nn.ModuleDict({"scene": make_scene(n)}) for n in (name, "none" if name == "none" else "hard")
-        )
-        state = {k: v.clone() if isinstance(v, torch.Tensor) else v for k, v in whole.state_dict().items()}
-        other.load_state_dict(state)
-        assert torch.equal(other["scene"](), whole["scene"]())
-        assert (other["scene"].regions is None) == (name == "none")
-
-    @pytest.mark.parametrize("other", ["none", "hard"])
-    def test_state_dict_of_a_scene_of_another_size_and_map(self, name: str, other: str) -> None:
-        """Ids, map, size and notes are the state's, or none, where it has none; strictly, and by weights only."""
-        scene, file = make_scene(name), io.BytesIO()
-        torch.save(scene.state_dict(), file)
-        file.seek(0)
-        small = torch.eye(9).long()
-        field = GaussianField.random(40, (9, 9), regions=None if other == "none" else small, seed=1)
-        loaded = Scene(field, None if other == "none" else small, {"title": "small", "by": "test"})
-        assert loaded().shape == (3, 9, 9)
-        loaded.load_state_dict(torch.load(file, weights_only=True))
-        assert torch.equal(loaded(), scene()) and loaded.size == SIZE and loaded.metadata == {"title": name}
-        assert (loaded.regions is None) == (loaded.field.region_ids is None) == (name == "none")
+        scene = make_scene(name)
+        other = torch.nn.ModuleDict({"scene": make_scene("none" if name == "none" else "hard")})
+        other.load_state_dict(state_of(torch.nn.ModuleDict({"scene": scene})))
+        assert torch.equal(other["scene"](), scene())
 
     def test_state_dict_assigned_to_a_scene_without_memory(self, name: str) -> None:
         scene = make_scene(name)
@@ -95,33 +92,23 @@ class TestKeepsItsMap:
         empty.load_state_dict(scene.state_dict(), assign=True)
         assert torch.equal(empty(), scene())
 
-    def test_safetensors(self, name: str, tmp_path: Path) -> None:
-        if name == "resized":
-            pytest.skip("a file keeps the labels of the new size, which are another map")
-        scene = make_scene(name)
-        assert scene.save(tmp_path / "scene.safetensors") == (tmp_path / "scene.safetensors").stat().st_size
-        assert torch.equal(load(tmp_path / "scene.safetensors")(), scene())
 
-
-def as_they_are(scenes: list[Scene]) -> list[Scene]:
+def identity(scenes: list[Scene]) -> list[Scene]:
     return scenes
 
 
-class TestProcesses:
-    """What torch sends between processes."""
-
-    @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
-    @pytest.mark.parametrize("start", ["fork", "spawn"])
-    def test_items_of_a_data_loader(self, start: str) -> None:
-        """Scenes with their maps, from two workers; they are rendered before, and render alike on both sides."""
-        scenes = [make_scene(name) for name in MAPS]
-        images = [scene().detach() for scene in scenes]
-        loader = DataLoader(scenes, 2, num_workers=2, collate_fn=as_they_are, multiprocessing_context=start)  # type: ignore[arg-type]
-        got = [scene for batch in loader for scene in batch]
-        for scene, sent, image in zip(got, scenes, images, strict=True):
-            assert torch.equal(scene(), image) and torch.equal(sent(), image) and scene.metadata == sent.metadata
-            scene().sum().backward()
-            assert scene.field.means.grad is not None and scene.field.means.grad.any()
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+@pytest.mark.parametrize("start", ["fork", "spawn"])
+def test_items_of_a_data_loader(start: str) -> None:
+    """Scenes that were rendered come from a worker, and render alike on both sides."""
+    scenes = [make_scene(name) for name in MAPS]
+    images = [scene().detach() for scene in scenes]
+    loader = DataLoader(scenes, 5, num_workers=1, collate_fn=identity, multiprocessing_context=start)  # type: ignore[arg-type]
+    (items,) = loader
+    for item, scene, image in zip(items, scenes, images, strict=True):
+        assert torch.equal(item(), image) and torch.equal(scene(), image) and item.metadata == scene.metadata
+        item().sum().backward()
+        assert item.field.means.grad is not None and item.field.means.grad.any()
 
 
 def scene_on(device: torch.device, dtype: torch.dtype, name: str = "soft") -> Scene:
@@ -146,7 +133,7 @@ class TestScene(BaseTester):
         assert scene.num_gaussians == 5 and scene.size == SIZE and (not lead or len(scene) == lead[0])
 
     def test_feature(self, device: torch.device, dtype: torch.dtype) -> None:
-        """Within a hard contour is what the Gaussians of the region render without a map."""
+        """Within a hard contour, a scene is what the Gaussians of the region render without a map."""
         scene = scene_on(device, dtype, "hard")
         regions, ids = scene.regions, scene.field.region_ids
         assert regions is not None and ids is not None
@@ -161,8 +148,8 @@ class TestScene(BaseTester):
         scene = Scene(scene.field.subset(torch.arange(4, device=device)), scene.regions)
         names = [name for name, _ in scene.named_parameters()]
 
-        def draw(*tensors: torch.Tensor) -> torch.Tensor:
-            image: torch.Tensor = torch.func.functional_call(scene, dict(zip(names, tensors, strict=True)), ())
+        def draw(*tensors: Tensor) -> Tensor:
+            image: Tensor = torch.func.functional_call(scene, dict(zip(names, tensors, strict=True)), ())
             return image
 
         self.gradcheck(draw, list(scene.parameters()))
@@ -198,19 +185,14 @@ class TestScene(BaseTester):
         assert scene.regions is not None and scene.regions.labels.device.type == "meta"
         assert make_scene().double().field.means.dtype == torch.float64
 
-    def test_label_tensor_means_hard_contours(self) -> None:
-        labels = (torch.arange(30) // 11).expand(SIZE)
-        regions = Scene(make_scene("hard").field, labels).regions
-        assert regions is not None and regions.softness == 0.0
-
-    def test_masks_and_arrays_mean_them_too(self) -> None:
+    def test_labels_are_a_map_with_hard_contours(self) -> None:
         mask = (torch.arange(30) >= 11).expand(SIZE)
-        want = Scene(GaussianField.random(40, SIZE, regions=mask, seed=0), mask)()
-        for labels in (mask.long(), mask.numpy(), mask.numpy().astype("uint8")):
-            assert torch.equal(Scene(GaussianField.random(40, SIZE, regions=labels, seed=0), labels)(), want)
+        expected = Scene(GaussianField.random(40, SIZE, regions=mask, seed=0), RegionMap.from_labels(mask))()
+        for labels in (mask, mask.long(), mask.numpy(), mask.numpy().astype("uint8")):
+            assert torch.equal(Scene(GaussianField.random(40, SIZE, regions=labels, seed=0), labels)(), expected)
 
     @pytest.mark.parametrize("name", MAPS)
-    def test_a_batch_says_so_and_comes_apart(self, name: str) -> None:
+    def test_batch(self, name: str) -> None:
         """Each image has its own map, with regions that others lack, but for "none" and one map for all."""
         one = MAPS[name]
         maps = one if one is None or name == "hard" else batch_of(one)
@@ -230,50 +212,36 @@ class TestScene(BaseTester):
         with pytest.raises(ValueError, match=r"must be of one image; got a batch of 3: scene\[t\] is one of them"):
             evaluate(batch, torch.rand(3, 3, *SIZE))
 
-    def test_repr_is_a_few_lines(self) -> None:
-        assert "3 regions" in repr(make_scene()) and len(repr(make_scene()).splitlines()) <= 4
-        assert make_scene().num_gaussians == 40 and make_scene().size == SIZE
-
-    def test_exception(self) -> None:
-        field = GaussianField.random(3, SIZE, seed=0)
-        with pytest.raises(TypeError, match="field must be a GaussianField; got Scene"):
-            Scene(Scene(field))  # type: ignore[arg-type]
-        with pytest.raises(TypeError, match="regions must be a RegionMap, a label map or None; got str"):
-            Scene(field, "map.png")  # type: ignore[arg-type]
-        with pytest.raises(TypeError, match="metadata must map str to str; got 'n': 3"):
-            Scene(field, metadata={"n": 3})  # type: ignore[dict-item]
+    @pytest.mark.parametrize(
+        ("arguments", "error", "message"),
+        [
+            ((make_scene("none"),), TypeError, "field must be a GaussianField; got Scene"),
+            ((make_field(), "map.png"), TypeError, "regions must be a RegionMap, a label map or None; got str"),
+            ((make_field(), [[0, 1]]), TypeError, "regions must be a RegionMap, a label map or None; got list"),
+            ((make_field(), None, {"n": 3}), TypeError, "metadata must map str to str; got 'n': 3"),
+            ((make_field(), None, "title"), TypeError, "metadata must map str to str; got str"),
+            (
+                (make_field(), torch.zeros(30, 20).long()),
+                ValueError,
+                r"the size \(20, 30\) of the field; got \(30,",
+            ),
+            ((make_field(), torch.zeros(2, *SIZE).long()), ValueError, "hold 1 map or one for each of 1 images; got 2"),
+        ],
+    )
+    def test_exception(self, arguments: tuple[Any, ...], error: type[Exception], message: str) -> None:
+        with pytest.raises(error, match=message):
+            Scene(*arguments)
 
 
 class TestFiles:
     def test_kcgs(self, tmp_path: Path) -> None:
-        path = tmp_path / "photo.kcgs"
-        size = save(path, make_scene("hard"))
-        assert size == path.stat().st_size < make_scene("hard").save(tmp_path / "scene.safetensors")
+        path, scene = tmp_path / "photo.kcgs", make_scene("hard")
+        assert save(path, scene) == path.stat().st_size < scene.save(tmp_path / "scene.safetensors")
         assert load(path).num_gaussians <= 40 and load(path).regions is not None
-
-    def test_errors_name_the_path_given(self) -> None:
-        for name in ("nofile", "nofile.kcgs"):
-            with pytest.raises(FileNotFoundError, match=f"^no such file: {name}$"):
-                load(name)
-        with pytest.raises(OSError, match="/proc/foo.safetensors"):
-            save("/proc/foo.safetensors", make_scene())
-
-    def test_cut_file_is_refused_with_its_name(self, tmp_path: Path) -> None:
-        path = tmp_path / "photo.kcgs"
-        save(path, make_scene("hard"))
         path.write_bytes(path.read_bytes()[:-3])
         with pytest.raises(ValueError, match=rf"cannot load {path}: .*ends early"):
             load(path)
 
-
-@pytest.mark.parametrize(
-    ("shape", "words"),
-    [
-        ((16, 8), r"regions must have the size \(8, 8\) of the field; got \(16, 8\)"),
-        ((2, 8, 8), "regions must hold 1 map or one for each of 3 images; got 2 maps"),
-    ],
-)
-def test_a_map_that_does_not_fit_is_refused(shape: tuple[int, ...], words: str) -> None:
-    field = GaussianField(torch.rand(3, 4, 2), torch.ones(3, 4, 3), torch.rand(3, 4, 3), size=(8, 8))
-    with pytest.raises(ValueError, match=words):
-        Scene(field, torch.zeros(shape).long())
+    def test_errors_name_the_path_of_the_caller(self) -> None:
+        with pytest.raises(OSError, match="/proc/foo.safetensors"):
+            save("/proc/foo.safetensors", make_scene())
