@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
 
 import kcgs
 
@@ -13,6 +16,7 @@ PUBLIC = {
     "evaluate", "fit", "load", "save",
 }  # fmt: skip
 FUNCTIONAL = {"region_splat", "edge_band", "psnr", "ssim", "ms_ssim", "ef_psnr", "ef_ssim"}
+PRIVATE = {"cli", "kernels", "recipes"}
 # what only some calls need
 HEAVY = {
     "PIL", "constriction", "kornia", "matplotlib", "numba", "onnx", "onnx_ir", "onnxruntime", "ray", "rich", "scipy",
@@ -65,6 +69,12 @@ def test_public_names() -> None:
     assert set(kcgs.__all__) >= PUBLIC
     assert set(kcgs.functional.__all__) >= FUNCTIONAL
     assert all(hasattr(kcgs, name) for name in kcgs.__all__)
+
+
+def test_packages_are_attributes_that_no_function_hides() -> None:
+    folders = {path.parent.name for path in Path(kcgs.__file__).parent.glob("*/__init__.py")}
+    assert {name for name in dir(kcgs) if isinstance(getattr(kcgs, name), ModuleType)} == folders - PRIVATE
+    assert not [name for name in kcgs.__all__ if find_spec(f"kcgs.{name}")]
 
 
 def test_help_and_usage_errors_load_no_torch() -> None:

@@ -23,8 +23,9 @@ def scene() -> Scene:
 class TestPrune(
     BaseTester,
     without={
-        "test_gradcheck": "what is left has no graph",
-        "test_module": "a function; what it returns is a Scene",
+        "test_gradcheck": "the result has no graph",
+        "test_module": "a function; it returns a Scene",
+        "test_dynamo": "it reads values; the scene that it returns compiles as any does",
     },
 ):
     def test_smoke(self, backend: str, device: torch.device, dtype: torch.dtype, scene: Scene) -> None:
@@ -42,10 +43,6 @@ class TestPrune(
         assert result.scene.num_gaussians == count - result.removed and result.scene.size == (9, 17)
         assert result.scene().shape == (channels, 9, 17) and result.scene.metadata == {"title": "few"}
 
-    def test_dynamo(self, device: torch.device, scene: Scene) -> None:
-        """What is left is found in values, outside of a graph; it compiles as any scene."""
-        self.assert_compiles(prune(scene.to(device), tolerance=1e-2).scene, rtol=1e-4, atol=1e-5)
-
     @pytest.mark.parametrize("tolerance", [0.0, 1e-4, 1e-2, 0.1])
     def test_feature(self, scene: Scene, tolerance: float) -> None:
         result = prune(scene, tolerance=tolerance)
@@ -59,31 +56,21 @@ class TestPrune(
         assert removed == sorted(removed)
         assert removed[0] == 0 < removed[1] < removed[2] < removed[3] == 300
 
-    def test_what_paints_nothing_goes(self, scene: Scene) -> None:
-        labels = torch.zeros(40, 60, dtype=torch.long)
-        ids = torch.zeros(300, dtype=torch.long)
-        ids[50:80] = 9
+    def test_gaussians_that_paint_nothing_go(self, scene: Scene) -> None:
+        """Those of a region that the map does not have, and those of opacity 0."""
+        labels, ids, opacities = torch.zeros(40, 60).long(), torch.zeros(300).long(), torch.ones(300)
+        ids[50:80], opacities[:40] = 9, 0.0
         field = scene.field
-        confined = GaussianField(field.means, field.cholesky, field.colors, ids, size=(40, 60))
-        result = prune(Scene(confined, labels), tolerance=0.0)
-        assert (result.removed, result.change) == (30, 0.0)
-
-    def test_opacities_count(self, scene: Scene) -> None:
-        opacities = torch.ones(300)
-        opacities[:40] = 0
-        field = scene.field
-        faint = GaussianField(field.means, field.cholesky, field.colors, opacities=opacities, size=(40, 60))
-        assert prune(Scene(faint), tolerance=0.0).removed == 40
+        field = GaussianField(field.means, field.cholesky, field.colors, ids, opacities, size=(40, 60))
+        result = prune(Scene(field, labels), tolerance=0.0)
+        assert (result.removed, result.change) == (70, 0.0)
 
     @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
     def test_without_a_graph(self, scene: Scene, mode: type) -> None:
-        want = prune(scene, tolerance=1e-2)
+        expected = prune(scene, tolerance=1e-2)
         with mode():
-            got = prune(scene, tolerance=1e-2)
-        assert got[1:] == want[1:]
-
-    def test_nothing_to_prune(self) -> None:
-        assert prune(Scene(GaussianField.random(0, (4, 4)))).removed == 0
+            result = prune(scene, tolerance=1e-2)
+        assert result[1:] == expected[1:]
 
     @pytest.mark.parametrize("tolerance", [-1e-3, math.nan, math.inf])
     def test_exception(self, scene: Scene, tolerance: float) -> None:
