@@ -64,11 +64,11 @@ def covariance_to_cholesky(covariance: Tensor) -> Tensor:
     if covariance.ndim < 2 or covariance.shape[-2] != 2:
         raise ValueError(f"covariance must have shape (..., 2, 2); got {tuple(covariance.shape)}")
     s_xx, s_xy, s_yy = covariance[..., 0, 0], covariance[..., 1, 0], covariance[..., 1, 1]
-    rest = s_yy - s_xy * s_xy / s_xx
-    if not ((s_xx > 0) & (rest > 0)).all():
+    schur = s_yy - s_xy * s_xy / s_xx  # the Schur complement, l22 squared
+    if not ((s_xx > 0) & (schur > 0)).all():
         raise ValueError("covariance must be positive definite; got a matrix that is not")
     l11 = s_xx.sqrt()
-    return torch.stack([l11, s_xy / l11, rest.sqrt()], -1)
+    return torch.stack([l11, s_xy / l11, schur.sqrt()], -1)
 
 
 def scale_rotation_to_cholesky(scales: Tensor, angle: Tensor) -> Tensor:

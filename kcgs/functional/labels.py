@@ -1,4 +1,4 @@
-"""Label maps as plain tensors: ids under centres, edges between regions, the band along contours, resampling."""
+"""Label maps as tensors: ids under centres, edges between regions, the band along contours, resampling."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from torch import Tensor
 
 from kcgs._check import check_floating, check_labels
 
-# places between two pixel centres that hard contours are sampled at
-_OFFSETS = 1024
+_OFFSETS = 1024  # places between two pixel centres at which hard contours are sampled
+_TABLE_IDS = 1 << 16  # up to this id a table is ten times faster than sorting every pixel
 
 
 def lookup_regions(means: Tensor, labels: Tensor) -> Tensor:
@@ -41,8 +41,8 @@ def lookup_regions(means: Tensor, labels: Tensor) -> Tensor:
             f"{tuple(means.shape)}"
         )
     height, width = labels.shape[-2:]
-    cell = means.detach().floor()
-    x, y = cell[..., 0].clamp(0, width - 1).long(), cell[..., 1].clamp(0, height - 1).long()
+    pixel = means.detach().floor()
+    x, y = pixel[..., 0].clamp(0, width - 1).long(), pixel[..., 1].clamp(0, height - 1).long()
     if labels.ndim == 2:
         return labels[y, x]
     return labels.flatten(1).gather(1, y * width + x)
@@ -135,7 +135,7 @@ def unique_pairs(pairs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def union_find(ids: Iterable[int], pairs: Iterable[tuple[int, int]]) -> Callable[[int], int]:
-    """Unite pairs of ids; what comes back gives the least id of those that one is united with."""
+    """Merge pairs of ids, and return the function from an id to the least of those that it is merged with."""
     root = {region: region for region in ids}
 
     def find(region: int) -> int:
@@ -145,8 +145,8 @@ def union_find(ids: Iterable[int], pairs: Iterable[tuple[int, int]]) -> Callable
             region = root[region]
         return region
 
-    for one, other in pairs:
-        low, high = sorted((find(one), find(other)))
+    for a, b in pairs:
+        low, high = sorted((find(a), find(b)))
         root[high] = low
     return find
 
@@ -156,8 +156,7 @@ def compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
 
     The table begins and ends with -1, for ids below and beyond it.
     """
-    highest = int(labels.max())
-    if highest < 1 << 16:  # a table is ten times faster than sorting every pixel
+    if int(labels.max()) < _TABLE_IDS:
         present = torch.bincount(labels.flatten()) > 0
         ids = present.nonzero().flatten()
         table = torch.where(present, present.cumsum(0) - 1, -1)
@@ -184,7 +183,7 @@ def sample_labels(labels: Tensor, height: int, width: int) -> Tensor:
     )
     corners = [labels.index_select(-2, r).index_select(-1, c) for r in rows for c in cols]
     sampled = corners[0].clone()
-    # nearly everywhere the four are one label
+    # most pixels have four equal neighbours
     mixed = (corners[1] != sampled).logical_or_(corners[2] != sampled).logical_or_(corners[3] != sampled)
     places = mixed.nonzero(as_tuple=True)
     weights = torch.stack([d[places[-2]] * a[places[-1]] for d in down for a in across])

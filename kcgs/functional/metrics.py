@@ -14,14 +14,15 @@ from kcgs._check import check_image, check_labels
 from .blur import blur, gaussian_taps
 from .labels import edge_band
 
+# Wang et al. 2004
 SSIM_WINDOW = 11  # pixels
-SSIM_SIGMA = 1.5
-K1, K2 = 0.01, 0.03
-_MARGIN = SSIM_WINDOW // 2
-SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
-_MS_SSIM_SIDE = (SSIM_WINDOW - 1) * 2 ** (len(SCALE_WEIGHTS) - 1) + 1
-# images go by blocks of rows, of about so many pixels, which stay in a processor's cache
-_BLOCK = 1 << 17
+SSIM_SIGMA = 1.5  # pixels
+K1 = 0.01  # of the luminance, as a share of the data range
+K2 = 0.03  # of contrast and structure
+SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # Wang et al. 2003, finest scale first
+_MARGIN = SSIM_WINDOW // 2  # pixels
+_MS_SSIM_SIDE = (SSIM_WINDOW - 1) * 2 ** (len(SCALE_WEIGHTS) - 1) + 1  # pixels: the coarsest scale holds one window
+_BLOCK = 1 << 17  # pixels of a block of rows: it stays in a processor's cache
 
 
 def psnr(image: Tensor, target: Tensor) -> Tensor:
@@ -45,9 +46,9 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
         >>> psnr(torch.full((3, 8, 8), 0.6), torch.full((3, 8, 8), 0.5))
         tensor(20.0000)
     """
-    image, target, lead = _check_pair(image, target)
+    image, target, batch_shape = _check_pair(image, target)
     mse = (image - target).square().flatten(1).mean(1)
-    return -10.0 * torch.log10(mse.reshape(lead))
+    return -10.0 * torch.log10(mse.reshape(batch_shape))
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -68,10 +69,10 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     Source: Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to structural
     similarity", 2004.
     """
-    image, target, lead = _check_pair(image, target)
+    image, target, batch_shape = _check_pair(image, target)
     if min(image.shape[-2:]) < SSIM_WINDOW:
-        return _too_small("ssim", image, lead, SSIM_WINDOW)
-    return _mean_ssim(image, target).reshape(lead)
+        return _nan("ssim", image, batch_shape, SSIM_WINDOW)
+    return _mean_ssim(image, target).reshape(batch_shape)
 
 
 def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -93,9 +94,9 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
 
     Source: Wang, Simoncelli, Bovik, "Multi-scale structural similarity for image quality assessment", 2003.
     """
-    image, target, lead = _check_pair(image, target)
+    image, target, batch_shape = _check_pair(image, target)
     if min(image.shape[-2:]) < _MS_SSIM_SIDE:
-        return _too_small("ms_ssim", image, lead, _MS_SSIM_SIDE)
+        return _nan("ms_ssim", image, batch_shape, _MS_SSIM_SIDE)
     batch, channels = image.shape[:2]
     # the powers are taken before channels are averaged: one at a time
     image, target = image.flatten(0, 1)[:, None], target.flatten(0, 1)[:, None]
@@ -104,7 +105,7 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
         product = product * _mean_ssim(image, target, contrast=True).relu() ** weight
         image, target = _halve(image), _halve(target)
     product = product * _mean_ssim(image, target).relu() ** SCALE_WEIGHTS[-1]
-    return product.reshape(batch, channels).mean(1).reshape(lead)
+    return product.reshape(batch, channels).mean(1).reshape(batch_shape)
 
 
 def ef_psnr(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> Tensor:
@@ -134,11 +135,11 @@ def ef_psnr(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> 
 
     Source: the paper's edge-focused evaluation.
     """
-    image, target, lead = _check_pair(image, target)
+    image, target, batch_shape = _check_pair(image, target)
     band = _check_band("ef_psnr", image, labels, width)
-    # an empty band gives 0 / 0, the NaN that was announced
+    # an empty band gives 0 / 0, the NaN of the warning
     error = ((image - target).square() * band).sum((1, 2, 3)) / (band.sum((1, 2, 3)) * image.shape[1])
-    return -10.0 * torch.log10(error.reshape(lead))
+    return -10.0 * torch.log10(error.reshape(batch_shape))
 
 
 def ef_ssim(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> Tensor:
@@ -160,11 +161,11 @@ def ef_ssim(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> 
 
     Source: the paper's edge-focused evaluation.
     """
-    image, target, lead = _check_pair(image, target)
+    image, target, batch_shape = _check_pair(image, target)
     band = _check_band("ef_ssim", image, labels, width)
     if min(image.shape[-2:]) < SSIM_WINDOW:
-        return _too_small("ef_ssim", image, lead, SSIM_WINDOW)
-    return _mean_ssim(image, target, band=band).reshape(lead)
+        return _nan("ef_ssim", image, batch_shape, SSIM_WINDOW)
+    return _mean_ssim(image, target, band=band).reshape(batch_shape)
 
 
 def _check_pair(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, torch.Size]:
@@ -176,9 +177,9 @@ def _check_pair(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, torch.Si
     if target.device != image.device:
         raise ValueError(f"target must be on {image.device} with image; got {target.device}")
     dtype = torch.promote_types(torch.promote_types(image.dtype, target.dtype), torch.float32)
-    lead = image.shape[:-3]
+    batch_shape = image.shape[:-3]
     image, target = (t.to(dtype).clamp(0.0, 1.0).reshape(-1, *t.shape[-3:]) for t in (image, target))
-    return image, target, lead
+    return image, target, batch_shape
 
 
 def _check_band(name: str, image: Tensor, labels: Tensor, width: float) -> Tensor:
@@ -189,8 +190,10 @@ def _check_band(name: str, image: Tensor, labels: Tensor, width: float) -> Tenso
     batch, _, height, breadth = image.shape
     maps = labels.shape[0] if labels.ndim == 3 else 1
     if labels.shape[-2:] != (height, breadth) or maps not in (1, batch):
-        wanted = f"({height}, {breadth}) or ({batch}, {height}, {breadth})"
-        raise ValueError(f"labels must have shape {wanted} to fit image; got {tuple(labels.shape)}")
+        raise ValueError(
+            f"labels must have shape ({height}, {breadth}) or ({batch}, {height}, {breadth}) to fit image; got "
+            f"{tuple(labels.shape)}"
+        )
     band = edge_band(labels, width).reshape(maps, 1, height, breadth)
     empty = (~band.flatten(1).any(1)).sum()
     if not torch.compiler.is_compiling() and empty:
@@ -199,14 +202,15 @@ def _check_band(name: str, image: Tensor, labels: Tensor, width: float) -> Tenso
     return band
 
 
-def _too_small(name: str, image: Tensor, lead: torch.Size, side: int) -> Tensor:
+def _nan(name: str, image: Tensor, batch_shape: torch.Size, side: int) -> Tensor:
+    """Return NaN for images smaller than a window of `side` pixels, and warn."""
     height, width = image.shape[-2:]
     warnings.warn(
         f"{name} is NaN: the image has {height} x {width} pixels, its window needs {side} x {side}",
         RuntimeWarning,
         stacklevel=3,
     )
-    return image.new_full(lead, math.nan)
+    return image.new_full(batch_shape, math.nan)
 
 
 def _halve(image: Tensor) -> Tensor:
@@ -222,12 +226,12 @@ def _mean_ssim(image: Tensor, target: Tensor, *, contrast: bool = False, band: T
     # compiled, a loop over blocks would be a graph of thousands of nodes
     rows = image.shape[-2] if torch.compiler.is_compiling() else max(4 * overlap, _BLOCK // image.shape[-1])
     total: Tensor | float = 0.0
-    count, above = 0, image.new_empty((2, *image.shape[:-2], 0, image.shape[-1]))
+    count, overhang = 0, image.new_empty((2, *image.shape[:-2], 0, image.shape[-1]))
     for block in zip(image.split(rows, -2), target.split(rows, -2), strict=True):
         # `split` and `cat`, since the gradient of overlapping slices would be as large as the image for each
-        window = torch.cat([above, torch.stack(block)], -2)
+        window = torch.cat([overhang, torch.stack(block)], -2)
         values = _similarity(window[0], window[1], contrast)
-        above, height = window[..., -overlap:, :], values.shape[-2]
+        overhang, height = window[..., -overlap:, :], values.shape[-2]
         values = values if band is None else values * band[..., count : count + height, :]
         total, count = total + values.sum((1, 2, 3), dtype=torch.float64), count + height
     pixels = count * (image.shape[-1] - overlap) if band is None else band.sum((1, 2, 3))

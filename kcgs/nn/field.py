@@ -64,13 +64,12 @@ class GaussianField(nn.Module):
         super().__init__()
         self.size = check_size("size", size)
         check_floating("means", means, last=2, dims=(2, 3))
-        lead = means.shape[:-1]
         check_cholesky("cholesky", cholesky)
         check_floating("colors", colors, dims=(2, 3))
         check_rows("cholesky", cholesky, means, 3)
         check_rows("colors", colors, means, "C")
-        if opacities is not None and check_floating("opacities", opacities).shape != lead:
-            raise ValueError(f"opacities must have shape {tuple(lead)}; got {tuple(opacities.shape)}")
+        if opacities is not None and check_floating("opacities", opacities).shape != means.shape[:-1]:
+            raise ValueError(f"opacities must have shape {tuple(means.shape[:-1])}; got {tuple(opacities.shape)}")
         self._register("means", means)
         self._register("cholesky", cholesky)
         self._register("colors", colors)
@@ -133,9 +132,9 @@ class GaussianField(nn.Module):
         generator = None if seed is None else torch.Generator().manual_seed(seed)
         means = torch.rand(num_gaussians, 2, generator=generator, dtype=dtype) * torch.tensor([width, height])
         cholesky = torch.tensor([sigma, 0.0, sigma], dtype=dtype).repeat(num_gaussians, 1)
-        # a Gaussian covers 2 pi sigma^2 pixels: with this factor the mean of the image is near the mean colour
-        cover = max(1e-12, 2 * torch.pi * sigma**2 * num_gaussians / (height * width))
-        colors = torch.rand(num_gaussians, channels, generator=generator, dtype=dtype) / max(1.0, cover)
+        # a Gaussian weighs 2 pi sigma^2 pixels: by this factor the mean of the image is near the mean colour
+        overlap = max(1.0, 2 * torch.pi * sigma**2 * num_gaussians / (height * width))
+        colors = torch.rand(num_gaussians, channels, generator=generator, dtype=dtype) / overlap
         field = cls(means.to(dtype), cholesky, colors, size=size)
         return field if regions is None else field.assign_regions(regions)
 
@@ -179,12 +178,7 @@ class GaussianField(nn.Module):
                     f"mask must hold indices in [0, {self.num_gaussians}); got {int(mask.min())}, {int(mask.max())}"
                 )
 
-        def pick(tensor: Tensor | None) -> Tensor | None:
-            return None if tensor is None else tensor.detach()[mask].clone()
-
-        means, cholesky, colors = (t.detach()[mask].clone() for t in (self.means, self.cholesky, self.colors))
-        ids, opacities = pick(self.region_ids), pick(self.opacities)
-        return GaussianField(means, cholesky, colors, ids, opacities, size=self.size)
+        return self._select(mask)
 
     def image(self, index: int | slice) -> GaussianField:
         """Copy one image of a batch, or a slice of it, into a field of parameters, without the graph.
@@ -200,8 +194,12 @@ class GaussianField(nn.Module):
         """
         if self.means.ndim == 2:
             raise ValueError(f"image needs a batched field; got means of shape {tuple(self.means.shape)}")
-        parts = (self.means, self.cholesky, self.colors, self.region_ids, self.opacities)
-        return GaussianField(*(None if part is None else part.detach()[index] for part in parts), size=self.size)  # type: ignore[arg-type]
+        return self._select(index)
+
+    def _select(self, index: int | slice | Tensor) -> GaussianField:
+        tensors = (self.means, self.cholesky, self.colors, self.region_ids, self.opacities)
+        parts = (None if tensor is None else tensor.detach()[index] for tensor in tensors)
+        return GaussianField(*parts, size=self.size)  # type: ignore[arg-type]
 
     def merged_colors(self) -> Tensor:
         """Colours with the opacities multiplied in, (N, C) or (B, N, C)."""
@@ -216,7 +214,7 @@ class GaussianField(nn.Module):
         self.size = check_size("size", tuple(state["size"]))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        # torch treats a buffer that is None as absent: take the ids that the state carries, or their absence
+        # torch ignores a buffer that is None: ids, or their absence, come from the state
         ids = state_dict.get(f"{prefix}region_ids")
         if ids is None and f"{prefix}means" in state_dict:
             self.region_ids = None
@@ -229,8 +227,8 @@ class GaussianField(nn.Module):
             warnings.warn("GaussianField stays in float32: half precision cannot hold pixel positions", stacklevel=3)
 
         def keep_precision(tensor: Tensor) -> Tensor:
-            moved = fn(tensor)
-            return tensor.to(moved.device, torch.float32) if moved.dtype in _HALF else moved
+            result = fn(tensor)
+            return tensor.to(result.device, torch.float32) if result.dtype in _HALF else result
 
         super()._apply(keep_precision, recurse)  # type: ignore[no-untyped-call]
         return self
@@ -266,8 +264,7 @@ def join(first: GaussianField, second: GaussianField) -> GaussianField:
     if first.region_ids is not None and second.region_ids is not None:
         ids = concatenate(first.region_ids, second.region_ids)
     if first.opacities is not None or second.opacities is not None:
-        ones = (f.means.new_ones(f.means.shape[:-1]) for f in (first, second))
-        parts = (f.opacities if f.opacities is not None else one for f, one in zip((first, second), ones, strict=True))
-        opacities = concatenate(*parts)
+        opaque = (f.means.new_ones(f.means.shape[:-1]) if f.opacities is None else f.opacities for f in (first, second))
+        opacities = concatenate(*opaque)
     means, cholesky = concatenate(first.means, second.means), concatenate(first.cholesky, second.cholesky)
     return GaussianField(means, cholesky, concatenate(first.colors, second.colors), ids, opacities, size=first.size)

@@ -250,28 +250,21 @@ class TestAgainstReference:
         assert (got - exact).abs().max() > 0
 
     def test_many_gaussians(self, backend: str) -> None:
-        scene = random_scene(10_000, (70, 90), 4)
+        scene = random_scene(4000, (70, 90), 4)
         got = region_splat(*as_float32(scene), backend=backend)
         want = region_splat(*scene, backend="reference")
         assert (got - want).abs().max() < 2e-3
 
-    def test_list_longer_than_a_segment(self, backend: str) -> None:
-        scene = random_scene(3000, (16, 16), 2)
-        want, want_gradients = gradients(scene, RegionMap.from_labels(scene.labels), cutoff=0, backend="reference")
-        regions = RegionMap.from_labels(scene.labels)
-        got, got_gradients = gradients(suited(scene, backend), regions, cutoff=0, backend=backend)
-        tolerance = 100 * rounding(backend)
-        torch.testing.assert_close(got.double(), want, rtol=tolerance, atol=tolerance)
-        assert_gradients_close(got_gradients, want_gradients, tolerance)
-
-    @pytest.mark.parametrize("channels", [1, 2, 4, 9, 32])
-    def test_channels(self, backend: str, channels: int) -> None:
-        scene = random_scene(40, (20, 30), 3, channels=channels)
+    @pytest.mark.parametrize(
+        ("count", "size", "channels"), [(3000, (16, 16), 3), *[(40, (20, 30), n) for n in (1, 2, 4, 9, 32)]]
+    )
+    def test_channels_and_long_lists(self, backend: str, count: int, size: tuple[int, int], channels: int) -> None:
+        """3000 Gaussians of one tile are more than a segment of the kernels' lists."""
+        scene = random_scene(count, size, 3, channels=channels)
         regions = RegionMap.from_labels(scene.labels)
         want, want_gradients = gradients(scene, regions, cutoff=0, backend="reference")
         got, got_gradients = gradients(suited(scene, backend), regions, cutoff=0, backend=backend)
-        assert got.shape == (channels, 20, 30)
-        tolerance = 10 * rounding(backend)
+        tolerance = (100 if count > 40 else 10) * rounding(backend)
         torch.testing.assert_close(got.double(), want, rtol=tolerance, atol=tolerance)
         assert_gradients_close(got_gradients, want_gradients, tolerance)
 
@@ -289,17 +282,12 @@ class TestConstraint:
         assert torch.equal(before[:, outside], after[:, outside])
         assert not torch.equal(before[:, ~outside], after[:, ~outside])
 
-    def test_an_unknown_region_draws_nothing(self, backend: str) -> None:
+    def test_an_unknown_region_paints_nothing(self, backend: str) -> None:
         scene = as_float32(random_scene(10, (12, 12), 2))
-        image = region_splat(*scene[:3], torch.full_like(scene.region_ids, 77), scene.labels, backend=backend)
-        assert torch.equal(image, torch.zeros_like(image))
-        means = scene.means.clone().requires_grad_()
-        strangers = torch.full_like(scene.region_ids, 77)
-        region_splat(means, *scene[1:3], strangers, scene.labels, backend=backend).sum().backward()
-        assert torch.equal(means.grad, torch.zeros_like(means))
-        single = torch.zeros(12, 12, dtype=torch.long)
-        image = region_splat(*scene[:3], torch.full_like(scene.region_ids, 77), single, backend=backend)
-        assert torch.equal(image, torch.zeros_like(image))
+        means, ids = scene.means.requires_grad_(), torch.full_like(scene.region_ids, 77)
+        for labels in (scene.labels, torch.zeros(12, 12, dtype=torch.long)):
+            image = region_splat(means, *scene[1:3], ids, labels, backend=backend)
+            assert not image.any() and not torch.autograd.grad(image.sum(), means)[0].any()
 
     def test_one_region_equals_no_regions(self, backend: str) -> None:
         scene = as_float32(random_scene(30, (20, 33), 1))
@@ -323,12 +311,8 @@ class TestConventions:
         for i, scene in enumerate(scenes):
             alone = region_splat(*scene[:4], maps[i], backend=backend)
             torch.testing.assert_close(together[i], alone, rtol=1e-5, atol=1e-6)
-
-    def test_shared_map(self, backend: str) -> None:
-        scenes = [as_float32(random_scene(25, (24, 40), 3, seed=s)) for s in range(2)]
-        stacked = [torch.stack(parts) for parts in zip(*scenes, strict=True)]
-        together = region_splat(*stacked[:4], scenes[0].labels, backend=backend)
-        torch.testing.assert_close(together[1], region_splat(*scenes[1], backend=backend), rtol=1e-5, atol=1e-6)
+        shared = region_splat(*stacked[:4], maps[1], backend=backend)
+        torch.testing.assert_close(shared[1], together[1], rtol=1e-5, atol=1e-6)
 
     def test_empty(self, backend: str) -> None:
         empty = torch.zeros(0, 2), torch.zeros(0, 3), torch.zeros(0, 3)
@@ -337,28 +321,16 @@ class TestConventions:
         image.sum().backward()
         assert empty[0].grad is None or empty[0].grad.shape == (0, 2)
 
-    @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-    def test_half_is_computed_in_float32(self, backend: str, dtype: torch.dtype) -> None:
-        scene = random_scene(20, (20, 30), 2)
-        half = [t.to(dtype) for t in scene[:3]]
-        image = region_splat(*half, *scene[3:], backend=backend)
-        want = region_splat(*(t.float() for t in half), *scene[3:], backend=backend)
-        assert image.dtype == dtype
-        assert torch.equal(image, want.to(dtype))
-
     @pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.uint16, torch.uint32])
     def test_integer_dtypes_of_ids(self, backend: str, dtype: torch.dtype) -> None:
         scene = as_float32(random_scene(20, (20, 30), 2))
         image = region_splat(*scene[:3], scene.region_ids.to(dtype), scene.labels.to(dtype), backend=backend)
         assert torch.equal(image, region_splat(*scene, backend=backend))
 
-    def test_lazy_negation(self, backend: str) -> None:
+    def test_strided_and_lazily_negated(self, backend: str) -> None:
         scene = as_float32(random_scene(20, (20, 30), 2))
-        image = region_splat(*scene[:2], torch._neg_view(scene.colors), *scene[3:], backend=backend)
-        torch.testing.assert_close(image, -region_splat(*scene, backend=backend))
-
-    def test_non_contiguous(self, backend: str) -> None:
-        scene = as_float32(random_scene(20, (20, 30), 2))
+        negative = region_splat(*scene[:2], torch._neg_view(scene.colors), *scene[3:], backend=backend)
+        torch.testing.assert_close(negative, -region_splat(*scene, backend=backend))
         strided = [t.T.contiguous().T for t in scene[:3]]
         assert not strided[0].is_contiguous()
         labels = scene.labels.T.contiguous().T
@@ -376,28 +348,6 @@ class TestConventions:
 class TestExtremes:
     """Image error against float64, relative to the largest colour; gradients finite."""
 
-    @pytest.mark.parametrize("anisotropy", [1.0, 1e2, 1e4])
-    @pytest.mark.parametrize("sigma", [0.05, 1.0, 1e4])
-    def test_stiff(self, backend: str, sigma: float, anisotropy: float) -> None:
-        angles = torch.linspace(0, math.pi, 25, dtype=torch.float64)
-        cos, sin = angles.cos(), angles.sin()
-        long, short = sigma * anisotropy, sigma
-        l11 = torch.hypot(long * cos, short * sin)
-        cholesky = torch.stack([l11, (long**2 - short**2) * sin * cos / l11, long * short / l11], -1).clamp_max(1e8)
-        means = torch.rand(25, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 40
-        scene = as_float32(Scene(means, cholesky, torch.ones(25, 1).double(), torch.zeros(25), torch.zeros(40, 50)))
-        scene = scene._replace(region_ids=scene.region_ids.long(), labels=scene.labels.long())
-        exact = Scene(*(t.double() for t in scene[:3]), *scene[3:])  # of the float32 numbers, which are given
-        want, want_gradients = gradients(exact, None, cutoff=0, backend="reference")
-        got, got_gradients = gradients(scene, None, cutoff=0, backend=backend)
-        assert torch.isfinite(got).all()
-        # the reference in float32 subtracts at full coordinates; the others in float64
-        tolerance = 1e-5 if backend != "reference" else 2e-4 * max(1.0, 0.05 / sigma)
-        assert (got - want).abs().max() <= tolerance * 25
-        for g, w in zip(got_gradients, want_gradients, strict=True):
-            assert torch.isfinite(g).all()
-            assert ((g - w).abs() <= 2e-3 * w.abs().amax(0)).all()
-
     def test_far_outside(self, backend: str) -> None:
         means = torch.tensor([[1e5, 3.0], [-1e7, 1e7], [4.0, 4.0], [1e8, -1e8]])
         cholesky = torch.tensor([[1.0, 0.0, 1.0], [2e-6, 1e8, 2e-6], [2.0, 0.0, 2.0], [1e8, 1e8, 1e8]])
@@ -412,14 +362,3 @@ class TestExtremes:
         means, colors = torch.full((n, 2), 2.5), torch.full((n, 1), 1e-4)
         image = region_splat(means, cholesky, colors, size=(5, 5), backend=backend)
         assert abs(float(image[0, 2, 2]) - 1.0) < 1e-4
-
-    def test_checkerboard_and_one_pixel_regions(self, backend: str) -> None:
-        size = (20, 24)
-        labels = torch.arange(20 * 24).view(size)
-        scene = as_float32(random_scene(100, size, 1))
-        ids = torch.arange(100) * 4
-        for softness in (0.0, 0.7):
-            regions = RegionMap.from_labels(labels, softness)
-            image = region_splat(*scene[:3], ids, regions, cutoff=0, backend=backend)
-            want = region_splat(*(t.double() for t in scene[:3]), ids, regions, cutoff=0, backend="reference")
-            assert (image - want).abs().max() < 1e-5

@@ -7,7 +7,6 @@ import io
 import math
 import pickle
 
-import kornia
 import pytest
 import torch
 from torch import Tensor, nn
@@ -80,10 +79,16 @@ class TestGaussianField(BaseTester):
 
         self.assert_compiles(draw, raw, leaves=[raw], backend="aot_eager")
 
-    def test_module(self, field: GaussianField) -> None:
-        assert {n for n, _ in field.named_parameters()} == {"means", "cholesky", "colors"}
-        assert dict(field.named_buffers())["region_ids"].dtype == torch.int64
-        assert field.num_gaussians == 60
+    def test_module(self, field: GaussianField, labels: Tensor) -> None:
+        """A parameter is used as it is, a tensor of a graph becomes a buffer, any other is copied to a parameter."""
+        assert {name for name, _ in field.named_parameters()} == {"means", "cholesky", "colors"}
+        means, colors = field.means.detach().clone(), (1 * field.colors).detach().requires_grad_()
+        other = GaussianField(means, field.cholesky, colors, field.region_ids, size=SIZE)
+        assert other.cholesky is field.cholesky and other.colors is colors and other.means is not means
+        assert {name for name, _ in other.named_buffers()} == {"colors", "region_ids"}
+        other.double()
+        assert other.region_ids is not None and other.region_ids.dtype == torch.int64
+        assert RegionSplatRenderer()(other, labels).dtype == torch.float64 and means.dtype == torch.float32
 
     def test_random_is_seeded(self) -> None:
         a, b = (GaussianField.random(10, SIZE, seed=3) for _ in range(2))
@@ -93,13 +98,6 @@ class TestGaussianField(BaseTester):
     def test_random_paints_about_grey(self) -> None:
         image = RegionSplatRenderer()(GaussianField.random(2000, (64, 64), seed=0))
         assert 0.3 < float(image.detach().mean()) < 0.7
-
-    def test_inputs_are_copied(self) -> None:
-        means = torch.zeros(1, 2)
-        field = GaussianField(means, torch.ones(1, 3), torch.ones(1, 3), size=SIZE)
-        with torch.no_grad():
-            field.means += 1
-        assert torch.equal(means, torch.zeros(1, 2))
 
     def test_state_dict_round_trip(self, field: GaussianField) -> None:
         buffer = io.BytesIO()
@@ -123,11 +121,6 @@ class TestGaussianField(BaseTester):
             move(field)  # type: ignore[operator]
         assert field.means.dtype == field.colors.dtype == torch.float32
         assert torch.equal(field.means, before)
-
-    def test_double(self, field: GaussianField, labels: Tensor) -> None:
-        field.double()
-        assert field.region_ids is not None and field.region_ids.dtype == torch.int64
-        assert RegionSplatRenderer()(field, labels).dtype == torch.float64
 
     def test_subset(self, field: GaussianField, labels: Tensor) -> None:
         assert field.region_ids is not None
@@ -209,6 +202,9 @@ class TestRegionSplatRenderer(BaseTester):
         """Each block of 3 x 3 pixels has the centre of its middle where a pixel of the small image has it."""
         scene, render = self.scene(device, dtype, labels), RegionSplatRenderer(0.0, backend=backend)
         self.assert_close(render(scene, size=(72, 108))[:, 1::3, 1::3], render(scene), rtol=1e-4, atol=1e-5)
+        scene = Scene(scene.field.subset(torch.arange(scene.num_gaussians)))
+        scene.field.region_ids = None
+        self.assert_close(render(scene, size=(24, 108))[:, :, 1::3], render(scene), rtol=1e-4, atol=1e-5)
 
     def test_module(self, backend: str, device: torch.device, dtype: torch.dtype, labels: Tensor) -> None:
         """The twin of region_splat."""
@@ -230,11 +226,6 @@ class TestRegionSplatRenderer(BaseTester):
         assert free.min() < 0 and free.max() > 1
         assert torch.equal(clamped, free.clamp(0, 1))
 
-    def test_another_aspect(self, field: GaussianField) -> None:
-        field.region_ids = None
-        wide = RegionSplatRenderer(cutoff=0)(field, None, (24, 108))
-        torch.testing.assert_close(wide[:, :, 1::3], RegionSplatRenderer(cutoff=0)(field), rtol=1e-4, atol=1e-5)
-
     @pytest.mark.parametrize("size", [(12, 18), (7, 36), (24, 11), (1, 1), (30, 11), (23, 35)])
     @pytest.mark.parametrize("softness", [None, 0.0, 0.8])
     def test_a_smaller_image_is_the_area_mean(
@@ -250,10 +241,6 @@ class TestRegionSplatRenderer(BaseTester):
             parts = image.repeat_interleave(side, dim).unflatten(dim, (side, -1))
             image = parts.mean(dim + 1)
         torch.testing.assert_close(scene(size), image.float(), rtol=1e-5, atol=1e-6)
-
-    def test_regions_of_the_target_size(self, field: GaussianField, labels: Tensor) -> None:
-        fine = labels.repeat_interleave(2, 0).repeat_interleave(2, 1)
-        assert RegionSplatRenderer()(field, fine, (48, 72)).shape == (3, 48, 72)
 
     def test_exception(self, field: GaussianField, labels: Tensor) -> None:
         render = RegionSplatRenderer()
@@ -285,28 +272,6 @@ class TestRegionSplatRenderer(BaseTester):
 
 
 class TestComposition:
-    def test_sequential_with_kornia(self, field: GaussianField, labels: Tensor) -> None:
-        chain = nn.Sequential(RegionSplatRenderer(keepdim=False), kornia.filters.GaussianBlur2d((3, 3), (1.0, 1.0)))
-        image = chain(Scene(field, labels))
-        loss = kornia.losses.ssim_loss(image, torch.full_like(image, 0.5), window_size=5)
-        loss.backward()
-        assert image.shape == (1, 3, *SIZE)
-        for parameter in field.parameters():
-            assert parameter.grad is not None and parameter.grad.abs().max() > 0
-
-    def test_batch_predicted_by_a_network(self, labels: Tensor) -> None:
-        network = nn.Linear(4, 10 * 8)
-        raw = network(torch.randn(2, 4, generator=torch.Generator().manual_seed(0))).view(2, 10, 8)
-        extent = torch.tensor([36.0, 24.0])
-        cholesky = nn.functional.softplus(raw[..., 2:5]) + 0.5
-        field = GaussianField(raw[..., :2].sigmoid() * extent, cholesky, raw[..., 5:], size=SIZE)
-        field.assign_regions(labels)
-        image = RegionSplatRenderer()(field, labels)
-        assert image.shape == (2, 3, *SIZE)
-        image.square().mean().backward()
-        assert network.weight.grad is not None and network.weight.grad.abs().max() > 0
-        assert not list(field.parameters())
-
     def test_no_grad_and_inference_mode(self, field: GaussianField, labels: Tensor) -> None:
         render = RegionSplatRenderer()
         want = render(field, labels)
@@ -322,18 +287,6 @@ class TestComposition:
             render(field, regions)
         render(field, regions).sum().backward()
         assert field.means.grad is not None
-
-    def test_gradient_descent_lowers_the_loss(self, field: GaussianField, labels: Tensor) -> None:
-        target = (labels > 0).float().expand(3, -1, -1)
-        optimizer = torch.optim.Adam(field.parameters(), lr=0.05)
-        losses = []
-        for _ in range(30):
-            loss = (RegionSplatRenderer()(field, labels) - target).square().mean()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            losses.append(float(loss.detach()))
-        assert losses[-1] < 0.3 * losses[0]
 
 
 class TestBatch:
