@@ -1,4 +1,4 @@
-"""Adaptive models: tables of what is likely, which learn from each symbol as it is coded (docs/format.md).
+"""Adaptive models: chances that are learned from each symbol as it is coded (docs/format.md).
 
 All numbers are float64; every sum goes from left to right, every operation is rounded once.
 """
@@ -12,35 +12,45 @@ import numpy as np
 from .exact import Floats, Integers
 from .rangecoder import ONE, Coder
 
-_LEAST = 64  # chance of an adaptive bit, in 1 / ONE
-# magnitudes below 16 have a bucket each; above, an octave has eight
-_PLAIN, _PER_OCTAVE = 16, 8
-_OCTAVES = (4, 24)
-_BUCKETS = _PLAIN + (_OCTAVES[1] - _OCTAVES[0]) * _PER_OCTAVE
-_EIGHTHS = [(1 << octave - 3) * eighth for octave in range(*_OCTAVES) for eighth in range(_PER_OCTAVE, 2 * _PER_OCTAVE)]
-_LOW = np.array([*range(_PLAIN), *_EIGHTHS], np.int64)
-_HIGH = np.append(_LOW[1:], 1 << _OCTAVES[1])
-_MIDDLES = np.maximum(np.append(_LOW, _HIGH[-1]) - 0.5, 0.0)  # between the magnitudes about each bound
-# bins of the shape that all scales share, in units of the scale
-_BINS, _WIDTH = 24, 0.125
-_PARTS = 256
-_TURN = 16  # bins of half a turn
-# magnitudes that are learned from together, so that their tables fit into memory
-_TOGETHER = 1 << 12
+_MIN_CHANCE = 64  # of an adaptive bit, in 1 / ONE
+
+# buckets of magnitudes
+_SINGLES = 16  # magnitudes below it have a bucket each
+_FIRST_OCTAVE = 4  # log2 of the least magnitude that shares a bucket
+_LAST_OCTAVE = 24  # log2 of the least magnitude that is too large
+_PER_OCTAVE = 8  # buckets of equal width
+_SHARED_LOW = [
+    (1 << octave - 3) * eighth
+    for octave in range(_FIRST_OCTAVE, _LAST_OCTAVE)
+    for eighth in range(_PER_OCTAVE, 2 * _PER_OCTAVE)
+]
+_LOW = np.array([*range(_SINGLES), *_SHARED_LOW], np.int64)  # least magnitude of each bucket
+_HIGH = np.append(_LOW[1:], 1 << _LAST_OCTAVE)  # least magnitude above each bucket
+_BORDERS = np.maximum(np.append(_LOW, _HIGH[-1]) - 0.5, 0.0)  # halfway between magnitudes
+_FLOOR = 1e-3  # share of the weights that all buckets have in equal parts
+
+# bins of the shape that all scales share
+_BINS = 24
+_BIN_WIDTH = 0.125  # in scales
+_PARTS = 256  # of a magnitude that is spread over bins
+_GROUP = 1 << 12  # magnitudes whose tables are in memory at a time
+
+_ANGLE_BINS = 16  # of half a turn
 
 
 class AdaptiveBit:
-    """A bit whose chance is learned, even at first."""
+    """A bit whose chance is learned; at first it is 1/2."""
 
     def __init__(self) -> None:
-        self._ones, self._all = 2, 4
+        self._ones = 2
+        self._total = 4
 
     def code(self, coder: Coder, value: bool) -> bool:
         """Code the bit."""
-        chance = min(max(self._ones * ONE // self._all, _LEAST), ONE - _LEAST)
+        chance = min(max(self._ones * ONE // self._total, _MIN_CHANCE), ONE - _MIN_CHANCE)
         bit = bool(coder.bits(np.array([chance / ONE]), np.array([value], np.int32))[0])
         self._ones += 2 * bit
-        self._all += 2
+        self._total += 2
         return bit
 
 
@@ -51,30 +61,30 @@ class AdaptiveSymbol:
         self._weights = weights.copy()
 
     def code(self, coder: Coder, count: int, values: Integers | None) -> Integers:
-        """Code `count` symbols."""
-        found = coder.repeat(self._weights, count, values)
-        np.add.at(self._weights, found, 1.0)
-        return found
+        """Code `count` symbols, (count,)."""
+        symbols = coder.categorical(self._weights, count, values)
+        np.add.at(self._weights, symbols, 1.0)
+        return symbols
 
 
 class AdaptiveNumber:
-    """A number whose count of bits is learned, with the weights of 0 bits, 1, 2 and so on, at first."""
+    """A number whose count of bits is learned; `weights` are those of 0 bits, 1, 2 and so on, at first."""
 
     def __init__(self, weights: Floats) -> None:
         self._length = AdaptiveSymbol(weights)
 
     def code(self, coder: Coder, value: int | None) -> int:
-        """Code the number: its count of bits, then what is below its highest bit."""
+        """Code the number: its count of bits, then the remainder below its highest bit."""
         length = int(self._length.code(coder, 1, None if value is None else np.array([value.bit_length()]))[0])
         highest = 1 << (length - 1) if length else 0
-        rest = None if value is None else np.array([value - highest])
-        return highest + int(coder.uniform(np.array([max(highest, 1)]), rest)[0])
+        remainder = None if value is None else np.array([value - highest])
+        return highest + int(coder.uniform(np.array([max(highest, 1)]), remainder)[0])
 
 
 class AdaptiveMagnitude:
-    """Magnitudes 0, 1, 2 ... whose scales are known: a shape over magnitude / scale, learned for all scales.
+    """Magnitudes 0, 1, 2 ... of known scales, by a shape over magnitude / scale that is learned for all scales.
 
-    `shapes` [contexts, bins] has the weights of the `_BINS` bins at first; each of the contexts learns by itself.
+    `shapes` [contexts, bins] has the weights of the bins at first; each context learns by itself.
     """
 
     def __init__(self, shapes: Floats) -> None:
@@ -83,72 +93,74 @@ class AdaptiveMagnitude:
     def code(
         self, coder: Coder, scales: Floats, level: Integers, context: Integers, values: Integers | None
     ) -> Integers:
-        """Code one magnitude for each context [n]; `level` [n] says by which of the scales, above 0, it is measured."""
+        """Code one magnitude for each entry of `level` [n], its index in `scales`, and of `context` [n]."""
         present, level = np.unique(level, return_inverse=True)
-        measures = scales[present].tolist()
-        tables = np.concatenate([self._tables(scale) for scale in measures])
+        present_scales = scales[present].tolist()
+        tables = np.concatenate([self._tables(scale) for scale in present_scales])
         bucket = None if values is None else np.searchsorted(_LOW, values, side="right") - 1
-        bucket = coder.choose(tables, level * len(self._shapes) + context, bucket)
+        bucket = coder.mixed_categorical(tables, level * len(self._shapes) + context, bucket)
         width = _HIGH[bucket] - _LOW[bucket]
-        found = _LOW[bucket] + coder.uniform(width, None if values is None else values - _LOW[bucket])
-        learned = np.zeros(self._shapes.shape)
-        for i, scale in enumerate(measures):
-            these = level == i
-            learned += self._parts(scale, context[these], found[these])
-        self._shapes += learned / _PARTS
-        return found
-
-    def _parts(self, scale: float, context: Integers, values: Integers) -> Floats:
-        # a magnitude stands for what rounds to it; in whole parts, whose sums no order changes: equal ones at once
-        edges = np.arange(_BINS + 1) * (scale * _WIDTH)
-        edges[-1] = np.inf
-        contexts = len(self._shapes)
-        kinds, counts = np.unique(values * contexts + context, return_counts=True)
-        learned = np.zeros(self._shapes.shape)
-        for start in range(0, len(kinds), _TOGETHER):
-            part = slice(start, start + _TOGETHER)
-            value, row = np.divmod(kinds[part], contexts)
-            low, high = np.maximum(value - 0.5, 0.0)[:, None], (value + 0.5)[:, None]
-            overlap = np.maximum(np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1]), 0.0) / (high - low)
-            share = np.floor(overlap * _PARTS + 0.5) * counts[part, None]
-            cell = row[:, None] * _BINS + np.arange(_BINS)
-            learned += np.bincount(cell.ravel(), share.ravel(), learned.size).reshape(learned.shape)
-        return learned
+        magnitudes = _LOW[bucket] + coder.uniform(width, None if values is None else values - _LOW[bucket])
+        parts = np.zeros(self._shapes.shape)
+        for i, scale in enumerate(present_scales):
+            index = level == i
+            parts += self._spread(scale, context[index], magnitudes[index])
+        self._shapes += parts / _PARTS
+        return magnitudes
 
     def _tables(self, scale: float) -> Floats:
-        # the share of each bucket: the integral of the shape between its bounds, by linear interpolation; its sums by
-        # hand, since numpy's have an order of their own
+        """Return the weights of the buckets, [contexts, buckets]: integrals of the shape, which is piecewise constant.
+
+        Sums and interpolation are written out, since the order of numpy's own operations may differ.
+        """
         total = np.array([list(itertools.accumulate(shape, initial=0.0)) for shape in self._shapes.tolist()])
-        edges: Floats = np.arange(_BINS + 1.0) * (scale * _WIDTH)
-        # numpy's own interpolation may order its operations otherwise
-        index = np.minimum(np.searchsorted(edges, _MIDDLES, side="right") - 1, _BINS - 1)
-        share = np.minimum((_MIDDLES - edges[index]) / (edges[index + 1] - edges[index]), 1.0)
+        edges: Floats = np.arange(_BINS + 1.0) * (scale * _BIN_WIDTH)
+        index = np.minimum(np.searchsorted(edges, _BORDERS, side="right") - 1, _BINS - 1)
+        share = np.minimum((_BORDERS - edges[index]) / (edges[index + 1] - edges[index]), 1.0)
         low = total.take(index, 1)
         cumulative: Floats = low + share * (total.take(index + 1, 1) - low)
-        tables: Floats = (cumulative[:, 1:] - cumulative[:, :-1]) + 1e-3 * total[:, -1:] / _BUCKETS
+        tables: Floats = (cumulative[:, 1:] - cumulative[:, :-1]) + _FLOOR * total[:, -1:] / len(_LOW)
         return tables
+
+    def _spread(self, scale: float, context: Integers, magnitudes: Integers) -> Floats:
+        """Spread each magnitude over the bins that round to it, in whole parts, whose sums no order changes."""
+        edges = np.arange(_BINS + 1) * (scale * _BIN_WIDTH)
+        edges[-1] = np.inf
+        num_contexts = len(self._shapes)
+        kinds, counts = np.unique(magnitudes * num_contexts + context, return_counts=True)
+        parts = np.zeros(self._shapes.shape)
+        for start in range(0, len(kinds), _GROUP):
+            group = slice(start, start + _GROUP)
+            magnitude, row = np.divmod(kinds[group], num_contexts)
+            low, high = np.maximum(magnitude - 0.5, 0.0)[:, None], (magnitude + 0.5)[:, None]
+            overlap = np.maximum(np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1]), 0.0) / (high - low)
+            share = np.floor(overlap * _PARTS + 0.5) * counts[group, None]
+            bins = row[:, None] * _BINS + np.arange(_BINS)
+            parts += np.bincount(bins.ravel(), share.ravel(), parts.size).reshape(parts.shape)
+        return parts
 
 
 class AdaptiveAngle:
-    """Angles, each one of so many in half a turn; with the weights of bins about 0, 1/16, 2/16 ... at first."""
+    """Angles, each one of so many in half a turn; `weights` are those of bins about 0, 1/16, 2/16 ... at first."""
 
     def __init__(self, weights: Floats) -> None:
         self._weights = weights.copy()
 
-    def code(self, coder: Coder, turns: Integers, values: Integers | None) -> Integers:
-        """Code one of 0 to `turns` - 1 each, (n,); bins know nothing of fewer angles than there are bins."""
-        many = turns >= _TURN
-        shift, sizes = np.where(many, turns // (2 * _TURN), 0), np.where(many, 1, turns)
-        turned = None if values is None else (values + shift) % turns
-        kinds, row = np.unique(turns[many], return_inverse=True)
-        borders = np.arange(_TURN + 1) * kinds[:, None] // _TURN
-        known = None
-        if turned is not None:
-            known = (borders[row, 1:] <= turned[many, None]).sum(1)
-        bins = coder.choose(self._weights * np.diff(borders), row, known) if len(row) else np.zeros(0, np.int64)
-        low = np.zeros(len(turns), np.int64)
-        low[many] = borders[row, bins]
-        sizes[many] = borders[row, bins + 1] - low[many]
-        found = low + coder.uniform(sizes, None if turned is None else turned - low)
+    def code(self, coder: Coder, num_angles: Integers, values: Integers | None) -> Integers:
+        """Code angles (n,), each below its entry of `num_angles` (n,); only entries of 16 or more have bins."""
+        has_bin = num_angles >= _ANGLE_BINS
+        # half a bin, so that angle 0 is in the middle of the first one
+        shift = np.where(has_bin, num_angles // (2 * _ANGLE_BINS), 0)
+        shifted = None if values is None else (values + shift) % num_angles
+        counts, row = np.unique(num_angles[has_bin], return_inverse=True)
+        borders = np.arange(_ANGLE_BINS + 1) * counts[:, None] // _ANGLE_BINS
+        bins = np.zeros(0, np.int64)
+        if len(row):
+            symbols = None if shifted is None else (borders[row, 1:] <= shifted[has_bin, None]).sum(1)
+            bins = coder.mixed_categorical(self._weights * np.diff(borders), row, symbols)
+        low, sizes = np.zeros(len(num_angles), np.int64), num_angles.copy()
+        low[has_bin] = borders[row, bins]
+        sizes[has_bin] = borders[row, bins + 1] - low[has_bin]
+        angles = low + coder.uniform(sizes, None if shifted is None else shifted - low)
         np.add.at(self._weights, bins, 1.0)
-        return (found - shift) % turns
+        return (angles - shift) % num_angles

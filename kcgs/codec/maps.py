@@ -1,29 +1,37 @@
-"""Label maps as files of their own, without loss (docs/format.md)."""
+"""Label maps as files of their own, without loss (docs/format.md, "A file of a label map")."""
 
 from __future__ import annotations
 
 import zlib
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_count, check_labels
+from kcgs.functional.labels import compact
 
-from .file import MAGIC, MAP_MAGIC, MOST_LABELS, MOST_SIDE, ByteReader, varint
+from .exact import Integers
+from .file import MAGIC, MAP_MAGIC, MAX_LABELS, MAX_REGIONS, MAX_SIDE, ByteReader, varint
 from .rangecoder import CodecError
 
-VERSION = 1
-_TURNS, _CRC = 8, 4  # ways to turn a map; bytes
 _TYPES = ("bool", "uint8", "int8", "uint16", "int16", "uint32", "int32", "int64")
+_CRC = 4  # bytes
+_TURNS = 8  # ways to transpose and mirror a map
+_TRIED_TURNS = 2  # of which the smallest is written
+_SEED_MARGIN = 3  # seeds by which a turn that is tried may exceed the fewest
+# a map of more regions, and of more than so many per byte, is noise; an encoder's takes more bytes
+_FREE_REGIONS = (1 << 18) + 1
+_REGIONS_PER_BYTE = 4
 
 
 def encode_labels(labels: Tensor | NDArray[Any]) -> bytes:
     """Write a label map as a `.kcgs` file; nothing is lost, and the same map gives the same bytes.
 
     Args:
-        labels: :math:`(H, W)` integer or bool, ids of 0 to 2**63 - 1; a numpy array will do. At most 2**26 pixels,
+        labels: :math:`(H, W)` integer or bool, Tensor or numpy array, ids of 0 to 2**63 - 1. At most 2**26 pixels,
             2**20 on a side, and fewer than 2**24 regions.
 
     Returns:
@@ -40,17 +48,40 @@ def encode_labels(labels: Tensor | NDArray[Any]) -> bytes:
         (14, True, torch.uint8)
     """
     if isinstance(labels, Tensor) and labels.dtype == torch.uint64:
-        labels = labels.cpu().numpy()  # of which torch has no minimum
-    ids = check_labels("labels", labels, dims=(2,))
+        labels = labels.cpu().numpy()  # torch has no minimum of uint64
+    checked = check_labels("labels", labels, dims=(2,))
     dtype = str(labels.dtype).removeprefix("torch.").replace("uint64", "int64")
-    check_count("pixels per side of labels", max(ids.shape), 1, MOST_SIDE)
-    check_count("pixels of labels", ids.numel(), 1, MOST_LABELS)
-    from .labels.coding import encode_turned  # loads numba
-
-    turn, stream = encode_turned(ids.cpu().numpy())
-    form = turn + _TURNS * (_TYPES.index(dtype) + len(_TYPES) * (VERSION - 1))
-    data = b"".join([MAP_MAGIC, bytes([form]), *map(varint, ids.shape), stream])
+    check_count("pixels per side of labels", max(checked.shape), 1, MAX_SIDE)
+    check_count("pixels of labels", checked.numel(), 1, MAX_LABELS)
+    ids, index = (numbers.numpy() for numbers in compact(checked.cpu())[:2])
+    check_count("number of regions", len(ids), 1, MAX_REGIONS)
+    turn, stream = _encode_smallest(ids, index)
+    form = turn + _TURNS * _TYPES.index(dtype)
+    data = b"".join([MAP_MAGIC, bytes([form]), *map(varint, checked.shape), stream])
     return data + zlib.crc32(data).to_bytes(_CRC, "big")
+
+
+def _encode_smallest(ids: Integers, index: NDArray[Any]) -> tuple[int, bytes]:
+    """Write the stream of a map, turned so that it takes few bytes; return the turn, too."""
+    from .labels.stream import FILE_PROFILE, count_seeds, encode_stream  # loads numba
+
+    seeds = [count_seeds(turned(index, turn), len(ids)) for turn in range(_TURNS)]
+    fewest = sorted(range(_TURNS), key=seeds.__getitem__)[:_TRIED_TURNS]
+    turns = [turn for turn in fewest if seeds[turn] <= min(seeds) + _SEED_MARGIN]
+    streams = [(turn, encode_stream(ids, turned(index, turn), FILE_PROFILE)) for turn in turns]
+    return min(streams, key=lambda pair: len(pair[1]))
+
+
+def turned(labels: NDArray[Any], turn: int) -> NDArray[Any]:
+    """Transpose a map if `turn` has the bit 4, reverse its rows if it has 2, then its columns if it has 1."""
+    labels = labels.T if turn & 4 else labels
+    return np.ascontiguousarray(labels[:: -1 if turn & 2 else 1, :: -1 if turn & 1 else 1])
+
+
+def turned_back(labels: NDArray[Any], turn: int) -> NDArray[Any]:
+    """Return the map that `turned` was given."""
+    labels = labels[:: -1 if turn & 2 else 1, :: -1 if turn & 1 else 1]
+    return np.ascontiguousarray(labels.T if turn & 4 else labels)
 
 
 def decode_labels(data: bytes) -> Tensor:
@@ -60,7 +91,7 @@ def decode_labels(data: bytes) -> Tensor:
         data: the whole file.
 
     Returns:
-        :math:`(H, W)` on the CPU, in the dtype that was given; of uint64, int64.
+        :math:`(H, W)` on the CPU, in the dtype that was encoded; of uint64, int64.
 
     Raises:
         TypeError: ``data`` is no bytes.
@@ -71,29 +102,30 @@ def decode_labels(data: bytes) -> Tensor:
         tensor([[      0, 1000000, 2000000],
                 [3000000, 4000000, 5000000]])
     """
-    return decode_with_ids(data)[0]
-
-
-def decode_with_ids(data: bytes) -> tuple[Tensor, NDArray[Any]]:
-    """Return a file's label map, and the ids in it."""
     if not isinstance(data, bytes | bytearray | memoryview):
         raise TypeError(f"data must be bytes; got {type(data).__name__}")
     data = bytes(data)
     content, checksum = data[:-_CRC], data[-_CRC:]
     if not data.startswith(MAP_MAGIC):
-        what = "a scene, which kcgs.codec.decode reads" if data.startswith(MAGIC) else f"{data[:4]!r}"
-        raise CodecError(f"data must be a label map, which starts with {MAP_MAGIC!r}; got {what}")
+        content_name = "a scene, which kcgs.codec.decode reads" if data.startswith(MAGIC) else f"{data[:4]!r}"
+        raise CodecError(f"data must be a label map, which starts with {MAP_MAGIC!r}; got {content_name}")
     if len(data) < len(MAP_MAGIC) + _CRC or zlib.crc32(content) != int.from_bytes(checksum, "big"):
-        raise CodecError("the file is damaged or ends early: its checksum is another")
+        raise CodecError("the file is damaged or ends early: its checksum is wrong")
     reader = ByteReader(content[len(MAP_MAGIC) :])
-    version, form = divmod(reader.take(1)[0], _TURNS * len(_TYPES))
-    if version + 1 != VERSION:
-        raise CodecError(f"its version must be {VERSION}; got {version + 1}")
-    height, width = reader.varint("height", 1, MOST_SIDE), reader.varint("width", 1, MOST_SIDE)
-    if height * width > MOST_LABELS:
-        raise CodecError(f"a map must have at most {MOST_LABELS} pixels; got {height} x {width}")
-    from .labels.coding import decode_turned  # loads numba
+    form = reader.take(1)[0]
+    if form >= _TURNS * len(_TYPES):
+        raise CodecError(f"turn and type must be below {_TURNS * len(_TYPES)}; got {form}")
+    type_index, turn = divmod(form, _TURNS)
+    height, width = reader.varint("height", 1, MAX_SIDE), reader.varint("width", 1, MAX_SIDE)
+    if height * width > MAX_LABELS:
+        raise CodecError(f"a map must have at most {MAX_LABELS} pixels; got {height} x {width}")
+    stream, size = reader.data[reader.position :], (width, height) if turn & 4 else (height, width)
+    from .labels.stream import FILE_PROFILE, decode_stream  # loads numba
 
-    stream, dtype = reader.data[reader.position :], _TYPES[form // _TURNS]
-    labels, ids = decode_turned(stream, (height, width), form % _TURNS, dtype)
-    return torch.from_numpy(labels), ids
+    max_regions = min(MAX_REGIONS, max(_FREE_REGIONS, _REGIONS_PER_BYTE * len(stream)))
+    ids, numbers = decode_stream(stream, size, max_regions, FILE_PROFILE)
+    dtype = _TYPES[type_index]
+    max_id = 1 if dtype == "bool" else np.iinfo(dtype).max
+    if ids.max() > max_id:
+        raise CodecError(f"ids of {dtype} must be at most {max_id}; got {ids.max()}")
+    return torch.from_numpy(turned_back(ids.astype(dtype)[numbers], turn))

@@ -12,10 +12,10 @@ import numpy as np
 
 from .exact import Floats, Integers
 
-ONE = 1 << 16  # chances are whole multiples of 1 / ONE
-_WINDOW = 64  # bits of the coder's state
-_ALPHABET = 1 << 16  # largest alphabet of equally likely numbers
-_FEW = 16  # symbols among which the library finds one faster by trying all than by a table
+ONE = 1 << 16  # a chance of 1: chances are whole multiples of 1 / ONE
+_STATE_BITS = 64  # of the coder
+_DIGIT = 1 << 16  # largest alphabet of `number`: larger numbers are coded in parts
+_LAZY_SIZE = 16  # alphabet below which constriction is faster by search than by a table
 
 
 class CodecError(ValueError):
@@ -23,15 +23,15 @@ class CodecError(ValueError):
 
 
 class Coder(ABC):
-    """Either side of a stream: what is written is returned, so is what is read; a reader ignores the values."""
+    """Either side of a stream: a writer takes values and returns them, a reader ignores them and returns its own."""
 
-    reads = False
+    is_reader = False
 
     def __init__(self) -> None:
         import constriction
 
         self._queue, self._models = constriction.stream.queue, constriction.stream.model
-        # constriction rounds chances to 1/2**24: whole 1 / ONE are exact
+        # constriction rounds chances to 1 / 2**24, so whole 1 / ONE are exact
         self._bernoulli = self._models.Bernoulli(perfect=True)
 
     @abstractmethod
@@ -39,21 +39,21 @@ class Coder(ABC):
         """Code by a model: one value, or one for each entry of the parameters, or `count` of them."""
 
     def bits(self, chances: Any, values: Any) -> Any:
-        """Code bits that are 1 with these chances: (n,) float64 in whole 1 / ONE, and int32."""
+        """Code bits (n,) int32 that are 1 with these chances (n,), float64 in whole 1 / ONE."""
         return self._code(values, self._bernoulli, chances)
 
     def number(self, value: int, size: int) -> int:
-        """Code one of 0 to size - 1, all about equally likely: what exceeds 16 bits, then 16 bits."""
-        if size > _ALPHABET:
+        """Code a number below `size`: what exceeds 16 bits, then 16 bits."""
+        if size > _DIGIT:
             high = self.number(value >> 16, -(-size >> 16))
-            return high << 16 | self.number(value & (_ALPHABET - 1), _ALPHABET)
+            return high << 16 | self.number(value & (_DIGIT - 1), _DIGIT)
         return int(self._code(value, self._models.Uniform(size))) if size > 1 else 0
 
-    def fair(self, value: bool) -> bool:
+    def fair_bit(self, value: bool) -> bool:
         """Code a bit that is as likely 0 as 1."""
         return bool(self.number(int(value), 2))
 
-    def plain(self, value: int, count: int) -> int:
+    def plain_bits(self, value: int, count: int) -> int:
         """Code the low `count` bits of a number, 16 at a time, lowest first."""
         result = 0
         for shift in range(0, count, 16):
@@ -61,42 +61,43 @@ class Coder(ABC):
             result |= self.number(value >> shift & (size - 1), size) << shift
         return result
 
-    def unbounded(self, value: int) -> int:
-        """Code a number below 2**63 that nothing is known of: its count of bits, then those below the highest."""
+    def unbounded_number(self, value: int) -> int:
+        """Code a number below 2**63: its count of bits, then those below the highest."""
         length = self.number(value.bit_length(), 64)
-        return 1 << (length - 1) | self.plain(value, length - 1) if length else 0
+        return 1 << (length - 1) | self.plain_bits(value, length - 1) if length else 0
 
     def numbers(self, values: Any, size: int, count: int) -> Any:
-        """Code that many, (count,) int32, of 0 to size - 1, all equally likely; size is 2 to 2**24."""
+        """Code `count` numbers (count,) int32 below `size`, which is 2 to 2**24."""
         return self._code(values, self._models.Uniform(size), count=count)
 
     def uniform(self, sizes: Integers, values: Integers | None) -> Integers:
-        """Code values of 0 to size - 1 (n,), all equally likely; sizes are below 2**24."""
-        found = np.zeros(len(sizes), np.int64)
-        several = np.flatnonzero(sizes > 1)  # a size of one says nothing, and the library knows none
-        if len(several):
-            given = None if values is None else values[several].astype(np.int32)
-            found[several] = self._code(given, self._models.Uniform(), sizes[several].astype(np.int32))
-        return found
+        """Code values (n,), each below its entry of `sizes` (n,), which is 1 to 2**24 - 1."""
+        coded = np.zeros(len(sizes), np.int64)
+        index = np.flatnonzero(sizes > 1)  # constriction has no alphabet of one
+        if len(index):
+            numbers = None if values is None else values[index].astype(np.int32)
+            coded[index] = self._code(numbers, self._models.Uniform(), sizes[index].astype(np.int32))
+        return coded
 
-    def repeat(self, table: Floats, count: int, values: Integers | None) -> Integers:
-        """Code `count` values by one table of weights, (A,)."""
+    def categorical(self, weights: Floats, count: int, values: Integers | None) -> Integers:
+        """Code `count` values by one table of weights (A,)."""
         if not count:
             return np.zeros(0, np.int64)
-        given = None if values is None else values.astype(np.int32)
-        return np.asarray(self._code(given, self._categorical(table), count=count), np.int64)
+        symbols = None if values is None else values.astype(np.int32)
+        return np.asarray(self._code(symbols, self._categorical(weights), count=count), np.int64)
 
-    def choose(self, tables: Floats, rows: Integers, values: Integers | None) -> Integers:
-        """Code values (n,) by tables of weights, (T, A); each by the one that its entry of `rows` (n,) names."""
+    def mixed_categorical(self, tables: Floats, rows: Integers, values: Integers | None) -> Integers:
+        """Code values (n,), each by the row of `tables` (T, A) that its entry of `rows` (n,) names."""
         if len(tables) == 1:
-            return self.repeat(tables[0], len(rows), values)
-        # one by one, since the library makes a model anew for each row of many tables
-        models, code = {row: self._categorical(tables[row]) for row in np.unique(rows).tolist()}, self._code
-        given = [None] * len(rows) if values is None else values.tolist()
-        return np.array([code(v, models[row]) for v, row in zip(given, rows.tolist(), strict=True)], np.int64)
+            return self.categorical(tables[0], len(rows), values)
+        # one by one: constriction would build a model for each value
+        models = {row: self._categorical(tables[row]) for row in np.unique(rows).tolist()}
+        symbols = [None] * len(rows) if values is None else values.tolist()
+        pairs = zip(symbols, rows.tolist(), strict=True)
+        return np.array([self._code(symbol, models[row]) for symbol, row in pairs], np.int64)
 
-    def _categorical(self, table: Floats) -> Any:
-        return self._models.Categorical(table, lazy=len(table) < _FEW, perfect=False)
+    def _categorical(self, weights: Floats) -> Any:
+        return self._models.Categorical(weights, lazy=len(weights) < _LAZY_SIZE, perfect=False)
 
 
 class Writer(Coder):
@@ -112,15 +113,15 @@ class Writer(Coder):
         return values
 
     def finish(self) -> bytes:
-        """Return the fewest bytes that, with zeros behind them, read as what was written."""
+        """Return the fewest bytes that, with zeros behind them, read as the symbols."""
         position, (lower, width) = self._encoder.pos()
-        length = 4 * position + _WINDOW // 8
+        length = 4 * position + _STATE_BITS // 8
         words: bytes = self._encoder.get_compressed().astype(">u4").tobytes()
         value = int.from_bytes(words[:length].ljust(length, b"\0"), "big")
-        # all values from `low` for `width` read the same; this one was constriction's choice
-        low = value - ((value - lower) % (1 << _WINDOW))
-        # the width is below 2**64: more zeros than that come by themselves
-        for zeros in range(min(length, _WINDOW // 8), -1, -1):
+        # all values from `low` to below `low + width` read the same; constriction chose `value`
+        low = value - ((value - lower) % (1 << _STATE_BITS))
+        # the width is below 2**64: rstrip removes zeros beyond 8
+        for zeros in range(min(length, _STATE_BITS // 8), -1, -1):
             step = 1 << (8 * zeros)
             value = -(-low // step) * step
             if value < low + width:
@@ -131,7 +132,7 @@ class Writer(Coder):
 class Reader(Coder):
     """Turns bytes into symbols; zeros follow the last byte."""
 
-    reads = True
+    is_reader = True
 
     def __init__(self, data: bytes) -> None:
         super().__init__()

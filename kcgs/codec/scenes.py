@@ -20,31 +20,32 @@ from kcgs.nn import GaussianField
 from kcgs.scene import Scene, check_scene
 
 from .exact import Integers
-from .file import MOST_CHANNELS, MOST_SIDE, SPARE, Header, most_gaussians, pack, unpack
+from .file import MAX_CHANNELS, MAX_SIDE, Header, max_gaussians, pack, unpack
 from .gaussians.layers import LayerCoder
-from .gaussians.quantize import QPS, Classes, Codes, Parameters, Quantizer
+from .gaussians.quantize import QP_PER_OCTAVE, QPS, Classes, Codes, Parameters, Quantizer
 from .rangecoder import CodecError, Reader, Writer
 
-# of the decoded image against the scene's own, in dB
-QUALITIES = (10.0, 90.0)
+# PSNR in dB of the decoded render against the scene's own
+QUALITIES = (10.0, 90.0)  # least and largest
 DEFAULT_QUALITY = 46.0
-# of the Gaussians of a file, which a layer holds at least
-_LEAST_SHARE = 1 / 16
+_MIN_DISTORTION = 1e-12  # squared error that a number adds
+_MIN_SHARE = 1 / 16  # of the Gaussians of a file, that a layer holds
+_FREE_GAUSSIANS = 64  # of a layer, whose other Gaussians take a bit each at least
 
 
 def encode(scene: Scene, *, quality: float | None = None, target_bytes: int | None = None) -> bytes:
     """Write a scene as a `.kcgs` file; the same scene gives the same bytes.
 
-    Convention: the image that was fitted is not looked at. Every parameter is rounded so that it adds the same squared
-    error to the render; where centres are far outside the image, they are brought nearer. Gaussians whose colour rounds
-    to black are left out. The map is kept without loss, but contour widths are rounded to fortieths of a pixel.
-    :func:`kcgs.rate.compress` makes up for most of the error where the image is at hand.
+    Convention: every parameter is rounded so that it adds the same squared error to the render; the fitted image plays
+    no part. Centres far outside the image are moved nearer. Gaussians whose colour rounds to black are left out. The
+    labels of the map are kept without loss, its softness is rounded to fortieths of a pixel.
+    :func:`kcgs.rate.compress` corrects most of the error where the image is at hand.
 
     Args:
-        scene: N Gaussians of one image; opacities are merged into the colours, and notes are not kept. A map of one
-            region takes one byte.
+        scene: N Gaussians of one image; opacities are merged into the colours, metadata is not kept. A map of one
+            region is not kept, either.
         quality: PSNR in dB of the decoded render against the scene's own, before clipping, 10 to 90; 46 by default.
-        target_bytes: the finest file that is not larger, in place of `quality`.
+        target_bytes: writes the largest file of at most so many bytes, in place of `quality`.
 
     Returns:
         The file.
@@ -53,7 +54,7 @@ def encode(scene: Scene, *, quality: float | None = None, target_bytes: int | No
         TypeError: an argument of the wrong type.
         ValueError: a batch, values that are not finite, region ids that the map does not hold, both
             `quality` and `target_bytes`, numbers out of range, more than a file may hold (:mod:`kcgs.codec.file`),
-            a target that the coarsest file misses.
+            a target below the smallest file.
 
     Example:
         >>> from kcgs import GaussianField
@@ -66,7 +67,7 @@ def encode(scene: Scene, *, quality: float | None = None, target_bytes: int | No
     qp = writer.qp_for(quality, target_bytes)
     if target_bytes is None:
         return writer.write_rounded(qp)
-    return writer.finest(writer.write_rounded, target_bytes)[1]
+    return writer.largest_file(writer.write_rounded, target_bytes)[1]
 
 
 def serialize(scene: Scene) -> bytes:
@@ -75,12 +76,12 @@ def serialize(scene: Scene) -> bytes:
 
 
 class SceneWriter:
-    """A scene that files are written of, at any quantization parameter; its map is coded once."""
+    """Writes files of a scene at any quantization parameter; its map is coded once."""
 
     def __init__(self, scene: Scene) -> None:
         field, regions = check_scene(scene).field, scene.regions
         if not field.num_gaussians:
-            field = _black(field, regions)
+            field = _black_field(field, regions)
         _check_field(field)
         self.size, self.channels = field.size, field.colors.shape[-1]
         tensors = field.means, field.cholesky, field.merged_colors()
@@ -89,49 +90,53 @@ class SceneWriter:
         self.ids = np.zeros(field.num_gaussians, np.int64)  # as positions among the map's ids
         self.region_map = b""
         if self.regions is not None:
-            from .labels import encode_map  # loads numba
+            from .region_map import encode_region_map  # loads numba
 
             assert field.region_ids is not None
             ids = field.region_ids.cpu()
             self.ids = self.regions.index_of(ids).numpy()
             if (self.ids < 0).any():
                 raise ValueError(f"region_ids must be ids of the map; got {int(ids[self.ids < 0][0])}")
-            self.region_map = encode_map(self.regions)
+            self.region_map = encode_region_map(self.regions)
 
     def qp_for(self, quality: float | None, target_bytes: int | None = None) -> int:
-        """Return the quantization parameter at which rounding costs this PSNR, in dB, against the unrounded scene."""
+        """Return the quantization parameter at which rounding alone costs `quality`, PSNR in dB."""
         if quality is not None and target_bytes is not None:
             raise InvalidArgument("quality", "None with target_bytes", quality)
         decibels = check_number("quality", DEFAULT_QUALITY if quality is None else quality, *QUALITIES, unit="dB")
         samples = self.channels * self.size[0] * self.size[1]
         distortion = samples * 10 ** (-decibels / 10) / self._count_numbers()
-        return min(max(math.floor(-32 * math.log2(max(distortion, 1e-12)) + 0.5), QPS[0]), QPS[1])
+        octaves = math.log2(max(distortion, _MIN_DISTORTION))
+        return min(max(math.floor(-QP_PER_OCTAVE * octaves + 0.5), QPS[0]), QPS[1])
 
-    def finest(self, write: Callable[[int], bytes], target_bytes: int) -> tuple[int, bytes]:
-        """Return the quantization parameter of the largest file of at most `target_bytes`, and the file.
-
-        A step of the parameter is 1/32 of a bit for each number of a Gaussian, so that a few files tell which.
-        """
-        most = check_count("target_bytes", target_bytes)
+    def largest_file(self, write: Callable[[int], bytes], target_bytes: int) -> tuple[int, bytes]:
+        """Search for the largest file of at most `target_bytes`; return its quantization parameter and the file."""
+        max_bytes = check_count("target_bytes", target_bytes)
         low, high = QPS[0], self.qp_for(QUALITIES[1])
         qp, best = min(max(self.qp_for(DEFAULT_QUALITY), low), high), None
         while low <= high:
             data = write(qp)
-            if len(data) <= most:
+            if len(data) <= max_bytes:
                 best, low = (qp, data), qp + 1
             else:
-                least, high = len(data), qp - 1
-            qp = min(max(self.next_qp(qp, len(data), most), low), high)
+                smallest, high = len(data), qp - 1
+            qp = min(max(self.next_qp(qp, len(data), max_bytes), low), high)
         if best is None:
-            raise InvalidArgument("target_bytes", f"at least {least} for this scene", target_bytes)
+            raise InvalidArgument("target_bytes", f"at least {smallest} for this scene", target_bytes)
         return best
 
     def next_qp(self, qp: int, num_bytes: int, target_bytes: int) -> int:
-        """Return the quantization parameter for so many bytes, where that of `qp` has `num_bytes`."""
-        found = qp + math.floor((target_bytes - num_bytes) * 8 * 32 / self._count_numbers())
-        return min(max(found, QPS[0]), QPS[1])
+        """Return the quantization parameter for `target_bytes`, where the file of `qp` has `num_bytes`.
 
-    def of(self, gaussians: Parameters, ids: Integers) -> SceneWriter:
+        An octave of the distortion is about a bit of each number.
+        """
+        bits = (target_bytes - num_bytes) * 8
+        return min(max(qp + math.floor(bits * QP_PER_OCTAVE / self._count_numbers()), QPS[0]), QPS[1])
+
+    def _count_numbers(self) -> int:
+        return len(self.ids) * (5 + self.channels)
+
+    def with_gaussians(self, gaussians: Parameters, ids: Integers) -> SceneWriter:
         """Return a writer of other Gaussians with the same map."""
         other = copy.copy(self)
         other.gaussians, other.ids = gaussians, ids
@@ -141,68 +146,65 @@ class SceneWriter:
         """Write the file of Gaussians that are rounded one by one."""
         quantizer = Quantizer(qp, self.size)
         classes = quantizer.classify(self.gaussians)
-        seen = quantizer.steps(classes).round_colors(self.gaussians.colors).any(1)
-        kept = np.flatnonzero(seen) if seen.any() else np.zeros(1, np.int64)
-        gaussians = Parameters(*(numbers[kept] for numbers in self.gaussians))
-        codes = quantizer.quantize(gaussians, Classes(*(numbers[kept] for numbers in classes)))
-        return self.write(quantizer, codes, self.ids[kept])
+        is_visible = quantizer.steps(classes).round_colors(self.gaussians.colors).any(1)
+        index = np.flatnonzero(is_visible) if is_visible.any() else np.zeros(1, np.int64)
+        gaussians = Parameters(*(numbers[index] for numbers in self.gaussians))
+        codes = quantizer.quantize(gaussians, Classes(*(numbers[index] for numbers in classes)))
+        return self.write(quantizer, codes, self.ids[index])
 
     def write(self, quantizer: Quantizer, codes: Codes, ids: Integers) -> bytes:
         """Write the file of Gaussians that are whole numbers already, with the positions of their regions' ids."""
-        # by energy, then by size, both falling; then by cell, row by row
+        # energies fall; within one energy sizes fall; within one size cells go row by row
         order = np.lexsort((codes.cell[:, 0], codes.cell[:, 1], -codes.size, -codes.energy))
-        codes, ids = codes.pick(order), ids[order]
-        model, layers, listed = LayerCoder(quantizer, self.channels, self.regions), [], []
+        codes, ids = codes.select(order), ids[order]
+        coder, layers, entries = LayerCoder(quantizer, self.channels, self.regions), [], []
         starts = [*np.unique(-codes.energy, return_index=True)[1].tolist(), len(ids)]
         groups = [slice(*ends) for ends in itertools.pairwise(starts)]
-        for layer in _join(groups, len(ids)):
+        for layer in _join_groups(groups, len(ids)):
             writer, energy = Writer(), int(codes.energy[layer[0].start])
-            model.code(writer, energy, [(codes.pick(group), ids[group]) for group in layer], len(ids))
-            # each Gaussian takes more than a bit, but zeros at the end are left out
+            coder.code(writer, energy, [(codes.select(group), ids[group]) for group in layer], len(ids))
+            # zeros at the end of a stream are left out, but a layer's length limits the number of its Gaussians
             count = layer[-1].stop - layer[0].start
-            layers.append(writer.finish().ljust(-(-(count - SPARE) // 8), b"\0"))
-            listed.append((energy, len(layers[-1])))
-        header = Header(self.size, self.channels, quantizer.qp, model.num_regions, tuple(listed))
+            layers.append(writer.finish().ljust(-(-(count - _FREE_GAUSSIANS) // 8), b"\0"))
+            entries.append((energy, len(layers[-1])))
+        header = Header(self.size, self.channels, quantizer.qp, coder.num_regions, tuple(entries))
         return pack(header, self.region_map, layers)
-
-    def _count_numbers(self) -> int:
-        return len(self.ids) * (5 + self.channels)
-
-
-def _join(groups: list[slice], count: int) -> list[list[slice]]:
-    """Return the groups of each layer: it takes bytes of its own, so none holds few of the `count` Gaussians."""
-    layers: list[list[slice]] = []
-    for group in groups:
-        first = layers[-1][0].start if layers else 0
-        if layers and min(group.start - first, count - group.start) < _LEAST_SHARE * count:
-            layers[-1].append(group)
-        else:
-            layers.append([group])
-    return layers
 
 
 def _check_field(field: GaussianField) -> None:
-    """Refuse what no file can hold; a parameter may have been changed since the field was made."""
+    """Validate the values again, which may have changed since the field was made, and the limits of a file."""
     check_floating("means", field.means.detach().float())
     check_cholesky("cholesky", field.cholesky.detach().float())
     check_floating("colors", field.merged_colors().detach().float())
     channels = field.colors.shape[-1]
-    check_count("pixels per side", max(field.size), 1, MOST_SIDE)
-    check_count("channels", channels, 1, MOST_CHANNELS)
-    check_count("number of Gaussians", field.num_gaussians, 1, most_gaussians(channels))
+    check_count("pixels per side", max(field.size), 1, MAX_SIDE)
+    check_count("channels", channels, 1, MAX_CHANNELS)
+    check_count("number of Gaussians", field.num_gaussians, 1, max_gaussians(channels))
 
 
-def _black(field: GaussianField, regions: RegionMap | None) -> GaussianField:
-    """Return one Gaussian that shows nothing: a file holds at least one."""
+def _black_field(field: GaussianField, regions: RegionMap | None) -> GaussianField:
+    """Return one black Gaussian: a file holds at least one."""
     height, width = field.size
     region = None if regions is None else regions.labels[height // 2, width // 2][None]
     centre, color = torch.tensor([[0.5 * width, 0.5 * height]]), torch.zeros(1, field.colors.shape[-1])
     return GaussianField(centre, torch.tensor([[1.0, 0.0, 1.0]]), color, region, size=field.size)
 
 
+def _join_groups(groups: list[slice], count: int) -> list[list[slice]]:
+    """Join groups into layers of at least a share of the `count` Gaussians, since a layer has overhead."""
+    layers: list[list[slice]] = []
+    for group in groups:
+        first = layers[-1][0].start if layers else 0
+        if layers and min(group.start - first, count - group.start) < _MIN_SHARE * count:
+            layers[-1].append(group)
+        else:
+            layers.append([group])
+    return layers
+
+
 @brief
 class Decoded(NamedTuple):
-    """The scene of a file (without regions where there is one), the layers that were there, and those of all of it."""
+    """The scene of a file, how many of its layers were read, and how many it has."""
 
     scene: Scene
     layers: int
@@ -213,15 +215,16 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
     """Read a `.kcgs` file, or the coarser scene that its first bytes hold.
 
     Args:
-        data: the file; one that ends early gives a coarser scene, as long as its first layer is whole.
-        max_bytes: read no more than these.
+        data: the file, or its beginning, as long as the first layer is whole.
+        max_bytes: reads the first bytes only.
 
     Returns:
-        The scene (float32, on the CPU, bit for bit the same on every machine), and how much of the file that is.
+        The scene (float32, on the CPU, bit for bit the same on every machine; without a map where the file has none),
+        how many layers were read, and how many the file has.
 
     Raises:
         TypeError: an argument of the wrong type.
-        CodecError: a ValueError; the file is damaged, or none, or too short to hold an image.
+        CodecError: a ValueError; the file is damaged, no scene, or too short to hold a layer.
 
     Example:
         >>> from kcgs.codec import encode
@@ -237,17 +240,17 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
     header, region_map, layers = unpack(bytes(data[:max_bytes]))
     regions = None
     if header.regions > 1:
-        from .labels import decode_map  # loads numba
+        from .region_map import decode_region_map  # loads numba
 
-        regions = decode_map(region_map, header.size, header.regions)
-    model = LayerCoder(Quantizer(header.qp, header.size), header.channels, regions)
-    parts, ids, left = [], [], most_gaussians(header.channels)
+        regions = decode_region_map(region_map, header.size, header.regions)
+    coder = LayerCoder(Quantizer(header.qp, header.size), header.channels, regions)
+    parts, ids, remaining = [], [], max_gaussians(header.channels)
     for (energy, _), layer in zip(header.layers, layers, strict=False):
-        # each Gaussian takes more than a bit, and all must fit into memory
-        for gaussians, positions in model.code(Reader(layer), energy, None, min(8 * len(layer) + SPARE, left)):
+        max_count = min(8 * len(layer) + _FREE_GAUSSIANS, remaining)
+        for gaussians, positions in coder.code(Reader(layer), energy, None, max_count):
             parts.append(gaussians)
             ids.append(positions)
-            left -= len(positions)
+            remaining -= len(positions)
     means, cholesky, colors = (torch.from_numpy(np.concatenate(numbers)) for numbers in zip(*parts, strict=True))
     region_ids = None if regions is None else regions.ids[torch.from_numpy(np.concatenate(ids))]
     try:

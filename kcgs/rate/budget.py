@@ -187,9 +187,9 @@ def _map_bytes(regions: RegionMap | None) -> int:
     """Return the bytes that the label map takes in a file."""
     if regions is None or regions.num_regions == 1:
         return 0
-    from kcgs.codec.labels import encode_map  # loads numba
+    from kcgs.codec.region_map import encode_region_map  # loads numba
 
-    return len(encode_map(regions))
+    return len(encode_region_map(regions))
 
 
 def _fit_share(

@@ -162,7 +162,7 @@ class _Compressor:
             return writer.next_qp(qp, size, size + round(_BYTES_GAIN * (_DESCENT_AIM * target_bytes - size)))
 
         writer = self._descend(update_qp(self.writer, self.writer.qp_for(None)), update_qp)
-        qp, fallback = writer.finest(lambda qp: self._round(writer, qp, 0), target_bytes)
+        qp, fallback = writer.largest_file(lambda qp: self._round(writer, qp, 0), target_bytes)
         max_qp = self.writer.qp_for(QUALITIES[1])
         data, candidates = fallback, []
         for _ in range(_MAX_ROUNDINGS):
@@ -205,7 +205,7 @@ class _Compressor:
                 descent.prune(quantizer)
             for _ in range(min(_UPDATE_INTERVAL, iterations - start)):
                 descent.step(quantizer)
-            writer = writer.of(descent.parameters(), descent.ids)
+            writer = writer.with_gaussians(descent.parameters(), descent.ids)
         return writer
 
     def _round(self, writer: SceneWriter, qp: int, iterations: int, max_bytes: float = math.inf) -> bytes:

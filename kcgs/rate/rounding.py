@@ -55,7 +55,7 @@ def round_gradually(
                 rows = descent.remove_weakest(_excess(len(write(codes)), max_bytes, len(descent.ids)))
                 order, classes = order[:, rows], Classes(*(numbers[rows] for numbers in classes))
                 codes = quantizer.quantize(descent.parameters(), classes)
-            rounded = quantizer.restore(codes)
+            rounded = quantizer.dequantize(codes)
             rounded_shapes = order[0] < progress / _SHAPE_SHARE
             rounded_colors = order[1] < (progress - _SHAPE_SHARE) / (1 - _SHAPE_SHARE)
         descent.step_around(rounded, rounded_shapes, rounded_colors, quantizer)

@@ -1,4 +1,4 @@
-"""How likely a pixel's candidates are, written from docs/format.md: for the decoder of maps."""
+"""The chances of a pixel, written from docs/format.md, for the decoder of maps."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ OF_SCENES, OF_MAPS = Prior("prior.bin", 48, 16), Prior("prior2.bin", 96, 32)
 
 
 class Decision:
-    """`contexts`, of one of the two."""
+    """The adaptive part of one of the two decisions."""
 
     def __init__(self, prior: Prior) -> None:
         self.prior, self.weights = prior, [list(prior.mixer) for _ in range(4)]
@@ -74,7 +74,7 @@ class Decision:
 
 
 class Question:
-    """A decision about a pixel, as it is coded."""
+    """A decision about one pixel."""
 
     def __init__(self, decision: Decision, logit: int, keys: list[tuple[int, ...]]) -> None:
         tables = zip(decision.counters, keys, strict=True)
@@ -95,14 +95,14 @@ class Question:
 
 
 class Pixel:
-    """One that is not quiet: its candidates and questions."""
+    """A pixel that is not quiet: its candidates and decisions."""
 
-    def __init__(self, around: list[int], decisions: list[Decision]) -> None:
-        first = around[0]
-        second = next(label for label in around if label != first)
+    def __init__(self, neighbours: list[int], decisions: list[Decision]) -> None:
+        first = neighbours[0]
+        second = next(label for label in neighbours if label != first)
         self.candidates = [first, second]
-        f = [0 if label == first else 1 if label == second else 2 for label in around]
+        f = [0 if label == first else 1 if label == second else 2 for label in neighbours]
         logits = decisions[0].prior.logits(f)
-        seen = [tuple(value > 0 for value in f[1 : 1 + nearest]) for nearest in (6, 11, 16)]
-        self.which = Question(decisions[0], logits[0], seen)
+        keys = [tuple(value > 0 for value in f[1 : 1 + nearest]) for nearest in (6, 11, 16)]
+        self.which = Question(decisions[0], logits[0], keys)
         self.neither = Question(decisions[1], logits[1], [(), tuple(f[1:5]), tuple(f[1:9])])

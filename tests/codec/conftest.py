@@ -1,13 +1,19 @@
-"""Small scenes that every codec test may use."""
+"""Small scenes and label maps for all tests of the codec."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from kcgs import GaussianField, RegionMap, Scene
+from kcgs.codec import encode
+
+GOLDEN = Path(__file__).parent / "golden.kcgs"
 
 
 def make_scene(
@@ -40,6 +46,23 @@ def make_scene(
     return Scene(GaussianField(means, cholesky, colors, ids, size=size), RegionMap.from_labels(labels, widths))
 
 
+def make_labels(seed: int, size: tuple[int, int] = (120, 160), count: int = 6) -> NDArray[np.int64]:
+    """Overlapping discs, from integers alone."""
+    rng = np.random.RandomState(seed)
+    y, x = np.mgrid[: size[0], : size[1]]
+    labels = np.zeros(size, np.int64)
+    for region in range(1, count):
+        cy, cx, radius = rng.randint(size[0]), rng.randint(size[1]), rng.randint(5, 40)
+        labels[(y - cy) ** 2 + (x - cx) ** 2 < radius**2] = region
+    return labels
+
+
 @pytest.fixture
 def scene() -> Scene:
     return make_scene()
+
+
+@pytest.fixture(scope="module")
+def data() -> bytes:
+    """The file of `scene`."""
+    return encode(make_scene())

@@ -1,11 +1,10 @@
-"""A decoder of layers, written from the words of docs/format.md: plain numbers, and of the codec only its tables."""
+"""A decoder of layers, written from docs/format.md alone: of the codec it reads tables and elementary functions."""
 
 from __future__ import annotations
 
 import bisect
 import itertools
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +12,19 @@ import numpy as np
 import pytest
 import torch
 
-from kcgs.codec import Decoded, decode, encode
-from kcgs.codec.exact import exp2, turn
+from kcgs.codec import decode, encode
+from kcgs.codec.exact import cos_sin, exp2
 from kcgs.codec.file import Header, unpack
+from kcgs.codec.gaussians import occupancy
 from kcgs.codec.gaussians.quantize import opponent
 from kcgs.codec.gaussians.shapes import ANGLE, SHAPES
 
 from .conftest import make_scene
-from .symbols import Bits, Choices, Symbols
+from .symbols import AdaptiveSymbol, Bits
 from .test_hostile import write_cells
 
 LN2 = 0.6931471805599453
+BAND = 65536  # cells
 BUCKETS = [
     *range(16),
     *((1 << octave) + ((1 << octave) // 8) * i for octave in range(4, 24) for i in range(8)),
@@ -47,14 +48,14 @@ class Magnitudes:
             share = min(max((x - edges[i]) / (edges[i + 1] - edges[i]), 0.0), 1.0)
             return heights[i] + share * (heights[i + 1] - heights[i])
 
-        at = [rise(max(bucket - 0.5, 0.0)) for bucket in BUCKETS]
-        return [(at[i + 1] - at[i]) + 0.001 * heights[-1] / 176 for i in range(176)]
+        sums = [rise(max(bucket - 0.5, 0.0)) for bucket in BUCKETS]
+        return [(sums[i + 1] - sums[i]) + 0.001 * heights[-1] / 176 for i in range(176)]
 
-    def read(self, symbols: Symbols, scales: list[float], contexts: list[int]) -> list[int]:
+    def read(self, bits: Bits, scales: list[float], contexts: list[int]) -> list[int]:
         kinds = list(zip(contexts, scales, strict=True))
         tables = {(context, t): self.weights(self.shapes[context], t) for context, t in set(kinds)}
-        buckets = [symbols.categorical(tables[kind]) for kind in kinds]
-        sizes = [BUCKETS[b] + symbols.uniform(BUCKETS[b + 1] - BUCKETS[b]) for b in buckets]
+        buckets = [bits.categorical(tables[kind]) for kind in kinds]
+        sizes = [BUCKETS[b] + bits.uniform(BUCKETS[b + 1] - BUCKETS[b]) for b in buckets]
         learned = [[0] * 24 for _ in self.shapes]
         for (context, t), size in zip(kinds, sizes, strict=True):
             edges = [*(i * (t * 0.125) for i in range(24)), math.inf]
@@ -71,62 +72,62 @@ class Angles:
     def __init__(self) -> None:
         self.weights = ANGLE.tolist()
 
-    def read(self, symbols: Symbols, turns: list[int]) -> list[int]:
-        begins = [[b * t // 16 for b in range(17)] for t in turns]
+    def read(self, bits: Bits, num_angles: list[int]) -> list[int]:
+        begins = [[b * t // 16 for b in range(17)] for t in num_angles]
         bins = [
-            symbols.categorical([w * (begin[b + 1] - begin[b]) for b, w in enumerate(self.weights)]) if t >= 16 else -1
-            for t, begin in zip(turns, begins, strict=True)
+            bits.categorical([w * (begin[b + 1] - begin[b]) for b, w in enumerate(self.weights)]) if t >= 16 else -1
+            for t, begin in zip(num_angles, begins, strict=True)
         ]
-        found = []
-        for t, begin, b in zip(turns, begins, bins, strict=True):
+        angles = []
+        for t, begin, b in zip(num_angles, begins, bins, strict=True):
             if t < 16:
-                found.append(symbols.uniform(t))
+                angles.append(bits.uniform(t))
             else:
-                found.append((begin[b] + symbols.uniform(begin[b + 1] - begin[b]) - t // 32) % t)
+                angles.append((begin[b] + bits.uniform(begin[b + 1] - begin[b]) - t // 32) % t)
                 self.weights[b] += 1
-        return found
+        return angles
 
 
 def power(x: float) -> float:
     return float(exp2(np.array([x]))[0])
 
 
-def read_length(symbols: Symbols, choices: Choices) -> int:
-    bits = choices.read(symbols)[0]
-    return (1 << (bits - 1)) + symbols.uniform(1 << (bits - 1)) if bits else 0
+def read_number(bits: Bits, lengths: AdaptiveSymbol) -> int:
+    length = lengths.read(bits)[0]
+    return (1 << (length - 1)) + bits.uniform(1 << (length - 1)) if length else 0
 
 
 class Occupancy:
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
-        self.margins = Choices(3.0, *[1.0] * 4, *[0.3] * 4)
-        self.beyond = Choices(0.3, *[1.0] * 4, *[0.3] * 17)
+        self.margins = AdaptiveSymbol(3.0, *[1.0] * 4, *[0.3] * 4)
+        self.outside = AdaptiveSymbol(0.3, *[1.0] * 4, *[0.3] * 17)
         self.earlier: list[tuple[int, float, float]] = []  # the class of size, and the middle of the cell
 
     def side(self, count: int) -> int:
         q = self.size[0] * self.size[1] // (16 * count)
         return int(2 ** (math.floor(math.log2(q) / 2))) if q else 1
 
-    def read(self, symbols: Bits, s: int, count: int) -> list[tuple[int, int]]:
+    def read(self, bits: Bits, s: int, count: int) -> list[tuple[int, int]]:
         side = self.side(count)
         rows, columns = (math.ceil(pixels / side) for pixels in self.size)
-        m = read_length(symbols, self.margins)
-        every = [(row, column) for row in range(-m, rows + m) for column in range(-m, columns + m)]
-        inside = [at for at in every if 0 <= at[0] < rows and 0 <= at[1] < columns]
-        beyond = [at for at in every if not (0 <= at[0] < rows and 0 <= at[1] < columns)]
-        held = self.read_cells(symbols, s, count, rows, inside, beyond)
-        found = [at for at in sorted(held) for _ in range(held[at])]
-        self.earlier += [(s, (row + 0.5) * side, (column + 0.5) * side) for row, column in found]
-        return found
+        m = read_number(bits, self.margins)
+        cells = [(row, column) for row in range(-m, rows + m) for column in range(-m, columns + m)]
+        inside = [cell for cell in cells if 0 <= cell[0] < rows and 0 <= cell[1] < columns]
+        outside = sorted({*cells} - {*inside})
+        counts = self.read_cells(bits, s, count, rows, inside, outside)
+        occupied = [cell for cell in sorted(counts) for _ in range(counts[cell])]
+        self.earlier += [(s, (row + 0.5) * side, (column + 0.5) * side) for row, column in occupied]
+        return occupied
 
-    def read_cells(self, symbols: Bits, s: int, count: int, rows: int, inside: Any, beyond: Any) -> dict[Any, int]:
-        outside = read_length(symbols, self.beyond) if beyond else 0
-        bands = max(8, math.ceil(len(inside) / 65536))
+    def read_cells(self, bits: Bits, s: int, count: int, rows: int, inside: Any, outside: Any) -> dict[Any, int]:
+        num_outside = read_number(bits, self.outside) if outside else 0
+        bands = max(8, math.ceil(len(inside) / BAND))
         borders = [rows * i // bands * (len(inside) // rows) for i in range(bands + 1)]
-        held = self.fill(symbols, count - outside, self.weigh(s, self.side(count), inside), borders)
-        bands = max(8, math.ceil(len(beyond) / 65536))
-        borders = [len(beyond) * i // bands for i in range(bands + 1)]
-        return held | self.fill(symbols, outside, dict.fromkeys(beyond, 1), borders)
+        counts = self.fill(bits, count - num_outside, self.weigh(s, self.side(count), inside), borders)
+        bands = max(8, math.ceil(len(outside) / BAND))
+        borders = [len(outside) * i // bands for i in range(bands + 1)]
+        return counts | self.fill(bits, num_outside, dict.fromkeys(outside, 1), borders)
 
     def weigh(self, s: int, side: int, inside: Any) -> dict[tuple[int, int], int]:
         def mirror(place: int, cells: int) -> int:
@@ -141,92 +142,88 @@ class Occupancy:
             if other in (s, s + 1, s + 2) and (row, column) in weights:
                 for dy in range(-4, 5):
                     for dx in range(-4, 5):
-                        at = mirror(row + dy, rows), mirror(column + dx, columns)
-                        weights[at] += 64 * (5 - abs(dx)) * (5 - abs(dy))
+                        cell = mirror(row + dy, rows), mirror(column + dx, columns)
+                        weights[cell] += 64 * (5 - abs(dx)) * (5 - abs(dy))
         return weights
 
-    def fill(self, symbols: Bits, left: int, weights: dict[Any, int], borders: list[int]) -> dict[Any, int]:
-        held, places, total = dict.fromkeys(weights, 0), list(weights), sum(weights.values())
+    def fill(self, bits: Bits, left: int, weights: dict[Any, int], borders: list[int]) -> dict[Any, int]:
+        counts, cells, total = dict.fromkeys(weights, 0), list(weights), sum(weights.values())
         for start, end in itertools.pairwise(borders):
             chances = {}
-            for at in places[start:end] if left else []:
-                chance = math.floor(65536 * (left * weights[at]) / (left * weights[at] + total))
-                chances[at] = min(max(chance, 16), 65520)
-            left -= sum(self.count(symbols, chances, held))
-            total -= sum(weights[at] for at in places[start:end])
-        return held
-
-    def count(self, symbols: Bits, chances: dict[Any, int], held: dict[Any, int]) -> Iterator[int]:
-        cells = list(chances)
-        while cells:
-            cells = [at for at in cells if symbols.bit(chances[at])]
-            for at in cells:
-                held[at] += 1
-            yield len(cells)
+            for cell in cells[start:end] if left else []:
+                chance = math.floor(65536 * (left * weights[cell]) / (left * weights[cell] + total))
+                chances[cell] = min(max(chance, 16), 65520)
+            band = list(chances)
+            while band := [cell for cell in band if bits.bit(chances[cell])]:
+                for cell in band:
+                    counts[cell] += 1
+                left -= len(band)
+            total -= sum(weights[cell] for cell in cells[start:end])
+        return counts
 
 
 class File:
-    """Gaussians."""
+    """Section "The stream of a layer"."""
 
     def __init__(self, header: Header, index: Any, regions: int) -> None:
         self.size, self.channels, self.index, self.regions = header.size, header.channels, index, regions
         self.distortion = power(-header.qp / 32)
-        self.lengths = Choices(2.0, *[1.0] * 9, *[0.3] * 12)
-        self.strays = Choices(20.0, 0.5)
+        self.lengths = AdaptiveSymbol(2.0, *[1.0] * 9, *[0.3] * 12)
+        self.strays = AdaptiveSymbol(20.0, 0.5)
         *self.colors, self.ratio = (Magnitudes(shapes) for shapes in SHAPES)
         self.angles = Angles()
         self.occupancy = Occupancy(header.size)
 
-    def layer(self, symbols: Bits, e: int) -> list[tuple[list[float], int]]:
-        found, follows = self.group(symbols, e), symbols.number(3)
-        while follows:
+    def layer(self, bits: Bits, e: int) -> list[tuple[list[float], int]]:
+        gaussians, symbol = self.group(bits, e), bits.number(3)
+        while symbol:
             e -= 1
             assert e >= -24
-            if follows == 1:
-                found += self.group(symbols, e)
-            follows = symbols.number(3)
-        return found
+            if symbol == 1:
+                gaussians += self.group(bits, e)
+            symbol = bits.number(3)
+        return gaussians
 
-    def group(self, symbols: Bits, e: int) -> list[tuple[list[float], int]]:
-        first = symbols.uniform(64)
-        last = first + symbols.uniform(64 - first)
-        counts = {s - 8: read_length(symbols, self.lengths) for s in range(first, last + 1)}
+    def group(self, bits: Bits, e: int) -> list[tuple[list[float], int]]:
+        first = bits.uniform(64)
+        last = first + bits.uniform(64 - first)
+        counts = {s - 8: read_number(bits, self.lengths) for s in range(first, last + 1)}
         classes = [s for s in sorted(counts, reverse=True) if counts[s]]
-        kinds = [(s, *at) for s in classes for at in self.occupancy.read(symbols, s, counts[s])]
+        kinds = [(s, *cell) for s in classes for cell in self.occupancy.read(bits, s, counts[s])]
         u = math.sqrt(12 * self.distortion / math.pi * power(-2 * e - 1))
         scales = min(max(math.floor(0.75 / (u * (math.sqrt(0.5) / LN2)) + 0.5), 1), 2**20)
         step = max(u * (1 / LN2), 12 / 2**20)
-        scale = [symbols.uniform(scales) for _ in kinds]
+        scale = [bits.uniform(scales) for _ in kinds]
         contexts = [min(max(s + 1, 0), 7) for s, _, _ in kinds]
-        ratio = self.ratio.read(symbols, [2 / step] * len(kinds), contexts)
+        ratio = self.ratio.read(bits, [2 / step] * len(kinds), contexts)
         stretch = [0.5 * (power(2 * r * step) - power(-2 * r * step)) for r in ratio]
-        turns = [
+        num_angles = [
             min(max(math.floor(math.pi * s / u + 0.5), 2), 2**20) if r else 1
             for s, r in zip(stretch, ratio, strict=True)
         ]
-        angle = self.angles.read(symbols, turns)
-        colors = self.read_colors(symbols, e, [(8 * one + 4) // scales for one in scale])
+        angle = self.angles.read(bits, num_angles)
+        colors = self.read_colors(bits, e, [(8 * one + 4) // scales for one in scale])
         shapes, parts, sides = [], [], []
         for i, (s, _, _) in enumerate(kinds):
             m, h = 0.75 * (s + (scale[i] + 0.5) / scales), ratio[i] * step
             one, two = power(m + h), power(m - h)
-            cos, sin = (float(t[0]) for t in turn(np.array([angle[i] / turns[i]])))
+            cos, sin = (float(t[0]) for t in cos_sin(np.array([angle[i] / num_angles[i]])))
             l11 = math.sqrt((one * cos) * (one * cos) + (two * sin) * (two * sin))
             shapes.append([l11, (one * one - two * two) * cos * sin / l11, one * two / l11])
             sides.append(self.occupancy.side(counts[s]))
             places = (math.ceil(sides[i] / (u * math.sqrt(2) * length)) for length in shapes[i][::2])
             parts.append([min(max(n, 1), 2**20) for n in places])
-        across, down = ([symbols.uniform(part[axis]) for part in parts] for axis in range(2))
-        found = []
+        across, down = ([bits.uniform(part[axis]) for part in parts] for axis in range(2))
+        gaussians = []
         for i, (s, row, column) in enumerate(kinds):
             x = np.float32(sides[i] * (column + (across[i] + 0.5) / parts[i][0]))
             y = np.float32(sides[i] * (row + (down[i] + 0.5) / parts[i][1]))
             area = min(math.pi * power(1.5 * (s + 0.5)), float(self.size[0] * self.size[1]))
-            told = np.array([colors[i]]) * math.sqrt(12 * self.distortion / area)
-            found.append([x, y, *shapes[i], *opponent(told, back=True)[0]])
-        return list(zip(found, self.read_regions(symbols, found), strict=True))
+            color = np.array([colors[i]]) * math.sqrt(12 * self.distortion / area)
+            gaussians.append([x, y, *shapes[i], *opponent(color, inverse=True)[0]])
+        return list(zip(gaussians, self.read_regions(bits, gaussians), strict=True))
 
-    def read_colors(self, symbols: Symbols, e: int, levels: list[int]) -> list[list[int]]:
+    def read_colors(self, bits: Bits, e: int, levels: list[int]) -> list[list[int]]:
         loud = math.sqrt(math.pi / (12 * self.distortion)) * 2.0**e
         scales = [loud * power(0.75 * (0.5 - (v + 0.5) / 8)) for v in levels]
         colors: list[list[int]] = [[] for _ in levels]
@@ -235,53 +232,55 @@ class File:
             if channel:
                 sizes = [abs(color[-1]) for color in colors]
                 contexts = [(a > 0.35 * t) + (a > 0.8 * t) for a, t in zip(sizes, scales, strict=True)]
-            sizes = self.colors[min(channel, 2)].read(symbols, scales, contexts)
-            signs = [symbols.uniform(2 if size else 1) for size in sizes]
+            sizes = self.colors[min(channel, 2)].read(bits, scales, contexts)
+            signs = [bits.uniform(2 if size else 1) for size in sizes]
             for color, size, sign in zip(colors, sizes, signs, strict=True):
                 color.append(-size if sign else size)
         return colors
 
-    def read_regions(self, symbols: Symbols, found: list[list[float]]) -> list[int]:
+    def read_regions(self, bits: Bits, gaussians: list[list[float]]) -> list[int]:
         if self.regions == 1:
-            return [0] * len(found)
-        height, width = self.size
-        at = [(min(max(math.floor(y), 0), height - 1), min(max(math.floor(x), 0), width - 1)) for x, y, *_ in found]
-        ids = [int(self.index[place]) for place in at]
-        strays = [i for i, stray in enumerate(self.strays.read(symbols, len(ids))) if stray]
+            return [0] * len(gaussians)
+        rows, columns = (
+            [min(max(math.floor(g[1 - axis]), 0), self.size[axis] - 1) for g in gaussians] for axis in (0, 1)
+        )
+        ids = self.index[rows, columns].tolist()
+        strays = [i for i, stray in enumerate(self.strays.read(bits, len(ids))) if stray]
         for i in strays:
-            ids[i] = (ids[i] + 1 + symbols.uniform(self.regions - 1)) % self.regions
+            ids[i] = (ids[i] + 1 + bits.uniform(self.regions - 1)) % self.regions
         return ids
 
 
-def as_the_words_say(data: bytes, known: Decoded) -> None:
+def check_scene(data: bytes) -> None:
     header, _, layers = unpack(data)
-    field, regions = known.scene.field, known.scene.regions
+    scene = decode(data).scene
+    field, regions = scene.field, scene.regions
     index = None if regions is None else regions.index_of(regions.labels).numpy()
-    file = File(header, index, header.regions)
-    found = [
-        row for (energy, _), layer in zip(header.layers, layers, strict=True) for row in file.layer(Bits(layer), energy)
-    ]
+    file, gaussians = File(header, index, header.regions), []
+    for (energy, _), layer in zip(header.layers, layers, strict=True):
+        gaussians += file.layer(Bits(layer), energy)
     expected = torch.cat([field.means, field.cholesky, field.colors], -1).detach().numpy()
-    assert np.array_equal(np.array([numbers for numbers, _ in found]).astype(np.float32), expected)
+    assert np.array_equal(np.array([numbers for numbers, _ in gaussians]).astype(np.float32), expected)
     if regions is not None:
         assert field.region_ids is not None
-        assert [id for _, id in found] == regions.index_of(field.region_ids).tolist()
+        assert [id for _, id in gaussians] == regions.index_of(field.region_ids).tolist()
 
 
-def test_golden() -> None:
-    data = (Path(__file__).parent / "golden.kcgs").read_bytes()
-    as_the_words_say(data, decode(data))
+class TestLayers:
+    def test_golden(self) -> None:
+        check_scene((Path(__file__).parent / "golden.kcgs").read_bytes())
+
+    @pytest.mark.parametrize(("regions", "channels", "quality"), [(1, 1, 20.0), (3, 3, 50.0), (2, 4, 80.0)])
+    def test_encoded(self, regions: int, channels: int, quality: float) -> None:
+        check_scene(encode(make_scene(120, regions=regions, channels=channels, seed=3), quality=quality))
 
 
-@pytest.mark.parametrize(("regions", "channels", "quality"), [(1, 1, 20.0), (3, 3, 50.0), (2, 4, 80.0)])
-def test_others(regions: int, channels: int, quality: float) -> None:
-    data = encode(make_scene(120, regions=regions, channels=channels, seed=3), quality=quality)
-    as_the_words_say(data, decode(data))
-
-
-@pytest.mark.parametrize("size", [(525, 1000), (1, 300), (300, 1), (2, 3)])
-def test_cells(size: tuple[int, int]) -> None:
-    data, listed = write_cells(size, min(36_000, size[0] * size[1]))
-    symbols, occupancy = Bits(data), Occupancy(size)
-    for s, cell in listed:
-        assert occupancy.read(symbols, s, len(cell)) == [(row, column) for column, row in cell.tolist()]
+@pytest.mark.parametrize("size", [(66, 125), (1, 300), (300, 1), (2, 3)])
+def test_cells(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """With bands of fewer cells, so that a small grid has more than eight."""
+    monkeypatch.setattr(occupancy, "_GROUP", 1024)
+    monkeypatch.setattr(f"{__name__}.BAND", 1024)
+    data, classes = write_cells(size, min(600, size[0] * size[1]))
+    bits, cells = Bits(data), Occupancy(size)
+    for s, cell in classes:
+        assert cells.read(bits, s, len(cell)) == [(row, column) for column, row in cell.tolist()]

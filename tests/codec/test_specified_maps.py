@@ -1,10 +1,11 @@
-"""A decoder of label maps, written from the words of docs/format.md: plain numbers, and of the codec only its table."""
+"""A decoder of label maps, written from docs/format.md alone: of the codec it reads the tables only."""
 
 from __future__ import annotations
 
 import binascii
 import zlib
-from itertools import pairwise
+from collections.abc import Callable
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from kcgs import RegionMap, codec
-from kcgs.codec import decode
-from kcgs.codec.labels import encode_labels, encode_map
+from kcgs import RegionMap
+from kcgs.codec import decode, encode_labels
+from kcgs.codec.region_map import encode_region_map
 
 from .chances import OF_MAPS, OF_SCENES, TEMPLATE, Decision, Pixel, Prior
-from .symbols import Bits, Bytes, Choices, Learnt, Symbols
+from .symbols import AdaptiveBit, AdaptiveSymbol, Bits, Bytes
 
 Labels = NDArray[np.int64]
 Rows = list[list[int]]
@@ -26,92 +27,92 @@ QUIET = [(-2, 0), (-1, 0), *((dx, -1) for dx in range(-2, 8)), *((dx, -2) for dx
 
 
 class Map:
-    """Labels: from the wavefront to pixels."""
+    """Sections "The wavefront", "Seeds" and "Pixels"."""
 
-    def __init__(self, bits: Bits, height: int, width: int, regions: int, prior: Prior = OF_SCENES) -> None:
+    def __init__(self, bits: Bits, height: int, width: int, regions: int, prior: Prior) -> None:
         self.bits, self.height, self.width, self.regions = bits, height, width, regions
         self.rows = [[-1] * width for _ in range(height)]
-        self.wave, self.met = 0, 1
+        self.front, self.met = 0, 1
         self.decisions = [Decision(prior), Decision(prior)]
-        self.new = {True: Learnt(), False: Learnt()}
-        self.near = {start: [Learnt() for _ in range(3)] for start in (True, False)}
+        self.is_new = {True: AdaptiveBit(), False: AdaptiveBit()}
+        self.is_nearest = {is_seed: [AdaptiveBit() for _ in range(3)] for is_seed in (True, False)}
 
     def label(self, x: int, y: int) -> int:
         if y < 0:
-            last = min(self.wave, self.width) - 1
+            last = min(self.front, self.width) - 1
             x, y = min(x, last) if x <= last + 9 else -1, 0
         if x < 0:
             return self.rows[y - 1][0] if y else 0
         return self.rows[y][min(x, self.width - 1)]
 
     def read(self) -> Rows:
-        starts = self.read_starts()
-        while self.wave < self.width + 8 * (self.height - 1):
-            self.read_wave([(self.wave - 8 * y, y) for y in range(self.height)], starts)
-            self.wave += 1
+        seeds = self.read_seeds()
+        while self.front < self.width + 8 * (self.height - 1):
+            self.read_front([(self.front - 8 * y, y) for y in range(self.height)], seeds)
+            self.front += 1
         return self.rows
 
-    def read_starts(self) -> set[tuple[int, int]]:
+    def read_seeds(self) -> set[tuple[int, int]]:
         bits = self.bits
-        starts: set[tuple[int, int]] = set()
-        extreme = [Learnt() for _ in range(8)]
-        blocks = [(0, 0, self.height, self.width, bits.magnitude())]
+        seeds: set[tuple[int, int]] = set()
+        is_extreme = [AdaptiveBit() for _ in range(8)]
+        blocks = [(0, 0, self.height, self.width, bits.unbounded_number())]
         while blocks:
             y, x, height, width, count = blocks.pop()
             size = height * width
             if count in (0, 1, size):
                 places = [bits.number(size)] if count == 1 else [*range(size if count else 0)]
-                starts |= {(x + place % width, y + place // width) for place in places}
+                seeds |= {(x + place % width, y + place // width) for place in places}
                 continue
             h, w = (height // 2, width) if height >= width else (height, width // 2)
             low, high = max(count - (size - h * w), 0), min(count, h * w)
-            if high - low > 1 and not bits.learnt(extreme[min(count.bit_length() - 2, 7)]):
+            if high - low > 1 and not bits.adaptive_bit(is_extreme[min(count.bit_length() - 2, 7)]):
                 first = low + 1 + bits.number(high - low - 1)
             else:
                 first = low if low == high or not bits.number(2) else high
             rest = (y + h, x, height - h, width) if height >= width else (y, x + w, height, width - w)
             blocks += [(y, x, h, w, first), (*rest, count - first)]
-        return starts
+        return seeds
 
-    def read_wave(self, pixels: list[tuple[int, int]], starts: set[tuple[int, int]]) -> None:
-        unquiet: dict[tuple[int, int], Pixel] = {}
+    def read_front(self, pixels: list[tuple[int, int]], seeds: set[tuple[int, int]]) -> None:
+        coded: dict[tuple[int, int], Pixel] = {}
         unknown: dict[tuple[int, int], list[int]] = {}
         for x, y in pixels:
             if not 0 <= x < self.width:
                 continue
-            around = {self.label(x + dx, y + dy) for dx, dy in QUIET}
-            if len(around) > 1:
+            neighbours = {self.label(x + dx, y + dy) for dx, dy in QUIET}
+            if len(neighbours) > 1:
                 unknown[x, y] = []
-                unquiet[x, y] = Pixel([self.label(x + dx, y + dy) for dx, dy in TEMPLATE], self.decisions)
-            elif (x, y) not in starts:
-                self.rows[y][x] = around.pop()
+                coded[x, y] = Pixel([self.label(x + dx, y + dy) for dx, dy in TEMPLATE], self.decisions)
+            elif (x, y) not in seeds:
+                self.rows[y][x] = neighbours.pop()
             elif self.regions == 2:
-                self.rows[y][x] = 1 - around.pop()
+                self.rows[y][x] = 1 - neighbours.pop()
             else:
-                unknown[x, y] = [*around]
-        three = self.regions > 2
-        neither = {at: self.bits.bit(pixel.neither.p) if three else 0 for at, pixel in unquiet.items()}
-        which = {at: self.bits.bit(pixel.which.p) for at, pixel in unquiet.items()}
+                unknown[x, y] = [*neighbours]
+        has_escapes = self.regions > 2
+        neither = {at: self.bits.bit(pixel.neither.p) if has_escapes else 0 for at, pixel in coded.items()}
+        which = {at: self.bits.bit(pixel.which.p) for at, pixel in coded.items()}
         for (x, y), candidates in unknown.items():
             at = (x, y)
-            if at in unquiet and not neither[at]:
-                self.rows[y][x] = unquiet[at].candidates[which[at]]
+            if at in coded and not neither[at]:
+                self.rows[y][x] = coded[at].candidates[which[at]]
             else:
-                self.rows[y][x] = self.read_label(x, y, candidates or unquiet[at].candidates, at not in unquiet)
-        for at, pixel in unquiet.items():
-            if three:
+                self.rows[y][x] = self.read_label(x, y, candidates or coded[at].candidates, at not in coded)
+        for at, pixel in coded.items():
+            if has_escapes:
                 pixel.neither.learn(neither[at])
             if neither[at]:
                 assert which[at]
             else:
                 pixel.which.learn(which[at])
 
-    def read_label(self, x: int, y: int, candidates: list[int], start: bool) -> int:
-        if self.met < self.regions and self.bits.learnt(self.new[start]):
+    def read_label(self, x: int, y: int, candidates: list[int], is_seed: bool) -> int:
+        if self.met < self.regions and self.bits.adaptive_bit(self.is_new[is_seed]):
             self.met += 1
             return self.met - 1
-        for label, model in zip(self.nearest(x, y, candidates), self.near[start], strict=False):
-            if self.bits.learnt(model):
+        for label, model in zip(self.nearest(x, y, candidates), self.is_nearest[is_seed], strict=False):
+            if self.bits.adaptive_bit(model):
                 return label
         return self.bits.number(self.met)
 
@@ -120,7 +121,7 @@ class Map:
         for radius in range(1, 33):
             top = [(x + dx, y - radius) for dx in range(-radius, radius + 1)]
             for column, row in top + [(x + dx, y - dy) for dy in range(radius - 1, -1, -1) for dx in (-radius, radius)]:
-                if row < -6 or not -8 <= column < self.width + 9 or column + 8 * row >= self.wave:
+                if row < -6 or not -8 <= column < self.width + 9 or column + 8 * row >= self.front:
                     continue
                 label = self.label(column, row)
                 if label not in candidates and label not in found:
@@ -131,16 +132,12 @@ class Map:
 
 
 def read_labels(data: bytes, height: int, width: int) -> Rows:
-    """`labels`, **Regions** and **Noise**."""
+    """Section "Labels"."""
     bits = Bits(data)
     regions = read_regions(bits)
     ids = [*range(regions)]
     if bits.number(2):
-        left, last = [], -1
-        for _ in range(regions):
-            last += 1 + bits.magnitude()
-            left.append(last)
-        ids = [left.pop(bits.number(len(left))) for _ in range(regions)]
+        ids = read_order(bits, read_rising(regions, bits.unbounded_number))
     return read_pixels(bits, height, width, ids, OF_SCENES)
 
 
@@ -162,12 +159,11 @@ def read_pixels(bits: Bits, height: int, width: int, ids: list[int], prior: Prio
 
 
 def read_file(data: bytes) -> tuple[str, Rows]:
-    """`A file of a label map`: the type of its numbers, and its rows."""
+    """Section "A file of a label map": the type of its numbers, and its rows."""
     assert int.from_bytes(data[-4:], "big") == zlib.crc32(data[:-4])
     stream = Bytes(data[:-4])
     assert stream.take(4) == b"kcgm"
-    (form,) = stream.take(1)
-    turn, kind = form % 8, form // 8
+    kind, turn = divmod(stream.take(1)[0], 8)
     height, width = stream.varint(), stream.varint()
     bits = Bits(stream.data)
     ids = read_ids(bits, read_regions(bits))
@@ -182,21 +178,27 @@ def read_file(data: bytes) -> tuple[str, Rows]:
 
 
 def read_ids(bits: Bits, regions: int) -> list[int]:
-    left = [*range(regions)]
+    rising, lengths = [*range(regions)], AdaptiveSymbol(8.0, *[1.0] * 16, *[0.125] * 47)
+
+    def read_distance() -> int:
+        (length,) = lengths.read(bits)
+        return 1 << length - 1 | bits.plain(length - 1) if length else 0
+
     if bits.number(2):
-        if regions == 2 and bits.number(2):
-            left = [0, 255]
-        else:
-            left, last, lengths = [], -1, Choices(8.0, *[1.0] * 16, *[0.125] * 47)
-            for _ in range(regions):
-                (length,) = lengths.read(bits)
-                last += 1 + (1 << length - 1 | bits.plain(length - 1) if length else 0)
-                left.append(last)
-    return [left.pop(bits.number(len(left))) for _ in range(regions)] if bits.number(2) else left
+        rising = [0, 255] if regions == 2 and bits.number(2) else read_rising(regions, read_distance)
+    return read_order(bits, rising) if bits.number(2) else rising
+
+
+def read_rising(regions: int, read_distance: Callable[[], int]) -> list[int]:
+    return [last - 1 for last in accumulate(1 + read_distance() for _ in range(regions))]
+
+
+def read_order(bits: Bits, remaining: list[int]) -> list[int]:
+    return [remaining.pop(bits.number(len(remaining))) for _ in range(len(remaining))]
 
 
 def read_map(data: bytes, height: int, width: int) -> tuple[Rows, dict[tuple[int, int], float]]:
-    """`maps`: the labels, and the width of each two that are side by side."""
+    """Section "The region map": the labels, and the width of each two that are side by side."""
     stream = Bytes(data)
     rows = read_labels(stream.take(stream.varint()), height, width)
     widths = [stream.varint() / 40 for _ in range(stream.varint())]
@@ -205,28 +207,28 @@ def read_map(data: bytes, height: int, width: int) -> tuple[Rows, dict[tuple[int
     pairs = sorted({(min(pair), max(pair)) for pair in beside if pair[0] != pair[1]})
     if len(widths) == 1:
         return rows, dict.fromkeys(pairs, widths[0])
-    symbols, counts = Symbols(stream.data), Choices(*[1.0] * len(widths))
+    symbols, counts = Bits(stream.data), AdaptiveSymbol(*[1.0] * len(widths))
     places: list[int] = []
     while len(places) < len(pairs):
         places += counts.read(symbols, min(32, len(pairs) - len(places)))
     return rows, {pair: widths[place] for pair, place in zip(pairs, places, strict=True)}
 
 
-def map_of(data: bytes) -> tuple[bytes, int, int]:
-    """`stream`: a file's map, and the picture's size."""
+def read_scene(data: bytes) -> tuple[bytes, int, int]:
+    """Section "The file of a scene": its map, and the image's size."""
     stream = Bytes(data)
     assert stream.take(5) == b"kcgs\1"
     height, width, _, _, regions = (stream.varint() for _ in range(5))
     assert regions > 1
     length = stream.varint()
     layers = [(stream.varint(), stream.varint()) for _ in range(stream.varint())]
-    above = data[: -len(stream.data)]
-    check, found = stream.take(4), stream.take(length)
-    assert int.from_bytes(check, "big") == zlib.crc32(above + found)
+    head = data[: -len(stream.data)]
+    checksum, region_map = stream.take(4), stream.take(length)
+    assert int.from_bytes(checksum, "big") == zlib.crc32(head + region_map)
     for _, size in layers:
         assert binascii.crc_hqx(stream.take(size), 0) == int.from_bytes(stream.take(2), "big")
     assert not stream.data
-    return found, height, width
+    return region_map, height, width
 
 
 def shuffled(index: Labels) -> Labels:
@@ -255,7 +257,7 @@ def blobs(regions: int) -> Labels:
 
 
 def points(regions: int) -> Labels:
-    """Single pixels, hundreds of them, each with one label around it."""
+    """Single pixels, hundreds of them, each with one label neighbours it."""
     rng = np.random.RandomState(regions)
     labels = np.zeros((60, 90), np.int64)
     labels[1::3, 2::4] = rng.randint(1, regions, size=(20, 22)) * (rng.rand(20, 22) < 0.7)
@@ -282,60 +284,52 @@ CASES = {
     "end of a row": np.repeat([0, 1, 2, 1], [200, 3, 25, 1])[None],
     # the place of its only start is a number of more than 65536
     "long row": np.eye(1, 66000, 65900),
+    # what is above the map, and to its right, decides much here
+    **{f"low {seed}": cells(1 + seed % 4, 40, 9, seed, noise=0.02) for seed in range(12)},
 }
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_labels(name: str) -> None:
-    labels = np.asarray(CASES[name], np.int64)
-    assert np.array_equal(read_labels(encode_labels(labels), *labels.shape), labels)
+class TestLabels:
+    def test_in_a_scene(self, name: str) -> None:
+        check_map(RegionMap.from_labels(torch.from_numpy(np.asarray(CASES[name], np.int64))))
 
-
-@pytest.mark.parametrize("name", CASES)
-def test_files(name: str) -> None:
-    labels = np.asarray(CASES[name], np.int64)
-    assert read_file(codec.encode_labels(labels)) == ("int64", labels.tolist())
+    def test_as_a_file(self, name: str) -> None:
+        labels = np.asarray(CASES[name], np.int64)
+        assert read_file(encode_labels(labels)) == ("int64", labels.tolist())
 
 
 @pytest.mark.parametrize("ids", [[0, 255], [255, 0], [0, 1], [1, 0], [7, 9], [0, 3, 2, 1, 5], [9, 1, 200, 3, 254]])
 @pytest.mark.parametrize("kind", ["uint8", "uint16", "int32"])
 def test_ids_of_files(ids: list[int], kind: str) -> None:
     labels = np.array(ids, kind)[cells(20, 30, len(ids))]
-    assert read_file(codec.encode_labels(labels)) == (kind, labels.tolist())
+    assert read_file(encode_labels(labels)) == (kind, labels.tolist())
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_low_maps(seed: int) -> None:
-    # what is above the map, and to its right, decides much here
-    labels = cells(1 + seed % 4, 40, 9, seed, noise=0.02)
-    assert np.array_equal(read_labels(encode_labels(labels), *labels.shape), labels)
-
-
-def check_map(regions: RegionMap, data: bytes) -> None:
-    rows, widths = read_map(data, *regions.size)
+def check_map(regions: RegionMap, data: bytes | None = None) -> None:
+    rows, widths = read_map(data or encode_region_map(regions), *regions.size)
     assert np.array_equal(rows, regions.labels.numpy())
     soft = regions.softness
     assert widths == {pair: soft if isinstance(soft, float) else soft.get(pair, 0.0) for pair in widths}
 
 
-@pytest.mark.parametrize("softness", [0.0, 0.75])
-def test_map(softness: float) -> None:
-    regions = RegionMap.from_labels(torch.from_numpy(cells(20, 30, 3)), softness)
-    check_map(regions, encode_map(regions))
+class TestWidths:
+    @pytest.mark.parametrize("softness", [0.0, 0.75])
+    def test_one(self, softness: float) -> None:
+        check_map(RegionMap.from_labels(torch.from_numpy(cells(20, 30, 3)), softness))
 
-
-def test_widths() -> None:
-    labels = torch.from_numpy(shuffled(cells(40, 60, 24)))
-    ids = labels.unique().tolist()
-    pairs = [(a, b) for a in ids for b in ids if a < b]
-    regions = RegionMap.from_labels(labels, {pair: (0.0, 0.5, 0.5, 1.25)[i % 4] for i, pair in enumerate(pairs)})
-    check_map(regions, encode_map(regions))
+    def test_of_each_pair(self) -> None:
+        labels = torch.from_numpy(shuffled(cells(40, 60, 24)))
+        ids = labels.unique().tolist()
+        pairs = [(a, b) for a in ids for b in ids if a < b]
+        widths = {pair: (0.0, 0.5, 0.5, 1.25)[i % 4] for i, pair in enumerate(pairs)}
+        check_map(RegionMap.from_labels(labels, widths))
 
 
 def test_golden() -> None:
     data = (Path(__file__).parent / "golden.kcgs").read_bytes()
     regions = decode(data).scene.regions
     assert regions is not None
-    found, height, width = map_of(data)
+    region_map, height, width = read_scene(data)
     assert (height, width) == regions.size
-    check_map(regions, found)
+    check_map(regions, region_map)

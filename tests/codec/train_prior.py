@@ -5,8 +5,8 @@
 
 Maps are files that `kcgs.data.load_labels` reads. Of each of the photos, and of scikit-image's, segmentations are made,
 of the whole size and of half, and smoothed ones. Synthetic shapes are added. Each map is coded, also mirrored and
-turned, and what the coder asks of it are the examples: the template of a pixel, and which candidate it has. A network
-with the format's rounding is trained on them by Adam and written as integers. `--compare` codes maps as files with the
+turned. Its coded pixels are the examples: the features of a pixel, and which candidate it has. A network with the
+format's rounding is trained on them by Adam and written as integers. `--compare` codes maps as files with the
 tables that kcgs has and with those of a file, and prints the bytes of both.
 
 The tables must not change, since all files depend on them. Those of files of maps, `prior2.bin`, were made by
@@ -36,26 +36,15 @@ from torch import Tensor
 
 import kcgs
 from benchmarks.core.images import load
-from kcgs.codec.labels.contexts import (
-    CODED,
-    FEATURE,
-    FIRST,
-    LABEL,
-    LEFT,
-    RIGHT,
-    SECOND,
-    TEMPLATE,
-    TOP,
-    layout,
-    load_prior,
-    new_tables,
-)
-from kcgs.codec.labels.wavefront import DECIDED, REGIONS, STATE, advance, new_work, survey
+from kcgs.codec.labels.contexts import TEMPLATE, layout
+from kcgs.codec.labels.wavefront import advance, new_scan, survey
 from kcgs.data import load_image, load_labels
 from kcgs.segment import segment
 
 MIXER = (46000, 7000, 7000, 8000)
-SHAPES, BATCH, PER_MAP = 60, 2048, 2000
+SHAPES = 60  # synthetic maps
+BATCH = 2048  # pixels of a step
+PER_MAP = 2000  # pixels, at most
 PHOTOS = ("astronaut", "chelsea", "coffee", "rocket")
 METHODS = ("auto", "kmeans", "felzenszwalb", "slic", "watershed")
 SMOOTH = (0.7, 1.0, 1.5, 2.0, 3.0)
@@ -91,39 +80,33 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def examples(labels: Any) -> tuple[Any, Any]:
-    """Code a map; return the features of each pixel that is asked for [N, T], and what it is [N].
+    """Code a map; return the features of each coded pixel [N, T], and its class [N].
 
-    That is 0 or 1 for the first or the second candidate, 2 for neither.
+    The class is 0 or 1 for the first or the second candidate, 2 for neither.
     """
     ids, index = np.unique(labels, return_inverse=True)
     truth, seeds, _ = survey(index.reshape(labels.shape).astype(np.int32), len(ids))
-    height, width = truth.shape
-    tables = load_prior()
-    work, state = new_work(height, tables), np.zeros(STATE, np.int64)
-    state[REGIONS] = len(ids)
-    padded = np.zeros((height + TOP + 1, width + LEFT + RIGHT), np.int32)
-    bits, features, kinds = np.zeros(2 * height, np.int32), [], []
-    memory = (truth, bits, state, padded, seeds, *new_tables(tables), *work)
-    while count := advance(bits, *memory):
-        rows = work[0][:count][work[0][:count, CODED] == 1]
-        features.append(rows[:, FEATURE : FEATURE + len(TEMPLATE)].astype(np.int8))
-        kinds.append(np.where(rows[:, LABEL] == rows[:, FIRST], 0, np.where(rows[:, LABEL] == rows[:, SECOND], 1, 2)))
-        assert len(rows) == state[DECIDED]
-    if not kinds:
-        return np.zeros((0, len(TEMPLATE)), np.int8), np.zeros(0, np.int64)
-    return np.concatenate(features), np.concatenate(kinds)
+    scan = new_scan(seeds, len(ids), is_file=False)
+    features, classes = [np.zeros((0, len(TEMPLATE)), np.int8)], [np.zeros(0, np.int64)]
+    while count := advance(scan, scan.answers, truth):
+        pixels = scan.pixels[:count]
+        pixels = pixels[pixels["is_coded"] == 1]
+        features.append(pixels["features"].astype(np.int8))
+        label = pixels["label"]
+        classes.append(np.where(label == pixels["first"], 0, np.where(label == pixels["second"], 1, 2)))
+    return np.concatenate(features), np.concatenate(classes)
 
 
 def segmentations(photos: list[Tensor], seed: int) -> list[Any]:
     """Segment photos in all ways that need no model, in two sizes; every other map is smoothed, by so many pixels."""
-    generator, found = np.random.default_rng(seed), []
+    generator, maps = np.random.default_rng(seed), []
     for number, whole in enumerate(photos):
         for image in (whole, torch.nn.functional.avg_pool2d(whole, 2)):
             for method in METHODS:
                 labels = segment(image, method).numpy()
-                found += [labels, smoothed(labels, generator.choice(SMOOTH))]
-        print(f"photo {number}: {len(found)} maps", file=sys.stderr)
-    return found
+                maps += [labels, smoothed(labels, generator.choice(SMOOTH))]
+        print(f"photo {number}: {len(maps)} maps", file=sys.stderr)
+    return maps
 
 
 def smoothed(labels: Any, sigma: float) -> Any:
@@ -131,11 +114,11 @@ def smoothed(labels: Any, sigma: float) -> Any:
     ids, index = np.unique(labels, return_inverse=True)
     index = index.reshape(labels.shape)
     shares = (gaussian_filter((index == region).astype(np.float32), sigma) for region in range(len(ids)))
-    most, found = np.full(labels.shape, -1.0, np.float32), np.zeros(labels.shape, np.int64)
+    largest, regions = np.full(labels.shape, -1.0, np.float32), np.zeros(labels.shape, np.int64)
     for region, share in enumerate(shares):
-        found[share > most] = region
-        most = np.maximum(most, share)
-    return found
+        regions[share > largest] = region
+        largest = np.maximum(largest, share)
+    return regions
 
 
 def shapes(generator: np.random.Generator) -> Any:
@@ -158,28 +141,28 @@ def train(maps: list[Any], steps: int, seed: int, units: tuple[int, int] = (48, 
     """Return the weights and biases of the three layers, in whole units."""
     generator = np.random.default_rng(seed)
     torch.manual_seed(seed)
-    found = []
+    samples = []
     for labels in [*maps, *(shapes(generator) for _ in range(SHAPES))]:
         for turned in (labels, labels[::-1], labels[:, ::-1], labels.T):
-            features, kinds = examples(np.ascontiguousarray(turned))
-            chosen = generator.permutation(len(kinds))[:PER_MAP]
-            several = np.full(len(chosen), len(np.unique(labels)) > 2)
-            found.append((features[chosen], kinds[chosen], several))
-    features, kinds, several = (torch.from_numpy(np.concatenate(parts)) for parts in zip(*found, strict=True))
-    print(f"{len(kinds)} examples", file=sys.stderr)
+            features, classes = examples(np.ascontiguousarray(turned))
+            index = generator.permutation(len(classes))[:PER_MAP]
+            has_escapes = np.full(len(index), len(np.unique(labels)) > 2)
+            samples.append((features[index], classes[index], has_escapes))
+    features, classes, has_escapes = (torch.from_numpy(np.concatenate(parts)) for parts in zip(*samples, strict=True))
+    print(f"{len(classes)} examples", file=sys.stderr)
     sizes = [2 * len(TEMPLATE), *units, 2]
     parameters = [torch.randn(a, b) * a**-0.5 for a, b in pairwise(sizes)]
     parameters = [t.requires_grad_() for w in parameters for t in (w, torch.zeros(w.shape[1]))]
     optimizer = torch.optim.Adam(parameters, lr=4e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 4e-3, total_steps=steps)
     for step in range(steps):
-        batch = torch.randint(len(kinds), (BATCH,))
-        kind, among = kinds[batch], several[batch]
+        batch = torch.randint(len(classes), (BATCH,))
+        target = classes[batch]
         logits = network(features[batch], parameters)
         losses = torch.nn.functional.binary_cross_entropy_with_logits(
-            logits, torch.stack([(kind == 1).float(), (kind == 2).float()], 1), reduction="none"
+            logits, torch.stack([(target == 1).float(), (target == 2).float()], 1), reduction="none"
         )
-        loss = (losses[:, 0] * (kind < 2) + losses[:, 1] * among).mean()
+        loss = (losses[:, 0] * (target < 2) + losses[:, 1] * has_escapes[batch]).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -237,8 +220,8 @@ def measure(root: Path, maps: list[Path]) -> list[int]:
         f"import sys; sys.path.insert(0, {str(root)!r}){_MEASURE}",
         *(str(path.resolve()) for path in maps),
     ]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=root)
-    return [int(line) for line in done.stdout.split()]
+    result = subprocess.run(command, capture_output=True, text=True, check=True, cwd=root)
+    return [int(line) for line in result.stdout.split()]
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""Gaussians as whole numbers in layers."""
+"""Gaussians as whole numbers, in layers."""

@@ -1,4 +1,4 @@
-"""The numbers of Gaussians, coded in layers, the strongest first, so that a part is an image.
+"""The numbers of Gaussians, coded in layers, the strongest first, so that a part of a file is an image.
 
 A layer has a group for each of its classes of energy: by class of size, how many Gaussians, then each (docs/format.md).
 """
@@ -18,67 +18,77 @@ from kcgs.codec.rangecoder import CodecError, Coder
 from kcgs.functional import RegionMap
 from kcgs.functional.labels import lookup_regions
 
-from .occupancy import MOST_BITS, Occupancy
-from .quantize import ENERGIES, MOST_RATIO, OCTAVES, SIZES, Classes, Codes, Parameters, Quantizer
+from .occupancy import COUNT_BITS, OccupancyCoder
+from .quantize import ENERGIES, MAX_RATIO, OCTAVES, SIZES, Classes, Codes, Parameters, Quantizer
 from .shapes import ANGLE, SHAPES
 
-_CLASSES = 64  # that a stream may name, of size
-# half the log2 of the ratio of scales is measured in this
-_RATIO_SCALE = 2.0
-# a colour's part is faint, middling or strong against the whole
-_FAINT, _STRONG = 0.35, 0.8
-# sizes within a class, by which colours are measured
-_LEVELS = 8
-# the first of the classes of size that have ratios of their own
-_LEAST_SIZE = -1
-# what follows a group: no other, that of the next energy down, or of an energy below that
-_END, _HOLDS, _EMPTY = 0, 1, 2
+_NUM_CLASSES = 64  # of size, that a stream can name
+# weights at first
+_STRAY_WEIGHTS = np.array([20.0, 0.5])  # a Gaussian of the region under its centre, and of another
+_COUNT_WEIGHTS = np.array([2.0, *[1.0] * 9, *[0.3] * (COUNT_BITS - 9)])  # by count of bits
+_RATIO_SCALE = 2.0  # half the log2 of the ratio of scales, by which ratios are measured
+_FIRST_RATIO_SIZE = -1  # class of size of the first context of ratios; smaller ones share it
+_LEVELS = 8  # scales within a class of size, by which colours are measured
+# amplitude of a channel, in the Gaussian's own, above which the next channel's context is 1, and 2
+_MEDIUM = 0.35
+_STRONG = 0.8
+# symbols after a group
+_END = 0  # of the layer
+_PRESENT = 1  # a group of the next energy down
+_ABSENT = 2  # no group of that energy
 Group = tuple[Codes, Integers]
 """Gaussians of one energy, and the positions of their regions' ids."""
 
 
 class LayerCoder:
-    """Codes layers one after another; what was learned in one helps the next. The map is on the CPU."""
+    """Codes layers one after another, by models that learn from all layers so far. The map is on the CPU."""
 
     def __init__(self, quantizer: Quantizer, channels: int, regions: RegionMap | None) -> None:
         self.quantizer, self.channels, self.regions = quantizer, channels, regions
         self.num_regions = 1 if regions is None else regions.num_regions
         self._magnitudes = [AdaptiveMagnitude(shapes) for shapes in SHAPES]
         self._angle = AdaptiveAngle(ANGLE)
-        self._strays = AdaptiveSymbol(np.array([20.0, 0.5]))
-        self._count = AdaptiveNumber(np.array([2.0, *[1.0] * 9, *[0.3] * (MOST_BITS - 9)]))
-        self._occupancy = Occupancy(quantizer.size)
+        self._strays = AdaptiveSymbol(_STRAY_WEIGHTS)
+        self._count = AdaptiveNumber(_COUNT_WEIGHTS)
+        self._occupancy = OccupancyCoder(quantizer.size)
 
     def code(
-        self, coder: Coder, energy: int, groups: list[Group] | None, most: int
+        self, coder: Coder, energy: int, groups: list[Group] | None, max_count: int
     ) -> list[tuple[Parameters, Integers]]:
-        """Code a layer, at most so many Gaussians, as groups of falling energies, the first of which is given.
+        """Code a layer of at most `max_count` Gaussians; return those of each group, as a decoder restores them.
 
-        Returns the Gaussians of each group and the positions of their regions' ids. `groups` are in the order of
-        a file; None: to read.
+        Args:
+            coder: of the layer's stream.
+            energy: class of the first group.
+            groups: in the order of a file, energies falling; None: to read.
+            max_count: more are an error.
         """
-        found, waiting = [], None if groups is None else list(groups)
-        following = _HOLDS
-        while following != _END:
-            if following == _HOLDS:
-                found.append(self._code_group(coder, energy, None if waiting is None else waiting.pop(0), most))
-                most -= len(found[-1][1])
+        coded, remaining = [], None if groups is None else list(groups)
+        symbol = _PRESENT
+        while symbol != _END:
+            if symbol == _PRESENT:
+                coded.append(
+                    self._code_group(coder, energy, None if remaining is None else remaining.pop(0), max_count)
+                )
+                max_count -= len(coded[-1][1])
             energy -= 1
-            if waiting is not None:
-                following = _EMPTY if waiting else _END
-                if waiting and waiting[0][0].energy[0] == energy:
-                    following = _HOLDS
-            following = coder.number(following, 3)
-            if following != _END and energy < ENERGIES[0]:
+            if remaining is not None:
+                symbol = _ABSENT if remaining else _END
+                if remaining and remaining[0][0].energy[0] == energy:
+                    symbol = _PRESENT
+            symbol = coder.number(symbol, 3)
+            if symbol != _END and energy < ENERGIES[0]:
                 raise CodecError(f"a class of energy must be at least {ENERGIES[0]}; got {energy}")
-        return found
+        return coded
 
-    def _code_group(self, coder: Coder, energy: int, group: Group | None, most: int) -> tuple[Parameters, Integers]:
-        """Code the Gaussians of one energy, at most so many."""
+    def _code_group(
+        self, coder: Coder, energy: int, group: Group | None, max_count: int
+    ) -> tuple[Parameters, Integers]:
+        """Code at most `max_count` Gaussians of one energy."""
         codes, ids = (None, None) if group is None else group
         counts = self._code_counts(coder, codes)
-        if counts.sum() > most:
-            raise CodecError(f"a layer must hold at most {most} Gaussians; got {counts.sum()}")
+        if counts.sum() > max_count:
+            raise CodecError(f"a layer must hold at most {max_count} Gaussians; got {counts.sum()}")
         if counts[SIZES[1] - SIZES[0] + 1 :].any():
             raise CodecError(f"a class of size must be at most {SIZES[1]}; got {np.flatnonzero(counts)[-1] + SIZES[0]}")
         if not counts.any():
@@ -86,71 +96,79 @@ class LayerCoder:
         cells, start = [], 0
         for size in np.flatnonzero(counts)[::-1].tolist():
             end = start + int(counts[size])
-            known = None if codes is None else codes.cell[start:end]
-            cells.append(self._occupancy.code(coder, size + SIZES[0], end - start, known))
+            cell = None if codes is None else codes.cell[start:end]
+            cells.append(self._occupancy.code(coder, size + SIZES[0], end - start, cell))
             start = end
-        size = np.repeat(np.arange(_CLASSES)[::-1], counts[::-1]) + SIZES[0]
+        size = np.repeat(np.arange(_NUM_CLASSES)[::-1], counts[::-1]) + SIZES[0]
         classes = Classes(np.full(start, energy), size)
-        gaussians = self._code_numbers(coder, classes, np.concatenate(cells), codes)
+        gaussians = self._code_parameters(coder, classes, np.concatenate(cells), codes)
         return gaussians, self._code_regions(coder, gaussians.means, ids)
 
     def _code_counts(self, coder: Coder, codes: Codes | None) -> Integers:
-        """Code how many Gaussians there are of each class of size."""
-        counts = None if codes is None else np.bincount(codes.size - SIZES[0], minlength=_CLASSES)
-        one = np.ones(1, np.int64)
+        """Code the number of Gaussians of each class of size."""
+        counts = None if codes is None else np.bincount(codes.size - SIZES[0], minlength=_NUM_CLASSES)
         present = None if counts is None else np.flatnonzero(counts)
-        first = int(coder.uniform(_CLASSES * one, None if present is None else present[:1])[0])
-        left = _CLASSES - first
-        span = int(coder.uniform(left * one, None if present is None else present[-1:] - first)[0]) + 1
-        found = np.zeros(_CLASSES, np.int64)
-        for size in range(first, first + span):
-            found[size] = self._count.code(coder, None if counts is None else int(counts[size]))
-        return found
+        first = int(coder.uniform(np.array([_NUM_CLASSES]), None if present is None else present[:1])[0])
+        span = None if present is None else present[-1:] - first
+        last = first + int(coder.uniform(np.array([_NUM_CLASSES - first]), span)[0])
+        coded = np.zeros(_NUM_CLASSES, np.int64)
+        for size in range(first, last + 1):
+            coded[size] = self._count.code(coder, None if counts is None else int(counts[size]))
+        return coded
 
-    def _code_numbers(self, coder: Coder, classes: Classes, cell: Integers, codes: Codes | None) -> Parameters:
+    def _code_parameters(self, coder: Coder, classes: Classes, cell: Integers, codes: Codes | None) -> Parameters:
+        """Code all numbers but the cells."""
         steps = self.quantizer.steps(classes)
-        scale = coder.uniform(steps.scales, None if codes is None else codes.scale)
-        context = np.clip(classes.size - _LEAST_SIZE, 0, len(SHAPES.ratio) - 1)
-        given = None if codes is None else codes.ratio
-        ratio = self._magnitudes[-1].code(coder, _RATIO_SCALE / steps.ratio[:1], np.zeros_like(context), context, given)
-        if (ratio > (most := math.floor(MOST_RATIO / steps.ratio[0] + 0.5))).any():
-            raise CodecError(f"a ratio must be at most {most} steps; got {ratio.max()}")
-        turns = steps.turns(ratio)
-        angle = self._angle.code(coder, turns, None if codes is None else codes.angle)
-        # how many steps the amplitude of a Gaussian of this energy has, where it is as large as the middle of its class
-        loud = math.ldexp(math.sqrt(math.pi / (12.0 * self.quantizer.distortion)), int(classes.energy[0]))
-        level = (_LEVELS * scale + _LEVELS // 2) // steps.scales
-        scales = loud * exp2(OCTAVES * (0.5 - (np.arange(_LEVELS) + 0.5) / _LEVELS))
-        colors = self._code_colors(coder, scales, level, None if codes is None else codes.colors)
-        shape = steps.shape(scale, ratio, angle / turns)
-        parts = steps.places(shape)
-        place = [coder.uniform(parts[:, axis], None if codes is None else codes.place[:, axis]) for axis in range(2)]
-        return steps.restore(Codes(*classes, scale, ratio, angle, colors, cell, np.stack(place, -1)), shape)
+        scale = coder.uniform(steps.num_scales, None if codes is None else codes.scale)
+        ratio = self._code_ratios(coder, classes, float(steps.ratio[0]), None if codes is None else codes.ratio)
+        num_angles = steps.num_angles(ratio)
+        angle = self._angle.code(coder, num_angles, None if codes is None else codes.angle)
+        # the amplitude at this energy, in steps of colour, where the scale is in the middle of its class
+        amplitude = math.ldexp(math.sqrt(math.pi / (12.0 * self.quantizer.distortion)), int(classes.energy[0]))
+        amplitudes = amplitude * exp2(OCTAVES * (0.5 - (np.arange(_LEVELS) + 0.5) / _LEVELS))
+        level = (_LEVELS * scale + _LEVELS // 2) // steps.num_scales
+        colors = self._code_colors(coder, amplitudes, level, None if codes is None else codes.colors)
+        shape = steps.shape(scale, ratio, angle / num_angles)
+        places = []
+        for axis, num_places in enumerate(steps.num_places(shape).T):
+            places.append(coder.uniform(num_places, None if codes is None else codes.place[:, axis]))
+        return steps.dequantize(Codes(*classes, scale, ratio, angle, colors, cell, np.stack(places, -1)), shape)
 
-    def _code_colors(self, coder: Coder, scales: Floats, level: Integers, colors: Integers | None) -> Integers:
+    def _code_ratios(self, coder: Coder, classes: Classes, step: float, ratios: Integers | None) -> Integers:
+        """Code the ratios of scales; `step` is that of the group."""
+        context = np.clip(classes.size - _FIRST_RATIO_SIZE, 0, len(SHAPES.ratio) - 1)
+        level = np.zeros_like(context)
+        ratio = self._magnitudes[-1].code(coder, np.array([_RATIO_SCALE / step]), level, context, ratios)
+        max_ratio = math.floor(MAX_RATIO / step + 0.5)
+        if (ratio > max_ratio).any():
+            raise CodecError(f"a ratio must be at most {max_ratio} steps; got {ratio.max()}")
+        return ratio
+
+    def _code_colors(self, coder: Coder, amplitudes: Floats, level: Integers, colors: Integers | None) -> Integers:
+        """Code colours channel by channel; `level` [N] is the index of each Gaussian's amplitude."""
         channels: list[Integers] = []
         for channel in range(self.channels):
             context = np.zeros(len(level), np.int64)
             if channel:
-                last, loud = np.abs(channels[-1]), scales[level]
-                context = (last > _FAINT * loud).astype(np.int64) + (last > _STRONG * loud)
-            value = None if colors is None else colors[:, channel]
+                last, amplitude = np.abs(channels[-1]), amplitudes[level]
+                context = (last > _MEDIUM * amplitude).astype(np.int64) + (last > _STRONG * amplitude)
+            values = None if colors is None else colors[:, channel]
             model = self._magnitudes[min(channel, 2)]
-            magnitude = model.code(coder, scales, level, context, None if value is None else np.abs(value))
-            sign = coder.uniform(1 + (magnitude > 0), None if value is None else (value < 0).astype(np.int64))
+            magnitude = model.code(coder, amplitudes, level, context, None if values is None else np.abs(values))
+            sign = coder.uniform(1 + (magnitude > 0), None if values is None else (values < 0).astype(np.int64))
             channels.append(np.where(sign == 1, -magnitude, magnitude))
         return np.stack(channels, -1)
 
     def _code_regions(self, coder: Coder, means: NDArray[Any], ids: Integers | None) -> Integers:
+        """Code the region of each Gaussian, as the position of its id: that under its centre, or another."""
         if self.regions is None:
             return np.zeros(len(means), np.int64)
         labels = lookup_regions(torch.from_numpy(means), self.regions.labels)
-        under = self.regions.index_of(labels).numpy().astype(np.int64)
-        strays = self._strays.code(coder, len(under), None if ids is None else (ids != under).astype(np.int64))
-        away = np.flatnonzero(strays)
-        # any but the one under it
-        others = None if ids is None else (ids[away] - under[away] - 1) % self.num_regions
-        step = coder.uniform(np.full(len(away), self.num_regions - 1), others)
-        found = under.copy()
-        found[away] = (under[away] + 1 + step) % self.num_regions
-        return found
+        coded = self.regions.index_of(labels).numpy().astype(np.int64)
+        strays = self._strays.code(coder, len(coded), None if ids is None else (ids != coded).astype(np.int64))
+        index = np.flatnonzero(strays)
+        # a distance from the region under the centre, modulo the number of regions
+        distance = None if ids is None else (ids[index] - coded[index] - 1) % self.num_regions
+        distance = coder.uniform(np.full(len(index), self.num_regions - 1), distance)
+        coded[index] = (coded[index] + 1 + distance) % self.num_regions
+        return coded

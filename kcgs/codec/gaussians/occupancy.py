@@ -13,37 +13,45 @@ from kcgs.codec.adaptive import AdaptiveNumber
 from kcgs.codec.exact import Floats, Integers
 from kcgs.codec.rangecoder import ONE, CodecError, Coder
 
-# cells beyond the image on each side; centres farther out are brought to the border of that
-MOST_BITS = 21  # of a number of Gaussians
-_MOST_MARGIN = 255
-_CELLS_OUTSIDE = 1 << 17
-# of a file, which else would take hours to read: cells outside, and those for each Gaussian, and classes of size; an
-# encoder has 65 * 37 at most
-_ALL_OUTSIDE, _EACH_OUTSIDE, _ALL_CLASSES = 1 << 26, 1 << 10, 1 << 12
-_MARGINS = np.array([3.0, *[1.0] * 4, *[0.3] * 4])  # weights at first
-# cells that are coded together
-_TOGETHER = 1 << 16
-# classes of size above their own whose Gaussians others are near to; within so many cells, with weights of this sum
-_NEAR, _REACH, _MASS = 2, 4, 625
-# so many Gaussians count as if they were everywhere; parts of a weight
-_EVERYWHERE, _PARTS = 12, 64
-_LEAST = 16  # chance of one more in a cell, in 1 / ONE
-# how often cells learn how many Gaussians are left
-_BANDS = 8
+COUNT_BITS = 21  # of a number of Gaussians
+_CELLS_PER_GAUSSIAN = 16  # at least, of cells larger than a pixel
+
+# limits on cells outside the image: Gaussians beyond are moved to the border
+_MAX_MARGIN = 255  # cells beyond each side
+_MAX_OUTSIDE = 1 << 17  # cells of a grid, beside 15 times those inside
+# limits on the work of a decoder: hours
+_MAX_TOTAL_OUTSIDE = 1 << 26  # cells of all grids of a file, beside those for its Gaussians
+_MAX_OUTSIDE_EACH = 1 << 10  # cells for each Gaussian
+_MAX_CLASSES = 1 << 12  # classes of size in all groups; an encoder has 65 * 37 at most
+
+# weights at first, by count of bits
+_MARGIN_WEIGHTS = np.array([3.0, *[1.0] * 4, *[0.3] * 4])
+_OUTSIDE_WEIGHTS = np.array([0.3, *[1.0] * 4, *[0.3] * (COUNT_BITS - 4)])
+
+# the weight of a cell, by the Gaussians near it
+_NEAR_SIZES = 2  # classes of size above a Gaussian's own that count as near
+_REACH = 4  # columns and rows within which a Gaussian is near
+_NEAR_SUM = 625  # of a Gaussian's weights in all cells
+_WEIGHT_PARTS = 64  # of a weight
+_PRIOR_GAUSSIANS = 12  # that all cells share in equal parts
+
+_MIN_CHANCE = 16  # of one more Gaussian in a cell, in 1 / ONE
+_MIN_BANDS = 8  # after each the number of remaining Gaussians is known
+_GROUP = 1 << 16  # cells whose weights are in memory at a time
 
 
 class Grid(NamedTuple):
-    """Cells over an image, with a margin of more around them; columns and rows count from the image's corner."""
+    """Cells over an image, and a margin of cells around them; columns and rows count from the image's corner."""
 
-    side: int
+    side: int  # pixels
     rows: int
     columns: int
     margin: int = 0
 
     @classmethod
-    def over(cls, size: tuple[int, int], count: int) -> Grid:
-        """Return the cells of `count` Gaussians: 16 to 64 cells per Gaussian, of at least a pixel."""
-        cells = size[0] * size[1] // (16 * max(count, 1))
+    def for_count(cls, size: tuple[int, int], count: int) -> Grid:
+        """Return the cells for `count` Gaussians: 16 to 64 cells per Gaussian, of at least a pixel."""
+        cells = size[0] * size[1] // (_CELLS_PER_GAUSSIAN * max(count, 1))
         return cls.of_side(size, 1 << max(0, (cells.bit_length() - 1) // 2))
 
     @classmethod
@@ -52,158 +60,174 @@ class Grid(NamedTuple):
         return cls(side, -(-size[0] // side), -(-size[1] // side))
 
     @property
-    def most_margin(self) -> int:
-        """How many cells there may be beyond each side of the image."""
-        # the largest m with (rows + 2 m) (columns + 2 m) at most so many more than those inside
-        more, both = _CELLS_OUTSIDE + 15 * self.rows * self.columns, self.rows + self.columns
-        return min((math.isqrt(both * both + 4 * more) - both) // 4, _MOST_MARGIN)
+    def max_margin(self) -> int:
+        """The largest margin m of which (rows + 2 m) (columns + 2 m) is within the limit."""
+        excess, perimeter = _MAX_OUTSIDE + 15 * self.rows * self.columns, self.rows + self.columns
+        return min((math.isqrt(perimeter * perimeter + 4 * excess) - perimeter) // 4, _MAX_MARGIN)
 
     @property
     def num_outside(self) -> int:
-        """How many cells the margin has."""
+        """The number of cells of the margin."""
         return (self.rows + 2 * self.margin) * (self.columns + 2 * self.margin) - self.rows * self.columns
 
     def split(self, cell: Integers) -> tuple[Integers, Integers]:
-        """Return the places of `cell` (N, 2), in order, among the cells inside, and among those outside."""
+        """Return the indices of `cell` (N, 2), in order, among the cells inside, and among those outside."""
         column, row = cell.T
-        within = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
-        before = np.clip(row, 0, self.rows) * self.columns
-        before += np.where((row >= 0) & (row < self.rows), np.clip(column, 0, self.columns), 0)
-        place = (row + self.margin) * (self.columns + 2 * self.margin) + column + self.margin
-        return before[within], (place - before)[~within]
+        is_inside_row = (row >= 0) & (row < self.rows)
+        is_inside = is_inside_row & (column >= 0) & (column < self.columns)
+        # the cells inside before each, and all cells before it
+        inside = np.clip(row, 0, self.rows) * self.columns
+        inside += np.where(is_inside_row, np.clip(column, 0, self.columns), 0)
+        index = (row + self.margin) * (self.columns + 2 * self.margin) + column + self.margin
+        return inside[is_inside], (index - inside)[~is_inside]
 
     def join(self, inside: Integers, outside: Integers) -> Integers:
-        """Return the cells (N, 2) of such places, in order."""
-        wide, ring = self.columns + 2 * self.margin, max(2 * self.margin, 1)
-        top = self.margin * wide
-        row, rest = np.divmod(outside - top, ring)
-        beside = top + row * wide + rest + np.where(rest >= self.margin, self.columns, 0)
+        """Return the cells (N, 2) of such indices, in order."""
+        width, ring = self.columns + 2 * self.margin, max(2 * self.margin, 1)
+        top = self.margin * width
+        row, column = np.divmod(outside - top, ring)
+        beside = top + row * width + column + np.where(column >= self.margin, self.columns, 0)
         below = outside + self.rows * self.columns
-        place = np.where(outside < top, outside, np.where(row < self.rows, beside, below))
+        index = np.where(outside < top, outside, np.where(row < self.rows, beside, below))
         row, column = np.divmod(inside, self.columns)
-        # both are in order, which a stable sort makes use of
-        place = np.sort(np.concatenate([(row + self.margin) * wide + column + self.margin, place]), kind="stable")
-        row, column = np.divmod(place, wide)
+        index = np.concatenate([(row + self.margin) * width + column + self.margin, index])
+        # a stable sort merges two sorted halves
+        row, column = np.divmod(np.sort(index, kind="stable"), width)
         return np.stack([column - self.margin, row - self.margin], -1)
 
 
-class Occupancy:
-    """Codes the cells of one class after another; what was learned in one helps the next."""
+class OccupancyCoder:
+    """Codes the cells of one class of size after another; earlier classes weigh the cells of later ones."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         self._size = size
-        self._margin = AdaptiveNumber(_MARGINS)
-        self._beyond = AdaptiveNumber(np.array([0.3, *[1.0] * 4, *[0.3] * (MOST_BITS - 4)]))
+        self._margin = AdaptiveNumber(_MARGIN_WEIGHTS)
+        self._num_outside = AdaptiveNumber(_OUTSIDE_WEIGHTS)
+        # size and middles of the cells, in half pixels, of each class so far
         self._classes: list[tuple[int, Integers]] = []
-        self._outside, self._count = 0, 0  # cells there and Gaussians, so far
+        self._total_outside = 0  # cells of margins so far
+        self._total = 0  # Gaussians so far
 
     def code(self, coder: Coder, size: int, count: int, cell: Integers | None) -> Integers:
         """Code the cells (N, 2) of `count` Gaussians of a class of size, sorted row by row; None: to read."""
-        if len(self._classes) == _ALL_CLASSES:
-            raise CodecError(f"groups must have at most {_ALL_CLASSES} classes of size; got more")
-        grid = Grid.over(self._size, count)
-        grid = grid._replace(margin=_code_margin(coder, self._margin, grid, cell))
-        places = (None, None) if cell is None else grid.split(cell)
-        beyond = 0
-        if grid.margin and (beyond := self._beyond.code(coder, None if places[1] is None else len(places[1]))) > count:
-            raise CodecError(f"at most {count} Gaussians may lie outside; got {beyond}")
-        inside = self._fill_inside(coder, grid, size, count - beyond, places[0])
-        ring = grid.num_outside
-        self._count += count
-        self._outside += ring if beyond else 0
-        if self._outside > (most := _ALL_OUTSIDE + _EACH_OUTSIDE * self._count):
-            raise CodecError(f"grids must have at most {most} cells outside; got {self._outside}")
-        outside = _fill(coder, _borders(ring, ring), lambda start, end: np.ones(end - start), ring, beyond, places[1])
+        if len(self._classes) == _MAX_CLASSES:
+            raise CodecError(f"groups must have at most {_MAX_CLASSES} classes of size; got more")
+        grid = Grid.for_count(self._size, count)
+        grid = grid._replace(margin=self._code_margin(coder, grid, cell))
+        inside, outside = (None, None) if cell is None else grid.split(cell)
+        num_outside = 0
+        if grid.margin:
+            num_outside = self._num_outside.code(coder, None if outside is None else len(outside))
+            if num_outside > count:
+                raise CodecError(f"at most {count} Gaussians may lie outside; got {num_outside}")
+        inside = self._code_inside(coder, grid, size, count - num_outside, inside)
+        outside = self._code_outside(coder, grid, count, num_outside, outside)
         cell = grid.join(inside, outside)
         self._classes.append((size, (2 * cell + 1) * grid.side))
         return cell
 
-    def _fill_inside(self, coder: Coder, grid: Grid, size: int, count: int, places: Integers | None) -> Integers:
+    def _code_margin(self, coder: Coder, grid: Grid, cell: Integers | None) -> int:
+        margin = None
+        if cell is not None:
+            distances = [0, -cell.min(), (cell[:, 0] - grid.columns + 1).max(), (cell[:, 1] - grid.rows + 1).max()]
+            margin = int(max(distances))
+        margin = self._margin.code(coder, margin)
+        if margin > grid.max_margin:
+            raise CodecError(f"a margin must be at most {grid.max_margin} cells; got {margin}")
+        return margin
+
+    def _code_inside(self, coder: Coder, grid: Grid, size: int, count: int, index: Integers | None) -> Integers:
         """Code the cells inside: the more likely, the more earlier Gaussians of about this size are near."""
-        shape, cells = (grid.rows, grid.columns), grid.rows * grid.columns
-        near = [twice // (2 * grid.side) for other, twice in self._classes if size <= other <= size + _NEAR]
+        shape, num_cells = (grid.rows, grid.columns), grid.rows * grid.columns
+        near = [middle // (2 * grid.side) for other, middle in self._classes if size <= other <= size + _NEAR_SIZES]
         column, row = np.concatenate([np.zeros((0, 2), np.int64), *near]).T
-        within = (row >= 0) & (row < grid.rows) & (column >= 0) & (column < grid.columns)
-        column, row = column[within], row[within]
-        least = max(_PARTS * _MASS * _EVERYWHERE // cells, 1)
+        is_inside = (row >= 0) & (row < grid.rows) & (column >= 0) & (column < grid.columns)
+        column, row = column[is_inside], row[is_inside]
+        base = max(_WEIGHT_PARTS * _NEAR_SUM * _PRIOR_GAUSSIANS // num_cells, 1)
 
         def weigh(start: int, end: int) -> Floats:
-            return (least + _PARTS * _crowd(column, row, shape, start // grid.columns, end // grid.columns)).ravel()
+            near = _sum_near(column, row, shape, start // grid.columns, end // grid.columns)
+            return (base + _WEIGHT_PARTS * near).ravel()
 
-        borders = [row * grid.columns for row in _borders(grid.rows, cells)]
-        return _fill(coder, borders, weigh, least * cells + _PARTS * _MASS * len(row), count, places)
+        borders = [row * grid.columns for row in _borders(grid.rows, num_cells)]
+        total = base * num_cells + _WEIGHT_PARTS * _NEAR_SUM * len(row)
+        return _code_cells(coder, borders, weigh, total, count, index)
+
+    def _code_outside(self, coder: Coder, grid: Grid, count: int, num_outside: int, index: Integers | None) -> Integers:
+        """Code the cells outside, all equally likely."""
+        num_cells = grid.num_outside
+        self._total += count
+        self._total_outside += num_cells if num_outside else 0
+        max_outside = _MAX_TOTAL_OUTSIDE + _MAX_OUTSIDE_EACH * self._total
+        if self._total_outside > max_outside:
+            raise CodecError(f"grids must have at most {max_outside} cells outside; got {self._total_outside}")
+        borders = _borders(num_cells, num_cells)
+        return _code_cells(coder, borders, lambda start, end: np.ones(end - start), num_cells, num_outside, index)
 
 
-def _borders(length: int, cells: int) -> list[int]:
-    """Divide a length into bands, so that none has many of so many cells."""
-    bands = max(_BANDS, -(-cells // _TOGETHER))
+def _borders(length: int, num_cells: int) -> list[int]:
+    """Divide a length into bands, so that none has many of `num_cells` cells."""
+    bands = max(_MIN_BANDS, -(-num_cells // _GROUP))
     return sorted({length * i // bands for i in range(bands + 1)})
 
 
-def _crowd(column: Integers, row: Integers, shape: tuple[int, int], first: int, last: int) -> Floats:
-    """Count Gaussians near the cells of some rows: in windows, twice; what is beyond a border is mirrored at it."""
+def _sum_near(column: Integers, row: Integers, shape: tuple[int, int], first: int, last: int) -> Floats:
+    """Sum the weights of Gaussians near the cells of rows first to last - 1, mirrored at the grid's borders.
+
+    A weight falls linearly with the distance in columns and in rows: two box filters, one after the other.
+    """
     top, bottom = max(first - _REACH, 0), min(last + _REACH, shape[0])
-    these = (row >= top) & (row < bottom)
-    place = (row[these] - top) * shape[1] + column[these]
-    near = np.bincount(place, minlength=(bottom - top) * shape[1]).reshape(-1, shape[1]).astype(np.int32)
-    above, below = _REACH - (first - top), _REACH - (bottom - last)
-    near = np.pad(near, [(above if top == 0 else 0, below if bottom == shape[0] else 0), (_REACH, _REACH)], "symmetric")
+    is_near = (row >= top) & (row < bottom)
+    index = (row[is_near] - top) * shape[1] + column[is_near]
+    near = np.bincount(index, minlength=(bottom - top) * shape[1]).reshape(-1, shape[1]).astype(np.int32)
+    above = _REACH - (first - top) if top == 0 else 0
+    below = _REACH - (bottom - last) if bottom == shape[0] else 0
+    near = np.pad(near, [(above, below), (_REACH, _REACH)], "symmetric")
     for _ in range(2):
         near = near[4:] + near[3:-1] + near[2:-2] + near[1:-3] + near[:-4]
         near = near[:, 4:] + near[:, 3:-1] + near[:, 2:-2] + near[:, 1:-3] + near[:, :-4]
     return near.astype(np.float64)
 
 
-def _fill(
+def _code_cells(
     coder: Coder,
     borders: list[int],
     weigh: Callable[[int, int], Floats],
     total: float,
     count: int,
-    places: Integers | None,
+    index: Integers | None,
 ) -> Integers:
-    """Code which cell each of `count` Gaussians lies in, in order, band by band; all cells together weigh `total`."""
-    left, found = count, [np.zeros(0, np.int64)]
-    together = _BANDS if borders[-1] <= _TOGETHER else 1  # whose weights are in memory
-    for first in range(0, len(borders) - 1, together):
-        if not left:
+    """Code the cells of `count` Gaussians, in order, band by band; the weights of all cells add up to `total`."""
+    remaining, parts = count, [np.zeros(0, np.int64)]
+    bands_per_group = _MIN_BANDS if borders[-1] <= _GROUP else 1
+    for first in range(0, len(borders) - 1, bands_per_group):
+        if not remaining:
             break
-        bands = borders[first : first + together + 1]
+        bands = borders[first : first + bands_per_group + 1]
         weights = weigh(bands[0], bands[-1])
         for start, end in itertools.pairwise(bands):
             weight = weights[start - bands[0] : end - bands[0]]
-            rate = left * weight
-            chances = np.clip(np.floor(ONE * rate / (rate + total)), _LEAST, ONE - _LEAST) / ONE
+            rate = remaining * weight
+            chances = np.clip(np.floor(ONE * rate / (rate + total)), _MIN_CHANCE, ONE - _MIN_CHANCE) / ONE
             total -= float(weight.sum())
-            wanted = None if places is None else places[slice(*np.searchsorted(places, [start, end]))] - start
-            found.append(start + _code_band(coder, chances, left, wanted))
-            left -= len(found[-1])
-    if left:
-        raise CodecError(f"cells must hold {count} Gaussians; got {count - left}")
-    return np.concatenate(found)
+            part = None if index is None else index[slice(*np.searchsorted(index, [start, end]))] - start
+            parts.append(start + _code_band(coder, chances, remaining, part))
+            remaining -= len(parts[-1])
+    if remaining:
+        raise CodecError(f"cells must hold {count} Gaussians; got {count - remaining}")
+    return np.concatenate(parts)
 
 
-def _code_band(coder: Coder, chances: Floats, most: int, places: Integers | None) -> Integers:
-    """Code which cells hold at most so many Gaussians, each one more with its chance."""
-    cells = np.arange(len(chances) if most else 0)
-    wanted = None if places is None else np.bincount(places, minlength=len(chances))
-    found, held = [cells[:0]], 0
+def _code_band(coder: Coder, chances: Floats, max_count: int, index: Integers | None) -> Integers:
+    """Code the cells of at most `max_count` Gaussians: a bit of its chance for each further one in a cell."""
+    cells = np.arange(len(chances) if max_count else 0)
+    counts = None if index is None else np.bincount(index, minlength=len(chances))
+    rounds, total = [cells[:0]], 0
     while len(cells):
-        more = None if wanted is None else (wanted[cells] > len(found) - 1).astype(np.int32)
-        cells = cells[np.asarray(coder.bits(chances[cells], more)) > 0]
-        found.append(cells)
-        held += len(cells)
-        if held > most:
-            raise CodecError("cells must hold no more Gaussians than are left; got more")
-    return np.sort(np.concatenate(found), kind="stable")
-
-
-def _code_margin(coder: Coder, model: AdaptiveNumber, grid: Grid, cell: Integers | None) -> int:
-    margin = None
-    if cell is not None:
-        beyond = [-cell.min(), (cell[:, 0] - grid.columns + 1).max(), (cell[:, 1] - grid.rows + 1).max(), 0]
-        margin = int(max(beyond))
-    margin = model.code(coder, margin)
-    if margin > grid.most_margin:
-        raise CodecError(f"a margin must be at most {grid.most_margin} cells; got {margin}")
-    return margin
+        bits = None if counts is None else (counts[cells] > len(rounds) - 1).astype(np.int32)
+        cells = cells[np.asarray(coder.bits(chances[cells], bits)) > 0]
+        rounds.append(cells)
+        total += len(cells)
+        if total > max_count:
+            raise CodecError(f"cells must hold at most the {max_count} Gaussians that remain; got more")
+    return np.sort(np.concatenate(rounds), kind="stable")

@@ -1,4 +1,4 @@
-"""Where the models of Gaussians begin: shapes found on photos that no report measures, in parts of a thousand."""
+"""The weights of the models of Gaussians at first, measured on photos that no benchmark uses."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import numpy as np
 
 from kcgs.codec.exact import Floats
 
-# what a start weighs against what is seen, in Gaussians
-_WEIGHT = 0.05
+_WEIGHT = 0.05  # Gaussians for which a part of a thousand stands
 
 
 class Shapes(NamedTuple):
-    """Weights of bins at first, for each context of each magnitude: [contexts, bins]."""
+    """Weights of the bins of each adaptive magnitude, [contexts, bins]."""
 
     grey: Floats
     hue: Floats
@@ -26,6 +25,7 @@ def _shapes(*tables: Sequence[Sequence[float]]) -> Shapes:
     return Shapes(*(_WEIGHT * np.array(table) for table in tables))
 
 
+# parts of a thousand: grey, hue, hue2 and ratio
 # fmt: off
 SHAPES = _shapes(
     [
@@ -53,5 +53,4 @@ SHAPES = _shapes(
     ],
 )
 # fmt: on
-# of the bins of an angle
-ANGLE = np.array([4.5, 3.5, 2.7, 2.5, 2.4, 2.5, 2.7, 3.5] * 2)
+ANGLE = np.array([4.5, 3.5, 2.7, 2.5, 2.4, 2.5, 2.7, 3.5] * 2)  # weights of the bins of an angle

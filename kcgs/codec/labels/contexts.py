@@ -1,7 +1,7 @@
-"""The model of label maps: what a pixel may be, given the pixels before it (docs/format.md, "Chances of a pixel").
+"""The context model of label maps: the chances of a pixel, given the pixels before it (docs/format.md).
 
-A small network, trained once by `tests/codec/train_prior.py`, says what is known before a map is seen. Loops in
-integers, compiled by numba: ``>>`` and ``//`` round down.
+A small network, trained once by `tests/codec/train_prior.py`, is the first estimate. Counters that learn from the map
+correct it. All loops are in integers and compiled by numba: ``>>`` and ``//`` round down.
 """
 
 from __future__ import annotations
@@ -13,66 +13,86 @@ import numpy as np
 
 from kcgs.kernels.compiled import inner
 
-# columns of each row above the pixel that the network sees, nearest row first
-_REACH = ((-8, -1), (-8, 7), (-7, 8), (-6, 7), (-5, 6), (-3, 4), (-2, 3))
-_OFFSETS = [(dx, -dy) for dy, (low, high) in enumerate(_REACH) for dx in range(low, high + 1)]
-TEMPLATE = sorted(_OFFSETS, key=lambda place: (place[0] ** 2 + place[1] ** 2, -place[1], place[0]))
-# tables of scenes and of files of maps, with the units of their layers; weights are in 1/64, biases of the second and
-# third layer in 1/4096, first estimates of the mixer in 1/65536
+# dx of the first and the last pixel of the template in each row, from the pixel's own row upwards
+_SPANS = ((-8, -1), (-8, 7), (-7, 8), (-6, 7), (-5, 6), (-3, 4), (-2, 3))
+_OFFSETS = [(dx, -dy) for dy, (first, last) in enumerate(_SPANS) for dx in range(first, last + 1)]
+TEMPLATE = sorted(_OFFSETS, key=lambda offset: (offset[0] ** 2 + offset[1] ** 2, -offset[1], offset[0]))
+# units of the two hidden layers of each network: of the maps in scenes, and of files of maps
 PRIORS = {"prior.bin": (48, 16), "prior2.bin": (96, 32)}
 
-LEFT, RIGHT, TOP = 8, 9, 6  # margins around the map
-CLIP = 3071  # largest logit, in 1/256
-HEADS, INPUTS = 2, 4  # decisions: which of two candidates, or neither; estimates that are mixed
-# columns of a pixel's row: its place, the candidates, whether it is decided by bits, its label; then for each decision
-# the estimates, and the three counters, the mixer's weights, the chance; then the template, and room for the network
-X, Y, FIRST, SECOND, CODED, LABEL, INPUT = 0, 1, 2, 3, 4, 5, 6
-SLOT = INPUT + HEADS * INPUTS
-CHOSEN, MIXED, DECISION = 3, 4, 5
-FEATURE = SLOT + HEADS * DECISION
-UNITS = FEATURE + len(TEMPLATE)
+LEFT = 8  # columns of the margin at the left of a map, in labels
+RIGHT = 9  # columns of the margin at its right
+TOP = 6  # rows of the margin above it
+DECISIONS = 2  # 0: second candidate rather than the first; 1: neither candidate
+COUNTERS = 3  # that a decision reads
+ESTIMATES = 1 + COUNTERS  # logits that are mixed: of the network, then of the counters
+PIXEL = np.dtype(
+    [
+        ("x", np.int32),  # column, margin included
+        ("y", np.int32),  # row, margin included
+        ("is_coded", np.int32),  # 1: bits decide between the candidates; 0: a seed
+        ("first", np.int32),  # candidate
+        ("second", np.int32),  # candidate
+        ("label", np.int32),
+        ("features", np.int32, len(TEMPLATE)),  # 0: has the first candidate, 1: the second, 2: neither
+        ("estimates", np.int32, (DECISIONS, ESTIMATES)),  # logits, in 1/256
+        ("counters", np.int32, (DECISIONS, COUNTERS)),  # their rows in the table of counters
+        ("weights", np.int32, DECISIONS),  # which set of the mixer's weights
+        ("chance", np.int32, DECISIONS),  # of a 1, in 1/65536
+    ]
+)
 
-# where the counters of each context begin
-_BASES = np.array([[0, 1 << 6, (1 << 6) + (1 << 11)], [67648, 67649, 67649 + 3**4]], np.int32)
-_SLOTS = 67649 + 3**4 + 3**8
-_RATE, _SHIFT = 6, 18  # the mixer's step
-_HEAVIEST = 1 << 22
-_MEMORY = 40  # decisions that a counter remembers
-_SURE = 16  # least chance, in 1/65536
+MAX_LOGIT = 3071  # in 1/256
+_MAX_UNIT = 4095  # largest activation of a hidden unit, in 1/64
+# counters of each context: of decision 0 by two values of 6, 11 and 16 features; of decision 1 by three of 0, 4 and 8
+_CONTEXT_SIZES = (2**6, 2**11, 2**16, 3**0, 3**4, 3**8)
+_BASES = np.cumsum((0, *_CONTEXT_SIZES[:-1])).reshape(DECISIONS, COUNTERS).astype(np.int32)
+_MIXER_RATE = 6  # of the mixer's steps, before _MIXER_SHIFT
+_MIXER_SHIFT = 18  # bits
+_MAX_WEIGHT = 1 << 22  # of the mixer, in 1/65536
+_WEIGHT_SETS = 4  # by the age of a decision's third counter: 0, below _YOUNG, below _OLD, or more
+_YOUNG = 5  # bits
+_OLD = 12  # bits
+_MAX_AGE = 40  # bits that a counter remembers
+_MIN_COUNTER = 32  # least chance of a counter, in 1/65536
+_MIN_CHANCE = 16  # least chance of a bit, in 1/65536
 
 
 def layout(hidden: int, latent: int) -> list[tuple[str, tuple[int, ...]]]:
     """Return type and shape of each table: weights and biases of three layers, then the mixer's first weights."""
-    weights = ("<i1", (len(TEMPLATE), 2, hidden)), ("<i1", (hidden, latent)), ("<i1", (latent, HEADS))
-    biases = ("<i2", (hidden,)), ("<i4", (latent,)), ("<i4", (HEADS,))
-    return [table for layer in zip(weights, biases, strict=True) for table in layer] + [("<i4", (INPUTS,))]
+    weights = ("<i1", (len(TEMPLATE), 2, hidden)), ("<i1", (hidden, latent)), ("<i1", (latent, DECISIONS))
+    biases = ("<i2", (hidden,)), ("<i4", (latent,)), ("<i4", (DECISIONS,))
+    return [table for layer in zip(weights, biases, strict=True) for table in layer] + [("<i4", (ESTIMATES,))]
 
 
-def load_prior(name: str = "prior.bin") -> tuple[Any, ...]:
+def load_prior(name: str) -> tuple[Any, ...]:
     """Read tables that come with the package, as int32, in the order of `layout`."""
     data = resources.files(__package__).joinpath(name).read_bytes()
     tables = np.frombuffer(data, [("", kind, shape) for kind, shape in layout(*PRIORS[name])])[0]
     return tuple(table.astype(np.int32) for table in tables)
 
 
-# constants of the loops: the template, 65536 / (1 + e**(-x / 256)) for logits from -CLIP, its inverse. No value of the
-# second but 32768 is within 1e-6 of a half before it is rounded: any machine's exp gives the same table.
-_DX, _DY = (np.array(axis, np.int32) for axis in zip(*TEMPLATE, strict=True))
-SQUASH = np.rint(65536 / (1 + np.exp(np.arange(CLIP, -CLIP - 1, -1) / 256))).astype(np.int32)
-_STRETCH = (np.searchsorted(SQUASH, np.arange(4096) * 16 + 8) - CLIP).astype(np.int32)
+def new_counters() -> Any:
+    """Return the counters at the start of a stream, (counters, 2) uint16: a chance in 1/65536, and an age in bits."""
+    return np.zeros((sum(_CONTEXT_SIZES), 2), np.uint16)
 
 
-def new_tables(prior: tuple[Any, ...]) -> tuple[Any, Any]:
-    """Return what adapts, as every stream starts with it.
+def new_mixer(prior: tuple[Any, ...]) -> Any:
+    """Return the mixer's weights at the start of a stream, (decisions, sets, estimates) int32 in 1/65536."""
+    return np.tile(prior[-1], (DECISIONS, _WEIGHT_SETS, 1))
 
-    Counters [slots, 2] uint16, a chance in 1/65536 and how often it was seen; the mixer's weights [HEADS, 4, INPUTS].
-    """
-    return np.zeros((_SLOTS, 2), np.uint16), np.tile(prior[-1], (HEADS, 4, 1))
+
+# constants of the loops. Only the middle value of SQUASH lies within 1e-6 of a half before it is rounded, so that any
+# machine's exp gives the same table
+_DX = np.array([dx for dx, _ in TEMPLATE], np.int32)
+_DY = np.array([dy for _, dy in TEMPLATE], np.int32)
+SQUASH = np.rint(65536 / (1 + np.exp(np.arange(MAX_LOGIT, -MAX_LOGIT - 1, -1) / 256))).astype(np.int32)
+_STRETCH = (np.searchsorted(SQUASH, np.arange(4096) * 16 + 8) - MAX_LOGIT).astype(np.int32)
 
 
 @inner
-def quiet(labels, y, x):  # type: ignore[no-untyped-def]
-    """Tell whether the pixels around (x, y) that come before it have one label."""
+def is_quiet(labels, y, x):  # type: ignore[no-untyped-def]
+    """True if the neighbours of (x, y) that come before it have one label."""
     label = labels[y, x - 1]
     for i in range(x - 2, x + 8):
         if labels[y - 1, i] != label:
@@ -84,121 +104,126 @@ def quiet(labels, y, x):  # type: ignore[no-untyped-def]
 
 
 @inner
-def describe(labels, y, x, row):  # type: ignore[no-untyped-def]
-    """Find the two candidates, and which of them each pixel of the template is."""
+def find_features(labels, pixel):  # type: ignore[no-untyped-def]
+    """Fill in the candidates of a pixel and its features."""
+    y, x, features = pixel.y, pixel.x, pixel.features
     first = labels[y, x - 1]
     second = -1
     for t in range(len(_DX)):
         label = labels[y + _DY[t], x + _DX[t]]
         if label == first:
-            row[FEATURE + t] = 0
+            features[t] = 0
         elif second < 0 or label == second:
             second = label
-            row[FEATURE + t] = 1
+            features[t] = 1
         else:
-            row[FEATURE + t] = 2
-    row[FIRST] = first
-    row[SECOND] = second
+            features[t] = 2
+    pixel.first = first
+    pixel.second = second
 
 
 def make_network(prior: tuple[Any, ...]) -> Any:
-    """Return the network of these tables, compiled; they are constants of its loops, which as arguments slow them.
+    """Compile a network: two layers of rectified sums give the first estimate of each decision.
 
-    Two layers of rectified sums of small integers give the first estimate of each decision, a logit in 1/256.
+    Its tables are constants of the loops: as arguments they would slow them down.
     """
     layer1, bias1, layer2, bias2, layer3, bias3, _ = prior
     num_hidden, num_latent = layer2.shape
 
     @inner
-    def network(row):  # type: ignore[no-untyped-def]
-        # lengths that a compiler cannot know: known loops it would write out, without vectors, at three times the time
-        latent, hidden = row[UNITS : len(row) - num_hidden], row[UNITS + num_latent :]
+    def network(pixel, units):  # type: ignore[no-untyped-def]
+        # lengths unknown to the compiler: it would unroll loops of known length, without vectors, and be 3 times slower
+        latent, hidden = units[: len(units) - num_hidden], units[num_latent:]
+        features, estimates = pixel.features, pixel.estimates
         for j in range(len(hidden)):
             hidden[j] = bias1[j]
         for t in range(len(_DX)):
-            kind = row[FEATURE + t]
-            if kind > 0:
-                weights = layer1[t, kind - 1]
+            feature = features[t]
+            if feature > 0:
+                weights = layer1[t, feature - 1]
                 for j in range(len(hidden)):
                     hidden[j] += weights[j]
         for k in range(len(latent)):
             latent[k] = bias2[k]
         for j in range(num_hidden):
-            value = min(hidden[j], 4095)
-            if value > 0:
+            unit = min(hidden[j], _MAX_UNIT)
+            if unit > 0:
                 weights = layer2[j]
                 for k in range(len(latent)):
-                    latent[k] += value * weights[k]
-        for h in range(HEADS):
-            total = bias3[h]
+                    latent[k] += unit * weights[k]
+        for decision in range(DECISIONS):
+            total = bias3[decision]
             for k in range(num_latent):
-                total += min(max(latent[k] >> 6, 0), 4095) * layer3[k, h]
-            row[INPUT + h * INPUTS] = min(max(total >> 4, -CLIP), CLIP)
+                total += min(max(latent[k] >> 6, 0), _MAX_UNIT) * layer3[k, decision]
+            estimates[decision, 0] = min(max(total >> 4, -MAX_LOGIT), MAX_LOGIT)
 
     return network
 
 
-network, network2 = map(make_network, map(load_prior, PRIORS))
+scene_network = make_network(load_prior("prior.bin"))
+file_network = make_network(load_prior("prior2.bin"))
 
 
 @inner
-def contexts(row):  # type: ignore[no-untyped-def]
-    """Find the counters of a pixel: by its nearest 6, 11 and 16; and for the other decision all, by 4 and by 8."""
+def find_counters(pixel):  # type: ignore[no-untyped-def]
+    """Fill in the counters of a pixel: those of the contexts that its features are in."""
+    features, counters = pixel.features, pixel.counters
     bits = 0
     for t in range(1, 17):
-        bits = bits << 1 | (row[FEATURE + t] > 0)
+        bits = bits << 1 | (features[t] > 0)
         if t == 6:
-            row[SLOT] = _BASES[0, 0] + bits
+            counters[0, 0] = _BASES[0, 0] + bits
         elif t == 11:
-            row[SLOT + 1] = _BASES[0, 1] + bits
+            counters[0, 1] = _BASES[0, 1] + bits
         elif t == 16:
-            row[SLOT + 2] = _BASES[0, 2] + bits
+            counters[0, 2] = _BASES[0, 2] + bits
+    counters[1, 0] = _BASES[1, 0]
     digits = 0
     for t in range(1, 9):
-        digits = digits * 3 + row[FEATURE + t]
+        digits = digits * 3 + features[t]
         if t == 4:
-            row[SLOT + DECISION + 1] = _BASES[1, 1] + digits
+            counters[1, 1] = _BASES[1, 1] + digits
         elif t == 8:
-            row[SLOT + DECISION + 2] = _BASES[1, 2] + digits
-    row[SLOT + DECISION] = _BASES[1, 0]
+            counters[1, 2] = _BASES[1, 2] + digits
 
 
 @inner
-def mix(counters, weights, row, h):  # type: ignore[no-untyped-def]
-    """Weigh the network and the counters into one chance."""
-    inputs, slots = row[INPUT + h * INPUTS :], row[SLOT + h * DECISION :]
-    seen: Any = 0
-    for c in range(3):
-        counter = counters[slots[c]]
-        seen = counter[1]
-        inputs[c + 1] = _STRETCH[counter[0] >> 4] if seen > 0 else inputs[0]
-    chosen = 0 if seen == 0 else 1 if seen < 5 else 2 if seen < 12 else 3
+def mix(counters, mixer, pixel, decision):  # type: ignore[no-untyped-def]
+    """Mix the estimates of the network and of the counters; return the chance of a 1."""
+    estimates, rows = pixel.estimates[decision], pixel.counters[decision]
+    age: Any = 0
+    for c in range(COUNTERS):
+        counter = counters[rows[c]]
+        age = counter[1]
+        estimates[c + 1] = _STRETCH[counter[0] >> 4] if age > 0 else estimates[0]
+    weights = 0 if age == 0 else 1 if age < _YOUNG else 2 if age < _OLD else 3
     total: Any = np.int64(0)
-    for k in range(INPUTS):
-        total += np.int64(weights[h, chosen, k]) * inputs[k]
-    logit: Any = min(max(total >> 16, -CLIP), CLIP)
-    slots[CHOSEN] = chosen
-    slots[MIXED] = min(max(SQUASH[logit + CLIP], _SURE), 65536 - _SURE)
-    return slots[MIXED] / 65536
+    for k in range(ESTIMATES):
+        total += np.int64(mixer[decision, weights, k]) * estimates[k]
+    logit: Any = min(max(total >> 16, -MAX_LOGIT), MAX_LOGIT)
+    chance = min(max(SQUASH[logit + MAX_LOGIT], _MIN_CHANCE), 65536 - _MIN_CHANCE)
+    pixel.weights[decision] = weights
+    pixel.chance[decision] = chance
+    return chance / 65536
 
 
 @inner
-def learn(counters, weights, row, h, bit):  # type: ignore[no-untyped-def]
-    """Move the weights along the error, and the counters to the bit."""
-    inputs, slots = row[INPUT + h * INPUTS :], row[SLOT + h * DECISION :]
-    error = (bit << 16) - slots[MIXED]
-    chosen = weights[h, slots[CHOSEN]]
-    for k in range(INPUTS):
-        step = np.int64(inputs[k]) * error * _RATE
-        weight = chosen[k] + ((step + (1 << (_SHIFT - 1))) >> _SHIFT)
-        chosen[k] = min(max(weight, -_HEAVIEST), _HEAVIEST)
-    for c in range(3):
-        counter = counters[slots[c]]
+def learn(counters, mixer, pixel, decision, bit):  # type: ignore[no-untyped-def]
+    """Move the mixer's weights along the error, and the counters towards the bit."""
+    estimates, rows = pixel.estimates[decision], pixel.counters[decision]
+    error = (bit << 16) - pixel.chance[decision]
+    weights = mixer[decision, pixel.weights[decision]]
+    for k in range(ESTIMATES):
+        step = np.int64(estimates[k]) * error * _MIXER_RATE
+        weight = weights[k] + ((step + (1 << (_MIXER_SHIFT - 1))) >> _MIXER_SHIFT)
+        weights[k] = min(max(weight, -_MAX_WEIGHT), _MAX_WEIGHT)
+    for c in range(COUNTERS):
+        counter = counters[rows[c]]
         chance: Any = np.int64(counter[0])
-        seen: Any = np.int64(counter[1])
-        if seen == 0:
-            chance = np.int64(SQUASH[inputs[0] + CLIP])
-            seen = 2
-        chance += ((bit << 16) - chance) * 2 // (2 * seen + 3)
-        counter[0] = min(max(chance, 32), 65504)
-        counter[1] = min(seen + 1, _MEMORY)
+        age: Any = np.int64(counter[1])
+        if age == 0:
+            chance = np.int64(SQUASH[estimates[0] + MAX_LOGIT])
+            age = 2
+        chance += ((bit << 16) - chance) * 2 // (2 * age + 3)
+        counter[0] = min(max(chance, _MIN_COUNTER), 65536 - _MIN_COUNTER)
+        counter[1] = min(age + 1, _MAX_AGE)

@@ -9,32 +9,30 @@ import numpy as np
 from kcgs.codec.adaptive import AdaptiveBit
 from kcgs.codec.rangecoder import CodecError, Coder
 
-_SIZES = 8  # contexts, by how many are in the block
+_CONTEXTS = 8  # by log2 of the number of seeds in a block
 
 
 def code_seeds(coder: Coder, seeds: Any) -> None:
-    """Code which entries of `seeds`, (H, W) uint8, are 1, by how many lie in each half of ever smaller blocks.
-
-    A reader sets them.
-    """
-    count = coder.unbounded(int(np.count_nonzero(seeds)))
+    """Code which entries of `seeds`, (H, W) uint8, are 1; a reader sets them."""
+    count = coder.unbounded_number(int(np.count_nonzero(seeds)))
     if count > seeds.size:
         raise CodecError(f"data must mark at most {seeds.size} pixels; got {count}")
-    extreme = [AdaptiveBit() for _ in range(_SIZES)]
-    waiting = [(seeds, count)]
-    while waiting:
-        block, count = waiting.pop()
+    is_extreme = [AdaptiveBit() for _ in range(_CONTEXTS)]
+    stack = [(seeds, count)]
+    while stack:
+        block, count = stack.pop()
         if count == 1:
-            place = coder.number(0 if coder.reads else int(block.argmax()), block.size)
-            if place >= block.size:
-                raise CodecError("data must mark pixels of the map")
-            block[place // block.shape[1], place % block.shape[1]] = 1
+            index = coder.number(0 if coder.is_reader else int(block.argmax()), block.size)
+            if index >= block.size:
+                raise CodecError(f"data must mark one of the {block.size} pixels of a block; got number {index}")
+            block[index // block.shape[1], index % block.shape[1]] = 1
         elif count == block.size:
             block[:] = 1
         elif count:
             first, second = _halves(block)
-            inside = _code_count(coder, first, count, second.size, extreme[min(count.bit_length() - 2, _SIZES - 1)])
-            waiting += [(first, inside), (second, count - inside)]
+            context = min(count.bit_length() - 2, _CONTEXTS - 1)
+            first_count = _code_count(coder, first, second.size, count, is_extreme[context])
+            stack += [(first, first_count), (second, count - first_count)]
 
 
 def _halves(block: Any) -> tuple[Any, Any]:
@@ -45,15 +43,15 @@ def _halves(block: Any) -> tuple[Any, Any]:
     return block[:, : width // 2], block[:, width // 2 :]
 
 
-def _code_count(coder: Coder, half: Any, seeds: int, rest: int, extreme: AdaptiveBit) -> int:
-    """Code how many of a block's seeds are in its first half: all, none, or some number between."""
-    low, high = max(0, seeds - rest), min(seeds, half.size)
+def _code_count(coder: Coder, first: Any, second_size: int, count: int, is_extreme: AdaptiveBit) -> int:
+    """Code how many of a block's seeds are in its first half: as few as can be, as many, or a number between."""
+    low, high = max(0, count - second_size), min(count, first.size)
     if low == high:
         return low
-    count = 0 if coder.reads else int(np.count_nonzero(half))
-    if high - low < 2 or extreme.code(coder, count in (low, high)):
-        return high if coder.fair(count == high) else low
-    count = low + 1 + coder.number(count - low - 1, high - low - 1)
-    if count >= high:
-        raise CodecError("data must mark pixels of the map")
-    return count
+    first_count = 0 if coder.is_reader else int(np.count_nonzero(first))
+    if high - low < 2 or is_extreme.code(coder, first_count in (low, high)):
+        return high if coder.fair_bit(first_count == high) else low
+    first_count = low + 1 + coder.number(first_count - low - 1, high - low - 1)
+    if first_count >= high:
+        raise CodecError(f"a half of a block must hold fewer than {high} seeds; got {first_count}")
+    return first_count

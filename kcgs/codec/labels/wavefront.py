@@ -1,76 +1,202 @@
-"""A label map from wavefront to wavefront: which pixels are to be decided, with what chances, and what follows.
+"""A label map from wavefront to wavefront: which pixels are coded, their chances, and what the model learns.
 
-A wavefront is the pixels of equal x + 8 y; what it asks depends on earlier ones only (docs/format.md). Rows continue
-with their last label until a decision changes it, so that only pixels near contours are looked at.
+A wavefront is the pixels of equal x + 8 y; the chances of its bits depend on earlier wavefronts only (docs/format.md).
+A row continues with its last label until a decision changes it, so that only pixels near contours cost time.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from kcgs.kernels.compiled import Program, inner
 
 from .contexts import (
-    CODED,
-    FIRST,
-    LABEL,
     LEFT,
+    PIXEL,
     RIGHT,
-    SECOND,
     TOP,
-    UNITS,
-    X,
-    Y,
-    contexts,
-    describe,
+    file_network,
+    find_counters,
+    find_features,
+    is_quiet,
     learn,
+    load_prior,
     mix,
-    network,
-    network2,
-    quiet,
+    new_counters,
+    new_mixer,
+    scene_network,
 )
 
 SLANT = 8  # pixels (x, y) of equal x + SLANT * y make a wavefront
-RANKS = 3  # nearest labels that one that is neither candidate is compared with
-_FAR = 32  # pixels within which they are looked for
-# entries of the state: the wavefront, its rows, those of them that bits decide; regions in all; whether the network is
-# that of files of maps
-FRONT, ROWS, DECIDED, REGIONS, WIDE, STATE = 0, 1, 2, 3, 4, 5
-# of a row of the map: its last pixel that differs from the one before, the next seed, the wavefront until which it is
-# quiet, how far its last label is written
-_CHANGE, _SEED, _WAKE, _END, _LINE = 0, 1, 2, 3, 4
-_AHEAD = 128  # pixels that a row is written at a time: to its end, a change would cost its width
+MAX_NEAREST = 3  # nearest labels that the label of an escape is compared with
+_MAX_RADIUS = 32  # of the search for nearest labels, in pixels
+_AHEAD = 128  # pixels that a row is written ahead: written to its end, each change would cost its width
+
+STATE = np.dtype(
+    [
+        ("front", np.int64),  # the present wavefront, x + SLANT * y
+        ("num_pixels", np.int64),  # of the wavefront that are seeds or coded
+        ("num_coded", np.int64),  # of these, pixels that bits decide
+        ("num_regions", np.int64),  # of the map
+        ("is_file", np.int64),  # 1: the network of files of maps; 0: that of scenes
+    ]
+)
+_LINE = np.dtype(
+    [
+        ("change", np.int32),  # column of the last pixel that differs from the one before
+        ("seed", np.int32),  # column of the next seed
+        ("wake", np.int32),  # the wavefront until which all pixels are quiet
+        ("end", np.int32),  # column up to which the last label is written
+    ]
+)
 
 
-def new_work(height: int, prior: tuple[Any, ...]) -> tuple[Any, Any, Any]:
-    """Return room for the pixels of a wavefront, the chances of their bits, and what is known of the map's rows."""
-    lines = np.zeros((TOP + height + 2, _LINE), np.int32)
-    return np.zeros((height, UNITS + sum(prior[2].shape)), np.int32), np.zeros(2 * height), lines
+class Scan(NamedTuple):
+    """What a pass over a map of height H and width W reads and writes."""
+
+    state: Any  # STATE
+    labels: Any  # [TOP + H + 1, LEFT + W + RIGHT] the labels so far, and margins
+    seeds: Any  # [H, W] uint8, 1 where a pixel is a seed
+    lines: Any  # [TOP + H + 2] _LINE, of each row of the labels
+    pixels: Any  # [H] PIXEL, of the present wavefront
+    units: Any  # the network's hidden units
+    counters: Any  # of the context model
+    mixer: Any  # its weights
+    chances: Any  # [2 H] float64, of the wavefront's bits
+    answers: Any  # [2 H] int32, the bits, where the map is known
+
+
+def new_scan(seeds: Any, num_regions: int, *, is_file: bool) -> Scan:
+    """Return the start of a pass over a map with these seeds."""
+    height, width = seeds.shape
+    prior = load_prior("prior2.bin" if is_file else "prior.bin")
+    state = np.zeros(1, STATE)[0]
+    state["num_regions"], state["is_file"] = num_regions, is_file
+    return Scan(
+        state,
+        np.zeros((height + TOP + 1, width + LEFT + RIGHT), np.int32),
+        seeds,
+        np.zeros(TOP + height + 2, _LINE),
+        np.zeros(height, PIXEL),
+        np.zeros(sum(prior[2].shape), np.int32),
+        new_counters(),
+        new_mixer(prior),
+        np.zeros(2 * height),
+        np.zeros(2 * height, np.int32),
+    )
+
+
+program = Program("label coder", __file__, "contexts.py", "prior.bin", "prior2.bin")
+
+
+@program.entry
+def advance(scan, bits, truth):  # type: ignore[no-untyped-def]
+    """Label the present wavefront by its bits, go on to the next that has seeds or coded pixels, return their number.
+
+    `truth` holds the regions' numbers; a decoder's is empty.
+    """
+    height, width = scan.seeds.shape
+    state = scan.state
+    _label_pixels(scan, bits)
+    state.num_pixels = 0
+    state.num_coded = 0
+    while state.num_pixels == 0 and state.front < width - 1 + SLANT * (height - 1):
+        state.front += 1
+        _find_pixels(scan)
+    _estimate(scan, truth)
+    return state.num_pixels
 
 
 @inner
-def _still(labels, y, x, lines):  # type: ignore[no-untyped-def]
-    """Tell the same as `quiet`, by the last change in each row, which in the row above is not beyond what it reads."""
+def _label_pixels(scan, bits):  # type: ignore[no-untyped-def]
+    """Give the wavefront's pixels their labels and learn from them."""
+    labels, lines, state = scan.labels, scan.lines, scan.state
+    num_escapes = state.num_coded if state.num_regions > 2 else 0
+    bit = 0
+    for n in range(state.num_pixels):
+        pixel = scan.pixels[n]
+        if pixel.is_coded:
+            is_escape = False
+            if num_escapes > 0:
+                is_escape = bits[bit] != 0
+                learn(scan.counters, scan.mixer, pixel, 1, bits[bit])
+            if not is_escape:
+                is_second = bits[num_escapes + bit]
+                learn(scan.counters, scan.mixer, pixel, 0, is_second)
+                pixel.label = pixel.second if is_second else pixel.first
+            bit += 1
+        y, x, label = pixel.y, pixel.x, pixel.label
+        if label != labels[y, x - 1]:
+            lines[y].change = x
+            for below in range(y, y + 3):
+                lines[below].wake = 0  # these rows see the change
+            _continue(labels, lines, y, x, label)
+        _fill_margins(labels, y, x, label)
+
+
+@inner
+def _find_pixels(scan):  # type: ignore[no-untyped-def]
+    """List the seeds and coded pixels of a wavefront; the others have their label, since rows continue."""
+    labels, seeds, lines, state = scan.labels, scan.seeds, scan.lines, scan.state
+    height, width = seeds.shape
+    front = state.front
+    for j in range(max(0, -((width - 1 - front) // SLANT)), min(height - 1, front // SLANT) + 1):
+        x, y = front - SLANT * j + LEFT, j + TOP
+        line = lines[y]
+        if x + RIGHT >= line.end:
+            _continue(labels, lines, y, x, labels[y, x - 1])
+        if line.wake > front:
+            continue
+        seed = max(line.seed, x)
+        while seed < width + LEFT and seeds[j, seed - LEFT] == 0:
+            seed += 1
+        line.seed = seed
+        pixel = scan.pixels[state.num_pixels]
+        if not _is_still_quiet(labels, lines, y, x):
+            pixel.x = x
+            pixel.y = y
+            pixel.is_coded = 1
+            find_features(labels, pixel)
+            state.num_pixels += 1
+            state.num_coded += 1
+        elif x == seed:
+            pixel.x = x
+            pixel.y = y
+            pixel.is_coded = 0
+            pixel.first = labels[y, x - 1]
+            pixel.second = -1
+            pixel.label = 1 - pixel.first  # the other one of two regions; of more, the escape overwrites it
+            state.num_pixels += 1
+        else:
+            _fill_margins(labels, y, x, labels[y, x - 1])
+            if y >= TOP + 2 and lines[y - 2].change < x:
+                line.wake = front + seed - x
+
+
+@inner
+def _is_still_quiet(labels, lines, y, x):  # type: ignore[no-untyped-def]
+    """Return what `is_quiet` does, by the last change in each row, which in the row above is within its reach."""
     if y < TOP + 2:
-        return quiet(labels, y, x)
+        return is_quiet(labels, y, x)
     label = labels[y, x - 1]
-    if lines[y, _CHANGE] > x - 2 or lines[y - 1, _CHANGE] > x - 2:
+    if lines[y].change > x - 2 or lines[y - 1].change > x - 2:
         return False
     if labels[y - 1, x] != label or labels[y - 2, x] != label:
         return False
-    return lines[y - 2, _CHANGE] < x or quiet(labels, y, x)
+    return lines[y - 2].change < x or is_quiet(labels, y, x)
 
 
 @inner
-def _continue(labels, y, x, label, lines):  # type: ignore[no-untyped-def]
+def _continue(labels, lines, y, x, label):  # type: ignore[no-untyped-def]
+    """Write a label at a pixel and ahead of it."""
     labels[y, x : x + _AHEAD] = label
-    lines[y, _END] = x + _AHEAD
+    lines[y].end = x + _AHEAD
 
 
 @inner
-def _margins(labels, y, x, label):  # type: ignore[no-untyped-def]
+def _fill_margins(labels, y, x, label):  # type: ignore[no-untyped-def]
     """Repeat the label of a pixel in the margins above and left of the map."""
     if y == TOP:
         labels[:TOP, x : x + RIGHT + 1] = label
@@ -79,142 +205,70 @@ def _margins(labels, y, x, label):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _settle(state, labels, bits, counters, weights, rows, lines):  # type: ignore[no-untyped-def]
-    """Give the wavefront's pixels their labels and learn from them."""
-    decided = state[DECIDED]
-    escapes = decided if state[REGIONS] > 2 else 0
-    asked = 0
-    for n in range(state[ROWS]):
-        row = rows[n]
-        if row[CODED]:
-            escaped = False
-            if escapes > 0:
-                escaped = bits[asked] != 0
-                learn(counters, weights, row, 1, bits[asked])
-            if not escaped:
-                bit = bits[escapes + asked]
-                learn(counters, weights, row, 0, bit)
-                row[LABEL] = row[SECOND] if bit else row[FIRST]
-            asked += 1
-        y, x, label = row[Y], row[X], row[LABEL]
-        if label != labels[y, x - 1]:
-            lines[y, _CHANGE] = x
-            lines[y : y + 3, _WAKE] = 0  # these rows see it
-            _continue(labels, y, x, label, lines)
-        _margins(labels, y, x, label)
-
-
-@inner
-def _look(state, labels, seeds, rows, lines):  # type: ignore[no-untyped-def]
-    """List the pixels of a wavefront that are to be decided; the others have their label, since rows continue."""
-    height, width = seeds.shape
-    front = state[FRONT]
-    for j in range(max(0, -((width - 1 - front) // SLANT)), min(height - 1, front // SLANT) + 1):
-        x, y = front - SLANT * j + LEFT, j + TOP
-        line = lines[y]
-        if x + RIGHT >= line[_END]:
-            _continue(labels, y, x, labels[y, x - 1], lines)
-        if line[_WAKE] > front:
-            continue
-        seed = max(line[_SEED], x)
-        while seed < width + LEFT and seeds[j, seed - LEFT] == 0:
-            seed += 1
-        line[_SEED] = seed
-        n = state[ROWS]
-        row = rows[n]
-        if not _still(labels, y, x, lines):
-            describe(labels, y, x, row)
-            row[X], row[Y], row[CODED] = x, y, 1
-            state[ROWS] += 1
-            state[DECIDED] += 1
-        elif x == seed:
-            row[X], row[Y], row[CODED], row[FIRST], row[SECOND] = x, y, 0, labels[y, x - 1], -1
-            row[LABEL] = 1 - row[FIRST]  # unless there are more than two regions
-            state[ROWS] += 1
-        else:
-            _margins(labels, y, x, labels[y, x - 1])
-            if y >= TOP + 2 and lines[y - 2, _CHANGE] < x:
-                line[_WAKE] = front + seed - x
-
-
-@inner
-def _weigh(truth, answers, state, counters, weights, rows, chances):  # type: ignore[no-untyped-def]
-    """Fill in the chances, and answers where the truth is known: first of being neither candidate, then the second."""
-    escapes = state[DECIDED] if state[REGIONS] > 2 else 0
-    asked = 0
-    for n in range(state[ROWS]):
-        row = rows[n]
+def _estimate(scan, truth):  # type: ignore[no-untyped-def]
+    """Fill in chances, and answers where the truth is known: first whether pixels escape, then which candidate."""
+    state, chances, answers = scan.state, scan.chances, scan.answers
+    num_escapes = state.num_coded if state.num_regions > 2 else 0
+    bit = 0
+    for n in range(state.num_pixels):
+        pixel = scan.pixels[n]
         if len(truth) > 0:
-            row[LABEL] = truth[row[Y] - TOP, row[X] - LEFT]
-        if row[CODED]:
-            if state[WIDE]:
-                network2(row)
+            pixel.label = truth[pixel.y - TOP, pixel.x - LEFT]
+        if pixel.is_coded:
+            if state.is_file:
+                file_network(pixel, scan.units)
             else:
-                network(row)
-            contexts(row)
-            if escapes > 0:
-                chances[asked] = mix(counters, weights, row, 1)
-                answers[asked] = row[LABEL] != row[FIRST] and row[LABEL] != row[SECOND]
-            chances[escapes + asked] = mix(counters, weights, row, 0)
-            answers[escapes + asked] = row[LABEL] != row[FIRST]
-            asked += 1
-
-
-program = Program("label coder", __file__, "contexts.py", "prior.bin", "prior2.bin")
+                scene_network(pixel, scan.units)
+            find_counters(pixel)
+            if num_escapes > 0:
+                chances[bit] = mix(scan.counters, scan.mixer, pixel, 1)
+                answers[bit] = pixel.label != pixel.first and pixel.label != pixel.second
+            chances[num_escapes + bit] = mix(scan.counters, scan.mixer, pixel, 0)
+            answers[num_escapes + bit] = pixel.label != pixel.first
+            bit += 1
 
 
 @program.entry
-def advance(bits, truth, answers, state, labels, seeds, counters, weights, rows, chances, lines):  # type: ignore[no-untyped-def]
-    """Take the bits of a wavefront in, go on to the next that has questions and return their number."""
-    height, width = seeds.shape
-    _settle(state, labels, bits, counters, weights, rows, lines)
-    state[ROWS] = 0
-    state[DECIDED] = 0
-    while state[ROWS] == 0 and state[FRONT] < width - 1 + SLANT * (height - 1):
-        state[FRONT] += 1
-        _look(state, labels, seeds, rows, lines)
-    _weigh(truth, answers, state, counters, weights, rows, chances)
-    return state[ROWS]
-
-
-@program.entry
-def nearest(labels, row, found):  # type: ignore[no-untyped-def]
-    """List up to RANKS labels other than the candidates, by distance from a pixel; return how many."""
+def find_nearest(labels, pixel, nearest):  # type: ignore[no-untyped-def]
+    """Fill in up to MAX_NEAREST labels other than the candidates, by distance from a pixel; return their number."""
     count = 0
-    for radius in range(1, _FAR + 1):
+    for radius in range(1, _MAX_RADIUS + 1):
         for j in range(-radius, 1):
             step = 1 if j == -radius else 2 * radius
             for i in range(-radius, radius + 1, step):
-                y, x = row[Y] + j, row[X] + i
+                y, x = pixel.y + j, pixel.x + i
                 if i + SLANT * j >= 0 or y < 0 or x < 0 or x >= labels.shape[1]:
                     continue
                 label = labels[y, x]
-                known = label == row[FIRST] or label == row[SECOND]
+                is_known = label == pixel.first or label == pixel.second
                 for k in range(count):
-                    known |= found[k] == label
-                if not known:
-                    found[count] = label
+                    is_known |= nearest[k] == label
+                if not is_known:
+                    nearest[count] = label
                     count += 1
-                    if count == RANKS:
+                    if count == MAX_NEAREST:
                         return count
     return count
 
 
 @program.entry
-def survey(index, regions):  # type: ignore[no-untyped-def]
-    """Number the labels in the order in which wavefronts meet them; mark pixels unlike their uniform surroundings."""
+def survey(index, num_regions):  # type: ignore[no-untyped-def]
+    """Number the regions as wavefronts meet them, and mark seeds.
+
+    Returns the number of each pixel's region, the seeds, and the position of each numbered region in `index`.
+    """
     height, width = index.shape
-    number = np.full(regions, -1, np.int32)
-    order = np.empty(regions, np.int32)
+    number = np.full(num_regions, -1, np.int32)
+    order = np.empty(num_regions, np.int32)
     count = 0
     for front in range(width + SLANT * (height - 1)):
         for j in range(max(0, -((width - 1 - front) // SLANT)), min(height - 1, front // SLANT) + 1):
-            label = index[j, front - SLANT * j]
-            if number[label] < 0:
-                number[label] = count
-                order[count] = label
+            position = index[j, front - SLANT * j]
+            if number[position] < 0:
+                number[position] = count
+                order[count] = position
                 count += 1
-        if count == regions:
+        if count == num_regions:
             break
     truth = np.empty(index.shape, np.int32)
     seeds = np.zeros(index.shape, np.uint8)
@@ -223,8 +277,8 @@ def survey(index, regions):  # type: ignore[no-untyped-def]
         for i in range(width):
             x, y = i + LEFT, j + TOP
             truth[j, i] = number[index[j, i]]
-            seeds[j, i] = truth[j, i] != labels[y, x - 1] and quiet(labels, y, x)
+            seeds[j, i] = truth[j, i] != labels[y, x - 1] and is_quiet(labels, y, x)
             labels[y, x] = truth[j, i]
-            _margins(labels, y, x, truth[j, i])
+            _fill_margins(labels, y, x, truth[j, i])
         labels[y, LEFT + width :] = truth[j, width - 1]
     return truth, seeds, order

@@ -1,0 +1,80 @@
+"""The region map of a scene's file: its labels and the softness of its contours (docs/format.md, "The region map")."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from kcgs._check import check_count
+from kcgs.functional import PairSoftness, RegionMap
+from kcgs.functional.labels import compact, touching_pairs
+from kcgs.functional.softness import MAX_SOFTNESS
+
+from .adaptive import AdaptiveSymbol
+from .exact import Integers
+from .file import MAX_LABELS, MAX_REGIONS, ByteReader, varint
+from .labels.stream import SCENE_PROFILE, decode_stream, encode_stream
+from .rangecoder import CodecError, Coder, Reader, Writer
+
+_UNITS = 40  # of softness, per pixel
+_MAX_UNITS = int(MAX_SOFTNESS) * _UNITS
+_GROUP = 32  # pairs that are coded before their model learns
+
+
+def encode_region_map(regions: RegionMap) -> bytes:
+    """Write a map of two regions or more; softness is rounded to fortieths of a pixel."""
+    if regions.resized:
+        raise ValueError("regions must be a map of its own pixels; got one that was resized")
+    check_count("number of labels", regions.labels.numel(), 1, MAX_LABELS)
+    check_count("number of regions", regions.num_regions, 1, MAX_REGIONS)
+    ids, index = compact(regions.labels.cpu())[:2]
+    labels = encode_stream(ids.numpy(), index.numpy(), SCENE_PROFILE)
+    softness = regions.softness
+    if isinstance(softness, PairSoftness):
+        units = [_round(softness.get(pair, 0.0)) for pair in sorted(touching_pairs(regions.labels))]
+    else:
+        units = [_round(softness)]
+    palette = sorted(set(units))
+    head = varint(len(labels)) + labels + b"".join(map(varint, [len(palette), *palette]))
+    if len(palette) == 1:
+        return head
+    writer = Writer()
+    _code_palette(writer, len(units), len(palette), np.array([palette.index(unit) for unit in units]))
+    return head + writer.finish()
+
+
+def _round(softness: float) -> int:
+    return math.floor(softness * _UNITS + 0.5)
+
+
+def decode_region_map(data: bytes, size: tuple[int, int], num_regions: int) -> RegionMap:
+    """Read a map of `num_regions` regions for an image of `size`."""
+    reader = ByteReader(data)
+    stream = reader.take(reader.varint("length of the labels", 1, len(data)))
+    ids, numbers = decode_stream(stream, size, num_regions, SCENE_PROFILE)
+    labels = torch.from_numpy(ids[numbers])
+    count = reader.varint("numbers of softness", 1, min(_MAX_UNITS + 1, len(data)))
+    palette = [reader.varint("softness", 0, _MAX_UNITS) / _UNITS for _ in range(count)]
+    softness: float | dict[tuple[int, int], float] = palette[0]
+    if count > 1:
+        pairs = sorted(touching_pairs(labels))
+        stream = reader.take(len(data) - reader.position)
+        indices = _code_palette(Reader(stream), len(pairs), count, None).tolist()
+        softness = {pair: palette[index] for pair, index in zip(pairs, indices, strict=True)}
+    elif reader.position != len(data):
+        raise CodecError(f"the map must end after {reader.position} bytes; got {len(data)}")
+    regions = RegionMap.from_labels(labels, softness)
+    if regions.num_regions != num_regions:
+        raise CodecError(f"the map must have {num_regions} regions; got {regions.num_regions}")
+    return regions
+
+
+def _code_palette(coder: Coder, num_pairs: int, size: int, indices: Integers | None) -> Integers:
+    """Code the softness of each pair, as its index in the palette."""
+    model, coded = AdaptiveSymbol(np.ones(size)), np.zeros(num_pairs, np.int64)
+    for start in range(0, num_pairs, _GROUP):
+        group = slice(start, start + _GROUP)
+        coded[group] = model.code(coder, len(coded[group]), None if indices is None else indices[group])
+    return coded
