@@ -1,7 +1,6 @@
-"""The inner loops of the CPU kernel as explicit vector code: a row of a tile, 16 pixels, at a time.
+"""Vectors of 16 float32, a row of a tile, in LLVM: what the code of `rows` and `spline` is written with.
 
-LLVM does not vectorise these loops by itself, but splits vectors of 16 float32 into what the processor has. The
-pixels of a tile lie in memory as [row][channel][column].
+LLVM does not vectorise these loops by itself, but splits such vectors into those of the processor.
 """
 
 from __future__ import annotations
@@ -21,22 +20,22 @@ _INT = ir.IntType(32)
 LONG = ir.IntType(64)
 VECTOR = ir.VectorType(FLOAT, SIDE)
 _VECTOR_INT = ir.VectorType(_INT, SIDE)
-START = ir.Constant(LONG, 0)
-NOTHING = ir.Constant(VECTOR, ir.Undefined)
+ZERO = ir.Constant(LONG, 0)
+UNDEFINED = ir.Constant(VECTOR, ir.Undefined)
 
 
 def exp2_coefficients(degree: int = 5) -> list[float]:
-    """Polynomial for 2^f on [-1/2, 1/2] that is exactly 1 at 0, lowest power first."""
+    """Return a polynomial for 2^f on [-1/2, 1/2] that is exactly 1 at 0, lowest power first."""
     nodes = 0.5 * np.cos((np.arange(64) + 0.5) * np.pi / 64)
-    rest = np.polynomial.Chebyshev.fit(nodes, (np.exp2(nodes) - 1) / nodes, degree - 1, domain=[-0.5, 0.5])
-    return [1.0, *rest.convert(kind=np.polynomial.Polynomial).coef.tolist()]
+    quotient = np.polynomial.Chebyshev.fit(nodes, (np.exp2(nodes) - 1) / nodes, degree - 1, domain=[-0.5, 0.5])
+    return [1.0, *quotient.convert(kind=np.polynomial.Polynomial).coef.tolist()]
 
 
 EXP2 = exp2_coefficients()
 
 
 def constant(value: float) -> ir.Constant:
-    """A number in all elements of a vector."""
+    """Return a number in all elements of a vector."""
     return ir.Constant(VECTOR, [ir.Constant(FLOAT, float(np.float32(value)))] * SIDE)
 
 
@@ -49,24 +48,24 @@ def apply(builder: Any, name: str, *arguments: Any) -> Any:
 
 
 def broadcast(builder: Any, value: Any) -> Any:
-    """A value in all elements of a vector."""
-    single = builder.insert_element(NOTHING, value, ir.Constant(_INT, 0))
-    return builder.shuffle_vector(single, NOTHING, ir.Constant(_VECTOR_INT, None))
+    """Return a value in all elements of a vector."""
+    single = builder.insert_element(UNDEFINED, value, ir.Constant(_INT, 0))
+    return builder.shuffle_vector(single, UNDEFINED, ir.Constant(_VECTOR_INT, None))
 
 
 def ramp() -> ir.Constant:
-    """Columns of the vector, counted from its middle."""
+    """Return the columns of a vector, counted from its middle."""
     return ir.Constant(VECTOR, [ir.Constant(FLOAT, column - (SIDE - 1) / 2) for column in range(SIDE)])
 
 
 def exp2(builder: Any, exponent: Any) -> Any:
-    """Two to the power of a vector: a polynomial between whole exponents."""
+    """Return 2 to the power of a vector: a polynomial between whole exponents."""
     exponent = apply(builder, "maxnum", exponent, constant(-126.0))
     whole = apply(builder, "rint", exponent)
-    rest = builder.fsub(exponent, whole)
+    fraction = builder.fsub(exponent, whole)
     value = constant(EXP2[-1])
     for coefficient in reversed(EXP2[:-1]):
-        value = apply(builder, "fma", value, rest, constant(coefficient))
+        value = apply(builder, "fma", value, fraction, constant(coefficient))
     bits = builder.shl(
         builder.add(builder.fptosi(whole, _VECTOR_INT), ir.Constant(_VECTOR_INT, [127] * SIDE)),
         ir.Constant(_VECTOR_INT, [23] * SIDE),
@@ -75,7 +74,7 @@ def exp2(builder: Any, exponent: Any) -> Any:
 
 
 def pointer(context: Any, builder: Any, array_type: Any, array: Any, offset: Any) -> Any:
-    """Where element `offset` of an array lies."""
+    """Return the pointer to element `offset` of an array."""
     data = context.make_array(array_type)(context, builder, array).data
     return builder.gep(data, [offset])
 
@@ -86,12 +85,12 @@ def _row(builder: Any, pointer: Any, index: Any) -> Any:
     return builder.bitcast(start, VECTOR.as_pointer())
 
 
-def load(builder: Any, pointer: Any, index: Any = START) -> Any:
+def load(builder: Any, pointer: Any, index: Any = ZERO) -> Any:
     """Load vector `index` from a pointer on."""
     return builder.load(_row(builder, pointer, index), align=4)
 
 
-def store(builder: Any, value: Any, pointer: Any, index: Any = START) -> None:
+def store(builder: Any, value: Any, pointer: Any, index: Any = ZERO) -> None:
     """Store vector `index` from a pointer on."""
     builder.store(value, _row(builder, pointer, index), align=4)
 
@@ -102,8 +101,8 @@ def shuffle(builder: Any, first: Any, second: Any, places: Sequence[int]) -> Any
     return builder.shuffle_vector(first, second, ir.Constant(kind, [ir.Constant(_INT, place) for place in places]))
 
 
-def both(builder: Any, condition: Any, emit: Callable[[bool], None]) -> None:
-    """Emit both branches of a condition."""
+def if_else(builder: Any, condition: Any, emit: Callable[[bool], None]) -> None:
+    """Emit both branches of a condition: emit(True) where it holds, emit(False) elsewhere."""
     with builder.if_else(condition) as (then, otherwise):
         with then:
             emit(True)
@@ -112,8 +111,8 @@ def both(builder: Any, condition: Any, emit: Callable[[bool], None]) -> None:
 
 
 @intrinsic
-def copy(typing_context, target, target_at, source, source_at, count):  # type: ignore[no-untyped-def]
-    """Copy elements; a constant number becomes vector code."""
+def copy(typing_context, target, target_start, source, source_start, count):  # type: ignore[no-untyped-def]
+    """Copy `count` elements of four bytes from element `source_start` to element `target_start`."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         to, start = (pointer(context, builder, signature.args[i], *arguments[i : i + 2]) for i in (0, 2))
@@ -124,8 +123,8 @@ def copy(typing_context, target, target_at, source, source_at, count):  # type: 
 
 
 @intrinsic
-def clear_rows(typing_context, target, at, stride, count):  # type: ignore[no-untyped-def]
-    """Set `count` rows of 16, each `stride` after the last, to zero."""
+def clear_rows(typing_context, target, origin, stride, count):  # type: ignore[no-untyped-def]
+    """Set `count` rows of 16 from element `origin` on, `stride` elements apart, to zero."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         start = pointer(context, builder, signature.args[0], *arguments[:2])
@@ -138,38 +137,38 @@ def clear_rows(typing_context, target, at, stride, count):  # type: ignore[no-un
 
 
 @intrinsic
-def sum_columns(typing_context, sums, count, out, at):  # type: ignore[no-untyped-def]
-    """out[at + k] = the sum of the sixteen columns of sums[k], in a fixed order, eight k at a time.
+def sum_columns(typing_context, sums, count, terms, start):  # type: ignore[no-untyped-def]
+    """Set terms[start + k] to the sum of the 16 columns of sums[k], for k < count, in a fixed order.
 
-    Both arrays have room for a multiple of eight.
+    Eight k are done at a time: both arrays have room for a multiple of eight.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        source = pointer(context, builder, signature.args[0], arguments[0], START)
+        source = pointer(context, builder, signature.args[0], arguments[0], ZERO)
         target = pointer(context, builder, signature.args[2], arguments[2], arguments[3])
         eight = ir.Constant(LONG, 8)
         groups = builder.sdiv(builder.add(arguments[1], ir.Constant(LONG, 7)), eight)
         with cgutils.for_range(builder, groups) as loop:
             first = builder.mul(loop.index, eight)
             rows = [load(builder, source, builder.add(first, ir.Constant(LONG, k))) for k in (0, 4, 2, 6, 1, 5, 3, 7)]
-            # halves of two rows are put side by side and added, until one row holds two columns of each
+            # the halves of two rows are interleaved and added, until one row holds two columns of each
             width = SIDE
             while len(rows) > 1:
                 rows = [_fold(builder, rows[k], rows[k + 1], width) for k in range(0, len(rows), 2)]
                 width //= 2
-            total = builder.fadd(*(shuffle(builder, rows[0], NOTHING, range(k, SIDE, 2)) for k in (0, 1)))
+            total = builder.fadd(*(shuffle(builder, rows[0], UNDEFINED, range(k, SIDE, 2)) for k in (0, 1)))
             place = builder.bitcast(builder.gep(target, [first]), total.type.as_pointer())
             builder.store(total, place, align=4)
         return context.get_dummy_value()
 
-    return types.void(sums, types.int64, out, types.int64), generate
+    return types.void(sums, types.int64, terms, types.int64), generate
 
 
-def _fold(builder: Any, one: Any, other: Any, width: int) -> Any:
+def _fold(builder: Any, first: Any, second: Any, width: int) -> Any:
     """Add the halves of every group of `width` elements of two vectors, the first's and the second's in turn."""
     half = width // 2
     places = [
         [SIDE * side + group + shift + k for group in range(0, SIDE, width) for side in (0, 1) for k in range(half)]
         for shift in (0, half)
     ]
-    return builder.fadd(*(shuffle(builder, one, other, place) for place in places))
+    return builder.fadd(*(shuffle(builder, first, second, place) for place in places))

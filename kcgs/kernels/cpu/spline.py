@@ -1,4 +1,4 @@
-"""From a grid to one of half its spacing, and back: blocks of 16 x 16 as vector code.
+"""Vector code from a coarse grid to one of half its spacing, and back, in blocks of 16 x 16.
 
 Along an axis, values 2 i and 2 i + 1 of the finer grid are each a sum of four neighbours, i ... i + 3, of a window of
 the coarser one, which begins at a block's first node or in its middle. Blocks lie in memory as [row][channel][column].
@@ -15,20 +15,21 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from .simd import FLOAT, LONG, NOTHING, SIDE, START, VECTOR, apply, both, constant, load, pointer, shuffle, store
+from .simd import FLOAT, LONG, SIDE, UNDEFINED, VECTOR, ZERO, apply, constant, if_else, load, pointer, shuffle, store
 
-# weights of the four neighbours: refinement of cubic B-splines, exact; and the spline at pixel centres, a quarter and
-# three quarters of the way from one node to the next
-REFINE = ((0.5, 0.5, 0.0, 0.0), (0.125, 0.75, 0.125, 0.0))
-SAMPLE = (
-    (27 / 384, 235 / 384, 121 / 384, 1 / 384),
-    (1 / 384, 121 / 384, 235 / 384, 27 / 384),
-)
+# weights of the four neighbours of values 2 i and 2 i + 1: the exact refinement of cubic B-splines
+_REFINE_EVEN = (0.5, 0.5, 0.0, 0.0)
+_REFINE_ODD = (0.125, 0.75, 0.125, 0.0)
+# cubic B-splines at pixel centres, a quarter and three quarters of the way from one node to the next
+_SAMPLE_EVEN = (27 / 384, 235 / 384, 121 / 384, 1 / 384)
+_SAMPLE_ODD = (1 / 384, 121 / 384, 235 / 384, 27 / 384)
 
+# nodes of the coarser grid within a block, along an axis
 _HALF = SIDE // 2
+# nodes of the coarser grid that a block reads, along an axis
 _WINDOW = _HALF + 3
-# of two vectors: the last half of the first and the first half of the second
-_SECOND_HALF = range(_HALF, _HALF + SIDE)
+# elements of two vectors: the last half of the first and the first half of the second
+_MIDDLE = range(_HALF, _HALF + SIDE)
 
 
 def _long(value: int) -> ir.Constant:
@@ -52,15 +53,15 @@ def _alternating(even: float, odd: float) -> ir.Constant:
 class _Blocks:
     """A block of the finer grid and the four of the coarser one that it reads, as LLVM values."""
 
-    def __init__(self, context: Any, builder: Any, types_of: Any, arguments: Any) -> None:
+    def __init__(self, context: Any, builder: Any, argument_types: Any, arguments: Any) -> None:
         self.builder = builder
         self.down, self.right = arguments[2:4]
-        at = pointer(context, builder, types_of[1], arguments[1], START)
-        offsets = [builder.load(builder.gep(at, [_long(k)])) for k in range(4)]
-        self.parents = [pointer(context, builder, types_of[0], arguments[0], offset) for offset in offsets]
-        self.fine = pointer(context, builder, types_of[4], arguments[4], arguments[5])
+        table = pointer(context, builder, argument_types[1], arguments[1], ZERO)
+        offsets = [builder.load(builder.gep(table, [_long(k)])) for k in range(4)]
+        self.parents = [pointer(context, builder, argument_types[0], arguments[0], offset) for offset in offsets]
+        self.fine = pointer(context, builder, argument_types[4], arguments[4], arguments[5])
         self.row_stride, self.channel_stride, self.channels = arguments[6:9]
-        self.masks = pointer(context, builder, types_of[9], arguments[9], arguments[10])
+        self.masks = pointer(context, builder, argument_types[9], arguments[9], arguments[10])
         self.mask_stride = arguments[11]
 
     def fine_row(self, channel: Any, row: int) -> Any:
@@ -70,7 +71,7 @@ class _Blocks:
         return builder.gep(self.fine, [builder.add(place, builder.mul(self.row_stride, _long(row)))])
 
     def mask(self, row: int) -> Any:
-        """Weights of a row."""
+        """Return the weights of a row."""
         return load(self.builder, self.builder.gep(self.masks, [self.builder.mul(self.mask_stride, _long(row))]))
 
     def window_row(self, channel: Any, row: int) -> tuple[Any, Any]:
@@ -79,9 +80,9 @@ class _Blocks:
         place = builder.add(_long(row), builder.select(self.down, _long(_HALF), _long(0)))
         below = builder.icmp_signed(">=", place, _long(SIDE))
         within = builder.select(below, builder.sub(place, _long(SIDE)), place)
-        at = builder.mul(builder.add(builder.mul(within, self.channels), channel), _long(SIDE))
+        offset = builder.mul(builder.add(builder.mul(within, self.channels), channel), _long(SIDE))
         left, right = (builder.select(below, self.parents[k + 2], self.parents[k]) for k in (0, 1))
-        return builder.gep(left, [at]), builder.gep(right, [at])
+        return builder.gep(left, [offset]), builder.gep(right, [offset])
 
     def each(self, emit: Callable[[Any, bool], None]) -> None:
         """Emit a loop over channels, for windows that begin in the middle of the left block and for others."""
@@ -90,16 +91,21 @@ class _Blocks:
             with cgutils.for_range(self.builder, self.channels) as loop:
                 emit(loop.index, right)
 
-        both(self.builder, self.right, loop_over)
+        if_else(self.builder, self.right, loop_over)
 
 
 def _make_loop(emit: Callable[[_Blocks, Any, bool], None]) -> Any:
-    """Make a function for numba of a block, from what is emitted for a channel of it."""
+    """Make an intrinsic over the channels of a block; emit(blocks, channel, right) is the code of one.
+
+    Its arguments: `coarse`, float32, has the parents at four `offsets`; the window begins in the middle of the upper
+    ones if `down`, of the left ones if `right`. `fine`, float32, has the block from element `origin` on, `masks`,
+    float32, the weights of its rows from element `mask_start` on; strides count elements.
+    """
 
     @intrinsic
     def loop(  # type: ignore[no-untyped-def]
-        typing_context, coarse, offsets, down, right, fine, at, row_stride, channel_stride, channels, masks, mask_at,
-        mask_stride,
+        typing_context, coarse, offsets, down, right, fine, origin, row_stride, channel_stride, channels, masks,
+        mask_start, mask_stride,
     ):  # fmt: skip
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             blocks = _Blocks(context, builder, signature.args, arguments)
@@ -113,28 +119,28 @@ def _make_loop(emit: Callable[[_Blocks, Any, bool], None]) -> Any:
 
 
 def _make_add(even: tuple[float, ...], odd: tuple[float, ...], replaces: bool = False) -> Any:
-    """fine[row, c, :] += mask[row, :] * what the coarser grid says there; or = in place of +=."""
-    used = [k for k in range(4) if even[k] or odd[k]]
+    """Make fine[row, c, :] += mask[row, :] * spline[row, c, :], or, if it `replaces`, = in place of +=."""
+    neighbors = [k for k in range(4) if even[k] or odd[k]]
 
     def widen(builder: Any, window: Any) -> Any:
         total = None
-        for k in used:
-            spread = shuffle(builder, window, NOTHING, [j // 2 + k for j in range(SIDE)])
+        for k in neighbors:
+            spread = shuffle(builder, window, UNDEFINED, [j // 2 + k for j in range(SIDE)])
             weights = _alternating(even[k], odd[k])
             total = builder.fmul(weights, spread) if total is None else apply(builder, "fma", weights, spread, total)
         return total
 
     def emit(blocks: _Blocks, channel: Any, right: bool) -> None:
         builder, rows = blocks.builder, []
-        for n in range(_HALF + used[-1]):
+        for n in range(_HALF + neighbors[-1]):
             places = blocks.window_row(channel, n)
             window = load(builder, places[0])
             if right:
-                window = shuffle(builder, window, load(builder, places[1]), _SECOND_HALF)
+                window = shuffle(builder, window, load(builder, places[1]), _MIDDLE)
             rows.append(widen(builder, window))
         for row in range(SIDE):
             total = None
-            for k in used:
+            for k in neighbors:
                 total = _multiply_add(builder, (even, odd)[row % 2][k], rows[row // 2 + k], total)
             place, mask = blocks.fine_row(channel, row), blocks.mask(row)
             value = builder.fmul(total, mask) if replaces else apply(builder, "fma", total, mask, load(builder, place))
@@ -144,17 +150,17 @@ def _make_add(even: tuple[float, ...], odd: tuple[float, ...], replaces: bool = 
 
 
 def _make_gather(even: tuple[float, ...], odd: tuple[float, ...]) -> Any:
-    """Add to the coarser grid what mask * fine has for it: the transpose of `_make_add`."""
-    used = [k for k in range(4) if even[k] or odd[k]]
+    """Make the transpose of `_make_add`: the gradient of mask * spline is added to the coarser grid."""
+    neighbors = [k for k in range(4) if even[k] or odd[k]]
 
-    def narrow(builder: Any, given: Any) -> Any:
-        # value 2 i + j of the finer grid goes to place i + k; what is out of range is read from the zeros
+    def narrow(builder: Any, row: Any) -> Any:
+        # value 2 i + j of the finer grid goes to place i + k; places out of range read zeros
         total = None
-        for k in used:
+        for k in neighbors:
             for j, weight in enumerate((even[k], odd[k])):
                 places = [2 * (n - k) + j if 0 <= n - k < _HALF else SIDE for n in range(SIDE)]
                 if weight:
-                    total = _multiply_add(builder, weight, shuffle(builder, given, constant(0.0), places), total)
+                    total = _multiply_add(builder, weight, shuffle(builder, row, constant(0.0), places), total)
         return total
 
     def emit(blocks: _Blocks, channel: Any, right: bool) -> None:
@@ -162,19 +168,21 @@ def _make_gather(even: tuple[float, ...], odd: tuple[float, ...]) -> Any:
         rows: list[Any] = [None] * _WINDOW
         for row in range(SIDE):
             value = builder.fmul(load(builder, blocks.fine_row(channel, row)), blocks.mask(row))
-            for k in used:
+            for k in neighbors:
                 rows[row // 2 + k] = _multiply_add(builder, (even, odd)[row % 2][k], value, rows[row // 2 + k])
-        for n, row in enumerate(rows[: _HALF + used[-1]]):
+        for n, row in enumerate(rows[: _HALF + neighbors[-1]]):
             total, zero = narrow(builder, row), constant(0.0)
             parts = [total]
             if right:
-                parts = [shuffle(builder, a, b, _SECOND_HALF) for a, b in ((zero, total), (total, zero))]
+                parts = [shuffle(builder, a, b, _MIDDLE) for a, b in ((zero, total), (total, zero))]
             for part, place in zip(parts, blocks.window_row(channel, n), strict=False):
                 store(builder, builder.fadd(load(builder, place), part), place)
 
     return _make_loop(emit)
 
 
-add_refined, gather_refined = _make_add(*REFINE), _make_gather(*REFINE)
-add_sampled, gather_sampled = _make_add(*SAMPLE), _make_gather(*SAMPLE)
-set_sampled = _make_add(*SAMPLE, replaces=True)
+add_refined = _make_add(_REFINE_EVEN, _REFINE_ODD)
+gather_refined = _make_gather(_REFINE_EVEN, _REFINE_ODD)
+add_sampled = _make_add(_SAMPLE_EVEN, _SAMPLE_ODD)
+gather_sampled = _make_gather(_SAMPLE_EVEN, _SAMPLE_ODD)
+set_sampled = _make_add(_SAMPLE_EVEN, _SAMPLE_ODD, replaces=True)

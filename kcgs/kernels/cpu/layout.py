@@ -1,0 +1,92 @@
+"""Arrays that the loops of the CPU kernel read, and the columns of these arrays; `program` holds the loops."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from ..compiled import Program
+from .simd import SIDE
+
+program = Program(
+    "CPU kernel",
+    __file__,
+    "../whitened.py", "channels.py", "ellipse.py", "gradients.py", "lists.py", "loops.py", "rows.py", "schedule.py",
+    "simd.py", "spline.py",
+)  # fmt: skip
+
+# whitened coordinates times this, squared, are an exponent of 2
+SCALE = math.sqrt(0.5 / math.log(2.0))
+# pixels on either side of a row of tiles, for vectors that begin before it or end behind it
+PADDING = 4 * SIDE
+
+# columns of Lists.gaussians; lengths in nodes of the Gaussian's level, which at level 0 are pixels
+MEAN_X = 0
+MEAN_Y = 1
+L11 = 2
+L21 = 3
+L22 = 4
+SIGMA_Y = 5  # standard deviation along y
+INVERSE_L11 = 6
+PEAK = 7  # x of the ellipse's highest point minus the mean, in standard deviations along x
+SLOPE1_X = 8  # SCALE * z1 per node along x
+SLOPE2_X = 9  # SCALE * z2 per node along x
+SLOPE2_Y = 10  # SCALE * z2 per node along y
+LEVEL = 11  # of the coarse grid; 0: the pixels
+COLOR_FACTOR = 12  # of its colours, where a spline widens it
+SHEAR = 13  # how far the middle of a row is from that of the row above
+COLUMNS = 14
+
+# columns of Table.grids
+NODE_ROWS = 0
+NODE_COLS = 1
+TILE_ROWS = 2
+TILE_COLS = 3
+FIRST_TILE = 4  # number of its first tile, through all levels
+FIRST_ROW = 5  # number of its first row of tiles, through all levels
+
+# columns of Lists.entries
+GAUSSIAN = 0
+FIRST = 1  # column of its first tile; or -1: it is narrow and alone in its region, see rows._ShearedRows
+END = 2  # column of its last tile + 1; or, of a narrow one, vectors of each row
+
+
+class Table(NamedTuple):
+    """The regions of each tile and block, from a label map, or of one region everywhere."""
+
+    num_regions: int
+    num_maps: int  # 1, or as many as images
+    grids: Any  # [levels, 6] int64
+    regions: Any  # [K] int64, region of each block, in the order of tiles
+    tile_start: Any  # [tiles + 1] int64 into blocks, all levels
+    parents: Any  # [K, 4] int64, blocks of the next level that each is refined from; K: none
+    odd: Any  # [K] uint8: 1 in an odd column of tiles, 2 in an odd row, 3 both
+    owner: Any  # [tiles of pixels] int64, the only region of a tile; -1: it has several
+    mask: Any  # [blocks of pixels] int64, row of masks; -1: alone in its tile
+    masks: Any  # [P * 256] float32, membership of the pixels of a tile
+
+
+class Batch(NamedTuple):
+    """Gaussians of a batch of images, and their order in the table: by image, row and column of tiles."""
+
+    num_images: int
+    means: Any  # [N, 2] float32, in the caller's order
+    cholesky: Any  # [N, 3] float32, in the caller's order
+    order: Any  # [N] int64, from the table's order to the caller's
+    images: Any  # [N] int64, in the table's order
+    regions: Any  # [N] int64, in the table's order; -1: none
+    colors: Any  # [N, C] float32, in the table's order; `list_tiles` multiplies them by COLOR_FACTOR
+
+
+class Lists(NamedTuple):
+    """The Gaussians of each row of tiles."""
+
+    gaussians: Any  # [N, COLUMNS] float64
+    colors: Any  # [N * C] float32
+    regions: Any  # [N] int64
+    start: Any  # [rows of tiles + 1] int64 into entries
+    entries: Any  # [E, 3] int32
+    table: Table
+    live: Any  # [copies * (blocks of nodes + 1)] bool: not all zero; the last block of a copy never is
+    radius: float  # largest |z| of a weight that is not zero
+    least_exponent: Any  # float32, exponent of 2 below which a weight is zero
