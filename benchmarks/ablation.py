@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .core.compare import Contest, answer, differences, grouped, losses, means
+from .core.compare import Comparison, differences_table, group_by, losses_table, means_table, summary
 from .core.figures import Panel, save_lines
 from .core.fits import Method, measure_fit, plan
 from .core.images import names
-from .core.run import Job, Options, Page, Row, experiment
+from .core.run import Job, Options, Page, Row
 
 COUNTS = (1_250, 7_500)
 PAPER_METHODS: dict[str, Method] = {
@@ -39,13 +39,15 @@ PRINTED = {
 }
 QUANTITIES = ("psnr", "ef_psnr")
 FIRST = next(iter(PAPER_METHODS))
-CONTESTS = (
-    *(Contest("best", name) for name in list(METHODS)[1:]),
-    *(Contest(name, FIRST) for name in list(PAPER_METHODS)[1:]),
+COMPARISONS = (
+    *(Comparison("best", name) for name in list(METHODS)[1:]),
+    *(Comparison(name, FIRST) for name in list(PAPER_METHODS)[1:]),
 )
 METHOD = """First frames of DAVIS with the given masks. Parts of `best` are taken away one by one; the paper's six rows
 differ from its clamped baseline. *Printed* figures are those of the paper, over all of DAVIS at 50,000 iterations;
 nobody measured them here. What the figures are: the report of `quality`."""
+
+measure = measure_fit
 
 
 def jobs(options: Options) -> list[Job]:
@@ -55,23 +57,18 @@ def jobs(options: Options) -> list[Job]:
     return [job for n in ((40,) if options.quick else COUNTS) for job in plan(images, (n,), methods, options)]
 
 
-def run(options: Options) -> None:
-    """Measure, and write the report."""
-    experiment(__name__, options, jobs, measure_fit, page)
-
-
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
     for row in rows:
         printed = PRINTED.get(row["method"], {}).get(row["n"])
         row |= dict(zip(("printed PSNR", "printed EF-PSNR"), printed, strict=True)) if printed else {}
-    groups = grouped([row for row in rows if row["method"] in METHODS], ["n", "method"])
+    groups = group_by([row for row in rows if row["method"] in METHODS], ["n", "method"])
     # a mean of fewer images is no point of the figure
     ours = [row for (n, _), of in groups.items() if len(of) == len(groups[n, "best"]) for row in of]
     save_lines(folder / "ablation.png", [Panel("", ours, "n", quantity) for quantity in QUANTITIES], "method", "n")
     columns = ("iterations", *QUANTITIES, "printed PSNR", "printed EF-PSNR", "bytes", "core_seconds")
-    tables = [differences(rows, CONTESTS, QUANTITIES, ["n"]), means(rows, ["n", "method"], columns)]
-    texts = [answer(rows, contest, QUANTITIES, ["n"]) for contest in CONTESTS]
+    tables = [differences_table(rows, COMPARISONS, QUANTITIES, ["n"]), means_table(rows, ["n", "method"], columns)]
+    texts = [summary(rows, comparison, QUANTITIES, ["n"]) for comparison in COMPARISONS]
     sentences = "\n".join(f"- {text}" for text in texts if text)
     question = "What does each part of the method gain?"
-    return Page(question, METHOD, sentences, "ablation.png", tables, losses(rows, CONTESTS, QUANTITIES, ["n"]))
+    return Page(question, METHOD, sentences, "ablation.png", tables, losses_table(rows, COMPARISONS, QUANTITIES, ["n"]))

@@ -18,9 +18,9 @@ from kcgs import RegionSplatRenderer, Scene, load
 from kcgs.onnx import scene_decoder
 
 from .core.clocks import milliseconds, peak_megabytes, threads
-from .core.compare import grouped, markdown, means
+from .core.compare import group_by, markdown, means_table
 from .core.figures import Panel, save_lines
-from .core.run import Job, Options, Page, Row, experiment
+from .core.run import Job, Options, Page, Row
 from .core.scenes import FITTED, SIZES, scene_of, size_of
 
 CUTOFFS = (1e-2, 1 / 255, 1e-3, 1e-4, 1e-6)
@@ -105,25 +105,24 @@ def jobs(options: Options) -> list[Job]:
     ]  # fmt: skip
 
 
-def run(options: Options) -> None:
-    """Measure, and write the report."""
-    experiment(__name__, options, jobs, measure, page)
-
-
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
     default = [row for row in rows if abs(row["cutoff"] / DEFAULT_CUTOFF - 1) < 0.01]
-    swept = [row for row in rows if row["size"] == "native" and row["threads"] == 1]
-    groups = {str(i): of for (i,), of in grouped(swept, ["image"]).items() if len(grouped(of, ["cutoff"])) > 1}
-    panels = [Panel(image, of, "ms", "error", ("log", "log")) for image, of in groups.items()]
+    native = [row for row in rows if row["size"] == "native" and row["threads"] == 1]
+    groups = {
+        str(image): image_rows
+        for (image,), image_rows in group_by(native, ["image"]).items()
+        if len(group_by(image_rows, ["cutoff"])) > 1
+    }
+    panels = [Panel(image, image_rows, "ms", "error", ("log", "log")) for image, image_rows in groups.items()]
     save_lines(folder / "decode.png", panels, "method", "cutoff")
     columns = ("ms", "error", "load_ms", "bytes", "peak_MB")
-    tables = [means(default, ["image", "size", "threads", "method"], columns)]
-    tables.append(means(swept, ["image", "method", "cutoff"], columns[:2]))
+    tables = [means_table(default, ["image", "size", "threads", "method"], columns)]
+    tables.append(means_table(native, ["image", "method", "cutoff"], columns[:2]))
     times = {(r["image"], r["size"], r["threads"], r["method"]): r["ms"] for r in default}
     ratios = {key[:3]: ms / times[*key[:3], "torch, cpu"] for key, ms in times.items() if key[3] == "onnxruntime"}
     one = [ratio for (_, size, count), ratio in ratios.items() if size == "native" and count == 1]
     text = f"`onnxruntime` takes {min(one):.2g} to {max(one):.2g} times the time of `torch, cpu` on one thread."
     lines = [[image, size, str(count), f"{ratio:.2g}"] for (image, size, count), ratio in ratios.items() if ratio > 1]
-    lost = markdown(["image", "size", "threads", "time of onnxruntime to that of torch, cpu"], lines) if lines else ""
-    return Page("How fast and how exactly do decoders render?", METHOD, text, "decode.png", tables, lost)
+    losses = markdown(["image", "size", "threads", "time of onnxruntime to that of torch, cpu"], lines) if lines else ""
+    return Page("How fast and how exactly do decoders render?", METHOD, text, "decode.png", tables, losses)

@@ -16,11 +16,11 @@ from kcgs import fit
 from kcgs.functional import ef_psnr, psnr
 
 from .core.clocks import milliseconds
-from .core.compare import Contest, answer, differences, grouped, losses, means
+from .core.compare import Comparison, differences_table, group_by, losses_table, means_table, summary
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS
 from .core.images import load_mapped, names
-from .core.run import Job, Options, Page, Row, experiment
+from .core.run import Job, Options, Page, Row
 
 FACTORS = (2, 4)
 # pixels of the small photo per Gaussian
@@ -29,7 +29,7 @@ ROUNDS = 3
 BAND = 5  # pixels of the small photo
 QUANTITIES = ("psnr", "ef_psnr")
 SCENE = "scene"
-CONTESTS = (Contest(SCENE, "own render, bicubic"), Contest(SCENE, "own render, Lanczos"))
+COMPARISONS = (Comparison(SCENE, "own render, bicubic"), Comparison(SCENE, "own render, Lanczos"))
 METHOD = f"""Photos are reduced by the means of blocks of pixels, their label maps to the labels of the blocks'
 middles, and fitted by `best`. `scene` is `scene.render(size)` at the original size, `own render` the scene's render at
 the small size, enlarged by Pillow, and `small photo` all pixels of the reduced photo, enlarged. All are measured
@@ -53,11 +53,11 @@ def measure(image: str, group: str, factor: int, share: int, data: str, quick: b
         methods[f"small photo, {how}"] = partial(enlarge, small.clone, (height, width), how)
     times = milliseconds(methods, ROUNDS)
     for method, render in methods.items():
-        shown = render()
+        enlargement = render()
         row = {"image": image, "group": group, "factor": factor, "n": n, "pixels per Gaussian": share, "method": method}
-        row |= {"ms": times[method], "psnr": float(psnr(shown, pixels))}
+        row |= {"ms": times[method], "psnr": float(psnr(enlargement, pixels))}
         if len(labels.unique()) > 1:
-            row["ef_psnr"] = float(ef_psnr(shown, pixels, labels, width=BAND * factor))
+            row["ef_psnr"] = float(ef_psnr(enlargement, pixels, labels, width=BAND * factor))
         rows.append(row)
     return rows
 
@@ -73,30 +73,28 @@ def jobs(options: Options) -> list[Job]:
     images = [("DAVIS", "disc")]
     if not options.quick:
         images = [(group, name) for group in ("DAVIS", "Kodak") for name in names(options.folder(), group.lower())]
-    listed = [
+    jobs_of_images = [
         {"image": image, "group": group, "factor": factor, "share": share}
         for group, image in images
         for factor in FACTORS
         for share in (SHARES[:1] if options.quick else SHARES)
     ]
-    fixed = {"data": str(options.data or ""), "quick": options.quick}
-    return [{**job, **fixed} for job in listed]
-
-
-def run(options: Options) -> None:
-    """Measure, and write the report."""
-    experiment(__name__, options, jobs, measure, page)
+    arguments = options.image_arguments()
+    return [{**job, **arguments} for job in jobs_of_images]
 
 
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
     cases = ["group", "factor", "pixels per Gaussian"]
     panels = [
-        Panel(f"{group}, {factor} times the size", of, "pixels per Gaussian", "psnr")
-        for (group, factor), of in grouped(rows, ["group", "factor"]).items()
+        Panel(f"{group}, {factor} times the size", group_rows, "pixels per Gaussian", "psnr")
+        for (group, factor), group_rows in group_by(rows, ["group", "factor"]).items()
     ]
     save_lines(folder / "enlarge.png", panels, "method", "pixels per Gaussian")
-    tables = [differences(rows, CONTESTS, QUANTITIES, cases), means(rows, [*cases, "method"], ("n", *QUANTITIES, "ms"))]
-    sentences = " ".join(answer(rows, contest, QUANTITIES, cases) for contest in CONTESTS)
+    tables = [
+        differences_table(rows, COMPARISONS, QUANTITIES, cases),
+        means_table(rows, [*cases, "method"], ("n", *QUANTITIES, "ms")),
+    ]
+    sentences = " ".join(summary(rows, comparison, QUANTITIES, cases) for comparison in COMPARISONS)
     question = "How good are scenes of small photos that are rendered large?"
-    return Page(question, METHOD, sentences, "enlarge.png", tables, losses(rows, CONTESTS, QUANTITIES, cases))
+    return Page(question, METHOD, sentences, "enlarge.png", tables, losses_table(rows, COMPARISONS, QUANTITIES, cases))

@@ -16,18 +16,21 @@ from kcgs import fit
 from kcgs.data import load_image, save_image
 from kcgs.editing import delete_region, move_region
 
-from .core.compare import Contest, answer, losses, means
+from .core.compare import Comparison, losses_table, means_table, summary
 from .core.figures import save_rows
 from .core.fits import QUICK_ITERATIONS
 from .core.images import load, names
-from .core.run import Job, Options, Page, Row, experiment
+from .core.run import Job, Options, Page, Row
 
-NUM_GAUSSIANS, QUICK_GAUSSIANS = 3_000, 60
+NUM_GAUSSIANS = 3_000
+QUICK_GAUSSIANS = 60
 FILLS = {"not filled": False, "filled": True}
 # in pixels: what is compared with the hole, the contour of a moved object, and what is shown around
-AROUND, CONTOUR, SHOWN = 40, 2, 45
+AROUND = 40
+CONTOUR = 2
+SHOWN = 45
 QUANTITIES = ("steep", "beyond [0, 1]")
-CONTEST = Contest("filled", "not filled")
+COMPARISON = Comparison("filled", "not filled")
 METHOD = f"""The object of each frame of DAVIS is deleted, and moved to the side by a third of its width, away from the
 nearer border. Figures are of the pixels that are uncovered; those within {CONTOUR} pixels of a moved object are left
 out. A pixel is steep whose gradient is above the 99.9th percentile of the {AROUND} pixels around; *steepest* is a
@@ -48,30 +51,31 @@ def measure(image: str, edit: str, n: int, folder: str, data: str, quick: bool) 
         columns = hole.any(0).nonzero().flatten().tolist()
         left, width = columns[0], columns[-1] + 1 - columns[0]
         step = max(1, round(width / 3)) * (1 if 2 * left + width <= hole.shape[1] else -1)
-        landed = pad(hole, (step, -step))
-        apply, covered = partial(move_region, scene, ids, (step, 0)), hole | landed
-        uncovered = hole & ~grown(landed, CONTOUR)
-    around, shown, rows = grown(covered, AROUND) & ~covered, [scene.render()], []
+        landing = pad(hole, (step, -step))
+        apply, covered = partial(move_region, scene, ids, (step, 0)), hole | landing
+        uncovered = hole & ~dilate(landing, CONTOUR)
+    around, images, rows = dilate(covered, AROUND) & ~covered, [scene.render()], []
     for method, fill in FILLS.items():
         start = time.process_time()
         edited = apply(fill=fill)
         seconds, values = time.process_time() - start, edited().detach()
         slopes = torch.stack(torch.gradient(values.double(), dim=(1, 2))).norm(dim=0).amax(0)
-        slope, there = slopes[uncovered] / slopes[around].quantile(0.999), values[:, uncovered]
+        slope, colors = slopes[uncovered] / slopes[around].quantile(0.999), values[:, uncovered]
         rows.append({
             "image": image, "edit": edit, "method": method, "pixels": len(slope), "steep": int((slope > 1).sum()),
-            "steepest": float(slope.max()), "beyond [0, 1]": float(torch.maximum(-there, there - 1).clamp_min(0).max()),
+            "steepest": float(slope.max()),
+            "beyond [0, 1]": float(torch.maximum(-colors, colors - 1).clamp_min(0).max()),
             "core_seconds": seconds, "added": edited.num_gaussians - scene.num_gaussians,
         })  # fmt: skip
-        shown.append(edited.render())
-    area = grown(covered, SHOWN)
-    part = [image[:, area.any(1)][..., area.any(0)] for image in shown]
+        images.append(edited.render())
+    area = dilate(covered, SHOWN)
+    details = [image[:, area.any(1)][..., area.any(0)] for image in images]
     Path(folder).mkdir(parents=True, exist_ok=True)
-    save_image(Path(folder, f"{image}-{edit}.png"), torch.cat(part, 2))
+    save_image(Path(folder, f"{image}-{edit}.png"), torch.cat(details, 2))
     return rows
 
 
-def grown(mask: Tensor, pixels: int) -> Tensor:
+def dilate(mask: Tensor, pixels: int) -> Tensor:
     """Return what is within so many pixels of a mask."""
     return torch.from_numpy(distance_transform_edt(~mask.numpy()) <= pixels)
 
@@ -80,13 +84,8 @@ def jobs(options: Options) -> list[Job]:
     """Edit frames of DAVIS."""
     images = ["disc"] if options.quick else list(options.only) or names(options.folder(), "davis")
     n = QUICK_GAUSSIANS if options.quick else NUM_GAUSSIANS
-    fixed = {"n": n, "folder": str(options.output / "runs"), "data": str(options.data or ""), "quick": options.quick}
-    return [{"image": image, "edit": edit, **fixed} for edit in ("delete", "move") for image in images]
-
-
-def run(options: Options) -> None:
-    """Measure, and write the report."""
-    experiment(__name__, options, jobs, measure, page)
+    arguments = {"n": n, "folder": str(options.output / "runs"), **options.image_arguments()}
+    return [{"image": image, "edit": edit, **arguments} for edit in ("delete", "move") for image in images]
 
 
 def page(folder: Path, rows: list[Row]) -> Page:
@@ -96,7 +95,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
     if sheet:
         save_rows(folder / "fill.jpg", sheet)
     columns = ("pixels", *QUANTITIES, "steepest", "core_seconds", "added")
-    tables = [means(rows, ["edit", "method"], columns), means(rows, ["edit", "image", "method"], columns)]
-    sentence = answer(rows, CONTEST, QUANTITIES, ["edit"])
+    tables = [means_table(rows, ["edit", "method"], columns), means_table(rows, ["edit", "image", "method"], columns)]
+    sentence = summary(rows, COMPARISON, QUANTITIES, ["edit"])
     question = "How well are the holes filled that deleted and moved objects leave?"
-    return Page(question, METHOD, sentence, "fill.jpg", tables, losses(rows, [CONTEST], QUANTITIES, ["edit"]))
+    return Page(question, METHOD, sentence, "fill.jpg", tables, losses_table(rows, [COMPARISON], QUANTITIES, ["edit"]))

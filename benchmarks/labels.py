@@ -19,10 +19,10 @@ from kcgs.codec import decode_labels, encode_labels
 from kcgs.data import load_labels
 from kcgs.segment import segment
 
-from .core.compare import Contest, answer, grouped, losses, means
+from .core.compare import Comparison, group_by, losses_table, means_table, summary
 from .core.figures import Panel, save_lines
 from .core.images import load
-from .core.run import Job, Options, Page, Row, experiment
+from .core.run import Job, Options, Page, Row
 
 # where maps are in the data; none of Kodak, on whose maps the tables of kcgs were trained
 SETS = {
@@ -105,9 +105,9 @@ def region_numbers(labels: Any) -> Any:
     return np.unique(labels, return_inverse=True)[1].reshape(labels.shape).astype(np.int32)
 
 
-def measure(image: str, group: str, data: str) -> list[Row]:
+def measure(image: str, group: str, data: str, quick: bool) -> list[Row]:
     """Code a map in all codecs that are there; a RuntimeError: one loses labels."""
-    labels = (load_labels(Path(data, image)) if data else segment(load(image).image)).numpy()
+    labels = (load_labels(Path(data, image)) if data else segment(load(image, quick=quick).image)).numpy()
     index, rows = region_numbers(labels), []
     for name, codec in CODECS.items():
         if find_spec(codec.package) is None:
@@ -130,20 +130,14 @@ def measure(image: str, group: str, data: str) -> list[Row]:
 
 def jobs(options: Options) -> list[Job]:
     """Code the maps of all sets; without data, one that is found in a photo."""
-    listed = [{"image": "astronaut", "group": "scikit-image, found", "data": ""}]
+    images = [("scikit-image, found", "astronaut")]
     if options.data is not None:
-        found = [(name, sorted(options.data.glob(pattern))) for name, pattern in SETS.items()]
-        listed = [
-            {"image": str(path.relative_to(options.data)), "group": name, "data": str(options.data)}
-            for name, paths in found
-            for path in paths[: 1 if options.quick else None]
+        images = [
+            (group, str(path.relative_to(options.data)))
+            for group, pattern in SETS.items()
+            for path in sorted(options.data.glob(pattern))[: 1 if options.quick else None]
         ]
-    return listed
-
-
-def run(options: Options) -> None:
-    """Measure, and write the report."""
-    experiment(__name__, options, jobs, measure, page)
+    return [{"image": image, "group": group, **options.image_arguments()} for group, image in images]
 
 
 def page(folder: Path, rows: list[Row]) -> Page:
@@ -151,12 +145,14 @@ def page(folder: Path, rows: list[Row]) -> Page:
     sizes = {row["image"]: row["bytes"] for row in rows if row["method"] == "WebP"}
     for row in rows:
         row["bytes to WebP, %"] = 100 * row["bytes"] / sizes[row["image"]]
-    contests = [Contest("kcgs", name) for name in CODECS if name != "kcgs"]
-    groups = {str(group): of for (group,), of in grouped(rows, ["group"]).items()}
-    panels = [Panel(group, of, "decode_speed", "bytes to WebP, %") for group, of in groups.items()]
+    comparisons = [Comparison("kcgs", name) for name in CODECS if name != "kcgs"]
+    groups = {str(group): group_rows for (group,), group_rows in group_by(rows, ["group"]).items()}
+    panels = [Panel(group, group_rows, "decode_speed", "bytes to WebP, %") for group, group_rows in groups.items()]
     save_lines(folder / "labels.png", panels, "method", "group")
     columns = ("bytes", "bytes to WebP, %", "encode_speed", "decode_speed")
-    sentences = " ".join(answer(rows, contest, ["bytes"], ["group"]) for contest in contests)
-    tables = [means(rows, ["group", "method"], columns)]
+    sentences = " ".join(summary(rows, comparison, ["bytes"], ["group"]) for comparison in comparisons)
+    tables = [means_table(rows, ["group", "method"], columns)]
     question = "How small are label maps as files, beside other lossless codecs?"
-    return Page(question, METHOD, sentences, "labels.png", tables, losses(rows, contests, ["bytes"], ["group"]))
+    return Page(
+        question, METHOD, sentences, "labels.png", tables, losses_table(rows, comparisons, ["bytes"], ["group"])
+    )

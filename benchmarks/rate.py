@@ -15,21 +15,32 @@ from kcgs.functional import ef_psnr, ms_ssim, psnr
 from kcgs.rate import fit_bytes
 
 from .core.codecs import CODECS, available_codecs, decode_file, largest_file
-from .core.compare import Contest, answer, at_equal_bits, column, differences, grouped, losses, markdown, means, write
+from .core.compare import (
+    Comparison,
+    at_equal_bits,
+    differences_table,
+    format_value,
+    group_by,
+    losses_table,
+    markdown,
+    means_table,
+    summary,
+    values_of,
+)
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS
 from .core.images import load, load_mapped, names
-from .core.run import Job, Options, Page, Row, experiment
+from .core.run import Job, Options, Page, Row
 
 # map, objective
 OURS = {"kcgs": (True, "psnr"), "kcgs, no regions": (False, "psnr"), "kcgs, ms-ssim": (True, "ms-ssim")}
 BYTES = {"DAVIS": (2_000, 4_000, 8_000, 16_000, 32_000), "Kodak": (3_932, 7_372, 14_745, 24_576, 39_321)}
 QUICK_BYTES = (450, 900)
 QUANTITIES = ("psnr", "ef_psnr", "ms_ssim")
-CONTESTS = (
-    *(Contest("kcgs", other) for other in ("kcgs, no regions", *CODECS)),
-    Contest("kcgs, no regions", "AVIF, tune=psnr"),
-    Contest("kcgs, ms-ssim", "AVIF"),
+COMPARISONS = (
+    *(Comparison("kcgs", other) for other in ("kcgs, no regions", *CODECS)),
+    Comparison("kcgs, no regions", "AVIF, tune=psnr"),
+    Comparison("kcgs, ms-ssim", "AVIF"),
 )
 # mean PSNR over Kodak's 24 photos by bits per pixel, as the authors of these codecs printed them
 PRINTED = {
@@ -50,22 +61,23 @@ the bytes). Printed figures are means over all 24 photos of Kodak, so they compa
 these."""
 
 
-def measure(image: str, group: str, method: str, asked: int, data: str, quick: bool) -> list[Row]:
+def measure(image: str, group: str, method: str, target_bytes: int, data: str, quick: bool) -> list[Row]:
     """Make a file and measure it."""
     pixels, labels = load(image, data, quick)
     start = time.process_time()
     if method in OURS:
         with_map, objective = OURS[method]
         regions = load_mapped(image, data, quick)[1] if with_map else None
-        made = fit_bytes(pixels, regions, asked, objective=objective, iterations=QUICK_ITERATIONS if quick else None)
-        size, render = len(made.data), made.scene.render()
-        seen = evaluate(made.scene, pixels, labels).get("ssimulacra2")
+        iterations = QUICK_ITERATIONS if quick else None
+        result = fit_bytes(pixels, regions, target_bytes, objective=objective, iterations=iterations)
+        size, render = len(result.data), result.scene.render()
+        ssimulacra2 = evaluate(result.scene, pixels, labels).get("ssimulacra2")
     else:
-        file = largest_file(method, pixels, asked)
-        size, render, seen = len(file), decode_file(file), None
-    row = {"group": group, "image": image, "method": method, "asked": asked, "bytes": size}
+        file = largest_file(method, pixels, target_bytes)
+        size, render, ssimulacra2 = len(file), decode_file(file), None
+    row = {"group": group, "image": image, "method": method, "target_bytes": target_bytes, "bytes": size}
     row |= {"bpp": 8 * size / pixels[0].numel(), "core_seconds": time.process_time() - start}
-    row |= {"psnr": float(psnr(render, pixels)), "ssimulacra2": seen}
+    row |= {"psnr": float(psnr(render, pixels)), "ssimulacra2": ssimulacra2}
     if min(pixels.shape[1:]) > 160:
         row["ms_ssim"] = float(ms_ssim(render, pixels))
     if labels is not None:
@@ -75,27 +87,22 @@ def measure(image: str, group: str, method: str, asked: int, data: str, quick: b
 
 def jobs(options: Options) -> list[Job]:
     """Make files of DAVIS and Kodak."""
-    methods = (*OURS, *available_codecs())
+    methods = [*(["kcgs"] if options.quick else OURS), *available_codecs()]
     if options.quick:
-        wanted = [("DAVIS", "disc", size) for size in QUICK_BYTES]
+        files = [("DAVIS", "disc", size) for size in QUICK_BYTES]
     else:
-        wanted = [
+        files = [
             (group, image, size)
             for group, sizes in BYTES.items()
             for size in sizes
             for image in names(options.folder(), group.lower())
         ]
-    fixed = {"data": str(options.data or ""), "quick": options.quick}
+    arguments = options.image_arguments()
     return [
-        {"group": group, "image": image, "asked": size, "method": method, **fixed}
-        for group, image, size in wanted
+        {"group": group, "image": image, "target_bytes": size, "method": method, **arguments}
+        for group, image, size in files
         for method in methods
     ]
-
-
-def run(options: Options) -> None:
-    """Measure, and write the report."""
-    experiment(__name__, options, jobs, measure, page)
 
 
 def bd_rate(ours: list[Row], other: list[Row], quantity: str = "psnr") -> float | None:
@@ -119,42 +126,45 @@ def bd_rate(ours: list[Row], other: list[Row], quantity: str = "psnr") -> float 
 
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
-    groups = {str(group): of for (group,), of in grouped(rows, ["group"]).items()}
+    groups = {str(group): group_rows for (group,), group_rows in group_by(rows, ["group"]).items()}
     equal = list(rows)
-    for contest in CONTESTS:
-        equal += at_equal_bits(rows, contest, QUANTITIES, ["group"])
-    contests = [Contest(ours, f"{other}, equal bits") for ours, other in CONTESTS]
-    cases, lines = ["group", "asked"], []
-    for group, of in groups.items():
-        images = {str(image): grouped(files, ["method"]) for (image,), files in grouped(of, ["image"]).items()}
-        for ours, other in CONTESTS:
-            both = {i: (m[ours,], m[other,]) for i, m in images.items() if (ours,) in m and (other,) in m}
-            rates = {image: rate for image, pair in both.items() if (rate := bd_rate(*pair)) is not None}
+    for comparison in COMPARISONS:
+        equal += at_equal_bits(rows, comparison, QUANTITIES, ["group"])
+    comparisons = [Comparison(ours, f"{other}, equal bits") for ours, other in COMPARISONS]
+    cases, lines = ["group", "target_bytes"], []
+    for group, group_rows in groups.items():
+        by_image = group_by(group_rows, ["image"])
+        images = {str(image): group_by(files, ["method"]) for (image,), files in by_image.items()}
+        for ours, other in COMPARISONS:
+            pairs = {i: (m[ours,], m[other,]) for i, m in images.items() if (ours,) in m and (other,) in m}
+            rates = {image: rate for image, pair in pairs.items() if (rate := bd_rate(*pair)) is not None}
             if rates:
                 worst = max(rates, key=rates.__getitem__)
                 numbers = f"{fmean(rates.values()):+.1f} %", f"{worst} {rates[worst]:+.1f} %"
                 lines.append([group, f"{ours} - {other}", str(len(rates)), *numbers])
-    panels = [Panel(group, of, "bpp", quantity) for group, of in groups.items() for quantity in ("psnr", "ms_ssim")]
-    save_lines(folder / "rate.png", panels, "method", "asked")
+    panels = [Panel(group, files, "bpp", name) for group, files in groups.items() for name in ("psnr", "ms_ssim")]
+    save_lines(folder / "rate.png", panels, "method", "target_bytes")
     tables = [markdown(["images", "files", "number", "BD-rate, mean", "worst"], lines)] if lines else []
-    tables.append(differences(equal, contests, QUANTITIES, cases))
+    tables.append(differences_table(equal, comparisons, QUANTITIES, cases))
     columns = ("bytes", "bpp", *QUANTITIES, "ssimulacra2", "core_seconds")
-    tables.append(means(rows, ["group", "asked", "method"], columns))
+    tables.append(means_table(rows, ["group", "target_bytes", "method"], columns))
     if "Kodak" in groups:
         tables.append(_printed(groups["Kodak"]))
-    sentences = "\n".join(f"- {text}" for contest in contests if (text := answer(equal, contest, QUANTITIES, cases)))
+    sentences = "\n".join(
+        f"- {text}" for comparison in comparisons if (text := summary(equal, comparison, QUANTITIES, cases))
+    )
     question = "How good are files of so many bytes, beside those of other codecs?"
-    return Page(question, METHOD, sentences, "rate.png", tables, losses(equal, contests, QUANTITIES, cases))
+    return Page(question, METHOD, sentences, "rate.png", tables, losses_table(equal, comparisons, QUANTITIES, cases))
 
 
 def _printed(rows: list[Row]) -> str:
     """Lay out mean PSNR on Kodak beside printed figures."""
     measured: dict[str, dict[float, float]] = {}
-    for (method, _), of in grouped(rows, ["method", "asked"]).items():
-        measured.setdefault(str(method), {})[round(fmean(column(of, "bpp")), 4)] = fmean(column(of, "psnr"))
+    for (method, _), files in group_by(rows, ["method", "target_bytes"]).items():
+        measured.setdefault(str(method), {})[round(fmean(values_of(files, "bpp")), 4)] = fmean(values_of(files, "psnr"))
     lines = [
-        [f"{method}, {len(grouped(rows, ['image']))} photos" if method in measured else f"{method}, as printed",
-         ", ".join(f"{write('psnr', psnr)} at {rate:g}" for rate, psnr in sorted(of.items()))]
-        for method, of in {**measured, **PRINTED}.items()
+        [f"{method}, {len(group_by(rows, ['image']))} photos" if method in measured else f"{method}, as printed",
+         ", ".join(f"{format_value('psnr', psnr)} at {rate:g}" for rate, psnr in sorted(curve.items()))]
+        for method, curve in {**measured, **PRINTED}.items()
     ]  # fmt: skip
     return markdown(["Kodak", "PSNR at bits per pixel"], lines)

@@ -14,9 +14,9 @@ from kcgs import GaussianField, Scene
 from kcgs.functional import region_splat, scale_rotation_to_cholesky
 
 from .core.clocks import milliseconds, peak_megabytes, threads
-from .core.compare import grouped, means, write
+from .core.compare import format_value, group_by, means_table
 from .core.figures import Panel, save_lines
-from .core.run import Job, Options, Page, Row, experiment
+from .core.run import Job, Options, Page, Row
 from .core.scenes import FITTED, scene_of
 
 CUTOFFS = (1 / 255, 1e-3, 1e-4, 1e-6)
@@ -86,11 +86,11 @@ def measure(image: str, count: int, cutoffs: list[float], rounds: int) -> list[R
     with threads(count), torch.no_grad():
         forward = milliseconds({key: partial(render, scene, *key) for key in keys}, rounds)
     with threads(count):
-        both = milliseconds({key: partial(differentiate, scene, *key) for key in keys}, rounds)
+        forward_and_backward = milliseconds({key: partial(differentiate, scene, *key) for key in keys}, rounds)
     rows = []
     for backend, cutoff in keys:
         row = {"image": image, "method": backend, "threads": count, "cutoff": cutoff}
-        row |= {"forward_ms": forward[backend, cutoff], "both_ms": both[backend, cutoff]}
+        row |= {"forward_ms": forward[backend, cutoff], "both_ms": forward_and_backward[backend, cutoff]}
         row |= errors(scene, backend, cutoff) if count == 1 and has_reference else {}
         if count == 1 and cutoff == DEFAULT_CUTOFF and rounds > 1:
             row["peak_MB"] = peak_megabytes(render_by_name, image, backend, warm_up=("W3", backend))
@@ -107,19 +107,14 @@ def jobs(options: Options) -> list[Job]:
     """Time workloads and fitted scenes, and look at needles."""
     swept = ["W3"] if options.quick else ["W3", "W1", *FITTED]
     images = [*swept, *([] if options.quick else ["W2", "W4"])]
-    listed = [
+    listing = [
         {"image": image, "count": count, "cutoffs": CUTOFFS if image in swept else (DEFAULT_CUTOFF,)}
         for image in images
         for count in (1, 2)
     ]
-    listed += [{"image": f"needles {a:g}", "count": 1, "cutoffs": (0.0,)} for a in ANISOTROPIES]
+    listing += [{"image": f"needles {a:g}", "count": 1, "cutoffs": (0.0,)} for a in ANISOTROPIES]
     rounds = 1 if options.quick else ROUNDS
-    return [{**job, "rounds": rounds} for job in listed]
-
-
-def run(options: Options) -> None:
-    """Measure, and write the report."""
-    experiment(__name__, options, jobs, measure, page)
+    return [{**job, "rounds": rounds} for job in listing]
 
 
 def page(folder: Path, rows: list[Row]) -> Page:
@@ -127,20 +122,22 @@ def page(folder: Path, rows: list[Row]) -> Page:
     timed = [row for row in rows if "both_ms" in row]
     default = [row for row in timed if abs(row["cutoff"] / DEFAULT_CUTOFF - 1) < 0.01]
     swept = [row for row in timed if "image_error" in row]
-    groups, scales = grouped(swept, ["image"]), ("log", "log")
-    panels = [Panel(str(image), of, "both_ms", "image_error", scales) for (image,), of in groups.items()]
+    groups, scales = group_by(swept, ["image"]), ("log", "log")
+    panels = [Panel(str(image), group, "both_ms", "image_error", scales) for (image,), group in groups.items()]
     save_lines(folder / "render.png", panels, "method", "cutoff")
     columns = ("forward_ms", "both_ms", "image_error", "gradient_error", "peak_MB")
-    tables = [means(default, ["image", "method", "threads"], columns)]
-    tables.append(means(swept, ["image", "method", "cutoff"], columns[:4]))
-    tables.append(means([row for row in rows if "both_ms" not in row], ["image", "method"], columns[2:4]))
+    tables = [means_table(default, ["image", "method", "threads"], columns)]
+    tables.append(means_table(swept, ["image", "method", "cutoff"], columns[:4]))
+    tables.append(means_table([row for row in rows if "both_ms" not in row], ["image", "method"], columns[2:4]))
     times = {(row["image"], row["method"], row["threads"]): row["both_ms"] for row in default}
     ratios = {
         image: times[image, "tiled", 1] / times[image, "cpu", 1] for image, method, _ in times if method == "tiled"
     }
     cores = {image: times[image, "cpu", 1] / times[image, "cpu", 2] for image in ratios if (image, "cpu", 2) in times}
     text = "`cpu` is {} times as fast as `tiled` on one thread; two threads are {} times as fast as one."
-    text = text.format(*(", ".join(f"{write('', r)} ({image})" for image, r in of.items()) for of in (ratios, cores)))
+    text = text.format(
+        *(", ".join(f"{format_value('', r)} ({image})" for image, r in values.items()) for values in (ratios, cores))
+    )
     slow = [f"{image}: {ratio:.2f}" for image, ratio in cores.items() if ratio < 1]
-    lost = f"Two threads are slower than one, times as fast: {', '.join(slow)}." if slow else ""
-    return Page("How fast and how exactly does each backend render?", METHOD, text, "render.png", tables, lost)
+    losses = f"Two threads are slower than one, times as fast: {', '.join(slow)}." if slow else ""
+    return Page("How fast and how exactly does each backend render?", METHOD, text, "render.png", tables, losses)

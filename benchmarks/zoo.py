@@ -41,20 +41,20 @@ PLANS: dict[str, Plan] = {
 }
 
 
-def run(options: Options) -> None:
+def make_zoo(options: Options) -> None:
     """Fit the scenes, or those that `only` names, and write them with their manifest."""
     unknown = [name for name in options.only if name not in PLANS]
     if unknown:
         raise ValueError(f"only must name scenes of the zoo, {', '.join(PLANS)}; got {unknown[0]!r}")
     manifest = options.output / "manifest.json"
-    known = {entry.name: entry for entry in entries(options.output)} if manifest.is_file() else {}
+    by_name = {entry.name: entry for entry in entries(options.output)} if manifest.is_file() else {}
     for name in options.only or PLANS:
-        known[name] = make(name, PLANS[name], options.output / name, options.quick)
-        listed = [known[name]._asdict() for name in PLANS if name in known]
-        manifest.write_text(json.dumps({"format": "kcgs.zoo", "entries": listed}, indent=1) + "\n", encoding="utf-8")
+        by_name[name] = make_entry(name, PLANS[name], options.output / name, options.quick)
+        content = {"format": "kcgs.zoo", "entries": [by_name[name]._asdict() for name in PLANS if name in by_name]}
+        manifest.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def make(name: str, plan: Plan, folder: Path, quick: bool) -> Entry:
+def make_entry(name: str, plan: Plan, folder: Path, quick: bool) -> Entry:
     """Fit a scene and write its files."""
     image, labels = load_mapped(plan.image)
     recipe = "best" if plan.image in CHARTS else "best-refined"  # contours that were found may move freely

@@ -1,4 +1,4 @@
-"""Rows beside each other: means, differences that are paired by image, and where a method loses."""
+"""Tables of means, of differences paired by image, and of the images on which a method is worse."""
 
 from __future__ import annotations
 
@@ -14,36 +14,52 @@ from scipy.interpolate import PchipInterpolator
 
 from .run import Row
 
-# how columns are called and written, and the least difference that counts; the rest has three digits
-FORMATS: dict[str, tuple[str, str, float]] = {
-    "n": ("N", ",.0f", 0),
-    "asked": ("bytes asked", ",.0f", 0),
-    "bytes": ("bytes", ",.0f", 0.5),
-    "map_bytes": ("of these map", ",.0f", 0.5),
-    "regions": ("regions", ".1f", 0),
-    "iterations": ("iterations", ",.0f", 0),
-    "bpp": ("bits per pixel", ".3f", 0.0005),
-    "psnr": ("PSNR", ".2f", 0.005),
-    "ms_ssim": ("MS-SSIM", ".4f", 0.0001),
-    "ef_psnr": ("EF-PSNR", ".2f", 0.005),
-    "ssimulacra2": ("SSIMULACRA2", ".1f", 0.05),
-    "decoded_psnr": ("PSNR decoded", ".2f", 0.005),
-    "decoded_ef_psnr": ("EF-PSNR decoded", ".2f", 0.005),
-    "core_seconds": ("core s", ".1f", 0.05),
+
+class Column(NamedTuple):
+    """A column of rows, as tables show it."""
+
+    title: str
+    format: str
+    tie: float = 0.0
+    """The largest difference that is no difference, where methods are compared."""
+    less_is_better: bool = False
+
+
+# other columns have their own name as the title, and three digits
+COLUMNS = {
+    "n": Column("N", ",.0f"),
+    "target_bytes": Column("target bytes", ",.0f"),
+    "bytes": Column("bytes", ",.0f", 0.5, less_is_better=True),
+    "map_bytes": Column("of these map", ",.0f", 0.5),
+    "regions": Column("regions", ".1f"),
+    "iterations": Column("iterations", ",.0f"),
+    "bpp": Column("bits per pixel", ".3f", 0.0005),
+    "psnr": Column("PSNR", ".2f", 0.005),
+    "ms_ssim": Column("MS-SSIM", ".4f", 0.0001),
+    "ef_psnr": Column("EF-PSNR", ".2f", 0.005),
+    "ssimulacra2": Column("SSIMULACRA2", ".1f", 0.05),
+    "decoded_psnr": Column("PSNR decoded", ".2f", 0.005),
+    "decoded_ef_psnr": Column("EF-PSNR decoded", ".2f", 0.005),
+    "core_seconds": Column("core s", ".1f", 0.05),
+    "steep": Column("steep", "", less_is_better=True),
+    "beyond [0, 1]": Column("beyond [0, 1]", "", less_is_better=True),
 }
-# less is better
-_LESS = ("bytes", "steep", "beyond [0, 1]")
-_SAMPLES = 10_000
-_MARGIN = math.log(1.05)
-_WORST = 5  # images that a table of losses names
+# of the bootstrap
+_NUM_SAMPLES = 10_000
+# in the logarithm of bytes: how far a curve is continued beyond its ends, 5 %
+_CURVE_MARGIN = math.log(1.05)
+# images that a table of losses names
+_NUM_WORST = 5
 
 
 class Gain(NamedTuple):
     """Differences between two methods, by image."""
 
     values: dict[str, float]
-    tie: float  # the least difference that counts
-    sign: int  # 1: more is better, -1: less is
+    tie: float
+    """The largest difference that is no difference."""
+    sign: int
+    """1: more is better, -1: less is."""
 
     @property
     def mean(self) -> float:
@@ -51,15 +67,15 @@ class Gain(NamedTuple):
         return fmean(self.values.values())
 
     @property
-    def won(self) -> int:
-        """Images on which the first is better."""
+    def num_wins(self) -> int:
+        """Number of images on which the first method is better."""
         return sum(self.sign * value > self.tie for value in self.values.values())
 
     @property
-    def lost(self) -> list[str]:
-        """Images on which the second is better, the worst first."""
-        behind = {image: self.sign * value for image, value in self.values.items() if self.sign * value < -self.tie}
-        return sorted(behind, key=behind.__getitem__)
+    def losses(self) -> list[str]:
+        """Images on which the second method is better, the worst first."""
+        values = {image: self.sign * value for image, value in self.values.items()}
+        return sorted((image for image, value in values.items() if value < -self.tie), key=values.__getitem__)
 
     @property
     def interval(self) -> tuple[float, float] | None:
@@ -67,31 +83,73 @@ class Gain(NamedTuple):
         count = len(self.values)
         if count < 5:
             return None
-        samples = np.random.default_rng(0).choice(list(self.values.values()), (_SAMPLES, count)).mean(1)
-        wider = float(stats.t.ppf(0.975, count - 1) / stats.norm.ppf(0.975)) * math.sqrt(count / (count - 1))
-        low, high = (self.mean + wider * float(end - self.mean) for end in np.percentile(samples, (2.5, 97.5)))
+        samples = np.random.default_rng(0).choice(list(self.values.values()), (_NUM_SAMPLES, count)).mean(1)
+        factor = float(stats.t.ppf(0.975, count - 1) / stats.norm.ppf(0.975)) * math.sqrt(count / (count - 1))
+        low, high = (self.mean + factor * float(end - self.mean) for end in np.percentile(samples, (2.5, 97.5)))
         return low, high
 
 
-class Contest(NamedTuple):
+class Comparison(NamedTuple):
     """Two methods."""
 
-    ours: str
-    other: str
+    first: str
+    second: str
 
     def gains(self, rows: Iterable[Row], quantity: str, cases: Sequence[str]) -> dict[tuple[object, ...], Gain]:
         """Return what the first has over the second in each case, a combination of columns, averaged over seeds."""
         values: dict[tuple[object, ...], dict[str, dict[str, list[float]]]] = {}
         for row in rows:
-            if row["method"] in self and not missing(row.get(quantity)):
-                case = values.setdefault(tuple(row.get(name) for name in cases), {})
-                case.setdefault(row["image"], {}).setdefault(row["method"], []).append(row[quantity])
-        tie, sign = FORMATS.get(quantity, ("", "", 0.0))[2], -1 if quantity in _LESS else 1
-        pairs = {
-            case: {image: fmean(of[self.ours]) - fmean(of[self.other]) for image, of in images.items() if len(of) == 2}
-            for case, images in values.items()
-        }
-        return {case: Gain(by_image, tie, sign) for case, by_image in pairs.items() if by_image}
+            if row["method"] in self and not is_missing(row.get(quantity)):
+                images = values.setdefault(tuple(row.get(name) for name in cases), {})
+                images.setdefault(row["image"], {}).setdefault(row["method"], []).append(row[quantity])
+        column = _column(quantity)
+        gains = {}
+        for case, images in values.items():
+            differences = {
+                image: fmean(methods[self.first]) - fmean(methods[self.second])
+                for image, methods in images.items()
+                if len(methods) == 2
+            }
+            if differences:
+                gains[case] = Gain(differences, column.tie, -1 if column.less_is_better else 1)
+        return gains
+
+
+def is_missing(value: Any) -> bool:
+    """True where a row has no number."""
+    return not isinstance(value, int | float) or math.isnan(value)
+
+
+def values_of(rows: Iterable[Row], name: str) -> list[float]:
+    """Return the numbers of a column."""
+    return [row[name] for row in rows if not is_missing(row.get(name))]
+
+
+def group_by(rows: Iterable[Row], names: Sequence[str]) -> dict[tuple[object, ...], list[Row]]:
+    """Group rows by their values of these columns, in order of appearance."""
+    groups = defaultdict(list)
+    for row in rows:
+        groups[tuple(row.get(name) for name in names)].append(row)
+    return groups
+
+
+def title(name: str) -> str:
+    """Return the title of a column."""
+    return _column(name).title
+
+
+def format_value(name: str, value: Any, sign: str = "") -> str:
+    """Format a value of a column; a text stays, a missing number is empty."""
+    if isinstance(value, str):
+        return value
+    if is_missing(value):
+        return ""
+    default = ",.0f" if abs(value) >= 100 else ".3g"
+    return format(value, sign + (_column(name).format or default))
+
+
+def _column(name: str) -> Column:
+    return COLUMNS.get(name, Column(name.replace("_", " "), ""))
 
 
 def markdown(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
@@ -99,120 +157,92 @@ def markdown(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in [header, ["---"] * len(header), *lines])
 
 
-def title(name: str) -> str:
-    """Say what readers call a column."""
-    return FORMATS[name][0] if name in FORMATS else name.replace("_", " ")
-
-
-def write(name: str, value: Any, sign: str = "") -> str:
-    """Write a number as its column is written, or a text."""
-    if isinstance(value, str):
-        return value
-    if missing(value):
-        return ""
-    default = ",.0f" if abs(value) >= 100 else ".3g"
-    return format(value, sign + (FORMATS[name][1] if name in FORMATS else default))
-
-
-def grouped(rows: Iterable[Row], names: Sequence[str]) -> dict[tuple[object, ...], list[Row]]:
-    """Group rows by what they have under these names, in order of appearance."""
-    groups = defaultdict(list)
-    for row in rows:
-        groups[tuple(row.get(name) for name in names)].append(row)
-    return groups
-
-
-def means(rows: Sequence[Row], names: Sequence[str], columns: Sequence[str]) -> str:
+def means_table(rows: Sequence[Row], names: Sequence[str], columns: Sequence[str]) -> str:
     """Lay out the means of columns, a line for each combination of names, with the number of images."""
     lines, count = [], [] if "image" in names else ["images"]
-    for key, group in grouped(rows, names).items():
-        numbers = {name: column(group, name) for name in columns}
-        line = [*map(write, names, key), *(str(len(grouped(group, ["image"]))) for _ in count)]
-        lines.append(line + [write(name, fmean(values)) if values else "" for name, values in numbers.items()])
+    for key, group in group_by(rows, names).items():
+        line = [*map(format_value, names, key), *(str(len(group_by(group, ["image"]))) for _ in count)]
+        for name in columns:
+            values = values_of(group, name)
+            line.append(format_value(name, fmean(values)) if values else "")
+        lines.append(line)
     return markdown([*map(title, names), *count, *map(title, columns)], lines)
 
 
-def differences(
-    rows: Sequence[Row], contests: Sequence[Contest], quantities: Sequence[str], cases: Sequence[str]
+def differences_table(
+    rows: Sequence[Row], comparisons: Sequence[Comparison], quantities: Sequence[str], cases: Sequence[str]
 ) -> str:
-    """Lay out paired differences, a line for each contest and case, above zero where the first is better."""
+    """Lay out paired differences, a line for each comparison and case, above zero where the first is better."""
     lines = []
-    for contest in contests:
-        found = [contest.gains(rows, quantity, cases) for quantity in quantities]
-        for case in dict.fromkeys(case for gains in found for case in gains):
-            line = [" - ".join(contest), *map(write, cases, case)]
-            for quantity, gains in zip(quantities, found, strict=True):
-                line += _gain_cells(quantity, gains[case]) if case in gains else [""] * 3
+    for comparison in comparisons:
+        gains = {quantity: comparison.gains(rows, quantity, cases) for quantity in quantities}
+        for case in dict.fromkeys(case for by_case in gains.values() for case in by_case):
+            line = [" - ".join(comparison), *map(format_value, cases, case)]
+            for quantity, by_case in gains.items():
+                line += _gain_cells(quantity, by_case[case]) if case in by_case else [""] * 3
             lines.append(line)
     header = [cell for quantity in quantities for cell in (title(quantity), "95 %", "won-lost")]
     return markdown(["difference", *map(title, cases), *header], lines)
 
 
 def _gain_cells(quantity: str, gain: Gain) -> list[str]:
-    interval = " to ".join(write(quantity, end, "+") for end in gain.interval or ())
-    return [write(quantity, gain.mean, "+"), interval, f"{gain.won}-{len(gain.lost)}"]
+    interval = " to ".join(format_value(quantity, end, "+") for end in gain.interval or ())
+    return [format_value(quantity, gain.mean, "+"), interval, f"{gain.num_wins}-{len(gain.losses)}"]
 
 
-def losses(rows: Sequence[Row], contests: Sequence[Contest], quantities: Sequence[str], cases: Sequence[str]) -> str:
-    """Lay out where a method is below the other, the worst images first."""
+def losses_table(
+    rows: Sequence[Row], comparisons: Sequence[Comparison], quantities: Sequence[str], cases: Sequence[str]
+) -> str:
+    """Lay out the cases in which the first method loses, the worst images first."""
     lines = []
-    for contest, quantity in ((contest, quantity) for contest in contests for quantity in quantities):
-        for case, gain in contest.gains(rows, quantity, cases).items():
-            if gain.lost:
-                worst = ", ".join(f"{image} {write(quantity, gain.values[image], '+')}" for image in gain.lost[:_WORST])
-                lost = f"{len(gain.lost)} of {len(gain.values)}"
-                lines.append([" - ".join(contest), *map(write, cases, case), title(quantity), lost, worst])
+    for comparison in comparisons:
+        for quantity in quantities:
+            for case, gain in comparison.gains(rows, quantity, cases).items():
+                images = [f"{i} {format_value(quantity, gain.values[i], '+')}" for i in gain.losses[:_NUM_WORST]]
+                if images:
+                    line = [" - ".join(comparison), *map(format_value, cases, case), title(quantity)]
+                    lines.append([*line, f"{len(gain.losses)} of {len(gain.values)}", ", ".join(images)])
     return markdown(["difference", *map(title, cases), "in", "lost", "worst"], lines) if lines else ""
 
 
-def answer(rows: Sequence[Row], contest: Contest, quantities: Sequence[str], cases: Sequence[str]) -> str:
+def summary(rows: Sequence[Row], comparison: Comparison, quantities: Sequence[str], cases: Sequence[str]) -> str:
     """Say in a sentence what the first method has over the second, over all cases."""
     parts = []
     for quantity in quantities:
-        gains = list(contest.gains(rows, quantity, cases).values())
+        gains = list(comparison.gains(rows, quantity, cases).values())
         if gains:
-            won, count = sum(gain.won for gain in gains), sum(len(gain.values) for gain in gains)
-            mean = write(quantity, fmean(value for gain in gains for value in gain.values.values()), "+")
-            parts.append(f"{title(quantity)} {mean} on average, better in {won} of {count} pairs")
-    return f"`{contest.ours}` beside `{contest.other}`: {'; '.join(parts)}." if parts else ""
+            wins, count = sum(gain.num_wins for gain in gains), sum(len(gain.values) for gain in gains)
+            mean = format_value(quantity, fmean(value for gain in gains for value in gain.values.values()), "+")
+            parts.append(f"{title(quantity)} {mean} on average, better in {wins} of {count} pairs")
+    return f"`{comparison.first}` beside `{comparison.second}`: {'; '.join(parts)}." if parts else ""
 
 
 def at_equal_bits(
-    rows: Sequence[Row], contest: Contest, quantities: Sequence[str], cases: Sequence[str]
+    rows: Sequence[Row], comparison: Comparison, quantities: Sequence[str], cases: Sequence[str]
 ) -> Iterator[Row]:
-    """Yield the other method's quality at the bytes of each file of the first.
+    """Yield the second method's quality at the bytes of each file of the first.
 
-    Its own files of that image are interpolated by monotone cubics over the logarithm of their bytes; more than 5 %
-    outside of them there is no number. The method is called "OTHER, equal bits".
+    The second method's own files of that image are interpolated by monotone cubics over the logarithm of their bytes;
+    more than 5 % outside of them there is no number. The rows' method is "SECOND, equal bits".
     """
     curves: dict[tuple[object, ...], PchipInterpolator] = {}
-    files = grouped([row for row in rows if row["method"] == contest.other], [*cases, "image"])
+    files = group_by([row for row in rows if row["method"] == comparison.second], [*cases, "image"])
     for key, group in files.items():
         for quantity in quantities:
             values: dict[float, list[float]] = defaultdict(list)
             for row in group:
-                if not missing(row.get(quantity)):
+                if not is_missing(row.get(quantity)):
                     values[math.log(row["bytes"])].append(row[quantity])
             if len(values) > 1:
                 sizes = sorted(values)
                 curves[*key, quantity] = PchipInterpolator(sizes, [fmean(values[size]) for size in sizes])
     for row in rows:
         key = (*(row.get(name) for name in cases), row["image"])
-        if row["method"] == contest.ours and key in files:
-            known, size = {}, math.log(row["bytes"])
+        if row["method"] == comparison.first and key in files:
+            qualities, size = {}, math.log(row["bytes"])
             for quantity in quantities:
                 curve = curves.get((*key, quantity))
-                if curve is not None and curve.x[0] - _MARGIN <= size <= curve.x[-1] + _MARGIN:
-                    known[quantity] = float(curve(size))
-            names = {name: row[name] for name in ("image", "n", "asked", *cases) if name in row}
-            yield {**names, "bytes": row["bytes"], "method": f"{contest.other}, equal bits", **known}
-
-
-def missing(value: Any) -> bool:
-    """Whether a row has no number here."""
-    return not isinstance(value, int | float) or math.isnan(value)
-
-
-def column(rows: Iterable[Row], name: str) -> list[float]:
-    """Return the numbers that rows have under a name."""
-    return [row[name] for row in rows if not missing(row.get(name))]
+                if curve is not None and curve.x[0] - _CURVE_MARGIN <= size <= curve.x[-1] + _CURVE_MARGIN:
+                    qualities[quantity] = float(curve(size))
+            names = {name: row[name] for name in ("image", "n", "target_bytes", *cases) if name in row}
+            yield {**names, "bytes": row["bytes"], "method": f"{comparison.second}, equal bits", **qualities}

@@ -15,7 +15,7 @@ from matplotlib.ticker import LogLocator
 from PIL import Image
 from torch import Tensor
 
-from .compare import grouped, missing, title
+from .compare import group_by, is_missing, title
 from .run import Row
 
 # of Okabe and Ito
@@ -40,19 +40,19 @@ def save_lines(path: Path, panels: Sequence[Panel], line: str, along: str, marke
     """Plot y over x, a line for each name under `line`, through the means at each value under `along`."""
     height = (len(panels) + 1) // 2
     figure = Figure(figsize=(9.5, 0.6 + 3.3 * height), layout="constrained")
-    shown: dict[object, Any] = {}
+    handles: dict[object, Any] = {}
     names = list(dict.fromkeys(row[line] for panel in panels for row in panel.rows))
     with matplotlib.rc_context({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3}):
         all_axes = np.ravel(figure.subplots(height, 2, squeeze=False))
     for panel, axes in zip(panels, all_axes, strict=False):
-        present = [row for row in panel.rows if not (missing(row.get(panel.x)) or missing(row.get(panel.y)))]
-        for (name,), rows in grouped(present, [line]).items():
-            groups = [group for _, group in sorted(grouped(rows, [along]).items())]
+        present = [row for row in panel.rows if not (is_missing(row.get(panel.x)) or is_missing(row.get(panel.y)))]
+        for (name,), rows in group_by(present, [line]).items():
+            groups = [group for _, group in sorted(group_by(rows, [along]).items())]
             points = [[fmean(row[quantity] for row in group) for quantity in (panel.x, panel.y)] for group in groups]
             index = names.index(name)
             style = {"marker": MARKERS[index % len(MARKERS)] if marker else None, "markersize": 4}
             x, y = zip(*points, strict=True)
-            (shown[name],) = axes.plot(x, y, color=COLORS[index % len(COLORS)], **style)
+            (handles[name],) = axes.plot(x, y, color=COLORS[index % len(COLORS)], **style)
         axes.set(xlabel=title(panel.x), ylabel=title(panel.y), title=panel.title)
         axes.set(xscale=panel.scales[0], yscale=panel.scales[1])
         axes.xaxis.set_major_formatter("{x:g}")
@@ -62,9 +62,9 @@ def save_lines(path: Path, panels: Sequence[Panel], line: str, along: str, marke
             axes.xaxis.set_minor_formatter("{x:g}" if high < 100 * low else "")
     for axes in all_axes[len(panels) :]:
         axes.set_visible(False)
-    labels = [str(name) for name in shown]
+    labels = [str(name) for name in handles]
     columns = _LEGEND_WIDTH // (max(map(len, labels), default=0) + _LEGEND_MARKER)
-    figure.legend(shown.values(), labels, loc="outside upper center", ncols=max(1, min(columns, len(labels))))
+    figure.legend(handles.values(), labels, loc="outside upper center", ncols=max(1, min(columns, len(labels))))
     figure.savefig(path, dpi=110)
 
 

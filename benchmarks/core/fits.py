@@ -19,7 +19,7 @@ from .run import Job, Options, Row
 # recipes as published have 50,000 iterations, which take a quarter of an hour per photo on a processor core
 PUBLISHED = ("paper", "gaussian-image", "gaussian-image-clamp", "image-gs")
 PUBLISHED_ITERATIONS = 2_000
-QUICK_ITERATIONS = 20
+QUICK_ITERATIONS = 10
 _FIGURES = ("psnr", "ms_ssim", "ef_psnr")
 Method = tuple[str, dict[str, Any]]  # a recipe, and settings that differ from it
 

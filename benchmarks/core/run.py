@@ -1,4 +1,4 @@
-"""An experiment: jobs are measured, their rows are kept, and a report of one page is written."""
+"""An experiment: measure jobs, keep their rows on disk, write a report of one page."""
 
 from __future__ import annotations
 
@@ -8,23 +8,24 @@ import inspect
 import json
 import os
 import platform
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from importlib.metadata import version
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
 from rich.progress import track
 
 import kcgs
+from kcgs.engine import run_jobs
 
 Row = dict[str, Any]
 Job = dict[str, Any]
 Measure = Callable[..., list[Row]]
-QUICK_TEXT = "This is the short form, with small images and few iterations: it only shows that all of it runs."
+RESULTS_FILE = "results.csv"
+# the command, the machine and a note on what is missing
+RUN_FILE = "run.json"
+QUICK_NOTE = "This is the short form, with small images and few iterations: it only shows that all of it runs."
 
 
 class Options(NamedTuple):
@@ -44,6 +45,10 @@ class Options(NamedTuple):
             raise ValueError("data must be a folder with images; got None")
         return self.data
 
+    def image_arguments(self) -> dict[str, Any]:
+        """Return arguments of `images.load` in the form of a job, which JSON can hold."""
+        return {"data": str(self.data or ""), "quick": self.quick}
+
 
 class Page(NamedTuple):
     """A report."""
@@ -56,39 +61,37 @@ class Page(NamedTuple):
     losses: str
 
 
-def experiment(
+def run_experiment(
     name: str,
     options: Options,
     jobs: Callable[[Options], list[Job]],
     measure: Measure,
     page: Callable[[Path, list[Row]], Page],
 ) -> None:
-    """Measure what is missing, then write results.csv, made.json and report.md.
+    """Measure the jobs without a result, then write results.csv, run.json and report.md.
 
-    `measure`, a function of a module, returns the rows of a job, whose values are those of JSON. What it returned is in
-    OUTPUT/runs, under a hash of the job, the text of `measure` and the code of kcgs; remove the folder to measure anew.
-    An interruption leaves the results so far: `--redraw` reports them, and the same command goes on.
+    A job is the keyword arguments of `measure`, a function of a module, which returns rows of JSON's values. The rows
+    are kept in OUTPUT/runs, under a hash of the job, the text of `measure` and the code of kcgs; remove the folder to
+    measure anew. An interruption leaves the results so far: `--redraw` reports them, and the same command goes on.
     """
     if not options.redraw:
-        listed = jobs(options)
-        chosen = [job for job in listed if not options.only or job["image"] in options.only]
-        if not chosen:
-            raise ValueError(f"only must name some of {', '.join({job['image']: 0 for job in listed})}")
+        all_jobs = jobs(options)
+        selection = [job for job in all_jobs if not options.only or job["image"] in options.only]
+        if not selection:
+            raise ValueError(f"only must name some of {', '.join({job['image']: 0 for job in all_jobs})}")
         options.output.mkdir(parents=True, exist_ok=True)
-        paths = {_path(options.output / "runs", measure, job): job for job in chosen}
+        paths = {_path(options.output / "runs", measure, job): job for job in selection}
         try:
             _measure_missing(measure, paths, options.workers)
         finally:
             present = [path for path in paths if path.is_file()]
-            rows = [row for path in present for row in json.loads(path.read_text())]
-            write_rows(options.output / "results.csv", rows)
-            made = {"command": _command(name, options), "quick": options.quick, "machine": _machine()}
-            stopped = f"Stopped: {len(present)} of {len(paths)} jobs are done."
-            made["note"] = stopped if len(present) < len(paths) else ""
-            (options.output / "made.json").write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
-    made = json.loads((options.output / "made.json").read_text(encoding="utf-8"))
-    written = page(options.output, read_rows(options.output / "results.csv"))
-    (options.output / "report.md").write_text(_text(written, made), encoding="utf-8")
+            write_rows(options.output / RESULTS_FILE, [row for path in present for row in json.loads(path.read_text())])
+            note = f"Stopped: {len(present)} of {len(paths)} jobs are done." if len(present) < len(paths) else ""
+            run = {"command": _command(name, options), "quick": options.quick, "machine": _machine(), "note": note}
+            (options.output / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
+    run = json.loads((options.output / RUN_FILE).read_text(encoding="utf-8"))
+    report = _text(page(options.output, read_rows(options.output / RESULTS_FILE)), run)
+    (options.output / "report.md").write_text(report, encoding="utf-8")
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
@@ -135,34 +138,22 @@ def _sources() -> str:
 
 
 def _measure_missing(measure: Measure, paths: dict[Path, Job], workers: int) -> None:
-    todo = {path: job for path, job in paths.items() if not path.is_file()}
-    for _ in track(_ended(partial(_work, measure), todo, workers), "benchmark", total=len(todo)):
+    missing = [(path, job) for path, job in paths.items() if not path.is_file()]
+    for _ in track(run_jobs(partial(_measure, measure), missing, workers=workers), "benchmark", total=len(missing)):
         pass
 
 
-def _ended(work: Callable[[Path, Job], None], todo: dict[Path, Job], workers: int) -> Iterator[None]:
-    if workers == 1:
-        yield from map(work, todo, todo.values())
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(work, todo, todo.values())
-
-
-def _work(measure: Measure, path: Path, job: Job) -> None:
-    """Measure a job on one thread; its file appears whole or not at all."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        rows = measure(**job)
-    finally:
-        torch.set_num_threads(before)
+def _measure(measure: Measure, item: tuple[Path, Job]) -> None:
+    """Measure a job; its file appears whole or not at all."""
+    path, job = item
+    rows = measure(**job)
     path.parent.mkdir(exist_ok=True)
     path.with_suffix(".part").write_text(json.dumps(rows))
     path.with_suffix(".part").replace(path)
 
 
 def _command(name: str, options: Options) -> str:
-    parts = [f"python -m {name} -o DIR".replace("benchmarks.", "benchmarks ")]
+    parts = [f"python -m benchmarks {name} -o DIR"]
     parts += ["--data DIR"] if options.data else []
     parts += ["--quick"] if options.quick else []
     parts += [f"--only {','.join(options.only)}"] if options.only else []
@@ -180,12 +171,12 @@ def _machine() -> str:
     return f"{processor}, {os.cpu_count()} cores; {python}; kcgs {kcgs.__version__}, {versions}"
 
 
-def _text(page: Page, made: dict[str, Any]) -> str:
-    parts = [f"# {page.question}", QUICK_TEXT if made["quick"] else "", made["note"], page.answer]
+def _text(page: Page, run: dict[str, Any]) -> str:
+    parts = [f"# {page.question}", QUICK_NOTE if run["quick"] else "", run["note"], page.answer]
     parts += [f"![]({page.figure})", *page.tables, "## Losses", page.losses or "None.", "## How", page.method]
     facts = [
-        f"- Command: `{made['command']}`",
-        f"- Machine: {made['machine']}",
+        f"- Command: `{run['command']}`",
+        f"- Machine: {run['machine']}",
         "- Every number: [results.csv](results.csv)",
     ]
     parts.append("\n".join(facts))

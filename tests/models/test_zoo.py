@@ -13,7 +13,7 @@ import torch
 import kcgs
 from benchmarks.core import images
 from benchmarks.core.run import Options
-from benchmarks.zoo import PLANS, run
+from benchmarks.zoo import PLANS, make_zoo
 from kcgs.functional import psnr
 from kcgs.onnx import scene_decoder
 from kcgs.scene import load
@@ -75,8 +75,8 @@ class TestErrors:
 
 
 def test_zoo_can_be_made(tmp_path: Path) -> None:
-    run(Options(tmp_path, quick=True, only=("chart-2x3",)))
+    make_zoo(Options(tmp_path, quick=True, only=("chart-2x3",)))
     (made,) = entries(tmp_path)
     assert made.name == "chart-2x3" and find("chart-2x3", tmp_path).is_file()
     with pytest.raises(ValueError, match="only must name scenes"):
-        run(Options(tmp_path, only=("chart-3x2",)))
+        make_zoo(Options(tmp_path, only=("chart-3x2",)))
