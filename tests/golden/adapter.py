@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
-import importlib.util
-import sys
 import tempfile
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +25,6 @@ from kcgs.pruning import prune
 from kcgs.rate import compress, fit_bytes
 from kcgs.video import fit_video, interpolate
 
-ROOT = Path(kcgs.__file__).resolve().parent.parent
 Softness = float | dict[tuple[int, int], float]
 
 
@@ -46,16 +41,13 @@ class Parts(NamedTuple):
     opacities: Tensor | None = None
 
 
-def _field(p: Parts) -> GaussianField:
-    return GaussianField(p.means, p.cholesky, p.colors, p.ids, p.opacities, size=p.size)
-
-
 def _regions(p: Parts) -> RegionMap | None:
     return None if p.labels is None else RegionMap.from_labels(p.labels, p.softness)
 
 
-def _scene(p: Parts) -> kcgs.Scene:
-    return kcgs.Scene(_field(p), _regions(p))
+def _scene(p: Parts, metadata: dict[str, str] | None = None) -> Scene:
+    field = GaussianField(p.means, p.cholesky, p.colors, p.ids, p.opacities, size=p.size)
+    return Scene(field, _regions(p), metadata)
 
 
 def _of_map(regions: RegionMap | None) -> dict[str, Any]:
@@ -65,25 +57,27 @@ def _of_map(regions: RegionMap | None) -> dict[str, Any]:
     return {"labels": regions.labels, "softness": softness}
 
 
-def _of_scene(field: GaussianField, regions: RegionMap | None) -> dict[str, Any]:
+def _of(scene: Scene) -> dict[str, Any]:
+    field = scene.field
     tensors = {"means": field.means, "cholesky": field.cholesky, "colors": field.colors}
-    return {**tensors, "ids": field.region_ids, "opacities": field.opacities, **_of_map(regions)}
+    return {**tensors, "ids": field.region_ids, "opacities": field.opacities, **_of_map(scene.regions)}
 
 
 def run_fit(image: Tensor, p: Parts | None, num_gaussians: int, recipe: str, **settings: Any) -> dict[str, Any]:
     """Fit an image with the map of `p`."""
     result = fit(image, None if p is None else _regions(p), num_gaussians, recipe=recipe, seed=3, **settings)
     history = [[e.iteration, e.loss, e.psnr, e.ef_psnr, e.num_gaussians] for e in result.history]
-    ending = {"stop": result.stop_reason, "removed": result.num_pruned, "change": result.prune_error}
     return {
-        **_of_scene(result.scene.field, result.scene.regions),
+        **_of(result.scene),
         "history": torch.tensor(history, dtype=torch.float64),
-        **ending,
+        "stop": result.stop_reason,
+        "removed": result.num_pruned,
+        "change": result.prune_error,
     }
 
 
 def run_resumed(
-    image: Tensor, p: Parts | None, num_gaussians: int, stop: int, recipe: str, **settings: Any
+    image: Tensor, p: Parts | None, num_gaussians: int, recipe: str, *, stop: int, **settings: Any
 ) -> dict[str, Any]:
     """Fit an image, stop after `stop` iterations, and resume from the checkpoint."""
     with tempfile.TemporaryDirectory() as folder:
@@ -109,7 +103,7 @@ def to_file(p: Parts, **settings: Any) -> bytes:
 def from_file(data: bytes, **settings: Any) -> dict[str, Any]:
     """Decode `.kcgs`."""
     decoded = decode(data, **settings)
-    return {**_of_scene(decoded.scene.field, decoded.scene.regions), "layers": (decoded.layers, decoded.num_layers)}
+    return {**_of(decoded.scene), "layers": (decoded.layers, decoded.num_layers)}
 
 
 def run_compress(p: Parts, image: Tensor, **settings: Any) -> bytes:
@@ -117,25 +111,25 @@ def run_compress(p: Parts, image: Tensor, **settings: Any) -> bytes:
     return compress(_scene(p), image, seed=3, **settings).data
 
 
-def run_fit_bytes(image: Tensor, p: Parts | None, num_bytes: int, recipe: str, **settings: Any) -> dict[str, Any]:
+def run_fit_bytes(image: Tensor, p: Parts | None, target_bytes: int, recipe: str, **settings: Any) -> dict[str, Any]:
     """Fit an image to a number of bytes."""
-    done = fit_bytes(image, None if p is None else _regions(p), num_bytes, recipe=recipe, seed=3, **settings)
-    return {"data": done.data, **_of_scene(done.scene.field, done.scene.regions)}
+    result = fit_bytes(image, None if p is None else _regions(p), target_bytes, recipe=recipe, seed=3, **settings)
+    return {"data": result.data, **_of(result.scene)}
 
 
 def saved(p: Parts, metadata: dict[str, str] | None = None) -> tuple[bytes, dict[str, Any]]:
     """Save a scene as `.safetensors`; return the file, and what it loads as."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.safetensors"
-        kcgs.save(path, Scene(_field(p), _regions(p), metadata))
+        kcgs.save(path, _scene(p, metadata))
         scene = kcgs.load(path)
-        return path.read_bytes(), {**_of_scene(scene.field, scene.regions), "metadata": scene.metadata}
+        return path.read_bytes(), {**_of(scene), "metadata": scene.metadata}
 
 
 def decoder_of(p: Parts, **settings: Any) -> onnx.ModelProto:
     """Build the ONNX decoder of one scene."""
     metadata = {"recipe": settings.pop("recipe")} if "recipe" in settings else None
-    return scene_decoder(Scene(_field(p), _regions(p), metadata), **{"clamp": False, **settings})
+    return scene_decoder(_scene(p, metadata), **{"clamp": False, **settings})
 
 
 def decoder_of_any(**settings: Any) -> onnx.ModelProto:
@@ -149,20 +143,6 @@ def run_onnx(model: onnx.ModelProto, feeds: dict[str, Any]) -> Tensor:
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
     return torch.from_numpy(session.run(["image"], {k: np.asarray(v) for k, v in feeds.items()})[0])
-
-
-def run_decode_script(decoder: bytes, options: list[str]) -> Tensor:
-    """Run export/decode.py on a decoder; return what it writes."""
-    spec = importlib.util.spec_from_file_location("kcgs_golden_decode", ROOT / "export" / "decode.py")
-    assert spec is not None and spec.loader is not None
-    script: ModuleType = sys.modules.setdefault(spec.name, importlib.util.module_from_spec(spec))
-    spec.loader.exec_module(script)
-    with tempfile.TemporaryDirectory() as folder:
-        path, output = Path(folder) / "decoder.onnx", Path(folder) / "out.npy"
-        path.write_bytes(decoder)
-        args: argparse.Namespace = script.parse([str(path), "-o", str(output), "--threads", "1", *options])
-        script.decode(args)
-        return torch.from_numpy(np.load(output))
 
 
 def splat(p: Parts, **settings: Any) -> Tensor:
@@ -185,8 +165,6 @@ def resized_map(p: Parts, size: tuple[int, int]) -> dict[str, Any]:
 
 def run_segment(image: Tensor, method: str, **options: Any) -> Tensor:
     """Run a segmenter by name."""
-    if options.get("snap") is True:
-        options["snap"] = 2  # what True meant
     return segment.segment(image, method, **options)
 
 
@@ -223,7 +201,7 @@ def metrics(image: Tensor, other: Tensor, labels: Tensor) -> dict[str, Tensor]:
 
 def edits(p: Parts, region: int, background: Tensor) -> dict[str, Any]:
     """Every edit of one region."""
-    scene = Scene(_field(p), _regions(p))
+    scene = _scene(p)
     larger = (2 * p.size[0], 2 * p.size[1])
     return {
         "move": _of(editing.move_region(scene, region, (3, -2), fill=False)),
@@ -235,14 +213,10 @@ def edits(p: Parts, region: int, background: Tensor) -> dict[str, Any]:
     }
 
 
-def _of(scene: Scene) -> dict[str, Any]:
-    return _of_scene(scene.field, scene.regions)
-
-
 def run_prune(p: Parts, tolerance: float) -> dict[str, Any]:
     """Prune a scene."""
-    left = prune(Scene(_field(p), _regions(p)), tolerance)
-    return {**_of_scene(left.scene.field, None), "removed": left.removed, "change": left.change}
+    pruned = prune(_scene(p), tolerance)
+    return {**_of(pruned.scene), "removed": pruned.removed, "change": pruned.change}
 
 
 def run_propose(p: Parts, residual: Tensor, count: int) -> tuple[Any, ...]:

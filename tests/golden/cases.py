@@ -23,92 +23,96 @@ MAPS: dict[str, dict[str, Any]] = {
 }
 
 
-def case(name: str) -> Callable[[Case], Case]:
-    """Register a case."""
-
-    def register(function: Case) -> Case:
-        assert name not in CASES, name
-        CASES[name] = function
-        return function
-
-    return register
-
-
 # Fits
 GRID = torch.arange(64)[:, None] // 22 * 4 + torch.arange(80) // 20
 MERGED = {(0, 1): 0.9, (1, 2): 0.6, (0, 9): 0.5, (1, 9): 0.8, (2, 9): 0.7}
+Regions = Callable[[], adapter.Parts]
+HARD: Regions = only_map
+SOFT: Regions = partial(only_map, 0.7)
+
+
+def saturated() -> Tensor:
+    return ((textured() - 0.5) * 6).clamp(0, 1)
+
+
+def on_photo(shift: tuple[int, int] = (0, 0)) -> adapter.Parts:
+    return only_map(labels=photo_map().roll(shift, (0, 1)))
+
+
+def on_chart() -> adapter.Parts:
+    return only_map(labels=flat_chart()[1])
+
+
+def on_blurred(softness: adapter.Softness = 0.0) -> adapter.Parts:
+    return only_map(softness, labels=blurred()[1])
+
+
+def _fit(
+    recipe: str,
+    num_gaussians: int,
+    iterations: int,
+    regions: Regions | None = None,
+    *,
+    image: Callable[[], Tensor] = textured,
+    run: Callable[..., Any] = adapter.run_fit,
+    **settings: Any,
+) -> Any:
+    parts = None if regions is None else regions()
+    return run(image(), parts, num_gaussians, recipe, iterations=iterations, **settings)
+
+
 FITS: dict[str, Case] = {
-    "paper-none": lambda: adapter.run_fit(textured(), None, 40, "paper", iterations=60),
-    "paper-hard": lambda: adapter.run_fit(textured(), only_map(), 40, "paper", iterations=60),
-    "paper-soft": lambda: adapter.run_fit(textured(), only_map(0.7), 40, "paper", iterations=60),
-    "paper-softness": lambda: adapter.run_fit(textured(), only_map(), 40, "paper", iterations=40, softness=1.0),
-    "paper-no-warmup": lambda: adapter.run_fit(textured(), only_map(), 40, "paper", iterations=40, warmup=False),
-    "gaussian-image": lambda: adapter.run_fit(textured(), only_map(), 40, "gaussian-image", iterations=60),
-    "gaussian-image-clamp": lambda: adapter.run_fit(textured(), None, 40, "gaussian-image-clamp", iterations=60),
-    "image-gs": lambda: adapter.run_fit(textured(), None, 40, "image-gs", iterations=60),
-    "image-gs-regions": lambda: adapter.run_fit(
-        textured(), only_map(0.7), 40, "image-gs", iterations=40, guidance=True
-    ),
-    "best-none": lambda: adapter.run_fit(photo(), None, 120, "best", iterations=60),
-    "best-hard": lambda: adapter.run_fit(textured(), only_map(), 90, "best", iterations=90),
-    "best-softness-0": lambda: adapter.run_fit(textured(), only_map(), 90, "best", iterations=60, softness=0.0),
-    "best-softness-1": lambda: adapter.run_fit(textured(), only_map(), 90, "best", iterations=60, softness=1.0),
-    "best-soft": lambda: adapter.run_fit(textured(), only_map(0.7), 90, "best", iterations=60),
-    "best-pairs": lambda: adapter.run_fit(textured(), only_map(PAIRS), 90, "best", iterations=60),
-    "best-photo": lambda: adapter.run_fit(photo(), only_map(labels=photo_map()), 160, "best", iterations=100),
-    "best-merged": lambda: adapter.run_fit(blurred()[0], only_map(labels=blurred()[1]), 60, "best", iterations=60),
-    "best-merged-soft": lambda: adapter.run_fit(
-        blurred()[0], only_map(MERGED, labels=blurred()[1]), 60, "best", iterations=60
-    ),
-    "best-merged-photo": lambda: adapter.run_fit(
-        photo(), only_map(labels=photo_map().roll((9, 14), (0, 1))), 160, "best", iterations=60
-    ),
-    "best-merged-late": lambda: adapter.run_fit(photo(), only_map(2.0, labels=GRID), 50, "best", iterations=60),
-    "best-unguided": lambda: adapter.run_fit(textured(), only_map(), 60, "best", iterations=30, guidance=False),
-    "best-saturated": lambda: adapter.run_fit(
-        ((textured() - 0.5) * 6).clamp(0, 1), only_map(), 60, "best", iterations=40
-    ),
-    "best-ms-ssim": lambda: adapter.run_fit(photo(), None, 90, "best", iterations=60, objective="ms-ssim"),
-    "best-adan": lambda: adapter.run_fit(textured(), only_map(), 90, "best", iterations=60, optimizer="adan"),
-    "best-resumed": lambda: adapter.run_resumed(textured(), only_map(), 90, 40, "best", iterations=60),
-    "paper-resumed": lambda: adapter.run_resumed(textured(), only_map(), 40, 20, "paper", iterations=40),
-    "image-gs-resumed": lambda: adapter.run_resumed(textured(), None, 40, 20, "image-gs", iterations=40),
-    "best-grey": lambda: adapter.run_fit(textured(channels=1), only_map(), 90, "best", iterations=60),
-    "best-double": lambda: adapter.run_fit(textured().double(), only_map(), 30, "best", iterations=30),
-    "best-baseline": lambda: adapter.run_fit(textured(), only_map(), 90, "best-baseline", iterations=60),
-    "best-refined": lambda: adapter.run_fit(textured(), only_map(), 90, "best-refined", iterations=90),
-    "best-refined-photo": lambda: adapter.run_fit(
-        photo(), only_map(labels=photo_map()), 120, "best-refined", iterations=60
-    ),
-    "chart-none": lambda: adapter.run_fit(flat_chart()[0], None, 4, "best-baseline", iterations=60),
-    "chart-hard": lambda: adapter.run_fit(flat_chart()[0], only_map(labels=flat_chart()[1]), 6, "best", iterations=60),
-    "chart-softness-0": lambda: adapter.run_fit(
-        flat_chart()[0], only_map(labels=flat_chart()[1]), 6, "best", iterations=60, softness=0.0
-    ),
-    "target-psnr": lambda: adapter.run_fit(photo(), None, 400, "best", iterations=150, target_psnr=22.0),
-    "target-psnr-regions": lambda: adapter.run_fit(
-        textured(), only_map(), 300, "best", iterations=120, target_psnr=27.0
-    ),
-    "target-psnr-paper": lambda: adapter.run_fit(textured(), only_map(), 60, "paper", iterations=60, target_psnr=17.0),
+    "paper-none": partial(_fit, "paper", 40, 60),
+    "paper-hard": partial(_fit, "paper", 40, 60, HARD),
+    "paper-soft": partial(_fit, "paper", 40, 60, SOFT),
+    "paper-softness": partial(_fit, "paper", 40, 40, HARD, softness=1.0),
+    "paper-no-warmup": partial(_fit, "paper", 40, 40, HARD, warmup=False),
+    "gaussian-image": partial(_fit, "gaussian-image", 40, 60, HARD),
+    "gaussian-image-clamp": partial(_fit, "gaussian-image-clamp", 40, 60),
+    "image-gs": partial(_fit, "image-gs", 40, 60),
+    "image-gs-regions": partial(_fit, "image-gs", 40, 40, SOFT, guidance=True),
+    "best-none": partial(_fit, "best", 120, 60, image=photo),
+    "best-hard": partial(_fit, "best", 90, 90, HARD),
+    "best-softness-0": partial(_fit, "best", 90, 60, HARD, softness=0.0),
+    "best-softness-1": partial(_fit, "best", 90, 60, HARD, softness=1.0),
+    "best-soft": partial(_fit, "best", 90, 60, SOFT),
+    "best-pairs": partial(_fit, "best", 90, 60, partial(only_map, PAIRS)),
+    "best-photo": partial(_fit, "best", 160, 100, on_photo, image=photo),
+    "best-merged": partial(_fit, "best", 60, 60, on_blurred, image=lambda: blurred()[0]),
+    "best-merged-soft": partial(_fit, "best", 60, 60, partial(on_blurred, MERGED), image=lambda: blurred()[0]),
+    "best-merged-photo": partial(_fit, "best", 160, 60, partial(on_photo, (9, 14)), image=photo),
+    "best-merged-late": partial(_fit, "best", 50, 60, partial(only_map, 2.0, labels=GRID), image=photo),
+    "best-unguided": partial(_fit, "best", 60, 30, HARD, guidance=False),
+    "best-saturated": partial(_fit, "best", 60, 40, HARD, image=saturated),
+    "best-ms-ssim": partial(_fit, "best", 90, 60, image=photo, objective="ms-ssim"),
+    "best-adan": partial(_fit, "best", 90, 60, HARD, optimizer="adan"),
+    "best-resumed": partial(_fit, "best", 90, 60, HARD, run=adapter.run_resumed, stop=40),
+    "paper-resumed": partial(_fit, "paper", 40, 40, HARD, run=adapter.run_resumed, stop=20),
+    "image-gs-resumed": partial(_fit, "image-gs", 40, 40, run=adapter.run_resumed, stop=20),
+    "best-grey": partial(_fit, "best", 90, 60, HARD, image=partial(textured, channels=1)),
+    "best-double": partial(_fit, "best", 30, 30, HARD, image=lambda: textured().double()),
+    "best-baseline": partial(_fit, "best-baseline", 90, 60, HARD),
+    "best-refined": partial(_fit, "best-refined", 90, 90, HARD),
+    "best-refined-photo": partial(_fit, "best-refined", 120, 60, on_photo, image=photo),
+    "chart-none": partial(_fit, "best-baseline", 4, 60, image=lambda: flat_chart()[0]),
+    "chart-hard": partial(_fit, "best", 6, 60, on_chart, image=lambda: flat_chart()[0]),
+    "chart-softness-0": partial(_fit, "best", 6, 60, on_chart, image=lambda: flat_chart()[0], softness=0.0),
+    "target-psnr": partial(_fit, "best", 400, 150, image=photo, target_psnr=22.0),
+    "target-psnr-regions": partial(_fit, "best", 300, 120, HARD, target_psnr=27.0),
+    "target-psnr-paper": partial(_fit, "paper", 60, 60, HARD, target_psnr=17.0),
 }
 CASES |= {f"fit/{name}": function for name, function in FITS.items()}
 
+
 # Videos: an image that moves to the right, once up to a cut
-VIDEOS: dict[str, dict[str, Any]] = {
-    "none": {"cut": False},
-    "cut": {"cut": True},
-    "map": {"cut": False, "regions": only_map(0.7)},
-}
-
-
-def _video(cut: bool, regions: adapter.Parts | None = None) -> dict[str, Any]:
+def _video(regions: Regions | None = None, *, cut: bool = False) -> Any:
     frames = [textured().roll(2 * t, 2) for t in range(3)]
     if cut:
         frames[2] = 1.0 - frames[2].flip(1)
-    return adapter.run_fit_video(frames, regions, 60, "best", iterations=40)
+    return adapter.run_fit_video(frames, None if regions is None else regions(), 60, "best", iterations=40)
 
 
-CASES |= {f"video/{name}": partial(_video, **settings) for name, settings in VIDEOS.items()}
+CASES |= {"video/none": _video, "video/cut": partial(_video, cut=True), "video/map": partial(_video, SOFT)}
 
 # Files
 FILES = {f"{name}": partial(gaussians, **settings) for name, settings in MAPS.items()} | {
@@ -138,35 +142,28 @@ for name, make in FILES.items():
 
 
 def _compress(**scene: Any) -> dict[str, Any]:
-    image = textured(channels=scene.get("channels", 3))
-    fine = adapter.run_compress(gaussians(60, **scene), image, iterations=12)
-    target = adapter.run_compress(gaussians(60, **scene), image, iterations=8, target_bytes=len(fine) - 60)
-    return {"data": fine, "target": target, "quality": adapter.run_compress(gaussians(60), image, quality=30)}
+    fine = adapter.run_compress(gaussians(60, **scene), textured(), iterations=12)
+    target = adapter.run_compress(gaussians(60, **scene), textured(), iterations=8, target_bytes=len(fine) - 60)
+    return {"data": fine, "target": target}
 
 
 for name in ("none", "hard", "pairs"):
     CASES[f"codec/compress-{name}"] = partial(_compress, **MAPS[name])
-CASES["codec/compress-ms-ssim"] = lambda: {
-    "data": adapter.run_compress(gaussians(60), textured(), iterations=8, objective="ms-ssim")
+for name, settings in {"quality": {"quality": 30}, "ms-ssim": {"iterations": 8, "objective": "ms-ssim"}}.items():
+    CASES[f"codec/compress-{name}"] = lambda s=settings: {"data": adapter.run_compress(gaussians(60), textured(), **s)}
+CASES |= {
+    "codec/fit-bytes-none": partial(_fit, "best", 700, 40, image=photo, run=adapter.run_fit_bytes),
+    "codec/fit-bytes-map": partial(_fit, "best", 800, 40, HARD, run=adapter.run_fit_bytes),
+    "codec/fit-bytes-baseline": partial(_fit, "best-baseline", 600, 30, HARD, run=adapter.run_fit_bytes),
+    "codec/fit-bytes-soft": partial(_fit, "best", 800, 30, SOFT, run=adapter.run_fit_bytes),
 }
-BYTES: dict[str, Case] = {
-    "none": lambda: adapter.run_fit_bytes(photo(), None, 700, "best", iterations=40),
-    "map": lambda: adapter.run_fit_bytes(textured(), only_map(), 800, "best", iterations=40),
-    "refined": lambda: adapter.run_fit_bytes(textured(), only_map(), 900, "best-refined", iterations=30),
-    "baseline": lambda: adapter.run_fit_bytes(textured(), only_map(), 600, "best-baseline", iterations=30),
-    "soft": lambda: adapter.run_fit_bytes(textured(), only_map(0.7), 800, "best", iterations=30),
-}
-CASES |= {f"codec/fit-bytes-{name}": function for name, function in BYTES.items()}
 
 
 # ONNX
 def _model(model: Any, **feeds: Any) -> dict[str, Any]:
-    bare = type(model)()
-    bare.CopyFrom(model)
-    del bare.metadata_props[:]
-    data = model.SerializeToString(deterministic=True)
-    outputs = {"image": adapter.run_onnx(model, feeds)} if feeds else {}
-    return {"bytes": data, "graph": bare.SerializeToString(deterministic=True), **outputs}
+    image = adapter.run_onnx(model, feeds)
+    del model.metadata_props[:]  # the version of kcgs is one of them
+    return {"graph": model.SerializeToString(deterministic=True), "image": image}
 
 
 def _decoder(scene: dict[str, Any], **settings: Any) -> dict[str, Any]:
@@ -186,7 +183,6 @@ CASES["onnx/cutoff-0"] = partial(_decoder, {"count": 40}, cutoff=0.0)
 CASES["onnx/large-ids"] = partial(_decoder, {"ids": (5, 300, 70_000, 9)}, interactive=True)
 
 
-@case("onnx/generic")
 def _generic() -> Any:
     p = gaussians()
     ids = p.labels.unique()
@@ -197,11 +193,7 @@ def _generic() -> Any:
     return {"free": free, "coarse": _model(adapter.decoder_of_any(cutoff=1e-3, clamp=True), **feeds)}
 
 
-@case("onnx/decode-script")
-def _decode_script() -> Any:
-    own = adapter.decoder_of(gaussians(softness=0.8), interactive=True).SerializeToString()
-    views = ([], ["--scale", "1.7"], ["--size", "70x50", "--view=-3,2,40.5,30"], ["--region", "7", "11"])
-    return {f"scene-{i}": adapter.run_decode_script(own, options) for i, options in enumerate(views)}
+CASES["onnx/generic"] = _generic
 
 
 # Renders and gradients
@@ -241,7 +233,7 @@ for name in (*MAPS, "opacities"):
 for name in ("auto", "felzenszwalb", "slic", "watershed", "kmeans"):
     CASES[f"segment/{name}"] = partial(lambda method: adapter.run_segment(photo(), method), name)
 CASES["segment/felzenszwalb-options"] = lambda: adapter.run_segment(
-    photo(), "felzenszwalb", scale=80.0, snap=True, max_regions=9, min_size=15
+    photo(), "felzenszwalb", scale=80.0, snap=2, max_regions=9, min_size=15
 )
 CASES["segment/cleanup"] = lambda: adapter.cleanups(photo(), photo_map())
 CASES["functional/contours"] = lambda: adapter.contour_functions(photo(), photo_map())
