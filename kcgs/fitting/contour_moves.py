@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 from kcgs.functional import RegionMap, edge_band
 from kcgs.scene import Scene
 
+from .config import FitConfig
 from .contour_energy import MovingLabels, RegionCosts, bounding_boxes, index_map
 
 
@@ -60,6 +62,35 @@ def refine_contours(
         return regions
     labels = regions.ids.cpu()[torch.from_numpy(moving.map).long()].to(regions.labels.device)
     return regions.relabel(labels, "mean")
+
+
+def move_contours(
+    scene: Scene,
+    image: Tensor,
+    anchor: Tensor,
+    config: FitConfig,
+    squared_error: Callable[[RegionMap], Tensor],
+    max_rise: float,
+) -> RegionMap:
+    """Refine the contours of a scene, and accept the moves that do not raise the squared error about them too much.
+
+    Args:
+        scene: Gaussians and the map.
+        image: (C, H, W).
+        anchor: labels (H, W) that contours may not move far from.
+        config: how far, and what a pixel of contour costs.
+        squared_error: of each pixel with a map, (H, W).
+        max_rise: factor by which a move may raise it.
+    """
+    regions = scene.regions
+    assert regions is not None
+    proposal = refine_contours(
+        scene, image, anchor=anchor, max_distance=None if config.max_move == "any" else config.max_move,
+        length_weight=config.contour_cost, backend=config.backend,
+    )  # fmt: skip
+    if proposal is regions:
+        return regions
+    return accept_moves(regions, proposal, max_rise * squared_error(regions) - squared_error(proposal))
 
 
 def accept_moves(before: RegionMap, after: RegionMap, gain: Tensor) -> RegionMap:

@@ -158,23 +158,23 @@ def _choose_regions(
     # squared error, summed over pixels, that one more bit of Gaussians saves: the derivative of the power law
     bit_value = _RATE_EXPONENT * _FINAL_ERROR_SHARE * plain_error * image[0].numel() / (8 * target_bytes)
     contour_cost = bit_value * (8 * map_bytes / max(len(contour_edges(regions.labels)[0]), 1))
-    paying = regions
+    paying_regions = regions
     if regions.softness == 0.0:
-        paying = RegionMap.from_labels(merge_regions(image, regions.labels, contour_cost))
-    changes = {"merged_for_bytes": regions.num_regions - paying.num_regions}
-    max_regions = num_gaussians(target_bytes - _map_bytes(paying))
-    merged = paying.merge(pairs_to_merge(image, paying.labels, max_regions))[0]
-    if merged is None or merged.num_regions == 1:
+        paying_regions = RegionMap.from_labels(merge_regions(image, regions.labels, contour_cost))
+    changes = {"merged_for_bytes": regions.num_regions - paying_regions.num_regions}
+    max_regions = num_gaussians(target_bytes - _map_bytes(paying_regions))
+    candidate = paying_regions.merge(pairs_to_merge(image, paying_regions.labels, max_regions))[0]
+    if candidate is None or candidate.num_regions == 1:
         return _RegionChoice(None, num_gaussians(target_bytes), contour_cost, changes)
-    count = num_gaussians(target_bytes - _map_bytes(merged))
-    if count < merged.num_regions or trial_error(merged, count) >= _CONTOUR_ALLOWANCE * plain_error:
+    count = num_gaussians(target_bytes - _map_bytes(candidate))
+    if count < candidate.num_regions or trial_error(candidate, count) >= _CONTOUR_ALLOWANCE * plain_error:
         return _RegionChoice(None, num_gaussians(target_bytes), contour_cost, {"dropped": "bytes"})
-    return _RegionChoice(merged, count, contour_cost, changes)
+    return _RegionChoice(candidate, count, contour_cost, changes)
 
 
-def gaussian_count(num_bytes: float, pixels: int, objective: str = "psnr") -> int:
-    """Return the number of Gaussians that makes the best file of `num_bytes`, from 1 to the number of pixels."""
-    bits = 8 * max(num_bytes - _HEADER_BYTES, 1)
+def gaussian_count(target_bytes: float, pixels: int, objective: str = "psnr") -> int:
+    """Return the number of Gaussians, from 1 to `pixels`, of the best file of at most `target_bytes` without a map."""
+    bits = 8 * max(target_bytes - _HEADER_BYTES, 1)
     count = bits / _BITS_PER_GAUSSIAN[objective]
     for _ in range(_COUNT_ITERATIONS):
         doublings = math.log2(max(count, 1.0) / _REFERENCE_COUNT)

@@ -123,9 +123,9 @@ def compress(
     compressor = _Compressor(writer, target, make_objective(objective, target), iterations, seed)
     with threads_for_kernels(target[0].numel()):
         if target_bytes is not None:
-            data = compressor.write_bytes(target_bytes)
+            data = compressor.search_bytes(target_bytes)
         elif target_psnr is not None:
-            data = compressor.write_psnr(target_psnr, float(psnr(scene.render().to(target), target)))
+            data = compressor.search_psnr(target_psnr, float(psnr(scene.render().to(target), target)))
         else:
             data = compressor.write(qp)
     return Compressed(data, decode(data).scene)
@@ -154,8 +154,8 @@ class _Compressor:
     iterations: int
     seed: int
 
-    def write_bytes(self, target_bytes: int) -> bytes:
-        """Return a file of at most `target_bytes` that fills them nearly."""
+    def search_bytes(self, target_bytes: int) -> bytes:
+        """Return a file of at most `target_bytes`, and nearly as many."""
 
         def update_qp(writer: SceneWriter, qp: int) -> int:
             size = len(writer.write_rounded(qp))
@@ -174,8 +174,8 @@ class _Compressor:
                 break
         return max(candidates, key=len, default=fallback)
 
-    def write_psnr(self, target_psnr: float, scene_psnr: float) -> bytes:
-        """Return the first of ever finer files that reaches `target_psnr`; the first where the scene does not."""
+    def search_psnr(self, target_psnr: float, scene_psnr: float) -> bytes:
+        """Return the coarsest file that reaches `target_psnr`, or where the scene does not, the coarsest of all."""
         for step in _QUALITY_STEPS if scene_psnr >= target_psnr else _QUALITY_STEPS[:1]:
             data = self.write(self.writer.qp_for(quality_for(scene_psnr + step)))
             if float(psnr(decode(data).scene.render(), self.image)) >= target_psnr:
@@ -195,9 +195,9 @@ class _Compressor:
         return self.iterations - self._descent_iterations
 
     def _descend(self, qp: int, update_qp: Callable[[SceneWriter, int], int]) -> SceneWriter:
-        """Lower error and bits with nothing rounded; `update_qp` is called with the scene and the QP now and then."""
+        """Lower error and bits with nothing rounded; `update_qp` returns the QP for the scene of the moment."""
         writer, iterations = self.writer, self._descent_iterations
-        descent = self._start(writer)
+        descent = self._new_descent(writer)
         for start in range(0, iterations, _UPDATE_INTERVAL):
             qp = update_qp(writer, qp)
             quantizer = Quantizer(qp, writer.size)
@@ -209,12 +209,12 @@ class _Compressor:
         return writer
 
     def _round(self, writer: SceneWriter, qp: int, iterations: int, max_bytes: float = math.inf) -> bytes:
-        descent, quantizer = self._start(writer), Quantizer(qp, writer.size)
+        descent, quantizer = self._new_descent(writer), Quantizer(qp, writer.size)
         descent.prune(quantizer)
         return round_gradually(
             descent, quantizer, lambda codes: writer.write(quantizer, codes, descent.ids), iterations, self.seed,
             max_bytes,
         )  # fmt: skip
 
-    def _start(self, writer: SceneWriter) -> RateDistortionDescent:
+    def _new_descent(self, writer: SceneWriter) -> RateDistortionDescent:
         return RateDistortionDescent(writer.gaussians, writer.ids, self.image, writer.regions, self.objective)

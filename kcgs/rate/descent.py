@@ -20,13 +20,13 @@ from .bits import soft_bits
 # Prices are in units of D, the distortion that one rounded number adds. In theory a bit saves 2 ln 2 D = 1.4 D. Here
 # neighbours correct rounding errors, so both numbers are tuned: vary one and compare `python -m benchmarks rate`.
 
-# error that a bit must save
+# error that a bit must save: a higher price makes Gaussians cheaper, and the image worse before they are rounded
 _BIT_PRICE = 0.9
-# energy of a Gaussian that pays for its bits, about 30
+# energy of a Gaussian that pays for its bits, about 30: a higher one leaves fewer Gaussians, each rounded less
 _GAUSSIAN_PRICE = 20.0
 # share of a Newton step in a step: larger ones oscillate, smaller ones take more iterations
 _RATE = 0.09
-# weights that renders skip
+# weights below it are skipped: renders are faster than at the 1e-4 of a result
 _CUTOFF = 1e-3
 # steps for which the gradient of the bits is reused, which changes slowly
 _BIT_GRADIENT_STEPS = 4
@@ -37,7 +37,7 @@ class RateDistortionDescent:
 
     Args:
         gaussians: the start.
-        ids: positions of their regions' ids in the map, (N,).
+        ids: region of each Gaussian, (N,), as a position in the map's ids.
         image: (C, H, W), on the CPU.
         regions: the map, which stays.
         objective: the error; None: the squared error.
@@ -53,8 +53,9 @@ class RateDistortionDescent:
     ) -> None:
         self.ids, self.image, self.regions, self.objective = ids, image, regions, objective
         self.gaussians = self._as_tensors(gaussians)
+        # steps are so short that the first order of the shear is enough
         self.newton = NewtonDescent(self.gaussians, exact=False)
-        # error of the objective per squared error
+        # mean weight of the squared error in the objective
         self._error_scale = float(error_weights(self.gaussians, objective).mean())
         self._bit_gradient: Gaussians | None = None
         self._num_steps = 0
@@ -68,24 +69,21 @@ class RateDistortionDescent:
         self.gaussians = self._step_from(self.gaussians, quantizer)
 
     def step_around(
-        self, rounded: Parameters, rounded_shapes: Tensor, rounded_colors: Tensor, quantizer: Quantizer
+        self, rounded_values: Parameters, shape_mask: Tensor, color_mask: Tensor, quantizer: Quantizer
     ) -> None:
-        """Move all Gaussians once but those that are rounded.
+        """Move all numbers once but those of a mask, which have their rounded values in this step.
 
         Args:
-            rounded: all Gaussians, rounded.
-            rounded_shapes: which have their rounded place and shape in this step, and do not move; bool (N,).
-            rounded_colors: which have their rounded colour.
+            rounded_values: of all Gaussians.
+            shape_mask: Gaussians whose place and shape are rounded, bool (N,).
+            color_mask: Gaussians whose colour is rounded, bool (N,).
             quantizer: of the file.
         """
-        shapes, colors = rounded_shapes[:, None], rounded_colors[:, None]
-        masks = shapes, shapes, colors
-        pairs = zip(masks, self._as_tensors(rounded), self.gaussians, strict=True)
-        current = Gaussians(*(torch.where(mask, fixed, free) for mask, fixed, free in pairs))
-        frozen = torch.cat([shapes.expand(-1, 5), colors.expand(-1, self.image.shape[0])], -1)
-        pairs = zip(masks, self.gaussians, self._step_from(current, quantizer, frozen), strict=True)
-        # rounded numbers keep their finer values: they may be rounded anew, by other steps
-        self.gaussians = Gaussians(*(torch.where(mask, free, moved) for mask, free, moved in pairs))
+        masks = Gaussians(shape_mask[:, None], shape_mask[:, None], color_mask[:, None])
+        current = _where(masks, self._as_tensors(rounded_values), self.gaussians)
+        frozen = torch.cat([masks.cholesky.expand(-1, 5), masks.colors.expand(-1, self.image.shape[0])], -1)
+        # numbers of the mask keep their values before rounding: later they may be rounded to others
+        self.gaussians = _where(masks, self.gaussians, self._step_from(current, quantizer, frozen))
 
     def prune(self, quantizer: Quantizer) -> None:
         """Remove the Gaussians that do not pay for their bits; one stays at least."""
@@ -138,3 +136,7 @@ class RateDistortionDescent:
 
     def _as_tensors(self, gaussians: Parameters) -> Gaussians:
         return Gaussians(*(torch.from_numpy(numbers).to(self.image) for numbers in gaussians))
+
+
+def _where(masks: Gaussians, values: Gaussians, others: Gaussians) -> Gaussians:
+    return Gaussians(*(torch.where(*numbers) for numbers in zip(masks, values, others, strict=True)))

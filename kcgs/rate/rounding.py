@@ -11,14 +11,14 @@ from kcgs.codec.gaussians.quantize import Classes, Codes, Quantizer
 
 from .descent import RateDistortionDescent
 
-# Tuned: vary one and compare the files of `python -m benchmarks rate`.
+# Numbers are tuned: vary one and compare the files of `python -m benchmarks rate`.
 
-# share of the iterations in which places and shapes are rounded; colours follow
+# share of the iterations in which places and shapes are rounded; colours are rounded in the rest
 _SHAPE_SHARE = 0.65
-# iterations between two groups of Gaussians that are rounded
+# iterations from one group of Gaussians that is rounded to the next
 _GROUP_INTERVAL = 3
-# shares of the iterations after which the file is measured, and Gaussians in excess of its size are removed: early
-# enough that the others replace them
+# shares of the iterations after which Gaussians are removed if the file is too large: early enough that the others
+# correct the error
 _SIZE_CHECKS = (0.3, 0.65, 0.9)
 
 
@@ -36,12 +36,12 @@ def round_gradually(
     to move. Places and shapes are rounded first, colours last.
 
     Args:
-        descent: the Gaussians.
+        descent: of the Gaussians, which are removed from it where the file is too large.
         quantizer: of the file.
-        write: makes the file of the Gaussians of the moment.
+        write: returns the file of the Gaussians of `descent`.
         iterations: steps of the descent; 0: round all at once.
         seed: of the order.
-        max_bytes: size of the file, which the weakest Gaussians are removed for; one Gaussian stays.
+        max_bytes: largest size of the file, unless one Gaussian alone takes more.
     """
     order = torch.rand(2, len(descent.ids), generator=torch.Generator().manual_seed(seed))
     classes = quantizer.classify(descent.parameters())
@@ -55,10 +55,10 @@ def round_gradually(
                 rows = descent.remove_weakest(_excess(len(write(codes)), max_bytes, len(descent.ids)))
                 order, classes = order[:, rows], Classes(*(numbers[rows] for numbers in classes))
                 codes = quantizer.quantize(descent.parameters(), classes)
-            rounded = quantizer.dequantize(codes)
-            rounded_shapes = order[0] < progress / _SHAPE_SHARE
-            rounded_colors = order[1] < (progress - _SHAPE_SHARE) / (1 - _SHAPE_SHARE)
-        descent.step_around(rounded, rounded_shapes, rounded_colors, quantizer)
+            rounded_values = quantizer.dequantize(codes)
+            shape_mask = order[0] < progress / _SHAPE_SHARE
+            color_mask = order[1] < (progress - _SHAPE_SHARE) / (1 - _SHAPE_SHARE)
+        descent.step_around(rounded_values, shape_mask, color_mask, quantizer)
     while len(data := write(quantizer.quantize(descent.parameters(), classes))) > max_bytes and len(descent.ids) > 1:
         rows = descent.remove_weakest(_excess(len(data), max_bytes, len(descent.ids)))
         classes = Classes(*(numbers[rows] for numbers in classes))
@@ -66,5 +66,5 @@ def round_gradually(
 
 
 def _excess(size: int, max_bytes: float, num_gaussians: int) -> int:
-    """Return the number of Gaussians that take the bytes above `max_bytes`."""
+    """Return the number of Gaussians that the bytes above `max_bytes` are for."""
     return max(0, math.ceil((size - max_bytes) * num_gaussians / size))

@@ -7,9 +7,10 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from kcgs.fitting.contour_moves import accept_moves, refine_contours
+from kcgs.fitting.contour_moves import move_contours
 from kcgs.fitting.objective import make_objective, propose_for
 from kcgs.fitting.redundancy import lowest_impact
+from kcgs.functional import RegionMap
 from kcgs.optim.frame import widen
 from kcgs.optim.newton import Gaussians, NewtonDescent, area, error_weights, half_gradients
 
@@ -44,12 +45,13 @@ class FrameDescent:
     Args:
         target: the image.
         splats: the start.
-        movable: rows that may move, bool (N,).
-        changed: pixels that rows may be relocated to, bool (H, W).
+        movable_rows: Gaussians that may move, bool (N,).
+        changed_pixels: where Gaussians may be relocated to, bool (H, W).
     """
 
-    def __init__(self, target: Target, splats: Splats, movable: Tensor, changed: Tensor) -> None:
-        self.target, self.splats, self.movable, self.changed = target, splats, movable, changed
+    def __init__(self, target: Target, splats: Splats, movable_rows: Tensor, changed_pixels: Tensor) -> None:
+        self.target, self.splats = target, splats
+        self.movable_rows, self.changed_pixels = movable_rows, changed_pixels
         self.objective = make_objective(target.config.objective, target.image)
         self.newton = NewtonDescent(Gaussians(*splats[:3]))
         self.crowding = torch.ones_like(splats.means[:, 0])
@@ -59,13 +61,13 @@ class FrameDescent:
 
         Args:
             relocations: share of the movable rows that is relocated, by the iteration before which it is.
-            anchor: labels that contours move from, as far as the config says; None: they stay.
+            anchor: labels that contours move from, as far as the config allows; None: they stay.
         """
         start = self.splats
         for iteration in range(_ITERATIONS):
             if iteration in relocations:
-                self._relocate(round(relocations[iteration] * int(self.movable.sum())))
-            if iteration == _CONTOUR_ITERATION and anchor is not None and self.target.config.move_contours:
+                self._relocate(round(relocations[iteration] * int(self.movable_rows.sum())))
+            if iteration == _CONTOUR_ITERATION and anchor is not None:
                 self._move_contours(anchor)
             self._step(_RATE if iteration < _ITERATIONS - _FINAL_ITERATIONS else 0.5 * _RATE)
         errors = [float(self.target.squared_error(splats).mean()) for splats in (self.splats, start)]
@@ -81,7 +83,7 @@ class FrameDescent:
 
         gradients = half_gradients(render, gaussians, self.target.image, self.objective)
         masses = area(cholesky) * error_weights(gaussians, self.objective) * self.crowding
-        means, cholesky, colors = self.newton.step(gaussians, gradients, masses, rate, ~self.movable[:, None])
+        means, cholesky, colors = self.newton.step(gaussians, gradients, masses, rate, ~self.movable_rows[:, None])
         self.splats = Splats(means, widen(cholesky, _MIN_SIGMA), colors, region_ids, regions)
 
     def _relocate(self, count: int) -> None:
@@ -90,20 +92,20 @@ class FrameDescent:
         Rows that lower it nowhere get the colour 0.
         """
         means, cholesky, colors, region_ids, regions = self.splats
+        image, backend = self.target.image, self.target.config.backend
         weights = error_weights(Gaussians(means, cholesky, colors), self.objective) * self._measure_overlap()
-        weights = torch.where(self.movable, weights, _FIXED_WEIGHT)
+        weights = torch.where(self.movable_rows, weights, _FIXED_WEIGHT)
         arrays = (
             means.cpu().numpy(), cholesky.cpu().numpy(), colors.cpu().numpy(), self.splats.region_index.cpu().numpy()
         )  # fmt: skip
-        removed, new_colors = lowest_impact(*arrays, count, weights.cpu().numpy())
-        relocated = torch.from_numpy(removed).to(means.device)
-        colors = torch.from_numpy(new_colors).to(colors).masked_fill(relocated[:, None], 0.0)
-        self.newton.velocity[relocated], self.movable = 0.0, self.movable | relocated
+        removal, new_colors = lowest_impact(*arrays, count, weights.cpu().numpy())
+        mask = torch.from_numpy(removal).to(means.device)
+        colors = torch.from_numpy(new_colors).to(colors).masked_fill(mask[:, None], 0.0)
+        self.newton.velocity[mask], self.movable_rows = 0.0, self.movable_rows | mask
 
-        rendered = self.target.render(self.splats._replace(colors=colors))
-        residual, backend = (self.target.image - rendered) * self.changed, self.target.config.backend
-        proposal = propose_for(self.objective, residual, regions, int(relocated.sum()), sigmas=_SIGMAS, backend=backend)
-        rows = relocated.nonzero()[: len(proposal.means), 0]
+        residual = (image - self.target.render(self.splats._replace(colors=colors))) * self.changed_pixels
+        proposal = propose_for(self.objective, residual, regions, int(mask.sum()), sigmas=_SIGMAS, backend=backend)
+        rows = mask.nonzero()[: len(proposal.means), 0]
         if region_ids is not None and proposal.region_ids is not None:
             region_ids = region_ids.index_copy(0, rows, proposal.region_ids)
         means = means.index_copy(0, rows, proposal.means)
@@ -123,15 +125,10 @@ class FrameDescent:
 
     def _move_contours(self, anchor: Tensor) -> None:
         """Move contours to where the error is lower, or little higher."""
-        regions, config = self.splats.regions, self.target.config
-        if regions is None or regions.num_regions == 1:
-            return
-        proposal = refine_contours(
-            self.splats.scene(self.target.size), self.target.image, anchor=anchor,
-            max_distance=None if config.max_move == "any" else config.max_move, length_weight=config.contour_cost,
-            backend=config.backend,
-        )  # fmt: skip
-        if proposal is not regions:
-            errors = [self.target.squared_error(self.splats._replace(regions=m)) for m in (regions, proposal)]
-            regions = accept_moves(regions, proposal, _MAX_RISE * errors[0] - errors[1])
-            self.splats = self.splats._replace(regions=regions)
+        config = self.target.config
+        scene, image = self.splats.scene(self.target.size), self.target.image
+        regions = move_contours(scene, image, anchor, config, self._squared_error, _MAX_RISE)
+        self.splats = self.splats._replace(regions=regions)
+
+    def _squared_error(self, regions: RegionMap) -> Tensor:
+        return self.target.squared_error(self.splats._replace(regions=regions))

@@ -68,9 +68,9 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
                 if before.region_ids is not None:
                     region_ids[rows] = before.region_ids[rows]
             start = Splats(means, cholesky, colors, region_ids, filled.image(t))
-            movable, changed = torch.ones_like(deleted_rows[t]), torch.ones_like(deleted_pixels[t])
+            movable_rows, changed_pixels = torch.ones_like(deleted_rows[t]), torch.ones_like(deleted_pixels[t])
             unused = deleted_rows[t] & (colors == 0).all(-1)
-            descent = FrameDescent(Target(images[t], FitConfig()), start, movable, changed)
+            descent = FrameDescent(Target(images[t], FitConfig()), start, movable_rows, changed_pixels)
             edited.append(descent.run({0: float(unused.float().mean())}))
     return stack(edited, scenes.size, scenes.metadata)
 

@@ -123,7 +123,7 @@ class _VideoFit:
         """Fit a frame; without labels the map of the frame before moves along, where there is one."""
         previous = self.image
         self.image, regions = check_image_and_regions(frame, labels)
-        target, changed = Target(self.image, self.config), torch.ones_like(self.image[0], dtype=torch.bool)
+        target, changed_pixels = Target(self.image, self.config), torch.ones_like(self.image[0], dtype=torch.bool)
         if not self.frames:
             splats = self._fit_anew(regions)
         elif previous.shape != self.image.shape:
@@ -131,9 +131,9 @@ class _VideoFit:
             raise InvalidArgument(name, f"shape {tuple(previous.shape)}", tuple(self.image.shape), verb="have")
         else:
             with threads_for_kernels(previous[0].numel()):
-                splats, changed = self._follow(target, estimate_motion(previous, self.image), regions)
+                splats, changed_pixels = self._follow(target, estimate_motion(previous, self.image), regions)
         self.frames.append(splats)
-        self.error = torch.where(changed, target.squared_error(splats), self.error)
+        self.error = torch.where(changed_pixels, target.squared_error(splats), self.error)
         return splats.scene(target.size)
 
     def _fit_anew(self, regions: RegionMap | None) -> Splats:
@@ -159,15 +159,15 @@ class _VideoFit:
         if first is not None and before is not None:
             labels = move_labels(motion, before.labels) if regions is None else regions.labels
             regions = first.relabel(labels, "mean")
-        start, movable, changed = self._start(target, motion, regions)
+        start, movable_rows, changed_pixels = self._start(target, motion, regions)
         if float(target.squared_error(start).mean()) > _CUT_SHARE * float(target.image.var((1, 2)).mean()):
             if is_moved and regions is not None:
                 regions = regions.relabel(regions.labels.flatten().mode()[0].expand(regions.size))
-            return self._fit_anew(regions), torch.ones_like(changed)
-        if changed.any():
-            anchor = None if regions is None else regions.labels
-            start = FrameDescent(target, start, movable, changed).run(_RELOCATIONS, anchor)
-        return start, changed
+            return self._fit_anew(regions), torch.ones_like(changed_pixels)
+        if changed_pixels.any():
+            anchor = regions.labels if regions is not None and self.config.move_contours else None
+            start = FrameDescent(target, start, movable_rows, changed_pixels).run(_RELOCATIONS, anchor)
+        return start, changed_pixels
 
     def _start(self, target: Target, motion: Tensor, regions: RegionMap | None) -> tuple[Splats, Tensor, Tensor]:
         """Return the Gaussians before, moved, the mask of those that may move, and that of the pixels that changed.
@@ -180,11 +180,11 @@ class _VideoFit:
             region_ids = torch.where(is_present, region_ids, regions.ids[0])
             colors = torch.where(is_present[:, None], colors, 0.0)
         still = Splats(means, cholesky, colors, region_ids, regions)
-        changed = _local_mean(target.squared_error(still)) > _MAX_GROWTH * _local_mean(self.error) + _LEVEL
+        changed_pixels = _local_mean(target.squared_error(still)) > _MAX_GROWTH * _local_mean(self.error) + _LEVEL
         _, sums = target.weight_sums(still)
-        movable = sums(changed[None].to(motion)) >= _MOVABLE_SHARE * sums(torch.ones_like(motion[:1]))
-        means = torch.where(movable[:, None], _move_means(motion, still), means)
-        return still._replace(means=means), movable, changed
+        movable_rows = sums(changed_pixels[None].to(motion)) >= _MOVABLE_SHARE * sums(torch.ones_like(motion[:1]))
+        means = torch.where(movable_rows[:, None], _move_means(motion, still), means)
+        return still._replace(means=means), movable_rows, changed_pixels
 
 
 def _local_mean(error: Tensor) -> Tensor:

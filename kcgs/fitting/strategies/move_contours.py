@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 
-from kcgs.fitting.contour_moves import accept_moves, refine_contours
+from kcgs.fitting.contour_moves import move_contours
 from kcgs.fitting.descent import squared_error
 from kcgs.fitting.state import FitState
 from kcgs.functional import RegionMap, choose_softness
@@ -36,7 +37,7 @@ class AdaptContours:
     @torch.no_grad()
     def apply(self, state: FitState) -> None:
         """Move the contours, and at times choose their softness."""
-        move_contours(state, self.max_rise)
+        _move(state, self.max_rise)
         regions, problem = state.scene.regions, state.problem
         addition = state.num_additions + 1
         if (
@@ -67,19 +68,12 @@ class SettleContours:
     def apply(self, state: FitState) -> None:
         """Move the contours."""
         state.num_late_moves += 1
-        move_contours(state, 1.0)
+        _move(state, 1.0)
 
 
-def move_contours(state: FitState, max_rise: float) -> None:
+def _move(state: FitState, max_rise: float) -> None:
     """Move the contours where that raises the squared error about them by no more than a factor."""
-    config, regions = state.problem.config, state.scene.regions
-    if regions is None or state.anchor is None:
-        return
-    proposal = refine_contours(
-        state.scene, state.problem.image, anchor=state.anchor.labels,
-        max_distance=None if config.max_move == "any" else config.max_move, length_weight=config.contour_cost,
-        backend=config.backend,
-    )  # fmt: skip
-    if proposal is not regions:
-        gain = max_rise * squared_error(state) - squared_error(state, proposal)
-        state.scene.regions = accept_moves(regions, proposal, gain)
+    problem, scene = state.problem, state.scene
+    if scene.regions is not None and state.anchor is not None:
+        error, anchor = partial(squared_error, state), state.anchor.labels
+        scene.regions = move_contours(scene, problem.image, anchor, problem.config, error, max_rise)
