@@ -6,29 +6,29 @@ from typing import Any
 
 
 class Progress:
-    """A bar, or without a known length a pulse, while a `with` block runs.
+    """A progress bar while a `with` block runs.
 
     Args:
         name: of the work.
-        known: whether the length of the work is known, so that `update` can say which share is done.
-        shown: False: there is no bar.
+        pulse: the length of the work is not known: the bar pulses, and shows no share.
+        visible: False: there is no bar.
     """
 
-    def __init__(self, name: str, *, known: bool = True, shown: bool = True) -> None:
+    def __init__(self, name: str, *, pulse: bool = False, visible: bool = True) -> None:
         self._name = name
-        self._known = known
-        self._shown = shown
+        self._pulse = pulse
+        self._visible = visible
 
     def __enter__(self) -> Progress:
         from rich import progress
         from rich.console import Console
 
         console = Console(stderr=True)
-        visible = self._shown and (console.is_terminal or console.is_jupyter)
+        visible = self._visible and (console.is_terminal or console.is_jupyter)
         note = progress.TextColumn("{task.fields[note]}")
         columns = progress.Progress.get_default_columns()
         self._bar: Any = progress.Progress(*columns, note, console=console, disable=not visible)
-        self._task = self._bar.add_task(self._name, total=1.0 if self._known else None, note="")
+        self._task = self._bar.add_task(self._name, total=None if self._pulse else 1.0, note="")
         self._bar.start()
         return self
 

@@ -36,16 +36,16 @@ _RENDERERS = {contours: RegionSplatRenderer(contours=contours) for contours in C
 
 
 class Scene(nn.Module):
-    r"""Gaussians, the label map that confines them, and notes.
+    r"""Gaussians, the label map that confines them, and metadata.
 
-    Convention: `to`, `state_dict`, `copy.deepcopy` and `pickle` keep the map and the notes too. `load_state_dict`
-    replaces the scene's own map and notes by those of the state.
+    Convention: `to`, `state_dict`, `copy.deepcopy` and `pickle` keep the map and the metadata too.
+    `load_state_dict` replaces the map and the metadata by those of the state.
 
     Args:
         field: N Gaussians, or a batch of them.
         regions: a RegionMap, or a label map, integer or bool, Tensor or numpy array, :math:`(H, W)` or
             :math:`(B, H, W)`, with hard contours, of the field's size; None: nothing is confined.
-        metadata: notes, str to str, which files keep.
+        metadata: notes of the user's, str to str, which .safetensors files keep.
 
     Raises:
         TypeError, ValueError: an argument of the wrong type; no label map; a map of another size, or a batch of maps
@@ -148,8 +148,8 @@ class Scene(nn.Module):
         regions = "no regions" if self.regions is None else f"{self.regions.num_regions} regions"
         if count := len(empty_regions(self)):
             regions += f", {count} of them without a Gaussian"
-        notes = f", metadata={self.metadata}" if self.metadata else ""
-        return shorten(f"Scene({self.field.extra_repr()}, {regions}{notes})")
+        metadata = f", metadata={self.metadata}" if self.metadata else ""
+        return shorten(f"Scene({self.field.extra_repr()}, {regions}{metadata})")
 
     def _repr_png_(self) -> bytes | None:
         if self.field.means.ndim != 2:
@@ -158,11 +158,11 @@ class Scene(nn.Module):
         return png(self.render((max(1, round(self.size[0] * factor)), max(1, round(self.size[1] * factor)))))
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Map and notes, for `state_dict`."""
+        """Map and metadata, for `state_dict`."""
         return {"regions": None if self.regions is None else self.regions.state(), "metadata": self.metadata}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Map and notes, from `load_state_dict`."""
+        """Map and metadata, from `load_state_dict`."""
         regions = state["regions"]
         self.regions = None if regions is None else RegionMap.from_state(regions)
         # a field on the device "meta" gets its tensors, and their device, later
@@ -205,9 +205,7 @@ def save(path: str | os.PathLike[str], scene: Scene) -> int:
     """
     path = Path(path)
     file_format = _format(path)
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
-    content: bytes = file_format.serialize(scene)
+    content: bytes = file_format.serialize(check_type(scene))
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return len(content)
@@ -263,10 +261,16 @@ def empty_regions(scene: Scene) -> Tensor:
     return regions.ids[~torch.isin(regions.ids, ids)]
 
 
-def check_unbatched(scene: object, name: str = "scene") -> Scene:
-    """Return `scene` if it is a Scene of one image."""
+def check_type(scene: object, name: str = "scene") -> Scene:
+    """Return `scene` if it is a Scene, of one image or a batch."""
     if not isinstance(scene, Scene):
         raise TypeError(f"{name} must be a Scene; got {type(scene).__name__}")
+    return scene
+
+
+def check_unbatched(scene: object, name: str = "scene") -> Scene:
+    """Return `scene` if it is a Scene of one image."""
+    scene = check_type(scene, name)
     if scene.field.means.ndim != 2:
         count = len(scene.field.means)
         raise InvalidArgument(name, "of one image", f"a batch of {count}: scene[t] is one of them")

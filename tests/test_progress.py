@@ -30,6 +30,6 @@ def test_nothing_elsewhere_or_where_it_is_not_wanted(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], is_terminal: bool
 ) -> None:
     monkeypatch.setattr("rich.console.Console.is_terminal", is_terminal)
-    with Progress("work", known=False, shown=not is_terminal) as progress:
+    with Progress("work", pulse=True, visible=not is_terminal) as progress:
         progress.update(0.5, "halfway")
     assert capsys.readouterr() == ("", "")

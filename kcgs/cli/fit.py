@@ -103,7 +103,7 @@ def fit_and_save(
         return SavedFit(result, scene, scene.save(output))
     quality = quality_for(max(entry.psnr for entry in result.history)) if target_psnr is None else None
     goal: Any = {"quality": quality, "target_psnr": target_psnr, "objective": config.objective}
-    with Progress("writing the file", known=False, shown=progress):
+    with Progress("writing the file", pulse=True, visible=progress):
         compressed = compress(result.scene, image, seed=request.seed, **goal)
     return SavedFit(result, compressed.scene, write_file(output, compressed.data))
 
@@ -115,7 +115,7 @@ def read_regions(regions: str, image: Tensor, *, progress: bool = False) -> Tens
     if regions == "auto":
         from kcgs.segment import segment
 
-        with Progress("finding regions", known=False, shown=progress):
+        with Progress("finding regions", pulse=True, visible=progress):
             return segment(image)
     from kcgs.data import load_labels
 

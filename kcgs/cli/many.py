@@ -61,7 +61,7 @@ def fit_many_command(
     workers = None if workers is None else min(workers, len(jobs))
     outcomes = dict[int, Outcome]()
     try:
-        with Progress("fit-many", shown=not quiet) as progress:
+        with Progress("fit-many", visible=not quiet) as progress:
             for index, outcome in run_jobs(fit_one, jobs, engine=engine, workers=workers, threads=threads):
                 outcomes[index] = outcome
                 progress.update(len(outcomes) / len(jobs), f"{len(outcomes)} of {len(jobs)}")

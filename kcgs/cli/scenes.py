@@ -160,7 +160,7 @@ def encode(
 
     loaded = load(scene)
     goal: dict[str, Any] = {"quality": quality, "target_bytes": target_bytes}
-    with Progress("writing the file", known=False, shown=not quiet):
+    with Progress("writing the file", pulse=True, visible=not quiet):
         if image is None:
             data = codec.encode(loaded, **goal)
         else:

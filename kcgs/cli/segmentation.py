@@ -59,7 +59,7 @@ def segment(
         check_output(overlay, *OUTPUT_IMAGES, name="overlay")
     options = _parse_options(option or [])
     target = load_image(image)
-    with Progress("finding regions", known=False, shown=not quiet):
+    with Progress("finding regions", pulse=True, visible=not quiet):
         labels, scores, names = segment_with_scores(target, method, **options)
     save_labels(output, labels)
     if overlay is not None:

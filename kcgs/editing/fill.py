@@ -28,13 +28,14 @@ _REMOVED_SHARE = 0.5
 _MAX_ADDED = 250
 # least distance of Gaussians that are added, in pixels
 _MIN_SPACING = 3.0
-# their standard deviation, in distances
+# their standard deviation, in that distance
 _SIGMA = 0.7
 # weight of a known pixel in the fit, where that of a filled one is 1: what is visible already must not change
 _KNOWN_WEIGHT = 4.0
 _STEPS = 150
-# factor of the learning rates: with more, Gaussians that are alike swing, and the hole shows ripples
-_RATE = 0.5
+# learning rates of geometry and colours: at higher ones Gaussians that are alike swing, and the hole shows ripples
+_RATE = 0.07
+_COLOR_RATE = 0.015
 
 
 def fill_hole(scene: Scene, hole: Tensor, visible: Tensor) -> Scene:
@@ -103,8 +104,8 @@ def _fit(field: GaussianField, regions: RegionMap, target: Tensor, weight: Tenso
     """Fit Gaussians to a target, with a weight per pixel; opacities are merged into the colours."""
     geometry = field.means.detach(), field.cholesky.detach()
     field = GaussianField(*geometry, field.merged_colors().detach(), field.region_ids, size=field.size)
-    rates = field.means.detach().new_tensor([0.14, 0.03]) * _RATE
-    optimizer = GaussianAdam(field, rates[0], color_lr=rates[1])
+    rate, color_rate = field.means.detach().new_tensor([_RATE, _COLOR_RATE])
+    optimizer = GaussianAdam(field, rate, color_lr=color_rate)
     schedule = LambdaLR(optimizer, lambda step: cosine_decay(step / _STEPS))
     for _ in range(_STEPS):
         rendered = region_splat(field.means, field.cholesky, field.colors, field.region_ids, regions)

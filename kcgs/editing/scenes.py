@@ -16,11 +16,11 @@ from kcgs._check import check_floating, check_number
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join, scaled_gaussians
-from kcgs.scene import Scene, check_scene
+from kcgs.scene import Scene, check_scene, check_type
 
 from .fill import fill_hole
 from .masks import check_offset, dilate, nearest_labels, shift_labels
-from .selection import check_region_ids, members_of, select_regions, select_removable_regions
+from .selection import members_of, select_regions, select_removable_regions, unique_region_ids
 
 Numbers = Tensor | NDArray[Any] | Sequence[Any] | float
 
@@ -86,10 +86,10 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
 
 
 def _contour_reach(regions: RegionMap) -> int:
-    """Return the pixels from a contour within which one sees what is behind a region."""
-    widths = regions.softness
-    width = widths if isinstance(widths, float) else max(widths.values(), default=0.0)
-    return math.ceil(1.0 + _CONTOUR_SIGMAS * width)
+    """Return the distance from a contour, in pixels, within which one sees what is behind a region."""
+    softness = regions.softness
+    largest = softness if isinstance(softness, float) else max(softness.values(), default=0.0)
+    return math.ceil(1.0 + _CONTOUR_SIGMAS * largest)
 
 
 def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers, bias: Numbers | None = None) -> Scene:
@@ -117,12 +117,10 @@ def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers,
         >>> torch.allclose(scene() + negative(), torch.ones(3, 4, 6), atol=1e-5)
         True
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene must be a Scene; got {type(scene).__name__}")
-    field = scene.field
+    field = check_type(scene).field
     if field.region_ids is None:
         raise ValueError("scene must have region ids; call scene.field.assign_regions(regions)")
-    ids = check_region_ids(region_ids, field.region_ids, "Gaussians")
+    ids = unique_region_ids(region_ids, field.region_ids, "Gaussians")
     members = members_of(field, torch.tensor(ids, device=field.means.device))
     channels = field.colors.shape[-1]
     matrix = _color_tensor("gain", gain, field.colors, [(), (channels,), (channels, channels)])

@@ -33,7 +33,7 @@ def select_regions(scene: Scene, region_ids: object) -> Selection:
     regions = check_scene(scene).regions
     if regions is None:
         raise InvalidArgument("scene", "a label map", "regions None", verb="have")
-    ids = torch.tensor(check_region_ids(region_ids, regions.ids, "map"), device=regions.ids.device)
+    ids = torch.tensor(unique_region_ids(region_ids, regions.ids, "map"), device=regions.ids.device)
     return Selection(regions, ids, torch.isin(regions.labels, ids), members_of(scene.field, ids))
 
 
@@ -47,8 +47,8 @@ def select_removable_regions(scene: Scene, region_ids: object) -> Selection:
     return selection
 
 
-def check_region_ids(region_ids: object, known: Tensor, owner: str) -> list[int]:
-    """Return one id or several as a list, each once, sorted, if all are among the `known` ids of the owner."""
+def unique_region_ids(region_ids: object, known: Tensor, owner: str) -> list[int]:
+    """Return one id or several as a sorted list, each once, if all are among the `known` ids of the owner."""
     sequence = region_ids if isinstance(region_ids, Iterable) else [region_ids]
     ids = sorted({check_count("region_ids", region, 0) for region in sequence})
     if not ids:

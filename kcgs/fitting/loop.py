@@ -98,9 +98,9 @@ def fit(
     if config.target_psnr is not None and checkpoint is not None:
         raise InvalidArgument("checkpoint", "None with target_psnr, which takes several fits", repr(checkpoint))
     prepare(config.backend, problem.image.device, problem.image.dtype, len(problem.image))
-    known = config.target_psnr is None
-    with Progress("fit", known=known, shown=progress) as bar, threads_for_kernels(problem.image[0].numel()):
-        if not known:
+    pulse = config.target_psnr is not None
+    with Progress("fit", pulse=pulse, visible=progress) as bar, threads_for_kernels(problem.image[0].numel()):
+        if pulse:
             return search(problem, lambda state: _run(state, Clock(), bar, on_step))
         clock, state = Clock(), start(problem)
         keeper = None if checkpoint is None else Checkpoint(checkpoint, problem)

@@ -120,7 +120,7 @@ def fit_bytes(
     check_count("target_bytes", target_bytes)
     if config.target_psnr is not None:
         raise InvalidArgument("target_psnr", "None with target_bytes", config.target_psnr)
-    with Progress("trial fits", known=False, shown=progress):
+    with Progress("trial fits", pulse=True, visible=progress):
         choice = _choose_regions(image, regions, target_bytes, config, seed)
     config = config.model_copy(update={"contour_cost": choice.contour_cost})
     share = _FIT_SHARE if choice.regions is None else _FIT_SHARE_WITH_REGIONS
@@ -128,7 +128,7 @@ def fit_bytes(
         share, image, choice.regions, choice.num_gaussians, config, seed=seed, on_step=on_step, progress=progress
     )
     report = report_regions(regions, result.scene, **choice.changes)
-    with Progress("writing the file", known=False, shown=progress):
+    with Progress("writing the file", pulse=True, visible=progress):
         data, scene = compress(result.scene, image, target_bytes=target_bytes, seed=seed, objective=config.objective)
     return FitBytesResult(data, scene, result._replace(regions=report))
 

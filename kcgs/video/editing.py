@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcgs.editing.masks import check_offset, shift_labels
-from kcgs.editing.selection import check_region_ids
+from kcgs.editing.selection import unique_region_ids
 from kcgs.fitting import FitConfig
 from kcgs.functional import RegionMap
 from kcgs.kernels import threads_for_kernels
@@ -109,7 +109,7 @@ def _check(scenes: Scene, region_ids: int | Iterable[int]) -> tuple[RegionMap, T
     count, regions, row_ids = len(check_batch(scenes)), scenes.regions, scenes.field.region_ids
     if regions is None or row_ids is None or regions.num_maps != count:
         raise ValueError("scenes must have a label map for each frame, and region ids")
-    ids = torch.tensor(check_region_ids(region_ids, regions.ids, "maps"), device=regions.ids.device)
+    ids = torch.tensor(unique_region_ids(region_ids, regions.ids, "maps"), device=regions.ids.device)
     has_others = (~torch.isin(regions.labels, ids)).flatten(1).any(1)
     if not has_others.all():
         frame = int(has_others.min(0)[1])

@@ -98,7 +98,7 @@ def fit_video(
     config = FitConfig.from_recipe(recipe, **({"merge_regions": False} | settings))
     video = _VideoFit(config, check_count("num_gaussians", num_gaussians), seed)
     length = len(frames) if isinstance(frames, Sized) else None
-    with Progress("fit-video", known=length is not None, shown=progress) as bar:
+    with Progress("fit-video", pulse=length is None, visible=progress) as bar:
         for number, (frame, labels) in enumerate(_pair(frames, label_maps if config.guidance else None)):
             scene = video.fit_next(frame, labels)
             bar.update((number + 1) / (length or math.inf), f"frame {number + 1}")
