@@ -21,6 +21,7 @@ PACKAGES = (
     "kcgs",
     "kcgs.functional",
     "kcgs.nn",
+    "kcgs.optim",
     "kcgs.editing",
     "kcgs.fitting",
     "kcgs.video",
