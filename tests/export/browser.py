@@ -67,9 +67,9 @@ def array(packed: dict[str, Any]) -> NDArray[np.float32]:
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """A plain static server; below /slow/ the second half of a file waits for `rest`."""
+    """A plain static server; below /slow/ the second half of a file waits for `release`."""
 
-    rest = threading.Event()
+    release = threading.Event()
 
     def translate_path(self, path: str) -> str:
         return super().translate_path(path.removeprefix("/slow"))
@@ -80,7 +80,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
         outputfile.write(data[:half])
         outputfile.flush()
         if half < len(data):
-            self.rest.wait()
+            self.release.wait()
             outputfile.write(data[half:])
 
     def end_headers(self) -> None:
@@ -108,15 +108,20 @@ def npm(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["npm", *arguments], cwd=WEB, capture_output=True, text=True)
 
 
+def check_npm(*arguments: str) -> str:
+    """Run npm; return what it prints."""
+    result = npm(*arguments)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
 def build(script: str, *arguments: str) -> None:
-    """Run a script that builds, without what comes before and after it: the decoder is there."""
-    done = npm("run", "--ignore-scripts", script, *arguments)
-    assert done.returncode == 0, done.stdout + done.stderr
+    """Run a script that builds, without the scripts before and after it: the decoder is there."""
+    check_npm("run", "--ignore-scripts", script, *arguments)
 
 
 def compile_decoder() -> None:
     """Make the decoder's WebAssembly, where it is missing or older than its sources."""
     program, sources = WEB / "decoder" / "program.wasm", (WEB / "decoder" / "assembly").glob("*.ts")
     if not program.exists() or program.stat().st_mtime < max(source.stat().st_mtime for source in sources):
-        done = npm("run", "wasm")
-        assert done.returncode == 0, done.stdout + done.stderr
+        check_npm("run", "wasm")

@@ -53,22 +53,26 @@ def digest(array: Any, dtype: str = "<f4") -> str:
 
 def scene_of(data: bytes) -> dict[str, Any]:
     """Decode in Python; describe it as describe.mjs does."""
-    found = decode(data)
-    field, regions = found.scene.field, found.scene.regions
+    decoded = decode(data)
+    field, regions = decoded.scene.field, decoded.scene.regions
     numbers = {name: getattr(field, name).detach().numpy() for name in ("means", "cholesky", "colors")}
     described: dict[str, Any] = {name: digest(array) for name, array in numbers.items()}
     described |= {"height": field.size[0], "width": field.size[1], "channels": field.colors.shape[-1]}
-    described |= {"count": field.num_gaussians, "layers": found.layers, "complete": found.layers == found.num_layers}
+    described |= {
+        "count": field.num_gaussians,
+        "layers": decoded.layers,
+        "complete": decoded.layers == decoded.num_layers,
+    }
     described |= {"regions": None, "positions": None}
     if regions is None or field.region_ids is None:
         return described
     labels, ids = regions.index_of(regions.labels).numpy(), regions.ids.numpy()
     described["positions"] = digest(regions.index_of(field.region_ids).numpy(), "<i4")
-    one = isinstance(regions.softness, float)
+    uniform = isinstance(regions.softness, float)
     described["regions"] = {
         "labels": digest(labels, "<i4"), "ids": digest(ids, "<f8"),
-        "softness": regions.softness if one else None,
-        "pairs": [] if one else [[*np.searchsorted(ids, pair).tolist(), w] for pair, w in regions.softness.items()],
+        "softness": regions.softness if uniform else None,
+        "pairs": [] if uniform else [[*np.searchsorted(ids, pair).tolist(), w] for pair, w in regions.softness.items()],
     }  # fmt: skip
     return described
 

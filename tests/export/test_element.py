@@ -6,6 +6,7 @@ import gzip
 import json
 import shutil
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,12 @@ from kcgs.codec import encode
 from kcgs.editing import move_region, recolor_region
 from kcgs.page import scene_page
 
-from .browser import WEB, Browser, Handler, array, build, npm, serving
+from .browser import WEB, Browser, Handler, array, build, check_npm, serving
 
 MODELS = WEB.parents[1] / "models"
 PAGE = WEB.parents[1] / "kcgs" / "page"
-MOST_BYTES = 39_000
+ZOO = ("chelsea-500", "rocket-1000")
+MOST_BYTES = 39_000  # of the element, compressed by gzip
 LEVELS = 2 / 255
 HTML = """<!doctype html><meta charset="utf-8">
 <meta http-equiv="Content-Security-Policy" content="default-src 'none'; connect-src 'self'; img-src blob: 'self';
@@ -31,7 +33,7 @@ HTML = """<!doctype html><meta charset="utf-8">
 <script type="module" src="kcgs-image.js"></script>
 <script type="module" nonce="test">
 const events = [];
-window.kcgs = { ready: Promise.resolve(), events, async show(markup, wanted = "load") {
+window.kcgs = { events, async show(markup) {
   document.querySelector("#here").innerHTML = markup;
   const image = document.querySelector("kcgs-image");
   for (const name of ["load", "error", "progress", "regionclick"])
@@ -61,9 +63,19 @@ def cells(size: tuple[int, int], count: int) -> torch.Tensor:
     return squares.argmin(-1) * 3 + 2
 
 
+def zoo(name: str) -> Scene:
+    return load(MODELS / name / "scene.safetensors")
+
+
+@cache
+def layered_file() -> bytes:
+    """A file of several layers."""
+    return encode(zoo("chelsea-500"))
+
+
 def random_scene(kind: str, channels: int = 3) -> Scene:
     size = (60, 90)
-    softness: Any = {"hard": 0.0, "soft": 1.3, "wide": 5.0, "widest": 24.0}.get(kind, 0.0)
+    softness: Any = {"soft": 1.3, "grey": 1.3, "wide": 5.0, "widest": 24.0}.get(kind, 0.0)
     labels = cells(size, 12)
     if kind == "pairs":
         ids = labels.unique().tolist()
@@ -73,17 +85,11 @@ def random_scene(kind: str, channels: int = 3) -> Scene:
     return Scene(GaussianField.random(150, size, channels=channels, regions=regions, seed=1), regions)
 
 
-SCENES = {
-    **{kind: lambda kind=kind: random_scene(kind) for kind in ("soft", "pairs", "hard")},
-}
-MORE = {
-    **{kind: lambda kind=kind: random_scene(kind) for kind in ("plain", "wide", "widest")},
-    "grey": lambda: random_scene("soft", 1),
-    **{name: lambda name=name: load(MODELS / name / "scene.safetensors") for name in ("chelsea-500", "rocket-1000")},
-}
-EVERY = [
-    *(pytest.param(make, id=name) for name, make in SCENES.items()),
-    *(pytest.param(make, id=name, marks=pytest.mark.slow) for name, make in MORE.items()),
+SCENES = [
+    "soft",
+    "pairs",
+    "hard",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("plain", "wide", "widest", "grey", *ZOO)),
 ]
 
 
@@ -91,26 +97,18 @@ EVERY = [
 def site(node_modules: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str]]:
     """A folder with the built element and a page, and its address."""
     folder = tmp_path_factory.mktemp("element")
-    done = npm("exec", "--", "vite", "build", "--mode", "element", "--outDir", str(folder))
-    assert done.returncode == 0, done.stdout + done.stderr
+    check_npm("exec", "--", "vite", "build", "--mode", "element", "--outDir", str(folder))
     (folder / "index.html").write_text(HTML)
     (folder / "grey.png").write_bytes(b"")
     with serving(folder) as address:
         yield folder, address
 
 
-@pytest.fixture(scope="module")
-def browser(chromium: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    driven = Browser(chromium, tmp_path_factory.mktemp("browser") / "errors.txt")
-    yield driven
-    driven.close()
-
-
 @pytest.fixture
 def page(browser: Browser, site: tuple[Path, str]) -> Iterator[Browser]:
     """The page; when a test ends nothing may have gone wrong, nor been asked of another server."""
     browser.do("look", width=1000, height=700)
-    browser.do("goto", url=site[1])
+    browser.do("open", url=site[1])
     yield browser
     assert all(address.startswith((site[1], f"blob:{site[1]}")) for address in browser.do("requests"))
     assert [text for text in browser.do("problems") if "404" not in text] == []
@@ -136,17 +134,18 @@ def pixels(page: Browser, size: tuple[int, int]) -> NDArray[np.float32]:
     return array(page.evaluate(f"kcgs.pixels({size[1]}, {size[0]})")).transpose(2, 0, 1) / 255
 
 
-def check(page: Browser, want: torch.Tensor) -> None:
-    got = pixels(page, (want.shape[-2], want.shape[-1]))
-    assert want.std() > 0.02
-    np.testing.assert_allclose(got[:3], want.expand(3, -1, -1).numpy(), atol=LEVELS, rtol=0)
+def check(page: Browser, expected: torch.Tensor) -> None:
+    image = pixels(page, (expected.shape[-2], expected.shape[-1]))
+    assert expected.std() > 0.02
+    np.testing.assert_allclose(image[:3], expected.expand(3, -1, -1).numpy(), atol=LEVELS, rtol=0)
 
 
 class TestPixels:
     @pytest.mark.parametrize("renderer", ["cpu", "webgl2"])
-    @pytest.mark.parametrize("make", EVERY)
-    def test_sizes(self, page: Browser, site: tuple[Path, str], make: Any, renderer: str) -> None:
-        scene = show(page, site, make(), f'renderer="{renderer}"')
+    @pytest.mark.parametrize("name", SCENES)
+    def test_sizes(self, page: Browser, site: tuple[Path, str], name: str, renderer: str) -> None:
+        scene = zoo(name) if name in ZOO else random_scene(name, 1 if name == "grey" else 3)
+        scene = show(page, site, scene, f'renderer="{renderer}"')
         assert page.evaluate("image.renderer").startswith(renderer)
         height, width = scene.size
         for size in ((height, width), (height // 2, width // 2), (3 * height, 3 * width), (height - 13, 2 * width + 5)):
@@ -160,12 +159,12 @@ class TestPixels:
 
     def test_alpha(self, page: Browser, site: tuple[Path, str]) -> None:
         scene = show(page, site, random_scene("soft", 4))
-        want = scene.render().numpy()
+        expected = scene.render().numpy()
         for renderer in ("cpu", "webgl2"):
             page.evaluate(f"(image.setAttribute('renderer', '{renderer}'), 1)")
-            got = pixels(page, scene.size)
-            np.testing.assert_allclose(got[3], want[3], atol=LEVELS)
-            np.testing.assert_allclose((got[:3] * got[3]), want[:3] * want[3], atol=LEVELS)
+            image = pixels(page, scene.size)
+            np.testing.assert_allclose(image[3], expected[3], atol=LEVELS)
+            np.testing.assert_allclose(image[:3] * image[3], expected[:3] * expected[3], atol=LEVELS)
 
     def test_an_emulated_gpu_is_not_taken(self, page: Browser, site: tuple[Path, str]) -> None:
         show(page, site, random_scene("soft"))
@@ -178,10 +177,9 @@ class TestPixels:
             "WebGL2RenderingContext.prototype.getExtension = function (name) {"
             "  return name === 'EXT_float_blend' ? null : find.call(this, name); }; return 1; })()"
         )
-        scene = show(page, site, load(MODELS / "chelsea-500" / "scene.safetensors"), 'renderer="webgl2"')
+        scene = show(page, site, random_scene("soft"), 'renderer="webgl2"')
         assert page.evaluate("image.renderer") == "webgl2 float16"
-        got = pixels(page, scene.size)[:3]
-        np.testing.assert_allclose(got, scene.render().numpy(), atol=LEVELS)
+        check(page, scene.render())
 
     @pytest.mark.parametrize("renderer", ["cpu", "webgl2"])
     def test_hidden_regions_are_clear(self, page: Browser, site: tuple[Path, str], renderer: str) -> None:
@@ -190,11 +188,11 @@ class TestPixels:
         assert regions is not None
         hidden = regions.ids[:3].tolist()
         page.evaluate(f"(image.hide({hidden}), image.hide({hidden[2]}, false), 1)")
-        got = pixels(page, scene.size)
-        left = regions.membership(regions.ids[2:].tolist()).numpy()
-        np.testing.assert_allclose(got[3], left, atol=LEVELS)
-        inside = left > 1 - 1e-6
-        np.testing.assert_allclose(got[:3, inside], scene.render().numpy()[:, inside], atol=LEVELS)
+        image = pixels(page, scene.size)
+        membership = regions.membership(regions.ids[2:].tolist()).numpy()
+        np.testing.assert_allclose(image[3], membership, atol=LEVELS)
+        inside = membership > 1 - 1e-6
+        np.testing.assert_allclose(image[:3, inside], scene.render().numpy()[:, inside], atol=LEVELS)
 
 
 class TestEdits:
@@ -214,7 +212,7 @@ class TestEdits:
         check(page, scene.render())
 
     @pytest.mark.parametrize(
-        ("call", "says"),
+        ("call", "message"),
         [
             ("hide(77)", "ids must be of the scene's regions; got 77"),
             ("move(5, 0.3, 0)", "dx and dy must be whole; got 0.3, 0"),
@@ -224,12 +222,12 @@ class TestEdits:
             ("toBlob({width: 1e5, height: 1e5})", "no image of 100000 x 100000 can be made"),
         ],
     )
-    def test_errors(self, page: Browser, site: tuple[Path, str], call: str, says: str) -> None:
+    def test_errors(self, page: Browser, site: tuple[Path, str], call: str, message: str) -> None:
         show(page, site, random_scene("soft"))
-        said = page.evaluate(
+        answer = page.evaluate(
             f"(async () => {{ try {{ await image.{call}; return ''; }} catch (error) {{ return error.message; }} }})()"
         )
-        assert said == says
+        assert answer == message
 
 
 class TestElement:
@@ -257,24 +255,24 @@ class TestElement:
         assert "image" not in [role for role, _ in page.do("accessible")]
 
     def test_layers_as_they_arrive(self, page: Browser, site: tuple[Path, str]) -> None:
-        show(page, site, load(MODELS / "chelsea-500" / "scene.safetensors"))
-        Handler.rest.clear()
+        show(page, site, layered_file())
+        Handler.release.clear()
         page.evaluate("(window.shown = kcgs.show('<kcgs-image src=slow/scene.kcgs></kcgs-image>'), 1)")
         page.do("wait", expression="kcgs.events.length > 0")
-        Handler.rest.set()
+        Handler.release.set()
         page.evaluate("shown")
         first, *_, last = page.evaluate("kcgs.events")
         assert first == ["progress", False] and last == ["load", True]
 
     def test_leaves_the_page_and_comes_back(self, page: Browser, site: tuple[Path, str]) -> None:
-        show(page, site, load(MODELS / "chelsea-500" / "scene.safetensors"))
-        Handler.rest.clear()
+        show(page, site, layered_file())
+        Handler.release.clear()
         page.evaluate(
             "(async () => { const here = document.querySelector('#here'), slow = document.createElement('kcgs-image');"
             "let next = new Promise((r) => (slow.onprogress = r)); slow.setAttribute('src', 'slow/scene.kcgs');"
             "here.replaceChildren(slow); await next; slow.remove(); here.append(slow); window.image = slow; })()"
         )
-        Handler.rest.set()
+        Handler.release.set()
         page.do("wait", expression="image.scene?.complete === true")
         page.evaluate("(image.remove(), image.setAttribute('src', 'none.kcgs'), document.body.append(image), 1)")
         page.do("wait", expression="image.scene === null")
@@ -284,19 +282,18 @@ class TestElement:
         assert page.do("requests") == [site[1] + name for name in ("", "kcgs-image.js", "scene.kcgs")]
 
     def test_a_file_that_ends_early_shows_what_is_whole(self, page: Browser, site: tuple[Path, str]) -> None:
-        data = encode(load(MODELS / "chelsea-500" / "scene.safetensors"))
-        show(page, site, data[: len(data) * 3 // 4])
+        show(page, site, layered_file()[: len(layered_file()) * 3 // 4])
         assert [name for name, _ in page.evaluate("kcgs.events")] == ["progress", "error"]
         assert "ends early" in page.evaluate("kcgs.events.at(-1)[1]")
         assert page.evaluate("[image.scene.complete, image.shadowRoot.firstChild.hidden]") == [False, False]
         assert pixels(page, (300, 451)).std() > 0.1
 
-    @pytest.mark.parametrize(("src", "says"), [("none.kcgs", "404"), ("index.html", 'must start with "kcgs"')])
-    def test_the_fallback_stays(self, page: Browser, src: str, says: str) -> None:
+    @pytest.mark.parametrize(("src", "words"), [("none.kcgs", "404"), ("index.html", 'must start with "kcgs"')])
+    def test_the_fallback_stays(self, page: Browser, src: str, words: str) -> None:
         inside = "<p>instead</p>"
         page.evaluate(f"kcgs.show({json.dumps(f'<kcgs-image src={src}>{inside}</kcgs-image>')})")
         name, message = page.evaluate("kcgs.events.at(-1)")
-        assert name == "error" and says in message
+        assert name == "error" and words in message
         assert page.evaluate("image.querySelector('p').offsetHeight") > 0
 
     def test_keyboard_wheel_and_touch(self, page: Browser, site: tuple[Path, str]) -> None:
@@ -364,14 +361,14 @@ class TestSources:
 
     def test_the_page_that_python_has_is_the_one_that_is_built(self, node_modules: Path, tmp_path: Path) -> None:
         build("build:page", "--", "--outDir", str(tmp_path))
-        fresh, ours = (folder.joinpath("page.js").read_text() for folder in (tmp_path, PAGE))
-        assert fresh == ours, "run npm --prefix export/web run build:page, and commit kcgs/page/page.js"
+        built, committed = (folder.joinpath("page.js").read_text() for folder in (tmp_path, PAGE))
+        assert built == committed, "run npm --prefix export/web run build:page, and commit kcgs/page/page.js"
 
     def test_the_package(self, node_modules: Path, tmp_path: Path) -> None:
         build("build:element")
-        done = npm("pack", "--prefix", "element", "--json", "--pack-destination", str(tmp_path), "./element")
-        assert done.returncode == 0, done.stdout + done.stderr
-        (packed,) = json.loads(done.stdout)
+        (packed,) = json.loads(
+            check_npm("pack", "--prefix", "element", "--json", "--pack-destination", str(tmp_path), "./element")
+        )
         names = {file["path"] for file in packed["files"]}
         assert {"package.json", "README.md", "dist/kcgs-image.js", "dist/types/element/index.d.ts"} <= names
         assert not any(name.endswith((".ts",)) and not name.endswith(".d.ts") for name in names)

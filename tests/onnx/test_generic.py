@@ -22,6 +22,7 @@ from kcgs.kernels.whitened import support_radius
 from kcgs.onnx import describe_decoder, generic_decoder
 
 ERROR = {0.0: 1e-4, 1e-6: 1e-4, 1e-4: 1e-3}  # allowed, by cutoff
+SIDE = 300
 
 
 @cache
@@ -68,11 +69,11 @@ def blobs(size: tuple[int, int], regions: int, seed: int = 0) -> Tensor:
 
 
 def make_field(
-    count: int, size: tuple[int, int], labels: Tensor, channels: int = 3, seed: int = 0, sigma: float | None = None
+    count: int, size: tuple[int, int], labels: Tensor, channels: int = 3, sigma: float | None = None
 ) -> GaussianField:
     """Slanted Gaussians of many widths, colours of both signs."""
-    generator = torch.Generator().manual_seed(seed)
-    field = GaussianField.random(count, size, channels=channels, regions=labels, seed=seed, sigma=sigma)
+    generator = torch.Generator().manual_seed(0)
+    field = GaussianField.random(count, size, channels=channels, regions=labels, seed=0, sigma=sigma)
     with torch.no_grad():
         field.cholesky *= (0.5 * torch.randn(count, 3, generator=generator)).exp()
         field.cholesky.clamp_(min=0.3)
@@ -86,64 +87,56 @@ def one(mean: tuple[float, float], cholesky: tuple[float, float, float], size: t
     return GaussianField(*tensors, torch.zeros(1, dtype=torch.int64), size=size)
 
 
-def needle(mean: tuple[float, float], angle: float, long: float, short: float, size: tuple[int, int]) -> GaussianField:
+def needle(angle: float, along: float) -> GaussianField:
+    """A needle of 300 x 0.3 pixels; `along` moves it by its length."""
     c, s = math.cos(angle), math.sin(angle)
+    long, short = 300.0, 0.3
     l11 = math.hypot(c * long, s * short)
-    return one(mean, (l11, c * s * (long**2 - short**2) / l11, long * short / l11), size)
+    mean = (150.3 + along * long * c, 149.8 + along * long * s)
+    return one(mean, (l11, c * s * (long**2 - short**2) / l11, long * short / l11), (SIDE, SIDE))
 
 
 class TestAgainstRenderer:
-    @pytest.mark.parametrize("softness", [0.0, 1.2])
-    @pytest.mark.parametrize("cutoff", [0.0, 1e-6, 1e-4])
     @pytest.mark.parametrize(
-        ("count", "regions", "channels", "size"),
+        ("count", "regions", "channels", "size", "cutoff", "softness"),
         [
-            (1, 1, 3, (1, 1)),
-            (5, 2, 1, (1, 50)),
-            (1, 3, 4, (50, 1)),
-            (7, 1, 3, (32, 32)),
-            (65, 1, 3, (33, 31)),
-            (64, 5, 1, (37, 53)),
-            (300, 50, 3, (64, 96)),
-            (1000, 6, 4, (37, 53)),
-            (1000, 12, 3, (130, 97)),
+            (1, 1, 3, (1, 1), 1e-4, 0.0),
+            (5, 2, 1, (1, 50), 1e-6, 1.2),
+            (1, 3, 4, (50, 1), 0.0, 0.0),
+            (7, 1, 3, (32, 32), 1e-6, 0.0),
+            (65, 1, 3, (33, 31), 0.0, 0.0),
+            (64, 5, 1, (37, 53), 1e-4, 1.2),
+            (300, 50, 3, (64, 96), 0.0, 1.2),
+            (1000, 6, 4, (37, 53), 1e-6, 0.0),
+            (1000, 12, 3, (130, 97), 1e-4, 1.2),
+            (500, 200, 3, (37, 53), 1e-4, 0.0),
+            (10_000, 50, 3, (480, 854), 1e-4, 0.0),
         ],
     )
     def test_sizes_numbers_and_regions(
         self, count: int, regions: int, channels: int, size: tuple[int, int], cutoff: float, softness: float
     ) -> None:
         labels = blobs(size, regions, seed=count)
-        field, shown = make_field(count, size, labels, channels), RegionMap.from_labels(labels, softness)
-        want = render(field, shown, cutoff)
-        assert want.abs().max() > 1e-3
-        assert (decode(field, shown, cutoff) - want).abs().max() < ERROR[cutoff]
+        field, regions_map = make_field(count, size, labels, channels), RegionMap.from_labels(labels, softness)
+        expected = render(field, regions_map, cutoff)
+        assert expected.abs().max() > 1e-3
+        assert (decode(field, regions_map, cutoff) - expected).abs().max() < ERROR[cutoff]
 
-    @pytest.mark.parametrize(("cutoff", "regions"), [(1e-4, 50), (1e-6, 1)])
-    def test_a_photo_of_ten_thousand(self, cutoff: float, regions: int) -> None:
-        size = (480, 854)
-        labels = blobs(size, regions)
-        assert len(labels.unique()) == regions
-        field, shown = make_field(10_000, size, labels), RegionMap.from_labels(labels)
-        want = render(field, shown, cutoff)
-        assert (decode(field, shown, cutoff) - want).abs().max() < ERROR[cutoff]
-
-    @pytest.mark.parametrize("cutoff", [1e-6, 1e-4])
-    @pytest.mark.parametrize("angle", [0.0, 0.3, math.pi / 4, math.pi / 2, 2.0])
-    @pytest.mark.parametrize("along", [0.0, 2.5])
+    @pytest.mark.parametrize(
+        ("angle", "along", "cutoff"),
+        [(0.0, 0.0, 1e-6), (0.3, 2.5, 1e-6), (math.pi / 4, 0.0, 1e-4), (math.pi / 2, 2.5, 1e-4), (2.0, 0.0, 1e-6)],
+    )
     def test_needles(self, angle: float, along: float, cutoff: float) -> None:
-        """Anisotropy 1,000, also where the picture shows one end alone."""
-        size = (300, 300)
-        mean = (150.3 + along * 300 * math.cos(angle), 149.8 + along * 300 * math.sin(angle))
-        field, regions = needle(mean, angle, 300.0, 0.3, size), one_region(size)
-        want = render(field, regions, cutoff)
-        assert want.max() > (0.3 if along == 0.0 else 0.01)
-        assert (decode(field, regions, cutoff) - want).abs().max() < ERROR[cutoff]
+        """Anisotropy 1,000, also where the image shows one end alone."""
+        field, regions = needle(angle, along), one_region((SIDE, SIDE))
+        expected = render(field, regions, cutoff)
+        assert expected.max() > (0.3 if along == 0.0 else 0.01)
+        assert (decode(field, regions, cutoff) - expected).abs().max() < ERROR[cutoff]
 
-    @pytest.mark.parametrize("cutoff", [0.0, 1e-6, 1e-4])
+    @pytest.mark.parametrize("cutoff", [0.0, 1e-4])
     @pytest.mark.parametrize(
         ("mean", "cholesky"),
         [
-            ((20.5, 20.5), (0.3, 0.0, 0.3)),
             ((20.5, 20.5), (0.05, 0.0, 0.05)),  # one pixel
             ((20.0, 20.0), (0.05, 0.0, 0.05)),  # between pixels
             ((20.0, 20.0), (1e5, 0.0, 1e5)),
@@ -155,27 +148,17 @@ class TestAgainstRenderer:
         ],
     )
     def test_extremes(self, mean: tuple[float, float], cholesky: tuple[float, float, float], cutoff: float) -> None:
-        size = (40, 70)
-        field, regions = one(mean, cholesky, size), one_region(size)
-        image = decode(field, regions, cutoff)
-        assert (image - render(field, regions, cutoff)).abs().max() < ERROR[cutoff]
-
-    def test_a_region_for_each_gaussian(self) -> None:
-        size = (37, 53)
-        labels = torch.randint(0, 200, size, generator=torch.Generator().manual_seed(0))
-        field, regions = make_field(500, size, labels), RegionMap.from_labels(labels)
-        want = render(field, regions)
-        assert want.abs().max() > 0.01
-        assert (decode(field, regions) - want).abs().max() < 1e-5
+        field, regions = one(mean, cholesky, (40, 70)), one_region((40, 70))
+        assert (decode(field, regions, cutoff) - render(field, regions, cutoff)).abs().max() < ERROR[cutoff]
 
     @pytest.mark.parametrize("cutoff", [1e-6, 1e-4, 0.3])
     def test_weights_below_the_cutoff_are_exactly_zero(self, cutoff: float) -> None:
         size = (40, 40)
         field, regions = one((18.3, 21.9), (3.0, 1.0, 2.0), size), one_region(size)
         image, exact = decode(field, regions, cutoff), render(field, regions, 0.0)
-        assert torch.equal(image[exact < cutoff * 0.999], torch.zeros(int((exact < cutoff * 0.999).sum())))
-        kept = exact > cutoff * 1.001
-        assert torch.allclose(image[kept], exact[kept], rtol=1e-4)
+        assert image[exact < cutoff * 0.999].abs().max() == 0
+        above = exact > cutoff * 1.001
+        assert torch.allclose(image[above], exact[above], rtol=1e-4)
         assert support_radius(cutoff, torch.float32) < 10  # so that both sets are there
 
     def test_no_gaussian_gives_black(self) -> None:
@@ -185,12 +168,12 @@ class TestAgainstRenderer:
 
     def test_clamp(self) -> None:
         labels = blobs((37, 53), 3)
-        field = make_field(50, (37, 53), labels, sigma=9.0)
+        field, regions = make_field(50, (37, 53), labels, sigma=9.0), RegionMap.from_labels(labels)
         with torch.no_grad():
             field.colors *= 30.0
-        plain = decode(field, RegionMap.from_labels(labels))
+        plain = decode(field, regions)
         assert plain.max() > 1.0 and plain.min() < 0.0
-        (clamped,) = session(clamp=True).run(None, feeds_of(field, RegionMap.from_labels(labels)))
+        (clamped,) = session(clamp=True).run(None, feeds_of(field, regions))
         assert torch.equal(torch.from_numpy(clamped[0]), plain.clamp(0, 1))
 
 
@@ -202,16 +185,16 @@ def all_nodes(graph: onnx.GraphProto) -> Iterator[onnx.NodeProto]:
                 yield from all_nodes(attribute.g)
 
 
-class TestGraph:
+class TestModel:
     def test_checked_scatter_free_and_small(self) -> None:
         model = generic_decoder()
         onnx.checker.check_model(model, full_check=True)
         operators = {node.op_type for node in all_nodes(model.graph)}
         assert {"Loop", "Exp", "MatMul"} <= operators
         assert not any(name.startswith("Scatter") or name == "NonZero" for name in operators)
-        assert {entry.domain for entry in model.opset_import} == {""}
-        assert model.opset_import[0].version == 18
-        assert len(model.SerializeToString()) < 5_000
+        assert [(entry.domain, entry.version) for entry in model.opset_import] == [("", 18)]
+        content = model.SerializeToString(deterministic=True)
+        assert len(content) < 5_000 and content == generic_decoder().SerializeToString(deterministic=True)
 
     def test_signature(self) -> None:
         run = session()
@@ -234,11 +217,7 @@ class TestGraph:
             "clamp": "false",
         }
 
-    def test_the_same_bytes_every_time(self) -> None:
-        contents = {generic_decoder().SerializeToString(deterministic=True) for _ in range(3)}
-        assert len(contents) == 1
-
-    def test_refuses(self) -> None:
+    def test_bad_cutoff(self) -> None:
         with pytest.raises(ValueError, match=r"cutoff must be in \[0, 1\); got 1.0"):
             generic_decoder(cutoff=1.0)
 
@@ -270,8 +249,8 @@ class TestMemory:
         count, size = 10_000, (480, 854)
         labels = blobs(size, 6)
         model, data = tmp_path / "generic.onnx", tmp_path / "scene.npz"
-        model.write_bytes(generic_decoder().SerializeToString())
+        onnx.save(generic_decoder(), model)
         np.savez(data, **feeds_of(make_field(count, size, labels), RegionMap.from_labels(labels)))
         command = [sys.executable, "-c", _MEASURE, str(model), str(data)]
-        grown = int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-        assert grown < 80e6
+        growth = int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        assert growth < 80e6

@@ -47,9 +47,9 @@ def run(program: Any, *inputs: Tensor) -> Tensor:
     return torch.from_numpy(session.run(None, feeds)[0])
 
 
-def assert_close(got: Tensor, want: Tensor, most: float = 1e-5) -> None:
-    assert want.abs().max() > 0.1
-    torch.testing.assert_close(got, want.detach(), rtol=0, atol=most)
+def assert_close(image: Tensor, expected: Tensor, error: float = 1e-5) -> None:
+    assert expected.abs().max() > 0.1
+    torch.testing.assert_close(image, expected.detach(), rtol=0, atol=error)
 
 
 @pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing:UserWarning")
@@ -64,16 +64,16 @@ class TestDecomposition:
     @pytest.mark.parametrize("cutoff", [0.0, 1e-2])
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     def test_without_a_map(self, cutoff: float, dtype: torch.dtype) -> None:
-        given = [t.to(dtype) for t in gaussians(2, 30, SIZE)[:3]]
-        args = (*given, None, None, None, *SIZE, cutoff, "reference")
+        tensors = [t.to(dtype) for t in gaussians(2, 30, SIZE)[:3]]
+        args = (*tensors, None, None, None, *SIZE, cutoff, "reference")
         assert decompose(*args).dtype == dtype
         assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
 
     def test_a_map_for_each_image_of_large_ids(self) -> None:
         labels = torch.stack([labels_of(SIZE), labels_of(SIZE).flip(1)]) << 40
-        given = gaussians(2, 30, SIZE)
-        given[3] <<= 40
-        args = (*given, labels, None, *SIZE, 1e-4, "reference")
+        tensors = gaussians(2, 30, SIZE)
+        tensors[3] <<= 40
+        args = (*tensors, labels, None, *SIZE, 1e-4, "reference")
         assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
 
     def test_no_gaussians(self) -> None:
@@ -104,30 +104,30 @@ class TestDecomposition:
 
     def test_memory_is_that_of_a_chunk_and_the_image(self, monkeypatch: pytest.MonkeyPatch) -> None:
         loops = torch.ops.higher_order
-        monkeypatch.setattr(loops, "scan", lambda body, *given: generic_scan(body, *given[:2], 0, given[2]))
+        monkeypatch.setattr(loops, "scan", lambda body, carry, xs, inputs: generic_scan(body, carry, xs, 0, inputs))
         monkeypatch.setattr(loops, "while_loop", while_loop_dense)
 
         class Largest(TorchDispatchMode):
             numel = 0
 
             def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-                found = func(*args, **(kwargs or {}))
-                self.numel = max(self.numel, found.numel() if isinstance(found, Tensor) else 0)
-                return found
+                result = func(*args, **(kwargs or {}))
+                self.numel = max(self.numel, result.numel() if isinstance(result, Tensor) else 0)
+                return result
 
         size, largest = (96, 128), Largest()
-        given = gaussians(1, 400, size)
+        tensors = gaussians(1, 400, size)
         with largest:
-            decompose(*given, labels_of(size), None, *size, 1e-4, "tiled")
+            decompose(*tensors, labels_of(size), None, *size, 1e-4, "tiled")
         assert largest.numel == 64 * 32 * 32 > 3 * 96 * 128
 
     def test_compilers_and_torch_export_keep_the_operator(self, monkeypatch: pytest.MonkeyPatch) -> None:
         operator = torch.ops.kcgs.region_splat.default
         monkeypatch.setitem(torch._decomp.decomposition_table, operator, None)  # not to be called
-        given = [t[0] for t in gaussians(1, 12, SIZE)]
+        tensors = [t[0] for t in gaussians(1, 12, SIZE)]
         torch._dynamo.reset()
         compiled = torch.compile(region_splat, backend="aot_eager", fullgraph=True, dynamic=True)
-        assert_close(compiled(*given, labels_of(SIZE)), region_splat(*given, labels_of(SIZE)))
+        assert_close(compiled(*tensors, labels_of(SIZE)), region_splat(*tensors, labels_of(SIZE)))
 
 
 class Predictor(nn.Module):
@@ -172,27 +172,14 @@ class TestTorchExport:
             inputs = (*gaussians(batch, count, size), torch.stack([labels_of(size).roll(k, 1) for k in range(batch)]))
             assert_close(run(session, *inputs), module(*inputs), 3e-4)  # the kernel interpolates wide Gaussians
 
-    def test_a_scene_of_soft_contours_at_sizes_that_were_not_traced(self) -> None:
+    def test_a_scene_at_sizes_below_and_above_its_own(self) -> None:
         regions = RegionMap.from_labels(labels_of(SIZE), PAIRS)
         module = Resized(Scene(GaussianField.random(40, SIZE, seed=0, regions=regions), regions)).eval()
         program = torch.onnx.export(
-            module, (torch.rand(3, 48, 60),), dynamo=True, verbose=False, dynamic_shapes=({1: "H", 2: "W"},)
+            module, (torch.rand(3, 13, 99),), dynamo=True, verbose=False, dynamic_shapes=({1: "H", 2: "W"},)
         )
         assert program is not None
-        for size in (SIZE, (90, 33)):
-            image = torch.rand(3, *size)
-            assert_close(run(program.model_proto, image), module(image), 3e-4)
-
-    @pytest.mark.parametrize("traced", [(13, 17), SIZE, (90, 99), (13, 99)])
-    def test_a_scene_at_sizes_below_and_above_its_own(self, traced: tuple[int, int]) -> None:
-        regions = RegionMap.from_labels(labels_of(SIZE), 0.7)
-        module = Resized(Scene(GaussianField.random(40, SIZE, seed=0, regions=regions), regions)).eval()
-        shapes = ({1: "H", 2: "W"},)
-        program = torch.onnx.export(
-            module, (torch.rand(3, *traced),), dynamo=True, verbose=False, dynamic_shapes=shapes
-        )
-        assert program is not None
-        for size in ((13, 17), SIZE, (90, 99), (13, 99)):
+        for size in ((13, 17), SIZE, (90, 33), (90, 99)):
             image = torch.rand(3, *size)
             assert_close(run(program.model_proto, image), module(image), 3e-4)
 

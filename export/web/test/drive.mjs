@@ -2,7 +2,7 @@
  * Drives one headless Chromium for a test in another language: a line of JSON in, a line of JSON out.
  *
  *     node drive.mjs CHROMIUM
- *     {"do": "goto", "url": "http://127.0.0.1:8000/"}    ->  {"value": null}  or  {"error": "..."}
+ *     {"do": "open", "url": "http://127.0.0.1:8000/"}    ->  {"value": null}  or  {"error": "..."}
  *
  * `evaluate` takes an expression; a Float32Array inside what it gives comes back as {"float32": base64}.
  */
@@ -60,11 +60,6 @@ const encode = (source) => `(async () => {
 })()`;
 
 const actions = {
-  goto: async ({ url }) => {
-    requests.length = problems.length = 0;
-    await page.goto(url);
-    await page.evaluate(() => window.kcgs.ready);
-  },
   open: async ({ url }) => {
     requests.length = problems.length = 0;
     await page.goto(url);
