@@ -110,6 +110,6 @@ def _prepare(arguments: Arguments, check: bool) -> tuple[SplatInputs, Steps]:
             region_index = membership = None
     inputs = SplatInputs(*arguments[:3], region_index, membership, arguments.size, arguments.cutoff)
     steps = resolve(arguments.backend, inputs)
-    if check and not steps.as_given:
+    if check and not steps.checks_inputs:
         check_values(*arguments[:3])
-    return inputs if steps.as_given else inputs.with_batch(), steps
+    return inputs if steps.checks_inputs else inputs.with_batch(), steps

@@ -52,15 +52,15 @@ class Steps(NamedTuple):
     differentiate: from (plan, inputs, gradient of the image, geometry) to the gradients of means, cholesky and colors;
         the first two are None unless `geometry`.
     image: from the inputs to the image, with a graph of all orders; None: the kernel is differentiable once.
-    as_given: Gaussians of one image may come without B, and so do the results; and `plan` raises OutOfRangeError.
-        Else B is there, and values have been checked.
+    checks_inputs: `plan` raises OutOfRangeError, and Gaussians of one image may come without B, as do the results then;
+        else values have been checked, and B is there.
     """
 
     plan: Callable[[SplatInputs], Any]
     render: Callable[[Any, SplatInputs], Tensor]
     differentiate: Callable[[Any, SplatInputs, Tensor, bool], Gradients]
     image: Callable[[SplatInputs], Tensor] | None = None
-    as_given: bool = False
+    checks_inputs: bool = False
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Coarse grids: which Gaussian is on which, that backends agree, and that gradients are those of what is rendered."""
+"""Coarse grids: the level of each Gaussian, agreement of backends, gradients."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CUTOFF = 1e-4
 def make_inputs(
     size: tuple[int, int] = (110, 150), *, n: int = 40, batch: int = 1, maps: int = 0, softness: float = 0.0
 ) -> SplatInputs:
-    """Scatter Gaussians of half a pixel to twice the image, around and in it; ids that the map has not, too."""
+    """Scatter Gaussians of half a pixel to twice the image, around and in it; some of no region of the map."""
     generator = torch.Generator().manual_seed(0)
     height, width = size
     means = (torch.rand(batch, n, 2, generator=generator) * 1.2 - 0.1) * torch.tensor([width, height])
@@ -81,7 +81,7 @@ def test_one_gaussian_of_each_level() -> None:
     assert_close(render(tiled, inputs), render(cpu, inputs), 2e-6)
 
 
-def test_what_is_narrow_costs_nothing() -> None:
+def test_narrow_gaussians_have_no_grids() -> None:
     inputs = make_inputs(maps=1)._replace(cholesky=torch.tensor([1.9, 0.0, 1.9]).expand(1, 40, 3))
     assert list_pairs(inputs).wide is None
     assert list_pairs(make_inputs(maps=1)._replace(cutoff=0.0)).wide is None
@@ -120,7 +120,7 @@ def test_splines_of_one_are_one() -> None:
     inputs = make_inputs((150, 110))._replace(cholesky=torch.tensor([1e3, 0.0, 1e3]).expand(1, 40, 3))
     pairs = list_pairs(inputs)
     assert pairs.wide is not None
-    # nodes of the coarsest grid alone: each level hands on what it is handed
+    # nodes of the coarsest grid alone
     plan, levels = pairs.wide.nodes, len(grids_of(inputs.size, 1))
     assert pairs.wide.gaussians.level.unique().tolist() == [levels - 1]
     nodes = torch.zeros(plan.live + 1, 1, 16, 16, dtype=torch.float64)

@@ -77,12 +77,12 @@ def inputs(dtype: torch.dtype = torch.float32) -> SplatInputs:
     return SplatInputs(*arrays, None, None, (4, 5), 0.0)
 
 
-def test_float64_is_refused() -> None:
+def test_float64() -> None:
     with pytest.raises(ValueError, match="backend 'cuda' computes in float32; got torch.float64: use 'tiled'"):
         cuda.steps(inputs(torch.float64))
 
 
-def test_cpu_is_refused() -> None:
+def test_cpu() -> None:
     with pytest.raises(ValueError, match="backend 'cuda' needs tensors on a CUDA device; got cpu"):
         cuda.steps(inputs())
 
@@ -96,7 +96,7 @@ def test_auto_takes_tiled_and_warns_once() -> None:
     assert registry._choose("cuda", devices[0], torch.float32) == "cuda"
 
 
-def test_missing_triton_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_triton(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda, "triton", None)
     on_a_gpu = inputs()._replace(means=SimpleNamespace(dtype=torch.float32, device=torch.device("cuda")))
     with pytest.raises(ImportError, match="backend 'cuda' needs Triton: pip install triton"):

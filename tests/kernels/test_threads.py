@@ -1,4 +1,4 @@
-"""Who gets the threads while short operations of torch and the kernels take turns."""
+"""Threads of torch and of the kernels while their short operations take turns."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LABELS = (torch.arange(32) >= 20).long().expand(SIZE)
 
 
 @pytest.fixture
-def three() -> Iterator[None]:
+def three_threads() -> Iterator[None]:
     """Have torch take three threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(3)
@@ -33,16 +33,16 @@ def scene() -> Scene:
     return Scene(GaussianField.random(30, SIZE, regions=LABELS, seed=0), LABELS)
 
 
-@pytest.mark.usefixtures("three")
+@pytest.mark.usefixtures("three_threads")
 class TestThreads:
-    def test_the_kernels_have_torch_s(self) -> None:
+    def test_kernels_have_all(self) -> None:
         with threads_for_kernels(24 * 32):
             with threads_for_kernels(24 * 32):
                 assert (torch.get_num_threads(), num_threads()) == (1, 3)
             assert (torch.get_num_threads(), num_threads()) == (1, 3)
         assert torch.get_num_threads() == num_threads() == 3
 
-    def test_torch_keeps_its_own_on_large_images(self) -> None:
+    def test_torch_has_all_on_large_images(self) -> None:
         with threads_for_kernels(1 << 22):
             assert torch.get_num_threads() == num_threads() == 3
 
@@ -56,15 +56,15 @@ class TestThreads:
             ("kcgs.rate.compress.psnr", lambda: compress(scene(), torch.rand(3, *SIZE), target_psnr=5.0)),
         ],
     )
-    def test_what_is_held(self, monkeypatch: pytest.MonkeyPatch, name: str, work: Callable[[], Any]) -> None:
+    def test_short_operations(self, monkeypatch: pytest.MonkeyPatch, name: str, work: Callable[[], Any]) -> None:
         threads: list[tuple[int, int]] = []
         module, _, inner = name.rpartition(".")
         function = getattr(import_module(module), inner)
 
-        def watched(*arguments: Any, **settings: Any) -> Any:
+        def record(*arguments: Any, **settings: Any) -> Any:
             threads.append((torch.get_num_threads(), num_threads()))
             return function(*arguments, **settings)
 
-        monkeypatch.setattr(import_module(module), inner, watched)
+        monkeypatch.setattr(import_module(module), inner, record)
         work()
         assert set(threads) == {(1, 3)} and torch.get_num_threads() == 3

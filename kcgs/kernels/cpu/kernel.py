@@ -36,7 +36,7 @@ def steps(inputs: SplatInputs) -> Steps:
         raise ValueError(f"backend 'cpu' computes in float32; got {inputs.means.dtype}: use 'tiled' or 'reference'")
     if inputs.means.device.type != "cpu":
         raise ValueError(f"backend 'cpu' needs tensors on the CPU; got {inputs.means.device}")
-    return Steps(plan, render, differentiate, as_given=True)
+    return Steps(plan, render, differentiate, checks_inputs=True)
 
 
 def plan(inputs: SplatInputs) -> _Plan:
