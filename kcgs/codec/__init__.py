@@ -1,6 +1,6 @@
 """The compressed file `.kcgs`, of a scene or of a label map; docs/format.md specifies it."""
 
-from .maps import decode_labels, encode_labels
+from .label_files import decode_labels, encode_labels
 from .rangecoder import CodecError
 from .scenes import Decoded, decode, encode
 

@@ -195,6 +195,7 @@ class TestDamagedMaps:
             (forge_map(0, b"\0\1", b""), r"height must be in \[1, 1048576\]; got 0"),
             (forge_map(0, b"\x80\x80\x40\x80\x80\x40", b""), "at most 67108864 pixels; got 1048576 x 1048576"),
             (forge_map(0, b"\1", b""), "the file ends early"),
+            (forge_map(0, b"\1\1", b"\xff" * 4), "at most 1 regions; got 16777216 or more"),
         ],
     )
     def test_headers(self, data: bytes, match: str) -> None:
@@ -210,18 +211,11 @@ class TestDamagedMaps:
         with pytest.raises(CodecError, match=r"ids of uint8 must be at most 255; got 1000"):
             decode_labels(forge_map(data[4] % 8 + 8, data[5:8], data[8:-4]))
 
-    @pytest.mark.parametrize(
-        ("count", "match"), [(1 << 20, "at most 262145 regions; got 1048576"), (1 << 24, "got 16777216 or more")]
-    )
-    def test_many_regions_of_few_bytes(self, count: int, match: str) -> None:
+    def test_many_regions_of_few_bytes(self) -> None:
         """They cost neither time nor memory."""
         writer = Writer()
-        writer_count = min(count, (1 << 24) - 1)
-        _code_count(writer, writer_count, count)
-        if count > writer_count:
-            writer = Writer()
-            writer.plain_bits((1 << 24) - 1, 24)
-        with pytest.raises(CodecError, match=match):
+        _code_count(writer, 1 << 20, 1 << 20)
+        with pytest.raises(CodecError, match="at most 262145 regions; got 1048576"):
             decode_labels(forge_map(0, b"\x80\x10\x80\x10", writer.finish()))
 
     def test_in_place_of_a_scene(self, files: list[bytes], tmp_path: Path) -> None:
@@ -271,10 +265,10 @@ class ForgedOccupancy(OccupancyCoder):
 class ForgedLayers(LayerCoder):
     """Names any classes of size, but few Gaussians of each."""
 
-    def _code_counts(self, coder: Any, codes: Any) -> Any:
+    def _code_counts(self, coder: Any, sizes: Any) -> Any:
         counts = np.zeros(64, np.int64)
         counts[coder._generator.choice([0, 1, 20, 35, 36], 2)] = coder._generator.integers(1, 80, 2)
-        return super()._code_counts(coder, SimpleNamespace(size=np.repeat(np.arange(64), counts) - 8))
+        return super()._code_counts(coder, np.repeat(np.arange(64), counts) - 8)
 
 
 def forge(header: Header, generator: np.random.Generator) -> bytes:
@@ -295,7 +289,7 @@ def forge(header: Header, generator: np.random.Generator) -> bytes:
 
 def test_any_number_that_a_file_can_hold() -> None:
     generator, num_valid = np.random.default_rng(0), 0
-    for _ in range(120):
+    for _ in range(70):
         energies = np.unique(generator.choice([-24, -23, 0, 5, 39, 40], 3))[::-1]
         size = [(1, 1), (7, 9), (300, 400), (1, 1 << 20), (1 << 20, 1 << 20)][generator.integers(5)]
         qp, channels = generator.choice([-512, 0, 300, 1023]), generator.choice([1, 3, 4, 20])
@@ -303,7 +297,7 @@ def test_any_number_that_a_file_can_hold() -> None:
         if data:
             assert_valid(decode(data))
             num_valid += 1
-    assert num_valid > 20
+    assert num_valid > 10
 
 
 def write_counts(first: int, count: int, writer: Writer | None = None) -> Writer:
@@ -335,7 +329,7 @@ def test_a_ratio_beyond_all() -> None:
     writer, zero = write_counts(5, 1), np.zeros(1, np.int64)
     model = LayerCoder(Quantizer(-512, (9, 9)), 1, None)
     model._occupancy.code(writer, -3, 1, np.zeros((1, 2), np.int64))
-    model._magnitudes[-1].code(writer, np.ones(1), zero, zero, zero + (1 << 23))
+    model._ratio.code(writer, np.ones(1), zero, zero, zero + (1 << 23))
     refuse(writer, "a ratio must be at most 0 steps", qp=-512, energy=-24)
 
 
@@ -396,7 +390,7 @@ def test_too_many_gaussians() -> None:
     model = LayerCoder(quantizer, 1, None)
     model._code_group(writer, 0, make_group(quantizer, 0), 5)
     writer.number(1, 3)
-    model._code_counts(writer, SimpleNamespace(size=np.zeros(5000, np.int64)))  # type: ignore[arg-type]
+    model._code_counts(writer, np.zeros(5000, np.int64))
     layer = writer.finish()
     with pytest.raises(CodecError, match=f"a layer must hold at most {8 * len(layer) + 64 - 5} Gaussians; got 5000"):
         decode(pack(Header((9, 9), 1, 0, 1, ((0, len(layer)),)), b"", [layer]))
@@ -479,7 +473,7 @@ def write_cells(size: tuple[int, int], count: int) -> tuple[bytes, list[tuple[in
     return writer.finish(), classes
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 3000), (3000, 1), (3, 1000), (1024, 1024), (1, 1 << 20), (1 << 20, 1)])
+@pytest.mark.parametrize("size", [(1, 1), (1, 3000), (3000, 1), (3, 1000), (1024, 1024), (1, 1 << 17)])
 def test_cells_of_any_shape(size: tuple[int, int]) -> None:
     data, classes = write_cells(size, min(40_000, size[0] * size[1]))
     reader, decoder = Reader(data), OccupancyCoder(size)

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from kcgs.cli import main
 from kcgs.codec import decode_labels, encode_labels
+from kcgs.codec.label_files import turned, turned_back
 from kcgs.codec.labels import pixels
-from kcgs.codec.maps import turned, turned_back
 from kcgs.data import load_labels, save_labels
 
 from .conftest import make_labels

@@ -1,13 +1,11 @@
 """Train the tables of the label model, `kcgs/codec/labels/prior.bin` and `prior2.bin`, on label maps.
 
     python tests/codec/train_prior.py MAP... -o prior.bin [--photos PHOTO...] [--units 48 16] [--steps 8000] [--seed 0]
-    python tests/codec/train_prior.py --compare prior2.bin MAP...
 
 Maps are files that `kcgs.data.load_labels` reads. Of each of the photos, and of scikit-image's, segmentations are made,
 of the whole size and of half, and smoothed ones. Synthetic shapes are added. Each map is coded, also mirrored and
 turned. Its coded pixels are the examples: the features of a pixel, and which candidate it has. A network with the
-format's rounding is trained on them by Adam and written as integers. `--compare` codes maps as files with the
-tables that kcgs has and with those of a file, and prints the bytes of both.
+format's rounding is trained on them by Adam and written as integers.
 
 The tables must not change, since all files depend on them. Those of files of maps, `prior2.bin`, were made by
 
@@ -21,10 +19,7 @@ The starting weights of the mixer were found by trying and are kept.
 from __future__ import annotations
 
 import argparse
-import shutil
-import subprocess
 import sys
-import tempfile
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -34,7 +29,6 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-import kcgs
 from benchmarks.core.images import load
 from kcgs.codec.labels.contexts import TEMPLATE, layout
 from kcgs.codec.labels.wavefront import advance, new_scan, survey
@@ -49,29 +43,17 @@ PHOTOS = ("astronaut", "chelsea", "coffee", "rocket")
 METHODS = ("auto", "kmeans", "felzenszwalb", "slic", "watershed")
 SMOOTH = (0.7, 1.0, 1.5, 2.0, 3.0)
 UNIT = 64  # weights and activations are whole 1 / UNIT
-_MEASURE = """
-import sys
-from kcgs.codec import encode_labels
-from kcgs.data import load_labels
-for path in sys.argv[1:]:
-    print(len(encode_labels(load_labels(path))))
-"""
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("maps", nargs="*", type=Path, metavar="MAP")
-    action = parser.add_mutually_exclusive_group(required=True)
-    action.add_argument("-o", "--output", type=Path)
-    action.add_argument("--compare", type=Path, metavar="PRIOR")
+    parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--photos", nargs="*", type=Path, default=[], metavar="PHOTO")
     parser.add_argument("--units", nargs=2, type=int, default=(48, 16))
     parser.add_argument("--steps", type=int, default=8000)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
-    if options.compare:
-        compare(options.compare.read_bytes(), options.maps)
-        return
     maps = [load_labels(path).numpy() for path in options.maps]
     if options.photos:
         photos = [load_image(path) for path in options.photos]
@@ -198,30 +180,6 @@ def pack(parameters: list[Tensor]) -> bytes:
     return b"".join(
         table.astype(kind).tobytes() for table, (kind, _) in zip(tables, layout(*whole[2].shape), strict=True)
     )
-
-
-def compare(prior: bytes, maps: list[Path]) -> None:
-    """Print the bytes of maps with the tables that kcgs has, and with others."""
-    package = Path(kcgs.__file__).parent
-    with tempfile.TemporaryDirectory() as folder:
-        shutil.copytree(package, Path(folder) / "kcgs")
-        (Path(folder) / "kcgs" / "codec" / "labels" / "prior2.bin").write_bytes(prior)
-        sizes = [measure(root, maps) for root in (package.parent, Path(folder))]
-    for path, present, other in zip(maps, *sizes, strict=True):
-        print(f"{path}: {present} {other}")
-    print(f"all: {sum(sizes[0])} {sum(sizes[1])}, {100 * (sum(sizes[1]) / sum(sizes[0]) - 1):+.1f} %")
-
-
-def measure(root: Path, maps: list[Path]) -> list[int]:
-    """Code maps in a process of its own, whose loops hold the tables of the kcgs at `root`."""
-    command = [
-        sys.executable,
-        "-c",
-        f"import sys; sys.path.insert(0, {str(root)!r}){_MEASURE}",
-        *(str(path.resolve()) for path in maps),
-    ]
-    result = subprocess.run(command, capture_output=True, text=True, check=True, cwd=root)
-    return [int(line) for line in result.stdout.split()]
 
 
 if __name__ == "__main__":

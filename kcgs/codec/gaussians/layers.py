@@ -38,6 +38,7 @@ _PRESENT = 1  # a group of the next energy down
 _ABSENT = 2  # no group of that energy
 Group = tuple[Codes, Integers]
 """Gaussians of one energy, and the positions of their regions' ids."""
+_UNKNOWN: Any = (Codes(*[None] * len(Codes._fields)), None)  # type: ignore[arg-type]  # a group that is to be read
 
 
 class LayerCoder:
@@ -46,7 +47,7 @@ class LayerCoder:
     def __init__(self, quantizer: Quantizer, channels: int, regions: RegionMap | None) -> None:
         self.quantizer, self.channels, self.regions = quantizer, channels, regions
         self.num_regions = 1 if regions is None else regions.num_regions
-        self._magnitudes = [AdaptiveMagnitude(shapes) for shapes in SHAPES]
+        *self._colors, self._ratio = (AdaptiveMagnitude(shapes) for shapes in SHAPES)  # grey, hue, hue2
         self._angle = AdaptiveAngle(ANGLE)
         self._strays = AdaptiveSymbol(_STRAY_WEIGHTS)
         self._count = AdaptiveNumber(_COUNT_WEIGHTS)
@@ -67,26 +68,19 @@ class LayerCoder:
         symbol = _PRESENT
         while symbol != _END:
             if symbol == _PRESENT:
-                coded.append(
-                    self._code_group(coder, energy, None if remaining is None else remaining.pop(0), max_count)
-                )
+                group = _UNKNOWN if remaining is None else remaining.pop(0)
+                coded.append(self._code_group(coder, energy, group, max_count))
                 max_count -= len(coded[-1][1])
             energy -= 1
-            if remaining is not None:
-                symbol = _ABSENT if remaining else _END
-                if remaining and remaining[0][0].energy[0] == energy:
-                    symbol = _PRESENT
-            symbol = coder.number(symbol, 3)
+            symbol = coder.number(_next_symbol(remaining, energy), 3)
             if symbol != _END and energy < ENERGIES[0]:
                 raise CodecError(f"a class of energy must be at least {ENERGIES[0]}; got {energy}")
         return coded
 
-    def _code_group(
-        self, coder: Coder, energy: int, group: Group | None, max_count: int
-    ) -> tuple[Parameters, Integers]:
+    def _code_group(self, coder: Coder, energy: int, group: Group, max_count: int) -> tuple[Parameters, Integers]:
         """Code at most `max_count` Gaussians of one energy."""
-        codes, ids = (None, None) if group is None else group
-        counts = self._code_counts(coder, codes)
+        codes, ids = group
+        counts = self._code_counts(coder, codes.size)
         if counts.sum() > max_count:
             raise CodecError(f"a layer must hold at most {max_count} Gaussians; got {counts.sum()}")
         if counts[SIZES[1] - SIZES[0] + 1 :].any():
@@ -96,7 +90,7 @@ class LayerCoder:
         cells, start = [], 0
         for size in np.flatnonzero(counts)[::-1].tolist():
             end = start + int(counts[size])
-            cell = None if codes is None else codes.cell[start:end]
+            cell = None if codes.cell is None else codes.cell[start:end]
             cells.append(self._occupancy.code(coder, size + SIZES[0], end - start, cell))
             start = end
         size = np.repeat(np.arange(_NUM_CLASSES)[::-1], counts[::-1]) + SIZES[0]
@@ -104,9 +98,9 @@ class LayerCoder:
         gaussians = self._code_parameters(coder, classes, np.concatenate(cells), codes)
         return gaussians, self._code_regions(coder, gaussians.means, ids)
 
-    def _code_counts(self, coder: Coder, codes: Codes | None) -> Integers:
+    def _code_counts(self, coder: Coder, sizes: Integers | None) -> Integers:
         """Code the number of Gaussians of each class of size."""
-        counts = None if codes is None else np.bincount(codes.size - SIZES[0], minlength=_NUM_CLASSES)
+        counts = None if sizes is None else np.bincount(sizes - SIZES[0], minlength=_NUM_CLASSES)
         present = None if counts is None else np.flatnonzero(counts)
         first = int(coder.uniform(np.array([_NUM_CLASSES]), None if present is None else present[:1])[0])
         span = None if present is None else present[-1:] - first
@@ -116,29 +110,29 @@ class LayerCoder:
             coded[size] = self._count.code(coder, None if counts is None else int(counts[size]))
         return coded
 
-    def _code_parameters(self, coder: Coder, classes: Classes, cell: Integers, codes: Codes | None) -> Parameters:
+    def _code_parameters(self, coder: Coder, classes: Classes, cell: Integers, codes: Codes) -> Parameters:
         """Code all numbers but the cells."""
         steps = self.quantizer.steps(classes)
-        scale = coder.uniform(steps.num_scales, None if codes is None else codes.scale)
-        ratio = self._code_ratios(coder, classes, float(steps.ratio[0]), None if codes is None else codes.ratio)
+        scale = coder.uniform(steps.num_scales, codes.scale)
+        ratio = self._code_ratios(coder, classes, float(steps.ratio[0]), codes.ratio)
         num_angles = steps.num_angles(ratio)
-        angle = self._angle.code(coder, num_angles, None if codes is None else codes.angle)
+        angle = self._angle.code(coder, num_angles, codes.angle)
         # the amplitude at this energy, in steps of colour, where the scale is in the middle of its class
         amplitude = math.ldexp(math.sqrt(math.pi / (12.0 * self.quantizer.distortion)), int(classes.energy[0]))
         amplitudes = amplitude * exp2(OCTAVES * (0.5 - (np.arange(_LEVELS) + 0.5) / _LEVELS))
         level = (_LEVELS * scale + _LEVELS // 2) // steps.num_scales
-        colors = self._code_colors(coder, amplitudes, level, None if codes is None else codes.colors)
+        colors = self._code_colors(coder, amplitudes, level, codes.colors)
         shape = steps.shape(scale, ratio, angle / num_angles)
         places = []
         for axis, num_places in enumerate(steps.num_places(shape).T):
-            places.append(coder.uniform(num_places, None if codes is None else codes.place[:, axis]))
+            places.append(coder.uniform(num_places, None if codes.place is None else codes.place[:, axis]))
         return steps.dequantize(Codes(*classes, scale, ratio, angle, colors, cell, np.stack(places, -1)), shape)
 
     def _code_ratios(self, coder: Coder, classes: Classes, step: float, ratios: Integers | None) -> Integers:
         """Code the ratios of scales; `step` is that of the group."""
         context = np.clip(classes.size - _FIRST_RATIO_SIZE, 0, len(SHAPES.ratio) - 1)
         level = np.zeros_like(context)
-        ratio = self._magnitudes[-1].code(coder, np.array([_RATIO_SCALE / step]), level, context, ratios)
+        ratio = self._ratio.code(coder, np.array([_RATIO_SCALE / step]), level, context, ratios)
         max_ratio = math.floor(MAX_RATIO / step + 0.5)
         if (ratio > max_ratio).any():
             raise CodecError(f"a ratio must be at most {max_ratio} steps; got {ratio.max()}")
@@ -153,7 +147,7 @@ class LayerCoder:
                 last, amplitude = np.abs(channels[-1]), amplitudes[level]
                 context = (last > _MEDIUM * amplitude).astype(np.int64) + (last > _STRONG * amplitude)
             values = None if colors is None else colors[:, channel]
-            model = self._magnitudes[min(channel, 2)]
+            model = self._colors[min(channel, len(self._colors) - 1)]
             magnitude = model.code(coder, amplitudes, level, context, None if values is None else np.abs(values))
             sign = coder.uniform(1 + (magnitude > 0), None if values is None else (values < 0).astype(np.int64))
             channels.append(np.where(sign == 1, -magnitude, magnitude))
@@ -172,3 +166,10 @@ class LayerCoder:
         distance = coder.uniform(np.full(len(index), self.num_regions - 1), distance)
         coded[index] = (coded[index] + 1 + distance) % self.num_regions
         return coded
+
+
+def _next_symbol(remaining: list[Group] | None, energy: int) -> int:
+    """Return what an encoder writes after a group, before this energy; a decoder ignores it."""
+    if not remaining:
+        return _END
+    return _PRESENT if remaining[0][0].energy[0] == energy else _ABSENT
