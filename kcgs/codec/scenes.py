@@ -253,10 +253,7 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
             remaining -= len(positions)
     means, cholesky, colors = (torch.from_numpy(np.concatenate(numbers)) for numbers in zip(*parts, strict=True))
     region_ids = None if regions is None else regions.ids[torch.from_numpy(np.concatenate(ids))]
-    try:
-        field = GaussianField(means, cholesky, colors, region_ids, size=header.size)
-    except ValueError as error:
-        raise CodecError(f"the file holds no Gaussians that can be rendered: {error}") from error
+    field = GaussianField(means, cholesky, colors, region_ids, size=header.size)
     return Decoded(Scene(field, regions), len(layers), len(header.layers))
 
 

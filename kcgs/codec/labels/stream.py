@@ -52,6 +52,7 @@ def encode_stream(ids: Integers, index: Any, profile: Profile) -> bytes:
 
 
 def _start(numbered: list[int], profile: Profile, *, is_noise: bool) -> Writer:
+    """Return a writer of what precedes the pixels."""
     writer = Writer()
     profile.code_ids(writer, numbered, len(numbered))
     writer.bits(_NOISE_CHANCE, np.array([is_noise], np.int32))
