@@ -9,7 +9,7 @@ import { nearest } from "../renderer/levels.ts";
 
 export type Edit = (scene: Scene) => Scene;
 
-const FLAT = 1e3; // standard deviation of a flat Gaussian, in sides of the image
+const FLAT_SIGMA = 1e3; // standard deviation of a flat Gaussian, in sides of the image
 
 /** Colours times `gain`, a number or one for each channel, plus `bias`, exactly so in the image. */
 export function recolour(regions: ReadonlySet<number>, gain: Channels, bias: Channels | null): Edit {
@@ -21,8 +21,8 @@ export function recolour(regions: ReadonlySet<number>, gain: Channels, bias: Cha
       if (positions !== null && !regions.has(positions[i]!)) continue;
       for (let c = 0; c < channels; c++) colors[i * channels + c]! *= factors[c]!;
     }
-    const changed = { ...scene, colors };
-    return bias === null ? changed : withFlat(changed, [...regions], spread("bias", bias, channels));
+    const recoloured = { ...scene, colors };
+    return bias === null ? recoloured : withFlat(recoloured, [...regions], spread("bias", bias, channels));
   };
 }
 
@@ -38,7 +38,7 @@ function spread(name: string, value: Channels, channels: number): readonly numbe
 
 /** Add a colour to regions: one Gaussian for each, flat over the whole image. */
 function withFlat(scene: Scene, regions: readonly number[], color: readonly number[]): Scene {
-  const sigma = FLAT * Math.max(scene.width, scene.height);
+  const sigma = FLAT_SIGMA * Math.max(scene.width, scene.height);
   const add = (numbers: Float32Array, row: readonly number[]): Float32Array =>
     Float32Array.from([...numbers, ...regions.flatMap(() => row)]);
   return {
@@ -52,16 +52,16 @@ function withFlat(scene: Scene, regions: readonly number[], color: readonly numb
 }
 
 /** Move regions over whatever lies there; what they leave falls to the nearest other region. */
-export function move(moved: ReadonlySet<number>, dx: number, dy: number): Edit {
+export function move(selection: ReadonlySet<number>, dx: number, dy: number): Edit {
   return (scene) => {
     const { regions, positions } = scene;
     if (regions === null || positions === null) throw new RangeError("a scene without regions has none to move");
-    if (moved.size === regions.ids.length) throw new RangeError("ids must leave a region that does not move");
+    if (selection.size === regions.ids.length) throw new RangeError("ids must leave a region that does not move");
     if (!Number.isInteger(dx) || !Number.isInteger(dy)) {
       throw new RangeError(`dx and dy must be whole; got ${dx}, ${dy}`);
     }
-    const labels = movedLabels(regions.labels, scene.width, moved, dx, dy);
-    const means = scene.means.map((value, i) => (moved.has(positions[i >> 1]!) ? value + (i % 2 ? dy : dx) : value));
+    const labels = movedLabels(regions.labels, scene.width, selection, dx, dy);
+    const means = scene.means.map((value, i) => (selection.has(positions[i >> 1]!) ? value + (i % 2 ? dy : dx) : value));
     return { ...scene, means, regions: { ...regions, labels, pairs: pairsOf(regions, labels, scene.width) } };
   };
 }
@@ -69,30 +69,30 @@ export function move(moved: ReadonlySet<number>, dx: number, dy: number): Edit {
 function movedLabels(
   labels: Int32Array,
   width: number,
-  moved: ReadonlySet<number>,
+  selection: ReadonlySet<number>,
   dx: number,
   dy: number,
 ): Int32Array {
   const height = labels.length / width;
-  const others = labels.map((label) => (moved.has(label) ? -1 : label));
+  const others = labels.map((label) => (selection.has(label) ? -1 : label));
   const result = Int32Array.from(nearest(others, width, height, Math.max(width, height)));
   labels.forEach((label, i) => {
-    if (!moved.has(label)) return;
+    if (!selection.has(label)) return;
     const [x, y] = [(i % width) + dx, Math.floor(i / width) + dy];
     if (x >= 0 && y >= 0 && x < width && y < height) result[y * width + x] = label;
   });
   return result;
 }
 
-/** The widths of contours with other labels: those of pairs that did not touch before are the mean of all. */
+/** Contour widths of the new labels: pairs that did not touch before have the mean of all. */
 function pairsOf(map: RegionMap, labels: Int32Array, width: number): ContourWidth[] {
   if (map.softness !== null) return map.pairs;
   const regions = map.ids.length;
   const mean = map.pairs.reduce((total, pair) => total + pair.width, 0) / map.pairs.length;
-  const known = new Set([
+  const previous = new Set([
     ...touchingPairs(map.labels, width, regions),
     ...map.pairs.map(({ a, b }) => a * regions + b),
   ]);
-  const added = Array.from(touchingPairs(labels, width, regions)).filter((pair) => !known.has(pair));
+  const added = Array.from(touchingPairs(labels, width, regions)).filter((pair) => !previous.has(pair));
   return [...map.pairs, ...added.map((pair) => ({ a: Math.floor(pair / regions), b: pair % regions, width: mean }))];
 }

@@ -24,7 +24,7 @@ export interface RegionClick {
 
 // a press that moves farther, in CSS pixels, is no click
 const CLICK = 5;
-// whether the browser tells the pixels of the screen that an element covers, and when they change
+// whether the browser reports the pixels of the screen that an element covers, and when they change
 const PIXEL_BOX = "devicePixelContentBoxSize" in ResizeObserverEntry.prototype;
 
 export class KcgsImage extends HTMLElement {
@@ -35,8 +35,8 @@ export class KcgsImage extends HTMLElement {
   private readonly internals = this.attachInternals();
   private readonly fallback = document.createElement("slot");
   private readonly observer = new ResizeObserver((entries) => this.measure(entries.at(-1)!));
-  private loaded: Scene | null = null; // as it came
-  private current: Scene | null = null; // as it was edited
+  private loaded: Scene | null = null; // as the file has it
+  private current: Scene | null = null; // with edits
   private edits: Edit[] = [];
   private readonly hiddenRegions = new Set<number>(); // positions among the ids of regions
   private unread = true; // whether `src` is to be read when the element is part of a page
@@ -68,7 +68,7 @@ export class KcgsImage extends HTMLElement {
   disconnectedCallback(): void {
     this.observer.disconnect();
     this.density?.abort();
-    // what is cut off begins again
+    // an interrupted load begins again when the element comes back
     this.unread ||= this.loading !== null;
     this.loading?.abort();
     this.loading = null;
@@ -95,8 +95,8 @@ export class KcgsImage extends HTMLElement {
     this.unread = false;
     this.loading?.abort();
     this.loading = null;
-    this.forget();
-    if (scene !== null) this.take(scene);
+    this.clear();
+    if (scene !== null) this.display(scene);
   }
 
   /** What rendered last: "webgl2 float32", "webgl2 float16", "cpu", or "" before anything did. */
@@ -133,11 +133,11 @@ export class KcgsImage extends HTMLElement {
     this.edit(recolour(this.positionsOf(ids), gain, bias));
   }
 
-  /** Show the scene as it came: nothing hidden, moved or recoloured. */
+  /** Show the scene as the file has it: nothing hidden, moved or recoloured. */
   reset(): void {
     this.edits = [];
     this.hiddenRegions.clear();
-    if (this.loaded !== null) this.take(this.loaded);
+    if (this.loaded !== null) this.display(this.loaded);
   }
 
   /** Zoom about the middle; 0 shows all. */
@@ -170,13 +170,13 @@ export class KcgsImage extends HTMLElement {
     const down = height ?? Math.max(1, Math.round(across * ratio));
     const canvas = this.stage.image(across, down);
     return new Promise((resolve, reject) => {
-      const made = (blob: Blob | null): void =>
+      const settle = (blob: Blob | null): void =>
         blob === null ? reject(new Error(`no image of ${across} x ${down} can be made`)) : resolve(blob);
-      canvas.toBlob(made, type, quality);
+      canvas.toBlob(settle, type, quality);
     });
   }
 
-  /** Wait until the view rests and is rendered. */
+  /** Wait until the view no longer moves and is rendered. */
   settled(): Promise<void> {
     return this.stage.settled();
   }
@@ -185,23 +185,23 @@ export class KcgsImage extends HTMLElement {
     this.unread = false;
     this.loading?.abort();
     this.loading = null;
-    this.forget();
+    this.clear();
     const src = this.getAttribute("src");
     if (src === null || src === "") return;
     const loading = new AbortController();
     this.loading = loading;
-    const end = (tell: () => void): void => {
+    const finish = (notify: () => void): void => {
       if (loading.signal.aborted) return;
       this.loading = null;
-      tell();
+      notify();
     };
-    load(src, loading.signal, (scene) => this.take(scene)).then(
-      () => end(() => this.dispatchEvent(new Event("load"))),
-      (error: unknown) => end(() => this.fail(error as Error, this.current !== null)),
+    load(src, loading.signal, (scene) => this.display(scene)).then(
+      () => finish(() => this.dispatchEvent(new Event("load"))),
+      (error: unknown) => finish(() => this.fail(error as Error, this.current !== null)),
     );
   }
 
-  private forget(): void {
+  private clear(): void {
     this.loaded = this.current = null;
     this.edits = [];
     this.hiddenRegions.clear();
@@ -210,8 +210,8 @@ export class KcgsImage extends HTMLElement {
     this.fallback.hidden = false;
   }
 
-  /** Take a scene, or one of more layers, and edit it as the one before. */
-  private take(scene: Scene): void {
+  /** Display a scene, or one of more layers, with the edits made so far. */
+  private display(scene: Scene): void {
     const edited = this.edits.reduce((before, edit) => edit(before), scene);
     this.stage.show(edited, this.hiddenRegions);
     this.loaded = scene;
@@ -249,10 +249,10 @@ export class KcgsImage extends HTMLElement {
 
   private setDevice(value: string): void {
     this.stage.device = oneOf("renderer", value, ["auto", "webgl2", "cpu"] satisfies Device[]);
-    this.stage.want();
+    this.stage.requestRender();
   }
 
-  /** Tell of an error; where there is nothing to be seen, show what is inside of the element. */
+  /** Dispatch an error; where there is nothing to be seen, show what is inside of the element. */
   private fail(error: Error, shown: boolean): void {
     this.stage.canvas.hidden = !shown;
     this.fallback.hidden = shown;
@@ -263,10 +263,10 @@ export class KcgsImage extends HTMLElement {
   private measure(entry: ResizeObserverEntry): void {
     if (this.stage.canvas.hidden) return;
     const [size, exact] = [entry.contentBoxSize[0]!, PIXEL_BOX ? entry.devicePixelContentBoxSize[0]! : null];
-    const pixels = (length: number, told = NaN): number => {
-      const about = length * devicePixelRatio;
-      // a browser that plays another screen tells the pixels of its own
-      return Math.max(1, Math.abs(told - about) < 1 ? told : Math.round(about));
+    const pixels = (length: number, reported = NaN): number => {
+      const estimate = length * devicePixelRatio;
+      // a browser that emulates another screen reports the pixels of its own
+      return Math.max(1, Math.abs(reported - estimate) < 1 ? reported : Math.round(estimate));
     };
     this.stage.resize(pixels(size.inlineSize, exact?.inlineSize), pixels(size.blockSize, exact?.blockSize));
   }
@@ -298,7 +298,7 @@ export class KcgsImage extends HTMLElement {
     const { signal } = this.gestures;
     const wheelNeedsCtrl = this.getAttribute("zoom") === "ctrl";
     const { stage } = this;
-    this.glide = listen(stage.canvas, (event) => stage.at(event), stage, { keyboard: this, wheelNeedsCtrl, signal });
+    this.glide = listen(stage.canvas, (event) => stage.locate(event), stage, { keyboard: this, wheelNeedsCtrl, signal });
   }
 
   private listenToClicks(canvas: HTMLCanvasElement): void {
@@ -306,16 +306,16 @@ export class KcgsImage extends HTMLElement {
     canvas.addEventListener("pointerdown", (event) => (pressed = [event.clientX, event.clientY]));
     canvas.addEventListener("click", (event) => {
       if (Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) < CLICK)
-        this.pick(...this.stage.at(event));
+        this.reportRegion(...this.stage.locate(event));
     });
     this.addEventListener("keydown", (event) => {
       if (event.key !== "Enter" || event.target !== this) return;
-      this.pick(canvas.width / 2, canvas.height / 2);
+      this.reportRegion(canvas.width / 2, canvas.height / 2);
     });
   }
 
-  /** Tell of the region at a position on the canvas. */
-  private pick(x: number, y: number): void {
+  /** Dispatch `regionclick` for the region at a position on the canvas. */
+  private reportRegion(x: number, y: number): void {
     if (!this.hasAttribute("regions")) return;
     const [sceneX, sceneY] = this.stage.anchorAt(x, y).scene;
     const id = this.regionAt(sceneX, sceneY);

@@ -2,13 +2,13 @@
 
 import { type DecodeError, ProgressiveDecoder, type Scene } from "../decoder/index.ts";
 
-/** Read an address; `found` takes each scene of more whole layers. Damage is an error, after the whole layers. */
-export async function load(src: string, signal: AbortSignal, found: (scene: Scene) => void): Promise<void> {
+/** Read an address; `onScene` takes each scene of more whole layers. Damage is an error, after the whole layers. */
+export async function load(src: string, signal: AbortSignal, onScene: (scene: Scene) => void): Promise<void> {
   const decoder = new ProgressiveDecoder();
   for await (const bytes of chunks(src, signal)) {
     const scene = decoder.push(bytes);
     if (signal.aborted) return;
-    if (scene !== null) found(scene);
+    if (scene !== null) onScene(scene);
     if (decoder.error !== null) throw decoder.error satisfies DecodeError;
   }
   decoder.finish();

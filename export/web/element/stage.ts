@@ -6,18 +6,18 @@ import { paint } from "../renderer/painter.ts";
 import type { Device } from "../renderer/painter.ts";
 import { prepare } from "../renderer/prepare.ts";
 import type { Prepared } from "../renderer/software.ts";
-import type { Hands } from "./gestures.ts";
+import type { Viewport } from "./gestures.ts";
 import { anchorAt, clamp, fit, pan, visiblePart, zoomAbout } from "./view.ts";
 import type { Anchor, Size, Transform } from "./view.ts";
 
-// a view rests when it has not moved for so many milliseconds
+// a view is settled when it has not moved for so many milliseconds
 const SETTLE = 150;
 // the longest that a frame may take while the view moves, in milliseconds; a GPU's are as long as those of the screen
 const CPU_BUDGET = 40;
 const GPU_BUDGET = 20;
-const MOST_DIVISOR = 8; // of the resolution
+const MAX_DIVISOR = 8; // of the resolution, along each side, while the view moves
 
-export class Stage implements Hands {
+export class Stage implements Viewport {
   transform: Transform = { x: 0, y: 0, scale: 1 };
   contours: Contours = "scaled";
   device: Device = "auto";
@@ -38,8 +38,8 @@ export class Stage implements Hands {
 
   constructor(
     readonly canvas: HTMLCanvasElement,
-    private readonly changed: () => void,
-    private readonly failed: (error: Error) => void,
+    private readonly onChange: () => void,
+    private readonly onError: (error: Error) => void,
   ) {
     this.context = canvas.getContext("2d")!;
   }
@@ -54,12 +54,12 @@ export class Stage implements Hands {
     this.scene = scene === null ? null : prepare(scene, this.contours);
     this.hide(hidden, scene?.regions?.ids.length ?? 1);
     if (first && this.scene !== null) this.fit();
-    else this.want();
+    else this.requestRender();
   }
 
   hide(hidden: ReadonlySet<number>, regions = this.visible.length): void {
     this.visible = new Uint8Array(regions).map((_, place) => Number(!hidden.has(place)));
-    this.want();
+    this.requestRender();
   }
 
   /** Set the canvas to the pixels that it has on the screen. */
@@ -76,7 +76,7 @@ export class Stage implements Hands {
   }
 
   /** Canvas position of a pointer. */
-  at(event: { clientX: number; clientY: number }): [x: number, y: number] {
+  locate(event: { clientX: number; clientY: number }): [x: number, y: number] {
     const box = this.canvas.getBoundingClientRect();
     const ratio = this.canvas.width / Math.max(1, box.width);
     return [(event.clientX - box.left) * ratio, (event.clientY - box.top) * ratio];
@@ -103,7 +103,7 @@ export class Stage implements Hands {
     this.fitted = true;
   }
 
-  /** Wait until the view rests and is rendered. */
+  /** Wait until the view no longer moves and is rendered. */
   async settled(): Promise<void> {
     while (this.moving || this.frame !== 0) await new Promise((resolve) => setTimeout(resolve, 20));
   }
@@ -114,7 +114,7 @@ export class Stage implements Hands {
     const canvas = Object.assign(document.createElement("canvas"), { width, height });
     const view = { rect: [0, 0, this.scene.width, this.scene.height] as const, width, height };
     const context = canvas.getContext("2d")!;
-    // of a canvas that is too large browsers tell nothing: it keeps no pixels
+    // a canvas that is too large keeps no pixels, without an error
     context.fillRect(0, 0, 1, 1);
     if (context.getImageData(0, 0, 1, 1).data[3] === 0) throw new Error(`no image of ${width} x ${height} can be made`);
     paint(context, 0, 0, this.scene, { ...view, rect: [...view.rect] }, this.visible, this.device);
@@ -122,26 +122,26 @@ export class Stage implements Hands {
   }
 
   /** Render in the next frame. */
-  want(): void {
+  requestRender(): void {
     if (this.frame !== 0 || !this.measured) return;
     this.frame = requestAnimationFrame((now) => {
       this.frame = 0;
       const elapsed = now - this.lastFrame;
       const pixels = (this.canvas.width * this.canvas.height) / this.divisor ** 2;
-      if (this.moving && this.renderer !== "cpu" && elapsed < 1000) this.note(elapsed / pixels);
+      if (this.moving && this.renderer !== "cpu" && elapsed < 1000) this.recordCost(elapsed / pixels);
       this.lastFrame = now;
       this.render();
     });
   }
 
-  private note(cost: number): void {
+  private recordCost(cost: number): void {
     this.cost = this.cost === 0 ? cost : (this.cost + cost) / 2;
   }
 
   /** By how much to divide the resolution of so many pixels while the view moves. */
   private divisorFor(pixels: number): number {
-    const most = Math.sqrt((pixels * this.cost) / (this.renderer === "cpu" ? CPU_BUDGET : GPU_BUDGET));
-    return Math.min(Math.max(Math.ceil(most), 1), MOST_DIVISOR);
+    const divisor = Math.sqrt((pixels * this.cost) / (this.renderer === "cpu" ? CPU_BUDGET : GPU_BUDGET));
+    return Math.min(Math.max(Math.ceil(divisor), 1), MAX_DIVISOR);
   }
 
   private move(next: (scene: Size, canvas: Size) => Transform): void {
@@ -152,10 +152,10 @@ export class Stage implements Hands {
     clearTimeout(this.settling);
     this.settling = window.setTimeout(() => {
       this.moving = false;
-      if (this.divisor > 1) this.want();
+      if (this.divisor > 1) this.requestRender();
     }, SETTLE);
-    this.want();
-    this.changed();
+    this.requestRender();
+    this.onChange();
   }
 
   private render(): void {
@@ -177,10 +177,10 @@ export class Stage implements Hands {
         context.drawImage(this.scratch, part.x, part.y, part.width, part.height);
       }
     } catch (error) {
-      this.failed(error as Error);
+      this.onError(error as Error);
       return;
     }
     if (before !== this.renderer) this.cost = 0;
-    if (this.renderer === "cpu") this.note((performance.now() - start) / (width * height));
+    if (this.renderer === "cpu") this.recordCost((performance.now() - start) / (width * height));
   }
 }

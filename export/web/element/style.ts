@@ -1,4 +1,4 @@
-/** The element's looks. Style sheets made by script work under any Content-Security-Policy. */
+/** The element's style. Style sheets made by script work under any Content-Security-Policy. */
 
 const STYLE = `
 :host { display: inline-block; max-width: 100%; vertical-align: bottom; outline-offset: 2px; }
@@ -7,7 +7,7 @@ canvas { display: block; width: 100%; height: 100%; }
 canvas[hidden], slot[hidden] { display: none; }
 :host([zoom]) canvas { cursor: zoom-in; touch-action: pan-x pan-y; }
 :host([zoom]) canvas.near { cursor: grab; touch-action: none; }
-:host([zoom]) canvas.held { cursor: grabbing; }
+:host([zoom]) canvas.dragged { cursor: grabbing; }
 :host([regions]:not([zoom])) canvas { cursor: pointer; }
 `;
 
