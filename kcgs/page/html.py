@@ -13,7 +13,7 @@ from kcgs.functional.softness import check_contours
 from kcgs.scene import Scene, check_scene
 
 _FOLDER = Path(__file__).resolve().parent
-# against the scene's own render, in dB: no difference of a level of 255
+# PSNR in dB against the scene's own render: no value differs by a level of 255
 _QUALITY = 60.0
 
 
@@ -23,9 +23,9 @@ def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "s
     Convention: the page zooms, pans, and hides regions. It holds the scene as a `.kcgs` file and loads nothing.
 
     Args:
-        scene: of one image, with 1, 3 or 4 channels; or the bytes of its `.kcgs` file, which are kept as they are.
-        title: of the page, and what it calls the image for who does not see it.
-        contours: "scaled" or "crisp", as :meth:`kcgs.Scene.render` has them.
+        scene: of one image, with 1, 3 or 4 channels; or the bytes of its `.kcgs` file, which the page holds unchanged.
+        title: title of the page and alternative text of the image.
+        contours: "scaled" or "crisp", as :meth:`kcgs.Scene.render` takes them.
 
     Returns:
         The page, about 100 kB and 4/3 of the scene's file.
@@ -53,7 +53,7 @@ def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "s
 
 
 def web_bytes(scene: Scene | bytes) -> bytes:
-    """Write a scene as a `.kcgs` file whose render is within a level of 255 of the scene's own; a file is kept."""
+    """Encode a scene for a page, within a level of 255 of its own render; bytes of a file are checked and returned."""
     loaded = check_scene(scene) if isinstance(scene, Scene) else decode(scene).scene
     channels = loaded.field.colors.shape[-1]
     if channels not in (1, 3, 4):

@@ -13,12 +13,12 @@ export class ByteReader {
     private readonly Early: typeof DecodeError = DecodeError,
   ) {}
 
-  get left(): number {
+  get remaining(): number {
     return this.data.length - this.position;
   }
 
   take(count: number): Uint8Array {
-    if (count > this.left) throw new this.Early(`the file ends early: it has ${this.data.length} bytes`);
+    if (count > this.remaining) throw new this.Early(`the file ends early: it has ${this.data.length} bytes`);
     this.position += count;
     return this.data.subarray(this.position - count, this.position);
   }

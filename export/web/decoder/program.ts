@@ -17,7 +17,7 @@ export interface Program {
   categorical(table: number, values: number): number;
   angleBin(turns: number): number;
   openEarlier(count: number): number;
-  readNear(rows: number, columns: number, least: number, near: number, most: number): number;
+  readNear(rows: number, columns: number, base: number, near: number, capacity: number): number;
   model(tables: number, groups: number, squash: number, stretch: number): void;
   readLabels(height: number, width: number, regions: number, template: number, positions: number): number;
 }
@@ -57,7 +57,7 @@ export function startProgram(): Program {
 
 /** Put numbers into the program's memory; return where. */
 export function put({ memory, allot }: Program, array: Uint8Array | Int8Array | Int32Array): number {
-  const at = allot(array.byteLength);
-  new Uint8Array(memory.buffer, at).set(new Uint8Array(array.buffer, array.byteOffset, array.byteLength));
-  return at;
+  const address = allot(array.byteLength);
+  new Uint8Array(memory.buffer, address).set(new Uint8Array(array.buffer, array.byteOffset, array.byteLength));
+  return address;
 }

@@ -3,7 +3,7 @@
 import { ByteReader, EndOfBytes } from "./bytes.ts";
 import { crc16 } from "./checksums.ts";
 import { LayerDecoder } from "./gaussians/layers.ts";
-import { Growing } from "./growing.ts";
+import { GrowingArray } from "./growing_array.ts";
 import { type Header, mostGaussians, readHeader } from "./header.ts";
 import { readRegionMap } from "./region_map.ts";
 import { DecodeError, type RegionMap, type Scene } from "./scene.ts";
@@ -18,15 +18,15 @@ interface Opened {
 }
 
 export class ProgressiveDecoder {
-  private readonly bytes = new Growing<Uint8Array>(new Uint8Array(0));
+  private readonly bytes = new GrowingArray<Uint8Array>(new Uint8Array(0));
   private opened: Opened | null = null;
   private position = 0; // of the next layer
   private layers = 0;
   private count = 0;
-  private readonly means = new Growing<Float32Array>(new Float32Array(0));
-  private readonly cholesky = new Growing<Float32Array>(new Float32Array(0));
-  private readonly colors = new Growing<Float32Array>(new Float32Array(0));
-  private readonly regions = new Growing<Int32Array>(new Int32Array(0));
+  private readonly means = new GrowingArray<Float32Array>(new Float32Array(0));
+  private readonly cholesky = new GrowingArray<Float32Array>(new Float32Array(0));
+  private readonly colors = new GrowingArray<Float32Array>(new Float32Array(0));
+  private readonly regions = new GrowingArray<Int32Array>(new Int32Array(0));
   private scene: Scene | null = null;
   /** What was wrong with the bytes so far; what follows is not read. */
   error: DecodeError | null = null;
@@ -42,10 +42,10 @@ export class ProgressiveDecoder {
     } catch (error) {
       damage = damageOf(error);
     }
-    const more = this.layers > before;
-    if (more) this.scene = this.makeScene();
+    const hasNewLayers = this.layers > before;
+    if (hasNewLayers) this.scene = this.makeScene();
     if (damage) this.error = new DecodeError(damage.message, this.scene);
-    return more ? this.scene : null;
+    return hasNewLayers ? this.scene : null;
   }
 
   /** End the file; a DecodeError if it was damaged, or too short to be whole. */
@@ -72,8 +72,8 @@ export class ProgressiveDecoder {
         throw new DecodeError(`the file is damaged: the checksum of its layer ${this.layers + 1} is another${sound}`);
       }
       // each Gaussian takes more than a bit, and all must fit into memory
-      const most = Math.min(8 * bytes + SPARE, mostGaussians(header.channels) - this.count);
-      for (const group of layers.read(layer, energy, most)) {
+      const limit = Math.min(8 * bytes + SPARE, mostGaussians(header.channels) - this.count);
+      for (const group of layers.read(layer, energy, limit)) {
         this.means.add(group.means);
         this.cholesky.add(group.cholesky);
         this.colors.add(group.colors);

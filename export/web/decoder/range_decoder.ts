@@ -22,8 +22,8 @@ export class RangeDecoder {
 
   /** Prepare one of 24 tables of categorical symbols, by weights above 0, of at most 2,562 values. */
   prepare(table: number, weights: Float64Array): void {
-    const { memory, prepare, weights: at } = this.program;
-    new Float64Array(memory.buffer, at.value, weights.length).set(weights);
+    const { memory, prepare, weights: address } = this.program;
+    new Float64Array(memory.buffer, address.value, weights.length).set(weights);
     prepare(table, weights.length);
     this.sizes[table] = weights.length;
   }

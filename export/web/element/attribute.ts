@@ -1,6 +1,6 @@
 /** The value of an attribute; the console is told of another, which changes nothing. */
 export function oneOf<T extends string>(name: string, value: string, values: readonly T[]): T {
-  const found = values.find((one) => one === value);
-  if (found === undefined) throw new RangeError(`${name} must be one of ${values.join(", ")}; got ${value}`);
-  return found;
+  const choice = values.find((one) => one === value);
+  if (choice === undefined) throw new RangeError(`${name} must be one of ${values.join(", ")}; got ${value}`);
+  return choice;
 }

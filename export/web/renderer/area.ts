@@ -25,8 +25,8 @@ function shrink(image: Float32Array, outer: number, axis: FineAxis, inner: numbe
       const share = (Math.min(end, line + 1) - Math.max(begin, line)) / (end - begin);
       if (share <= 0) continue;
       for (let o = 0; o < outer; o++) {
-        const [to, at] = [(o * count + i) * inner, (o * axis.count + line) * inner];
-        for (let c = 0; c < inner; c++) result[to + c]! += share * image[at + c]!;
+        const [to, source] = [(o * count + i) * inner, (o * axis.count + line) * inner];
+        for (let c = 0; c < inner; c++) result[to + c]! += share * image[source + c]!;
       }
     }
   }

@@ -79,10 +79,10 @@ export class Blur {
         if (x > 0 && labels[row + x] !== labels[row + x - 1]) end = x;
       }
       for (let x = 0, changes = 0; x < width; x++) {
-        const at = row + x;
-        if (x > 0 && labels[at] !== labels[at - 1]) changes++;
+        const position = row + x;
+        if (x > 0 && labels[position] !== labels[position - 1]) changes++;
         across[(y + 1) * (width + 1) + x + 1] = across[y * (width + 1) + x + 1]! + changes;
-        if (y > 0) down[at] = down[at - width]! + Number(labels[at] !== labels[at - width]);
+        if (y > 0) down[position] = down[position - width]! + Number(labels[position] !== labels[position - width]);
       }
     }
   }
@@ -113,11 +113,11 @@ export class Blur {
     const whole = (sums[x1 - x + reach]! - sums[x0 - x + reach]!) * (sums[y1 - y + reach]! - sums[y0 - y + reach]!);
     for (let row = y0; row < y1; row++) {
       const factor = weights[Math.abs(row - y)]! / whole;
-      for (let at = x0; at < x1; ) {
-        const region = labels[row * width + at]!;
-        const end = Math.min(x1, runEnds[row * width + at]!);
-        into.add(region, factor * (sums[end - x + reach]! - sums[at - x + reach]!));
-        at = end;
+      for (let position = x0; position < x1; ) {
+        const region = labels[row * width + position]!;
+        const end = Math.min(x1, runEnds[row * width + position]!);
+        into.add(region, factor * (sums[end - x + reach]! - sums[position - x + reach]!));
+        position = end;
       }
     }
   }
@@ -135,7 +135,7 @@ export class Blur {
     ] as const) {
       if (share === 0) continue;
       const { regions, weights } = this.blurAt(column + right, row + down, kernel);
-      for (let at = 0; at < regions.length; at++) this.pixel.add(regions[at]!, share * weights[at]!);
+      for (let position = 0; position < regions.length; position++) this.pixel.add(regions[position]!, share * weights[position]!);
     }
   }
 

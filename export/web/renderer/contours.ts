@@ -44,11 +44,11 @@ function hardPixels(membership: Membership, across: FineAxis, down: FineAxis): W
 
 function largest(labels: readonly [number, number, number, number], across: number, down: number): number {
   const shares = [(1 - down) * (1 - across), (1 - down) * across, down * (1 - across), down * across];
-  let [best, most] = [labels[0], -1];
+  let [best, peak] = [labels[0], -1];
   for (const label of labels) {
     let sum = 0;
     for (let i = 0; i < 4; i++) if (labels[i] === label) sum += shares[i]!;
-    if (sum > most) [best, most] = [label, sum];
+    if (sum > peak) [best, peak] = [label, sum];
   }
   return best;
 }
@@ -61,8 +61,8 @@ function softPixels(membership: Membership, across: FineAxis, down: FineAxis): W
   const exponent = exponentOf(membership, across, down);
   const add = (writer: RunWriter, head: number, share: number): void => {
     if (head < SHARED) return writer.add(head, share);
-    for (let at = head - SHARED; lists[at] !== 0; at++) {
-      writer.add(lists[at]! >>> 16, (share * (lists[at]! & 0xffff)) / whole);
+    for (let entry = head - SHARED; lists[entry] !== 0; entry++) {
+      writer.add(lists[entry]! >>> 16, (share * (lists[entry]! & 0xffff)) / whole);
     }
   };
   return (x, y, writer) => {
@@ -118,7 +118,7 @@ class RunWriter {
   private readonly spare: Float32Array[] = [];
   private readonly runs: number[] = []; // region, row, from, to, place of weights
   private weights = new Float32Array(1 << 14);
-  private used = 0;
+  private length = 0;
   private last: Open | null = null;
 
   constructor(
@@ -181,11 +181,11 @@ class RunWriter {
       Int32Array,
     ];
     for (let i = 0; i < count; i++) {
-      const at = next[runs[5 * i]!]!++;
-      rows[at] = runs[5 * i + 1]!;
-      from[at] = runs[5 * i + 2]!;
-      to[at] = runs[5 * i + 3]!;
-      weights[at] = runs[5 * i + 4]!;
+      const entry = next[runs[5 * i]!]!++;
+      rows[entry] = runs[5 * i + 1]!;
+      from[entry] = runs[5 * i + 2]!;
+      to[entry] = runs[5 * i + 3]!;
+      weights[entry] = runs[5 * i + 4]!;
     }
     return { starts, rows, from, to, weights, shares: this.weights };
   }
@@ -206,10 +206,10 @@ class RunWriter {
   }
 
   private keep(shares: Float32Array): number {
-    const start = this.used;
-    this.used += shares.length;
-    if (this.used > this.weights.length) {
-      const larger = new Float32Array(2 * this.used);
+    const start = this.length;
+    this.length += shares.length;
+    if (this.length > this.weights.length) {
+      const larger = new Float32Array(2 * this.length);
       larger.set(this.weights);
       this.weights = larger;
     }
@@ -219,8 +219,8 @@ class RunWriter {
 }
 
 function sharpen(shares: number[], exponent: number): void {
-  let [most, total] = [0, 0];
-  for (const share of shares) most = Math.max(most, share);
-  for (let i = 0; i < shares.length; i++) total += shares[i] = (shares[i]! / most) ** exponent;
+  let [peak, total] = [0, 0];
+  for (const share of shares) peak = Math.max(peak, share);
+  for (let i = 0; i < shares.length; i++) total += shares[i] = (shares[i]! / peak) ** exponent;
   for (let i = 0; i < shares.length; i++) shares[i]! /= total;
 }

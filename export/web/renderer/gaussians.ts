@@ -4,7 +4,7 @@ import type { Scene } from "../decoder/scene.ts";
 
 /** Weights below it are skipped in Python; weights that add less colour than it are skipped here. */
 const CUTOFF = 1e-4;
-const MOST_CUTOFF = 0.5;
+const MAX_CUTOFF = 0.5;
 
 export interface Gaussians {
   readonly count: number;
@@ -41,10 +41,10 @@ export function gaussiansOf(scene: Scene): Gaussians {
 }
 
 function radius(colors: Float32Array, from: number, channels: number): number {
-  let most = 0;
-  for (let c = 0; c < channels; c++) most = Math.max(most, Math.abs(colors[from + c]!));
-  if (most <= CUTOFF) return 0;
-  return Math.sqrt(-2 * Math.log(Math.min(Math.max(CUTOFF / most, CUTOFF), MOST_CUTOFF)));
+  let largest = 0;
+  for (let c = 0; c < channels; c++) largest = Math.max(largest, Math.abs(colors[from + c]!));
+  if (largest <= CUTOFF) return 0;
+  return Math.sqrt(-2 * Math.log(Math.min(Math.max(CUTOFF / largest, CUTOFF), MAX_CUTOFF)));
 }
 
 function pick(numbers: Float32Array, order: Uint32Array, width: number): Float32Array {

@@ -55,13 +55,13 @@ export function linked(gl: WebGL2RenderingContext, vertex: string, fragment: str
 
 /** A texture that is read texel by texel. */
 export function texture(gl: WebGL2RenderingContext, kind: GLenum = gl.TEXTURE_2D): WebGLTexture {
-  const made = gl.createTexture();
-  gl.bindTexture(kind, made);
+  const handle = gl.createTexture();
+  gl.bindTexture(kind, handle);
   gl.texParameteri(kind, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
   gl.texParameteri(kind, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
   gl.texParameteri(kind, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
   gl.texParameteri(kind, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
-  return made;
+  return handle;
 }
 
 /** The values that were used last, a few of them; others are freed. */
@@ -69,7 +69,7 @@ export class Recent<K, V> {
   private readonly values = new Map<K, V>();
 
   constructor(
-    private readonly most: number,
+    private readonly capacity: number,
     private readonly free: (value: V) => void,
   ) {}
 
@@ -77,10 +77,10 @@ export class Recent<K, V> {
     const value = this.values.get(key) ?? make();
     this.values.delete(key);
     this.values.set(key, value);
-    for (const [oldest, kept] of this.values) {
-      if (this.values.size <= this.most) break;
+    for (const [oldest, entry] of this.values) {
+      if (this.values.size <= this.capacity) break;
       this.values.delete(oldest);
-      this.free(kept);
+      this.free(entry);
     }
     return value;
   }

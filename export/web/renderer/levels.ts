@@ -13,13 +13,13 @@ export function contourLevels(map: RegionMap, width: number, height: number): Le
   if (map.softness !== null) return { widths: [map.softness], of: null };
   const regions = map.ids.length;
   const widthOf = new Map(map.pairs.map(({ a, b, width }) => [a * regions + b, width]));
-  const found = new Map<number, number>();
+  const levelOfWidth = new Map<number, number>();
   const touching = touchingLevels(map.labels, width, height, (a, b) => {
     const sigma = widthOf.get(Math.min(a, b) * regions + Math.max(a, b)) ?? 0;
-    if (!found.has(sigma)) found.set(sigma, found.size);
-    return found.get(sigma)!;
+    if (!levelOfWidth.has(sigma)) levelOfWidth.set(sigma, levelOfWidth.size);
+    return levelOfWidth.get(sigma)!;
   });
-  const widths = [...found.keys()];
+  const widths = [...levelOfWidth.keys()];
   if (widths.length < 2) return { widths: [widths[0] ?? 0], of: null };
   // farther labels are of one region alone, and so are those beside them
   const search = Math.ceil(SEARCH_SIGMAS * Math.max(...widths)) + 2;
@@ -34,15 +34,15 @@ function touchingLevels(
   levelOf: (a: number, b: number) => number,
 ): Int32Array {
   const levels = new Int32Array(labels.length).fill(-1);
-  for (let y = 0, at = 0; y < height; y++) {
-    for (let x = 0; x < width; x++, at++) {
-      const label = labels[at]!;
+  for (let y = 0, pixel = 0; y < height; y++) {
+    for (let x = 0; x < width; x++, pixel++) {
+      const label = labels[pixel]!;
       let other = label;
-      if (y > 0 && labels[at - width] !== label) other = labels[at - width]!;
-      else if (x > 0 && labels[at - 1] !== label) other = labels[at - 1]!;
-      else if (x < width - 1 && labels[at + 1] !== label) other = labels[at + 1]!;
-      else if (y < height - 1 && labels[at + width] !== label) other = labels[at + width]!;
-      if (other !== label) levels[at] = levelOf(label, other);
+      if (y > 0 && labels[pixel - width] !== label) other = labels[pixel - width]!;
+      else if (x > 0 && labels[pixel - 1] !== label) other = labels[pixel - 1]!;
+      else if (x < width - 1 && labels[pixel + 1] !== label) other = labels[pixel + 1]!;
+      else if (y < height - 1 && labels[pixel + width] !== label) other = labels[pixel + width]!;
+      if (other !== label) levels[pixel] = levelOf(label, other);
     }
   }
   return levels;
@@ -82,14 +82,14 @@ function nearestRows(levels: Int32Array, width: number, height: number): Int32Ar
   const rows = new Int32Array(levels.length);
   for (let x = 0; x < width; x++) {
     for (let y = 0, last = -1; y < height; y++) {
-      const at = y * width + x;
-      if (levels[at]! >= 0) last = y;
-      rows[at] = last;
+      const pixel = y * width + x;
+      if (levels[pixel]! >= 0) last = y;
+      rows[pixel] = last;
     }
     for (let y = height - 1, next = -1; y >= 0; y--) {
-      const at = y * width + x;
-      if (levels[at]! >= 0) next = y;
-      if (next >= 0 && (rows[at]! < 0 || next - y < y - rows[at]!)) rows[at] = next;
+      const pixel = y * width + x;
+      if (levels[pixel]! >= 0) next = y;
+      if (next >= 0 && (rows[pixel]! < 0 || next - y < y - rows[pixel]!)) rows[pixel] = next;
     }
   }
   return rows;

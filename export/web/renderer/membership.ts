@@ -21,7 +21,7 @@ const MAX_REGIONS = 0xfffe;
 const CRISP_MARGIN = 0.25;
 const CRISP_WIDTH = 1; // pixels of the scene
 const CRISPNESS = 2; // the exponent at the scene's own size
-const LEAST_VARIANCE = 1e-6;
+const MIN_VARIANCE = 1e-6;
 
 export interface Membership {
   readonly width: number; // cells
@@ -69,24 +69,24 @@ function blurred(map: RegionMap, width: number, height: number, levels: Levels, 
   const blur = new Blur(map.labels, width, height, map.ids.length, levels);
   const heads = new Uint32Array(width * height);
   const lists = new Lists();
-  for (let y = 0, at = 0; y < height; y++) {
-    for (let x = 0; x < width; x++, at++) {
+  for (let y = 0, pixel = 0; y < height; y++) {
+    for (let x = 0; x < width; x++, pixel++) {
       if (blur.alone(x, y)) {
-        heads[at] = map.labels[at]!;
+        heads[pixel] = map.labels[pixel]!;
         continue;
       }
       const shares = blur.weigh(x, y);
-      if (whole === CRISP_WHOLE) keepOwn(shares, map.labels[at]!);
-      heads[at] = lists.add(shares, whole);
+      if (whole === CRISP_WHOLE) keepOwn(shares, map.labels[pixel]!);
+      heads[pixel] = lists.add(shares, whole);
     }
   }
   return { width, height, heads, lists: lists.finish(), whole };
 }
 
-function keepOwn({ regions, weights }: Shares, own: number): void {
-  const most = Math.max(...weights);
-  const place = regions.indexOf(own);
-  if (weights[place]! < most) weights[place] = most + CRISP_MARGIN;
+function keepOwn({ regions, weights }: Shares, label: number): void {
+  const largest = Math.max(...weights);
+  const place = regions.indexOf(label);
+  if (weights[place]! < largest) weights[place] = largest + CRISP_MARGIN;
 }
 
 /** Lists of weights, one after the other. */
@@ -124,8 +124,8 @@ class Lists {
 
 /** What weights between cells are raised to; `lost` is 1 - cells / pixels of the output, and 1 changes nothing. */
 export function sharpness(variance: number, lost: number): number {
-  const least = Math.max(variance, LEAST_VARIANCE);
-  return Math.sqrt((least + lost / 6) / Math.max(least - lost / 12, lost / 24));
+  const bounded = Math.max(variance, MIN_VARIANCE);
+  return Math.sqrt((bounded + lost / 6) / Math.max(bounded - lost / 12, lost / 24));
 }
 
 /** The exponent of crisp contours where a pixel of the scene has so many pixels of the output. */

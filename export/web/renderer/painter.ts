@@ -11,8 +11,8 @@ export type Device = "auto" | "webgl2" | "cpu";
 const contexts = new Map<boolean, WebGl | null>();
 
 function openGpu(emulated: boolean): WebGl | null {
-  const found = contexts.get(emulated);
-  if (found === undefined || found?.lost) contexts.set(emulated, WebGl.open(emulated));
+  const webGl = contexts.get(emulated);
+  if (webGl === undefined || webGl?.lost) contexts.set(emulated, WebGl.open(emulated));
   return contexts.get(emulated) ?? null;
 }
 

@@ -7,7 +7,7 @@ import type { Contours, Membership } from "./membership.ts";
 import type { Prepared } from "./software.ts";
 
 const CHANNELS = [1, 3, 4];
-const kept = new WeakMap<Int32Array, Map<string, Membership>>();
+const memberships = new WeakMap<Int32Array, Map<string, Membership>>();
 
 export function prepare(scene: Scene, contours: Contours): Prepared {
   const { width, height, channels, regions } = scene;
@@ -19,9 +19,9 @@ export function prepare(scene: Scene, contours: Contours): Prepared {
 }
 
 function find(regions: RegionMap, width: number, contours: Contours): Membership {
-  const found = kept.get(regions.labels) ?? new Map<string, Membership>();
-  kept.set(regions.labels, found);
-  const membership = found.get(contours) ?? membershipOf(regions, width, contours);
-  found.set(contours, membership);
+  const ofMap = memberships.get(regions.labels) ?? new Map<string, Membership>();
+  memberships.set(regions.labels, ofMap);
+  const membership = ofMap.get(contours) ?? membershipOf(regions, width, contours);
+  ofMap.set(contours, membership);
   return membership;
 }

@@ -37,11 +37,11 @@ export function hardAxis(fine: FineAxis, cells: number): Axis {
 function axis({ start, step, count }: FineAxis, cells: number, shareOf: (part: number) => number): Axis {
   const [low, high, share] = [new Int32Array(count), new Int32Array(count), new Float32Array(count)];
   for (let i = 0; i < count; i++) {
-    const at = start + (i + 0.5) * step - 0.5;
-    const first = Math.floor(at + NOISE);
+    const position = start + (i + 0.5) * step - 0.5;
+    const first = Math.floor(position + NOISE);
     low[i] = Math.min(Math.max(first, 0), cells - 1);
     high[i] = Math.min(Math.max(first + 1, 0), cells - 1);
-    share[i] = shareOf(at - first);
+    share[i] = shareOf(position - first);
   }
   return { low, high, share };
 }

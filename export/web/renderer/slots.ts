@@ -6,23 +6,23 @@ import type { Membership } from "./membership.ts";
 /** The most regions around any point between cells, `limit` at most. */
 export function mostRegions(membership: Membership, limit: number): number {
   const { width, height, heads, lists } = membership;
-  const seen: number[] = [];
+  const present: number[] = [];
   const note = (region: number): void => {
-    if (!seen.includes(region)) seen.push(region);
+    if (!present.includes(region)) present.push(region);
   };
-  let most = 1;
-  for (let y = 0; y < height && most < limit; y++) {
+  let largest = 1;
+  for (let y = 0; y < height && largest < limit; y++) {
     for (let x = 0; x < width; x++) {
-      seen.length = 0;
+      present.length = 0;
       for (let j = y; j <= Math.min(height - 1, y + 1); j++) {
         for (let i = x; i <= Math.min(width - 1, x + 1); i++) {
           const head = heads[j * width + i]!;
           if (head < SHARED) note(head);
-          else for (let at = head - SHARED; lists[at] !== 0; at++) note(lists[at]! >>> 16);
+          else for (let entry = head - SHARED; lists[entry] !== 0; entry++) note(lists[entry]! >>> 16);
         }
       }
-      most = Math.max(most, seen.length);
+      largest = Math.max(largest, present.length);
     }
   }
-  return Math.min(most, limit);
+  return Math.min(largest, limit);
 }

@@ -47,12 +47,12 @@ function toImage(colors: Float32Array, channels: number, alpha: Float32Array | n
   const image = new ImageData(view.width, view.height);
   const { data } = image;
   const step = channels === 1 ? 0 : 1;
-  for (let i = 0, at = 0; at < data.length; i++, at += 4) {
+  for (let i = 0, offset = 0; offset < data.length; i++, offset += 4) {
     const cover = alpha === null ? 1 : Math.max(alpha[i]!, 1e-6);
     const from = i * channels;
     // a clamped array rounds and clips by itself
-    for (let c = 0; c < 3; c++) data[at + c] = (colors[from + c * step]! / cover) * 255;
-    data[at + 3] = Math.min(1, alpha?.[i] ?? 1) * (channels === 4 ? colors[from + 3]! / cover : 1) * 255;
+    for (let c = 0; c < 3; c++) data[offset + c] = (colors[from + c * step]! / cover) * 255;
+    data[offset + 3] = Math.min(1, alpha?.[i] ?? 1) * (channels === 4 ? colors[from + 3]! / cover : 1) * 255;
   }
   return image;
 }

@@ -36,7 +36,7 @@ const row: Row = { weight: 0, ratio: 0, bend: 0 };
 
 type Add = (
   image: Float32Array,
-  at: number,
+  offset: number,
   count: number,
   colors: Float32Array,
   color: number,
@@ -80,9 +80,9 @@ function addGaussian(
     const stop = rowStarts[line + 1]!;
     if (run === stop) continue;
     const dy = line - y;
-    const least = (dy * dy) / variance;
+    const nearest = (dy * dy) / variance;
     const middle = x + dy * slope;
-    const half = Math.sqrt(Math.max(0, square - least) * narrow);
+    const half = Math.sqrt(Math.max(0, square - nearest) * narrow);
     const begin = Math.max(Math.ceil(middle - half), 0);
     const end = Math.min(Math.floor(middle + half) + 1, across.count);
     for (let r = run; r < stop; r++) {
@@ -90,7 +90,7 @@ function addGaussian(
       const to = Math.min(end, runs.to[r]!);
       if (from >= to) continue;
       const t = from - middle;
-      row.weight = Math.exp(-0.5 * (least + (t * t) / narrow));
+      row.weight = Math.exp(-0.5 * (nearest + (t * t) / narrow));
       row.ratio = Math.exp((-0.5 * (2 * t + 1)) / narrow);
       const place = runs.weights[r]!;
       const shares = place < 0 ? null : runs.shares;
@@ -110,7 +110,7 @@ function addGaussian(
 
 function addColors(
   image: Float32Array,
-  at: number,
+  offset: number,
   count: number,
   colors: Float32Array,
   color: number,
@@ -121,22 +121,22 @@ function addColors(
   const [red, green, blue] = [colors[color]!, colors[color + 1]!, colors[color + 2]!];
   let { weight, ratio } = row;
   const bend = row.bend;
-  const end = at + 3 * count;
+  const end = offset + 3 * count;
   if (shares === null) {
-    for (; at < end; at += 3) {
-      image[at] = image[at]! + weight * red;
-      image[at + 1] = image[at + 1]! + weight * green;
-      image[at + 2] = image[at + 2]! + weight * blue;
+    for (; offset < end; offset += 3) {
+      image[offset] = image[offset]! + weight * red;
+      image[offset + 1] = image[offset + 1]! + weight * green;
+      image[offset + 2] = image[offset + 2]! + weight * blue;
       weight *= ratio;
       ratio *= bend;
     }
     return;
   }
-  for (; at < end; at += 3) {
+  for (; offset < end; offset += 3) {
     const part = weight * shares[share++]!;
-    image[at] = image[at]! + part * red;
-    image[at + 1] = image[at + 1]! + part * green;
-    image[at + 2] = image[at + 2]! + part * blue;
+    image[offset] = image[offset]! + part * red;
+    image[offset + 1] = image[offset + 1]! + part * green;
+    image[offset + 2] = image[offset + 2]! + part * blue;
     weight *= ratio;
     ratio *= bend;
   }
@@ -144,7 +144,7 @@ function addColors(
 
 function addAny(
   image: Float32Array,
-  at: number,
+  offset: number,
   count: number,
   colors: Float32Array,
   color: number,
@@ -155,7 +155,7 @@ function addAny(
   let { weight, ratio } = row;
   for (let i = 0; i < count; i++) {
     const part = shares === null ? weight : weight * shares[share + i]!;
-    for (let c = 0; c < channels; c++) image[at + i * channels + c]! += part * colors[color + c]!;
+    for (let c = 0; c < channels; c++) image[offset + i * channels + c]! += part * colors[color + c]!;
     weight *= ratio;
     ratio *= row.bend;
   }

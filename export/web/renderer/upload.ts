@@ -8,7 +8,7 @@ import { mostRegions } from "./slots.ts";
 import type { Prepared } from "./software.ts";
 
 /** As many regions of a pixel are kept; of more, those with the largest shares. */
-const MOST_LAYERS = 4;
+const MAX_LAYERS = 4;
 const LIST_WIDTH = 1 << 12;
 const VISIBLE_WIDTH = 1 << 8;
 // mean, factor, colour, radius, region, bounds
@@ -30,36 +30,36 @@ export interface MapTextures {
 export function uploadMembership(gl: WebGL2RenderingContext, membership: Membership, regions: number): MapTextures {
   const { width, height, heads, lists, variances } = membership;
   const integers = (data: Uint32Array, across: number): WebGLTexture => {
-    const made = texture(gl);
+    const resources = texture(gl);
     const down = Math.ceil(data.length / across);
     const padded = data.length === across * down ? data : new Uint32Array(across * down);
     if (padded !== data) padded.set(data);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32UI, across, down, 0, gl.RED_INTEGER, gl.UNSIGNED_INT, padded);
-    return made;
+    return resources;
   };
-  const made = {
+  const resources = {
     heads: integers(heads, width),
     lists: integers(lists, LIST_WIDTH),
     visible: texture(gl),
     variances: texture(gl),
   };
   const squares = variances ?? new Float32Array(1);
-  gl.bindTexture(gl.TEXTURE_2D, made.variances);
+  gl.bindTexture(gl.TEXTURE_2D, resources.variances);
   const size = variances === null ? ([1, 1] as const) : ([width, height] as const);
   gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32F, ...size, 0, gl.RED, gl.FLOAT, squares);
-  const most = mostRegions(membership, MOST_LAYERS * SLOTS_OF_A_LAYER);
+  const maxRegions = mostRegions(membership, MAX_LAYERS * SLOTS_OF_A_LAYER);
   return {
-    ...made,
-    layers: Math.ceil(most / SLOTS_OF_A_LAYER),
+    ...resources,
+    layers: Math.ceil(maxRegions / SLOTS_OF_A_LAYER),
     bounds: boundsOf(membership, regions),
     show: (visible) => {
       const padded = new Uint8Array(Math.ceil(visible.length / VISIBLE_WIDTH) * VISIBLE_WIDTH);
       padded.set(visible);
-      gl.bindTexture(gl.TEXTURE_2D, made.visible);
+      gl.bindTexture(gl.TEXTURE_2D, resources.visible);
       const down = padded.length / VISIBLE_WIDTH;
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.R8UI, VISIBLE_WIDTH, down, 0, gl.RED_INTEGER, gl.UNSIGNED_BYTE, padded);
     },
-    free: () => Object.values(made).forEach((kept) => gl.deleteTexture(kept)),
+    free: () => Object.values(resources).forEach((resource) => gl.deleteTexture(resource)),
   };
 }
 
@@ -68,15 +68,15 @@ function boundsOf({ width, height, heads, lists }: Membership, regions: number):
   const bounds = new Float32Array(4 * regions);
   for (let r = 0; r < regions; r++) bounds.set([Infinity, Infinity, -Infinity, -Infinity], 4 * r);
   const note = (region: number, x: number, y: number): void => {
-    const at = 4 * region;
-    if (x < bounds[at]!) bounds[at] = x;
-    if (y < bounds[at + 1]!) bounds[at + 1] = y;
-    if (x > bounds[at + 2]!) bounds[at + 2] = x;
-    if (y > bounds[at + 3]!) bounds[at + 3] = y;
+    const start = 4 * region;
+    if (x < bounds[start]!) bounds[start] = x;
+    if (y < bounds[start + 1]!) bounds[start + 1] = y;
+    if (x > bounds[start + 2]!) bounds[start + 2] = x;
+    if (y > bounds[start + 3]!) bounds[start + 3] = y;
   };
-  for (let y = 0, at = 0; y < height; y++) {
-    for (let x = 0; x < width; x++, at++) {
-      const head = heads[at]!;
+  for (let y = 0, start = 0; y < height; y++) {
+    for (let x = 0; x < width; x++, start++) {
+      const head = heads[start]!;
       if (head < SHARED) note(head, x, y);
       else for (let entry = head - SHARED; lists[entry] !== 0; entry++) note(lists[entry]! >>> 16, x, y);
     }
@@ -100,13 +100,13 @@ export function uploadGaussians(gl: WebGL2RenderingContext, { gaussians }: Prepa
   const { count, channels, means, cholesky, colors, radii, regions } = gaussians;
   const floats = new Float32Array(count * STRIDE);
   const whole = new Uint32Array(floats.buffer);
-  for (let i = 0, at = 0; i < count; i++, at += STRIDE) {
-    floats.set(means.subarray(2 * i, 2 * i + 2), at);
-    floats.set(cholesky.subarray(3 * i, 3 * i + 3), at + 2);
-    floats.set(colors.subarray(channels * i, channels * (i + 1)), at + 5);
-    floats[at + 9] = radii[i]!;
-    whole[at + 10] = regions[i]!;
-    floats.set(map.bounds.subarray(4 * regions[i]!, 4 * regions[i]! + 4), at + 11);
+  for (let i = 0, start = 0; i < count; i++, start += STRIDE) {
+    floats.set(means.subarray(2 * i, 2 * i + 2), start);
+    floats.set(cholesky.subarray(3 * i, 3 * i + 3), start + 2);
+    floats.set(colors.subarray(channels * i, channels * (i + 1)), start + 5);
+    floats[start + 9] = radii[i]!;
+    whole[start + 10] = regions[i]!;
+    floats.set(map.bounds.subarray(4 * regions[i]!, 4 * regions[i]! + 4), start + 11);
   }
   const array = gl.createVertexArray();
   const buffer = gl.createBuffer();

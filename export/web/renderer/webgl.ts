@@ -13,7 +13,7 @@ import type { GaussianBuffer, MapTextures } from "./upload.ts";
 
 // pixels along a side that are rendered at once
 const TILE = 2048;
-const KEPT_SCENES = 8;
+const CACHED_SCENES = 8;
 
 interface Target {
   readonly width: number;
@@ -31,8 +31,8 @@ export type Precision = "float32" | "float16";
 export class WebGl {
   readonly precision: Precision;
   private readonly programs = new Map<string, Program>();
-  private readonly maps = new Recent<object, MapTextures>(KEPT_SCENES, (kept) => kept.free());
-  private readonly buffers = new Recent<object, GaussianBuffer>(KEPT_SCENES, (kept) => kept.free());
+  private readonly maps = new Recent<object, MapTextures>(CACHED_SCENES, (resource) => resource.free());
+  private readonly buffers = new Recent<object, GaussianBuffer>(CACHED_SCENES, (resource) => resource.free());
   private readonly axes: [WebGLTexture, WebGLTexture];
   private target: Target | null = null;
 
@@ -211,8 +211,8 @@ export class WebGl {
     const { gl, target } = this;
     if (target?.width === width && target.height === height && target.layers === layers) return target;
     if (target !== null) {
-      for (const kept of [target.sums, target.slots]) gl.deleteTexture(kept);
-      for (const kept of [target.sumBuffer, target.slotBuffer]) gl.deleteFramebuffer(kept);
+      for (const resource of [target.sums, target.slots]) gl.deleteTexture(resource);
+      for (const resource of [target.sumBuffer, target.slotBuffer]) gl.deleteFramebuffer(resource);
     }
     const [sums, slots] = [texture(gl), texture(gl, gl.TEXTURE_2D_ARRAY)];
     gl.bindTexture(gl.TEXTURE_2D, sums);

@@ -4,7 +4,7 @@ import { test } from "node:test";
 import { ByteReader, EndOfBytes } from "../decoder/bytes.ts";
 import { crc16, crc32 } from "../decoder/checksums.ts";
 import { cosine, exp2, sine } from "../decoder/exact.ts";
-import { Growing } from "../decoder/growing.ts";
+import { GrowingArray } from "../decoder/growing_array.ts";
 import { readHeader } from "../decoder/header.ts";
 import { Remaining } from "../decoder/labels/remaining.ts";
 import { GROUPS, TEMPLATE } from "../decoder/labels/template.ts";
@@ -64,7 +64,7 @@ test("pairs of regions side by side, each once, in order", () => {
 });
 
 test("numbers to which more are added", () => {
-  const growing = new Growing<Int32Array>(new Int32Array(0));
+  const growing = new GrowingArray<Int32Array>(new Int32Array(0));
   for (let i = 0; i < 100; i++) growing.add(Int32Array.of(i, -i));
   assert.equal(growing.length, 200);
   assert.deepEqual([...growing.all().subarray(-2)], [99, -99]);

@@ -43,13 +43,13 @@ export class Decision {
   questions: usize;
 
   /** `counters`: in all three tables; `most`: questions in a wavefront. */
-  static of(counters: usize, most: usize): Decision {
-    const made = changetype<Decision>(allot(offsetof<Decision>()));
-    made.counters = allot(4 * counters);
-    made.weights = allot(64);
-    for (let set: usize = 0; set < 64; set += 16) memory.copy(made.weights + set, mixer, 16);
-    made.questions = allot(offsetof<Question>() * most);
-    return made;
+  static of(counters: usize, count: usize): Decision {
+    const decision = changetype<Decision>(allot(offsetof<Decision>()));
+    decision.counters = allot(4 * counters);
+    decision.weights = allot(64);
+    for (let set: usize = 0; set < 64; set += 16) memory.copy(decision.weights + set, mixer, 16);
+    decision.questions = allot(offsetof<Question>() * count);
+    return decision;
   }
 
   private question(n: usize): Question {
@@ -105,8 +105,8 @@ function estimate(counter: usize, logit: i32): i32 {
 // @ts-ignore: decorator
 @inline
 function move(weight: usize, x: i32, error: i32): void {
-  const moved = load<i32>(weight) + ((6 * x * error + (1 << 17)) >> 18);
-  store<i32>(weight, min(max(moved, -HEAVIEST), HEAVIEST));
+  const updated = load<i32>(weight) + ((6 * x * error + (1 << 17)) >> 18);
+  store<i32>(weight, min(max(updated, -HEAVIEST), HEAVIEST));
 }
 
 function remember(counter: usize, bit: i32, logit: i32): void {

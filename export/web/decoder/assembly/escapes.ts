@@ -14,13 +14,13 @@ let met: i32 = 1;
 let count: i32 = 0;
 let fresh: usize = 0; // [2] of seeds, of others
 let ranks: usize = 0; // [2, RANKS]
-let found: usize = 0; // [RANKS] i32
+let candidates: usize = 0; // [RANKS] i32
 
 export function openEscapes(all: i32): void {
   regions = all;
   fresh = adaptiveBits(2);
   ranks = adaptiveBits(2 * RANKS);
-  found = allot(4 * RANKS);
+  candidates = allot(4 * RANKS);
 }
 
 /** Read the label of pixel (x, y) with these candidates; a seed has one, and -1. */
@@ -28,9 +28,9 @@ export function readEscape(y: i32, x: i32, first: i32, second: i32): i32 {
   if (++count > MOST) fail(MANY_ESCAPES);
   const kind = second < 0 ? 0 : 1;
   if (met < regions && readAdaptive(fresh, kind)) return met++;
-  const most = listNearest(y, x, first, second);
-  for (let rank = 0; rank < most; rank++)
-    if (readAdaptive(ranks, kind * RANKS + rank)) return load<i32>(found + 4 * rank);
+  const total = listNearest(y, x, first, second);
+  for (let rank = 0; rank < total; rank++)
+    if (readAdaptive(ranks, kind * RANKS + rank)) return load<i32>(candidates + 4 * rank);
   const escaped = <i32>number(met);
   if (escaped >= met) fail(NO_REGION);
   return escaped;
@@ -46,7 +46,7 @@ function listNearest(y: i32, x: i32, first: i32, second: i32): i32 {
         if (x + dx < 0 || x + dx >= stride) continue;
         const near = label(y + dy, x + dx);
         if (near === first || near === second || isListed(near, listed)) continue;
-        store<i32>(found + 4 * listed, near);
+        store<i32>(candidates + 4 * listed, near);
         if (++listed === RANKS) return listed;
       }
     }
@@ -54,6 +54,6 @@ function listNearest(y: i32, x: i32, first: i32, second: i32): i32 {
 }
 
 function isListed(near: i32, listed: i32): bool {
-  for (let i = 0; i < listed; i++) if (load<i32>(found + 4 * i) === near) return true;
+  for (let i = 0; i < listed; i++) if (load<i32>(candidates + 4 * i) === near) return true;
   return false;
 }

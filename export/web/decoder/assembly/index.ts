@@ -26,11 +26,11 @@ export let met: i32 = 0;
 export function readLabels(height: i32, width: i32, regions: i32, template: usize, positions: usize): usize {
   const size = <usize>height * width;
   const labels = bit(NOISE) ? readNoise(size, regions) : readMap(height, width, regions, template);
-  const seen = allot(regions);
+  const marks = allot(regions);
   for (let i: usize = 0; i < size; i++) {
     const region = <usize>load<u32>(labels + 4 * i);
-    if (!load<u8>(seen + region)) {
-      store<u8>(seen + region, 1);
+    if (!load<u8>(marks + region)) {
+      store<u8>(marks + region, 1);
       met++;
     }
     store<i32>(labels + 4 * i, load<i32>(positions + 4 * region));

@@ -20,19 +20,19 @@ export function openMargins(height: i32, width: i32): void {
 /** Where the label of a pixel is. */
 // @ts-ignore: decorator
 @inline
-export function at(y: i32, x: i32): usize {
+export function pixelAddress(y: i32, x: i32): usize {
   return labels + 4 * (<usize>y * stride + x);
 }
 
 // @ts-ignore: decorator
 @inline
 export function label(y: i32, x: i32): i32 {
-  return load<i32>(at(y, x));
+  return load<i32>(pixelAddress(y, x));
 }
 
 function fill(y: i32, x: i32, end: i32, label: i32): void {
-  const last = at(y, end);
-  for (let pixel = at(y, x); pixel < last; pixel += 4) store<i32>(pixel, label);
+  const last = pixelAddress(y, end);
+  for (let pixel = pixelAddress(y, x); pixel < last; pixel += 4) store<i32>(pixel, label);
 }
 
 /** Rows continue with their last label, so that only pixels near contours are looked at. */
@@ -65,6 +65,6 @@ export function allAlike(y: i32, x: i32): bool {
 
 /** Where the labels of the map alone are, row by row; nothing else is left. */
 export function strip(height: i32, width: i32): usize {
-  for (let y = 0; y < height; y++) memory.copy(labels + 4 * (<usize>y * width), at(y + TOP, LEFT), 4 * width);
+  for (let y = 0; y < height; y++) memory.copy(labels + 4 * (<usize>y * width), pixelAddress(y + TOP, LEFT), 4 * width);
   return labels;
 }

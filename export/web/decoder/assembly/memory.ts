@@ -17,9 +17,9 @@ let top: usize = (__heap_base + 15) & ~15;
 
 /** Room for so many bytes, all 0, which is never given back. */
 export function allot(bytes: usize): usize {
-  const at = top;
+  const address = top;
   top = (top + bytes + 15) & ~15;
-  const more = <i32>((top + 0xffff) >> 16) - memory.size();
-  if (more > 0 && memory.grow(more) < 0) fail(NO_MEMORY);
-  return at;
+  const pages = <i32>((top + 0xffff) >> 16) - memory.size();
+  if (pages > 0 && memory.grow(pages) < 0) fail(NO_MEMORY);
+  return address;
 }

@@ -61,10 +61,10 @@ function sumGroups(layer1: usize): void {
       if (place === 255) continue;
       const feature = kind / weight;
       const sum = groups + (group * KINDS + kind) * 2 * A;
-      const rest = sum - feature * weight * 2 * A;
+      const others = sum - feature * weight * 2 * A;
       const added = layer1 + (2 * place + feature - 1) * A;
       for (let j: usize = 0; j < A; j += 8)
-        v128.store(sum + 2 * j, i16x8.add(v128.load(rest + 2 * j), v128.load_ext<i8>(added + j)));
+        v128.store(sum + 2 * j, i16x8.add(v128.load(others + 2 * j), v128.load_ext<i8>(added + j)));
     }
 }
 
@@ -72,9 +72,9 @@ function sumGroups(layer1: usize): void {
 export function evaluate(): void {
   sumFeatures();
   const zero = i16x8.splat(0);
-  const most = i16x8.splat(<i16>MOST);
+  const limit = i16x8.splat(<i16>MOST);
   for (let j: usize = 0; j < 2 * A; j += 16)
-    v128.store(hidden + j, i16x8.min_s(i16x8.max_s(v128.load(hidden + j), zero), most));
+    v128.store(hidden + j, i16x8.min_s(i16x8.max_s(v128.load(hidden + j), zero), limit));
   for (let k: usize = 0; k < B; k += 4) {
     let sums = v128.load(bias2 + 4 * k);
     let weights = layer2 + 4 * k;

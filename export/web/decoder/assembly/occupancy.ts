@@ -9,8 +9,8 @@ const REACH: i32 = 4; // cells
 const PARTS: f64 = 64; // of a weight
 const MASS: f64 = 625; // of a Gaussian, over all cells
 
-let most: u32 = 0;
-let found: u32 = 0;
+let capacity: u32 = 0;
+let size: u32 = 0;
 /** The cell of each Gaussian, u32, in no order. */
 export let cells: usize = 0;
 let chances: usize = 0; // i32: that its cell holds another one
@@ -27,26 +27,26 @@ const ROWS = 3;
 
 /** Room of at least so many bytes for a list. */
 function room(list: usize, bytes: usize): usize {
-  const at = rooms + 8 * list;
-  if (bytes > load<u32>(at)) {
-    store<u32>(at, 2 * bytes);
-    store<u32>(at, allot(2 * bytes), 4);
+  const address = rooms + 8 * list;
+  if (bytes > load<u32>(address)) {
+    store<u32>(address, 2 * bytes);
+    store<u32>(address, allot(2 * bytes), 4);
   }
-  return load<u32>(at, 4);
+  return load<u32>(address, 4);
 }
 
 function begin(count: u32): void {
-  most = count;
-  found = 0;
+  capacity = count;
+  size = 0;
   cells = room(CELLS, 4 * count);
   chances = room(CHANCES, 4 * count);
 }
 
 function add(cell: u32, chance: i32): void {
-  if (found === most) fail(MANY_GAUSSIANS);
-  store<u32>(cells + 4 * found, cell);
-  store<i32>(chances + 4 * found, chance);
-  found++;
+  if (size === capacity) fail(MANY_GAUSSIANS);
+  store<u32>(cells + 4 * size, cell);
+  store<i32>(chances + 4 * size, chance);
+  size++;
 }
 
 /** Room for the row and the column of so many Gaussians, for `readNear`. */
@@ -59,40 +59,40 @@ export function openEarlier(count: u32): usize {
  * Read which cell each of so many Gaussians lies in: of the weight `least`, and more where earlier ones are near. Return
  * how many there are.
  */
-export function readNear(rows: u32, columns: u32, least: u32, near: u32, count: u32): u32 {
+export function readNear(rows: u32, columns: u32, base: u32, near: u32, count: u32): u32 {
   begin(count);
   const all = rows * columns;
-  let total = <f64>least * all + PARTS * MASS * near;
+  let total = <f64>base * all + PARTS * MASS * near;
   const bands = max(BANDS, (all + TOGETHER - 1) / TOGETHER);
-  let at: usize = 0;
-  for (let band: u32 = 0; band < bands && found < count; band++) {
+  let address: usize = 0;
+  for (let band: u32 = 0; band < bands && size < count; band++) {
     const first = <u32>((<u64>rows * band) / bands);
     const last = <u32>((<u64>rows * (band + 1)) / bands);
     // all bands at once, where they are small
     if (near && (bands > BANDS || band === 0)) {
       spread(rows, columns, near, first, bands > BANDS ? last : rows);
-      at = rowsNear;
+      address = rowsNear;
     }
-    const left = <f64>(count - found);
-    let before = found;
+    const remaining = <f64>(count - size);
+    let before = size;
     let sum: f64 = 0;
     let cell = first * columns;
-    for (let row = first; row < last; row++, at += 8 * REACH)
-      for (const end = cell + columns; cell < end; cell++, at += 4) {
-        const weight = near ? least + PARTS * window(at) : <f64>least;
+    for (let row = first; row < last; row++, address += 8 * REACH)
+      for (const end = cell + columns; cell < end; cell++, address += 4) {
+        const weight = near ? base + PARTS * window(address) : <f64>base;
         sum += weight;
-        const rate = left * weight;
+        const rate = remaining * weight;
         const chance = <i32>min(max(floor((65536 * rate) / (rate + total)), 16), 65520);
         if (bit(chance)) add(cell, chance);
       }
     // cells that hold one may hold another
-    for (; before < found; before++) {
+    for (; before < size; before++) {
       const chance = load<i32>(chances + 4 * before);
       if (bit(chance)) add(load<u32>(cells + 4 * before), chance);
     }
     total -= sum;
   }
-  return found;
+  return size;
 }
 
 /** Spread Gaussians over those rows from `first` to `last` that are near theirs, and mirror these rows at their ends. */
@@ -106,10 +106,10 @@ function spread(rows: i32, columns: i32, near: u32, first: i32, last: i32): void
     if (row < first - REACH || row >= last + REACH) continue;
     const column = load<i32>(earlier + 8 * i + 4);
     for (let off = -REACH; off <= REACH; off++) {
-      let at = row + off;
-      if (<u32>at >= <u32>rows) at = mirror(at, rows);
-      if (at < first || at >= last) continue;
-      const sum = rowsNear + 4 * <usize>((at - first) * stride + REACH + column);
+      let address = row + off;
+      if (<u32>address >= <u32>rows) address = mirror(address, rows);
+      if (address < first || address >= last) continue;
+      const sum = rowsNear + 4 * <usize>((address - first) * stride + REACH + column);
       store<u32>(sum, load<u32>(sum) + REACH + 1 - abs(off));
     }
   }
@@ -121,21 +121,21 @@ function spread(rows: i32, columns: i32, near: u32, first: i32, last: i32): void
 }
 
 function mirror(place: i32, count: i32): i32 {
-  let at = place;
-  while (at < 0 || at >= count) at = at < 0 ? -1 - at : 2 * count - 1 - at;
-  return at;
+  let address = place;
+  while (address < 0 || address >= count) address = address < 0 ? -1 - address : 2 * count - 1 - address;
+  return address;
 }
 
 /** Sum up what is spread over nine columns. */
 // @ts-ignore: decorator
 @inline
-function window(at: usize): f64 {
+function window(address: usize): f64 {
   return (
-    load<u32>(at) +
-    load<u32>(at, 32) +
-    2 * (load<u32>(at, 4) + load<u32>(at, 28)) +
-    3 * (load<u32>(at, 8) + load<u32>(at, 24)) +
-    4 * (load<u32>(at, 12) + load<u32>(at, 20)) +
-    5 * load<u32>(at, 16)
+    load<u32>(address) +
+    load<u32>(address, 32) +
+    2 * (load<u32>(address, 4) + load<u32>(address, 28)) +
+    3 * (load<u32>(address, 8) + load<u32>(address, 24)) +
+    4 * (load<u32>(address, 12) + load<u32>(address, 20)) +
+    5 * load<u32>(address, 16)
   );
 }

@@ -17,25 +17,25 @@ const tables = allot(4 * (VALUES + 1) * TABLES);
 export const weights = allot(8 * VALUES);
 
 /** Begin a stream. */
-export function open(at: usize, bytes: usize): void {
-  data = at;
-  end = at + bytes;
+export function open(address: usize, bytes: usize): void {
+  data = address;
+  end = address + bytes;
   difference = (word() << 32) | word();
   range = u64.MAX_VALUE;
 }
 
 function word(): u64 {
-  let found: u64 = 0;
-  if (data + 4 <= end) found = bswap(load<u32>(data));
-  else for (let i: usize = 0; i < 4; i++) found = (found << 8) | (data + i < end ? load<u8>(data + i) : 0);
+  let result: u64 = 0;
+  if (data + 4 <= end) result = bswap(load<u32>(data));
+  else for (let i: usize = 0; i < 4; i++) result = (result << 8) | (data + i < end ? load<u8>(data + i) : 0);
   data += 4;
-  return found;
+  return result;
 }
 
 function code(): u64 {
-  const found = difference / (range >> 24);
-  if (found >= CODES) fail(NOT_A_STREAM);
-  return found;
+  const result = difference / (range >> 24);
+  if (result >= CODES) fail(NOT_A_STREAM);
+  return result;
 }
 
 /** Go into the interval [from, to) of the codes. */
@@ -72,14 +72,14 @@ export function bit(chance: i32): i32 {
   const step = range >> 24;
   const border = (CODES - 256 * <u64>chance) * step;
   if (difference >= CODES * step) fail(NOT_A_STREAM);
-  const found = difference >= border;
-  difference -= found ? border : 0;
-  range = found ? CODES * step - border : border;
+  const result = difference >= border;
+  difference -= result ? border : 0;
+  range = result ? CODES * step - border : border;
   if (!(range >> 32)) {
     difference = (difference << 32) | word();
     range <<= 32;
   }
-  return <i32>found;
+  return <i32>result;
 }
 
 export function unbounded(): u64 {
@@ -122,15 +122,15 @@ export function prepare(table: u32, values: u32): void {
 
 /** A categorical symbol by a table of so many values. */
 export function categorical(table: u32, values: u32): u32 {
-  const found = <u32>code();
+  const result = <u32>code();
   let value: u32 = 0;
   let last = values;
   // the first values are the likely ones of short tables
-  if (values <= 16) while (found >= load<u32>(begin(table, value + 1))) value++;
+  if (values <= 16) while (result >= load<u32>(begin(table, value + 1))) value++;
   else
     while (last - value > 1) {
       const middle = (value + last) >> 1;
-      if (found >= load<u32>(begin(table, middle))) value = middle;
+      if (result >= load<u32>(begin(table, middle))) value = middle;
       else last = middle;
     }
   take(load<u32>(begin(table, value)), load<u32>(begin(table, value + 1)));

@@ -9,10 +9,10 @@ let stride: u32 = 0;
 let extreme: usize = 0;
 
 /** Set a byte to 1 for each seed, row by row, from `at` on. */
-export function readSeeds(at: usize, height: u32, width: u32): void {
+export function readSeeds(address: usize, height: u32, width: u32): void {
   const seeds = unbounded();
   if (seeds > <u64>height * width) fail(MANY_SEEDS);
-  marks = at;
+  marks = address;
   stride = width;
   extreme = adaptiveBits(8);
   readBlock(0, 0, height, width, <u32>seeds);
@@ -42,8 +42,8 @@ function readBlock(y: u32, x: u32, height: u32, width: u32, seeds: u32): void {
 }
 
 /** How many of the seeds are in the first half, of that area, and not in the rest. */
-function readCount(seeds: u32, first: u32, rest: u32): u32 {
-  const low = seeds > rest ? seeds - rest : 0;
+function readCount(seeds: u32, first: u32, others: u32): u32 {
+  const low = seeds > others ? seeds - others : 0;
   const high = min(seeds, first);
   if (low === high) return low;
   const level = min(<u32>30 - clz(seeds), 7);

@@ -2,14 +2,14 @@
 
 import { Decision } from "./decision";
 import { openEscapes, readEscape } from "./escapes";
-import { allAlike, at, continueRow, label, LEFT, openMargins, reach, repeat, stride, strip, TOP } from "./margins";
+import { allAlike, pixelAddress, continueRow, label, LEFT, openMargins, reach, repeat, stride, strip, TOP } from "./margins";
 import { allot, fail, MANY_ASKED } from "./memory";
 import { evaluate, features, neither, which } from "./network";
 import { bit } from "./range_decoder";
 
 const SLANT: i32 = 8;
 const PLACES: usize = 80; // of the template
-const MOST_ASKED: i32 = 1 << 23; // pixels that bits decide; more take minutes
+const MAX_UNCERTAIN: i32 = 1 << 23; // pixels that bits decide; more take minutes
 // where the counters of each decision begin, and their number
 const SECOND: usize = 1 << 6;
 const THIRD: usize = SECOND + (1 << 11);
@@ -55,10 +55,10 @@ export function readWavefronts(rows: i32, columns: i32, marks: usize, regions: i
   several = regions > 2;
   openMargins(height, width);
   openEscapes(regions);
-  const most = min(height, (width + SLANT - 1) / SLANT);
-  isSecond = Decision.of(WHICH, most);
-  isNeither = Decision.of(NEITHER, most);
-  pixels = allot(offsetof<Pixel>() * most);
+  const count = min(height, (width + SLANT - 1) / SLANT);
+  isSecond = Decision.of(WHICH, count);
+  isNeither = Decision.of(NEITHER, count);
+  pixels = allot(offsetof<Pixel>() * count);
   changes = allot(4 * (TOP + height + 2));
   nextSeed = allot(4 * (TOP + height + 2));
   wake = allot(4 * (TOP + height + 2));
@@ -127,7 +127,7 @@ function list(y: i32, x: i32, first: i32, second: i32): void {
 
 /** List a pixel that bits decide, with their chances. */
 function ask(y: i32, x: i32, first: i32): void {
-  const here = at(y, x);
+  const here = pixelAddress(y, x);
   let second = -1;
   for (let t: usize = 0; t < PLACES; t++) {
     const near = load<i32>(here + load<i32>(offsets + 4 * t));
@@ -153,7 +153,7 @@ function ask(y: i32, x: i32, first: i32): void {
 function readBits(): void {
   for (let n: usize = 0; n < listed; n++) {
     if (pixel(n).second < 0) continue;
-    if (++asked > MOST_ASKED) fail(MANY_ASKED);
+    if (++asked > MAX_UNCERTAIN) fail(MANY_ASKED);
     if (several) pixel(n).bits = 2 * bit(isNeither.chance(n));
   }
   for (let n: usize = 0; n < listed; n++) if (pixel(n).second >= 0) pixel(n).bits |= bit(isSecond.chance(n));
@@ -179,11 +179,11 @@ function settle(): void {
   }
 }
 
-function write(y: i32, x: i32, found: i32): void {
-  if (found !== label(y, x - 1)) {
+function write(y: i32, x: i32, region: i32): void {
+  if (region !== label(y, x - 1)) {
     store<i32>(changes + 4 * y, x);
     memory.fill(wake + 4 * y, 0, 12); // these rows see it
-    continueRow(y, x, found);
+    continueRow(y, x, region);
   }
-  repeat(y, x, found);
+  repeat(y, x, region);
 }

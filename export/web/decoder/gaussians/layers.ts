@@ -10,7 +10,7 @@ import { ENERGIES, type Header } from "../header.ts";
 import { startProgram } from "../program.ts";
 import { RangeDecoder } from "../range_decoder.ts";
 import { DecodeError } from "../scene.ts";
-import { angles, LEAST_SIZE, MOST_SIZE, OCTAVES, places, Quantizer, restoreColor, restoreShape, type Steps } from "./quantizer.ts";
+import { angles, MIN_SIZE, MAX_SIZE, OCTAVES, places, Quantizer, restoreColor, restoreShape, type Steps } from "./quantizer.ts";
 import { ANGLES, COUNTS, SHAPES, STRAYS } from "./weights.ts";
 
 const CLASSES = 64; // of size, that a stream may name
@@ -50,26 +50,26 @@ export class LayerDecoder {
   }
 
   /** Read a layer, whose highest energy is given, of at most so many Gaussians. */
-  read(bytes: Uint8Array, energy: number, most: number): Group[] {
+  read(bytes: Uint8Array, energy: number, limit: number): Group[] {
     const decoder = new RangeDecoder(bytes, this.program);
     const groups: Group[] = [];
-    let left = most;
+    let remaining = limit;
     for (let follows = HOLDS; follows !== END; energy--) {
-      if (energy < ENERGIES.least)
-        throw new DecodeError(`a class of energy must be at least ${ENERGIES.least}; got ${energy}`);
+      if (energy < ENERGIES.min)
+        throw new DecodeError(`a class of energy must be at least ${ENERGIES.min}; got ${energy}`);
       if (follows === HOLDS) {
-        const group = this.readGroup(decoder, energy, left);
+        const group = this.readGroup(decoder, energy, remaining);
         groups.push(group);
-        left -= group.count;
+        remaining -= group.count;
       }
       follows = decoder.uniform(3);
     }
     return groups;
   }
 
-  private readGroup(decoder: RangeDecoder, energy: number, most: number): Group {
+  private readGroup(decoder: RangeDecoder, energy: number, limit: number): Group {
     const steps = this.quantizer.steps(energy);
-    const classes = this.readClasses(decoder, most);
+    const classes = this.readClasses(decoder, limit);
     const count = classes.reduce((sum, { cells }) => sum + cells.row.length, 0);
     const scale = new Int32Array(count).map(() => decoder.uniform(steps.scales));
     const ratio = this.ratio.read(decoder, [2 / steps.ratio], new Uint8Array(count), this.ratioContexts(classes, count));
@@ -95,7 +95,7 @@ export class LayerDecoder {
   }
 
   /** Read the classes of size, falling, and the cells of their Gaussians. */
-  private readClasses(decoder: RangeDecoder, most: number): Class[] {
+  private readClasses(decoder: RangeDecoder, limit: number): Class[] {
     const first = decoder.uniform(CLASSES);
     const last = first + decoder.uniform(CLASSES - first);
     const counts: { size: number; count: number }[] = [];
@@ -103,13 +103,13 @@ export class LayerDecoder {
     for (let position = first; position <= last; position++) {
       const count = this.counts.read(decoder);
       total += count;
-      if (count) counts.unshift({ size: position + LEAST_SIZE, count });
+      if (count) counts.unshift({ size: position + MIN_SIZE, count });
     }
-    if (total > most) throw new DecodeError(`a layer must hold at most ${most} Gaussians; got ${total}`);
+    if (total > limit) throw new DecodeError(`a layer must hold at most ${limit} Gaussians; got ${total}`);
     const largest = counts[0];
     if (!largest) throw new DecodeError("a layer must hold Gaussians; got none");
-    if (largest.size > MOST_SIZE)
-      throw new DecodeError(`a class of size must be at most ${MOST_SIZE}; got ${largest.size}`);
+    if (largest.size > MAX_SIZE)
+      throw new DecodeError(`a class of size must be at most ${MAX_SIZE}; got ${largest.size}`);
     return counts.map(({ size, count }) => ({ size, cells: this.occupancy.read(decoder, size, count) }));
   }
 

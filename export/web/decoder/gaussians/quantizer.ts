@@ -4,8 +4,8 @@ import { cosine, exp2, sine } from "../exact.ts";
 
 const LN2 = 0.6931471805599453;
 export const OCTAVES = 0.75; // that a class of size spans
-const MOST_RATIO = 12;
-const MOST_LEVELS = 2 ** 20;
+const MAX_RATIO = 12;
+const MAX_LEVELS = 2 ** 20;
 // grey, red against blue, green against both: how much of each of the three a channel has
 const OPPONENT = [
   [0.5773502691896258, 0.7071067811865476, -0.408248290463863],
@@ -13,10 +13,10 @@ const OPPONENT = [
   [0.5773502691896258, -0.7071067811865476, -0.408248290463863],
 ] as const;
 
-export const LEAST_SIZE = -8;
-export const MOST_SIZE = 28;
+export const MIN_SIZE = -8;
+export const MAX_SIZE = 28;
 
-const clip = (value: number, least: number): number => Math.min(Math.max(value, least), MOST_LEVELS);
+const clip = (value: number, lowest: number): number => Math.min(Math.max(value, lowest), MAX_LEVELS);
 
 /** The steps of a layer, whose Gaussians have one class of energy. */
 export interface Steps {
@@ -38,12 +38,12 @@ export class Quantizer {
 
   steps(energy: number): Steps {
     const unit = Math.sqrt(((12 * this.distortion) / Math.PI) * exp2(-2 * energy - 1));
-    const ratio = Math.max(unit * (1 / LN2), MOST_RATIO / MOST_LEVELS);
+    const ratio = Math.max(unit * (1 / LN2), MAX_RATIO / MAX_LEVELS);
     return {
       unit,
       scales: clip(Math.floor(OCTAVES / (unit * (Math.sqrt(0.5) / LN2)) + 0.5), 1),
       ratio,
-      mostRatio: Math.floor(MOST_RATIO / ratio + 0.5),
+      mostRatio: Math.floor(MAX_RATIO / ratio + 0.5),
       loud: Math.sqrt(Math.PI / (12 * this.distortion)) * exp2(energy),
     };
   }
@@ -71,7 +71,7 @@ export function restoreShape(
   ratio: number,
   share: number,
   into: Float64Array,
-  at: number,
+  offset: number,
 ): void {
   const middle = OCTAVES * (size + (scale + 0.5) / steps.scales);
   const stretch = ratio * steps.ratio;
@@ -82,9 +82,9 @@ export function restoreShape(
   const along = major * cos;
   const across = minor * sin;
   const l11 = Math.sqrt(along * along + across * across);
-  into[at] = l11;
-  into[at + 1] = ((major * major - minor * minor) * cos * sin) / l11;
-  into[at + 2] = (major * minor) / l11;
+  into[offset] = l11;
+  into[offset + 1] = ((major * major - minor * minor) * cos * sin) / l11;
+  into[offset + 2] = (major * minor) / l11;
 }
 
 /** How many places there are along the side of a cell, for a Gaussian whose l11, or l22, is `length`. */
@@ -98,14 +98,14 @@ export function restoreColor(
   channels: number,
   step: number,
   into: Float32Array,
-  at: number,
+  offset: number,
 ): void {
   if (channels !== 3) {
-    for (let i = at; i < at + channels; i++) into[i] = codes[i]! * step;
+    for (let i = offset; i < offset + channels; i++) into[i] = codes[i]! * step;
     return;
   }
-  const grey = codes[at]! * step;
-  const hue = codes[at + 1]! * step;
-  const hue2 = codes[at + 2]! * step;
-  OPPONENT.forEach(([a, b, c], i) => (into[at + i] = grey * a + hue * b + hue2 * c));
+  const grey = codes[offset]! * step;
+  const hue = codes[offset + 1]! * step;
+  const hue2 = codes[offset + 2]! * step;
+  OPPONENT.forEach(([a, b, c], i) => (into[offset + i] = grey * a + hue * b + hue2 * c));
 }

@@ -4,7 +4,7 @@ import type { RangeDecoder } from "../range_decoder.ts";
 import { DecodeError } from "../scene.ts";
 import { Remaining } from "./remaining.ts";
 
-const MOST_BITS = 24; // of the number of regions
+const MAX_BITS = 24; // of the number of regions
 
 /** Ids that rise, and the position among them of each region, in the order in which the wavefront meets regions. */
 export interface Ids {
@@ -31,16 +31,16 @@ export function readIds(decoder: RangeDecoder, regions: number): Ids {
 function readCount(decoder: RangeDecoder): number {
   let bits = 1;
   while (decoder.fair())
-    if (++bits > MOST_BITS) throw new DecodeError(`a map must have fewer than 2**${MOST_BITS} regions; got more`);
+    if (++bits > MAX_BITS) throw new DecodeError(`a map must have fewer than 2**${MAX_BITS} regions; got more`);
   return Number(decoder.ofLength(bits));
 }
 
 function readOrder(decoder: RangeDecoder, count: number): Int32Array {
   const remaining = new Remaining(count);
   return new Int32Array(count).map((_, i) => {
-    const left = count - i;
-    const rank = decoder.number(left);
-    if (rank >= left) throw new DecodeError(`data must name one of ${left} ids that are left; got number ${rank}`);
+    const choices = count - i;
+    const rank = decoder.number(choices);
+    if (rank >= choices) throw new DecodeError(`data must name one of ${choices} ids that are left; got number ${rank}`);
     return remaining.take(rank);
   });
 }

@@ -22,8 +22,8 @@ export function readPixels({ program }: RangeDecoder, height: number, width: num
   const groups = put(program, Uint8Array.from(GROUPS.flat()));
   program.model(put(program, model.tables), groups, put(program, model.squash), put(program, model.stretch));
   const template = put(program, Int8Array.from(TEMPLATE.flat()));
-  const at = program.readLabels(height, width, positions.length, template, put(program, positions));
-  return { labels: new Int32Array(program.memory.buffer, at, height * width).slice(), met: program.met.value };
+  const address = program.readLabels(height, width, positions.length, template, put(program, positions));
+  return { labels: new Int32Array(program.memory.buffer, address, height * width).slice(), met: program.met.value };
 }
 
 /** squash(x) for x from -CLIP to CLIP, and stretch(q) for q from 0 to 4095. */

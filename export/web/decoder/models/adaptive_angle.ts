@@ -14,8 +14,8 @@ export class AdaptiveAngle {
   read(decoder: RangeDecoder, turns: Int32Array): Int32Array {
     const { program } = decoder;
     new Float64Array(program.memory.buffer, program.weights.value + 8 * BINS, BINS).set(this.weights);
-    const found = turns.map((all) => (all < BINS ? 0 : program.angleBin(all)));
-    return found.map((bin, n) => {
+    const bins = turns.map((all) => (all < BINS ? 0 : program.angleBin(all)));
+    return bins.map((bin, n) => {
       const all = turns[n]!;
       if (all < BINS) return decoder.uniform(all);
       this.weights[bin]! += 1;

@@ -74,11 +74,11 @@ function weights(shape: Float64Array, scale: number): Float64Array {
     return sums[bin]! + share * (sums[bin + 1]! - sums[bin]!);
   };
   let before = rise(0);
-  const found = new Float64Array(BUCKETS);
+  const chances = new Float64Array(BUCKETS);
   for (let bucket = 0; bucket < BUCKETS; bucket++) {
     const after = rise(BOUNDS[bucket + 1]! - 0.5);
-    found[bucket] = after - before + (0.001 * total) / BUCKETS;
+    chances[bucket] = after - before + (0.001 * total) / BUCKETS;
     before = after;
   }
-  return found;
+  return chances;
 }

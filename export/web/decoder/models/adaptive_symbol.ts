@@ -12,10 +12,10 @@ export class AdaptiveSymbol {
   /** Read a group of symbols, which are learned from together. */
   read(decoder: RangeDecoder, count: number): Int32Array {
     decoder.prepare(0, this.weights);
-    const found = new Int32Array(count);
-    for (let i = 0; i < count; i++) found[i] = decoder.categorical(0);
-    for (let i = 0; i < count; i++) this.weights[found[i]!]! += 1;
-    return found;
+    const symbols = new Int32Array(count);
+    for (let i = 0; i < count; i++) symbols[i] = decoder.categorical(0);
+    for (let i = 0; i < count; i++) this.weights[symbols[i]!]! += 1;
+    return symbols;
   }
 
   /** Read a symbol that is coded alone. */

@@ -6,12 +6,12 @@ import type { RangeDecoder } from "../range_decoder.ts";
 import { DecodeError } from "../scene.ts";
 import { AdaptiveNumber } from "./adaptive_number.ts";
 
-const MOST_MARGIN = 255;
+const MAX_MARGIN = 255;
 const NEAR = 2; // classes of size
 const EVERYWHERE = 480000;
 // of a file: classes of size, cells outside, and those for each Gaussian
-const MOST_CLASSES = 4096;
-const MOST_OUTSIDE = 2 ** 26;
+const MAX_CLASSES = 4096;
+const MAX_OUTSIDE = 2 ** 26;
 const EACH_OUTSIDE = 1024;
 
 /** For each Gaussian of a class the column and the row of its cell; in order, row by row. */
@@ -52,8 +52,8 @@ export class Occupancy {
     const rows = Math.ceil(this.height / side);
     const columns = Math.ceil(this.width / side);
     const margin = this.margin.read(decoder);
-    const most = mostMargin(rows, columns);
-    if (margin > most) throw new DecodeError(`a margin must be at most ${most} cells; got ${margin}`);
+    const limit = mostMargin(rows, columns);
+    if (margin > limit) throw new DecodeError(`a margin must be at most ${limit} cells; got ${margin}`);
     const wide = columns + 2 * margin;
     const grid = { rows, columns, side, ring: (rows + 2 * margin) * wide - rows * columns };
     const [inside, outside] = this.readNear(decoder, grid, size, count);
@@ -66,9 +66,9 @@ export class Occupancy {
       row[i] = Math.floor(place[i]! / wide) - margin;
       column[i] = (place[i]! % wide) - margin;
     }
-    const found = { side, column, row };
-    this.earlier.set(size, [...(this.earlier.get(size) ?? []), found]);
-    return found;
+    const coarser = { side, column, row };
+    this.earlier.set(size, [...(this.earlier.get(size) ?? []), coarser]);
+    return coarser;
   }
 
   /** Read cells that are the more likely, the more earlier Gaussians of about this size are near. */
@@ -78,7 +78,7 @@ export class Occupancy {
     if (beyond > count) throw new DecodeError(`at most ${count} Gaussians may lie outside; got ${beyond}`);
     this.gaussians += count;
     if (beyond) this.outside += ring;
-    if (this.classes++ === MOST_CLASSES || this.outside > MOST_OUTSIDE + EACH_OUTSIDE * this.gaussians)
+    if (this.classes++ === MAX_CLASSES || this.outside > MAX_OUTSIDE + EACH_OUTSIDE * this.gaussians)
       throw new DecodeError("a file must have fewer grids of cells");
     const near: number[] = [];
     const shift = 32 - Math.clz32(side); // of half pixels
@@ -89,10 +89,10 @@ export class Occupancy {
           const column = ((2 * cells.column[n]! + 1) * cells.side) >> shift;
           if (row >= 0 && row < rows && column >= 0 && column < columns) near.push(row, column);
         });
-    const at = program.openEarlier(near.length / 2);
-    new Int32Array(program.memory.buffer, at, near.length).set(near);
-    const least = Math.max(Math.floor(EVERYWHERE / (rows * columns)), 1);
-    const inside = listed(program, program.readNear(rows, columns, least, near.length / 2, count - beyond));
+    const address = program.openEarlier(near.length / 2);
+    new Int32Array(program.memory.buffer, address, near.length).set(near);
+    const base = Math.max(Math.floor(EVERYWHERE / (rows * columns)), 1);
+    const inside = listed(program, program.readNear(rows, columns, base, near.length / 2, count - beyond));
     return [inside, listed(program, program.readNear(ring, 1, 1, 0, beyond))];
   }
 }
@@ -125,9 +125,9 @@ function cellSide(height: number, width: number, count: number): number {
 
 /** The most cells on each side, such that all are at most 2**17 plus 16 times those inside. */
 function mostMargin(rows: number, columns: number): number {
-  const most = 2 ** 17 + 16 * rows * columns;
+  const limit = 2 ** 17 + 16 * rows * columns;
   let margin = 0;
-  while (margin < MOST_MARGIN && (rows + 2 * margin + 2) * (columns + 2 * margin + 2) <= most) margin++;
+  while (margin < MAX_MARGIN && (rows + 2 * margin + 2) * (columns + 2 * margin + 2) <= limit) margin++;
   return margin;
 }
 

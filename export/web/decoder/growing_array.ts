@@ -1,17 +1,17 @@
 /** Numbers to which more are added. */
-export class Growing<T extends Uint8Array | Float32Array | Int32Array> {
+export class GrowingArray<T extends Uint8Array | Float32Array | Int32Array> {
   length = 0;
 
   constructor(private numbers: T) {}
 
-  add(more: T): void {
-    const length = this.length + more.length;
+  add(values: T): void {
+    const length = this.length + values.length;
     if (length > this.numbers.length) {
       const larger = new (this.numbers.constructor as new (length: number) => T)(Math.max(length, 2 * this.length));
       larger.set(this.all());
       this.numbers = larger;
     }
-    this.numbers.set(more, this.length);
+    this.numbers.set(values, this.length);
     this.length = length;
   }
 
