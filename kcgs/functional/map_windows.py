@@ -39,7 +39,8 @@ class MapWindows:
         self.search = math.ceil(math.sqrt(2) * self.reach)
         self.halo = self.search + 1 if self.pairs else self.reach
         self.resized = not all(is_equal(new, old) for new, old in zip(size, labels.shape[-2:], strict=True))
-        down, across = (self._axis(size[k], labels.shape[k - 2], device) for k in (0, 1))
+        axis = self._soft_axis if self.soft else self._hard_axis
+        down, across = (axis(size[k], labels.shape[k - 2], device) for k in (0, 1))
         self._tables_per_axis = len(down)
         shape = (labels.shape[0] if labels.ndim == 3 else 1, *labels.shape[-2:])
         numbers = torch.stack([torch.full((), n, dtype=torch.int64, device=device) for n in shape])
@@ -49,18 +50,23 @@ class MapWindows:
             enlargement = (1 - sides[0] * sides[1] / (sides[2] * sides[3])).clamp_min(0).to(dtype)
             self.tables = (*self.tables, enlargement, softness)
 
-    def _axis(self, new: int, length: int, device: torch.device) -> tuple[Tensor, ...]:
-        """Return tables of the rows, or columns, of tiles; the last pixel is repeated past the edge."""
+    def _hard_axis(self, new: int, length: int, device: torch.device) -> tuple[Tensor, ...]:
+        """Return the pixels of the rows, or columns, of tiles: both neighbours and their shares where resized."""
         count = (new + self.side - 1) // self.side
+        # the last pixel is repeated past the edge
         pixels = torch.arange(count * self.side, device=device).clamp_max(new - 1)
-        if self.soft and not self.resized:
+        if not self.resized:
+            return (pixels.reshape(count, -1),)
+        ends, shares = sample_places(new, length, device)
+        parts = (*ends, *shares.to(self.dtype))
+        return tuple(part.index_select(0, pixels).reshape(count, -1) for part in parts)
+
+    def _soft_axis(self, new: int, length: int, device: torch.device) -> tuple[Tensor, ...]:
+        """Return the lines of the windows of tiles, and a matrix of interpolation for each where resized."""
+        count = (new + self.side - 1) // self.side
+        if not self.resized:
             return self._lines(torch.arange(count, device=device) * self.side, self.side, length)
-        if not self.soft:
-            if not self.resized:
-                return (pixels.reshape(count, -1),)
-            ends, shares = sample_places(new, length, device)
-            parts = (*ends, *shares.to(self.dtype))
-            return tuple(part.index_select(0, pixels).reshape(count, -1) for part in parts)
+        pixels = torch.arange(count * self.side, device=device).clamp_max(new - 1)
         # between which pixels of the map each pixel lies, and how far
         place = ((2 * pixels + 1).double() * length - new) / (2 * new)
         low = place.floor().reshape(count, -1, 1)

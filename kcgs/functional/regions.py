@@ -86,7 +86,7 @@ class RegionMap:
 
     @classmethod
     def coerce(cls, value: object, name: str = "regions") -> RegionMap | None:
-        """Return a RegionMap, a label map's with hard contours, or None; TypeError calls anything else `name`."""
+        """Return a RegionMap or None as they are, and the map with hard contours of labels; `name` is for errors."""
         if value is None or isinstance(value, RegionMap):
             return value
         if isinstance(value, Tensor | np.ndarray):

@@ -9,7 +9,17 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from kcgs._check import check_floating, check_ids, check_integer, check_labels, check_rows, check_size, check_tensor
+from kcgs._check import (
+    check_count,
+    check_floating,
+    check_ids,
+    check_integer,
+    check_labels,
+    check_number,
+    check_rows,
+    check_size,
+    check_tensor,
+)
 from kcgs.functional import RegionMap, lookup_regions
 from kcgs.functional.covariance import check_cholesky
 from kcgs.functional.sizes import is_equal
@@ -120,15 +130,14 @@ class GaussianField(nn.Module):
             dtype: float32 or float64.
 
         Raises:
-            ValueError: a number out of range.
+            TypeError, ValueError: a number of another type or out of range.
         """
         height, width = check_size("size", size)
-        if num_gaussians < 0 or channels < 1:
-            raise ValueError(f"num_gaussians must be >= 0 and channels >= 1; got {num_gaussians!r} and {channels!r}")
+        check_count("num_gaussians", num_gaussians, 0)
+        check_count("channels", channels)
         if sigma is None:
             sigma = max(0.5, 0.5 * (height * width / max(1, num_gaussians)) ** 0.5)
-        if not 0.0 < sigma < float("inf"):
-            raise ValueError(f"sigma must be positive and finite; got {sigma!r}")
+        check_number("sigma", sigma, 0.0, above=True)
         generator = None if seed is None else torch.Generator().manual_seed(seed)
         means = torch.rand(num_gaussians, 2, generator=generator, dtype=dtype) * torch.tensor([width, height])
         cholesky = torch.tensor([sigma, 0.0, sigma], dtype=dtype).repeat(num_gaussians, 1)

@@ -101,9 +101,9 @@ class TestChooseSoftness:
     @pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
     def test_dtype_contrast_and_colour_do_not_matter(self, dtype: torch.dtype) -> None:
         labels, image = ellipse(), paint(ellipse(), 1.0)
-        want = choose_softness(image, labels)
-        assert choose_softness(image.to(dtype).requires_grad_(), labels.to(torch.uint8)) == want
-        assert choose_softness(0.3 + 0.2 * image, labels) == choose_softness(1 - image, labels) == want
+        expected = choose_softness(image, labels)
+        assert choose_softness(image.to(dtype).requires_grad_(), labels.to(torch.uint8)) == expected
+        assert choose_softness(0.3 + 0.2 * image, labels) == choose_softness(1 - image, labels) == expected
 
     def test_candidates(self) -> None:
         labels, image = ellipse(), paint(ellipse(), 1.0)

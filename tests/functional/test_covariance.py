@@ -38,8 +38,8 @@ class TestForms:
 
     def test_scale_rotation(self, factors: Tensor) -> None:
         scales, angle = cholesky_to_scale_rotation(factors)
-        want = torch.linalg.svdvals(triangle(factors))
-        torch.testing.assert_close(scales, want)
+        expected = torch.linalg.svdvals(triangle(factors))
+        torch.testing.assert_close(scales, expected)
         torch.testing.assert_close(scale_rotation_to_cholesky(scales, angle), factors)
 
     @pytest.mark.parametrize("angle", [0.0, 1e-9, math.pi / 4, math.pi / 2, 2.0, math.pi])

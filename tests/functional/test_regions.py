@@ -198,23 +198,23 @@ class TestResize:
             exponent = ((variance + lost / 6) / (variance - lost / 12).clamp_min(lost / 24)).sqrt()
             powers = torch.stack(means) ** exponent
             means = [*(powers / powers.sum(0))]
-        for region, want in enumerate(means):
-            got = resized.tables.membership.weights(0, region, torch.float64)
-            assert (got - want).abs().max() < 1e-8
+        for region, expected in enumerate(means):
+            result = resized.tables.membership.weights(0, region, torch.float64)
+            assert (result - expected).abs().max() < 1e-8
             for key, mask in zip(table.keys.tolist(), table.mask.tolist(), strict=True):
                 if key % 3 != region:
                     continue
                 y, x = key // 3 // tiles_x * 16, key // 3 % tiles_x * 16
-                part = want[y : y + 16, x : x + 16]
+                part = expected[y : y + 16, x : x + 16]
                 shares = torch.ones(16, 16).double() if mask < 0 else table.masks[mask].view(16, 16)
                 assert (shares[: part.shape[0], : part.shape[1]] - part).abs().max() < 1e-8
-                want[y : y + 16, x : x + 16] = 0.0
-            assert want.abs().max() < 1e-8, "tiles without the key have none of the region"
+                expected[y : y + 16, x : x + 16] = 0.0
+            assert expected.abs().max() < 1e-8, "tiles without the key have none of the region"
 
     @pytest.mark.parametrize("size", [(9, 9), (12, 18), (60, 66), (5, 7)])
     def test_largest_share_in_exact_arithmetic(self, size: tuple[int, int]) -> None:
         for labels in (torch.arange(36).view(6, 6), torch.arange(36).view(6, 6) % 7 % 2):
-            got = RegionMap.from_labels(labels).resize(size).labels
+            result = RegionMap.from_labels(labels).resize(size).labels
             for i in range(size[0]):
                 for j in range(size[1]):
                     shares: dict[int, int] = {}
@@ -230,7 +230,7 @@ class TestResize:
                             shares[label] = shares.get(label, 0) + weight_y * weight_x
                     best, *others = sorted(shares.values(), reverse=True)
                     assert not others or best > others[0], "no two labels tie"
-                    assert shares[int(got[i, j])] == best
+                    assert shares[int(result[i, j])] == best
 
     def test_batch(self) -> None:
         maps = torch.stack([blobs(seed=0), blobs(seed=1)])
@@ -266,15 +266,15 @@ class TestCrisp:
         labels = blobs()
         crisp = RegionMap.from_labels(labels, softness).resize(size, "crisp")
         assert crisp.contours == "crisp" and crisp.softness == 0.5 and crisp.size == size
-        want, table, tiles_x = stated_crisp(labels, size), crisp.tables.membership.tiles(16), -(-size[1] // 16)
+        expected, table, tiles_x = stated_crisp(labels, size), crisp.tables.membership.tiles(16), -(-size[1] // 16)
         found = torch.zeros(4, -(-size[0] // 16) * 16, tiles_x * 16, dtype=torch.float64)
         for key, mask in zip(table.keys.tolist(), table.mask.tolist(), strict=True):
             y, x = key // 4 // tiles_x * 16, key // 4 % tiles_x * 16
             found[key % 4, y : y + 16, x : x + 16] = 1.0 if mask < 0 else table.masks[mask].view(16, 16)
         # what is beyond the blur's reach of 4 deviations differs by less than its weights there
-        assert (found[:, : size[0], : size[1]] - want).abs().max() < 1e-6
+        assert (found[:, : size[0], : size[1]] - expected).abs().max() < 1e-6
         for region in range(4):
-            assert (crisp.tables.membership.weights(0, region, torch.float64) - want[region]).abs().max() < 1e-9
+            assert (crisp.tables.membership.weights(0, region, torch.float64) - expected[region]).abs().max() < 1e-9
 
     def test_a_disc_is_round(self) -> None:
         """The half-way line stays within 0.4 pixels of the map from the circle; stairs are 0.7 off."""
@@ -326,8 +326,8 @@ class TestCrisp:
             assert other.contours == "crisp" and torch.equal(
                 other.tables.membership.tiles(16).masks, crisp.tables.membership.tiles(16).masks
             )
-        want = crisp.tables.membership.weights(1, 2, torch.float64)
-        torch.testing.assert_close(crisp.image(1).membership(2), want, rtol=0, atol=1e-9)
+        expected = crisp.tables.membership.weights(1, 2, torch.float64)
+        torch.testing.assert_close(crisp.image(1).membership(2), expected, rtol=0, atol=1e-9)
         assert crisp.resize((45, 70)) is regions and crisp.resize((90, 140), "crisp") is crisp
         assert RegionMap.from_labels(torch.zeros(4, 5).long()).resize((4, 5), "crisp").num_regions == 1
 

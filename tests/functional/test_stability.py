@@ -15,7 +15,7 @@ FAST = ["tiled", "cpu"]
 SIZE = (40, 50)
 
 
-def draw(
+def render(
     backend: str, scene: list[Tensor], ids: Tensor | None = None, regions: RegionMap | None = None
 ) -> list[Tensor]:
     """Return the image and the gradients, of the reference in float64, of others in float32."""
@@ -31,18 +31,18 @@ def draw(
 def compare(
     backend: str, scene: list[Tensor], ids: Tensor | None = None, regions: RegionMap | None = None
 ) -> tuple[float, float, float]:
-    return errors(draw(backend, scene, ids, regions), draw("reference", scene, ids, regions))
+    return errors(render(backend, scene, ids, regions), render("reference", scene, ids, regions))
 
 
-def errors(got: list[Tensor], want: list[Tensor]) -> tuple[float, float, float]:
+def errors(result: list[Tensor], expected: list[Tensor]) -> tuple[float, float, float]:
     """Return the image error, the gradient error relative to each component's largest, and 1 - cosine."""
-    assert all(torch.isfinite(g).all() for g in got)
+    assert all(torch.isfinite(g).all() for g in result)
     gradient, angle = 0.0, 0.0
-    for g, w in zip(got[1:], want[1:], strict=True):
+    for g, w in zip(result[1:], expected[1:], strict=True):
         gradient = max(gradient, float(((g - w).abs() / w.abs().amax(0).clamp_min(1e-12)).max()))
         if w.norm() > 1e-9:
             angle = max(angle, 1 - float(torch.nn.functional.cosine_similarity(g.flatten(), w.flatten(), dim=0)))
-    return float((got[0] - want[0]).abs().max()), gradient, angle
+    return float((result[0] - expected[0]).abs().max()), gradient, angle
 
 
 def centres(count: int) -> Tensor:
@@ -85,7 +85,7 @@ def test_centres_far_away(backend: str, distance: float) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing:UserWarning")
-@pytest.mark.parametrize("size", [(1, 1), (1, 2000), (2000, 1), (3, 17)])
+@pytest.mark.parametrize("size", [(1, 1), (1, 700), (700, 1), (3, 17)])
 @pytest.mark.parametrize("count", [0, 1, 40])
 def test_shapes(size: tuple[int, int], count: int) -> None:
     generator = torch.Generator().manual_seed(0)
@@ -99,9 +99,9 @@ def test_shapes(size: tuple[int, int], count: int) -> None:
         if not count:
             assert all(not region_splat(*scene, ids, regions, backend=backend).any() for backend in FAST)
             continue
-        want = draw("reference", scene, ids, regions)  # once for all: on so many pixels it takes seconds
+        expected = render("reference", scene, ids, regions)  # once for all: on so many pixels it takes seconds
         for backend in FAST:
-            image, gradient, _ = errors(draw(backend, scene, ids, regions), want)
+            image, gradient, _ = errors(render(backend, scene, ids, regions), expected)
             assert image < 1e-5 * count, backend
             assert gradient < 1e-3, backend  # of a component that may be a small difference of large terms
 
@@ -128,9 +128,8 @@ def test_65535_regions_of_a_few_pixels(backend: str) -> None:
         means, torch.tensor([[4.0, 0.0, 4.0]]).repeat(len(ids), 1), colors, ids, labels, backend=backend
     )
     painted = torch.zeros(65_535).index_put((ids,), colors[:, 0])
-    at = labels[0, ::2]
-    want = painted[at] * math.exp(-0.5 * (0.5 / 4) ** 2)
-    torch.testing.assert_close(image[0, 0, ::2], want, rtol=1e-3, atol=1e-6)
+    expected = painted[labels[0, ::2]] * math.exp(-0.5 * (0.5 / 4) ** 2)
+    torch.testing.assert_close(image[0, 0, ::2], expected, rtol=1e-3, atol=1e-6)
     assert (image[0] > 0).float().mean() == pytest.approx(1 / 7, abs=0.01)
 
 

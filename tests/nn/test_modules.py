@@ -274,13 +274,13 @@ class TestRegionSplatRenderer(BaseTester):
 class TestComposition:
     def test_no_grad_and_inference_mode(self, field: GaussianField, labels: Tensor) -> None:
         render = RegionSplatRenderer()
-        want = render(field, labels)
-        assert want.requires_grad
+        expected = render(field, labels)
+        assert expected.requires_grad
         with torch.no_grad():
-            got = render(field, labels)
-            assert torch.equal(got, want) and not got.requires_grad
+            result = render(field, labels)
+            assert torch.equal(result, expected) and not result.requires_grad
         with torch.inference_mode():
-            assert torch.equal(render(field, labels), want)
+            assert torch.equal(render(field, labels), expected)
         # tables made in inference mode serve a later backward
         regions = RegionMap.from_labels(labels, 0.7)
         with torch.inference_mode():
@@ -333,10 +333,10 @@ class TestHalf:
 
         halves = [p.detach().to(dtype).requires_grad_() for p in (field.means, field.cholesky, field.colors)]
         floats = [t.detach().float().requires_grad_() for t in halves]
-        image, want = render(*halves), render(*floats)
-        assert image.dtype == dtype and torch.equal(image, want.to(dtype))
-        got = torch.autograd.grad(image.float().sum(), halves)
-        for gradient, exact, leaf in zip(got, torch.autograd.grad(want.sum(), floats), halves, strict=True):
+        image, expected = render(*halves), render(*floats)
+        assert image.dtype == dtype and torch.equal(image, expected.to(dtype))
+        result = torch.autograd.grad(image.float().sum(), halves)
+        for gradient, exact, leaf in zip(result, torch.autograd.grad(expected.sum(), floats), halves, strict=True):
             assert gradient.dtype == leaf.dtype == dtype and torch.equal(gradient, exact.to(dtype))
         # one of the three is enough, and the colours decide
         assert render(halves[0], floats[1], floats[2]).dtype == torch.float32

@@ -17,27 +17,27 @@ SIZE = (32, 40)
 Loss = Callable[[Tensor, Tensor], Tensor]
 
 
-def sobel(drawn: Tensor, target: Tensor) -> Tensor:
-    return (kornia.filters.sobel(drawn) - kornia.filters.sobel(target)).abs().mean()
+def sobel(image: Tensor, target: Tensor) -> Tensor:
+    return (kornia.filters.sobel(image) - kornia.filters.sobel(target)).abs().mean()
 
 
-def gradient(drawn: Tensor, target: Tensor) -> Tensor:
-    one, two = (kornia.filters.spatial_gradient(image, "sobel", order=1) for image in (drawn, target))
+def gradient(image: Tensor, target: Tensor) -> Tensor:
+    one, two = (kornia.filters.spatial_gradient(image, "sobel", order=1) for image in (image, target))
     return (one - two).square().mean()
 
 
-def laplacian(drawn: Tensor, target: Tensor) -> Tensor:
-    return (kornia.filters.laplacian(drawn, 5) - kornia.filters.laplacian(target, 5)).abs().mean()
+def laplacian(image: Tensor, target: Tensor) -> Tensor:
+    return (kornia.filters.laplacian(image, 5) - kornia.filters.laplacian(target, 5)).abs().mean()
 
 
-def ssim(drawn: Tensor, target: Tensor) -> Tensor:
-    return kornia.losses.ssim_loss(drawn, target, window_size=5)
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    return kornia.losses.ssim_loss(image, target, window_size=5)
 
 
-def edge_aware_smoothness(drawn: Tensor, target: Tensor) -> Tensor:
+def edge_aware_smoothness(image: Tensor, target: Tensor) -> Tensor:
     """Penalise slopes of the drawn brightness except where the target has edges, together with the difference."""
-    smooth = kornia.losses.inverse_depth_smoothness_loss(drawn.mean(1, keepdim=True), target)
-    return smooth + (drawn - target).square().mean()
+    smooth = kornia.losses.inverse_depth_smoothness_loss(image.mean(1, keepdim=True), target)
+    return smooth + (image - target).square().mean()
 
 
 LOSSES = [sobel, gradient, laplacian, ssim, edge_aware_smoothness]
@@ -67,9 +67,9 @@ class TestEdgeLosses(BaseTester):
     def test_smoke(
         self, loss: Loss, backend: str, device: torch.device, dtype: torch.dtype, target: Tensor, regions: RegionMap
     ) -> None:
-        drawn = RegionSplatRenderer(backend=backend, keepdim=False)(self.scene(regions, device, dtype))
-        value = loss(drawn, target.to(drawn))
-        assert value.isfinite() and value > 0 and value.device.type == device.type and value.dtype == drawn.dtype
+        image = RegionSplatRenderer(backend=backend, keepdim=False)(self.scene(regions, device, dtype))
+        value = loss(image, target.to(image))
+        assert value.isfinite() and value > 0 and value.device.type == device.type and value.dtype == image.dtype
 
     @pytest.mark.parametrize("loss", LOSSES)
     @pytest.mark.parametrize("images", [1, 3])
@@ -78,8 +78,8 @@ class TestEdgeLosses(BaseTester):
         maps = torch.stack([(target[0, 0] > 0.8).roll(k, 1).long() for k in range(images)])
         tensors = [torch.rand(images, 20, n, generator=torch.Generator().manual_seed(n)) for n in (2, 3, 3)]
         field = GaussianField(30 * tensors[0], 1 + 3 * tensors[1], tensors[2], size=SIZE).assign_regions(maps)
-        drawn = RegionSplatRenderer()(field.to(device), maps.to(device))
-        assert drawn.shape == (images, 3, *SIZE) and loss(drawn, target.to(device).expand_as(drawn)).shape == ()
+        image = RegionSplatRenderer()(field.to(device), maps.to(device))
+        assert image.shape == (images, 3, *SIZE) and loss(image, target.to(device).expand_as(image)).shape == ()
 
     @pytest.mark.parametrize("loss", LOSSES)
     def test_exception(self, loss: Loss, target: Tensor) -> None:
@@ -110,8 +110,8 @@ class TestEdgeLosses(BaseTester):
         """Filters as links of a chain behind the renderer."""
         scene = self.scene(regions, device, dtype)
         links = nn.Sequential(RegionSplatRenderer(keepdim=False), kornia.filters.Sobel(), kornia.filters.Laplacian(5))
-        want = kornia.filters.laplacian(kornia.filters.sobel(scene()[None]), 5)
-        self.assert_close(links(scene), want)
+        expected = kornia.filters.laplacian(kornia.filters.sobel(scene()[None]), 5)
+        self.assert_close(links(scene), expected)
 
     @pytest.mark.parametrize("loss", LOSSES)
     def test_feature(self, loss: Loss, target: Tensor, regions: RegionMap) -> None:
@@ -142,17 +142,3 @@ class TestEdgeLosses(BaseTester):
         loss(RegionSplatRenderer()(field, regions)[None], target).backward()
         for parameter in field.parameters():
             assert parameter.grad is not None and parameter.grad.isfinite().all()
-
-    def test_sobel_draws_the_contour(self, target: Tensor, regions: RegionMap) -> None:
-        """Slopes alone, without a term in the colours, put the steps of the picture where they are in the target."""
-        field = GaussianField.random(60, SIZE, regions=regions, seed=0)
-        optimizer = torch.optim.Adam(field.parameters(), lr=0.03)
-        for _ in range(150):
-            loss = gradient(RegionSplatRenderer()(field, regions)[None], target)
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-        with torch.no_grad():
-            drawn = RegionSplatRenderer()(field, regions)[None]
-        slopes = torch.stack([kornia.filters.sobel(image).flatten() for image in (drawn, target)])
-        assert torch.corrcoef(slopes)[0, 1] > 0.9

@@ -215,8 +215,8 @@ class TestRenderRegion:
         rgba = cut(scene, DISC)
         inside = rgba[3] > 0
         assert 0 < rgba[3, inside].min() < 1e-3 < 0.999 < rgba[3].max()
-        want = torch.tensor([0.9, 0.5, 0.1])[:, None].expand(-1, int(inside.sum()))
-        torch.testing.assert_close(rgba[:3, inside], want, rtol=0, atol=1e-5)
+        expected = torch.tensor([0.9, 0.5, 0.1])[:, None].expand(-1, int(inside.sum()))
+        torch.testing.assert_close(rgba[:3, inside], expected, rtol=0, atol=1e-5)
         assert not rgba[:3, ~inside].any()
 
     def test_colours_are_clipped_unless_asked_otherwise(self) -> None:
@@ -231,8 +231,8 @@ class TestRenderRegion:
         scene = scene_of(regions)
         rgba, disc, box = render_region(scene, [BOX, DISC], clamp=False).detach(), cut(scene, DISC), cut(scene, BOX)
         torch.testing.assert_close(rgba[3], disc[3] + box[3], rtol=0, atol=1e-6)
-        want = disc[:3] * disc[3] + box[:3] * box[3]
-        torch.testing.assert_close(rgba[:3] * rgba[3], want, rtol=0, atol=1e-5)
+        expected = disc[:3] * disc[3] + box[:3] * box[3]
+        torch.testing.assert_close(rgba[:3] * rgba[3], expected, rtol=0, atol=1e-5)
 
 
 class TestExtract:
@@ -299,15 +299,15 @@ class TestRecolor:
         assert changed.num_gaussians == scene.num_gaussians + 1
         before, after = cut(scene, DISC), cut(changed, DISC)
         matrix = gain if isinstance(gain, Tensor) and gain.ndim == 2 else torch.eye(3) * gain
-        want = torch.einsum("ij,jhw->ihw", matrix, before[:3]) + bias[:, None, None]
-        torch.testing.assert_close(after[:3], torch.where(after[3] > 0, want, 0.0), rtol=0, atol=2e-5)
+        expected = torch.einsum("ij,jhw->ihw", matrix, before[:3]) + bias[:, None, None]
+        torch.testing.assert_close(after[:3], torch.where(after[3] > 0, expected, 0.0), rtol=0, atol=2e-5)
         torch.testing.assert_close(cut(changed, BOX), cut(scene, BOX))
 
     def test_lists_and_arrays_are_tensors(self) -> None:
         scene, gain = scene_of(MAPS["hard"]()), [1.4, 1.0, 0.6]
-        want = recolor_region(scene, BOX, torch.tensor(gain), torch.tensor(gain))().detach()
+        expected = recolor_region(scene, BOX, torch.tensor(gain), torch.tensor(gain))().detach()
         for other in (gain, tuple(gain), np.array(gain), torch.diag(torch.tensor(gain)).tolist()):
-            torch.testing.assert_close(recolor_region(scene, BOX, other, gain)().detach(), want)
+            torch.testing.assert_close(recolor_region(scene, BOX, other, gain)().detach(), expected)
 
     def test_without_bias_no_gaussian_is_added(self) -> None:
         scene = scene_of(MAPS["hard"]())
@@ -331,26 +331,26 @@ class TestDelete:
         generator = torch.Generator().manual_seed(0)
         coarse = torch.randint(0, 5, (6, 8), generator=generator)
         labels = coarse.repeat_interleave(4, 0).repeat_interleave(4, 1)
-        got = map_of(delete_region(scene_of(labels), 2, fill=False)).labels
+        result = map_of(delete_region(scene_of(labels), 2, fill=False)).labels
         stays = (labels != 2).nonzero()
         for y, x in (labels == 2).nonzero().tolist():
             squared = (stays - torch.tensor([y, x])).square().sum(1)
-            assert got[y, x] in labels[tuple(stays[squared == squared.min()].T)]
-        assert torch.equal(got[labels != 2], labels[labels != 2])
+            assert result[y, x] in labels[tuple(stays[squared == squared.min()].T)]
+        assert torch.equal(result[labels != 2], labels[labels != 2])
 
 
 class TestRenderOver:
     def test_shares_blend(self, regions: RegionMap) -> None:
         scene, background = scene_of(regions), torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(1))
         cuts = {r: cut(scene, r) for r in (BOX, DISC, GROUND)}
-        got = render_over(scene, GROUND, background)
-        want = sum(cuts[r][:3] * cuts[r][3:] for r in (BOX, DISC)) + background * cuts[GROUND][3:]
-        torch.testing.assert_close(got, want, rtol=0, atol=1e-5)
+        result = render_over(scene, GROUND, background)
+        expected = sum(cuts[r][:3] * cuts[r][3:] for r in (BOX, DISC)) + background * cuts[GROUND][3:]
+        torch.testing.assert_close(result, expected, rtol=0, atol=1e-5)
 
     def test_all_of_it_is_the_background_at_its_size(self, regions: RegionMap) -> None:
         background = torch.rand(3, 100, 70, generator=torch.Generator().manual_seed(1))
-        got = render_over(scene_of(regions), regions.ids.tolist(), background)
-        torch.testing.assert_close(got, background, rtol=0, atol=1e-6)
+        result = render_over(scene_of(regions), regions.ids.tolist(), background)
+        torch.testing.assert_close(result, background, rtol=0, atol=1e-6)
 
 
 class TestReplaceBackground:
@@ -358,17 +358,17 @@ class TestReplaceBackground:
     def test_the_rest_stays_and_the_background_shows(self, size: tuple[int, int]) -> None:
         scene = scene_of(MAPS["hard"]())
         other = Scene(GaussianField.random(60, size, seed=3))
-        got = replace_background(scene, GROUND, other)
-        image, ground = got().detach(), map_of(scene).labels == GROUND
+        result = replace_background(scene, GROUND, other)
+        image, ground = result().detach(), map_of(scene).labels == GROUND
         torch.testing.assert_close(image[:, ~ground], scene().detach()[:, ~ground], rtol=0, atol=1e-6)
-        want = region_splat(*scaled_gaussians(other.field, SIZE), other.field.colors, size=SIZE).detach()
-        torch.testing.assert_close(image[:, ground], want[:, ground], rtol=0, atol=1e-5)
-        assert got.metadata == scene.metadata
+        expected = region_splat(*scaled_gaussians(other.field, SIZE), other.field.colors, size=SIZE).detach()
+        torch.testing.assert_close(image[:, ground], expected[:, ground], rtol=0, atol=1e-5)
+        assert result.metadata == scene.metadata
 
     def test_regions_of_the_background_stay_apart(self) -> None:
         scene, other = scene_of(MAPS["soft"]()), scene_of((torch.arange(64) // 20).expand(SIZE), opacities=True)
-        got = replace_background(scene, [GROUND, BOX], other)
-        assert map_of(got).ids.tolist() == [DISC, *range(DISC + 1, DISC + 5)]
+        result = replace_background(scene, [GROUND, BOX], other)
+        assert map_of(result).ids.tolist() == [DISC, *range(DISC + 1, DISC + 5)]
         hard = replace_background(Scene(scene.field, map_of(scene).labels), [GROUND, BOX], other)
         outside = map_of(scene).labels != DISC
         torch.testing.assert_close(hard().detach()[:, outside], other().detach()[:, outside], rtol=0, atol=1e-5)

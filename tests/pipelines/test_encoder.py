@@ -74,8 +74,8 @@ class Encoder(nn.Module):
         rows, columns = (torch.arange(n // self.cell) for n in images.shape[-2:])
         grid = (torch.cartesian_prod(rows, columns).flip(-1) + 0.5) * self.cell
         means = grid + self.cell * raw[..., :2].tanh()
-        widths = 1 + self.cell * (raw[..., 2:4] - 1).sigmoid()
-        cholesky = torch.stack([widths[..., 0], raw[..., 4], widths[..., 1]], -1)
+        diagonal = 1 + self.cell * (raw[..., 2:4] - 1).sigmoid()
+        cholesky = torch.stack([diagonal[..., 0], raw[..., 4], diagonal[..., 1]], -1)
         colors = raw[..., 5:] + 0.6 * functional.avg_pool2d(images, self.cell).flatten(2).mT
         return means, cholesky, colors, lookup_regions(means, labels)
 
@@ -145,19 +145,6 @@ def test_a_batch_is_its_images(backend: str) -> None:
     for b, scene in enumerate(Scene(field, labels)):
         assert scene.regions is not None and scene.regions.num_regions == (3, 2)[b % 2]
         torch.testing.assert_close(together[b], render(scene), rtol=1e-5, atol=1e-5)
-
-
-def test_gradients_agree_between_backends() -> None:
-    torch.manual_seed(0)
-    encoder = Encoder()
-    images, labels = draw_shapes(3)
-    gradients = {}
-    for name in ("reference", "tiled", "cpu"):
-        image = region_splat(*encoder.predict(images, labels), labels, backend=name)
-        gradients[name] = torch.autograd.grad((image - images).square().sum(), list(encoder.parameters()))
-    for name in ("tiled", "cpu"):
-        for got, want in zip(gradients[name], gradients["reference"], strict=True):
-            torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-3 * float(want.abs().max()))
 
 
 class TestOneGraph:

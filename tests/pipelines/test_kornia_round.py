@@ -110,12 +110,6 @@ class TestFirstLink:
         for keepdim in (False, True):
             assert nn.Sequential(RegionSplatRenderer(keepdim=keepdim), *links)(both).shape == (2, 3, 12, 18)
 
-    def test_keepdim(self, scene: Scene) -> None:
-        """As Kornia's augmentations have it, but with (C, H, W) kept by default: a scene is one image."""
-        image = RegionSplatRenderer()(scene)
-        assert image.shape == (3, *self.SIZE) and torch.equal(RegionSplatRenderer(keepdim=False)(scene)[0], image)
-        assert K.RandomHorizontalFlip(p=1.0, keepdim=True)(image).shape == (3, *self.SIZE)
-
     @pytest.mark.parametrize(
         "loss",
         [

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -229,18 +230,6 @@ class TestExport:
         other = [nn.functional.interpolate(batch(2)[0], (30, 41)), batch(2)[1].repeat(1, 2, 2)[:, :30, :41]]
         torch.testing.assert_close(program.module()(*other), encoder(*other), rtol=1e-5, atol=1e-6)
 
-    @compiler_warnings
-    def test_encoder_in_one_graph_for_any_batch(self) -> None:
-        torch._dynamo.reset()
-        counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
-        encoder = Encoder(False)
-        compiled, counts = torch.compile(encoder, backend=counter, fullgraph=True), []
-        for count in (2, 3, 5):
-            assert torch.equal(compiled(*batch(count)), encoder(*batch(count)))
-            compiled(*batch(count)).sum().backward()
-            counts.append(counter.frame_count)
-        assert counts == [1, 2, 2]
-
 
 class Splat(nn.Module):
     def forward(self, *tensors: Tensor) -> Tensor:
@@ -294,13 +283,13 @@ class TestOperator:
         tensors[2].requires_grad_()
         ids = field.region_ids[None]
 
-        def render(of: RegionMap) -> Tensor:
-            return region_splat(*tensors, ids, of, backend=kernel).square().sum()
+        def render(regions: RegionMap) -> Tensor:
+            return region_splat(*tensors, ids, regions, backend=kernel).square().sum()
 
-        want = [torch.autograd.grad(render(of), tensors[2])[0] for of in maps]
-        for image, gradient in zip([render(of) for of in maps], want, strict=True):
+        expected = [torch.autograd.grad(render(regions), tensors[2])[0] for regions in maps]
+        for image, gradient in zip([render(regions) for regions in maps], expected, strict=True):
             assert torch.equal(torch.autograd.grad(image, tensors[2])[0], gradient)
-        assert not torch.equal(*want)
+        assert not torch.equal(*expected)
 
     @pytest.mark.parametrize("write", ["counted", "numpy", "data", "inference"])
     def test_labels_that_change(self, field: GaussianField, write: str) -> None:
@@ -357,16 +346,16 @@ class TestOperator:
         tensors = [t.detach().clone().requires_grad_() for t in (field.means, field.cholesky, field.colors)]
         labels, ids = regions.labels.clone(), field.region_ids.clone()
         image = region_splat(*tensors, ids, labels, backend=kernel)
-        want = torch.autograd.grad(image.square().sum(), tensors, retain_graph=True)
+        expected = torch.autograd.grad(image.square().sum(), tensors, retain_graph=True)
         labels.fill_(0)
         ids.fill_(3)
         monkeypatch.setattr("kcgs.functional.operator.plan_splat", None)
         for _ in range(2):
-            got = torch.autograd.grad(image.square().sum(), tensors, retain_graph=True)
-            assert all(torch.equal(a, b) for a, b in zip(got, want, strict=True))
+            result = torch.autograd.grad(image.square().sum(), tensors, retain_graph=True)
+            assert all(torch.equal(a, b) for a, b in zip(result, expected, strict=True))
         assert image.grad_fn.plan is not None
         image.sum().backward()
-        assert image.grad_fn.plan is None  # a loss that is kept for its value does not hold megabytes
+        assert image.grad_fn.plan is None  # a loss that stays alive for its value holds no plan
 
 
 class TestFunctional:
@@ -376,9 +365,9 @@ class TestFunctional:
         before = field.colors.detach().clone()
         swapped = {name: p.detach().clone() for name, p in module.named_parameters()}
         swapped["field.colors"] = (0.5 * swapped["field.colors"]).requires_grad_()
-        got = torch.func.functional_call(module, swapped, (torch.full((1,), 2.0),))
-        torch.testing.assert_close(got, module(torch.ones(1)), rtol=1e-5, atol=1e-6)
-        got.sum().backward()
+        result = torch.func.functional_call(module, swapped, (torch.full((1,), 2.0),))
+        torch.testing.assert_close(result, module(torch.ones(1)), rtol=1e-5, atol=1e-6)
+        result.sum().backward()
         assert swapped["field.colors"].grad is not None and swapped["field.colors"].grad.any()
         assert field.colors.grad is None and torch.equal(field.colors, before)
 
@@ -386,17 +375,17 @@ class TestFunctional:
     def test_checkpoint(self, field: GaussianField, regions: RegionMap, backend: str, reentrant: bool) -> None:
         """Evaluated again in the backward, the same gradients, bit for bit."""
         results = []
-        for wrap in (lambda f, *given: f(*given), lambda f, *given: checkpoint(f, *given, use_reentrant=reentrant)):
+        for checkpointed in (False, True):
             leaves = [t.detach().clone().requires_grad_() for t in (field.means, field.cholesky, field.colors)]
 
             def render(*tensors: Tensor) -> Tensor:
                 return region_splat(*tensors, field.region_ids, regions, backend=backend)
 
-            image = wrap(render, *leaves)
+            image = checkpoint(render, *leaves, use_reentrant=reentrant) if checkpointed else render(*leaves)
             (image * image.detach().cos()).sum().backward()
             results.append([image.detach(), *(t.grad for t in leaves)])
-        for got, want in zip(*results, strict=True):
-            assert want is not None and want.any() and torch.equal(got, want)
+        for result, expected in zip(*results, strict=True):
+            assert expected is not None and expected.any() and torch.equal(result, expected)
 
     @pytest.mark.parametrize("kernel", ["cpu", "tiled", "reference"])
     def test_grad_and_vjp(self, field: GaussianField, regions: RegionMap, kernel: str) -> None:
@@ -406,11 +395,11 @@ class TestFunctional:
         def loss(values: dict[str, Tensor]) -> Tensor:
             return torch.func.functional_call(module, values, (torch.ones(1),)).square().sum()
 
-        want = dict(zip(parameters, image_and_gradients(module, torch.ones(1))[1:], strict=True))
-        for name, got in torch.func.grad(loss)(parameters).items():
-            torch.testing.assert_close(got, want[name], rtol=1e-5, atol=1e-6)
+        expected = dict(zip(parameters, image_and_gradients(module, torch.ones(1))[1:], strict=True))
+        for name, result in torch.func.grad(loss)(parameters).items():
+            torch.testing.assert_close(result, expected[name], rtol=1e-5, atol=1e-6)
         _, pull = torch.func.vjp(loss, parameters)
-        torch.testing.assert_close(pull(torch.tensor(2.0))[0]["field.means"], 2 * want["field.means"])
+        torch.testing.assert_close(pull(torch.tensor(2.0))[0]["field.means"], 2 * expected["field.means"])
 
     def test_jvp(self, field: GaussianField, regions: RegionMap) -> None:
         """The picture is linear in the colours: its derivative along a colour is the picture of that colour."""
@@ -431,15 +420,15 @@ class TestFunctional:
         shifted = means + torch.rand(4, 1, 2, generator=generator)
         labels = torch.stack([regions.labels.roll(k, 1) for k in range(4)])
 
-        def render(c: Tensor, m: Tensor = means, of: RegionMap | Tensor = regions) -> Tensor:
-            return region_splat(m, cholesky, c, ids, of, backend=backend)
+        def render(c: Tensor, m: Tensor = means, regions: RegionMap | Tensor = regions) -> Tensor:
+            return region_splat(m, cholesky, c, ids, regions, backend=backend)
 
         for mapped, singles in (
             (torch.func.vmap(render)(colors), [render(c) for c in colors]),
             (torch.func.vmap(render)(colors, shifted), [render(c, m) for c, m in zip(colors, shifted, strict=True)]),
             (
                 torch.func.vmap(lambda labels: render(colors[0], means, labels))(labels),
-                [render(colors[0], means, of) for of in labels],
+                [render(colors[0], means, regions) for regions in labels],
             ),
         ):
             torch.testing.assert_close(mapped, torch.stack(singles), rtol=1e-5, atol=1e-5)
@@ -463,23 +452,23 @@ class TestFunctional:
         """Dimensions in any place, a map for each image of each batch, ids alone, levels in levels, none."""
         generator = torch.Generator().manual_seed(1)
         means = 12 * torch.rand(2, 3, 6, 2, generator=generator)
-        rest = torch.ones(2, 6, 3), torch.rand(2, 6, 3, generator=generator)
+        others = torch.ones(2, 6, 3), torch.rand(2, 6, 3, generator=generator)
         ids, labels = (
             torch.randint(2, (3, 6), generator=generator),
             torch.randint(2, (2, 3, 9, 14), generator=generator),
         )
 
-        def render(m: Tensor, of: Tensor, i: Tensor) -> Tensor:
-            return region_splat(m, *rest, i.expand(2, 6), of, backend=backend)
+        def render(m: Tensor, regions: Tensor, i: Tensor) -> Tensor:
+            return region_splat(m, *others, i.expand(2, 6), regions, backend=backend)
 
-        def slope(m: Tensor, of: Tensor, i: Tensor) -> Tensor:
-            return torch.func.grad(lambda m: render(m, of, i).square().sum())(m)
+        def slope(m: Tensor, regions: Tensor, i: Tensor) -> Tensor:
+            return torch.func.grad(lambda m: render(m, regions, i).square().sum())(m)
 
         for function in (render, slope):
             mapped = torch.func.vmap(function, in_dims=(1, 1, 0), out_dims=1)(means, labels, ids)
             singles = [function(means[:, k], labels[:, k], ids[k]) for k in range(3)]
             torch.testing.assert_close(mapped, torch.stack(singles, 1), rtol=1e-4, atol=1e-5)
-        one = rest[0][0], rest[1][0], ids[0], labels[0, 0]
+        one = others[0][0], others[1][0], ids[0], labels[0, 0]
         levels = torch.func.vmap(torch.func.vmap(lambda m: region_splat(m, *one, backend=backend)))(means)
         torch.testing.assert_close(levels[1, 2], region_splat(means[1, 2], *one, backend=backend), rtol=1e-4, atol=1e-5)
         none = torch.func.vmap(
@@ -488,7 +477,7 @@ class TestFunctional:
         assert torch.equal(none(torch.ones(3, 0, 2)), torch.zeros(3, 1, 4, 5))
 
     def test_jacobian(self, backend: str) -> None:
-        """By rows and by whole batches of gradients, and through a graph that is kept."""
+        """By rows and by whole batches of gradients, and through a graph that is retained."""
         colors = torch.rand(3, 2, generator=torch.Generator().manual_seed(1), requires_grad=True)
         means, cholesky = torch.tensor([[1.0, 2.0], [4.0, 1.0], [3.0, 3.0]], requires_grad=True), torch.ones(3, 3)
 
@@ -501,10 +490,10 @@ class TestFunctional:
         batched = torch.autograd.grad(image, (means, colors), rows, is_grads_batched=True)
         jacobians = torch.func.jacrev(render, (0, 1))(means.detach(), colors.detach())
         for k, (at_once, mapped) in enumerate(zip(batched, jacobians, strict=True)):
-            want = torch.stack([pair[k] for pair in singles])
-            assert want.any()
-            torch.testing.assert_close(at_once, want, rtol=1e-5, atol=1e-6)
-            torch.testing.assert_close(mapped.flatten(0, 2), want, rtol=1e-5, atol=1e-6)
+            expected = torch.stack([pair[k] for pair in singles])
+            assert expected.any()
+            torch.testing.assert_close(at_once, expected, rtol=1e-5, atol=1e-6)
+            torch.testing.assert_close(mapped.flatten(0, 2), expected, rtol=1e-5, atol=1e-6)
 
     @pytest.mark.filterwarnings(
         "ignore:There is a performance drop:UserWarning"
@@ -513,19 +502,19 @@ class TestFunctional:
     def test_levels_of_gradients(self, field: GaussianField, regions: RegionMap, kernel: str) -> None:
         """A gradient of a gradient is not zero: it is right, or refused by name."""
         means = field.means.detach()[:4]
-        rest = field.cholesky.detach()[:4], field.colors.detach()[:4].requires_grad_(), field.region_ids[:4]
+        others = field.cholesky.detach()[:4], field.colors.detach()[:4].requires_grad_(), field.region_ids[:4]
 
         def loss(m: Tensor) -> Tensor:
-            return region_splat(m, *rest, regions, backend=kernel).square().sum()
+            return region_splat(m, *others, regions, backend=kernel).square().sum()
 
         inner = torch.func.grad(loss)
         slopes = [lambda m: torch.func.grad(lambda m: inner(m).square().sum())(m), torch.func.jacrev(inner)]
         # the inner loop of a training: its gradient, differentiated by what the loop does not know of
-        slopes.append(lambda m: torch.autograd.grad(inner(m).square().sum(), rest[1])[0])
+        slopes.append(lambda m: torch.autograd.grad(inner(m).square().sum(), others[1])[0])
 
         def twice(m: Tensor) -> Tensor:
-            (first,) = torch.autograd.grad(loss(m), rest[1], create_graph=True)
-            return torch.autograd.grad(first.square().sum(), rest[1])[0]
+            (first,) = torch.autograd.grad(loss(m), others[1], create_graph=True)
+            return torch.autograd.grad(first.square().sum(), others[1])[0]
 
         if kernel != "reference":
             for slope in (*slopes, twice):
@@ -536,32 +525,25 @@ class TestFunctional:
             torch.func.hessian(loss)(means)
         leaf = means.clone().requires_grad_()
         (first,) = torch.autograd.grad(loss(leaf), leaf, create_graph=True)
-        want = [torch.autograd.grad(first.square().sum(), t, retain_graph=True)[0] for t in (leaf, rest[1])]
+        expected = [torch.autograd.grad(first.square().sum(), t, retain_graph=True)[0] for t in (leaf, others[1])]
         rows = [torch.autograd.grad(value, leaf, retain_graph=True)[0] for value in first.flatten()]
-        want.insert(1, torch.stack(rows).view(4, 2, 4, 2))
-        for slope, expected in zip(slopes, want, strict=True):
-            assert expected.any()
-            torch.testing.assert_close(slope(means), expected, rtol=1e-4, atol=1e-4)
+        expected.insert(1, torch.stack(rows).view(4, 2, 4, 2))
+        for slope, reference in zip(slopes, expected, strict=True):
+            assert reference.any()
+            torch.testing.assert_close(slope(means), reference, rtol=1e-4, atol=1e-4)
 
 
 class TestState:
-    def test_renderer_has_none(self, field: GaussianField, regions: RegionMap) -> None:
-        render = RegionSplatRenderer()
-        before = {name: value for name, value in vars(render).items() if not name.startswith("_")}
-        render(field, regions).sum().backward()
-        assert not list(render.parameters()) and not list(render.buffers()) and not render.state_dict()
-        assert {name: value for name, value in vars(render).items() if not name.startswith("_")} == before
-
     @pytest.mark.parametrize("clone", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
-    @pytest.mark.parametrize("drawn", [False, True])
-    def test_copies_draw_the_same(self, field: GaussianField, regions: RegionMap, clone: object, drawn: bool) -> None:
-        """The label map goes along, before and after the tables of a first picture are made."""
+    @pytest.mark.parametrize("cached", [False, True])
+    def test_copies_render_the_same(self, field: GaussianField, regions: RegionMap, clone: Any, cached: bool) -> None:
+        """The label map goes along, before and after a kernel has cached its tables of it."""
         module = Exposure(field, regions)
-        if drawn:
+        if cached:
             module(torch.ones(1))
-        other = clone(module)  # type: ignore[operator]
-        got, want = (image_and_gradients(m, torch.ones(1)) for m in (other, module))
-        assert all(torch.equal(a, b) for a, b in zip(got, want, strict=True))
+        other = clone(module)
+        result, expected = (image_and_gradients(m, torch.ones(1)) for m in (other, module))
+        assert all(torch.equal(a, b) for a, b in zip(result, expected, strict=True))
         with torch.no_grad():
             other.field.colors.zero_()
-        assert torch.equal(module(torch.ones(1)).detach(), want[0])
+        assert torch.equal(module(torch.ones(1)).detach(), expected[0])
