@@ -88,16 +88,19 @@ def _newton_step(gaussians: Gaussians, gradients: Gaussians, masses: Tensor) -> 
 
 
 def half_gradients(
-    render: Callable[[Tensor, Tensor, Tensor], Tensor], gaussians: Gaussians, image: Tensor, objective: Objective | None
+    renderer: Callable[[Tensor, Tensor, Tensor], Tensor],
+    gaussians: Gaussians,
+    image: Tensor,
+    objective: Objective | None,
 ) -> Gaussians:
     """Return half the gradients of the objective of a render, (C, H, W); without one, of the squared error."""
     leaves = [t.detach().requires_grad_() for t in gaussians]
     with torch.enable_grad():
-        rendered = render(*leaves)
-    residual = rendered.detach() - image
+        render = renderer(*leaves)
+    residual = render.detach() - image
     if objective is not None:
         residual = objective.apply(residual)
-    return Gaussians(*torch.autograd.grad(rendered, leaves, residual))
+    return Gaussians(*torch.autograd.grad(render, leaves, residual))
 
 
 def error_weights(gaussians: Gaussians, objective: Objective | None) -> Tensor:

@@ -52,27 +52,27 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
     """
     regions, row_ids, deleted_ids = _check(scenes, region_ids)
     deleted_pixels, deleted_rows = torch.isin(regions.labels, deleted_ids), torch.isin(row_ids, deleted_ids)
-    edited: list[Splats] = []
+    frames: list[Splats] = []
     with threads_for_kernels(scenes.size[0] * scenes.size[1]):
         motions = background_motions(scenes.field.means.detach(), ~deleted_rows)
         images, labels = fill_holes(scenes.render(), regions.labels, deleted_pixels, motions)
-        filled = regions.relabel(labels, "mean")
+        new_regions = regions.relabel(labels, "mean")
         for t, scene in enumerate(scenes):
             means, cholesky, colors, _, _ = Splats.of(scene)
-            region_ids = torch.where(deleted_rows[t], filled.image(t).ids[0], row_ids[t])
+            region_ids = torch.where(deleted_rows[t], new_regions.image(t).ids[0], row_ids[t])
             colors[deleted_rows[t]] = 0.0
             if t:  # rows that filled the frame before go on
-                rows, before = deleted_rows[t] & deleted_rows[t - 1], edited[-1]
+                rows, before = deleted_rows[t] & deleted_rows[t - 1], frames[-1]
                 means[rows] = apply_affine(motions[t] @ motions[t - 1].inverse(), before.means[rows])
                 cholesky[rows], colors[rows] = before.cholesky[rows], before.colors[rows]
                 if before.region_ids is not None:
                     region_ids[rows] = before.region_ids[rows]
-            start = Splats(means, cholesky, colors, region_ids, filled.image(t))
+            start = Splats(means, cholesky, colors, region_ids, new_regions.image(t))
             movable_rows, changed_pixels = torch.ones_like(deleted_rows[t]), torch.ones_like(deleted_pixels[t])
             unused = deleted_rows[t] & (colors == 0).all(-1)
             descent = FrameDescent(Target(images[t], FitConfig()), start, movable_rows, changed_pixels)
-            edited.append(descent.run({0: float(unused.float().mean())}))
-    return stack(edited, scenes.size, scenes.metadata)
+            frames.append(descent.run({0: float(unused.float().mean())}))
+    return stack(frames, scenes.size, scenes.metadata)
 
 
 @torch.inference_mode(False)
@@ -99,9 +99,9 @@ def move_region(scenes: Scene, region_ids: int | Iterable[int], offset: Sequence
     rows = is_moved.any(0)
     means = field.means[:, rows] + field.means.new_tensor(steps)
     colors = (field.merged_colors() * is_moved[..., None])[:, rows]
-    moved = GaussianField(means, field.cholesky[:, rows], colors, row_ids[:, rows], size=scenes.size)
+    moved_field = GaussianField(means, field.cholesky[:, rows], colors, row_ids[:, rows], size=scenes.size)
     labels = shift_labels(regions.labels, torch.isin(regions.labels, moved_ids), steps, behind.regions.labels)[1]
-    return Scene(join(behind.field, moved), regions.relabel(labels, "mean"), scenes.metadata)
+    return Scene(join(behind.field, moved_field), regions.relabel(labels, "mean"), scenes.metadata)
 
 
 def _check(scenes: Scene, region_ids: int | Iterable[int]) -> tuple[RegionMap, Tensor, Tensor]:

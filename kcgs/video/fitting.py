@@ -111,13 +111,13 @@ def fit_video(
 
 
 class _VideoFit:
-    """The frames that are fitted, and the error of the last."""
+    """A fit of one frame after the other."""
 
     def __init__(self, config: FitConfig, num_gaussians: int, seed: int) -> None:
         self.config, self.num_gaussians, self.seed = config, num_gaussians, seed
         self.frames: list[Splats] = []
-        self.image = torch.zeros(())  # of the last frame
-        self.error = torch.zeros(())  # of each pixel, (H, W), when it was last fitted
+        self.image = torch.zeros(())  # the last frame, (C, H, W); a placeholder before the first
+        self.error = torch.zeros(())  # of each pixel when it was last fitted, (H, W)
 
     def fit_next(self, frame: Any, labels: Labels | None) -> Scene:
         """Fit a frame; without labels the map of the frame before moves along, where there is one."""
@@ -193,14 +193,14 @@ def _local_mean(error: Tensor) -> Tensor:
 
 def _move_means(motion: Tensor, splats: Splats) -> Tensor:
     """Move centres along a motion; a centre that would leave its region moves as the region does on average."""
-    moved, regions = move_points(motion, splats.means), splats.regions
+    new_means, regions = move_points(motion, splats.means), splats.regions
     if regions is None or splats.region_ids is None:
-        return moved
+        return new_means
     pixels = regions.index_of(regions.labels).flatten()
     sums = torch.stack([pixels.bincount(offsets.flatten()) for offsets in motion], -1)
     mean = sums / pixels.bincount()[:, None]
-    inside = lookup_regions(moved, regions.labels) == splats.region_ids
-    return torch.where(inside[:, None], moved, splats.means - mean[splats.region_index].to(moved))
+    inside = lookup_regions(new_means, regions.labels) == splats.region_ids
+    return torch.where(inside[:, None], new_means, splats.means - mean[splats.region_index].to(new_means))
 
 
 def _pair(frames: Iterable[Any], label_maps: Labels | Iterable[Labels] | None) -> Iterator[tuple[Any, Labels | None]]:

@@ -55,13 +55,13 @@ def fill_holes(renders: Tensor, labels: Tensor, deleted: Tensor, motions: Tensor
     """
     holes = [dilate(mask, _FRINGE) for mask in deleted]
     originals = [_Pixels(*pixels) for pixels in zip(renders, labels, holes, strict=True)]
-    filled: list[_Pixels] = []
+    results: list[_Pixels] = []
     for t, original in enumerate(originals):
         pixels = _Pixels(*(plane.clone() for plane in original))
         nearest = sorted(range(len(originals)), key=lambda s: abs(s - t))[1:]
         sources = [(s, originals[s]) for s in nearest]
         if t:  # pixels that no frame shows continue those of the frame before
-            sources.append((t - 1, filled[-1]))
+            sources.append((t - 1, results[-1]))
         for s, source in sources:
             if pixels.unknown.any():
                 _copy(source, pixels, motions[s] @ motions[t].inverse())
@@ -69,8 +69,8 @@ def fill_holes(renders: Tensor, labels: Tensor, deleted: Tensor, motions: Tensor
         if unknown.any():
             image, new_labels = inpaint(image, unknown), nearest_labels(new_labels, unknown)
         new_labels = torch.where(deleted[t], new_labels, original.labels)  # the fringe keeps its labels
-        filled.append(_Pixels(image, new_labels, torch.zeros_like(unknown)))
-    return torch.stack([pixels.image for pixels in filled]), torch.stack([pixels.labels for pixels in filled])
+        results.append(_Pixels(image, new_labels, torch.zeros_like(unknown)))
+    return torch.stack([pixels.image for pixels in results]), torch.stack([pixels.labels for pixels in results])
 
 
 class _Pixels(NamedTuple):
@@ -87,10 +87,10 @@ def _copy(source: _Pixels, target: _Pixels, motion: Tensor) -> None:
     points = apply_affine(motion, torch.stack([x, y], -1).to(target.image) + 0.5)
     cols, rows = points.floor().long().unbind(-1)
     height, width = target.unknown.shape
-    known = (cols >= 0) & (cols < width) & (rows >= 0) & (rows < height)
-    known &= ~source.unknown[rows.clamp(0, height - 1), cols.clamp(0, width - 1)]
-    y, x, rows, cols = y[known], x[known], rows[known], cols[known]
-    target.image[:, y, x] = sample(source.image, points[known]).T
+    is_known = (cols >= 0) & (cols < width) & (rows >= 0) & (rows < height)
+    is_known &= ~source.unknown[rows.clamp(0, height - 1), cols.clamp(0, width - 1)]
+    y, x, rows, cols = y[is_known], x[is_known], rows[is_known], cols[is_known]
+    target.image[:, y, x] = sample(source.image, points[is_known]).T
     target.labels[y, x] = source.labels[rows, cols]
     target.unknown[y, x] = False
 

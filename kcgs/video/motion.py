@@ -43,10 +43,10 @@ def sample(planes: Tensor, points: Tensor) -> Tensor:
 
 def move_points(motion: Tensor, points: Tensor) -> Tensor:
     """Return the places in the image of points (N, 2) of the previous one: q with q + motion(q) = p."""
-    moved = points
+    places = points
     for _ in range(_ITERATIONS):
-        moved = points - sample(motion, moved)
-    return moved
+        places = points - sample(motion, places)
+    return places
 
 
 def move_labels(motion: Tensor, labels: Tensor) -> Tensor:

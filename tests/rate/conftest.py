@@ -26,8 +26,8 @@ def photo(astronaut: Tensor) -> Photo:
 
 
 @pytest.fixture(scope="package")
-def fitted(photo: Photo) -> Scene:
+def scene(photo: Photo) -> Scene:
     image, labels = photo
-    scene = fit(image, labels, 300, iterations=150, merge_regions=False).scene
-    assert scene.regions is not None
-    return scene
+    result = fit(image, labels, 300, iterations=150, merge_regions=False)
+    assert result.scene.regions is not None
+    return result.scene

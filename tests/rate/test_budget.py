@@ -41,7 +41,7 @@ class TestFitBytes:
         """The file fills its bytes, the scene is the file's, and more bytes have less error."""
         image, labels = photo
         psnrs = [10.0]
-        for target in (500, 1200, 2600):
+        for target in (500, 1500):
             done = fit_bytes(image, labels, target, iterations=150)
             assert 0.93 * target < len(done.data) <= target
             assert torch.equal(decode(done.data).scene.field.means, done.scene.field.means)

@@ -21,58 +21,58 @@ from .conftest import Photo, psnr
 
 class TestCompress:
     @pytest.mark.parametrize("target", [700, 1300])
-    def test_bytes(self, photo: Photo, fitted: Scene, target: int) -> None:
+    def test_bytes(self, photo: Photo, scene: Scene, target: int) -> None:
         """The file fills its bytes, with less error than one that does not know the image."""
-        compressed = compress(fitted, photo[0], target_bytes=target, iterations=150)
+        compressed = compress(scene, photo[0], target_bytes=target, iterations=150)
         assert 0.99 * target <= len(compressed.data) <= target
-        plain = decode(encode(fitted, target_bytes=target)).scene
+        plain = decode(encode(scene, target_bytes=target)).scene
         assert psnr(plain, photo[0]) + 0.1 < psnr(compressed.scene, photo[0])
         assert torch.equal(compressed.scene.render(), decode(compressed.data).scene.render())
 
-    def test_quality(self, photo: Photo, fitted: Scene) -> None:
+    def test_quality(self, photo: Photo, scene: Scene) -> None:
         """A file of the scene's quality is nearly as good as the scene, and a PSNR that the scene has is reached."""
-        scene_psnr = psnr(fitted, photo[0])
-        quality = compress(fitted, photo[0], iterations=200, quality=quality_for(scene_psnr))
+        scene_psnr = psnr(scene, photo[0])
+        quality = compress(scene, photo[0], iterations=200, quality=quality_for(scene_psnr))
         assert scene_psnr - 0.3 < psnr(quality.scene, photo[0])
-        exact = compress(fitted, photo[0], iterations=20, target_psnr=scene_psnr - 0.1)
+        exact = compress(scene, photo[0], iterations=20, target_psnr=scene_psnr - 0.1)
         assert scene_psnr - 0.1 <= psnr(exact.scene, photo[0])
 
-    def test_psnr_beyond_the_scene(self, photo: Photo, fitted: Scene) -> None:
-        coarse = compress(fitted, photo[0], iterations=2, quality=quality_for(psnr(fitted, photo[0])))
-        assert compress(fitted, photo[0], iterations=2, target_psnr=99.0).data == coarse.data
+    def test_psnr_beyond_the_scene(self, photo: Photo, scene: Scene) -> None:
+        coarse = compress(scene, photo[0], iterations=2, quality=quality_for(psnr(scene, photo[0])))
+        assert compress(scene, photo[0], iterations=2, target_psnr=99.0).data == coarse.data
 
-    def test_objective(self, photo: Photo, fitted: Scene) -> None:
+    def test_objective(self, photo: Photo, scene: Scene) -> None:
         images = [
-            compress(fitted, photo[0], quality=36, iterations=100, objective=name).scene.render()
+            compress(scene, photo[0], quality=36, iterations=100, objective=name).scene.render()
             for name in ("psnr", "ms-ssim")
         ]
         error = MsSsimObjective(photo[0])
         assert error.value(images[1] - photo[0]) < 0.95 * error.value(images[0] - photo[0])
 
-    def test_array(self, photo: Photo, fitted: Scene) -> None:
+    def test_array(self, photo: Photo, scene: Scene) -> None:
         """An array is an image, and gives the same bytes."""
         array = photo[0].permute(1, 2, 0).numpy()
-        expected = compress(fitted, photo[0], quality=30, iterations=2)
-        assert compress(fitted, array, quality=30, iterations=2).data == expected.data
+        expected = compress(scene, photo[0], quality=30, iterations=2)
+        assert compress(scene, array, quality=30, iterations=2).data == expected.data
 
-    def test_faint_gaussians(self, photo: Photo, fitted: Scene) -> None:
+    def test_faint_gaussians(self, photo: Photo, scene: Scene) -> None:
         """They are removed, unless a descent makes them pay."""
-        field = fitted.field
+        field = scene.field
         colors = field.merged_colors().detach().clone()
         colors[::3] *= 1e-4
         faint = GaussianField(field.means, field.cholesky, colors, field.region_ids, size=field.size)
-        assert compress(Scene(faint, fitted.regions), photo[0], quality=36, iterations=1).scene.num_gaussians <= 200
+        assert compress(Scene(faint, scene.regions), photo[0], quality=36, iterations=1).scene.num_gaussians <= 200
 
     @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
-    def test_without_gradients(self, photo: Photo, fitted: Scene, mode: Callable[[], Any]) -> None:
-        image, field = photo[0], fitted.field
-        assert fitted.regions is not None
-        expected = compress(fitted, image, quality=30, iterations=3).data
+    def test_without_gradients(self, photo: Photo, scene: Scene, mode: Callable[[], Any]) -> None:
+        image, field = photo[0], scene.field
+        assert scene.regions is not None
+        expected = compress(scene, image, quality=30, iterations=3).data
         with mode():
             copy = GaussianField(field.means, field.cholesky, field.colors, field.region_ids, size=field.size)
-            scene = Scene(copy, RegionMap.from_labels(fitted.regions.labels))
-            assert compress(scene, image.clone(), quality=30, iterations=3)
-            assert compress(fitted, image, quality=30, iterations=3).data == expected
+            other = Scene(copy, RegionMap.from_labels(scene.regions.labels))
+            assert compress(other, image.clone(), quality=30, iterations=3)
+            assert compress(scene, image, quality=30, iterations=3).data == expected
 
     @pytest.mark.parametrize(
         ("changes", "match"),
@@ -85,20 +85,20 @@ class TestCompress:
             ({"target_bytes": 40, "iterations": 1}, "target_bytes must be at least [0-9]+ for this scene; got 40"),
         ],
     )
-    def test_exceptions(self, photo: Photo, fitted: Scene, changes: dict[str, Any], match: str) -> None:
+    def test_exceptions(self, photo: Photo, scene: Scene, changes: dict[str, Any], match: str) -> None:
         with pytest.raises(ValueError, match=match):
-            compress(**{"scene": fitted, "image": photo[0], **changes})
+            compress(**{"scene": scene, "image": photo[0], **changes})
 
 
 class TestSoftBits:
     @pytest.mark.parametrize(("brightness", "slant"), [(0.5, 1.0), (1.0, 0.3)])
-    def test_against_files(self, fitted: Scene, brightness: float, slant: float) -> None:
+    def test_against_files(self, scene: Scene, brightness: float, slant: float) -> None:
         """Weaker and rounder Gaussians make a smaller file, by about as much."""
-        field, quantizer = fitted.field, Quantizer(150, fitted.size)
+        field, quantizer = scene.field, Quantizer(150, scene.size)
         cholesky, colors = field.cholesky.detach(), field.merged_colors().detach()
         new_cholesky, new_colors = cholesky * torch.tensor([1.0, slant, 1.0]), brightness * colors
         changed = GaussianField(field.means, new_cholesky, new_colors, field.region_ids, size=field.size)
-        sizes = [len(SceneWriter(Scene(f, fitted.regions)).write_rounded(150)) for f in (field, changed)]
+        sizes = [len(SceneWriter(Scene(f, scene.regions)).write_rounded(150)) for f in (field, changed)]
         saved = 8 * (sizes[0] - sizes[1])
         estimate = soft_bits(cholesky, colors, quantizer) - soft_bits(new_cholesky, new_colors, quantizer)
         assert saved > 0 and 0.5 * saved < float(estimate.sum()) < 1.6 * saved
@@ -116,10 +116,10 @@ class TestSoftBits:
         soft_bits(cholesky, torch.ones(1, 3), Quantizer(150, (48, 64))).sum().backward()
         assert cholesky.grad is not None and not cholesky.grad[:, ::2].any()
 
-    def test_descent(self, photo: Photo, fitted: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_descent(self, photo: Photo, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
         """A price of bits lowers the error at equal bytes."""
         psnrs = []
         for price in (0.0, 0.9):
             monkeypatch.setattr("kcgs.rate.descent._BIT_PRICE", price)
-            psnrs.append(psnr(compress(fitted, photo[0], target_bytes=1100, iterations=200).scene, photo[0]))
+            psnrs.append(psnr(compress(scene, photo[0], target_bytes=1100, iterations=200).scene, photo[0]))
         assert psnrs[0] + 0.05 < psnrs[1]
