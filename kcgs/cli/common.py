@@ -98,6 +98,11 @@ def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
     Console(markup=False).print(table)
 
 
+def describe_error(error: Exception) -> str:
+    """Return an error's message on one line, or its type if it has none."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 class InterruptHandler:
     """Ctrl-C in a `with` block stops a fit, which is then saved; a second one ends the command."""
 

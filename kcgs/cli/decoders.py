@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -70,8 +70,7 @@ def models(as_json: Json = False) -> None:
     """List the fitted scenes that come with kcgs; every command that reads a scene takes them as zoo:NAME."""
     from kcgs.zoo import entries
 
-    if as_json:
-        print_report({entry.name: entry._asdict() for entry in entries()}, as_json, "zoo")
-    else:
-        lines = {entry.name: f"{entry.title}; {entry.psnr:.2f} dB, {entry.bytes} bytes" for entry in entries()}
-        print_report(lines, as_json, "zoo")
+    report: dict[str, Any] = {entry.name: entry._asdict() for entry in entries()}
+    if not as_json:
+        report = {name: "{title}; {psnr:.2f} dB, {bytes} bytes".format(**entry) for name, entry in report.items()}
+    print_report(report, as_json, "zoo")

@@ -10,6 +10,7 @@ import typer
 # each module adds its commands to `app`, in the order of `kcgs --help`
 from . import fit, many, video, scenes, segmentation, decoders, demo  # noqa: F401  # isort: skip
 from .commands import app
+from .common import describe_error
 
 
 def main() -> None:
@@ -24,19 +25,12 @@ def main() -> None:
             warnings.showwarning = _print_warning
             app(prog_name="kcgs")
     except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
-        typer.echo(f"kcgs: {_describe(error)}", err=True)
+        message = describe_error(error)
+        if isinstance(error, OSError) and error.filename is not None:
+            message = f"{error.strerror}: {error.filename}"
+        typer.echo(f"kcgs: {message}", err=True)
         sys.exit(1)
 
 
 def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
-    typer.echo(f"warning: {_one_line(message)}", err=True)
-
-
-def _describe(error: Exception) -> str:
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.strerror}: {error.filename}"
-    return _one_line(error) or type(error).__name__
-
-
-def _one_line(text: object) -> str:
-    return " ".join(str(text).split())
+    typer.echo(f"warning: {' '.join(str(message).split())}", err=True)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from kcgs._atomic import write_file
 
-from .common import replace_undefined
+from .common import describe_error, replace_undefined
 from .fit import fit_and_save, read_regions, report_fit
 from .options import FitRequest
 
@@ -52,7 +52,7 @@ def fit_one(job: FitJob) -> Outcome:
         write_file(record, json.dumps(row))
         return Outcome(row, True, tuple(str(message.message) for message in messages))
     except Exception as error:
-        return Outcome({"error": " ".join(str(error).split()) or type(error).__name__}, True)
+        return Outcome({"error": describe_error(error)}, True)
 
 
 def _fit(job: FitJob) -> dict[str, Any]:

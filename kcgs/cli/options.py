@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
 DEFAULT_GAUSSIANS = 1000
 
-Scale = Annotated[float | None, typer.Option(help="Magnification.")]
-Size = Annotated[str | None, typer.Option(metavar="WxH", help="Width and height in pixels.")]
 Contours = Annotated[
     Literal["scaled", "crisp"],
     typer.Option(help="Width of contours: scaled with the image, or crisp, about a pixel of the image."),

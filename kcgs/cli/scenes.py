@@ -25,7 +25,7 @@ from .common import (
     print_report,
 )
 from .fit import describe_file, describe_scene
-from .options import Contours, Objective, Scale, Size, exclude, target_size
+from .options import Contours, Objective, exclude, target_size
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -40,8 +40,8 @@ def render(
             "-o", "--output", help="Image to write; of a batch of scenes a video (.mp4 and others), or a folder."
         ),
     ],
-    scale: Scale = None,
-    size: Size = None,
+    scale: Annotated[float | None, typer.Option(help="Magnification.")] = None,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Width and height in pixels.")] = None,
     contours: Contours = "scaled",
     frame_rate: Annotated[float | None, typer.Option(help="Of a batch: frames per second; default: its own.")] = None,
     frame: Annotated[

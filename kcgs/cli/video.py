@@ -43,7 +43,6 @@ def fit_video_command(
     frame_rate: Annotated[
         float | None, typer.Option(help="Frames per second; default: the file's, of a folder 24.")
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Number of frames; default: all.")] = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -66,7 +65,7 @@ def fit_video_command(
     with InterruptHandler() as interrupts:
         scenes = fit_video(
             source, maps, request.num_gaussians, recipe=request.config, seed=request.seed, progress=not quiet,
-            on_frame=lambda number, scene: interrupts.on_step(number, scene) or number + 1 == frames,
+            on_frame=interrupts.on_step,
         )  # fmt: skip
         seconds = time.perf_counter() - start
         size = scenes.save(output)

@@ -1,5 +1,5 @@
 """Independent jobs: one after another in this process, in worker processes, or on a Ray cluster."""
 
-from .jobs import ENGINES, run_jobs
+from .jobs import run_jobs
 
-__all__ = ["ENGINES", "run_jobs"]
+__all__ = ["run_jobs"]

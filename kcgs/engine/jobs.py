@@ -23,7 +23,7 @@ from kcgs.errors import InvalidArgument
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-ENGINES = ("local", "ray")
+_ENGINES = ("local", "ray")
 # libraries read these once, when they are loaded
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _KILLED = "a worker process was killed, perhaps because memory ran out: the same command goes on where it stopped"
@@ -63,8 +63,8 @@ def run_jobs(
         >>> list(run_jobs(str.upper, ["a", "b"]))
         [(0, 'A'), (1, 'B')]
     """
-    if engine not in ENGINES:
-        raise InvalidArgument("engine", f"one of {', '.join(ENGINES)}", repr(engine))
+    if engine not in _ENGINES:
+        raise InvalidArgument("engine", f"one of {', '.join(_ENGINES)}", repr(engine))
     for name, count in (("workers", workers), ("threads", threads)):
         if count is not None and count < 1:
             raise InvalidArgument(name, "at least 1", count)

@@ -59,9 +59,9 @@ class TestFitVideo:
         Path("masks").mkdir()
         for number in range(COUNT):
             save_labels(f"masks/{number}.png", make_labels(2 * number))
-        kcgs(*FIT, "--regions", "masks", "--frames", "2")
+        kcgs(*FIT, "--regions", "masks")
         regions = load("a.safetensors").regions
-        assert regions is not None and regions.labels.shape == (2, 32, 48)
+        assert regions is not None and regions.labels.shape == (COUNT, 32, 48)
 
     @pytest.mark.parametrize(
         ("arguments", "code", "words"),
