@@ -29,32 +29,41 @@ settings.register_profile(
 )
 settings.load_profile("kcgs")
 
-# The files that take longest, 8 seconds and more: workers begin with them, so that the last file to end is a short one.
-# (By itself pytest-xdist begins with the files of most tests, and these have few.)
+# The files that take longest, 8 seconds and more, in the order of their time: workers begin with them, so that the last
+# file to end is a short one. (By itself pytest-xdist begins with the files of most tests, and these have few.)
+# The first two go to two workers: golden compiles every kernel, while the site needs none.
 LONGEST = (
-    "notebooks/test_notebooks.py",
     "golden/test_golden.py",
-    "export/test_web.py",
-    "export/test_element.py",
-    "cli/test_cli.py",
-    "engine/test_ray.py",
-    "cli/test_many.py",
-    "engine/test_local.py",
-    "kernels/test_cuda.py",
-    "kernels/test_cpu.py",
-    "fitting/test_best.py",
-    "test_wheel.py",
-    "benchmarks/test_quick.py",
-    "export/test_decode.py",
-    "fitting/test_loop.py",
     "docs/test_site.py",
+    "notebooks/test_notebooks.py",
+    "onnx/test_torch_export.py",
+    "benchmarks/test_quick.py",
+    "engine/test_ray.py",
+    "kernels/test_cuda.py",
+    "cli/test_many.py",
+    "kernels/test_cpu.py",
+    "rate/test_budget.py",
+    "export/test_web.py",
     "docs/test_pages.py",
+    "pipelines/test_torch_transforms.py",
+    "fitting/test_best.py",
+    "engine/test_local.py",
+    "cli/test_files.py",
+    "fitting/test_loop.py",
+    "onnx/test_scene.py",
+    "codec/test_hostile.py",
+    "export/test_decoder.py",
+    "cli/test_cli.py",
+    "pipelines/test_encoder.py",
+    "pipelines/test_editing_fill.py",
+    "export/test_element.py",
+    "test_wheel.py",
 )
 
 
 def pytest_configure(config: pytest.Config) -> None:
     if hasattr(config.option, "loadscopereorder"):
-        config.option.loadscopereorder = False  # files go to workers in the order below
+        config.option.loadscopereorder = False  # files go to workers in the order of LONGEST
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

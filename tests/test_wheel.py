@@ -22,9 +22,9 @@ ROOT = Path(kcgs.__file__).resolve().parent.parent
 if not (ROOT / "pyproject.toml").is_file():
     pytest.skip("not a source checkout", allow_module_level=True)
 
-# imports nothing: torch would take longer than all the rest
+# without importing kcgs, which takes seconds
 FIND = "import importlib.util; print(importlib.util.find_spec('kcgs').origin)"
-# runs commands one after another, for importing torch takes longer than most of them
+# all commands in one process, which imports torch once
 RUN_COMMANDS = """
 import json, sys
 from kcgs.cli import main
@@ -49,8 +49,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "-o", str(folder), str(source)]
     built = subprocess.run(command, capture_output=True, text=True)
     assert built.returncode == 0, built.stderr
-    (found,) = folder.glob("*.whl")
-    return found
+    (path,) = folder.glob("*.whl")
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -77,14 +77,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def without_path() -> dict[str, str]:
+    """Return the environment without PYTHONPATH, by which Python would find this checkout."""
+    return {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+
+
 def call(environment: Path, folder: Path, command: list[str], text: str = "") -> str:
-    clean = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    done = subprocess.run(
+    process = subprocess.run(
         [str(environment / "bin" / command[0]), *command[1:]],
-        input=text, capture_output=True, text=True, cwd=folder, env=clean,
+        input=text, capture_output=True, text=True, cwd=folder, env=without_path(),
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert process.returncode == 0, process.stderr
+    return process.stdout
 
 
 def test_holds_kcgs_only(wheel: Path) -> None:
@@ -100,25 +104,25 @@ def test_holds_kcgs_only(wheel: Path) -> None:
 
 def test_it_is_the_wheel_that_runs(environment: Path, folder: Path) -> None:
     assert call(environment, folder, ["kcgs", "--version"]) == f"kcgs {kcgs.__version__}\n"
-    where = call(environment, folder, ["python", "-c", FIND])
-    assert Path(where.strip()).is_relative_to(environment.resolve())
+    origin = call(environment, folder, ["python", "-c", FIND])
+    assert Path(origin.strip()).is_relative_to(environment.resolve())
 
 
 def test_every_command(environment: Path, folder: Path) -> None:
-    few = ("-n", "10", "--iterations", "10")
+    short = ("-n", "10", "--iterations", "10")
     commands = [
         ("models",),
         ("info", "zoo:chart-2x3"),
         ("render", "zoo:chart-2x3", "-o", "chart.png", "--size", "60x40"),
-        ("fit", "photo.png", *few),
+        ("fit", "photo.png", *short),
         ("segment", "photo.png", "-o", "regions.png"),
-        ("fit", "photo.png", *few, "--regions", "none", "-o", "plain.safetensors"),
+        ("fit", "photo.png", *short, "--regions", "none", "-o", "plain.safetensors"),
         ("eval", "photo.safetensors", "photo.png"),
         ("encode", "plain.safetensors", "-o", "plain.kcgs"),
         ("decode", "plain.kcgs", "-o", "plain.png"),
         ("export", "photo.safetensors", "-o", "photo.onnx"),
         ("export", "photo.safetensors", "-o", "photo.html"),
-        ("fit-many", "photos", *few, "-o", "many", "--regions", "none"),
+        ("fit-many", "photos", *short, "-o", "many", "--regions", "none"),
     ]
     out = call(environment, folder, ["python", "-c", RUN_COMMANDS], "\n".join(map(json.dumps, commands)))
     assert "chart-2x3" in out
@@ -130,8 +134,7 @@ def test_every_command(environment: Path, folder: Path) -> None:
 
 def test_view(environment: Path, folder: Path) -> None:
     command = [str(environment / "bin" / "kcgs"), "view", "zoo:chart-2x3", "--no-browser"]
-    clean = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    with subprocess.Popen(command, cwd=folder, env=clean, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, cwd=folder, env=without_path(), stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
             url = process.stdout.readline().split(" ")[0]
