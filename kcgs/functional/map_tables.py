@@ -14,8 +14,7 @@ from kcgs.kernels import Crisp, Membership, Resampled
 from .labels import compact, sample_labels
 from .softness import CRISP_SOFTNESS, PairSoftness, check_softness, is_crisp, scaled_softness, softness_of
 
-# sizes that a map is cached at, its own among them: a viewer renders at ever new sizes
-_CACHED_SIZES = 4
+_CACHED_SIZES = 4  # of a map, its own among them: a viewer renders at ever new sizes
 
 
 class MapOperands(NamedTuple):

@@ -40,9 +40,6 @@ class PairSoftness(Mapping[tuple[int, int], float]):
     def __len__(self) -> int:
         return len(self._pixels)
 
-    def __hash__(self) -> int:
-        return hash(tuple(self._pixels.items()))
-
     def __repr__(self) -> str:
         if len(self) <= _PRINTED_PAIRS:
             return f"PairSoftness({self._pixels})"

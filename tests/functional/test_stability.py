@@ -107,17 +107,6 @@ def test_shapes(size: tuple[int, int], count: int) -> None:
 
 
 @pytest.mark.parametrize("backend", FAST)
-@pytest.mark.parametrize("softness", [0.0, 0.7])
-def test_checkerboard(backend: str, softness: float) -> None:
-    y, x = torch.meshgrid(torch.arange(SIZE[0]), torch.arange(SIZE[1]), indexing="ij")
-    cholesky = torch.tensor([[6.0, 1.0, 4.0]]).repeat(40, 1)
-    regions = RegionMap.from_labels((x + y) % 2, softness)
-    image, gradient, _ = compare(backend, [centres(40), cholesky, torch.rand(40, 3)], torch.arange(40) % 2, regions)
-    assert image < 1e-5
-    assert gradient < 1e-5
-
-
-@pytest.mark.parametrize("backend", FAST)
 def test_65535_regions_of_a_few_pixels(backend: str) -> None:
     labels = torch.arange(256 * 512).view(256, 512) // 2 % 65_535
     ids = torch.arange(0, 65_535, 7)
