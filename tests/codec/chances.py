@@ -65,7 +65,7 @@ class Prior:
 OF_SCENES, OF_MAPS = Prior("prior.bin", 48, 16), Prior("prior2.bin", 96, 32)
 
 
-class Decision:
+class Model:
     """The adaptive part of one of the two decisions."""
 
     def __init__(self, prior: Prior) -> None:
@@ -73,14 +73,14 @@ class Decision:
         self.counters: list[dict[tuple[int, ...], list[int]]] = [{}, {}, {}]
 
 
-class Question:
+class Decision:
     """A decision about one pixel."""
 
-    def __init__(self, decision: Decision, logit: int, keys: list[tuple[int, ...]]) -> None:
-        tables = zip(decision.counters, keys, strict=True)
+    def __init__(self, model: Model, logit: int, keys: list[tuple[int, ...]]) -> None:
+        tables = zip(model.counters, keys, strict=True)
         self.counters = [table.setdefault(key, [0, 0]) for table, key in tables]
         self.x = [logit, *(STRETCH[chance >> 4] if age else logit for chance, age in self.counters)]
-        self.weights = decision.weights[bisect.bisect([1, 5, 12], self.counters[2][1])]
+        self.weights = model.weights[bisect.bisect([1, 5, 12], self.counters[2][1])]
         self.p = min(max(SQUASH[clip(sum(map(mul, self.weights, self.x)) >> 16, 3071)], 16), 65520)
 
     def learn(self, bit: int) -> None:
@@ -97,12 +97,12 @@ class Question:
 class Pixel:
     """A pixel that is not quiet: its candidates and decisions."""
 
-    def __init__(self, neighbours: list[int], decisions: list[Decision]) -> None:
+    def __init__(self, neighbours: list[int], models: list[Model]) -> None:
         first = neighbours[0]
         second = next(label for label in neighbours if label != first)
         self.candidates = [first, second]
         f = [0 if label == first else 1 if label == second else 2 for label in neighbours]
-        logits = decisions[0].prior.logits(f)
+        logits = models[0].prior.logits(f)
         keys = [tuple(value > 0 for value in f[1 : 1 + nearest]) for nearest in (6, 11, 16)]
-        self.which = Question(decisions[0], logits[0], keys)
-        self.neither = Question(decisions[1], logits[1], [(), tuple(f[1:5]), tuple(f[1:9])])
+        self.is_second = Decision(models[0], logits[0], keys)
+        self.is_escape = Decision(models[1], logits[1], [(), tuple(f[1:5]), tuple(f[1:9])])

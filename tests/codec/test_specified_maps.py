@@ -17,7 +17,7 @@ from kcgs import RegionMap
 from kcgs.codec import decode, encode_labels
 from kcgs.codec.region_map import encode_region_map
 
-from .chances import OF_MAPS, OF_SCENES, TEMPLATE, Decision, Pixel, Prior
+from .chances import OF_MAPS, OF_SCENES, TEMPLATE, Model, Pixel, Prior
 from .symbols import AdaptiveBit, AdaptiveSymbol, Bits, Bytes
 
 Labels = NDArray[np.int64]
@@ -33,7 +33,7 @@ class Map:
         self.bits, self.height, self.width, self.regions = bits, height, width, regions
         self.rows = [[-1] * width for _ in range(height)]
         self.front, self.met = 0, 1
-        self.decisions = [Decision(prior), Decision(prior)]
+        self.models = [Model(prior), Model(prior)]
         self.is_new = {True: AdaptiveBit(), False: AdaptiveBit()}
         self.is_nearest = {is_seed: [AdaptiveBit() for _ in range(3)] for is_seed in (True, False)}
 
@@ -83,7 +83,7 @@ class Map:
             neighbours = {self.label(x + dx, y + dy) for dx, dy in QUIET}
             if len(neighbours) > 1:
                 unknown[x, y] = []
-                coded[x, y] = Pixel([self.label(x + dx, y + dy) for dx, dy in TEMPLATE], self.decisions)
+                coded[x, y] = Pixel([self.label(x + dx, y + dy) for dx, dy in TEMPLATE], self.models)
             elif (x, y) not in seeds:
                 self.rows[y][x] = neighbours.pop()
             elif self.regions == 2:
@@ -91,21 +91,21 @@ class Map:
             else:
                 unknown[x, y] = [*neighbours]
         has_escapes = self.regions > 2
-        neither = {at: self.bits.bit(pixel.neither.p) if has_escapes else 0 for at, pixel in coded.items()}
-        which = {at: self.bits.bit(pixel.which.p) for at, pixel in coded.items()}
+        is_escape = {at: self.bits.bit(pixel.is_escape.p) if has_escapes else 0 for at, pixel in coded.items()}
+        is_second = {at: self.bits.bit(pixel.is_second.p) for at, pixel in coded.items()}
         for (x, y), candidates in unknown.items():
             at = (x, y)
-            if at in coded and not neither[at]:
-                self.rows[y][x] = coded[at].candidates[which[at]]
+            if at in coded and not is_escape[at]:
+                self.rows[y][x] = coded[at].candidates[is_second[at]]
             else:
                 self.rows[y][x] = self.read_label(x, y, candidates or coded[at].candidates, at not in coded)
         for at, pixel in coded.items():
             if has_escapes:
-                pixel.neither.learn(neither[at])
-            if neither[at]:
-                assert which[at]
+                pixel.is_escape.learn(is_escape[at])
+            if is_escape[at]:
+                assert is_second[at]
             else:
-                pixel.which.learn(which[at])
+                pixel.is_second.learn(is_second[at])
 
     def read_label(self, x: int, y: int, candidates: list[int], is_seed: bool) -> int:
         if self.met < self.regions and self.bits.adaptive_bit(self.is_new[is_seed]):
@@ -117,18 +117,18 @@ class Map:
         return self.bits.number(self.met)
 
     def nearest(self, x: int, y: int, candidates: list[int]) -> list[int]:
-        found: list[int] = []
+        nearest: list[int] = []
         for radius in range(1, 33):
             top = [(x + dx, y - radius) for dx in range(-radius, radius + 1)]
             for column, row in top + [(x + dx, y - dy) for dy in range(radius - 1, -1, -1) for dx in (-radius, radius)]:
                 if row < -6 or not -8 <= column < self.width + 9 or column + 8 * row >= self.front:
                     continue
                 label = self.label(column, row)
-                if label not in candidates and label not in found:
-                    found.append(label)
-                    if len(found) == 3:
-                        return found
-        return found
+                if label not in candidates and label not in nearest:
+                    nearest.append(label)
+                    if len(nearest) == 3:
+                        return nearest
+        return nearest
 
 
 def read_labels(data: bytes, height: int, width: int) -> Rows:

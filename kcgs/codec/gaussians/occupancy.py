@@ -28,10 +28,10 @@ _MAX_CLASSES = 1 << 12  # classes of size in all groups; an encoder has 65 * 37 
 _MARGIN_WEIGHTS = np.array([3.0, *[1.0] * 4, *[0.3] * 4])
 _OUTSIDE_WEIGHTS = np.array([0.3, *[1.0] * 4, *[0.3] * (COUNT_BITS - 4)])
 
-# the weight of a cell, by the Gaussians near it
-_NEAR_SIZES = 2  # classes of size above a Gaussian's own that count as near
-_REACH = 4  # columns and rows within which a Gaussian is near
-_NEAR_SUM = 625  # of a Gaussian's weights in all cells
+# the weight of a cell, by the density of earlier Gaussians
+_DENSITY_SIZES = 2  # classes of size above a Gaussian's own that count, too
+_REACH = 4  # columns and rows to either side, to which a Gaussian adds density
+_KERNEL_SUM = 625  # density that a Gaussian adds in all cells: (1 + 2 + 3 + 4 + 5 + 4 + 3 + 2 + 1)^2
 _WEIGHT_PARTS = 64  # of a weight
 _PRIOR_GAUSSIANS = 12  # that all cells share in equal parts
 
@@ -137,20 +137,20 @@ class OccupancyCoder:
         return margin
 
     def _code_inside(self, coder: Coder, grid: Grid, size: int, count: int, index: Integers | None) -> Integers:
-        """Code the cells inside: the more likely, the more earlier Gaussians of about this size are near."""
+        """Code the cells inside: a cell is the likelier, the denser earlier Gaussians of about this size are."""
         shape, num_cells = (grid.rows, grid.columns), grid.rows * grid.columns
-        near = [middle // (2 * grid.side) for other, middle in self._classes if size <= other <= size + _NEAR_SIZES]
-        column, row = np.concatenate([np.zeros((0, 2), np.int64), *near]).T
+        cells = [middle // (2 * grid.side) for other, middle in self._classes if size <= other <= size + _DENSITY_SIZES]
+        column, row = np.concatenate([np.zeros((0, 2), np.int64), *cells]).T
         is_inside = (row >= 0) & (row < grid.rows) & (column >= 0) & (column < grid.columns)
         column, row = column[is_inside], row[is_inside]
-        base = max(_WEIGHT_PARTS * _NEAR_SUM * _PRIOR_GAUSSIANS // num_cells, 1)
+        base = max(_WEIGHT_PARTS * _KERNEL_SUM * _PRIOR_GAUSSIANS // num_cells, 1)
 
         def weigh(start: int, end: int) -> Floats:
-            near = _sum_near(column, row, shape, start // grid.columns, end // grid.columns)
-            return (base + _WEIGHT_PARTS * near).ravel()
+            density = _sum_density(column, row, shape, start // grid.columns, end // grid.columns)
+            return (base + _WEIGHT_PARTS * density).ravel()
 
         borders = [row * grid.columns for row in _borders(grid.rows, num_cells)]
-        total = base * num_cells + _WEIGHT_PARTS * _NEAR_SUM * len(row)
+        total = base * num_cells + _WEIGHT_PARTS * _KERNEL_SUM * len(row)
         return _code_cells(coder, borders, weigh, total, count, index)
 
     def _code_outside(self, coder: Coder, grid: Grid, count: int, num_outside: int, index: Integers | None) -> Integers:
@@ -171,22 +171,22 @@ def _borders(length: int, num_cells: int) -> list[int]:
     return sorted({length * i // bands for i in range(bands + 1)})
 
 
-def _sum_near(column: Integers, row: Integers, shape: tuple[int, int], first: int, last: int) -> Floats:
-    """Sum the weights of Gaussians near the cells of rows first to last - 1, mirrored at the grid's borders.
+def _sum_density(column: Integers, row: Integers, shape: tuple[int, int], first: int, last: int) -> Floats:
+    """Sum the density of Gaussians in the cells of rows first to last - 1, mirrored at the grid's borders.
 
-    A weight falls linearly with the distance in columns and in rows: two box filters, one after the other.
+    What a Gaussian adds falls linearly with the distance in columns and in rows: two box filters.
     """
     top, bottom = max(first - _REACH, 0), min(last + _REACH, shape[0])
-    is_near = (row >= top) & (row < bottom)
-    index = (row[is_near] - top) * shape[1] + column[is_near]
-    near = np.bincount(index, minlength=(bottom - top) * shape[1]).reshape(-1, shape[1]).astype(np.int32)
+    is_within = (row >= top) & (row < bottom)
+    index = (row[is_within] - top) * shape[1] + column[is_within]
+    density = np.bincount(index, minlength=(bottom - top) * shape[1]).reshape(-1, shape[1]).astype(np.int32)
     above = _REACH - (first - top) if top == 0 else 0
     below = _REACH - (bottom - last) if bottom == shape[0] else 0
-    near = np.pad(near, [(above, below), (_REACH, _REACH)], "symmetric")
+    density = np.pad(density, [(above, below), (_REACH, _REACH)], "symmetric")
     for _ in range(2):
-        near = near[4:] + near[3:-1] + near[2:-2] + near[1:-3] + near[:-4]
-        near = near[:, 4:] + near[:, 3:-1] + near[:, 2:-2] + near[:, 1:-3] + near[:, :-4]
-    return near.astype(np.float64)
+        density = density[4:] + density[3:-1] + density[2:-2] + density[1:-3] + density[:-4]
+        density = density[:, 4:] + density[:, 3:-1] + density[:, 2:-2] + density[:, 1:-3] + density[:, :-4]
+    return density.astype(np.float64)
 
 
 def _code_cells(
