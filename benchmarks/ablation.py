@@ -64,7 +64,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
         row |= dict(zip(("printed PSNR", "printed EF-PSNR"), printed, strict=True)) if printed else {}
     groups = group_by([row for row in rows if row["method"] in METHODS], ["n", "method"])
     # a mean of fewer images is no point of the figure
-    ours = [row for (n, _), of in groups.items() if len(of) == len(groups[n, "best"]) for row in of]
+    ours = [row for (n, _), group in groups.items() if len(group) == len(groups[n, "best"]) for row in group]
     save_lines(folder / "ablation.png", [Panel("", ours, "n", quantity) for quantity in QUANTITIES], "method", "n")
     columns = ("iterations", *QUANTITIES, "printed PSNR", "printed EF-PSNR", "bytes", "core_seconds")
     tables = [differences_table(rows, COMPARISONS, QUANTITIES, ["n"]), means_table(rows, ["n", "method"], columns)]

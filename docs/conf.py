@@ -62,10 +62,10 @@ def copy_pages() -> None:
     for name in ("notebooks", "benchmarks/reports"):
         folder, source = HERE / name, ROOT / name
         originals = {path.relative_to(source) for path in source.rglob("*") if path.is_file()}
-        kept = {path for path in originals if path.suffix in (".ipynb", ".md", ".png", ".jpg", ".csv")}
-        for stale in {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()} - kept:
+        pages = {path for path in originals if path.suffix in (".ipynb", ".md", ".png", ".jpg", ".csv")}
+        for stale in {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()} - pages:
             (folder / stale).unlink()
-        for path in kept:
+        for path in pages:
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(source / path, folder / path)
 

@@ -58,14 +58,16 @@ def objectives(path: Path) -> None:
         raise RuntimeError('the figure needs SSIMULACRA2: pip install -e ".[visual]"')
     image = torch.from_numpy(coffee() / 255).permute(2, 0, 1).float()
     labels = segment(image)
-    shown = {"photo": image}
+    panels = {"photo": image}
     for name in ("psnr", "ms-ssim"):
-        done = fit_bytes(image, labels, NUM_BYTES, objective=name)
-        found = evaluate(done.scene, image, labels)
-        figures = f"PSNR {found['psnr']:.1f}, EF-PSNR {found['ef_psnr']:.1f}, SSIMULACRA2 {found['ssimulacra2']:.0f}"
-        shown[f'objective="{name}": {figures}'] = done.scene.render()
+        result = fit_bytes(image, labels, NUM_BYTES, objective=name)
+        metrics = evaluate(result.scene, image, labels)
+        figures = (
+            f"PSNR {metrics['psnr']:.1f}, EF-PSNR {metrics['ef_psnr']:.1f}, SSIMULACRA2 {metrics['ssimulacra2']:.0f}"
+        )
+        panels[f'objective="{name}": {figures}'] = result.scene.render()
     figure, axes = plt.subplots(1, 3, figsize=(16, 4), layout="constrained")
-    for axis, (title, render) in zip(axes.flat, shown.items(), strict=True):
+    for axis, (title, render) in zip(axes.flat, panels.items(), strict=True):
         axis.imshow(render.clamp(0, 1).permute(1, 2, 0), interpolation="lanczos")
         axis.set_title(title, fontsize=9)
         axis.set_axis_off()

@@ -166,17 +166,17 @@ def gallery() -> dict[str, str]:
     from kcgs.page import scene_page
     from kcgs.zoo import entries, find
 
-    pages, shown = {}, []
+    pages, frames = {}, []
     for entry in sorted(entries(), key=lambda entry: entry.name.startswith("chart")):
         scene, name = load(find(entry.name)), f"gallery-{entry.name}.html"
         height, width = scene.size
         pages[name] = scene_page(scene, title=entry.title)
         facts = f"{entry.num_gaussians} Gaussians, {entry.num_regions} regions; {entry.licence}"
-        shown.append(
+        frames.append(
             f'<iframe src="{name}" title="{entry.title}" loading="lazy" style="aspect-ratio: {width} / {height}">'
             f'</iframe>\n<p>{entry.title[0].upper()}{entry.title[1:]}. {facts}. <a href="{name}">In a window</a></p>'
         )
-    pages["gallery.md"] = "\n\n".join(shown) + "\n"
+    pages["gallery.md"] = "\n\n".join(frames) + "\n"
     return pages
 
 
@@ -188,10 +188,10 @@ def segmenters() -> str:
     shared = inspect.signature(Cleanup).parameters
     rows = ["| method | how | its options |", "|---|---|---|"]
     for name in available_methods():
-        own = [f"`{key}`" for key in method_options(name) if key not in shared]
+        options = [f"`{key}`" for key in method_options(name) if key not in shared]
         sentence = inspect.cleandoc(_methods[name].function.__doc__ or "").split("\n\n")[0]
         sentence = re.sub(r":func:`([^`]+)`", r"`\1`", sentence)
-        rows.append(f"| `{name}` | {_cell(sentence)} | {', '.join(own)} |")
+        rows.append(f"| `{name}` | {_cell(sentence)} | {', '.join(options)} |")
     return "\n".join(rows) + "\n"
 
 

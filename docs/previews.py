@@ -33,13 +33,13 @@ def resized(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 def other(codec: str, image: Tensor, most: int) -> Preview | None:
     """Shrink the image as far as gives the best preview of at most so many bytes; None: no size fits."""
-    size, found = (image.shape[1], image.shape[2]), []
+    size, candidates = (image.shape[1], image.shape[2]), []
     for factor in FACTORS:
         small = resized(image, (max(1, round(size[0] / factor)), max(1, round(size[1] / factor))))
         coded = largest_file(codec, small, most)
         if len(coded) <= most:
-            found.append((len(coded), resized(decode_file(coded), size)))
-    return max(found, key=lambda preview: float(psnr(preview[1], image)), default=None)
+            candidates.append((len(coded), resized(decode_file(coded), size)))
+    return max(candidates, key=lambda preview: float(psnr(preview[1], image)), default=None)
 
 
 def beginning(data: bytes, most: int) -> Preview | None:
@@ -66,11 +66,11 @@ def thumbhash(image: Tensor) -> Preview:
         # 6 bits for the mean, 5 or 6 for the scale
         steps = 31 if name == "l" else 63
         mean = (values[0] * 63).round() / 63 if name == "l" else ((values[0] + 1) * 31.5).round() / 31.5 - 1
-        kept = ((0.5 + 0.5 / scale * values[1:]) * 15).round() / 7.5 - 1
-        kept = kept * (scale * steps).round() / steps * (1 if name == "l" else 1.25)
-        parts = (2 * value * cosines(x, y, size) for (x, y), value in zip(terms[1:], kept, strict=True))
+        coefficients = ((0.5 + 0.5 / scale * values[1:]) * 15).round() / 7.5 - 1
+        coefficients = coefficients * (scale * steps).round() / steps * (1 if name == "l" else 1.25)
+        parts = (2 * value * cosines(x, y, size) for (x, y), value in zip(terms[1:], coefficients, strict=True))
         decoded[name] = sum(parts, mean.expand(size))
-        numbers += len(kept)
+        numbers += len(coefficients)
     blue = decoded["l"] - 2 / 3 * decoded["p"]
     red = (3 * decoded["l"] - blue + decoded["q"]) / 2
     return 5 + math.ceil(numbers / 2), torch.stack([red, red - decoded["q"], blue]).clamp(0, 1)
@@ -86,25 +86,25 @@ def previews(image: Tensor) -> dict[str, dict[int, Preview | None]]:
     """Make all previews of an image, by codec and bytes."""
     labels = segment(image)
     whole = fit_bytes(image, labels, WHOLE).data
-    found: dict[str, dict[int, Preview | None]] = {PREFIX: {}, FILE: {}, "WebP": {}, "AVIF": {}}
+    by_codec: dict[str, dict[int, Preview | None]] = {PREFIX: {}, FILE: {}, "WebP": {}, "AVIF": {}}
     for most in BYTES:
-        made = fit_bytes(image, labels, most).data
-        found[PREFIX][most] = beginning(whole, most)
-        found[FILE][most] = len(made), decode(made).scene.render()
+        file = fit_bytes(image, labels, most).data
+        by_codec[PREFIX][most] = beginning(whole, most)
+        by_codec[FILE][most] = len(file), decode(file).scene.render()
         for codec in ("WebP", "AVIF"):
-            found[codec][most] = other(codec, image, most)
-    return found
+            by_codec[codec][most] = other(codec, image, most)
+    return by_codec
 
 
-def show(image: Tensor, found: dict[str, dict[int, Preview | None]]) -> None:
+def show(image: Tensor, by_codec: dict[str, dict[int, Preview | None]]) -> None:
     """Write the figure of one image."""
-    figure, axes = plt.subplots(len(BYTES) + 1, len(found), figsize=(13, 9.2), layout="constrained")
+    figure, axes = plt.subplots(len(BYTES) + 1, len(by_codec), figsize=(13, 9.2), layout="constrained")
     for axis in axes.flat:
         axis.set_axis_off()
     hashed = thumbhash(image)
     for axis, (title, preview) in zip(axes[0], (("photo", None), ("ThumbHash", hashed)), strict=False):
         place(axis, title, image if preview is None else preview[1], None if preview is None else preview[0], image)
-    for column, (codec, by_size) in enumerate(found.items()):
+    for column, (codec, by_size) in enumerate(by_codec.items()):
         for row, most in enumerate(BYTES, 1):
             preview = by_size[most]
             if preview is None:
@@ -125,11 +125,11 @@ def place(axis: plt.Axes, title: str, shown: Tensor, size: int | None, image: Te
 if __name__ == "__main__":
     for name in ("coffee", "astronaut", "chelsea"):
         image = torch.from_numpy(getattr(photos, name)() / 255).permute(2, 0, 1).float()
-        found = previews(image)
+        by_codec = previews(image)
         if name == "coffee":
-            show(image, found)
-        for codec, by_size in found.items():
+            show(image, by_codec)
+        for codec, by_size in by_codec.items():
             figures = ["-" if p is None else f"{float(psnr(p[1], image)):.1f}" for p in by_size.values()]
             print(f"| {name} | {codec} | {' | '.join(figures)} |", flush=True)
-        size, shown = thumbhash(image)
-        print(f"| {name} | ThumbHash, {size} bytes | {float(psnr(shown, image)):.1f} | | |", flush=True)
+        size, preview = thumbhash(image)
+        print(f"| {name} | ThumbHash, {size} bytes | {float(psnr(preview, image)):.1f} | | |", flush=True)

@@ -37,8 +37,8 @@ CODECS = {
 
 def available_codecs() -> list[str]:
     """Name the codecs that this machine's Pillow has."""
-    known = {"JPEG": "jpg", "WEBP": "webp", "AVIF": "avif"}
-    return [name for name, codec in CODECS.items() if features.check(known[codec.format])]
+    pillow_names = {"JPEG": "jpg", "WEBP": "webp", "AVIF": "avif"}
+    return [name for name, codec in CODECS.items() if features.check(pillow_names[codec.format])]
 
 
 def decode_file(data: bytes) -> Tensor:

@@ -45,8 +45,10 @@ def save_lines(path: Path, panels: Sequence[Panel], line: str, along: str, marke
     with matplotlib.rc_context({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3}):
         all_axes = np.ravel(figure.subplots(height, 2, squeeze=False))
     for panel, axes in zip(panels, all_axes, strict=False):
-        present = [row for row in panel.rows if not (is_missing(row.get(panel.x)) or is_missing(row.get(panel.y)))]
-        for (name,), rows in group_by(present, [line]).items():
+        rows_with_values = [
+            row for row in panel.rows if not (is_missing(row.get(panel.x)) or is_missing(row.get(panel.y)))
+        ]
+        for (name,), rows in group_by(rows_with_values, [line]).items():
             groups = [group for _, group in sorted(group_by(rows, [along]).items())]
             points = [[fmean(row[quantity] for row in group) for quantity in (panel.x, panel.y)] for group in groups]
             index = names.index(name)

@@ -46,14 +46,14 @@ def load_mapped(name: str, data: str | None = None, quick: bool = False) -> tupl
 
 def names(data: Path, group: str) -> list[str]:
     """List the images of "davis" (six frames), "kodak" or "bsds" that are in the data; a ValueError: there are none."""
-    present = {
+    images = {
         "davis": [name for name in FRAMES if (data / "DAVIS" / "JPEGImages" / "480p" / name).is_dir()],
         "kodak": sorted(path.stem for path in (data / "kodak").glob("kodim*.png")),
         "bsds": sorted((path.parent.name for path in (data / "bsds").glob("*/image.jpg")), key=int),
     }[group]
-    if not present:
+    if not images:
         raise ValueError(f"data must have a folder with {group} in it; got {str(data)!r}")
-    return present
+    return images
 
 
 def _read(name: str, data: Path) -> tuple[Tensor, Tensor | None]:

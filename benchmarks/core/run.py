@@ -84,9 +84,15 @@ def run_experiment(
         try:
             _measure_missing(measure, paths, options.workers)
         finally:
-            present = [path for path in paths if path.is_file()]
-            write_rows(options.output / RESULTS_FILE, [row for path in present for row in json.loads(path.read_text())])
-            note = f"Stopped: {len(present)} of {len(paths)} jobs are done." if len(present) < len(paths) else ""
+            finished_paths = [path for path in paths if path.is_file()]
+            write_rows(
+                options.output / RESULTS_FILE, [row for path in finished_paths for row in json.loads(path.read_text())]
+            )
+            note = (
+                f"Stopped: {len(finished_paths)} of {len(paths)} jobs are done."
+                if len(finished_paths) < len(paths)
+                else ""
+            )
             run = {"command": _command(name, options), "quick": options.quick, "machine": _machine(), "note": note}
             (options.output / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
     run = json.loads((options.output / RUN_FILE).read_text(encoding="utf-8"))
@@ -138,8 +144,10 @@ def _sources() -> str:
 
 
 def _measure_missing(measure: Measure, paths: dict[Path, Job], workers: int) -> None:
-    missing = [(path, job) for path, job in paths.items() if not path.is_file()]
-    for _ in track(run_jobs(partial(_measure, measure), missing, workers=workers), "benchmark", total=len(missing)):
+    jobs_to_run = [(path, job) for path, job in paths.items() if not path.is_file()]
+    for _ in track(
+        run_jobs(partial(_measure, measure), jobs_to_run, workers=workers), "benchmark", total=len(jobs_to_run)
+    ):
         pass
 
 

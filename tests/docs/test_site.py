@@ -42,8 +42,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
             pytest.skip("the site is built with the extra 'docs'")
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-d", str(folder / "doctrees")]
-    done = subprocess.run([*command, str(DOCS), str(folder / "html")], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0, done.stdout + done.stderr
+    build = subprocess.run([*command, str(DOCS), str(folder / "html")], capture_output=True, text=True, cwd=ROOT)
+    assert build.returncode == 0, build.stdout + build.stderr
     return folder / "html"
 
 
@@ -70,8 +70,8 @@ def test_every_page_has_commands_recipes_and_figures(site: Path, generate: Modul
     from kcgs.fitting import FitConfig, available_recipes
 
     commands, recipes = ((site / f"{name}.html").read_text(encoding="utf-8") for name in ("command-line", "recipes"))
-    shown = "fit", "render", "eval", "segment", "info", "encode", "decode", "export", "view", "demo"
-    for name in (*shown, "fit-many", "fit-video"):
+    names = "fit", "render", "eval", "segment", "info", "encode", "decode", "export", "view", "demo"
+    for name in (*names, "fit-many", "fit-video"):
         assert f'id="kcgs-{name}"' in commands
     for name in (*FitConfig.model_fields, *available_recipes()):
         assert name in recipes

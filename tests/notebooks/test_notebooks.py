@@ -53,8 +53,8 @@ def read(path: Path) -> Any:
 def run_quick(name: str, folder: Path) -> Any:
     """Return a notebook with the outputs of its quick form."""
     command = [sys.executable, str(SCRIPT), "--quick", "-o", str(folder), str(FOLDER / f"{name}.ipynb")]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    run = subprocess.run(command, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
     return read(folder / f"{name}.ipynb")
 
 
@@ -66,9 +66,9 @@ def quick(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     subprocess.run([sys.executable, "-c", _COMPILE], check=True)
     folder = tmp_path_factory.mktemp("quick")
     with ThreadPoolExecutor(1 if "PYTEST_XDIST_WORKER" in os.environ else 2) as pool:
-        chosen = {item.name for item in request.session.items}
-        wanted = [name for name in PRINTED if f"test_runs[{name}]" in chosen]
-        yield {name: pool.submit(run_quick, name, folder) for name in wanted}
+        item_names = {item.name for item in request.session.items}
+        notebooks = [name for name in PRINTED if f"test_runs[{name}]" in item_names]
+        yield {name: pool.submit(run_quick, name, folder) for name in notebooks}
         pool.shutdown(cancel_futures=True)
 
 
@@ -116,10 +116,12 @@ class TestCommitted:
         cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
         assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
         for cell in cells:
-            shown = {output.output_type for output in cell.outputs}
+            output_types = {output.output_type for output in cell.outputs}
             # a helper's own body is indented and shows nothing until it is called
-            assert ("stream" in shown) == bool(re.search(r"^( {4})?print\(", cell.source, re.MULTILINE)), cell.source
-            assert ("display_data" in shown) == bool(
+            assert ("stream" in output_types) == bool(re.search(r"^( {4})?print\(", cell.source, re.MULTILINE)), (
+                cell.source
+            )
+            assert ("display_data" in output_types) == bool(
                 re.search(r"^(show\(|\w.*= plt\.subplots\()", cell.source, re.MULTILINE)
             ), cell.source
         assert_clean(notebook)
@@ -140,5 +142,5 @@ class TestCommitted:
 
 
 def test_quick_form_is_not_written_in_place() -> None:
-    done = subprocess.run([sys.executable, str(SCRIPT), "--quick"], capture_output=True, text=True)
-    assert done.returncode == 2 and "needs -o" in done.stderr
+    run = subprocess.run([sys.executable, str(SCRIPT), "--quick"], capture_output=True, text=True)
+    assert run.returncode == 2 and "needs -o" in run.stderr
