@@ -78,7 +78,7 @@ class Blocks:
     def _sort(self, group: Value, count: int) -> tuple[Value, list[Value], list[Value], Value]:
         """Sort blocks by group, (NB,); return them, one to spare, groups' begins, their ends, where each is rendered.
 
-        A group without a block renders one that nobody looks at: tensors without elements are not for every runtime.
+        A group without a block renders one that the image leaves out: not every runtime takes tensors without elements.
         """
         g = self.graph
         total = g.Shape(group)
@@ -86,11 +86,11 @@ class Blocks:
         rank = g.argsort(order, total)
         members = g.Equal(g.constant(np.arange(count + 1)[:, None]), group).astype(INT64)
         counts = g.ReduceSum(members, [1], keepdims=0)
-        rendered = g.Max(counts, [1] * count + [0])
-        starts, firsts = (g.CumSum(n, 0, exclusive=1) for n in (counts, rendered))
+        sizes = g.Max(counts, [1] * count + [0])
+        starts, firsts = (g.CumSum(n, 0, exclusive=1) for n in (counts, sizes))
         index = g.Min(rank + (firsts - starts)[group], firsts[g.constant([count])])
         order = g.Concat(order, [0], axis=0)
-        begins, ends = (g.split(bound, [1] * (count + 1)) for bound in (starts, starts + rendered))
+        begins, ends = (g.split(bound, [1] * (count + 1)) for bound in (starts, starts + sizes))
         return order, begins, ends, index
 
     def _render_group(

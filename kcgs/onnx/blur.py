@@ -53,13 +53,13 @@ class BlurredWindows:
     def unfold(self, number: int) -> Value:
         """Sum the parts of a group's windows over their widths, and normalise: (T, K, S, S)."""
         g, group = self.graph, self.groups[number]
-        most = max(self.places[tile].shape[1] for tile in group.tiles.tolist())
-        ids = np.zeros((len(group.tiles), group.regions, most), np.int64)
+        num_widths = max(self.places[tile].shape[1] for tile in group.tiles.tolist())
+        ids = np.zeros((len(group.tiles), group.regions, num_widths), np.int64)
         for row, tile in zip(ids, group.tiles.tolist(), strict=True):
             count, widths = self.places[tile].shape
             row[:count, :widths] = self.places[tile]
-        windows = self.parts[pack_integers(g, ids if most > 1 else ids[:, :, 0])]
-        windows = g.ReduceSum(windows, [2], keepdims=0) if most > 1 else windows
+        windows = self.parts[pack_integers(g, ids if num_widths > 1 else ids[:, :, 0])]
+        windows = g.ReduceSum(windows, [2], keepdims=0) if num_widths > 1 else windows
         # beyond the map there is no label, and no membership
         return windows / g.Max(g.ReduceSum(windows, [1], keepdims=1), 1e-30)
 

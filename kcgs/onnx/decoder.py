@@ -1,4 +1,9 @@
-"""From a scene to its decoder: the plan of its tiles, what the graph stores, the image, the model."""
+"""From a scene to its decoder, in one direction.
+
+`plan` decides what is rendered where, with `tiles`, `reach` and `groups`. `entries` stores that and unfolds it, with
+`tables` and `packing`. `axis` places the pixels of the output. `blocks` renders them, with `membership` where tiles
+have several regions and `grids` where Gaussians are wide.
+"""
 
 from __future__ import annotations
 

@@ -79,9 +79,9 @@ def store(g: Graph, plan: Plan, visible: Value | None) -> Stored:
     sizes = [len(group.tiles) * group.longest for group in groups]
     begins = [np.arange(size) % group.longest == 0 for size, group in zip(sizes, groups, strict=True)]
     tile = g.CumSum(pack_flags(g, np.concatenate(begins)), 0) - 1  # of each entry, its rank
-    ids, used = _list_gaussians(g, plan, slots, tile, sum(sizes))
+    ids, mask = _list_gaussians(g, plan, slots, tile, sum(sizes))
     squares, polynomials = (g.split(part, sizes) for part in _whiten(g, plan, slots, table, ids, tile))
-    colors = g.split(g.constant(gaussians.colors)[ids] * used, sizes)
+    colors = g.split(g.constant(gaussians.colors)[ids] * mask, sizes)
     regions: list[Value | None] = [None] * len(groups)
     if visible is not None or any(group.regions > 1 for group in groups):
         regions = [*g.split(pack_integers(g, gaussians.region)[ids], sizes)]
@@ -100,9 +100,9 @@ def _list_gaussians(g: Graph, plan: Plan, slots: Slots, tile: Value, count: int)
     firsts, begins = (g.CumSum(n, 0, exclusive=1) for n in (lengths, longest))
     rank = g.Range(np.int32(0), np.int32(count), np.int32(1)) - begins[tile]
     length = lengths[tile]
-    used = g.Unsqueeze(g.Less(rank, length).astype(FLOAT), [1])
+    mask = g.Unsqueeze(g.Less(rank, length).astype(FLOAT), [1])
     pair = firsts[tile] + g.Min(rank, length - 1)
-    return _sorted_pairs(g, plan, slots)[pair], used
+    return _sorted_pairs(g, plan, slots)[pair], mask
 
 
 def _sorted_pairs(g: Graph, plan: Plan, slots: Slots) -> Value:

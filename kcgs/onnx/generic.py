@@ -79,10 +79,10 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = True) -> onnx.ModelPr
         window = g.Slice(memberships, begin, begin + _SIDE, [1, 2])
         window = g.Reshape(window, [0, -1])  # [R, pixels]
         middle = corner.astype(FLOAT) + _SIDE / 2
-        near = g.LessOrEqual(g.Abs(means - middle), reach + _SIDE / 2).astype(FLOAT)
-        near = g.ReduceMin(near, [1], keepdims=0)
-        present = g.ReduceMax(window, [1], keepdims=0)[ids]
-        gaussian = g.Compress(g.Range(0, g.Squeeze(g.Shape(ids)), 1), g.Greater(near * present, 0.0), axis=0)  # [K]
+        overlap = g.LessOrEqual(g.Abs(means - middle), reach + _SIDE / 2).astype(FLOAT)
+        overlap = g.ReduceMin(overlap, [1], keepdims=0)
+        share = g.ReduceMax(window, [1], keepdims=0)[ids]
+        gaussian = g.Compress(g.Range(0, g.Squeeze(g.Shape(ids)), 1), g.Greater(overlap * share, 0.0), axis=0)  # [K]
         x, y, k1, k2, slope = g.split(g.Unsqueeze(frame[gaussian], [2, 3]), 5, axis=1)  # [K, 1, 1, 1]
         left, top = g.split(middle, [1, 1])
         offsets = np.arange(_SIDE, dtype=np.float32) - np.float32((_SIDE - 1) / 2)

@@ -99,18 +99,18 @@ class CoarseGrids:
         """Add to each grid what the next coarser one says there; return the quarters of the finest one's blocks."""
         g, channels, table = self.graph, self.stored.channels, self.table
         counts = np.bincount(table.nodes.place[:, 0]).tolist()
-        quarters_of = self._find_quarters(table.level + 1, table.region, table.row, table.col)
-        grids, read = g.split(values, counts), g.split(quarters_of, counts)
+        ids = self._find_quarters(table.level + 1, table.region, table.row, table.col)
+        grids, coarser = g.split(values, counts), g.split(ids, counts)
         matrix = np.zeros((TILE, TILE), np.uint8)
         for node in range(TILE):
             matrix[node, node // 2 : node // 2 + 3] = _REFINE[node % 2]
         along = g.constant(matrix).astype(FLOAT) * (1 / 8)
         back = g.Transpose(along, perm=[1, 0])
         quarters, first = None, sum(counts)
-        for count, grid, wanted in reversed(list(zip(counts, grids, read, strict=True))):
+        for count, grid, ids in reversed(list(zip(counts, grids, coarser, strict=True))):
             grid = g.Reshape(grid, [0, channels, TILE, TILE])
             if quarters is not None:
-                grid = grid + along @ self._join(quarters, wanted, first) @ back
+                grid = grid + along @ self._join(quarters, ids, first) @ back
             first -= count
             grid = g.Reshape(grid, [0, channels, 2, _HALF, 2, _HALF])
             grid = g.Transpose(grid, perm=[0, 4, 2, 1, 3, 5])

@@ -21,6 +21,43 @@ _FARTHEST = 16
 _WIDTH_STEPS = 1 << 14
 
 
+def make_membership(stored: Stored, regions: RegionMap, down: Axis, across: Axis, crisp: bool) -> Membership | None:
+    """Store the windows of a map; None where no tile has several regions.
+
+    Samples lose the blur of pixels, as :class:`kcgs.kernels.Resampled` has it, or with `crisp`, of labels that are
+    blurred by the width of one, make contours as narrow as :class:`kcgs.kernels.Crisp` has them.
+    """
+    g, tiles, membership = stored.graph, stored.plan.tiles, regions.tables.membership
+    groups = {number: group for number, group in enumerate(stored.plan.groups) if group.regions > 1}
+    if not groups:
+        return None
+    soft = regions.softness != 0.0
+    columns = across.sampling(soft)
+    rows = g.Transpose(down.sampling(soft), perm=[0, 2, 1])
+    pixel = down.step * across.step  # area of one of the output, in pixels of the scene
+    q = g.Relu(1 - pixel)  # as the formula of `Resampled` has it
+    if not soft:
+        return Membership(g, rows, columns, HardWindows(g, tiles, groups))
+    if crisp:
+        exponent = g.Max(2 / g.Sqrt(pixel), 1.0)
+        return SoftMembership(g, rows, columns, CrispWindows(g, regions, tiles, groups), exponent)
+    widths, level = membership.levels
+    variance = np.array([widths[0] ** 2], np.float32)
+    uniform = _sharpness(g, g.constant(variance), q) if level is None else None  # exponent of a map of one width
+    wide = membership.radius > _FARTHEST
+    blurred = None if wide else BlurredWindows(g, regions, tiles, groups)
+    windows = blurred or WideWindows(g, tiles, groups)
+    if uniform is not None:
+        return SoftMembership(g, rows, columns, windows, uniform)
+    if blurred is not None and blurred.levels is not None:
+        squares = g.constant(np.array(widths, np.float32) ** 2)[blurred.levels]
+    else:
+        steps = np.round(np.sqrt(membership.variances[0].cpu().numpy()) * _WIDTH_STEPS)
+        width = pack_windows(g, cut_windows(tiles, tile_ids(groups), steps)).astype(FLOAT) * (1 / _WIDTH_STEPS)
+        squares = width * width
+    return PairMembership(g, rows, columns, windows, split_groups(g, groups, squares), q)
+
+
 class Windows(Protocol):
     """The windows of groups, by their number."""
 
@@ -63,73 +100,35 @@ class SoftMembership(Membership):
         self.exponent = exponent
 
     def _normalize(self, samples: Value, group: int, slots: Value, across: Value, down: Value) -> Value:
-        return _raise(self.graph, samples, self.exponent)
+        return _sharpen(self.graph, samples, self.exponent)
 
 
 class PairMembership(Membership):
     """Memberships in a map whose pairs of regions have widths of their own: exponents are sampled, too."""
 
     def __init__(
-        self, g: Graph, down: Value, across: Value, windows: Windows, variances: dict[int, Value], lost: Value
+        self, g: Graph, down: Value, across: Value, windows: Windows, variances: dict[int, Value], q: Value
     ) -> None:
         super().__init__(g, down, across, windows)
         self.variances = variances  # of each group, (T, S, S), squares of widths
-        self.lost = lost
+        self.q = q  # share of a pixel's blur that interpolation loses
 
     def _normalize(self, samples: Value, group: int, slots: Value, across: Value, down: Value) -> Value:
         g = self.graph
         variance = self.variances[group][slots]
         variance = g.Squeeze(across, [1]) @ variance @ g.Squeeze(down, [1])
-        return _raise(g, samples, _sharpness(g, g.Unsqueeze(variance, [1]), self.lost))
+        return _sharpen(g, samples, _sharpness(g, g.Unsqueeze(variance, [1]), self.q))
 
 
-def make_membership(stored: Stored, regions: RegionMap, down: Axis, across: Axis, crisp: bool) -> Membership | None:
-    """Store the windows of a map; None where no tile has several regions.
-
-    What is sampled loses the blur of pixels, as :class:`kcgs.kernels.Resampled` has it, or with `crisp`, of labels that
-    are blurred by the width of one, becomes as narrow as :class:`kcgs.kernels.Crisp` has it.
-    """
-    g, tiles, membership = stored.graph, stored.plan.tiles, regions.tables.membership
-    groups = {number: group for number, group in enumerate(stored.plan.groups) if group.regions > 1}
-    if not groups:
-        return None
-    soft = regions.softness != 0.0
-    columns = across.sampling(soft)
-    rows = g.Transpose(down.sampling(soft), perm=[0, 2, 1])
-    pixel = down.step * across.step  # area of one of the output, in pixels of the scene
-    lost = g.Relu(1 - pixel)
-    if not soft:
-        return Membership(g, rows, columns, HardWindows(g, tiles, groups))
-    if crisp:
-        exponent = g.Max(2 / g.Sqrt(pixel), 1.0)
-        return SoftMembership(g, rows, columns, CrispWindows(g, regions, tiles, groups), exponent)
-    wide = membership.radius > _FARTHEST
-    widths, level = membership.levels
-    if level is None:
-        exponent = _sharpness(g, g.constant(np.array([widths[0] ** 2], np.float32)), lost)
-        windows = WideWindows(g, tiles, groups) if wide else BlurredWindows(g, regions, tiles, groups)
-        return SoftMembership(g, rows, columns, windows, exponent)
-    if wide:
-        windows = WideWindows(g, tiles, groups)
-        steps = np.round(np.sqrt(membership.variances[0].cpu().numpy()) * _WIDTH_STEPS)
-        width = pack_windows(g, cut_windows(tiles, tile_ids(groups), steps)).astype(FLOAT) * (1 / _WIDTH_STEPS)
-        squares = width * width
-    else:
-        windows = blurred = BlurredWindows(g, regions, tiles, groups)
-        assert blurred.levels is not None  # a map of several widths has levels
-        squares = g.constant(np.array(widths, np.float32) ** 2)[blurred.levels]
-    return PairMembership(g, rows, columns, windows, split_groups(g, groups, squares), lost)
-
-
-def _sharpness(g: Graph, variance: Value, lost: Value) -> Value:
-    """Evaluate `kcgs.kernels.resampled.sharpness`, which is 1 where nothing is lost."""
+def _sharpness(g: Graph, variance: Value, q: Value) -> Value:
+    """Evaluate `kcgs.kernels.resampled.sharpness`, which is 1 where q is 0."""
     variance = g.Max(variance, TINY)
-    interpolated = variance + lost * (1 / 6)
-    contour = g.Max(variance - lost * (1 / 12), lost * (1 / 24))
+    interpolated = variance + q * (1 / 6)
+    contour = g.Max(variance - q * (1 / 12), q * (1 / 24))
     return g.Sqrt(interpolated / contour)
 
 
-def _raise(g: Graph, samples: Value, exponent: Value) -> Value:
+def _sharpen(g: Graph, samples: Value, exponent: Value) -> Value:
     """Raise the samples of each pixel to a power, and let them sum to one."""
     samples = g.Relu(samples)  # the last region's is what is left of one, up to rounding
     powers = g.Pow(samples / g.ReduceMax(samples, [1], keepdims=1), exponent)

@@ -81,17 +81,17 @@ def plan_decoder(field: GaussianField, regions: RegionMap | None, cutoff: float)
         region = regions.index_of(field.region_ids).cpu()
     keys = [number * num_regions + r for number, present in enumerate(tiles.regions) for r in present]
     blocks = make_blocks(torch.tensor(keys), num_regions, (1, *field.size))
-    placed, gaussian, block = _pair(field, region, num_regions, blocks, cutoff)
+    coarsened, gaussian, block = _pair(field, region, num_regions, blocks, cutoff)
     nodes, number = _number_blocks(blocks, num_regions, tiles, block)
     tile = number[block]
 
-    stored = _in_raster_order(placed, gaussian.unique())
+    ids = _in_raster_order(coarsened, gaussian.unique())
     entry = torch.full((field.num_gaussians,), -1)
-    entry[stored] = torch.arange(len(stored))
+    entry[ids] = torch.arange(len(ids))
     entry = entry[gaussian]
-    merged = field.merged_colors().detach().double().cpu() * placed.factor[:, None]
-    means, cholesky, colors = (t[stored].float().numpy() for t in (placed.means, placed.cholesky, merged))
-    gaussians = Gaussians(means, cholesky, colors, region[stored].numpy())
+    merged = field.merged_colors().detach().double().cpu() * coarsened.factor[:, None]
+    means, cholesky, colors = (t[ids].float().numpy() for t in (coarsened.means, coarsened.cholesky, merged))
+    gaussians = Gaussians(means, cholesky, colors, region[ids].numpy())
     narrow = _is_narrow(gaussians.cholesky, _NARROW if cutoff >= _FAINT else _NARROW_OF_FAINT)
     pairs = torch.stack([entry, tile])[:, torch.argsort(entry * len(number) + tile)].numpy()
     groups = group_tiles(pairs, narrow, tiles, 0 if nodes is None else len(nodes.place))
@@ -112,16 +112,16 @@ def _pair(
     return coarse, *pair_with_blocks(coarse, region, num_regions, blocks, cutoff)
 
 
-def _number_blocks(blocks: Blocks, num_regions: int, tiles: Tiles, reached: Tensor) -> tuple[Nodes | None, Tensor]:
+def _number_blocks(blocks: Blocks, num_regions: int, tiles: Tiles, block: Tensor) -> tuple[Nodes | None, Tensor]:
     """Return the blocks of nodes where anything is, and the numbers of all blocks."""
     number = blocks.keys // num_regions
-    live = torch.zeros(len(number) + 1, dtype=torch.bool)
-    live[reached] = True
-    if not live[blocks.first :].any():
+    is_needed = torch.zeros(len(number) + 1, dtype=torch.bool)
+    is_needed[block] = True
+    if not is_needed[blocks.first :].any():
         return None, number
     for first, end in reversed(list(pairwise(blocks.starts[1:]))):
-        live[first:end] |= live[blocks.parents[first:end]].any(1)
-    ids = live[blocks.first : -1].nonzero()[:, 0] + blocks.first
+        is_needed[first:end] |= is_needed[blocks.parents[first:end]].any(1)
+    ids = is_needed[blocks.first : -1].nonzero()[:, 0] + blocks.first
     level = torch.searchsorted(torch.tensor(blocks.starts[1:]), ids, right=True) - 1
     cols, first_tile = torch.tensor([[grid.cols, grid.first_tile] for grid in blocks.grids[1:]])[level].T
     tile = number[ids] - first_tile
@@ -132,13 +132,13 @@ def _number_blocks(blocks: Blocks, num_regions: int, tiles: Tiles, reached: Tens
     return Nodes(place[order], shape), number
 
 
-def _in_raster_order(placed: Coarsened, ids: Tensor) -> Tensor:
+def _in_raster_order(coarsened: Coarsened, ids: Tensor) -> Tensor:
     """Sort ids by level and tile: neighbours get neighbouring numbers, so that lists are stored as small steps."""
     if len(ids) == 0:
         return ids
-    column, row = (placed.means[ids] / TILE).floor().unbind(-1)
+    column, row = (coarsened.means[ids] / TILE).floor().unbind(-1)
     ids = ids[torch.argsort(row * (1 + 2 * column.abs().amax()) + column, stable=True)]
-    return ids[torch.argsort(placed.level[ids], stable=True)]
+    return ids[torch.argsort(coarsened.level[ids], stable=True)]
 
 
 def _is_narrow(cholesky: Floats, width: float) -> NDArray[np.bool_]:

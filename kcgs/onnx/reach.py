@@ -17,21 +17,21 @@ def place_gaussians(means: Tensor, cholesky: Tensor, cutoff: float, levels: int)
     """Move float64 Gaussians to the coarsest of so many levels whose nodes are close enough; level 0 are the pixels."""
     level = choose_levels(cholesky, most_spacing(cutoff), levels)
     wide = level > 0
-    placed = Coarsened(level, means.clone(), cholesky.clone(), torch.ones_like(means[:, 0]))
-    for values, coarse in zip(placed[1:], coarsen(level[wide], means[wide], cholesky[wide])[1:], strict=True):
+    result = Coarsened(level, means.clone(), cholesky.clone(), torch.ones_like(means[:, 0]))
+    for values, coarse in zip(result[1:], coarsen(level[wide], means[wide], cholesky[wide])[1:], strict=True):
         values[wide] = coarse
-    return placed
+    return result
 
 
 def pair_with_blocks(
-    placed: Coarsened, region: Tensor, num_regions: int, blocks: Blocks, cutoff: float
+    coarsened: Coarsened, region: Tensor, num_regions: int, blocks: Blocks, cutoff: float
 ) -> tuple[Tensor, Tensor]:
     """Pair Gaussians, (P,), with the blocks of their level and region, (P,), that they reach, between pixels too."""
     radius = support_radius(cutoff, torch.float32)
-    gaussians, numbers = [], []
+    gaussians, numbers = [], []  # of each level
     for level, grid in enumerate(blocks.grids):
-        ids = (placed.level == level).nonzero()[:, 0]
-        means, cholesky, regions = placed.means[ids], placed.cholesky[ids], region[ids]
+        ids = (coarsened.level == level).nonzero()[:, 0]
+        means, cholesky, regions = coarsened.means[ids], coarsened.cholesky[ids], region[ids]
         size = (grid.height, grid.width)
         gaussian, column_row, origin = bounding_tiles(means, cholesky, radius, size, between=level == 0)
         tile = grid.first_tile + column_row[:, 1] * grid.cols + column_row[:, 0]

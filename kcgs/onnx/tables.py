@@ -24,15 +24,15 @@ def make_slots(g: Graph, plan: Plan) -> Slots:
     """Sort tiles and blocks of nodes by group."""
     groups = plan.groups
     group_of = np.full(plan.num_blocks, len(groups))
-    for number, group in enumerate(groups):
-        group_of[group.tiles] = number
-    table = pack_integers(g, group_of)
-    order = argsort(g, table, plan.num_blocks)
+    for number, members in enumerate(groups):
+        group_of[members.tiles] = number
+    group = pack_integers(g, group_of)
+    order = argsort(g, group, plan.num_blocks)
     rank = argsort(g, order, plan.num_blocks)
-    starts = np.cumsum([0, *(len(group.tiles) for group in groups)])
-    slot = rank - g.constant(starts.astype(np.int32))[table]
+    starts = np.cumsum([0, *(len(members.tiles) for members in groups)])
+    slot = rank - g.constant(starts.astype(np.int32))[group]
     tiles = g.split(g.Slice(order, [0], starts[-1:]), np.diff(starts).tolist()) if groups else []
-    return Slots(table, slot, rank, tiles)
+    return Slots(group, slot, rank, tiles)
 
 
 class NodeTable(NamedTuple):
