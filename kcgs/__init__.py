@@ -11,13 +11,14 @@ if TYPE_CHECKING:
     from .fitting import FitConfig, FitResult, fit
     from .functional import RegionMap
     from .nn import GaussianField, RegionSplatRenderer
+    from .pruning import prune
     from .scene import Scene, load, save
 
 __version__ = "0.1.0"
 
 __all__ = [
     "FitConfig", "FitResult", "GaussianField", "InvalidArgument", "InvalidArgumentType", "RegionMap",
-    "RegionSplatRenderer", "Scene", "__version__", "evaluate", "fit", "load", "save",
+    "RegionSplatRenderer", "Scene", "__version__", "evaluate", "fit", "load", "prune", "save",
 ]  # fmt: skip
 
 # Public names by module. A module is imported when one of its names is used, so that `kcgs --help` loads no torch.
@@ -27,6 +28,7 @@ _MODULES = {
     "fitting": ("FitConfig", "FitResult", "fit"),
     "functional": ("RegionMap",),
     "nn": ("GaussianField", "RegionSplatRenderer"),
+    "pruning": ("prune",),
     "scene": ("Scene", "load", "save"),
 }
 _PACKAGES = (

@@ -8,10 +8,12 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_number
+from kcgs._repr import brief
 from kcgs.nn import GaussianField, RegionSplatRenderer
 from kcgs.scene import Scene, check_scene
 
 
+@brief
 class PruneResult(NamedTuple):
     """A scene with fewer Gaussians."""
 

@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 from kcgs._repr import brief
 
+__all__ = ["Entry", "entries", "find"]
+
 _PACKAGE = Path(__file__).resolve().parent
 # within the package in a wheel, beside it in a checkout
 _FOLDER = _PACKAGE / "models" if (_PACKAGE / "models").is_dir() else _PACKAGE.parent / "models"

@@ -115,12 +115,12 @@ def test_private_names_stay_in_their_package() -> None:
 
 
 def test_benchmarks_use_public_names() -> None:
-    """They import what a package lists in its `__all__`, and the zoo; kcgs imports no benchmark."""
+    """They import what a package lists in its `__all__`; kcgs imports no benchmark."""
     for path in sorted((ROOT / "benchmarks").rglob("*.py")):
         for module, name in imports(path, list(path.relative_to(ROOT).parent.parts)):
             assert not module.startswith("unittest"), f"{path.name} patches: {module}"
             package, public = (module, name) if name else module.rpartition(".")[::2]
-            if package.startswith("kcgs.") and package != "kcgs.zoo":
+            if package.startswith("kcgs."):
                 assert public in import_module(package).__all__, f"{path.name} imports {package}.{public}"
     assert not [m for m in MODULES if any(entry.module.split(".")[0] == "benchmarks" for entry in imports_of(m))]
 

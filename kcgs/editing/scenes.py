@@ -1,4 +1,4 @@
-"""Move, recolour, delete and extract regions, and put other scenes behind them; each returns a new scene."""
+"""Move, recolour, delete and extract regions, and put other scenes behind them: each edit returns a new scene."""
 
 from __future__ import annotations
 
