@@ -20,7 +20,7 @@ _COARSEST_SIDE = 2 * TILE
 # spacing of nodes, in standard deviations, at cutoff 1; it grows with cutoff^(1/4), so that the error of interpolation,
 # 0.0042 spacing^4, is 1.7 times the cutoff
 _SPACING = 4.5
-# largest spacing of nodes, in standard deviations: covariances of nodes are positive
+# largest spacing of nodes, in standard deviations: a spline has 0.7^2 / 3 = 0.16 of the Gaussian's variance at most
 _MAX_SPACING = 0.7
 
 
@@ -49,7 +49,7 @@ class Blocks(NamedTuple):
         return self.starts[1]
 
 
-def most_spacing(cutoff: float) -> float:
+def max_spacing(cutoff: float) -> float:
     """Return the largest spacing of nodes that a Gaussian allows, in its smaller standard deviations; 0: none."""
     return min(_SPACING * float(cutoff**0.25), _MAX_SPACING)
 
@@ -74,8 +74,8 @@ def grids_of(size: tuple[int, int], maps: int) -> tuple[Grid, ...]:
     while max(height, width) > _COARSEST_SIDE:
         last = grids[-1]
         # the last pixel, at n - 1/2, needs two nodes after it; node n - 2 the one at its place, and one more
-        pixels = len(grids) == 1
-        height, width = ((n - 1) // 2 + 4 if pixels else (n - 2) // 2 + 3 for n in (height, width))
+        is_finest = len(grids) == 1
+        height, width = ((n - 1) // 2 + 4 if is_finest else (n - 2) // 2 + 3 for n in (height, width))
         first_tile = last.first_tile + maps * last.rows * last.cols
         grids.append(Grid(height, width, -(-height // TILE), -(-width // TILE), first_tile))
     return tuple(grids)

@@ -24,7 +24,7 @@ except ImportError:  # steps() raises
 
 # sums of v (z1, z2, z1 z1, z1 z2, z2 z2), see whitened.sums_to_gradients
 _MOMENTS = 5
-# channels that a thread holds at once; more would spill registers
+# channels that a thread holds at once, in registers
 _MAX_CHANNELS = 8
 # Gaussians of a program of the backward, one for each thread of its one warp
 _PIECE = 32

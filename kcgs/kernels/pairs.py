@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .coarse_grids import Coarsened, Grid, blocks_of, choose_levels, coarsen, grids_of, most_spacing, uncoarsen
+from .coarse_grids import Coarsened, Grid, blocks_of, choose_levels, coarsen, grids_of, max_spacing, uncoarsen
 from .interface import Gradients, SplatInputs
 from .splines import Nodes, find_nodes
 from .tiles import TILE, bounding_tiles, coefficients, find_keys, grid_of, reaches
@@ -41,7 +41,7 @@ def list_pairs(inputs: SplatInputs) -> Pairs:
     """List the tiles and blocks that each Gaussian's support touches and that hold its region."""
     means, cholesky = (t.detach().double().flatten(0, 1) for t in inputs[:2])
     grids = grids_of(inputs.size, 1 if inputs.membership is None else len(inputs.membership.index))
-    level = choose_levels(cholesky, most_spacing(inputs.cutoff), len(grids))
+    level = choose_levels(cholesky, max_spacing(inputs.cutoff), len(grids))
     ids = level.nonzero().flatten()
     if not len(ids):
         return _pairs_on(grids[0], inputs, means, cholesky)[0]
@@ -58,7 +58,7 @@ def list_pairs(inputs: SplatInputs) -> Pairs:
         position += pairs.gaussian[on_nodes] // inputs.means.shape[1] * (len(blocks.keys) - blocks.first + 1)
     nodes = find_nodes(blocks, inputs.membership, position, copies)
     pairs.tile[on_nodes] = nodes.number.view(-1)[position] + pairs.num_tiles
-    return pairs._replace(num_tiles=pairs.num_tiles + nodes.live + 1, wide=Wide(ids, coarse, nodes))
+    return pairs._replace(num_tiles=pairs.num_tiles + nodes.num_live + 1, wide=Wide(ids, coarse, nodes))
 
 
 def _pairs_on(grid: Grid | Tensor, inputs: SplatInputs, means: Tensor, cholesky: Tensor) -> tuple[Pairs, Tensor]:

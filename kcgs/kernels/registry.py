@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import warnings
 from importlib import import_module
-from typing import Any
 
 import torch
 
@@ -22,13 +21,21 @@ def resolve(backend: str, inputs: SplatInputs) -> Steps:
     Raises:
         ValueError: inputs that the backend does not take.
     """
-    kernel: Steps = _load(backend, inputs.means.device, inputs.means.dtype).steps(inputs)
+    name = _choose(backend, inputs.means.device, inputs.means.dtype)
+    kernel: Steps = import_module(f"{__package__}.{name}").steps(inputs)
     return kernel
 
 
-@functools.cache
-def _load(backend: str, device: torch.device, dtype: torch.dtype) -> Any:
-    return import_module(f"{__package__}.{_choose(backend, device, dtype)}")
+def prepare(backend: str, device: torch.device, dtype: torch.dtype, channels: int) -> None:
+    """Render and differentiate once, before a clock starts, since much is compiled or loaded at first use."""
+    means, cholesky, colors = (torch.full((1, 1, n), 8.0, device=device, dtype=dtype) for n in (2, 3, channels))
+    inputs = SplatInputs(means, cholesky, colors, None, None, (16, 16), 1e-4)
+    steps = resolve(backend, inputs)
+    plan = steps.plan(inputs)
+    image = steps.render(plan, inputs)
+    steps.differentiate(plan, inputs, torch.ones_like(image), True)
+    leaf = image.detach().requires_grad_()
+    torch.autograd.grad(leaf.sum(), leaf)  # torch, too, loads much at its first gradient
 
 
 def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
@@ -43,19 +50,6 @@ def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
 def _warn_about_cuda() -> None:
     # until a report of a GPU shows that the Triton kernel is right
     warnings.warn("backend 'auto' takes 'tiled' on CUDA; pass backend='cuda' for the Triton kernel", stacklevel=2)
-
-
-@functools.cache
-def prepare(backend: str, device: torch.device, dtype: torch.dtype, channels: int) -> None:
-    """Render and differentiate once, before a clock starts, since much is compiled or loaded at first use."""
-    means, cholesky, colors = (torch.full((1, 1, n), 8.0, device=device, dtype=dtype) for n in (2, 3, channels))
-    inputs = SplatInputs(means, cholesky, colors, None, None, (16, 16), 1e-4)
-    steps = resolve(backend, inputs)
-    plan = steps.plan(inputs)
-    image = steps.render(plan, inputs)
-    steps.differentiate(plan, inputs, torch.ones_like(image), True)
-    leaf = image.detach().requires_grad_()
-    torch.autograd.grad(leaf.sum(), leaf)  # torch, too, loads much at its first gradient
 
 
 def check_backend(backend: str) -> str:

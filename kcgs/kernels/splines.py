@@ -46,8 +46,8 @@ class Step(NamedTuple):
 class Nodes(NamedTuple):
     """The live blocks of nodes, those that are not all zero, and the steps from them to the pixels."""
 
-    number: Tensor  # [copies, blocks of nodes + 1] int64, of each live block; of others `live`
-    live: int
+    number: Tensor  # [copies, blocks of nodes + 1] int64, of each live block; of others `num_live`
+    num_live: int
     refinements: list[Step]  # live blocks, coarsest first
     samples: list[Step]  # tiles of pixels
 
@@ -106,7 +106,7 @@ def sample(nodes: Tensor, plan: Nodes, masks: Tensor | None, tiles: Tensor) -> N
 def gather(grad: Tensor, plan: Nodes, masks: Tensor | None) -> Tensor:
     """Turn gradients of tiles, (tiles, C, 16, 16), into those of nodes: the transpose of `sample`."""
     refinement, sampling = _refinement(grad.dtype, grad.device), _sampling(grad.dtype, grad.device)
-    nodes = grad.new_zeros(plan.live + 1, *grad.shape[1:])
+    nodes = grad.new_zeros(plan.num_live + 1, *grad.shape[1:])
     for step in plan.samples:
         _collect(nodes, step, sampling, _weigh(grad.index_select(0, step.blocks), step, masks))
     for step in reversed(plan.refinements):

@@ -18,7 +18,7 @@ from .splines import gather, sample
 from .tiles import TILE, expand_runs, grid_of, join_tiles, split_into_tiles, sum_runs
 from .whitened import least_exponent
 
-# weights (pairs times pixels) of a batch: what fits the caches of one core takes the least time
+# weights (pairs times pixels) of a batch, 1 MiB in float32: more would leave the caches, fewer take more calls
 _CHUNK_WEIGHTS = 1 << 18
 # pairs of a segment: a tile with more has several
 _MAX_SEGMENT = 1024

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcgs.kernels.coarse_grids import Blocks, Coarsened, choose_levels, coarsen, most_spacing
+from kcgs.kernels.coarse_grids import Blocks, Coarsened, choose_levels, coarsen, max_spacing
 from kcgs.kernels.tiles import TILE, bounding_tiles, find_keys
 from kcgs.kernels.whitened import support_radius
 
@@ -15,7 +15,7 @@ _CHUNK = 1 << 20
 
 def place_gaussians(means: Tensor, cholesky: Tensor, cutoff: float, levels: int) -> Coarsened:
     """Move float64 Gaussians to the coarsest of so many levels whose nodes are close enough; level 0 are the pixels."""
-    level = choose_levels(cholesky, most_spacing(cutoff), levels)
+    level = choose_levels(cholesky, max_spacing(cutoff), levels)
     wide = level > 0
     result = Coarsened(level, means.clone(), cholesky.clone(), torch.ones_like(means[:, 0]))
     for values, coarse in zip(result[1:], coarsen(level[wide], means[wide], cholesky[wide])[1:], strict=True):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcgs.kernels import Membership, SplatInputs, reference, tiled
-from kcgs.kernels.coarse_grids import choose_levels, coarsen, grids_of, most_spacing, uncoarsen
+from kcgs.kernels.coarse_grids import choose_levels, coarsen, grids_of, max_spacing, uncoarsen
 from kcgs.kernels.cpu import kernel as cpu
 from kcgs.kernels.pairs import list_pairs
 from kcgs.kernels.splines import gather, sample
@@ -72,7 +72,7 @@ def test_backends_agree(size: tuple[int, int], batch: int, maps: int, softness: 
 
 def test_one_gaussian_of_each_level() -> None:
     inputs = make_inputs((150, 110), n=4, maps=1, softness=0.7)
-    sigma = 2.0 ** torch.arange(4) / (most_spacing(CUTOFF) / 2**0.25) * 1.01
+    sigma = 2.0 ** torch.arange(4) / (max_spacing(CUTOFF) / 2**0.25) * 1.01
     cholesky = sigma[:, None] * torch.tensor([[[1.0, 0.0, 1.0]]])
     inputs = inputs._replace(cholesky=cholesky, region_index=torch.tensor([[0, 1, 2, 1]]))
     pairs = list_pairs(inputs)
@@ -107,7 +107,7 @@ def test_gather_is_the_transpose_of_sample() -> None:
     plan, masks = pairs.wide.nodes, inputs.membership.tiles(16).masks
     assert any(step.masks is not None for step in plan.samples)
     nodes, pixels = (
-        torch.randn(k, 2, 16, 16, dtype=torch.float64) for k in (plan.live + 1, pairs.num_tiles - plan.live - 1)
+        torch.randn(k, 2, 16, 16, dtype=torch.float64) for k in (plan.num_live + 1, pairs.num_tiles - plan.num_live - 1)
     )
     nodes[-1] = 0.0
     back, tiles = gather(pixels, plan, masks), torch.zeros_like(pixels)
@@ -123,11 +123,11 @@ def test_splines_of_one_are_one() -> None:
     # nodes of the coarsest grid alone
     plan, levels = pairs.wide.nodes, len(grids_of(inputs.size, 1))
     assert pairs.wide.gaussians.level.unique().tolist() == [levels - 1]
-    nodes = torch.zeros(plan.live + 1, 1, 16, 16, dtype=torch.float64)
+    nodes = torch.zeros(plan.num_live + 1, 1, 16, 16, dtype=torch.float64)
     finer = torch.cat([step.blocks for step in plan.refinements])
-    coarsest = torch.ones(plan.live, dtype=torch.bool).index_fill(0, finer, False)
+    coarsest = torch.ones(plan.num_live, dtype=torch.bool).index_fill(0, finer, False)
     nodes[:-1][coarsest] = 1.0
-    tiles = torch.zeros(pairs.num_tiles - plan.live - 1, 1, 16, 16, dtype=torch.float64)
+    tiles = torch.zeros(pairs.num_tiles - plan.num_live - 1, 1, 16, 16, dtype=torch.float64)
     sample(nodes, plan, None, tiles)
     seen = tiles.view(10, 7, 16, 16).transpose(1, 2).reshape(160, 112)[:150, :110]
     torch.testing.assert_close(seen, torch.ones_like(seen), rtol=1e-14, atol=0)
@@ -139,10 +139,10 @@ def test_levels_by_the_axes_of_the_ellipse() -> None:
     l11, l21, l22 = cholesky.unbind(-1)
     factor = torch.stack([torch.stack([l11, 0 * l11], -1), torch.stack([l21, l22], -1)], -2)
     scales = torch.linalg.svdvals(factor)
-    fits = [((2.0**n / scales) ** 4).sum(-1) <= most_spacing(CUTOFF) ** 4 for n in range(1, 6)]
-    levels = choose_levels(cholesky, most_spacing(CUTOFF), 6)
+    fits = [((2.0**n / scales) ** 4).sum(-1) <= max_spacing(CUTOFF) ** 4 for n in range(1, 6)]
+    levels = choose_levels(cholesky, max_spacing(CUTOFF), 6)
     assert torch.equal(levels, torch.stack(fits).sum(0)) and levels.unique().tolist() == list(range(6))
-    assert not choose_levels(cholesky, most_spacing(0.0), 6).any()
+    assert not choose_levels(cholesky, max_spacing(0.0), 6).any()
 
 
 def test_gradients_of_coarsened_gaussians() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..coarse_grids import blocks_of, most_spacing
+from ..coarse_grids import blocks_of, max_spacing
 from ..interface import Gradients, OutOfRangeError, SplatInputs, Steps
 from ..membership import Membership
 from ..whitened import least_exponent, support_radius
@@ -55,7 +55,7 @@ def plan(inputs: SplatInputs) -> _Plan:
     radius = support_radius(inputs.cutoff, torch.float32)
     least = np.float32(least_exponent(inputs.cutoff, torch.float32) / math.log(2))
     batch = Batch(num_images, means, cholesky, order, images[order], regions, colors[order])
-    gaussians, start, entries, live = list_tiles(batch, table, radius, most_spacing(inputs.cutoff))
+    gaussians, start, entries, live = list_tiles(batch, table, radius, max_spacing(inputs.cutoff))
     lists = Lists(gaussians, batch.colors.ravel(), regions, start, entries, table, live, radius, least)
     return _Plan(lists, order, live.any(), order_rows(tuple(table.grids[:, TILE_ROWS].tolist()), num_images))
 
