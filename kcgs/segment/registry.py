@@ -22,66 +22,6 @@ class _Method(NamedTuple):
 _methods: dict[str, _Method] = {}
 
 
-def register(name: str, cleanup: Cleanup | None = None) -> Callable[[Function], Function]:
-    """Make a function a segmentation method.
-
-    The function gets the image, a checked tensor :math:`(3, H, W)` float32 in [0, 1], and the options of its keyword
-    parameters. It returns labels :math:`(H, W)`, integer or bool, a tensor or a numpy array; or a `Prediction` with
-    scores and names. A parameter with the name of a clean-up option gets the value of the clean-up, ``min_size`` in
-    pixels. Optional libraries are imported inside the function.
-
-    Args:
-        name: for `segment`; no other method has it.
-        cleanup: the method's defaults of the clean-up options; None: those of `Cleanup`.
-
-    Returns:
-        A decorator that returns the function.
-
-    Raises:
-        ValueError: the name is empty or taken.
-
-    Example:
-        >>> import torch
-        >>> @register("halves")
-        ... def halves(image: Tensor) -> Tensor:
-        ...     columns = torch.arange(image.shape[-1]) >= image.shape[-1] // 2
-        ...     return columns.expand(image.shape[-2:])
-        >>> segment(torch.zeros(3, 2, 4), method="halves")[0].tolist()
-        [0, 0, 1, 1]
-    """
-    if not name or name in _methods:
-        raise InvalidArgument("name", f"a new name, not empty, none of {', '.join(available_methods())}", repr(name))
-
-    def add(function: Function) -> Function:
-        _methods[name] = _Method(function, cleanup or Cleanup())
-        return function
-
-    return add
-
-
-def available_methods() -> list[str]:
-    """Return the names that `segment` knows, sorted."""
-    return sorted(_methods)
-
-
-def method_options(method: str) -> dict[str, Any]:
-    """Return the options of a method with their defaults, clean-up last; ``Parameter.empty`` where there is none.
-
-    Raises:
-        ValueError: no such method.
-
-    Example:
-        >>> method_options("auto")
-        {'snap': 0, 'min_size': None, 'connected': True, 'max_regions': 30}
-    """
-    if method not in _methods:
-        raise InvalidArgument("method", f"one of {', '.join(available_methods())}", repr(method))
-    function, cleanup = _methods[method]
-    _, *parameters = inspect.signature(function).parameters.values()
-    shared = asdict(cleanup)
-    return {option.name: option.default for option in parameters if option.name not in shared} | shared
-
-
 def segment(image: Any, method: str = "auto", **options: Any) -> Tensor:
     """Divide an image into regions by the named method.
 
@@ -137,3 +77,63 @@ def segment_with_scores(image: Any, method: str = "auto", **options: Any) -> Seg
     cleanup = replace(cleanup, min_size=cleanup.smallest(pixels[0].numel()))
     shared = {key: value for key, value in asdict(cleanup).items() if key in inspect.signature(function).parameters}
     return cleanup.apply(pixels, function(pixels, **options, **shared))
+
+
+def available_methods() -> list[str]:
+    """Return the names that `segment` knows, sorted."""
+    return sorted(_methods)
+
+
+def method_options(method: str) -> dict[str, Any]:
+    """Return the options of a method with their defaults, clean-up last; ``Parameter.empty`` where there is none.
+
+    Raises:
+        ValueError: no such method.
+
+    Example:
+        >>> method_options("auto")
+        {'snap': 0, 'min_size': None, 'connected': True, 'max_regions': 30}
+    """
+    if method not in _methods:
+        raise InvalidArgument("method", f"one of {', '.join(available_methods())}", repr(method))
+    function, cleanup = _methods[method]
+    _, *parameters = inspect.signature(function).parameters.values()
+    shared = asdict(cleanup)
+    return {option.name: option.default for option in parameters if option.name not in shared} | shared
+
+
+def register(name: str, cleanup: Cleanup | None = None) -> Callable[[Function], Function]:
+    """Make a function a segmentation method.
+
+    The function gets the image, a checked tensor :math:`(3, H, W)` float32 in [0, 1], and the options of its keyword
+    parameters. It returns labels :math:`(H, W)`, integer or bool, a tensor or a numpy array; or a `Prediction` with
+    scores and names. A parameter with the name of a clean-up option gets the value of the clean-up, ``min_size`` in
+    pixels. Optional libraries are imported inside the function.
+
+    Args:
+        name: for `segment`; no other method has it.
+        cleanup: the method's defaults of the clean-up options; None: those of `Cleanup`.
+
+    Returns:
+        A decorator that returns the function.
+
+    Raises:
+        ValueError: the name is empty or taken.
+
+    Example:
+        >>> import torch
+        >>> @register("halves")
+        ... def halves(image: Tensor) -> Tensor:
+        ...     columns = torch.arange(image.shape[-1]) >= image.shape[-1] // 2
+        ...     return columns.expand(image.shape[-2:])
+        >>> segment(torch.zeros(3, 2, 4), method="halves")[0].tolist()
+        [0, 0, 1, 1]
+    """
+    if not name or name in _methods:
+        raise InvalidArgument("name", f"a new name, not empty, none of {', '.join(available_methods())}", repr(name))
+
+    def add(function: Function) -> Function:
+        _methods[name] = _Method(function, cleanup or Cleanup())
+        return function
+
+    return add
