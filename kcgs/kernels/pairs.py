@@ -86,8 +86,8 @@ def _pairs_on(grid: Grid | Tensor, inputs: SplatInputs, means: Tensor, cholesky:
             masks = torch.nn.functional.pad(masks, (0, len(keys) - len(masks)), value=-1)
         block, is_present = find_keys(keys, block, region, inputs.membership.num_regions)
         is_touched &= is_present
-    touched = is_touched.nonzero().flatten()
-    gaussian, tile, block, origin = (t.index_select(0, touched) for t in (gaussian, tile, block, origin))
+    indices = is_touched.nonzero().flatten()
+    gaussian, tile, block, origin = (t.index_select(0, indices) for t in (gaussian, tile, block, origin))
     mask = None if masks is None else masks[block]
     affine = coefficients(origin, cholesky[gaussian]).to(inputs.means.dtype)
     return Pairs(gaussian, tile, mask, affine, cholesky, pixel_grid.total, None), block

@@ -93,8 +93,8 @@ def _bases(means: Tensor) -> tuple[Tensor, Tensor]:
     """Return what the coefficients of z1 and of z2 multiply at the pixels of a tile, in the dtype of the means."""
     offset = torch.arange(TILE, device=means.device, dtype=means.dtype) - (TILE - 1) / 2
     x, y = offset.repeat(TILE), offset.repeat_interleave(TILE)
-    one = torch.ones_like(x)
-    return torch.stack([one, x]), torch.stack([one, x, y])  # [2, 256], [3, 256]
+    ones = torch.ones_like(x)
+    return torch.stack([ones, x]), torch.stack([ones, x, y])  # [2, 256], [3, 256]
 
 
 def _weights(plan: _Plan, batch: _Batch, bases: tuple[Tensor, Tensor], cutoff: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -123,11 +123,11 @@ def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
     for batch in plan.batches:
         _, _, weight = _weights(plan, batch, bases, inputs.cutoff)
         values[batch.segments] = colors[batch.entries].transpose(1, 2) @ weight
-    touched, counts = torch.unique_consecutive(plan.segment_tile, return_counts=True)
-    if len(touched) < len(values):
+    tile_ids, counts = torch.unique_consecutive(plan.segment_tile, return_counts=True)
+    if len(tile_ids) < len(values):
         values = sum_runs(values.flatten(1), counts).unflatten(1, (channels, _PIXELS))
     tiles = colors.new_zeros(plan.pairs.num_tiles, channels, _PIXELS)
-    tiles[touched] = values
+    tiles[tile_ids] = values
     tiles, grid = tiles.unflatten(2, (TILE, TILE)), grid_of(inputs)
     if plan.pairs.wide is not None:
         sample(tiles[grid.total :], plan.pairs.wide.nodes, plan.masks, tiles[: grid.total])

@@ -44,14 +44,16 @@ from .simd import SIDE
 @program.entry
 def in_range(means, cholesky, colors):  # type: ignore[no-untyped-def]
     """Tell whether all of (N, 2), (N, 3), (N, C) is finite, and within the limits of whitened.py."""
-    least, most = SCALE_LIMITS[0] * (1 - 1e-6), SCALE_LIMITS[1]
-    fine = True
+    least, largest = SCALE_LIMITS[0] * (1 - 1e-6), SCALE_LIMITS[1]
+    is_valid = True
     for i in range(len(means)):  # written so that NaN fails
-        fine &= abs(means[i, 0]) <= MEAN_LIMIT and abs(means[i, 1]) <= MEAN_LIMIT
-        fine &= least <= cholesky[i, 0] <= most and abs(cholesky[i, 1]) <= most and least <= cholesky[i, 2] <= most
+        is_valid &= abs(means[i, 0]) <= MEAN_LIMIT and abs(means[i, 1]) <= MEAN_LIMIT
+        is_valid &= (
+            least <= cholesky[i, 0] <= largest and abs(cholesky[i, 1]) <= largest and least <= cholesky[i, 2] <= largest
+        )
         for c in range(colors.shape[1]):
-            fine &= abs(colors[i, c]) < math.inf
-    return fine
+            is_valid &= abs(colors[i, c]) < math.inf
+    return is_valid
 
 
 @program.entry
