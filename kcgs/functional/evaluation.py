@@ -51,9 +51,7 @@ def differentiate(arguments: Arguments, plan: Plan, grad: Tensor, geometry: bool
     means, cholesky, colors = [gradients[2].new_empty(0) if g is None else g.contiguous() for g in gradients]
     if colors.ndim == arguments.colors.ndim:
         return means, cholesky, colors
-    if geometry:
-        means, cholesky = means.squeeze(0), cholesky.squeeze(0)
-    return means, cholesky, colors.squeeze(0)
+    return means.squeeze(0), cholesky.squeeze(0), colors.squeeze(0)
 
 
 def differentiate_twice(

@@ -129,9 +129,9 @@ def unique_pairs(pairs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     As `unique(dim=0)`, which compares row by row and is 20 times slower.
     """
     ids, ends = pairs.unique(return_inverse=True)
-    codes, place, counts = (ends[:, 0] * len(ids) + ends[:, 1]).unique(return_inverse=True, return_counts=True)
-    rows = torch.stack([codes // max(1, len(ids)), codes % max(1, len(ids))], 1)
-    return ids[rows], place, counts
+    base = max(1, len(ids))
+    codes, place, counts = (ends[:, 0] * base + ends[:, 1]).unique(return_inverse=True, return_counts=True)
+    return ids[torch.stack([codes // base, codes % base], 1)], place, counts
 
 
 def union_find(ids: Iterable[int], pairs: Iterable[tuple[int, int]]) -> Callable[[int], int]:

@@ -49,7 +49,7 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Tensor:
         image: Tensor
-        if _is_plain(arguments[:3]):
+        if _is_plain(arguments[:3]):  # the plan stays on this side of the operator
             image, ctx.plan = _below_autograd(_render_planned, Arguments(*arguments))
         else:
             image, ctx.plan = _unrecorded(splat_operator, *arguments), None
@@ -90,7 +90,7 @@ class _SplatBackward(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
         ctx.save_for_backward(*arguments[:7])
-        ctx.settings = arguments[7:]
+        ctx.constants = arguments[7:]
         return _unrecorded(_backward_operator, *arguments)  # type: ignore[no-any-return]
 
     @staticmethod
@@ -101,7 +101,7 @@ class _SplatBackward(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        second = _second_operator(*grads, *ctx.saved_tensors, *ctx.settings)
+        second = _second_operator(*grads, *ctx.saved_tensors, *ctx.constants)
         needed = zip(second, ctx.needs_input_grad[:4], strict=True)
         return (*(g if need else None for g, need in needed), *[None] * 8)
 
@@ -128,7 +128,7 @@ def _apply(function: Any, *arguments: Any) -> Any:
 
 
 def _unrecorded(operator: Any, *arguments: Any) -> Any:
-    """Evaluate the forward of a function, which records nothing; levels of torch.func around it go on recording."""
+    """Evaluate below autograd; outer levels of torch.func still record."""
     if not torch._C._are_functorch_transforms_active():
         return _below_autograd(operator, *arguments)
     with torch.enable_grad():
@@ -247,7 +247,7 @@ _LIBRARY.impl("region_splat", _splat_autograd, "Autograd")
 _LIBRARY.impl("region_splat_backward", _backward_autograd, "Autograd")
 torch.library.register_vmap("kcgs::region_splat", _splat_vmap, lib=_LIBRARY)
 torch.library.register_vmap("kcgs::region_splat_backward", _backward_vmap, lib=_LIBRARY)
-torch.library.register_autocast("kcgs::region_splat", "cpu", torch.float32, lib=_LIBRARY)
-torch.library.register_autocast("kcgs::region_splat", "cuda", torch.float32, lib=_LIBRARY)
+for _device in ("cpu", "cuda"):
+    torch.library.register_autocast("kcgs::region_splat", _device, torch.float32, lib=_LIBRARY)
 # fake tensors of open sizes prefer a decomposition where this table has nothing, and torch.onnx.export is given one
 torch._decomp.register_decomposition(splat_operator, type="meta")(_splat_shape)

@@ -131,9 +131,9 @@ def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
     check_floating("colors", colors, dims=(2, 3), finite=False)
     check_rows("cholesky", cholesky, means, 3)
     check_rows("colors", colors, means, "C")
-    if not cholesky.device == colors.device == means.device:
-        name, tensor = ("cholesky", cholesky) if cholesky.device != means.device else ("colors", colors)
-        raise ValueError(f"{name} must be on {means.device} with means; got {tensor.device}")
+    for name, tensor in (("cholesky", cholesky), ("colors", colors)):
+        if tensor.device != means.device:
+            raise ValueError(f"{name} must be on {means.device} with means; got {tensor.device}")
     if means.ndim == 3 and means.shape[0] == 0:
         raise ValueError(f"means must hold at least one image; got shape {tuple(means.shape)}")
 

@@ -97,8 +97,7 @@ class GaussianField(nn.Module):
             self.register_parameter(name, nn.Parameter(value.detach().clone()))
 
     def _checked_ids(self, region_ids: Tensor) -> Tensor:
-        if isinstance(region_ids, Tensor):
-            region_ids = region_ids.to(self.means.device)
+        region_ids = check_tensor("region_ids", region_ids).to(self.means.device)
         return check_ids("region_ids", region_ids, self.means).clone()
 
     @property
