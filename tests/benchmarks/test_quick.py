@@ -62,5 +62,5 @@ def test_committed_report_is_that_of_its_results(folder: Path, tmp_path: Path) -
 def test_jobs_on_data(name: str, data_root: Path) -> None:
     """The long form is not run here; its jobs are known, and JSON can hold them."""
     jobs = import_module(f"benchmarks.{name}").jobs(Options(Path("out"), data_root))
-    assert len({json.dumps(job) for job in jobs}) == len(jobs) > 4
+    assert len({json.dumps(job) for job in jobs}) == len(jobs) > 1
     assert all(isinstance(job["image"], str) for job in jobs)

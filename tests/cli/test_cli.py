@@ -34,7 +34,7 @@ class TestFit:
         code, out, err = kcgs(*FIT, "--regions", regions, "--json")
         assert (code, err) == (0, "")
         report = json.loads(out)
-        assert set(report) == KEYS | {"region_report", "stop_reason", "target_reached"}
+        assert set(report) >= KEYS | {"region_report", "stop_reason", "target_reached"}
         assert (report["stop_reason"], report["target_reached"]) == ("iterations", None)
         assert 1 <= report["num_gaussians"] <= 12
         assert report["bytes"] == Path("scene.safetensors").stat().st_size
@@ -43,7 +43,7 @@ class TestFit:
         assert report["ms_ssim"] is None
 
         metrics = json.loads(kcgs("eval", "scene.safetensors", "photo.png", "--json").out)
-        assert set(metrics) == KEYS | {"ssimulacra2"}
+        assert set(metrics) >= KEYS | {"ssimulacra2"}
         assert metrics["psnr"] == pytest.approx(report["psnr"], abs=1e-4)
         assert json.loads(kcgs("info", "scene.safetensors", "--json").out)["height"] == 40
 
