@@ -6,6 +6,7 @@ import hashlib
 import os
 import pickle
 import time
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,8 @@ from .state import FitState
 # a checkpoint is written when the fit has run this many times as long as the last one took to write
 _RUN_PER_WRITE = 100.0
 _VERSION = 6
-_NUMBERS = ("cutoff", "num_initial", "num_requested", "iteration", "num_additions", "num_late_moves", "best_score")
+# all fields of the state that are numbers
+_NUMBERS = [field.name for field in fields(FitState) if field.type in ("int", "float")]
 
 
 class Checkpoint:

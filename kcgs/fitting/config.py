@@ -100,15 +100,15 @@ class FitConfig(BaseModel):
     )
 
     def model_post_init(self, context: Any) -> None:
-        """Check what a type cannot say."""
+        """Check what types do not express."""
         if self.backend not in BACKENDS:
             raise InvalidArgument("backend", f"one of {', '.join(BACKENDS)}", repr(self.backend))
         if self.objective != "psnr" and self.loss != "l2":
             raise InvalidArgument("objective", f"psnr with loss {self.loss!r}", repr(self.objective))
         if self.softness != "auto" and not 0.0 <= self.softness <= MAX_SOFTNESS:
-            raise ValueError(f"softness must be 'auto' or in [0, {MAX_SOFTNESS:g}] pixels; got {self.softness!r}")
+            raise InvalidArgument("softness", f"'auto' or in [0, {MAX_SOFTNESS:g}] pixels", repr(self.softness))
         if self.max_move != "any" and self.max_move < 1.0:
-            raise ValueError(f"max_move must be 'any' or at least 1 pixel; got {self.max_move!r}")
+            raise InvalidArgument("max_move", "'any' or at least 1 pixel", repr(self.max_move))
 
     @property
     def usual_iterations(self) -> int:

@@ -98,21 +98,21 @@ def fit(
     if config.target_psnr is not None and checkpoint is not None:
         raise InvalidArgument("checkpoint", "None with target_psnr, which takes several fits", repr(checkpoint))
     prepare(config.backend, problem.image.device, problem.image.dtype, len(problem.image))
-    pulse = config.target_psnr is not None
-    with Progress("fit", pulse=pulse, visible=progress) as bar, threads_for_kernels(problem.image[0].numel()):
-        if pulse:
+    _warn_of_regions(problem)
+    searches = config.target_psnr is not None
+    with Progress("fit", pulse=searches, visible=progress) as bar, threads_for_kernels(problem.image[0].numel()):
+        if searches:
             return search(problem, lambda state: _run(state, Clock(), bar, on_step))
         clock, state = Clock(), start(problem)
-        keeper = None if checkpoint is None else Checkpoint(checkpoint, problem)
-        if keeper is not None and resume and keeper.path.exists():
-            state, seconds = keeper.read()
+        store = None if checkpoint is None else Checkpoint(checkpoint, problem)
+        if store is not None and resume and store.path.exists():
+            state, seconds = store.read()
             clock = Clock(seconds)
-        _warn_of_regions(problem)
-        return _run(state, clock, bar, on_step, keeper)
+        return _run(state, clock, bar, on_step, store)
 
 
 def _run(
-    state: FitState, clock: Clock, bar: Progress, on_step: OnStep | None, keeper: Checkpoint | None = None
+    state: FitState, clock: Clock, bar: Progress, on_step: OnStep | None, store: Checkpoint | None = None
 ) -> FitResult:
     """Take a fit from its state to its end."""
     config = state.problem.config
@@ -139,8 +139,8 @@ def _run(
 
         entry = state.history[-1]
         bar.update(state.progress, f"iteration {state.iteration}, {entry.num_gaussians} Gaussians, {entry.psnr:.2f} dB")
-        if keeper is not None and (keeper.due() or state.iteration == limit):
-            keeper.write(state, clock.seconds())
+        if store is not None and (store.due() or state.iteration == limit):
+            store.write(state, clock.seconds())
         if on_step is not None and on_step(state.iteration, entry):
             reason = "callback"
             break

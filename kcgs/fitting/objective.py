@@ -13,7 +13,7 @@ from kcgs.functional import RegionMap
 from kcgs.functional.metrics import K1, K2, SCALE_WEIGHTS, SSIM_SIGMA, SSIM_WINDOW, window_mean
 from kcgs.nn import GaussianField
 
-from .pursuit import halve, propose
+from .pursuit import SIGMAS, halve, propose
 
 # weight of the squared error
 _SQUARED = 0.003
@@ -137,13 +137,13 @@ def make_objective(name: str, image: Tensor) -> MsSsimObjective | None:
     return MsSsimObjective(image) if name == "ms-ssim" else None
 
 
-def propose_for(
+def propose_gaussians(
     objective: MsSsimObjective | None,
     residual: Tensor,
     regions: RegionMap | None,
     count: int,
     *,
-    sigmas: Sequence[float],
+    sigmas: Sequence[float] = SIGMAS,
     backend: str = "auto",
 ) -> GaussianField:
     """Find at most `count` Gaussians that lower the objective most, of a residual, image - render: see `propose`."""

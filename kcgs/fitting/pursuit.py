@@ -27,6 +27,8 @@ _MIN_CANDIDATES = 4096
 # two Gaussians whose normalised inner product is above this explain the same error: 2.5 sigma apart, at one scale
 _OVERLAP = 0.2
 _CUTOFF = 1e-4
+# Standard deviations that are tried, in pixels. More of them cost time, and descent changes them anyway.
+SIGMAS = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
 
 Array = NDArray[Any]
 
@@ -49,7 +51,7 @@ class _Candidates(NamedTuple):
 
 
 def propose(
-    residual: Tensor, regions: RegionMap | None, count: int, *, sigmas: Sequence[float], backend: str = "auto"
+    residual: Tensor, regions: RegionMap | None, count: int, *, sigmas: Sequence[float] = SIGMAS, backend: str = "auto"
 ) -> GaussianField:
     r"""Find at most `count` round Gaussians that lower the squared error most when they are added to the render.
 

@@ -22,7 +22,7 @@ from .removal import remove_gaussians
 from .result import FitResult
 from .start import draft_cutoff, start
 from .state import FitState
-from .strategies import Densify
+from .strategies import make_densify
 
 # pixels per Gaussian of the first fit
 _FIRST_SPACING = 256
@@ -98,7 +98,7 @@ def _warm_start(problem: Problem, finished: FitState) -> FitState:
     )  # fmt: skip
     remove_gaussians(state, state.num_gaussians - count)
     with torch.no_grad():
-        Densify().add(state, count - state.num_gaussians)
+        make_densify(problem.config).add(state, count - state.num_gaussians)
     return state
 
 

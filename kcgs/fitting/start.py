@@ -11,13 +11,12 @@ from kcgs.functional.merging import pairs_to_merge
 from kcgs.scene import Scene
 
 from .config import FitConfig
+from .descent import DRAFT_CUTOFF
 from .initial import gradient_field, initial_field, initial_sigma, random_field
 from .optimizers import make_optimizer
 from .problem import Problem
 from .state import FitState
 
-# cutoff of most of a fit by our optimizer, where the config's is below it: it saves a third of the weights
-_DRAFT_CUTOFF = 1e-3
 _INITIALIZERS = {"uniform": initial_field, "random": random_field, "gradient": gradient_field}
 
 
@@ -41,7 +40,7 @@ def start(problem: Problem) -> FitState:
 
 def draft_cutoff(config: FitConfig) -> float:
     """Return the cutoff of most of a fit."""
-    return max(config.cutoff, _DRAFT_CUTOFF) if config.optimizer == "gaussian-adam" else config.cutoff
+    return max(config.cutoff, DRAFT_CUTOFF) if config.optimizer == "gaussian-adam" else config.cutoff
 
 
 def _as_many_as_gaussians(problem: Problem) -> RegionMap | None:

@@ -16,6 +16,9 @@ from kcgs.nn import GaussianField
 
 from .frame import local_gradient, move, widen
 
+# steps of place in standard deviations and of log scale, and steps of colours: found on photos, and good on all images
+LEARNING_RATE = 0.14
+COLOR_LEARNING_RATE = 0.03
 # pixels: factors are at least this before they are widened, so that their squares are far from underflow
 _MIN_FACTOR = 0.1
 # standard deviations by which a centre may lie outside the image
@@ -62,9 +65,9 @@ class GaussianAdam(Optimizer):
     def __init__(
         self,
         fields: GaussianField | Iterable[GaussianField],
-        lr: float | Tensor = 0.14,
+        lr: float | Tensor = LEARNING_RATE,
         *,
-        color_lr: float | Tensor = 0.03,
+        color_lr: float | Tensor = COLOR_LEARNING_RATE,
         betas: tuple[float, float] = (0.9, 0.99),
         eps: float = 1e-12,
         min_sigma: float = 0.5,
@@ -74,9 +77,10 @@ class GaussianAdam(Optimizer):
         for field in [fields] if isinstance(fields, GaussianField) else fields:
             if not isinstance(field, GaussianField):
                 raise InvalidArgumentType("fields", "GaussianFields", type(field).__name__)
-            tones = [field.colors] if field.opacities is None else [field.colors, field.opacities]
-            groups.append({"params": [field.means, field.cholesky], "lr": lr, "size": field.size})
-            groups.append({"params": tones, "lr": color_lr, "size": None})
+            geometry = [field.means, field.cholesky]
+            colors = [field.colors] if field.opacities is None else [field.colors, field.opacities]
+            groups.append({"kind": "geometry", "params": geometry, "lr": lr, "size": field.size})
+            groups.append({"kind": "colors", "params": colors, "lr": color_lr})
         super().__init__(groups, {"betas": betas, "eps": eps, "min_sigma": min_sigma, "max_step": max_step})
 
     @torch.no_grad()
@@ -92,7 +96,8 @@ class GaussianAdam(Optimizer):
                 loss = closure()
         for group in self.param_groups:
             if any(parameter.grad is not None for parameter in group["params"]):
-                _step_colors(self, group) if group["size"] is None else _step_geometry(self, group)
+                step = _step_geometry if group["kind"] == "geometry" else _step_colors
+                step(self.state[group["params"][0]], group)
         return loss
 
     @torch.no_grad()
@@ -144,20 +149,20 @@ class GaussianAdam(Optimizer):
         return (self.state[tensor] for tensor in (field.means, field.colors) if tensor in self.state)
 
 
-def _step_colors(optimizer: GaussianAdam, group: dict[str, Any]) -> None:
+def _step_colors(state: dict[str, Tensor], group: dict[str, Any]) -> None:
     colors, *opacities = group["params"]
     gradients = [_gradient(colors), *(_gradient(alpha)[..., None] for alpha in opacities)]
-    change = _adam(optimizer.state[colors], torch.cat(gradients, -1), group)
+    change = _adam(state, torch.cat(gradients, -1), group)
     channels = colors.shape[-1]
     colors.add_(change[..., :channels])
     for alpha in opacities:
         alpha.add_(change[..., channels])
 
 
-def _step_geometry(optimizer: GaussianAdam, group: dict[str, Any]) -> None:
+def _step_geometry(state: dict[str, Tensor], group: dict[str, Any]) -> None:
     means, cholesky = group["params"]
     local = local_gradient(cholesky, _gradient(means), _gradient(cholesky))
-    step = _adam(optimizer.state[means], local, group).clamp(-group["max_step"], group["max_step"])
+    step = _adam(state, local, group).clamp(-group["max_step"], group["max_step"])
     bounded = _bounded(*move(means, cholesky, step), group["size"], group["min_sigma"])
     means.copy_(bounded[0])
     cholesky.copy_(bounded[1])

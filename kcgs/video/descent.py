@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcgs.fitting.contour_moves import move_contours
-from kcgs.fitting.objective import make_objective, propose_for
+from kcgs.fitting.objective import make_objective, propose_gaussians
 from kcgs.fitting.redundancy import lowest_impact
 from kcgs.functional import RegionMap
 from kcgs.optim.frame import widen
@@ -104,7 +104,9 @@ class FrameDescent:
         self.newton.velocity[mask], self.movable_rows = 0.0, self.movable_rows | mask
 
         residual = (image - self.target.render(self.splats._replace(colors=colors))) * self.changed_pixels
-        proposal = propose_for(self.objective, residual, regions, int(mask.sum()), sigmas=_SIGMAS, backend=backend)
+        proposal = propose_gaussians(
+            self.objective, residual, regions, int(mask.sum()), sigmas=_SIGMAS, backend=backend
+        )
         rows = mask.nonzero()[: len(proposal.means), 0]
         if region_ids is not None and proposal.region_ids is not None:
             region_ids = region_ids.index_copy(0, rows, proposal.region_ids)

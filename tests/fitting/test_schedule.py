@@ -54,7 +54,7 @@ class TestDensify:
         state.progress = 0.05
         assert not densify.due(state)  # nothing is logged yet
         state.history.append(HistoryEntry(0, 0.0, 1.0, 10.0, 10.0, 5))
-        assert densify.due(state) and densify.adds(state)
+        assert densify.due(state)
         state.progress = 0.04
         assert not densify.due(state)
 
@@ -90,8 +90,8 @@ class TestStrategies:
     @pytest.mark.parametrize(
         ("settings", "names"),
         [
-            ({}, ["EndDrafts", "AdaptContours", "Densify", "SettleContours"]),
-            ({"warmup": True, "move_contours": False}, ["EndDrafts", "RefreshIds", "Densify"]),
+            ({}, ["EndDrafts", "Densify", "SettleContours"]),
+            ({"warmup": True, "move_contours": False}, ["EndDrafts", "Warmup", "Densify"]),
             ({"densify": "largest-error", "move_contours": False}, ["EndDrafts", "DensifyAtLargestError"]),
         ],
     )

@@ -7,6 +7,7 @@ import math
 from kcgs.fitting.config import FitConfig
 from kcgs.nn import GaussianField
 from kcgs.optim import GaussianAdam
+from kcgs.optim.gaussian_adam import COLOR_LEARNING_RATE, LEARNING_RATE
 
 from .adan import Adan
 from .gaussian_image import GaussianImageAdan
@@ -34,7 +35,7 @@ def make_optimizer(config: FitConfig, field: GaussianField, sigma: float) -> Gau
     if config.optimizer == "adam":
         return ImageGSAdam(field, factor)
     # as tensors, rates are rounded as the Gaussians are
-    lr, color_lr = field.means.detach().new_tensor([0.14, 0.03]) * factor
+    lr, color_lr = field.means.detach().new_tensor([LEARNING_RATE, COLOR_LEARNING_RATE]) * factor
     optimizer = GaussianAdam(field, lr, color_lr=color_lr)
     for group in optimizer.param_groups:
         group["initial_lr"] = group["lr"]

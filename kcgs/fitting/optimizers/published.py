@@ -20,9 +20,9 @@ MIN_SIGMA = 0.1
 class PublishedOptimizer(ABC):
     """A torch optimizer that moves its own parameters of Gaussians, and shows them in a field.
 
-    It has the face of :class:`kcgs.optim.GaussianAdam`. A step takes the field's gradients back to the parameters. When
-    Gaussians are added or removed, the averages of all start anew. Colours are parameters as they are, and share their
-    memory with the field's.
+    It has the methods of :class:`kcgs.optim.GaussianAdam` that a fit calls. A step takes the field's
+    gradients back to the parameters. When Gaussians are added or removed, the averages of all start anew. Colours are
+    parameters as they are, and share their memory with the field's.
     """
 
     def __init__(

@@ -14,11 +14,11 @@ from kcgs.fitting.state import FitState
 from .densify import Densify, DensifyAtLargestError
 from .end_drafts import EndDrafts
 from .move_contours import AdaptContours, SettleContours
-from .refresh_ids import RefreshIds
+from .warmup import Warmup
 
 __all__ = [
-    "AdaptContours", "Densify", "DensifyAtLargestError", "EndDrafts", "RefreshIds", "SettleContours", "Strategy",
-    "make_strategies",
+    "AdaptContours", "Densify", "DensifyAtLargestError", "EndDrafts", "SettleContours", "Strategy", "Warmup",
+    "make_densify", "make_strategies",
 ]  # fmt: skip
 
 
@@ -34,10 +34,17 @@ class Strategy(Protocol):
 
 def make_strategies(config: FitConfig) -> list[Strategy]:
     """Return the strategies of a fit, in the order in which an iteration applies them."""
-    densify = Densify() if config.densify == "matching-pursuit" else DensifyAtLargestError()
+    densify = make_densify(config)
     strategies: list[Strategy] = [EndDrafts()]
     if config.warmup:
-        strategies.append(RefreshIds())
+        strategies.append(Warmup())
+    strategies.append(densify)
     if config.move_contours:
-        return [*strategies, AdaptContours(densify), densify, SettleContours(densify.end)]
-    return [*strategies, densify]
+        strategies.append(SettleContours(densify.end))
+    return strategies
+
+
+def make_densify(config: FitConfig) -> Densify:
+    """Return the strategy that adds Gaussians."""
+    kind = Densify if config.densify == "matching-pursuit" else DensifyAtLargestError
+    return kind(AdaptContours() if config.move_contours else None)

@@ -9,12 +9,14 @@ import numpy as np
 import torch
 
 from kcgs.fitting.descent import render, squared_error
-from kcgs.fitting.objective import propose_for
+from kcgs.fitting.objective import propose_gaussians
 from kcgs.fitting.removal import remove_gaussians
 from kcgs.fitting.sampling import sample_pixels
 from kcgs.fitting.state import FitState
 from kcgs.functional import lookup_regions
 from kcgs.nn import GaussianField
+
+from .move_contours import AdaptContours
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,8 @@ class Densify:
     each time with knowledge of the others.
     """
 
+    contours: AdaptContours | None = None
+    """Moves the contours before additions while the number of Gaussians grows."""
     steps: int = 8
     """Number of additions until the number of Gaussians is largest."""
     begin: float = 0.05
@@ -40,8 +44,6 @@ class Densify:
     """About how many iterations a cycle takes."""
     removals: int = 4
     """Number of removals in a cycle."""
-    sigmas: tuple[float, ...] = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
-    """Standard deviations in pixels that are tried."""
 
     def target(self, state: FitState) -> int:
         """Return the number of Gaussians that the schedule asks for."""
@@ -63,10 +65,6 @@ class Densify:
         """True when the schedule asks for another number of Gaussians, and one state was measured."""
         return bool(state.history) and self.target(state) != state.num_requested
 
-    def adds(self, state: FitState) -> bool:
-        """True when Gaussians are to be added."""
-        return bool(state.history) and self.target(state) > state.num_requested
-
     @torch.no_grad()
     def apply(self, state: FitState) -> None:
         """Add or remove Gaussians."""
@@ -75,6 +73,8 @@ class Densify:
             remove_gaussians(state, state.num_gaussians - target)
         else:
             state.num_additions += 1
+            if self.contours is not None and state.progress < self.end:
+                self.contours.apply(state)
             self.add(state, target - state.num_gaussians)
         state.num_requested = target
 
@@ -86,9 +86,8 @@ class Densify:
     def propose(self, state: FitState, count: int) -> GaussianField:
         """Return the Gaussians to add."""
         problem, residual = state.problem, state.problem.image - render(state)
-        return propose_for(
-            problem.objective, residual, state.scene.regions, count, sigmas=self.sigmas, backend=problem.config.backend
-        )
+        regions, backend = state.scene.regions, problem.config.backend
+        return propose_gaussians(problem.objective, residual, regions, count, backend=backend)
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,14 @@ from kcgs.fitting.descent import squared_error
 from kcgs.fitting.state import FitState
 from kcgs.functional import RegionMap, choose_softness
 
-from .densify import Densify
-
 
 @dataclass(frozen=True)
 class AdaptContours:
-    """Move the contours before some of the additions of Gaussians, which adapt to the new contours."""
+    """Move the contours before some of the additions of Gaussians, which then adapt to the new contours.
 
-    densify: Densify
-    """The strategy that adds Gaussians."""
+    It is no strategy: :class:`~kcgs.fitting.strategies.Densify` applies it.
+    """
+
     max_rise: float = 1.5
     """Factor by which a move may raise the squared error about it."""
     additions_per_move: int = 2
@@ -28,23 +27,14 @@ class AdaptContours:
     additions_per_softness: int = 4
     """Before every fourth addition their softness is chosen anew, where the settings ask for it."""
 
-    def due(self, state: FitState) -> bool:
-        """True before every second addition while the number of Gaussians grows."""
-        if state.progress >= self.densify.end or not self.densify.adds(state):
-            return False
-        return (state.num_additions + 1) % self.additions_per_move == 0
-
-    @torch.no_grad()
     def apply(self, state: FitState) -> None:
-        """Move the contours, and at times choose their softness."""
+        """Move the contours, and at times choose their softness, if that is due before this addition."""
+        if state.num_additions % self.additions_per_move:
+            return
         _move(state, self.max_rise)
         regions, problem = state.scene.regions, state.problem
-        addition = state.num_additions + 1
-        if (
-            regions is not None
-            and problem.chooses_softness
-            and addition % self.additions_per_softness == self.additions_per_move
-        ):
+        is_turn = state.num_additions % self.additions_per_softness == self.additions_per_move
+        if regions is not None and problem.chooses_softness and is_turn:
             softness = choose_softness(problem.image, regions.labels)
             state.scene.regions = RegionMap.from_labels(regions.labels, softness)
 

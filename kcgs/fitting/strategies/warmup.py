@@ -1,4 +1,4 @@
-"""Region ids while centres move: the paper's warm-up."""
+"""The paper's warm-up: region ids that follow the moving centres."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kcgs.functional import lookup_regions
 
 
 @dataclass(frozen=True)
-class RefreshIds:
+class Warmup:
     """Read the region ids again under the moving centres, as the paper does; by iterations, whatever the clock says."""
 
     every: float = 0.02
