@@ -18,9 +18,9 @@ class PruneResult(NamedTuple):
     """A scene with fewer Gaussians."""
 
     scene: Scene
-    removed: int
-    """Number of Gaussians that it lacks."""
-    change: float
+    num_pruned: int
+    """Number of Gaussians that were removed."""
+    prune_error: float
     """Largest change of a value of the image."""
 
 
@@ -48,7 +48,7 @@ def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backen
         >>> with torch.no_grad():
         ...     scene.field.means[:20] += 1000.0
         >>> result = prune(scene)
-        >>> result.removed, result.change
+        >>> result.num_pruned, result.prune_error
         (20, 0.0)
     """
     check_scene(scene)

@@ -32,7 +32,7 @@ class TestPrune(
         scene = scene.to(device, torch.promote_types(dtype, torch.float32))
         result = prune(scene, tolerance=1e-2, backend=backend)
         image = result.scene()
-        assert 0 < result.removed < 300 and 0 < result.change <= 1e-2
+        assert 0 < result.num_pruned < 300 and 0 < result.prune_error <= 1e-2
         assert image.device.type == device.type and image.dtype == scene.field.colors.dtype and image.any()
 
     @pytest.mark.parametrize("channels", [1, 4])
@@ -40,7 +40,7 @@ class TestPrune(
     def test_cardinality(self, device: torch.device, count: int, channels: int) -> None:
         scene = Scene(GaussianField.random(count, (9, 17), channels=channels, seed=0), metadata={"title": "few"})
         result = prune(scene.to(device), tolerance=0.1)
-        assert result.scene.num_gaussians == count - result.removed and result.scene.size == (9, 17)
+        assert result.scene.num_gaussians == count - result.num_pruned and result.scene.size == (9, 17)
         assert result.scene().shape == (channels, 9, 17) and result.scene.metadata == {"title": "few"}
 
     @pytest.mark.parametrize("tolerance", [0.0, 1e-4, 1e-2, 0.1])
@@ -48,13 +48,13 @@ class TestPrune(
         result = prune(scene, tolerance=tolerance)
         with torch.no_grad():
             change = (scene() - result.scene()).abs().max()
-        assert float(change) == result.change <= tolerance + 1e-6
-        assert result.scene.num_gaussians == 300 - result.removed
+        assert float(change) == result.prune_error <= tolerance + 1e-6
+        assert result.scene.num_gaussians == 300 - result.num_pruned
 
     def test_a_larger_tolerance_removes_more(self, scene: Scene) -> None:
-        removed = [prune(scene, tolerance=t).removed for t in (0.0, 1e-3, 1e-1, 1e3)]
-        assert removed == sorted(removed)
-        assert removed[0] == 0 < removed[1] < removed[2] < removed[3] == 300
+        counts = [prune(scene, tolerance=t).num_pruned for t in (0.0, 1e-3, 1e-1, 1e3)]
+        assert counts == sorted(counts)
+        assert counts[0] == 0 < counts[1] < counts[2] < counts[3] == 300
 
     def test_gaussians_that_paint_nothing_go(self, scene: Scene) -> None:
         """Those of a region that the map does not have, and those of opacity 0."""
@@ -63,7 +63,7 @@ class TestPrune(
         field = scene.field
         field = GaussianField(field.means, field.cholesky, field.colors, ids, opacities, size=(40, 60))
         result = prune(Scene(field, labels), tolerance=0.0)
-        assert (result.removed, result.change) == (70, 0.0)
+        assert (result.num_pruned, result.prune_error) == (70, 0.0)
 
     @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
     def test_without_a_graph(self, scene: Scene, mode: type) -> None:

@@ -216,7 +216,7 @@ def edits(p: Parts, region: int, background: Tensor) -> dict[str, Any]:
 def run_prune(p: Parts, tolerance: float) -> dict[str, Any]:
     """Prune a scene."""
     pruned = prune(_scene(p), tolerance)
-    return {**_of(pruned.scene), "removed": pruned.removed, "change": pruned.change}
+    return {**_of(pruned.scene), "removed": pruned.num_pruned, "change": pruned.prune_error}
 
 
 def run_propose(p: Parts, residual: Tensor, count: int) -> tuple[Any, ...]:
