@@ -16,14 +16,12 @@ from kcgs._atomic import atomic_path
 from kcgs._check import check_size
 from kcgs._memory import check_memory
 from kcgs._repr import png, shorten
+from kcgs._suffixes import SCENE_FORMATS
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.functional.softness import CONTOURS, check_contours
 from kcgs.nn import GaussianField, RegionSplatRenderer
 from kcgs.nn.renderer import rendered_size
-
-FORMATS = {".safetensors": "kcgs.storage", ".kcgs": "kcgs.codec.scenes"}
-"""File formats by suffix: a module, imported on use, with ``serialize(scene)`` and ``deserialize(data)``."""
 
 # peak memory of a render that is saved: bytes per number of the image, measured
 _IMAGE_BYTES = 12
@@ -248,9 +246,9 @@ def load(path: str | os.PathLike[str]) -> Scene:
 
 
 def _format(path: Path) -> Any:
-    if path.suffix not in FORMATS:
-        raise ValueError(f"path must end in {' or '.join(FORMATS)}; got {str(path)!r}")
-    return import_module(FORMATS[path.suffix])
+    if path.suffix not in SCENE_FORMATS:
+        raise ValueError(f"path must end in {' or '.join(SCENE_FORMATS)}; got {str(path)!r}")
+    return import_module(SCENE_FORMATS[path.suffix])
 
 
 def empty_regions(scene: Scene) -> Tensor:

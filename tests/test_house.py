@@ -17,6 +17,7 @@ PACKAGE = Path(kcgs.__file__).resolve().parent
 ROOT = PACKAGE.parent
 # a room imports itself and what is below it
 LAYERS = [
+    {"__main__"},
     {"cli"},
     {"zoo"},
     {"page"},
@@ -30,7 +31,7 @@ LAYERS = [
     {"functional"},
     {"kernels", "engine", "plots"},
     {"_image"},
-    {"_check", "_memory", "_atomic", "_progress", "_repr"},
+    {"_check", "_memory", "_atomic", "_progress", "_repr", "_suffixes"},
     {"errors"},
 ]
 # what to say: what not to

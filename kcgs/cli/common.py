@@ -12,18 +12,11 @@ from typing import Annotated, Any
 import typer
 
 from kcgs._atomic import check_writable
+from kcgs._suffixes import LABEL_MAPS, SCENE_FORMATS
 from kcgs.errors import InvalidArgument
 
 # exit status of a program that Ctrl-C ended
 INTERRUPTED = 130
-# the keys of `kcgs.scene.FORMATS`, whose module loads torch
-SCENES = (".safetensors", ".kcgs")
-OUTPUT_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-# the files of a folder that are images; a file that is named is tried whatever its suffix
-IMAGES = (*OUTPUT_IMAGES, ".gif")
-LABEL_MAPS = (*IMAGES, ".npy")
-# videos that H.264 is written into
-VIDEOS = (".mp4", ".mov", ".mkv")
 
 
 def _scene_path(text: str, other_suffixes: tuple[str, ...] = ()) -> Path:
@@ -35,8 +28,8 @@ def _scene_path(text: str, other_suffixes: tuple[str, ...] = ()) -> Path:
         except ValueError as error:
             raise typer.BadParameter(str(error)) from error
     path = Path(text)
-    if path.suffix not in SCENES and path.suffix.lower() not in other_suffixes:
-        suffixes = " or ".join((*SCENES, *other_suffixes))
+    if path.suffix not in SCENE_FORMATS and path.suffix.lower() not in other_suffixes:
+        suffixes = " or ".join((*SCENE_FORMATS, *other_suffixes))
         raise typer.BadParameter(f"must end in {suffixes}, or be zoo:NAME; got {text!r}")
     return path
 

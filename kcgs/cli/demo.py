@@ -22,6 +22,7 @@ CLOSE_UPS = ((0.24, 0.36, 0.2), (0.42, 0.5, 0.2))
 # side of a column of the comparison, and the margin around it, in pixels
 SIDE = 512
 GAP = 12
+DETAIL_SIDE = (SIDE - GAP) // 2
 # height of the text above a column, in pixels
 HEADER = 136
 
@@ -83,31 +84,35 @@ def compare(output: Path, image: Tensor, target_bytes: int, **settings: Any) -> 
 
 
 def compose(panels: Sequence[Panel]) -> Image:
-    """Lay out columns of a title, two lines, a square image and two close-ups of it, with hard pixels."""
+    """Lay panels side by side."""
+    from PIL import Image
+
+    columns = [draw_column(panel) for panel in panels]
+    canvas = Image.new("RGB", (len(columns) * (SIDE + GAP) + GAP, columns[0].height), "white")
+    for index, column in enumerate(columns):
+        canvas.paste(column, (GAP + index * (SIDE + GAP), 0))
+    return canvas
+
+
+def draw_column(panel: Panel) -> Image:
+    """Write a title and two lines above a square image, and two framed close-ups of it below; pixels stay hard."""
     from PIL import Image, ImageDraw, ImageFont
 
     from kcgs.plots import COLORS
 
-    detail_side = (SIDE - GAP) // 2
-    width = len(panels) * (SIDE + GAP) + GAP
-    height = HEADER + SIDE + GAP + detail_side + GAP
-    canvas = Image.new("RGB", (width, height), "white")
-    pen = ImageDraw.Draw(canvas)
-    for column, panel in enumerate(panels):
-        left = GAP + column * (SIDE + GAP)
-        for text, middle, font_size in zip((panel.title, *panel.lines), (30, 74, 108), (36, 26, 26), strict=True):
-            font = ImageFont.load_default(font_size)
-            pen.text((left + SIDE / 2, middle), text, fill="black", font=font, anchor="mm")
-        pixels = (255 * panel.image.clamp(0, 1)).round().byte().permute(1, 2, 0).numpy()
-        image = Image.fromarray(pixels).resize((SIDE, SIDE), Image.Resampling.NEAREST)
-        canvas.paste(image, (left, HEADER))
-        for index, (y, x, share) in enumerate(CLOSE_UPS):
-            box = round(SIDE * x), round(SIDE * y), round(SIDE * (x + share)), round(SIDE * (y + share))
-            corner = left + index * (detail_side + GAP), HEADER + SIDE + GAP
-            detail = image.crop(box).resize((detail_side, detail_side), Image.Resampling.NEAREST)
-            canvas.paste(detail, corner)
-            border = (*corner, corner[0] + detail_side - 1, corner[1] + detail_side - 1)
-            pen.rectangle(border, outline=COLORS[index], width=5)
-            frame = (left + box[0], HEADER + box[1], left + box[2], HEADER + box[3])
-            pen.rectangle(frame, outline=COLORS[index], width=3)
-    return canvas
+    column = Image.new("RGB", (SIDE, HEADER + SIDE + GAP + DETAIL_SIDE + GAP), "white")
+    pen = ImageDraw.Draw(column)
+    for text, middle, font_size in zip((panel.title, *panel.lines), (30, 74, 108), (36, 26, 26), strict=True):
+        pen.text((SIDE / 2, middle), text, fill="black", font=ImageFont.load_default(font_size), anchor="mm")
+    pixels = (255 * panel.image.clamp(0, 1)).round().byte().permute(1, 2, 0).numpy()
+    image = Image.fromarray(pixels).resize((SIDE, SIDE), Image.Resampling.NEAREST)
+    column.paste(image, (0, HEADER))
+    for index, (y, x, share) in enumerate(CLOSE_UPS):
+        left, top, right, bottom = (round(SIDE * place) for place in (x, y, x + share, y + share))
+        detail = image.crop((left, top, right, bottom)).resize((DETAIL_SIDE, DETAIL_SIDE), Image.Resampling.NEAREST)
+        corner = index * (DETAIL_SIDE + GAP), HEADER + SIDE + GAP
+        column.paste(detail, corner)
+        border = (*corner, corner[0] + DETAIL_SIDE - 1, corner[1] + DETAIL_SIDE - 1)
+        pen.rectangle(border, outline=COLORS[index], width=5)
+        pen.rectangle((left, HEADER + top, right, HEADER + bottom), outline=COLORS[index], width=3)
+    return column

@@ -11,10 +11,11 @@ import typer
 
 from kcgs._atomic import write_file
 from kcgs._progress import Progress
+from kcgs._suffixes import SCENE_FORMATS
 
 from . import options
 from .commands import app
-from .common import SCENES, ImageFile, InterruptHandler, Json, Quiet, check_output, exit_interrupted, print_report
+from .common import ImageFile, InterruptHandler, Json, Quiet, check_output, exit_interrupted, print_report
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -44,7 +45,7 @@ def fit_command(
 ) -> None:
     """Fit Gaussians to an image and save the scene. Ctrl-C saves the best so far."""
     output = output or Path(f"{image.stem}{request.default_suffix}")
-    check_output(output, *(SCENES if request.target_bytes is None else (".kcgs",)))
+    check_output(output, *(SCENE_FORMATS if request.target_bytes is None else (".kcgs",)))
     from kcgs.data import load_image
 
     target = load_image(image)
@@ -62,7 +63,7 @@ def fit_command(
     if interrupts.count:
         raise exit_interrupted(f"the best so far to {output}")
     if report["target_reached"] is False:
-        target_psnr, psnr = request.config.target_psnr, report["psnr"]
+        target_psnr, psnr = request.load_config().target_psnr, report["psnr"]
         typer.echo(f"kcgs: --target-psnr {target_psnr:g} was not reached: {psnr:.2f} dB is the best", err=True)
         raise typer.Exit(1)
 
@@ -90,7 +91,8 @@ def fit_and_save(
     from kcgs.rate import compress, fit_bytes, quality_for
     from kcgs.scene import Scene
 
-    config, target_psnr, is_compressed = request.config, request.config.target_psnr, output.suffix == ".kcgs"
+    config, is_compressed = request.load_config(), output.suffix == ".kcgs"
+    target_psnr = config.target_psnr
     if target_psnr is not None and is_compressed:
         config = config.model_copy(update={"target_psnr": target_psnr + _ROUNDING_MARGIN})
     settings: Any = {"recipe": config, "seed": request.seed, "on_step": on_step, "progress": progress}
@@ -129,7 +131,7 @@ def report_fit(
     from kcgs.evaluation import evaluate
 
     metrics = evaluate(saved_fit.scene, image, labels, visual=False)
-    target_psnr = request.config.target_psnr
+    target_psnr = request.load_config().target_psnr
     return {
         **metrics,
         **describe_scene(saved_fit.scene),

@@ -13,11 +13,12 @@ import typer
 
 from kcgs._atomic import atomic_path
 from kcgs._progress import Progress
+from kcgs._suffixes import IMAGES, LABEL_MAPS
 from kcgs.errors import InvalidArgument
 
 from . import options
 from .commands import app
-from .common import IMAGES, LABEL_MAPS, Json, Quiet, print_report
+from .common import Json, Quiet, print_report
 from .many_jobs import FitJob, Outcome, fit_one
 
 
@@ -54,7 +55,7 @@ def fit_many_command(
     jobs = _make_jobs(images, regions, output, suffix or request.default_suffix, request)
     from kcgs.engine import run_jobs
 
-    _ = request.config  # refuses wrong settings before the work
+    request.load_config()  # refuses wrong settings before the work
     output.mkdir(parents=True, exist_ok=True)
     if workers is None and engine == "local":
         workers = max(1, _count_cores() // threads)

@@ -67,6 +67,6 @@ def _fit(job: FitJob) -> dict[str, Any]:
 def _fingerprint(job: FitJob) -> str:
     """Hash the image, the mask and all settings."""
     request = job.request
-    settings = request.config.model_dump_json(), request.num_gaussians, request.target_bytes, request.seed
+    settings = request.load_config().model_dump_json(), request.num_gaussians, request.target_bytes, request.seed
     mask = job.regions.encode() if job.regions in ("auto", "none") else Path(job.regions).read_bytes()
     return hashlib.sha256(b"\0".join((repr(settings).encode(), job.image.read_bytes(), mask))).hexdigest()

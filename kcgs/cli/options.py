@@ -39,9 +39,8 @@ class FitRequest(NamedTuple):
         """Suffix of the file, where none is given."""
         return ".safetensors" if self.target_bytes is None else ".kcgs"
 
-    @property
-    def config(self) -> FitConfig:
-        """The recipe with these settings; a ValueError names a wrong one."""
+    def load_config(self) -> FitConfig:
+        """Return the recipe with these settings; a ValueError names a wrong one."""
         from kcgs.fitting import FitConfig
 
         return FitConfig.from_recipe(self.recipe, **self.settings)
@@ -67,7 +66,7 @@ def fit_request(
     keep_contours: Annotated[bool, typer.Option("--keep-contours", help="Take the label map as exact.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of the random start.")] = 0,
 ) -> FitRequest:
-    """Put the options together."""
+    """Return a request of the options."""
     if target_bytes is not None:
         exclude("--target-bytes", num_gaussians=num_gaussians, target_psnr=target_psnr)
     settings: dict[str, Any] = {
@@ -80,7 +79,10 @@ def fit_request(
 
 
 def with_fit_options(command: Callable[..., None], *, without: tuple[str, ...] = ()) -> Callable[..., None]:
-    """Give a command the options of `fit_request`, less those of `without`, in place of its argument `request`."""
+    """Give a command the options of `fit_request`, less those of `without`, in place of its argument `request`.
+
+    Typer reads options from a function's signature and knows no groups of them, so a signature is put together here.
+    """
     fit_options = dict(inspect.signature(fit_request, eval_str=True).parameters)
     for name in without:
         del fit_options[name]

@@ -10,12 +10,10 @@ import typer
 
 from kcgs._atomic import write_file
 from kcgs._progress import Progress
+from kcgs._suffixes import SCENE_FORMATS, VIDEOS, WRITTEN_IMAGES
 
 from .commands import app
 from .common import (
-    OUTPUT_IMAGES,
-    SCENES,
-    VIDEOS,
     ImageFile,
     Json,
     Quiet,
@@ -51,7 +49,7 @@ def render(
 ) -> None:
     """Render a scene at any size, or a batch of scenes as a video, at any frame rate."""
     if output.suffix:  # none: a folder
-        check_output(output, *OUTPUT_IMAGES, *VIDEOS)
+        check_output(output, *WRITTEN_IMAGES, *VIDEOS)
     from kcgs import load
     from kcgs.data import save_image
 
@@ -64,7 +62,7 @@ def render(
         print_report({"frames": num_frames, "height": target[0], "width": target[1]}, as_json, str(output))
         return
     exclude("a scene of one image", frame_rate=frame_rate, frame=frame)
-    check_output(output, *OUTPUT_IMAGES)
+    check_output(output, *WRITTEN_IMAGES)
     target = target_size(loaded, scale, size)
     save_image(output, loaded.render(target, contours))
     print_report(_describe_image(output, target), as_json, str(output))
@@ -142,7 +140,7 @@ def encode(
 ) -> None:
     """Compress a scene, or a label map without loss."""
     check_output(output, ".kcgs")
-    if scene.suffix not in SCENES:
+    if scene.suffix not in SCENE_FORMATS:
         exclude("a label map", target_bytes=target_bytes, quality=quality, image=image, objective=objective)
         from kcgs.codec import encode_labels
         from kcgs.data import load_labels
@@ -196,7 +194,7 @@ def decode(
         save_labels(output, labels, rgb_ids=output.suffix.lower() == ".png" and int(labels.max()) > 65535)
         print_report(_describe_map(output, labels), as_json, str(output))
         return
-    check_output(output, *OUTPUT_IMAGES)
+    check_output(output, *WRITTEN_IMAGES)
     scene = codec.decode(file.read_bytes(), max_bytes=max_bytes).scene
     save_image(output, scene.render(target_size(scene, None, None)))
     print_report(_describe_image(output, scene.size), as_json, str(output))

@@ -10,10 +10,11 @@ from typing import Annotated, Any
 import typer
 
 from kcgs._progress import Progress
+from kcgs._suffixes import WRITTEN_IMAGES
 from kcgs.errors import InvalidArgument
 
 from .commands import app
-from .common import OUTPUT_IMAGES, ImageFile, Json, Quiet, check_output, print_report, replace_undefined
+from .common import ImageFile, Json, Quiet, check_output, print_report, replace_undefined
 
 
 def _list_methods(is_set: bool) -> None:
@@ -56,7 +57,7 @@ def segment(
 
     check_output(output, ".png", ".npy")
     if overlay is not None:
-        check_output(overlay, *OUTPUT_IMAGES, name="overlay")
+        check_output(overlay, *WRITTEN_IMAGES, name="overlay")
     options = _parse_options(option or [])
     target = load_image(image)
     with Progress("finding regions", pulse=True, visible=not quiet):

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from kcgs._suffixes import VIDEOS, WRITTEN_IMAGES
+
 from . import options
 from .commands import app
-from .common import OUTPUT_IMAGES, VIDEOS, InterruptHandler, Json, Quiet, check_output, exit_interrupted, print_report
+from .common import InterruptHandler, Json, Quiet, check_output, exit_interrupted, print_report
 from .fit import describe_scene, read_regions
 
 if TYPE_CHECKING:
@@ -64,7 +66,7 @@ def fit_video_command(
     start = time.perf_counter()
     with InterruptHandler() as interrupts:
         scenes = fit_video(
-            source, maps, request.num_gaussians, recipe=request.config, seed=request.seed, progress=not quiet,
+            source, maps, request.num_gaussians, recipe=request.load_config(), seed=request.seed, progress=not quiet,
             on_frame=interrupts.on_step,
         )  # fmt: skip
         seconds = time.perf_counter() - start
@@ -90,7 +92,7 @@ def render_batch(
 
     if frame is not None:
         options.exclude("--frame", frame_rate=frame_rate)
-        check_output(output, *OUTPUT_IMAGES)
+        check_output(output, *WRITTEN_IMAGES)
         check_number("frame", frame, 0.0, len(scenes) - 1.0, unit="frames")
         save_image(output, interpolate(scenes, frame).render(size, contours))
         return 1

@@ -126,6 +126,7 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
+    # a worker ends with its parent, even in the middle of a fit: sys.exit would end this thread alone
     os._exit(1)
 
 
@@ -148,7 +149,7 @@ def _on_cluster(
             # no usage report to the makers of Ray
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
             options |= {"num_cpus": workers and workers * threads, "include_dashboard": False}
-            # workers import what this process can import, as those of the engine local do
+            # Ray's workers get this process's sys.path, as spawned processes do
             options["runtime_env"] = {"env_vars": {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}}
         ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
     try:

@@ -49,7 +49,7 @@ def test_ctrl_c(kcgs: Kcgs, monkeypatch: pytest.MonkeyPatch, name: str, argument
 def test_closed_standard_output() -> None:
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "kcgs.cli", "models"]
+    command = [sys.executable, "-m", "kcgs", "models"]
     ended = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, check=False)
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (1, b"")

@@ -1,0 +1,5 @@
+"""`python -m kcgs`."""
+
+from kcgs.cli import main
+
+main()

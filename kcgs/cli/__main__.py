@@ -1,5 +1,0 @@
-"""`python -m kcgs.cli`."""
-
-from . import main
-
-main()
