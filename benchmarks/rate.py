@@ -11,7 +11,6 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from kcgs import evaluate
-from kcgs.functional import ef_psnr, ms_ssim, psnr
 from kcgs.rate import fit_bytes
 
 from .core.codecs import CODECS, available_codecs, decode_file, largest_file
@@ -28,7 +27,7 @@ from .core.compare import (
     values_of,
 )
 from .core.figures import Panel, save_lines
-from .core.fits import QUICK_ITERATIONS
+from .core.fits import METRICS, QUICK_ITERATIONS, measure_render
 from .core.images import load, load_mapped, names
 from .core.run import Job, Options, Page, Row
 
@@ -36,7 +35,7 @@ from .core.run import Job, Options, Page, Row
 OURS = {"kcgs": (True, "psnr"), "kcgs, no regions": (False, "psnr"), "kcgs, ms-ssim": (True, "ms-ssim")}
 BYTES = {"DAVIS": (2_000, 4_000, 8_000, 16_000, 32_000), "Kodak": (3_932, 7_372, 14_745, 24_576, 39_321)}
 QUICK_BYTES = (450, 900)
-QUANTITIES = ("psnr", "ef_psnr", "ms_ssim")
+QUANTITIES = tuple(METRICS)
 COMPARISONS = (
     *(Comparison("kcgs", other) for other in ("kcgs, no regions", *CODECS)),
     Comparison("kcgs, no regions", "AVIF, tune=psnr"),
@@ -77,12 +76,7 @@ def measure(image: str, group: str, method: str, target_bytes: int, data: str, q
         size, render, ssimulacra2 = len(file), decode_file(file), None
     row = {"group": group, "image": image, "method": method, "target_bytes": target_bytes, "bytes": size}
     row |= {"bpp": 8 * size / pixels[0].numel(), "core_seconds": time.process_time() - start}
-    row |= {"psnr": float(psnr(render, pixels)), "ssimulacra2": ssimulacra2}
-    if min(pixels.shape[1:]) > 160:
-        row["ms_ssim"] = float(ms_ssim(render, pixels))
-    if labels is not None:
-        row["ef_psnr"] = float(ef_psnr(render, pixels, labels))
-    return [row]
+    return [{**row, **measure_render(render, pixels, labels), "ssimulacra2": ssimulacra2}]
 
 
 def jobs(options: Options) -> list[Job]:

@@ -18,7 +18,7 @@ from torch import Tensor
 from .compare import group_by, is_missing, title
 from .run import Row
 
-# of Okabe and Ito
+# of Okabe and Ito; those of `kcgs.plots` have no public name, and benchmarks import only public names
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 MARKERS = "osD^vP"
 # in characters

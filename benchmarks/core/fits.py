@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from itertools import product
 from typing import Any
+
+from torch import Tensor
 
 from kcgs import FitConfig, evaluate, fit
 from kcgs.codec import decode, encode, encode_labels
 from kcgs.fitting import precompile
+from kcgs.functional import ef_psnr, ms_ssim, psnr
 from kcgs.rate import quality_for
 
 from .images import load_mapped
@@ -20,7 +24,8 @@ from .run import Job, Options, Row
 PUBLISHED = ("paper", "gaussian-image", "gaussian-image-clamp", "image-gs")
 PUBLISHED_ITERATIONS = 2_000
 QUICK_ITERATIONS = 10
-_FIGURES = ("psnr", "ms_ssim", "ef_psnr")
+# of reports, by the names that `kcgs.evaluate` gives them; those of contours begin with ef_
+METRICS: dict[str, Callable[..., Tensor]] = {"psnr": psnr, "ef_psnr": ef_psnr, "ms_ssim": ms_ssim}
 Method = tuple[str, dict[str, Any]]  # a recipe, and settings that differ from it
 
 
@@ -59,8 +64,22 @@ def measure_fit(
     stored = None if regions is None or regions.num_regions == 1 else regions.labels
     return [{
         "image": image, "n": n, "method": method, "seed": seed, "iterations": result.history[-1].iteration,
-        **{name: figures[name] for name in _FIGURES}, "ssimulacra2": figures.get("ssimulacra2", math.nan),
+        **{name: figures[name] for name in METRICS}, "ssimulacra2": figures.get("ssimulacra2", math.nan),
         "bytes": len(file), "map_bytes": 0 if stored is None else len(encode_labels(stored)),
         "bpp": 8 * len(file) / pixels[0].numel(), "core_seconds": seconds,
-        **{f"decoded_{name}": decoded[name] for name in _FIGURES},
+        **{f"decoded_{name}": decoded[name] for name in METRICS},
     }]  # fmt: skip
+
+
+def measure_render(render: Tensor, image: Tensor, labels: Tensor | None) -> Row:
+    """Return the metrics of a render; those of contours where there are labels."""
+    figures: Row = {}
+    with warnings.catch_warnings():
+        # NaN: the image is too small for MS-SSIM
+        warnings.simplefilter("ignore", RuntimeWarning)
+        for name, metric in METRICS.items():
+            if not name.startswith("ef_"):
+                figures[name] = float(metric(render, image))
+            elif labels is not None:
+                figures[name] = float(metric(render, image, labels))
+    return figures
