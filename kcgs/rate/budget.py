@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -25,33 +26,66 @@ from kcgs.scene import Scene
 
 from .compress import compress
 
-# Numbers without a derivation are tuned: vary one and compare the files of `python -m benchmarks rate`.
-
-# bits of the file per Gaussian of the fit, at `_REFERENCE_COUNT` of them, by objective: more bits make fewer Gaussians,
-# each rounded less. MS-SSIM suffers more from rounding than from fewer Gaussians.
-_BITS_PER_GAUSSIAN = {"psnr": 25.2, "ms-ssim": 28.5}
-# Gaussians for which the bits above hold
-_REFERENCE_COUNT = 2100
-# more bits per Gaussian for each doubling of their number
-_BITS_PER_DOUBLING = 1.9
-# bits per Gaussian, however few there are
-_MIN_BITS_PER_GAUSSIAN = 8.0
-# bytes of a file beside Gaussians and map
-_HEADER_BYTES = 60
 # fixed-point iterations of the number of Gaussians, which the bits of one depend on
 _COUNT_ITERATIONS = 4
-# e in "squared error ~ bytes^-e", the slope of the rate-distortion curve
-_RATE_EXPONENT = 0.93
-# squared error after the whole fit, as a share of that after a trial fit
-_FINAL_ERROR_SHARE = 0.65
-# factor of the squared error, 0.1 dB, by which an image with sharp contours may be worse and still look better
-_CONTOUR_ALLOWANCE = 1.023
-# iterations of a trial fit: fewer are faster, more predict the whole fit better
-_TRIAL_ITERATIONS = 80
-# share of a fit's schedule that is run: the rate-distortion descent of `compress` does what the rest would do
-_FIT_SHARE = 0.845
-# the same with a label map, whose contours move for the last time at 0.88
-_FIT_SHARE_WITH_REGIONS = 0.89
+
+
+@dataclass(frozen=True)
+class GaussianBudget:
+    """The number of Gaussians of the best file of so many bytes.
+
+    More Gaussians leave fewer bits for each: the fit has less error, and rounding adds more. All fields are tuned.
+    To tune one again, change it and compare the files of ``python -m benchmarks rate``, which are of one size.
+    """
+
+    bits_per_gaussian: float = 25.2
+    """Bits of the file per Gaussian of the fit, at `reference_count`. More: fewer Gaussians, each rounded less."""
+    reference_count: int = 2100
+    """Number of Gaussians for which `bits_per_gaussian` holds: a file of 6,700 bytes."""
+    bits_per_doubling: float = 1.9
+    """More bits per Gaussian for each doubling of their number. More: small files get more Gaussians, large ones
+    fewer."""
+    min_bits_per_gaussian: float = 8.0
+    """Bits per Gaussian, however few there are."""
+    header_bytes: int = 60
+    """Bytes of a file beside Gaussians and map."""
+
+    def num_gaussians(self, target_bytes: float, pixels: int) -> int:
+        """Return the number of Gaussians, from 1 to `pixels`, of a file of at most `target_bytes` without a map."""
+        bits = 8 * max(target_bytes - self.header_bytes, 1)
+        count = bits / self.bits_per_gaussian
+        for _ in range(_COUNT_ITERATIONS):
+            doublings = math.log2(max(count, 1.0) / self.reference_count)
+            bits_per_gaussian = self.bits_per_gaussian + self.bits_per_doubling * doublings
+            count = bits / max(bits_per_gaussian, self.min_bits_per_gaussian)
+        return min(max(1, round(count)), pixels)
+
+
+@dataclass(frozen=True)
+class FitBytesSettings:
+    """What a fit to so many bytes trades off: time, and contours against Gaussians.
+
+    All fields are tuned. To tune one again, change it and compare the files of ``python -m benchmarks rate``.
+    """
+
+    fit_share: float = 0.845
+    """Share of a fit's schedule that is run; the descent of `compress` does what the rest would do. More: slower."""
+    fit_share_with_regions: float = 0.89
+    """The same with a label map, whose contours move for the last time at 0.88: not below it."""
+    trial_iterations: int = 80
+    """Iterations of a trial fit. More: slower, and its error predicts that of the whole fit better."""
+    final_error_share: float = 0.65
+    """Squared error after the whole fit, as a share of that after a trial. More: contours must save more error."""
+    rate_exponent: float = 0.93
+    """e in "squared error ~ bytes^-e", the slope of the rate-distortion curve. More: contours must save more error."""
+    contour_allowance: float = 1.023
+    """Factor of the squared error, 0.1 dB, by which a trial with contours may be worse, since sharp contours look
+    better. More: more files have a label map, at a lower PSNR."""
+
+
+# MS-SSIM suffers more from rounding than from fewer Gaussians
+BUDGETS = {"psnr": GaussianBudget(), "ms-ssim": GaussianBudget(bits_per_gaussian=28.5)}
+_SETTINGS = FitBytesSettings()
 
 
 @brief
@@ -74,8 +108,8 @@ class _RegionChoice(NamedTuple):
 
 def fit_bytes(
     image: Any,
-    regions: RegionMap | Tensor | NDArray[Any] | None = None,
-    target_bytes: int = 8000,
+    regions: RegionMap | Tensor | NDArray[Any] | None,
+    target_bytes: int,
     *,
     recipe: str | FitConfig = "best",
     seed: int = 0,
@@ -123,7 +157,7 @@ def fit_bytes(
     with Progress("trial fits", pulse=True, visible=progress):
         choice = _choose_regions(image, regions, target_bytes, config, seed)
     config = config.model_copy(update={"contour_cost": choice.contour_cost})
-    share = _FIT_SHARE if choice.regions is None else _FIT_SHARE_WITH_REGIONS
+    share = _SETTINGS.fit_share if choice.regions is None else _SETTINGS.fit_share_with_regions
     result = _fit_share(
         share, image, choice.regions, choice.num_gaussians, config, seed=seed, on_step=on_step, progress=progress
     )
@@ -138,7 +172,7 @@ def _choose_regions(
     image: Tensor, regions: RegionMap | None, target_bytes: int, config: FitConfig, seed: int
 ) -> _RegionChoice:
     """Merge regions whose contours do not pay for their bytes, then drop the map if it does not pay as a whole."""
-    num_gaussians = partial(gaussian_count, pixels=image.shape[1] * image.shape[2], objective=config.objective)
+    num_gaussians = partial(BUDGETS[config.objective].num_gaussians, pixels=image.shape[1] * image.shape[2])
     if not config.guidance:
         return _RegionChoice(None, num_gaussians(target_bytes), config.contour_cost, {"dropped": "recipe"})
     if regions is None or regions.num_regions == 1:
@@ -147,16 +181,18 @@ def _choose_regions(
     if not config.merge_regions:
         return _RegionChoice(regions, num_gaussians(target_bytes - map_bytes), config.contour_cost, {})
     # by iterations, so that without a clock the same arguments give the same file
-    iterations = min(_TRIAL_ITERATIONS, config.usual_iterations)
+    iterations = min(_SETTINGS.trial_iterations, config.usual_iterations)
     trial = FitConfig.from_recipe(config, merge_regions=False, iterations=iterations, max_seconds=None)
 
     def trial_error(regions: RegionMap | None, count: int) -> float:
-        history = _fit_share(_FIT_SHARE, image, regions, count, trial, seed=seed).history
+        history = _fit_share(_SETTINGS.fit_share, image, regions, count, trial, seed=seed).history
         return float(10 ** (-max(entry.psnr for entry in history) / 10))
 
     plain_error = trial_error(None, num_gaussians(target_bytes))
     # squared error, summed over pixels, that one more bit of Gaussians saves: the derivative of the power law
-    bit_value = _RATE_EXPONENT * _FINAL_ERROR_SHARE * plain_error * image[0].numel() / (8 * target_bytes)
+    bit_value = (
+        _SETTINGS.rate_exponent * _SETTINGS.final_error_share * plain_error * image[0].numel() / (8 * target_bytes)
+    )
     contour_cost = bit_value * (8 * map_bytes / max(len(contour_edges(regions.labels)[0]), 1))
     paying_regions = regions
     if regions.softness == 0.0:
@@ -167,20 +203,9 @@ def _choose_regions(
     if candidate is None or candidate.num_regions == 1:
         return _RegionChoice(None, num_gaussians(target_bytes), contour_cost, changes)
     count = num_gaussians(target_bytes - _map_bytes(candidate))
-    if count < candidate.num_regions or trial_error(candidate, count) >= _CONTOUR_ALLOWANCE * plain_error:
+    if count < candidate.num_regions or trial_error(candidate, count) >= _SETTINGS.contour_allowance * plain_error:
         return _RegionChoice(None, num_gaussians(target_bytes), contour_cost, {"dropped": "bytes"})
     return _RegionChoice(candidate, count, contour_cost, changes)
-
-
-def gaussian_count(target_bytes: float, pixels: int, objective: str = "psnr") -> int:
-    """Return the number of Gaussians, from 1 to `pixels`, of the best file of at most `target_bytes` without a map."""
-    bits = 8 * max(target_bytes - _HEADER_BYTES, 1)
-    count = bits / _BITS_PER_GAUSSIAN[objective]
-    for _ in range(_COUNT_ITERATIONS):
-        doublings = math.log2(max(count, 1.0) / _REFERENCE_COUNT)
-        bits_per_gaussian = _BITS_PER_GAUSSIAN[objective] + _BITS_PER_DOUBLING * doublings
-        count = bits / max(bits_per_gaussian, _MIN_BITS_PER_GAUSSIAN)
-    return min(max(1, round(count)), pixels)
 
 
 def _map_bytes(regions: RegionMap | None) -> int:

@@ -32,26 +32,6 @@ _QUALITY_MARGIN = 14.5
 # dB added to the quality, one after the other, until a file reaches `target_psnr`
 _QUALITY_STEPS = (0.0, 2.0, 5.0, 9.0, 14.0, 20.0, 30.0, 50.0)
 
-# Numbers without a derivation are tuned: vary one and compare the files of `python -m benchmarks rate`.
-
-# share of the iterations that descend before anything is rounded; the others descend while Gaussians are rounded
-_DESCENT_SHARE = 0.7
-# iterations between two updates of the quantization parameter
-_UPDATE_INTERVAL = 70
-# share of the descent from which on Gaussians are pruned that do not pay for their bits
-_PRUNE_FROM = 0.8
-# bytes that the descent aims at, as a share of `target_bytes`: rounding gradually saves 0.6 %
-_DESCENT_AIM = 1.006
-# bytes that rounding aims at before Gaussians in excess of `target_bytes` are removed
-_ROUNDING_AIM = 1.01
-# share of `target_bytes` that is enough
-_MIN_FILL = 0.995
-# roundings until a file fills so much
-_MAX_ROUNDINGS = 3
-# factor of the bytes that a change of the quantization parameter must aim at in the descent: numbers that round to 0
-# take no more bits when their steps become finer
-_BYTES_GAIN = 1.3
-
 
 @brief
 class Compressed(NamedTuple):
@@ -145,6 +125,40 @@ def quality_for(psnr: float) -> float:
 
 
 @dataclass(frozen=True)
+class CompressionSchedule:
+    """How the iterations of a file are spent, and which sizes they aim at on the way to `target_bytes`.
+
+    All fields are tuned. To tune one again, change it and compare the files of ``python -m benchmarks rate``, which are
+    of one size.
+    """
+
+    descent_share: float = 0.7
+    """Share of the iterations that descend before anything is rounded; the others descend while Gaussians are rounded.
+    More: Gaussians are cheaper, and their neighbours correct less of what rounding adds."""
+    update_interval: int = 70
+    """Iterations between two updates of the QP, each of which writes a file. More: faster, and farther from the
+    target."""
+    prune_from: float = 0.8
+    """Share of the descent from which on Gaussians are pruned that do not pay for their bits. More: they have longer to
+    become useful, and the others less time to replace them."""
+    descent_aim: float = 1.006
+    """Size that the descent aims at, as a share of `target_bytes`, since rounding gradually saves 0.6 %."""
+    rounding_aim: float = 1.01
+    """Size that rounding aims at, as a share of `target_bytes`; Gaussians in excess are removed on the way. More: more
+    are removed. Less: more files are too small and rounded again."""
+    min_fill: float = 0.995
+    """Share of `target_bytes` that is enough. More: slower, and less error."""
+    max_roundings: int = 3
+    """Most roundings of a scene until a file has `min_fill`."""
+    bytes_gain: float = 1.3
+    """Factor of the change of bytes that an update of the QP aims at: numbers that round to 0 take no more bits when
+    their steps become finer. More: the size swings. Less: it lags behind."""
+
+
+_SCHEDULE = CompressionSchedule()
+
+
+@dataclass(frozen=True)
 class _Compressor:
     """Rate-distortion descent and gradual rounding of one scene, at any quantization parameter (QP)."""
 
@@ -159,18 +173,19 @@ class _Compressor:
 
         def update_qp(writer: SceneWriter, qp: int) -> int:
             size = len(writer.write_rounded(qp))
-            return writer.next_qp(qp, size, size + round(_BYTES_GAIN * (_DESCENT_AIM * target_bytes - size)))
+            change = _SCHEDULE.descent_aim * target_bytes - size
+            return writer.next_qp(qp, size, size + round(_SCHEDULE.bytes_gain * change))
 
         writer = self._descend(update_qp(self.writer, self.writer.qp_for(None)), update_qp)
         qp, fallback = writer.largest_file(lambda qp: self._round(writer, qp, 0), target_bytes)
         max_qp = self.writer.qp_for(QUALITIES[1])
         data, candidates = fallback, []
-        for _ in range(_MAX_ROUNDINGS):
-            qp = min(writer.next_qp(qp, len(data), round(_ROUNDING_AIM * target_bytes)), max_qp)
+        for _ in range(_SCHEDULE.max_roundings):
+            qp = min(writer.next_qp(qp, len(data), round(_SCHEDULE.rounding_aim * target_bytes)), max_qp)
             data = self._round(writer, qp, self._rounding_iterations, target_bytes)
             if len(data) <= target_bytes:
                 candidates.append(data)
-            if len(data) >= _MIN_FILL * target_bytes or qp == max_qp:
+            if len(data) >= _SCHEDULE.min_fill * target_bytes or qp == max_qp:
                 break
         return max(candidates, key=len, default=fallback)
 
@@ -188,7 +203,7 @@ class _Compressor:
 
     @property
     def _descent_iterations(self) -> int:
-        return int(_DESCENT_SHARE * self.iterations)
+        return int(_SCHEDULE.descent_share * self.iterations)
 
     @property
     def _rounding_iterations(self) -> int:
@@ -198,12 +213,12 @@ class _Compressor:
         """Lower error and bits with nothing rounded; `update_qp` returns the QP for the scene of the moment."""
         writer, iterations = self.writer, self._descent_iterations
         descent = self._new_descent(writer)
-        for start in range(0, iterations, _UPDATE_INTERVAL):
+        for start in range(0, iterations, _SCHEDULE.update_interval):
             qp = update_qp(writer, qp)
             quantizer = Quantizer(qp, writer.size)
-            if start >= _PRUNE_FROM * iterations:
+            if start >= _SCHEDULE.prune_from * iterations:
                 descent.prune(quantizer)
-            for _ in range(min(_UPDATE_INTERVAL, iterations - start)):
+            for _ in range(min(_SCHEDULE.update_interval, iterations - start)):
                 descent.step(quantizer)
             writer = writer.with_gaussians(descent.parameters(), descent.ids)
         return writer

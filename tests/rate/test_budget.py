@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcgs.codec import decode
 from kcgs.rate import fit_bytes
-from kcgs.rate.budget import gaussian_count
+from kcgs.rate.budget import BUDGETS
 from tests.conftest import Clock
 
 from .conftest import Photo, psnr
@@ -42,18 +42,18 @@ class TestFitBytes:
         image, labels = photo
         psnrs = [10.0]
         for target in (500, 1500):
-            done = fit_bytes(image, labels, target, iterations=150)
-            assert 0.93 * target < len(done.data) <= target
-            assert torch.equal(decode(done.data).scene.field.means, done.scene.field.means)
-            assert done.result.stop_reason == "iterations"
-            psnrs.append(psnr(done.scene, image))
+            file = fit_bytes(image, labels, target, iterations=150)
+            assert 0.93 * target < len(file.data) <= target
+            assert torch.equal(decode(file.data).scene.field.means, file.scene.field.means)
+            assert file.result.stop_reason == "iterations"
+            psnrs.append(psnr(file.scene, image))
             assert psnrs[-1] > psnrs[-2] + 0.8
 
     def test_clock(self, photo: Photo, clock: Clock) -> None:
         """The clock is that of the fit."""
-        done = fit_bytes(*photo, 1500, max_seconds=1.0, iterations=10**7)
-        assert done.result.stop_reason == "seconds" and 0.9 < done.result.seconds < 1.15
-        assert 0.9 * 1500 < len(done.data) <= 1500
+        file = fit_bytes(*photo, 1500, max_seconds=1.0, iterations=10**7)
+        assert file.result.stop_reason == "seconds" and 0.9 < file.result.seconds < 1.15
+        assert 0.9 * 1500 < len(file.data) <= 1500
 
     def test_callback(self, photo: Photo) -> None:
         iterations: list[int] = []
@@ -79,9 +79,9 @@ class TestFitBytes:
     ) -> None:
         """Regions stay that pay for their bytes, or that must not be merged."""
         image, labels = problem(photo[0])
-        done = fit_bytes(image, labels, target, iterations=100, **settings)
-        regions, report = done.scene.regions, done.result.regions
-        assert len(done.data) <= target and psnr(done.scene, image) > min_psnr
+        file = fit_bytes(image, labels, target, iterations=100, **settings)
+        regions, report = file.scene.regions, file.result.regions
+        assert len(file.data) <= target and psnr(file.scene, image) > min_psnr
         assert (1 if regions is None else regions.num_regions) == num_regions
         assert report is not None and (report.num_before, report.num_after) == (len(labels.unique()), num_regions)
         if "move_contours" in settings:
@@ -101,7 +101,7 @@ class TestFitBytes:
             fit_bytes(torch.rand(3, 16, 16), None, target, **settings)
 
 
-def test_gaussian_count() -> None:
-    counts = [gaussian_count(size, 10_000) for size in (1, 100, 1000, 8000, 50_000)]
+def test_gaussian_budget() -> None:
+    counts = [BUDGETS["psnr"].num_gaussians(size, 10_000) for size in (1, 100, 1000, 8000, 50_000)]
     assert counts == sorted(counts) and counts[0] == 1 and 2200 < counts[3] < 2700
-    assert gaussian_count(8000, 10_000, "ms-ssim") < 0.95 * counts[3]
+    assert BUDGETS["ms-ssim"].num_gaussians(8000, 10_000) < 0.95 * counts[3]
