@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
@@ -15,27 +17,40 @@ from kcgs.optim import GaussianAdam
 from kcgs.scene import Scene
 
 from .inpainting import inpaint
-from .masks import dilate
+from .masks import FRINGE, dilate
 
-# Tuned on the photos of `python -m benchmarks fill`.
-# pixels around the hole that still have colours of the object: they are filled too
-_FRINGE = 3
-# a Gaussian with more than this share of its weight in the hole is fitted
-_FREE_SHARE = 0.01
-# a Gaussian with more than this share of its weight in the hole is removed
-_REMOVED_SHARE = 0.5
-# most Gaussians that are added: a large hole gets larger ones
-_MAX_ADDED = 250
-# least distance of Gaussians that are added, in pixels
-_MIN_SPACING = 3.0
-# their standard deviation, in that distance
-_SIGMA = 0.7
-# weight of a known pixel in the fit, where that of a filled one is 1: what is visible already must not change
-_KNOWN_WEIGHT = 4.0
-_STEPS = 150
-# learning rates of geometry and colours: at higher ones Gaussians that are alike swing, and the hole shows ripples
-_RATE = 0.07
-_COLOR_RATE = 0.015
+
+@dataclass(frozen=True)
+class FillSettings:
+    """Which Gaussians of a hole are fitted, and how.
+
+    All fields are tuned on the photos of ``python -m benchmarks fill``, for values in [0, 1]: to tune one again, change
+    it and compare the steepest gradients and the values beyond [0, 1] in the holes.
+    """
+
+    free_share: float = 0.01
+    """A Gaussian with more than this share of its weight in the hole is fitted. More: fewer Gaussians change,
+    and more of those that stay show the object in the hole."""
+    removed_share: float = 0.5
+    """A Gaussian with more than this share of its weight in the hole is removed instead, and new ones replace it."""
+    max_added: int = 250
+    """Most Gaussians that are added: a large hole gets larger ones. More: larger files, and a finer fill."""
+    min_spacing: float = 3.0
+    """Least distance of Gaussians that are added, in pixels: a small hole gets fewer than `max_added`."""
+    sigma: float = 0.7
+    """Their standard deviation, in that distance. Less: gaps between them show. More: they are alike, and swing."""
+    known_weight: float = 4.0
+    """Weight of a known pixel in the fit, where that of a filled one is 1. More: what is visible already changes less,
+    and the hole follows it less smoothly."""
+    steps: int = 150
+    """Iterations of the fit. More: slower, and less error."""
+    rate: float = 0.07
+    """Learning rate of means and factors. More: Gaussians that are alike swing, and the hole shows ripples."""
+    color_rate: float = 0.015
+    """Learning rate of colours, likewise."""
+
+
+_SETTINGS = FillSettings()
 
 
 def fill_hole(scene: Scene, hole: Tensor, visible: Tensor) -> Scene:
@@ -59,17 +74,17 @@ def fill_hole(scene: Scene, hole: Tensor, visible: Tensor) -> Scene:
     with threads_for_kernels(unknown.numel()), torch.no_grad():
         target = inpaint(scene(), unknown)
         share = _share_in(scene.field, ids, regions, unknown)
-        fixed = scene.field.subset(share <= _FREE_SHARE)
-        free = scene.field.subset((share > _FREE_SHARE) & (share <= _REMOVED_SHARE))
+        fixed = scene.field.subset(share <= _SETTINGS.free_share)
+        free = scene.field.subset((share > _SETTINGS.free_share) & (share <= _SETTINGS.removed_share))
         target = target - Scene(fixed, regions)()
         free = join(free, _spread(target - Scene(free, regions)(), filled, regions))
-        weight = torch.where(unknown, filled.to(target), _KNOWN_WEIGHT)
+        weight = torch.where(unknown, filled.to(target), _SETTINGS.known_weight)
         return Scene(join(fixed, _fit(free, regions, target, weight)), regions, scene.metadata)
 
 
 def _fringe(mask: Tensor, labels: Tensor) -> Tensor:
     """Return the pixels near a mask, (H, W) bool, of the regions that are in it and go on farther away."""
-    near = dilate(mask, _FRINGE)
+    near = dilate(mask, FRINGE)
     return near & torch.isin(labels, labels[mask].unique()) & torch.isin(labels, labels[~near].unique())
 
 
@@ -88,13 +103,13 @@ def _share_in(field: GaussianField, ids: Tensor, regions: RegionMap, hole: Tenso
 
 def _spread(residual: Tensor, mask: Tensor, regions: RegionMap) -> GaussianField:
     """Spread round Gaussians over a mask that together about make the residual there."""
-    spacing = max(_MIN_SPACING, float(mask.sum() / _MAX_ADDED) ** 0.5)
+    spacing = max(_SETTINGS.min_spacing, float(mask.sum() / _SETTINGS.max_added) ** 0.5)
     rows, cols = (torch.arange(min(spacing, n) / 2, n, spacing, device=mask.device).long() for n in mask.shape)
     grid = torch.zeros_like(mask)
     grid[rows[:, None], cols] = True
     y, x = (grid & mask).nonzero().T
     means, ids = torch.stack([x, y], -1).to(residual) + 0.5, regions.labels[y, x]
-    cholesky = residual.new_tensor([_SIGMA * spacing, 0.0, _SIGMA * spacing]).expand(len(x), 3)
+    cholesky = residual.new_tensor([_SETTINGS.sigma * spacing, 0.0, _SETTINGS.sigma * spacing]).expand(len(x), 3)
     total = region_splat(means, cholesky, torch.ones_like(means[:, :1]), ids, regions)[:, y, x]
     return GaussianField(means, cholesky, (residual[:, y, x] / total).T, ids, size=regions.size)
 
@@ -104,10 +119,10 @@ def _fit(field: GaussianField, regions: RegionMap, target: Tensor, weight: Tenso
     """Fit Gaussians to a target, with a weight per pixel; opacities are merged into the colours."""
     geometry = field.means.detach(), field.cholesky.detach()
     field = GaussianField(*geometry, field.merged_colors().detach(), field.region_ids, size=field.size)
-    rate, color_rate = field.means.detach().new_tensor([_RATE, _COLOR_RATE])
+    rate, color_rate = field.means.detach().new_tensor([_SETTINGS.rate, _SETTINGS.color_rate])
     optimizer = GaussianAdam(field, rate, color_lr=color_rate)
-    schedule = LambdaLR(optimizer, lambda step: cosine_decay(step / _STEPS))
-    for _ in range(_STEPS):
+    schedule = LambdaLR(optimizer, lambda step: cosine_decay(step / _SETTINGS.steps))
+    for _ in range(_SETTINGS.steps):
         rendered = region_splat(field.means, field.cholesky, field.colors, field.region_ids, regions)
         rendered.backward((rendered.detach() - target) * weight)
         optimizer.step()

@@ -34,8 +34,9 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
     """Move regions: their Gaussians and their labels, over what lies there.
 
     Convention: pixels that the regions leave take the label of the nearest pixel of another region. Pixels that leave
-    the image are lost. A region that is covered whole, or leaves the image, is lost with its Gaussians. Where pairs of
-    regions have widths, a new contour takes the mean of the widths.
+    the image are lost. A region that is covered whole, or leaves the image, is lost with its Gaussians. Where the
+    softness differs by pairs of regions, a new contour has their mean. :func:`kcgs.video.move_region` moves regions in
+    all frames of a video, and always fills what they leave.
 
     Args:
         scene: unbatched, with a map of its own size, not a resized one.
@@ -164,8 +165,9 @@ def delete_region(scene: Scene, region_ids: int | Iterable[int], *, fill: bool =
     """Delete regions with their Gaussians; their neighbours take over their pixels.
 
     Convention: each pixel takes the label of the nearest pixel of another region, and is filled. Arguments and errors
-    are those of :func:`move_region`. Where pairs of regions have widths, contours between regions that did not touch
-    before are hard.
+    are those of :func:`move_region`. Where the softness differs by pairs of regions, contours between regions that did
+    not touch before are hard. :func:`kcgs.video.delete_region` deletes regions from all frames of a video, and always
+    fills what they hid, from frames that show it.
 
     Example:
         >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])
@@ -200,7 +202,7 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
     """Put another scene in place of some regions, stretched to the size of this one.
 
     Convention: the regions of the background, or the background as one region, get ids above those of the scene. Where
-    pairs of regions of the scene have widths, a new contour takes the mean of the widths.
+    the softness of the scene differs by pairs of regions, a new contour has their mean.
 
     Args:
         scene: unbatched, with a map of its own size, not a resized one.

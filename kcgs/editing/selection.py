@@ -12,7 +12,7 @@ from kcgs._check import check_count
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
-from kcgs.scene import Scene, check_scene
+from kcgs.scene import Scene, check_scene, check_type
 
 
 class Selection(NamedTuple):
@@ -39,6 +39,9 @@ def select_regions(scene: Scene, region_ids: object) -> Selection:
 
 def select_removable_regions(scene: Scene, region_ids: object) -> Selection:
     """Select regions whose pixels other regions of the map can take over."""
+    if check_type(scene).field.means.ndim == 3:
+        advice = "scene[t] is one of them, and kcgs.video edits regions in all of them"
+        raise InvalidArgument("scene", "of one image", f"a batch of {len(scene.field.means)}: {advice}")
     selection = select_regions(scene, region_ids)
     if selection.regions.resized:
         raise ValueError("scene must not have a resized map: edit the map at its own size, then resize it")

@@ -16,15 +16,15 @@ from kcgs.nn import GaussianField
 from kcgs.nn.field import join
 from kcgs.scene import Scene, check_batch
 
+from .background import affine_motions, apply_affine, restore_background
 from .descent import FrameDescent
-from .inpainting import apply_affine, background_motions, fill_holes
 from .splats import Splats, Target, stack
 
 
 @torch.inference_mode(False)
 @torch.no_grad()
 def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
-    """Delete regions from all frames, and show what is behind them.
+    """Delete regions from all frames, and show what is behind them; :func:`kcgs.editing.delete_region` edits one image.
 
     Convention: a hidden pixel takes colour and label from the nearest frame that shows it. Its place there follows from
     the motion of the Gaussians of the other regions, which is taken as affine. What no frame shows continues its
@@ -52,10 +52,12 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
     """
     regions, row_ids, deleted_ids = _check(scenes, region_ids)
     deleted_pixels, deleted_rows = torch.isin(regions.labels, deleted_ids), torch.isin(row_ids, deleted_ids)
-    frames: list[Splats] = []
+    # scenes don't keep the config of their fit; of it a descent uses the backend, the cutoff and the objective, whose
+    # defaults suit every scene
+    config, frames = FitConfig(), list[Splats]()
     with threads_for_kernels(scenes.size[0] * scenes.size[1]):
-        motions = background_motions(scenes.field.means.detach(), ~deleted_rows)
-        images, labels = fill_holes(scenes.render(), regions.labels, deleted_pixels, motions)
+        motions = affine_motions(scenes.field.means.detach(), ~deleted_rows)
+        images, labels = restore_background(scenes.render(), regions.labels, deleted_pixels, motions)
         new_regions = regions.relabel(labels, "mean")
         for t, scene in enumerate(scenes):
             means, cholesky, colors, _, _ = Splats.of(scene)
@@ -70,7 +72,7 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
             start = Splats(means, cholesky, colors, region_ids, new_regions.image(t))
             movable_rows, changed_pixels = torch.ones_like(deleted_rows[t]), torch.ones_like(deleted_pixels[t])
             unused = deleted_rows[t] & (colors == 0).all(-1)
-            descent = FrameDescent(Target(images[t], FitConfig()), start, movable_rows, changed_pixels)
+            descent = FrameDescent(Target(images[t], config), start, movable_rows, changed_pixels)
             frames.append(descent.run({0: float(unused.float().mean())}))
     return stack(frames, scenes.size, scenes.metadata)
 
@@ -78,7 +80,9 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
 @torch.inference_mode(False)
 @torch.no_grad()
 def move_region(scenes: Scene, region_ids: int | Iterable[int], offset: Sequence[float]) -> Scene:
-    """Move regions in all frames, over whatever lies there; :func:`delete_region` fills what they leave.
+    """Move regions in all frames, over what lies there; :func:`kcgs.editing.move_region` edits one image.
+
+    Convention: what they leave is filled as :func:`delete_region` does it.
 
     Args:
         scenes: T frames with label maps, as :func:`fit_video` gives them.

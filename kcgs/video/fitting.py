@@ -24,7 +24,7 @@ from kcgs.scene import Scene
 
 from .descent import FrameDescent
 from .files import DEFAULT_FRAME_RATE
-from .motion import estimate_motion, move_labels, move_points
+from .flow import move_labels, move_points, optical_flow
 from .splats import Splats, Target, stack
 
 OnFrame = Callable[[int, Scene], bool | None]
@@ -131,7 +131,7 @@ class _VideoFit:
             raise InvalidArgument(name, f"shape {tuple(previous.shape)}", tuple(self.image.shape), verb="have")
         else:
             with threads_for_kernels(previous[0].numel()):
-                splats, changed_pixels = self._follow(target, estimate_motion(previous, self.image), regions)
+                splats, changed_pixels = self._follow(target, optical_flow(previous, self.image), regions)
         self.frames.append(splats)
         self.error = torch.where(changed_pixels, target.squared_error(splats), self.error)
         return splats.scene(target.size)
@@ -153,13 +153,13 @@ class _VideoFit:
             region_ids[: len(fitted_ids)] = fitted_ids
         return Splats(means, cholesky, colors, region_ids, regions)
 
-    def _follow(self, target: Target, motion: Tensor, regions: RegionMap | None) -> tuple[Splats, Tensor]:
+    def _follow(self, target: Target, flow: Tensor, regions: RegionMap | None) -> tuple[Splats, Tensor]:
         """Return a frame, fitted from the one before, and the mask of the pixels that changed."""
         first, before, is_moved = self.frames[0].regions, self.frames[-1].regions, regions is None
         if first is not None and before is not None:
-            labels = move_labels(motion, before.labels) if regions is None else regions.labels
+            labels = move_labels(flow, before.labels) if regions is None else regions.labels
             regions = first.relabel(labels, "mean")
-        start, movable_rows, changed_pixels = self._start(target, motion, regions)
+        start, movable_rows, changed_pixels = self._start(target, flow, regions)
         if float(target.squared_error(start).mean()) > _CUT_SHARE * float(target.image.var((1, 2)).mean()):
             if is_moved and regions is not None:
                 regions = regions.relabel(regions.labels.flatten().mode()[0].expand(regions.size))
@@ -169,10 +169,10 @@ class _VideoFit:
             start = FrameDescent(target, start, movable_rows, changed_pixels).run(_RELOCATIONS, anchor)
         return start, changed_pixels
 
-    def _start(self, target: Target, motion: Tensor, regions: RegionMap | None) -> tuple[Splats, Tensor, Tensor]:
+    def _start(self, target: Target, flow: Tensor, regions: RegionMap | None) -> tuple[Splats, Tensor, Tensor]:
         """Return the Gaussians before, moved, the mask of those that may move, and that of the pixels that changed.
 
-        A pixel changed if the Gaussians, without motion, explain its surroundings less well than when they were fitted.
+        A pixel changed if the Gaussians, not moved, explain its surroundings less well than when they were fitted.
         """
         means, cholesky, colors, region_ids, _ = self.frames[-1]
         if regions is not None and region_ids is not None:  # rows of a region that is gone have no use
@@ -182,8 +182,8 @@ class _VideoFit:
         still = Splats(means, cholesky, colors, region_ids, regions)
         changed_pixels = _local_mean(target.squared_error(still)) > _MAX_GROWTH * _local_mean(self.error) + _LEVEL
         _, sums = target.weight_sums(still)
-        movable_rows = sums(changed_pixels[None].to(motion)) >= _MOVABLE_SHARE * sums(torch.ones_like(motion[:1]))
-        means = torch.where(movable_rows[:, None], _move_means(motion, still), means)
+        movable_rows = sums(changed_pixels[None].to(flow)) >= _MOVABLE_SHARE * sums(torch.ones_like(flow[:1]))
+        means = torch.where(movable_rows[:, None], _move_means(flow, still), means)
         return still._replace(means=means), movable_rows, changed_pixels
 
 
@@ -191,13 +191,13 @@ def _local_mean(error: Tensor) -> Tensor:
     return avg_pool2d(error[None], _WINDOW, 1, _WINDOW // 2, count_include_pad=False)[0]
 
 
-def _move_means(motion: Tensor, splats: Splats) -> Tensor:
-    """Move centres along a motion; a centre that would leave its region moves as the region does on average."""
-    new_means, regions = move_points(motion, splats.means), splats.regions
+def _move_means(flow: Tensor, splats: Splats) -> Tensor:
+    """Move centres along the flow; a centre that would leave its region moves as the region does on average."""
+    new_means, regions = move_points(flow, splats.means), splats.regions
     if regions is None or splats.region_ids is None:
         return new_means
     pixels = regions.index_of(regions.labels).flatten()
-    sums = torch.stack([pixels.bincount(offsets.flatten()) for offsets in motion], -1)
+    sums = torch.stack([pixels.bincount(offsets.flatten()) for offsets in flow], -1)
     mean = sums / pixels.bincount()[:, None]
     inside = lookup_regions(new_means, regions.labels) == splats.region_ids
     return torch.where(inside[:, None], new_means, splats.means - mean[splats.region_index].to(new_means))

@@ -12,14 +12,14 @@ from kcgs.nn import GaussianField
 from kcgs.nn.field import join
 from kcgs.scene import Scene, check_batch
 
-from .motion import estimate_motion, move_labels, move_points, sample
+from .flow import move_labels, move_points, optical_flow, sample
 
 
 @torch.no_grad()
 def interpolate(scenes: Scene, time: float) -> Scene:
     """Return the scene at any time of a batch of scenes.
 
-    Convention: between two frames the scene has the Gaussians of both, moved along the motion between their renders.
+    Convention: between two frames the scene has the Gaussians of both, moved along the optical flow between their renders.
     Those of the earlier frame fade out while those of the later fade in. The label map is that of the earlier frame,
     moved.
 
@@ -45,10 +45,10 @@ def interpolate(scenes: Scene, time: float) -> Scene:
     if fraction == 0.0:
         return scenes[number]
     first, second = scenes[number], scenes[number + 1]
-    motion = estimate_motion(first.render(), second.render())
+    flow = optical_flow(first.render(), second.render())
     earlier, later = first.field, second.field
-    earlier_means = earlier.means.lerp(move_points(motion, earlier.means), fraction)
-    later_means = later.means + (1 - fraction) * sample(motion, later.means)
+    earlier_means = earlier.means.lerp(move_points(flow, earlier.means), fraction)
+    later_means = later.means + (1 - fraction) * sample(flow, later.means)
     fading_out, fading_in = (1 - fraction) * earlier.merged_colors(), fraction * later.merged_colors()
     field = join(
         GaussianField(earlier_means, earlier.cholesky, fading_out, earlier.region_ids, size=scenes.size),
@@ -56,5 +56,5 @@ def interpolate(scenes: Scene, time: float) -> Scene:
     )
     if first.regions is None:
         return Scene(field, None, scenes.metadata)
-    regions = first.regions.relabel(move_labels(fraction * motion, first.regions.labels))
+    regions = first.regions.relabel(move_labels(fraction * flow, first.regions.labels))
     return Scene(field.subset(members_of(field, regions.ids)), regions, scenes.metadata)

@@ -146,8 +146,12 @@ class TestEditing(BaseTester):
         two = [torch.ones(2, 5, n) for n in (2, 3, 3)]
         field = GaussianField(*two, torch.zeros(2, 5, dtype=torch.long), size=SIZE)
         batch = Scene(field, torch.zeros(2, *SIZE, dtype=torch.long))
-        for edit in (extract_region, delete_region, render_region, lambda s, i: move_region(s, i, (1, 0))):
-            with pytest.raises(ValueError, match="scene must be of one image; got a batch of 2"):
+        match = r"scene must be of one image; got a batch of 2: scene\[t\] is one of them"
+        for edit in (extract_region, render_region):
+            with pytest.raises(ValueError, match=match):
+                edit(batch, 0)
+        for edit in (delete_region, lambda s, i: move_region(s, i, (1, 0))):
+            with pytest.raises(ValueError, match=match + ", and kcgs.video edits"):
                 edit(batch, 0)
 
     def test_feature(self, edit: Edit, regions: RegionMap) -> None:

@@ -1,4 +1,4 @@
-"""Pixels of a video that are unknown in one frame and shown by others."""
+"""The background that a region hides in one frame of a video and others show."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ import torch
 from torch import Tensor
 
 from kcgs.editing.inpainting import inpaint
-from kcgs.editing.masks import dilate, nearest_labels
+from kcgs.editing.masks import FRINGE, dilate, nearest_labels
 
-from .motion import sample
+from .flow import sample
 
-# pixels around a region that still have colours of it
-_FRINGE = 3
 # pixels between a Gaussian and where a motion puts it, up to which it follows the motion
 _MAX_RESIDUAL = 1.0
 # samples of three rows: with more, the motion of most rows is found more surely
@@ -22,8 +20,11 @@ _RANSAC_TRIALS = 200
 _MIN_ROWS = 12
 
 
-def background_motions(means: Tensor, background: Tensor) -> Tensor:
-    """Return the affine motion (T, 3, 3) from the first frame to each that most rows of the background (T, N) have."""
+def affine_motions(means: Tensor, background: Tensor) -> Tensor:
+    """Return the affine motion (T, 3, 3) from the first frame to each that most rows of the background (T, N) have.
+
+    Optical flow, which the fit follows, ends where a region hides the background; an affine motion goes on behind it.
+    """
     from skimage.measure import ransac
     from skimage.transform import AffineTransform
 
@@ -41,8 +42,8 @@ def background_motions(means: Tensor, background: Tensor) -> Tensor:
     return torch.stack(motions)
 
 
-def fill_holes(renders: Tensor, labels: Tensor, deleted: Tensor, motions: Tensor) -> tuple[Tensor, Tensor]:
-    """Fill pixels of all frames from the nearest frame that shows them, or from their surroundings.
+def restore_background(renders: Tensor, labels: Tensor, deleted: Tensor, motions: Tensor) -> tuple[Tensor, Tensor]:
+    """Fill pixels of all frames from the nearest frame that shows them; `inpaint` fills those that none shows.
 
     Args:
         renders: (T, C, H, W).
@@ -53,7 +54,7 @@ def fill_holes(renders: Tensor, labels: Tensor, deleted: Tensor, motions: Tensor
     Returns:
         The images and the labels.
     """
-    holes = [dilate(mask, _FRINGE) for mask in deleted]
+    holes = [dilate(mask, FRINGE) for mask in deleted]
     originals = [_Pixels(*pixels) for pixels in zip(renders, labels, holes, strict=True)]
     results: list[_Pixels] = []
     for t, original in enumerate(originals):

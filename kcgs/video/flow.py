@@ -1,4 +1,4 @@
-"""Motion between two frames, and points and label maps that move with it."""
+"""Optical flow between two images, and points and label maps that move with it."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-# pixels: shorter side of the images that motion is estimated on; larger ones take longer and show finer motion
+# pixels: shorter side of the images whose flow is estimated; larger ones take longer and show finer motion
 _SIDE = 160
-# pixels of these: half the side of the window in which motion is constant; larger ones are more robust
+# pixels of these: half the side of the window in which the flow is constant; larger ones are more robust
 _RADIUS = 5
-# of the fixed point in `move_points`, which converges where neighbouring motions differ by less than a pixel per pixel
+# of the fixed point in `move_points`, which converges where neighbouring offsets differ by less than a pixel per pixel
 _ITERATIONS = 5
 
 
-def estimate_motion(previous: Tensor, image: Tensor) -> Tensor:
+def optical_flow(previous: Tensor, image: Tensor) -> Tensor:
     """Return the offset (x, y) from each pixel of an image to its place in the previous one, (2, H, W), in pixels.
 
     Source: the iterative Lucas-Kanade solver of scikit-image, `optical_flow_ilk`, on smaller grey images.
@@ -29,30 +29,30 @@ def estimate_motion(previous: Tensor, image: Tensor) -> Tensor:
         interpolate(frame.mean(0)[None, None], size, mode="area")[0, 0].cpu().numpy() for frame in (image, previous)
     ]
     rows, cols = optical_flow_ilk(*grey, radius=_RADIUS)
-    motion = torch.from_numpy(np.stack([cols * (width / size[1]), rows * (height / size[0])])).to(image)
-    return interpolate(motion[None], (height, width), mode="bilinear")[0]
+    flow = torch.from_numpy(np.stack([cols * (width / size[1]), rows * (height / size[0])])).to(image)
+    return interpolate(flow[None], (height, width), mode="bilinear")[0]
 
 
 def sample(planes: Tensor, points: Tensor) -> Tensor:
-    """Sample a motion or an image (C, H, W) bilinearly at points (N, 2); outside it continues from the border."""
+    """Sample a flow or an image (C, H, W) bilinearly at points (N, 2); outside it continues from the border."""
     height, width = planes.shape[1:]
     grid = points / points.new_tensor([width, height]) * 2 - 1
     values = grid_sample(planes[None], grid[None, None].to(planes), padding_mode="border", align_corners=False)
     return values[0, :, 0].T.to(points)
 
 
-def move_points(motion: Tensor, points: Tensor) -> Tensor:
-    """Return the places in the image of points (N, 2) of the previous one: q with q + motion(q) = p."""
+def move_points(flow: Tensor, points: Tensor) -> Tensor:
+    """Return the places in the image of points (N, 2) of the previous one: q with q + flow(q) = p."""
     places = points
     for _ in range(_ITERATIONS):
-        places = points - sample(motion, places)
+        places = points - sample(flow, places)
     return places
 
 
-def move_labels(motion: Tensor, labels: Tensor) -> Tensor:
+def move_labels(flow: Tensor, labels: Tensor) -> Tensor:
     """Return the labels (H, W) for the image, each read at the pixel's place in the previous one."""
     height, width = labels.shape
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    cols = (x.to(motion) + motion[0]).round().long().clamp(0, width - 1)
-    rows = (y.to(motion) + motion[1]).round().long().clamp(0, height - 1)
+    cols = (x.to(flow) + flow[0]).round().long().clamp(0, width - 1)
+    rows = (y.to(flow) + flow[1]).round().long().clamp(0, height - 1)
     return labels[rows, cols]
