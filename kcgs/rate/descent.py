@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kcgs.codec.exact import Integers
 from kcgs.codec.gaussians.quantize import Parameters, Quantizer
+from kcgs.fitting.descent import DRAFT_CUTOFF
 from kcgs.fitting.objective import MsSsimObjective
 from kcgs.functional import RegionMap, region_splat
 from kcgs.optim.newton import Gaussians, NewtonDescent, area, error_weights, half_gradients
@@ -26,14 +27,15 @@ _BIT_PRICE = 0.9
 _GAUSSIAN_PRICE = 20.0
 # share of a Newton step in a step: larger ones oscillate, smaller ones take more iterations
 _RATE = 0.09
-# weights below it are skipped: renders are faster than at the 1e-4 of a result
-_CUTOFF = 1e-3
 # steps for which the gradient of the bits is reused, which changes slowly
 _BIT_GRADIENT_STEPS = 4
 
 
 class RateDistortionDescent:
     """Gaussians on their way to less error and fewer bits.
+
+    The Newton steps are those of :class:`kcgs.optim.newton.NewtonDescent`, which the frames of a video take, too. This
+    descent adds the price of bits and moves contours never; when Gaussians are pruned or rounded, its callers say.
 
     Args:
         gaussians: the start.
@@ -125,7 +127,7 @@ class RateDistortionDescent:
     def _render(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
         ids = None if self.regions is None else self.regions.ids[torch.from_numpy(self.ids)]
         size = self.image.shape[1], self.image.shape[2]
-        return region_splat(means, cholesky, colors, ids, self.regions, size=size, cutoff=_CUTOFF)
+        return region_splat(means, cholesky, colors, ids, self.regions, size=size, cutoff=DRAFT_CUTOFF)
 
     def _energy(self) -> Tensor:
         """Return the error that each Gaussian saves, (N,), if no other overlaps it."""

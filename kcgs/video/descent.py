@@ -27,8 +27,6 @@ _FINAL_ITERATIONS = 20
 _CONTOUR_ITERATION = 30
 # factor by which a move of a contour may raise the squared error about it: Gaussians adapt to it afterwards
 _MAX_RISE = 1.5
-# pixels: standard deviations that are tried for a relocated Gaussian
-_SIGMAS = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
 # pixels: no Gaussian gets thinner
 _MIN_SIGMA = 0.5
 # weight of the error of a row that may not move, so large that it is never relocated
@@ -40,7 +38,8 @@ _USUAL_OVERLAP = 12.0
 class FrameDescent:
     """Newton steps, relocations of rows and moves of contours towards an image.
 
-    Newton steps, unlike Adam's, leave what is still in a video where it is: Adam moves it six times as far.
+    Newton steps, unlike Adam's, leave what is still in a video where it is: Adam moves it six times as far. They are
+    those of :class:`kcgs.optim.newton.NewtonDescent`, which files take, too, for a price of bits and without contours.
 
     Args:
         target: the image.
@@ -104,9 +103,7 @@ class FrameDescent:
         self.newton.velocity[mask], self.movable_rows = 0.0, self.movable_rows | mask
 
         residual = (image - self.target.render(self.splats._replace(colors=colors))) * self.changed_pixels
-        proposal = propose_gaussians(
-            self.objective, residual, regions, int(mask.sum()), sigmas=_SIGMAS, backend=backend
-        )
+        proposal = propose_gaussians(self.objective, residual, regions, int(mask.sum()), backend=backend)
         rows = mask.nonzero()[: len(proposal.means), 0]
         if region_ids is not None and proposal.region_ids is not None:
             region_ids = region_ids.index_copy(0, rows, proposal.region_ids)

@@ -19,9 +19,9 @@ from .flow import move_labels, move_points, optical_flow, sample
 def interpolate(scenes: Scene, time: float) -> Scene:
     """Return the scene at any time of a batch of scenes.
 
-    Convention: between two frames the scene has the Gaussians of both, moved along the optical flow between their renders.
-    Those of the earlier frame fade out while those of the later fade in. The label map is that of the earlier frame,
-    moved.
+    Convention: between two frames the scene has the Gaussians of both, moved along the optical flow between their
+    renders. Those of the earlier frame fade out while those of the later fade in. The label map is that of the earlier
+    frame, moved.
 
     Args:
         scenes: T frames, as :func:`fit_video` gives them.

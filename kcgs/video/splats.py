@@ -10,12 +10,10 @@ import torch
 from torch import Tensor
 
 from kcgs.fitting import FitConfig
+from kcgs.fitting.descent import DRAFT_CUTOFF
 from kcgs.functional import RegionMap, region_splat
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
-
-# weights that renders skip, unless the config skips more
-_CUTOFF = 1e-3
 
 
 class Splats(NamedTuple):
@@ -76,7 +74,7 @@ class Target:
 
     def render(self, splats: Splats) -> Tensor:
         """Render (C, H, W), with the cutoff of a draft."""
-        cutoff = max(self.config.cutoff, _CUTOFF)
+        cutoff = max(self.config.cutoff, DRAFT_CUTOFF)
         return region_splat(*splats, size=self.size, cutoff=cutoff, backend=self.config.backend)
 
     def squared_error(self, splats: Splats) -> Tensor:
