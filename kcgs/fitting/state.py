@@ -28,7 +28,10 @@ class FitState:
     num_initial: int
     """Gaussians at the start."""
     num_requested: int
-    """Gaussians that the strategies last asked for; fewer exist where fewer were of use."""
+    """Gaussians that the strategies last asked for; fewer exist where fewer were of use.
+
+    A strategy that removes Gaussians lowers it: then `Densify`, after it in the list, adds as many elsewhere.
+    """
     progress: float = 0.0
     """Share of the fit that is over: of its iterations or of its seconds, whichever is more."""
     iteration: int = 0

@@ -1,7 +1,8 @@
 """What happens to a fit besides the descent.
 
-A strategy is a frozen dataclass whose fields are its thresholds. It holds no state: whatever it counts is in the
-:class:`~kcgs.fitting.state.FitState` that it gets when it is applied.
+A strategy is a frozen dataclass whose fields are its thresholds. It holds no state: whatever it counts is a field of
+:class:`~kcgs.fitting.state.FitState`, which a checkpoint keeps. Gaussians are added and removed by ``append`` and
+``keep`` of the state's optimizer, or by :func:`~kcgs.fitting.removal.remove_gaussians`.
 """
 
 from __future__ import annotations
