@@ -19,16 +19,6 @@ BOOL = ir.DataType.BOOL
 FLOAT = ir.DataType.FLOAT
 INT32 = ir.DataType.INT32
 INT64 = ir.DataType.INT64
-# operators whose results have another type than their first operand; loops and branches return images
-_RESULT_TYPES = {
-    "Equal": BOOL,
-    "Less": BOOL,
-    "LessOrEqual": BOOL,
-    "Greater": BOOL,
-    "Shape": INT64,
-    "Loop": FLOAT,
-    "If": FLOAT,
-}
 
 Array = NDArray[np.generic]
 
@@ -47,37 +37,37 @@ class Value:
         self.dtype = dtype
 
     def __add__(self, other: Operand) -> Value:
-        return self._apply("Add", self, other)
+        return self.graph.Add(self, self._operand(other))
 
     def __sub__(self, other: Operand) -> Value:
-        return self._apply("Sub", self, other)
+        return self.graph.Sub(self, self._operand(other))
 
     def __rsub__(self, other: Operand) -> Value:
-        return self._apply("Sub", other, self)
+        return self.graph.Sub(self._operand(other), self)
 
     def __mul__(self, other: Operand) -> Value:
-        return self._apply("Mul", self, other)
+        return self.graph.Mul(self, self._operand(other))
 
     def __truediv__(self, other: Operand) -> Value:
-        return self._apply("Div", self, other)
+        return self.graph.Div(self, self._operand(other))
 
     def __rtruediv__(self, other: Operand) -> Value:
-        return self._apply("Div", other, self)
+        return self.graph.Div(self._operand(other), self)
 
     def __floordiv__(self, other: Operand) -> Value:
-        return self._apply("Div", self, other)
+        return self.graph.Div(self, self._operand(other))
 
     def __mod__(self, other: Operand) -> Value:
-        return self._apply("Mod", self, other)
+        return self.graph.Mod(self, self._operand(other))
 
     def __matmul__(self, other: Operand) -> Value:
-        return self._apply("MatMul", self, other)
+        return self.graph.MatMul(self, self._operand(other))
 
     def __neg__(self) -> Value:
-        return self._apply("Neg", self)
+        return self.graph.Neg(self)
 
     def __getitem__(self, indices: Value) -> Value:
-        return self._apply("Gather", self, indices)
+        return self.graph.Gather(self, indices)
 
     def astype(self, dtype: ir.DataType) -> Value:
         """Cast to a type."""
@@ -85,13 +75,33 @@ class Value:
             return self
         return Value(self.graph, self.graph.Cast(self, to=dtype).value, dtype)
 
-    def _apply(self, operator: str, *operands: Operand) -> Value:
-        numbers = (np.asarray(x, self.dtype.numpy()) if isinstance(x, int | float) else x for x in operands)
-        return self.graph.results(operator, 1, *numbers)[0]
+    def _operand(self, other: Operand) -> Operand:
+        """Give numbers of Python the type of this value."""
+        return np.asarray(other, self.dtype.numpy()) if isinstance(other, int | float) else other
 
 
 # what an operator takes: lists are int64, and so are Python's integers; its floats are float32
 Operand = Value | Array | np.generic | int | float | Sequence[int]
+
+
+class Operator:
+    """An operator of ONNX with one result, as a method of graphs that takes operands and attributes."""
+
+    def __init__(self, dtype: ir.DataType | None = None, *, typed_by: int = 0) -> None:
+        """Say the type of the result; None: that of the operand at position `typed_by`."""
+        self.dtype = dtype
+        self.typed_by = typed_by
+
+    def __set_name__(self, owner: type[Graph], name: str) -> None:
+        self.name = name
+
+    def __get__(self, graph: Graph, owner: type[Graph] | None = None) -> Callable[..., Value]:
+        return partial(self._apply, graph)
+
+    def _apply(self, graph: Graph, *operands: Operand, **attributes: object) -> Value:
+        values = [graph.constant(operand) for operand in operands]
+        dtype = self.dtype or values[self.typed_by].dtype
+        return graph.add_node(self.name, values, [dtype], **attributes)[0]
 
 
 class Scope(NamedTuple):
@@ -114,6 +124,54 @@ class Graph:
         >>> [node.op_type for node in model.graph.node]
         ['Mul', 'ReduceProd']
     """
+
+    # the operators that decoders use, by their names in ONNX
+    Abs = Operator()
+    Add = Operator()
+    And = Operator()
+    Cast = Operator()
+    Clip = Operator()
+    Compress = Operator()
+    Concat = Operator()
+    CumSum = Operator()
+    Div = Operator()
+    Equal = Operator(BOOL)
+    Exp = Operator()
+    Expand = Operator()
+    Flatten = Operator()
+    Gather = Operator()
+    Greater = Operator(BOOL)
+    Identity = Operator()
+    If = Operator(FLOAT)  # branches return images
+    Less = Operator(BOOL)
+    LessOrEqual = Operator(BOOL)
+    Loop = Operator(FLOAT)  # its turns return parts of an image
+    MatMul = Operator()
+    Max = Operator()
+    Min = Operator()
+    Mod = Operator()
+    Mul = Operator()
+    Neg = Operator()
+    Or = Operator()
+    Pad = Operator()
+    Pow = Operator()
+    Range = Operator()
+    Reciprocal = Operator()
+    ReduceMax = Operator()
+    ReduceMin = Operator()
+    ReduceProd = Operator()
+    ReduceSum = Operator()
+    Relu = Operator()
+    Reshape = Operator()
+    Shape = Operator(INT64)
+    Slice = Operator()
+    Sqrt = Operator()
+    Squeeze = Operator()
+    Sub = Operator()
+    ThresholdedRelu = Operator()
+    Transpose = Operator()
+    Unsqueeze = Operator()
+    Where = Operator(typed_by=1)
 
     def __init__(self) -> None:
         self._scopes = [Scope(Tape(), [], {})]  # the graph, and the bodies that are being built in it
@@ -139,45 +197,37 @@ class Graph:
             constants[key] = Value(self, tape.initializer(tensor, name=name), tensor.dtype)
         return constants[key]
 
-    def __getattr__(self, operator: str) -> Callable[..., Value]:
-        """Return a function that applies an operator of one result."""
-        if not operator[:1].isupper():
-            raise AttributeError(f"operators begin with a capital letter; got {operator}")
-        return partial(self._result, operator)
-
-    def _result(self, operator: str, *operands: Operand, **attributes: object) -> Value:
-        return self.results(operator, 1, *operands, **attributes)[0]
-
-    def results(self, operator: str, count: int, *operands: Operand, **attributes: object) -> list[Value]:
-        """Apply an operator of so many results."""
-        inputs = [self.constant(operand) for operand in operands]
+    def add_node(
+        self, operator: str, operands: Sequence[Value], dtypes: Sequence[ir.DataType], **attributes: object
+    ) -> list[Value]:
+        """Apply an operator whose results have these types."""
         results = self._scopes[-1].tape.op_multi_out(
             operator,
-            [value.value for value in inputs],
+            [operand.value for operand in operands],
             attributes,  # type: ignore[arg-type]
-            num_outputs=count,
+            num_outputs=len(dtypes),
         )
         for value in results:
             value.name = self._name("v")
         node = results[0].producer()
         assert node is not None
         node.name = ""  # names of nodes are optional, and weigh as much as the nodes
-        typed = inputs[-1] if operator == "Where" else inputs[0]
-        dtype = _RESULT_TYPES.get(operator, typed.dtype)
-        return [Value(self, value, dtype) for value in results]
+        return [Value(self, value, dtype) for value, dtype in zip(results, dtypes, strict=True)]
 
     def split(self, value: Operand, parts: int | Sequence[int], axis: int = 0) -> list[Value]:
         """Cut a value into so many equal parts, or into parts of these lengths."""
+        value = self.constant(value)
         if isinstance(parts, int):
-            return self.results("Split", parts, value, axis=axis, num_outputs=parts)
-        return self.results("Split", len(parts), value, parts, axis=axis)
+            return self.add_node("Split", [value], [value.dtype] * parts, axis=axis, num_outputs=parts)
+        return self.add_node("Split", [value, self.constant(parts)], [value.dtype] * len(parts), axis=axis)
 
     def argsort(self, numbers: Value, count: Operand, largest: int = 0) -> Value:
         """Find the `count` smallest or largest numbers, int64 indices, in order; of equal ones, the first comes first.
 
         So it finds flags, too: onnxruntime would leave Compress for every run.
         """
-        return self.results("TopK", 2, numbers.astype(INT64), count, largest=largest, axis=0)[1]
+        operands = [numbers.astype(INT64), self.constant(count)]
+        return self.add_node("TopK", operands, [INT64, INT64], largest=largest, axis=0)[1]
 
     def body(self, name: str, build: Callable[[], Sequence[Value]]) -> ir.Graph:
         """Make the graph inside a Loop or an If: what `build` adds and returns; it may use values from outside."""
