@@ -1,4 +1,4 @@
-"""Where the pixels of the output lie along one side of the scene, and which blocks they make up."""
+"""The pixels of the output along one side of the scene, and their blocks: for `blocks`, `grids` and `membership`."""
 
 from __future__ import annotations
 

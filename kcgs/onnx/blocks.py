@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from .axis import Axis
-from .entries import Stored
+from .entries import Storage
 from .graph import INT64, Value
 from .grids import CoarseGrids
 from .groups import Group, Integers
-from .membership import Membership
+from .membership import MembershipSampler
 from .packing import pack_integers
 from .tiles import Tiles
 from .weights import monomials, weigh
@@ -33,26 +33,26 @@ _SHIFT = (
 )
 
 
-class Blocks:
+class BlockRenderer:
     """Renders blocks, of rows `down` and columns `across`, group by group; what groups have in common is made once."""
 
-    def __init__(self, stored: Stored, down: Axis, across: Axis, cutoff: float) -> None:
-        self.graph = stored.graph
-        self.stored = stored
+    def __init__(self, storage: Storage, down: Axis, across: Axis, cutoff: float) -> None:
+        self.graph = storage.graph
+        self.storage = storage
         self.down = down
         self.across = across
         self.cutoff = cutoff
         self.pixels = across.side * down.side  # P
-        self.monomials = monomials(stored.graph, across.steps, down.steps)  # [6, P]
+        self.monomials = monomials(storage.graph, across.steps, down.steps)  # [6, P]
         self.shifts = self._make_shifts()
 
-    def image(self, membership: Membership | None, grids: CoarseGrids | None) -> Value:
+    def image(self, membership: MembershipSampler | None, grids: CoarseGrids | None) -> Value:
         """Render the image, (1, C, H, W); memberships are needed where any tile has several regions."""
-        g, groups, channels = self.graph, self.stored.plan.pixel_groups, self.stored.channels
-        tile = g.Unsqueeze(self.down.tile * self.stored.plan.tiles.cols, [1]) + self.across.tile
+        g, groups, channels = self.graph, self.storage.plan.pixel_groups, self.storage.channels
+        tile = g.Unsqueeze(self.down.tile * self.storage.plan.tiles.cols, [1]) + self.across.tile
         tile = g.Reshape(tile, [-1])
-        group_of_block = g.Min(self.stored.slots.group[tile].astype(INT64), len(groups))
-        slots = self.stored.slots.slot[tile].astype(INT64)
+        group_of_block = g.Min(self.storage.slots.group[tile].astype(INT64), len(groups))
+        slots = self.storage.slots.slot[tile].astype(INT64)
         order, starts, stops, index = self._sort(group_of_block, len(groups))
         rendered = []
         for number, group in enumerate(groups):
@@ -94,13 +94,13 @@ class Blocks:
         return order, begins, ends, index
 
     def _render_group(
-        self, number: int, blocks: Value, slots: Value, membership: Membership | None, grids: CoarseGrids | None
+        self, number: int, blocks: Value, slots: Value, membership: MembershipSampler | None, grids: CoarseGrids | None
     ) -> Value:
         """Render blocks (B,) of a group, (B, C, P); `slots`, (B,), are their tiles by place in the group."""
-        g, entries = self.graph, self.stored.entries[number]
+        g, entries = self.graph, self.storage.entries[number]
         group, regions = entries.group, None
         if group.regions > 1:
-            regions = pack_integers(g, _regions_of_tiles(self.stored.plan.tiles, group))
+            regions = pack_integers(g, _regions_of_tiles(self.storage.plan.tiles, group))
         colors = entries.shaped_colors(regions)
         coefficients = entries.shaped_coefficients()[slots]  # [B, L, 6]
         exponent = (self._squares if group.narrow else self._polynomial)(coefficients, blocks)
@@ -110,7 +110,7 @@ class Blocks:
         row, col = blocks // self.across.blocks, blocks % self.across.blocks
         if grids is not None:
             values = values + grids.blocks(entries, regions, slots, row, col)
-        values = g.Reshape(values, [0, group.regions, self.stored.channels, -1])
+        values = g.Reshape(values, [0, group.regions, self.storage.channels, -1])
         return g.ReduceSum(values * membership.blocks(number, slots, row, col), [1], keepdims=0)
 
     def _polynomial(self, coefficients: Value, blocks: Value) -> Value:
@@ -127,7 +127,7 @@ class Blocks:
 
     def _join(self, blocks: Value, index: Value, grids: CoarseGrids | None) -> Value:
         """Join the blocks (n, C, P), and add the coarse grids; then leave out the pixels to spare."""
-        g, down, across, channels = self.graph, self.down, self.across, self.stored.channels
+        g, down, across, channels = self.graph, self.down, self.across, self.storage.channels
         # stretches of memory: of a block's channel and column, all its rows
         stretches = g.Reshape(blocks, g.Concat([-1], down.side, axis=0))
         area = across.side * np.array([channels])

@@ -1,4 +1,4 @@
-"""Memberships in windows by the blur of labels, computed when a decoder is loaded."""
+"""Windows of soft contours: the membership of their pixels, blurred out of labels. Made for `membership`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from kcgs.functional import RegionMap
-from kcgs.kernels.membership import Membership
+from kcgs.kernels.membership import RADIUS_SIGMAS, Membership
 from kcgs.kernels.resampled import MARGIN
 from kcgs.kernels.tiles import TILE
 
@@ -92,10 +92,13 @@ def cut_windows(tiles: Tiles, ids: Integers, grid: Integers) -> Integers:
 
 
 def _kernels(g: Graph, membership: Membership) -> Value:
-    """Make the blurs of V widths from the pixels of a label window to those of a window, (V, S, side)."""
+    """Make the blurs of V widths from the pixels of a label window to those of a window, (V, S, side).
+
+    The taps are those of `kcgs.kernels.membership`, by operators, since a file that stored them would be larger.
+    """
     widths, radius = np.array(membership.levels.widths), membership.radius
     distance = np.abs(np.arange(WINDOW)[:, None] - np.arange(WINDOW + 2 * radius) + radius).astype(np.float32)
-    ends, sigma = np.ceil(4 * widths), np.maximum(widths, 1e-3)
+    ends, sigma = np.ceil(RADIUS_SIGMAS * widths), np.maximum(widths, 1e-3)
     falloff = g.Div(distance, sigma.astype(np.float32)[:, None, None])
     kernels = g.Exp(falloff * falloff * -0.5)
     return kernels * g.LessOrEqual(distance, ends.astype(np.float32)[:, None, None]).astype(FLOAT)

@@ -1,9 +1,4 @@
-"""From a scene to its decoder, in one direction.
-
-`plan` decides what is rendered where, with `tiles`, `reach` and `groups`. `entries` stores that and unfolds it, with
-`tables` and `packing`. `axis` places the pixels of the output. `blocks` renders them, with `membership` where tiles
-have several regions and `grids` where Gaussians are wide.
-"""
+"""`scene_decoder`: the graph of one scene. The package's docstring walks through its parts."""
 
 from __future__ import annotations
 
@@ -15,8 +10,8 @@ from kcgs.functional.softness import check_contours
 from kcgs.scene import Scene, check_scene
 
 from .axis import Axis, make_axis
-from .blocks import Blocks
-from .entries import store
+from .blocks import BlockRenderer
+from .entries import store_entries
 from .graph import FLOAT, INT64, Graph, Value
 from .grids import CoarseGrids
 from .membership import make_membership
@@ -73,18 +68,18 @@ def scene_decoder(
 
     g = Graph()
     down, across, visible = _inputs(g, scene, interactive)
-    stored = store(g, plan, visible)
-    blocks = Blocks(stored, down, across, cutoff)
-    membership = None if regions is None else make_membership(stored, regions, down, across, crisp)
-    grids = None if stored.table is None else CoarseGrids(stored, stored.table, down, across, cutoff)
+    storage = store_entries(g, plan, visible)
+    blocks = BlockRenderer(storage, down, across, cutoff)
+    membership = None if regions is None else make_membership(storage, regions, down, across, crisp)
+    grids = None if storage.table is None else CoarseGrids(storage, storage.table, down, across, cutoff)
     image = _shrink(g, blocks.image(membership, grids), down, across)
     if clamp:
         image = g.Clip(image, 0.0, 1.0)
     return g.close(
         image,
         "image",
-        [1, stored.channels, "height", "width"],
-        image_doc(stored.channels, clamp),
+        [1, storage.channels, "height", "width"],
+        image_doc(storage.channels, clamp),
         graph_doc=f"Renders one image at any size: {scene.num_gaussians} Gaussians of a kcgs scene.",
         metadata=scene_metadata(scene, cutoff=cutoff, clamp=clamp, crisp=crisp),
     )

@@ -1,4 +1,4 @@
-"""The lists of Gaussians of all tiles, unfolded from what is stored: once, when the decoder is loaded."""
+"""The lists of Gaussians of all tiles, which `blocks` and `grids` render: stored, and unfolded at loading."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kcgs.kernels.whitened import Z_LIMIT
 from .graph import FLOAT, Graph, Value
 from .groups import Group
 from .packing import pack_flags, pack_integers, pack_runs, pack_sparse
-from .plan import Plan
+from .plan import DecoderPlan
 from .tables import NodeTable, Slots, argsort, make_node_table, make_slots
 
 _ROOT = math.sqrt(0.5)
@@ -52,11 +52,11 @@ class Entries(NamedTuple):
         return self.graph.Reshape(values, [len(self.group.tiles), self.group.longest, width])
 
 
-class Stored(NamedTuple):
+class Storage(NamedTuple):
     """All that a graph stores of the Gaussians."""
 
     graph: Graph
-    plan: Plan
+    plan: DecoderPlan
     slots: Slots
     table: NodeTable | None  # None: no coarser grids
     entries: list[Entries]  # of each group
@@ -68,13 +68,13 @@ class Stored(NamedTuple):
         return int(self.plan.gaussians.colors.shape[1])
 
 
-def store(g: Graph, plan: Plan, visible: Value | None) -> Stored:
+def store_entries(g: Graph, plan: DecoderPlan, visible: Value | None) -> Storage:
     """Store the Gaussians of a plan, and unfold the lists of all groups at once: every operator takes time to load."""
     slots = make_slots(g, plan)
     table = None if plan.nodes is None else make_node_table(g, plan.nodes)
-    stored = Stored(g, plan, slots, table, [], visible)
+    storage = Storage(g, plan, slots, table, [], visible)
     if not plan.groups:
-        return stored
+        return storage
     groups, gaussians = plan.groups, plan.gaussians
     sizes = [len(group.tiles) * group.longest for group in groups]
     begins = [np.arange(size) % group.longest == 0 for size, group in zip(sizes, groups, strict=True)]
@@ -89,11 +89,11 @@ def store(g: Graph, plan: Plan, visible: Value | None) -> Stored:
         coefficients = (squares if group.narrow else polynomials)[number]
         factors = None if group.nodes else visible  # coarse grids are made when the decoder is loaded
         values = slots.tiles[number], coefficients, colors[number], regions[number], factors
-        stored.entries.append(Entries(g, group, stored.channels, *values))
-    return stored
+        storage.entries.append(Entries(g, group, storage.channels, *values))
+    return storage
 
 
-def _list_gaussians(g: Graph, plan: Plan, slots: Slots, tile: Value, count: int) -> tuple[Value, Value]:
+def _list_gaussians(g: Graph, plan: DecoderPlan, slots: Slots, tile: Value, count: int) -> tuple[Value, Value]:
     """Which Gaussian each of `count` entries is, (P,), and 1, or 0 where it only fills a list up, (P, 1)."""
     lengths = pack_integers(g, np.concatenate([group.lengths for group in plan.groups]))
     longest = pack_runs(g, np.concatenate([np.full(len(group.tiles), group.longest) for group in plan.groups]))
@@ -105,7 +105,7 @@ def _list_gaussians(g: Graph, plan: Plan, slots: Slots, tile: Value, count: int)
     return _sorted_pairs(g, plan, slots)[pair], mask
 
 
-def _sorted_pairs(g: Graph, plan: Plan, slots: Slots) -> Value:
+def _sorted_pairs(g: Graph, plan: DecoderPlan, slots: Slots) -> Value:
     """Which Gaussian each pair of Gaussian and tile is of, sorted by the tile's rank, then by Gaussian.
 
     They are stored the other way, Gaussian by Gaussian: its first tile, and how many tiles lie between one and the
@@ -125,7 +125,7 @@ def _sorted_pairs(g: Graph, plan: Plan, slots: Slots) -> Value:
 
 
 def _whiten(
-    g: Graph, plan: Plan, slots: Slots, table: NodeTable | None, ids: Value, tile: Value
+    g: Graph, plan: DecoderPlan, slots: Slots, table: NodeTable | None, ids: Value, tile: Value
 ) -> tuple[Value, Value]:
     """Coefficients of all entries, (P, 6): of 1, x, y in whitened coordinates, and of their polynomial log w.
 
@@ -148,7 +148,7 @@ def _whiten(
     return squares, terms * np.array([-1, -2, -2, -1, -2, -1], np.float32)
 
 
-def _places(g: Graph, plan: Plan, table: NodeTable | None) -> Value:
+def _places(g: Graph, plan: DecoderPlan, table: NodeTable | None) -> Value:
     """Columns and rows of tiles, and of blocks of nodes, (n, 2)."""
     tiles = plan.tiles
     tile = g.Range(np.int32(0), np.int32(len(tiles.regions)), np.int32(1))

@@ -11,7 +11,7 @@ import numpy as np
 from kcgs.kernels.tiles import TILE
 
 from .axis import NODES, Axis
-from .entries import Entries, Stored
+from .entries import Entries, Storage
 from .graph import FLOAT, INT32, Value
 from .packing import pack_runs
 from .tables import NodeTable
@@ -26,9 +26,9 @@ _REFINE = ((4, 4, 0), (1, 6, 1))
 class CoarseGrids:
     """Samples the nodes at the pixels of blocks, whose rows and columns are `down` and `across`."""
 
-    def __init__(self, stored: Stored, table: NodeTable, down: Axis, across: Axis, cutoff: float) -> None:
-        self.graph = stored.graph
-        self.stored = stored
+    def __init__(self, storage: Storage, table: NodeTable, down: Axis, across: Axis, cutoff: float) -> None:
+        self.graph = storage.graph
+        self.storage = storage
         self.table = table
         self.down = down
         self.across = across
@@ -38,7 +38,7 @@ class CoarseGrids:
 
     def image(self) -> Value:
         """Sample tiles of one region, (blocks, C, side, width); the others are zero."""
-        g, tiles, channels = self.graph, self.stored.plan.tiles, self.stored.channels
+        g, tiles, channels = self.graph, self.storage.plan.tiles, self.storage.channels
         none = self.table.nodes.no_region
         of_tile = [none if number in tiles.windows else present[0] for number, present in enumerate(tiles.regions)]
         region = pack_runs(g, np.array(of_tile))
@@ -55,11 +55,11 @@ class CoarseGrids:
         return g.Unsqueeze(self.down_spline, [1]) @ columns
 
     def blocks(self, entries: Entries, regions: Value, slots: Value, row: Value, col: Value) -> Value:
-        """Sample blocks (B,) of tiles with several regions, (T, K), to (B, K * C, P), as `Membership.blocks` does."""
+        """Sample blocks (B,) of tiles with several regions, (T, K), to (B, K * C, P), column by column."""
         g, group = self.graph, entries.group
         tile = g.Reshape(g.Expand(g.Unsqueeze(entries.tiles, [1]), g.Shape(regions)), [-1])
         region = g.Min(g.Reshape(regions, [-1]), np.int32(self.table.nodes.no_region))
-        count = group.regions * self.stored.channels
+        count = group.regions * self.storage.channels
         values = g.Reshape(self._window(region, tile), [len(group.tiles), count * NODES, NODES])
         rows = values[slots] @ g.Transpose(self.down_spline, perm=[0, 2, 1])[row]
         rows = g.Reshape(rows, g.Concat([0, count, NODES], self.down.side, axis=0))
@@ -68,21 +68,21 @@ class CoarseGrids:
 
     def _window(self, region: Value, tile: Value) -> Value:
         """Return the nodes that tiles (n,) read, (n, C, column, row); those of hidden regions are zero."""
-        g, cols = self.graph, self.stored.plan.tiles.cols
+        g, cols = self.graph, self.storage.plan.tiles.cols
         quarters = self._find_quarters(np.int32(0), region, tile // cols, tile % cols)
         nodes = self._join(self.quarters, quarters, 0)
         nodes = g.Slice(nodes, [0, 0], [NODES, NODES], [2, 3])
-        if self.stored.visible is None:
+        if self.storage.visible is None:
             return nodes
-        factors = g.Concat(self.stored.visible, np.zeros(1, np.float32), axis=0)
+        factors = g.Concat(self.storage.visible, np.zeros(1, np.float32), axis=0)
         return nodes * g.Unsqueeze(factors[region], [1, 2, 3])
 
     def _evaluate(self, cutoff: float) -> Value:
         """Evaluate the Gaussians of every block at its nodes, (n, C, 256)."""
-        g, plan, channels = self.graph, self.stored.plan, self.stored.channels
+        g, plan, channels = self.graph, self.storage.plan, self.storage.channels
         steps = g.constant(np.arange(TILE, dtype=np.float32) - np.float32((TILE - 1) / 2))
         at_nodes = monomials(g, steps, steps)
-        entries = [part for part in self.stored.entries if part.group.nodes]
+        entries = [part for part in self.storage.entries if part.group.nodes]
         values = []
         for part in entries:
             weights = weigh(g, part.shaped_coefficients() @ at_nodes, cutoff)
@@ -90,14 +90,14 @@ class CoarseGrids:
         # the last is for blocks that are only refined
         values.append(g.Expand(np.float32(0), [1, channels, TILE * TILE]))
         first = len(plan.tiles.regions)
-        rank = g.Slice(self.stored.slots.rank, [first], [plan.num_blocks])
+        rank = g.Slice(self.storage.slots.rank, [first], [plan.num_blocks])
         tiles = sum(len(group.tiles) for group in plan.pixel_groups)
         last = sum(len(part.group.tiles) for part in entries)
         return g.Concat(*values, axis=0)[g.Min(rank - tiles, np.int32(last))]
 
     def _refine(self, values: Value) -> Value:
         """Add to each grid what the next coarser one says there; return the quarters of the finest one's blocks."""
-        g, channels, table = self.graph, self.stored.channels, self.table
+        g, channels, table = self.graph, self.storage.channels, self.table
         counts = np.bincount(table.nodes.place[:, 0]).tolist()
         ids = self._find_quarters(table.level + 1, table.region, table.row, table.col)
         grids, coarser = g.split(values, counts), g.split(ids, counts)
@@ -141,4 +141,4 @@ class CoarseGrids:
         last = g.Shape(quarters, end=1).astype(INT32) - 1
         place = g.Min(ids - 4 * first, last)
         joined = g.Transpose(quarters[place], perm=[0, 3, 2, 4, 1, 5])
-        return g.Reshape(joined, [0, self.stored.channels, TILE, TILE])
+        return g.Reshape(joined, [0, self.storage.channels, TILE, TILE])

@@ -1,4 +1,4 @@
-"""Tiles in groups whose lists of Gaussians are of similar length: those of a group are rendered at once."""
+"""Groups of tiles, for `plan`: their lists of Gaussians are of similar length, and they are rendered at once."""
 
 from __future__ import annotations
 

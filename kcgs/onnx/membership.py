@@ -1,4 +1,4 @@
-"""Memberships of the pixels of blocks, sampled from the windows of tiles with several regions."""
+"""The membership of a block's pixels, sampled from the window of its tile: a factor that `blocks` multiplies."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kcgs.kernels.resampled import TINY
 
 from .axis import Axis
 from .blur import BlurredWindows, CrispWindows, cut_windows
-from .entries import Stored
+from .entries import Storage
 from .graph import FLOAT, Graph, Value
 from .windows import HardWindows, WideWindows, pack_windows, split_groups, tile_ids
 
@@ -21,14 +21,16 @@ _FARTHEST = 16
 _WIDTH_STEPS = 1 << 14
 
 
-def make_membership(stored: Stored, regions: RegionMap, down: Axis, across: Axis, crisp: bool) -> Membership | None:
+def make_membership(
+    storage: Storage, regions: RegionMap, down: Axis, across: Axis, crisp: bool
+) -> MembershipSampler | None:
     """Store the windows of a map; None where no tile has several regions.
 
     Samples lose the blur of pixels, as :class:`kcgs.kernels.Resampled` has it, or with `crisp`, of labels that are
     blurred by the width of one, make contours as narrow as :class:`kcgs.kernels.Crisp` has them.
     """
-    g, tiles, membership = stored.graph, stored.plan.tiles, regions.tables.membership
-    groups = {number: group for number, group in enumerate(stored.plan.groups) if group.regions > 1}
+    g, tiles, membership = storage.graph, storage.plan.tiles, regions.tables.membership
+    groups = {number: group for number, group in enumerate(storage.plan.groups) if group.regions > 1}
     if not groups:
         return None
     soft = regions.softness != 0.0
@@ -37,10 +39,10 @@ def make_membership(stored: Stored, regions: RegionMap, down: Axis, across: Axis
     pixel = down.step * across.step  # area of one of the output, in pixels of the scene
     q = g.Relu(1 - pixel)  # as the formula of `Resampled` has it
     if not soft:
-        return Membership(g, rows, columns, HardWindows(g, tiles, groups))
+        return MembershipSampler(g, rows, columns, HardWindows(g, tiles, groups))
     if crisp:
         exponent = g.Max(2 / g.Sqrt(pixel), 1.0)
-        return SoftMembership(g, rows, columns, CrispWindows(g, regions, tiles, groups), exponent)
+        return SoftSampler(g, rows, columns, CrispWindows(g, regions, tiles, groups), exponent)
     widths, level = membership.levels
     variance = np.array([widths[0] ** 2], np.float32)
     uniform = _sharpness(g, g.constant(variance), q) if level is None else None  # exponent of a map of one width
@@ -48,14 +50,14 @@ def make_membership(stored: Stored, regions: RegionMap, down: Axis, across: Axis
     blurred = None if wide else BlurredWindows(g, regions, tiles, groups)
     windows = blurred or WideWindows(g, tiles, groups)
     if uniform is not None:
-        return SoftMembership(g, rows, columns, windows, uniform)
+        return SoftSampler(g, rows, columns, windows, uniform)
     if blurred is not None and blurred.levels is not None:
         squares = g.constant(np.array(widths, np.float32) ** 2)[blurred.levels]
     else:
         steps = np.round(np.sqrt(membership.variances[0].cpu().numpy()) * _WIDTH_STEPS)
         width = pack_windows(g, cut_windows(tiles, tile_ids(groups), steps)).astype(FLOAT) * (1 / _WIDTH_STEPS)
         squares = width * width
-    return PairMembership(g, rows, columns, windows, split_groups(g, groups, squares), q)
+    return PairSampler(g, rows, columns, windows, split_groups(g, groups, squares), q)
 
 
 class Windows(Protocol):
@@ -65,7 +67,7 @@ class Windows(Protocol):
         """Unfold the windows of a group, (T, K, S, S)."""
 
 
-class Membership:
+class MembershipSampler:
     """Memberships in a map of hard contours: a pixel is of the region with the largest sample.
 
     `down` and `across` are bilinear weights of windows at the pixels of blocks, (blocks, S, side), (blocks, side, S).
@@ -92,7 +94,7 @@ class Membership:
         return self.graph.Equal(samples, self.graph.ReduceMax(samples, [1], keepdims=1)).astype(FLOAT)
 
 
-class SoftMembership(Membership):
+class SoftSampler(MembershipSampler):
     """Memberships in a map of one width: samples to a power, which takes the blur of pixels away, or more of it."""
 
     def __init__(self, g: Graph, down: Value, across: Value, windows: Windows, exponent: Value) -> None:
@@ -103,7 +105,7 @@ class SoftMembership(Membership):
         return _sharpen(self.graph, samples, self.exponent)
 
 
-class PairMembership(Membership):
+class PairSampler(MembershipSampler):
     """Memberships in a map whose pairs of regions have widths of their own: exponents are sampled, too."""
 
     def __init__(
@@ -121,7 +123,7 @@ class PairMembership(Membership):
 
 
 def _sharpness(g: Graph, variance: Value, q: Value) -> Value:
-    """Evaluate `kcgs.kernels.resampled.sharpness`, which is 1 where q is 0."""
+    """Evaluate `kcgs.kernels.resampled.sharpness` by operators, since q is known only when the graph runs."""
     variance = g.Max(variance, TINY)
     interpolated = variance + q * (1 / 6)
     contour = g.Max(variance - q * (1 / 12), q * (1 / 24))

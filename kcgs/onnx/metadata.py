@@ -1,4 +1,4 @@
-"""What a decoder says of itself: the metadata of its file, and the doc string of its image."""
+"""The metadata of a decoder, and the doc string of its image: written by both decoders, read by `describe_decoder`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Integer constants in few bytes, and the operators that unfold them to int32 when a decoder is loaded."""
+"""Integer constants in few bytes, and the operators that unfold them to int32 at loading. All modules store by it."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ _FAINT = 1e-5
 Floats = NDArray[np.float32]
 
 
-class Gaussians(NamedTuple):
+class GaussianTable(NamedTuple):
     """The Gaussians that reach a pixel; those of coarser grids in units of their nodes."""
 
     means: Floats  # [N, 2]
@@ -40,7 +40,7 @@ class Gaussians(NamedTuple):
     region: Integers  # [N], position in the map
 
 
-class Nodes(NamedTuple):
+class NodeBlocks(NamedTuple):
     """The blocks of coarser grids where anything is, and the table of all that there may be."""
 
     place: Integers  # [n, 4] level - 1, region, row and column, ascending
@@ -52,14 +52,14 @@ class Nodes(NamedTuple):
         return self.shape[1] - 1
 
 
-class Plan(NamedTuple):
+class DecoderPlan(NamedTuple):
     """All that a decoder stores."""
 
     tiles: Tiles
-    gaussians: Gaussians
+    gaussians: GaussianTable
     groups: list[Group]  # those of nodes last
     pairs: Integers  # [2, P] Gaussian and tile of every entry, in this order
-    nodes: Nodes | None  # None: no coarser grids
+    nodes: NodeBlocks | None  # None: no coarser grids
 
     @property
     def num_blocks(self) -> int:
@@ -72,7 +72,7 @@ class Plan(NamedTuple):
         return [group for group in self.groups if not group.nodes]
 
 
-def plan_decoder(field: GaussianField, regions: RegionMap | None, cutoff: float) -> Plan:
+def plan_decoder(field: GaussianField, regions: RegionMap | None, cutoff: float) -> DecoderPlan:
     """Find what is rendered where, and group it."""
     tiles = find_tiles(regions, field.size)
     num_regions = 1 if regions is None else regions.num_regions
@@ -91,11 +91,11 @@ def plan_decoder(field: GaussianField, regions: RegionMap | None, cutoff: float)
     entry = entry[gaussian]
     merged = field.merged_colors().detach().double().cpu() * coarsened.factor[:, None]
     means, cholesky, colors = (t[ids].float().numpy() for t in (coarsened.means, coarsened.cholesky, merged))
-    gaussians = Gaussians(means, cholesky, colors, region[ids].numpy())
+    gaussians = GaussianTable(means, cholesky, colors, region[ids].numpy())
     narrow = _is_narrow(gaussians.cholesky, _NARROW if cutoff >= _FAINT else _NARROW_OF_FAINT)
     pairs = torch.stack([entry, tile])[:, torch.argsort(entry * len(number) + tile)].numpy()
     groups = group_tiles(pairs, narrow, tiles, 0 if nodes is None else len(nodes.place))
-    return Plan(tiles, gaussians, groups, pairs, nodes)
+    return DecoderPlan(tiles, gaussians, groups, pairs, nodes)
 
 
 def _pair(
@@ -112,7 +112,7 @@ def _pair(
     return coarse, *pair_with_blocks(coarse, region, num_regions, blocks, cutoff)
 
 
-def _number_blocks(blocks: Blocks, num_regions: int, tiles: Tiles, block: Tensor) -> tuple[Nodes | None, Tensor]:
+def _number_blocks(blocks: Blocks, num_regions: int, tiles: Tiles, block: Tensor) -> tuple[NodeBlocks | None, Tensor]:
     """Return the blocks of nodes where anything is, and the numbers of all blocks."""
     number = blocks.keys // num_regions
     is_needed = torch.zeros(len(number) + 1, dtype=torch.bool)
@@ -129,7 +129,7 @@ def _number_blocks(blocks: Blocks, num_regions: int, tiles: Tiles, block: Tensor
     order = np.lexsort(place.T[::-1])
     number[ids[order]] = len(tiles.regions) + torch.arange(len(place))
     shape = (int(level.max()) + 2, num_regions + 1, tiles.rows // 2 + 1, tiles.cols // 2 + 1)
-    return Nodes(place[order], shape), number
+    return NodeBlocks(place[order], shape), number
 
 
 def _in_raster_order(coarsened: Coarsened, ids: Tensor) -> Tensor:

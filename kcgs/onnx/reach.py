@@ -1,4 +1,4 @@
-"""Which Gaussian reaches which block: tiles of pixels, or, where it is wide, blocks of nodes of a coarser grid."""
+"""Pairs of a Gaussian and a block that it reaches, for `plan`: a tile of pixels or, if wide, a block of nodes."""
 
 from __future__ import annotations
 

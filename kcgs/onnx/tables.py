@@ -1,4 +1,4 @@
-"""Tables of a graph: where each tile is rendered, and which blocks of nodes there are."""
+"""Tables that `entries` makes: the group and place that each tile is rendered at, and the blocks of nodes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from .graph import INT32, Graph, Value
 from .packing import pack_flags, pack_integers
-from .plan import Nodes, Plan
+from .plan import DecoderPlan, NodeBlocks
 
 
 class Slots(NamedTuple):
@@ -20,7 +20,7 @@ class Slots(NamedTuple):
     tiles: list[Value]  # of each group, (T,)
 
 
-def make_slots(g: Graph, plan: Plan) -> Slots:
+def make_slots(g: Graph, plan: DecoderPlan) -> Slots:
     """Sort tiles and blocks of nodes by group."""
     groups = plan.groups
     group_of = np.full(plan.num_blocks, len(groups))
@@ -38,7 +38,7 @@ def make_slots(g: Graph, plan: Plan) -> Slots:
 class NodeTable(NamedTuple):
     """The n blocks of nodes, int32, and which of them lies where."""
 
-    nodes: Nodes
+    nodes: NodeBlocks
     block: Value  # of each level, region, row and column; n, a block of zeros, where there is none
     level: Value  # (n,), from 0 for the finest grid
     region: Value  # (n,)
@@ -46,7 +46,7 @@ class NodeTable(NamedTuple):
     col: Value  # (n,)
 
 
-def make_node_table(g: Graph, nodes: Nodes) -> NodeTable:
+def make_node_table(g: Graph, nodes: NodeBlocks) -> NodeTable:
     """Store the blocks of nodes as flags, and unfold them."""
     count = len(nodes.place)
     flags = np.zeros(nodes.shape, np.bool_)

@@ -1,4 +1,4 @@
-"""The tiles of a scene: which regions each has, and how their labels or memberships lie around it."""
+"""The tiles of a scene, for `plan`: the regions of each, and the labels or memberships of the pixels around it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Weights of Gaussians: the monomials of their polynomials in the pixel, and the exponential with its cutoff."""
+"""Weights of Gaussians for `blocks`, `grids` and `generic`: monomials of the pixel, the exponential, its cutoff."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Memberships in windows, a tile and the pixels around it: of hard contours, and of contours too wide to be blurred."""
+"""Windows, tiles and the pixels around them, of hard contours and of very wide ones. Made for `membership`."""
 
 from __future__ import annotations
 
