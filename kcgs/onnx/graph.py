@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import onnx
 import onnx_ir as ir
+import onnx_ir.passes.common as passes
 from numpy.typing import NDArray
 from onnx_ir.tape import Tape
 
@@ -251,6 +252,7 @@ class Graph:
         graph.doc_string = graph_doc
         model = ir.Model(graph, ir_version=_IR_VERSION, producer_name="kcgs")
         model.metadata_props.update(metadata or {})
+        passes.RemoveUnusedNodesPass()(model)  # modules make what only some scenes need, such as sums of squares
         proto = ir.to_proto(model)
         onnx.checker.check_model(proto, full_check=True)
         return proto

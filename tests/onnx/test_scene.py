@@ -257,8 +257,8 @@ class TestInteractive:
 
 class TestModel:
     @pytest.mark.parametrize("interactive", [False, True])
-    def test_every_constant_is_read(self, interactive: bool) -> None:
-        """The runtime says so of others, at every load."""
+    def test_every_constant_and_result_is_read(self, interactive: bool) -> None:
+        """The runtime warns of others, at every load."""
         graphs = [scene_decoder(with_regions("soft", 40, SIZE, 4), interactive=interactive).graph]
         read: set[str] = set()
         stored: set[str] = set()
@@ -267,6 +267,7 @@ class TestModel:
             read |= {name for node in graph.node for name in node.input} | {value.name for value in graph.output}
             graphs += [attribute.g for node in graph.node for attribute in node.attribute if attribute.HasField("g")]
         assert stored and stored <= read
+        assert all(read & {*node.output} for graph in graphs for node in graph.node)
 
     @pytest.mark.parametrize(
         ("kind", "options", "contours"),
