@@ -37,13 +37,13 @@ def check_floating(
         raise InvalidArgumentType(name, "a real floating dtype", tensor.dtype, verb="have")
     if last is not None and (tensor.ndim == 0 or tensor.shape[-1] != last):
         raise InvalidArgument(name, f"shape (..., {last})", tuple(tensor.shape), verb="have")
-    if finite and not holds(torch.isfinite(tensor).all(), f"{name} must be finite"):
+    if finite and not verify(torch.isfinite(tensor).all(), f"{name} must be finite"):
         raise InvalidArgument(name, "finite", f"{int((~torch.isfinite(tensor)).sum())} NaN or infinite values")
     return tensor
 
 
-def holds(condition: Tensor, message: str) -> bool:
-    """Return whether a condition on values holds; in a graph and on CUDA, assert it without a host sync instead."""
+def verify(condition: Tensor, message: str) -> bool:
+    """Return whether `condition` is true; in a graph and on CUDA, True, and an assertion without a host sync."""
     try:
         torch._assert_async(condition, message)
     except RuntimeError:
@@ -81,7 +81,7 @@ def check_ids(name: str, value: object, means: Tensor, values: bool = True) -> T
     if tensor.device != means.device:
         raise InvalidArgument(name, f"on {means.device} with means", tensor.device)
     tensor = tensor.long()
-    if values and not holds((tensor >= 0).all(), f"{name} must be non-negative"):
+    if values and not verify((tensor >= 0).all(), f"{name} must be non-negative"):
         raise InvalidArgument(name, "non-negative", int(tensor.min()))
     return tensor
 
@@ -152,7 +152,7 @@ def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values:
     if tensor.numel() == 0:
         raise InvalidArgument(name, "at least one pixel", f"shape {tuple(tensor.shape)}", verb="have")
     tensor = tensor.long()
-    if values and not holds(tensor.min() >= 0, f"{name} must hold non-negative ids"):
+    if values and not verify(tensor.min() >= 0, f"{name} must hold non-negative ids"):
         raise InvalidArgument(name, "non-negative ids", int(tensor.min()), verb="hold")
     return tensor
 

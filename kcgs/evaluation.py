@@ -13,6 +13,7 @@ from torch import Tensor
 from kcgs._image import as_image
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, ef_psnr, ef_ssim, ms_ssim, psnr, ssim
+from kcgs.functional.regions import as_region_map
 from kcgs.scene import Scene, check_scene
 
 
@@ -49,7 +50,7 @@ def evaluate(
     render, target = check_scene(scene).render(), as_image("image", image)
     if tuple(target.shape) != tuple(render.shape):
         raise InvalidArgument("image", f"the scene's shape {tuple(render.shape)}", tuple(target.shape), verb="have")
-    regions = scene.regions if labels is None else RegionMap.coerce(labels, "labels")
+    regions = scene.regions if labels is None else as_region_map(labels, "labels")
     metrics = _compare(render, target.to(render.device), None if regions is None else regions.labels)
     return {**metrics, "ssimulacra2": ssimulacra2(render, target)} if visual else metrics
 

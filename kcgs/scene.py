@@ -19,6 +19,7 @@ from kcgs._repr import png, shorten
 from kcgs._suffixes import SCENE_FORMATS
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
+from kcgs.functional.regions import as_region_map
 from kcgs.functional.softness import CONTOURS, check_contours
 from kcgs.nn import GaussianField, RegionSplatRenderer
 from kcgs.nn.renderer import rendered_size
@@ -66,7 +67,7 @@ class Scene(nn.Module):
         if not isinstance(field, GaussianField):
             raise TypeError(f"field must be a GaussianField; got {type(field).__name__}")
         self.field = field
-        self.regions = _check_regions(field, RegionMap.coerce(regions))
+        self.regions = _check_regions(field, as_region_map(regions))
         self.metadata = _check_metadata(metadata)
 
     @property

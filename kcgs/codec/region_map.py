@@ -25,7 +25,7 @@ _GROUP = 32  # pairs that are coded before their model learns
 
 def encode_region_map(regions: RegionMap) -> bytes:
     """Write a map of two regions or more; softness is rounded to fortieths of a pixel."""
-    if regions.resized:
+    if regions.is_resampled:
         raise ValueError("regions must be a map of its own pixels; got one that was resized")
     check_count("number of labels", regions.labels.numel(), 1, MAX_LABELS)
     check_count("number of regions", regions.num_regions, 1, MAX_REGIONS)

@@ -43,7 +43,7 @@ def select_removable_regions(scene: Scene, region_ids: object) -> Selection:
         advice = "scene[t] is one of them, and kcgs.video edits regions in all of them"
         raise InvalidArgument("scene", "of one image", f"a batch of {len(scene.field.means)}: {advice}")
     selection = select_regions(scene, region_ids)
-    if selection.regions.resized:
+    if selection.regions.is_resampled:
         raise ValueError("scene must not have a resized map: edit the map at its own size, then resize it")
     if selection.regions.num_regions == len(selection.ids):
         raise ValueError(f"region_ids must leave a region that takes over pixels; got all {len(selection.ids)} regions")

@@ -13,6 +13,7 @@ from kcgs._check import check_count
 from kcgs._image import as_image
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, edge_band
+from kcgs.functional.regions import as_region_map
 
 from .config import FitConfig
 from .objective import MsSsimObjective, make_objective
@@ -75,7 +76,7 @@ def make_problem(image: Any, regions: object, num_gaussians: object, config: Fit
 def check_image_and_regions(image: Any, regions: object) -> tuple[Tensor, RegionMap | None]:
     """Return a copy of the image, (C, H, W), that may take part in a graph, and its regions, on its device."""
     image = as_image("image", image)
-    regions = RegionMap.coerce(regions)
+    regions = as_region_map(regions)
     if regions is not None:
         if regions.num_maps == 1:
             regions = regions.image(0)

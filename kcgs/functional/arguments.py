@@ -32,6 +32,6 @@ class Arguments(NamedTuple):
         return self.height, self.width
 
     @property
-    def map(self) -> MapOperands | None:
+    def map_operands(self) -> MapOperands | None:
         """The map at the size of the image; None: one region covers everything."""
         return None if self.labels is None else MapOperands(self.labels, self.softness, self.size)

@@ -9,13 +9,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcgs._check import check_floating, holds
+from kcgs._check import check_floating, verify
 
 
 def check_cholesky(name: str, value: object) -> Tensor:
     """Return `value` if it is a finite (..., 3) tensor with positive l11 and l22."""
     cholesky = check_floating(name, value, last=3)
-    if not holds((cholesky[..., ::2] > 0).all(), f"{name} must have l11 > 0 and l22 > 0"):
+    if not verify((cholesky[..., ::2] > 0).all(), f"{name} must have l11 > 0 and l22 > 0"):
         raise ValueError(f"{name} must have l11 > 0 and l22 > 0; got a least of {float(cholesky[..., ::2].min()):g}")
     return cholesky
 

@@ -55,7 +55,7 @@ def decompose(*operands: Any) -> Tensor:
     # not -(-height // _SIDE): division of integers rounds to zero in ONNX
     down, across = (height + _SIDE - 1) // _SIDE, (width + _SIDE - 1) // _SIDE
     counts = torch.stack([torch.full((), n, dtype=torch.int64, device=device) for n in (down, across, count)])
-    windows = None if arguments.map is None else MapWindows(arguments.map, _SIDE, means.dtype)
+    windows = None if arguments.map_operands is None else MapWindows(arguments.map_operands, _SIDE, means.dtype)
 
     def render_tile(carry: Tensor, number: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor]:
         (down, across, count), columns, rows, ids = tensors[0].unbind(), *tensors[1:4]
@@ -117,7 +117,7 @@ def _sum_regions(
     start = torch.zeros_like(gaussians.num_gaussians), black, torch.zeros_like(black[:1])
     loop = torch.ops.higher_order.while_loop
     _, total, weight = loop(has_region, add_region, start, (near, ids, *gaussians, *window))
-    image: Tensor = total / weight if windows.soft and windows.resized else total
+    image: Tensor = total / weight if windows.soft and windows.is_resized else total
     return image
 
 

@@ -95,10 +95,10 @@ def _image_with_graph(arguments: Arguments) -> tuple[Tensor, list[Tensor]]:
 def _prepare(arguments: Arguments, check: bool) -> tuple[SplatInputs, Steps]:
     """Return the inputs of the kernel, and the kernel."""
     region_index = membership = None
-    if arguments.map is not None and arguments.region_ids is not None:
-        tables = tables_at(arguments.map)
+    if arguments.map_operands is not None and arguments.region_ids is not None:
+        tables = tables_at(arguments.map_operands)
         region_index = tables.index_of(torch.atleast_2d(arguments.region_ids))
-        # on CUDA nothing waits for the answer
+        # not read on CUDA: that would be a device synchronisation
         known = region_index.device.type == "cpu" and int(region_index.numpy().min(initial=0)) >= 0
         if check and not known:
             check_region_ids(arguments.region_ids, region_index, tables.complete)

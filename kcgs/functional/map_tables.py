@@ -1,4 +1,4 @@
-"""What rendering derives from a label map at one size, cached on the tensor of labels that a RegionMap owns."""
+"""What rendering derives from a label map at one size."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kcgs.kernels import Crisp, Membership, Resampled
 from .labels import compact, sample_labels
 from .softness import CRISP_SOFTNESS, PairSoftness, check_softness, is_crisp, scaled_softness, softness_of
 
-_CACHED_SIZES = 4  # of a map, its own among them: a viewer renders at ever new sizes
+_CACHED_VIEWS = 3  # of a map: a viewer renders at ever new sizes
 
 
 class MapOperands(NamedTuple):
@@ -50,22 +50,56 @@ class MapTables(NamedTuple):
         return self.positions[(region_ids.long() + 1).clamp(0, len(self.positions) - 1)]
 
 
+class TableCache:
+    """The tables of one map: at its own size, and of the views added last, which are other sizes or crisp contours.
+
+    It is an attribute of the labels that a RegionMap owns, since the operator receives these and not the map.
+    """
+
+    def __init__(self, original: MapTables) -> None:
+        self.original = original
+        self._views: dict[tuple[tuple[int, int], bool], MapTables] = {}
+
+    @staticmethod
+    def of(labels: Tensor) -> TableCache | None:
+        """Return the cache of labels that a RegionMap owns; None: of others, which their owner may write to."""
+        return getattr(labels, "kcgs_tables", None)
+
+    def attach(self, labels: Any) -> None:
+        """Make this the cache of labels."""
+        labels.kcgs_tables = self
+
+    def view(self, size: tuple[int, int], crisp: bool) -> MapTables | None:
+        """Return the tables of a view."""
+        return self._views.get((size, crisp))
+
+    def add(self, size: tuple[int, int], crisp: bool, tables: MapTables) -> None:
+        """Add a view, in place of the oldest where there are too many."""
+        # a new dict: another thread may read the present one
+        self._views = dict([*self._views.items(), ((size, crisp), tables)][-_CACHED_VIEWS:])
+
+
 def tables_at(operands: MapOperands) -> MapTables:
-    """Return the tables of a map at its size: those cached on its labels, or new ones."""
+    """Return the tables of a map at its size, cached where a RegionMap owns the labels."""
     labels, softness, size = operands
-    crisp, cache = is_crisp(softness), cached_tables(labels)
-    if (*size, crisp) in cache:
-        return cache[*size, crisp]
-    tables = cache.get((*labels.shape[-2:], False))
-    if tables is None:
+    crisp, cache = is_crisp(softness), TableCache.of(labels)
+    if cache is None:
         check_labels("regions", labels)
-        tables = make_tables(labels, 0.0 if crisp else softness_of(softness))
-    sharpened = crisp and len(tables.ids) > 1
-    if sharpened or size != labels.shape[-2:]:
-        tables = resample(tables, labels, size, sharpened)[1]
-    if cache:  # others than a RegionMap may write to their labels
-        cache_tables(labels, size, crisp, tables)
+        return _view(make_tables(labels, 0.0 if crisp else softness_of(softness)), operands)
+    tables = cache.view(size, crisp)
+    if tables is None:
+        tables = _view(cache.original, operands)
+        cache.add(size, crisp, tables)
     return tables
+
+
+def _view(original: MapTables, operands: MapOperands) -> MapTables:
+    """Return the tables of a map at a size for those at its own."""
+    labels, softness, size = operands
+    crisp = is_crisp(softness) and len(original.ids) > 1
+    if not crisp and size == labels.shape[-2:]:
+        return original
+    return resample(original, labels, size, crisp)[1]
 
 
 def make_tables(labels: Tensor, softness: object) -> MapTables:
@@ -92,16 +126,3 @@ def resample(tables: MapTables, labels: Tensor, size: tuple[int, int], crisp: bo
     scale = math.sqrt(size[0] * size[1] / (labels.shape[-2] * labels.shape[-1]))
     softness = CRISP_SOFTNESS if crisp else scaled_softness(tables.softness, scale)
     return sampled, tables._replace(softness=softness, membership=membership)
-
-
-def cached_tables(labels: Any) -> dict[tuple[int, int, bool], MapTables]:
-    """Return the tables cached on labels by height, width and whether contours are crisp; none but of a RegionMap."""
-    return getattr(labels, "kcgs_tables", {})
-
-
-def cache_tables(labels: Any, size: tuple[int, int], crisp: bool, tables: MapTables) -> None:
-    """Cache the tables of a map at a size on its labels, beside those of few other sizes."""
-    labels.kcgs_tables = cache = cached_tables(labels)
-    cache[*size, crisp] = tables
-    if len(cache) > _CACHED_SIZES:
-        cache.pop(list(cache)[1], None)  # not the first, the map's own; another thread may have been before

@@ -38,7 +38,7 @@ class MapWindows:
         # the nearest contour of a pixel of several regions is no farther away than this
         self.search = math.ceil(math.sqrt(2) * self.reach)
         self.halo = self.search + 1 if self.pairs else self.reach
-        self.resized = not all(is_equal(new, old) for new, old in zip(size, labels.shape[-2:], strict=True))
+        self.is_resized = not all(is_equal(new, old) for new, old in zip(size, labels.shape[-2:], strict=True))
         axis = self._soft_axis if self.soft else self._hard_axis
         down, across = (axis(size[k], labels.shape[k - 2], device) for k in (0, 1))
         self._tables_per_axis = len(down)
@@ -55,7 +55,7 @@ class MapWindows:
         count = (new + self.side - 1) // self.side
         # the last pixel is repeated past the edge
         pixels = torch.arange(count * self.side, device=device).clamp_max(new - 1)
-        if not self.resized:
+        if not self.is_resized:
             return (pixels.reshape(count, -1),)
         ends, shares = sample_places(new, length, device)
         parts = (*ends, *shares.to(self.dtype))
@@ -64,7 +64,7 @@ class MapWindows:
     def _soft_axis(self, new: int, length: int, device: torch.device) -> tuple[Tensor, ...]:
         """Return the lines of the windows of tiles, and a matrix of interpolation for each where resized."""
         count = (new + self.side - 1) // self.side
-        if not self.resized:
+        if not self.is_resized:
             return self._lines(torch.arange(count, device=device) * self.side, self.side, length)
         pixels = torch.arange(count * self.side, device=device).clamp_max(new - 1)
         # between which pixels of the map each pixel lies, and how far
@@ -101,7 +101,7 @@ class MapWindows:
             places = (first_row + rows)[:, None] * width + columns
             return labels.index_select(0, places.flatten()).reshape(places.shape)
 
-        if not self.soft and self.resized:
+        if not self.soft and self.is_resized:
             shares = torch.stack([d[:, None] * a for d in down[2:] for a in across[2:]])
             corners = torch.stack([read(rows, columns) for rows in down[:2] for columns in across[:2]])
             window = most_shared(corners, shares)
@@ -115,7 +115,7 @@ class MapWindows:
         blurs, variance = self._blurs(softness, ids, window, down[1], across[1])
         taps = torch.arange(-self.reach, self.reach + 1, device=labels.device).abs()
         operands = (window, down[1], across[1], blurs.to(self.dtype).index_select(1, taps))
-        if not self.resized:
+        if not self.is_resized:
             return ids, *operands
         sides = [n - 2 * self.halo for n in window.shape]
         variances = variance.to(self.dtype).expand(sides[0] * sides[1]).reshape(sides)

@@ -10,29 +10,36 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_legacy_batchedtensor
-from torch._functorch.utils import enable_single_level_autograd_function
-from torch.autograd import forward_ad
 
 from .arguments import Arguments
 from .evaluation import Plan, differentiate, differentiate_forward, differentiate_twice, plan_splat, render
+from .torch_internals import (
+    apply,
+    below_autograd,
+    has_mode,
+    is_batched_gradient,
+    is_forward_mode,
+    is_graph_retained,
+    is_transforming,
+    register_decomposition,
+)
 
 _ARGUMENTS = (
     "Tensor means, Tensor cholesky, Tensor colors, Tensor? region_ids, Tensor? labels, Tensor? softness, "
     "SymInt height, SymInt width, float cutoff, str backend"
 )
 _BACKWARD = f"Tensor grad, {_ARGUMENTS}, bool geometry"
-_TANGENTS = "Tensor by_means, Tensor by_cholesky, Tensor by_colors"
+_TANGENTS = "Tensor d_means, Tensor d_cholesky, Tensor d_colors"
 _LIBRARY = torch.library.Library("kcgs", "DEF")
 _LIBRARY.define(f"region_splat({_ARGUMENTS}) -> Tensor")
 _LIBRARY.define(f"region_splat_backward({_BACKWARD}) -> (Tensor, Tensor, Tensor)")
-_LIBRARY.define(f"region_splat_second({_TANGENTS}, {_BACKWARD}) -> (Tensor, Tensor, Tensor, Tensor)")
+_LIBRARY.define(f"region_splat_double_backward({_TANGENTS}, {_BACKWARD}) -> (Tensor, Tensor, Tensor, Tensor)")
 _LIBRARY.define(f"region_splat_forward({_TANGENTS}, {_ARGUMENTS}) -> Tensor")
 
 # as Python calls them
 splat_operator: Any = torch.ops.kcgs.region_splat.default
 _backward_operator: Any = torch.ops.kcgs.region_splat_backward.default
-_second_operator: Any = torch.ops.kcgs.region_splat_second.default
+_double_backward_operator: Any = torch.ops.kcgs.region_splat_double_backward.default
 _forward_operator: Any = torch.ops.kcgs.region_splat_forward.default
 
 
@@ -41,8 +48,8 @@ _forward_operator: Any = torch.ops.kcgs.region_splat_forward.default
 
 def _splat_autograd(*arguments: Any) -> Any:
     if _is_differentiated(arguments[:3]):
-        return _apply(_Splat, *arguments)
-    return _below_autograd(splat_operator, *arguments)
+        return apply(_Splat, *arguments)
+    return below_autograd(splat_operator, *arguments)
 
 
 class _Splat(torch.autograd.Function):
@@ -50,7 +57,7 @@ class _Splat(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> Tensor:
         image: Tensor
         if _is_plain(arguments[:3]):  # the plan stays on this side of the operator
-            image, ctx.plan = _below_autograd(_render_planned, Arguments(*arguments))
+            image, ctx.plan = below_autograd(_render_planned, Arguments(*arguments))
         else:
             image, ctx.plan = _unrecorded(splat_operator, *arguments), None
         ctx.save_for_backward(*arguments[:3])
@@ -71,10 +78,10 @@ class _Splat(torch.autograd.Function):
         means, cholesky, colors = ctx.needs_input_grad[:3]
         arguments, geometry = (*ctx.saved_tensors, *ctx.constants), means or cholesky
         if ctx.plan is not None and _is_plain((grad, *arguments[:3])) and not torch.is_grad_enabled():
-            gradients = _below_autograd(differentiate, Arguments(*arguments), ctx.plan, grad, geometry)
+            gradients = below_autograd(differentiate, Arguments(*arguments), ctx.plan, grad, geometry)
         else:
             gradients = _backward_operator(grad, *arguments, geometry)
-        if not torch._C._autograd._get_current_graph_task_keep_graph():
+        if not is_graph_retained():
             ctx.plan = None  # as torch frees what is saved: a loss that stays alive holds no plan
         needed = zip(gradients, (means, cholesky, colors), strict=True)
         return (*(g if need else None for g, need in needed), *[None] * 7)
@@ -82,8 +89,8 @@ class _Splat(torch.autograd.Function):
 
 def _backward_autograd(*arguments: Any) -> Any:
     if _is_differentiated(arguments[:4]):
-        return _apply(_SplatBackward, *arguments)
-    return _below_autograd(_backward_operator, *arguments)
+        return apply(_SplatBackward, *arguments)
+    return below_autograd(_backward_operator, *arguments)
 
 
 class _SplatBackward(torch.autograd.Function):
@@ -101,43 +108,30 @@ class _SplatBackward(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        second = _second_operator(*grads, *ctx.saved_tensors, *ctx.constants)
+        second = _double_backward_operator(*grads, *ctx.saved_tensors, *ctx.constants)
         needed = zip(second, ctx.needs_input_grad[:4], strict=True)
         return (*(g if need else None for g, need in needed), *[None] * 8)
 
 
 def _is_differentiated(tensors: tuple[Tensor, ...]) -> bool:
-    return (torch.is_grad_enabled() and any([t.requires_grad for t in tensors])) or forward_ad._current_level >= 0
+    return (torch.is_grad_enabled() and any([t.requires_grad for t in tensors])) or is_forward_mode()
 
 
 def _is_plain(tensors: tuple[Tensor, ...]) -> bool:
     """True where no transform, mode or subclass of torch has to see the operator."""
-    if torch._C._are_functorch_transforms_active() or torch._C._len_torch_dispatch_stack():
+    if is_transforming() or has_mode():
         return False
     return all(
-        [type(t) in (Tensor, torch.nn.Parameter) and not t.is_meta and not is_legacy_batchedtensor(t) for t in tensors]
+        [type(t) in (Tensor, torch.nn.Parameter) and not t.is_meta and not is_batched_gradient(t) for t in tensors]
     )
-
-
-def _apply(function: Any, *arguments: Any) -> Any:
-    """Apply a function whose forward is the operator itself, inside of transforms of torch.func too."""
-    if torch._C._are_functorch_transforms_active():
-        with enable_single_level_autograd_function():
-            return super(torch.autograd.Function, function).apply(*arguments)
-    return super(torch.autograd.Function, function).apply(*arguments)
 
 
 def _unrecorded(operator: Any, *arguments: Any) -> Any:
     """Evaluate below autograd; outer levels of torch.func still record."""
-    if not torch._C._are_functorch_transforms_active():
-        return _below_autograd(operator, *arguments)
+    if not is_transforming():
+        return below_autograd(operator, *arguments)
     with torch.enable_grad():
-        return _below_autograd(operator, *arguments)
-
-
-def _below_autograd(function: Any, *arguments: Any) -> Any:
-    with torch._C._AutoDispatchBelowAutograd():
-        return function(*arguments)
+        return below_autograd(operator, *arguments)
 
 
 # Evaluation, below autograd
@@ -157,7 +151,7 @@ def _splat_backward(grad: Tensor, *arguments: Any) -> tuple[Tensor, Tensor, Tens
     return differentiate(gaussians, plan_splat(gaussians, check=False), grad, arguments[-1])
 
 
-def _splat_second(*arguments: Any) -> tuple[Tensor, ...]:
+def _splat_double_backward(*arguments: Any) -> tuple[Tensor, ...]:
     return differentiate_twice(arguments[:3], arguments[3], Arguments(*arguments[4:-1]))
 
 
@@ -182,7 +176,7 @@ def _backward_shapes(grad: Tensor, *arguments: Any) -> tuple[Tensor, Tensor, Ten
     )
 
 
-def _second_shapes(*arguments: Any) -> tuple[Tensor, ...]:
+def _double_backward_shapes(*arguments: Any) -> tuple[Tensor, ...]:
     return tuple(torch.empty_like(t, memory_format=torch.contiguous_format) for t in arguments[3:7])
 
 
@@ -238,7 +232,7 @@ def _fold(info: Any, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...]
 for _name, _evaluate, _shape in (
     ("region_splat", _splat, _splat_shape),
     ("region_splat_backward", _splat_backward, _backward_shapes),
-    ("region_splat_second", _splat_second, _second_shapes),
+    ("region_splat_double_backward", _splat_double_backward, _double_backward_shapes),
     ("region_splat_forward", _splat_forward, _forward_shape),
 ):
     _LIBRARY.impl(_name, _evaluate, "CompositeExplicitAutograd")
@@ -249,5 +243,4 @@ torch.library.register_vmap("kcgs::region_splat", _splat_vmap, lib=_LIBRARY)
 torch.library.register_vmap("kcgs::region_splat_backward", _backward_vmap, lib=_LIBRARY)
 for _device in ("cpu", "cuda"):
     torch.library.register_autocast("kcgs::region_splat", _device, torch.float32, lib=_LIBRARY)
-# fake tensors of open sizes prefer a decomposition where this table has nothing, and torch.onnx.export is given one
-torch._decomp.register_decomposition(splat_operator, type="meta")(_splat_shape)
+register_decomposition(splat_operator, _splat_shape, "meta")

@@ -14,7 +14,7 @@ from torch import Tensor
 from kcgs._check import check_labels, check_size
 
 from .labels import touching_pairs, union_find
-from .map_tables import MapOperands, MapTables, cache_tables, make_tables, resample
+from .map_tables import MapOperands, MapTables, TableCache, make_tables, resample
 from .softness import PairSoftness, check_contours, crisp_tensor, is_crisp, merged_softness, softness_tensor
 
 
@@ -41,11 +41,13 @@ class RegionMap:
 
     def __post_init__(self) -> None:
         """Cache the tables where the operator finds them."""
-        labels, softness, size = self.operands
-        cache_tables(labels, size, is_crisp(softness), self.tables)
+        if self._source is None:
+            TableCache(self.tables).attach(self._labels)
+        elif cache := TableCache.of(self._source._labels):
+            cache.add(self.size, is_crisp(self._softness), self.tables)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the tables of other sizes, which are cached on the labels."""
+        """Leave out the cache, an attribute of the labels."""
         return {**vars(self), "_labels": self._labels.detach()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -83,15 +85,6 @@ class RegionMap:
             labels = check_labels("labels", labels).clone()
         tables = make_tables(labels, softness)
         return cls(labels, tables, softness_tensor(tables.softness, labels.device))
-
-    @classmethod
-    def coerce(cls, value: object, name: str = "regions") -> RegionMap | None:
-        """Return a RegionMap or None as they are, and the map with hard contours of labels; `name` is for errors."""
-        if value is None or isinstance(value, RegionMap):
-            return value
-        if isinstance(value, Tensor | np.ndarray):
-            return cls.from_labels(value)
-        raise TypeError(f"{name} must be a RegionMap, a label map or None; got {type(value).__name__}")
 
     @property
     def labels(self) -> Tensor:
@@ -134,15 +127,9 @@ class RegionMap:
         return self.tables.membership.index
 
     @property
-    def resized(self) -> bool:
-        """Whether these are memberships of another map's pixels, interpolated, or made crisp."""
+    def is_resampled(self) -> bool:
+        """True if `resize` made this map from soft contours, or made contours crisp: it interpolates another map."""
         return self._source is not None
-
-    @property
-    def operands(self) -> MapOperands:
-        """What :func:`region_splat` hands to its operator: labels that nobody writes to, softness and size."""
-        source = self if self._source is None else self._source
-        return MapOperands(source._labels, self._softness, self.size)
 
     def index_of(self, region_ids: Tensor) -> Tensor:
         """Return the position of each id among `ids`, -1 where the map does not hold it."""
@@ -170,7 +157,7 @@ class RegionMap:
             raise ValueError(f"membership needs one map; got a batch of {self.num_maps}")
         ids = [region_ids] if isinstance(region_ids, int) else sorted(set(region_ids))
         places = self.index_of(torch.tensor(ids, dtype=torch.int64, device=self.ids.device)).tolist()
-        parts = [self.tables.membership.whole(0, place) for place in places if place >= 0]
+        parts = [self.tables.membership.full_map(0, place) for place in places if place >= 0]
         black = torch.zeros(self.size, dtype=torch.float64, device=self.ids.device)
         return (sum(parts[1:], parts[0]) if parts else black).to(dtype)
 
@@ -258,7 +245,12 @@ class RegionMap:
         return RegionMap.from_labels(labels, softness)
 
     def state(self) -> dict[str, Any]:
-        """Return what :meth:`from_state` makes the same map of: tensors, numbers, tuples and None only."""
+        """Return the map as tensors, numbers and tuples, which ``torch.load(weights_only=True)`` reads.
+
+        Example:
+            >>> RegionMap.from_labels(torch.tensor([[1, 2]])).state()
+            {'labels': tensor([[1, 2]]), 'softness': 0.0, 'size': (1, 2)}
+        """
         if self._source is not None:
             return {**self._source.state(), "size": self.size, "contours": self.contours}
         softness = self.softness if isinstance(self.softness, float) else tuple(self.softness.items())
@@ -266,7 +258,12 @@ class RegionMap:
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> RegionMap:
-        """Make the map that :meth:`state` describes."""
+        """Return the map that :meth:`state` describes, on the device of its labels.
+
+        Example:
+            >>> RegionMap.from_state(RegionMap.from_labels(torch.tensor([[1, 2]])).state())
+            RegionMap(2 regions, size=(1, 2), softness=0.0)
+        """
         pairs = state["softness"]
         softness = pairs if isinstance(pairs, float) else {tuple(pair): value for pair, value in pairs}
         return cls.from_labels(state["labels"], softness).resize(state["size"], state.get("contours", "scaled"))
@@ -307,3 +304,23 @@ class RegionMap:
         if not crisp and self.softness == 0.0:  # a map of its own: hard contours are not interpolated
             return RegionMap(labels, tables, None)
         return RegionMap(labels, tables, crisp_tensor(labels.device) if crisp else self._softness, self)
+
+
+def as_region_map(value: object, name: str = "regions") -> RegionMap | None:
+    """Return a RegionMap or None as they are, and the map with hard contours of labels; `name` is for errors."""
+    if value is None or isinstance(value, RegionMap):
+        return value
+    if isinstance(value, Tensor | np.ndarray):
+        return RegionMap.from_labels(value)
+    raise TypeError(f"{name} must be a RegionMap, a label map or None; got {type(value).__name__}")
+
+
+def map_operands(regions: object) -> MapOperands:
+    """Return a map as the operator takes it, which also checks the values of labels; refuse anything else."""
+    if isinstance(regions, RegionMap):
+        source = regions if regions._source is None else regions._source
+        return MapOperands(source._labels, regions._softness, regions.size)
+    if isinstance(regions, (Tensor, np.ndarray)):  # graphs of torch 2.7 know no other form
+        labels = check_labels("regions", regions, values=False)
+        return MapOperands(labels, None, (labels.shape[-2], labels.shape[-1]))
+    raise TypeError(f"regions must be a RegionMap, a label map or None; got {type(regions).__name__}")

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs._check import check_cutoff, check_floating, check_ids, check_labels, check_rows, check_size
+from kcgs._check import check_cutoff, check_floating, check_ids, check_rows, check_size
 from kcgs.kernels import check_backend
 
 from .decomposition import decompose
 from .map_tables import MapOperands
 from .operator import splat_operator
-from .regions import RegionMap
+from .regions import RegionMap, map_operands
 from .softness import crisp_tensor
+from .torch_internals import register_decomposition
 
-# what torch.onnx.export puts in place of the operator; compilers and torch.export do not
-torch._decomp.register_decomposition(splat_operator)(decompose)
+# for torch.onnx.export alone: compilers and torch.export keep the operator
+register_decomposition(splat_operator, decompose)
 
 
 def region_splat(
@@ -86,16 +86,6 @@ def region_splat(
     if size not in (None, operands.size):
         raise ValueError(f"size must equal the size of regions, {operands.size}; got {size}")
     return splat_at(operands.size, means, cholesky, colors, region_ids, operands, cutoff=cutoff, backend=backend)
-
-
-def map_operands(regions: object) -> MapOperands:
-    """Return a map as the operator takes it, which also checks the values of labels; refuse anything else."""
-    if isinstance(regions, RegionMap):
-        return regions.operands
-    if isinstance(regions, (Tensor, np.ndarray)):  # graphs of torch 2.7 know no other form
-        labels = check_labels("regions", regions, values=False)
-        return MapOperands(labels, None, (labels.shape[-2], labels.shape[-1]))
-    raise TypeError(f"regions must be a RegionMap, a label map or None; got {type(regions).__name__}")
 
 
 def splat_at(

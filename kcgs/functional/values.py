@@ -15,7 +15,7 @@ from .covariance import check_cholesky
 
 
 def check_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
-    """Refuse values that are not finite or out of range; on CUDA by assertions that nothing waits for."""
+    """Refuse values that are not finite or out of range; on CUDA by assertions, without device synchronisation."""
     if means.numel() == 0:
         return
     if means.device.type != "cpu":
@@ -43,7 +43,7 @@ def check_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
 def check_region_ids(region_ids: Tensor, index: Tensor, complete: bool) -> None:
     """Refuse negative ids, and warn of Gaussians whose id is not in the map: their `index`, (B, N), is negative.
 
-    A map that is not `complete` may have lost regions: no warning. On CUDA nothing waits, nothing warns.
+    No warning where a map that is not `complete` may have lost regions, and on CUDA: no device synchronisation.
     """
     if index.device.type != "cpu":
         torch._assert_async((region_ids >= 0).all(), "region_ids must be non-negative")

@@ -40,7 +40,7 @@ class Blocks(NamedTuple):
     grids: tuple[Grid, ...]
     keys: Tensor  # [K] int64, sorted: tile * num_regions + region
     parents: Tensor  # [K, 4] int64 into keys: above left, above right, below left, below right; K: none
-    odd: Tensor  # [K] uint8: 1 in an odd column of tiles, 2 in an odd row, 3 both
+    parity: Tensor  # [K] uint8: 1 in an odd column of tiles, 2 in an odd row, 3 both
     starts: tuple[int, ...]  # first block of each level, and the end
 
     @property
@@ -85,10 +85,10 @@ def make_blocks(keys: Tensor, num_regions: int, shape: tuple[int, ...]) -> Block
     """Return the blocks of all levels for those of pixels: keys, sorted, of maps of a shape (maps, height, width)."""
     maps, *size = shape
     grids = grids_of((size[0], size[1]), maps)
-    levels, parents, odd, starts = [keys], [], [], [0, len(keys)]
+    levels, parents, parities, starts = [keys], [], [], [0, len(keys)]
     for grid, coarser in zip(grids, (*grids[1:], None), strict=True):
         row, col = _places(keys, num_regions, grid)[1:3]
-        odd.append(2 * (row % 2) + col % 2)
+        parities.append(2 * (row % 2) + col % 2)
         if coarser is None:
             break
         parent_keys = _parent_keys(keys, num_regions, grid, coarser)
@@ -99,7 +99,7 @@ def make_blocks(keys: Tensor, num_regions: int, shape: tuple[int, ...]) -> Block
     parents.append(keys.new_full((len(keys), 4), -1))
     table = torch.cat(parents)
     table[table < 0] = starts[-1]
-    return Blocks(grids, torch.cat(levels), table, torch.cat(odd).to(torch.uint8), tuple(starts))
+    return Blocks(grids, torch.cat(levels), table, torch.cat(parities).to(torch.uint8), tuple(starts))
 
 
 def _places(keys: Tensor, num_regions: int, grid: Grid) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -65,11 +65,12 @@ def _make_plan(inputs: SplatInputs) -> _Plan:
     pairs = list_pairs(inputs)
     order = torch.argsort(pairs.tile, stable=True)
     counts = _starts(pairs.gaussian, inputs.means.shape[0] * inputs.means.shape[1]).diff()
-    mask, masks = None, None
-    if pairs.mask is not None and inputs.membership is not None:
-        mask, masks = pairs.mask[order], inputs.membership.derived("cuda", lambda m: m.tiles(TILE).masks.float())
+    mask_rows, masks = None, None
+    if pairs.mask_rows is not None and inputs.membership is not None:
+        mask_rows = pairs.mask_rows[order]
+        masks = inputs.membership.derived("cuda", lambda m: m.tiles(TILE).masks.float())
     gaussian, tile, affine = pairs.gaussian[order], pairs.tile[order], pairs.coefficients[order]
-    pairs = pairs._replace(gaussian=gaussian, tile=tile, mask=mask, coefficients=affine)
+    pairs = pairs._replace(gaussian=gaussian, tile=tile, mask_rows=mask_rows, coefficients=affine)
     return _Plan(pairs, _starts(tile, pairs.num_tiles), masks, order, counts)
 
 
@@ -81,15 +82,15 @@ def _starts(values: Tensor, count: int) -> Tensor:
 def _lists(plan: _Plan, inputs: SplatInputs) -> tuple[Any, ...]:
     pairs = plan.pairs
     # where there are no maps, any address will do: it is not read
-    mask = pairs.gaussian if pairs.mask is None else pairs.mask
+    mask_rows = pairs.gaussian if pairs.mask_rows is None else pairs.mask_rows
     masks = pairs.coefficients if plan.masks is None else plan.masks
-    return plan.start, pairs.coefficients, pairs.gaussian, mask, masks, inputs.cutoff
+    return plan.start, pairs.coefficients, pairs.gaussian, mask_rows, masks, inputs.cutoff
 
 
 def _constants(plan: _Plan, inputs: SplatInputs) -> dict[str, Any]:
     channels = inputs.colors.shape[-1]
     block = min(_MAX_CHANNELS, 1 << (channels - 1).bit_length())
-    return {"SIDE": TILE, "CHANNELS": channels, "BLOCK": block, "MAPPED": plan.pairs.mask is not None}
+    return {"SIDE": TILE, "CHANNELS": channels, "BLOCK": block, "MAPPED": plan.pairs.mask_rows is not None}
 
 
 def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:

@@ -28,7 +28,7 @@ class TileMembership(NamedTuple):
     """
 
     keys: Tensor  # [K] int64, sorted: tile * num_regions + region
-    mask: Tensor  # [K] int64, row of `masks`, -1 where the region is alone in its tile
+    mask_rows: Tensor  # [K] int64, row of `masks`, -1 where the region is alone in its tile
     masks: Tensor  # [P, tile * tile], the membership: bool (hard contours) or float64
 
     @classmethod
@@ -112,16 +112,16 @@ class Membership:
         """Return the tables for square tiles of `tile` pixels."""
         return self.derived(("tiles", tile), lambda _: self._build_tiles(tile))
 
-    def whole(self, batch: int, region: int, tile: int = 16) -> Tensor:
+    def full_map(self, batch: int, region: int, tile: int = 16) -> Tensor:
         """Assemble s_r of one region from the tables of tiles, (H, W) float64."""
         (maps, height, width), table = self.index.shape, self.tiles(tile)
         rows, cols = -(-height // tile), -(-width // tile)
         entries = (table.keys % self.num_regions == region).nonzero().flatten()
-        tiles, mask = table.keys[entries] // self.num_regions, table.mask[entries]
+        tiles, mask_rows = table.keys[entries] // self.num_regions, table.mask_rows[entries]
         weights = torch.zeros(maps * rows * cols, tile * tile, dtype=torch.float64, device=self.index.device)
         weights[tiles] = 1.0
-        is_mixed = mask >= 0
-        weights[tiles[is_mixed]] = table.masks[mask[is_mixed]].double()
+        is_mixed = mask_rows >= 0
+        weights[tiles[is_mixed]] = table.masks[mask_rows[is_mixed]].double()
         image = weights.view(maps, rows, cols, tile, tile)[batch].transpose(1, 2).reshape(rows * tile, cols * tile)
         return image[:height, :width]
 

@@ -30,7 +30,7 @@ class Pairs(NamedTuple):
 
     gaussian: Tensor  # [P] int64, b * N + i
     tile: Tensor  # [P] int64
-    mask: Tensor | None  # [P] int64 row of TileMembership.masks, -1: weight 1; None where no map is used
+    mask_rows: Tensor | None  # [P] int64 row of TileMembership.masks, -1: weight 1; None where no map is used
     coefficients: Tensor  # [P, 5], in the dtype of the inputs: see tiles.coefficients
     cholesky: Tensor  # [B * N, 3] float64, as the Gaussians are evaluated
     num_tiles: int
@@ -76,21 +76,21 @@ def _pairs_on(grid: Grid | Tensor, inputs: SplatInputs, means: Tensor, cholesky:
     rows, cols, first = grid[2:] if isinstance(grid, Grid) else grid[gaussian, 2:].unbind(-1)
     if inputs.membership is not None and len(inputs.membership.index) > 1:
         row = image * rows + row
-    block, masks = row * cols + col + first, None
+    block, mask_rows = row * cols + col + first, None
     if inputs.membership is not None and inputs.region_index is not None:
         table, region = inputs.membership.tiles(TILE), inputs.region_index.flatten()[gaussian]
-        keys, masks = table.keys, table.mask
+        keys, mask_rows = table.keys, table.mask_rows
         if not isinstance(grid, Grid):
             keys = blocks_of(inputs.membership, inputs.size, means.device).keys
             # blocks of nodes come after those of pixels, and have no masks
-            masks = torch.nn.functional.pad(masks, (0, len(keys) - len(masks)), value=-1)
+            mask_rows = torch.nn.functional.pad(mask_rows, (0, len(keys) - len(mask_rows)), value=-1)
         block, is_present = find_keys(keys, block, region, inputs.membership.num_regions)
         is_touched &= is_present
     indices = is_touched.nonzero().flatten()
     gaussian, tile, block, origin = (t.index_select(0, indices) for t in (gaussian, tile, block, origin))
-    mask = None if masks is None else masks[block]
+    mask_rows = None if mask_rows is None else mask_rows[block]
     affine = coefficients(origin, cholesky[gaussian]).to(inputs.means.dtype)
-    return Pairs(gaussian, tile, mask, affine, cholesky, pixel_grid.total, None), block
+    return Pairs(gaussian, tile, mask_rows, affine, cholesky, pixel_grid.total, None), block
 
 
 def colors_of(pairs: Pairs, inputs: SplatInputs) -> Tensor:

@@ -49,7 +49,11 @@ def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
 @functools.cache
 def _warn_about_cuda() -> None:
     # until a report of a GPU shows that the Triton kernel is right
-    warnings.warn("backend 'auto' takes 'tiled' on CUDA; pass backend='cuda' for the Triton kernel", stacklevel=2)
+    warnings.warn(
+        "backend 'auto' takes 'tiled' on CUDA, since the Triton kernel is untested on GPUs: compare a render with "
+        "backend='cuda' to this one, and pass backend='cuda' if they agree; pass backend='tiled' to hide this warning",
+        stacklevel=2,
+    )
 
 
 def check_backend(backend: str) -> str:

@@ -32,14 +32,14 @@ _CHUNK = 2048
 
 
 class Step(NamedTuple):
-    """Blocks of one level, all alike in `odd`, no two of a tile: no two have the same parent in the same place.
+    """Blocks of one level, all alike in `parity`, no two of a tile: no two have the same parent in the same place.
 
     So every sum has one owner, and is the same every time: the zeros alone are added to twice, and nothing reads that.
     """
 
     blocks: Tensor  # [k] int64, numbers of live blocks or of tiles
     parents: Tensor  # [k, 4] int64, live blocks of the next level; their number: zeros
-    odd: int  # as in Blocks
+    parity: int  # as in Blocks
     masks: Tensor | None  # [k] int64, rows of masks, where the region is not alone in the tile
 
 
@@ -71,14 +71,14 @@ def find_nodes(blocks: Blocks, membership: Membership | None, touched: Tensor, c
     last, ends = 4 * len(blocks.grids) - 4, torch.tensor(starts[1:], device=block.device)
     group = last - 4 * torch.bucketize(block, ends, right=True)  # coarsest first
     if membership is not None:
-        rows[pixels], regions = membership.tiles(TILE).mask[block[pixels]], membership.num_regions
+        rows[pixels], regions = membership.tiles(TILE).mask_rows[block[pixels]], membership.num_regions
     tile = copy * blocks.grids[1].first_tile + blocks.keys[block] // regions
     place = torch.where(pixels, tile, number[copy, (block - first).clamp_min(0)])
     # regions that share a tile go one after the other
     pixel_tile = tile[pixels]
     rank = torch.arange(len(pixel_tile), device=block.device) - torch.searchsorted(pixel_tile, pixel_tile) + 1
     group[pixels] += 4 * torch.where(rows[pixels] < 0, 0, rank)
-    group += blocks.odd[block]
+    group += blocks.parity[block]
 
     order = torch.argsort(group, stable=True)
     refinements: list[Step] = []
@@ -122,9 +122,10 @@ def _weigh(values: Tensor, step: Step, masks: Tensor | None) -> Tensor:
 
 def _spread(nodes: Tensor, step: Step, matrix: Tensor) -> Tensor:
     rows = []
-    for down, y, _ in _PARTS[step.odd // 2]:
+    for down, y, _ in _PARTS[step.parity // 2]:
         row = [
-            nodes.index_select(0, step.parents[:, 2 * down + right])[..., y, x] for right, x, _ in _PARTS[step.odd % 2]
+            nodes.index_select(0, step.parents[:, 2 * down + right])[..., y, x]
+            for right, x, _ in _PARTS[step.parity % 2]
         ]
         rows.append(torch.cat(row, -1))
     return matrix @ (torch.cat(rows, -2) @ matrix.T)
@@ -132,8 +133,8 @@ def _spread(nodes: Tensor, step: Step, matrix: Tensor) -> Tensor:
 
 def _collect(nodes: Tensor, step: Step, matrix: Tensor, grad: Tensor) -> None:
     window = matrix.T @ grad @ matrix
-    for down, y, top in _PARTS[step.odd // 2]:
-        for right, x, left in _PARTS[step.odd % 2]:
+    for down, y, top in _PARTS[step.parity // 2]:
+        for right, x, left in _PARTS[step.parity % 2]:
             nodes[..., y, x].index_add_(0, step.parents[:, 2 * down + right], window[..., top, left])
 
 

@@ -50,7 +50,7 @@ def steps(inputs: SplatInputs) -> Steps:
 def _make_plan(inputs: SplatInputs) -> _Plan:
     pairs = list_pairs(inputs)
     masks = None
-    if pairs.mask is not None and inputs.membership is not None:
+    if pairs.mask_rows is not None and inputs.membership is not None:
         masks = inputs.membership.tiles(TILE).masks.to(inputs.means.dtype)
 
     # segments: a tile's list cut into pieces of at most _MAX_SEGMENT
@@ -60,8 +60,8 @@ def _make_plan(inputs: SplatInputs) -> _Plan:
     start = (lengths.cumsum(0) - lengths)[run] + piece * _MAX_SEGMENT
     length = (lengths[run] - piece * _MAX_SEGMENT).clamp_max(_MAX_SEGMENT)
     mixed = torch.zeros_like(length, dtype=torch.bool)
-    if pairs.mask is not None:
-        mixed = pairs.mask[order][start] >= 0
+    if pairs.mask_rows is not None:
+        mixed = pairs.mask_rows[order][start] >= 0
     batches = [
         batch
         for kind in (False, True)
@@ -106,9 +106,9 @@ def _weights(plan: _Plan, batch: _Batch, bases: tuple[Tensor, Tensor], cutoff: f
     if cutoff > 0.0:
         weight.mul_(weight >= cutoff)
     if batch.mixed:
-        assert plan.masks is not None and plan.pairs.mask is not None
-        mask = torch.cat([plan.pairs.mask, plan.pairs.mask.new_zeros(1)])[batch.entries]
-        weight.mul_(plan.masks[mask])
+        assert plan.masks is not None and plan.pairs.mask_rows is not None
+        mask_rows = torch.cat([plan.pairs.mask_rows, plan.pairs.mask_rows.new_zeros(1)])[batch.entries]
+        weight.mul_(plan.masks[mask_rows])
     return z1, z2, weight
 
 

@@ -9,9 +9,10 @@ from torch import Tensor, nn
 
 from kcgs._check import check_cutoff, check_size
 from kcgs.functional import RegionMap
+from kcgs.functional.regions import map_operands
 from kcgs.functional.sizes import is_equal
 from kcgs.functional.softness import check_contours
-from kcgs.functional.splat import map_operands, splat_at
+from kcgs.functional.splat import splat_at
 
 from .field import GaussianField, scaled_gaussians
 

@@ -58,7 +58,7 @@ def scene_decoder(
         (1, 3, 64, 96)
     """
     regions = check_scene(scene).regions
-    if regions is not None and regions.resized:
+    if regions is not None and regions.is_resampled:
         raise ValueError("scene must have the map itself; got one that was resized")
     cutoff = check_cutoff(cutoff)
     crisp = check_contours(contours) == "crisp" and regions is not None

@@ -62,7 +62,7 @@ class Prior:
         ]
 
 
-OF_SCENES, OF_MAPS = Prior("prior.bin", 48, 16), Prior("prior2.bin", 96, 32)
+OF_SCENES, OF_MAPS = Prior("scene_prior.bin", 48, 16), Prior("map_file_prior.bin", 96, 32)
 
 
 class Model:

@@ -185,7 +185,7 @@ class TestResize:
         for region, expected in enumerate(means):
             result = resized.tables.membership.weights(0, region, torch.float64)
             assert (result - expected).abs().max() < 1e-8
-            for key, mask in zip(table.keys.tolist(), table.mask.tolist(), strict=True):
+            for key, mask in zip(table.keys.tolist(), table.mask_rows.tolist(), strict=True):
                 if key % 3 != region:
                     continue
                 y, x = key // 3 // tiles_x * 16, key // 3 % tiles_x * 16
@@ -247,7 +247,7 @@ class TestCrisp:
         assert crisp.contours == "crisp" and crisp.softness == 0.5 and crisp.size == size
         expected, table, tiles_x = stated_crisp(labels, size), crisp.tables.membership.tiles(16), -(-size[1] // 16)
         found = torch.zeros(4, -(-size[0] // 16) * 16, tiles_x * 16, dtype=torch.float64)
-        for key, mask in zip(table.keys.tolist(), table.mask.tolist(), strict=True):
+        for key, mask in zip(table.keys.tolist(), table.mask_rows.tolist(), strict=True):
             y, x = key // 4 // tiles_x * 16, key // 4 % tiles_x * 16
             found[key % 4, y : y + 16, x : x + 16] = 1.0 if mask < 0 else table.masks[mask].view(16, 16)
         # what is beyond the blur's reach of 4 deviations differs by less than its weights there

@@ -44,7 +44,7 @@ def from_tiles(membership: Membership, tile: int, batch: int = 0) -> Tensor:
     height, width = membership.index.shape[1:]
     rows, cols = -(-height // tile), -(-width // tile)
     weights = torch.zeros(membership.num_regions, rows * tile, cols * tile, dtype=torch.float64)
-    for key, mask in zip(table.keys.tolist(), table.mask.tolist(), strict=True):
+    for key, mask in zip(table.keys.tolist(), table.mask_rows.tolist(), strict=True):
         place, region = divmod(key, membership.num_regions)
         image, place = divmod(place, rows * cols)
         if image != batch:
@@ -169,7 +169,7 @@ class TestPairWidths:
         table = RegionMap.from_labels(labels, {(0, 1): 0.7}).tables.membership.tiles(TILE)
         assert len(table.masks) == 2 * 20
         # between 1 and 2 no pixel is soft, and their contour is a border of tiles
-        assert (table.mask < 0).sum() == 80
+        assert (table.mask_rows < 0).sum() == 80
 
 
 def test_to(device: torch.device) -> None:

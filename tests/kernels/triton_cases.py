@@ -99,7 +99,7 @@ def test_batch(maps: int, size: tuple[int, int]) -> None:
 def test_tile_inside_one_region_beside_mixed_tiles() -> None:
     inputs = make_inputs(size=(16, 48), regions=2)
     assert inputs.membership is not None
-    assert len(inputs.membership.tiles(16).keys) > (inputs.membership.tiles(16).mask < 0).sum() > 0
+    assert len(inputs.membership.tiles(16).keys) > (inputs.membership.tiles(16).mask_rows < 0).sum() > 0
     assert_matches_reference(inputs)
 
 

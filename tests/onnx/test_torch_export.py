@@ -15,6 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.functional import region_splat
 from kcgs.functional.decomposition import decompose
+from kcgs.functional.regions import map_operands
 
 SIZE = (40, 56)
 PAIRS = {(0, 3): 1.1, (0, 7): 0.0, (3, 7): 2.0}
@@ -58,7 +59,7 @@ class TestDecomposition:
     @pytest.mark.parametrize("softness", [0.0, 0.7, PAIRS, {(0, 3): 1.0}])
     def test_maps(self, softness: Any, size: tuple[int, int]) -> None:
         regions = RegionMap.from_labels(labels_of(SIZE), softness)
-        args = (*gaussians(2, 30, size), regions.labels, regions.operands.softness, *size, 1e-4, "reference")
+        args = (*gaussians(2, 30, size), regions.labels, map_operands(regions).softness, *size, 1e-4, "reference")
         assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
 
     @pytest.mark.parametrize("cutoff", [0.0, 1e-2])
@@ -94,7 +95,7 @@ class TestDecomposition:
             colors,
             torch.arange(40)[None],
             labels,
-            regions.operands.softness,
+            map_operands(regions).softness,
             24,
             36,
             1e-4,

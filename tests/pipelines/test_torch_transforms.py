@@ -20,6 +20,7 @@ from torch.utils.checkpoint import checkpoint
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.functional import lookup_regions, region_splat
+from kcgs.functional.regions import map_operands
 
 SIZE = (24, 32)
 
@@ -241,7 +242,7 @@ class TestOperator:
     @pytest.mark.parametrize("kernel", ["cpu", "tiled", "reference"])
     def test_opcheck(self, field: GaussianField, regions: RegionMap, kernel: str) -> None:
         gaussians = [t.detach()[None].clone().requires_grad_() for t in (field.means, field.cholesky, field.colors)]
-        settings = (field.region_ids[None], regions.labels, regions.operands.softness, *SIZE, 1e-4, kernel)
+        settings = (field.region_ids[None], regions.labels, map_operands(regions).softness, *SIZE, 1e-4, kernel)
         torch.library.opcheck(torch.ops.kcgs.region_splat.default, (*gaussians, *settings))
         grad = torch.rand(1, 3, *SIZE, requires_grad=kernel == "reference")
         gaussians = gaussians if kernel == "reference" else [t.detach() for t in gaussians]

@@ -18,7 +18,7 @@ _SPANS = ((-8, -1), (-8, 7), (-7, 8), (-6, 7), (-5, 6), (-3, 4), (-2, 3))
 _OFFSETS = [(dx, -dy) for dy, (first, last) in enumerate(_SPANS) for dx in range(first, last + 1)]
 TEMPLATE = sorted(_OFFSETS, key=lambda offset: (offset[0] ** 2 + offset[1] ** 2, -offset[1], offset[0]))
 # units of the two hidden layers of each network: of the maps in scenes, and of files of maps
-PRIORS = {"prior.bin": (48, 16), "prior2.bin": (96, 32)}
+PRIORS = {"scene_prior.bin": (48, 16), "map_file_prior.bin": (96, 32)}
 
 LEFT = 8  # columns of the margin at the left of a map, in labels
 RIGHT = 9  # columns of the margin at its right
@@ -160,8 +160,8 @@ def make_network(prior: tuple[Any, ...]) -> Any:
     return network
 
 
-scene_network = make_network(load_prior("prior.bin"))
-file_network = make_network(load_prior("prior2.bin"))
+scene_network = make_network(load_prior("scene_prior.bin"))
+file_network = make_network(load_prior("map_file_prior.bin"))
 
 
 @inner

@@ -71,7 +71,7 @@ class Scan(NamedTuple):
 def new_scan(seeds: Any, num_regions: int, *, is_file: bool) -> Scan:
     """Return the start of a pass over a map with these seeds."""
     height, width = seeds.shape
-    prior = load_prior("prior2.bin" if is_file else "prior.bin")
+    prior = load_prior("map_file_prior.bin" if is_file else "scene_prior.bin")
     state = np.zeros(1, STATE)[0]
     state["num_regions"], state["is_file"] = num_regions, is_file
     return Scan(
@@ -88,7 +88,7 @@ def new_scan(seeds: Any, num_regions: int, *, is_file: bool) -> Scan:
     )
 
 
-program = Program("label coder", __file__, "contexts.py", "prior.bin", "prior2.bin")
+program = Program("label coder", __file__, "contexts.py", "scene_prior.bin", "map_file_prior.bin")
 
 
 @program.entry

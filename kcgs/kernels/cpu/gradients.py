@@ -26,7 +26,7 @@ def sum_terms(lists, order, factors, terms, geometry, gradients):  # type: ignor
         lists: Lists.
         order: (N,) int64, from the table's order to the caller's.
         factors: (N, 3) float32, Cholesky factors in the caller's order.
-        terms: (E, ...) float32, as loops.gather fills them.
+        terms: (E, ...) float32, as loops.gather_gradients fills them.
         geometry: whether they hold moments of z, too.
         gradients: GaussianGradients; without `geometry` its colours alone are filled.
     """

@@ -17,7 +17,7 @@ from ..whitened import least_exponent, support_radius
 from .gradients import GaussianGradients, sum_terms
 from .layout import TILE_ROWS, Batch, Lists, Table
 from .lists import in_range, list_tiles
-from .loops import gather
+from .loops import gather_gradients
 from .loops import render as render_rows
 from .schedule import Schedule, order_rows, run
 from .simd import SIDE
@@ -82,21 +82,21 @@ def _table_without_map(size: tuple[int, int]) -> Table:
 def _table(membership: Membership | None, size: tuple[int, int]) -> Table:
     blocks = blocks_of(membership, size, torch.device("cpu"))
     keys, num_regions, num_maps = blocks.keys.numpy(), 1, 1
-    mask, masks = np.full(blocks.first, -1), np.zeros(1, np.float32)
+    mask_rows, masks = np.full(blocks.first, -1), np.zeros(1, np.float32)
     if membership is not None:
         num_regions, num_maps = membership.num_regions, len(membership.index)
         tiles = membership.tiles(SIDE)
-        mask, masks = tiles.mask.numpy(), tiles.masks.to(torch.float32).flatten().numpy()
+        mask_rows, masks = tiles.mask_rows.numpy(), tiles.masks.to(torch.float32).flatten().numpy()
     finest, coarsest = blocks.grids[0], blocks.grids[-1]
     num_tiles = coarsest.first_tile + num_maps * coarsest.rows * coarsest.cols
     tile_start = np.searchsorted(keys, np.arange(num_tiles + 1) * num_regions)
     first_rows = np.cumsum([0, *(grid.rows for grid in blocks.grids[:-1])])
     grids = np.column_stack([np.array(blocks.grids), first_rows])
-    regions, parents, odd = keys % num_regions, blocks.parents.numpy(), blocks.odd.numpy()
-    unmixed = np.flatnonzero(mask < 0)
+    regions, parents, parity = keys % num_regions, blocks.parents.numpy(), blocks.parity.numpy()
+    unmixed = np.flatnonzero(mask_rows < 0)
     owner = np.full(num_maps * finest.rows * finest.cols, -1)
     owner[keys[unmixed] // num_regions] = regions[unmixed]
-    return Table(num_regions, num_maps, grids, regions, tile_start, parents, odd, owner, mask, masks)
+    return Table(num_regions, num_maps, grids, regions, tile_start, parents, parity, owner, mask_rows, masks)
 
 
 def render(planned: _Plan, inputs: SplatInputs) -> Tensor:
@@ -116,7 +116,7 @@ def differentiate(planned: _Plan, inputs: SplatInputs, grad: Tensor, geometry: b
     terms = np.empty((len(planned.lists.entries), -(-(channels + 5 * geometry) // 8) * 8), np.float32)
     values = grad.resolve_neg().contiguous().numpy().reshape(-1, *grad.shape[-3:])
     nodes = _make_nodes(planned, channels)
-    _run(lambda rows: gather(planned.lists, rows, values, terms, geometry, nodes), planned, reverse=False)
+    _run(lambda rows: gather_gradients(planned.lists, rows, values, terms, geometry, nodes), planned, reverse=False)
     means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs.gaussians)
     gradients = GaussianGradients(*(t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors)))
     sum_terms(planned.lists, planned.order, _array(inputs.cholesky), terms, geometry, gradients)

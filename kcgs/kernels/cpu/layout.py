@@ -60,9 +60,9 @@ class Table(NamedTuple):
     regions: Any  # [K] int64, region of each block, in the order of tiles
     tile_start: Any  # [tiles + 1] int64 into blocks, all levels
     parents: Any  # [K, 4] int64, blocks of the next level that each is refined from; K: none
-    odd: Any  # [K] uint8: 1 in an odd column of tiles, 2 in an odd row, 3 both
+    parity: Any  # [K] uint8: 1 in an odd column of tiles, 2 in an odd row, 3 both
     owner: Any  # [tiles of pixels] int64, the only region of a tile; -1: it has several
-    mask: Any  # [blocks of pixels] int64, row of masks; -1: alone in its tile
+    mask_rows: Any  # [blocks of pixels] int64, row of masks; -1: alone in its tile
     masks: Any  # [P * 256] float32, membership of the pixels of a tile
 
 

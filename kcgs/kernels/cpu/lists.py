@@ -43,7 +43,7 @@ from .simd import SIDE
 
 @program.entry
 def in_range(means, cholesky, colors):  # type: ignore[no-untyped-def]
-    """Tell whether all of (N, 2), (N, 3), (N, C) is finite, and within the limits of whitened.py."""
+    """True where means, factors and colours are finite, and within the limits of whitened.py."""
     least, largest = SCALE_LIMITS[0] * (1 - 1e-6), SCALE_LIMITS[1]
     is_valid = True
     for i in range(len(means)):  # written so that NaN fails
@@ -105,7 +105,10 @@ def _fill(g, mean, cholesky, levels, radius, spacing):  # type: ignore[no-untype
 
 @inner
 def _coarsen(g, spacing, levels):  # type: ignore[no-untyped-def]
-    """Move a Gaussian to its level, as coarse_grids.choose_levels and coarsen do."""
+    """Move a Gaussian to its level.
+
+    coarse_grids.choose_levels and coarsen in scalars, since numba compiles no torch; test_backends_agree compares them.
+    """
     # of the variances along the axes of the ellipse: their sum, and their product
     total, product = g[L11] * g[L11] + g[L21] * g[L21] + g[L22] * g[L22], g[L11] * g[L22] * g[L11] * g[L22]
     bound = spacing**4 * product * product / (total * total - 2 * product)  # of h^4
@@ -129,9 +132,9 @@ def _coarsen(g, spacing, levels):  # type: ignore[no-untyped-def]
 @inner
 def _list_entries(batch, table, gaussians, span, start, radius):  # type: ignore[no-untyped-def]
     end, entries = start[:-1].copy(), np.empty((start[-1], 3), np.int32)
-    grids, mask, maps, owner = table.grids, table.mask, table.num_maps, table.owner
+    grids, mask_rows, maps, owner = table.grids, table.mask_rows, table.num_maps, table.owner
     num_regions, tile_start, block_regions = table.num_regions, table.tile_start, table.regions
-    nodes = len(block_regions) - len(mask)
+    nodes = len(block_regions) - len(mask_rows)
     live = np.zeros((batch.num_images if maps == 1 else 1) * (nodes + 1), np.bool_)
     for i in range(len(gaussians)):
         g, image, region = gaussians[i], batch.images[i], batch.regions[i]
@@ -140,7 +143,7 @@ def _list_entries(batch, table, gaussians, span, start, radius):  # type: ignore
         base = grids[level, FIRST_ROW] * batch.num_images + image * grids[level, TILE_ROWS]
         tile = grids[level, FIRST_TILE] + (image % maps * grids[level, TILE_ROWS] - base) * cols
         vectors = count_vectors(g, radius)
-        first_block = (image * (nodes + 1) if maps == 1 else 0) - len(mask)
+        first_block = (image * (nodes + 1) if maps == 1 else 0) - len(mask_rows)
         if level == 0 and SIDE * vectors <= PADDING:
             first, last = bounding_columns(g, width, radius)
             is_alone = True
@@ -164,7 +167,7 @@ def _list_entries(batch, table, gaussians, span, start, radius):  # type: ignore
                     block = find_block(num_regions, tile_start, block_regions, k, region)
                     if block >= 0:
                         live[first_block + block] = True
-    _spread(live, table.parents, len(mask))
+    _spread(live, table.parents, len(mask_rows))
     return entries, live
 
 
@@ -205,4 +208,4 @@ def first_tile(table, level, image, row):  # type: ignore[no-untyped-def]
 @inner
 def first_node_block(table, image):  # type: ignore[no-untyped-def]
     """Return the number of an image's first block of nodes; images that share a map have a copy each."""
-    return image * (len(table.regions) - len(table.mask) + 1) if table.num_maps == 1 else 0
+    return image * (len(table.regions) - len(table.mask_rows) + 1) if table.num_maps == 1 else 0

@@ -53,7 +53,7 @@ def render(lists, rows, image, nodes):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def gather(lists, rows, grad, terms, geometry, nodes):  # type: ignore[no-untyped-def]
+def gather_gradients(lists, rows, grad, terms, geometry, nodes):  # type: ignore[no-untyped-def]
     """Sum the gradients of the entries of rows of tiles, and those of nodes.
 
     Args:
@@ -110,14 +110,14 @@ def _copy_row(pixels, image, b, row, outward):  # type: ignore[no-untyped-def]
 def _refine(lists, nodes, channels, transposed):  # type: ignore[no-untyped-def]
     """Add the splines of coarser blocks to every block of nodes; or, transposed, its gradients to the coarser ones."""
     table, live, stride = lists.table, lists.live, SIDE * channels
-    parents, odd, offsets, ones = table.parents, table.odd, np.empty(4, np.int64), np.ones(SIDE, np.float32)
-    first, count = len(table.mask), len(parents) - len(table.mask)
+    parents, parity, offsets, ones = table.parents, table.parity, np.empty(4, np.int64), np.ones(SIDE, np.float32)
+    first, count = len(table.mask_rows), len(parents) - len(table.mask_rows)
     for base in range(-first, len(live) - first, count + 1):
         for n in range(count):
             block = first + (n if transposed else count - 1 - n)
             if not _set_offsets(live, parents, block, base, SIDE * stride, offsets):
                 continue
-            start, down, right = (base + block) * SIDE * stride, odd[block] >= 2, odd[block] % 2 == 1
+            start, down, right = (base + block) * SIDE * stride, parity[block] >= 2, parity[block] % 2 == 1
             if transposed:
                 gather_refined(nodes, offsets, down, right, nodes, start, stride, SIDE, channels, ones, 0, 0)
             else:
@@ -128,18 +128,18 @@ def _refine(lists, nodes, channels, transposed):  # type: ignore[no-untyped-def]
 def _sample_row(lists, image, row, pixels, nodes, channels, transposed):  # type: ignore[no-untyped-def]
     """Set a row of tiles to the nodes' splines times the membership; or, transposed, add its gradients to the nodes."""
     table, live, stride = lists.table, lists.live, len(pixels) // (SIDE * channels)
-    tile_start, parents, mask, masks = table.tile_start, table.parents, table.mask, table.masks
+    tile_start, parents, mask_rows, masks = table.tile_start, table.parents, table.mask_rows, table.masks
     offsets, ones, down = np.empty(4, np.int64), np.ones(SIDE, np.float32), row % 2 == 1
     across = channels * stride  # elements from a row of pixels to the next
-    base, tile = first_node_block(table, image) - len(mask), first_tile(table, 0, image, row)
+    base, tile = first_node_block(table, image) - len(mask_rows), first_tile(table, 0, image, row)
     for col in range(table.grids[0, TILE_COLS]):
         start, right, empty = PADDING + col * SIDE, col % 2 == 1, True
         for block in range(tile_start[tile + col], tile_start[tile + col + 1]):
             if not _set_offsets(live, parents, block, base, SIDE * SIDE * channels, offsets):
                 continue
             weights, mask_start, step = ones, 0, 0
-            if mask[block] >= 0:
-                weights, mask_start, step = masks, mask[block] * SIDE * SIDE, SIDE
+            if mask_rows[block] >= 0:
+                weights, mask_start, step = masks, mask_rows[block] * SIDE * SIDE, SIDE
             if transposed:
                 gather_sampled(
                     nodes, offsets, down, right, pixels, start, across, stride, channels, weights, mask_start, step
@@ -183,9 +183,10 @@ def _make_row_loop(gathers: bool) -> Any:
         number, level, image, row = place
         block_size, across = SIDE * SIDE * channels, channels * stride
         table, gaussians, entries, colors = lists.table, lists.gaussians, lists.entries, lists.colors
-        num_regions, tile_start, regions, mask = table.num_regions, table.tile_start, table.regions, table.mask
+        num_regions, regions = table.num_regions, table.regions
+        tile_start, mask_rows = table.tile_start, table.mask_rows
         height, width = table.grids[level, NODE_ROWS], table.grids[level, NODE_COLS]
-        tile, first_block = first_tile(table, level, image, row), first_node_block(table, image) - len(mask)
+        tile, first_block = first_tile(table, level, image, row), first_node_block(table, image) - len(mask_rows)
         masks, radius, least = table.masks, lists.radius, lists.least_exponent
         for e in range(lists.start[number], lists.start[number + 1]):
             i, start, end = entries[e, GAUSSIAN], entries[e, FIRST], entries[e, END]
@@ -214,7 +215,7 @@ def _make_row_loop(gathers: bool) -> Any:
                     continue
                 origin, mask_start = (first_block + block) * block_size, -1
                 if level == 0:
-                    origin, mask_start = PADDING + col * SIDE, mask[block] * SIDE * SIDE
+                    origin, mask_start = PADDING + col * SIDE, mask_rows[block] * SIDE * SIDE
                 if gathers:
                     gather_rows(  # type: ignore[call-arg]
                         pixels, origin, across, stride, channels, first, last, shape, colors, i * channels, least,

@@ -1,6 +1,6 @@
 /** The pixels of a label map (docs/format.md, "The wavefront"). */
 
-import tables from "../../../../kcgs/codec/labels/prior.bin?packed";
+import tables from "../../../../kcgs/codec/labels/scene_prior.bin?packed";
 import { unpack } from "../packed_text.ts";
 import { put } from "../program.ts";
 import type { RangeDecoder } from "../range_decoder.ts";

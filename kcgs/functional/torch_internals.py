@@ -1,0 +1,61 @@
+"""Private names of torch that the operator needs: one function each, and what breaks without it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch._C._functorch import is_legacy_batchedtensor
+from torch._functorch.utils import enable_single_level_autograd_function
+from torch.autograd import forward_ad
+
+
+def below_autograd(function: Any, *arguments: Any) -> Any:
+    """Call a function without autograd; else an operator that its own autograd kernel calls would call that again."""
+    with torch._C._AutoDispatchBelowAutograd():
+        return function(*arguments)
+
+
+def is_transforming() -> bool:
+    """True inside of `torch.func`; else a kernel would read the wrappers that vmap and jvp put around tensors."""
+    return bool(torch._C._are_functorch_transforms_active())
+
+
+def has_mode() -> bool:
+    """True under a mode, fake tensors or a counter of operations; else the mode would not see the operator."""
+    return bool(torch._C._len_torch_dispatch_stack())
+
+
+def is_batched_gradient(tensor: Tensor) -> bool:
+    """True for gradients of `is_grads_batched`, wrappers of an older kind; else a kernel would read them."""
+    return bool(is_legacy_batchedtensor(tensor))
+
+
+def is_forward_mode() -> bool:
+    """True inside of `forward_ad.dual_level`; else tensors that need no gradient would lose their tangents."""
+    return forward_ad._current_level >= 0
+
+
+def is_graph_retained() -> bool:
+    """True in a backward with `retain_graph`; else a loss that stays alive would hold the memory of a plan."""
+    return bool(torch._C._autograd._get_current_graph_task_keep_graph())
+
+
+def apply(function: Any, *arguments: Any) -> Any:
+    """Apply an autograd.Function; else torch refuses one whose forward takes `ctx` inside of `torch.func`.
+
+    It may, since its forward calls an operator that transforms see.
+    """
+    if is_transforming():
+        with enable_single_level_autograd_function():
+            return super(torch.autograd.Function, function).apply(*arguments)
+    return super(torch.autograd.Function, function).apply(*arguments)
+
+
+def register_decomposition(operator: Any, function: Any, kind: str = "post_autograd") -> None:
+    """Give `torch.onnx.export` standard operators, or fake tensors of open sizes a shape (`kind` "meta").
+
+    Else the first has no translation of the operator, and the second decompose it.
+    """
+    torch._decomp.register_decomposition(operator, type=kind)(function)
