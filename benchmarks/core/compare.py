@@ -40,7 +40,7 @@ COLUMNS = {
     "ssimulacra2": Column("SSIMULACRA2", ".1f", 0.05),
     "decoded_psnr": Column("PSNR decoded", ".2f", 0.005),
     "decoded_ef_psnr": Column("EF-PSNR decoded", ".2f", 0.005),
-    "core_seconds": Column("core s", ".1f", 0.05),
+    "core_seconds": Column("core s", ".1f", 0.05, less_is_better=True),
     "steep": Column("steep", "", less_is_better=True),
     "beyond [0, 1]": Column("beyond [0, 1]", "", less_is_better=True),
 }
