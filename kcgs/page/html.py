@@ -12,6 +12,8 @@ from kcgs.errors import InvalidArgument
 from kcgs.functional.softness import check_contours
 from kcgs.scene import Scene, check_scene
 
+# page.html, a template for `str.format`, and page.css are written by hand; page.js is committed as `make page` builds
+# it out of export/web/element/page.ts, so that an installation needs no npm
 _FOLDER = Path(__file__).resolve().parent
 # PSNR in dB against the scene's own render: no value differs by a level of 255
 _QUALITY = 60.0
@@ -40,13 +42,13 @@ def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "s
         >>> page[:15], "<title>Blobs &amp; more</title>" in page
         ('<!doctype html>', True)
     """
-    style, script, page = ((_FOLDER / f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html"))
+    style, script, template = ((_FOLDER / f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html"))
     script = script.strip()
     policy = (
         f"default-src 'none'; script-src '{_policy_hash(script)}' 'wasm-unsafe-eval'; "
         f"style-src '{_policy_hash(style)}'; img-src data:; base-uri 'none'; form-action 'none'"
     )
-    return page.format(
+    return template.format(
         policy=policy, title=html.escape(title), style=style, script=script,
         contours=check_contours(contours), scene=base64.b64encode(web_bytes(scene)).decode(),
     )  # fmt: skip

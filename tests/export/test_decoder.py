@@ -200,7 +200,7 @@ class TestDamage:
         data = GOLDEN.read_bytes()
         flipped = data[:-9] + bytes([data[-9] ^ 1]) + data[-8:]
         answer, layers = node.do("scene", flipped), len(unpack(data)[2])
-        assert f"the checksum of its layer {layers} is another" in answer["message"]
+        assert f"the checksum of its layer {layers} is wrong" in answer["message"]
         assert answer["partial"]["layers"] == layers - 1
         for content, message in [
             (b"kcgs\2" + data[5:], "its version must be 1; got 2"),

@@ -51,7 +51,7 @@ export function readHeader(reader: ByteReader): { header: Header; map: Uint8Arra
   const checksum = reader.number(4);
   const map = reader.take(length);
   if (crc32(map, crc32(above)) !== checksum)
-    throw new DecodeError("the file is damaged: the checksum of its header and map is another");
+    throw new DecodeError("the file is damaged: the checksum of its header and map is wrong");
   return { header: { height, width, channels, quantizationParameter, regions, layers }, map };
 }
 

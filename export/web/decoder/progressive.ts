@@ -69,7 +69,7 @@ export class ProgressiveDecoder {
       const layer = reader.take(bytes);
       if (reader.number(2) !== crc16(layer)) {
         const sound = this.layers ? `; its first ${this.position} bytes are sound` : "";
-        throw new DecodeError(`the file is damaged: the checksum of its layer ${this.layers + 1} is another${sound}`);
+        throw new DecodeError(`the file is damaged: the checksum of its layer ${this.layers + 1} is wrong${sound}`);
       }
       // each Gaussian takes more than a bit, and all must fit into memory
       const limit = Math.min(8 * bytes + SPARE, mostGaussians(header.channels) - this.count);

@@ -17,7 +17,7 @@ export interface Viewport {
   native(): void;
 }
 
-type Locate = (event: { clientX: number; clientY: number }) => [x: number, y: number];
+export type Locate = (event: { clientX: number; clientY: number }) => [x: number, y: number];
 
 /** Spreads a step of zoom over a few frames; zooms at once where the user prefers reduced motion. */
 export class Glide {

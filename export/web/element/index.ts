@@ -5,7 +5,8 @@ import { KcgsImage } from "./kcgs-image.ts";
 
 export { decode, DecodeError, ProgressiveDecoder } from "../decoder/index.ts";
 export type { ContourWidth, RegionMap, Scene } from "../decoder/index.ts";
-export type { Ids, ImageOptions, RegionClick } from "./kcgs-image.ts";
+export type { ImageOptions } from "./image_file.ts";
+export type { Ids, RegionClick } from "./kcgs-image.ts";
 export { KcgsImage };
 
 declare global {

@@ -7,9 +7,13 @@ import { listen, zoomAtMiddle } from "./gestures.ts";
 import type { Glide } from "./gestures.ts";
 import type { Transform } from "./view.ts";
 import { oneOf } from "./attribute.ts";
+import { listenToClicks } from "./clicks.ts";
 import { move, recolour } from "./edits.ts";
 import type { Channels, Edit } from "./edits.ts";
+import { imageFile, imageSize } from "./image_file.ts";
+import type { ImageOptions } from "./image_file.ts";
 import { load } from "./loading.ts";
+import { ScreenSize } from "./screen_size.ts";
 import { Stage } from "./stage.ts";
 import { elementStyle, sizeStyle } from "./style.ts";
 
@@ -22,11 +26,6 @@ export interface RegionClick {
   readonly y: number;
 }
 
-// a press that moves farther, in CSS pixels, is no click
-const CLICK = 5;
-// whether the browser reports the pixels of the screen that an element covers, and when they change
-const PIXEL_BOX = "devicePixelContentBoxSize" in ResizeObserverEntry.prototype;
-
 export class KcgsImage extends HTMLElement {
   static readonly observedAttributes = ["src", "alt", "zoom", "regions", "contours", "renderer"];
 
@@ -34,7 +33,7 @@ export class KcgsImage extends HTMLElement {
   private readonly sizes = new CSSStyleSheet();
   private readonly internals = this.attachInternals();
   private readonly fallback = document.createElement("slot");
-  private readonly observer = new ResizeObserver((entries) => this.measure(entries.at(-1)!));
+  private readonly screenSize: ScreenSize;
   private loaded: Scene | null = null; // as the file has it
   private current: Scene | null = null; // with edits
   private edits: Edit[] = [];
@@ -42,7 +41,6 @@ export class KcgsImage extends HTMLElement {
   private unread = true; // whether `src` is to be read when the element is part of a page
   private loading: AbortController | null = null;
   private gestures: AbortController | null = null;
-  private density: AbortController | null = null;
   private glide: Glide | null = null;
 
   constructor() {
@@ -57,17 +55,22 @@ export class KcgsImage extends HTMLElement {
       () => this.viewChanged(),
       (error) => this.fail(error, false),
     );
-    this.listenToClicks(canvas);
+    this.screenSize = new ScreenSize(canvas, (width, height) => this.stage.resize(width, height));
+    listenToClicks(
+      canvas,
+      (event) => this.stage.locate(event),
+      this,
+      (x, y) => this.reportRegion(x, y),
+    );
   }
 
   connectedCallback(): void {
-    this.observe();
+    this.screenSize.observe();
     if (this.unread) this.start();
   }
 
   disconnectedCallback(): void {
-    this.observer.disconnect();
-    this.density?.abort();
+    this.screenSize.disconnect();
     // an interrupted load begins again when the element comes back
     this.unread ||= this.loading !== null;
     this.loading?.abort();
@@ -161,19 +164,8 @@ export class KcgsImage extends HTMLElement {
   async toBlob({ width, height, type = "image/png", quality }: ImageOptions = {}): Promise<Blob> {
     const { current } = this;
     if (current === null) throw new Error("there is no scene yet");
-    for (const [name, length] of Object.entries({ width, height })) {
-      if (length === undefined || (Number.isInteger(length) && length > 0)) continue;
-      throw new RangeError(`${name} must be a whole number of pixels, 1 or more; got ${length}`);
-    }
-    const ratio = current.height / current.width;
-    const across = width ?? (height === undefined ? current.width : Math.max(1, Math.round(height / ratio)));
-    const down = height ?? Math.max(1, Math.round(across * ratio));
-    const canvas = this.stage.image(across, down);
-    return new Promise((resolve, reject) => {
-      const settle = (blob: Blob | null): void =>
-        blob === null ? reject(new Error(`no image of ${across} x ${down} can be made`)) : resolve(blob);
-      canvas.toBlob(settle, type, quality);
-    });
+    const size = imageSize(current, width, height);
+    return imageFile(this.stage.image(size.width, size.height), type, quality);
   }
 
   /** Wait until the view no longer moves and is rendered. */
@@ -260,27 +252,6 @@ export class KcgsImage extends HTMLElement {
     this.dispatchEvent(new ErrorEvent("error", { error, message }));
   }
 
-  private measure(entry: ResizeObserverEntry): void {
-    if (this.stage.canvas.hidden) return;
-    const [size, exact] = [entry.contentBoxSize[0]!, PIXEL_BOX ? entry.devicePixelContentBoxSize[0]! : null];
-    const pixels = (length: number, reported = NaN): number => {
-      const estimate = length * devicePixelRatio;
-      // a browser that emulates another screen reports the pixels of its own
-      return Math.max(1, Math.abs(reported - estimate) < 1 ? reported : Math.round(estimate));
-    };
-    this.stage.resize(pixels(size.inlineSize, exact?.inlineSize), pixels(size.blockSize, exact?.blockSize));
-  }
-
-  /** Measure the canvas now, and whenever its size or the screen's density changes. */
-  private observe(): void {
-    this.density?.abort();
-    this.density = new AbortController();
-    const { signal } = this.density;
-    matchMedia(`(resolution: ${devicePixelRatio}dppx)`).addEventListener("change", () => this.observe(), { signal });
-    this.observer.disconnect();
-    this.observer.observe(this.stage.canvas, { box: PIXEL_BOX ? "device-pixel-content-box" : "content-box" });
-  }
-
   private describe(): void {
     const alt = this.getAttribute("alt");
     this.internals.role = alt === "" ? "presentation" : "img";
@@ -301,19 +272,6 @@ export class KcgsImage extends HTMLElement {
     this.glide = listen(stage.canvas, (event) => stage.locate(event), stage, { keyboard: this, wheelNeedsCtrl, signal });
   }
 
-  private listenToClicks(canvas: HTMLCanvasElement): void {
-    let pressed: [number, number] = [0, 0];
-    canvas.addEventListener("pointerdown", (event) => (pressed = [event.clientX, event.clientY]));
-    canvas.addEventListener("click", (event) => {
-      if (Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) < CLICK)
-        this.reportRegion(...this.stage.locate(event));
-    });
-    this.addEventListener("keydown", (event) => {
-      if (event.key !== "Enter" || event.target !== this) return;
-      this.reportRegion(canvas.width / 2, canvas.height / 2);
-    });
-  }
-
   /** Dispatch `regionclick` for the region at a position on the canvas. */
   private reportRegion(x: number, y: number): void {
     if (!this.hasAttribute("regions")) return;
@@ -331,11 +289,4 @@ export class KcgsImage extends HTMLElement {
     canvas.classList.toggle("near", !whole);
     this.dispatchEvent(new Event("viewchange"));
   }
-}
-
-export interface ImageOptions {
-  width?: number;
-  height?: number;
-  type?: string;
-  quality?: number;
 }

@@ -139,7 +139,7 @@ export class Blur {
     }
   }
 
-  /** The blur at a node, which may lie beyond the map; evaluated once. */
+  /** The blur at a node, which may lie outside the map; evaluated once. */
   private blurAt(column: number, row: number, kernel: Kernel): Shares {
     const { spacing, nodes } = kernel;
     const key = row * this.width + column;

@@ -73,8 +73,8 @@ export class LayerDecoder {
     const count = classes.reduce((sum, { cells }) => sum + cells.row.length, 0);
     const scale = new Int32Array(count).map(() => decoder.uniform(steps.scales));
     const ratio = this.ratio.read(decoder, [2 / steps.ratio], new Uint8Array(count), this.ratioContexts(classes, count));
-    const beyond = ratio.find((steep) => steep > steps.mostRatio);
-    if (beyond !== undefined) throw new DecodeError(`a ratio must be at most ${steps.mostRatio} steps; got ${beyond}`);
+    const excess = ratio.find((steep) => steep > steps.mostRatio);
+    if (excess !== undefined) throw new DecodeError(`a ratio must be at most ${steps.mostRatio} steps; got ${excess}`);
     const turns = ratio.map((steep) => angles(steps, steep));
     const angle = this.angle.read(decoder, turns);
     const codes = this.readColors(decoder, steps, scale);

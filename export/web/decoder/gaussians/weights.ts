@@ -10,7 +10,7 @@ export const COUNTS = [2, ...repeat(9, 1), ...repeat(12, 0.3)];
 export const MARGINS = [3, ...repeat(4, 1), ...repeat(4, 0.3)];
 export const STRAYS = [20, 0.5];
 export const ANGLES = repeat(2, [4.5, 3.5, 2.7, 2.5, 2.4, 2.5, 2.7, 3.5]).flat();
-export const BEYOND = [0.3, ...repeat(4, 1), ...repeat(17, 0.3)];
+export const OUTSIDE = [0.3, ...repeat(4, 1), ...repeat(17, 0.3)];
 
 /** The bins of the adaptive magnitudes, for each context. */
 export const SHAPES = {

@@ -1,6 +1,6 @@
 /** The number of Gaussians in each cell of a grid over the image (docs/format.md, "Occupancy"). */
 
-import { BEYOND, MARGINS } from "../gaussians/weights.ts";
+import { MARGINS, OUTSIDE } from "../gaussians/weights.ts";
 import type { Program } from "../program.ts";
 import type { RangeDecoder } from "../range_decoder.ts";
 import { DecodeError } from "../scene.ts";
@@ -35,11 +35,11 @@ type Places = readonly [Uint32Array, Uint32Array];
 /** Reads the cells of one class after another; what was learned in one helps the next. */
 export class Occupancy {
   private readonly margin = new AdaptiveNumber(MARGINS);
-  private readonly beyond = new AdaptiveNumber(BEYOND);
+  private readonly outside = new AdaptiveNumber(OUTSIDE);
   private readonly earlier = new Map<number, Cells[]>(); // by class of size
   private classes = 0;
   private gaussians = 0; // so far
-  private outside = 0; // cells there, so far
+  private outsideCells = 0; // so far
 
   constructor(
     private readonly height: number,
@@ -74,11 +74,11 @@ export class Occupancy {
   /** Read cells that are the more likely, the more earlier Gaussians of about this size are near. */
   private readNear(decoder: RangeDecoder, { rows, columns, side, ring }: Grid, size: number, count: number): Places {
     const { program } = decoder;
-    const beyond = ring ? this.beyond.read(decoder) : 0;
-    if (beyond > count) throw new DecodeError(`at most ${count} Gaussians may lie outside; got ${beyond}`);
+    const outside = ring ? this.outside.read(decoder) : 0;
+    if (outside > count) throw new DecodeError(`at most ${count} Gaussians may lie outside; got ${outside}`);
     this.gaussians += count;
-    if (beyond) this.outside += ring;
-    if (this.classes++ === MAX_CLASSES || this.outside > MAX_OUTSIDE + EACH_OUTSIDE * this.gaussians)
+    if (outside) this.outsideCells += ring;
+    if (this.classes++ === MAX_CLASSES || this.outsideCells > MAX_OUTSIDE + EACH_OUTSIDE * this.gaussians)
       throw new DecodeError("a file must have fewer grids of cells");
     const near: number[] = [];
     const shift = 32 - Math.clz32(side); // of half pixels
@@ -92,8 +92,8 @@ export class Occupancy {
     const address = program.openEarlier(near.length / 2);
     new Int32Array(program.memory.buffer, address, near.length).set(near);
     const base = Math.max(Math.floor(EVERYWHERE / (rows * columns)), 1);
-    const inside = listed(program, program.readNear(rows, columns, base, near.length / 2, count - beyond));
-    return [inside, listed(program, program.readNear(ring, 1, 1, 0, beyond))];
+    const inside = listed(program, program.readNear(rows, columns, base, near.length / 2, count - outside));
+    return [inside, listed(program, program.readNear(ring, 1, 1, 0, outside))];
   }
 }
 
