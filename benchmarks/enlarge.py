@@ -48,9 +48,9 @@ def measure(image: str, group: str, factor: int, share: int, data: str, quick: b
     scene = fit(small, small_labels, n, iterations=QUICK_ITERATIONS if quick else None).scene
     rows = []
     methods: dict[str, Callable[[], Tensor]] = {SCENE: partial(scene.render, (height, width))}
-    for how in ("bicubic", "Lanczos"):
-        methods[f"own render, {how}"] = partial(enlarge, scene.render, (height, width), how)
-        methods[f"small photo, {how}"] = partial(enlarge, small.clone, (height, width), how)
+    for resampling in ("bicubic", "Lanczos"):
+        methods[f"own render, {resampling}"] = partial(enlarge, scene.render, (height, width), resampling)
+        methods[f"small photo, {resampling}"] = partial(enlarge, small.clone, (height, width), resampling)
     times = milliseconds(methods, ROUNDS)
     for method, render in methods.items():
         enlargement = render()
@@ -62,9 +62,11 @@ def measure(image: str, group: str, factor: int, share: int, data: str, quick: b
     return rows
 
 
-def enlarge(image: Callable[[], Tensor], size: tuple[int, int], how: str) -> Tensor:
-    """Make (C, H, W) and enlarge it by Pillow, in floats."""
-    planes = [Image.fromarray(plane.numpy()).resize(size[::-1], Image.Resampling[how.upper()]) for plane in image()]
+def enlarge(image: Callable[[], Tensor], size: tuple[int, int], resampling: str) -> Tensor:
+    """Make an image (C, H, W) and enlarge it by Pillow, in floats."""
+    planes = [
+        Image.fromarray(plane.numpy()).resize(size[::-1], Image.Resampling[resampling.upper()]) for plane in image()
+    ]
     return torch.from_numpy(np.stack([np.asarray(plane) for plane in planes])).clamp(0, 1)
 
 

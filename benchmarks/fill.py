@@ -25,15 +25,17 @@ from .core.run import Job, Options, Page, Row
 NUM_GAUSSIANS = 3_000
 QUICK_GAUSSIANS = 60
 FILLS = {"not filled": False, "filled": True}
-# in pixels: what is compared with the hole, the contour of a moved object, and what is shown around
-AROUND = 40
+# of the ring around the uncovered pixels that they are compared with, in pixels
+RING = 40
+# around a moved object, which is not measured, in pixels
 CONTOUR = 2
-SHOWN = 45
+# around the edit in the figure, in pixels
+FIGURE_MARGIN = 45
 QUANTITIES = ("steep", "beyond [0, 1]")
 COMPARISON = Comparison("filled", "not filled")
 METHOD = f"""The object of each frame of DAVIS is deleted, and moved to the side by a third of its width, away from the
 nearer border. Figures are of the pixels that are uncovered; those within {CONTOUR} pixels of a moved object are left
-out. A pixel is steep whose gradient is above the 99.9th percentile of the {AROUND} pixels around; *steepest* is a
+out. A pixel is steep whose gradient is above the 99.9th percentile of the {RING} pixels around; *steepest* is a
 multiple of that. The figure shows, for each edit, the scene, the edit without filling, and filled."""
 
 
@@ -54,7 +56,7 @@ def measure(image: str, edit: str, n: int, folder: str, data: str, quick: bool) 
         landing = pad(hole, (step, -step))
         apply, covered = partial(move_region, scene, ids, (step, 0)), hole | landing
         uncovered = hole & ~dilate(landing, CONTOUR)
-    around, images, rows = dilate(covered, AROUND) & ~covered, [scene.render()], []
+    around, images, rows = dilate(covered, RING) & ~covered, [scene.render()], []
     for method, fill in FILLS.items():
         start = time.process_time()
         edited = apply(fill=fill)
@@ -68,7 +70,7 @@ def measure(image: str, edit: str, n: int, folder: str, data: str, quick: bool) 
             "core_seconds": seconds, "added": edited.num_gaussians - scene.num_gaussians,
         })  # fmt: skip
         images.append(edited.render())
-    area = dilate(covered, SHOWN)
+    area = dilate(covered, FIGURE_MARGIN)
     details = [image[:, area.any(1)][..., area.any(0)] for image in images]
     Path(folder).mkdir(parents=True, exist_ok=True)
     save_image(Path(folder, f"{image}-{edit}.png"), torch.cat(details, 2))

@@ -48,22 +48,22 @@ class Codec(NamedTuple):
 
 
 def _write(format: str, index: Any, **settings: Any) -> bytes:
-    file, most = BytesIO(), int(index.max())
+    file, largest_id = BytesIO(), int(index.max())
     if format == "WEBP":
         image = Image.fromarray(np.stack([index >> 16, index >> 8, index], -1).astype(np.uint8))
     else:
-        image = Image.fromarray(index.astype(np.uint8 if most < 256 else np.uint16))
+        image = Image.fromarray(index.astype(np.uint8 if largest_id < 256 else np.uint16))
     image.save(file, format, **settings)
     return file.getvalue()
 
 
 def _png(index: Any) -> bytes:
-    grey, most = _write("PNG", index, optimize=True), int(index.max())
-    if most > 255:
+    grey, largest_id = _write("PNG", index, optimize=True), int(index.max())
+    if largest_id > 255:
         return grey
     file, image = BytesIO(), Image.fromarray(index.astype(np.uint8))
-    image.putpalette(list(range(most + 1)) * 3)
-    image.save(file, "PNG", optimize=True, bits=next(bits for bits in (1, 2, 4, 8) if most < 1 << bits))
+    image.putpalette(list(range(largest_id + 1)) * 3)
+    image.save(file, "PNG", optimize=True, bits=next(bits for bits in (1, 2, 4, 8) if largest_id < 1 << bits))
     return min(grey, file.getvalue(), key=len)
 
 

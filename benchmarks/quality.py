@@ -18,8 +18,8 @@ CHART_METHODS: dict[str, Method] = {**METHODS, "paper, clamp": ("paper", {"clamp
 CHART_COUNT = 20
 CHART_ITERATIONS = 5_000
 COUNTS = (500, 1_250, 2_500, 5_000, 7_500, 10_000)
-# of the baseline alone: its files reach the bytes of the largest of `best`
-MORE = 12_500
+# N of one more fit of the baseline, so that its files reach the bytes of the largest file of `best`
+BASELINE_COUNT = 12_500
 QUANTITIES = ("psnr", "ef_psnr")
 DECODED = ("decoded_psnr", "decoded_ef_psnr")
 PAIR = Comparison("best", "best-baseline")
@@ -46,7 +46,7 @@ def jobs(options: Options) -> list[Job]:
     if options.data is not None:
         frames = options.only or names(options.data, "davis")
         fits += plan([frame for frame in frames if frame not in CHARTS], COUNTS, METHODS, options)
-        fits += plan(frames, (MORE,), {PAIR.second: METHODS[PAIR.second]}, options)
+        fits += plan(frames, (BASELINE_COUNT,), {PAIR.second: METHODS[PAIR.second]}, options)
     return fits
 
 

@@ -31,21 +31,21 @@ def resized(image: Tensor, size: tuple[int, int]) -> Tensor:
     return interpolate(image[None], size, mode="bicubic", antialias=True)[0].clamp(0, 1)
 
 
-def other(codec: str, image: Tensor, most: int) -> Preview | None:
-    """Shrink the image as far as gives the best preview of at most so many bytes; None: no size fits."""
+def other(codec: str, image: Tensor, max_bytes: int) -> Preview | None:
+    """Shrink the image as far as gives the best preview of at most `max_bytes`; None: no size fits."""
     size, candidates = (image.shape[1], image.shape[2]), []
     for factor in FACTORS:
         small = resized(image, (max(1, round(size[0] / factor)), max(1, round(size[1] / factor))))
-        coded = largest_file(codec, small, most)
-        if len(coded) <= most:
+        coded = largest_file(codec, small, max_bytes)
+        if len(coded) <= max_bytes:
             candidates.append((len(coded), resized(decode_file(coded), size)))
     return max(candidates, key=lambda preview: float(psnr(preview[1], image)), default=None)
 
 
-def beginning(data: bytes, most: int) -> Preview | None:
+def beginning(data: bytes, max_bytes: int) -> Preview | None:
     """Decode a file's first bytes; None: they hold no layer yet."""
     try:
-        return most, decode(data[:most]).scene.render()
+        return max_bytes, decode(data[:max_bytes]).scene.render()
     except CodecError:
         return None
 
@@ -87,12 +87,12 @@ def previews(image: Tensor) -> dict[str, dict[int, Preview | None]]:
     labels = segment(image)
     whole = fit_bytes(image, labels, WHOLE).data
     by_codec: dict[str, dict[int, Preview | None]] = {PREFIX: {}, FILE: {}, "WebP": {}, "AVIF": {}}
-    for most in BYTES:
-        file = fit_bytes(image, labels, most).data
-        by_codec[PREFIX][most] = beginning(whole, most)
-        by_codec[FILE][most] = len(file), decode(file).scene.render()
+    for max_bytes in BYTES:
+        file = fit_bytes(image, labels, max_bytes).data
+        by_codec[PREFIX][max_bytes] = beginning(whole, max_bytes)
+        by_codec[FILE][max_bytes] = len(file), decode(file).scene.render()
         for codec in ("WebP", "AVIF"):
-            by_codec[codec][most] = other(codec, image, most)
+            by_codec[codec][max_bytes] = other(codec, image, max_bytes)
     return by_codec
 
 
@@ -105,10 +105,10 @@ def show(image: Tensor, by_codec: dict[str, dict[int, Preview | None]]) -> None:
     for axis, (title, preview) in zip(axes[0], (("photo", None), ("ThumbHash", hashed)), strict=False):
         place(axis, title, image if preview is None else preview[1], None if preview is None else preview[0], image)
     for column, (codec, by_size) in enumerate(by_codec.items()):
-        for row, most in enumerate(BYTES, 1):
-            preview = by_size[most]
+        for row, max_bytes in enumerate(BYTES, 1):
+            preview = by_size[max_bytes]
             if preview is None:
-                axes[row, column].set_title(f"{codec}:\nnothing in {most} bytes", fontsize=9)
+                axes[row, column].set_title(f"{codec}:\nnothing in {max_bytes} bytes", fontsize=9)
             else:
                 place(axes[row, column], codec, preview[1], preview[0], image)
     figure.savefig(PATH, dpi=90, pil_kwargs={"quality": 85})

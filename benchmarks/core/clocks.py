@@ -29,7 +29,7 @@ def threads(count: int) -> Iterator[None]:
 
 
 def milliseconds(actions: Mapping[Key, Callable[[], object]], rounds: int) -> dict[Key, float]:
-    """Time actions, medians after a first call; they take turns, so that a machine's changing speed meets all alike."""
+    """Time actions, medians after a first call; they take turns, so that a change of the machine's speed meets all."""
     times: dict[Key, list[float]] = {key: [] for key in actions}
     for _ in range(rounds + 1):
         for key, action in actions.items():
@@ -42,7 +42,7 @@ def milliseconds(actions: Mapping[Key, Callable[[], object]], rounds: int) -> di
 def peak_megabytes(action: Callable[..., object], *arguments: Any, warm_up: tuple[Any, ...]) -> float:
     """Measure, in a process of its own, what an action adds to the peak of memory after a call with `warm_up`.
 
-    NaN where the system does not say: Linux does.
+    NaN where the system does not report it; Linux does.
     """
     if not _CLEAR.exists():
         return math.nan

@@ -30,7 +30,7 @@ CODECS = {
     "JPEG": Codec("JPEG", range(96), {"optimize": True, "progressive": True}, _SAMPLINGS),
     "WebP": Codec("WEBP", range(101), {"method": 6}),
     "AVIF": Codec("AVIF", range(101), _AVIF),
-    # libaom's encoder minds other measures unless told; with that, full colour pays
+    # by default libaom optimizes other measures than PSNR; for PSNR, 4:4:4 may be better
     "AVIF, tune=psnr": Codec("AVIF", range(101), {**_AVIF, "advanced": {"tune": "psnr"}}, _SAMPLINGS),
 }
 
@@ -48,19 +48,19 @@ def decode_file(data: bytes) -> Tensor:
     return torch.from_numpy(pixels.copy()).permute(2, 0, 1).float() / 255
 
 
-def largest_file(codec: str, image: Tensor, most: int) -> bytes:
-    """Make the largest file of at most `most` bytes, or the smallest; of variants, the one with the higher PSNR."""
+def largest_file(codec: str, image: Tensor, max_bytes: int) -> bytes:
+    """Make the largest file of at most `max_bytes`, or the smallest; of variants, the one with the higher PSNR."""
     pixels = (image * 255).round().byte().permute(1, 2, 0).contiguous().numpy()
     size, qualities, files = (image.shape[2], image.shape[1]), CODECS[codec].qualities, []
     for variant in range(len(CODECS[codec].variants)):
         arguments = codec, variant, pixels.tobytes(), size
-        index = bisect_right(qualities[1:], most, key=lambda quality: len(_encode(*arguments, quality)))
+        index = bisect_right(qualities[1:], max_bytes, key=lambda quality: len(_encode(*arguments, quality)))
         files.append(_encode(*arguments, qualities[index]))
-    small = [file for file in files if len(file) <= most]
+    small = [file for file in files if len(file) <= max_bytes]
     return max(small, key=lambda file: float(psnr(decode_file(file), image))) if small else min(files, key=len)
 
 
-# files at several sizes are often the same
+# searches for several sizes try the same qualities
 @lru_cache(maxsize=256)
 def _encode(codec: str, variant: int, pixels: bytes, size: tuple[int, int], quality: int) -> bytes:
     kind, file = CODECS[codec], BytesIO()

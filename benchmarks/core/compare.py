@@ -96,7 +96,7 @@ class Comparison(NamedTuple):
     second: str
 
     def gains(self, rows: Iterable[Row], quantity: str, cases: Sequence[str]) -> dict[tuple[object, ...], Gain]:
-        """Return what the first has over the second in each case, a combination of columns, averaged over seeds."""
+        """Return the gains of the first over the second by case, the values of these columns; seeds are averaged."""
         values: dict[tuple[object, ...], dict[str, dict[str, list[float]]]] = {}
         for row in rows:
             if row["method"] in self and not is_missing(row.get(quantity)):
@@ -206,7 +206,7 @@ def losses_table(
 
 
 def summary(rows: Sequence[Row], comparison: Comparison, quantities: Sequence[str], cases: Sequence[str]) -> str:
-    """Say in a sentence what the first method has over the second, over all cases."""
+    """Return a sentence on the gains of the first method over the second in all cases."""
     parts = []
     for quantity in quantities:
         gains = list(comparison.gains(rows, quantity, cases).values())

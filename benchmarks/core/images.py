@@ -1,4 +1,4 @@
-"""The images of experiments, by name, with the label maps that they come with."""
+"""The images of experiments by name, with their label maps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Sample(NamedTuple):
     """An image and its label map."""
 
     image: Tensor  # (3, H, W)
-    labels: Tensor | None  # (H, W); None: it comes with none
+    labels: Tensor | None  # (H, W); None: the image has no map
 
 
 @lru_cache(maxsize=4)
@@ -39,7 +39,7 @@ def load(name: str, data: str | None = None, quick: bool = False) -> Sample:
 
 
 def load_mapped(name: str, data: str | None = None, quick: bool = False) -> tuple[Tensor, Tensor]:
-    """Read an image and its label map; one that comes with none has the map that `segment` finds."""
+    """Read an image and its label map, or the map of `segment` where it has none."""
     image, labels = load(name, data, quick)
     return image, segment(image) if labels is None else labels
 

@@ -1,4 +1,4 @@
-"""Scenes that anybody can render too: made by rule, and fitted ones of the zoo."""
+"""Scenes of experiments: synthetic workloads, and fitted scenes of the zoo."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SIZES = ("native", "3840 wide")
 
 
 def scene_of(name: str) -> Scene:
-    """Make a workload, or read a scene of the zoo; "none", "hard" or "soft" behind the name: what contours it has."""
+    """Make a workload, or read a scene of the zoo; "none", "hard" or "soft" behind the name are its contours."""
     name, _, contours = name.partition(" ")
     scene = workload(*WORKLOADS[name]) if name in WORKLOADS else load(find(name))
     field, regions = scene.field, scene.regions

@@ -193,7 +193,7 @@ class TestCodecs:
     @pytest.mark.parametrize("codec", available_codecs())
     def test_largest_file(self, codec: str, astronaut: Tensor) -> None:
         image = astronaut[:, 128:256, 128:256].contiguous()
-        files = [largest_file(codec, image, most) for most in (1_500, 3_000)]
+        files = [largest_file(codec, image, size) for size in (1_500, 3_000)]
         assert all(0.7 * most < len(file) <= most for file, most in zip(files, (1_500, 3_000), strict=True))
         assert psnr(decode_file(files[0]), image) < psnr(decode_file(files[1]), image)
         # no file is as small
