@@ -10,13 +10,13 @@ from torch import Tensor
 
 from kcgs import Scene, fit
 from kcgs.codec import decode, encode
-from kcgs.functional import ef_psnr, psnr
+from kcgs.functional import psnr
 from kcgs.rate import quality_for
 from kcgs.segment import segment
 
 from .core.compare import Comparison, differences_table, losses_table, means_table, summary
 from .core.figures import Panel, save_lines
-from .core.fits import QUICK_ITERATIONS
+from .core.fits import QUICK_ITERATIONS, measure_render
 from .core.images import load, names
 from .core.run import Job, Options, Page, Row
 
@@ -54,12 +54,10 @@ def measure(image: str, n: int, sources: list[str], data: str, quick: bool) -> l
             ("no map, equal bits", equal, equal_file, equal_n),
         ):  # fmt: skip
             render = decode(data_bytes).scene.render() if method != "no map" else scene.render()
-            figures = {"psnr": float(psnr(scene.render(), pixels)), "decoded_psnr": float(psnr(render, pixels))}
-            if band is not None:
-                figures["ef_psnr"] = float(ef_psnr(scene.render(), pixels, band))
-                figures["decoded_ef_psnr"] = float(ef_psnr(render, pixels, band))
+            figures = measure_render(scene.render(), pixels, band)
+            decoded = {f"decoded_{name}": value for name, value in measure_render(render, pixels, band).items()}
             rows.append({
-                "image": image, "n": n, "source": source, "method": method, "gaussians": count, **figures,
+                "image": image, "n": n, "source": source, "method": method, "gaussians": count, **figures, **decoded,
                 "bytes": len(data_bytes) or size, "regions": 1 if regions is None else regions.num_regions,
                 "map_seconds": seconds if method == "map" else math.nan,
             })  # fmt: skip
