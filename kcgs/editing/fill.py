@@ -18,6 +18,7 @@ from kcgs.scene import Scene
 
 from .inpainting import inpaint
 from .masks import FRINGE, dilate
+from .weights import weight_sums
 
 
 @dataclass(frozen=True)
@@ -88,21 +89,15 @@ def _fringe(mask: Tensor, labels: Tensor) -> Tensor:
     return near & torch.isin(labels, labels[mask].unique()) & torch.isin(labels, labels[~near].unique())
 
 
-@torch.enable_grad()
 def _share_in(field: GaussianField, ids: Tensor, regions: RegionMap, hole: Tensor) -> Tensor:
     """Return the share of the weight of each Gaussian that is in the hole, (N,)."""
-    ones = torch.ones_like(field.colors[:, :1]).requires_grad_()
-    total = region_splat(field.means.detach(), field.cholesky.detach(), ones, ids, regions)
-    # the render is linear in the colours: the gradient of its sum over a mask is each Gaussian's weight there
-    inside, everywhere = (
-        torch.autograd.grad(total, ones, mask.to(total)[None], retain_graph=True)[0][:, 0]
-        for mask in (hole, torch.ones_like(hole))
-    )
-    return inside / everywhere.clamp_min(1e-9)
+    means, cholesky = field.means.detach(), field.cholesky.detach()
+    total, sums = weight_sums(lambda ones: region_splat(means, cholesky, ones, ids, regions), field.colors)
+    return sums(hole.to(total)[None]) / sums(torch.ones_like(total)).clamp_min(1e-9)
 
 
 def _spread(residual: Tensor, mask: Tensor, regions: RegionMap) -> GaussianField:
-    """Spread round Gaussians over a mask that together about make the residual there."""
+    """Spread round Gaussians over a mask, whose sum is about the residual there."""
     spacing = max(_SETTINGS.min_spacing, float(mask.sum() / _SETTINGS.max_added) ** 0.5)
     rows, cols = (torch.arange(min(spacing, n) / 2, n, spacing, device=mask.device).long() for n in mask.shape)
     grid = torch.zeros_like(mask)

@@ -173,13 +173,14 @@ def _choose_regions(
 ) -> _RegionChoice:
     """Merge regions whose contours do not pay for their bytes, then drop the map if it does not pay as a whole."""
     num_gaussians = partial(BUDGETS[config.objective].num_gaussians, pixels=image.shape[1] * image.shape[2])
+    choice = _RegionChoice(None, num_gaussians(target_bytes), config.contour_cost, {})
     if not config.guidance:
-        return _RegionChoice(None, num_gaussians(target_bytes), config.contour_cost, {"dropped": "recipe"})
+        return choice._replace(changes={"dropped": "recipe"})
     if regions is None or regions.num_regions == 1:
-        return _RegionChoice(None, num_gaussians(target_bytes), config.contour_cost, {})
+        return choice
     map_bytes = _map_bytes(regions)
     if not config.merge_regions:
-        return _RegionChoice(regions, num_gaussians(target_bytes - map_bytes), config.contour_cost, {})
+        return choice._replace(regions=regions, num_gaussians=num_gaussians(target_bytes - map_bytes))
     # by iterations, so that without a clock the same arguments give the same file
     iterations = min(_SETTINGS.trial_iterations, config.usual_iterations)
     trial = FitConfig.from_recipe(config, merge_regions=False, iterations=iterations, max_seconds=None)
@@ -188,7 +189,7 @@ def _choose_regions(
         history = _fit_share(_SETTINGS.fit_share, image, regions, count, trial, seed=seed).history
         return float(10 ** (-max(entry.psnr for entry in history) / 10))
 
-    plain_error = trial_error(None, num_gaussians(target_bytes))
+    plain_error = trial_error(None, choice.num_gaussians)
     # squared error, summed over pixels, that one more bit of Gaussians saves: the derivative of the power law
     bit_value = (
         _SETTINGS.rate_exponent * _SETTINGS.final_error_share * plain_error * image[0].numel() / (8 * target_bytes)
@@ -197,20 +198,20 @@ def _choose_regions(
     paying_regions = regions
     if regions.softness == 0.0:
         paying_regions = RegionMap.from_labels(merge_regions(image, regions.labels, contour_cost))
-    changes = {"merged_for_bytes": regions.num_regions - paying_regions.num_regions}
+    choice = choice._replace(changes={"merged_for_bytes": regions.num_regions - paying_regions.num_regions})
     max_regions = num_gaussians(target_bytes - _map_bytes(paying_regions))
     candidate = paying_regions.merge(pairs_to_merge(image, paying_regions.labels, max_regions))[0]
     if candidate is None or candidate.num_regions == 1:
-        return _RegionChoice(None, num_gaussians(target_bytes), contour_cost, changes)
+        return choice
     count = num_gaussians(target_bytes - _map_bytes(candidate))
     if count < candidate.num_regions or trial_error(candidate, count) >= _SETTINGS.contour_allowance * plain_error:
-        return _RegionChoice(None, num_gaussians(target_bytes), contour_cost, {"dropped": "bytes"})
-    return _RegionChoice(candidate, count, contour_cost, changes)
+        return choice._replace(changes={"dropped": "bytes"})
+    return choice._replace(regions=candidate, num_gaussians=count, contour_cost=contour_cost)
 
 
-def _map_bytes(regions: RegionMap | None) -> int:
+def _map_bytes(regions: RegionMap) -> int:
     """Return the bytes that the label map takes in a file."""
-    if regions is None or regions.num_regions == 1:
+    if regions.num_regions == 1:
         return 0
     from kcgs.codec.region_map import encode_region_map  # loads numba
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcgs.editing.weights import weight_sums
 from kcgs.fitting import FitConfig
 from kcgs.fitting.descent import DRAFT_CUTOFF
 from kcgs.functional import RegionMap, region_splat
@@ -82,12 +83,5 @@ class Target:
         return (self.render(splats) - self.image).square().mean(0)
 
     def weight_sums(self, splats: Splats) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """Return the sum of all weights at each pixel, (1, H, W), and a function that sums such a map per Gaussian.
-
-        The function weighs each pixel by the weight of the Gaussian there and returns (N,).
-        """
-        ones = torch.ones_like(splats.colors[:, :1]).requires_grad_()
-        with torch.enable_grad():
-            total = self.render(splats._replace(colors=ones))
-        # the render is linear in the colours, so its gradient by them has the sums
-        return total.detach(), lambda values: torch.autograd.grad(total, ones, values, retain_graph=True)[0][:, 0]
+        """Sum weights per pixel and per Gaussian: see :func:`kcgs.editing.weights.weight_sums`."""
+        return weight_sums(lambda colors: self.render(splats._replace(colors=colors)), splats.colors)
