@@ -104,7 +104,8 @@ def _spread(residual: Tensor, mask: Tensor, regions: RegionMap) -> GaussianField
     grid[rows[:, None], cols] = True
     y, x = (grid & mask).nonzero().T
     means, ids = torch.stack([x, y], -1).to(residual) + 0.5, regions.labels[y, x]
-    cholesky = residual.new_tensor([_SETTINGS.sigma * spacing, 0.0, _SETTINGS.sigma * spacing]).expand(len(x), 3)
+    sigma = _SETTINGS.sigma * spacing
+    cholesky = residual.new_tensor([sigma, 0.0, sigma]).expand(len(x), 3)
     total = region_splat(means, cholesky, torch.ones_like(means[:, :1]), ids, regions)[:, y, x]
     return GaussianField(means, cholesky, (residual[:, y, x] / total).T, ids, size=regions.size)
 
@@ -114,6 +115,7 @@ def _fit(field: GaussianField, regions: RegionMap, target: Tensor, weight: Tenso
     """Fit Gaussians to a target, with a weight per pixel; opacities are merged into the colours."""
     geometry = field.means.detach(), field.cholesky.detach()
     field = GaussianField(*geometry, field.merged_colors().detach(), field.region_ids, size=field.size)
+    # tensors, so that the schedule, too, is in the precision of the field
     rate, color_rate = field.means.detach().new_tensor([_SETTINGS.rate, _SETTINGS.color_rate])
     optimizer = GaussianAdam(field, rate, color_lr=color_rate)
     schedule = LambdaLR(optimizer, lambda step: cosine_decay(step / _SETTINGS.steps))

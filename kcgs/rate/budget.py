@@ -159,7 +159,7 @@ def fit_bytes(
     config = config.model_copy(update={"contour_cost": choice.contour_cost})
     share = _SETTINGS.fit_share if choice.regions is None else _SETTINGS.fit_share_with_regions
     result = _fit_share(
-        share, image, choice.regions, choice.num_gaussians, config, seed=seed, on_step=on_step, progress=progress
+        share, image, choice.regions, choice.num_gaussians, config, on_step, seed=seed, progress=progress
     )
     report = report_regions(regions, result.scene, **choice.changes)
     with Progress("writing the file", pulse=True, visible=progress):
@@ -224,10 +224,8 @@ def _fit_share(
     regions: RegionMap | None,
     num_gaussians: int,
     config: FitConfig,
-    *,
-    seed: int,
     on_step: Callable[[int, HistoryEntry], bool | None] | None = None,
-    progress: bool = False,
+    **settings: Any,
 ) -> FitResult:
     """Run the first share of a fit's schedule; all of it where a clock ends the fit."""
     last = math.inf if config.max_seconds else math.ceil(share * config.usual_iterations)
@@ -235,6 +233,6 @@ def _fit_share(
     def stop(iteration: int, entry: HistoryEntry) -> bool:
         return (on_step is not None and bool(on_step(iteration, entry))) or iteration >= last
 
-    result = fit(image, regions, num_gaussians, recipe=config, seed=seed, on_step=stop, progress=progress)
+    result = fit(image, regions, num_gaussians, recipe=config, on_step=stop, **settings)
     is_complete = result.history[-1].iteration >= last
     return result._replace(stop_reason="iterations") if is_complete else result

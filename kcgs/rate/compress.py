@@ -100,7 +100,10 @@ def compress(
     check_count("iterations", iterations)
     if objective not in get_args(Objective):
         raise InvalidArgument("objective", f"one of {', '.join(get_args(Objective))}", repr(objective))
-    compressor = _Compressor(writer, target, make_objective(objective, target), iterations, seed)
+    descent_iterations = int(_SCHEDULE.descent_share * iterations)
+    compressor = _Compressor(
+        writer, target, make_objective(objective, target), descent_iterations, iterations - descent_iterations, seed
+    )
     with threads_for_kernels(target[0].numel()):
         if target_bytes is not None:
             data = compressor.search_bytes(target_bytes)
@@ -165,7 +168,8 @@ class _Compressor:
     writer: SceneWriter
     image: Tensor  # [C, H, W]
     objective: MsSsimObjective | None
-    iterations: int
+    descent_iterations: int
+    rounding_iterations: int
     seed: int
 
     def search_bytes(self, target_bytes: int) -> bytes:
@@ -182,7 +186,7 @@ class _Compressor:
         data, candidates = fallback, []
         for _ in range(_SCHEDULE.max_roundings):
             qp = min(writer.next_qp(qp, len(data), round(_SCHEDULE.rounding_aim * target_bytes)), max_qp)
-            data = self._round(writer, qp, self._rounding_iterations, target_bytes)
+            data = self._round(writer, qp, self.rounding_iterations, target_bytes)
             if len(data) <= target_bytes:
                 candidates.append(data)
             if len(data) >= _SCHEDULE.min_fill * target_bytes or qp == max_qp:
@@ -199,19 +203,11 @@ class _Compressor:
 
     def write(self, qp: int) -> bytes:
         """Return the file at a QP."""
-        return self._round(self._descend(qp, lambda _, qp: qp), qp, self._rounding_iterations)
-
-    @property
-    def _descent_iterations(self) -> int:
-        return int(_SCHEDULE.descent_share * self.iterations)
-
-    @property
-    def _rounding_iterations(self) -> int:
-        return self.iterations - self._descent_iterations
+        return self._round(self._descend(qp, lambda _, qp: qp), qp, self.rounding_iterations)
 
     def _descend(self, qp: int, update_qp: Callable[[SceneWriter, int], int]) -> SceneWriter:
         """Lower error and bits with nothing rounded; `update_qp` returns the QP for the scene of the moment."""
-        writer, iterations = self.writer, self._descent_iterations
+        writer, iterations = self.writer, self.descent_iterations
         descent = self._new_descent(writer)
         for start in range(0, iterations, _SCHEDULE.update_interval):
             qp = update_qp(writer, qp)

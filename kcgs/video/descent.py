@@ -18,6 +18,7 @@ from .splats import Splats, Target
 
 # Numbers are tuned: more iterations and relocations lower the error, and take longer and flicker more.
 
+# of each frame
 _ITERATIONS = 85
 # share of a Newton step in a step: larger ones oscillate
 _RATE = 0.12
@@ -92,7 +93,8 @@ class FrameDescent:
         """
         means, cholesky, colors, region_ids, regions = self.splats
         image, backend = self.target.image, self.target.config.backend
-        weights = error_weights(Gaussians(means, cholesky, colors), self.objective) * self._measure_overlap()
+        visibility, self.crowding = self._overlap()
+        weights = error_weights(Gaussians(means, cholesky, colors), self.objective) * visibility
         weights = torch.where(self.movable_rows, weights, _FIXED_WEIGHT)
         arrays = (
             means.cpu().numpy(), cholesky.cpu().numpy(), colors.cpu().numpy(), self.splats.region_index.cpu().numpy()
@@ -112,22 +114,22 @@ class FrameDescent:
         colors = colors.index_copy(0, rows, proposal.colors)
         self.splats = Splats(means, cholesky, colors, region_ids, regions)
 
-    def _measure_overlap(self) -> Tensor:
-        """Return the share of each Gaussian that is visible, (N,), and note where Gaussians are crowded.
+    def _overlap(self) -> tuple[Tensor, Tensor]:
+        """Return the share of each Gaussian that is visible, and the factor by which its place is crowded, (N,) each.
 
         Gaussians in one place move together: with the second derivative of one alone, their steps would be too long.
         """
         total, sums = self.target.weight_sums(self.splats)
         areas = area(self.splats.cholesky)
-        self.crowding = (sums(total) / areas / _USUAL_OVERLAP).clamp_min(1.0)
-        return (sums(torch.ones_like(total)) / (2 * areas)).clamp_max(1.0)
+        visibility = (sums(torch.ones_like(total)) / (2 * areas)).clamp_max(1.0)
+        return visibility, (sums(total) / areas / _USUAL_OVERLAP).clamp_min(1.0)
 
     def _move_contours(self, anchor: Tensor) -> None:
         """Move contours to where the error is lower, or little higher."""
-        config = self.target.config
         scene, image = self.splats.scene(self.target.size), self.target.image
-        regions = move_contours(scene, image, anchor, config, self._squared_error, _MAX_RISE)
-        self.splats = self.splats._replace(regions=regions)
 
-    def _squared_error(self, regions: RegionMap) -> Tensor:
-        return self.target.squared_error(self.splats._replace(regions=regions))
+        def squared_error(regions: RegionMap) -> Tensor:
+            return self.target.squared_error(self.splats._replace(regions=regions))
+
+        regions = move_contours(scene, image, anchor, self.target.config, squared_error, _MAX_RISE)
+        self.splats = self.splats._replace(regions=regions)
