@@ -1,4 +1,8 @@
-"""Image files as arrays of the samples that they store, at full precision."""
+"""Image files as arrays of the samples that they store, at full precision.
+
+Pillow reads all kinds but two, of which it would keep 8 bits: colour PNG of 16 bits per channel, which kornia_rs
+reads, and TIFF of more than 8 bits or of floats, which tifffile reads.
+"""
 
 import logging
 import os
@@ -55,7 +59,8 @@ def decode(path: str | os.PathLike[str], *, indices: bool = False) -> Samples:
 
 
 def _pillow(data: bytes, image: Image.Image, indices: bool) -> Samples:
-    if data.startswith(_PNG) and data[24] == 16 and data[25] in (2, 6):  # 16 bits per channel, of which Pillow reads 8
+    # in a PNG, byte 24 is the number of bits, and byte 25 the kind of colours: 2 is RGB, 6 RGBA
+    if data.startswith(_PNG) and data[24] == 16 and data[25] in (2, 6):
         from kornia_rs.io import decode_image_png_u16
 
         mode = "rgb" if data[25] == 2 else "rgba"
@@ -74,13 +79,15 @@ def _pillow(data: bytes, image: Image.Image, indices: bool) -> Samples:
 
 
 def _tiff(data: bytes) -> Samples | None:
-    """Decode a grey or RGB TIFF that Pillow would reduce to 8 bits or refuse; None: Pillow reads it."""
+    """Decode a grey or RGB TIFF of more than 8 bits or of floats; None: any other, which Pillow reads."""
     import tifffile
+    from tifffile import EXTRASAMPLE, PHOTOMETRIC
 
     with tifffile.TiffFile(BytesIO(data)) as file:
         page: Any = file.pages[0]
-        is_rgb, is_unsigned = int(page.photometric) == 2, page.sampleformat == 1
-        if int(page.photometric) not in (0, 1, 2) or (is_unsigned and page.bitspersample in (1, 8)):
+        is_grey = page.photometric in (PHOTOMETRIC.MINISBLACK, PHOTOMETRIC.MINISWHITE)
+        is_unsigned = page.sampleformat == tifffile.SAMPLEFORMAT.UINT
+        if not (is_grey or page.photometric == PHOTOMETRIC.RGB) or (is_unsigned and page.bitspersample in (1, 8)):
             return None
         # a damaged or hostile header can claim any size: the limit is that of Pillow for its own formats
         count, limit = page.imagewidth * page.imagelength, Image.MAX_IMAGE_PIXELS
@@ -88,16 +95,17 @@ def _tiff(data: bytes) -> Samples | None:
             raise ValueError(f"its header claims {count} pixels, more than twice the limit of {limit}")
         values = page.asarray()
         orientation = page.tags[_ORIENTATION].value if _ORIENTATION in page.tags else 1
-    extra = int(page.extrasamples[0]) if page.extrasamples else 0
-    if page.axes not in ("YX", "YXS") or extra == 1:
+    alpha = page.extrasamples[0] if page.extrasamples else None
+    if page.axes not in ("YX", "YXS") or alpha == EXTRASAMPLE.ASSOCALPHA:
         raise ValueError(f"its first page has axes {page.axes}; expected one image, alpha not multiplied in")
-    values = values[..., None] if page.axes == "YX" else values[..., : (3 if is_rgb else 1) + (extra == 2)]
+    channels = (1 if is_grey else 3) + (alpha == EXTRASAMPLE.UNASSALPHA)
+    values = values[..., None] if page.axes == "YX" else values[..., :channels]
     white = None
     if values.dtype.kind == "f":
         white = 1.0
     elif is_unsigned and page.bitspersample <= 16:
         white = float(2**page.bitspersample - 1)
-    if int(page.photometric) == 0:  # white is 0
+    if page.photometric == PHOTOMETRIC.MINISWHITE:
         values = ~values
     return Samples(_upright(values, orientation), white, "TIFF", True)
 

@@ -13,20 +13,16 @@ from torch import Tensor
 
 from kcgs._atomic import atomic_path
 from kcgs._image import as_image, on_white
+from kcgs._suffixes import WRITTEN_IMAGES
 from kcgs.data._decode import decode
 
 # Rec. 601
 _LUMA = (0.299, 0.587, 0.114)
 _MODES = {1: "L", 3: "RGB", 4: "RGBA"}
-# format and options of Pillow by suffix
-_WRITERS: dict[str, tuple[str, dict[str, object]]] = {
-    ".png": ("PNG", {}),
-    ".jpg": ("JPEG", {"quality": 95, "subsampling": 0}),
-    ".jpeg": ("JPEG", {"quality": 95, "subsampling": 0}),
-    ".webp": ("WEBP", {"lossless": True, "exact": True}),
-    ".tif": ("TIFF", {}),
-    ".tiff": ("TIFF", {}),
-    ".bmp": ("BMP", {}),
+# of Pillow, by format
+_OPTIONS: dict[str, dict[str, object]] = {
+    "JPEG": {"quality": 95, "subsampling": 0},
+    "WEBP": {"lossless": True, "exact": True},
 }
 
 
@@ -113,13 +109,13 @@ def save_image(path: str | os.PathLike[str], image: Any) -> None:
     if image.shape[0] not in _MODES:
         raise ValueError(f"image must have shape (1, H, W), (3, H, W) or (4, H, W); got {tuple(image.shape)}")
     suffix = Path(path).suffix.lower()
-    if suffix not in _WRITERS:
-        raise ValueError(f"path must end in {', '.join(_WRITERS)}; got {str(path)!r}")
-    name, options = _WRITERS[suffix]
-    if image.shape[0] == 4 and name in ("JPEG", "BMP"):
+    if suffix not in WRITTEN_IMAGES:
+        raise ValueError(f"path must end in {', '.join(WRITTEN_IMAGES)}; got {str(path)!r}")
+    kind = Image.registered_extensions()[suffix]
+    if image.shape[0] == 4 and kind in ("JPEG", "BMP"):
         raise ValueError(f"path must end in .png, .webp or .tif to hold alpha; got {str(path)!r}")
     levels = (image.detach().float().clamp(0, 1) * 255 + 0.5).floor().to(torch.uint8)
     pixels = levels.permute(1, 2, 0).cpu().numpy()
     stored = Image.fromarray(np.ascontiguousarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels))
     with atomic_path(path) as temporary:
-        stored.save(temporary, format=name, **options)
+        stored.save(temporary, format=kind, **_OPTIONS.get(kind, {}))

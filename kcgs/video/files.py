@@ -16,13 +16,12 @@ from torch import Tensor
 from kcgs._atomic import atomic_path
 from kcgs._check import check_number
 from kcgs._image import as_image
+from kcgs._suffixes import LABEL_MAPS, WRITTEN_IMAGES
 from kcgs.data.images import load_image, save_image
 from kcgs.data.labels import load_labels
 
 # frames per second where a file or an iterable does not have a rate
 DEFAULT_FRAME_RATE = 24.0
-_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-_LABEL_MAP_SUFFIXES = (".png", ".npy", ".tif", ".tiff", ".bmp", ".gif", ".webp")
 # matrix, primaries and transfer in H.273
 _BT709 = 1
 # AVCOL_RANGE_MPEG
@@ -54,7 +53,7 @@ class Frames:
 
     def _read(self) -> Iterator[tuple[Tensor, float]]:
         if self._path.is_dir():
-            return ((load_image(file), DEFAULT_FRAME_RATE) for file in _list_files(self._path, _IMAGE_SUFFIXES))
+            return ((load_image(file), DEFAULT_FRAME_RATE) for file in _list_files(self._path, WRITTEN_IMAGES))
         return _decode(self._path)
 
 
@@ -112,9 +111,9 @@ def read_label_maps(folder: str | os.PathLike[str]) -> list[Tensor]:
         ...     [(tuple(labels.shape), int(labels.max())) for labels in read_label_maps(f"{folder}/maps")]
         [((4, 6), 0), ((4, 6), 0)]
     """
-    files = _list_files(Path(folder), _LABEL_MAP_SUFFIXES)
+    files = _list_files(Path(folder), LABEL_MAPS)
     if not files:
-        raise ValueError(f"{folder} has no label maps ({', '.join(_LABEL_MAP_SUFFIXES)})")
+        raise ValueError(f"{folder} has no label maps ({', '.join(LABEL_MAPS)})")
     return [load_labels(file, rgb_ids=True) for file in files]
 
 
