@@ -23,7 +23,10 @@ class CodecError(ValueError):
 
 
 class Coder(ABC):
-    """Either side of a stream: a writer takes values and returns them, a reader ignores them and returns its own."""
+    """Either side of a stream: a writer takes values and returns them, a reader ignores them and returns its own.
+
+    So one procedure writes and reads; where it has nothing to write, values are None.
+    """
 
     is_reader = False
 

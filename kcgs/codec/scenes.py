@@ -162,7 +162,7 @@ class SceneWriter:
         groups = [slice(*ends) for ends in itertools.pairwise(starts)]
         for layer in _join_groups(groups, len(ids)):
             writer, energy = Writer(), int(codes.energy[layer[0].start])
-            coder.code(writer, energy, [(codes.select(group), ids[group]) for group in layer], len(ids))
+            coder.write(writer, [(codes.select(group), ids[group]) for group in layer])
             # zeros at the end of a stream are left out, but a layer's length limits the number of its Gaussians
             count = layer[-1].stop - layer[0].start
             layers.append(writer.finish().ljust(-(-(count - _FREE_GAUSSIANS) // 8), b"\0"))
@@ -247,7 +247,7 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
     parts, ids, remaining = [], [], max_gaussians(header.channels)
     for (energy, _), layer in zip(header.layers, layers, strict=False):
         max_count = min(8 * len(layer) + _FREE_GAUSSIANS, remaining)
-        for gaussians, positions in coder.code(Reader(layer), energy, None, max_count):
+        for gaussians, positions in coder.read(Reader(layer), energy, max_count):
             parts.append(gaussians)
             ids.append(positions)
             remaining -= len(positions)

@@ -17,7 +17,7 @@ from kcgs import RegionMap, Scene, load
 from kcgs.codec import CodecError, Decoded, decode, decode_labels, encode, encode_labels
 from kcgs.codec.exact import Integers
 from kcgs.codec.file import ByteReader, Header, pack, unpack
-from kcgs.codec.gaussians.layers import Group, LayerCoder
+from kcgs.codec.gaussians.layers import Group, LayerCoder, _Values
 from kcgs.codec.gaussians.occupancy import Grid, OccupancyCoder
 from kcgs.codec.gaussians.quantize import Classes, Quantizer
 from kcgs.codec.labels.ids import _code_count
@@ -279,7 +279,7 @@ def forge(header: Header, generator: np.random.Generator) -> bytes:
     for energy, _ in header.layers:
         forger = Forger(generator)
         try:
-            model.code(forger, energy, None, 5000)
+            model.read(forger, energy, 5000)
         except CodecError:
             break
         layers.append(forger.finish().ljust(600, b"\0"))
@@ -381,14 +381,15 @@ def test_an_energy_below_all(energy: int, symbols: list[int]) -> None:
     writer, quantizer, message = Scripted(*symbols), Quantizer(0, (9, 9)), "must be at least -24; got -25"
     groups = [make_group(quantizer, energy - i) for i in range(1 + symbols[:-1].count(1))]
     with pytest.raises(CodecError, match=message):
-        LayerCoder(quantizer, 1, None).code(writer, energy, groups, 5000)
+        LayerCoder(quantizer, 1, None).write(writer, groups)
     refuse(writer, message, energy=energy)
 
 
 def test_too_many_gaussians() -> None:
     writer, quantizer = Writer(), Quantizer(0, (9, 9))
     model = LayerCoder(quantizer, 1, None)
-    model._code_group(writer, 0, make_group(quantizer, 0), 5)
+    codes, ids = make_group(quantizer, 0)
+    model._code_group(writer, 0, _Values(*codes, ids), 5)
     writer.number(1, 3)
     model._code_counts(writer, np.zeros(5000, np.int64))
     layer = writer.finish()

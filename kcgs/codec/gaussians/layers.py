@@ -6,7 +6,7 @@ A layer has a group for each of its classes of energy: by class of size, how man
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kcgs.codec.adaptive import AdaptiveAngle, AdaptiveMagnitude, AdaptiveNumber, AdaptiveSymbol
 from kcgs.codec.exact import Floats, Integers, exp2
-from kcgs.codec.rangecoder import CodecError, Coder
+from kcgs.codec.rangecoder import CodecError, Coder, Reader, Writer
 from kcgs.functional import RegionMap
 from kcgs.functional.labels import lookup_regions
 
@@ -38,11 +38,27 @@ _PRESENT = 1  # a group of the next energy down
 _ABSENT = 2  # no group of that energy
 Group = tuple[Codes, Integers]
 """Gaussians of one energy, and the positions of their regions' ids."""
-_UNKNOWN: Any = (Codes(*[None] * len(Codes._fields)), None)  # type: ignore[arg-type]  # a group that is to be read
+
+
+class _Values(NamedTuple):
+    """What a writer codes of a group: `Codes`, and the positions of the regions' ids; of a reader all are None."""
+
+    energy: Integers | None = None
+    size: Integers | None = None
+    scale: Integers | None = None
+    ratio: Integers | None = None
+    angle: Integers | None = None
+    colors: Integers | None = None
+    cell: Integers | None = None
+    place: Integers | None = None
+    ids: Integers | None = None
 
 
 class LayerCoder:
-    """Codes layers one after another, by models that learn from all layers so far. The map is on the CPU."""
+    """Writes or reads layers one after another, by models that learn from all layers so far. The map is on the CPU.
+
+    One procedure does both, so that they agree: `_code` and what it calls take values, which are None to read.
+    """
 
     def __init__(self, quantizer: Quantizer, channels: int, regions: RegionMap | None) -> None:
         self.quantizer, self.channels, self.regions = quantizer, channels, regions
@@ -53,23 +69,26 @@ class LayerCoder:
         self._count = AdaptiveNumber(_COUNT_WEIGHTS)
         self._occupancy = OccupancyCoder(quantizer.size)
 
-    def code(
+    def write(self, writer: Writer, groups: list[Group]) -> None:
+        """Write a layer of groups in the order of a file, energies falling."""
+        self._code(writer, int(groups[0][0].energy[0]), groups, sum(len(ids) for _, ids in groups))
+
+    def read(self, reader: Reader, energy: int, max_count: int) -> list[tuple[Parameters, Integers]]:
+        """Read the groups of a layer; `energy` is the class of the first, and more Gaussians an error."""
+        return self._code(reader, energy, None, max_count)
+
+    def _code(
         self, coder: Coder, energy: int, groups: list[Group] | None, max_count: int
     ) -> list[tuple[Parameters, Integers]]:
-        """Code a layer of at most `max_count` Gaussians; return those of each group, as a decoder restores them.
-
-        Args:
-            coder: of the layer's stream.
-            energy: class of the first group.
-            groups: in the order of a file, energies falling; None: to read.
-            max_count: more are an error.
-        """
         coded, remaining = [], None if groups is None else list(groups)
         symbol = _PRESENT
         while symbol != _END:
             if symbol == _PRESENT:
-                group = _UNKNOWN if remaining is None else remaining.pop(0)
-                coded.append(self._code_group(coder, energy, group, max_count))
+                values = _Values()
+                if remaining is not None:
+                    codes, ids = remaining.pop(0)
+                    values = _Values(*codes, ids)
+                coded.append(self._code_group(coder, energy, values, max_count))
                 max_count -= len(coded[-1][1])
             energy -= 1
             symbol = coder.number(_next_symbol(remaining, energy), 3)
@@ -77,10 +96,9 @@ class LayerCoder:
                 raise CodecError(f"a class of energy must be at least {ENERGIES[0]}; got {energy}")
         return coded
 
-    def _code_group(self, coder: Coder, energy: int, group: Group, max_count: int) -> tuple[Parameters, Integers]:
+    def _code_group(self, coder: Coder, energy: int, values: _Values, max_count: int) -> tuple[Parameters, Integers]:
         """Code at most `max_count` Gaussians of one energy."""
-        codes, ids = group
-        counts = self._code_counts(coder, codes.size)
+        counts = self._code_counts(coder, values.size)
         if counts.sum() > max_count:
             raise CodecError(f"a layer must hold at most {max_count} Gaussians; got {counts.sum()}")
         if counts[SIZES[1] - SIZES[0] + 1 :].any():
@@ -90,13 +108,13 @@ class LayerCoder:
         cells, start = [], 0
         for size in np.flatnonzero(counts)[::-1].tolist():
             end = start + int(counts[size])
-            cell = None if codes.cell is None else codes.cell[start:end]
+            cell = None if values.cell is None else values.cell[start:end]
             cells.append(self._occupancy.code(coder, size + SIZES[0], end - start, cell))
             start = end
         size = np.repeat(np.arange(_NUM_CLASSES)[::-1], counts[::-1]) + SIZES[0]
         classes = Classes(np.full(start, energy), size)
-        gaussians = self._code_parameters(coder, classes, np.concatenate(cells), codes)
-        return gaussians, self._code_regions(coder, gaussians.means, ids)
+        gaussians = self._code_parameters(coder, classes, np.concatenate(cells), values)
+        return gaussians, self._code_regions(coder, gaussians.means, values.ids)
 
     def _code_counts(self, coder: Coder, sizes: Integers | None) -> Integers:
         """Code the number of Gaussians of each class of size."""
@@ -110,22 +128,22 @@ class LayerCoder:
             coded[size] = self._count.code(coder, None if counts is None else int(counts[size]))
         return coded
 
-    def _code_parameters(self, coder: Coder, classes: Classes, cell: Integers, codes: Codes) -> Parameters:
+    def _code_parameters(self, coder: Coder, classes: Classes, cell: Integers, values: _Values) -> Parameters:
         """Code all numbers but the cells."""
         steps = self.quantizer.steps(classes)
-        scale = coder.uniform(steps.num_scales, codes.scale)
-        ratio = self._code_ratios(coder, classes, float(steps.ratio[0]), codes.ratio)
+        scale = coder.uniform(steps.num_scales, values.scale)
+        ratio = self._code_ratios(coder, classes, float(steps.ratio[0]), values.ratio)
         num_angles = steps.num_angles(ratio)
-        angle = self._angle.code(coder, num_angles, codes.angle)
+        angle = self._angle.code(coder, num_angles, values.angle)
         # the amplitude at this energy, in steps of colour, where the scale is in the middle of its class
         amplitude = math.ldexp(math.sqrt(math.pi / (12.0 * self.quantizer.distortion)), int(classes.energy[0]))
         amplitudes = amplitude * exp2(OCTAVES * (0.5 - (np.arange(_LEVELS) + 0.5) / _LEVELS))
         level = (_LEVELS * scale + _LEVELS // 2) // steps.num_scales
-        colors = self._code_colors(coder, amplitudes, level, codes.colors)
+        colors = self._code_colors(coder, amplitudes, level, values.colors)
         shape = steps.shape(scale, ratio, angle / num_angles)
         places = []
         for axis, num_places in enumerate(steps.num_places(shape).T):
-            places.append(coder.uniform(num_places, None if codes.place is None else codes.place[:, axis]))
+            places.append(coder.uniform(num_places, None if values.place is None else values.place[:, axis]))
         return steps.dequantize(Codes(*classes, scale, ratio, angle, colors, cell, np.stack(places, -1)), shape)
 
     def _code_ratios(self, coder: Coder, classes: Classes, step: float, ratios: Integers | None) -> Integers:
