@@ -113,17 +113,8 @@ def make_axis(g: Graph, output: Value, length: int, ends: tuple[Value, Value] | 
     # bounded once it is small: onnxruntime 1.31 takes the wrong one of two int64 beyond 32 bits
     tiles = -(-length // TILE)
     tile = g.Min(g.Max(centre // (parts * TILE), 0), tiles - 1)
-
-    # runs of pixels in one tile, cut into blocks
-    numbers = g.constant(np.arange(tiles)[:, None])
-    counts = g.ReduceSum(g.Equal(numbers, tile).astype(INT64), [1], keepdims=0)
-    starts = g.CumSum(counts, 0, exclusive=1)
-    longest = g.ReduceMax(counts, keepdims=1)
-    pieces = (longest + (TILE - 1)) // TILE
-    side = (longest + (pieces - 1)) // pieces
-    rank = (pixel - starts[tile]) % side
-    begins = g.Equal(rank, 0)
-    first = g.Compress(pixel, begins, axis=0)
+    rank, begins, side = _cut_blocks(g, pixel, tile, tiles)
+    first = g.Compress(pixel, begins, axis=0)  # of each block
     blocks = g.Shape(first)
     block_tile = tile[first]
     place = (g.CumSum(begins.astype(INT64), 0) - 1) * side + rank
@@ -138,3 +129,18 @@ def make_axis(g: Graph, output: Value, length: int, ends: tuple[Value, Value] | 
     begin = (centre[first] - corner).astype(FLOAT) / parts.astype(FLOAT)
     origins = begin - TILE / 2 + middle * step
     return Axis(g, length, output, size, parts, step, side, blocks, block_tile, place, local, steps, origins)
+
+
+def _cut_blocks(g: Graph, pixel: Value, tile: Value, tiles: int) -> tuple[Value, Value, Value]:
+    """Cut the pixels of each tile into blocks: the place of each pixel in its block, whether it is the first, the side.
+
+    All blocks are of one side, (1,), as even as the longest run of pixels allows.
+    """
+    numbers = g.constant(np.arange(tiles)[:, None])
+    counts = g.ReduceSum(g.Equal(numbers, tile).astype(INT64), [1], keepdims=0)
+    starts = g.CumSum(counts, 0, exclusive=1)
+    longest = g.ReduceMax(counts, keepdims=1)
+    pieces = (longest + (TILE - 1)) // TILE
+    side = (longest + (pieces - 1)) // pieces
+    rank = (pixel - starts[tile]) % side
+    return rank, g.Equal(rank, 0), side

@@ -148,5 +148,5 @@ class BlockRenderer:
 def _regions_of_tiles(tiles: Tiles, group: Group) -> Integers:
     """Regions of a group's tiles, (T, K), filled up with one that no Gaussian has."""
     lists = [tiles.regions[tile] for tile in group.tiles.tolist()]
-    beyond = 1 + max(max(regions) for regions in tiles.regions)
-    return np.array([regions + [beyond] * (group.regions - len(regions)) for regions in lists])
+    no_region = 1 + max(max(regions) for regions in tiles.regions)
+    return np.array([regions + [no_region] * (group.regions - len(regions)) for regions in lists])

@@ -34,21 +34,16 @@ class BlurredWindows:
         levels = np.zeros((len(ids), WINDOW, WINDOW), np.int64)
         if level is not None:
             levels = cut_windows(tiles, ids, level[0].cpu().numpy())
-        triples: list[tuple[int, int, int]] = []  # window, region and width of each part
-        self.places: dict[int, Integers] = {}  # of each tile, [regions, widths] among the parts, behind one of zeros
-        for number, tile in enumerate(ids.tolist()):
-            pairs = list(product(tiles.regions[tile], np.unique(levels[number]).tolist()))
-            self.places[tile] = 1 + len(triples) + np.arange(len(pairs)).reshape(len(tiles.regions[tile]), -1)
-            triples += [(number, *pair) for pair in pairs]
+        parts, self.places = _list_parts(tiles, ids, levels)
         axes = g.constant([1, 2])
-        window, region, width = (pack_runs(g, np.array(column)) for column in zip(*triples, strict=True))
+        window, region, width = (pack_runs(g, column) for column in parts)
         inside = g.Equal(_label_windows(g, regions, tiles, ids)[window], g.Unsqueeze(region, axes))
         kernels = _kernels(g, regions.tables.membership)[width]  # [parts, S, side]
-        parts = kernels @ inside.astype(FLOAT) @ g.Transpose(kernels, perm=[0, 2, 1])
+        blurred = kernels @ inside.astype(FLOAT) @ g.Transpose(kernels, perm=[0, 2, 1])
         self.levels = None if level is None else pack_windows(g, levels)  # (T, S, S), place among the map's widths
         if self.levels is not None:
-            parts = parts * g.Equal(self.levels[window], g.Unsqueeze(width, axes)).astype(FLOAT)
-        self.parts = g.Concat(np.zeros((1, WINDOW, WINDOW), np.float32), parts, axis=0)
+            blurred = blurred * g.Equal(self.levels[window], g.Unsqueeze(width, axes)).astype(FLOAT)
+        self.parts = g.Concat(np.zeros((1, WINDOW, WINDOW), np.float32), blurred, axis=0)
 
     def unfold(self, number: int) -> Value:
         """Sum the parts of a group's windows over their widths, and normalise: (T, K, S, S)."""
@@ -60,7 +55,7 @@ class BlurredWindows:
             row[:count, :widths] = self.places[tile]
         windows = self.parts[pack_integers(g, ids if num_widths > 1 else ids[:, :, 0])]
         windows = g.ReduceSum(windows, [2], keepdims=0) if num_widths > 1 else windows
-        # beyond the map there is no label, and no membership
+        # outside the map there is no label, and no membership
         return windows / g.Max(g.ReduceSum(windows, [1], keepdims=1), 1e-30)
 
 
@@ -79,8 +74,8 @@ class CrispWindows(BlurredWindows):
         ids = np.full((len(group.tiles), group.regions, 1, 1), -1, np.int32)
         for row, tile in zip(ids[..., 0, 0], group.tiles.tolist(), strict=True):
             row[: len(self.tiles.regions[tile])] = self.tiles.regions[tile]
-        lost = g.And(g.Equal(g.Unsqueeze(self.labels[number], [1]), ids), g.Less(windows, best))
-        return g.Where(lost, best + MARGIN, windows)
+        loses = g.And(g.Equal(g.Unsqueeze(self.labels[number], [1]), ids), g.Less(windows, best))
+        return g.Where(loses, best + MARGIN, windows)
 
 
 def cut_windows(tiles: Tiles, ids: Integers, grid: Integers) -> Integers:
@@ -89,6 +84,20 @@ def cut_windows(tiles: Tiles, ids: Integers, grid: Integers) -> Integers:
     padded = np.pad(grid.astype(np.int64), sides, mode="edge")
     windows: Integers = sliding_window_view(padded, (WINDOW, WINDOW))[::TILE, ::TILE].reshape(-1, WINDOW, WINDOW)
     return windows[ids]
+
+
+def _list_parts(tiles: Tiles, ids: Integers, levels: Integers) -> tuple[Integers, dict[int, Integers]]:
+    """List the window, region and width of each part, (3, parts), and the places of each tile's, [regions, widths].
+
+    Place 0 is that of zeros.
+    """
+    triples: list[tuple[int, int, int]] = []
+    places: dict[int, Integers] = {}
+    for number, tile in enumerate(ids.tolist()):
+        pairs = list(product(tiles.regions[tile], np.unique(levels[number]).tolist()))
+        places[tile] = 1 + len(triples) + np.arange(len(pairs)).reshape(len(tiles.regions[tile]), -1)
+        triples += [(number, *pair) for pair in pairs]
+    return np.array(triples).T, places
 
 
 def _kernels(g: Graph, membership: Membership) -> Value:
@@ -107,19 +116,19 @@ def _kernels(g: Graph, membership: Membership) -> Value:
 def _label_windows(g: Graph, regions: RegionMap, tiles: Tiles, ids: Integers) -> Value:
     """Cut windows out of the label map with all that their blur reads, (T, side, side), column by column.
 
-    The map is stored in tiles, one beyond it around: those of one label by that label, the others by their pixels.
+    The map is stored in tiles, with some around it: those of one label by that label, the others by their pixels.
     """
     rows, cols, radius = tiles.rows, tiles.cols, regions.tables.membership.radius
     index = regions.tables.membership.index[0].cpu().numpy()
-    beyond = regions.num_regions + 1  # nor is it what lists of regions are filled up with
+    outside = regions.num_regions + 1  # a label that no region has, nor what lists of regions are filled up with
     rim = -(-(radius + 1) // TILE)  # tiles around the map
     frame = [(rim * TILE, (rim + n) * TILE - length) for n, length in zip((rows, cols), index.shape, strict=True)]
-    grid = np.pad(index, frame, constant_values=beyond).astype(np.int64)
+    grid = np.pad(index, frame, constant_values=outside).astype(np.int64)
     down, across = rows + 2 * rim, cols + 2 * rim
     blocks = grid.reshape(down, TILE, across, TILE).transpose(0, 2, 3, 1).reshape(down * across, TILE * TILE)
     mixed = blocks.min(1) != blocks.max(1)
-    slots = np.where(mixed, beyond + np.cumsum(mixed), blocks[:, 0])
-    flat = g.Expand(np.arange(beyond + 1, dtype=np.int32)[:, None], [beyond + 1, TILE**2])
+    slots = np.where(mixed, outside + np.cumsum(mixed), blocks[:, 0])
+    flat = g.Expand(np.arange(outside + 1, dtype=np.int32)[:, None], [outside + 1, TILE**2])
     labels = g.Concat(g.Reshape(flat, [-1]), pack_runs(g, blocks[mixed].ravel()), axis=0)
     # rows of a window: how many tiles from the window's, and where in their own; whole tiles along them
     first, side = -1 - radius, WINDOW + 2 * radius

@@ -39,10 +39,10 @@ class CoarseGrids:
     def image(self) -> Value:
         """Sample tiles of one region, (blocks, C, side, width); the others are zero."""
         g, tiles, channels = self.graph, self.storage.plan.tiles, self.storage.channels
-        none = self.table.nodes.no_region
-        of_tile = [none if number in tiles.windows else present[0] for number, present in enumerate(tiles.regions)]
-        region = pack_runs(g, np.array(of_tile))
-        values = self._window(region, g.Range(np.int32(0), np.int32(len(of_tile)), np.int32(1)))
+        no_region = self.table.nodes.no_region
+        regions = [no_region if number in tiles.windows else ids[0] for number, ids in enumerate(tiles.regions)]
+        region = pack_runs(g, np.array(regions))
+        values = self._window(region, g.Range(np.int32(0), np.int32(len(regions)), np.int32(1)))
         values = g.Reshape(values, [tiles.rows, tiles.cols, -1, NODES, NODES])
         # [tile column, node, (tile row, C, node)]: what is beyond the tile column is multiplied at once
         values = g.Transpose(values, perm=[1, 3, 0, 2, 4])
@@ -81,11 +81,11 @@ class CoarseGrids:
         """Evaluate the Gaussians of every block at its nodes, (n, C, 256)."""
         g, plan, channels = self.graph, self.storage.plan, self.storage.channels
         steps = g.constant(np.arange(TILE, dtype=np.float32) - np.float32((TILE - 1) / 2))
-        at_nodes = monomials(g, steps, steps)
+        basis = monomials(g, steps, steps)
         entries = [part for part in self.storage.entries if part.group.nodes]
         values = []
         for part in entries:
-            weights = weigh(g, part.shaped_coefficients() @ at_nodes, cutoff)
+            weights = weigh(g, part.shaped_coefficients() @ basis, cutoff)
             values.append(part.shaped_colors() @ weights)
         # the last is for blocks that are only refined
         values.append(g.Expand(np.float32(0), [1, channels, TILE * TILE]))

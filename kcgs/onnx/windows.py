@@ -42,12 +42,12 @@ class WideWindows:
         """Unfold the windows of a group, (T, K, S, S): all but the last region's are stored; they sum to one."""
         g, group = self.graph, self.groups[number]
         windows = [self.tiles.windows[tile].numpy() for tile in group.tiles.tolist()]
-        stored = np.concatenate([window[:-1] for window in windows]).swapaxes(1, 2)
+        memberships = np.concatenate([window[:-1] for window in windows]).swapaxes(1, 2)
         counts = np.array([len(window) for window in windows])[:, None]
         place = np.arange(group.regions)
-        # which of the stored a region has; the one beyond them is zero
-        ids = np.where(place < counts - 1, np.cumsum(counts - 1)[:, None] - counts + 1 + place, len(stored))
-        masks = pack_integers(g, np.round(stored * _STEPS).astype(np.int64)).astype(FLOAT)
+        # place of a region's membership; the last place is that of zeros
+        ids = np.where(place < counts - 1, np.cumsum(counts - 1)[:, None] - counts + 1 + place, len(memberships))
+        masks = pack_integers(g, np.round(memberships * _STEPS).astype(np.int64)).astype(FLOAT)
         masks = g.Pad(masks * (1 / _STEPS), [0, 0, 0, 1, 0, 0])
         weights = masks[pack_integers(g, ids)]
         remainder = 1 - g.ReduceSum(weights, [1], keepdims=1)
