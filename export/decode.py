@@ -65,7 +65,7 @@ def open_decoder(path: Path, providers: Sequence[str], threads: int) -> Decoder:
     start = time.perf_counter()
     content = _read(path)
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # errors come as exceptions, and are told once
+    options.log_severity_level = 4  # errors come as exceptions, and are printed once
     options.intra_op_num_threads = threads
     try:
         session = onnxruntime.InferenceSession(content, options, providers=list(providers), enable_fallback=0)
@@ -105,14 +105,14 @@ def run(decoder: Decoder, feeds: Mapping[str, Array], size: tuple[int, int]) -> 
 
 def scene_feeds(decoder: Decoder, args: argparse.Namespace) -> tuple[dict[str, Array], tuple[int, int]]:
     """Inputs of a scene decoder, and the image's size."""
-    own = _note_side(decoder.path, decoder.notes, "height"), _note_side(decoder.path, decoder.notes, "width")
-    for option, given, name in (("--view", args.view, "view"), ("--region", args.region, "visible")):
-        if given is not None and name not in decoder.inputs:
+    scene_size = _note_side(decoder.path, decoder.notes, "height"), _note_side(decoder.path, decoder.notes, "width")
+    for option, argument, name in (("--view", args.view, "view"), ("--region", args.region, "visible")):
+        if argument is not None and name not in decoder.inputs:
             raise DecodeError(f"{option} needs an interactive decoder, with the input {name}; {decoder.path} has none")
-    size = target_size(args, own)
+    size = target_size(args, scene_size)
     feeds: dict[str, Array] = {"size": np.array(size, np.int64)}
     if "view" in decoder.inputs:
-        feeds["view"] = np.array(args.view or (0, 0, own[1], own[0]), np.float32)
+        feeds["view"] = np.array(args.view or (0, 0, scene_size[1], scene_size[0]), np.float32)
     if "visible" in decoder.inputs:
         try:
             ids = np.array(json.loads(decoder.notes.get("region_ids", "")), np.int64).reshape(-1)
@@ -131,12 +131,12 @@ def _chosen(ids: Array, wanted: Sequence[int] | None) -> Array:
     return np.isin(ids, wanted)
 
 
-def target_size(args: argparse.Namespace, own: tuple[int, int]) -> tuple[int, int]:
+def target_size(args: argparse.Namespace, scene_size: tuple[int, int]) -> tuple[int, int]:
     """Height and width of the image: as asked, or those of the view at a scale."""
     if args.size is not None:
         sides = args.size
     else:
-        height, width = (args.view[3] - args.view[1], args.view[2] - args.view[0]) if args.view else own
+        height, width = (args.view[3] - args.view[1], args.view[2] - args.view[0]) if args.view else scene_size
         # compared before rounding, which an infinite side has not
         sides = [min(side * args.scale, MAX_SIDE + 1.0) for side in (height, width)]
         sides = [max(1, round(side)) for side in sides]

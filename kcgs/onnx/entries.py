@@ -29,7 +29,7 @@ class Entries(NamedTuple):
     # (P, 6): of 1, x, y, xx, xy, yy in log w around the centre of the tile; or, narrow, of 1, x, y in z1 and z2
     coefficients: Value
     colors: Value  # (P, C), zero in what lists are filled up with
-    regions: Value | None  # (P,), position in the map; None where nothing tells regions apart
+    regions: Value  # (P,), position in the map
     visible: Value | None  # (R,), factor on each region; None: all are shown
 
     def shaped_coefficients(self) -> Value:
@@ -39,10 +39,10 @@ class Entries(NamedTuple):
     def shaped_colors(self, tile_regions: Value | None = None) -> Value:
         """Colours, (T, K * C, L), zero where a Gaussian is of another of the tiles' regions, (T, K)."""
         g, colors = self.graph, self._shape(self.colors, self.channels)
-        if self.visible is not None and self.regions is not None:
+        if self.visible is not None:
             colors = colors * self.visible[self._shape(self.regions, 1)]
         colors = g.Transpose(colors, perm=[0, 2, 1])
-        if tile_regions is None or self.regions is None:
+        if tile_regions is None:
             return colors
         region = g.Reshape(self.regions, [len(self.group.tiles), 1, 1, self.group.longest])
         same = g.Equal(region, g.Unsqueeze(tile_regions, [2, 3])).astype(FLOAT)  # [T, K, 1, L]
@@ -82,9 +82,7 @@ def store_entries(g: Graph, plan: DecoderPlan, visible: Value | None) -> Storage
     ids, mask = _list_gaussians(g, plan, slots, tile, sum(sizes))
     squares, polynomials = (g.split(part, sizes) for part in _whiten(g, plan, slots, table, ids, tile))
     colors = g.split(g.constant(gaussians.colors)[ids] * mask, sizes)
-    regions: list[Value | None] = [None] * len(groups)
-    if visible is not None or any(group.regions > 1 for group in groups):
-        regions = [*g.split(pack_integers(g, gaussians.region)[ids], sizes)]
+    regions = g.split(pack_integers(g, gaussians.region)[ids], sizes)
     for number, group in enumerate(groups):
         coefficients = (squares if group.narrow else polynomials)[number]
         factors = None if group.nodes else visible  # coarse grids are made when the decoder is loaded
