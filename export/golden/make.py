@@ -125,7 +125,7 @@ def make_arrays(case: Case) -> dict[str, Array]:
     arrays["softness"] = np.array([(*k, v) for k, v in pairs.items()] if isinstance(pairs, Mapping) else pairs)
     widths, level = regions.tables.membership.levels
     if level is not None:
-        # where contours are equally near, which one a pixel takes is nobody else's to know
+        # a pixel may be equally near to several contours: other programs need not break the tie as this one does
         arrays["contour_width"] = torch.tensor(widths)[level[0].long()].float().numpy()
     visible = torch.ones(regions.num_regions)
     visible[case.hidden] = 0

@@ -14,8 +14,8 @@ const B: usize = 16;
 /** The features of the pixel, by place in the template. */
 export let features: usize = 0;
 /** The logits of the two decisions. */
-export let which: i32 = 0;
-export let neither: i32 = 0;
+export let secondLogit: i32 = 0;
+export let neitherLogit: i32 = 0;
 /** The weights that decisions begin with. */
 export let mixer: usize = 0;
 
@@ -91,8 +91,8 @@ export function evaluate(): void {
     first += value * load<i8>(layer3 + 2 * k);
     second += value * load<i8>(layer3 + 2 * k + 1);
   }
-  which = min(max(first >> 4, -CLIP), CLIP);
-  neither = min(max(second >> 4, -CLIP), CLIP);
+  secondLogit = min(max(first >> 4, -CLIP), CLIP);
+  neitherLogit = min(max(second >> 4, -CLIP), CLIP);
 }
 
 /** The sums of the first layer. */

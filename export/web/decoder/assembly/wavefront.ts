@@ -4,7 +4,7 @@ import { Decision } from "./decision";
 import { openEscapes, readEscape } from "./escapes";
 import { allAlike, pixelAddress, continueRow, label, LEFT, openMargins, reach, repeat, stride, strip, TOP } from "./margins";
 import { allot, fail, MANY_UNCERTAIN } from "./memory";
-import { evaluate, features, neither, which } from "./network";
+import { evaluate, features, neitherLogit, secondLogit } from "./network";
 import { bit } from "./range_decoder";
 
 const SLANT: i32 = 8;
@@ -13,9 +13,9 @@ const MAX_UNCERTAIN: i32 = 1 << 23; // pixels that bits decide; more take minute
 // where the counters of each decision begin, and their number
 const SECOND: usize = 1 << 6;
 const THIRD: usize = SECOND + (1 << 11);
-const WHICH: usize = THIRD + (1 << 16);
+const SECOND_COUNTERS: usize = THIRD + (1 << 16);
 const NEITHER_THIRD: usize = 1 + 81;
-const NEITHER: usize = NEITHER_THIRD + 6561;
+const NEITHER_COUNTERS: usize = NEITHER_THIRD + 6561;
 
 /**
  * Return where the numbers of the regions are, row by row; `seeds`: a byte for each pixel, 1 for a seed; `template`: dx
@@ -65,8 +65,8 @@ class WavefrontReader {
     reader.seeds = seeds;
     reader.several = regions > 2;
     const longest = min(height, (width + SLANT - 1) / SLANT); // pixels of a wavefront
-    reader.isSecond = Decision.of(WHICH, longest);
-    reader.isNeither = Decision.of(NEITHER, longest);
+    reader.isSecond = Decision.of(SECOND_COUNTERS, longest);
+    reader.isNeither = Decision.of(NEITHER_COUNTERS, longest);
     reader.pixels = allot(offsetof<Pixel>() * longest);
     reader.changes = allot(4 * (TOP + height + 2));
     reader.nextSeed = allot(4 * (TOP + height + 2));
@@ -154,11 +154,11 @@ class WavefrontReader {
     evaluate();
     let near: usize = 0;
     for (let t: usize = 1; t <= 16; t++) near = (near << 1) | (load<u8>(features + t) ? 1 : 0);
-    this.isSecond.prepare(n, which, near >> 10, SECOND + (near >> 5), THIRD + near);
+    this.isSecond.prepare(n, secondLogit, near >> 10, SECOND + (near >> 5), THIRD + near);
     if (!this.several) return;
     let digits: usize = 0;
     for (let t: usize = 1; t <= 8; t++) digits = digits * 3 + load<u8>(features + t);
-    this.isNeither.prepare(n, neither, 0, 1 + digits / 81, NEITHER_THIRD + digits);
+    this.isNeither.prepare(n, neitherLogit, 0, 1 + digits / 81, NEITHER_THIRD + digits);
   }
 
   private readBits(): void {
