@@ -121,8 +121,8 @@ def page(folder: Path, rows: list[Row]) -> Page:
     tables.append(means_table(native, ["image", "method", "cutoff"], columns[:2]))
     times = {(r["image"], r["size"], r["threads"], r["method"]): r["ms"] for r in default}
     ratios = {key[:3]: ms / times[*key[:3], "torch, cpu"] for key, ms in times.items() if key[3] == "onnxruntime"}
-    native = [ratio for (_, size, count), ratio in ratios.items() if size == "native" and count == 1]
-    text = f"`onnxruntime` takes {min(native):.2g} to {max(native):.2g} times the time of `torch, cpu` on one thread."
+    factors = [ratio for (_, size, count), ratio in ratios.items() if size == "native" and count == 1]
+    text = f"`onnxruntime` takes {min(factors):.2g} to {max(factors):.2g} times the time of `torch, cpu` on one thread."
     lines = [[image, size, str(count), f"{ratio:.2g}"] for (image, size, count), ratio in ratios.items() if ratio > 1]
     losses = markdown(["image", "size", "threads", "time of onnxruntime to that of torch, cpu"], lines) if lines else ""
     return Page("How fast and how exactly do decoders render?", METHOD, text, "decode.png", tables, losses)
