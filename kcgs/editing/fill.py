@@ -68,9 +68,9 @@ def fill_hole(scene: Scene, hole: Tensor, visible: Tensor) -> Scene:
     """
     regions, ids = scene.regions, scene.field.region_ids
     assert regions is not None and ids is not None
-    filled = visible | _fringe(visible, regions.labels)
-    unknown = hole | filled
-    if not filled.any():
+    fill_mask = visible | _fringe(visible, regions.labels)
+    unknown = hole | fill_mask
+    if not fill_mask.any():
         return scene
     with threads_for_kernels(unknown.numel()), torch.no_grad():
         target = inpaint(scene(), unknown)
@@ -78,8 +78,8 @@ def fill_hole(scene: Scene, hole: Tensor, visible: Tensor) -> Scene:
         fixed = scene.field.subset(share <= _SETTINGS.free_share)
         free = scene.field.subset((share > _SETTINGS.free_share) & (share <= _SETTINGS.removed_share))
         target = target - Scene(fixed, regions)()
-        free = join(free, _spread(target - Scene(free, regions)(), filled, regions))
-        weight = torch.where(unknown, filled.to(target), _SETTINGS.known_weight)
+        free = join(free, _spread(target - Scene(free, regions)(), fill_mask, regions))
+        weight = torch.where(unknown, fill_mask.to(target), _SETTINGS.known_weight)
         return Scene(join(fixed, _fit(free, regions, target, weight)), regions, scene.metadata)
 
 

@@ -33,11 +33,11 @@ def nearest_labels(labels: Tensor, hole: Tensor) -> Tensor:
     return labels[torch.from_numpy(rows).long(), torch.from_numpy(cols).long()]
 
 
-def shift_labels(labels: Tensor, mask: Tensor, offset: tuple[int, int], behind: Tensor) -> tuple[Tensor, Tensor]:
-    """Move the labels of a mask over those behind, (..., H, W); return the mask where it lands, and all labels."""
+def shift_labels(labels: Tensor, mask: Tensor, offset: tuple[int, int], background: Tensor) -> tuple[Tensor, Tensor]:
+    """Move the labels of a mask over those of a background, (..., H, W); return the mask, moved, and all labels."""
     dx, dy = (max(-length, min(step, length)) for length, step in zip(labels.shape[:-3:-1], offset, strict=True))
     landing = pad(mask, (dx, -dx, dy, -dy))
-    return landing, torch.where(landing, labels.roll((dy, dx), (-2, -1)), behind)
+    return landing, torch.where(landing, labels.roll((dy, dx), (-2, -1)), background)
 
 
 def check_offset(offset: Sequence[float]) -> tuple[int, int]:

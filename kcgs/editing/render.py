@@ -46,19 +46,19 @@ def render_region(
     """
     selection, field = select_regions(scene, region_ids), scene.field
     target = scene.size if size is None else check_size("size", size)
-    finer = rendered_size(scene.size, target)
-    regions = selection.regions.resize(finer)
+    render_size = rendered_size(scene.size, target)
+    regions = selection.regions.resize(render_size)
     memberships = {region: regions.membership(region) for region in selection.ids.tolist()}
     total = torch.stack([*memberships.values()]).sum(0)
     alpha = total.clamp_max(1.0).to(field.colors.dtype)
-    colors = field.colors.new_zeros(field.colors.shape[-1], *finer)
+    colors = field.colors.new_zeros(field.colors.shape[-1], *render_size)
     for region, membership in memberships.items():
         # rendered without the map, which gives the colour itself: nothing is divided by a small alpha
         part = _subset(field, field.region_ids == region, None)
-        alone = region_splat(*scaled_gaussians(part, finer), part.merged_colors(), size=finer)
-        share = (membership / torch.where(total > 0, total, 1.0)).to(alone.dtype)
-        colors = colors + torch.where(alpha > 0, alone * share, 0.0)
-    if finer != target:
+        region_image = region_splat(*scaled_gaussians(part, render_size), part.merged_colors(), size=render_size)
+        share = (membership / torch.where(total > 0, total, 1.0)).to(region_image.dtype)
+        colors = colors + torch.where(alpha > 0, region_image * share, 0.0)
+    if render_size != target:
         colors, alpha = area_mean(colors * alpha, target), area_mean(alpha, target)
         colors = torch.where(alpha > 0, colors / torch.where(alpha > 0, alpha, 1.0), 0.0)
     return torch.cat([colors.clamp(0.0, 1.0) if clamp else colors, alpha[None]])

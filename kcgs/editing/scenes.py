@@ -66,8 +66,8 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
     selection = select_removable_regions(scene, region_ids)
     regions, hole = selection.regions, selection.pixels
     steps = check_offset(offset)
-    behind = nearest_labels(regions.labels, hole)
-    landing, labels = shift_labels(regions.labels, hole, steps, behind)
+    background_labels = nearest_labels(regions.labels, hole)
+    landing, labels = shift_labels(regions.labels, hole, steps, background_labels)
 
     lost_ids = regions.ids[~torch.isin(regions.ids, labels)].tolist()
     if lost_ids:
@@ -75,7 +75,7 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
 
     field = scene.field
     if fill and (hole & ~landing).any():
-        background = Scene(field.subset(~selection.members), regions.relabel(behind))
+        background = Scene(field.subset(~selection.members), regions.relabel(background_labels))
         uncovered = dilate(~landing, _contour_reach(regions))
         filled = fill_hole(background, hole, hole & uncovered)
         field = join(filled.field, field.subset(selection.members))
@@ -228,13 +228,14 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
     if other.colors.shape[-1] != channels:
         raise ValueError(f"background must have {channels} channels; got {other.colors.shape[-1]}")
     first_id = int(regions.ids.max()) + 1
-    behind = torch.full_like(regions.labels, first_id)
-    ids = behind.new_full((other.num_gaussians,), first_id)
+    background_labels = torch.full_like(regions.labels, first_id)
+    ids = background_labels.new_full((other.num_gaussians,), first_id)
     if background.regions is not None and other.region_ids is not None:
-        resized = RegionMap.from_labels(background.regions.labels).resize(scene.size)
-        behind, ids = resized.labels.to(behind.device) + first_id, other.region_ids.to(behind.device) + first_id
-    labels = torch.where(pixels, behind, regions.labels)
+        background_map = RegionMap.from_labels(background.regions.labels).resize(scene.size)
+        background_labels = background_map.labels.to(ids.device) + first_id
+        ids = other.region_ids.to(ids.device) + first_id
+    labels = torch.where(pixels, background_labels, regions.labels)
     means, cholesky, colors = (t.to(field.means) for t in (*scaled_gaussians(other, scene.size), other.merged_colors()))
-    joined = join(field.subset(~members), GaussianField(means, cholesky, colors, ids, size=scene.size))
-    joined = joined.subset(members_of(joined, labels))
-    return Scene(joined, regions.relabel(labels, "mean"), scene.metadata)
+    new_field = join(field.subset(~members), GaussianField(means, cholesky, colors, ids, size=scene.size))
+    new_field = new_field.subset(members_of(new_field, labels))
+    return Scene(new_field, regions.relabel(labels, "mean"), scene.metadata)

@@ -95,17 +95,17 @@ def move_region(scenes: Scene, region_ids: int | Iterable[int], offset: Sequence
     Raises:
         TypeError, ValueError: as :func:`delete_region`; an offset that is not two whole numbers.
     """
-    regions, row_ids, moved_ids = _check(scenes, region_ids)
+    regions, row_ids, ids = _check(scenes, region_ids)
     steps = check_offset(offset)
-    behind = delete_region(scenes, region_ids)
-    assert behind.regions is not None
-    is_moved, field = torch.isin(row_ids, moved_ids), scenes.field
-    rows = is_moved.any(0)
+    background = delete_region(scenes, region_ids)
+    assert background.regions is not None
+    is_member, field = torch.isin(row_ids, ids), scenes.field
+    rows = is_member.any(0)
     means = field.means[:, rows] + field.means.new_tensor(steps)
-    colors = (field.merged_colors() * is_moved[..., None])[:, rows]
-    moved_field = GaussianField(means, field.cholesky[:, rows], colors, row_ids[:, rows], size=scenes.size)
-    labels = shift_labels(regions.labels, torch.isin(regions.labels, moved_ids), steps, behind.regions.labels)[1]
-    return Scene(join(behind.field, moved_field), regions.relabel(labels, "mean"), scenes.metadata)
+    colors = (field.merged_colors() * is_member[..., None])[:, rows]
+    region_field = GaussianField(means, field.cholesky[:, rows], colors, row_ids[:, rows], size=scenes.size)
+    labels = shift_labels(regions.labels, torch.isin(regions.labels, ids), steps, background.regions.labels)[1]
+    return Scene(join(background.field, region_field), regions.relabel(labels, "mean"), scenes.metadata)
 
 
 def _check(scenes: Scene, region_ids: int | Iterable[int]) -> tuple[RegionMap, Tensor, Tensor]:

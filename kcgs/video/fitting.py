@@ -155,7 +155,8 @@ class _VideoFit:
 
     def _follow(self, target: Target, flow: Tensor, regions: RegionMap | None) -> tuple[Splats, Tensor]:
         """Return a frame, fitted from the one before, and the mask of the pixels that changed."""
-        first, before, is_moved = self.frames[0].regions, self.frames[-1].regions, regions is None
+        first, before = self.frames[0].regions, self.frames[-1].regions
+        is_moved = regions is None
         if first is not None and before is not None:
             labels = move_labels(flow, before.labels) if regions is None else regions.labels
             regions = first.relabel(labels, "mean")
