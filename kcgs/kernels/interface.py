@@ -65,7 +65,7 @@ class Steps(NamedTuple):
 
 @contextmanager
 def with_autograd() -> Iterator[None]:
-    """Record a graph inside of an operator, which is evaluated below autograd."""
+    """Record a graph inside of an operator; else nothing would be, since operators are evaluated below autograd."""
     keys = torch._C.DispatchKey.AutogradFunctionality, torch._C.DispatchKey.ADInplaceOrView
     with ExitStack() as stack:
         for key in keys:
