@@ -42,8 +42,8 @@ def backward(problem: Problem, rendered: Tensor) -> None:
     config, image = problem.config, problem.image
     if config.loss == "l2":
         # in the memory of the render, which nothing needs again: new memory would take as long as the sum
-        residual = rendered.data.sub_(image)
-        rendered.backward(residual if problem.objective is None else problem.objective.apply(residual))
+        difference = rendered.data.sub_(image)
+        rendered.backward(difference if problem.objective is None else problem.objective.apply(difference))
         return
     sign = torch.sub(rendered.detach(), image).sign_()
     if config.loss == "l1+ssim":

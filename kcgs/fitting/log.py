@@ -29,8 +29,8 @@ def log_is_due(state: FitState, seconds: float) -> bool:
 def log(state: FitState, rendered: Tensor, seconds: float, scene: Scene | None = None) -> None:
     """Measure a render of the state's scene, or of another, and keep a copy of the scene if it is the best so far."""
     scene, problem = scene or state.scene, state.problem
-    residual = rendered.detach() - problem.image
-    loss = float(residual.square().mean() if problem.config.loss == "l2" else residual.abs().mean())
+    difference = rendered.detach() - problem.image
+    loss = float(difference.square().mean() if problem.config.loss == "l2" else difference.abs().mean())
     clipped = rendered.detach().clamp(0.0, 1.0) - problem.image
     value = None if problem.objective is None else problem.objective.value(clipped)
     error = clipped.square_().flatten(1)

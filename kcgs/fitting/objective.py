@@ -69,16 +69,18 @@ class MsSsimObjective:
             bright = _blur(inside * weight / self._norm / (2.0 * mean * mean + K1**2)).mean(0)
             self._bands.append((level, blocks + window, math.inf, bright))
 
-    def apply(self, residual: Tensor) -> Tensor:
-        """Return half the gradient of E, (C, H, W), at a residual r, render - image.
+    def apply(self, difference: Tensor) -> Tensor:
+        """Return half the gradient of E, (C, H, W), at a difference r, render - image.
 
         Where the mean of a scale is below 0.2, E takes it as 0.2, and the slope is that of the mean by 0.2.
         """
-        return self._measure(residual)[1]
+        return self._measure(difference)[1]
 
-    def value(self, residual: Tensor) -> float:
+    def value(self, difference: Tensor) -> float:
         """Return E, as a mean over pixels and channels."""
-        return float(self._measure(residual)[0]) / residual[0].numel() + _SQUARED * float(residual.square().mean())
+        return float(self._measure(difference)[0]) / difference[0].numel() + _SQUARED * float(
+            difference.square().mean()
+        )
 
     def weigh(self, means: Tensor, cholesky: Tensor) -> Tensor:
         """Return about what the squared error of Gaussians counts in E, by their places and sizes, (N,)."""
@@ -98,9 +100,9 @@ class MsSsimObjective:
             total += 0.25**level * mask[row, column] * (energy_after(fine) - energy_after(coarse))
         return total
 
-    def _measure(self, residual: Tensor) -> tuple[Tensor, Tensor]:
+    def _measure(self, difference: Tensor) -> tuple[Tensor, Tensor]:
         """Return E without the squared error, as a sum over pixels, and half the gradient of all of E."""
-        total, gradients, plane = residual.new_zeros(()), [_SQUARED * residual], residual
+        total, gradients, plane = difference.new_zeros(()), [_SQUARED * difference], difference
         for level, (image, inside, mean, variance, weight) in enumerate(self._scales, 1):
             plane = halve(plane)
             render = image + plane

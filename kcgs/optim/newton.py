@@ -59,19 +59,24 @@ class NewtonDescent:
         self.exact = exact
 
     def step(
-        self, gaussians: Gaussians, gradients: Gaussians, masses: Tensor, rate: float, frozen: Tensor | None = None
+        self,
+        gaussians: Gaussians,
+        gradients: Gaussians,
+        color_curvature: Tensor,
+        rate: float,
+        frozen: Tensor | None = None,
     ) -> Gaussians:
         """Return the Gaussians after a step.
 
         Args:
             gaussians: before the step.
             gradients: half the gradients of the error.
-            masses: half the second derivative of the error by a colour, (N,).
+            color_curvature: half the second derivative of the error by a colour, (N,).
             rate: share of a Newton step.
             frozen: numbers that do not move, bool, (N, 5 + C) or what broadcasts to it.
         """
         means, cholesky, colors = gaussians
-        self.velocity = _MOMENTUM * self.velocity + _newton_step(gaussians, gradients, masses)
+        self.velocity = _MOMENTUM * self.velocity + _newton_step(gaussians, gradients, color_curvature)
         if frozen is not None:
             self.velocity = torch.where(frozen, 0.0, self.velocity)
         step = rate * self.velocity
@@ -79,12 +84,12 @@ class NewtonDescent:
         return Gaussians(means, cholesky, colors + step[:, 5:])
 
 
-def _newton_step(gaussians: Gaussians, gradients: Gaussians, masses: Tensor) -> Tensor:
+def _newton_step(gaussians: Gaussians, gradients: Gaussians, color_curvature: Tensor) -> Tensor:
     """Return Newton's steps of centre, factor and colours, (N, 5 + C)."""
-    energy = (gaussians.colors.square().sum(-1) * masses).clamp_min(_MIN_ENERGY)
+    energy = (gaussians.colors.square().sum(-1) * color_curvature).clamp_min(_MIN_ENERGY)
     local = local_gradient(gaussians.cholesky, gradients.means, gradients.cholesky)
     geometry = (local / (energy[:, None] * energy.new_tensor(_CURVATURE))).clamp(-_MAX_NEWTON_STEP, _MAX_NEWTON_STEP)
-    return -torch.cat([geometry, gradients.colors / masses[:, None]], -1)
+    return -torch.cat([geometry, gradients.colors / color_curvature[:, None]], -1)
 
 
 def half_gradients(

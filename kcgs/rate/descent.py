@@ -114,8 +114,8 @@ class RateDistortionDescent:
         self._num_steps += 1
         gradients = half_gradients(self._render, gaussians, self.image, self.objective)
         gradients = Gaussians(*(error + bits for error, bits in zip(gradients, self._bit_gradient, strict=True)))
-        masses = area(gaussians.cholesky).clamp_max(height * width) * error_weights(gaussians, self.objective)
-        return self.newton.step(gaussians, gradients, masses, _RATE, frozen)
+        color_curvature = area(gaussians.cholesky).clamp_max(height * width) * error_weights(gaussians, self.objective)
+        return self.newton.step(gaussians, gradients, color_curvature, _RATE, frozen)
 
     def _half_bit_gradient(self, gaussians: Gaussians, quantizer: Quantizer) -> Gaussians:
         """Return half the gradient of the price of the bits, which is 0 by means."""

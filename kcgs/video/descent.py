@@ -54,7 +54,7 @@ class FrameDescent:
         self.movable_rows, self.changed_pixels = movable_rows, changed_pixels
         self.objective = make_objective(target.config.objective, target.image)
         self.newton = NewtonDescent(Gaussians(*splats[:3]))
-        self.crowding = torch.ones_like(splats.means[:, 0])
+        self.overlap = torch.ones_like(splats.means[:, 0])
 
     def run(self, relocations: Mapping[int, float], anchor: Tensor | None = None) -> Splats:
         """Return the Gaussians after the descent, or the start if its error is lower.
@@ -82,8 +82,10 @@ class FrameDescent:
             return self.target.render(Splats(means, cholesky, colors, region_ids, regions))
 
         gradients = half_gradients(render, gaussians, self.target.image, self.objective)
-        masses = area(cholesky) * error_weights(gaussians, self.objective) * self.crowding
-        means, cholesky, colors = self.newton.step(gaussians, gradients, masses, rate, ~self.movable_rows[:, None])
+        color_curvature = area(cholesky) * error_weights(gaussians, self.objective) * self.overlap
+        means, cholesky, colors = self.newton.step(
+            gaussians, gradients, color_curvature, rate, ~self.movable_rows[:, None]
+        )
         self.splats = Splats(means, widen(cholesky, _MIN_SIGMA), colors, region_ids, regions)
 
     def _relocate(self, count: int) -> None:
@@ -93,7 +95,7 @@ class FrameDescent:
         """
         means, cholesky, colors, region_ids, regions = self.splats
         image, backend = self.target.image, self.target.config.backend
-        visibility, self.crowding = self._overlap()
+        visibility, self.overlap = self._overlap()
         weights = error_weights(Gaussians(means, cholesky, colors), self.objective) * visibility
         weights = torch.where(self.movable_rows, weights, _FIXED_WEIGHT)
         arrays = (

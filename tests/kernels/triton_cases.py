@@ -79,19 +79,18 @@ def test_sizes(size: tuple[int, int], softness: float) -> None:
     assert_matches_reference(make_inputs(size=size, regions=1 if size == (1, 1) else 3, softness=softness))
 
 
-@pytest.mark.parametrize("cutoff", [0.0, 1e-3])
-@pytest.mark.parametrize("regions", [1, 2])
+@pytest.mark.parametrize(("regions", "cutoff"), [(1, 1e-3), (2, 0.0), *([(1, 0.0), (2, 1e-3)] if GPU else [])])
 def test_cutoffs(regions: int, cutoff: float) -> None:
     assert_matches_reference(make_inputs(40, (16, 20) if GPU else (9, 16), regions=regions, cutoff=cutoff))
 
 
-# one; part of a block; more than a block, and part of the last
-@pytest.mark.parametrize("channels", [1, 5, 11, *([32] if GPU else [])])
+# one; more than a block, and part of the last; part of a block; blocks
+@pytest.mark.parametrize("channels", [1, 11, *([5, 32] if GPU else [])])
 def test_channels(channels: int) -> None:
     assert_matches_reference(make_inputs(size=(16, 16), channels=channels))
 
 
-@pytest.mark.parametrize(("maps", "size"), [(1, (9, 16)), (2, (16, 20)), *([(1, (16, 20))] if GPU else [])])
+@pytest.mark.parametrize(("maps", "size"), [(2, (16, 20)), *([(1, (9, 16)), (1, (16, 20))] if GPU else [])])
 def test_batch(maps: int, size: tuple[int, int]) -> None:
     assert_matches_reference(make_inputs(size=size, batch=2, maps=maps, regions=3, softness=0.7))
 

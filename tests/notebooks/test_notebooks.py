@@ -34,15 +34,6 @@ PRINTED = {
 }
 # those that take half a minute in their quick form, too
 SLOW = ("06_differentiable_layer", "07_compact_files")
-_COMPILE = (
-    "import torch\n"
-    "from kcgs import GaussianField, Scene\n"
-    "from kcgs.codec import encode\n"
-    "labels = (torch.arange(16) > 7).long().expand(16, 16)\n"
-    "scene = Scene(GaussianField.random(2, (16, 16), regions=labels, seed=0), labels)\n"
-    "scene().sum().backward()\n"
-    "encode(scene)\n"
-)
 BYTES = 2_400_000
 
 
@@ -61,9 +52,6 @@ def run_quick(name: str, folder: Path) -> Any:
 @pytest.fixture(scope="module")
 def quick(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Future[Any]]]:
     """Run all, two at a time unless tests do: a kernel takes one thread, and seconds to import what it needs."""
-    # Compiled and kept here, so that no tutorial has to, and says so. In a new process, as they are: this one may have
-    # the code in memory when it is on disk no more, since two that keep theirs at once may drop the other's.
-    subprocess.run([sys.executable, "-c", _COMPILE], check=True)
     folder = tmp_path_factory.mktemp("quick")
     with ThreadPoolExecutor(1 if "PYTEST_XDIST_WORKER" in os.environ else 2) as pool:
         item_names = {item.name for item in request.session.items}

@@ -61,7 +61,7 @@ class Codes(NamedTuple):
         return Codes(*(numbers[index] for numbers in self))
 
 
-class Steps(NamedTuple):
+class StepSizes(NamedTuple):
     """The steps of each Gaussian's parameters."""
 
     size: Integers  # [N] class
@@ -129,7 +129,7 @@ class Quantizer:
             np.clip(np.floor(scale / OCTAVES), *SIZES).astype(np.int64),
         )
 
-    def steps(self, classes: Classes) -> Steps:
+    def steps(self, classes: Classes) -> StepSizes:
         """Return the steps at which every parameter adds the distortion; cells are of all Gaussians of a class."""
         relative: Floats = self._energy_steps[classes.energy - ENERGIES[0]]
         log_scale = relative * (math.sqrt(0.5) / LN2)
@@ -138,7 +138,7 @@ class Quantizer:
         sides = np.zeros(len(counts), np.int64)
         for index in np.flatnonzero(counts).tolist():
             sides[index] = Grid.for_count(self.size, int(counts[index])).side
-        return Steps(
+        return StepSizes(
             classes.size,
             place=relative * math.sqrt(2.0),
             num_scales=np.clip(np.floor(OCTAVES / log_scale + 0.5), 1, _MAX_STEPS).astype(np.int64),
@@ -173,7 +173,7 @@ class Quantizer:
         share = codes.angle / steps.num_angles(codes.ratio)
         return steps.dequantize(codes, steps.shape(codes.scale, codes.ratio, share))
 
-    def _locate(self, means: Floats, shape: Floats, steps: Steps) -> tuple[Integers, Integers]:
+    def _locate(self, means: Floats, shape: Floats, steps: StepSizes) -> tuple[Integers, Integers]:
         """Round x, then y, which makes up for the error of x along the slant of the Gaussian."""
         num_places, side = steps.num_places(shape), steps.side
         sides, index = np.unique(side, return_inverse=True)

@@ -9,16 +9,17 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from kcgs.fitting.adapt_contours import AdaptContours
 from kcgs.fitting.config import FitConfig
 from kcgs.fitting.state import FitState
 
 from .densify import Densify, DensifyAtLargestError
 from .end_drafts import EndDrafts
-from .move_contours import AdaptContours, SettleContours
+from .settle_contours import SettleContours
 from .warmup import Warmup
 
 __all__ = [
-    "AdaptContours", "Densify", "DensifyAtLargestError", "EndDrafts", "SettleContours", "Strategy", "Warmup",
+    "Densify", "DensifyAtLargestError", "EndDrafts", "SettleContours", "Strategy", "Warmup",
     "make_densify", "make_strategies",
 ]  # fmt: skip
 

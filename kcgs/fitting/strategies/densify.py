@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from kcgs.fitting.adapt_contours import AdaptContours
 from kcgs.fitting.descent import render, squared_error
+from kcgs.fitting.initial import initial_sigma
 from kcgs.fitting.objective import propose_gaussians
 from kcgs.fitting.removal import remove_gaussians
 from kcgs.fitting.sampling import sample_pixels
 from kcgs.fitting.state import FitState
 from kcgs.functional import lookup_regions
 from kcgs.nn import GaussianField
-
-from .move_contours import AdaptContours
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,7 @@ class DensifyAtLargestError(Densify):
         pixels = torch.from_numpy(sample_pixels(error, count, rng)).to(problem.image.device)
         width = problem.size[1]
         means = torch.stack([pixels % width, pixels // width], -1).to(problem.image.dtype) + 0.5
-        sigma = means.new_full((count,), max(1.0, 0.5 * math.sqrt(len(error) / problem.num_gaussians)))
+        sigma = means.new_full((count,), initial_sigma(problem.size, problem.num_gaussians))
         colors = (problem.image - render(state)).flatten(1)[:, pixels].T
         ids = None if regions is None else lookup_regions(means, regions.labels)
         cholesky = torch.stack([sigma, torch.zeros_like(sigma), sigma], -1)
