@@ -83,16 +83,16 @@ def _fill_empty_regions(field: GaussianField, regions: RegionMap, seed: int) -> 
     """Move Gaussians from the regions with most into those with none, the largest first, to a random pixel there."""
     assert field.region_ids is not None
     generator = torch.Generator().manual_seed(seed)
-    index = regions.index_of(field.region_ids)
+    labels, index = regions.labels, regions.index_of(field.region_ids)
     counts = index.bincount(minlength=regions.num_regions)
-    areas = regions.index_of(regions.labels.flatten()).bincount(minlength=regions.num_regions)
+    areas = regions.index_of(labels.flatten()).bincount(minlength=regions.num_regions)
     empty = [r for r in areas.argsort(descending=True, stable=True).tolist() if counts[r] == 0]
     for region in empty:
         donor = int(counts.argmax())
         if counts[donor] < 2:
             return
         row = int((index == donor).nonzero()[-1])
-        pixels = (regions.labels == regions.ids[region]).nonzero()
+        pixels = (labels == regions.ids[region]).nonzero()
         y, x = pixels[int(torch.randint(len(pixels), (1,), generator=generator))].tolist()
         field.means[row] = field.means.new_tensor([x + 0.5, y + 0.5])
         index[row] = region

@@ -9,8 +9,8 @@ from torch import Tensor
 from .map_tables import MapOperands
 
 
-class Arguments(NamedTuple):
-    """Arguments of the operator, in order; floating tensors share one dtype, float32 or float64.
+class SplatArguments(NamedTuple):
+    """SplatArguments of the operator, in order; floating tensors share one dtype, float32 or float64.
 
     For one image B may be left out of means, cholesky, colors and region_ids together, and so of the image.
     """

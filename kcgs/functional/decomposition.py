@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcgs.kernels.whitened import least_exponent, support_radius
 
-from .arguments import Arguments
+from .arguments import SplatArguments
 from .map_windows import MapWindows
 from .softness import is_crisp
 
@@ -35,7 +35,7 @@ class _TileGaussians(NamedTuple):
 
 def decompose(*operands: Any) -> Tensor:
     """Render as `kcgs::region_splat` does, whose arguments these are; to be traced, and slow in eager mode."""
-    arguments = Arguments(*operands)
+    arguments = SplatArguments(*operands)
     if is_crisp(arguments.softness):
         raise ValueError(
             "contours must be scaled in graphs of torch.onnx.export; got crisp: kcgs.onnx.scene_decoder has both"

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcgs.kernels import OutOfRangeError, SplatInputs, Steps, resolve, with_autograd
 
-from .arguments import Arguments
+from .arguments import SplatArguments
 from .map_tables import tables_at
 from .values import check_region_ids, check_values
 
@@ -26,7 +26,7 @@ class Plan(NamedTuple):
     content: Any  # what `steps.plan` returned
 
 
-def plan_splat(arguments: Arguments, check: bool = True) -> Plan:
+def plan_splat(arguments: SplatArguments, check: bool = True) -> Plan:
     """Prepare Gaussians and map for the kernel that the backend names, with `check` of values."""
     inputs, steps = _prepare(arguments, check)
     try:
@@ -36,13 +36,13 @@ def plan_splat(arguments: Arguments, check: bool = True) -> Plan:
         raise
 
 
-def render(arguments: Arguments, plan: Plan) -> Tensor:
+def render(arguments: SplatArguments, plan: Plan) -> Tensor:
     """Return the image, with B where the Gaussians have it."""
     image = plan.steps.render(plan.content, plan.inputs).contiguous()
     return image if image.ndim == arguments.means.ndim + 1 else image.squeeze(0)
 
 
-def differentiate(arguments: Arguments, plan: Plan, grad: Tensor, geometry: bool) -> tuple[Tensor, Tensor, Tensor]:
+def differentiate(arguments: SplatArguments, plan: Plan, grad: Tensor, geometry: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Return the gradients of means, cholesky and colors; without `geometry` the first two are empty."""
     inputs = plan.inputs
     if grad.ndim < inputs.means.ndim + 1:
@@ -55,7 +55,7 @@ def differentiate(arguments: Arguments, plan: Plan, grad: Tensor, geometry: bool
 
 
 def differentiate_twice(
-    tangents: tuple[Tensor, Tensor, Tensor], grad: Tensor, arguments: Arguments
+    tangents: tuple[Tensor, Tensor, Tensor], grad: Tensor, arguments: SplatArguments
 ) -> tuple[Tensor, ...]:
     """Differentiate the scalar product of gradients and `tangents` by the image's gradient and by the Gaussians."""
     with with_autograd():
@@ -69,7 +69,7 @@ def differentiate_twice(
     return tuple(t.contiguous() for t in second)
 
 
-def differentiate_forward(tangents: tuple[Tensor, Tensor, Tensor], arguments: Arguments) -> Tensor:
+def differentiate_forward(tangents: tuple[Tensor, Tensor, Tensor], arguments: SplatArguments) -> Tensor:
     """Differentiate the image along a change of the Gaussians."""
     with with_autograd():
         image, leaves = _image_with_graph(arguments)
@@ -80,7 +80,7 @@ def differentiate_forward(tangents: tuple[Tensor, Tensor, Tensor], arguments: Ar
     return derivative.contiguous()
 
 
-def _image_with_graph(arguments: Arguments) -> tuple[Tensor, list[Tensor]]:
+def _image_with_graph(arguments: SplatArguments) -> tuple[Tensor, list[Tensor]]:
     """Render with a graph, and return its leaves, too."""
     inputs, steps = _prepare(arguments, check=False)
     if steps.image is None:
@@ -92,7 +92,7 @@ def _image_with_graph(arguments: Arguments) -> tuple[Tensor, list[Tensor]]:
     return image if arguments.means.ndim == 3 else image.squeeze(0), leaves
 
 
-def _prepare(arguments: Arguments, check: bool) -> tuple[SplatInputs, Steps]:
+def _prepare(arguments: SplatArguments, check: bool) -> tuple[SplatInputs, Steps]:
     """Return the inputs of the kernel, and the kernel."""
     region_index = membership = None
     if arguments.map_operands is not None and arguments.region_ids is not None:

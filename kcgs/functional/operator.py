@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .arguments import Arguments
+from .arguments import SplatArguments
 from .evaluation import Plan, differentiate, differentiate_forward, differentiate_twice, plan_splat, render
 from .torch_internals import (
     apply,
@@ -57,7 +57,7 @@ class _Splat(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> Tensor:
         image: Tensor
         if _is_plain(arguments[:3]):  # the plan stays on this side of the operator
-            image, ctx.plan = below_autograd(_render_planned, Arguments(*arguments))
+            image, ctx.plan = below_autograd(_render_planned, SplatArguments(*arguments))
         else:
             image, ctx.plan = _unrecorded(splat_operator, *arguments), None
         ctx.save_for_backward(*arguments[:3])
@@ -78,7 +78,7 @@ class _Splat(torch.autograd.Function):
         means, cholesky, colors = ctx.needs_input_grad[:3]
         arguments, geometry = (*ctx.saved_tensors, *ctx.constants), means or cholesky
         if ctx.plan is not None and _is_plain((grad, *arguments[:3])) and not torch.is_grad_enabled():
-            gradients = below_autograd(differentiate, Arguments(*arguments), ctx.plan, grad, geometry)
+            gradients = below_autograd(differentiate, SplatArguments(*arguments), ctx.plan, grad, geometry)
         else:
             gradients = _backward_operator(grad, *arguments, geometry)
         if not is_graph_retained():
@@ -138,32 +138,32 @@ def _unrecorded(operator: Any, *arguments: Any) -> Any:
 
 
 def _splat(*arguments: Any) -> Tensor:
-    return _render_planned(Arguments(*arguments))[0]
+    return _render_planned(SplatArguments(*arguments))[0]
 
 
-def _render_planned(arguments: Arguments) -> tuple[Tensor, Plan]:
+def _render_planned(arguments: SplatArguments) -> tuple[Tensor, Plan]:
     plan = plan_splat(arguments)
     return render(arguments, plan), plan
 
 
 def _splat_backward(grad: Tensor, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
-    gaussians = Arguments(*arguments[:-1])
+    gaussians = SplatArguments(*arguments[:-1])
     return differentiate(gaussians, plan_splat(gaussians, check=False), grad, arguments[-1])
 
 
 def _splat_double_backward(*arguments: Any) -> tuple[Tensor, ...]:
-    return differentiate_twice(arguments[:3], arguments[3], Arguments(*arguments[4:-1]))
+    return differentiate_twice(arguments[:3], arguments[3], SplatArguments(*arguments[4:-1]))
 
 
 def _splat_forward(*arguments: Any) -> Tensor:
-    return differentiate_forward(arguments[:3], Arguments(*arguments[3:]))
+    return differentiate_forward(arguments[:3], SplatArguments(*arguments[3:]))
 
 
 # Shapes, for tensors without values
 
 
 def _splat_shape(*arguments: Any) -> Tensor:
-    splat = Arguments(*arguments)
+    splat = SplatArguments(*arguments)
     return splat.colors.new_empty(*splat.colors.shape[:-2], splat.colors.shape[-1], *splat.size)
 
 

@@ -17,7 +17,7 @@ from kcgs import RegionMap, Scene, load
 from kcgs.codec import CodecError, Decoded, decode, decode_labels, encode, encode_labels
 from kcgs.codec.exact import Integers
 from kcgs.codec.file import ByteReader, Header, pack, unpack
-from kcgs.codec.gaussians.layers import Group, LayerCoder, _Values
+from kcgs.codec.gaussians.layers import Group, GroupValues, LayerCoder
 from kcgs.codec.gaussians.occupancy import Grid, OccupancyCoder
 from kcgs.codec.gaussians.quantize import Classes, Quantizer
 from kcgs.codec.labels.ids import _code_count
@@ -389,7 +389,7 @@ def test_too_many_gaussians() -> None:
     writer, quantizer = Writer(), Quantizer(0, (9, 9))
     model = LayerCoder(quantizer, 1, None)
     codes, ids = make_group(quantizer, 0)
-    model._code_group(writer, 0, _Values(*codes, ids), 5)
+    model._code_group(writer, 0, GroupValues(*codes, ids), 5)
     writer.number(1, 3)
     model._code_counts(writer, np.zeros(5000, np.int64))
     layer = writer.finish()

@@ -40,7 +40,7 @@ Group = tuple[Codes, Integers]
 """Gaussians of one energy, and the positions of their regions' ids."""
 
 
-class _Values(NamedTuple):
+class GroupValues(NamedTuple):
     """What a writer codes of a group: `Codes`, and the positions of the regions' ids; of a reader all are None."""
 
     energy: Integers | None = None
@@ -84,10 +84,10 @@ class LayerCoder:
         symbol = _PRESENT
         while symbol != _END:
             if symbol == _PRESENT:
-                values = _Values()
+                values = GroupValues()
                 if remaining is not None:
                     codes, ids = remaining.pop(0)
-                    values = _Values(*codes, ids)
+                    values = GroupValues(*codes, ids)
                 coded.append(self._code_group(coder, energy, values, max_count))
                 max_count -= len(coded[-1][1])
             energy -= 1
@@ -96,7 +96,9 @@ class LayerCoder:
                 raise CodecError(f"a class of energy must be at least {ENERGIES[0]}; got {energy}")
         return coded
 
-    def _code_group(self, coder: Coder, energy: int, values: _Values, max_count: int) -> tuple[Parameters, Integers]:
+    def _code_group(
+        self, coder: Coder, energy: int, values: GroupValues, max_count: int
+    ) -> tuple[Parameters, Integers]:
         """Code at most `max_count` Gaussians of one energy."""
         counts = self._code_counts(coder, values.size)
         if counts.sum() > max_count:
@@ -128,7 +130,7 @@ class LayerCoder:
             coded[size] = self._count.code(coder, None if counts is None else int(counts[size]))
         return coded
 
-    def _code_parameters(self, coder: Coder, classes: Classes, cell: Integers, values: _Values) -> Parameters:
+    def _code_parameters(self, coder: Coder, classes: Classes, cell: Integers, values: GroupValues) -> Parameters:
         """Code all numbers but the cells."""
         steps = self.quantizer.steps(classes)
         scale = coder.uniform(steps.num_scales, values.scale)
