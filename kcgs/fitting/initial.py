@@ -53,7 +53,12 @@ def initial_field(
     """
     image, regions = check_image_and_regions(image, regions)
     count = check_num_gaussians(num_gaussians, image)
-    field = random_field(image, count, regions, check_count("seed", seed, 0, 2**63 - 1))
+    return uniform_field(image, count, regions, check_count("seed", seed, 0, 2**63 - 1))
+
+
+def uniform_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:
+    """Scatter round Gaussians uniformly over the image, in its colours: `initial_field` without its checks."""
+    field = random_field(image, num_gaussians, regions, seed)
     x, y = field.means.detach().long().unbind(-1)
     field.colors.data = image[:, y, x].T / _OVERLAP
     return field

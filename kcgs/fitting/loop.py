@@ -103,12 +103,12 @@ def fit(
     with Progress("fit", pulse=searches, visible=progress) as bar, threads_for_kernels(problem.image[0].numel()):
         if searches:
             return search(problem, lambda state: _run(state, Clock(), bar, on_step))
-        clock, state = Clock(), start(problem)
         store = None if checkpoint is None else Checkpoint(checkpoint, problem)
         if store is not None and resume and store.path.exists():
             state, seconds = store.read()
-            clock = Clock(seconds)
-        return _run(state, clock, bar, on_step, store)
+            return _run(state, Clock(seconds), bar, on_step, store)
+        clock = Clock()
+        return _run(start(problem), clock, bar, on_step, store)
 
 
 def _run(
@@ -158,4 +158,4 @@ def _warn_of_regions(problem: Problem) -> None:
     effect = f"{count - most} of {count} regions get no Gaussian and stay black"
     if problem.config.merge_regions:
         effect = f"{count - most} of {count} regions were merged with others"
-    warnings.warn(f"{effect}: there are more than num_gaussians, {most}", stacklevel=4)  # past the decorators
+    warnings.warn(f"{effect}: there are more than num_gaussians, {most}", stacklevel=5)  # past the decorators

@@ -12,12 +12,12 @@ from kcgs.scene import Scene
 
 from .config import FitConfig
 from .descent import DRAFT_CUTOFF
-from .initial import gradient_field, initial_field, initial_sigma, random_field
+from .initial import gradient_field, initial_sigma, random_field, uniform_field
 from .optimizers import make_optimizer
 from .problem import Problem
 from .state import FitState
 
-_INITIALIZERS = {"uniform": initial_field, "random": random_field, "gradient": gradient_field}
+_INITIALIZERS = {"uniform": uniform_field, "random": random_field, "gradient": gradient_field}
 
 
 def start(problem: Problem) -> FitState:

@@ -195,8 +195,9 @@ class TestHardCases:
     def test_fewer_gaussians_than_regions(self) -> None:
         image, _ = scene()
         labels = torch.arange(48)[:, None] // 12 * 4 + torch.arange(64) // 16
-        with pytest.warns(UserWarning, match="11 of 16 regions get no Gaussian and stay black"):
+        with pytest.warns(UserWarning, match="11 of 16 regions get no Gaussian and stay black") as warned:
             result = fit(image, labels, 5, recipe=quick(iterations=10, move_contours=False, merge_regions=False))
+        assert [warning.filename for warning in warned] == [__file__]
         assert result.scene.field.num_gaussians <= 5
         assert result.regions == RegionReport(16, 16, empty=11, empty_pixels=11 * 12 * 16)
         assert str(result.regions) == "16 of 16 regions kept; 11 without a Gaussian, black: 2112 pixels"
