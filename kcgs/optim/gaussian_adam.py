@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 from torch.optim import Optimizer
 
-from kcgs.errors import InvalidArgumentType
+from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.nn import GaussianField
 
 from .frame import local_gradient, move, widen
@@ -107,8 +107,12 @@ class GaussianAdam(Optimizer):
         Args:
             field: one that the optimizer was made for; it gets new parameters.
             added: of the same channels, both with region ids and opacities or neither.
+
+        Raises:
+            ValueError: a field that the optimizer was not made for.
         """
-        means, cholesky = _bounded(added.means, added.cholesky, field.size, self.defaults["min_sigma"])
+        min_sigma = self._group(field)["min_sigma"]
+        means, cholesky = _bounded(added.means, added.cholesky, field.size, min_sigma)
         for name, rows in (("means", means), ("cholesky", cholesky), ("colors", added.colors)):
             self._replace(field, name, torch.cat([getattr(field, name), rows], -2))
         if field.opacities is not None and added.opacities is not None:
@@ -125,7 +129,11 @@ class GaussianAdam(Optimizer):
         Args:
             field: one that the optimizer was made for; it gets new parameters.
             mask: boolean :math:`(N)`, for all images of a batch.
+
+        Raises:
+            ValueError: a field that the optimizer was not made for.
         """
+        self._group(field)
         for name in ("means", "cholesky", "colors"):
             self._replace(field, name, getattr(field, name)[..., mask, :])
         if field.opacities is not None:
@@ -134,6 +142,13 @@ class GaussianAdam(Optimizer):
             field.region_ids = field.region_ids[..., mask]
         for state in self._states(field):
             state.update({name: average[..., mask, :] for name, average in state.items()})
+
+    def _group(self, field: GaussianField) -> dict[str, Any]:
+        """Return the group of a field's geometry; ValueError for a field that the optimizer was not made for."""
+        for group in self.param_groups:
+            if group["params"][0] is field.means:
+                return group
+        raise InvalidArgument("field", "one that the optimizer was made for", "another")
 
     def _replace(self, field: GaussianField, name: str, rows: Tensor) -> None:
         """Put another parameter into the field, its group, and the state."""

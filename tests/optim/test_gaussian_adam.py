@@ -169,6 +169,21 @@ class TestProtocol:
         with pytest.raises(error, match=words):
             GaussianAdam(fields)
 
+    def test_another_field(self) -> None:
+        optimizer, other = GaussianAdam(field_of()), field_of()
+        for change in (lambda: optimizer.append(other, other), lambda: optimizer.keep(other, torch.ones(20) > 0)):
+            with pytest.raises(ValueError, match="field must be one that the optimizer was made for; got another"):
+                change()
+        assert other.num_gaussians == 20
+
+    def test_new_rows_are_as_wide_as_a_loaded_state_asks(self) -> None:
+        field = field_of()
+        optimizer = GaussianAdam(field)
+        optimizer.load_state_dict(GaussianAdam(field_of(), min_sigma=2.0).state_dict())
+        thin = GaussianField(torch.ones(1, 2), torch.tensor([[1.0, 0.0, 1.0]]), torch.ones(1, 3), size=SIZE)
+        optimizer.append(field, thin)
+        torch.testing.assert_close(field.cholesky.detach()[-1], torch.tensor([2.0, 0.0, 2.0]))
+
 
 @pytest.mark.parametrize("kind", KINDS)
 class TestRows:
