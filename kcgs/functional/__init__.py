@@ -1,5 +1,6 @@
 """Stateless public operations: splatting, covariances, label maps, metrics."""
 
+from .activation import activate_gaussians
 from .contour_fit import choose_softness
 from .covariance import (
     cholesky_to_covariance,
@@ -15,7 +16,7 @@ from .softness import PairSoftness
 from .splat import region_splat
 
 __all__ = [
-    "PairSoftness", "RegionMap", "cholesky_to_covariance", "cholesky_to_scale_rotation", "choose_softness",
-    "covariance_to_cholesky", "edge_band", "ef_psnr", "ef_ssim", "lookup_regions", "merge_regions", "ms_ssim", "psnr",
-    "region_splat", "scale_rotation_to_cholesky", "ssim",
+    "PairSoftness", "RegionMap", "activate_gaussians", "cholesky_to_covariance", "cholesky_to_scale_rotation",
+    "choose_softness", "covariance_to_cholesky", "edge_band", "ef_psnr", "ef_ssim", "lookup_regions", "merge_regions",
+    "ms_ssim", "psnr", "region_splat", "scale_rotation_to_cholesky", "ssim",
 ]  # fmt: skip

@@ -19,7 +19,7 @@ from torch.nn import functional
 
 import kcgs
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
-from kcgs.functional import edge_band, lookup_regions, region_splat
+from kcgs.functional import activate_gaussians, edge_band, lookup_regions, region_splat
 
 # run by a process of its own
 RUN = """
@@ -70,13 +70,11 @@ class Encoder(nn.Module):
     def predict(self, images: Tensor, labels: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return means, factors, colours and region ids of a batch."""
         contours = edge_band(labels, width=1)[:, None].to(images)
-        raw = self.net(torch.cat([images, contours], 1)).flatten(2).mT  # [B, N, 8]
-        rows, columns = (torch.arange(n // self.cell) for n in images.shape[-2:])
-        grid = (torch.cartesian_prod(rows, columns).flip(-1) + 0.5) * self.cell
-        means = grid + self.cell * raw[..., :2].tanh()
-        diagonal = 1 + self.cell * (raw[..., 2:4] - 1).sigmoid()
-        cholesky = torch.stack([diagonal[..., 0], raw[..., 4], diagonal[..., 1]], -1)
-        colors = raw[..., 5:] + 0.6 * functional.avg_pool2d(images, self.cell).flatten(2).mT
+        raw = self.net(torch.cat([images, contours], 1)).flatten(2).mT  # [B, N, 8], any real numbers
+        height, width = images.shape[-2:]
+        cells = kornia.geometry.create_meshgrid(height // self.cell, width // self.cell, False).flatten(0, 2)
+        means, cholesky, colors = activate_gaussians(raw, (cells + 0.5) * self.cell, self.cell)
+        colors = colors + 0.6 * functional.avg_pool2d(images, self.cell).flatten(2).mT
         return means, cholesky, colors, lookup_regions(means, labels)
 
     def forward(self, images: Tensor, labels: Tensor) -> Tensor:
