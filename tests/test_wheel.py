@@ -94,7 +94,7 @@ def call(environment: Path, folder: Path, command: list[str], text: str = "") ->
 def test_holds_kcgs_only(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     assert {n.split("/")[0] for n in names} == {"kcgs", f"kcgs-{kcgs.__version__}.dist-info"}
-    for name in ("recipes/paper.toml", "py.typed", "models/manifest.json", "page/page.js"):
+    for name in ("recipes/paper.toml", "py.typed", "models/manifest.json", "page/page.js", "page/kcgs-image.js"):
         assert f"kcgs/{name}" in names
     assert any(n.endswith("licenses/LICENSE") for n in names)
     data = [n for n in names if n.startswith("kcgs/models/")]

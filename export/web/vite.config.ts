@@ -15,7 +15,7 @@ const shaders: Plugin = {
 };
 
 // for each mode the module that is built, its folder and its name: the decoder alone, the element with renderer and
-// decoder, or the script of the page that `kcgs export` and `kcgs view` write, which the Python package holds
+// decoder, or what the page that `kcgs export` and `kcgs view` write adds to the element
 const BUNDLES: Record<string, readonly [input: string, folder: string, name: string]> = {
   decoder: ["decoder/index.ts", "build", "decoder"],
   element: ["element/index.ts", "element/dist", "kcgs-image"],
@@ -31,7 +31,7 @@ export default defineConfig(({ mode }) => {
     build: {
       target: "es2022",
       outDir: path(folder),
-      emptyOutDir: mode !== "page",
+      emptyOutDir: false,
       modulePreload: false,
       rolldownOptions: {
         input: path(input),

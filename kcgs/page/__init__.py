@@ -1,5 +1,5 @@
 """A scene as one web page, which needs no server and no network."""
 
-from .html import scene_page
+from .html import ELEMENT, scene_page
 
-__all__ = ["scene_page"]
+__all__ = ["ELEMENT", "scene_page"]

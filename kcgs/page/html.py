@@ -12,9 +12,11 @@ from kcgs.errors import InvalidArgument
 from kcgs.functional.softness import check_contours
 from kcgs.scene import Scene, check_scene
 
-# page.html, a template for `str.format`, and page.css are written by hand; page.js is committed as `make page` builds
-# it out of export/web/element/page.ts, so that an installation needs no npm
+# page.html, a template for `str.format`, and page.css are written by hand; page.js and the element are committed as
+# `make page` builds them out of export/web/element, so that an installation needs no npm
 _FOLDER = Path(__file__).resolve().parent
+ELEMENT = _FOLDER / "kcgs-image.js"
+"""The script of `<kcgs-image>`, one file to copy to a site."""
 # PSNR in dB against the scene's own render: no value differs by a level of 255
 _QUALITY = 60.0
 
@@ -42,14 +44,14 @@ def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "s
         >>> page[:15], "<title>Blobs &amp; more</title>" in page
         ('<!doctype html>', True)
     """
-    style, script, template = ((_FOLDER / f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html"))
-    script = script.strip()
+    files = (_FOLDER / "page.css", _FOLDER / "page.js", _FOLDER / "page.html", ELEMENT)
+    style, script, template, element = (file.read_text(encoding="utf-8").strip() for file in files)
     policy = (
-        f"default-src 'none'; script-src '{_policy_hash(script)}' 'wasm-unsafe-eval'; "
+        f"default-src 'none'; script-src '{_policy_hash(script)}' '{_policy_hash(element)}' 'wasm-unsafe-eval'; "
         f"style-src '{_policy_hash(style)}'; img-src data:; base-uri 'none'; form-action 'none'"
     )
     return template.format(
-        policy=policy, title=html.escape(title), style=style, script=script,
+        policy=policy, title=html.escape(title), style=style, element=element, script=script,
         contours=check_contours(contours), scene=base64.b64encode(web_bytes(scene)).decode(),
     )  # fmt: skip
 

@@ -1,6 +1,9 @@
-/** The page that `kcgs export` and `kcgs view` write: the element in a window of its own, with buttons around it. */
+/**
+ * The page that `kcgs export` and `kcgs view` write: the element in a window of its own, with buttons around it. It runs
+ * before the element is defined, so that no event is missed.
+ */
 
-import { KcgsImage } from "./index.ts";
+import type { KcgsImage } from "./index.ts";
 
 const image = document.querySelector("kcgs-image") as KcgsImage;
 const bar = document.querySelector<HTMLElement>("#bar")!;
