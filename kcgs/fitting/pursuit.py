@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +27,8 @@ _MIN_CANDIDATES = 4096
 # two Gaussians whose normalised inner product is above this explain the same error: 2.5 sigma apart, at one scale
 _OVERLAP = 0.2
 _CUTOFF = 1e-4
+# pixels of crops that are searched at once
+_CROP_PIXELS = 1 << 16
 # Standard deviations that are tried, in pixels. More of them cost time, and descent changes them anyway.
 SIGMAS = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
 
@@ -48,6 +50,14 @@ class _Candidates(NamedTuple):
     def take(self, positions: NDArray[np.int64]) -> _Candidates:
         """Return those at these positions."""
         return _Candidates(*(column[positions] for column in self))
+
+
+class _Crops(NamedTuple):
+    """Boxes of R regions of the same size."""
+
+    regions: Array  # [R], position in the map's ids
+    corners: Array  # [R, 2], first row and column
+    planes: Tensor  # [R, C + 1, h, w], the residual inside the region, zero outside, and the mask
 
 
 def propose(
@@ -86,29 +96,42 @@ def _search(residual: Tensor, labels: NDArray[np.int32], sigmas: Sequence[float]
 
     limit = max(_CANDIDATES_PER_GAUSSIAN * count, _MIN_CANDIDATES)
     scales = {block: [s for s in sigmas if _block(s) == block] for block in sorted(map(_block, sigmas))}
-    align = 2 * max(scales)
     parts: list[_Candidates] = []
-    for region, box in enumerate(find_objects(labels + 1)):
-        if box is None:
-            continue
-        # blocks of all regions start at multiples of their side
-        top, left = (side.start // align * align for side in box)
-        crop = residual[:, top : box[0].stop, left : box[1].stop]
-        mask = torch.from_numpy(labels[top : box[0].stop, left : box[1].stop] == region)
-        height, width = (-(-length // align) * align for length in mask.shape)
-        planes = crop.new_zeros(len(residual) + 1, height, width)
-        planes[-1, : len(mask), : mask.shape[1]] = mask
-        torch.mul(crop, planes[-1, : len(mask), : mask.shape[1]], out=planes[:-1, : len(mask), : mask.shape[1]])
-        averages, side = planes, 1
+    for crops in _crop_regions(residual, labels, find_objects(labels + 1), 2 * max(scales)):
+        averages, side = crops.planes, 1
         for block, choices in scales.items():
             while side < block:
                 averages, side = halve(averages), 2 * side
             margin = math.ceil(_REACH * max(choices) / block)
             padded = pad(averages, (margin, margin, margin, margin))
-            parts += [_best_of_squares(padded, margin, region, sigma, block, (left, top), limit) for sigma in choices]
+            parts += [_best_of_squares(crops, padded, margin, sigma, block, limit) for sigma in choices]
     everywhere = _Candidates(*(np.concatenate(values) for values in zip(*parts, strict=True)))
     strong = everywhere.take(_strongest(everywhere.gain, limit))
     return strong.take(np.lexsort((strong.sigma, strong.x, strong.y, strong.region)))
+
+
+def _crop_regions(residual: Tensor, labels: NDArray[np.int32], boxes: list[Any], align: int) -> Iterator[_Crops]:
+    """Crop the residual to each region's box, begun and filled up to multiples of `align`; boxes of a size together."""
+    corners, sizes = {}, {}
+    for region, box in enumerate(boxes):
+        if box is not None:
+            corners[region] = [side.start // align * align for side in box]
+            sizes[region] = tuple(
+                -(-(side.stop - start) // align) * align for side, start in zip(box, corners[region], strict=True)
+            )
+    for height, width in sorted(set(sizes.values())):
+        members = [region for region, size in sizes.items() if size == (height, width)]
+        count = max(1, _CROP_PIXELS // (height * width))
+        for first in range(0, len(members), count):
+            group = members[first : first + count]
+            planes = residual.new_zeros(len(group), len(residual) + 1, height, width)
+            for plane, region in zip(planes, group, strict=True):
+                top, left = corners[region]
+                mask = torch.from_numpy(labels[top : top + height, left : left + width] == region)
+                inside = plane[:, : mask.shape[0], : mask.shape[1]]
+                inside[-1] = mask
+                torch.mul(residual[:, top : top + height, left : left + width], inside[-1], out=inside[:-1])
+            yield _Crops(np.array(group), np.array([corners[region] for region in group]), planes)
 
 
 def _block(sigma: float) -> int:
@@ -117,40 +140,40 @@ def _block(sigma: float) -> int:
 
 
 def halve(planes: Tensor) -> Tensor:
-    """Average blocks of 2 x 2, (N, h, w), without an odd last row; five times faster on one core than torch's."""
-    rows = planes[:, : planes.shape[1] // 2 * 2 : 2] + planes[:, 1::2]
-    return (rows[..., : rows.shape[2] // 2 * 2 : 2] + rows[..., 1::2]).mul_(0.25)
+    """Average blocks of 2 x 2, (..., h, w), without an odd last row; five times faster on one core than torch's."""
+    rows = planes[..., : planes.shape[-2] // 2 * 2 : 2, :] + planes[..., 1::2, :]
+    return (rows[..., : rows.shape[-1] // 2 * 2 : 2] + rows[..., 1::2]).mul_(0.25)
 
 
-def _best_of_squares(
-    padded: Tensor, margin: int, region: int, sigma: float, block: int, corner: tuple[int, int], limit: int
-) -> _Candidates:
-    """Gains at every block of one region, at one scale; the best of each square of blocks, the `limit` best of those.
+def _best_of_squares(crops: _Crops, padded: Tensor, margin: int, sigma: float, block: int, limit: int) -> _Candidates:
+    """Gains at every block of some regions, at one scale; the best of each square of blocks, the `limit` best of those.
 
-    `padded`, (C + 1, h, w), is the residual inside the region, zero outside, and the mask, averaged over blocks, with
-    `margin` blocks of zeros around them; `corner` is the first pixel (x, y) inside the margin.
+    `padded`, (R, C + 1, h, w), are the crops' planes, averaged over blocks, with `margin` blocks of zeros around them.
     """
     # <g, e> and <g, g> of the blocks; g^2 is a Gaussian too, narrower by sqrt 2
-    inner = _inner_products(padded[:-1], sigma / block, margin).mul_(block**2)
-    norm = _inner_products(padded[-1:], sigma / block / math.sqrt(2), margin)[0].mul_(block**2)
-    inside = padded[-1, margin:-margin, margin:-margin] > 0
-    gain = inner.square().sum(0).div_(norm).where(inside, -1.0)
+    inner = _inner_products(padded[:, :-1], sigma / block, margin).mul_(block**2)
+    norm = _inner_products(padded[:, -1], sigma / block / math.sqrt(2), margin).mul_(block**2)
+    inside = padded[:, -1, margin:-margin, margin:-margin] > 0
+    gain = inner.square().sum(1).div_(norm).where(inside, -1.0)
     side = 2 if block == 1 or sigma / block >= _SIGMA_PER_BLOCK * math.sqrt(2) else 1
-    best, where = (v.flatten() for v in max_pool2d(gain[None], side, return_indices=True))
-    values = best.cpu().numpy()
+    best, where = max_pool2d(gain, side, return_indices=True)
+    values = best.flatten().cpu().numpy()
     positive = np.flatnonzero(values > 0)
     strongest = positive[_strongest(values[positive], limit)]
-    blocks = where[torch.from_numpy(strongest).to(where.device)]
-    places = blocks.cpu().numpy()
+    crop = strongest // best[0].numel()
+    places = where.flatten()[torch.from_numpy(strongest).to(where.device)].cpu().numpy()
+    blocks = torch.from_numpy(crop * gain[0].numel() + places).to(gain.device)
+    rows, columns = np.divmod(places, gain.shape[2])
     return _Candidates(
-        np.full(len(places), region), corner[0] + (places % gain.shape[1] + 0.5) * block,
-        corner[1] + (places // gain.shape[1] + 0.5) * block, np.full(len(places), sigma), np.full(len(places), block),
-        inner.flatten(1)[:, blocks].T.cpu().numpy(), norm.flatten()[blocks].cpu().numpy(), values[strongest],
+        crops.regions[crop], crops.corners[crop, 1] + (columns + 0.5) * block,
+        crops.corners[crop, 0] + (rows + 0.5) * block, np.full(len(places), sigma), np.full(len(places), block),
+        inner.transpose(0, 1).flatten(1)[:, blocks].T.cpu().numpy(), norm.flatten()[blocks].cpu().numpy(),
+        values[strongest],
     )  # fmt: skip
 
 
 def _inner_products(padded: Tensor, sigma: float, margin: int) -> Tensor:
-    """Inner products with exp(-0.5 d^2 / sigma^2) at every pixel inside the margin, (N, h, w)."""
+    """Inner products with exp(-0.5 d^2 / sigma^2) at every pixel inside the margin, (..., h, w)."""
     reach = math.ceil(_REACH * sigma)
     return blur(pad(padded, [reach - margin] * 4), gaussian_taps(sigma, reach))
 

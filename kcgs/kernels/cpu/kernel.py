@@ -74,7 +74,8 @@ def _sort(means: Any, images: Any, size: tuple[int, int]) -> Any:
     return np.argsort(tile.astype(np.uint16) if tile.size and tile.max() < 1 << 16 else tile, kind="stable")
 
 
-@functools.lru_cache(maxsize=4)
+# contour moves render each region alone, in the size of its box
+@functools.lru_cache(maxsize=256)
 def _table_without_map(size: tuple[int, int]) -> Table:
     return _table(None, size)
 
