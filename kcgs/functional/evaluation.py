@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.kernels import OutOfRangeError, SplatInputs, Steps, resolve, with_autograd
+from kcgs.kernels import SplatInputs, Steps, resolve, with_autograd
 
 from .arguments import SplatArguments
 from .map_tables import tables_at
@@ -29,11 +29,10 @@ class Plan(NamedTuple):
 def plan_splat(arguments: SplatArguments, check: bool = True) -> Plan:
     """Prepare Gaussians and map for the kernel that the backend names, with `check` of values."""
     inputs, steps = _prepare(arguments, check)
-    try:
-        return Plan(steps, inputs, steps.plan(inputs))
-    except OutOfRangeError:
+    content = steps.plan(inputs)
+    if content is None:
         check_values(*arguments[:3])
-        raise
+    return Plan(steps, inputs, content)
 
 
 def render(arguments: SplatArguments, plan: Plan) -> Tensor:

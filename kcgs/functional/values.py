@@ -8,10 +8,13 @@ import warnings
 import torch
 from torch import Tensor
 
-from kcgs._check import check_floating
+from kcgs.errors import InvalidArgument
 from kcgs.kernels.whitened import MEAN_LIMIT, SCALE_LIMITS
 
-from .covariance import check_cholesky
+_ADVICE = (
+    "kcgs.optim.GaussianAdam keeps a field valid as it trains; kcgs.functional.activate_gaussians makes a network's "
+    "output valid"
+)
 
 
 def check_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
@@ -24,20 +27,24 @@ def check_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
     # the extremes of a tensor with NaN are NaN: one pass checks finiteness and range; comparisons with NaN must fail
     low, high = (float(t) for t in torch.aminmax(means))
     if not (low >= -MEAN_LIMIT and high <= MEAN_LIMIT):
-        check_floating("means", means)
-        raise ValueError(f"means must be within {MEAN_LIMIT:g} pixels; got {max(-low, high):g}")
+        raise _invalid("means", f"finite, within {MEAN_LIMIT:g} pixels", means, f"[{low:g}, {high:g}]")
     smallest, largest = (float(t) for t in torch.aminmax(cholesky[..., ::2]))
     low, high = (float(t) for t in torch.aminmax(cholesky[..., 1]))
-    if not (smallest >= SCALE_LIMITS[0] * (1 - 1e-6) and max(largest, -low, high) <= SCALE_LIMITS[1]):
-        check_cholesky("cholesky", cholesky)
-        raise ValueError(
-            f"cholesky must have l11, l22 in [{SCALE_LIMITS[0]:g}, {SCALE_LIMITS[1]:g}] pixels and |l21| at most "
-            f"{SCALE_LIMITS[1]:g}; got a least diagonal of {smallest:g} and a largest value of "
-            f"{max(largest, -low, high):g}"
-        )
+    least, most = SCALE_LIMITS
+    if not (smallest >= least * (1 - 1e-6) and max(largest, -low, high) <= most):
+        bounds = f"finite, l11 and l22 in [{least:g}, {most:g}] pixels and |l21| at most {most:g}"
+        extremes = f"l11 and l22 in [{smallest:g}, {largest:g}], l21 in [{low:g}, {high:g}]"
+        raise _invalid("cholesky", bounds, cholesky, extremes)
     low, high = (float(t) for t in torch.aminmax(colors))
     if not (low > -math.inf and high < math.inf):
-        check_floating("colors", colors)
+        raise _invalid("colors", "finite", colors, f"[{low:g}, {high:g}]")
+
+
+def _invalid(name: str, expected: str, tensor: Tensor, extremes: str) -> InvalidArgument:
+    """Return the error of values that are not finite, or of their extremes."""
+    count = int((~tensor.isfinite()).sum())
+    received = f"{count} NaN or infinite values" if count else extremes
+    return InvalidArgument(name, expected, f"{received}. {_ADVICE}")
 
 
 def check_region_ids(region_ids: Tensor, index: Tensor, complete: bool) -> None:

@@ -40,10 +40,6 @@ class SplatInputs(NamedTuple):
         return SplatInputs(self.means[None], self.cholesky[None], self.colors[None], *self[3:])
 
 
-class OutOfRangeError(ValueError):
-    """A value is not finite or beyond the limits in whitened.py; the public function says which."""
-
-
 class Steps(NamedTuple):
     """A kernel as three functions, none of which records a graph.
 
@@ -52,8 +48,8 @@ class Steps(NamedTuple):
     differentiate: from (plan, inputs, gradient of the image, geometry) to the gradients of means, cholesky and colors;
         the first two are None unless `geometry`.
     image: from the inputs to the image, with a graph of all orders; None: the kernel is differentiable once.
-    checks_inputs: `plan` raises OutOfRangeError, and Gaussians of one image may come without B, as do the results then;
-        else values have been checked, and B is there.
+    checks_inputs: `plan` returns None where a value is not finite or beyond the limits in whitened.py, and Gaussians of
+        one image may come without B, as do the results then; else values have been checked, and B is there.
     """
 
     plan: Callable[[SplatInputs], Any]

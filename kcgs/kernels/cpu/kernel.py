@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..coarse_grids import blocks_of, max_spacing
-from ..interface import Gradients, OutOfRangeError, SplatInputs, Steps
+from ..interface import Gradients, SplatInputs, Steps
 from ..membership import Membership
 from ..whitened import least_exponent, support_radius
 from .gradients import GaussianGradients, sum_terms
@@ -39,12 +39,12 @@ def steps(inputs: SplatInputs) -> Steps:
     return Steps(plan, render, differentiate, checks_inputs=True)
 
 
-def plan(inputs: SplatInputs) -> _Plan:
-    """List which Gaussians touch which tiles, for the loops."""
+def plan(inputs: SplatInputs) -> _Plan | None:
+    """List which Gaussians touch which tiles, for the loops; None where a value is out of range."""
     num_images, count = inputs.colors.shape[:-2].numel(), inputs.colors.shape[-2]
     means, cholesky, colors = (_array(t) for t in inputs.gaussians)
     if not in_range(means, cholesky, colors):
-        raise OutOfRangeError
+        return None
     images = np.repeat(np.arange(num_images), count)
     order = _sort(means, images, inputs.size)
     if inputs.membership is not None and inputs.region_index is not None:
