@@ -1,5 +1,5 @@
 PYTHON ?= python3
-VENV ?= .venv
+VENV ?= .venv-dev
 EXTRAS ?= dev
 BIN := $(VENV)/bin
 # Tests take one thread each. Those of a file stay together: they share a browser, an environment, networks, fits.

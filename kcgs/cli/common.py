@@ -70,6 +70,12 @@ def check_output(path: Path, *suffixes: str, name: str = "output") -> None:
     check_writable(f"--{name}", path)
 
 
+def check_new(path: Path, overwrite: bool) -> None:
+    """Refuse an output that exists, before the work, unless it may be replaced."""
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} exists; --overwrite replaces it")
+
+
 def replace_undefined(report: dict[str, Any]) -> dict[str, Any]:
     """Replace numbers that JSON does not have by None."""
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in report.items()}

@@ -45,6 +45,7 @@ def demo(
 
     from kcgs.fitting import FitConfig, precompile
 
+    typer.echo(f"fitting a photo to {TARGET_BYTES:,} bytes twice, without and with regions: about a minute", err=True)
     precompile(FitConfig.from_recipe("best"))  # the clock counts no compilation
     image = torch.from_numpy(astronaut()).permute(2, 0, 1).float() / 255
     compare(output, image, TARGET_BYTES, progress=True)

@@ -8,7 +8,7 @@ import warnings
 import typer
 
 # each module adds its commands to `app`, in the order of `kcgs --help`
-from . import fit, many, video, scenes, segmentation, decoders, demo  # noqa: F401  # isort: skip
+from . import fit, many, video, scenes, edit, segmentation, decoders, demo  # noqa: F401  # isort: skip
 from .commands import app
 from .common import describe_error
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -12,10 +13,11 @@ import typer
 from kcgs._atomic import write_file
 from kcgs._progress import Progress
 from kcgs._suffixes import SCENE_FORMATS
+from kcgs.errors import InvalidArgument
 
 from . import options
 from .commands import app
-from .common import ImageFile, InterruptHandler, Json, Quiet, check_output, exit_interrupted, print_report
+from .common import ImageFile, InterruptHandler, Json, Quiet, check_new, check_output, exit_interrupted, print_report
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -40,16 +42,23 @@ def fit_command(
         Path | None,
         typer.Option("-o", "--output", help="Scene (.safetensors) or file (.kcgs); default: IMAGE's name, here."),
     ] = None,
+    overwrite: options.Overwrite = False,
+    resize_regions: options.ResizeRegions = False,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Fit Gaussians to an image and save the scene. Ctrl-C saves the best so far."""
+    """Fit Gaussians to an image and save the scene. Ctrl-C saves the best so far.
+
+    EF-PSNR and EF-SSIM are along the contours of the label map as it was before the fit; those of `eval` are along the
+    scene's, which the fit may have moved. The seconds are those of the fit and of the writing of its file.
+    """
     output = output or Path(f"{image.stem}{request.default_suffix}")
     check_output(output, *(SCENE_FORMATS if request.target_bytes is None else (".kcgs",)))
+    check_new(output, overwrite)
     from kcgs.data import load_image
 
     target = load_image(image)
-    labels = read_regions(regions, target, progress=not quiet)
+    labels = read_regions(regions, target, resize=resize_regions, progress=not quiet)
     with InterruptHandler() as interrupts:
         saved_fit = fit_and_save(output, target, labels, request, on_step=interrupts.on_step, progress=not quiet)
     report, regions_report = report_fit(saved_fit, target, labels, output, request), saved_fit.result.regions
@@ -75,6 +84,8 @@ class SavedFit(NamedTuple):
     scene: Scene
     """As a reader of the file has it: rounded, if the file is compressed."""
     num_bytes: int
+    seconds: float
+    """Of the fit and the writing of the file."""
 
 
 def fit_and_save(
@@ -95,23 +106,24 @@ def fit_and_save(
     target_psnr = config.target_psnr
     if target_psnr is not None and is_compressed:
         config = config.model_copy(update={"target_psnr": target_psnr + _ROUNDING_MARGIN})
+    start = time.perf_counter()
     settings: Any = {"recipe": config, "seed": request.seed, "on_step": on_step, "progress": progress}
     if request.target_bytes is not None:
         file = fit_bytes(image, labels, request.target_bytes, **settings)
-        return SavedFit(file.result, file.scene, write_file(output, file.data))
+        return SavedFit(file.result, file.scene, write_file(output, file.data), time.perf_counter() - start)
     result = fit(image, labels, request.num_gaussians, **settings)
     if not is_compressed:
         scene = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe})
-        return SavedFit(result, scene, scene.save(output))
+        return SavedFit(result, scene, scene.save(output), time.perf_counter() - start)
     quality = quality_for(max(entry.psnr for entry in result.history)) if target_psnr is None else None
     goal: Any = {"quality": quality, "target_psnr": target_psnr, "objective": config.objective}
     with Progress("writing the file", pulse=True, visible=progress):
         compressed = compress(result.scene, image, seed=request.seed, **goal)
-    return SavedFit(result, compressed.scene, write_file(output, compressed.data))
+    return SavedFit(result, compressed.scene, write_file(output, compressed.data), time.perf_counter() - start)
 
 
-def read_regions(regions: str, image: Tensor, *, progress: bool = False) -> Tensor | None:
-    """Return the label map that the option --regions names."""
+def read_regions(regions: str, image: Tensor, *, resize: bool = False, progress: bool = False) -> Tensor | None:
+    """Return the label map that the option --regions names, with `resize` at the size of the image."""
     if regions == "none":
         return None
     if regions == "auto":
@@ -121,7 +133,15 @@ def read_regions(regions: str, image: Tensor, *, progress: bool = False) -> Tens
             return segment(image)
     from kcgs.data import load_labels
 
-    return load_labels(Path(regions))
+    labels, size = load_labels(Path(regions)), (image.shape[-2], image.shape[-1])
+    if tuple(labels.shape) == size:
+        return labels
+    if not resize:
+        expected = f"one map of the image's size, {size[1]} x {size[0]}, which --resize-regions makes of it"
+        raise InvalidArgument("regions", expected, f"{labels.shape[-1]} x {labels.shape[-2]}")
+    from kcgs.functional import RegionMap
+
+    return RegionMap.from_labels(labels).resize(size).labels
 
 
 def report_fit(
@@ -135,7 +155,7 @@ def report_fit(
     return {
         **metrics,
         **describe_scene(saved_fit.scene),
-        "seconds": saved_fit.result.seconds,
+        "seconds": saved_fit.seconds,
         **describe_file(output, saved_fit.num_bytes, saved_fit.scene.size),
         "stop_reason": saved_fit.result.stop_reason,
         "target_reached": None if target_psnr is None else metrics["psnr"] >= target_psnr,

@@ -18,7 +18,7 @@ from kcgs.errors import InvalidArgument
 
 from . import options
 from .commands import app
-from .common import Json, Quiet, print_report
+from .common import INTERRUPTED, Json, Quiet, print_report
 from .many_jobs import FitJob, Outcome, fit_one
 
 
@@ -42,17 +42,32 @@ def fit_many_command(
     ] = "local",
     workers: Annotated[int | None, typer.Option(min=1, help="Images at a time; default: cores / --threads.")] = None,
     threads: Annotated[int, typer.Option(min=1, help="Threads of each fit.")] = 1,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace files that were made with other settings.")
+    ] = False,
+    resize_regions: options.ResizeRegions = False,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Fit many images, each into a scene or a compressed file of its own.
 
     The same command again goes on where an earlier one stopped: a file that was made from the same image, mask and
-    settings is kept. One image's failure stops no other; with any, the exit status is 1.
+    settings is kept; any other file that exists is an error of that image without --overwrite. One image's failure
+    stops no other; with any, the exit status is 1.
     """
     if request.target_bytes is not None and suffix == ".safetensors":
         options.exclude("--target-bytes", suffix=suffix)
-    jobs = _make_jobs(images, regions, output, suffix or request.default_suffix, request)
+    jobs = [
+        FitJob(
+            image,
+            output.absolute() / f"{stem}{suffix or request.default_suffix}",
+            mask,
+            request,
+            overwrite,
+            resize_regions,
+        )
+        for stem, image, mask in _find_images(images, regions)
+    ]
     from kcgs.engine import run_jobs
 
     request.load_config()  # refuses wrong settings before the work
@@ -68,6 +83,10 @@ def fit_many_command(
                 progress.update(len(outcomes) / len(jobs), f"{len(outcomes)} of {len(jobs)}")
                 for warning in outcome.warnings:
                     typer.echo(f"warning: {jobs[index].image.name}: {warning}", err=True)
+    except KeyboardInterrupt:
+        done = f"{len(outcomes)} of {len(jobs)} images are done"
+        typer.echo(f"kcgs: interrupted: {done}; the same command goes on where it stopped", err=True)
+        raise typer.Exit(INTERRUPTED) from None
     finally:
         rows = [{"image": str(jobs[index].image), **outcomes[index].row} for index in sorted(outcomes)]
         _write_table(output / "results.csv", rows)
@@ -85,8 +104,11 @@ def fit_many_command(
         raise typer.Exit(1)
 
 
-def _make_jobs(paths: list[Path], regions: str, output: Path, suffix: str, request: options.FitRequest) -> list[FitJob]:
-    """Return a job for each image; paths are absolute, for a worker on a cluster has a working folder of its own."""
+def _find_images(paths: list[Path], regions: str) -> list[tuple[str, Path, str]]:
+    """Return each image's stem, its path and its regions: auto, none or a path.
+
+    Paths are absolute, for a worker on a cluster has a working folder of its own.
+    """
     images = _by_stem("images", (image for path in paths for image in _list_images(path)))
     if regions in ("auto", "none"):
         sources = dict.fromkeys(images, regions)
@@ -94,10 +116,7 @@ def _make_jobs(paths: list[Path], regions: str, output: Path, suffix: str, reque
         files = (path for path in Path(regions).iterdir() if path.suffix.lower() in LABEL_MAPS)
         masks = _by_stem("regions", files)
         sources = {stem: str(masks.get(stem, Path(regions, f"{stem}.*")).absolute()) for stem in images}
-    return [
-        FitJob(image.absolute(), output.absolute() / f"{stem}{suffix}", sources[stem], request)
-        for stem, image in images.items()
-    ]
+    return [(stem, image.absolute(), sources[stem]) for stem, image in images.items()]
 
 
 def _list_images(path: Path) -> list[Path]:

@@ -24,6 +24,9 @@ class FitJob(NamedTuple):
     regions: str
     """auto, none, or the mask."""
     request: FitRequest
+    overwrite: bool = False
+    """Replace a scene of another image, mask or settings."""
+    resize_regions: bool = False
 
 
 class Outcome(NamedTuple):
@@ -38,30 +41,32 @@ class Outcome(NamedTuple):
 
 def fit_one(job: FitJob) -> Outcome:
     """Fit an image, write its scene and its row, unless they are there; an error is returned."""
+    from kcgs.data import load_image
+
     record = job.output.with_suffix(".json")
     try:
         fingerprint = _fingerprint(job)
-        if job.output.is_file() and record.is_file():
-            row = json.loads(record.read_text(encoding="utf-8"))
-            if row.get("fingerprint") == fingerprint:
+        if job.output.is_file():
+            row = json.loads(record.read_text(encoding="utf-8")) if record.is_file() else {}
+            is_same = row.get("fingerprint") == fingerprint
+            if is_same and "psnr" in row:
                 return Outcome(row, False)
+            if not (is_same or job.overwrite):
+                raise FileExistsError(f"{job.output} exists, made with other settings; --overwrite replaces it")
         # a warning of one image among many must say which image: the caller does
         with warnings.catch_warnings(record=True) as messages:
             warnings.simplefilter("always", UserWarning)
-            row = {**replace_undefined(_fit(job)), "fingerprint": fingerprint}
+            image = load_image(job.image)
+            labels = read_regions(job.regions, image, resize=job.resize_regions)
+            # a command that is killed between scene and row knows the scene as its own when it is run again
+            write_file(record, json.dumps({"fingerprint": fingerprint}))
+            saved_fit = fit_and_save(job.output, image, labels, job.request)
+            report = report_fit(saved_fit, image, labels, job.output, job.request)
+            row = {**replace_undefined(report), "fingerprint": fingerprint}
         write_file(record, json.dumps(row))
         return Outcome(row, True, tuple(str(message.message) for message in messages))
     except Exception as error:
         return Outcome({"error": describe_error(error)}, True)
-
-
-def _fit(job: FitJob) -> dict[str, Any]:
-    from kcgs.data import load_image
-
-    image = load_image(job.image)
-    labels = read_regions(job.regions, image)
-    saved_fit = fit_and_save(job.output, image, labels, job.request)
-    return report_fit(saved_fit, image, labels, job.output, job.request)
 
 
 def _fingerprint(job: FitJob) -> str:

@@ -22,11 +22,13 @@ from .common import (
     check_output,
     print_report,
 )
-from .fit import describe_file, describe_scene
-from .options import Contours, Objective, exclude, target_size
+from .fit import describe_file, describe_scene, read_regions
+from .options import Contours, Objective, ResizeRegions, exclude, target_size
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from kcgs.scene import Scene
 
 
 @app.command()
@@ -75,18 +77,22 @@ def eval_command(
     regions: Annotated[
         Path | None,
         typer.Option(
-            metavar="MASK", help="Label map whose contours EF-PSNR looks at; default: the scene's.", dir_okay=False
+            metavar="MASK",
+            help="Label map whose contours EF-PSNR looks at, such as that of the fit; default: the scene's.",
+            dir_okay=False,
         ),
     ] = None,
+    resize_regions: ResizeRegions = False,
     as_json: Json = False,
 ) -> None:
     """Compare a scene with an image; the seconds are those of a render."""
     from kcgs import evaluate, load
-    from kcgs.data import load_image, load_labels
+    from kcgs.data import load_image
     from kcgs.scene import check_unbatched
 
-    loaded = check_unbatched(load(scene))
-    report: dict[str, Any] = evaluate(loaded, load_image(image), None if regions is None else load_labels(regions))
+    loaded, target = check_unbatched(load(scene)), load_image(image)
+    labels = read_regions("none" if regions is None else str(regions), target, resize=resize_regions)
+    report: dict[str, Any] = evaluate(loaded, target, labels)
     start = time.perf_counter()
     loaded.render()
     report |= {**describe_scene(loaded), "seconds": time.perf_counter() - start}
@@ -95,7 +101,10 @@ def eval_command(
 
 @app.command()
 def info(scene: SceneFile, as_json: Json = False) -> None:
-    """Describe a scene, a batch of scenes, or a compressed label map."""
+    """Describe a scene with its regions, a batch of scenes, or a compressed label map.
+
+    Regions have their id, area, centre and mean colour. `view` shows the id of a region that is clicked.
+    """
     from kcgs import load
 
     if (labels := _read_map(scene)) is not None:
@@ -106,7 +115,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
     softness = 0.0 if loaded.regions is None else loaded.regions.softness
     if not isinstance(softness, float):
         softness = sum(softness.values()) / max(1, len(softness))
-    report = {
+    report: dict[str, Any] = {
         "images": loaded.field.means.shape[:-2].numel(),
         **describe_scene(loaded),
         "channels": loaded.field.colors.shape[-1],
@@ -116,6 +125,13 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
         **describe_file(scene, scene.stat().st_size, loaded.size),
         **{f"metadata.{key}": value for key, value in loaded.metadata.items()},
     }
+    if loaded.regions is not None and loaded.field.means.ndim == 2:
+        table = _describe_regions(loaded)
+        if as_json:
+            report["table"] = table
+        for row in () if as_json else table:
+            facts = "{area} pixels around {x}, {y}; mean {color}".format_map(row)
+            report[f"region {row['id']}"] = facts
     print_report(report, as_json, str(scene))
 
 
@@ -207,6 +223,22 @@ def _read_map(file: Path) -> Tensor | None:
 
     data = file.read_bytes()
     return decode_labels(data) if data.startswith(MAP_MAGIC) else None
+
+
+def _describe_regions(scene: Scene) -> list[dict[str, Any]]:
+    """Return the id, the area, the centre in pixels and the mean colour of each region."""
+    assert scene.regions is not None
+    image, labels = scene.render().detach().clamp(0, 1).cpu(), scene.regions.labels.cpu()
+    ids, index = labels.unique(return_inverse=True)
+    y, x = (labels >= 0).nonzero().T
+    areas = index.flatten().bincount()
+    *levels, xs, ys = (
+        (index.flatten().bincount(values.flatten().double()) / areas).round().int().tolist()
+        for values in (*(255 * image), x, y)
+    )
+    colors = ["#" + "".join(f"{level:02x}" for level in color) for color in zip(*levels, strict=True)]
+    rows = zip(ids.tolist(), areas.tolist(), xs, ys, colors, strict=True)
+    return [dict(zip(("id", "area", "x", "y", "color"), row, strict=True)) for row in rows]
 
 
 def _describe_image(file: Path, size: tuple[int, int]) -> dict[str, Any]:

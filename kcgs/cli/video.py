@@ -14,7 +14,7 @@ from kcgs._suffixes import VIDEOS, WRITTEN_IMAGES
 
 from . import options
 from .commands import app
-from .common import InterruptHandler, Json, Quiet, check_output, exit_interrupted, print_report
+from .common import InterruptHandler, Json, Quiet, check_new, check_output, exit_interrupted, print_report
 from .fit import describe_scene, read_regions
 
 if TYPE_CHECKING:
@@ -31,7 +31,12 @@ def fit_video_command(
     *,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="Batch of scenes to write (.safetensors); default: VIDEO's name, here."),
+        typer.Option(
+            "-o",
+            "--output",
+            help="Batch of scenes to write (.safetensors), or a folder for one scene per frame; default: VIDEO's name, "
+            "here.",
+        ),
     ] = None,
     regions: Annotated[
         str,
@@ -45,12 +50,15 @@ def fit_video_command(
     frame_rate: Annotated[
         float | None, typer.Option(help="Frames per second; default: the file's, of a folder 24.")
     ] = None,
+    overwrite: options.Overwrite = False,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Fit Gaussians to a video, each frame from the one before, and save a batch of scenes."""
     output = output or Path(f"{video.stem}.safetensors")
-    check_output(output, ".safetensors")
+    if output.suffix:  # none: a folder
+        check_output(output, ".safetensors")
+    check_new(output, overwrite)
     from kcgs.data import load_labels
     from kcgs.functional import psnr
     from kcgs.video import fit_video, read_label_maps, read_video
@@ -70,7 +78,7 @@ def fit_video_command(
             on_frame=interrupts.on_step,
         )  # fmt: skip
         seconds = time.perf_counter() - start
-        size = scenes.save(output)
+        size = _save(scenes, output)
     psnrs = [float(psnr(scene.render(), frame)) for scene, frame in zip(scenes, source, strict=False)]
     report = {
         "frames": len(scenes), "width": scenes.size[1], "height": scenes.size[0],
@@ -80,6 +88,14 @@ def fit_video_command(
     print_report(report, as_json, str(output))
     if interrupts.count:
         raise exit_interrupted(f"the {len(scenes)} frames that are done to {output}")
+
+
+def _save(scenes: Scene, output: Path) -> int:
+    """Write a batch into a file, or its scenes into a folder as 00000.safetensors and so on; return the bytes."""
+    if output.suffix:
+        return scenes.save(output)
+    output.mkdir(parents=True, exist_ok=True)
+    return sum(scene.save(output / f"{number:05}.safetensors") for number, scene in enumerate(scenes))
 
 
 def render_batch(

@@ -94,8 +94,20 @@ class TestResume:
         assert json.loads(fit_many(*arguments).out)["fitted"] == 0 and rows() == before
         assert [path.stat().st_mtime_ns for path in sorted(Path("out").glob("*.safetensors"))] == times
         Path("photos/b.png").write_bytes(Path("photos/c.png").read_bytes())
-        assert json.loads(fit_many(*arguments).out)["fitted"] == 1
-        assert json.loads(fit_many(*arguments, "--seed", "1").out)["fitted"] == 2
+        code, out, err = fit_many(*arguments)
+        assert (code, json.loads(out)["failed"]) == (1, 1) and err.startswith("kcgs: b.png: ")
+        assert "b.safetensors exists, made with other settings; --overwrite replaces it\n" in err
+        assert json.loads(fit_many(*arguments, "--overwrite").out)["fitted"] == 1
+        assert json.loads(fit_many(*arguments, "--overwrite", "--seed", "1").out)["fitted"] == 2
+
+    def test_scene_without_its_row(self, fit_many: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A command that ended between scene and row goes on; a scene without any record is another's."""
+        with monkeypatch.context() as patch:
+            patch.setattr(many_jobs, "report_fit", lambda *_: signal.raise_signal(signal.SIGINT))
+            assert fit_many("photos/a.png", *SETTINGS).code == 130
+        assert Path("out/a.safetensors").is_file() and fit_many("photos/a.png", *SETTINGS).code == 0
+        Path("out/a.json").unlink()
+        assert fit_many("photos/a.png", *SETTINGS).code == 1
 
     def test_killed_worker(self, fit_many: Kcgs) -> None:
         """A worker is killed over the second image: the next call keeps the first, which is that of this process."""
@@ -105,7 +117,8 @@ class TestResume:
             "fit_and_save = many_jobs.fit_and_save\n"
             "def fit_or_die(path, *arguments, **settings):\n"
             "    if path.stem == 'b':\n"
-            "        while not (path.parent / 'a.json').exists(): pass\n"
+            "        record = path.parent / 'a.json'\n"
+            "        while not record.exists() or 'psnr' not in record.read_text(): pass\n"
             "        os.kill(os.getpid(), signal.SIGKILL)\n"
             "    return fit_and_save(path, *arguments, **settings)\n"
             "many_jobs.fit_and_save = fit_or_die\n"
@@ -131,7 +144,8 @@ class TestResume:
 
         fit_and_save = many_jobs.fit_and_save
         monkeypatch.setattr(many_jobs, "fit_and_save", interrupt)
-        assert fit_many("photos", *SETTINGS) == (130, "", "")
+        message = "kcgs: interrupted: 1 of 3 images are done; the same command goes on where it stopped\n"
+        assert fit_many("photos", *SETTINGS) == (130, "", message)
         assert list(rows()) == ["a"]
 
 

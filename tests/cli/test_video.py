@@ -55,6 +55,16 @@ class TestFitVideo:
         scenes = load("a.safetensors")
         assert len(scenes) == COUNT and scenes.metadata["frame_rate"] == "12"
 
+    def test_a_folder_gets_one_scene_per_frame(self, kcgs: Kcgs) -> None:
+        arguments = (*FIT[:-1], "scenes", "--regions", "mask.png")
+        assert kcgs(*arguments).code == 0
+        assert [path.name for path in sorted(Path("scenes").iterdir())] == [
+            f"0000{t}.safetensors" for t in range(COUNT)
+        ]
+        assert load("scenes/00001.safetensors").num_gaussians == 20
+        code, _, err = kcgs(*arguments)
+        assert (code, err) == (1, "kcgs: scenes exists; --overwrite replaces it\n")
+
     def test_maps_of_every_frame(self, kcgs: Kcgs) -> None:
         Path("masks").mkdir()
         for number in range(COUNT):

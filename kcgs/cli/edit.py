@@ -1,0 +1,97 @@
+"""The command that edits a scene by region."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from kcgs._suffixes import SCENE_FORMATS
+from kcgs.errors import InvalidArgument
+
+from .commands import app
+from .common import Json, SceneFile, check_output, print_report
+from .fit import describe_file, describe_scene
+from .options import exclude
+
+if TYPE_CHECKING:
+    from kcgs.scene import Scene
+
+
+@app.command()
+def edit(
+    scene: SceneFile,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Scene to write (.safetensors), or file (.kcgs).")],
+    delete: Annotated[list[int] | None, typer.Option(metavar="ID", help="Delete a region.")] = None,
+    recolor: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ID=COLOR", help="Give a region the mean colour COLOR, such as #ff0000, with its shading."
+        ),
+    ] = None,
+    move: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID=DX,DY", help="Move a region by whole pixels, to the right and down."),
+    ] = None,
+    no_fill: Annotated[
+        bool, typer.Option("--no-fill", help="Do not paint what is uncovered anew: it shows streaks, or black.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Delete, recolour and move regions of a scene, in this order; options may be repeated. `info` lists the regions.
+
+    Of a batch of scenes, all frames are edited. A .kcgs file has the quality that `encode` has by default.
+    """
+    check_output(output, *SCENE_FORMATS)
+    if not (delete or recolor or move):
+        raise typer.BadParameter("an edit needs --delete, --recolor or --move")
+    colors = [_parse("recolor", "ID=COLOR, such as 2=#ff0000", text) for text in recolor or []]
+    offsets = [_parse_move(text) for text in move or []]
+    if no_fill and not (delete or move):
+        exclude("--recolor alone", no_fill=True)
+    from kcgs import editing, load, video
+
+    edited = load(scene)
+    editor: Any = editing
+    settings = {"fill": not no_fill}
+    if edited.field.means.ndim == 3:
+        exclude("a batch of scenes", no_fill=no_fill or None)
+        check_output(output, ".safetensors")
+        editor, settings = video, {}
+    if delete:
+        edited = _apply("delete", editor.delete_region, edited, delete, **settings)
+    for region, color in colors:
+        edited = _apply("recolor", editing.recolor_region, edited, region, color=color)
+    for region, offset in offsets:
+        edited = _apply("move", editor.move_region, edited, region, offset, **settings)
+    size = edited.save(output)
+    print_report({**describe_scene(edited), **describe_file(output, size, edited.size)}, as_json, str(output))
+
+
+def _parse(option: str, expected: str, text: str) -> tuple[int, str]:
+    region, equals, value = text.partition("=")
+    if not (equals and region.strip().isdecimal()):
+        raise InvalidArgument(option, expected, repr(text))
+    return int(region), value.strip()
+
+
+def _parse_move(text: str) -> tuple[int, tuple[float, float]]:
+    expected = "ID=DX,DY in pixels, such as 1=40,0"
+    region, value = _parse("move", expected, text)
+    try:
+        dx, dy = map(float, value.split(","))
+    except ValueError as error:
+        raise InvalidArgument("move", expected, repr(text)) from error
+    return region, (dx, dy)
+
+
+def _apply(option: str, function: Callable[..., Scene], *arguments: object, **settings: object) -> Scene:
+    """Edit a scene; an error of an edit's argument is one of the option."""
+    try:
+        return function(*arguments, **settings)
+    except InvalidArgument as error:
+        if error.name == "scene":
+            raise
+        raise InvalidArgument(option, error.expected, error.received, error.verb) from error
