@@ -99,6 +99,8 @@ def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
 
 def describe_error(error: Exception) -> str:
     """Return an error's message on one line, or its type if it has none."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.strerror}: {error.filename}"
     return " ".join(str(error).split()) or type(error).__name__
 
 

@@ -25,10 +25,7 @@ def main() -> None:
             warnings.showwarning = _print_warning
             app(prog_name="kcgs")
     except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
-        message = describe_error(error)
-        if isinstance(error, OSError) and error.filename is not None:
-            message = f"{error.strerror}: {error.filename}"
-        typer.echo(f"kcgs: {message}", err=True)
+        typer.echo(f"kcgs: {describe_error(error)}", err=True)
         sys.exit(1)
 
 

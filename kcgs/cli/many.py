@@ -121,6 +121,7 @@ def _find_images(paths: list[Path], regions: str) -> list[tuple[str, Path, str]]
 
 def _list_images(path: Path) -> list[Path]:
     if not path.is_dir():
+        path.stat()  # an error, where nothing is there
         return [path]
     images = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGES)
     if not images:

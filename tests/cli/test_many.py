@@ -175,6 +175,7 @@ class TestFailures:
             (("photos", "--recipe", "worst"), 2, "'--recipe': must be one of"),
             (("photos", "--engine", "slurm"), 2, "slurm"),
             (("empty",), 2, "must hold images"),
+            (("nowhere",), 1, "kcgs: No such file or directory: nowhere"),
             (("photos", "-n", "5", "--target-bytes", "9"), 2, "must be left out with --target-bytes"),
             (("photos", "--suffix", ".safetensors", "--target-bytes", "9"), 2, "must be left out with --target-bytes"),
         ],
