@@ -58,6 +58,14 @@ def test_batch(kcgs: Kcgs, scene: Scene) -> None:
     assert torch.equal(load("new.safetensors").render(), expected.render())
 
 
+@pytest.mark.parametrize("name", ["scene", "batch"])
+def test_recolor(kcgs: Kcgs, scene: Scene, name: str) -> None:
+    code, _, err = kcgs("edit", f"{name}.safetensors", "--recolor", "7=#0000ff", "-o", "new.safetensors")
+    assert code == 0, err
+    pixels = load("new.safetensors")().detach()[..., 8:14, 14:20].mean((-1, -2)).reshape(-1, 3)
+    assert torch.allclose(pixels, torch.tensor([0.0, 0.0, 1.0]), atol=1e-3)
+
+
 def test_compressed_file(kcgs: Kcgs, scene: Scene) -> None:
     assert kcgs("edit", "scene.safetensors", "--delete", "3", "--delete", "7", "--no-fill", "-o", "new.kcgs").code == 0
     assert load("new.kcgs").regions is None
@@ -73,6 +81,8 @@ def test_compressed_file(kcgs: Kcgs, scene: Scene) -> None:
         (("--move", "3=1"), "'--move': must be ID=DX,DY in pixels, such as 1=40,0; got '3=1'"),
         (("--move", "3=0.5,0"), "'--move': must be whole multiples of 1 pixel"),
         (("--recolor", "#ff0000"), "'--recolor': must be ID=COLOR, such as 2=#ff0000; got '#ff0000'"),
+        (("--recolor", "3=reddish"), "'--recolor': must be ID=COLOR, such as 2=#ff0000; got '3=reddish'"),
+        (("--recolor", "9=red"), "'--recolor': must be among"),
         (("--recolor", "3=#ff0000", "--no-fill"), "'--no-fill': must be left out with --recolor alone"),
     ],
 )
