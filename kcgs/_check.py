@@ -138,25 +138,6 @@ def check_cutoff(value: object) -> float:
     return float(value)
 
 
-def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values: bool = True) -> Tensor:
-    """Return a label map, a tensor or a numpy array of integers or bool, as int64; `values`: and no id is negative."""
-    if isinstance(value, np.ndarray):
-        if value.dtype.kind not in "biu":
-            raise InvalidArgumentType(name, "an integer dtype", value.dtype, verb="have")
-        if values and value.dtype == np.uint64 and value.size and value.max() >= 1 << 63:
-            raise InvalidArgument(name, "ids below 2**63", value.max(), verb="hold")
-        value = torch.from_numpy(np.array(value, np.int64, order="C"))
-    elif isinstance(value, Tensor) and value.dtype == torch.bool:
-        value = value.long()
-    tensor = check_integer(name, value, dims=dims)
-    if tensor.numel() == 0:
-        raise InvalidArgument(name, "at least one pixel", f"shape {tuple(tensor.shape)}", verb="have")
-    tensor = tensor.long()
-    if values and not verify(tensor.min() >= 0, f"{name} must hold non-negative ids"):
-        raise InvalidArgument(name, "non-negative ids", int(tensor.min()), verb="hold")
-    return tensor
-
-
 def check_size(name: str, value: object) -> tuple[int, int]:
     """Return (height, width) if both are whole numbers of at least 1."""
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:

@@ -1,4 +1,4 @@
-"""Images as people have them, tensors, numpy arrays and PIL images, as one tensor."""
+"""Images as people have them, tensors, numpy arrays, PIL images and files, as one tensor."""
 
 from __future__ import annotations
 
@@ -11,25 +11,37 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_floating, check_image
+from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 
+# Rec. 601
+_LUMA = (0.299, 0.587, 0.114)
 
-def as_image(name: str, value: object, tolerance: float = 0.0) -> Tensor:
+
+def as_image(name: str, value: object, tolerance: float = 0.0, keep_alpha: bool = False) -> Tensor:
     """Return an image as a tensor (C, H, W) in [0, 1], which its values may pass by `tolerance`.
 
-    An image is a Tensor (C, H, W) or (1, C, H, W), a numpy array (H, W, C) or (H, W) of uint8, uint16 or floats in
-    [0, 1], or a PIL image, whose palette is resolved and whose transparent pixels are composed on white. A Tensor that
-    looks like (H, W, C) is refused: more than 4 channels and rows, and 1, 3 or 4 columns.
+    An image is a Tensor (C, H, W) or (1, C, H, W), whose channels are taken as they are; a numpy array (H, W, C) or
+    (H, W) of uint8, uint16 or floats in [0, 1]; a PIL image; or a path, as `kcgs.data.load_image` reads it. Arrays of
+    four channels and PIL images with alpha are composed on white, with a warning where a pixel is transparent, unless
+    `keep_alpha`. A Tensor that looks like (H, W, C) is refused: more than 4 channels and rows, and 1, 3 or 4 columns.
     """
+    has_alpha = False
     if isinstance(value, np.ndarray):
         image = _from_array(name, value)
+        has_alpha = len(image) == 4
     elif hasattr(value, "getbands") and hasattr(value, "convert"):  # PIL, which need not be imported for this
-        image = on_white(_from_array(name, pil_samples(value)))
+        from kcgs._decode import pil_samples
+
+        image = _from_array(name, pil_samples(value))
+        has_alpha = len(image) in (2, 4)
     elif isinstance(value, Tensor):
         image = check_floating(name, value, dims=(3, 4), finite=False)  # check_image does that below
+    elif isinstance(value, str | os.PathLike):
+        return read_image(value)
     else:
-        hint = ": read it with kcgs.data.load_image" if isinstance(value, str | os.PathLike) else ""
-        raise InvalidArgumentType(name, "a Tensor, a numpy array or a PIL image", f"{type(value).__name__}{hint}")
+        expected = "a Tensor, a numpy array, a PIL image or a path"
+        raise InvalidArgumentType(name, expected, type(value).__name__)
     if image.ndim == 4:
         if image.shape[0] != 1:
             raise InvalidArgument(name, "one image, (C, H, W) or (1, C, H, W)", tuple(image.shape))
@@ -41,7 +53,7 @@ def as_image(name: str, value: object, tolerance: float = 0.0) -> Tensor:
     low, high = float(image.detach().min()), float(image.detach().max())
     if low < -tolerance or high > 1 + tolerance:
         raise InvalidArgument(name, "in [0, 1]", f"[{low:g}, {high:g}]")
-    return image
+    return _on_white(name, image) if has_alpha and not keep_alpha else image
 
 
 def _from_array(name: str, array: NDArray[Any]) -> Tensor:
@@ -56,23 +68,31 @@ def _from_array(name: str, array: NDArray[Any]) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))
 
 
-def pil_samples(image: Any) -> NDArray[Any]:
-    """Return the pixels of a PIL image, (H, W, C): grey, grey and alpha, RGB or RGBA, of uint8, uint16 or float32."""
-    if image.mode == "F":
-        values = np.asarray(image)
-    elif image.mode.startswith("I"):  # 16-bit grey, which Pillow has in 32 bits for some formats
-        values = np.asarray(image).astype(np.uint16)
-    else:
-        mode = "L" if image.mode in ("1", "L") else "RGB"
-        if image.has_transparency_data:
-            mode = "LA" if image.mode in ("LA", "La") else "RGBA"
-        values = np.asarray(image.convert(mode))
-    return values if values.ndim == 3 else values[..., None]
+def read_image(path: str | os.PathLike[str], channels: str = "RGB") -> Tensor:
+    """Read an image, as `kcgs.data.load_image` documents it."""
+    from kcgs._decode import decode
+
+    samples = decode(path)
+    if samples.white is None:
+        raise ValueError(f"cannot read {path}: {samples.values.dtype} samples have no stated white")
+    if samples.frames > 1:
+        warn_user(f"{path} holds {samples.frames} images: the first is read")
+    pixels = samples.values.astype(np.float32) / np.float32(samples.white)
+    image = as_image(str(path), torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))))
+    if channels == "RGBA":
+        color, alpha = (image[:-1], image[-1:]) if len(image) in (2, 4) else (image, torch.ones_like(image[:1]))
+        return torch.cat([color.expand(3, -1, -1), alpha])
+    image = _on_white(str(path), image)
+    if channels == "RGB":
+        return image.expand(3, -1, -1).contiguous()
+    return image if len(image) == 1 else torch.einsum("chw,c->hw", image, torch.tensor(_LUMA))[None].clamp(0, 1)
 
 
-def on_white(image: Tensor) -> Tensor:
-    """Compose an image with alpha, (2, H, W) or (4, H, W), on white; return others as they are."""
+def _on_white(name: str, image: Tensor) -> Tensor:
+    """Compose an image with alpha, (2, H, W) or (4, H, W), on white, and say so; return others as they are."""
     if len(image) not in (2, 4):
         return image
     color, alpha = image[:-1], image[-1:]
+    if alpha.min() < 1:
+        warn_user(f"{name} has transparent pixels: they are composed on white")
     return (color * alpha + (1 - alpha)).clamp(0, 1)

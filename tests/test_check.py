@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import copy
 import pickle
+import warnings
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 
-from kcgs import InvalidArgument, InvalidArgumentType
-from kcgs._check import check_count, check_floating, check_labels, check_number, check_numbers, check_size
+from kcgs import InvalidArgument, InvalidArgumentType, RegionMap, evaluate, fit
+from kcgs._check import check_count, check_floating, check_number, check_numbers, check_size
 from kcgs._image import as_image
+from kcgs._labels import check_labels
+from kcgs.data import load_image, load_labels, save_image, save_labels
+from kcgs.functional import edge_band
+from kcgs.segment import segment
 
 LABELS = torch.tensor([[0, 1, 1], [0, 0, 1]])
 LEVELS = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
@@ -49,7 +56,9 @@ def test_errors_survive_pickling_and_copies(kind: type[InvalidArgument] | type[I
         (lambda: as_image("i", np.zeros((3, 4, 3), np.int64)), "uint8, uint16, float32 or float64; got int64"),
         (lambda: as_image("i", np.zeros((3, 4, 5), np.float32)), "1 to 4 channels"),
         (lambda: as_image("i", torch.zeros(2, 3, 4, 4)), "must be one image"),
-        (lambda: as_image("i", "photo.jpg"), "or a PIL image; got str: read it with kcgs.data.load_image"),
+        (lambda: as_image("i", [[0.5]]), "i must be a Tensor, a numpy array, a PIL image or a path; got list"),
+        (lambda: check_labels("labels", [[1]]), "labels must be a Tensor, a numpy array, a PIL image or a path; got"),
+        (lambda: as_image("i", np.full((2, 2, 4), 255.0)), r"i must be in \[0, 1\]; got \[255, 255\]"),
         *(
             (lambda s=s: as_image("i", torch.zeros(s)), r"looks like \(H, W, C\): pass i.permute\(2, 0, 1\)")
             for s in ((80, 120, 3), (1, 80, 120, 3), (80, 120, 1))
@@ -74,6 +83,10 @@ def test_masks_and_arrays_are_labels(dtype: str) -> None:
         assert torch.equal(labels, LABELS) and labels.dtype == torch.int64
 
 
+def with_alpha(alpha: int) -> np.ndarray:
+    return np.concatenate([LEVELS, np.full((5, 7, 1), alpha, np.uint8)], -1)
+
+
 @pytest.mark.parametrize(
     ("image", "expected"),
     [
@@ -82,13 +95,71 @@ def test_masks_and_arrays_are_labels(dtype: str) -> None:
         *((image, torch.from_numpy(GREY)[None] / 255) for image in (GREY, GREY[..., None], Image.fromarray(GREY))),
         (Image.fromarray(GREY).convert("P"), (torch.from_numpy(GREY) / 255).expand(3, -1, -1)),
         (np.full((5, 7), 65535, np.uint16), torch.ones(1, 5, 7)),
-        (Image.new("RGBA", (7, 5), (0, 0, 0, 0)), torch.ones(3, 5, 7)),
+        (with_alpha(255), IMAGE),
+        (Image.fromarray(with_alpha(255)), IMAGE),
+        (torch.zeros(4, 5, 7), torch.zeros(4, 5, 7)),
         # thin images, and many channels
         *((torch.zeros(shape), torch.zeros(shape)) for shape in ((3, 120, 3), (80, 3, 3), (80, 120, 2), (80, 1, 1))),
     ],
 )
 def test_images(image: object, expected: torch.Tensor) -> None:
     assert torch.equal(as_image("image", image), expected)
+
+
+def test_transparent_pixels_are_white_by_every_way_in(tmp_path: Path) -> None:
+    image = Image.fromarray(with_alpha(0))
+    image.save(tmp_path / "a.png")
+    for value in (with_alpha(0), image, tmp_path / "a.png", str(tmp_path / "a.png")):
+        with pytest.warns(UserWarning, match="composed on white") as caught:
+            assert torch.equal(as_image("image", value), torch.ones(3, 5, 7))
+        assert [warning.filename for warning in caught] == [__file__]
+    save_image(tmp_path / "b.png", with_alpha(0))
+    assert load_image(tmp_path / "b.png", channels="RGBA")[3].max() == 0
+
+
+@pytest.mark.parametrize("mode", ["1", "P", "L", "I;16", "RGB"])
+def test_maps_mean_the_same_by_every_way_in(mode: str, tmp_path: Path) -> None:
+    values = np.kron(np.array([[0, 1], [1, 0]]), np.ones((8, 8), int))
+    image = Image.fromarray((values * 255).astype(np.uint16 if mode == "I;16" else np.uint8))
+    image = image if mode == "I;16" else image.convert(mode)
+    image.save(tmp_path / "map.png")
+    expected = load_labels(tmp_path / "map.png")
+    assert torch.equal(expected > 0, torch.from_numpy(values > 0))
+    for value in (image, tmp_path / "map.png", str(tmp_path / "map.png")):
+        assert torch.equal(RegionMap.from_labels(value).labels, expected)
+        assert torch.equal(edge_band(value), edge_band(expected))
+
+
+def test_paths_are_arguments_of_fit_and_evaluate(tmp_path: Path) -> None:
+    image, labels = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)), torch.eye(16).long()
+    photo, mask = str(tmp_path / "photo.png"), tmp_path / "mask.png"
+    save_image(photo, image)
+    save_labels(mask, labels)
+    scene = fit(photo, Image.open(mask), 20, iterations=2).scene
+    assert scene.regions is not None and scene.regions.num_regions == 2
+    assert evaluate(scene, photo, mask)["ef_psnr"] == evaluate(scene, load_image(photo), labels)["ef_psnr"]
+    assert segment(photo).shape == (16, 16)
+
+
+@pytest.mark.parametrize(("blur", "levels", "bounds"), [(0, (0, 255), None), (1, (0, 255), "128")])
+def test_antialiased_masks_get_a_hint(blur: int, levels: tuple[int, ...], bounds: str | None) -> None:
+    y, x = np.mgrid[:96, :96] - 48
+    rings = np.digitize(np.hypot(x, y), [15, 38][: len(levels) - 1])
+    mask = gaussian_filter(np.array(levels, np.float32)[rings], blur).round().astype(np.uint8)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        RegionMap.from_labels(mask)
+    messages = [str(warning.message) for warning in caught]
+    expected = [] if bounds is None else [f"np.digitize(np.asarray(labels), [{bounds}])"]
+    assert [message.partition("with ")[2] for message in messages] == expected
+
+
+def test_many_ids_are_no_antialiased_mask() -> None:
+    cells = np.kron(np.arange(144).reshape(12, 12), np.ones((4, 4))).astype(np.uint8)
+    big = np.zeros((96, 96), np.uint8)
+    big[:, 48:], big[:48, :48] = 255, cells
+    for labels in (cells, big, np.asarray(Image.fromarray(cells).resize((20, 20), Image.Resampling.NEAREST))):
+        assert RegionMap.from_labels(labels).num_regions == len(np.unique(labels))
 
 
 def test_images_may_pass_their_range_by_a_tolerance() -> None:

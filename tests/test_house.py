@@ -30,8 +30,8 @@ LAYERS = [
     {"nn"},
     {"functional"},
     {"kernels", "engine", "plots"},
-    {"_image"},
-    {"_check", "_memory", "_atomic", "_progress", "_repr", "_suffixes"},
+    {"_image", "_labels"},
+    {"_check", "_decode", "_memory", "_atomic", "_progress", "_repr", "_suffixes", "_warn"},
     {"errors"},
 ]
 # what to say: what not to

@@ -10,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import check_count, check_labels
+from kcgs._check import check_count
+from kcgs._labels import check_labels
 from kcgs.functional.labels import compact
 
 from .exact import Integers

@@ -7,8 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs._check import check_count, check_labels
+from kcgs._check import check_count
 from kcgs._image import as_image
+from kcgs._labels import check_labels
 from kcgs.functional.labels import touching_pairs
 
 # step of the hue, the golden ratio less 1: any run of hues is spread over the circle

@@ -2,7 +2,6 @@
 
 import math
 import os
-import warnings
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,12 +11,9 @@ from PIL import Image
 from torch import Tensor
 
 from kcgs._atomic import atomic_path
-from kcgs._image import as_image, on_white
+from kcgs._image import as_image, read_image
 from kcgs._suffixes import WRITTEN_IMAGES
-from kcgs.data._decode import decode
 
-# Rec. 601
-_LUMA = (0.299, 0.587, 0.114)
 _MODES = {1: "L", 3: "RGB", 4: "RGBA"}
 # of Pillow, by format
 _OPTIONS: dict[str, dict[str, object]] = {
@@ -63,23 +59,7 @@ def load_image(
     """
     if channels not in _MODES.values():
         raise ValueError(f'channels must be "RGB", "L" or "RGBA"; got {channels!r}')
-    samples = decode(path)
-    if samples.white is None:
-        raise ValueError(f"cannot read {path}: {samples.values.dtype} samples have no stated white")
-    if samples.frames > 1:
-        warnings.warn(f"{path} holds {samples.frames} images: the first is read", stacklevel=2)
-    pixels = samples.values.astype(np.float32) / np.float32(samples.white)
-    image = as_image(str(path), torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))))
-    has_alpha = len(image) in (2, 4)
-    if channels == "RGBA":
-        color, alpha = (image[:-1], image[-1:]) if has_alpha else (image, torch.ones_like(image[:1]))
-        return torch.cat([color.expand(3, -1, -1), alpha])
-    if has_alpha and image[-1].min() < 1:
-        warnings.warn(f"{path} has transparent pixels: they are composed on white", stacklevel=2)
-    image = on_white(image)
-    if channels == "RGB":
-        return image.expand(3, -1, -1).contiguous()
-    return image if len(image) == 1 else torch.einsum("chw,c->hw", image, torch.tensor(_LUMA))[None].clamp(0, 1)
+    return read_image(path, channels)
 
 
 def save_image(path: str | os.PathLike[str], image: Any) -> None:
@@ -105,7 +85,7 @@ def save_image(path: str | os.PathLike[str], image: Any) -> None:
         ...     (load_image(f"{folder}/a.png", channels="L") * 255).round().tolist()
         [[[0.0, 128.0, 255.0]]]
     """
-    image = as_image("image", image, tolerance=math.inf)
+    image = as_image("image", image, tolerance=math.inf, keep_alpha=True)
     if image.shape[0] not in _MODES:
         raise ValueError(f"image must have shape (1, H, W), (3, H, W) or (4, H, W); got {tuple(image.shape)}")
     suffix = Path(path).suffix.lower()

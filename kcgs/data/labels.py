@@ -9,12 +9,8 @@ from PIL import Image
 from torch import Tensor
 
 from kcgs._atomic import atomic_path
-from kcgs._check import check_labels
-from kcgs.data._decode import Array, decode
+from kcgs._labels import check_labels, read_labels
 from kcgs.data.colors import label_colors
-
-MAX_COLORS = 4096
-"""An image with more distinct colours is taken for a photo, not for a label map."""
 
 
 def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False) -> Tensor:
@@ -41,6 +37,9 @@ def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False) -> Tenso
         ValueError: the file cannot be read, is lossy or a photo (more than 4,096 colours), or holds negative values or
             another number of dimensions.
 
+    Warns:
+        UserWarning: a grey file looks like an antialiased mask; the warning has the line that thresholds it.
+
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -48,21 +47,7 @@ def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False) -> Tenso
         ...     load_labels(f"{folder}/map.png").tolist()
         [[0, 0, 7], [3, 3, 7]]
     """
-    if Path(path).suffix.lower() == ".npy":
-        try:
-            values = np.asarray(np.load(path, allow_pickle=False))  # of an archive an object, which is no map
-        except (ValueError, EOFError) as error:
-            raise ValueError(f"cannot read {path} as an .npy array: {error}") from error
-        return check_labels(str(path), values, dims=(2,))
-    samples = decode(path, indices=True)
-    if not samples.lossless:
-        raise ValueError(
-            "path must be a label map in a lossless format (PNG, TIFF, GIF, BMP, .npy); "
-            f"got {samples.format} at {path}, whose compression can change labels"
-        )
-    if samples.values.shape[-1] == 1:
-        return check_labels(str(path), samples.values[..., 0], dims=(2,))
-    return _from_ids(samples.values, path) if rgb_ids else _from_colors(samples.values, path)
+    return read_labels(path, rgb_ids)
 
 
 def save_labels(path: str | os.PathLike[str], labels: Tensor, *, rgb_ids: bool = False) -> None:
@@ -107,25 +92,3 @@ def save_labels(path: str | os.PathLike[str], labels: Tensor, *, rgb_ids: bool =
         stored.putpalette((label_colors(256) * 255 + 0.5).floor().to(torch.uint8).flatten().tolist())
     with atomic_path(path) as temporary:
         stored.save(temporary, format="PNG")
-
-
-def _from_ids(values: Array, path: str | os.PathLike[str]) -> Tensor:
-    if values.dtype != np.uint8 or values.shape[-1] != 3:
-        samples = f"{values.shape[-1]} channels of {values.dtype}"
-        raise ValueError(f"colours that are ids must be RGB of 8 bits; got {samples} in {path}")
-    return torch.from_numpy(values @ np.array([1, 1 << 8, 1 << 16]))
-
-
-def _from_colors(values: Array, path: str | os.PathLike[str]) -> Tensor:
-    packed = np.zeros(values.shape[:2], dtype=np.uint64)
-    for channel in range(values.shape[-1]):
-        packed = (packed << np.uint64(16)) | values[..., channel].astype(np.uint64)
-    if values.shape[-1] == 4:
-        packed[values[..., 3] == 0] = 0
-    colors, ids = np.unique(packed, return_inverse=True)
-    if len(colors) > MAX_COLORS:
-        raise ValueError(
-            f"label images must have at most {MAX_COLORS} distinct colours; got {len(colors)} in {path}, "
-            "which looks like a photo, or a mask after lossy compression"
-        )
-    return torch.from_numpy(ids.reshape(packed.shape).astype(np.int64))

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs._check import check_floating, check_labels, check_number
+from kcgs._check import check_floating, check_number
+from kcgs._labels import check_labels
 from kcgs.kernels.membership import RADIUS_SIGMAS
 
 from .labels import contour_edges, unique_pairs

@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable
 import torch
 from torch import Tensor
 
-from kcgs._check import check_floating, check_labels
+from kcgs._check import check_floating
+from kcgs._labels import check_labels
 
 _OFFSETS = 1024  # places between two pixel centres at which hard contours are sampled
 _TABLE_IDS = 1 << 16  # up to this id a table is ten times faster than sorting every pixel

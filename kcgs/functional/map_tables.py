@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs._check import check_labels
+from kcgs._labels import check_labels
 from kcgs.kernels import Crisp, Membership, Resampled
 
 from .labels import compact, sample_labels

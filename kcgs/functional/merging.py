@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import check_labels, check_number
+from kcgs._check import check_number
+from kcgs._labels import check_labels
 
 from .contour_fit import check_problem, contour_gain
 from .labels import compact, contour_edges, unique_pairs

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from kcgs._check import check_image, check_labels
+from kcgs._check import check_image
+from kcgs._labels import check_labels
 
 from .blur import blur, gaussian_taps
 from .labels import edge_band

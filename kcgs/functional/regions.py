@@ -8,10 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import check_labels, check_size
+from kcgs._check import check_size
+from kcgs._labels import check_labels, is_label_source
 
 from .labels import touching_pairs, union_find
 from .map_tables import MapOperands, MapTables, TableCache, make_tables, resample
@@ -61,20 +61,23 @@ class RegionMap:
     @classmethod
     def from_labels(
         cls,
-        labels: Tensor | NDArray[Any],
+        labels: Any,
         softness: float | Mapping[tuple[int, int], float] = 0.0,
     ) -> RegionMap:
         r"""Build from a label map.
 
         Args:
             labels: integer or bool, a Tensor or a numpy array, :math:`(H, W)` or :math:`(B, H, W)`, non-negative; ids
-                need not be consecutive.
+                need not be consecutive. Or a PIL image, or the path of a file that :func:`kcgs.data.load_labels` reads.
             softness: of contours (standard deviation) in pixels, 0 to 64; or one for each pair of ids in any order, 0
                 for pairs that are not mentioned.
 
         Raises:
             TypeError: labels are no integers; softness of another type.
             ValueError: wrong shape, no pixels, negative ids, softness out of range or of ids that are not in the map.
+
+        Warns:
+            UserWarning: a grey image or array looks like an antialiased mask; it has the line that thresholds it.
 
         Example:
             >>> edge = torch.tensor([[1, 1, 1, 2], [1, 1, 1, 2]])
@@ -310,7 +313,7 @@ def as_region_map(value: object, name: str = "regions") -> RegionMap | None:
     """Return a RegionMap or None as they are, and the map with hard contours of labels; `name` is for errors."""
     if value is None or isinstance(value, RegionMap):
         return value
-    if isinstance(value, Tensor | np.ndarray):
+    if is_label_source(value):
         return RegionMap.from_labels(value)
     raise TypeError(f"{name} must be a RegionMap, a label map or None; got {type(value).__name__}")
 

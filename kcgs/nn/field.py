@@ -14,12 +14,13 @@ from kcgs._check import (
     check_floating,
     check_ids,
     check_integer,
-    check_labels,
     check_number,
     check_rows,
     check_size,
     check_tensor,
 )
+from kcgs._labels import check_labels
+from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, lookup_regions
 from kcgs.functional.covariance import check_cholesky
 from kcgs.functional.sizes import is_equal
@@ -222,6 +223,9 @@ class GaussianField(nn.Module):
         self.size = check_size("size", tuple(state["size"]))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        means = state_dict.get(f"{prefix}means")
+        if means is not None and means.shape != self.means.shape:
+            raise InvalidArgument("state_dict", f"of {_describe_rows(self.means)}", _describe_rows(means))
         # torch ignores a buffer that is None: ids, or their absence, come from the state
         ids = state_dict.get(f"{prefix}region_ids")
         if ids is None and f"{prefix}means" in state_dict:
@@ -246,6 +250,10 @@ class GaussianField(nn.Module):
         confined = "confined" if self.region_ids is not None else "not confined"
         images = f"{len(self.means)} x " if self.means.ndim == 3 else ""
         return f"{images}{self.num_gaussians} Gaussians, {self.colors.shape[-1]} channels, size={self.size}, {confined}"
+
+
+def _describe_rows(means: Tensor) -> str:
+    return f"{' x '.join(map(str, means.shape[:-1]))} Gaussians"
 
 
 def scaled_gaussians(field: GaussianField, size: tuple[int, int]) -> tuple[Tensor, Tensor]:

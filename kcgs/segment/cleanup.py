@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import check_count, check_labels
+from kcgs._check import check_count
+from kcgs._labels import check_labels
 from kcgs._repr import brief
 from kcgs.functional.labels import compact
 from kcgs.functional.merging import Labels, RegionGraph, merge_nearest

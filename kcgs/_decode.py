@@ -14,8 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from kcgs._image import pil_samples
-
 Array = NDArray[Any]
 
 # tifffile logs the defects of a file, too, which the error names already
@@ -65,17 +63,41 @@ def _pillow(data: bytes, image: Image.Image, indices: bool) -> Samples:
 
         mode = "rgb" if data[25] == 2 else "rgba"
         values = np.asarray(decode_image_png_u16(data, (image.height, image.width), mode))
-    elif indices and image.mode in ("1", "P"):
-        values = np.asarray(image)[..., None].astype(np.uint8)
     else:
-        values = pil_samples(image)
+        values = pil_indices(image) if indices else pil_samples(image)
     if image.format != "TIFF":  # which Pillow turns itself
         values = _upright(values, image.getexif().get(_ORIENTATION, 1))
     white = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
     # the second image in a photo of a telephone is no frame: it belongs to the first
     frames = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)
-    lossless = image.format in _LOSSLESS_FORMATS and image.info.get("compression") != "jpeg"
-    return Samples(values, white, image.format or "unknown", lossless, frames)
+    return Samples(values, white, image.format or "unknown", is_lossless(image), frames)
+
+
+def is_lossless(image: Image.Image) -> bool:
+    """Return whether the format of a file that Pillow opened gives back the very samples that were stored."""
+    return image.format in _LOSSLESS_FORMATS and image.info.get("compression") != "jpeg"
+
+
+def pil_samples(image: Any) -> NDArray[Any]:
+    """Return the pixels of a PIL image, (H, W, C): grey, grey and alpha, RGB or RGBA, of uint8, uint16 or float32."""
+    if image.mode == "F":
+        values = np.asarray(image)
+    elif image.mode.startswith("I"):  # 16-bit grey, which Pillow has in 32 bits for some formats
+        values = np.asarray(image).astype(np.uint16)
+    else:
+        mode = "L" if image.mode in ("1", "L") else "RGB"
+        if image.has_transparency_data:
+            mode = "LA" if image.mode in ("LA", "La") else "RGBA"
+        values = np.asarray(image.convert(mode))
+    return values if values.ndim == 3 else values[..., None]
+
+
+def pil_indices(image: Any) -> Array:
+    """Return `pil_samples`, but the indices of a palette image, and grey of more than 8 bits as it is stored."""
+    if image.mode in ("1", "P") or image.mode.startswith("I"):
+        values = np.asarray(image)[..., None]
+        return values.astype(np.uint8) if image.mode == "1" else values
+    return pil_samples(image)
 
 
 def _tiff(data: bytes) -> Samples | None:

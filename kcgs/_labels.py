@@ -1,0 +1,156 @@
+"""Label maps as people have them, tensors, numpy arrays, PIL images and files, as one tensor."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcgs._check import check_integer, verify
+from kcgs._warn import warn_user
+from kcgs.errors import InvalidArgument, InvalidArgumentType
+
+MAX_COLORS = 4096
+"""An image with more distinct colours is taken for a photo, not for a label map."""
+
+# an antialiased mask: how many ids it has at least besides its levels, the share of pixels that two, three or four
+# levels cover, and the share of the other pixels that may have eight neighbours of their own id
+_LEAST_IDS = 16
+_LEAST_SHARE = 0.75
+_MOST_INTERIOR = 0.05
+
+
+def is_label_source(value: object) -> bool:
+    """Return whether a value is of a type that `check_labels` reads."""
+    return isinstance(value, Tensor | np.ndarray | str | os.PathLike) or _is_pil(value)
+
+
+def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values: bool = True) -> Tensor:
+    """Return a label map as int64; `values`: and no id is negative.
+
+    A map is a tensor or a numpy array of integers or bool, a PIL image, or a path: see `kcgs.data.load_labels`.
+    """
+    if isinstance(value, Tensor):
+        value = value.long() if value.dtype == torch.bool else value
+    elif isinstance(value, np.ndarray):
+        if values:
+            _warn_of_antialiasing(value, f"np.asarray({name})")
+        value = _from_array(name, value, values)
+    elif isinstance(value, str | os.PathLike):
+        value = read_labels(value)
+    elif _is_pil(value):
+        value = _from_pil(name, value)
+    else:
+        raise InvalidArgumentType(name, "a Tensor, a numpy array, a PIL image or a path", type(value).__name__)
+    tensor = check_integer(name, value, dims=dims)
+    if tensor.numel() == 0:
+        raise InvalidArgument(name, "at least one pixel", f"shape {tuple(tensor.shape)}", verb="have")
+    tensor = tensor.long()
+    if values and not verify(tensor.min() >= 0, f"{name} must hold non-negative ids"):
+        raise InvalidArgument(name, "non-negative ids", int(tensor.min()), verb="hold")
+    return tensor
+
+
+def read_labels(path: str | os.PathLike[str], rgb_ids: bool = False) -> Tensor:
+    """Read a label map, as `kcgs.data.load_labels` documents it."""
+    if Path(path).suffix.lower() == ".npy":
+        try:
+            values = np.asarray(np.load(path, allow_pickle=False))  # of an archive an object, which is no map
+        except (ValueError, EOFError) as error:
+            raise ValueError(f"cannot read {path} as an .npy array: {error}") from error
+        return check_labels(str(path), values, dims=(2,))
+    from kcgs._decode import decode
+
+    samples = decode(path, indices=True)
+    if not samples.lossless:
+        raise ValueError(
+            "path must be a label map in a lossless format (PNG, TIFF, GIF, BMP, .npy); "
+            f"got {samples.format} at {path}, whose compression can change labels"
+        )
+    if rgb_ids and samples.values.shape[-1] > 1:
+        return _from_ids(samples.values, path)
+    return _from_samples(str(path), samples.values, f"np.asarray(PIL.Image.open({os.fspath(path)!r}))")
+
+
+def _is_pil(value: object) -> bool:
+    return hasattr(value, "getbands") and hasattr(value, "convert")  # PIL need not be imported for this
+
+
+def _from_pil(name: str, image: Any) -> Tensor:
+    from kcgs._decode import is_lossless, pil_indices
+
+    if image.format is not None and not is_lossless(image):
+        expected = "a label map from a lossless format (PNG, TIFF, GIF, BMP)"
+        raise InvalidArgument(name, expected, f"{image.format}, whose compression can change labels")
+    return _from_samples(name, pil_indices(image), f"np.asarray({name})")
+
+
+def _from_samples(name: str, values: NDArray[Any], expression: str) -> Tensor:
+    if values.shape[-1] > 1:
+        return _from_colors(values, name)
+    _warn_of_antialiasing(values[..., 0], expression)
+    return check_labels(name, _from_array(name, values[..., 0], True), dims=(2,))
+
+
+def _from_array(name: str, array: NDArray[Any], values: bool) -> Tensor:
+    if array.dtype.kind not in "biu":
+        raise InvalidArgumentType(name, "an integer dtype", array.dtype, verb="have")
+    if values and array.dtype == np.uint64 and array.size and array.max() >= 1 << 63:
+        raise InvalidArgument(name, "ids below 2**63", array.max(), verb="hold")
+    return torch.from_numpy(np.array(array, np.int64, order="C"))
+
+
+def _from_ids(values: NDArray[Any], path: str | os.PathLike[str]) -> Tensor:
+    if values.dtype != np.uint8 or values.shape[-1] != 3:
+        samples = f"{values.shape[-1]} channels of {values.dtype}"
+        raise ValueError(f"colours that are ids must be RGB of 8 bits; got {samples} in {path}")
+    return torch.from_numpy(values @ np.array([1, 1 << 8, 1 << 16]))
+
+
+def _from_colors(values: NDArray[Any], path: str | os.PathLike[str]) -> Tensor:
+    packed = np.zeros(values.shape[:2], dtype=np.uint64)
+    for channel in range(values.shape[-1]):
+        packed = (packed << np.uint64(16)) | values[..., channel].astype(np.uint64)
+    if values.shape[-1] == 4:
+        packed[values[..., 3] == 0] = 0
+    colors, ids = np.unique(packed, return_inverse=True)
+    if len(colors) > MAX_COLORS:
+        raise ValueError(
+            f"label images must have at most {MAX_COLORS} distinct colours; got {len(colors)} in {path}, "
+            "which looks like a photo, or a mask after lossy compression"
+        )
+    return torch.from_numpy(ids.reshape(packed.shape).astype(np.int64))
+
+
+def _warn_of_antialiasing(array: NDArray[Any], expression: str) -> None:
+    """Warn of grey levels that lie between a few common ones, and only along their contours."""
+    if array.ndim != 2 or array.size == 0 or array.dtype not in (np.uint8, np.uint16):
+        return
+    counts = np.bincount(array.ravel())
+    for number in (2, 3, 4):
+        levels = np.sort(np.argsort(counts)[-number:])
+        rest = ~np.isin(array, levels)
+        ids = np.unique(array[rest])
+        if len(ids) < _LEAST_IDS or ids[0] < levels[0] or ids[-1] > levels[-1]:
+            continue
+        if rest.mean() > 1 - _LEAST_SHARE or rest[_interior(array)].sum() > _MOST_INTERIOR * rest.sum():
+            continue
+        bounds = [int(bound) for bound in (levels[1:].astype(int) + levels[:-1] + 1) // 2]
+        warn_user(
+            f"{len(ids) + number} ids, most of them only along contours, look like an antialiased mask of {number} "
+            f"regions: threshold it, with np.digitize({expression}, {bounds})"
+        )
+        return
+
+
+def _interior(array: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    """Return the indices of the pixels whose eight neighbours have their value."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    return np.nonzero(minimum_filter(array, 3) == maximum_filter(array, 3))
