@@ -133,7 +133,7 @@ class TestEncodeLabels:
         ("labels", "error", "match"),
         [
             (torch.zeros(3, 3), TypeError, "labels must have an integer dtype"),
-            ([[1]], TypeError, "labels must be a Tensor; got list"),
+            ([[1]], TypeError, "a PIL image or a path; got list"),
             (torch.zeros(1, 3, 3).long(), ValueError, "labels must have 2 dimensions"),
             (torch.zeros(0, 3).long(), ValueError, "labels must have at least one pixel"),
             (torch.tensor([[-1]]), ValueError, "labels must hold non-negative ids"),

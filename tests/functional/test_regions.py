@@ -79,7 +79,7 @@ class TestRegionMap(
             (torch.zeros(3, 3, dtype=torch.long), -0.1, ValueError, r"softness must be in \[0, 64\] pixels; got -0.1"),
             (torch.zeros(3, 3, dtype=torch.long), math.nan, ValueError, "softness must be in"),
             (torch.zeros(3, 3, dtype=torch.long), "a", TypeError, "softness must be a number of pixels; got 'a'"),
-            ([[0]], 0.0, TypeError, "labels must be a Tensor; got list"),
+            ([[0]], 0.0, TypeError, "labels must be a Tensor, a numpy array, a PIL image or a path; got list"),
         ],
     )
     def test_exception(self, labels: Tensor, softness: float, error: type[Exception], words: str) -> None:

@@ -45,7 +45,7 @@ class TestEveryMethod:
 @pytest.mark.parametrize(
     ("image", "error", "message"),
     [
-        ([0.5], TypeError, "image must be a Tensor, a numpy array or a PIL image; got list"),
+        ([0.5], TypeError, "image must be a Tensor, a numpy array, a PIL image or a path; got list"),
         (torch.zeros(2, 4, 4), ValueError, "image must have shape"),
         (torch.full((3, 4, 4), 255.0), ValueError, r"image must be in \[0, 1\]"),
     ],
