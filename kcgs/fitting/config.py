@@ -147,7 +147,7 @@ class FitConfig(BaseModel):
         try:
             return cls(**{**values, **settings})
         except ValidationError as error:
-            raise _first(error) from error
+            raise _first(error) from None
 
 
 def available_recipes() -> list[str]:

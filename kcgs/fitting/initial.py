@@ -60,7 +60,7 @@ def uniform_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, 
     """Scatter round Gaussians uniformly over the image, in its colours: `initial_field` without its checks."""
     field = random_field(image, num_gaussians, regions, seed)
     x, y = field.means.detach().long().unbind(-1)
-    field.colors.data = image[:, y, x].T / _OVERLAP
+    field.colors.data = (image[:, y, x].T / _OVERLAP).contiguous()
     return field
 
 

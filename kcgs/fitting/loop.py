@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._progress import Progress
+from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.kernels import prepare, threads_for_kernels
@@ -122,7 +122,7 @@ def _run(
     while state.iteration < limit:
         state.progress = max(state.iteration / limit, clock.seconds() / max_seconds)
         if not is_finite(state.scene.field):
-            warnings.warn(f"the fit diverged at iteration {state.iteration}: the best so far is kept", stacklevel=5)
+            warn_user(f"the fit diverged at iteration {state.iteration}: the best so far is kept")
             reason = "diverged"
             break
         for strategy in strategies:
@@ -158,4 +158,4 @@ def _warn_of_regions(problem: Problem) -> None:
     effect = f"{count - most} of {count} regions get no Gaussian and stay black"
     if problem.config.merge_regions:
         effect = f"{count - most} of {count} regions were merged with others"
-    warnings.warn(f"{effect}: there are more than num_gaussians, {most}", stacklevel=5)  # past the decorators
+    warn_user(f"{effect}: there are more than num_gaussians, {most}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 
 import torch
 from torch import Tensor
@@ -11,6 +10,7 @@ from torch.nn.functional import avg_pool2d, pad
 
 from kcgs._check import check_image
 from kcgs._labels import check_labels
+from kcgs._warn import warn_user
 
 from .blur import blur, gaussian_taps
 from .labels import edge_band
@@ -199,17 +199,16 @@ def _check_band(name: str, image: Tensor, labels: Tensor, width: float) -> Tenso
     empty = (~band.flatten(1).any(1)).sum()
     if not torch.compiler.is_compiling() and empty:
         which = "the label map has" if maps == 1 else f"{empty} of {maps} label maps have"
-        warnings.warn(f"{name} is NaN: {which} one region and so no edge band", RuntimeWarning, stacklevel=3)
+        warn_user(f"{name} is NaN: {which} one region and so no edge band", RuntimeWarning)
     return band
 
 
 def _nan(name: str, image: Tensor, batch_shape: torch.Size, side: int) -> Tensor:
     """Return NaN for images smaller than a window of `side` pixels, and warn."""
     height, width = image.shape[-2:]
-    warnings.warn(
+    warn_user(
         f"{name} is NaN: the image has {height} x {width} pixels, its window needs {side} x {side}",
         RuntimeWarning,
-        stacklevel=3,
     )
     return image.new_full(batch_shape, math.nan)
 

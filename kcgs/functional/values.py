@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-import warnings
 
 import torch
 from torch import Tensor
 
+from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
 from kcgs.kernels.whitened import MEAN_LIMIT, SCALE_LIMITS
 
-_ADVICE = (
-    "kcgs.optim.GaussianAdam keeps a field valid as it trains; kcgs.functional.activate_gaussians makes a network's "
-    "output valid"
+_OUT_OF_RANGE = (
+    "Where an optimizer's step made them so, take a smaller learning rate, or kcgs.optim.GaussianAdam, which keeps a "
+    "field valid; kcgs.functional.activate_gaussians makes a network's output valid"
 )
+_NOT_FINITE = "A loss or a gradient that is not finite, or a learning rate that is far too large, makes parameters so"
 
 
 def check_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
@@ -43,8 +44,8 @@ def check_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
 def _invalid(name: str, expected: str, tensor: Tensor, extremes: str) -> InvalidArgument:
     """Return the error of values that are not finite, or of their extremes."""
     count = int((~tensor.isfinite()).sum())
-    received = f"{count} NaN or infinite values" if count else extremes
-    return InvalidArgument(name, expected, f"{received}. {_ADVICE}")
+    received = f"{count} NaN or infinite values. {_NOT_FINITE}" if count else f"{extremes}. {_OUT_OF_RANGE}"
+    return InvalidArgument(name, expected, received)
 
 
 def check_region_ids(region_ids: Tensor, index: Tensor, complete: bool) -> None:
@@ -59,10 +60,9 @@ def check_region_ids(region_ids: Tensor, index: Tensor, complete: bool) -> None:
         raise ValueError(f"region_ids must be non-negative; got {int(region_ids.min())}")
     foreign = region_ids.view_as(index)[index < 0]
     if complete and len(foreign):
-        warnings.warn(
+        warn_user(
             f"{len(foreign)} of {index.numel()} Gaussians paint nothing: regions does not hold their region ids, such "
-            f"as {int(foreign[0])}; pass the map that they belong to, or call field.assign_regions(regions)",
-            stacklevel=2,
+            f"as {int(foreign[0])}; pass the map that they belong to, or call field.assign_regions(regions)"
         )
 
 

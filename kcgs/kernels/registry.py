@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import functools
-import warnings
 from importlib import import_module
 
 import torch
 
+from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
 
 from .interface import SplatInputs, Steps
@@ -49,10 +49,9 @@ def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
 @functools.cache
 def _warn_about_cuda() -> None:
     # until a report of a GPU shows that the Triton kernel is right
-    warnings.warn(
+    warn_user(
         "backend 'auto' takes 'tiled' on CUDA, since the Triton kernel is untested on GPUs: compare a render with "
-        "backend='cuda' to this one, and pass backend='cuda' if they agree; pass backend='tiled' to hide this warning",
-        stacklevel=2,
+        "backend='cuda' to this one, and pass backend='cuda' if they agree; pass backend='tiled' to hide this warning"
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +19,7 @@ from kcgs._check import (
     check_tensor,
 )
 from kcgs._labels import check_labels
+from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, lookup_regions
 from kcgs.functional.covariance import check_cholesky
@@ -95,7 +95,7 @@ class GaussianField(nn.Module):
         elif value.requires_grad:
             self.register_buffer(name, value)
         else:
-            self.register_parameter(name, nn.Parameter(value.detach().clone()))
+            self.register_parameter(name, nn.Parameter(value.detach().clone(memory_format=torch.contiguous_format)))
 
     def _checked_ids(self, region_ids: Tensor) -> Tensor:
         region_ids = check_tensor("region_ids", region_ids).to(self.means.device)
@@ -236,7 +236,7 @@ class GaussianField(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianField:
         if fn(self.means.detach().new_zeros(1)).dtype in _HALF:
-            warnings.warn("GaussianField stays in float32: half precision cannot hold pixel positions", stacklevel=3)
+            warn_user("GaussianField stays in float32: half precision cannot hold pixel positions")
 
         def keep_precision(tensor: Tensor) -> Tensor:
             result = fn(tensor)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 from torch.optim import Optimizer
 
+from kcgs._check import check_number, verify
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.nn import GaussianField
 
@@ -44,7 +45,8 @@ class GaussianAdam(Optimizer):
         max_step: the largest step of place and of log scale.
 
     Raises:
-        TypeError: something else than fields, or a field that holds no parameters.
+        TypeError: something else than fields, or a setting that is no number.
+        ValueError: a field that is a network's output, and so holds no parameters; a setting out of range.
 
     Example:
         >>> from kcgs import RegionSplatRenderer
@@ -73,10 +75,18 @@ class GaussianAdam(Optimizer):
         min_sigma: float = 0.5,
         max_step: float = 0.5,
     ) -> None:
+        for name, value in {"lr": lr, "color_lr": color_lr, "eps": eps, "min_sigma": min_sigma}.items():
+            check_number(name, float(value) if isinstance(value, Tensor) else value, 0.0)
+        check_number("max_step", max_step, 0.0, above=True)
+        if not all(0 <= beta < 1 for beta in betas):
+            raise InvalidArgument("betas", "in [0, 1)", betas)
         groups: list[dict[str, Any]] = []
-        for field in [fields] if isinstance(fields, GaussianField) else fields:
+        for field in [fields] if isinstance(fields, nn.Module) and not isinstance(fields, nn.ModuleList) else fields:
             if not isinstance(field, GaussianField):
-                raise InvalidArgumentType("fields", "GaussianFields", type(field).__name__)
+                raise InvalidArgumentType("fields", "GaussianFields, such as scene.field", type(field).__name__)
+            if len([*field.parameters()]) < 3 + (field.opacities is not None):
+                received = "a network's output: give the network's parameters to an optimizer of torch"
+                raise InvalidArgument("fields", "of parameters", received)
             geometry = [field.means, field.cholesky]
             colors = [field.colors] if field.opacities is None else [field.colors, field.opacities]
             groups.append({"kind": "geometry", "params": geometry, "lr": lr, "size": field.size})
@@ -89,16 +99,28 @@ class GaussianAdam(Optimizer):
 
         Args:
             closure: evaluates the loss anew, and returns it.
+
+        Raises:
+            ValueError: a gradient that is not finite, before anything moves.
         """
         loss = None
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
+        for parameter in (parameter for group in self.param_groups for parameter in group["params"]):
+            _check_gradient(parameter.grad)
         for group in self.param_groups:
             if any(parameter.grad is not None for parameter in group["params"]):
                 step = _step_geometry if group["kind"] == "geometry" else _step_colors
                 step(self.state[group["params"][0]], group)
         return loss
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """Refuse groups that are no field's: torch calls this when the optimizer is made."""
+        if "kind" not in param_group:
+            expected = "a GaussianField's: train other parameters with an optimizer of their own"
+            raise InvalidArgument("param_group", expected, f"one of {[*param_group]}")
+        super().add_param_group(param_group)
 
     @torch.no_grad()
     def append(self, field: GaussianField, added: GaussianField) -> None:
@@ -109,8 +131,10 @@ class GaussianAdam(Optimizer):
             added: of the same channels, both with region ids and opacities or neither.
 
         Raises:
-            ValueError: a field that the optimizer was not made for.
+            ValueError: a field that the optimizer was not made for, or one to which the Gaussians do not fit.
         """
+        if _layout(field) != _layout(added):
+            raise InvalidArgument("added", _layout(field), _layout(added), verb="have")
         min_sigma = self._group(field)["min_sigma"]
         means, cholesky = _bounded(added.means, added.cholesky, field.size, min_sigma)
         for name, rows in (("means", means), ("cholesky", cholesky), ("colors", added.colors)):
@@ -131,9 +155,11 @@ class GaussianAdam(Optimizer):
             mask: boolean :math:`(N)`, for all images of a batch.
 
         Raises:
-            ValueError: a field that the optimizer was not made for.
+            ValueError: a field that the optimizer was not made for; a mask of another type or shape.
         """
         self._group(field)
+        if mask.dtype != torch.bool or mask.shape != (field.num_gaussians,):
+            raise InvalidArgument("mask", f"boolean, ({field.num_gaussians})", f"{mask.dtype}, {tuple(mask.shape)}")
         for name in ("means", "cholesky", "colors"):
             self._replace(field, name, getattr(field, name)[..., mask, :])
         if field.opacities is not None:
@@ -164,6 +190,13 @@ class GaussianAdam(Optimizer):
         return (self.state[tensor] for tensor in (field.means, field.colors) if tensor in self.state)
 
 
+def _layout(field: GaussianField) -> str:
+    """Say what another field must have to fit to a field."""
+    *batch, _, channels = field.colors.shape
+    optional = [name for name in ("region_ids", "opacities") if getattr(field, name) is not None]
+    return " and ".join([f"colors ({', '.join(map(str, [*batch, 'N', channels]))})", *optional])
+
+
 def _step_colors(state: dict[str, Tensor], group: dict[str, Any]) -> None:
     colors, *opacities = group["params"]
     gradients = [_gradient(colors), *(_gradient(alpha)[..., None] for alpha in opacities)]
@@ -179,8 +212,16 @@ def _step_geometry(state: dict[str, Tensor], group: dict[str, Any]) -> None:
     local = local_gradient(cholesky, _gradient(means), _gradient(cholesky))
     step = _adam(state, local, group).clamp(-group["max_step"], group["max_step"])
     bounded = _bounded(*move(means, cholesky, step), group["size"], group["min_sigma"])
-    means.copy_(bounded[0])
-    cholesky.copy_(bounded[1])
+    for parameter, values in zip((means, cholesky), bounded, strict=True):
+        if parameter.requires_grad:  # a frozen one is not even brought within bounds
+            parameter.copy_(values)
+
+
+def _check_gradient(gradient: Tensor | None) -> None:
+    if gradient is not None and not verify(gradient.isfinite().all(), "gradients must be finite"):
+        count = int((~gradient.isfinite()).sum())
+        received = f"{count} NaN or infinite values: the loss, or an operation between it and the render, is not finite"
+        raise InvalidArgument("gradients", "finite", received)
 
 
 def _gradient(parameter: Tensor) -> Tensor:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 import io
+import math
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from kcgs import GaussianField, RegionSplatRenderer
+from kcgs import GaussianField, RegionSplatRenderer, Scene
 from kcgs.optim import GaussianAdam
 from kcgs.optim.frame import widen
 
@@ -33,6 +34,11 @@ def field_of(kind: str = "plain", num_gaussians: int = 20) -> GaussianField:
         return GaussianField(*tensors, size=SIZE)
     ids = torch.arange(num_gaussians) % 2
     return GaussianField(*tensors, ids, torch.full((num_gaussians,), 0.7), size=SIZE)
+
+
+def network_output() -> GaussianField:
+    means, cholesky = torch.ones(5, 2, requires_grad=True), torch.tensor([[1.0, 0.0, 1.0]] * 5)
+    return GaussianField(2 * means, cholesky, torch.ones(5, 3), size=SIZE)
 
 
 def regions_of(kind: str) -> Tensor | None:
@@ -159,15 +165,35 @@ class TestProtocol:
         assert descend(field, optimizer, 4, regions) == descend(twin, resumed, 4, regions) and same(field, twin)
 
     @pytest.mark.parametrize(
-        ("fields", "error", "words"),
+        ("fields", "settings", "error", "words"),
         [
-            ([torch.zeros(3)], TypeError, "fields must be GaussianFields; got Tensor"),
-            ([], ValueError, "empty parameter list"),
+            ([torch.zeros(3)], {}, TypeError, "fields must be GaussianFields, such as scene.field; got Tensor"),
+            (Scene(field_of()), {}, TypeError, "fields must be GaussianFields, such as scene.field; got Scene"),
+            (network_output(), {}, ValueError, "fields must be of parameters; got a network's output"),
+            ([], {}, ValueError, "empty parameter list"),
+            (field_of(), {"lr": -1.0}, ValueError, "^lr must be finite and at least 0; got -1.0"),
+            (field_of(), {"color_lr": torch.tensor(math.nan)}, ValueError, "color_lr must be .*; got nan"),
+            (field_of(), {"betas": (0.9, 1.0)}, ValueError, r"betas must be in \[0, 1\); got \(0.9, 1.0\)"),
+            (field_of(), {"max_step": 0}, ValueError, "max_step must be finite and above 0; got 0"),
         ],
     )
-    def test_bad_input(self, fields: Any, error: type[Exception], words: str) -> None:
+    def test_bad_input(self, fields: Any, settings: dict[str, Any], error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):
-            GaussianAdam(fields)
+            GaussianAdam(fields, **settings)
+
+    def test_other_parameters(self) -> None:
+        with pytest.raises(ValueError, match="param_group must be a GaussianField's: train other parameters with"):
+            GaussianAdam(field_of()).add_param_group({"params": [torch.zeros(3, requires_grad=True)]})
+
+    @pytest.mark.parametrize("name", ["means", "cholesky", "colors"])
+    def test_a_frozen_parameter_stays(self, name: str) -> None:
+        """Even one that is out of bounds: far outside, or thinner than `min_sigma`."""
+        field = field_of()
+        field.means.data[0] = -300.0
+        frozen = getattr(field, name).requires_grad_(False)
+        before = frozen.clone()
+        descend(field, GaussianAdam(field, min_sigma=8.0), 3)
+        assert torch.equal(frozen, before)
 
     def test_another_field(self) -> None:
         optimizer, other = GaussianAdam(field_of()), field_of()
@@ -175,6 +201,26 @@ class TestProtocol:
             with pytest.raises(ValueError, match="field must be one that the optimizer was made for; got another"):
                 change()
         assert other.num_gaussians == 20
+
+    @pytest.mark.parametrize(
+        ("added", "words"),
+        [
+            (field_of(), r"added must have colors \(N, 3\) and region_ids and opacities; got colors \(N, 3\)"),
+            (GaussianField.random(2, SIZE, channels=1), r"got colors \(N, 1\)"),
+            (field_of("batch"), r"got colors \(2, N, 3\)"),
+        ],
+    )
+    def test_rows_of_another_kind(self, added: GaussianField, words: str) -> None:
+        field = field_of("opacities")
+        with pytest.raises(ValueError, match=words):
+            GaussianAdam(field).append(field, added)
+        assert field.num_gaussians == 20
+
+    @pytest.mark.parametrize("mask", [torch.ones(3) > 0, torch.ones(20), torch.arange(20)])
+    def test_no_mask(self, mask: Tensor) -> None:
+        field = field_of()
+        with pytest.raises(ValueError, match=r"mask must be boolean, \(20\); got torch\."):
+            GaussianAdam(field).keep(field, mask)
 
     def test_new_rows_are_as_wide_as_a_loaded_state_asks(self) -> None:
         field = field_of()

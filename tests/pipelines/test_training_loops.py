@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
+from pathlib import Path
 
 import kornia
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
-from kcgs import GaussianField, RegionSplatRenderer
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer
+from kcgs.errors import InvalidArgument
 from kcgs.fitting import initial_field
+from kcgs.functional import region_splat
 from kcgs.optim import GaussianAdam
 
 SIZE = (24, 36)
@@ -67,9 +72,10 @@ class TestLossesFall:
         """At the default rate, with a schedule; the field is valid at every step, since the renderer takes it."""
         dtype = torch.float64 if kind == "double" else torch.float32
         image = target(2 if kind == "batch" else 1, dtype).to(device)
-        field = batch_field(dtype) if kind == "batch" else initial_field(image, 40, halves())
         regions = halves().to(device)
-        renderer = RegionSplatRenderer(keepdim=False, backend="tiled" if kind == "tiled" else "auto")
+        field = batch_field(dtype) if kind == "batch" else initial_field(image, 40, regions)
+        tiled = kind == "tiled" or device.type == "cuda"
+        renderer = RegionSplatRenderer(keepdim=False, backend="tiled" if tiled else "auto")
         optimizer = GaussianAdam(field.to(device))
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 50)
         losses = []
@@ -96,25 +102,94 @@ class TestLossesFall:
             losses.append(float(loss.detach()))
         assert losses[-1] < 0.2 * losses[0]
 
+    def test_compiled_with_its_loss(self) -> None:
+        """One graph of render and loss, with a map that has soft contours."""
+        image, field, renderer = target(), initial_field(target(), 40, halves()), RegionSplatRenderer(keepdim=False)
+        regions, optimizer = RegionMap.from_labels(halves(), softness=0.7), GaussianAdam(field)
+        error = torch.compile(lambda: LOSSES["L1"](renderer(field, regions), image), fullgraph=True, backend="eager")
+        losses = []
+        for _ in range(50):
+            optimizer.zero_grad()
+            losses.append(error())
+            losses[-1].backward()
+            optimizer.step()
+        assert losses[-1] < 0.6 * losses[0]
+
+    def test_lbfgs(self) -> None:
+        """It flattens gradients by `view`: they have the strides of parameters, which are contiguous."""
+        image, field, renderer = target(), initial_field(target(), 40), RegionSplatRenderer(keepdim=False)
+        optimizer = torch.optim.LBFGS([field.colors], max_iter=10)
+
+        def closure() -> Tensor:
+            optimizer.zero_grad()
+            loss = (renderer(field) - image).square().sum()
+            loss.backward()
+            return loss
+
+        assert optimizer.step(closure) > 2 * closure()
+
+
+def splat(means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
+    return region_splat(means, cholesky, colors, size=SIZE).sum()
+
+
+Gaussians = tuple[Tensor, Tensor, Tensor]
+WAYS: dict[str, Callable[[Gaussians], object]] = {
+    "auto": lambda gaussians: splat(*gaussians),
+    "tiled": lambda gaussians: region_splat(*gaussians, size=SIZE, backend="tiled"),
+    "reference": lambda gaussians: region_splat(*gaussians, size=SIZE, backend="reference"),
+    "float64": lambda gaussians: splat(*(t.double() for t in gaussians)),
+    "batch": lambda gaussians: splat(*(t.expand(3, -1, -1) for t in gaussians)),
+    "torch.func.grad": lambda gaussians: torch.func.grad(splat)(*gaussians),
+    "torch.func.vmap": lambda gaussians: torch.func.vmap(splat)(*(t.expand(3, -1, -1) for t in gaussians)),
+    "checkpoint": lambda gaussians: checkpoint(splat, *gaussians, use_reentrant=False),
+    "torch.compile": lambda gaussians: torch.compile(splat, fullgraph=True, backend="eager")(*gaussians),
+}
+
 
 class TestInvalidFields:
-    @pytest.mark.parametrize("backend", ["auto", "tiled", "reference"])
+    @pytest.mark.parametrize("way", WAYS)
     @pytest.mark.parametrize(
         ("name", "value", "words"),
         [
             (
                 "cholesky",
                 -0.5,
-                r"cholesky must be finite, l11 and l22 in .* pixels and .*; got l11 and l22 in \[-0.5, ",
+                r"got l11 and l22 in \[-0.5, .*smaller learning rate, or kcgs.optim.GaussianAdam, which",
             ),
-            ("means", float("nan"), "means must be finite, .*; got 1 NaN or infinite values"),
-            ("colors", float("inf"), "colors must be finite; got 1 NaN or infinite values"),
+            ("means", 1e9, r"got \[.*, 1e\+09\]. Where an optimizer's step made them so, take a smaller learning rate"),
+            ("means", float("nan"), r"got \d NaN or infinite values. A loss or a gradient that is not finite"),
+            ("colors", float("inf"), r"got \d NaN or infinite values. A loss or a gradient"),
         ],
     )
-    def test_one_error_that_says_what_helps(self, backend: str, name: str, value: float, words: str) -> None:
+    def test_one_error_that_says_what_helps(self, way: str, name: str, value: float, words: str) -> None:
         """A step of another optimizer made it so: one exception, without another behind it."""
         field = initial_field(target(), 10)
         getattr(field, name).data[0, 0] = value
-        with pytest.raises(ValueError, match=words + ".*GaussianAdam keeps a field valid") as error:
-            RegionSplatRenderer(backend=backend)(field)
+        with pytest.raises(InvalidArgument, match=f"^{name} must be .*{words}") as error:
+            WAYS[way]((field.means, field.cholesky, field.colors))
         assert error.value.__cause__ is None and error.value.__context__ is None
+
+    @pytest.mark.parametrize("factor", [float("nan"), float("inf")])
+    def test_a_loss_that_is_not_finite(self, factor: float) -> None:
+        """Nothing moves, and the loop may go on."""
+        image, field, renderer = target(), initial_field(target(), 10), RegionSplatRenderer()
+        before, optimizer = field.means.detach().clone(), GaussianAdam(field)
+        for _ in range(2):
+            optimizer.zero_grad()
+            ((renderer(field) - image).square().mean() * factor).backward()
+            with pytest.raises(
+                ValueError, match=r"gradients must be finite; got \d+ NaN or infinite values: the loss,"
+            ):
+                optimizer.step()
+        assert torch.equal(field.means, before) and not optimizer.state
+
+
+def test_a_warning_of_a_loop_names_its_line_and_shows_once() -> None:
+    """However deep in torch it arises; Python's default filter compares the text and the line."""
+    field, renderer = initial_field(target(), 10, halves()), RegionSplatRenderer()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        for _ in range(3):
+            renderer(field, torch.zeros_like(halves())).sum().backward()
+    assert [(Path(w.filename), "Gaussians paint nothing" in str(w.message)) for w in caught] == [(Path(__file__), True)]
