@@ -15,7 +15,7 @@ from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 
 # Rec. 601
-_LUMA = (0.299, 0.587, 0.114)
+LUMA = (0.299, 0.587, 0.114)
 
 
 def as_image(name: str, value: object, tolerance: float = 0.0, keep_alpha: bool = False) -> Tensor:
@@ -85,7 +85,7 @@ def read_image(path: str | os.PathLike[str], channels: str = "RGB") -> Tensor:
     image = _on_white(str(path), image)
     if channels == "RGB":
         return image.expand(3, -1, -1).contiguous()
-    return image if len(image) == 1 else torch.einsum("chw,c->hw", image, torch.tensor(_LUMA))[None].clamp(0, 1)
+    return image if len(image) == 1 else torch.einsum("chw,c->hw", image, torch.tensor(LUMA))[None].clamp(0, 1)
 
 
 def _on_white(name: str, image: Tensor) -> Tensor:

@@ -19,11 +19,12 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 MAX_COLORS = 4096
 """An image with more distinct colours is taken for a photo, not for a label map."""
 
-# an antialiased mask: how many ids it has at least besides its levels, the share of pixels that two, three or four
-# levels cover, and the share of the other pixels that may have eight neighbours of their own id
-_LEAST_IDS = 16
-_LEAST_SHARE = 0.75
-_MOST_INTERIOR = 0.05
+# An antialiased mask has at least so many grey levels,
+_MIN_LEVELS = 16
+# of which the darkest and the lightest cover so much of it,
+_MIN_SHARE = 0.75
+# and so few of the other pixels have eight neighbours of their own level.
+_MAX_INTERIOR = 0.05
 
 
 def is_label_source(value: object) -> bool:
@@ -129,28 +130,19 @@ def _from_colors(values: NDArray[Any], path: str | os.PathLike[str]) -> Tensor:
 
 
 def _warn_of_antialiasing(array: NDArray[Any], expression: str) -> None:
-    """Warn of grey levels that lie between a few common ones, and only along their contours."""
+    """Warn of grey levels between two common ones that occur along contours only."""
     if array.ndim != 2 or array.size == 0 or array.dtype not in (np.uint8, np.uint16):
         return
     counts = np.bincount(array.ravel())
-    for number in (2, 3, 4):
-        levels = np.sort(np.argsort(counts)[-number:])
-        rest = ~np.isin(array, levels)
-        ids = np.unique(array[rest])
-        if len(ids) < _LEAST_IDS or ids[0] < levels[0] or ids[-1] > levels[-1]:
-            continue
-        if rest.mean() > 1 - _LEAST_SHARE or rest[_interior(array)].sum() > _MOST_INTERIOR * rest.sum():
-            continue
-        bounds = [int(bound) for bound in (levels[1:].astype(int) + levels[:-1] + 1) // 2]
-        warn_user(
-            f"{len(ids) + number} ids, most of them only along contours, look like an antialiased mask of {number} "
-            f"regions: threshold it, with np.digitize({expression}, {bounds})"
-        )
+    ids, (low, high) = np.flatnonzero(counts), np.sort(np.argsort(counts)[-2:])
+    num_common = counts[low] + counts[high]
+    if len(ids) < _MIN_LEVELS or (ids[0], ids[-1]) != (low, high) or num_common < _MIN_SHARE * array.size:
         return
-
-
-def _interior(array: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """Return the indices of the pixels whose eight neighbours have their value."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    return np.nonzero(minimum_filter(array, 3) == maximum_filter(array, 3))
+    interior = (minimum_filter(array, 3) == maximum_filter(array, 3)) & (array != low) & (array != high)
+    if interior.sum() <= _MAX_INTERIOR * (array.size - num_common):
+        warn_user(
+            f"the {len(ids)} ids of this map look like an antialiased mask of two regions: threshold it, "
+            f"{expression} > {(int(low) + int(high)) // 2}"
+        )

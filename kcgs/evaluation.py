@@ -7,27 +7,24 @@ import warnings
 from io import BytesIO
 from typing import Any
 
-from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._image import as_image
 from kcgs.errors import InvalidArgument
-from kcgs.functional import RegionMap, ef_psnr, ef_ssim, ms_ssim, psnr, ssim
+from kcgs.functional import ef_psnr, ef_ssim, ms_ssim, psnr, ssim
 from kcgs.functional.regions import as_region_map
 from kcgs.scene import Scene, check_scene
 
 
-def evaluate(
-    scene: Scene, image: Any, labels: RegionMap | Tensor | NDArray[Any] | None = None, *, visual: bool = True
-) -> dict[str, float]:
+def evaluate(scene: Scene, image: Any, labels: Any = None, *, visual: bool = True) -> dict[str, float]:
     r"""Render a scene, clipped to [0, 1], and compare it with an image.
 
     Args:
         scene: unbatched.
-        image: of the scene's size and channels in [0, 1]: :math:`(C, H, W)`, a numpy array (H, W, C) of uint8 or
-            floats, or a PIL image.
-        labels: the map with the contours of the edge-focused metrics; None: the scene's own, which a fit may have
-            moved. The history of a fit and `kcgs fit` take the map of their input: pass it for the same numbers.
+        image: of the scene's size and channels, as :func:`kcgs.fit` takes it.
+        labels: a map as :func:`kcgs.fit` takes it, with the contours of the edge-focused metrics; None: the scene's
+            own, which a fit may have moved. The history of a fit and `kcgs fit` take the map of their input: pass it
+            for the same numbers.
         visual: whether :func:`ssimulacra2` is among the metrics; it takes about 0.3 s for 480 x 854.
 
     Returns:

@@ -47,7 +47,7 @@ def edit(
     check_output(output, *SCENE_FORMATS)
     if not (delete or recolor or move):
         raise typer.BadParameter("an edit needs --delete, --recolor or --move")
-    colors = [_parse_color(text) for text in recolor or []]
+    colors = [_parse("recolor", "ID=COLOR, such as 2=#ff0000", text) for text in recolor or []]
     offsets = [_parse_move(text) for text in move or []]
     if no_fill and not (delete or move):
         exclude("--recolor alone", no_fill=True)
@@ -63,7 +63,7 @@ def edit(
     if delete:
         edited = _apply("delete", editor.delete_region, edited, delete, **settings)
     for region, color in colors:
-        edited = _apply("recolor", _paint_region, edited, region, color)
+        edited = _apply("recolor", editing.recolor_region, edited, region, color=color)
     for region, offset in offsets:
         edited = _apply("move", editor.move_region, edited, region, offset, **settings)
     size = edited.save(output)
@@ -75,34 +75,6 @@ def _parse(option: str, expected: str, text: str) -> tuple[int, str]:
     if not (equals and region.strip().isdecimal()):
         raise InvalidArgument(option, expected, repr(text))
     return int(region), value.strip()
-
-
-def _parse_color(text: str) -> tuple[int, list[float]]:
-    from PIL import ImageColor
-
-    expected = "ID=COLOR, such as 2=#ff0000"
-    region, value = _parse("recolor", expected, text)
-    try:
-        return region, [level / 255 for level in ImageColor.getrgb(value)[:3]]
-    except ValueError as error:
-        raise InvalidArgument("recolor", expected, repr(text)) from error
-
-
-def _paint_region(scene: Scene, region: int, color: list[float]) -> Scene:
-    """Give a region a colour, with its shading: the colour times one plus the relative difference to its mean luma."""
-    import torch
-
-    from kcgs.editing import recolor_region
-
-    recolor_region(scene, region, 1.0)  # refuses an unknown id
-    assert scene.regions is not None
-    image, target = scene().detach(), torch.tensor(color)
-    weights = torch.tensor([0.299, 0.587, 0.114])
-    luma = (image.movedim(-3, -1) @ weights)[scene.regions.labels == region].mean()
-    # dark regions would get more contrast than they had
-    contrast = 1.0 / luma.clamp_min(0.25)
-    bias = target * (1.0 - contrast * luma)
-    return recolor_region(scene, region, contrast * torch.outer(target, weights), bias if bias.any() else None)
 
 
 def _parse_move(text: str) -> tuple[int, tuple[float, float]]:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_floating, check_number
+from kcgs._image import LUMA
+from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join, scaled_gaussians
@@ -26,6 +28,8 @@ Numbers = Tensor | NDArray[Any] | Sequence[Any] | float
 
 # standard deviation of a flat Gaussian, in longer sides of the image: its values differ by 3 in 10^7 at most
 _FLAT_SIGMA = 1e3
+# mean luma below which a region that gets a colour keeps its contrast: brighter, its noise would be seen
+_MIN_LUMA = 0.25
 # standard deviations of a soft contour beyond which it is taken as 0 or 1
 _CONTOUR_SIGMAS = 4.0
 
@@ -93,17 +97,27 @@ def _contour_reach(regions: RegionMap) -> int:
     return math.ceil(1.0 + _CONTOUR_SIGMAS * largest)
 
 
-def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers, bias: Numbers | None = None) -> Scene:
-    r"""Change the colours of regions in the image to c' = gain c + bias.
+def recolor_region(
+    scene: Scene,
+    region_ids: int | Iterable[int],
+    gain: Numbers | None = None,
+    bias: Numbers | None = None,
+    *,
+    color: str | Numbers | None = None,
+) -> Scene:
+    r"""Change the colours of regions in the image to c' = gain c + bias, or give them another colour.
 
     Convention: a gain acts on the colours of the Gaussians. A bias is one more Gaussian per region, flat over the whole
-    image, for pixels are sums of Gaussians, not means.
+    image, for pixels are sums of Gaussians, not means. A `color` keeps the shading: it is multiplied by the luma of
+    each pixel over the region's mean luma; in regions darker than a quarter contrast is kept in place of the ratio.
 
     Args:
-        scene: with region ids; of a batch, all images.
+        scene: with region ids; of a batch, all images. With `color` it needs a map.
         region_ids: an id of some of its Gaussians, or several.
         gain: a number, one for each channel :math:`(C)`, or a matrix :math:`(C, C)`: tensors, arrays or lists.
         bias: a number, or one for each channel :math:`(C)`; None: no Gaussian is added.
+        color: in place of gain and bias the mean colour, a name such as "red" or "#ff0000", or a number for each
+            channel :math:`(C)`.
 
     Returns:
         A new scene, without a graph.
@@ -117,11 +131,24 @@ def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers,
         >>> negative = recolor_region(scene, 0, -1.0, 1.0)
         >>> torch.allclose(scene() + negative(), torch.ones(3, 4, 6), atol=1e-5)
         True
+        >>> recolor_region(scene, 0, color="red").render().shape
+        torch.Size([3, 4, 6])
     """
     field = check_type(scene).field
     if field.region_ids is None:
         raise ValueError("scene must have region ids; call scene.field.assign_regions(regions)")
     ids = unique_region_ids(region_ids, field.region_ids, "Gaussians")
+    if (color is None) == (gain is None and bias is None):
+        raise ValueError("color must be given, or gain and bias; got both or neither")
+    if color is None:
+        return _recolor(scene, ids, 1.0 if gain is None else gain, bias)
+    for region_id in ids:
+        scene = _paint(scene, region_id, color)
+    return scene
+
+
+def _recolor(scene: Scene, ids: list[int], gain: Numbers, bias: Numbers | None) -> Scene:
+    field = scene.field
     members = members_of(field, torch.tensor(ids, device=field.means.device))
     channels = field.colors.shape[-1]
     matrix = _color_tensor("gain", gain, field.colors, [(), (channels,), (channels, channels)])
@@ -134,6 +161,33 @@ def recolor_region(scene: Scene, region_ids: int | Iterable[int], gain: Numbers,
         for region_id in ids:
             result = join(result, _flat_gaussian(result, region_id, color))
     return Scene(result, scene.regions, scene.metadata)
+
+
+def _paint(scene: Scene, region_id: int, color: str | Numbers) -> Scene:
+    """Give a region a colour: the colour times 1 + contrast (luma - mean luma)."""
+    if scene.regions is None:
+        raise InvalidArgument("scene", "a label map", "regions None", verb="have")
+    image = scene().detach()
+    channels = image.shape[-3]
+    target = _color_tensor("color", _named_color(color), image, [(channels,)])
+    weights = image.new_tensor(LUMA) if channels == len(LUMA) else image.new_full((channels,), 1 / channels)
+    luma = torch.einsum("...chw,c->...hw", image, weights)
+    mean = luma[(scene.regions.labels == region_id).expand(luma.shape)].mean()
+    contrast = 1.0 / mean.clamp_min(_MIN_LUMA)
+    bias = target * (1.0 - contrast * mean)
+    return _recolor(scene, [region_id], contrast * torch.outer(target, weights), bias if bias.any() else None)
+
+
+def _named_color(color: str | Numbers) -> Numbers:
+    """Return the numbers of a colour's name, in RGB."""
+    if not isinstance(color, str):
+        return color
+    from PIL import ImageColor
+
+    try:
+        return [level / 255 for level in ImageColor.getrgb(color)[:3]]
+    except ValueError:
+        raise InvalidArgument("color", "a name such as red or #ff0000", repr(color)) from None
 
 
 def _color_tensor(name: str, value: Numbers, colors: Tensor, shapes: list[tuple[int, ...]]) -> Tensor:

@@ -8,13 +8,10 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
 from kcgs._progress import Progress
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
-from kcgs.functional import RegionMap
 from kcgs.kernels import prepare, threads_for_kernels
 
 from .checkpoint import Checkpoint
@@ -38,7 +35,7 @@ OnStep = Callable[[int, HistoryEntry], bool | None]
 @torch.enable_grad()
 def fit(
     image: Any,
-    regions: RegionMap | Tensor | NDArray[Any] | None = None,
+    regions: Any = None,
     num_gaussians: int = 1000,
     *,
     recipe: str | FitConfig = "best",
@@ -59,9 +56,10 @@ def fit(
 
     Args:
         image: Tensor :math:`(C, H, W)` or :math:`(1, C, H, W)`, floating, values in [0, 1]; a numpy array
-            :math:`(H, W, C)`, uint8 or floating; or a PIL image.
-        regions: label map of the image's size, integer or bool, a Tensor or a numpy array; or a RegionMap. EF-PSNR is
-            measured along its contours. None: one region.
+            :math:`(H, W, C)`, uint8 or floating; a PIL image; or a path, as :func:`kcgs.data.load_image` reads it.
+        regions: label map of the image's size: a Tensor or a numpy array, integer or bool, a PIL image, or a path, as
+            :func:`kcgs.data.load_labels` reads it; or a RegionMap. EF-PSNR is measured along its contours. None: one
+            region.
         num_gaussians: N, the most there may be, from 1 to the number of pixels. Where it is below the number of
             regions, those most alike are merged until each has a Gaussian, or with ``merge_regions=False`` the smaller
             ones stay empty and black; a UserWarning gives their number.

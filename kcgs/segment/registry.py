@@ -29,7 +29,7 @@ def segment(image: Any, method: str = "auto", **options: Any) -> Tensor:
     ``max_regions``; `method_options` returns its defaults.
 
     Args:
-        image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1]; or a numpy array (H, W, C), or a PIL image.
+        image: :math:`(3, H, W)` or :math:`(1, H, W)`, as :func:`kcgs.fit` takes it.
         method: one of `available_methods`.
         options: of the method and of `Cleanup`.
 

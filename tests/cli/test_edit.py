@@ -81,7 +81,7 @@ def test_compressed_file(kcgs: Kcgs, scene: Scene) -> None:
         (("--move", "3=1"), "'--move': must be ID=DX,DY in pixels, such as 1=40,0; got '3=1'"),
         (("--move", "3=0.5,0"), "'--move': must be whole multiples of 1 pixel"),
         (("--recolor", "#ff0000"), "'--recolor': must be ID=COLOR, such as 2=#ff0000; got '#ff0000'"),
-        (("--recolor", "3=reddish"), "'--recolor': must be ID=COLOR, such as 2=#ff0000; got '3=reddish'"),
+        (("--recolor", "3=reddish"), "'--recolor': must be a name such as red or #ff0000; got 'reddish'"),
         (("--recolor", "9=red"), "'--recolor': must be among"),
         (("--recolor", "3=#ff0000", "--no-fill"), "'--no-fill': must be left out with --recolor alone"),
     ],

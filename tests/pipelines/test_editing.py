@@ -128,6 +128,15 @@ class TestEditing(BaseTester):
             (lambda s: recolor_region(s, BOX, "red"), TypeError, "gain must be a number"),
             (lambda s: recolor_region(s, BOX, [1.0, "a", 0.0]), TypeError, "gain must hold numbers; got"),
             (lambda s: recolor_region(s, BOX, 1.0, torch.eye(3)), ValueError, "bias must have shape"),
+            (
+                lambda s: recolor_region(s, BOX),
+                ValueError,
+                "color must be given, or gain and bias; got both or neither",
+            ),
+            (lambda s: recolor_region(s, BOX, 1.0, color="red"), ValueError, "got both or neither"),
+            (lambda s: recolor_region(s, BOX, color="reddish"), ValueError, "color must be a name such as red"),
+            (lambda s: recolor_region(s, BOX, color=[1.0, 0.0]), ValueError, r"color must have shape \(3,\)"),
+            (lambda s: recolor_region(Scene(s.field), BOX, color="red"), ValueError, "scene must have a label map"),
             (lambda s: move_region(scene_of(RESIZED), BOX, (2, 0)), ValueError, "must not have a resized map"),
             (lambda s: render_region(s, BOX, (0, 4)), ValueError, "size must be at least 1 x 1"),
             (lambda s: render_region(Scene(GaussianField.random(3, SIZE), s.regions), BOX), ValueError, "region ids"),
@@ -292,6 +301,10 @@ class TestMove:
         assert moved.softness == {(GROUND, BOX): 1.0, (GROUND, DISC): 0.5, (BOX, DISC): 0.75}  # type: ignore[comparison-overlap]
 
 
+def luma(scene: Scene) -> Tensor:
+    return torch.einsum("chw,c->hw", scene().detach(), torch.tensor([0.299, 0.587, 0.114]))
+
+
 class TestRecolor:
     @pytest.mark.parametrize("opacities", [False, True])
     @pytest.mark.parametrize(
@@ -312,6 +325,21 @@ class TestRecolor:
         expected = recolor_region(scene, BOX, torch.tensor(gain), torch.tensor(gain))().detach()
         for other in (gain, tuple(gain), np.array(gain), torch.diag(torch.tensor(gain)).tolist()):
             torch.testing.assert_close(recolor_region(scene, BOX, other, gain)().detach(), expected)
+
+    @pytest.mark.parametrize(("level", "added"), [(0.6, 0), (0.1, 1)])
+    def test_a_colour_keeps_the_shading(self, level: float, added: int) -> None:
+        """The mean is the colour; luma varies in proportion, and in a dark region four times as much as it did."""
+        scene = scene_of(MAPS["hard"]())
+        pixels = scene.regions.labels == BOX  # type: ignore[union-attr]
+        gain = level / float(luma(scene)[pixels].mean())
+        scene = recolor_region(scene, BOX, gain)
+        changed, color = recolor_region(scene, BOX, color="#0080ff"), torch.tensor([0.0, 128 / 255, 1.0])
+        assert changed.num_gaussians == scene.num_gaussians + added
+        inside = changed().detach()[:, pixels]
+        torch.testing.assert_close(inside.mean(1), color, rtol=0, atol=1e-4)
+        contrast = (luma(scene)[pixels] - level) / max(level, 0.25)
+        torch.testing.assert_close(inside, color[:, None] * (1 + contrast), rtol=0, atol=1e-4)
+        torch.testing.assert_close(changed().detach()[:, ~pixels], scene().detach()[:, ~pixels], rtol=0, atol=1e-5)
 
     def test_without_bias_no_gaussian_is_added(self) -> None:
         scene = scene_of(MAPS["hard"]())
