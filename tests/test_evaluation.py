@@ -56,7 +56,7 @@ class TestEvaluate:
         [
             (make_scene(), torch.zeros(3, 40, 61), None, r"have the scene's shape \(3, 40, 60\); got \(3, 40, 61\)"),
             (make_scene().field, torch.zeros(3, 40, 60), None, "scene must be a Scene; got GaussianField"),
-            (make_scene(), torch.zeros(3, 40, 60), "mask.png", "labels must be a RegionMap"),
+            (make_scene(), torch.zeros(3, 40, 60), [[0, 1]], "labels must be a RegionMap"),
         ],
     )
     def test_bad_arguments(self, scene: Any, image: Any, labels: Any, message: str) -> None:

@@ -216,7 +216,7 @@ class TestScene(BaseTester):
         ("arguments", "error", "message"),
         [
             ((make_scene("none"),), TypeError, "field must be a GaussianField; got Scene"),
-            ((make_field(), "map.png"), TypeError, "regions must be a RegionMap, a label map or None; got str"),
+            ((make_field(), 3), TypeError, "regions must be a RegionMap, a label map or None; got int"),
             ((make_field(), [[0, 1]]), TypeError, "regions must be a RegionMap, a label map or None; got list"),
             ((make_field(), None, {"n": 3}), TypeError, "metadata must map str to str; got 'n': 3"),
             ((make_field(), None, "title"), TypeError, "metadata must map str to str; got str"),

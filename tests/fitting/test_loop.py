@@ -254,7 +254,7 @@ class TestErrors:
             ({"image": torch.zeros(3, 0, 4)}, ValueError, "image must not be empty"),
             ({"image": torch.zeros(3, 4, 4, dtype=torch.uint8)}, TypeError, "image must have a real floating dtype"),
             ({"regions": torch.zeros(5, 4).long()}, ValueError, "regions must be one map of the image's size"),
-            ({"regions": "auto"}, TypeError, "regions must be a RegionMap"),
+            ({"regions": 3}, TypeError, "regions must be a RegionMap"),
             ({"num_gaussians": 0}, ValueError, "num_gaussians must be at least 1; got 0"),
             ({"seed": "a"}, TypeError, "seed must be an integer; got 'a'"),
             ({"seed": -1}, ValueError, r"seed must be in \[0, 9223372036854775807\]; got -1"),

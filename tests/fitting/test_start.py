@@ -111,7 +111,7 @@ class TestInitialField:
     @pytest.mark.parametrize(
         ("change", "error", "words"),
         [
-            ({"image": "photo.png"}, TypeError, "image must be a Tensor"),
+            ({"image": 3}, TypeError, "image must be a Tensor"),
             ({"num_gaussians": 0}, ValueError, "num_gaussians must be at least 1; got 0"),
             ({"num_gaussians": 50}, ValueError, "num_gaussians must be at most 16"),
             ({"regions": torch.zeros(5, 4).long()}, ValueError, "regions must be one map of the image's size"),
