@@ -32,7 +32,7 @@ def refine_contours(
 ) -> RegionMap:
     """Move contours to where the image is explained better, at most `max_distance` from the map `anchor`.
 
-    Exact coordinate descent on the energy in docs/fitting.md; no region is lost. Pieces under `smallest` pixels that
+    Exact coordinate descent on the energy in docs/method.md; no region is lost. Pieces under `smallest` pixels that
     moves have made are merged into the adjacent label that costs least. Where no move lowers the energy, the result is
     the scene's map itself.
 

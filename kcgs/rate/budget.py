@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
-from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_count
@@ -108,7 +107,7 @@ class _RegionChoice(NamedTuple):
 
 def fit_bytes(
     image: Any,
-    regions: RegionMap | Tensor | NDArray[Any] | None,
+    regions: Any,
     target_bytes: int,
     *,
     recipe: str | FitConfig = "best",
