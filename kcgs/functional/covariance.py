@@ -10,13 +10,16 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_floating, verify
+from kcgs.errors import InvalidArgument
 
 
 def check_cholesky(name: str, value: object) -> Tensor:
     """Return `value` if it is a finite (..., 3) tensor with positive l11 and l22."""
     cholesky = check_floating(name, value, last=3)
     if not verify((cholesky[..., ::2] > 0).all(), f"{name} must have l11 > 0 and l22 > 0"):
-        raise ValueError(f"{name} must have l11 > 0 and l22 > 0; got a least of {float(cholesky[..., ::2].min()):g}")
+        least = f"a least of {float(cholesky[..., ::2].min()):g}"
+        hint = "kcgs.functional.activate_gaussians makes a network's output valid"
+        raise InvalidArgument(name, "l11 > 0 and l22 > 0", f"{least}; {hint}", verb="have")
     return cholesky
 
 

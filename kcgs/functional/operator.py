@@ -16,6 +16,7 @@ from .evaluation import Plan, differentiate, differentiate_forward, differentiat
 from .torch_internals import (
     apply,
     below_autograd,
+    forward_derivatives,
     has_mode,
     is_batched_gradient,
     is_forward_mode,
@@ -35,6 +36,8 @@ _LIBRARY.define(f"region_splat({_ARGUMENTS}) -> Tensor")
 _LIBRARY.define(f"region_splat_backward({_BACKWARD}) -> (Tensor, Tensor, Tensor)")
 _LIBRARY.define(f"region_splat_double_backward({_TANGENTS}, {_BACKWARD}) -> (Tensor, Tensor, Tensor, Tensor)")
 _LIBRARY.define(f"region_splat_forward({_TANGENTS}, {_ARGUMENTS}) -> Tensor")
+
+_THIRD = "region_splat is differentiable twice: torch.autograd.functional.vhp needs no third derivative, as hvp does"
 
 # as Python calls them
 splat_operator: Any = torch.ops.kcgs.region_splat.default
@@ -69,8 +72,7 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:
         gaussians = ctx.saved_tensors
-        filled = [torch.zeros_like(t) if v is None else v for v, t in zip(tangents[:3], gaussians, strict=True)]
-        image: Tensor = _forward_operator(*filled, *gaussians, *ctx.constants)
+        image: Tensor = _forward_operator(*_filled(tangents[:3], gaussians), *gaussians, *ctx.constants)
         return image
 
     @staticmethod
@@ -97,20 +99,74 @@ class _SplatBackward(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
         ctx.save_for_backward(*arguments[:7])
+        ctx.save_for_forward(*arguments[:7])
         ctx.constants = arguments[7:]
         return _unrecorded(_backward_operator, *arguments)  # type: ignore[no-any-return]
 
     @staticmethod
-    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:
-        raise RuntimeError(
-            "a gradient of region_splat has no forward derivative: take jacrev twice in place of hessian"
-        )
+    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor, ...]:
+        arguments = ctx.saved_tensors
+        d_grad, *d_gaussians = _filled(tangents[:4], arguments[:4])
+        first = _backward_operator(d_grad, *arguments[1:], *ctx.constants)
+        # second derivatives are symmetric: backward and forward are the same sum
+        second = _double_backward_operator(*d_gaussians, *arguments, *ctx.constants)[1:]
+        return tuple(a + b if len(a) else a for a, b in zip(first, second, strict=True))
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         second = _double_backward_operator(*grads, *ctx.saved_tensors, *ctx.constants)
         needed = zip(second, ctx.needs_input_grad[:4], strict=True)
         return (*(g if need else None for g, need in needed), *[None] * 8)
+
+
+def _forward_autograd(*arguments: Any) -> Any:
+    if _is_differentiated(arguments[:6]):
+        return apply(_SplatForward, *arguments)
+    return below_autograd(_forward_operator, *arguments)
+
+
+class _SplatForward(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> Tensor:
+        ctx.save_for_backward(*arguments[:6])
+        ctx.constants = arguments[6:]
+        image: Tensor = _unrecorded(_forward_operator, *arguments)
+        return image
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:
+        raise RuntimeError("region_splat is differentiable forward once: take jacrev of a jvp in place of its jvp")
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        tangents, gaussians = ctx.saved_tensors[:3], ctx.saved_tensors[3:]
+        first = _backward_operator(grad, *gaussians, *ctx.constants, True)
+        second = _double_backward_operator(*tangents, grad, *gaussians, *ctx.constants, True)[1:]
+        return (*first, *second, *[None] * 7)
+
+
+def _double_backward_autograd(*arguments: Any) -> Any:
+    if _is_differentiated(arguments[:7]):
+        return apply(_SplatDoubleBackward, *arguments)
+    return below_autograd(_double_backward_operator, *arguments)
+
+
+class _SplatDoubleBackward(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        return _unrecorded(_double_backward_operator, *arguments)  # type: ignore[no-any-return]
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor, ...]:
+        raise RuntimeError(_THIRD)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        raise RuntimeError(_THIRD)
+
+
+def _filled(tangents: tuple[Tensor | None, ...], tensors: tuple[Tensor, ...]) -> list[Tensor]:
+    return [torch.zeros_like(t) if v is None else v for v, t in zip(tangents, tensors, strict=True)]
 
 
 def _is_differentiated(tensors: tuple[Tensor, ...]) -> bool:
@@ -130,7 +186,7 @@ def _unrecorded(operator: Any, *arguments: Any) -> Any:
     """Evaluate below autograd; outer levels of torch.func still record."""
     if not is_transforming():
         return below_autograd(operator, *arguments)
-    with torch.enable_grad():
+    with torch.enable_grad(), forward_derivatives():
         return below_autograd(operator, *arguments)
 
 
@@ -239,6 +295,8 @@ for _name, _evaluate, _shape in (
     torch.library.register_fake(f"kcgs::{_name}", _shape, lib=_LIBRARY)
 _LIBRARY.impl("region_splat", _splat_autograd, "Autograd")
 _LIBRARY.impl("region_splat_backward", _backward_autograd, "Autograd")
+_LIBRARY.impl("region_splat_double_backward", _double_backward_autograd, "Autograd")
+_LIBRARY.impl("region_splat_forward", _forward_autograd, "Autograd")
 torch.library.register_vmap("kcgs::region_splat", _splat_vmap, lib=_LIBRARY)
 torch.library.register_vmap("kcgs::region_splat_backward", _backward_vmap, lib=_LIBRARY)
 for _device in ("cpu", "cuda"):

@@ -36,8 +36,8 @@ def region_splat(
 
     Convention: points are (x, y) in pixels and pixel (j, i) is sampled at (j + 0.5, i + 0.5); a Gaussian whose id the
     map does not hold paints nothing; N = 0 gives a black image. Half precision is computed in float32. The result is
-    not clamped. Once differentiable in means, cholesky and colors; with backend "reference" twice, and
-    forward. It is the operator ``torch.ops.kcgs.region_splat``: one node of a graph of `torch.compile` and
+    not clamped. Once differentiable in means, cholesky and colors, backward; with backend "reference" twice, once of
+    which may be forward. It is the operator ``torch.ops.kcgs.region_splat``: one node of a graph of `torch.compile` and
     `torch.export`, and `torch.func` transforms it, `vmap` by a larger batch.
 
     Args:

@@ -37,6 +37,11 @@ def is_forward_mode() -> bool:
     return forward_ad._current_level >= 0
 
 
+def forward_derivatives() -> Any:
+    """Take forward derivatives inside of the forward of an autograd.Function; else outer levels of `jvp` would be 0."""
+    return forward_ad._set_fwd_grad_enabled(True)
+
+
 def is_graph_retained() -> bool:
     """True in a backward with `retain_graph`; else a loss that stays alive would hold the memory of a plan."""
     return bool(torch._C._autograd._get_current_graph_task_keep_graph())

@@ -102,7 +102,8 @@ class RegionSplatRenderer(nn.Module):
         if operands is not None and field.region_ids is None:
             raise ValueError("field must have region_ids where regions are given; call field.assign_regions(regions)")
         if operands is not None and operands.size not in (field.size, size):
-            raise ValueError(f"regions must have the size {field.size} of the field or {size}; got {operands.size}")
+            other = "" if size == field.size else f" or {size}"
+            raise ValueError(f"regions must have the size {field.size} of the field{other}; got {operands.size}")
         # a map of the image's size does not say what there is between its pixels
         resized = operands is not None and operands.size != field.size
         fine = size if resized else rendered_size(field.size, size)

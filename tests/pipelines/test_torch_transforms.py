@@ -496,6 +496,46 @@ class TestFunctional:
             torch.testing.assert_close(at_once, expected, rtol=1e-5, atol=1e-6)
             torch.testing.assert_close(mapped.flatten(0, 2), expected, rtol=1e-5, atol=1e-6)
 
+    @pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")  # as below
+    @pytest.mark.parametrize("name", ["means", "cholesky", "colors"])
+    def test_second_derivatives_forward_and_backward(self, field: GaussianField, regions: RegionMap, name: str) -> None:
+        """In any order, the same Hessian; third derivatives are refused, and never zero."""
+        gaussians = {n: getattr(field, n).detach()[:4].double() for n in ("means", "cholesky", "colors")}
+
+        def loss(value: Tensor) -> Tensor:
+            values = {**gaussians, name: value}
+            return (
+                region_splat(**values, region_ids=field.region_ids[:4], regions=regions, backend="reference")
+                .exp()
+                .sum()
+            )
+
+        func, place = torch.func, gaussians[name]
+        direction = torch.rand(place.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        leaf = place.clone().requires_grad_()
+        (slope,) = torch.autograd.grad(loss(leaf), leaf, create_graph=True)
+        (expected,) = torch.autograd.grad((slope * direction).sum(), leaf)
+        assert expected.any()
+
+        def along(value: Tensor) -> Tensor:
+            return func.jvp(loss, (value,), (direction,))[1]
+
+        results = [
+            func.jvp(func.grad(loss), (place,), (direction,))[1],
+            func.grad(along)(place),
+            torch.tensordot(func.hessian(loss)(place), direction, 2),
+            torch.autograd.functional.vhp(loss, place, direction)[1],
+        ]
+        for result in results:
+            torch.testing.assert_close(result, expected)
+        for third in (
+            lambda: func.jvp(along, (place,), (direction,)),
+            lambda: torch.autograd.functional.hvp(loss, place, direction),
+            lambda: func.grad(lambda value: (func.grad(along)(value) * direction).sum())(place),
+        ):
+            with pytest.raises(RuntimeError, match="region_splat is differentiable (twice|forward once)"):
+                third()
+
     @pytest.mark.filterwarnings(
         "ignore:There is a performance drop:UserWarning"
     )  # of vmap, second derivatives one by one
@@ -522,8 +562,6 @@ class TestFunctional:
                 with pytest.raises(RuntimeError, match=f"backend '{kernel}' has first derivatives by backward only"):
                     slope(means)
             return
-        with pytest.raises(RuntimeError, match="take jacrev twice in place of hessian"):
-            torch.func.hessian(loss)(means)
         leaf = means.clone().requires_grad_()
         (first,) = torch.autograd.grad(loss(leaf), leaf, create_graph=True)
         expected = [torch.autograd.grad(first.square().sum(), t, retain_graph=True)[0] for t in (leaf, others[1])]
