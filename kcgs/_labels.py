@@ -134,9 +134,12 @@ def _warn_of_antialiasing(array: NDArray[Any], expression: str) -> None:
     if array.ndim != 2 or array.size == 0 or array.dtype not in (np.uint8, np.uint16):
         return
     counts = np.bincount(array.ravel())
-    ids, (low, high) = np.flatnonzero(counts), np.sort(np.argsort(counts)[-2:])
+    ids = np.flatnonzero(counts)
+    if len(ids) < _MIN_LEVELS:
+        return
+    low, high = np.sort(np.argsort(counts)[-2:])
     num_common = counts[low] + counts[high]
-    if len(ids) < _MIN_LEVELS or (ids[0], ids[-1]) != (low, high) or num_common < _MIN_SHARE * array.size:
+    if (ids[0], ids[-1]) != (low, high) or num_common < _MIN_SHARE * array.size:
         return
     from scipy.ndimage import maximum_filter, minimum_filter
 

@@ -35,7 +35,7 @@ def tensors(draw: st.DrawFn, likely: tuple[int, ...]) -> object:
     """A tensor of the likely shape most of the time, now and then something else altogether."""
     kind = draw(st.integers(0, 11))
     if kind == 0:
-        return draw(st.sampled_from([None, 3, "x", [[1.0]]]))
+        return draw(st.sampled_from([None, 3, b"x", [[1.0]]]))
     shape = tuple(draw(st.lists(st.integers(0, 5), max_size=4))) if kind == 1 else likely
     generator = torch.Generator().manual_seed(draw(st.integers(0, 1000)))
     tensor = torch.rand(shape, generator=generator, dtype=torch.float64) * draw(st.sampled_from([1.0, 9.0, 255.0]))
