@@ -27,9 +27,7 @@ def edit(
     delete: Annotated[list[int] | None, typer.Option(metavar="ID", help="Delete a region.")] = None,
     recolor: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="ID=COLOR", help="Give a region the mean colour COLOR, such as #ff0000, with its shading."
-        ),
+        typer.Option(metavar="ID=COLOR", help="Give a region the colour COLOR, such as #ff0000, with its shading."),
     ] = None,
     move: Annotated[
         list[str] | None,

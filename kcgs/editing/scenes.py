@@ -28,7 +28,9 @@ Numbers = Tensor | NDArray[Any] | Sequence[Any] | float
 
 # standard deviation of a flat Gaussian, in longer sides of the image: its values differ by 3 in 10^7 at most
 _FLAT_SIGMA = 1e3
-# mean luma below which a region that gets a colour keeps its contrast: brighter, its noise would be seen
+# share of a region's pixels that are no brighter than those that get its new colour: brighter ones saturate
+_BRIGHT_SHARE = 0.9
+# their luma, at least, for contrast: in darker regions noise would be seen
 _MIN_LUMA = 0.25
 # standard deviations of a soft contour beyond which it is taken as 0 or 1
 _CONTOUR_SIGMAS = 4.0
@@ -108,16 +110,16 @@ def recolor_region(
     r"""Change the colours of regions in the image to c' = gain c + bias, or give them another colour.
 
     Convention: a gain acts on the colours of the Gaussians. A bias is one more Gaussian per region, flat over the whole
-    image, for pixels are sums of Gaussians, not means. A `color` keeps the shading: it is multiplied by the luma of
-    each pixel over the region's mean luma; in regions darker than a quarter contrast is kept in place of the ratio.
+    image, for pixels are sums of Gaussians, not means. A `color` is that of the brightest tenth of a region, and keeps
+    its shading: it is multiplied by the luma of each pixel over the luma there. Regions whose brightest tenth is below
+    a quarter get the contrast of one where it is a quarter.
 
     Args:
         scene: with region ids; of a batch, all images. With `color` it needs a map.
         region_ids: an id of some of its Gaussians, or several.
         gain: a number, one for each channel :math:`(C)`, or a matrix :math:`(C, C)`: tensors, arrays or lists.
         bias: a number, or one for each channel :math:`(C)`; None: no Gaussian is added.
-        color: in place of gain and bias the mean colour, a name such as "red" or "#ff0000", or a number for each
-            channel :math:`(C)`.
+        color: in place of gain and bias, a name such as "red" or "#ff0000", or a number for each channel :math:`(C)`.
 
     Returns:
         A new scene, without a graph.
@@ -164,7 +166,7 @@ def _recolor(scene: Scene, ids: list[int], gain: Numbers, bias: Numbers | None) 
 
 
 def _paint(scene: Scene, region_id: int, color: str | Numbers) -> Scene:
-    """Give a region a colour: the colour times 1 + contrast (luma - mean luma)."""
+    """Give a region a colour: the colour times 1 + contrast (luma - luma of the brightest tenth)."""
     if scene.regions is None:
         raise InvalidArgument("scene", "a label map", "regions None", verb="have")
     image = scene().detach()
@@ -172,9 +174,10 @@ def _paint(scene: Scene, region_id: int, color: str | Numbers) -> Scene:
     target = _color_tensor("color", _named_color(color), image, [(channels,)])
     weights = image.new_tensor(LUMA) if channels == len(LUMA) else image.new_full((channels,), 1 / channels)
     luma = torch.einsum("...chw,c->...hw", image, weights)
-    mean = luma[(scene.regions.labels == region_id).expand(luma.shape)].mean()
-    contrast = 1.0 / mean.clamp_min(_MIN_LUMA)
-    bias = target * (1.0 - contrast * mean)
+    inside = luma[(scene.regions.labels == region_id).expand(luma.shape)]
+    reference = inside.kthvalue(math.ceil(_BRIGHT_SHARE * len(inside))).values
+    contrast = 1.0 / reference.clamp_min(_MIN_LUMA)
+    bias = target * (1.0 - contrast * reference)
     return _recolor(scene, [region_id], contrast * torch.outer(target, weights), bias if bias.any() else None)
 
 
