@@ -62,6 +62,13 @@ class TestFit:
         regions = load("scene.safetensors").regions
         assert regions is not None and torch.equal(regions.labels, load_labels("mask.png"))
 
+    def test_regions_that_a_file_loses(self, kcgs: Kcgs) -> None:
+        """Stripes save no error; what keeps them is said."""
+        height, width = load_image("photo.png").shape[1:]
+        save_labels("stripes.png", (torch.arange(width) // 3 % 2).expand(height, width))
+        run = kcgs("fit", "photo.png", "--regions", "stripes.png", "--iterations", "5", "--target-bytes", "200")
+        assert run.out.endswith(". --keep-contours keeps them\n")
+
     def test_recipe(self, kcgs: Kcgs) -> None:
         kcgs(*FIT, "--recipe", "gaussian-image")
         scene = load("scene.safetensors")
