@@ -314,7 +314,7 @@ def as_region_map(value: object, name: str = "regions") -> RegionMap | None:
     if value is None or isinstance(value, RegionMap):
         return value
     if is_label_source(value):
-        return RegionMap.from_labels(value)
+        return RegionMap.from_labels(check_labels(name, value))
     raise TypeError(f"{name} must be a RegionMap, a label map or None; got {type(value).__name__}")
 
 
@@ -326,4 +326,5 @@ def map_operands(regions: object) -> MapOperands:
     if isinstance(regions, (Tensor, np.ndarray)):  # graphs of torch 2.7 know no other form
         labels = check_labels("regions", regions, values=False)
         return MapOperands(labels, None, (labels.shape[-2], labels.shape[-1]))
-    raise TypeError(f"regions must be a RegionMap, a label map or None; got {type(regions).__name__}")
+    hint = ": RegionMap.from_labels reads it, once for all renders" if is_label_source(regions) else ""
+    raise TypeError(f"regions must be a RegionMap, a Tensor, an array or None; got {type(regions).__name__}{hint}")

@@ -121,7 +121,7 @@ class TestRegionSplat(BaseTester):
             ({"regions": torch.tensor([[0, -1]])}, ValueError, "regions must hold non-negative ids; got -1"),
             ({"regions": torch.zeros(0, 3).long()}, ValueError, "regions must have at least one pixel"),
             ({"regions": torch.zeros(2, 3, 3).long()}, ValueError, "regions must hold 1 map"),
-            ({"regions": "map.png"}, TypeError, "regions must be a RegionMap, a label map or None"),
+            ({"regions": "map.png"}, TypeError, "got str: RegionMap.from_labels reads it"),
             ({"regions": None}, ValueError, "regions must be given with region_ids; got None"),
             ({"regions": None, "region_ids": None}, ValueError, "size must be given"),
             ({"regions": None, "size": (0, 4)}, ValueError, "size must be at least 1 x 1"),
