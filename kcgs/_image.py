@@ -36,6 +36,8 @@ def as_image(name: str, value: object, tolerance: float = 0.0, keep_alpha: bool 
         image = _from_array(name, pil_samples(value))
         has_alpha = len(image) in (2, 4)
     elif isinstance(value, Tensor):
+        if value.dtype == torch.uint8:
+            raise InvalidArgumentType(name, "floating, in [0, 1]", f"{value.dtype}: pass {name} / 255")
         image = check_floating(name, value, dims=(3, 4), finite=False)  # check_image does that below
     elif isinstance(value, str | os.PathLike):
         return read_image(value)
@@ -52,7 +54,8 @@ def as_image(name: str, value: object, tolerance: float = 0.0, keep_alpha: bool 
         raise InvalidArgument(name, "(C, H, W)", f"{tuple(image.shape)}, which looks like (H, W, C): {advice}")
     low, high = float(image.detach().min()), float(image.detach().max())
     if low < -tolerance or high > 1 + tolerance:
-        raise InvalidArgument(name, "in [0, 1]", f"[{low:g}, {high:g}]")
+        hint = ": divide it by 255" if 1 < high <= 255 and low >= 0 else ""
+        raise InvalidArgument(name, "in [0, 1]", f"[{low:g}, {high:g}]{hint}")
     return _on_white(name, image) if has_alpha and not keep_alpha else image
 
 

@@ -68,7 +68,6 @@ def fit_command(
         report["region_report"] = None if regions_report is None else asdict(regions_report)
     print_report(report, as_json, str(output))
     if regions_report is not None and not as_json:
-        # "recipe": it uses no map
         is_lost = regions_report.num_after == 1 < regions_report.num_before and regions_report.dropped != "recipe"
         typer.echo(f"regions: {regions_report}{'. --keep-contours keeps them' if is_lost else ''}")
     if interrupts.count:

@@ -67,7 +67,10 @@ def fit_request(
     target_bytes: Annotated[
         int | None, typer.Option(min=1, help="The best .kcgs file that is not larger; chooses the number of Gaussians.")
     ] = None,
-    keep_contours: Annotated[bool, typer.Option("--keep-contours", help="Take the label map as exact.")] = False,
+    keep_contours: Annotated[
+        bool,
+        typer.Option("--keep-contours", help="Keep the label map: no contour moves, no region is merged."),
+    ] = False,
     seed: Annotated[int, typer.Option(help="Seed of the random start.")] = 0,
 ) -> FitRequest:
     """Return a request of the options."""

@@ -211,7 +211,9 @@ def decode(
         print_report(_describe_map(output, labels), as_json, str(output))
         return
     check_output(output, *WRITTEN_IMAGES)
-    scene = codec.decode(file.read_bytes(), max_bytes=max_bytes).scene
+    scene, layers, num_layers = codec.decode(file.read_bytes(), max_bytes=max_bytes)
+    if max_bytes is None and layers < num_layers:
+        typer.echo(f"warning: {file} ends after {layers} of {num_layers} layers: the image is coarser", err=True)
     save_image(output, scene.render(target_size(scene, None, None)))
     print_report(_describe_image(output, scene.size), as_json, str(output))
 

@@ -168,7 +168,7 @@ def _recolor(scene: Scene, ids: list[int], gain: Numbers, bias: Numbers | None) 
 def _paint(scene: Scene, region_id: int, color: str | Numbers) -> Scene:
     """Give a region a colour: the colour times 1 + contrast (luma - luma of the brightest tenth)."""
     if scene.regions is None:
-        raise InvalidArgument("scene", "a label map", "regions None", verb="have")
+        raise InvalidArgument("scene", "a label map", "none", verb="have")
     image = scene().detach()
     channels = image.shape[-3]
     target = _color_tensor("color", _named_color(color), image, [(channels,)])

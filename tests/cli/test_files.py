@@ -66,6 +66,13 @@ class TestDecode:
         whole, part = (float(psnr(load_image(name), image)) for name in ("whole.png", "part.png"))
         assert whole > 35 and whole > part + 3
 
+    def test_a_truncated_file_is_said(self, kcgs: Kcgs) -> None:
+        kcgs("encode", "scene.safetensors", "-o", "a.kcgs")
+        data = Path("a.kcgs").read_bytes()
+        Path("a.kcgs").write_bytes(data[: len(data) // 2])
+        code, _, err = kcgs("decode", "a.kcgs", "-o", "a.png")
+        assert code == 0 and err.startswith("warning: a.kcgs ends after ")
+
     def test_damage(self, kcgs: Kcgs) -> None:
         Path("a.kcgs").write_bytes(b"kcgs\1 and so on")
         code, _, err = kcgs("decode", "a.kcgs", "-o", "a.png")
