@@ -138,6 +138,11 @@ class TestEditing(BaseTester):
             (lambda s: recolor_region(s, BOX, color="reddish"), ValueError, "color must be a name such as red"),
             (lambda s: recolor_region(s, BOX, color=[1.0, 0.0]), ValueError, r"color must have shape \(3,\)"),
             (lambda s: recolor_region(Scene(s.field), BOX, color="red"), ValueError, "scene must have a label map"),
+            (
+                lambda s: recolor_region(Scene(s.field, torch.full_like(s.regions.labels, GROUND)), BOX, color="red"),
+                ValueError,
+                "region_ids must be of regions with pixels in the map; got",
+            ),
             (lambda s: move_region(scene_of(RESIZED), BOX, (2, 0)), ValueError, "must not have a resized map"),
             (lambda s: render_region(s, BOX, (0, 4)), ValueError, "size must be at least 1 x 1"),
             (lambda s: render_region(Scene(GaussianField.random(3, SIZE), s.regions), BOX), ValueError, "region ids"),
