@@ -16,6 +16,11 @@ _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32)
 
 
+def is_pil(value: object) -> bool:
+    """Return whether a value is an image of Pillow, which need not be imported for this."""
+    return hasattr(value, "getbands") and hasattr(value, "convert")
+
+
 def check_tensor(name: str, value: object, dims: Sequence[int] = ()) -> Tensor:
     """Return `value` if it is a dense tensor of an allowed rank."""
     if not isinstance(value, Tensor):

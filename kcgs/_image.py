@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import check_floating, check_image
+from kcgs._check import check_floating, check_image, is_pil
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 
@@ -30,7 +30,7 @@ def as_image(name: str, value: object, tolerance: float = 0.0, keep_alpha: bool 
     if isinstance(value, np.ndarray):
         image = _from_array(name, value)
         has_alpha = len(image) == 4
-    elif hasattr(value, "getbands") and hasattr(value, "convert"):  # PIL, which need not be imported for this
+    elif is_pil(value):
         from kcgs._decode import pil_samples
 
         image = _from_array(name, pil_samples(value))

@@ -111,16 +111,19 @@ def fit_and_save(
     settings: Any = {"recipe": config, "seed": request.seed, "on_step": on_step, "progress": progress}
     if request.target_bytes is not None:
         file = fit_bytes(image, labels, request.target_bytes, **settings)
-        return SavedFit(file.result, file.scene, write_file(output, file.data), time.perf_counter() - start)
-    result = fit(image, labels, request.num_gaussians, **settings)
-    if not is_compressed:
+        result, scene, num_bytes = file.result, file.scene, write_file(output, file.data)
+    elif is_compressed:
+        result = fit(image, labels, request.num_gaussians, **settings)
+        quality = quality_for(max(entry.psnr for entry in result.history)) if target_psnr is None else None
+        goal: Any = {"quality": quality, "target_psnr": target_psnr, "objective": config.objective}
+        with Progress("writing the file", pulse=True, visible=progress):
+            compressed = compress(result.scene, image, seed=request.seed, **goal)
+        scene, num_bytes = compressed.scene, write_file(output, compressed.data)
+    else:
+        result = fit(image, labels, request.num_gaussians, **settings)
         scene = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe})
-        return SavedFit(result, scene, scene.save(output), time.perf_counter() - start)
-    quality = quality_for(max(entry.psnr for entry in result.history)) if target_psnr is None else None
-    goal: Any = {"quality": quality, "target_psnr": target_psnr, "objective": config.objective}
-    with Progress("writing the file", pulse=True, visible=progress):
-        compressed = compress(result.scene, image, seed=request.seed, **goal)
-    return SavedFit(result, compressed.scene, write_file(output, compressed.data), time.perf_counter() - start)
+        num_bytes = scene.save(output)
+    return SavedFit(result, scene, num_bytes, time.perf_counter() - start)
 
 
 def read_regions(regions: str, image: Tensor, *, resize: bool = False, progress: bool = False) -> Tensor | None:

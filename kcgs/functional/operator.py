@@ -6,6 +6,7 @@ context, which neither compilers nor transforms see: they plan again.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import torch
@@ -49,10 +50,11 @@ _forward_operator: Any = torch.ops.kcgs.region_splat_forward.default
 # Derivatives: what runs first where a gradient may be needed
 
 
-def _splat_autograd(*arguments: Any) -> Any:
-    if _is_differentiated(arguments[:3]):
-        return apply(_Splat, *arguments)
-    return below_autograd(splat_operator, *arguments)
+def _differentiable(operator: Any, function: Any, num_tensors: int, *arguments: Any) -> Any:
+    """Evaluate an operator by its autograd.Function where the first tensors need a derivative, else below autograd."""
+    if _is_differentiated(arguments[:num_tensors]):
+        return apply(function, *arguments)
+    return below_autograd(operator, *arguments)
 
 
 class _Splat(torch.autograd.Function):
@@ -89,12 +91,6 @@ class _Splat(torch.autograd.Function):
         return (*(g if need else None for g, need in needed), *[None] * 7)
 
 
-def _backward_autograd(*arguments: Any) -> Any:
-    if _is_differentiated(arguments[:4]):
-        return apply(_SplatBackward, *arguments)
-    return below_autograd(_backward_operator, *arguments)
-
-
 class _SplatBackward(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
@@ -119,12 +115,6 @@ class _SplatBackward(torch.autograd.Function):
         return (*(g if need else None for g, need in needed), *[None] * 8)
 
 
-def _forward_autograd(*arguments: Any) -> Any:
-    if _is_differentiated(arguments[:6]):
-        return apply(_SplatForward, *arguments)
-    return below_autograd(_forward_operator, *arguments)
-
-
 class _SplatForward(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Tensor:
@@ -143,12 +133,6 @@ class _SplatForward(torch.autograd.Function):
         first = _backward_operator(grad, *gaussians, *ctx.constants, True)
         second = _double_backward_operator(*tangents, grad, *gaussians, *ctx.constants, True)[1:]
         return (*first, *second, *[None] * 7)
-
-
-def _double_backward_autograd(*arguments: Any) -> Any:
-    if _is_differentiated(arguments[:7]):
-        return apply(_SplatDoubleBackward, *arguments)
-    return below_autograd(_double_backward_operator, *arguments)
 
 
 class _SplatDoubleBackward(torch.autograd.Function):
@@ -285,18 +269,17 @@ def _fold(info: Any, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...]
     return batched, folded
 
 
-for _name, _evaluate, _shape in (
-    ("region_splat", _splat, _splat_shape),
-    ("region_splat_backward", _splat_backward, _backward_shapes),
-    ("region_splat_double_backward", _splat_double_backward, _double_backward_shapes),
-    ("region_splat_forward", _splat_forward, _forward_shape),
+# the last is the number of tensors at the beginning of the arguments that it is differentiated by
+for _name, _evaluate, _shape, _function, _num_tensors in (
+    ("region_splat", _splat, _splat_shape, _Splat, 3),
+    ("region_splat_backward", _splat_backward, _backward_shapes, _SplatBackward, 4),
+    ("region_splat_double_backward", _splat_double_backward, _double_backward_shapes, _SplatDoubleBackward, 7),
+    ("region_splat_forward", _splat_forward, _forward_shape, _SplatForward, 6),
 ):
+    _operator = getattr(torch.ops.kcgs, _name).default
+    _LIBRARY.impl(_name, functools.partial(_differentiable, _operator, _function, _num_tensors), "Autograd")
     _LIBRARY.impl(_name, _evaluate, "CompositeExplicitAutograd")
     torch.library.register_fake(f"kcgs::{_name}", _shape, lib=_LIBRARY)
-_LIBRARY.impl("region_splat", _splat_autograd, "Autograd")
-_LIBRARY.impl("region_splat_backward", _backward_autograd, "Autograd")
-_LIBRARY.impl("region_splat_double_backward", _double_backward_autograd, "Autograd")
-_LIBRARY.impl("region_splat_forward", _forward_autograd, "Autograd")
 torch.library.register_vmap("kcgs::region_splat", _splat_vmap, lib=_LIBRARY)
 torch.library.register_vmap("kcgs::region_splat_backward", _backward_vmap, lib=_LIBRARY)
 for _device in ("cpu", "cuda"):

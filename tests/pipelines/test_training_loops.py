@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import kornia
 import pytest
@@ -65,6 +66,20 @@ LOSSES: dict[str, Loss] = {
 }
 
 
+def descend(optimizer: GaussianAdam, error: Callable[[], Tensor], schedule: Any = None) -> list[float]:
+    """Take fifty steps; return the losses."""
+    losses = []
+    for _ in range(50):
+        loss = error()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        if schedule is not None:
+            schedule.step()
+        losses.append(float(loss.detach()))
+    return losses
+
+
 class TestLossesFall:
     @pytest.mark.parametrize("kind", ["one", "double", "batch", "tiled"])
     @pytest.mark.parametrize("name", LOSSES)
@@ -78,41 +93,24 @@ class TestLossesFall:
         renderer = RegionSplatRenderer(keepdim=False, backend="tiled" if tiled else "auto")
         optimizer = GaussianAdam(field.to(device))
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 50)
-        losses = []
-        for _ in range(50):
-            loss = LOSSES[name](renderer(field, regions), image)
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-            losses.append(float(loss.detach()))
+        losses = descend(optimizer, lambda: LOSSES[name](renderer(field, regions), image), schedule)
         assert losses[-1] < 0.6 * losses[0]
 
     def test_two_fields_in_one_image(self) -> None:
         """A sum of two renders under one optimizer."""
         image, renderer = target(), RegionSplatRenderer(keepdim=False)
         fields = [GaussianField.random(30, SIZE, seed=seed) for seed in range(2)]
-        optimizer = GaussianAdam(fields)
-        losses = []
-        for _ in range(50):
-            loss = (renderer(fields[0]) + renderer(fields[1]) - image).square().mean()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            losses.append(float(loss.detach()))
+        losses = descend(
+            GaussianAdam(fields), lambda: (renderer(fields[0]) + renderer(fields[1]) - image).square().mean()
+        )
         assert losses[-1] < 0.2 * losses[0]
 
     def test_compiled_with_its_loss(self) -> None:
         """One graph of render and loss, with a map that has soft contours."""
         image, field, renderer = target(), initial_field(target(), 40, halves()), RegionSplatRenderer(keepdim=False)
-        regions, optimizer = RegionMap.from_labels(halves(), softness=0.7), GaussianAdam(field)
+        regions = RegionMap.from_labels(halves(), softness=0.7)
         error = torch.compile(lambda: LOSSES["L1"](renderer(field, regions), image), fullgraph=True, backend="eager")
-        losses = []
-        for _ in range(50):
-            optimizer.zero_grad()
-            losses.append(error())
-            losses[-1].backward()
-            optimizer.step()
+        losses = descend(GaussianAdam(field), error)
         assert losses[-1] < 0.6 * losses[0]
 
     def test_lbfgs(self) -> None:
