@@ -12,24 +12,26 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import check_integer, verify
+from kcgs._check import check_integer, is_pil, verify
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 
 MAX_COLORS = 4096
 """An image with more distinct colours is taken for a photo, not for a label map."""
 
-# An antialiased mask has at least so many grey levels,
-_MIN_LEVELS = 16
-# of which the darkest and the lightest cover so much of it,
+# In an antialiased mask the darkest and the lightest levels, each this share of the range,
+_END_SHARE = 1 / 16
+# cover so much of it,
 _MIN_SHARE = 0.75
-# and so few of the other pixels have eight neighbours of their own level.
+# there are at least so many levels between them,
+_MIN_LEVELS = 16
+# and so few of the pixels between have eight neighbours of their own level.
 _MAX_INTERIOR = 0.05
 
 
 def is_label_source(value: object) -> bool:
     """Return whether a value is of a type that `check_labels` reads."""
-    return isinstance(value, Tensor | np.ndarray | str | os.PathLike) or _is_pil(value)
+    return isinstance(value, Tensor | np.ndarray | str | os.PathLike) or is_pil(value)
 
 
 def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values: bool = True) -> Tensor:
@@ -45,7 +47,7 @@ def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values:
         value = _from_array(name, value, values)
     elif isinstance(value, str | os.PathLike):
         value = read_labels(value)
-    elif _is_pil(value):
+    elif is_pil(value):
         value = _from_pil(name, value)
     else:
         raise InvalidArgumentType(name, "a Tensor, a numpy array, a PIL image or a path", type(value).__name__)
@@ -65,7 +67,7 @@ def read_labels(path: str | os.PathLike[str], rgb_ids: bool = False) -> Tensor:
             values = np.asarray(np.load(path, allow_pickle=False))  # of an archive an object, which is no map
         except (ValueError, EOFError) as error:
             raise ValueError(f"cannot read {path} as an .npy array: {error}") from error
-        return check_labels(str(path), values, dims=(2,))
+        return _from_grey(str(path), values, f"np.load({os.fspath(path)!r})")
     from kcgs._decode import decode
 
     samples = decode(path, indices=True)
@@ -77,10 +79,6 @@ def read_labels(path: str | os.PathLike[str], rgb_ids: bool = False) -> Tensor:
     if rgb_ids and samples.values.shape[-1] > 1:
         return _from_ids(samples.values, path)
     return _from_samples(str(path), samples.values, f"np.asarray(PIL.Image.open({os.fspath(path)!r}))")
-
-
-def _is_pil(value: object) -> bool:
-    return hasattr(value, "getbands") and hasattr(value, "convert")  # PIL need not be imported for this
 
 
 def _from_pil(name: str, image: Any) -> Tensor:
@@ -95,8 +93,12 @@ def _from_pil(name: str, image: Any) -> Tensor:
 def _from_samples(name: str, values: NDArray[Any], expression: str) -> Tensor:
     if values.shape[-1] > 1:
         return _from_colors(values, name)
-    _warn_of_antialiasing(values[..., 0], expression)
-    return check_labels(name, _from_array(name, values[..., 0], True), dims=(2,))
+    return _from_grey(name, values[..., 0], expression)
+
+
+def _from_grey(name: str, values: NDArray[Any], expression: str) -> Tensor:
+    _warn_of_antialiasing(values, expression)
+    return check_labels(name, _from_array(name, values, True), dims=(2,))
 
 
 def _from_array(name: str, array: NDArray[Any], values: bool) -> Tensor:
@@ -130,22 +132,22 @@ def _from_colors(values: NDArray[Any], path: str | os.PathLike[str]) -> Tensor:
 
 
 def _warn_of_antialiasing(array: NDArray[Any], expression: str) -> None:
-    """Warn of grey levels between two common ones that occur along contours only."""
+    """Warn of grey levels between dark and light ones that occur along contours only."""
     if array.ndim != 2 or array.size == 0 or array.dtype not in (np.uint8, np.uint16):
         return
-    counts = np.bincount(array.ravel())
-    ids = np.flatnonzero(counts)
-    if len(ids) < _MIN_LEVELS:
+    ids = np.flatnonzero(np.bincount(array.ravel()))
+    low, high = int(ids[0]), int(ids[-1])
+    darkest, lightest = low + _END_SHARE * (high - low), high - _END_SHARE * (high - low)
+    if ((ids > darkest) & (ids < lightest)).sum() < _MIN_LEVELS:
         return
-    low, high = np.sort(np.argsort(counts)[-2:])
-    num_common = counts[low] + counts[high]
-    if (ids[0], ids[-1]) != (low, high) or num_common < _MIN_SHARE * array.size:
+    between = (array > darkest) & (array < lightest)
+    if between.sum() > (1 - _MIN_SHARE) * array.size:
         return
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    interior = (minimum_filter(array, 3) == maximum_filter(array, 3)) & (array != low) & (array != high)
-    if interior.sum() <= _MAX_INTERIOR * (array.size - num_common):
+    interior = (minimum_filter(array, 3) == maximum_filter(array, 3)) & between
+    if interior.sum() <= _MAX_INTERIOR * between.sum():
         warn_user(
             f"the {len(ids)} ids of this map look like an antialiased mask of two regions: threshold it, "
-            f"{expression} > {(int(low) + int(high)) // 2}"
+            f"{expression} > {(low + high) // 2}"
         )

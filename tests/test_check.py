@@ -141,10 +141,16 @@ def test_paths_are_arguments_of_fit_and_evaluate(tmp_path: Path) -> None:
     assert segment(photo).shape == (16, 16)
 
 
-@pytest.mark.parametrize(("blur", "hint"), [(0, []), (1, ["np.asarray(labels) > 127"])])
-def test_antialiased_masks_get_a_hint(blur: int, hint: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("blur", "noise", "hint"),
+    [(0, 0, []), (1, 0, ["np.asarray(labels) > 127"]), (1, 3, ["np.asarray(labels) > 127"])],
+)
+def test_antialiased_masks_get_a_hint(blur: int, noise: int, hint: list[str]) -> None:
+    """Also the probabilities of a network, whose levels are only near to dark and light."""
     y, x = np.mgrid[:96, :96] - 48
-    mask = gaussian_filter(255.0 * (np.hypot(x, y) < 30), blur).round().astype(np.uint8)
+    mask = gaussian_filter(255.0 * (np.hypot(x, y) < 30), blur)
+    mask = np.abs(mask - np.random.default_rng(0).uniform(0, noise, mask.shape)).round().astype(np.uint8)
+    mask[0, 0], mask[48, 48] = 0, 255
     with warnings.catch_warnings(record=True) as messages:
         warnings.simplefilter("always")
         RegionMap.from_labels(mask)
