@@ -169,15 +169,16 @@ def _paint(scene: Scene, region_id: int, color: str | Numbers) -> Scene:
     """Give a region a colour: the colour times 1 + contrast (luma - luma of the brightest tenth)."""
     if scene.regions is None:
         raise InvalidArgument("scene", "a label map", "none", verb="have")
+    pixels = scene.regions.labels == region_id
+    if not pixels.any():
+        raise InvalidArgument("region_ids", "of regions with pixels in the map", region_id)
     with torch.no_grad():
         image = scene()
     channels = image.shape[-3]
     target = _color_tensor("color", _named_color(color), image, [(channels,)])
     weights = image.new_tensor(LUMA) if channels == len(LUMA) else image.new_full((channels,), 1 / channels)
     luma = torch.einsum("...chw,c->...hw", image, weights)
-    inside = luma[(scene.regions.labels == region_id).expand(luma.shape)]
-    if not len(inside):
-        raise InvalidArgument("region_ids", "of regions with pixels in the map", region_id)
+    inside = luma[pixels.expand(luma.shape)]
     reference = inside.kthvalue(math.ceil(_BRIGHT_SHARE * len(inside))).values
     contrast = 1.0 / reference.clamp_min(_MIN_LUMA)
     bias = target * (1.0 - contrast * reference)
