@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.graph import increment_version
 from torch.nn.functional import pad
 from torch.optim import Optimizer
 
@@ -199,26 +200,67 @@ def _layout(field: GaussianField) -> str:
 
 def _step_colors(state: dict[str, Tensor], group: dict[str, Any]) -> None:
     colors, *opacities = group["params"]
+    tables = [colors, *(alpha[..., None] for alpha in opacities)]
     gradients = [_gradient(colors), *(_gradient(alpha)[..., None] for alpha in opacities)]
+    _grow_older(state, colors, colors.shape[-1] + len(opacities))
+    if loops := _compiled(*tables, *state.values()):
+        adam, column = loops.Adam(*_settings(group), *_arrays(*state.values())), 0
+        for table, gradient in zip(tables, gradients, strict=True):
+            loops.step_table(*_arrays(table, gradient), column, adam)
+            column += table.shape[-1]
+        increment_version(group["params"])
+        return
     change = _adam(state, torch.cat(gradients, -1), group)
-    channels = colors.shape[-1]
-    colors.add_(change[..., :channels])
-    for alpha in opacities:
-        alpha.add_(change[..., channels])
+    for table, part in zip(tables, change.split([table.shape[-1] for table in tables], -1), strict=True):
+        table.add_(part)
 
 
 def _step_geometry(state: dict[str, Tensor], group: dict[str, Any]) -> None:
     means, cholesky = group["params"]
-    local = local_gradient(cholesky, _gradient(means), _gradient(cholesky))
-    step = _adam(state, local, group).clamp(-group["max_step"], group["max_step"])
+    gradients = [_gradient(means), _gradient(cholesky)]
+    _grow_older(state, means, 5)
+    if loops := _compiled(means, cholesky, *state.values()):
+        adam = loops.Adam(*_settings(group), *_arrays(*state.values()))
+        bounds = loops.Bounds(group["max_step"], *group["size"], group["min_sigma"], _MIN_FACTOR, _MAX_OUTSIDE)
+        moves = means.requires_grad, cholesky.requires_grad
+        loops.step_geometry(*_arrays(means, cholesky, *gradients), moves, adam, bounds)
+        increment_version([parameter for parameter in group["params"] if parameter.requires_grad])
+        return
+    step = _adam(state, local_gradient(cholesky, *gradients), group).clamp(-group["max_step"], group["max_step"])
     bounded = _bounded(*move(means, cholesky, step), group["size"], group["min_sigma"])
     for parameter, values in zip((means, cholesky), bounded, strict=True):
         if parameter.requires_grad:  # a frozen one is not even brought within bounds
             parameter.copy_(values)
 
 
+def _compiled(*tensors: Tensor) -> Any:
+    """Return the compiled loops, where they can change tensors in place; else None."""
+    if torch.compiler.is_compiling() or not all(
+        t.dtype == torch.float32 and t.device.type == "cpu" and t.is_contiguous() for t in tensors
+    ):
+        return None
+    from . import loops
+
+    return loops
+
+
+def _arrays(*tensors: Tensor) -> list[Any]:
+    """Return arrays (N, K) of tensors (..., N, K), in the same memory where that is contiguous."""
+    return [t.detach().contiguous().numpy().reshape(-1, t.shape[-1]) for t in tensors]
+
+
+def _settings(group: dict[str, Any]) -> tuple[float, float, float, float]:
+    return float(group["lr"]), *group["betas"], group["eps"]
+
+
 def _check_gradient(gradient: Tensor | None) -> None:
-    if gradient is not None and not verify(gradient.isfinite().all(), "gradients must be finite"):
+    if gradient is None:
+        return
+    if loops := _compiled(gradient):
+        finite = loops.is_finite(gradient.numpy().ravel())
+    else:
+        finite = verify(gradient.isfinite().all(), "gradients must be finite")
+    if not finite:
         count = int((~gradient.isfinite()).sum())
         received = f"{count} NaN or infinite values: the loss, or an operation between it and the render, is not finite"
         raise InvalidArgument("gradients", "finite", received)
@@ -228,14 +270,19 @@ def _gradient(parameter: Tensor) -> Tensor:
     return torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
 
 
-def _adam(state: dict[str, Tensor], gradient: Tensor, group: dict[str, Any]) -> Tensor:
-    """Update the averages of a table (..., N, K), and return Adam's step; each row has an age of its own."""
+def _grow_older(state: dict[str, Tensor], parameter: Tensor, columns: int) -> None:
+    """Begin the averages of a table (..., N, columns), or go on with them; each row has an age of its own."""
     if not state:
-        state["age"] = torch.zeros_like(gradient[..., :1])
-        state["average"], state["square"] = torch.zeros_like(gradient), torch.zeros_like(gradient)
+        shape = parameter.shape[:-1]
+        state["age"] = parameter.new_zeros(*shape, 1)
+        state["average"], state["square"] = (parameter.new_zeros(*shape, columns) for _ in range(2))
+    state["age"] += 1
+
+
+def _adam(state: dict[str, Tensor], gradient: Tensor, group: dict[str, Any]) -> Tensor:
+    """Update the averages of a table (..., N, K), and return Adam's step."""
     beta1, beta2 = group["betas"]
     age, average, square = state["age"], state["average"], state["square"]
-    age += 1
     average.lerp_(gradient, 1 - beta1)
     square.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
     scale = (square / (1 - beta2**age)).sqrt_().add_(group["eps"])

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from kcgs import GaussianField, RegionSplatRenderer, Scene
 from kcgs.optim import GaussianAdam
@@ -126,6 +126,31 @@ class TestAlgorithm:
         descend(field, GaussianAdam(field), steps)
         for value, expected in zip(tensors(field), (means, cholesky, tones.detach()), strict=True):
             torch.testing.assert_close(value, expected, rtol=1e-6, atol=1e-8)
+
+    @pytest.mark.parametrize("kind", ["plain", "opacities", "batch", "strided"])
+    def test_compiled_loops_take_the_steps_of_torch_operations(self, kind: str) -> None:
+        """In float32 and in float64, with the same gradients, of rows that are of two ages and reach the bounds."""
+        field = field_of("plain" if kind == "strided" else kind)
+        if kind == "strided":
+            field.means = nn.Parameter(field.means.detach().mT.contiguous().mT)
+        twin, generator = copy.deepcopy(field).double(), torch.Generator().manual_seed(2)
+        optimizers = [GaussianAdam(each, 0.5, min_sigma=2.0) for each in (field, twin)]
+        for step in range(6):
+            if step == 3:
+                for each, optimizer in zip((field, twin), optimizers, strict=True):
+                    optimizer.append(each, copy.deepcopy(each))
+            for parameter, other in zip(field.parameters(), twin.parameters(), strict=True):
+                gradient = torch.randn(*parameter.shape, 2, generator=generator)[..., 0]
+                parameter.grad, other.grad = gradient, gradient.double()
+            version = field.means._version
+            for optimizer in optimizers:
+                optimizer.step()
+            assert field.means._version > version  # autograd refuses a backward through an older render
+        for value, expected in zip(tensors(field), tensors(twin), strict=True):
+            torch.testing.assert_close(value, expected, rtol=1e-5, atol=2e-5, check_dtype=False)
+        for state, reference in zip(*(optimizer.state.values() for optimizer in optimizers), strict=True):
+            for name, expected in reference.items():
+                torch.testing.assert_close(state[name], expected, rtol=1e-5, atol=1e-6, check_dtype=False)
 
 
 class TestProtocol:
