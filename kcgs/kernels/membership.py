@@ -17,8 +17,6 @@ T = TypeVar("T")
 
 # reach of a contour, in widths: the blur's kernel is cut there
 RADIUS_SIGMAS = 4.0
-# pixels of windows that are blurred at once: 32 MiB in float64
-_CHUNK_PIXELS = 1 << 22
 
 
 class TileMembership(NamedTuple):
@@ -139,98 +137,63 @@ class Membership:
         place = torch.cartesian_prod(*[torch.arange(n, device=self.index.device) for n in counts])
         place[:, 1:] *= tile
         # the widest contour of a tile decides how far its pixels see
-        widest = torch.zeros(len(place), device=place.device)
+        reaches = torch.tensor([self._reach(contour) for contour in widths], device=place.device)
+        widest = torch.zeros(len(place), dtype=torch.int64, device=place.device)
         if level is not None:
-            widest = torch.nn.functional.max_pool2d(level.float(), tile, ceil_mode=True).flatten()
-        lists = []
-        for position, contour in enumerate(widths):
-            tiles = (widest == position).nonzero().flatten()
-            batch, row, col = place[tiles].unbind(1)
-            lists.append(self.list_keys(tiles, (batch, row, col), (tile, tile), self._reach(contour)))
-        single, keys = (torch.cat(parts) for parts in zip(*lists, strict=True))
-        keys = keys.sort().values
-        batch, row, col = place[keys // self.num_regions].unbind(1)
-        masks = self.window_weights(batch, keys % self.num_regions, row, col, (tile, tile)).flatten(1)
+            widest = torch.nn.functional.max_pool2d(level.float(), tile, ceil_mode=True).flatten().long()
+        single, keys = self.list_keys(place, (tile, tile), reaches[widest])
+        masks = self.window_weights(place[keys // self.num_regions], keys % self.num_regions, (tile, tile)).flatten(1)
         return TileMembership.assemble(single, keys, masks.bool() if widths == (0.0,) else masks)
 
-    def list_keys(
-        self, tiles: Tensor, place: tuple[Tensor, ...], sides: Sequence[int], reach: int
-    ) -> tuple[Tensor, Tensor]:
-        """List keys, tile * num_regions + region, of tiles with one region, and, in order, of tiles with several.
+    def list_keys(self, place: Tensor, sides: Sequence[int], reaches: Tensor) -> tuple[Tensor, Tensor]:
+        """List keys, tile * num_regions + region, of tiles with one region, and of tiles with several; both sorted.
 
         Args:
-            tiles: numbers, (T,).
-            place: their image, first row and first column, (T,) each.
+            place: image, first row and first column of each tile, (T, 3); at least one of its pixels is in the image.
             sides: height and width of a tile, in pixels.
-            reach: distance, in pixels, at which a region around a tile belongs to it.
+            reaches: distance, in pixels, at which a region around a tile belongs to it, (T,).
         """
-        single, several = [], []
-        chunks = torch.arange(len(tiles), device=tiles.device)
-        for chunk in chunks.split(max(1, _CHUNK_PIXELS // ((sides[0] + 2 * reach) * (sides[1] + 2 * reach)))):
-            labels = self._read(self.index, tuple(part[chunk] for part in place), sides, reach)[0].flatten(1)
-            keys = tiles[chunk, None] * self.num_regions + labels
-            low, high = keys.aminmax(dim=1)
-            single.append(low[low == high])
-            several.append(keys[low < high].unique())
-        return torch.cat(single), torch.cat(several)
+        from .windows import list_regions  # loads numba
 
-    def window_weights(self, batch: Tensor, region: Tensor, rows: Tensor, cols: Tensor, span: Sequence[int]) -> Tensor:
-        """Evaluate s_r over windows of `span` pixels: image, region, first row and first column (P,) give (P, *span).
+        counts, regions = list_regions(
+            _array(self.index), _array(place), (sides[0], sides[1]), _array(reaches), self.num_regions
+        )
+        keys = np.repeat(np.arange(len(counts)), counts) * self.num_regions + regions
+        is_single = np.repeat(counts == 1, counts)
+        single, several = (torch.from_numpy(part).to(place.device) for part in (keys[is_single], keys[~is_single]))
+        return single, several
 
-        In float64. Windows may reach beyond the image, where s_r has no meaning.
+    def window_weights(self, place: Tensor, region: Tensor, span: Sequence[int]) -> Tensor:
+        """Evaluate s_r over windows of `span` pixels, (P, *span) float64, of image, first row and first column, (P, 3).
+
+        Windows may reach beyond the image, where s_r has no meaning.
         """
+        from .windows import fill_weights
+
         widths, level = self.levels
-        weights = torch.zeros(len(region), *span, dtype=torch.float64, device=region.device)
-        reach = max(self._reach(width) for width in widths)
-        windows = torch.arange(len(region), device=region.device)
-        for chunk in windows.split(max(1, _CHUNK_PIXELS // ((span[0] + 2 * reach) * (span[1] + 2 * reach)))):
-            place, ids = (batch[chunk], rows[chunk], cols[chunk]), region[chunk]
-            if level is None:
-                weights[chunk] = self._blurred(place, ids, span, widths[0])
-                continue
-            levels = self._read(level, place, span, 0)[0]
-            for position, width in enumerate(widths):
-                inside = levels == position
-                members = inside.flatten(1).any(1).nonzero().flatten()
-                if len(members):
-                    blurred = self._blurred(tuple(part[members] for part in place), ids[members], span, width)
-                    weights[chunk[members]] += torch.where(inside[members], blurred, 0.0)
-        return weights
+        offsets = torch.arange(self.radius + 1)
+        taps = torch.stack([self._gaussian(offsets, width) if width else (offsets == 0).double() for width in widths])
+        levels = np.empty((0, 0, 0), np.int32) if level is None else _array(level)
+        weights = np.zeros((len(region), *span))
+        fill_weights(_array(self.index), levels, taps.numpy(), _array(place), _array(region), weights)
+        return torch.from_numpy(weights).to(region.device)
 
-    def read(self, pixels: Tensor, place: tuple[Tensor, ...], span: Sequence[int]) -> Tensor:
-        """Read (B, H, W) over windows, (P, *span): image, first row and first column, (P,) each; the border repeats."""
-        return self._read(pixels, place, span, 0)[0]
+    def read(self, pixels: Tensor, place: Tensor, span: Sequence[int]) -> Tensor:
+        """Read (B, H, W) over windows, (P, *span), at places as of `window_weights`; the border repeats."""
+        lines = [
+            (first[:, None] + torch.arange(side, device=pixels.device)).clamp(0, length - 1)
+            for first, side, length in zip(place.unbind(1)[1:], span, pixels.shape[1:], strict=True)
+        ]
+        return pixels[place[:, :1, None], lines[0][:, :, None], lines[1][:, None, :]]
 
     @property
     def variances(self) -> Tensor:
         """Squared widths of contours at pixels, (B, H, W) float64."""
         return self.derived("variances", _find_variances)
 
-    def _read(
-        self, grid: Tensor, place: tuple[Tensor, ...], sides: Sequence[int], reach: int
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return windows of a grid with a halo, its border repeated, and which of their rows and columns are inside."""
-        lines, inside = [], []
-        for first, side, length in zip(place[1:], sides, grid.shape[1:], strict=True):
-            line = first[:, None] + torch.arange(-reach, side + reach, device=grid.device)
-            lines.append(line.clamp(0, length - 1))
-            inside.append((line == lines[-1]).double())
-        return grid[place[0][:, None, None], lines[0][:, :, None], lines[1][:, None, :]], inside[0], inside[1]
 
-    def _blurred(self, place: tuple[Tensor, ...], region: Tensor, sides: Sequence[int], width: float) -> Tensor:
-        """Blur [M = r] over windows of the grid, of one width."""
-        reach = self._reach(width)
-        labels, down, across = self._read(self.index, place, sides, reach)
-        inside = (labels == region[:, None, None]).double()
-        if width == 0.0:
-            return inside
-        blurs = []
-        for side in sides:
-            line = torch.arange(side + 2 * reach, device=region.device)
-            blurs.append(self._gaussian(line[reach : reach + side, None] - line, width))
-        total = (down @ blurs[0].T)[:, :, None] * (across @ blurs[1].T)[:, None, :]
-        inside *= down[:, :, None] * across[:, None, :]
-        return (blurs[0] @ inside @ blurs[1].T) / total.clamp_min(1e-300)
+def _array(tensor: Tensor) -> Any:
+    return tensor.cpu().contiguous().numpy()
 
 
 def _find_levels(membership: Membership) -> Levels:

@@ -112,9 +112,8 @@ class Resampled(Membership):
         )  # [tiles of the axis, tile, span] each
         place = torch.cartesian_prod(*[torch.arange(n, device=firsts[0].device) for n in (maps, *map(len, firsts))])
         batch, row, col = place.unbind(1)
-        source, corners = self.source, (firsts[0][row], firsts[1][col])
-        numbers = torch.arange(len(batch), device=batch.device)
-        single, keys = source.list_keys(numbers, (batch, *corners), spans, source.radius)
+        corners = torch.stack([batch, firsts[0][row], firsts[1][col]], 1)
+        single, keys = self.source.list_keys(corners, spans, torch.full_like(row, self.source.radius))
         tiles, region = keys // self.num_regions, keys % self.num_regions
         groups = tiles.unique(return_inverse=True)[1]
         masks = torch.zeros(len(keys), tile * tile, dtype=torch.float64, device=keys.device)
@@ -123,19 +122,19 @@ class Resampled(Membership):
         # exponents need all regions of a tile in one chunk
         for chunk in equal_chunks if self._exponents() is None else _chunks(groups, length):
             t, y, x = tiles[chunk], row[tiles[chunk]], col[tiles[chunk]]
-            corner = batch[t], firsts[0][y], firsts[1][x]
-            mean = down[y] @ self._windows(corner, region[chunk], groups[chunk], spans) @ across[x].mT
+            mean = down[y] @ self._windows(corners[t], region[chunk], groups[chunk], spans) @ across[x].mT
             exponent = self._exponents()
             if isinstance(exponent, Tensor):
-                exponent = sharpness(down[y] @ source.read(exponent, corner, spans) @ across[x].mT, self._enlargement)
+                exponent = sharpness(
+                    down[y] @ self.source.read(exponent, corners[t], spans) @ across[x].mT, self._enlargement
+                )
             masks[chunk] = (mean if exponent is None else _sharpen(mean, groups[chunk], exponent)).flatten(1)
         is_present = (masks > 0).any(1)
         return TileMembership.assemble(single, keys[is_present], masks[is_present])
 
-    def _windows(self, place: tuple[Tensor, ...], region: Tensor, group: Tensor, spans: Sequence[int]) -> Tensor:
+    def _windows(self, place: Tensor, region: Tensor, group: Tensor, spans: Sequence[int]) -> Tensor:
         """Evaluate the weights of the map's own pixels over windows, (P, *spans), at the same place within a group."""
-        batch, rows, cols = place
-        return self.source.window_weights(batch, region, rows, cols, spans)
+        return self.source.window_weights(place, region, spans)
 
 
 class Crisp(Resampled):
@@ -162,7 +161,7 @@ class Crisp(Resampled):
         weights = (self.source.weights(batch, r, torch.float64) for r in range(self.num_regions))
         return functools.reduce(torch.maximum, weights)
 
-    def _windows(self, place: tuple[Tensor, ...], region: Tensor, group: Tensor, spans: Sequence[int]) -> Tensor:
+    def _windows(self, place: Tensor, region: Tensor, group: Tensor, spans: Sequence[int]) -> Tensor:
         weights = super()._windows(place, region, group, spans)
         labels = self.source.read(self.source.index, place, spans)
         return _restore(weights, _group_max(weights, group), labels == region[:, None, None])

@@ -74,8 +74,8 @@ def _soft_tiles(regions: RegionMap, rows: int, cols: int) -> Tiles:
 def _membership_windows(regions: RegionMap, tile: Tensor, cols: int, region: Tensor) -> Tensor:
     """Evaluate a region over the window of a tile, (P, WINDOW, WINDOW), for P pairs of both."""
     corners = tile // cols * TILE - 1, tile % cols * TILE - 1
-    image, r, y, x = (part.to(regions.labels.device) for part in (torch.zeros_like(region), region, *corners))
-    weights = regions.tables.membership.window_weights(image, r, y, x, (WINDOW, WINDOW)).cpu()
+    place = torch.stack([torch.zeros_like(region), *corners], 1)
+    weights = regions.tables.membership.window_weights(place, region, (WINDOW, WINDOW)).cpu()
     down, across = (
         (begin[:, None] + torch.arange(WINDOW)).clamp(0, length - 1) - begin[:, None]
         for begin, length in zip(corners, regions.size, strict=True)

@@ -1,0 +1,118 @@
+"""Loops over windows of label maps: which regions a window holds, and their membership there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .compiled import Program, inner
+
+program = Program("tables of label maps", __file__)
+
+
+@program.entry
+def list_regions(index, places, sides, reaches, num_regions):  # type: ignore[no-untyped-def]
+    """Return the number of regions in each window, (T,), and the regions, ascending, one window after the other.
+
+    Windows of `sides` pixels begin at places, (T, 3): map, first row, first column; each is widened by its reach.
+    """
+    counts, regions = np.empty(len(places), np.int64), np.empty(len(places) + 1, np.int64)
+    windows = np.full(num_regions, -1)  # the last that holds a region
+    end, (_, height, width) = 0, index.shape
+    for t in range(len(places)):
+        image, row, col = places[t]
+        first, last = end, -1
+        for y in range(max(row - reaches[t], 0), min(row + sides[0] + reaches[t], height)):
+            for x in range(max(col - reaches[t], 0), min(col + sides[1] + reaches[t], width)):
+                region = index[image, y, x]
+                if region == last:
+                    continue
+                last = region
+                if windows[region] == t:
+                    continue
+                windows[region] = t
+                if end == len(regions):
+                    regions = np.append(regions, np.empty_like(regions))
+                k = end
+                while k > first and regions[k - 1] > region:
+                    regions[k] = regions[k - 1]
+                    k -= 1
+                regions[k] = region
+                end += 1
+        counts[t] = end - first
+    return counts, regions[:end]
+
+
+@program.entry
+def fill_weights(index, levels, taps, places, regions, weights):  # type: ignore[no-untyped-def]
+    """Fill the membership of regions, (P,), over windows, (P, h, w), that begin at places, (P, 3).
+
+    Row k of taps is half of the blur for pixels of level k, its centre first, then zeros; `levels` is empty where one
+    blur is for all.
+    """
+    height, width = weights.shape[1:]
+    reach = taps.shape[1] - 1
+    line, rows = np.empty(width + 2 * reach), np.empty((height + 2 * reach, width))
+    is_empty, total = np.empty(len(rows), np.bool_), np.empty(width)
+    for p in range(len(places)):
+        image, top, left = places[p]
+        for k in range(len(taps)):
+            if len(levels) and not _has_level(levels[image], k, top, left, height, width):
+                continue
+            half = taps[k, : np.count_nonzero(taps[k])]
+            n = len(half) - 1
+            down = _sum_inside(half, top, height, index.shape[1])
+            across = _sum_inside(half, left, width, index.shape[2])
+            for y in range(height + 2 * n):
+                is_empty[y] = True
+                row = top + y - n
+                for x in range(width + 2 * n if 0 <= row < index.shape[1] else 0):
+                    col = left + x - n
+                    line[x] = 1.0 if 0 <= col < index.shape[2] and index[image, row, col] == regions[p] else 0.0
+                    is_empty[y] &= line[x] == 0.0
+                if not is_empty[y]:
+                    _blur(half, line, rows[y])
+            for y in range(height):
+                total[:] = 0.0
+                for t in range(2 * n + 1):
+                    if not is_empty[y + t]:
+                        for x in range(width):
+                            total[x] += half[abs(t - n)] * rows[y + t, x]
+                for x in range(width):
+                    if not len(levels) or _level(levels[image], top + y, left + x) == k:
+                        weights[p, y, x] = total[x] / max(down[y] * across[x], 1e-300)
+
+
+@inner
+def _blur(half, line, blurred):  # type: ignore[no-untyped-def]
+    """Blur a line to the places where the whole window lies in it."""
+    n = len(half) - 1
+    blurred[:] = 0.0
+    for t in range(2 * n + 1):
+        for x in range(len(blurred)):
+            blurred[x] += half[abs(t - n)] * line[x + t]
+
+
+@inner
+def _sum_inside(half, first, count, length):  # type: ignore[no-untyped-def]
+    """Sum the taps that lie inside of an axis, around each of `count` pixels."""
+    line = np.zeros(count + 2 * len(half) - 2)
+    begin = len(half) - 1 - first
+    line[max(begin, 0) : max(begin + length, 0)] = 1.0
+    sums = np.empty(count)
+    _blur(half, line, sums)
+    return sums
+
+
+@inner
+def _level(levels, row, col):  # type: ignore[no-untyped-def]
+    """Return the level of a pixel; beyond the image the border repeats."""
+    return levels[min(max(row, 0), levels.shape[0] - 1), min(max(col, 0), levels.shape[1] - 1)]
+
+
+@inner
+def _has_level(levels, k, top, left, height, width):  # type: ignore[no-untyped-def]
+    for y in range(top, top + height):
+        for x in range(left, left + width):
+            if _level(levels, y, x) == k:
+                return True
+    return False
