@@ -10,10 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import max_pool2d, pad
 
 from kcgs.functional import RegionMap, region_splat
-from kcgs.functional.blur import blur, gaussian_taps
+from kcgs.functional.blur import gaussian_taps
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join
 
@@ -97,14 +96,16 @@ def _search(residual: Tensor, labels: NDArray[np.int32], sigmas: Sequence[float]
     limit = max(_CANDIDATES_PER_GAUSSIAN * count, _MIN_CANDIDATES)
     scales = {block: [s for s in sigmas if _block(s) == block] for block in sorted(map(_block, sigmas))}
     parts: list[_Candidates] = []
+    least = 0.0
     for crops in _crop_regions(residual, labels, find_objects(labels + 1), 2 * max(scales)):
         averages, side = crops.planes, 1
         for block, choices in scales.items():
             while side < block:
                 averages, side = halve(averages), 2 * side
-            margin = math.ceil(_REACH * max(choices) / block)
-            padded = pad(averages, (margin, margin, margin, margin))
-            parts += [_best_of_squares(crops, padded, margin, sigma, block, limit) for sigma in choices]
+            for sigma in choices:
+                parts.append(_best_of_squares(crops, averages, sigma, block, limit, least))
+                if len(parts[-1].gain) == limit:  # what is less cannot be among the strongest
+                    least = max(least, parts[-1].gain.min())
     everywhere = _Candidates(*(np.concatenate(values) for values in zip(*parts, strict=True)))
     strong = everywhere.take(_strongest(everywhere.gain, limit))
     return strong.take(np.lexsort((strong.sigma, strong.x, strong.y, strong.region)))
@@ -145,37 +146,38 @@ def halve(planes: Tensor) -> Tensor:
     return (rows[..., : rows.shape[-1] // 2 * 2 : 2] + rows[..., 1::2]).mul_(0.25)
 
 
-def _best_of_squares(crops: _Crops, padded: Tensor, margin: int, sigma: float, block: int, limit: int) -> _Candidates:
+def _best_of_squares(crops: _Crops, planes: Tensor, sigma: float, block: int, limit: int, least: float) -> _Candidates:
     """Gains at every block of some regions, at one scale; the best of each square of blocks, the `limit` best of those.
 
-    `padded`, (R, C + 1, h, w), are the crops' planes, averaged over blocks, with `margin` blocks of zeros around them.
+    `planes`, (R, C + 1, h, w), are the crops' planes, averaged over blocks. Gains are positive, and at least `least`.
     """
-    # <g, e> and <g, g> of the blocks; g^2 is a Gaussian too, narrower by sqrt 2
-    inner = _inner_products(padded[:, :-1], sigma / block, margin).mul_(block**2)
-    norm = _inner_products(padded[:, -1], sigma / block / math.sqrt(2), margin).mul_(block**2)
-    inside = padded[:, -1, margin:-margin, margin:-margin] > 0
-    gain = inner.square().sum(1).div_(norm).where(inside, -1.0)
+    from .gains import find_best_places  # loads numba
+
     side = 2 if block == 1 or sigma / block >= _SIGMA_PER_BLOCK * math.sqrt(2) else 1
-    best, where = max_pool2d(gain, side, return_indices=True)
-    values = best.flatten().cpu().numpy()
-    positive = np.flatnonzero(values > 0)
-    strongest = positive[_strongest(values[positive], limit)]
-    crop = strongest // best[0].numel()
-    places = where.flatten()[torch.from_numpy(strongest).to(where.device)].cpu().numpy()
-    blocks = torch.from_numpy(crop * gain[0].numel() + places).to(gain.device)
-    rows, columns = np.divmod(places, gain.shape[2])
+    count, channels, height, width = planes.shape
+    shape, values = (count, height // side, width // side), planes.cpu().contiguous().numpy()
+    squares = (
+        np.empty(shape, values.dtype), np.empty(shape, np.int64), np.empty((*shape, channels - 1), values.dtype),
+        np.empty(shape, values.dtype),
+    )  # fmt: skip
+    # g^2 is a Gaussian too, narrower by sqrt 2
+    taps, norm_taps = (_window(width, values.dtype) for width in (sigma / block, sigma / block / math.sqrt(2)))
+    find_best_places(values, np.arange(count * shape[1]), taps, norm_taps, values.dtype.type(block**2), squares)
+    gains, places, products, norms = (part.reshape(-1, *part.shape[3:]) for part in squares)
+    positive = np.flatnonzero((gains > 0) & (gains >= least))
+    strongest = positive[_strongest(gains[positive], limit)]
+    crop, (rows, columns) = strongest // (shape[1] * shape[2]), np.divmod(places[strongest], width)
     return _Candidates(
         crops.regions[crop], crops.corners[crop, 1] + (columns + 0.5) * block,
-        crops.corners[crop, 0] + (rows + 0.5) * block, np.full(len(places), sigma), np.full(len(places), block),
-        inner.transpose(0, 1).flatten(1)[:, blocks].T.cpu().numpy(), norm.flatten()[blocks].cpu().numpy(),
-        values[strongest],
+        crops.corners[crop, 0] + (rows + 0.5) * block, np.full(len(crop), sigma), np.full(len(crop), block),
+        products[strongest], norms[strongest], gains[strongest],
     )  # fmt: skip
 
 
-def _inner_products(padded: Tensor, sigma: float, margin: int) -> Tensor:
-    """Inner products with exp(-0.5 d^2 / sigma^2) at every pixel inside the margin, (..., h, w)."""
-    reach = math.ceil(_REACH * sigma)
-    return blur(pad(padded, [reach - margin] * 4), gaussian_taps(sigma, reach))
+def _window(sigma: float, dtype: Any) -> Array:
+    """Values of exp(-0.5 d^2 / sigma^2) at pixels, the middle one at 0."""
+    half = gaussian_taps(sigma, math.ceil(_REACH * sigma))
+    return np.array([*half[:0:-1], *half], dtype)
 
 
 def _strongest(gain: Array, limit: int) -> NDArray[np.int64]:

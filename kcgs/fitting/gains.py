@@ -1,0 +1,98 @@
+"""The gains of round Gaussians of one size, in compiled loops."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba.extending import intrinsic
+
+from kcgs.kernels.compiled import Program, inner
+
+program = Program("matching pursuit", __file__)
+
+
+@intrinsic
+def _fma(typing_context, a, b, c):  # type: ignore[no-untyped-def]
+    """Return a * b + c, rounded once."""
+    return a(a, b, c), lambda context, builder, signature, arguments: builder.fma(*arguments)
+
+
+@inner
+def _blur_row(plane, y, left, right, taps, line, blurred):  # type: ignore[no-untyped-def]
+    """Blur row y of a plane, surrounded by zeros, from column `left` to `right`; `line` has zeros at both ends."""
+    reach, (height, width) = len(taps) // 2, plane.shape
+    first, last = max(left - reach, 0), min(right + reach, width)
+    middle = line[first + reach : last + reach]
+    middle[:] = 0.0
+    for t in range(max(reach - y, 0), min(height + reach - y, len(taps))):
+        tap, row = taps[t], plane[y + t - reach, first:last]
+        for x in range(len(middle)):
+            middle[x] = _fma(row[x], tap, middle[x])  # type: ignore[call-arg]
+    blurred[left:right] = 0.0
+    for t in range(len(taps)):
+        tap, row, target = taps[t], line[left + t : right + t], blurred[left:right]
+        for x in range(len(target)):
+            target[x] = _fma(row[x], tap, target[x])  # type: ignore[call-arg]
+
+
+@program.entry
+def find_best_places(planes, numbers, taps, norm_taps, area, squares):  # type: ignore[no-untyped-def]
+    """Find the place of the largest gain in each square of pixels, in some rows of squares.
+
+    Planes, (R, C + 1, h, w), are the residual and the mask of regions. Squares, numbered by row through all regions,
+    are gains, (R, H, W), -1 where there is none; places, y * w + x; and there <g, residual>, (R, H, W, C), and <g, g>.
+    Taps are those of g and g^2, for pixels of this area.
+    """
+    gains, places, products, norms = squares
+    channels, height, width = planes.shape[1] - 1, planes.shape[2], planes.shape[3]
+    side = height // gains.shape[1]
+    line, norm_line = np.zeros(width + len(taps), planes.dtype), np.zeros(width + len(norm_taps), planes.dtype)
+    gain, norm = np.empty((side, width), planes.dtype), np.empty((side, width), planes.dtype)
+    product = np.empty((channels, side, width), planes.dtype)
+    for number in numbers:
+        region, row = number // gains.shape[1], number % gains.shape[1]
+        for dy in range(side):
+            y = row * side + dy
+            gain[dy] = -1.0
+            left, right = _extent(planes[region, channels, y])
+            if left == right:
+                continue
+            for c in range(channels):
+                _blur_row(planes[region, c], y, left, right, taps, line, product[c, dy])
+            _blur_row(planes[region, channels], y, left, right, norm_taps, norm_line, norm[dy])
+            row_norm, row_gain = norm[dy, left:right], gain[dy, left:right]
+            _fill_gains(planes[region, channels, y, left:right], area, product[:, dy, left:right], row_norm, row_gain)
+        for col in range(gains.shape[2]):
+            best, best_dy, best_x = gain[0, col * side], 0, col * side
+            for dy in range(side):
+                for x in range(col * side, (col + 1) * side):
+                    if gain[dy, x] > best:
+                        best, best_dy, best_x = gain[dy, x], dy, x
+            gains[region, row, col] = best
+            places[region, row, col] = (row * side + best_dy) * width + best_x
+            norms[region, row, col] = norm[best_dy, best_x]
+            for c in range(channels):
+                products[region, row, col, c] = product[c, best_dy, best_x]
+
+
+@inner
+def _extent(mask):  # type: ignore[no-untyped-def]
+    """Return the first column of a row of a mask, and the end; equal where there is none."""
+    left, right = 0, len(mask)
+    while left < right and not mask[left] > 0.0:
+        left += 1
+    while left < right and not mask[right - 1] > 0.0:
+        right -= 1
+    return left, right
+
+
+@inner
+def _fill_gains(mask, area, products, norm, gain):  # type: ignore[no-untyped-def]
+    gain[:] = 0.0
+    for c in range(len(products)):
+        product = products[c]
+        for x in range(len(gain)):
+            product[x] *= area
+            gain[x] += product[x] * product[x]
+    for x in range(len(gain)):
+        norm[x] *= area
+        gain[x] = gain[x] / norm[x] if mask[x] > 0.0 else -1.0
