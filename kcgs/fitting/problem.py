@@ -85,7 +85,7 @@ def check_image_and_regions(image: Any, regions: object) -> tuple[Tensor, Region
             raise InvalidArgument("regions", expected, tuple(regions.labels.shape))
         regions = regions.to(image.device)
     dtype = torch.float64 if image.dtype == torch.float64 else torch.float32
-    return image.detach().to(dtype, copy=True), regions
+    return image.detach().to(dtype, copy=True, memory_format=torch.contiguous_format), regions
 
 
 def check_num_gaussians(value: object, image: Tensor) -> int:

@@ -202,9 +202,9 @@ def _step_colors(state: dict[str, Tensor], group: dict[str, Any]) -> None:
     colors, *opacities = group["params"]
     tables = [colors, *(alpha[..., None] for alpha in opacities)]
     gradients = [_gradient(colors), *(_gradient(alpha)[..., None] for alpha in opacities)]
-    _grow_older(state, colors, colors.shape[-1] + len(opacities))
+    _begin(state, colors, colors.shape[-1] + len(opacities))
     if loops := _compiled(*tables, *state.values()):
-        adam, column = loops.Adam(*_settings(group), *_arrays(*state.values())), 0
+        adam, column = loops.Adam(*_settings(group), *_arrays(*_tables(state))), 0
         for table, gradient in zip(tables, gradients, strict=True):
             loops.step_table(*_arrays(table, gradient), column, adam)
             column += table.shape[-1]
@@ -218,10 +218,11 @@ def _step_colors(state: dict[str, Tensor], group: dict[str, Any]) -> None:
 def _step_geometry(state: dict[str, Tensor], group: dict[str, Any]) -> None:
     means, cholesky = group["params"]
     gradients = [_gradient(means), _gradient(cholesky)]
-    _grow_older(state, means, 5)
+    _begin(state, means, 5)
     if loops := _compiled(means, cholesky, *state.values()):
-        adam = loops.Adam(*_settings(group), *_arrays(*state.values()))
-        bounds = loops.Bounds(group["max_step"], *group["size"], group["min_sigma"], _MIN_FACTOR, _MAX_OUTSIDE)
+        adam = loops.Adam(*_settings(group), *_arrays(*_tables(state)))
+        limits = group["max_step"], *group["size"], group["min_sigma"], _MIN_FACTOR, _MAX_OUTSIDE
+        bounds = loops.Bounds(*map(float, limits))
         moves = means.requires_grad, cholesky.requires_grad
         loops.step_geometry(*_arrays(means, cholesky, *gradients), moves, adam, bounds)
         increment_version([parameter for parameter in group["params"] if parameter.requires_grad])
@@ -249,8 +250,12 @@ def _arrays(*tensors: Tensor) -> list[Any]:
     return [t.detach().contiguous().numpy().reshape(-1, t.shape[-1]) for t in tensors]
 
 
-def _settings(group: dict[str, Any]) -> tuple[float, float, float, float]:
-    return float(group["lr"]), *group["betas"], group["eps"]
+def _settings(group: dict[str, Any]) -> Iterator[float]:
+    return map(float, (group["lr"], *group["betas"], group["eps"]))
+
+
+def _tables(state: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    return state["age"], state["average"], state["square"]
 
 
 def _check_gradient(gradient: Tensor | None) -> None:
@@ -270,19 +275,18 @@ def _gradient(parameter: Tensor) -> Tensor:
     return torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
 
 
-def _grow_older(state: dict[str, Tensor], parameter: Tensor, columns: int) -> None:
-    """Begin the averages of a table (..., N, columns), or go on with them; each row has an age of its own."""
+def _begin(state: dict[str, Tensor], parameter: Tensor, columns: int) -> None:
+    """Make the averages of a table (..., N, columns), if there are none; each row has an age of its own."""
     if not state:
-        shape = parameter.shape[:-1]
-        state["age"] = parameter.new_zeros(*shape, 1)
-        state["average"], state["square"] = (parameter.new_zeros(*shape, columns) for _ in range(2))
-    state["age"] += 1
+        for name, width in {"age": 1, "average": columns, "square": columns}.items():
+            state[name] = parameter.new_zeros(*parameter.shape[:-1], width)
 
 
 def _adam(state: dict[str, Tensor], gradient: Tensor, group: dict[str, Any]) -> Tensor:
     """Update the averages of a table (..., N, K), and return Adam's step."""
     beta1, beta2 = group["betas"]
-    age, average, square = state["age"], state["average"], state["square"]
+    age, average, square = _tables(state)
+    age += 1
     average.lerp_(gradient, 1 - beta1)
     square.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
     scale = (square / (1 - beta2**age)).sqrt_().add_(group["eps"])

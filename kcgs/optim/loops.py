@@ -87,6 +87,7 @@ def step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, ada
     age, corrections = 0.0, (0.0, 0.0)
     diagonal = math.hypot(bounds.height, bounds.width)
     for i in range(len(means)):
+        adam.age[i, 0] += 1
         if adam.age[i, 0] != age:
             age = np.float64(adam.age[i, 0])
             corrections = _corrections(adam, age)
@@ -117,9 +118,11 @@ def step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, ada
 
 @program.entry
 def step_table(table, gradient, column, adam):  # type: ignore[no-untyped-def]
-    """Move a table whose averages begin at a column."""
+    """Move a table whose averages begin at a column; the first one makes the averages older."""
     age, corrections = 0.0, (0.0, 0.0)
     for i in range(len(table)):
+        if column == 0:
+            adam.age[i, 0] += 1
         if adam.age[i, 0] != age:
             age = np.float64(adam.age[i, 0])
             corrections = _corrections(adam, age)

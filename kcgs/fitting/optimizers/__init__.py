@@ -34,9 +34,7 @@ def make_optimizer(config: FitConfig, field: GaussianField, sigma: float) -> Gau
         return GaussianImageAdan(field, sigma, config.usual_iterations, factor)
     if config.optimizer == "adam":
         return ImageGSAdam(field, factor)
-    # as tensors, rates are rounded as the Gaussians are
-    lr, color_lr = field.means.detach().new_tensor([LEARNING_RATE, COLOR_LEARNING_RATE]) * factor
-    optimizer = GaussianAdam(field, lr, color_lr=color_lr)
+    optimizer = GaussianAdam(field, LEARNING_RATE * factor, color_lr=COLOR_LEARNING_RATE * factor)
     for group in optimizer.param_groups:
         group["initial_lr"] = group["lr"]
     return optimizer
