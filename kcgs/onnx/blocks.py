@@ -43,42 +43,55 @@ class BlockRenderer:
         self.across = across
         self.cutoff = cutoff
         self.pixels = across.side * down.side  # P
+        self.pieces = across.pieces * down.pieces  # blocks of a tile, Q
         self.monomials = monomials(storage.graph, across.steps, down.steps)  # [6, P]
         self.shifts = self._make_shifts()
 
     def image(self, membership: MembershipSampler | None, grids: CoarseGrids | None) -> Value:
-        """Render the image, (1, C, H, W); memberships are needed where any tile has several regions."""
-        g, groups, channels = self.graph, self.storage.plan.pixel_groups, self.storage.channels
+        """Render the image, (1, C, H, W) and pixels to spare; memberships are needed where a tile has several regions.
+
+        All that is known of the tiles is computed at loading, if all of the scene is rendered.
+        """
+        g, groups = self.graph, self.storage.plan.pixel_groups
         tile = g.Unsqueeze(self.down.tile * self.storage.plan.tiles.cols, [1]) + self.across.tile
         tile = g.Reshape(tile, [-1])
-        group_of_block = g.Min(self.storage.slots.group[tile].astype(INT64), len(groups))
+        group_of_tile = g.Min(self.storage.slots.group[tile].astype(INT64), len(groups))
         slots = self.storage.slots.slot[tile].astype(INT64)
-        order, starts, stops, index = self._sort(group_of_block, len(groups))
+        order, starts, stops, index = self._sort(group_of_tile, len(groups))
         rendered = []
         for number, group in enumerate(groups):
-            blocks = g.Slice(order, starts[number], stops[number], [0])
-            slot = g.Min(slots[blocks], len(group.tiles) - 1)
-            rendered.append(self._render_group(number, blocks, slot, membership, grids))
-        # one black block for all that nothing reaches
-        rendered.append(g.Expand(np.float32(0), g.Concat([1, channels], self.pixels, axis=0)))
-        return self._join(g.Concat(*rendered, axis=0), index, grids)
+            tiles = g.Slice(order, starts[number], stops[number], [0])
+            slot = g.Min(slots[tiles], len(group.tiles) - 1)
+            rendered.append(self._render_group(number, tiles, slot, membership, grids))
+        # a black tile for all that nothing reaches
+        shape = g.Concat([1], self.pieces, [self.storage.channels], self.pixels, axis=0)
+        rendered.append(g.Expand(np.float32(0), shape))
+        image = self._join(g.Concat(*rendered, axis=0), index)
+        if grids is not None:
+            image = image + self._shape(grids.image())
+        return image
 
     def _make_shifts(self) -> Value:
-        """Make what turns coefficients around a tile's centre into those around each block's middle, (NB, 6, 6)."""
-        g = self.graph
-        sides = g.Concat(self.down.blocks, self.across.blocks, [1], axis=0)
-        x = g.Expand(g.Reshape(self.across.origins, [1, -1, 1]), sides)
-        y = g.Expand(g.Reshape(self.down.origins, [-1, 1, 1]), sides)
-        powers = g.Reshape(g.Concat(x, y, x * x, x * y, y * y, axis=2), [-1, 5])
+        """Make what turns coefficients around a tile's centre into those around its blocks' middles, (V, Q, 6, 6)."""
+        g, (down, across) = self.graph, (self.down, self.across)
+        sides = g.Concat(
+            *(g.Shape(axis.origins, start=k, end=k + 1) for k in (0, 1) for axis in (down, across)), axis=0
+        )
+        x, y = (
+            g.Reshape(g.Expand(g.Unsqueeze(axis.origins, axes), sides), [-1, 1])
+            for axis, axes in ((across, [0, 2]), (down, [1, 3]))
+        )
+        powers = g.Concat(x, y, x * x, x * y, y * y, axis=1)
         basis = np.zeros((5, 6, 6), np.float32)
         for factor, there, here, count in _SHIFT:
             basis[factor, there, here] = count
-        return g.Reshape(powers @ basis.reshape(5, 36), [-1, 6, 6]) + np.eye(6, dtype=np.float32)
+        shifts = powers @ basis.reshape(5, 36) + np.eye(6, dtype=np.float32).ravel()
+        return g.Reshape(shifts, g.Concat([-1], self.pieces, [6, 6], axis=0))
 
     def _sort(self, group: Value, count: int) -> tuple[Value, list[Value], list[Value], Value]:
-        """Sort blocks by group, (NB,); return them, one to spare, groups' begins, their ends, where each is rendered.
+        """Sort tiles by group, (V,); return them, one to spare, groups' begins, their ends, where each is rendered.
 
-        A group without a block renders one that the image leaves out: not every runtime takes tensors without elements.
+        A group without a tile renders one that the image leaves out: not every runtime takes tensors without elements.
         """
         g = self.graph
         total = g.Shape(group)
@@ -94,55 +107,51 @@ class BlockRenderer:
         return order, begins, ends, index
 
     def _render_group(
-        self, number: int, blocks: Value, slots: Value, membership: MembershipSampler | None, grids: CoarseGrids | None
+        self, number: int, tiles: Value, slots: Value, membership: MembershipSampler | None, grids: CoarseGrids | None
     ) -> Value:
-        """Render blocks (B,) of a group, (B, C, P); `slots`, (B,), are their tiles by place in the group."""
+        """Render tiles (T,) of a group, (T, Q, C, P); `slots`, (T,), are their places in the group."""
         g, entries = self.graph, self.storage.entries[number]
         group, regions = entries.group, None
         if group.regions > 1:
             regions = pack_integers(g, _regions_of_tiles(self.storage.plan.tiles, group))
-        colors = entries.shaped_colors(regions)
-        coefficients = entries.shaped_coefficients()[slots]  # [B, L, 6]
-        exponent = (self._squares if group.narrow else self._polynomial)(coefficients, blocks)
-        values = colors[slots] @ weigh(g, exponent, self.cutoff)  # [B, K * C, P]
+        colors = g.Unsqueeze(entries.shaped_colors(regions)[slots], [1])
+        coefficients = g.Unsqueeze(entries.shaped_coefficients()[slots], [1])  # [T, 1, L, 6]
+        exponent = (self._squares if group.narrow else self._polynomial)(coefficients, self.shifts[tiles])
+        values = colors @ weigh(g, exponent, self.cutoff)  # [T, Q, K * C, P]
         if membership is None or regions is None:
             return values
-        row, col = blocks // self.across.blocks, blocks % self.across.blocks
+        columns = g.Shape(self.across.tile)
+        row, col = tiles // columns, tiles % columns
+        values = g.Reshape(values, [0, 0, group.regions, self.storage.channels, -1])
         if grids is not None:
             values = values + grids.blocks(entries, regions, slots, row, col)
-        values = g.Reshape(values, [0, group.regions, self.storage.channels, -1])
-        return g.ReduceSum(values * membership.blocks(number, slots, row, col), [1], keepdims=0)
+        return g.ReduceSum(values * membership.blocks(number, group, slots, row, col), [2], keepdims=0)
 
-    def _polynomial(self, coefficients: Value, blocks: Value) -> Value:
+    def _polynomial(self, coefficients: Value, shifts: Value) -> Value:
         """Log w as coefficients times monomials."""
-        return coefficients @ self.shifts[blocks] @ self.monomials
+        return coefficients @ shifts @ self.monomials
 
-    def _squares(self, coefficients: Value, blocks: Value) -> Value:
+    def _squares(self, coefficients: Value, shifts: Value) -> Value:
         """Log w as a sum of squares, which no rounding of large coefficients harms."""
         g, three = self.graph, self.graph.constant([3])
-        shift = g.Slice(self.shifts[blocks], [0, 0], [3, 3], [1, 2])
+        shifts = g.Slice(shifts, [0, 0], [3, 3], [2, 3])
         linear = g.Slice(self.monomials, [0], three, [0])
-        z1, z2 = (part @ shift @ linear for part in g.split(coefficients, [3, 3], axis=2))
+        z1, z2 = (part @ shifts @ linear for part in g.split(coefficients, [3, 3], axis=3))
         return -(z1 * z1 + z2 * z2)
 
-    def _join(self, blocks: Value, index: Value, grids: CoarseGrids | None) -> Value:
-        """Join the blocks (n, C, P), and add the coarse grids; then leave out the pixels to spare."""
+    def _join(self, blocks: Value, index: Value) -> Value:
+        """Join the blocks of all tiles, (n, Q, C, P), to an image with pixels to spare; tile k is at `index`."""
         g, down, across, channels = self.graph, self.down, self.across, self.storage.channels
-        # stretches of memory: of a block's channel and column, all its rows
-        stretches = g.Reshape(blocks, g.Concat([-1], down.side, axis=0))
-        area = across.side * np.array([channels])
-        first = g.Reshape(index, g.Concat(down.blocks, across.blocks, axis=0)) * area
-        first = g.Gather(first, across.place // across.side, axis=1) + across.place % across.side
-        channel = np.arange(channels)[:, None]
-        stretch = g.Unsqueeze(first, [1]) + g.constant(channel) * across.side
-        image = stretches[stretch]  # [blocks, C, width, side]: blocks are read one row of them at a time
-        image = g.Transpose(image, perm=[0, 1, 3, 2])
-        if grids is not None:
-            image = image + grids.image()
-        image = g.Reshape(image, g.Concat([-1], across.size, axis=0))
-        place = down.place // down.side * channels + channel
-        place = place * down.side + down.place % down.side
-        return image[g.Unsqueeze(place, [0])]
+        first = g.Reshape(index * self.pieces, g.Concat([-1, 1], g.Shape(across.tile), [1], axis=0))
+        piece = g.Reshape(g.Range(0, g.Squeeze(self.pieces), 1), g.Concat(down.pieces, [1], across.pieces, axis=0))
+        place = (first + piece) * channels  # [tile row, piece, tile column, piece]
+        place = place + g.constant(np.arange(channels).reshape(-1, 1, 1, 1, 1))
+        blocks = g.Reshape(blocks, g.Concat([-1], self.pixels, axis=0))[place]
+        columns = g.Reshape(blocks, g.Concat([channels, -1], across.padded, down.side, axis=0))
+        return self._shape(g.Transpose(columns, perm=[0, 1, 3, 2]))
+
+    def _shape(self, image: Value) -> Value:
+        return self.graph.Reshape(image, self.graph.Concat([1, self.storage.channels, -1], self.across.padded, axis=0))
 
 
 def _regions_of_tiles(tiles: Tiles, group: Group) -> Integers:

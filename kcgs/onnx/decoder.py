@@ -72,7 +72,7 @@ def scene_decoder(
     blocks = BlockRenderer(storage, down, across, cutoff)
     membership = None if regions is None else make_membership(storage, regions, down, across, crisp)
     grids = None if storage.table is None else CoarseGrids(storage, storage.table, down, across, cutoff)
-    image = _shrink(g, blocks.image(membership, grids), down, across)
+    image = _crop(g, blocks.image(membership, grids), down, across)
     if clamp:
         image = g.Clip(image, 0.0, 1.0)
     return g.close(
@@ -100,9 +100,21 @@ def _inputs(g: Graph, scene: Scene, interactive: bool) -> tuple[Axis, Axis, Valu
     return make_axis(g, rows, height, (top, bottom)), make_axis(g, cols, width, (left, right)), visible
 
 
-def _shrink(g: Graph, image: Value, down: Axis, across: Axis) -> Value:
-    """Reduce an image that was rendered larger than the output; leave others as they are."""
-    smaller = g.body("smaller", lambda: [across.shrink(down.shrink(image, 2), 3)])
-    same = g.body("as_it_is", lambda: [g.Identity(image)])
-    condition = g.Or(*(g.Less(axis.output, axis.size) for axis in (down, across)))
-    return g.If(condition, then_branch=smaller, else_branch=same)
+def _crop(g: Graph, image: Value, down: Axis, across: Axis) -> Value:
+    """Leave out pixels to spare, and reduce an image that was rendered larger than the output."""
+
+    def crop() -> list[Value]:
+        return [g.Slice(image, [0, 0], g.Concat(down.size, across.size, axis=0), [2, 3])]
+
+    def crop_uneven() -> list[Value]:
+        rows = g.Gather(image, down.places(), axis=2)
+        columns = g.Gather(g.Transpose(rows, perm=[0, 1, 3, 2]), across.places(), axis=2)
+        return [g.Transpose(columns, perm=[0, 1, 3, 2])]
+
+    def reduce() -> list[Value]:
+        smaller = g.body("smaller", lambda: [across.shrink(down.shrink(image, 2), 3)])
+        return [g.If(is_smaller, then_branch=smaller, else_branch=g.body("uneven", crop_uneven))]
+
+    is_smaller = g.Or(*(g.Less(axis.output, axis.size) for axis in (down, across)))
+    is_plain = g.And(g.And(down.is_even(), across.is_even()), g.Not(is_smaller))
+    return g.If(is_plain, then_branch=g.body("plain", crop), else_branch=g.body("reduced", reduce))

@@ -146,6 +146,7 @@ class Graph:
     If = Operator(FLOAT)  # branches return images
     Less = Operator(BOOL)
     LessOrEqual = Operator(BOOL)
+    Log = Operator()
     Loop = Operator(FLOAT)  # its turns return parts of an image
     MatMul = Operator()
     Max = Operator()
@@ -153,6 +154,7 @@ class Graph:
     Mod = Operator()
     Mul = Operator()
     Neg = Operator()
+    Not = Operator()
     Or = Operator()
     Pad = Operator()
     Pow = Operator()

@@ -10,7 +10,7 @@ import numpy as np
 
 from kcgs.kernels.tiles import TILE
 
-from .axis import NODES, Axis
+from .axis import NODES, Axis, Interpolator
 from .entries import Entries, Storage
 from .graph import FLOAT, INT32, Value
 from .packing import pack_runs
@@ -32,39 +32,34 @@ class CoarseGrids:
         self.table = table
         self.down = down
         self.across = across
-        self.across_spline = across.spline()  # [blocks, side, NODES]
         self.down_spline = down.spline()
+        self.places = Interpolator(down, across, self.down_spline, across.spline(), NODES)
         self.quarters = self._refine(self._evaluate(cutoff))  # [4 n + 1, C, 8, 8], of the finest grid's blocks
 
     def image(self) -> Value:
-        """Sample tiles of one region, (blocks, C, side, width); the others are zero."""
+        """Sample tiles of one region, (C, V, pieces * side, width) with pixels to spare; the others are zero."""
         g, tiles, channels = self.graph, self.storage.plan.tiles, self.storage.channels
         no_region = self.table.nodes.no_region
         regions = [no_region if number in tiles.windows else ids[0] for number, ids in enumerate(tiles.regions)]
         region = pack_runs(g, np.array(regions))
         values = self._window(region, g.Range(np.int32(0), np.int32(len(regions)), np.int32(1)))
         values = g.Reshape(values, [tiles.rows, tiles.cols, -1, NODES, NODES])
-        # [tile column, node, (tile row, C, node)]: what is beyond the tile column is multiplied at once
-        values = g.Transpose(values, perm=[1, 3, 0, 2, 4])
-        values = g.Reshape(values, [tiles.cols, NODES, -1])
-        columns = self.across_spline @ values[self.across.tile]  # [blocks, side, (tile row, C, node)]
-        columns = g.Reshape(columns, [-1, tiles.rows * channels * NODES])
-        columns = g.Transpose(columns[self.across.place], perm=[1, 0])
-        shape = g.Concat([tiles.rows, channels, NODES], self.across.size, axis=0)
-        columns = g.Reshape(columns, shape)[self.down.tile]  # [blocks, C, node, width]
-        return g.Unsqueeze(self.down_spline, [1]) @ columns
+        values = g.Gather(values[self.down.tile], self.across.tile, axis=1)
+        # [tile column, node, (C, tile row, node)]: what is beyond the tile column is multiplied at once
+        values = g.Transpose(values, perm=[1, 3, 2, 0, 4])
+        values = g.Reshape(values, g.Concat(g.Shape(self.across.tile), [NODES, -1], axis=0))
+        columns = g.Reshape(self.places.columns, [0, -1, NODES]) @ values
+        columns = g.Transpose(g.Flatten(columns, axis=2), perm=[1, 0])  # [(C, tile row, node), width]
+        columns = g.Reshape(columns, g.Concat([channels, -1, NODES], self.across.padded, axis=0))
+        return g.Reshape(self.down_spline, [0, -1, NODES]) @ columns
 
     def blocks(self, entries: Entries, regions: Value, slots: Value, row: Value, col: Value) -> Value:
-        """Sample blocks (B,) of tiles with several regions, (T, K), to (B, K * C, P), column by column."""
-        g, group = self.graph, entries.group
+        """Sample the blocks of tiles with several regions, (T, K), to (T, blocks, K, C, P), column by column."""
+        g, group, channels = self.graph, entries.group, self.storage.channels
         tile = g.Reshape(g.Expand(g.Unsqueeze(entries.tiles, [1]), g.Shape(regions)), [-1])
         region = g.Min(g.Reshape(regions, [-1]), np.int32(self.table.nodes.no_region))
-        count = group.regions * self.storage.channels
-        values = g.Reshape(self._window(region, tile), [len(group.tiles), count * NODES, NODES])
-        rows = values[slots] @ g.Transpose(self.down_spline, perm=[0, 2, 1])[row]
-        rows = g.Reshape(rows, g.Concat([0, count, NODES], self.down.side, axis=0))
-        image = g.Unsqueeze(self.across_spline[col], [1]) @ rows
-        return g.Reshape(image, [0, count, -1])
+        windows = g.Reshape(self._window(region, tile), [len(group.tiles), -1, NODES, NODES])
+        return self.places.blocks(windows[slots], row, col, (group.regions, channels))
 
     def _window(self, region: Value, tile: Value) -> Value:
         """Return the nodes that tiles (n,) read, (n, C, column, row); those of hidden regions are zero."""
