@@ -19,6 +19,11 @@ Labels = NDArray[np.int32]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+# sides of the boxes that are rendered, in pixels, are multiples of it
+_BOX_UNIT = 16
+# pixels of boxes that are rendered at once
+_BATCH_PIXELS = 1 << 20
+
 
 def index_map(regions: RegionMap, labels: Tensor) -> Labels:
     """Return the position of each label among the map's ids, (H, W); -1 for a label that the map lacks."""
@@ -53,26 +58,28 @@ class RegionCosts:
     def __init__(self, scene: Scene, image: Tensor, boxes: Ints, pad: int, sigma: float, backend: str) -> None:
         field, regions = scene.field, scene.regions
         assert regions is not None and field.region_ids is not None
-        owners = regions.index_of(field.region_ids)
-        colors = field.merged_colors()
-        margin = math.ceil(4 * sigma)
-        parts = []
-        for region, (top, bottom, left, right) in enumerate(boxes.tolist()):
-            y, x = max(0, top - margin), max(0, left - margin)
-            target = image[:, y : bottom + margin, x : right + margin]
-            if top < bottom:
-                members = (owners == region).nonzero().flatten()
-                means = field.means[members] - field.means.new_tensor([x, y])
-                size = (target.shape[1], target.shape[2])
-                rendered = region_splat(means, field.cholesky[members], colors[members], size=size, backend=backend)
-                error = _mean_around((rendered - target).square_().mean(0), sigma)
-                parts.append(error[top - y : bottom - y, left - x : right - x].cpu().numpy().ravel())
-        self._values = np.concatenate(parts)
-        self._stride = image.shape[2] + 2 * pad
+        owners, order = regions.index_of(field.region_ids).sort(stable=True)
+        first = torch.searchsorted(owners, torch.arange(len(boxes) + 1, device=owners.device))
+        gaussians = tuple(values[order] for values in (field.means, field.cholesky, field.merged_colors()))
+        self._stride, self._start = image.shape[2] + 2 * pad, np.zeros(len(boxes), np.int64)
         self._top, self._bottom, self._left, self._right = np.ascontiguousarray(boxes.T + pad)
-        self._width = self._right - self._left
-        sizes = (self._bottom - self._top) * self._width
-        self._start = np.cumsum(sizes) - sizes
+        margin = math.ceil(4 * sigma)
+        planes = torch.nn.functional.pad(
+            torch.cat([image, torch.ones_like(image[:1])]), [margin, margin + _BOX_UNIT] * 2
+        )
+        # boxes of about the same size are rendered as one batch
+        sizes = -(-(boxes[:, 1::2] - boxes[:, ::2]) // _BOX_UNIT) * _BOX_UNIT
+        self._width, parts, end = sizes[:, 1], [], 0
+        for size in np.unique(sizes[sizes.all(1)], axis=0):
+            group = np.flatnonzero((sizes == size).all(1))
+            count = max(1, _BATCH_PIXELS // size.prod())
+            for members in np.split(group, range(count, len(group), count)):
+                corners = torch.from_numpy(boxes[members, ::2]).to(image.device)
+                batch = _pad_rows(gaussians, *(first[torch.from_numpy(members + k)] for k in (0, 1)))
+                parts.append(_region_errors(batch, planes, corners, size.tolist(), sigma, backend).cpu().numpy())
+                self._start[members] = end + np.arange(len(members)) * size.prod()
+                end += parts[-1].size
+        self._values = np.concatenate([part.ravel() for part in parts])
 
     def of(self, pixels: Ints, region: Labels) -> Floats:
         """Return the costs of pixels in regions, infinite outside a region's box."""
@@ -83,11 +90,29 @@ class RegionCosts:
         return np.where(inside, self._values[np.where(inside, place, 0)].astype(np.float64), np.inf)
 
 
-def _mean_around(error: Tensor, sigma: float) -> Tensor:
-    """Blur (h, w), normalised at the borders."""
-    radius = math.ceil(4 * sigma)
-    padded = torch.nn.functional.pad(torch.stack([error, torch.ones_like(error)]), [radius] * 4)
-    total, within = blur(padded, gaussian_taps(sigma, radius))
+def _pad_rows(gaussians: tuple[Tensor, ...], first: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Make a batch of the rows from first to end, (B,), as long as the longest; what follows the end has no colour."""
+    means, cholesky, colors = gaussians
+    rows = first[:, None] + torch.arange(max(1, int((end - first).max())), device=first.device)
+    is_member, rows = (rows < end[:, None])[:, :, None], rows.clamp_max(len(means) - 1)
+    return means[rows], cholesky[rows], colors[rows] * is_member
+
+
+def _region_errors(
+    batch: tuple[Tensor, Tensor, Tensor], planes: Tensor, corners: Tensor, size: list[int], sigma: float, backend: str
+) -> Tensor:
+    """Blurred squared error of each scene of a batch in boxes of one size, (B, h, w), at corners (B, 2), row first.
+
+    Planes, (C + 1, H, W), are the image and a mask of its pixels, with a margin.
+    """
+    means, cholesky, colors = batch
+    margin = math.ceil(4 * sigma)
+    height, width = (side + 2 * margin for side in size)
+    shift = (corners.flip(1) - margin)[:, None].to(means)
+    rendered = region_splat(means - shift, cholesky, colors, size=(height, width), backend=backend)
+    crops = torch.stack([planes[:, y : y + height, x : x + width] for y, x in corners.tolist()])
+    error = (rendered - crops[:, :-1]).square_().mean(1) * crops[:, -1]
+    total, within = blur(torch.stack([error, crops[:, -1]]), gaussian_taps(sigma, margin))
     mean: Tensor = total / within
     return mean
 
