@@ -5,10 +5,8 @@ from __future__ import annotations
 import copy
 import math
 
-import numpy as np
 from torch import Tensor
 
-from kcgs.kernels.compiled import Program
 from kcgs.scene import Scene
 
 from .result import HistoryEntry
@@ -16,8 +14,6 @@ from .state import FitState
 
 # about how many entries a history has
 _HISTORY_LENGTH = 100
-
-program = Program("measurement of a fit", __file__)
 
 
 def log_is_due(state: FitState, seconds: float) -> bool:
@@ -45,25 +41,14 @@ def log(state: FitState, rendered: Tensor, seconds: float, scene: Scene | None =
 
 def _measure(rendered: Tensor, image: Tensor, is_squared: bool, band: Tensor | None) -> tuple[float, float, float]:
     """Return the loss, then the mean squared errors of the clipped render: everywhere, and in the band, or NaN."""
+    from .measurement import mean_errors  # loads numba
+
     rows = (t.cpu().numpy().reshape(-1, t.shape[-1]) for t in (rendered, image))
-    loss, error = _mean_errors(*rows, is_squared)
+    loss, error = mean_errors(*rows, is_squared)
     if band is None:
         return loss, error, math.nan
     values, targets = (t.flatten(1).index_select(1, band) for t in (rendered, image))
     return loss, error, float((values.clamp(0.0, 1.0) - targets).square().mean())
-
-
-@program.entry
-def _mean_errors(rendered, image, is_squared):  # type: ignore[no-untyped-def]
-    """Return the mean error of rows (R, W), absolute or squared, and the mean squared error of the clipped render."""
-    loss, squares = np.zeros((2, rendered.shape[1]))
-    for y in range(len(rendered)):
-        for x in range(rendered.shape[1]):
-            difference = rendered[y, x] - image[y, x]
-            loss[x] += difference * difference if is_squared else abs(difference)
-            difference = min(max(rendered[y, x], rendered.dtype.type(0)), rendered.dtype.type(1)) - image[y, x]
-            squares[x] += difference * difference
-    return loss.sum() / rendered.size, squares.sum() / rendered.size
 
 
 def _decibel(mean_square: float) -> float:

@@ -202,15 +202,15 @@ def _step_colors(state: dict[str, Tensor], group: dict[str, Any]) -> None:
     colors, *opacities = group["params"]
     tables = [colors, *(alpha[..., None] for alpha in opacities)]
     gradients = [_gradient(colors), *(_gradient(alpha)[..., None] for alpha in opacities)]
-    _begin(state, colors, colors.shape[-1] + len(opacities))
-    if loops := _compiled(*tables, *state.values()):
-        adam, column = loops.Adam(*_settings(group), *_arrays(*_tables(state))), 0
-        for table, gradient in zip(tables, gradients, strict=True):
-            loops.step_table(*_arrays(table, gradient), column, adam)
-            column += table.shape[-1]
+    gradient = torch.cat(gradients, -1) if opacities else gradients[0]
+    _begin(state, colors, gradient.shape[-1])
+    if _is_compiled(*tables, *state.values()):
+        from . import loops  # loads numba
+
+        loops.step_tables(tuple(_rows(*tables)), *_rows(gradient), loops.Adam(*_settings(group), *_averages(state)))
         increment_version(group["params"])
         return
-    change = _adam(state, torch.cat(gradients, -1), group)
+    change = _adam(state, gradient, group)
     for table, part in zip(tables, change.split([table.shape[-1] for table in tables], -1), strict=True):
         table.add_(part)
 
@@ -219,12 +219,13 @@ def _step_geometry(state: dict[str, Tensor], group: dict[str, Any]) -> None:
     means, cholesky = group["params"]
     gradients = [_gradient(means), _gradient(cholesky)]
     _begin(state, means, 5)
-    if loops := _compiled(means, cholesky, *state.values()):
-        adam = loops.Adam(*_settings(group), *_arrays(*_tables(state)))
+    if _is_compiled(means, cholesky, *state.values()):
+        from . import loops  # loads numba
+
         limits = group["max_step"], *group["size"], group["min_sigma"], _MIN_FACTOR, _MAX_OUTSIDE
-        bounds = loops.Bounds(*map(float, limits))
         moves = means.requires_grad, cholesky.requires_grad
-        loops.step_geometry(*_arrays(means, cholesky, *gradients), moves, adam, bounds)
+        adam, bounds = loops.Adam(*_settings(group), *_averages(state)), loops.Bounds(*map(float, limits))
+        loops.step_geometry(*_rows(means, cholesky, *gradients), moves, adam, bounds)
         increment_version([parameter for parameter in group["params"] if parameter.requires_grad])
         return
     step = _adam(state, local_gradient(cholesky, *gradients), group).clamp(-group["max_step"], group["max_step"])
@@ -234,18 +235,14 @@ def _step_geometry(state: dict[str, Tensor], group: dict[str, Any]) -> None:
             parameter.copy_(values)
 
 
-def _compiled(*tensors: Tensor) -> Any:
-    """Return the compiled loops, where they can change tensors in place; else None."""
-    if torch.compiler.is_compiling() or not all(
-        t.dtype == torch.float32 and t.device.type == "cpu" and t.is_contiguous() for t in tensors
-    ):
-        return None
-    from . import loops
-
-    return loops
+def _is_compiled(*tensors: Tensor) -> bool:
+    """True where compiled loops may read and change the memory of tensors."""
+    return not torch.compiler.is_compiling() and all(
+        t.dtype is torch.float32 and t.is_cpu and t.is_contiguous() for t in tensors
+    )
 
 
-def _arrays(*tensors: Tensor) -> list[Any]:
+def _rows(*tensors: Tensor) -> list[Any]:
     """Return arrays (N, K) of tensors (..., N, K), in the same memory where that is contiguous."""
     return [t.detach().contiguous().numpy().reshape(-1, t.shape[-1]) for t in tensors]
 
@@ -254,15 +251,17 @@ def _settings(group: dict[str, Any]) -> Iterator[float]:
     return map(float, (group["lr"], *group["betas"], group["eps"]))
 
 
-def _tables(state: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    return state["age"], state["average"], state["square"]
+def _averages(state: dict[str, Tensor]) -> list[Any]:
+    return _rows(state["age"], state["average"], state["square"])
 
 
 def _check_gradient(gradient: Tensor | None) -> None:
     if gradient is None:
         return
-    if loops := _compiled(gradient):
-        finite = loops.is_finite(gradient.numpy().ravel())
+    if _is_compiled(gradient):
+        from . import loops  # loads numba
+
+        finite = loops.is_within(gradient.numpy().ravel(), math.inf)
     else:
         finite = verify(gradient.isfinite().all(), "gradients must be finite")
     if not finite:
@@ -285,7 +284,7 @@ def _begin(state: dict[str, Tensor], parameter: Tensor, columns: int) -> None:
 def _adam(state: dict[str, Tensor], gradient: Tensor, group: dict[str, Any]) -> Tensor:
     """Update the averages of a table (..., N, K), and return Adam's step."""
     beta1, beta2 = group["betas"]
-    age, average, square = _tables(state)
+    age, average, square = state["age"], state["average"], state["square"]
     age += 1
     average.lerp_(gradient, 1 - beta1)
     square.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
