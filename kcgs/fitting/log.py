@@ -28,27 +28,18 @@ def log_is_due(state: FitState, seconds: float) -> bool:
 
 def log(state: FitState, rendered: Tensor, seconds: float, scene: Scene | None = None) -> None:
     """Measure a render of the state's scene, or of another, and keep a copy of the scene if it is the best so far."""
+    from .measurement import mean_errors  # loads numba
+
     scene, problem = scene or state.scene, state.problem
     rendered = rendered.detach()
-    loss, error, band_error = _measure(rendered, problem.image, problem.config.loss == "l2", problem.band)
+    arrays = [t.cpu().numpy() for t in (rendered, problem.image, problem.band)]
+    loss, error, band_error = mean_errors(*arrays, problem.config.loss == "l2")
     psnr, ef_psnr = _decibel(error), _decibel(band_error)
     state.history.append(HistoryEntry(state.iteration, seconds, loss, psnr, ef_psnr, scene.num_gaussians))
     objective = problem.objective
     score = psnr if objective is None else _decibel(objective.value(rendered.clamp(0.0, 1.0) - problem.image))
     if score > state.best_score:
         state.best_score, state.best = score, Scene(copy.deepcopy(scene.field), scene.regions)
-
-
-def _measure(rendered: Tensor, image: Tensor, is_squared: bool, band: Tensor | None) -> tuple[float, float, float]:
-    """Return the loss, then the mean squared errors of the clipped render: everywhere, and in the band, or NaN."""
-    from .measurement import mean_errors  # loads numba
-
-    rows = (t.cpu().numpy().reshape(-1, t.shape[-1]) for t in (rendered, image))
-    loss, error = mean_errors(*rows, is_squared)
-    if band is None:
-        return loss, error, math.nan
-    values, targets = (t.flatten(1).index_select(1, band) for t in (rendered, image))
-    return loss, error, float((values.clamp(0.0, 1.0) - targets).square().mean())
 
 
 def _decibel(mean_square: float) -> float:

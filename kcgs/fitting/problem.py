@@ -48,12 +48,11 @@ class Problem:
         return float(((self.image == 0.0) | (self.image == 1.0)).float().mean()) >= _SATURATED_SHARE
 
     @cached_property
-    def band(self) -> Tensor | None:
-        """Positions of the pixels near a contour of the user's map, for EF-PSNR; None without contours."""
+    def band(self) -> Tensor:
+        """Rows and columns (M, 2) of the pixels near a contour of the user's map, for EF-PSNR."""
         if self.regions is None:
-            return None
-        pixels = edge_band(self.regions.labels).flatten().nonzero().flatten()
-        return pixels if len(pixels) else None
+            return torch.empty(0, 2, dtype=torch.int64)
+        return edge_band(self.regions.labels).nonzero().contiguous()
 
     @property
     def chooses_softness(self) -> bool:
