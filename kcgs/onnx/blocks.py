@@ -18,18 +18,18 @@ from .packing import pack_integers
 from .tiles import Tiles
 from .weights import monomials, weigh
 
-# what the monomials 1, x, y, xx, xy, yy at (x + a, y + b) have besides those at (x, y): place of the factor among a, b,
-# aa, ab, bb, the monomial there, the monomial here, and how often
+# what the monomials 1, x, y, xx, xy, yy at (x + a, y + b) have besides those at (x, y): place of the factor among 1, a,
+# b, aa, ab, bb, the monomial there, the monomial here, and how often
 _SHIFT = (
-    (0, 1, 0, 1),
-    (1, 2, 0, 1),
-    (2, 3, 0, 1),
-    (3, 4, 0, 1),
-    (4, 5, 0, 1),
-    (0, 3, 1, 2),
-    (1, 4, 1, 1),
-    (0, 4, 2, 1),
-    (1, 5, 2, 2),
+    (1, 1, 0, 1),
+    (2, 2, 0, 1),
+    (3, 3, 0, 1),
+    (4, 4, 0, 1),
+    (5, 5, 0, 1),
+    (1, 3, 1, 2),
+    (2, 4, 1, 1),
+    (1, 4, 2, 1),
+    (2, 5, 2, 2),
 )
 
 
@@ -44,7 +44,7 @@ class BlockRenderer:
         self.cutoff = cutoff
         self.pixels = across.side * down.side  # P
         self.pieces = across.pieces * down.pieces  # blocks of a tile, Q
-        self.monomials = monomials(storage.graph, across.steps, down.steps)  # [6, P]
+        self.monomials = monomials(storage.graph, storage.graph.Unsqueeze(across.steps, [1]), down.steps)  # [6, P]
         self.shifts = self._make_shifts()
 
     def image(self, membership: MembershipSampler | None, grids: CoarseGrids | None) -> Value:
@@ -73,19 +73,13 @@ class BlockRenderer:
 
     def _make_shifts(self) -> Value:
         """Make what turns coefficients around a tile's centre into those around its blocks' middles, (V, Q, 6, 6)."""
-        g, (down, across) = self.graph, (self.down, self.across)
-        sides = g.Concat(
-            *(g.Shape(axis.origins, start=k, end=k + 1) for k in (0, 1) for axis in (down, across)), axis=0
-        )
-        x, y = (
-            g.Reshape(g.Expand(g.Unsqueeze(axis.origins, axes), sides), [-1, 1])
-            for axis, axes in ((across, [0, 2]), (down, [1, 3]))
-        )
-        powers = g.Concat(x, y, x * x, x * y, y * y, axis=1)
-        basis = np.zeros((5, 6, 6), np.float32)
+        g = self.graph
+        x, y = g.Unsqueeze(self.across.origins, [0, 2]), g.Unsqueeze(self.down.origins, [1, 3])
+        basis = np.zeros((6, 6, 6), np.float32)
+        basis[0] = np.eye(6)
         for factor, there, here, count in _SHIFT:
             basis[factor, there, here] = count
-        shifts = powers @ basis.reshape(5, 36) + np.eye(6, dtype=np.float32).ravel()
+        shifts = g.Transpose(monomials(g, x, y), perm=[1, 0]) @ basis.reshape(6, 36)
         return g.Reshape(shifts, g.Concat([-1], self.pieces, [6, 6], axis=0))
 
     def _sort(self, group: Value, count: int) -> tuple[Value, list[Value], list[Value], Value]:

@@ -43,7 +43,7 @@ class CoarseGrids:
         regions = [no_region if number in tiles.windows else ids[0] for number, ids in enumerate(tiles.regions)]
         region = pack_runs(g, np.array(regions))
         values = self._window(region, g.Range(np.int32(0), np.int32(len(regions)), np.int32(1)))
-        values = g.Reshape(values, [tiles.rows, tiles.cols, -1, NODES, NODES])
+        values = g.Reshape(values, [tiles.rows, tiles.cols, channels, NODES, NODES])
         values = g.Gather(values[self.down.tile], self.across.tile, axis=1)
         # [tile column, node, (C, tile row, node)]: what is beyond the tile column is multiplied at once
         values = g.Transpose(values, perm=[1, 3, 2, 0, 4])
@@ -76,7 +76,7 @@ class CoarseGrids:
         """Evaluate the Gaussians of every block at its nodes, (n, C, 256)."""
         g, plan, channels = self.graph, self.storage.plan, self.storage.channels
         steps = g.constant(np.arange(TILE, dtype=np.float32) - np.float32((TILE - 1) / 2))
-        basis = monomials(g, steps, steps)
+        basis = monomials(g, g.Unsqueeze(steps, [1]), steps)
         entries = [part for part in self.storage.entries if part.group.nodes]
         values = []
         for part in entries:

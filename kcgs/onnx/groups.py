@@ -13,7 +13,9 @@ Integers = NDArray[np.int64]
 
 # what one more group costs, in entries of lists: fewer groups are fewer operators, more groups are lists with fewer
 # entries that only fill them up. Tune it by the times of `python -m benchmarks decode`
-_GROUP_COST = 450
+_GROUP_COST = 300
+# entries of a group at most: the weights of more, 1 kB of an entry, do not stay in a core's cache
+_MOST_ENTRIES = 4096
 # the same of a group of blocks of nodes, which is evaluated only when a decoder is loaded
 _NODE_GROUP_COST = 4000
 
@@ -73,6 +75,7 @@ def _split_by_length(lists: list[tuple[int, int]], group_cost: int) -> list[list
     parts, j = [], len(ends)
     while j > 0:
         i = cut[j]
-        parts.append(lists[first[i] : ends[j - 1]])
+        step = max(1, _MOST_ENTRIES // max(1, int(lengths[j - 1])))
+        parts += [lists[k : min(k + step, ends[j - 1])] for k in range(first[i], ends[j - 1], step)]
         j = i
-    return parts[::-1]
+    return parts

@@ -1,4 +1,4 @@
-"""Weights of Gaussians for `blocks`, `grids` and `generic`: monomials of the pixel, the exponential, its cutoff."""
+"""Weights of Gaussians for `blocks`, `grids` and `generic`: monomials of places, the exponential, its cutoff."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from .graph import Graph, Value
 
 
 def monomials(g: Graph, x: Value, y: Value) -> Value:
-    """Make 1, x, y, xx, xy, yy at the pixels of a block, column by column, (6, P), from its columns and rows."""
-    x, y = g.Unsqueeze(x, [1]), g.Unsqueeze(y, [0])
-    sides = g.Concat(g.Shape(x, end=1), g.Shape(y, start=1), axis=0)
-    x, y = (g.Reshape(g.Expand(side, sides), [-1]) for side in (x, y))
-    rows = (x * 0 + 1, x, y, x * x, x * y, y * y)
-    return g.Concat(*[g.Unsqueeze(row, [0]) for row in rows], axis=0)
+    """Make 1, x, y, xx, xy, yy of numbers of up to four dimensions, which are broadcast: (6, all of them)."""
+    one, first, second = np.eye(3, dtype=np.float32).reshape(3, 3, 1, 1, 1, 1)
+    linear = g.Flatten(x * first + y * second + one, axis=1)
+    return linear[g.constant([0, 0, 0, 1, 1, 2])] * linear[g.constant([0, 1, 2, 1, 2, 2])]
 
 
 def weigh(g: Graph, exponent: Value, cutoff: float) -> Value:
