@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs.functional import RegionMap, edge_band, region_splat
+from kcgs.functional import RegionMap, region_splat
 from kcgs.functional.blur import blur, gaussian_taps
 from kcgs.scene import Scene
+
+from .contour_loops import CostTable, list_small_pieces, measure_depth, sweep
 
 Ints = NDArray[np.int64]
 Labels = NDArray[np.int32]
@@ -41,14 +42,6 @@ def bounding_boxes(index: Labels, count: int, margin: int) -> Ints:
     return boxes.clip(0, np.repeat(index.shape, 2))
 
 
-def count_unequal_pairs(padded: Labels) -> int:
-    """Count the unordered pairs of 8-neighbours with different labels; the rim holds -1."""
-    width = padded.shape[1]
-    flat = padded.ravel()
-    pairs = ((flat[:-step], flat[step:]) for step in (1, width - 1, width, width + 1))
-    return sum(int(np.count_nonzero((a != b) & (np.minimum(a, b) >= 0))) for a, b in pairs)
-
-
 class RegionCosts:
     """Blurred squared error of each region's Gaussians rendered alone, kept inside the region's box.
 
@@ -61,15 +54,13 @@ class RegionCosts:
         owners, order = regions.index_of(field.region_ids).sort(stable=True)
         first = torch.searchsorted(owners, torch.arange(len(boxes) + 1, device=owners.device))
         gaussians = tuple(values[order] for values in (field.means, field.cholesky, field.merged_colors()))
-        self._stride, self._start = image.shape[2] + 2 * pad, np.zeros(len(boxes), np.int64)
-        self._top, self._bottom, self._left, self._right = np.ascontiguousarray(boxes.T + pad)
+        starts, parts, end = np.zeros(len(boxes), np.int64), [], 0
         margin = math.ceil(4 * sigma)
         planes = torch.nn.functional.pad(
             torch.cat([image, torch.ones_like(image[:1])]), [margin, margin + _BOX_UNIT] * 2
         )
         # boxes of about the same size are rendered as one batch
         sizes = -(-(boxes[:, 1::2] - boxes[:, ::2]) // _BOX_UNIT) * _BOX_UNIT
-        self._width, parts, end = sizes[:, 1], [], 0
         for size in np.unique(sizes[sizes.all(1)], axis=0):
             group = np.flatnonzero((sizes == size).all(1))
             count = max(1, _BATCH_PIXELS // size.prod())
@@ -77,17 +68,19 @@ class RegionCosts:
                 corners = torch.from_numpy(boxes[members, ::2]).to(image.device)
                 batch = _pad_rows(gaussians, *(first[torch.from_numpy(members + k)] for k in (0, 1)))
                 parts.append(_region_errors(batch, planes, corners, size.tolist(), sigma, backend).cpu().numpy())
-                self._start[members] = end + np.arange(len(members)) * size.prod()
+                starts[members] = end + np.arange(len(members)) * size.prod()
                 end += parts[-1].size
-        self._values = np.concatenate([part.ravel() for part in parts])
+        values = np.concatenate([part.ravel() for part in parts])
+        self.table = CostTable(values, starts, boxes + pad, sizes[:, 1].copy(), image.shape[2] + 2 * pad)
 
     def of(self, pixels: Ints, region: Labels) -> Floats:
         """Return the costs of pixels in regions, infinite outside a region's box."""
-        y, x = np.divmod(pixels, self._stride)
-        top, left = self._top[region], self._left[region]
-        inside = (y >= top) & (y < self._bottom[region]) & (x >= left) & (x < self._right[region])
-        place = self._start[region] + (y - top) * self._width[region] + (x - left)
-        return np.where(inside, self._values[np.where(inside, place, 0)].astype(np.float64), np.inf)
+        values, starts, boxes, widths, stride = self.table
+        y, x = np.divmod(pixels, stride)
+        top, bottom, left, right = boxes[region].T
+        inside = (y >= top) & (y < bottom) & (x >= left) & (x < right)
+        place = starts[region] + (y - top) * widths[region] + (x - left)
+        return np.where(inside, values[np.where(inside, place, 0)].astype(np.float64), np.inf)
 
 
 def _pad_rows(gaussians: tuple[Tensor, ...], first: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -129,53 +122,37 @@ class MovingLabels:
         self._sides = disc(1, self._stride)[1:]
         self._eight = disc(1.5, self._stride)[1:]
         self._floor = np.minimum(np.bincount(index.ravel()), smallest)
-        self._free = np.ones(index.shape, np.bool_)
-        specks = np.zeros(padded.shape, np.bool_)
-        specks[pad:-pad, pad:-pad].flat[small_pieces(index, smallest)[0]] = True
-        self._specks = specks.reshape(-1)  # pixels of pieces that were small before any move
+        self._free = self._labels >= 0
+        self._specks = np.zeros(padded.size, np.bool_)  # pixels of pieces that were small before any move
+        self._specks[list_small_pieces(self._labels, self._stride, smallest)[0]] = True
         self._anchor = np.zeros(0, np.int32)
-        self._anchor_disc: Ints | None = None  # None: a pixel may take any label
+        self._anchor_disc = np.zeros(0, np.int64)  # empty: a pixel may take any label
 
     def fix_cores(self, rim: Mask, distance: int) -> None:
         """Fix the pixels that each region keeps, unless it has that many beyond the distance that contours move."""
-        from scipy.ndimage import distance_transform_cdt
-
-        depth = distance_transform_cdt(~rim, "chessboard")
-        deep = np.bincount(self.map[depth > distance], minlength=len(self._floor))
+        depth, deep = measure_depth(self.map, rim, self._floor, distance + 1)
         y, x = np.nonzero((deep < self._floor)[self.map])
         region = self.map[y, x]
         order = np.lexsort((-depth[y, x], region))
         rank = np.arange(len(order)) - np.searchsorted(region[order], region[order])
         fixed = order[rank < self._floor[region[order]]]
-        self._free[y[fixed], x[fixed]] = False
+        self._free[(y[fixed] + self._pad) * self._stride + x[fixed] + self._pad] = False
 
     def limit_moves(self, anchor: Labels, distance: float) -> None:
         """Allow a pixel only the labels that another map has within the distance."""
         # repeated beyond the border: a label across it is nearer still
         self._anchor = np.pad(anchor, self._pad, mode="edge").reshape(-1)
         self._anchor_disc = disc(distance, self._stride)
-        self._free &= edge_band(torch.from_numpy(anchor + 1), distance).numpy()
 
     def sweep(self, reach: int) -> bool:
         """Give every free pixel near a contour its best label; True if one changed."""
-        y, x = np.nonzero(edge_band(torch.from_numpy(self.map.copy()), reach).numpy() & self._free)
-        # neighbours differ in parity: pixels of one parity change at the same time
-        pixels, parity = (y + self._pad) * self._stride + x + self._pad, 2 * (y % 2) + x % 2
-        neighborhood, before = disc(reach, self._stride), self._labels.copy()
-        for value in range(4):
-            group = pixels[parity == value]
-            self._improve(group, before[group[:, None] + neighborhood])
-        return not np.array_equal(before, self._labels)
-
-    def _improve(self, pixels: Ints, candidates: Labels) -> None:
-        around, present = self._labels[pixels[:, None] + self._eight], self._labels[pixels]
-        best, least = present.copy(), self._cost(pixels, present, around)
-        for rows, labels in _alternatives(candidates, present):
-            cost = self._cost(pixels[rows], labels, around[rows])
-            better = np.flatnonzero(cost < least[rows])
-            better = better[self._allowed(pixels[rows[better]], labels[better])]
-            best[rows[better]], least[rows[better]] = labels[better], cost[better]
-        self._labels[pixels] = best
+        neighborhood = disc(reach, self._stride)
+        return bool(
+            sweep(
+                self._labels, self._free, self._costs.table, self._pair, neighborhood, self._eight, self._anchor,
+                self._anchor_disc,
+            )
+        )  # fmt: skip
 
     def _cost(self, pixels: Ints, labels: Labels, around: Labels) -> Floats:
         """Return the part of the energy that depends on each pixel's label, up to a constant."""
@@ -183,9 +160,7 @@ class MovingLabels:
         return np.asarray(self._costs.of(pixels, labels) - self._pair * equal)
 
     def _allowed(self, pixels: Ints, labels: Labels) -> Mask:
-        if self._anchor_disc is None:
-            return np.ones(len(pixels), np.bool_)
-        allowed = np.zeros(len(pixels), np.bool_)
+        allowed = np.full(len(pixels), len(self._anchor_disc) == 0)
         for start in range(0, len(self._anchor_disc), 32):  # the nearest first: most labels are near
             rows = np.flatnonzero(~allowed)
             anchors = self._anchor[pixels[rows, None] + self._anchor_disc[start : start + 32]]
@@ -197,9 +172,9 @@ class MovingLabels:
 
         Each call that returns True leaves fewer pieces, so that repetition ends.
         """
-        small, pieces = small_pieces(self.map, self._smallest)
-        y, x = np.divmod(small, self.map.shape[1])
-        pixels = (y + self._pad) * self._stride + x + self._pad
+        pixels, pieces = list_small_pieces(self._labels, self._stride, self._smallest)
+        order = np.lexsort((pixels, pieces))
+        pixels, pieces = pixels[order], pieces[order]
         areas = np.bincount(self.map.ravel(), minlength=len(self._floor))
         changed = np.zeros(len(self._labels), np.bool_)
         for piece in sorted(np.split(pixels, np.flatnonzero(np.diff(pieces)) + 1), key=len):
@@ -233,8 +208,13 @@ class MovingLabels:
         """Return the energy of the map, less that before all moves."""
         changed = np.flatnonzero(self._labels != self._before)
         data = self._costs.of(changed, self._labels[changed]) - self._costs.of(changed, self._before[changed])
-        pairs = [count_unequal_pairs(flat.reshape(-1, self._stride)) for flat in (self._labels, self._before)]
-        return float(data.sum()) + self._pair * (pairs[0] - pairs[1])
+        around = changed[:, None] + self._eight
+        before, after = (
+            (labels[around] != labels[changed, None]) & (labels[around] >= 0) for labels in (self._before, self._labels)
+        )
+        # pairs of two pixels that changed come twice
+        share = np.where(self._labels[around] == self._before[around], 1.0, 0.5)
+        return float(data.sum()) + self._pair * float((share * after - share * before).sum())
 
 
 def disc(radius: float, stride: int) -> Ints:
@@ -243,25 +223,3 @@ def disc(radius: float, stride: int) -> Ints:
     square = y * y + x * x
     inside = square <= radius * radius
     return np.asarray((y * stride + x)[inside][np.argsort(square[inside], kind="stable")], dtype=np.int64)
-
-
-def small_pieces(labels: Labels, smallest: int) -> tuple[Ints, Ints]:
-    """Return the pixels of 4-connected pieces under `smallest` pixels as flat indices, and their pieces, sorted."""
-    from skimage.measure import label
-
-    pieces = label(labels + 1, background=0, connectivity=1).ravel()
-    small = np.flatnonzero((np.bincount(pieces) < smallest)[pieces])
-    small = small[np.argsort(pieces[small], kind="stable")]
-    return small, pieces[small]
-
-
-def _alternatives(candidates: Labels, present: Labels) -> Iterator[tuple[Ints, Labels]]:
-    """Yield (rows, labels) until each label in a row of candidates (P, K) came once, but not the present one or -1."""
-    rows = np.arange(len(present))
-    pending = (candidates != present[:, None]) & (candidates >= 0)
-    while len(rows):
-        has_more = pending.any(axis=1)
-        rows, candidates, pending = rows[has_more], candidates[has_more], pending[has_more]
-        labels = candidates[np.arange(len(rows)), pending.argmax(axis=1)]
-        yield rows, labels
-        pending &= candidates != labels[:, None]

@@ -13,7 +13,6 @@ from kcgs.functional import RegionMap, edge_band
 from kcgs.scene import Scene
 
 from .config import FitConfig
-from .contour_energy import MovingLabels, RegionCosts, bounding_boxes, index_map
 
 
 @torch.no_grad()
@@ -38,6 +37,8 @@ def refine_contours(
 
     Source: Mumford and Shah's functional of 1989; Besag's iterated conditional modes of 1986.
     """
+    from .contour_energy import MovingLabels, RegionCosts, bounding_boxes, index_map  # loads numba
+
     regions = scene.regions
     assert regions is not None
     anchor = regions.labels if anchor is None else anchor
@@ -45,7 +46,7 @@ def refine_contours(
         return regions
     index = index_map(regions, regions.labels)
     distance = min(1 if max_distance is None else max_distance, math.hypot(*index.shape))
-    pad = max(reach, int(distance))
+    pad = 2 * math.ceil(max(reach, distance) / 2)  # even: with the rim, rows and columns keep their parity
     rim = edge_band(torch.from_numpy(index), 1).numpy()
     boxes = bounding_boxes(np.where(rim, index, -1), regions.num_regions, reach * sweeps + smallest)
     costs = RegionCosts(scene, image, boxes, pad, blur, backend)
@@ -101,11 +102,15 @@ def accept_moves(before: RegionMap, after: RegionMap, gain: Tensor) -> RegionMap
     """
     from scipy import ndimage
 
-    changed = (before.labels != after.labels).cpu().numpy()
-    groups, count = ndimage.label(ndimage.binary_dilation(changed, iterations=2), np.ones((3, 3)))
-    sums = ndimage.sum_labels(gain.double().cpu().numpy(), groups, np.arange(1, count + 1))
-    accepted = torch.from_numpy(np.concatenate([[False], sums > 0])[groups]).to(before.labels.device)
-    labels = torch.where(accepted, after.labels, before.labels)
-    if not bool(accepted.any()) or len(torch.unique(labels)) < before.num_regions:
+    changed, accepted = (before.labels != after.labels).cpu().numpy(), np.zeros(before.size, np.bool_)
+    box = tuple(slice(max(0, places.min() - 3), places.max() + 4) for places in np.nonzero(changed))
+    groups, count = ndimage.label(ndimage.binary_dilation(changed[box], iterations=2), np.ones((3, 3)))
+    sums = ndimage.sum_labels(gain.double().cpu().numpy()[box], groups, np.arange(1, count + 1))
+    accepted[box] = np.concatenate([[False], sums > 0])[groups]
+    if not (accepted & changed).any():
         return before
-    return after.relabel(labels, "mean")
+    if accepted[changed].all():
+        return after
+    labels = torch.where(torch.from_numpy(accepted).to(before.labels.device), after.labels, before.labels)
+    regions = after.relabel(labels, "mean")
+    return before if regions.num_regions < before.num_regions else regions

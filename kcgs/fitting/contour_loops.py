@@ -1,0 +1,175 @@
+"""Compiled loops of contour refinement: sweeps of single pixels, the depth of regions, and small pieces."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kcgs.kernels.compiled import Program, inner
+
+program = Program("contour refinement", __file__)
+
+# states of a pixel in the search for small pieces
+_UNKNOWN = 0
+_PENDING = 1
+_SMALL = 2
+_LARGE = 3
+
+
+class CostTable(NamedTuple):
+    """Costs of pixels in regions, kept inside each region's box; positions are those of a map with a rim."""
+
+    values: Any  # the boxes' pixels, one box after the other
+    starts: Any  # [R], of the boxes in values
+    boxes: Any  # [R, 4], top, bottom, left, right
+    widths: Any  # [R], values of a row of the box
+    stride: int  # pixels of a row of the map
+
+
+@inner
+def _cost(costs, pixel, region):  # type: ignore[no-untyped-def]
+    top, bottom, left, right = costs.boxes[region]
+    y, x = pixel // costs.stride, pixel % costs.stride
+    if not (top <= y < bottom and left <= x < right):
+        return math.inf
+    return float(costs.values[costs.starts[region] + (y - top) * costs.widths[region] + x - left])
+
+
+@inner
+def _has(labels, pixel, offsets, label):  # type: ignore[no-untyped-def]
+    found = False
+    for offset in offsets:
+        found |= labels[pixel + offset] == label
+    return found
+
+
+@program.entry
+def sweep(labels, free, costs, pair_cost, neighborhood, eight, anchor, anchor_disc):  # type: ignore[no-untyped-def]
+    """Give every free pixel the best label of its neighborhood; True if one changed.
+
+    The map is flat and has a rim of -1. Neighborhoods are those before the sweep. Where there is a disc, a label must
+    be in it on the anchor.
+    """
+    before, changed = labels.copy(), False
+    pixels = _list_near_contours(labels, free, costs.stride, neighborhood)
+    for parity in range(4):  # neighbours differ in parity: pixels of one parity change at the same time
+        for pixel in pixels:
+            if pixel // costs.stride % 2 * 2 + pixel % costs.stride % 2 != parity:
+                continue
+            present = before[pixel]
+            best, least = present, _energy(labels, costs, pair_cost, eight, pixel, present)
+            for k in range(1, len(neighborhood)):
+                label = before[pixel + neighborhood[k]]
+                if label == present or label == -1 or _has(before, pixel, neighborhood[:k], label):
+                    continue
+                energy = _energy(labels, costs, pair_cost, eight, pixel, label)
+                if energy < least and (len(anchor_disc) == 0 or _has(anchor, pixel, anchor_disc, label)):
+                    best, least = label, energy
+            labels[pixel] = best
+            changed |= best != present
+    return changed
+
+
+@inner
+def _list_near_contours(labels, free, stride, neighborhood):  # type: ignore[no-untyped-def]
+    """List the free pixels whose neighborhood holds the two sides of a contour, and a few more."""
+    pixels, is_listed, count = np.empty(len(labels), np.int64), np.zeros(len(labels), np.bool_), 0
+    for pixel in range(len(labels) - stride):
+        for other in (pixel + 1, pixel + stride):
+            if labels[pixel] == labels[other] or labels[pixel] == -1 or labels[other] == -1:
+                continue
+            for end in (pixel, other):
+                for offset in neighborhood:
+                    near = end + offset
+                    if free[near] and not is_listed[near]:
+                        pixels[count], is_listed[near] = near, True
+                        count += 1
+    return pixels[:count]
+
+
+@inner
+def _energy(labels, costs, pair_cost, eight, pixel, label):  # type: ignore[no-untyped-def]
+    """Return the part of the energy that depends on a pixel's label, up to a constant."""
+    equal = 0
+    for offset in eight:
+        equal += labels[pixel + offset] == label
+    return _cost(costs, pixel, label) - pair_cost * equal
+
+
+@program.entry
+def measure_depth(regions, rim, enough, most):  # type: ignore[no-untyped-def]
+    """Return the distance of pixels to the rim, at most `most` (rows or columns, whichever is more).
+
+    Regions with `enough` pixels of distance `most` are not measured further; also returns how many were found in each.
+    """
+    height, width = regions.shape
+    depth, count = np.zeros(regions.shape, np.int64), np.zeros(len(enough), np.int64)
+    for y in range(height):
+        for x in range(width):
+            region = regions[y, x]
+            if count[region] >= enough[region]:
+                continue
+            distance = 0
+            while distance < most and not _touches(rim, y, x, distance):
+                distance += 1
+            depth[y, x] = distance
+            count[region] += distance == most
+    return depth, count
+
+
+@inner
+def _touches(mask, y, x, distance):  # type: ignore[no-untyped-def]
+    """True where the square ring of this distance around a pixel meets the mask."""
+    for row in range(max(y - distance, 0), min(y + distance + 1, mask.shape[0])):
+        step = 1 if abs(row - y) == distance else 2 * distance
+        for col in range(x - distance, x + distance + 1, max(step, 1)):
+            if 0 <= col < mask.shape[1] and mask[row, col]:
+                return True
+    return False
+
+
+@program.entry
+def list_small_pieces(labels, stride, smallest):  # type: ignore[no-untyped-def]
+    """Return the pixels of 4-connected pieces under `smallest` pixels, and the first pixel of each one's piece.
+
+    The map is flat and has a rim of -1. Every piece has a pixel beside another label: from there it is filled, until it
+    is too large.
+    """
+    state, queue = np.zeros(len(labels), np.uint8), np.empty(smallest, np.int64)
+    pixels, first, end = np.empty(64, np.int64), np.empty(64, np.int64), 0
+    for pixel in range(len(labels) - stride):
+        for other in (pixel + 1, pixel + stride):
+            if labels[other] == labels[pixel]:
+                continue
+            for seed in (pixel, other):
+                if labels[seed] == -1 or state[seed] != _UNKNOWN:
+                    continue
+                count = _fill(labels, stride, seed, state, queue)
+                if end + count > len(pixels):
+                    more = np.empty(len(pixels) + count, np.int64)
+                    pixels, first = np.append(pixels, more), np.append(first, more)
+                pixels[end : end + count] = queue[:count]
+                for k in range(count):
+                    first[end + k] = queue[:count].min()
+                end += count
+    return pixels[:end], first[:end]
+
+
+@inner
+def _fill(labels, stride, seed, state, queue):  # type: ignore[no-untyped-def]
+    """Fill the queue with the piece around a pixel; return how many pixels it has, 0 if it has more than fit."""
+    queue[0], state[seed], count, k, is_large = seed, _PENDING, 1, 0, len(queue) == 1
+    while k < count and not is_large:
+        for step in (-stride, -1, 1, stride):
+            other = queue[k] + step
+            if labels[other] == labels[seed] and state[other] != _PENDING:
+                is_large |= state[other] == _LARGE or count + 1 == len(queue)
+                if not is_large:
+                    queue[count], state[other] = other, _PENDING
+                    count += 1
+        k += 1
+    for pixel in queue[:count]:
+        state[pixel] = _LARGE if is_large else _SMALL
+    return 0 if is_large else count
