@@ -48,6 +48,8 @@ class Steps(NamedTuple):
     differentiate: from (plan, inputs, gradient of the image, geometry) to the gradients of means, cholesky and colors;
         the first two are None unless `geometry`.
     image: from the inputs to the image, with a graph of all orders; None: the kernel is differentiable once.
+    descend: from (plan, inputs, target) to the gradients of half the squared error against the target, (B, C, H, W), in
+        one pass; None: there is none.
     checks_inputs: `plan` returns None where a value is not finite or beyond the limits in whitened.py, and Gaussians of
         one image may come without B, as do the results then; else values have been checked, and B is there.
     """
@@ -56,6 +58,7 @@ class Steps(NamedTuple):
     render: Callable[[Any, SplatInputs], Tensor]
     differentiate: Callable[[Any, SplatInputs, Tensor, bool], Gradients]
     image: Callable[[SplatInputs], Tensor] | None = None
+    descend: Callable[[Any, SplatInputs, Tensor], Gradients] | None = None
     checks_inputs: bool = False
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kcgs import RegionMap
 from kcgs.functional import region_splat
-from kcgs.kernels.cpu import gradients, lists, loops
+from kcgs.kernels.cpu import lists, loops
 from kcgs.kernels.cpu.simd import EXP2
 
 RANDOM = torch.Generator()
@@ -127,5 +127,5 @@ def test_auto_is_this_kernel(scene: tuple[Tensor, ...]) -> None:
 def test_compiled_once_for_all_channels(scene: tuple[Tensor, ...]) -> None:
     for channels in (1, 5):
         render((*scene[:2], scene[2].repeat(1, 2)[:, :channels], *scene[3:]))
-    for loop in (lists.in_range, lists.list_tiles, loops.render, loops.gather_gradients, gradients.sum_terms):
+    for loop in (lists.in_range, lists.measure, lists.list_visits, loops.visit):
         assert len(loop.signatures) == 1

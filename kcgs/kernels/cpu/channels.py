@@ -8,20 +8,23 @@ from typing import Any
 from llvmlite import ir
 from numba.core import cgutils
 
-from .simd import LONG, apply, broadcast, constant, load, store
+from .simd import LONG, SIDE, apply, broadcast, constant, load, store, sum_columns
+
+# sums of v, v z2 and v z2 z2
+_MOMENTS = 3
 
 
 class Channels:
     """Code for every channel; three channels have no loop, and their sums stay in registers."""
 
-    def __init__(self, builder: Any, colors: Any, count: Any, stride: Any, is_rgb: bool) -> None:
-        self.builder, self.colors, self.count, self.stride, self.is_rgb = builder, colors, count, stride, is_rgb
+    def __init__(self, builder: Any, colors: Any, count: Any, is_rgb: bool) -> None:
+        self.builder, self.colors, self.count, self.is_rgb = builder, colors, count, is_rgb
 
     def each(self, emit: Callable[[Any, Any], None], pixels: Any) -> None:
         """Call emit(channel, pointer to its pixels), within a loop or for each of three."""
 
         def visit(channel: Any) -> None:
-            emit(channel, self.builder.gep(pixels, [self.builder.mul(channel, self.stride)]))
+            emit(channel, self.builder.gep(pixels, [self.builder.mul(channel, ir.Constant(LONG, SIDE))]))
 
         if self.is_rgb:
             for c in range(3):
@@ -47,47 +50,59 @@ class Channels:
 class Sums:
     """Sums over rows of 16: w g_c of each channel, then the moments of v = w sum_c g_c colors_c."""
 
-    def __init__(self, channels: Channels, sums: Any, moments: int) -> None:
+    def __init__(self, channels: Channels, sums: Any) -> None:
         builder = self.builder = channels.builder
         self.channels, self.sums = channels, sums
         zero = constant(0.0)
-        self.totals = [cgutils.alloca_once_value(builder, zero) for _ in range(3 if channels.is_rgb else 0)]
         # variables, which LLVM keeps in registers
-        self.moments = [cgutils.alloca_once_value(builder, zero) for _ in range(moments)]
+        self.totals = [cgutils.alloca_once_value(builder, zero) for _ in range(3 if channels.is_rgb else 0)]
+        self.moments = [cgutils.alloca_once_value(builder, zero) for _ in range(_MOMENTS)]
+        if not self.totals:
+            with cgutils.for_range(builder, channels.count) as loop:
+                store(builder, zero, sums, loop.index)
 
-    def gather(self, weight: Any, pixels: Any) -> Any:
-        """Add w g_c; return w sum_c g_c colors_c."""
+    def gather(self, weight: Any, pixels: Any, second: Any) -> None:
+        """Add the terms of a row of pixels of that weight and z2."""
         builder = self.builder
         # -0.0 added changes nothing, not even the sign of a zero
-        value = cgutils.alloca_once_value(builder, constant(-0.0))
+        product = cgutils.alloca_once_value(builder, constant(-0.0))
 
         def gather_channel(channel: Any, place: Any) -> None:
             grad = load(builder, place)
             if self.totals:
-                total = self.totals[channel.constant]
-                builder.store(apply(builder, "fma", weight, grad, builder.load(total)), total)
+                self._add(self.totals[channel.constant], weight, grad)
             else:
                 total = apply(builder, "fma", weight, grad, load(builder, self.sums, channel))
                 store(builder, total, self.sums, channel)
-            if self.moments:
-                builder.store(apply(builder, "fma", grad, self.channels.color(channel), builder.load(value)), value)
+            self._add(product, grad, self.channels.color(channel))
 
         self.channels.each(gather_channel, pixels)
-        return builder.fmul(builder.load(value), weight)
+        value = builder.fmul(builder.load(product), weight)
+        along = builder.fmul(value, second)
+        for total, term in zip(self.moments, (value, along), strict=False):
+            builder.store(builder.fadd(builder.load(total), term), total)
+        self._add(self.moments[2], along, second)
 
-    def add(self, k: int, first: Any, second: Any = None) -> None:
-        """Add a term, or the product of two, to a moment."""
-        builder, total = self.builder, self.moments[k]
-        if second is None:
-            builder.store(builder.fadd(builder.load(total), first), total)
-        else:
-            builder.store(apply(builder, "fma", first, second, builder.load(total)), total)
+    def _add(self, total: Any, first: Any, second: Any) -> None:
+        self.builder.store(apply(self.builder, "fma", first, second, self.builder.load(total)), total)
 
-    def finish(self, moments: list[Any]) -> None:
-        """Add what is in registers to the sums in memory."""
+    def finish(self, z1: Any, terms: Any) -> None:
+        """Store the sums over columns; z1, the same in every row of a block, multiplies the sums, not the terms."""
         builder = self.builder
-        terms = [(ir.Constant(LONG, c), builder.load(total)) for c, total in enumerate(self.totals)]
+        value, along, square = (builder.load(total) for total in self.moments)
+        first = builder.fmul(value, z1)
+        moments = [first, along, builder.fmul(first, z1), builder.fmul(along, z1), square]
+        if self.totals:
+            self._store([*(builder.load(total) for total in self.totals), *moments], terms)
+            return
         for k, moment in enumerate(moments):
-            terms.append((builder.add(self.channels.count, ir.Constant(LONG, k)), moment))
-        for index, term in terms:
-            store(builder, builder.fadd(load(builder, self.sums, index), term), self.sums, index)
+            store(builder, moment, self.sums, builder.add(self.channels.count, ir.Constant(LONG, k)))
+        eight = ir.Constant(LONG, 8)
+        end = builder.add(self.channels.count, ir.Constant(LONG, len(moments)))
+        with cgutils.for_range_slice(builder, ir.Constant(LONG, 0), end, eight) as (row, _):
+            rows = [load(builder, self.sums, builder.add(row, ir.Constant(LONG, k))) for k in range(8)]
+            self._store(rows, builder.gep(terms, [row]))
+
+    def _store(self, rows: list[Any], terms: Any) -> None:
+        total = sum_columns(self.builder, rows)
+        self.builder.store(total, self.builder.bitcast(terms, total.type.as_pointer()), align=4)

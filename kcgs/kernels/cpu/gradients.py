@@ -1,4 +1,4 @@
-"""The end of the CPU kernel's backward: from the terms of the lists' entries to the gradients of the Gaussians."""
+"""The end of the CPU kernel's backward: from the terms of visits to the gradients of the Gaussians."""
 
 from __future__ import annotations
 
@@ -7,53 +7,53 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..compiled import inner
-from .layout import COLOR_FACTOR, GAUSSIAN, L11, L21, L22, LEVEL, SCALE, program
+from .layout import COLOR_FACTOR, L11, L21, L22, LEVEL, SCALE
 
 
-class GaussianGradients(NamedTuple):
-    """What `sum_terms` fills, in the caller's order."""
+class Backward(NamedTuple):
+    """What `sum_terms` needs and fills, in the caller's order."""
 
-    means: Any  # [N, 2] float32
-    cholesky: Any  # [N, 3] float32
-    colors: Any  # [N, C] float32
+    order: Any  # [N] int64, from the table's order to the caller's
+    factors: Any  # [N, 3] float32, Cholesky factors
+    means_gradient: Any  # [N, 2] float32
+    cholesky_gradient: Any  # [N, 3] float32
+    colors_gradient: Any  # [N, C] float32
 
 
-@program.entry
-def sum_terms(lists, order, factors, terms, geometry, gradients):  # type: ignore[no-untyped-def]
-    """Add up each Gaussian's terms in float64 and turn them into gradients; the formulas are in docs/performance.md.
+@inner
+def sum_terms(lists, backward, terms, begin, end):  # type: ignore[no-untyped-def]
+    """Add up the terms of some Gaussians in float64 and turn them into gradients; docs/performance.md has the formulas.
 
     Args:
         lists: Lists.
-        order: (N,) int64, from the table's order to the caller's.
-        factors: (N, 3) float32, Cholesky factors in the caller's order.
-        terms: (E, ...) float32, as loops.gather_gradients fills them.
-        geometry: whether they hold moments of z, too.
-        gradients: GaussianGradients; without `geometry` its colours alone are filled.
+        backward: Backward.
+        terms: (V, ...) float32, as loops.visit fills them.
+        begin: the first Gaussian, in the table's order.
+        end: the last one + 1.
     """
-    count, channels = gradients.colors.shape
-    total = np.zeros((count, terms.shape[1]))
-    mean, factor = np.empty(2), np.empty(3)
-    for e in range(terms.shape[0]):
-        for k in range(terms.shape[1]):
-            total[lists.entries[e, GAUSSIAN], k] += terms[e, k]
-    for i in range(count):
-        t, g, n = total[i], lists.gaussians[i], order[i]
+    channels = backward.colors_gradient.shape[1]
+    t, mean, factor = np.empty(terms.shape[1]), np.empty(2), np.empty(3)
+    for i in range(begin, end):
+        t[:] = 0.0
+        for place in range(lists.first_terms[i], lists.first_terms[i] + lists.num_terms[i]):
+            for k in range(len(t)):
+                t[k] += terms[place, k]
+        g, n = lists.gaussians[i], backward.order[i]
         by_factor = 0.0
         for c in range(channels):
             by_factor += t[c] * (lists.colors[i * channels + c] / g[COLOR_FACTOR])
-            gradients.colors[n, c] = t[c] * g[COLOR_FACTOR]
-        if geometry:
-            s1, s2 = t[channels] / SCALE, t[channels + 1] / SCALE
-            s11, s12 = t[channels + 2] / (SCALE * SCALE), t[channels + 3] / (SCALE * SCALE)
-            s22 = t[channels + 4] / (SCALE * SCALE)
-            slope = g[L21] / g[L22]
-            mean[0], mean[1] = (s1 - slope * s2) / g[L11], s2 / g[L22]
-            factor[0], factor[1], factor[2] = (s11 - slope * s12) / g[L11], s12 / g[L22], s22 / g[L22]
-            if g[LEVEL] > 0:
-                _uncoarsen(g, factors[n], mean, factor, by_factor)
-            gradients.means[n, 0], gradients.means[n, 1] = mean[0], mean[1]
-            for k in range(3):
-                gradients.cholesky[n, k] = factor[k]
+            backward.colors_gradient[n, c] = t[c] * g[COLOR_FACTOR]
+        s1, s2 = t[channels] / SCALE, t[channels + 1] / SCALE
+        s11, s12 = t[channels + 2] / (SCALE * SCALE), t[channels + 3] / (SCALE * SCALE)
+        s22 = t[channels + 4] / (SCALE * SCALE)
+        slope = g[L21] / g[L22]
+        mean[0], mean[1] = (s1 - slope * s2) / g[L11], s2 / g[L22]
+        factor[0], factor[1], factor[2] = (s11 - slope * s12) / g[L11], s12 / g[L22], s22 / g[L22]
+        if g[LEVEL] > 0:
+            _uncoarsen(g, backward.factors[n], mean, factor, by_factor)
+        backward.means_gradient[n, 0], backward.means_gradient[n, 1] = mean[0], mean[1]
+        for k in range(3):
+            backward.cholesky_gradient[n, k] = factor[k]
 
 
 @inner

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,21 +14,25 @@ from torch import Tensor
 from ..coarse_grids import blocks_of, max_spacing
 from ..interface import Gradients, SplatInputs, Steps
 from ..membership import Membership
+from ..tasks import chunks, phases, run_tasks
 from ..whitened import least_exponent, support_radius
-from .gradients import GaussianGradients, sum_terms
-from .layout import TILE_ROWS, Batch, Lists, Table
-from .lists import in_range, list_tiles
-from .loops import gather_gradients
-from .loops import render as render_rows
-from .schedule import Schedule, order_rows, run
+from .gradients import Backward
+from .layout import COLUMNS, TILE_ROWS, Batch, Lists, Table
+from .lists import in_range, list_visits, measure
+from .loops import visit
+from .schedule import ADDS, GATHERS, order_tasks
 from .simd import SIDE
+
+# Gaussians that one task lists, at least, and tasks at most
+_PART = 512
+_MOST_PARTS = 16
+# visits up to which the calling thread does all: waking another costs as much
+_SERIAL_VISITS = 300
 
 
 class _Plan(NamedTuple):
     lists: Lists
     order: Any  # [N] int64, from the lists' order to the caller's
-    has_nodes: bool
-    schedule: Schedule
 
 
 def steps(inputs: SplatInputs) -> Steps:
@@ -36,7 +41,7 @@ def steps(inputs: SplatInputs) -> Steps:
         raise ValueError(f"backend 'cpu' computes in float32; got {inputs.means.dtype}: use 'tiled' or 'reference'")
     if inputs.means.device.type != "cpu":
         raise ValueError(f"backend 'cpu' needs tensors on the CPU; got {inputs.means.device}")
-    return Steps(plan, render, differentiate, checks_inputs=True)
+    return Steps(plan, render, differentiate, descend=descend, checks_inputs=True)
 
 
 def plan(inputs: SplatInputs) -> _Plan | None:
@@ -52,12 +57,30 @@ def plan(inputs: SplatInputs) -> _Plan | None:
         regions = inputs.region_index.flatten().numpy()[order]
     else:
         table, regions = _table_without_map(inputs.size), np.zeros(num_images * count, np.int64)
-    radius = support_radius(inputs.cutoff, torch.float32)
-    least = np.float32(least_exponent(inputs.cutoff, torch.float32) / math.log(2))
     batch = Batch(num_images, means, cholesky, order, images[order], regions, colors[order])
-    gaussians, start, entries, live = list_tiles(batch, table, radius, max_spacing(inputs.cutoff))
-    lists = Lists(gaussians, batch.colors.ravel(), regions, start, entries, table, live, radius, least)
-    return _Plan(lists, order, live.any(), order_rows(tuple(table.grids[:, TILE_ROWS].tolist()), num_images))
+    return _Plan(_list_visits(batch, table, inputs.cutoff), order)
+
+
+def _list_visits(batch: Batch, table: Table, cutoff: float) -> Lists:
+    radius = support_radius(cutoff, torch.float32)
+    count, blocks = len(batch.order), len(table.parents)
+    least = np.float32(math.exp(least_exponent(cutoff, torch.float32)))
+    copies = batch.num_images if table.num_maps == 1 else 1
+    gaussians, spans, counts = np.empty((count, COLUMNS)), np.empty((count, 2), np.int32), np.empty(count, np.int64)
+    parts = chunks(count, _PART, _MOST_PARTS)
+    spacing = max_spacing(cutoff)
+    run_tasks(partial(measure, batch, table, radius, spacing, gaussians, spans, counts), phases(parts))
+    first_terms = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
+    total = int(first_terms[-1])
+    lists = Lists(
+        gaussians, batch.colors.ravel(), np.empty(copies * blocks + 1, np.int64), np.empty((total, 4), np.int32),
+        first_terms, np.empty(count, np.int32), table, np.zeros(copies * (blocks - len(table.mask_rows) + 1), np.bool_),
+        least,
+    )  # fmt: skip
+    histogram, places = np.zeros((len(parts), copies * blocks), np.int32), np.empty((total, 3), np.int32)
+    tasks = phases(parts, np.zeros((1, 2), np.int64), parts)
+    run_tasks(partial(list_visits, batch, radius, spans, places, histogram, lists), tasks)
+    return lists
 
 
 def _array(tensor: Tensor) -> Any:
@@ -88,16 +111,13 @@ def _table(membership: Membership | None, size: tuple[int, int]) -> Table:
         num_regions, num_maps = membership.num_regions, len(membership.index)
         tiles = membership.tiles(SIDE)
         mask_rows, masks = tiles.mask_rows.numpy(), tiles.masks.to(torch.float32).flatten().numpy()
-    finest, coarsest = blocks.grids[0], blocks.grids[-1]
+    coarsest = blocks.grids[-1]
     num_tiles = coarsest.first_tile + num_maps * coarsest.rows * coarsest.cols
     tile_start = np.searchsorted(keys, np.arange(num_tiles + 1) * num_regions)
     first_rows = np.cumsum([0, *(grid.rows for grid in blocks.grids[:-1])])
     grids = np.column_stack([np.array(blocks.grids), first_rows])
     regions, parents, parity = keys % num_regions, blocks.parents.numpy(), blocks.parity.numpy()
-    unmixed = np.flatnonzero(mask_rows < 0)
-    owner = np.full(num_maps * finest.rows * finest.cols, -1)
-    owner[keys[unmixed] // num_regions] = regions[unmixed]
-    return Table(num_regions, num_maps, grids, regions, tile_start, parents, parity, owner, mask_rows, masks)
+    return Table(num_regions, num_maps, grids, regions, tile_start, parents, parity, mask_rows, masks)
 
 
 def render(planned: _Plan, inputs: SplatInputs) -> Tensor:
@@ -105,28 +125,46 @@ def render(planned: _Plan, inputs: SplatInputs) -> Tensor:
     *batch, _, channels = inputs.colors.shape
     # numpy asks for huge pages where an array is large: first use costs a quarter of what torch.empty's does
     image = np.empty((*batch, channels, *inputs.size), np.float32)
-    images, nodes = image.reshape(-1, *image.shape[-3:]), _make_nodes(planned, channels)
-    _run(lambda rows: render_rows(planned.lists, rows, images, nodes), planned, reverse=True)
+    nothing = np.empty((0, 3), np.float32)
+    backward = Backward(planned.order[:0], nothing, nothing, nothing, nothing)
+    nodes = _make_nodes(planned, channels)
+    _visit(planned, ADDS, backward, image.reshape(-1, *image.shape[-3:]), nodes, nodes[:0], nothing)
     return torch.from_numpy(image)
 
 
 def differentiate(planned: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
     """Return the gradients of means, cholesky (None each without `geometry`) and colors."""
-    channels = inputs.colors.shape[-1]
-    # the loops sum eight terms at a time
-    terms = np.empty((len(planned.lists.entries), -(-(channels + 5 * geometry) // 8) * 8), np.float32)
-    values = grad.resolve_neg().contiguous().numpy().reshape(-1, *grad.shape[-3:])
-    nodes = _make_nodes(planned, channels)
-    _run(lambda rows: gather_gradients(planned.lists, rows, values, terms, geometry, nodes), planned, reverse=False)
-    means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs.gaussians)
-    gradients = GaussianGradients(*(t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors)))
-    sum_terms(planned.lists, planned.order, _array(inputs.cholesky), terms, geometry, gradients)
+    means, cholesky, colors = _gather(planned, inputs, grad, GATHERS)
     return (means, cholesky, colors) if geometry else (None, None, colors)
 
 
+def descend(planned: _Plan, inputs: SplatInputs, target: Tensor) -> Gradients:
+    """Return the gradients of half the squared error, summed over the pixels, against (B, C, H, W)."""
+    return _gather(planned, inputs, target, ADDS | GATHERS)
+
+
+def _gather(planned: _Plan, inputs: SplatInputs, image: Tensor, kind: int) -> tuple[Tensor, Tensor, Tensor]:
+    channels = inputs.colors.shape[-1]
+    # the loops sum eight terms at a time
+    terms = np.empty((len(planned.lists.visits), -(-(channels + 5) // 8) * 8), np.float32)
+    values = image.resolve_neg().contiguous().numpy().reshape(-1, *image.shape[-3:])
+    slopes = _make_nodes(planned, channels)
+    nodes = np.zeros_like(slopes) if kind & ADDS else slopes[:0]
+    means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs.gaussians)
+    gradients = (t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors))
+    backward = Backward(planned.order, _array(inputs.cholesky), *gradients)
+    _visit(planned, kind, backward, values, nodes, slopes, terms)
+    return means, cholesky, colors
+
+
 def _make_nodes(planned: _Plan, channels: int) -> Any:
-    return np.zeros(len(planned.lists.live) * SIDE * SIDE * channels if planned.has_nodes else 0, np.float32)
+    live = planned.lists.live
+    return np.zeros(len(live) * SIDE * SIDE * channels if live.any() else 0, np.float32)
 
 
-def _run(visit: Any, planned: _Plan, reverse: bool) -> None:
-    run(visit, planned.schedule, len(planned.lists.entries), planned.has_nodes, reverse)
+def _visit(planned: _Plan, kind: int, backward: Backward, image: Any, nodes: Any, slopes: Any, terms: Any) -> None:
+    lists = planned.lists
+    counts = tuple(lists.table.grids[: None if lists.live.any() else 1, TILE_ROWS].tolist())
+    tasks = order_tasks(counts, len(image), kind, len(planned.order))
+    loop = partial(visit, lists, backward, image, nodes, slopes, terms)
+    run_tasks(loop, tasks, serial=len(lists.visits) < _SERIAL_VISITS)

@@ -6,19 +6,16 @@ import math
 from typing import Any, NamedTuple
 
 from ..compiled import Program
-from .simd import SIDE
 
 program = Program(
     "CPU kernel",
     __file__,
-    "../whitened.py", "channels.py", "ellipse.py", "gradients.py", "lists.py", "loops.py", "rows.py", "schedule.py",
-    "simd.py", "spline.py",
+    "../tasks.py", "../whitened.py", "channels.py", "ellipse.py", "gradients.py", "lists.py", "loops.py", "rows.py",
+    "schedule.py", "simd.py", "spline.py",
 )  # fmt: skip
 
 # whitened coordinates times this, squared, are an exponent of 2
 SCALE = math.sqrt(0.5 / math.log(2.0))
-# pixels on either side of a row of tiles, for vectors that begin before it or end behind it
-PADDING = 4 * SIDE
 
 # columns of Lists.gaussians; lengths in nodes of the Gaussian's level, which at level 0 are pixels
 MEAN_X = 0
@@ -34,8 +31,9 @@ SLOPE2_X = 9  # SCALE * z2 per node along x
 SLOPE2_Y = 10  # SCALE * z2 per node along y
 LEVEL = 11  # of the coarse grid; 0: the pixels
 COLOR_FACTOR = 12  # of its colours, where a spline widens it
-SHEAR = 13  # how far the middle of a row is from that of the row above
-COLUMNS = 14
+CHANGE = 13  # c - 1, where c is the ratio of a weight's ratios between rows, see rows.py
+RUN = 14  # rows from an exponential to the next
+COLUMNS = 15
 
 # columns of Table.grids
 NODE_ROWS = 0
@@ -45,10 +43,11 @@ TILE_COLS = 3
 FIRST_TILE = 4  # number of its first tile, through all levels
 FIRST_ROW = 5  # number of its first row of tiles, through all levels
 
-# columns of Lists.entries
+# columns of Lists.visits
 GAUSSIAN = 0
-FIRST = 1  # column of its first tile; or -1: it is narrow and alone in its region, see rows._ShearedRows
-END = 2  # column of its last tile + 1; or, of a narrow one, vectors of each row
+TERMS = 1  # place of its sums
+FIRST = 2  # row of the block to visit
+LAST = 3  # the last one + 1
 
 
 class Table(NamedTuple):
@@ -61,7 +60,6 @@ class Table(NamedTuple):
     tile_start: Any  # [tiles + 1] int64 into blocks, all levels
     parents: Any  # [K, 4] int64, blocks of the next level that each is refined from; K: none
     parity: Any  # [K] uint8: 1 in an odd column of tiles, 2 in an odd row, 3 both
-    owner: Any  # [tiles of pixels] int64, the only region of a tile; -1: it has several
     mask_rows: Any  # [blocks of pixels] int64, row of masks; -1: alone in its tile
     masks: Any  # [P * 256] float32, membership of the pixels of a tile
 
@@ -75,18 +73,18 @@ class Batch(NamedTuple):
     order: Any  # [N] int64, from the table's order to the caller's
     images: Any  # [N] int64, in the table's order
     regions: Any  # [N] int64, in the table's order; -1: none
-    colors: Any  # [N, C] float32, in the table's order; `list_tiles` multiplies them by COLOR_FACTOR
+    colors: Any  # [N, C] float32, in the table's order; `measure` multiplies them by COLOR_FACTOR
 
 
 class Lists(NamedTuple):
-    """The Gaussians of each row of tiles."""
+    """The Gaussians of each block: tiles of pixels, and blocks of nodes."""
 
     gaussians: Any  # [N, COLUMNS] float64
     colors: Any  # [N * C] float32
-    regions: Any  # [N] int64
-    start: Any  # [rows of tiles + 1] int64 into entries
-    entries: Any  # [E, 3] int32
+    start: Any  # [copies * K + 1] int64 into visits; images that share a map have a copy of its blocks each
+    visits: Any  # [V, 4] int32, by block, then by Gaussian
+    first_terms: Any  # [N + 1] int64, place of each Gaussian's first sums
+    num_terms: Any  # [N] int32, blocks that each Gaussian touches
     table: Table
     live: Any  # [copies * (blocks of nodes + 1)] bool: not all zero; the last block of a copy never is
-    radius: float  # largest |z| of a weight that is not zero
-    least_exponent: Any  # float32, exponent of 2 below which a weight is zero
+    cutoff: Any  # float32, weight below which it is zero

@@ -1,44 +1,46 @@
-"""The lists of the CPU kernel: the table of Gaussians, which rows of tiles each touches, and which blocks of nodes."""
+"""The lists of the CPU kernel: the table of Gaussians, and which of them touch each block of pixels or nodes."""
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from ..compiled import inner
+from ..tasks import first_task, next_task
 from ..whitened import MEAN_LIMIT, SCALE_LIMITS
-from .ellipse import bounded, bounding_columns, count_vectors, tile_columns, tile_rows
+from .ellipse import block_rows, bounded, tile_columns, tile_rows
 from .layout import (
+    CHANGE,
     COLOR_FACTOR,
-    COLUMNS,
-    END,
     FIRST,
-    FIRST_ROW,
     FIRST_TILE,
     GAUSSIAN,
     INVERSE_L11,
     L11,
     L21,
     L22,
+    LAST,
     LEVEL,
     MEAN_X,
     MEAN_Y,
     NODE_COLS,
     NODE_ROWS,
-    PADDING,
     PEAK,
+    RUN,
     SCALE,
-    SHEAR,
     SIGMA_Y,
     SLOPE1_X,
     SLOPE2_X,
     SLOPE2_Y,
+    TERMS,
     TILE_COLS,
     TILE_ROWS,
     program,
 )
 from .simd import SIDE
+
+_LOG_4 = math.log(4.0)
+# |z| at which a weight is 2^-126, the least normal number, and a little less
+_NORMAL_RADIUS = 13.1
 
 
 @program.entry
@@ -57,34 +59,122 @@ def in_range(means, cholesky, colors):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def list_tiles(batch, table, radius, spacing):  # type: ignore[no-untyped-def]
-    """Return the gaussians, start, entries and live of Lists for a Batch and a Table; scale the Batch's colours.
+def measure(batch, table, radius, spacing, gaussians, spans, counts, tasks, counters):  # type: ignore[no-untyped-def]
+    """Fill the table of Gaussians, the rows of blocks that each may touch, and how many blocks; scale their colours.
 
-    `radius` is the largest |z| of a weight, `spacing` that of nodes in standard deviations, see coarse_grids.
+    Args:
+        batch: Batch.
+        table: Table.
+        radius: the largest |z| of a weight.
+        spacing: of nodes in standard deviations, see coarse_grids.
+        gaussians: (N, COLUMNS) float64.
+        spans: (N, 2) int32, first row and last + 1.
+        counts: (N,) int64, at least the number of blocks.
+        tasks: ranges of Gaussians, see `tasks.py`.
+        counters: see there.
     """
-    count, grids, channels = len(batch.order), table.grids, batch.colors.shape[1]
-    levels, images = len(grids), batch.num_images
-    gaussians = np.empty((count, COLUMNS))
-    start = np.zeros((grids[levels - 1, FIRST_ROW] + grids[levels - 1, TILE_ROWS]) * images + 1, np.int64)
-    span = np.empty((count, 2), np.int32)  # rows of tiles, first and last + 1
-    for i in range(count):
-        g = gaussians[i]
-        _fill(g, batch.means[batch.order[i]], batch.cholesky[batch.order[i]], levels, radius, spacing)
+    grids, channels = table.grids, batch.colors.shape[1]
+    k = first_task(tasks, counters)
+    while k >= 0:
+        for i in range(tasks[k, 1], tasks[k, 2]):
+            g, n = gaussians[i], batch.order[i]
+            _fill(g, batch.means[n], batch.cholesky[n], len(grids), radius, spacing)
+            level = int(g[LEVEL])
+            if level > 0:
+                for c in range(channels):
+                    batch.colors[i, c] *= g[COLOR_FACTOR]
+            first, end, count = 0, 0, 0
+            if batch.regions[i] >= 0:
+                height, width = grids[level, NODE_ROWS], grids[level, NODE_COLS]
+                first, end = tile_rows(g, height, width, radius)
+                for row in range(first, end):
+                    left, right = tile_columns(g, row, height, width, radius)
+                    count += right - left
+            spans[i, 0], spans[i, 1], counts[i] = first, end, count
+        k = next_task(tasks, counters)
+
+
+@program.entry
+def list_visits(batch, radius, spans, blocks, histogram, lists, tasks, counters):  # type: ignore[no-untyped-def]
+    """Fill start, visits, num_terms and live of Lists.
+
+    Args:
+        batch: Batch.
+        radius: the largest |z| of a weight.
+        spans: as `measure` returns them.
+        blocks: (V, 3) int32, room for the block, first row and last + 1 of each visit, by Gaussian.
+        histogram: (T, copies * K) int32, zeros.
+        lists: Lists, of which first_terms has the sums of `counts`.
+        tasks: ranges of Gaussians, then the sum over all, then the ranges once more; see `tasks.py`.
+        counters: see there.
+    """
+    parts = len(histogram)
+    k = first_task(tasks, counters)
+    while k >= 0:
+        if k < parts:
+            _find_blocks(batch, radius, spans, blocks, histogram[k], lists, tasks[k, 1], tasks[k, 2])
+        elif k == parts:
+            _sum_histogram(histogram, lists)
+        else:
+            _place_visits(blocks, histogram[k - parts - 1], lists, tasks[k, 1], tasks[k, 2])
+        k = next_task(tasks, counters)
+
+
+@inner
+def _find_blocks(batch, radius, spans, blocks, histogram, lists, begin, end):  # type: ignore[no-untyped-def]
+    table = lists.table
+    grids, maps = table.grids, table.num_maps
+    num_regions, tile_start, block_regions = table.num_regions, table.tile_start, table.regions
+    for i in range(begin, end):
+        g, image, region, place = lists.gaussians[i], batch.images[i], batch.regions[i], lists.first_terms[i]
         level = int(g[LEVEL])
-        if level > 0:
-            for c in range(channels):
-                batch.colors[i, c] *= g[COLOR_FACTOR]
-        first, end = 0, 0
-        if batch.regions[i] >= 0:
-            first, end = tile_rows(g, grids[level, NODE_ROWS], grids[level, NODE_COLS], radius)
-        base = grids[level, FIRST_ROW] * images + batch.images[i] * grids[level, TILE_ROWS]
-        span[i, 0], span[i, 1] = base + first, base + end
-        for row in range(base + first, base + end):
-            start[row + 1] += 1
-    for r in range(len(start) - 1):
-        start[r + 1] += start[r]
-    entries, live = _list_entries(batch, table, gaussians, span, start, radius)
-    return gaussians, start, entries, live
+        height, width, cols = grids[level, NODE_ROWS], grids[level, NODE_COLS], grids[level, TILE_COLS]
+        tile = grids[level, FIRST_TILE] + image % maps * grids[level, TILE_ROWS] * cols
+        head = image * len(block_regions) if maps == 1 else 0
+        for row in range(spans[i, 0], spans[i, 1]):
+            left, right = tile_columns(g, row, height, width, radius)
+            for col in range(left, right):
+                block = find_block(num_regions, tile_start, block_regions, tile + row * cols + col, region)
+                if block < 0:
+                    continue
+                first, last = block_rows(g, row, col, height, width, radius)
+                if first < last:
+                    blocks[place, 0], blocks[place, 1], blocks[place, 2] = head + block, first, last
+                    histogram[head + block] += 1
+                    place += 1
+        lists.num_terms[i] = place - lists.first_terms[i]
+
+
+@inner
+def _sum_histogram(histogram, lists):  # type: ignore[no-untyped-def]
+    """Turn numbers of visits into places of the first, set `start`, and mark the blocks of nodes that are not zero."""
+    table, start, live, total = lists.table, lists.start, lists.live, 0
+    for head in range(len(start) - 1):
+        start[head] = total
+        for part in range(len(histogram)):
+            count = histogram[part, head]
+            histogram[part, head] = total
+            total += count
+    start[len(start) - 1] = total
+    blocks, first = len(table.parents), len(table.mask_rows)
+    for copy in range((len(start) - 1) // blocks):
+        base = copy * (blocks - first + 1) - first
+        for block in range(blocks - 1, first - 1, -1):
+            head = copy * blocks + block
+            is_live = start[head] < start[head + 1]
+            for k in range(4):  # parents come after their blocks
+                is_live |= live[base + table.parents[block, k]]
+            live[base + block] = is_live
+
+
+@inner
+def _place_visits(blocks, places, lists, begin, end):  # type: ignore[no-untyped-def]
+    for i in range(begin, end):
+        first = lists.first_terms[i]
+        for k in range(first, first + lists.num_terms[i]):
+            visit = lists.visits[places[blocks[k, 0]]]
+            places[blocks[k, 0]] += 1
+            visit[GAUSSIAN], visit[TERMS], visit[FIRST], visit[LAST] = i, k, blocks[k, 1], blocks[k, 2]
 
 
 @inner
@@ -96,11 +186,12 @@ def _fill(g, mean, cholesky, levels, radius, spacing):  # type: ignore[no-untype
     g[SIGMA_Y] = math.sqrt(g[L21] * g[L21] + g[L22] * g[L22])
     g[INVERSE_L11] = 1.0 / g[L11]
     g[PEAK] = radius * g[L21] / g[SIGMA_Y]
-    g[SHEAR] = g[L11] * g[L21] / (g[SIGMA_Y] * g[SIGMA_Y])
     g[SLOPE1_X] = bounded(SCALE * g[INVERSE_L11])
     g[SLOPE2_Y] = SCALE / g[L22]
     g[SLOPE2_X] = bounded(-g[SLOPE2_Y] * g[L21] * g[INVERSE_L11])
     g[SLOPE2_Y] = bounded(g[SLOPE2_Y])
+    g[CHANGE] = math.expm1(-g[SLOPE2_Y] * g[SLOPE2_Y] * _LOG_4)
+    g[RUN] = min(max(math.floor((_NORMAL_RADIUS - radius) * g[L22]), 1), SIDE)
 
 
 @inner
@@ -111,10 +202,11 @@ def _coarsen(g, spacing, levels):  # type: ignore[no-untyped-def]
     """
     # of the variances along the axes of the ellipse: their sum, and their product
     total, product = g[L11] * g[L11] + g[L21] * g[L21] + g[L22] * g[L22], g[L11] * g[L22] * g[L11] * g[L22]
-    bound = spacing**4 * product * product / (total * total - 2 * product)  # of h^4
-    level = 0
-    while level + 1 < levels and 16.0 ** (level + 1) <= bound:
-        level += 1
+    spacing *= spacing
+    bound = spacing * spacing * product * product / (total * total - 2 * product)  # of h^4
+    level, power = 0, 16.0
+    while level + 1 < levels and power <= bound:
+        level, power = level + 1, power * 16.0
     g[LEVEL], g[COLOR_FACTOR] = level, 1.0
     if level == 0:
         return
@@ -127,59 +219,6 @@ def _coarsen(g, spacing, levels):  # type: ignore[no-untyped-def]
     g[COLOR_FACTOR] = l11 * l22 / (g[L11] * g[L22])
     g[L11], g[L21], g[L22] = g[L11] / h, g[L21] / h, g[L22] / h
     g[MEAN_X], g[MEAN_Y] = g[MEAN_X] / h + 1.5, g[MEAN_Y] / h + 1.5
-
-
-@inner
-def _list_entries(batch, table, gaussians, span, start, radius):  # type: ignore[no-untyped-def]
-    end, entries = start[:-1].copy(), np.empty((start[-1], 3), np.int32)
-    grids, mask_rows, maps, owner = table.grids, table.mask_rows, table.num_maps, table.owner
-    num_regions, tile_start, block_regions = table.num_regions, table.tile_start, table.regions
-    nodes = len(block_regions) - len(mask_rows)
-    live = np.zeros((batch.num_images if maps == 1 else 1) * (nodes + 1), np.bool_)
-    for i in range(len(gaussians)):
-        g, image, region = gaussians[i], batch.images[i], batch.regions[i]
-        level = int(g[LEVEL])
-        height, width, cols = grids[level, NODE_ROWS], grids[level, NODE_COLS], grids[level, TILE_COLS]
-        base = grids[level, FIRST_ROW] * batch.num_images + image * grids[level, TILE_ROWS]
-        tile = grids[level, FIRST_TILE] + (image % maps * grids[level, TILE_ROWS] - base) * cols
-        vectors = count_vectors(g, radius)
-        first_block = (image * (nodes + 1) if maps == 1 else 0) - len(mask_rows)
-        if level == 0 and SIDE * vectors <= PADDING:
-            first, last = bounding_columns(g, width, radius)
-            is_alone = True
-            for k in range(tile + span[i, 0] * cols, tile + span[i, 1] * cols, cols):
-                for col in range(first, last):
-                    if owner[k + col] != region:
-                        is_alone = False
-            if is_alone:
-                for row in range(span[i, 0], span[i, 1]):
-                    e = end[row]
-                    end[row] += 1
-                    entries[e, GAUSSIAN], entries[e, FIRST], entries[e, END] = i, -1, vectors
-                continue
-        for row in range(span[i, 0], span[i, 1]):
-            e = end[row]
-            end[row] += 1
-            first, last = tile_columns(g, row - base, height, width, radius)
-            entries[e, GAUSSIAN], entries[e, FIRST], entries[e, END] = i, first, last
-            if level > 0:
-                for k in range(tile + row * cols + first, tile + row * cols + last):
-                    block = find_block(num_regions, tile_start, block_regions, k, region)
-                    if block >= 0:
-                        live[first_block + block] = True
-    _spread(live, table.parents, len(mask_rows))
-    return entries, live
-
-
-@inner
-def _spread(live, parents, first):  # type: ignore[no-untyped-def]
-    """Mark blocks as live where one of their parents is; these come after them."""
-    blocks = len(parents)
-    for base in range(-first, len(live) - first, blocks - first + 1):
-        for block in range(blocks - 1, first - 1, -1):
-            for k in range(4):
-                if live[base + parents[block, k]]:
-                    live[base + block] = True
 
 
 @inner

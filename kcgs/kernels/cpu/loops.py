@@ -1,160 +1,145 @@
-"""The loops of the CPU kernel over rows of tiles, forward and backward: `render` and `gather`.
+"""The loops of the CPU kernel over rows of blocks: forward, backward, or both at once against a target.
 
-A row of tiles belongs to one thread, so the result does not depend on the number of threads. Within a tile only the
-rows of pixels that the ellipse crosses are visited. Wide Gaussians are evaluated in blocks of nodes of coarser grids,
-which are refined from level to level and sampled at the pixels.
-
-Pixels of a row of tiles lie in one array as [SIDE rows][channel][PADDING + columns + PADDING]; blocks of nodes lie one
-after the other as [SIDE rows][channel][SIDE columns].
+A block, 16 x 16 pixels or nodes of a coarse grid, stays in the processor's cache while all of its Gaussians are added
+or gathered. Within it only the rows that the ellipse crosses are visited. Wide Gaussians are evaluated in blocks of
+nodes, which are refined from level to level and sampled at the pixels. A row of blocks is one task, and every sum has
+an order of its own, so the result does not depend on the number of threads. A block lies in memory as
+[SIDE rows][channel][SIDE columns].
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ..compiled import inner
-from .ellipse import enter_rows, enter_tile
-from .layout import END, FIRST, GAUSSIAN, NODE_COLS, NODE_ROWS, PADDING, TILE_COLS, program
-from .lists import find_block, first_node_block, first_tile
-from .rows import add_rows, add_sheared, gather_rows, gather_sheared
-from .schedule import REFINEMENT
-from .simd import SIDE, clear_rows, copy, sum_columns
-from .spline import add_refined, add_sampled, gather_refined, gather_sampled, set_sampled
+from ..tasks import first_task, next_task
+from .ellipse import enter
+from .gradients import sum_terms
+from .layout import FIRST, GAUSSIAN, LAST, RUN, TERMS, TILE_COLS, program
+from .lists import first_node_block, first_tile
+from .rows import add_rows, gather_rows
+from .schedule import ADDS, FIRST_FIELD, GATHERS, IMAGE, KIND, LEVEL_FIELD, ROW
+from .simd import SIDE, exchange_rows
+from .spline import add_refined, add_sampled, gather_refined, gather_sampled
 
 
 @program.entry
-def render(lists, rows, image, nodes):  # type: ignore[no-untyped-def]
-    """Render rows of tiles into nodes and into the image, one after the other.
+def visit(lists, backward, image, nodes, slopes, terms, tasks, counters):  # type: ignore[no-untyped-def]
+    """Visit rows of blocks, and sum up the terms of Gaussians.
 
     Args:
         lists: Lists.
-        rows: (R, 4) int64, see schedule.Schedule.
-        image: (B, C, H, W) float32, of which each row of pixels fills its part.
+        backward: gradients.Backward; of no Gaussians where tasks add only.
+        image: (B, C, H, W) float32: what tasks that add fill, the gradient where they gather, the target where they do
+            both, of which the gradient is what they added minus that.
         nodes: float32, the live blocks of all coarse grids, from zero; empty where no Gaussian is wide.
+        slopes: float32, gradients of the nodes, from zero.
+        terms: (V, C + 5, rounded up to a multiple of 8) float32, of which each visit's is set: w g of each channel,
+            then v (z1, z2, z1 z1, z1 z2, z2 z2) with z times SCALE, see whitened.sums_to_gradients.
+        tasks: see schedule.py.
+        counters: see tasks.py.
     """
-    channels, stride = image.shape[1], _row_stride(image)
-    pixels, shape = np.empty(SIDE * channels * stride, np.float32), np.empty(9)
-    for k in range(len(rows)):
-        _, level, b, row = rows[k]
-        if level == REFINEMENT:
-            _refine(lists, nodes, channels, False)
-            continue
-        if level == 0 and len(nodes) > 0:
-            _sample_row(lists, b, row, pixels, nodes, channels, False)
-        elif level == 0:
-            for i in range(len(pixels)):
-                pixels[i] = 0.0
-        values, step = (nodes, SIDE) if level > 0 else (pixels, stride)
-        _add_row(lists, rows[k], values, step, channels, shape, None, None, False)
-        if level == 0:
-            _copy_row(pixels, image, b, row, True)
-
-
-@program.entry
-def gather_gradients(lists, rows, grad, terms, geometry, nodes):  # type: ignore[no-untyped-def]
-    """Sum the gradients of the entries of rows of tiles, and those of nodes.
-
-    Args:
-        lists: Lists.
-        rows: (R, 4) int64, see schedule.Schedule.
-        grad: (B, C, H, W) float32, of the image.
-        terms: (E, C + 5 or C, rounded up to a multiple of 8) float32, of which each entry's is set: w g of each
-            channel, then v (z1, z2, z1 z1, z1 z2, z2 z2) with z times SCALE, see whitened.sums_to_gradients.
-        geometry: whether to sum the latter five, too.
-        nodes: float32, as in `render`; becomes the gradients of the nodes.
-    """
-    channels, stride = grad.shape[1], _row_stride(grad)
-    pixels, shape = np.zeros(SIDE * channels * stride, np.float32), np.empty(9)
-    sums = np.zeros(terms.shape[1] * SIDE, np.float32)
-    for k in range(len(rows)):
-        number, level, b, row = rows[k]
-        if level == REFINEMENT:
-            _refine(lists, nodes, channels, True)
-            continue
-        if level == 0 and len(nodes) == 0 and lists.start[number] == lists.start[number + 1]:
-            continue
-        if level == 0:
-            _copy_row(pixels, grad, b, row, False)
-        if level == 0 and len(nodes) > 0:
-            _sample_row(lists, b, row, pixels, nodes, channels, True)
-        values, step = (nodes, SIDE) if level > 0 else (pixels, stride)
-        _gather_row(lists, rows[k], values, step, channels, shape, sums, terms, geometry)
+    channels = image.shape[1]
+    # a vector that begins at a multiple of its size lies in one line of the cache
+    room = np.zeros(SIDE * SIDE * channels + SIDE, np.float32)
+    pixels = room[-(room.ctypes.data // 4) % SIDE :]
+    sums, shape = np.zeros(max(terms.shape[1], 8) * SIDE, np.float32), np.empty(6, np.float32)
+    offsets, ones = np.empty(4, np.int64), np.ones(SIDE, np.float32)
+    k = first_task(tasks, counters)
+    while k >= 0:
+        if tasks[k, KIND] == 0:
+            sum_terms(lists, backward, terms, tasks[k, FIRST_FIELD], tasks[k, FIRST_FIELD + 1])
+        else:
+            _visit_row(lists, tasks[k], image, pixels, nodes, slopes, terms, sums, shape, offsets, ones)
+        k = next_task(tasks, counters)
 
 
 @inner
-def _row_stride(image):  # type: ignore[no-untyped-def]
-    """Return the elements from a channel of a row of pixels to the next."""
-    return -(-image.shape[3] // SIDE) * SIDE + 2 * PADDING
+def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, shape, offsets, ones):  # type: ignore[no-untyped-def]
+    """Visit a row of blocks: add, gather, or both."""
+    table, live, start, visits = lists.table, lists.live, lists.start, lists.visits
+    tile_start, parents, parity = table.tile_start, table.parents, table.parity
+    mask_rows, masks = table.mask_rows, table.masks
+    level, b, row = task[LEVEL_FIELD], task[IMAGE], task[ROW]
+    adds, gathers = (task[KIND] & ADDS) != 0, (task[KIND] & GATHERS) != 0
+    channels = image.shape[1]
+    size, across = SIDE * SIDE * channels, SIDE * channels
+    tile, base = first_tile(table, level, b, row), first_node_block(table, b) - len(mask_rows)
+    head = b * len(parents) if table.num_maps == 1 else 0
+    values, gradients = (nodes, slopes) if level > 0 else (pixels, pixels)
+    for col in range(table.grids[level, TILE_COLS]):
+        first_block, end_block = tile_start[tile + col], tile_start[tile + col + 1]
+        if adds and level == 0:
+            pixels[:size] = 0.0
+        for block in range(first_block, end_block if adds else first_block):
+            origin = (base + block) * size if level > 0 else 0
+            weights, first, step = _mask(mask_rows, masks, ones, block, level)
+            mask = first if step > 0 else -1
+            if len(nodes) > 0 and _set_offsets(live, parents, block, base, size, offsets):
+                down, right = parity[block] >= 2, parity[block] % 2 == 1
+                if level > 0:
+                    add_refined(
+                        nodes, offsets, down, right, values, origin, across, SIDE, channels, weights, first, step
+                    )
+                else:
+                    add_sampled(
+                        nodes, offsets, down, right, values, origin, across, SIDE, channels, weights, first, step
+                    )
+            for v in range(start[head + block], start[head + block + 1]):
+                i = visits[v, GAUSSIAN]
+                enter(lists.gaussians[i], row, col, shape)
+                add_rows(  # type: ignore[call-arg]
+                    values, origin, channels, visits[v, FIRST], visits[v, LAST], shape,
+                    int(lists.gaussians[i, RUN]), lists.colors, i * channels, lists.cutoff, masks, mask,
+                )  # fmt: skip
+        if level == 0:
+            _exchange(image, pixels, b, row * SIDE, col * SIDE, adds, gathers)
+        for block in range(first_block, end_block if gathers else first_block):
+            origin = (base + block) * size if level > 0 else 0
+            weights, first, step = _mask(mask_rows, masks, ones, block, level)
+            mask = first if step > 0 else -1
+            for v in range(start[head + block], start[head + block + 1]):
+                i = visits[v, GAUSSIAN]
+                enter(lists.gaussians[i], row, col, shape)
+                gather_rows(  # type: ignore[call-arg]
+                    gradients, origin, channels, visits[v, FIRST], visits[v, LAST], shape,
+                    int(lists.gaussians[i, RUN]), lists.colors, i * channels, lists.cutoff, masks, mask, sums, terms,
+                    visits[v, TERMS] * terms.shape[1],
+                )  # fmt: skip
+            if len(slopes) > 0 and _set_offsets(live, parents, block, base, size, offsets):
+                down, right = parity[block] >= 2, parity[block] % 2 == 1
+                if level > 0:
+                    gather_refined(
+                        slopes, offsets, down, right, gradients, origin, across, SIDE, channels, weights, first, step
+                    )
+                else:
+                    gather_sampled(
+                        slopes, offsets, down, right, gradients, origin, across, SIDE, channels, weights, first, step
+                    )
 
 
 @inner
-def _copy_row(pixels, image, b, row, outward):  # type: ignore[no-untyped-def]
-    """Copy the pixels of a row of tiles to an image, or from there; outside of the image they are zero."""
+def _exchange(image, pixels, b, top, left, adds, gathers):  # type: ignore[no-untyped-def]
+    """Copy a block to an image (if it adds), from there (if it gathers), or subtract that; outside it is zero."""
     channels, height, width = image.shape[1:]
-    stride, top = _row_stride(image), row * SIDE
-    for r in range(min(SIDE, height - top)):
-        for c in range(channels):
-            outside, inside = ((b * channels + c) * height + top + r) * width, (r * channels + c) * stride + PADDING
-            if outward:
-                copy(image, outside, pixels, inside, width)  # type: ignore[call-arg]
-            else:
-                copy(pixels, inside, image, outside, width)  # type: ignore[call-arg]
-    if not outward:
-        for k in range((height - top) * channels * stride, len(pixels)):
-            pixels[k] = 0.0
+    rows, cols = min(SIDE, height - top), min(SIDE, width - left)
+    if gathers and (rows < SIDE or cols < SIDE):
+        for r in range(SIDE):
+            for k in range((cols if r < rows else 0), SIDE):
+                for c in range(channels):
+                    pixels[(r * channels + c) * SIDE + k] = 0.0
+    exchange_rows(  # type: ignore[call-arg]
+        image, (b * channels * height + top) * width + left, width, height * width, pixels, channels, rows, cols, adds,
+        gathers,
+    )  # fmt: skip
 
 
 @inner
-def _refine(lists, nodes, channels, transposed):  # type: ignore[no-untyped-def]
-    """Add the splines of coarser blocks to every block of nodes; or, transposed, its gradients to the coarser ones."""
-    table, live, stride = lists.table, lists.live, SIDE * channels
-    parents, parity, offsets, ones = table.parents, table.parity, np.empty(4, np.int64), np.ones(SIDE, np.float32)
-    first, count = len(table.mask_rows), len(parents) - len(table.mask_rows)
-    for base in range(-first, len(live) - first, count + 1):
-        for n in range(count):
-            block = first + (n if transposed else count - 1 - n)
-            if not _set_offsets(live, parents, block, base, SIDE * stride, offsets):
-                continue
-            start, down, right = (base + block) * SIDE * stride, parity[block] >= 2, parity[block] % 2 == 1
-            if transposed:
-                gather_refined(nodes, offsets, down, right, nodes, start, stride, SIDE, channels, ones, 0, 0)
-            else:
-                add_refined(nodes, offsets, down, right, nodes, start, stride, SIDE, channels, ones, 0, 0)
-
-
-@inner
-def _sample_row(lists, image, row, pixels, nodes, channels, transposed):  # type: ignore[no-untyped-def]
-    """Set a row of tiles to the nodes' splines times the membership; or, transposed, add its gradients to the nodes."""
-    table, live, stride = lists.table, lists.live, len(pixels) // (SIDE * channels)
-    tile_start, parents, mask_rows, masks = table.tile_start, table.parents, table.mask_rows, table.masks
-    offsets, ones, down = np.empty(4, np.int64), np.ones(SIDE, np.float32), row % 2 == 1
-    across = channels * stride  # elements from a row of pixels to the next
-    base, tile = first_node_block(table, image) - len(mask_rows), first_tile(table, 0, image, row)
-    for col in range(table.grids[0, TILE_COLS]):
-        start, right, empty = PADDING + col * SIDE, col % 2 == 1, True
-        for block in range(tile_start[tile + col], tile_start[tile + col + 1]):
-            if not _set_offsets(live, parents, block, base, SIDE * SIDE * channels, offsets):
-                continue
-            weights, mask_start, step = ones, 0, 0
-            if mask_rows[block] >= 0:
-                weights, mask_start, step = masks, mask_rows[block] * SIDE * SIDE, SIDE
-            if transposed:
-                gather_sampled(
-                    nodes, offsets, down, right, pixels, start, across, stride, channels, weights, mask_start, step
-                )
-            elif empty:
-                set_sampled(
-                    nodes, offsets, down, right, pixels, start, across, stride, channels, weights, mask_start, step
-                )
-            else:
-                add_sampled(
-                    nodes, offsets, down, right, pixels, start, across, stride, channels, weights, mask_start, step
-                )
-            empty = False
-        if empty and not transposed:
-            clear_rows(pixels, start, stride, SIDE * channels)  # type: ignore[call-arg]
+def _mask(mask_rows, masks, ones, block, level):  # type: ignore[no-untyped-def]
+    """Return the membership of a block's pixels: array, first element, and step from row to row; step 0: all are 1."""
+    if level > 0 or mask_rows[block] < 0:
+        return ones, 0, 0
+    return masks, mask_rows[block] * SIDE * SIDE, SIDE
 
 
 @inner
@@ -169,68 +154,3 @@ def _set_offsets(live, parents, block, base, size, offsets):  # type: ignore[no-
             parent = base + len(parents)  # the block of zeros
         offsets[k] = parent * size
     return is_live
-
-
-def _make_row_loop(gathers: bool) -> Any:
-    """Make the loop over the Gaussians of a row of tiles, which adds them to pixels, or gathers their gradients."""
-
-    @inner
-    def visit_row(lists, place, pixels, stride, channels, shape, sums, terms, geometry):  # type: ignore[no-untyped-def]
-        """Visit a row of Schedule, whose `pixels` are those of its tiles, or the blocks of all nodes.
-
-        `shape` (9,) float64 and `sums` (as many as terms, times SIDE) float32 are room.
-        """
-        number, level, image, row = place
-        block_size, across = SIDE * SIDE * channels, channels * stride
-        table, gaussians, entries, colors = lists.table, lists.gaussians, lists.entries, lists.colors
-        num_regions, regions = table.num_regions, table.regions
-        tile_start, mask_rows = table.tile_start, table.mask_rows
-        height, width = table.grids[level, NODE_ROWS], table.grids[level, NODE_COLS]
-        tile, first_block = first_tile(table, level, image, row), first_node_block(table, image) - len(mask_rows)
-        masks, radius, least = table.masks, lists.radius, lists.least_exponent
-        for e in range(lists.start[number], lists.start[number + 1]):
-            i, start, end = entries[e, GAUSSIAN], entries[e, FIRST], entries[e, END]
-            region = lists.regions[i]
-            if gathers:
-                for k in range(len(sums)):
-                    sums[k] = 0.0
-            if start < 0:
-                first, last = enter_rows(gaussians[i], row, height, width, radius, end, shape)
-                if gathers:
-                    gather_sheared(  # type: ignore[call-arg]
-                        pixels, PADDING, across, stride, channels, first, last, shape, colors, i * channels, least,
-                        end, sums, geometry,
-                    )  # fmt: skip
-                else:
-                    add_sheared(  # type: ignore[call-arg]
-                        pixels, PADDING, across, stride, channels, first, last, shape, colors, i * channels, least, end
-                    )
-                start = end  # it is on no list of tiles
-            for col in range(start, end):
-                block = find_block(num_regions, tile_start, regions, tile + col, region)
-                if block < 0:
-                    continue
-                first, last = enter_tile(gaussians[i], row, col, height, width, radius, shape)
-                if first >= last:
-                    continue
-                origin, mask_start = (first_block + block) * block_size, -1
-                if level == 0:
-                    origin, mask_start = PADDING + col * SIDE, mask_rows[block] * SIDE * SIDE
-                if gathers:
-                    gather_rows(  # type: ignore[call-arg]
-                        pixels, origin, across, stride, channels, first, last, shape, colors, i * channels, least,
-                        masks, mask_start, sums, geometry,
-                    )  # fmt: skip
-                else:
-                    add_rows(  # type: ignore[call-arg]
-                        pixels, origin, across, stride, channels, first, last, shape, colors, i * channels, least,
-                        masks, mask_start,
-                    )  # fmt: skip
-            if gathers:
-                sum_columns(sums, terms.shape[1], terms, e * terms.shape[1])  # type: ignore[call-arg]
-
-    return visit_row
-
-
-_add_row = _make_row_loop(False)
-_gather_row = _make_row_loop(True)

@@ -17,6 +17,7 @@ from numba.extending import intrinsic
 SIDE = 16  # of a tile, and elements of a vector
 FLOAT = ir.FloatType()
 _INT = ir.IntType(32)
+_BYTE = ir.IntType(8).as_pointer()
 LONG = ir.IntType(64)
 VECTOR = ir.VectorType(FLOAT, SIDE)
 _VECTOR_INT = ir.VectorType(_INT, SIDE)
@@ -24,7 +25,7 @@ ZERO = ir.Constant(LONG, 0)
 UNDEFINED = ir.Constant(VECTOR, ir.Undefined)
 
 
-def exp2_coefficients(degree: int = 5) -> list[float]:
+def exp2_coefficients(degree: int = 6) -> list[float]:
     """Return a polynomial for 2^f on [-1/2, 1/2] that is exactly 1 at 0, lowest power first."""
     nodes = 0.5 * np.cos((np.arange(64) + 0.5) * np.pi / 64)
     quotient = np.polynomial.Chebyshev.fit(nodes, (np.exp2(nodes) - 1) / nodes, degree - 1, domain=[-0.5, 0.5])
@@ -58,19 +59,22 @@ def ramp() -> ir.Constant:
     return ir.Constant(VECTOR, [ir.Constant(FLOAT, column - (SIDE - 1) / 2) for column in range(SIDE)])
 
 
-def exp2(builder: Any, exponent: Any) -> Any:
-    """Return 2 to the power of a vector: a polynomial between whole exponents."""
+def exp2(builder: Any, exponent: Any, minus_one: bool = False) -> Any:
+    """Return 2 to the power of a vector, or that minus one: a polynomial between whole exponents."""
     exponent = apply(builder, "maxnum", exponent, constant(-126.0))
     whole = apply(builder, "rint", exponent)
     fraction = builder.fsub(exponent, whole)
     value = constant(EXP2[-1])
-    for coefficient in reversed(EXP2[:-1]):
+    for coefficient in reversed(EXP2[1:-1]):
         value = apply(builder, "fma", value, fraction, constant(coefficient))
     bits = builder.shl(
         builder.add(builder.fptosi(whole, _VECTOR_INT), ir.Constant(_VECTOR_INT, [127] * SIDE)),
         ir.Constant(_VECTOR_INT, [23] * SIDE),
     )
-    return builder.fmul(value, builder.bitcast(bits, VECTOR))
+    power = builder.bitcast(bits, VECTOR)
+    if minus_one:  # the first term of the polynomial is 1
+        return apply(builder, "fma", builder.fmul(value, fraction), power, builder.fsub(power, constant(1.0)))
+    return builder.fmul(apply(builder, "fma", value, fraction, constant(1.0)), power)
 
 
 def pointer(context: Any, builder: Any, array_type: Any, array: Any, offset: Any) -> Any:
@@ -111,57 +115,71 @@ def if_else(builder: Any, condition: Any, emit: Callable[[bool], None]) -> None:
 
 
 @intrinsic
-def copy(typing_context, target, target_start, source, source_start, count):  # type: ignore[no-untyped-def]
-    """Copy `count` elements of four bytes from element `source_start` to element `target_start`."""
+def exchange_rows(  # type: ignore[no-untyped-def]
+    typing_context, image, place, row_stride, channel_stride, pixels, channels, rows, columns, adds, gathers
+):
+    """Copy a block to an image, from element `place` on, if it `adds`; from there if it `gathers`; if both, subtract.
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        to, start = (pointer(context, builder, signature.args[i], *arguments[i : i + 2]) for i in (0, 2))
-        cgutils.raw_memcpy(builder, to, start, arguments[4], 4)
-        return context.get_dummy_value()
-
-    return types.void(target, types.int64, source, types.int64, types.int64), generate
-
-
-@intrinsic
-def clear_rows(typing_context, target, origin, stride, count):  # type: ignore[no-untyped-def]
-    """Set `count` rows of 16 from element `origin` on, `stride` elements apart, to zero."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        start = pointer(context, builder, signature.args[0], *arguments[:2])
-        with cgutils.for_range(builder, arguments[3]) as loop:
-            store(builder, constant(0.0), builder.gep(start, [builder.mul(loop.index, arguments[2])]))
-        return context.get_dummy_value()
-
-    long = types.int64
-    return types.void(target, long, long, long), generate
-
-
-@intrinsic
-def sum_columns(typing_context, sums, count, terms, start):  # type: ignore[no-untyped-def]
-    """Set terms[start + k] to the sum of the 16 columns of sums[k], for k < count, in a fixed order.
-
-    Eight k are done at a time: both arrays have room for a multiple of eight.
+    The block has rows of 16 elements, [row][channel][column]; `rows` and `columns` are those within the image.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        source = pointer(context, builder, signature.args[0], arguments[0], ZERO)
-        target = pointer(context, builder, signature.args[2], arguments[2], arguments[3])
-        eight = ir.Constant(LONG, 8)
-        groups = builder.sdiv(builder.add(arguments[1], ir.Constant(LONG, 7)), eight)
-        with cgutils.for_range(builder, groups) as loop:
-            first = builder.mul(loop.index, eight)
-            rows = [load(builder, source, builder.add(first, ir.Constant(LONG, k))) for k in (0, 4, 2, 6, 1, 5, 3, 7)]
-            # the halves of two rows are interleaved and added, until one row holds two columns of each
-            width = SIDE
-            while len(rows) > 1:
-                rows = [_fold(builder, rows[k], rows[k + 1], width) for k in range(0, len(rows), 2)]
-                width //= 2
-            total = builder.fadd(*(shuffle(builder, rows[0], UNDEFINED, range(k, SIDE, 2)) for k in (0, 1)))
-            place = builder.bitcast(builder.gep(target, [first]), total.type.as_pointer())
-            builder.store(total, place, align=4)
+        image = pointer(context, builder, signature.args[0], *arguments[:2])
+        pixels = pointer(context, builder, signature.args[4], arguments[4], ZERO)
+        row_stride, channel_stride, channels, rows, columns, adds, gathers = (
+            arguments[k] for k in (2, 3, *range(5, 10))
+        )
+
+        prefetch = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(ir.VoidType(), [_BYTE, _INT, _INT, _INT]), "llvm.prefetch.p0i8"
+        )
+
+        def exchange(inside: Any, outside: Any, subtracts: bool | None) -> None:
+            """Exchange what two pointers hold; `subtracts`: None to copy outward."""
+            if subtracts is None:
+                builder.store(builder.load(inside, align=4), outside, align=4)
+            elif subtracts:
+                builder.store(builder.fsub(*(builder.load(p, align=4) for p in (inside, outside))), inside, align=4)
+            else:
+                builder.store(builder.load(outside, align=4), inside, align=4)
+
+        def emit(subtracts: bool | None) -> None:
+            with cgutils.for_range(builder, rows) as row, cgutils.for_range(builder, channels) as channel:
+                first = builder.add(builder.mul(row.index, channels), channel.index)
+                inside = builder.gep(pixels, [builder.mul(first, ir.Constant(LONG, SIDE))])
+                offset = builder.add(builder.mul(row.index, row_stride), builder.mul(channel.index, channel_stride))
+                outside = builder.gep(image, [offset])
+                # the end of the row of the next block, whose lines are too far apart for the processor to foresee
+                following = builder.bitcast(builder.gep(outside, [ir.Constant(LONG, 2 * SIDE - 1)]), _BYTE)
+                builder.call(prefetch, [following, *(ir.Constant(_INT, k) for k in (int(subtracts is None), 3, 1))])
+
+                def emit_row(is_whole: bool) -> None:
+                    if is_whole:
+                        kind = VECTOR.as_pointer()
+                        exchange(builder.bitcast(inside, kind), builder.bitcast(outside, kind), subtracts)
+                        return
+                    with cgutils.for_range(builder, columns) as loop:
+                        places = [loop.index]
+                        exchange(builder.gep(inside, places), builder.gep(outside, places), subtracts)
+
+                if_else(builder, builder.icmp_signed("==", columns, ir.Constant(LONG, SIDE)), emit_row)
+
+        if_else(builder, gathers, lambda g: if_else(builder, adds, emit) if g else emit(None))
         return context.get_dummy_value()
 
-    return types.void(sums, types.int64, terms, types.int64), generate
+    long, flag = types.int64, types.boolean
+    return types.void(image, long, long, long, pixels, long, long, long, flag, flag), generate
+
+
+def sum_columns(builder: Any, rows: Sequence[Any]) -> Any:
+    """Return the sums of the 16 columns of eight vectors, as a vector of eight, in a fixed order."""
+    rows = [rows[k] for k in (0, 4, 2, 6, 1, 5, 3, 7)]
+    # the halves of two rows are interleaved and added, until one row holds two columns of each
+    width = SIDE
+    while len(rows) > 1:
+        rows = [_fold(builder, rows[k], rows[k + 1], width) for k in range(0, len(rows), 2)]
+        width //= 2
+    return builder.fadd(*(shuffle(builder, rows[0], UNDEFINED, range(k, SIDE, 2)) for k in (0, 1)))
 
 
 def _fold(builder: Any, first: Any, second: Any, width: int) -> Any:

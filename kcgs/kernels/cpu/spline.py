@@ -118,8 +118,8 @@ def _make_loop(emit: Callable[[_Blocks, Any, bool], None]) -> Any:
     return loop
 
 
-def _make_add(even: tuple[float, ...], odd: tuple[float, ...], replaces: bool = False) -> Any:
-    """Make fine[row, c, :] += mask[row, :] * spline[row, c, :], or, if it `replaces`, = in place of +=."""
+def _make_add(even: tuple[float, ...], odd: tuple[float, ...]) -> Any:
+    """Make fine[row, c, :] += mask[row, :] * spline[row, c, :]."""
     neighbors = [k for k in range(4) if even[k] or odd[k]]
 
     def widen(builder: Any, window: Any) -> Any:
@@ -143,8 +143,7 @@ def _make_add(even: tuple[float, ...], odd: tuple[float, ...], replaces: bool = 
             for k in neighbors:
                 total = _multiply_add(builder, (even, odd)[row % 2][k], rows[row // 2 + k], total)
             place, mask = blocks.fine_row(channel, row), blocks.mask(row)
-            value = builder.fmul(total, mask) if replaces else apply(builder, "fma", total, mask, load(builder, place))
-            store(builder, value, place)
+            store(builder, apply(builder, "fma", total, mask, load(builder, place)), place)
 
     return _make_loop(emit)
 
@@ -185,4 +184,3 @@ add_refined = _make_add(_REFINE_EVEN, _REFINE_ODD)
 gather_refined = _make_gather(_REFINE_EVEN, _REFINE_ODD)
 add_sampled = _make_add(_SAMPLE_EVEN, _SAMPLE_ODD)
 gather_sampled = _make_gather(_SAMPLE_EVEN, _SAMPLE_ODD)
-set_sampled = _make_add(_SAMPLE_EVEN, _SAMPLE_ODD, replaces=True)

@@ -1,0 +1,155 @@
+"""Tasks that threads take from a shared counter, for compiled loops.
+
+A compiled function receives `tasks`, int64, a row for each, of which the first column is the number of tasks that must
+be done before: those of earlier phases. Its loop is::
+
+    k = first_task(tasks, counters)
+    while k >= 0:
+        ...  # task tasks[k]
+        k = next_task(tasks, counters)
+
+Which thread takes which task is left to chance, so a task writes where no other one of its phase does.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from .compiled import inner
+from .threads import num_threads
+
+# columns of tasks and of counters
+START = 0  # tasks that must be done before
+_TAKEN = 0
+_DONE = 1
+
+# times that a thread yields before it sleeps, so that one that was interrupted finds a processor
+_YIELDS = 40
+_MICROSECONDS = 20  # of a sleep
+
+
+def run_tasks(function: Callable[[Any, Any], None], tasks: Any, *, serial: bool = False) -> None:
+    """Call function(tasks, counters) on this thread and, unless `serial`, on others; return when all is done."""
+    counters = np.zeros(2, np.int64)
+    threads = 1 if serial else min(num_threads(), len(tasks))
+    for _ in range(threads - 1):
+        # one that starts too late finds nothing to do, so nobody waits for it
+        _pool(os.getpid(), num_threads() - 1).submit(function, tasks, counters)
+    function(tasks, counters)
+
+
+@functools.cache
+def _pool(process: int, threads: int) -> ThreadPoolExecutor:
+    # by process, since threads do not survive a fork
+    return ThreadPoolExecutor(threads, thread_name_prefix="kcgs")
+
+
+def phases(*parts: Any) -> Any:
+    """Join the tasks of phases, (T, K) int64 each, and put the tasks that must be done before them in front."""
+    starts = np.repeat(np.cumsum([0, *map(len, parts[:-1])]), [len(part) for part in parts])
+    return np.column_stack([starts, np.concatenate(parts)])
+
+
+def chunks(count: int, size: int, most: int) -> Any:
+    """Split a range into at most `most` parts of at least about `size`: first and last + 1, (T, 2) int64."""
+    parts = min(max(-(-count // size), 1), most)
+    ends = np.arange(parts + 1) * count // parts
+    return np.column_stack([ends[:-1], ends[1:]])
+
+
+@intrinsic
+def _add(typing_context, counters, place):  # type: ignore[no-untyped-def]
+    """Add 1 to a counter at once for all threads; return what it was."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.atomic_rmw("add", _pointer(context, builder, signature, arguments), _long(1), "seq_cst")
+
+    return types.int64(counters, types.int64), generate
+
+
+@intrinsic
+def _read(typing_context, counters, place):  # type: ignore[no-untyped-def]
+    """Return a counter, which other threads change."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.load_atomic(_pointer(context, builder, signature, arguments), "acquire", 8)
+
+    return types.int64(counters, types.int64), generate
+
+
+@intrinsic
+def _yield_thread(typing_context):  # type: ignore[no-untyped-def]
+    """Let another thread have the processor."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        _call(builder, "SwitchToThread" if os.name == "nt" else "sched_yield", [])
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+@intrinsic
+def _sleep(typing_context):  # type: ignore[no-untyped-def]
+    """Sleep for a moment."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        _call(builder, *(("Sleep", [0]) if os.name == "nt" else ("usleep", [_MICROSECONDS])))
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+def _call(builder: Any, name: str, numbers: list[int]) -> None:
+    """Call a function of the system on integers."""
+    arguments = [ir.Constant(ir.IntType(32), number) for number in numbers]
+    kind = ir.FunctionType(ir.IntType(32), [argument.type for argument in arguments])
+    builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments)
+
+
+def _pointer(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+    return builder.gep(data, [arguments[1]])
+
+
+def _long(value: int) -> ir.Constant:
+    return ir.Constant(ir.IntType(64), value)
+
+
+@inner
+def _wait(counters, count):  # type: ignore[no-untyped-def]
+    """Wait until so many tasks are done."""
+    yields = 0
+    while _read(counters, _DONE) < count:  # type: ignore[call-arg]
+        if yields < _YIELDS:
+            _yield_thread()
+        else:
+            _sleep()
+        yields += 1
+
+
+@inner
+def first_task(tasks, counters):  # type: ignore[no-untyped-def]
+    """Take a task, and wait for those before it; return its number, or -1 when all are done."""
+    k: int = _add(counters, _TAKEN)  # type: ignore[call-arg]
+    if k < len(tasks):
+        _wait(counters, tasks[k, START])
+        return k
+    _wait(counters, len(tasks))
+    return -1
+
+
+@inner
+def next_task(tasks, counters):  # type: ignore[no-untyped-def]
+    """Say that a task is done, and take the next one, as `first_task` does."""
+    _add(counters, _DONE)  # type: ignore[call-arg]
+    return first_task(tasks, counters)
