@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap, region_splat, ssim
+from kcgs.functional.splat import squared_error_gradients
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
@@ -37,9 +38,20 @@ def squared_error(state: FitState, regions: RegionMap | None = None) -> Tensor:
     return (render(state, scene).detach() - state.problem.image).square().mean(0)
 
 
-def backward(problem: Problem, rendered: Tensor) -> None:
-    """Leave half the gradient of the loss at the field; no optimizer here depends on the factor."""
+def backward(state: FitState, rendered: Tensor | None) -> None:
+    """Leave half the gradient of the loss at the field; no optimizer here depends on the factor.
+
+    Without a render, (C, H, W), the scene is rendered and differentiated in one pass, if the loss is local.
+    """
+    problem, field = state.problem, state.scene.field
     config, image = problem.config, problem.image
+    if rendered is None and _has_local_loss(problem):
+        field.means.grad, field.cholesky.grad, field.colors.grad = squared_error_gradients(
+            image, field.means, field.cholesky, field.colors, field.region_ids, state.scene.regions,
+            cutoff=state.cutoff, backend=config.backend,
+        )  # fmt: skip
+        return
+    rendered = render(state) if rendered is None else rendered
     if config.loss == "l2":
         # in the memory of the render, which nothing needs again: new memory would take as long as the sum
         difference = rendered.data.sub_(image)
@@ -51,6 +63,11 @@ def backward(problem: Problem, rendered: Tensor) -> None:
         (slope,) = torch.autograd.grad(ssim(leaf, image), leaf)
         sign -= _SSIM_WEIGHT * leaf.numel() * slope
     rendered.backward(sign)
+
+
+def _has_local_loss(problem: Problem) -> bool:
+    """True where the loss is the squared error of the render as it is."""
+    return problem.config.loss == "l2" and problem.objective is None and not problem.clamp
 
 
 def is_finite(field: GaussianField) -> bool:

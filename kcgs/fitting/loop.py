@@ -126,10 +126,11 @@ def _run(
         for strategy in strategies:
             if strategy.due(state):
                 strategy.apply(state)
-        rendered = render(state)
+        rendered = None
         if log_is_due(state, clock.seconds()):
+            rendered = render(state)
             log(state, rendered, clock.seconds())
-        backward(state.problem, rendered)
+        backward(state, rendered)
         set_learning_rates(state.optimizer, config, state.progress)
         state.optimizer.step()
         state.optimizer.zero_grad()

@@ -8,7 +8,9 @@ from torch import Tensor
 from kcgs._check import check_cutoff, check_floating, check_ids, check_rows, check_size
 from kcgs.kernels import check_backend
 
+from .arguments import SplatArguments
 from .decomposition import decompose
+from .evaluation import descend
 from .map_tables import MapOperands
 from .operator import splat_operator
 from .regions import RegionMap, map_operands
@@ -113,6 +115,28 @@ def splat_at(
         *gaussians, region_ids, labels, softness, *size, check_cutoff(cutoff), check_backend(backend)
     )
     return image if colors.dtype == dtype else image.to(colors.dtype)
+
+
+def squared_error_gradients(
+    image: Tensor,
+    means: Tensor,
+    cholesky: Tensor,
+    colors: Tensor,
+    region_ids: Tensor | None,
+    regions: RegionMap | None,
+    *,
+    cutoff: float,
+    backend: str,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the gradients of half the squared error of a render, summed over the pixels of an image (C, H, W).
+
+    For descents: one pass over the image where the backend has it, no graph, and arguments are not checked.
+    """
+    height, width = image.shape[1:]
+    operands = None if regions is None else map_operands(regions)
+    labels, softness = (None, None) if operands is None else operands[:2]
+    gaussians = means.detach(), cholesky.detach(), colors.detach()
+    return descend(SplatArguments(*gaussians, region_ids, labels, softness, height, width, cutoff, backend), image)
 
 
 def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
