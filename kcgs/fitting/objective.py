@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -15,10 +16,13 @@ from kcgs.nn import GaussianField
 
 from .pursuit import SIGMAS, halve, propose
 
+if TYPE_CHECKING:
+    from .similarity import Passes
+
 # weight of the squared error
 _SQUARED = 0.003
 # least mean of a scale, since the logarithm has no bound at 0
-_MIN_SCORE = 0.2
+MIN_SCORE = 0.2
 
 
 class MsSsimObjective:
@@ -29,8 +33,9 @@ class MsSsimObjective:
 
     x is the image, :math:`P_k` averages blocks, v is the variance under the window of SSIM, and the last :math:`s_k` is
     times the luminance. Scales and weights are those of :func:`kcgs.functional.ms_ssim`, without the finest, which
-    has a weight of 4 % and would take three quarters of the time. Windows that the border cuts count as much as others,
-    else the outer tenth of an image would count little. Near the image E is quadratic, and `importance` and `weigh`
+    has a weight of 4 % and would take three quarters of the time. Of the windows, which overlap, those at even rows and
+    columns count. Those that the border cuts count as much as others, else the outer tenth of an image would count
+    little. Near the image E is quadratic, and `importance` and `weigh`
     are that form's. Farther off it is not: where texture is missing, more variance in the render is better, so `apply`
     is half the gradient of E itself.
 
@@ -68,19 +73,32 @@ class MsSsimObjective:
             _, inside, mean, _, weight = self._scales[-1]
             bright = _blur(inside * weight / self._norm / (2.0 * mean * mean + K1**2)).mean(0)
             self._bands.append((level, blocks + window, math.inf, bright))
+        self._passes = self._compile() if image.device.type == "cpu" and image.dtype == torch.float32 else None
+
+    def _compile(self) -> Passes | None:
+        """Return the compiled form of `_measure`; None where the image has no scale."""
+        if not self._scales:
+            return None
+        from .similarity import Passes  # loads numba
+
+        factors = [weight / self._norm * 0.25**level for level, (*_, weight) in enumerate(self._scales, 1)]
+        return Passes([[plane.numpy() for plane in planes] for *planes, _ in self._scales], factors)
 
     def apply(self, difference: Tensor) -> Tensor:
         """Return half the gradient of E, (C, H, W), at a difference r, render - image.
 
         Where the mean of a scale is below 0.2, E takes it as 0.2, and the slope is that of the mean by 0.2.
         """
-        return self._measure(difference)[1]
+        if self._passes is None:
+            return self._measure(difference)[1]
+        return torch.from_numpy(self._passes.half_gradient(difference.contiguous().numpy(), _SQUARED))
 
     def value(self, difference: Tensor) -> float:
         """Return E, as a mean over pixels and channels."""
-        return float(self._measure(difference)[0]) / difference[0].numel() + _SQUARED * float(
-            difference.square().mean()
-        )
+        squared = _SQUARED * float(difference.square().mean())
+        if self._passes is None:
+            return float(self._measure(difference)[0]) / difference[0].numel() + squared
+        return self._passes.value(difference.contiguous().numpy()) / difference[0].numel() + squared
 
     def weigh(self, means: Tensor, cholesky: Tensor) -> Tensor:
         """Return about what the squared error of Gaussians counts in E, by their places and sizes, (N,)."""
@@ -115,9 +133,13 @@ class MsSsimObjective:
                 means = mean * mean + render_mean * render_mean + K1**2
                 luminance = (2.0 * mean * render_mean + K1**2) / means
                 luminance_slope = structure * (luminance * render_mean - mean) / means
-            score = (structure * luminance).mean((1, 2)).clamp_min(_MIN_SCORE)
+            windows = (structure * luminance)[:, ::2, ::2]
+            score = windows.mean((1, 2)).clamp_min(MIN_SCORE)
             total -= weight / self._norm * mean[0].numel() * score.log().mean()
-            share = inside * (weight / self._norm * 0.25**level) / score[:, None, None]
+            # of windows at even rows and columns, for all
+            share = torch.zeros_like(plane)
+            factor = weight / self._norm * 0.25**level * mean.numel() / windows.numel()
+            share[:, ::2, ::2] = inside[:, ::2, ::2] * factor / score[:, None, None]
             by_product = share * luminance / variances
             by_square = by_product * structure
             by_mean = by_product * mean - by_square * render_mean + share * luminance_slope

@@ -250,6 +250,11 @@ def _similarity(image: Tensor, target: Tensor, contrast: bool) -> Tensor:
 
 def window_mean(maps: Tensor) -> Tensor:
     """Filter by the Gaussian window along both sides, without padding."""
+    return blur(maps, window_taps())
+
+
+def window_taps() -> list[float]:
+    """Return half of the Gaussian window along one side, its centre first."""
     taps = gaussian_taps(SSIM_SIGMA, _MARGIN)
     total = sum([*taps[:0:-1], *taps])
-    return blur(maps, [tap / total for tap in taps])
+    return [tap / total for tap in taps]

@@ -14,7 +14,7 @@ from kcgs._check import check_count, check_number
 from kcgs._image import as_image
 from kcgs._repr import brief
 from kcgs.codec import decode
-from kcgs.codec.gaussians.quantize import Quantizer
+from kcgs.codec.gaussians.quantize import QPS, Quantizer
 from kcgs.codec.scenes import QUALITIES, SceneWriter
 from kcgs.errors import InvalidArgument
 from kcgs.fitting.config import Objective
@@ -153,6 +153,8 @@ class CompressionSchedule:
     """Share of `target_bytes` that is enough. More: slower, and less error."""
     max_roundings: int = 3
     """Most roundings of a scene until a file has `min_fill`."""
+    max_secants: int = 4
+    """Most files that are written to find the QP of the first rounding."""
     bytes_gain: float = 1.3
     """Factor of the change of bytes that an update of the QP aims at: numbers that round to 0 take no more bits when
     their steps become finer. More: the size swings. Less: it lags behind."""
@@ -180,18 +182,32 @@ class _Compressor:
             change = _SCHEDULE.descent_aim * target_bytes - size
             return writer.next_qp(qp, size, size + round(_SCHEDULE.bytes_gain * change))
 
-        writer = self._descend(update_qp(self.writer, self.writer.qp_for(None)), update_qp)
-        qp, fallback = writer.largest_file(lambda qp: self._round(writer, qp, 0), target_bytes)
-        max_qp = self.writer.qp_for(QUALITIES[1])
-        data, candidates = fallback, []
+        writer, qp = self._descend(update_qp(self.writer, self.writer.qp_for(None)), update_qp)
+        qp, max_qp = self._secant(writer, qp, target_bytes), self.writer.qp_for(QUALITIES[1])
+        size, candidates = target_bytes, []
         for _ in range(_SCHEDULE.max_roundings):
-            qp = min(writer.next_qp(qp, len(data), round(_SCHEDULE.rounding_aim * target_bytes)), max_qp)
+            qp = min(writer.next_qp(qp, size, round(_SCHEDULE.rounding_aim * target_bytes)), max_qp)
             data = self._round(writer, qp, self.rounding_iterations, target_bytes)
-            if len(data) <= target_bytes:
+            size = len(data)
+            if size <= target_bytes:
                 candidates.append(data)
-            if len(data) >= _SCHEDULE.min_fill * target_bytes or qp == max_qp:
+            if size >= _SCHEDULE.min_fill * target_bytes or qp == max_qp:
                 break
-        return max(candidates, key=len, default=fallback)
+        if candidates:
+            return max(candidates, key=len)
+        return writer.largest_file(lambda qp: self._round(writer, qp, 0), target_bytes)[1]
+
+    def _secant(self, writer: SceneWriter, qp: int, target_bytes: int) -> int:
+        """Return the QP at which a file that is rounded at once has about `target_bytes`, by the secant method."""
+        sizes: dict[int, int] = {}
+        while len(sizes) < _SCHEDULE.max_secants and qp not in sizes:
+            sizes[qp] = len(self._round(writer, qp, 0))
+            next_qp = writer.next_qp(qp, sizes[qp], target_bytes)
+            if len(sizes) > 1:
+                (a, size_a), (b, size_b) = [*sizes.items()][-2:]
+                next_qp = b + round((target_bytes - size_b) * (b - a) / ((size_b - size_a) or math.inf))
+            qp = min(max(next_qp, QPS[0]), QPS[1])
+        return qp
 
     def search_psnr(self, target_psnr: float, scene_psnr: float) -> bytes:
         """Return the coarsest file that reaches `target_psnr`, or where the scene does not, the coarsest of all."""
@@ -203,10 +219,14 @@ class _Compressor:
 
     def write(self, qp: int) -> bytes:
         """Return the file at a QP."""
-        return self._round(self._descend(qp, lambda _, qp: qp), qp, self.rounding_iterations)
+        return self._round(self._descend(qp, lambda _, qp: qp)[0], qp, self.rounding_iterations)
 
-    def _descend(self, qp: int, update_qp: Callable[[SceneWriter, int], int]) -> SceneWriter:
-        """Lower error and bits with nothing rounded; `update_qp` returns the QP for the scene of the moment."""
+    def _descend(self, qp: int, update_qp: Callable[[SceneWriter, int], int]) -> tuple[SceneWriter, int]:
+        """Lower error and bits with nothing rounded; `update_qp` returns the QP for the scene of the moment.
+
+        Returns:
+            The Gaussians, and the last QP.
+        """
         writer, iterations = self.writer, self.descent_iterations
         descent = self._new_descent(writer)
         for start in range(0, iterations, _SCHEDULE.update_interval):
@@ -217,7 +237,7 @@ class _Compressor:
             for _ in range(min(_SCHEDULE.update_interval, iterations - start)):
                 descent.step(quantizer)
             writer = writer.with_gaussians(descent.parameters(), descent.ids)
-        return writer
+        return writer, qp
 
     def _round(self, writer: SceneWriter, qp: int, iterations: int, max_bytes: float = math.inf) -> bytes:
         descent, quantizer = self._new_descent(writer), Quantizer(qp, writer.size)

@@ -14,6 +14,7 @@ from kcgs.codec.gaussians.quantize import Parameters, Quantizer
 from kcgs.fitting.descent import DRAFT_CUTOFF
 from kcgs.fitting.objective import MsSsimObjective
 from kcgs.functional import RegionMap, region_splat
+from kcgs.functional.splat import squared_error_gradients
 from kcgs.optim.newton import Gaussians, NewtonDescent, area, error_weights, half_gradients
 
 from .bits import soft_bits
@@ -27,8 +28,8 @@ _BIT_PRICE = 0.9
 _GAUSSIAN_PRICE = 20.0
 # share of a Newton step in a step: larger ones oscillate, smaller ones take more iterations
 _RATE = 0.09
-# steps for which the gradient of the bits is reused, which changes slowly
-_BIT_GRADIENT_STEPS = 4
+# steps for which the gradient of the bits, and what errors weigh, are reused, which change slowly
+_REUSE_STEPS = 4
 
 
 class RateDistortionDescent:
@@ -57,8 +58,8 @@ class RateDistortionDescent:
         self.gaussians = self._as_tensors(gaussians)
         # steps are so short that the first order of the shear is enough
         self.newton = NewtonDescent(self.gaussians, exact=False)
-        # mean weight of the squared error in the objective
-        self._error_scale = float(error_weights(self.gaussians, objective).mean())
+        self._error_weights = error_weights(self.gaussians, objective)
+        self._error_scale = float(self._error_weights.mean())
         self._bit_gradient: Gaussians | None = None
         self._num_steps = 0
 
@@ -109,12 +110,13 @@ class RateDistortionDescent:
 
     def _step_from(self, gaussians: Gaussians, quantizer: Quantizer, frozen: Tensor | None = None) -> Gaussians:
         height, width = quantizer.size
-        if self._bit_gradient is None or self._num_steps % _BIT_GRADIENT_STEPS == 0:
+        if self._bit_gradient is None or self._num_steps % _REUSE_STEPS == 0:
             self._bit_gradient = self._half_bit_gradient(gaussians, quantizer)
+            self._error_weights = error_weights(gaussians, self.objective)
         self._num_steps += 1
-        gradients = half_gradients(self._render, gaussians, self.image, self.objective)
+        gradients = self._half_error_gradient(gaussians)
         gradients = Gaussians(*(error + bits for error, bits in zip(gradients, self._bit_gradient, strict=True)))
-        color_curvature = area(gaussians.cholesky).clamp_max(height * width) * error_weights(gaussians, self.objective)
+        color_curvature = area(gaussians.cholesky).clamp_max(height * width) * self._error_weights
         return self.newton.step(gaussians, gradients, color_curvature, _RATE, frozen)
 
     def _half_bit_gradient(self, gaussians: Gaussians, quantizer: Quantizer) -> Gaussians:
@@ -124,10 +126,21 @@ class RateDistortionDescent:
         bits = price * soft_bits(cholesky, colors, quantizer).sum()
         return Gaussians(torch.zeros_like(gaussians.means), *torch.autograd.grad(bits, (cholesky, colors)))
 
+    def _half_error_gradient(self, gaussians: Gaussians) -> Gaussians:
+        if self.objective is not None:
+            return half_gradients(self._render, gaussians, self.image, self.objective)
+        ids = self._region_ids()
+        gradients = squared_error_gradients(
+            self.image, *gaussians, ids, self.regions, cutoff=DRAFT_CUTOFF, backend="auto"
+        )
+        return Gaussians(*gradients)
+
     def _render(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
-        ids = None if self.regions is None else self.regions.ids[torch.from_numpy(self.ids)]
         size = self.image.shape[1], self.image.shape[2]
-        return region_splat(means, cholesky, colors, ids, self.regions, size=size, cutoff=DRAFT_CUTOFF)
+        return region_splat(means, cholesky, colors, self._region_ids(), self.regions, size=size, cutoff=DRAFT_CUTOFF)
+
+    def _region_ids(self) -> Tensor | None:
+        return None if self.regions is None else self.regions.ids[torch.from_numpy(self.ids)]
 
     def _energy(self) -> Tensor:
         """Return the error that each Gaussian saves, (N,), if no other overlaps it."""

@@ -17,6 +17,8 @@ from .descent import RateDistortionDescent
 _SHAPE_SHARE = 0.65
 # iterations from one group of Gaussians that is rounded to the next
 _GROUP_INTERVAL = 3
+# bytes of one of the weakest Gaussians, as a share of the mean
+_WEAK_SHARE = 0.75
 # shares of the iterations after which Gaussians are removed if the file is too large: early enough that the others
 # correct the error
 _SIZE_CHECKS = (0.3, 0.65, 0.9)
@@ -66,5 +68,5 @@ def round_gradually(
 
 
 def _excess(size: int, max_bytes: float, num_gaussians: int) -> int:
-    """Return the number of Gaussians that the bytes above `max_bytes` are for."""
-    return max(0, math.ceil((size - max_bytes) * num_gaussians / size))
+    """Return how many of the weakest Gaussians the bytes above `max_bytes` are for."""
+    return max(0, math.ceil((size - max_bytes) * num_gaussians / (_WEAK_SHARE * size)))

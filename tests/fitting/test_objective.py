@@ -30,8 +30,10 @@ def lacking(image: Tensor, residual: Tensor) -> Tensor:
     x, y, total = image[:, None], (image + residual)[:, None], torch.zeros((), dtype=torch.float64)
     for scale, weight in enumerate((0.2856, 0.3001, 0.2363, 0.1333), 1):
         x, y = avg_pool2d(x, 2), avg_pool2d(y, 2)
-        inside = conv2d(torch.ones_like(x), window, padding=5)  # of windows that the border cuts
-        mean_x, mean_y, xx, yy, xy = (conv2d(t, window, padding=5) / inside for t in (x, y, x * x, y * y, x * y))
+        inside = conv2d(torch.ones_like(x), window, stride=2, padding=5)  # of windows that the border cuts
+        mean_x, mean_y, xx, yy, xy = (
+            conv2d(t, window, stride=2, padding=5) / inside for t in (x, y, x * x, y * y, x * y)
+        )
         score = (2 * (xy - mean_x * mean_y) + 0.03**2) / (xx - mean_x**2 + yy - mean_y**2 + 0.03**2)
         if scale == 4:
             score = score * (2 * mean_x * mean_y + 0.01**2) / (mean_x**2 + mean_y**2 + 0.01**2)
@@ -74,11 +76,19 @@ class TestMsSsim:
             g = 1e-4 * torch.exp(-0.5 * ((x - 60.5) ** 2 + (y - 90.5) ** 2) / sigma**2).expand(3, -1, -1).double()
             assert float(weight) == pytest.approx(objective.value(g) / float(g.square().mean()), rel=0.5)
 
-    @pytest.mark.parametrize("size", [(1, 1), (1, 9), (21, 30), (22, 30), (50, 47)])
-    def test_small_images(self, size: tuple[int, int]) -> None:
-        objective = MsSsimObjective(torch.full((1, *size), 0.5))
-        assert objective.apply(torch.ones(1, *size)).isfinite().all()
-        assert objective.value(torch.ones(1, *size)) > 0
+    @pytest.mark.parametrize("size", [(1, 1), (1, 9), (21, 30), (22, 30), (50, 47), (283, 39)])
+    def test_compiled(self, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+        """Float32 is compiled: it agrees with float64, at all sizes and on any number of threads."""
+        image, residual = photo(*size), 0.1 * photo(*size, seed=1)
+        objective, expected = MsSsimObjective(image.float()), MsSsimObjective(image)
+        slope = expected.apply(residual)
+        slopes = []
+        for threads in (1, 2):
+            monkeypatch.setattr("kcgs.kernels.tasks.num_threads", lambda count=threads: count)
+            slopes.append(objective.apply(residual.float()))
+        torch.testing.assert_close(slopes[0].double(), slope, rtol=0, atol=1e-3 * float(slope.abs().max()))
+        assert torch.equal(*slopes)
+        assert objective.value(residual.float()) == pytest.approx(expected.value(residual), rel=1e-4)
         assert objective.weigh(torch.ones(1, 2), torch.tensor([[3.0, 0.0, 3.0]])).isfinite().all()
 
 
