@@ -85,13 +85,15 @@ class MsSsimObjective:
         return Passes([[plane.numpy() for plane in planes] for *planes, _ in self._scales], factors)
 
     def apply(self, difference: Tensor) -> Tensor:
-        """Return half the gradient of E, (C, H, W), at a difference r, render - image.
+        """Return half the gradient of E, (C, H, W), at a difference r, render - image, in whose memory it may be.
 
         Where the mean of a scale is below 0.2, E takes it as 0.2, and the slope is that of the mean by 0.2.
         """
         if self._passes is None:
             return self._measure(difference)[1]
-        return torch.from_numpy(self._passes.half_gradient(difference.contiguous().numpy(), _SQUARED))
+        gradient = difference.contiguous()
+        self._passes.differentiate(gradient.numpy(), _SQUARED)
+        return gradient
 
     def value(self, difference: Tensor) -> float:
         """Return E, as a mean over pixels and channels."""

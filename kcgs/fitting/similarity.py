@@ -292,17 +292,17 @@ def _mean_score(scales, sums, tasks, scale, channel):  # type: ignore[no-untyped
 
 
 @inner
-def _add(source, factor, coarse, target):  # type: ignore[no-untyped-def]
-    """Set a row to another times a factor, and add what the blocks of a coarser one have."""
+def _add(row, factor, coarse):  # type: ignore[no-untyped-def]
+    """Multiply a row by a factor, and add to it what the blocks of a coarser one have."""
     for x in range(len(coarse)):
-        target[2 * x] = source[2 * x] * factor + coarse[x]
-        target[2 * x + 1] = source[2 * x + 1] * factor + coarse[x]
-    for x in range(2 * len(coarse), len(target)):
-        target[x] = source[x] * factor
+        row[2 * x] = row[2 * x] * factor + coarse[x]
+        row[2 * x + 1] = row[2 * x + 1] * factor + coarse[x]
+    for x in range(2 * len(coarse), len(row)):
+        row[x] *= factor
 
 
 @inner
-def _sum(scales, difference, squared, sums, tasks, k, gradient):  # type: ignore[no-untyped-def]
+def _sum(scales, difference, squared, sums, tasks, k):  # type: ignore[no-untyped-def]
     """Fill rows of the gradient by the image's pixels: the coarser scales' are added to the finer ones'."""
     table, channels, channel = scales.table, len(difference), tasks[k, _CHANNEL]
     first, last = tasks[k, _FIRST], tasks[k, _LAST]
@@ -314,17 +314,16 @@ def _sum(scales, difference, squared, sums, tasks, k, gradient):  # type: ignore
         coarse = _plane(scales.planes, table, scale + has_coarse, channel, channels)
         rows = table[scale + 1, _HEIGHT] if has_coarse else 0
         for y in range(first >> scale, last >> scale):
-            _add(plane[y], factor, coarse[y // 2] if y // 2 < rows else nothing, plane[y])
+            _add(plane[y], factor, coarse[y // 2] if y // 2 < rows else nothing)
     plane = _plane(scales.planes, table, 0, channel, channels)
     end = difference.shape[1] if last == len(plane) else 2 * last
     for y in range(2 * first, end):
-        row = plane[y // 2] if y // 2 < len(plane) else nothing
-        _add(difference[channel, y], np.float32(squared), row, gradient[channel, y])
+        _add(difference[channel, y], np.float32(squared), plane[y // 2] if y // 2 < len(plane) else nothing)
 
 
 @program.entry
-def run_phases(scales, difference, squared, sums, gradient, has_gradient, tasks, counters):  # type: ignore[no-untyped-def]
-    """Fill the sums of scores, (T,) by task, and half the gradient, (C, H, W), of a difference."""
+def run_phases(scales, difference, squared, sums, has_gradient, tasks, counters):  # type: ignore[no-untyped-def]
+    """Fill the sums of scores, (T,) by task; with the last phase replace a difference by half the gradient."""
     k = first_task(tasks, counters)
     while k >= 0:
         phase, scale, channel, first, last = tasks[k, 1], tasks[k, 2], tasks[k, 3], tasks[k, 4], tasks[k, 5]
@@ -333,7 +332,7 @@ def run_phases(scales, difference, squared, sums, gradient, has_gradient, tasks,
         elif phase == _SCORE:
             sums[k] = _score(scales, scale, channel, first, last, len(difference), has_gradient)
         else:
-            _sum(scales, difference, squared, sums, tasks, k, gradient)
+            _sum(scales, difference, squared, sums, tasks, k)
         k = next_task(tasks, counters)
 
 
@@ -382,19 +381,14 @@ class Passes:
         logs = np.log(np.maximum(scores / windows[:, None], MIN_SCORE)).mean(1)
         return -float((self._scales.factors * 4.0 ** np.arange(1, len(table) + 1) * windows * logs).sum())
 
-    def half_gradient(self, difference: NDArray[Any], squared: float) -> NDArray[Any]:
-        """Return half its gradient, (C, H, W), and `squared` times the difference, contiguous float32."""
-        gradient = np.empty_like(difference)
-        self._run(difference, self._tasks, squared, gradient)
-        return gradient
+    def differentiate(self, difference: NDArray[Any], squared: float) -> None:
+        """Replace a difference, (C, H, W), contiguous float32, by half the gradient and `squared` times itself."""
+        self._run(difference, self._tasks, squared)
 
-    def _run(
-        self, difference: NDArray[Any], tasks: Any, squared: float = 0.0, gradient: NDArray[Any] | None = None
-    ) -> NDArray[Any]:
+    def _run(self, difference: NDArray[Any], tasks: Any, squared: float = 0.0) -> NDArray[Any]:
         """Run tasks; return the sums of scores, by task."""
         sums = np.zeros(len(tasks))
-        target = difference if gradient is None else gradient
-        arguments = self._scales, difference, squared, sums, target, gradient is not None
+        arguments = self._scales, difference, squared, sums, tasks is self._tasks
         run_tasks(lambda tasks, counters: run_phases(*arguments, tasks, counters), tasks)
         return sums
 

@@ -38,7 +38,7 @@ class Objective(Protocol):
     """An error of a render that is about quadratic, such as the fit's for MS-SSIM."""
 
     def apply(self, residual: Tensor) -> Tensor:
-        """Return half the gradient at a residual, render - image, (C, H, W)."""
+        """Return half the gradient at a residual, render - image, (C, H, W), in whose memory it may be."""
 
     def weigh(self, means: Tensor, cholesky: Tensor) -> Tensor:
         """Return what the squared error of each Gaussian weighs in the objective, (N,)."""
@@ -102,7 +102,7 @@ def half_gradients(
     leaves = [t.detach().requires_grad_() for t in gaussians]
     with torch.enable_grad():
         render = renderer(*leaves)
-    residual = render.detach() - image
+    residual = render.data.sub_(image)
     if objective is not None:
         residual = objective.apply(residual)
     return Gaussians(*torch.autograd.grad(render, leaves, residual))
