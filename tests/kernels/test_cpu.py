@@ -127,5 +127,5 @@ def test_auto_is_this_kernel(scene: tuple[Tensor, ...]) -> None:
 def test_compiled_once_for_all_channels(scene: tuple[Tensor, ...]) -> None:
     for channels in (1, 5):
         render((*scene[:2], scene[2].repeat(1, 2)[:, :channels], *scene[3:]))
-    for loop in (lists.in_range, lists.measure, lists.list_visits, loops.visit):
+    for loop in (lists.arrange, lists.measure, lists.list_visits, loops.visit):
         assert len(loop.signatures) == 1

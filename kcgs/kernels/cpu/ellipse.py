@@ -65,8 +65,8 @@ def tile_columns(g, row, height, width, radius):  # type: ignore[no-untyped-def]
     top = max((row * SIDE + 0.5 - _MARGIN - g[MEAN_Y]) / sigma, -radius)
     bottom = min((min(row * SIDE + SIDE, height) - 0.5 + _MARGIN - g[MEAN_Y]) / sigma, radius)
     along, across = g[L11] * g[L21] / sigma, g[L11] * g[L22] / sigma
-    right = g[MEAN_X] + _highest(along, across, g[PEAK], top, bottom, radius) + _MARGIN
-    left = g[MEAN_X] - _highest(along, across, g[PEAK], -bottom, -top, radius) - _MARGIN
+    right = g[MEAN_X] + _highest(along, across, radius * g[PEAK], top, bottom, radius) + _MARGIN
+    left = g[MEAN_X] - _highest(along, across, radius * g[PEAK], -bottom, -top, radius) - _MARGIN
     first = math.ceil(max(left - 0.5, 0.0))
     last = math.floor(min(right - 0.5, width - 1.0))
     return (first // SIDE, last // SIDE + 1) if first <= last else (0, 0)
@@ -80,8 +80,8 @@ def block_rows(g, row, col, height, width, radius):  # type: ignore[no-untyped-d
     if left > right:
         return 0, 0
     base = row * SIDE
-    bottom = g[MEAN_Y] + _highest(g[L21], g[L22], g[PEAK], left, right, radius) + _MARGIN
-    top = g[MEAN_Y] - _highest(g[L21], g[L22], g[PEAK], -right, -left, radius) - _MARGIN
+    bottom = g[MEAN_Y] + _highest(g[L21], g[L22], radius * g[PEAK], left, right, radius) + _MARGIN
+    top = g[MEAN_Y] - _highest(g[L21], g[L22], radius * g[PEAK], -right, -left, radius) - _MARGIN
     first = math.ceil(max(top - 0.5, float(base)))
     last = math.floor(min(bottom - 0.5, min(base + SIDE, height) - 1.0))
     return first - base, last + 1 - base

@@ -13,7 +13,6 @@ from .layout import COLOR_FACTOR, L11, L21, L22, LEVEL, SCALE
 class Backward(NamedTuple):
     """What `sum_terms` needs and fills, in the caller's order."""
 
-    order: Any  # [N] int64, from the table's order to the caller's
     factors: Any  # [N, 3] float32, Cholesky factors
     means_gradient: Any  # [N, 2] float32
     cholesky_gradient: Any  # [N, 3] float32
@@ -28,7 +27,7 @@ def sum_terms(lists, backward, terms, begin, end):  # type: ignore[no-untyped-de
         lists: Lists.
         backward: Backward.
         terms: (V, ...) float32, as loops.visit fills them.
-        begin: the first Gaussian, in the table's order.
+        begin: the first Gaussian, in the lists' order.
         end: the last one + 1.
     """
     channels = backward.colors_gradient.shape[1]
@@ -38,7 +37,7 @@ def sum_terms(lists, backward, terms, begin, end):  # type: ignore[no-untyped-de
         for place in range(lists.first_terms[i], lists.first_terms[i] + lists.num_terms[i]):
             for k in range(len(t)):
                 t[k] += terms[place, k]
-        g, n = lists.gaussians[i], backward.order[i]
+        g, n = lists.gaussians[i], lists.order[i]
         by_factor = 0.0
         for c in range(channels):
             by_factor += t[c] * (lists.colors[i * channels + c] / g[COLOR_FACTOR])

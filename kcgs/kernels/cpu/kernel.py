@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,8 +17,8 @@ from ..membership import Membership
 from ..tasks import chunks, phases, run_tasks
 from ..whitened import least_exponent, support_radius
 from .gradients import Backward
-from .layout import COLUMNS, TILE_ROWS, Batch, Lists, Table
-from .lists import in_range, list_visits, measure
+from .layout import COLUMNS, SHAPE_COLUMNS, TILE_COLS, TILE_ROWS, VISIT_COLUMNS, Batch, Lists, Table
+from .lists import arrange, list_visits, measure
 from .loops import visit
 from .schedule import ADDS, GATHERS, order_tasks
 from .simd import SIDE
@@ -30,11 +30,6 @@ _MOST_PARTS = 16
 _SERIAL_VISITS = 300
 
 
-class _Plan(NamedTuple):
-    lists: Lists
-    order: Any  # [N] int64, from the lists' order to the caller's
-
-
 def steps(inputs: SplatInputs) -> Steps:
     """Return the kernel, if it takes these inputs."""
     if inputs.means.dtype != torch.float32:
@@ -44,57 +39,51 @@ def steps(inputs: SplatInputs) -> Steps:
     return Steps(plan, render, differentiate, descend=descend, checks_inputs=True)
 
 
-def plan(inputs: SplatInputs) -> _Plan | None:
-    """List which Gaussians touch which tiles, for the loops; None where a value is out of range."""
-    num_images, count = inputs.colors.shape[:-2].numel(), inputs.colors.shape[-2]
+def plan(inputs: SplatInputs) -> Lists | None:
+    """List which Gaussians touch which blocks; None where a value is out of range."""
     means, cholesky, colors = (_array(t) for t in inputs.gaussians)
-    if not in_range(means, cholesky, colors):
-        return None
-    images = np.repeat(np.arange(num_images), count)
-    order = _sort(means, images, inputs.size)
     if inputs.membership is not None and inputs.region_index is not None:
         table = inputs.membership.derived("cpu", lambda m: _table(m, inputs.size))
-        regions = inputs.region_index.flatten().numpy()[order]
+        regions = inputs.region_index.flatten().numpy()
     else:
-        table, regions = _table_without_map(inputs.size), np.zeros(num_images * count, np.int64)
-    batch = Batch(num_images, means, cholesky, order, images[order], regions, colors[order])
-    return _Plan(_list_visits(batch, table, inputs.cutoff), order)
+        table, regions = _table_without_map(inputs.size), np.empty(0, np.int64)
+    batch = Batch(inputs.colors.shape[:-2].numel(), means, cholesky, colors, regions)
+    is_valid, order = arrange(batch, *table.grids[0, TILE_ROWS : TILE_COLS + 1].tolist())
+    return _list_visits(batch, table, order, inputs.cutoff) if is_valid else None
 
 
-def _list_visits(batch: Batch, table: Table, cutoff: float) -> Lists:
-    radius = support_radius(cutoff, torch.float32)
-    count, blocks = len(batch.order), len(table.parents)
-    least = np.float32(math.exp(least_exponent(cutoff, torch.float32)))
+def _list_visits(batch: Batch, table: Table, order: Any, cutoff: float) -> Lists:
+    radius, least = support_radius(cutoff, torch.float32), least_exponent(cutoff, torch.float32)
+    count, blocks = len(order), len(table.parents)
     copies = batch.num_images if table.num_maps == 1 else 1
     gaussians, spans, counts = np.empty((count, COLUMNS)), np.empty((count, 2), np.int32), np.empty(count, np.int64)
-    parts = chunks(count, _PART, _MOST_PARTS)
+    colors = np.empty(batch.colors.size, np.float32)
+    parts, measurement, listing = _list_tasks(count)
     spacing = max_spacing(cutoff)
-    run_tasks(partial(measure, batch, table, radius, spacing, gaussians, spans, counts), phases(parts))
-    first_terms = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
+    run_tasks(partial(measure, batch, table, radius, spacing, order, gaussians, colors, spans, counts), measurement)
+    first_terms = np.zeros(count + 1, np.int64)
+    np.cumsum(counts, out=first_terms[1:])
     total = int(first_terms[-1])
     lists = Lists(
-        gaussians, batch.colors.ravel(), np.empty(copies * blocks + 1, np.int64), np.empty((total, 4), np.int32),
-        first_terms, np.empty(count, np.int32), table, np.zeros(copies * (blocks - len(table.mask_rows) + 1), np.bool_),
-        least,
+        order, gaussians, colors, np.empty(copies * blocks + 1, np.int64), np.empty((total, VISIT_COLUMNS), np.int32),
+        np.empty((total, SHAPE_COLUMNS), np.float32), first_terms, np.empty(count, np.int32), table,
+        np.zeros(copies * (blocks - len(table.mask_rows) + 1), np.bool_), np.float32(math.exp(least)),
     )  # fmt: skip
-    histogram, places = np.zeros((len(parts), copies * blocks), np.int32), np.empty((total, 3), np.int32)
-    tasks = phases(parts, np.zeros((1, 2), np.int64), parts)
-    run_tasks(partial(list_visits, batch, radius, spans, places, histogram, lists), tasks)
+    histogram, room = np.zeros((parts, copies * blocks), np.int32), np.empty((total, 3), np.int32)
+    run_tasks(partial(list_visits, batch, radius, spans, room, histogram, lists), listing)
     return lists
+
+
+@functools.lru_cache(maxsize=64)
+def _list_tasks(count: int) -> tuple[int, Any, Any]:
+    """Return the number of ranges of so many Gaussians, and the tasks of `measure` and `list_visits`."""
+    parts = chunks(count, _PART, _MOST_PARTS)
+    return len(parts), phases(parts), phases(parts, np.zeros((1, 2), np.int64), parts)
 
 
 def _array(tensor: Tensor) -> Any:
     # contiguous, since every other layout would be compiled for
     return tensor.detach().resolve_neg().reshape(-1, tensor.shape[-1]).contiguous().numpy()
-
-
-def _sort(means: Any, images: Any, size: tuple[int, int]) -> Any:
-    """Order by image, row and column of tiles: neighbours in the image become neighbours in memory."""
-    rows, cols = (-(-side // SIDE) + 2 for side in size)
-    row, col = (np.clip(means[:, k] * (1 / SIDE) + 1, 0, n - 1).astype(np.int64) for k, n in ((1, rows), (0, cols)))
-    tile = (images * rows + row) * cols + col
-    # numbers of 16 bits are sorted in linear time; stable, so that the order of two does not depend on others
-    return np.argsort(tile.astype(np.uint16) if tile.size and tile.max() < 1 << 16 else tile, kind="stable")
 
 
 # contour moves render each region alone, in the size of its box
@@ -120,51 +109,50 @@ def _table(membership: Membership | None, size: tuple[int, int]) -> Table:
     return Table(num_regions, num_maps, grids, regions, tile_start, parents, parity, mask_rows, masks)
 
 
-def render(planned: _Plan, inputs: SplatInputs) -> Tensor:
+def render(lists: Lists, inputs: SplatInputs) -> Tensor:
     """Render (B, C, H, W)."""
     *batch, _, channels = inputs.colors.shape
     # numpy asks for huge pages where an array is large: first use costs a quarter of what torch.empty's does
     image = np.empty((*batch, channels, *inputs.size), np.float32)
     nothing = np.empty((0, 3), np.float32)
-    backward = Backward(planned.order[:0], nothing, nothing, nothing, nothing)
-    nodes = _make_nodes(planned, channels)
-    _visit(planned, ADDS, backward, image.reshape(-1, *image.shape[-3:]), nodes, nodes[:0], nothing)
+    backward = Backward(nothing, nothing, nothing, nothing)
+    nodes = _make_nodes(lists, channels)
+    _visit(lists, ADDS, backward, image.reshape(-1, *image.shape[-3:]), nodes, nodes[:0], nothing)
     return torch.from_numpy(image)
 
 
-def differentiate(planned: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
+def differentiate(lists: Lists, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
     """Return the gradients of means, cholesky (None each without `geometry`) and colors."""
-    means, cholesky, colors = _gather(planned, inputs, grad, GATHERS)
+    means, cholesky, colors = _gather(lists, inputs, grad, GATHERS)
     return (means, cholesky, colors) if geometry else (None, None, colors)
 
 
-def descend(planned: _Plan, inputs: SplatInputs, target: Tensor) -> Gradients:
+def descend(lists: Lists, inputs: SplatInputs, target: Tensor) -> Gradients:
     """Return the gradients of half the squared error, summed over the pixels, against (B, C, H, W)."""
-    return _gather(planned, inputs, target, ADDS | GATHERS)
+    return _gather(lists, inputs, target, ADDS | GATHERS)
 
 
-def _gather(planned: _Plan, inputs: SplatInputs, image: Tensor, kind: int) -> tuple[Tensor, Tensor, Tensor]:
+def _gather(lists: Lists, inputs: SplatInputs, image: Tensor, kind: int) -> tuple[Tensor, Tensor, Tensor]:
     channels = inputs.colors.shape[-1]
     # the loops sum eight terms at a time
-    terms = np.empty((len(planned.lists.visits), -(-(channels + 5) // 8) * 8), np.float32)
+    terms = np.empty((len(lists.visits), -(-(channels + 5) // 8) * 8), np.float32)
     values = image.resolve_neg().contiguous().numpy().reshape(-1, *image.shape[-3:])
-    slopes = _make_nodes(planned, channels)
+    slopes = _make_nodes(lists, channels)
     nodes = np.zeros_like(slopes) if kind & ADDS else slopes[:0]
     means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs.gaussians)
     gradients = (t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors))
-    backward = Backward(planned.order, _array(inputs.cholesky), *gradients)
-    _visit(planned, kind, backward, values, nodes, slopes, terms)
+    backward = Backward(_array(inputs.cholesky), *gradients)
+    _visit(lists, kind, backward, values, nodes, slopes, terms)
     return means, cholesky, colors
 
 
-def _make_nodes(planned: _Plan, channels: int) -> Any:
-    live = planned.lists.live
+def _make_nodes(lists: Lists, channels: int) -> Any:
+    live = lists.live
     return np.zeros(len(live) * SIDE * SIDE * channels if live.any() else 0, np.float32)
 
 
-def _visit(planned: _Plan, kind: int, backward: Backward, image: Any, nodes: Any, slopes: Any, terms: Any) -> None:
-    lists = planned.lists
+def _visit(lists: Lists, kind: int, backward: Backward, image: Any, nodes: Any, slopes: Any, terms: Any) -> None:
     counts = tuple(lists.table.grids[: None if lists.live.any() else 1, TILE_ROWS].tolist())
-    tasks = order_tasks(counts, len(image), kind, len(planned.order))
+    tasks = order_tasks(counts, len(image), kind, len(lists.order))
     loop = partial(visit, lists, backward, image, nodes, slopes, terms)
     run_tasks(loop, tasks, serial=len(lists.visits) < _SERIAL_VISITS)

@@ -25,15 +25,14 @@ L21 = 3
 L22 = 4
 SIGMA_Y = 5  # standard deviation along y
 INVERSE_L11 = 6
-PEAK = 7  # x of the ellipse's highest point minus the mean, in standard deviations along x
+PEAK = 7  # x of a contour's highest point minus the mean, by its |z|, in standard deviations along x
 SLOPE1_X = 8  # SCALE * z1 per node along x
 SLOPE2_X = 9  # SCALE * z2 per node along x
 SLOPE2_Y = 10  # SCALE * z2 per node along y
 LEVEL = 11  # of the coarse grid; 0: the pixels
 COLOR_FACTOR = 12  # of its colours, where a spline widens it
 CHANGE = 13  # c - 1, where c is the ratio of a weight's ratios between rows, see rows.py
-RUN = 14  # rows from an exponential to the next
-COLUMNS = 15
+COLUMNS = 14
 
 # columns of Table.grids
 NODE_ROWS = 0
@@ -48,6 +47,9 @@ GAUSSIAN = 0
 TERMS = 1  # place of its sums
 FIRST = 2  # row of the block to visit
 LAST = 3  # the last one + 1
+RUN = 4  # rows from an exponential to the next
+VISIT_COLUMNS = 5
+SHAPE_COLUMNS = 6
 
 
 class Table(NamedTuple):
@@ -65,24 +67,27 @@ class Table(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Gaussians of a batch of images, and their order in the table: by image, row and column of tiles."""
+    """Gaussians of a batch of images, in the caller's order."""
 
     num_images: int
-    means: Any  # [N, 2] float32, in the caller's order
-    cholesky: Any  # [N, 3] float32, in the caller's order
-    order: Any  # [N] int64, from the table's order to the caller's
-    images: Any  # [N] int64, in the table's order
-    regions: Any  # [N] int64, in the table's order; -1: none
-    colors: Any  # [N, C] float32, in the table's order; `measure` multiplies them by COLOR_FACTOR
+    means: Any  # [N, 2] float32
+    cholesky: Any  # [N, 3] float32
+    colors: Any  # [N, C] float32
+    regions: Any  # [N] int64, -1: none; empty: all are of the only one
 
 
 class Lists(NamedTuple):
-    """The Gaussians of each block: tiles of pixels, and blocks of nodes."""
+    """The Gaussians of each block: tiles of pixels, and blocks of nodes.
 
+    Gaussians are ordered by image, row and column of tiles: neighbours in the image are neighbours in memory.
+    """
+
+    order: Any  # [N] int64, from this order to the caller's
     gaussians: Any  # [N, COLUMNS] float64
-    colors: Any  # [N * C] float32
+    colors: Any  # [N * C] float32, times COLOR_FACTOR
     start: Any  # [copies * K + 1] int64 into visits; images that share a map have a copy of its blocks each
-    visits: Any  # [V, 4] int32, by block, then by Gaussian
+    visits: Any  # [V, 5] int32, by block, then by Gaussian
+    shapes: Any  # [V, 6] float32, the Gaussian in the block, see ellipse.enter; in the order of sums
     first_terms: Any  # [N + 1] int64, place of each Gaussian's first sums
     num_terms: Any  # [N] int32, blocks that each Gaussian touches
     table: Table

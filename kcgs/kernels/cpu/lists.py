@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from ..compiled import inner
 from ..tasks import first_task, next_task
 from ..whitened import MEAN_LIMIT, SCALE_LIMITS
-from .ellipse import block_rows, bounded, tile_columns, tile_rows
+from .ellipse import block_rows, bounded, enter, tile_columns, tile_rows
 from .layout import (
     CHANGE,
     COLOR_FACTOR,
@@ -44,8 +46,34 @@ _NORMAL_RADIUS = 13.1
 
 
 @program.entry
-def in_range(means, cholesky, colors):  # type: ignore[no-untyped-def]
-    """True where means, factors and colours are finite, and within the limits of whitened.py."""
+def arrange(batch, rows, cols):  # type: ignore[no-untyped-def]
+    """Return whether all is finite and within the limits of whitened.py, and if so the `order` of Lists.
+
+    Args:
+        batch: Batch.
+        rows: of tiles of an image.
+        cols: the same.
+    """
+    means, per_image = batch.means, max(len(batch.means) // batch.num_images, 1)
+    order = np.empty(len(means), np.int64)
+    if not _in_range(means, batch.cholesky, batch.colors):
+        return False, order
+    tiles, start = np.empty(len(means), np.int64), np.zeros(batch.num_images * (rows + 2) * (cols + 2) + 1, np.int64)
+    for n in range(len(means)):
+        row = min(max(math.floor(means[n, 1] / SIDE) + 1, 0), rows + 1)
+        col = min(max(math.floor(means[n, 0] / SIDE) + 1, 0), cols + 1)
+        tiles[n] = (n // per_image * (rows + 2) + row) * (cols + 2) + col
+        start[tiles[n] + 1] += 1
+    for tile in range(len(start) - 1):
+        start[tile + 1] += start[tile]
+    for n in range(len(means)):
+        order[start[tiles[n]]] = n
+        start[tiles[n]] += 1
+    return True, order
+
+
+@inner
+def _in_range(means, cholesky, colors):  # type: ignore[no-untyped-def]
     least, largest = SCALE_LIMITS[0] * (1 - 1e-6), SCALE_LIMITS[1]
     is_valid = True
     for i in range(len(means)):  # written so that NaN fails
@@ -59,15 +87,17 @@ def in_range(means, cholesky, colors):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def measure(batch, table, radius, spacing, gaussians, spans, counts, tasks, counters):  # type: ignore[no-untyped-def]
-    """Fill the table of Gaussians, the rows of blocks that each may touch, and how many blocks; scale their colours.
+def measure(batch, table, radius, spacing, order, gaussians, colors, spans, counts, tasks, counters):  # type: ignore[no-untyped-def]
+    """Fill gaussians and colors of Lists, the rows of blocks that each Gaussian may touch, and how many blocks.
 
     Args:
         batch: Batch.
         table: Table.
         radius: the largest |z| of a weight.
         spacing: of nodes in standard deviations, see coarse_grids.
-        gaussians: (N, COLUMNS) float64.
+        order: see Lists.
+        gaussians: see there.
+        colors: see there.
         spans: (N, 2) int32, first row and last + 1.
         counts: (N,) int64, at least the number of blocks.
         tasks: ranges of Gaussians, see `tasks.py`.
@@ -77,14 +107,13 @@ def measure(batch, table, radius, spacing, gaussians, spans, counts, tasks, coun
     k = first_task(tasks, counters)
     while k >= 0:
         for i in range(tasks[k, 1], tasks[k, 2]):
-            g, n = gaussians[i], batch.order[i]
-            _fill(g, batch.means[n], batch.cholesky[n], len(grids), radius, spacing)
+            g, n = gaussians[i], order[i]
+            _fill(g, batch.means[n], batch.cholesky[n], len(grids), spacing)
             level = int(g[LEVEL])
-            if level > 0:
-                for c in range(channels):
-                    batch.colors[i, c] *= g[COLOR_FACTOR]
+            for c in range(channels):
+                colors[i * channels + c] = batch.colors[n, c] * g[COLOR_FACTOR]
             first, end, count = 0, 0, 0
-            if batch.regions[i] >= 0:
+            if len(batch.regions) == 0 or batch.regions[n] >= 0:
                 height, width = grids[level, NODE_ROWS], grids[level, NODE_COLS]
                 first, end = tile_rows(g, height, width, radius)
                 for row in range(first, end):
@@ -96,7 +125,7 @@ def measure(batch, table, radius, spacing, gaussians, spans, counts, tasks, coun
 
 @program.entry
 def list_visits(batch, radius, spans, blocks, histogram, lists, tasks, counters):  # type: ignore[no-untyped-def]
-    """Fill start, visits, num_terms and live of Lists.
+    """Fill start, visits, shapes, num_terms and live of Lists.
 
     Args:
         batch: Batch.
@@ -116,17 +145,18 @@ def list_visits(batch, radius, spans, blocks, histogram, lists, tasks, counters)
         elif k == parts:
             _sum_histogram(histogram, lists)
         else:
-            _place_visits(blocks, histogram[k - parts - 1], lists, tasks[k, 1], tasks[k, 2])
+            _place_visits(radius, blocks, histogram[k - parts - 1], lists, tasks[k, 1], tasks[k, 2])
         k = next_task(tasks, counters)
 
 
 @inner
 def _find_blocks(batch, radius, spans, blocks, histogram, lists, begin, end):  # type: ignore[no-untyped-def]
-    table = lists.table
+    table, per_image = lists.table, max(len(lists.order) // batch.num_images, 1)
     grids, maps = table.grids, table.num_maps
     num_regions, tile_start, block_regions = table.num_regions, table.tile_start, table.regions
     for i in range(begin, end):
-        g, image, region, place = lists.gaussians[i], batch.images[i], batch.regions[i], lists.first_terms[i]
+        g, n, place = lists.gaussians[i], lists.order[i], lists.first_terms[i]
+        image, region = n // per_image, batch.regions[n] if len(batch.regions) > 0 else 0
         level = int(g[LEVEL])
         height, width, cols = grids[level, NODE_ROWS], grids[level, NODE_COLS], grids[level, TILE_COLS]
         tile = grids[level, FIRST_TILE] + image % maps * grids[level, TILE_ROWS] * cols
@@ -140,6 +170,7 @@ def _find_blocks(batch, radius, spans, blocks, histogram, lists, begin, end):  #
                 first, last = block_rows(g, row, col, height, width, radius)
                 if first < last:
                     blocks[place, 0], blocks[place, 1], blocks[place, 2] = head + block, first, last
+                    enter(g, row, col, lists.shapes[place])
                     histogram[head + block] += 1
                     place += 1
         lists.num_terms[i] = place - lists.first_terms[i]
@@ -168,30 +199,31 @@ def _sum_histogram(histogram, lists):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _place_visits(blocks, places, lists, begin, end):  # type: ignore[no-untyped-def]
+def _place_visits(radius, blocks, places, lists, begin, end):  # type: ignore[no-untyped-def]
     for i in range(begin, end):
         first = lists.first_terms[i]
+        run = min(max(math.floor((_NORMAL_RADIUS - radius) * lists.gaussians[i, L22]), 1), SIDE)
         for k in range(first, first + lists.num_terms[i]):
             visit = lists.visits[places[blocks[k, 0]]]
             places[blocks[k, 0]] += 1
             visit[GAUSSIAN], visit[TERMS], visit[FIRST], visit[LAST] = i, k, blocks[k, 1], blocks[k, 2]
+            visit[RUN] = run
 
 
 @inner
-def _fill(g, mean, cholesky, levels, radius, spacing):  # type: ignore[no-untyped-def]
+def _fill(g, mean, cholesky, levels, spacing):  # type: ignore[no-untyped-def]
     """Fill in the columns of a Gaussian."""
     g[MEAN_X], g[MEAN_Y] = mean[0], mean[1]
     g[L11], g[L21], g[L22] = cholesky[0], cholesky[1], cholesky[2]
     _coarsen(g, spacing, levels)
     g[SIGMA_Y] = math.sqrt(g[L21] * g[L21] + g[L22] * g[L22])
     g[INVERSE_L11] = 1.0 / g[L11]
-    g[PEAK] = radius * g[L21] / g[SIGMA_Y]
+    g[PEAK] = g[L21] / g[SIGMA_Y]
     g[SLOPE1_X] = bounded(SCALE * g[INVERSE_L11])
     g[SLOPE2_Y] = SCALE / g[L22]
     g[SLOPE2_X] = bounded(-g[SLOPE2_Y] * g[L21] * g[INVERSE_L11])
     g[SLOPE2_Y] = bounded(g[SLOPE2_Y])
     g[CHANGE] = math.expm1(-g[SLOPE2_Y] * g[SLOPE2_Y] * _LOG_4)
-    g[RUN] = min(max(math.floor((_NORMAL_RADIUS - radius) * g[L22]), 1), SIDE)
 
 
 @inner

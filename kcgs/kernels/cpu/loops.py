@@ -13,9 +13,8 @@ import numpy as np
 
 from ..compiled import inner
 from ..tasks import first_task, next_task
-from .ellipse import enter
 from .gradients import sum_terms
-from .layout import FIRST, GAUSSIAN, LAST, RUN, TERMS, TILE_COLS, program
+from .layout import FIRST, GAUSSIAN, LAST, RUN, SHAPE_COLUMNS, TERMS, TILE_COLS, program
 from .lists import first_node_block, first_tile
 from .rows import add_rows, gather_rows
 from .schedule import ADDS, FIRST_FIELD, GATHERS, IMAGE, KIND, LEVEL_FIELD, ROW
@@ -43,23 +42,23 @@ def visit(lists, backward, image, nodes, slopes, terms, tasks, counters):  # typ
     # a vector that begins at a multiple of its size lies in one line of the cache
     room = np.zeros(SIDE * SIDE * channels + SIDE, np.float32)
     pixels = room[-(room.ctypes.data // 4) % SIDE :]
-    sums, shape = np.zeros(max(terms.shape[1], 8) * SIDE, np.float32), np.empty(6, np.float32)
+    sums = np.zeros(max(terms.shape[1], 8) * SIDE, np.float32)
     offsets, ones = np.empty(4, np.int64), np.ones(SIDE, np.float32)
     k = first_task(tasks, counters)
     while k >= 0:
         if tasks[k, KIND] == 0:
             sum_terms(lists, backward, terms, tasks[k, FIRST_FIELD], tasks[k, FIRST_FIELD + 1])
         else:
-            _visit_row(lists, tasks[k], image, pixels, nodes, slopes, terms, sums, shape, offsets, ones)
+            _visit_row(lists, tasks[k], image, pixels, nodes, slopes, terms, sums, offsets, ones)
         k = next_task(tasks, counters)
 
 
 @inner
-def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, shape, offsets, ones):  # type: ignore[no-untyped-def]
+def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, offsets, ones):  # type: ignore[no-untyped-def]
     """Visit a row of blocks: add, gather, or both."""
     table, live, start, visits = lists.table, lists.live, lists.start, lists.visits
     tile_start, parents, parity = table.tile_start, table.parents, table.parity
-    mask_rows, masks = table.mask_rows, table.masks
+    mask_rows, masks, shapes = table.mask_rows, table.masks, lists.shapes.ravel()
     level, b, row = task[LEVEL_FIELD], task[IMAGE], task[ROW]
     adds, gathers = (task[KIND] & ADDS) != 0, (task[KIND] & GATHERS) != 0
     channels = image.shape[1]
@@ -87,10 +86,10 @@ def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, shape, of
                     )
             for v in range(start[head + block], start[head + block + 1]):
                 i = visits[v, GAUSSIAN]
-                enter(lists.gaussians[i], row, col, shape)
                 add_rows(  # type: ignore[call-arg]
-                    values, origin, channels, visits[v, FIRST], visits[v, LAST], shape,
-                    int(lists.gaussians[i, RUN]), lists.colors, i * channels, lists.cutoff, masks, mask,
+                    values, origin, channels, visits[v, FIRST], visits[v, LAST], shapes,
+                    visits[v, TERMS] * SHAPE_COLUMNS, visits[v, RUN], lists.colors, i * channels, lists.cutoff, masks,
+                    mask,
                 )  # fmt: skip
         if level == 0:
             _exchange(image, pixels, b, row * SIDE, col * SIDE, adds, gathers)
@@ -100,11 +99,10 @@ def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, shape, of
             mask = first if step > 0 else -1
             for v in range(start[head + block], start[head + block + 1]):
                 i = visits[v, GAUSSIAN]
-                enter(lists.gaussians[i], row, col, shape)
                 gather_rows(  # type: ignore[call-arg]
-                    gradients, origin, channels, visits[v, FIRST], visits[v, LAST], shape,
-                    int(lists.gaussians[i, RUN]), lists.colors, i * channels, lists.cutoff, masks, mask, sums, terms,
-                    visits[v, TERMS] * terms.shape[1],
+                    gradients, origin, channels, visits[v, FIRST], visits[v, LAST], shapes,
+                    visits[v, TERMS] * SHAPE_COLUMNS, visits[v, RUN], lists.colors, i * channels, lists.cutoff, masks,
+                    mask, sums, terms, visits[v, TERMS] * terms.shape[1],
                 )  # fmt: skip
             if len(slopes) > 0 and _set_offsets(live, parents, block, base, size, offsets):
                 down, right = parity[block] >= 2, parity[block] % 2 == 1

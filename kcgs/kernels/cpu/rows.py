@@ -10,7 +10,7 @@ Arguments in common:
 - pixels, origin: float32 array, and the first element of the block, [SIDE rows][channel][SIDE columns];
 - channels: their number;
 - first, last: rows to visit, last + 1;
-- shape: float32, see ellipse.enter;
+- shapes, shape_start: float32 array, and the first element of what ellipse.enter made;
 - run: rows from an exponential to the next;
 - colors, color_start: float32 array, and the Gaussian's first element;
 - cutoff: the least weight; smaller ones are zero;
@@ -41,14 +41,14 @@ class _Rows:
     def __init__(self, context: Any, builder: Any, argument_types: Any, arguments: Any) -> None:
         self.builder = builder
         self.channels, self.first, self.last = arguments[2:5]
-        self.run = arguments[6]
+        self.run = arguments[7]
         self.pixels = pointer(context, builder, argument_types[0], arguments[0], arguments[1])
-        self.colors = pointer(context, builder, argument_types[7], arguments[7], arguments[8])
-        self.cutoff = broadcast(builder, arguments[9])
-        self.masks = pointer(context, builder, argument_types[10], arguments[10], arguments[11])
-        self.is_masked = builder.icmp_signed(">=", arguments[11], ZERO)
+        self.colors = pointer(context, builder, argument_types[8], arguments[8], arguments[9])
+        self.cutoff = broadcast(builder, arguments[10])
+        self.masks = pointer(context, builder, argument_types[11], arguments[11], arguments[12])
+        self.is_masked = builder.icmp_signed(">=", arguments[12], ZERO)
         self.is_rgb = builder.icmp_signed("==", self.channels, ir.Constant(LONG, 3))
-        shape = pointer(context, builder, argument_types[5], arguments[5], ZERO)
+        shape = pointer(context, builder, argument_types[5], arguments[5], arguments[6])
         k = [broadcast(builder, builder.load(builder.gep(shape, [ir.Constant(LONG, i)]))) for i in range(6)]
         self.z1 = apply(builder, "fma", k[1], ramp(), k[0])
         self.negative = builder.fneg(builder.fmul(self.z1, self.z1))
@@ -109,7 +109,20 @@ _ROW_TYPES = (types.int64,) * 4
 
 @intrinsic
 def add_rows(  # type: ignore[no-untyped-def]
-    typing_context, pixels, origin, channels, first, last, shape, run, colors, color_start, cutoff, masks, mask_start
+    typing_context,
+    pixels,
+    origin,
+    channels,
+    first,
+    last,
+    shapes,
+    shape_start,
+    run,
+    colors,
+    color_start,
+    cutoff,
+    masks,
+    mask_start,
 ):
     """pixels[row, c, :] += weight[row, :] * colors[c] for rows first ... last - 1."""
 
@@ -124,21 +137,21 @@ def add_rows(  # type: ignore[no-untyped-def]
         return context.get_dummy_value()
 
     long = types.int64
-    return types.void(pixels, *_ROW_TYPES, shape, long, colors, long, types.float32, masks, long), generate
+    return types.void(pixels, *_ROW_TYPES, shapes, long, long, colors, long, types.float32, masks, long), generate
 
 
 @intrinsic
 def gather_rows(  # type: ignore[no-untyped-def]
-    typing_context, pixels, origin, channels, first, last, shape, run, colors, color_start, cutoff, masks, mask_start,
-    sums, terms, place,
+    typing_context, pixels, origin, channels, first, last, shapes, shape_start, run, colors, color_start, cutoff, masks,
+    mask_start, sums, terms, place,
 ):  # fmt: skip
     """Set the terms from `place` on to sums over rows and columns: w g_c for every channel c, then, with
     v = w sum_c g_c colors_c, of v z1, v z2, v z1 z1, v z1 z2, v z2 z2; `sums`, float32, is room for them times SIDE."""  # noqa: D205, D209
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         rows = _Rows(context, builder, signature.args, arguments)
-        room = pointer(context, builder, signature.args[12], arguments[12], ZERO)
-        target = pointer(context, builder, signature.args[13], *arguments[13:])
+        room = pointer(context, builder, signature.args[13], arguments[13], ZERO)
+        target = pointer(context, builder, signature.args[14], *arguments[14:])
 
         def emit(channels: Channels, masked: bool) -> None:
             total = Sums(channels, room)
@@ -150,5 +163,5 @@ def gather_rows(  # type: ignore[no-untyped-def]
         return context.get_dummy_value()
 
     long = types.int64
-    kinds = pixels, *_ROW_TYPES, shape, long, colors, long, types.float32, masks, long, sums, terms, long
+    kinds = pixels, *_ROW_TYPES, shapes, long, long, colors, long, types.float32, masks, long, sums, terms, long
     return types.void(*kinds), generate
