@@ -36,6 +36,7 @@ class Axis:
     output: Value  # (1,) int64, pixels of the output
     size: Value  # (1,) int64, pixels that are rendered
     parts: Value  # (1,) int64, integers of a place per pixel of the scene
+    is_native: Value  # (1,) bool, whether the pixels are those of the scene, and a tile one block
     step: Value  # (1,) float32, pixels of the scene per rendered pixel
     tile: Value  # (V,), tiles with a run, one after the other; a constant where all of the scene is rendered
     runs: Value  # (V,), pixels of each run
@@ -143,6 +144,7 @@ def make_axis(g: Graph, output: Value, length: int, ends: tuple[Value, Value] | 
     longest = g.ReduceMax(runs, keepdims=1)
     pieces = (longest + (TILE - 1)) // TILE
     side = (longest + (pieces - 1)) // pieces
+    is_native = g.And(g.And(g.Equal(start, 0), g.Equal(extent, size * _PARTS)), g.Equal(side, TILE))
 
     within = g.Reshape(g.Range(0, g.Squeeze(pieces * side), 1), g.Concat([1], pieces, side, axis=0))
     axes = g.constant([1, 2])
@@ -151,7 +153,7 @@ def make_axis(g: Graph, output: Value, length: int, ends: tuple[Value, Value] | 
     middle = (side - 1).astype(FLOAT) * 0.5
     steps = (g.Range(0, g.Squeeze(side), 1).astype(FLOAT) - middle) * step
     origins = g.Gather(local, 0, axis=2).astype(FLOAT) / parts.astype(FLOAT) + (middle * step - TILE / 2)
-    return Axis(g, length, output, size, parts, step, tile, runs, pieces, side, local, steps, origins)
+    return Axis(g, length, output, size, parts, is_native, step, tile, runs, pieces, side, local, steps, origins)
 
 
 class Interpolator:
@@ -164,6 +166,7 @@ class Interpolator:
         self.columns = columns
         self.side = side
         self.pixels = down.side * across.side  # P
+        self.is_native = self.graph.And(down.is_native, across.is_native)
 
     def blocks(self, windows: Value, row: Value, col: Value, shape: tuple[int, int]) -> Value:
         """Interpolate windows, (T, K, n, n), in the blocks of tiles at `row` and `col`, (T,): (T, blocks, *shape, P).

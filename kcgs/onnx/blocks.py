@@ -6,13 +6,15 @@ weights. docs/onnx.md has the whole graph.
 
 from __future__ import annotations
 
+from itertools import groupby
+
 import numpy as np
 
 from .axis import Axis
 from .entries import Storage
 from .graph import INT64, Value
 from .grids import CoarseGrids
-from .groups import Group, Integers
+from .groups import Integers
 from .membership import MembershipSampler
 from .packing import pack_integers
 from .tiles import Tiles
@@ -46,6 +48,7 @@ class BlockRenderer:
         self.pieces = across.pieces * down.pieces  # blocks of a tile, Q
         self.monomials = monomials(storage.graph, storage.graph.Unsqueeze(across.steps, [1]), down.steps)  # [6, P]
         self.shifts = self._make_shifts()
+        self.is_native = storage.graph.And(down.is_native, across.is_native)
 
     def image(self, membership: MembershipSampler | None, grids: CoarseGrids | None) -> Value:
         """Render the image, (1, C, H, W) and pixels to spare; memberships are needed where a tile has several regions.
@@ -58,11 +61,16 @@ class BlockRenderer:
         group_of_tile = g.Min(self.storage.slots.group[tile].astype(INT64), len(groups))
         slots = self.storage.slots.slot[tile].astype(INT64)
         order, starts, stops, index = self._sort(group_of_tile, len(groups))
-        rendered = []
+        members = []  # tiles of each group, and their places in it
         for number, group in enumerate(groups):
             tiles = g.Slice(order, starts[number], stops[number], [0])
-            slot = g.Min(slots[tiles], len(group.tiles) - 1)
-            rendered.append(self._render_group(number, tiles, slot, membership, grids))
+            members.append((tiles, g.Min(slots[tiles], len(group.tiles) - 1)))
+        rendered = []
+        for count, numbers in groupby(range(len(groups)), lambda number: groups[number].regions):
+            if count == 1 or membership is None:
+                rendered += [self._render_group(number, *members[number]) for number in numbers]
+            else:
+                rendered.append(self._render_mixed(count, [*numbers], members, membership, grids))
         # a black tile for all that nothing reaches
         shape = g.Concat([1], self.pieces, [self.storage.channels], self.pixels, axis=0)
         rendered.append(g.Expand(np.float32(0), shape))
@@ -100,35 +108,48 @@ class BlockRenderer:
         begins, ends = (g.split(bound, [1] * (count + 1)) for bound in (starts, starts + sizes))
         return order, begins, ends, index
 
-    def _render_group(
-        self, number: int, tiles: Value, slots: Value, membership: MembershipSampler | None, grids: CoarseGrids | None
-    ) -> Value:
-        """Render tiles (T,) of a group, (T, Q, C, P); `slots`, (T,), are their places in the group."""
+    def _render_group(self, number: int, tiles: Value, slots: Value, regions: Value | None = None) -> Value:
+        """Render Gaussians in tiles (T,) of a group, (T, Q, C, P), or for each of their regions, (T, Q, K * C, P)."""
         g, entries = self.graph, self.storage.entries[number]
-        group, regions = entries.group, None
-        if group.regions > 1:
-            regions = pack_integers(g, _regions_of_tiles(self.storage.plan.tiles, group))
         colors = g.Unsqueeze(entries.shaped_colors(regions)[slots], [1])
         coefficients = g.Unsqueeze(entries.shaped_coefficients()[slots], [1])  # [T, 1, L, 6]
-        exponent = (self._squares if group.narrow else self._polynomial)(coefficients, self.shifts[tiles])
-        values = colors @ weigh(g, exponent, self.cutoff)  # [T, Q, K * C, P]
-        if membership is None or regions is None:
-            return values
+        exponent = (self._squares if entries.group.narrow else self._polynomial)(coefficients, tiles)
+        return colors @ weigh(g, exponent, self.cutoff)
+
+    def _render_mixed(
+        self,
+        count: int,
+        numbers: list[int],
+        members: list[tuple[Value, Value]],
+        membership: MembershipSampler,
+        grids: CoarseGrids | None,
+    ) -> Value:
+        """Render the groups of tiles with K regions, (T, Q, C, P)."""
+        g, plan = self.graph, self.storage.plan
+        lengths = [len(plan.groups[number].tiles) for number in numbers]
+        regions = pack_integers(g, _regions_of_tiles(plan.tiles, plan.mixed_tiles[count], count))
+        parts = zip(numbers, g.split(regions, lengths), strict=True)
+        values = g.Concat(*(self._render_group(number, *members[number], part) for number, part in parts), axis=0)
+        values = g.Reshape(values, [0, 0, count, self.storage.channels, -1])
+        tiles = g.Concat(*(members[number][0] for number in numbers), axis=0)
+        firsts = np.cumsum([0, *lengths[:-1]]).tolist()
+        slots = g.Concat(*(members[number][1] + first for number, first in zip(numbers, firsts, strict=True)), axis=0)
         columns = g.Shape(self.across.tile)
         row, col = tiles // columns, tiles % columns
-        values = g.Reshape(values, [0, 0, group.regions, self.storage.channels, -1])
         if grids is not None:
-            values = values + grids.blocks(entries, regions, slots, row, col)
-        return g.ReduceSum(values * membership.blocks(number, group, slots, row, col), [2], keepdims=0)
+            values = values + grids.blocks(count, regions, slots, row, col)
+        return g.ReduceSum(values * membership.blocks(count, slots, row, col), [2], keepdims=0)
 
-    def _polynomial(self, coefficients: Value, shifts: Value) -> Value:
+    def _polynomial(self, coefficients: Value, tiles: Value) -> Value:
         """Log w as coefficients times monomials."""
-        return coefficients @ shifts @ self.monomials
+        g = self.graph
+        centred = g.choose(self.is_native, lambda: g.Identity(coefficients), lambda: coefficients @ self.shifts[tiles])
+        return centred @ self.monomials
 
-    def _squares(self, coefficients: Value, shifts: Value) -> Value:
+    def _squares(self, coefficients: Value, tiles: Value) -> Value:
         """Log w as a sum of squares, which no rounding of large coefficients harms."""
         g, three = self.graph, self.graph.constant([3])
-        shifts = g.Slice(shifts, [0, 0], [3, 3], [2, 3])
+        shifts = g.Slice(self.shifts[tiles], [0, 0], [3, 3], [2, 3])
         linear = g.Slice(self.monomials, [0], three, [0])
         z1, z2 = (part @ shifts @ linear for part in g.split(coefficients, [3, 3], axis=3))
         return -(z1 * z1 + z2 * z2)
@@ -148,8 +169,8 @@ class BlockRenderer:
         return self.graph.Reshape(image, self.graph.Concat([1, self.storage.channels, -1], self.across.padded, axis=0))
 
 
-def _regions_of_tiles(tiles: Tiles, group: Group) -> Integers:
-    """Regions of a group's tiles, (T, K), filled up with one that no Gaussian has."""
-    lists = [tiles.regions[tile] for tile in group.tiles.tolist()]
+def _regions_of_tiles(tiles: Tiles, ids: Integers, count: int) -> Integers:
+    """Regions of tiles, (T, K), filled up with one that no Gaussian has."""
+    lists = [tiles.regions[tile] for tile in ids.tolist()]
     no_region = 1 + max(max(regions) for regions in tiles.regions)
-    return np.array([regions + [no_region] * (group.regions - len(regions)) for regions in lists])
+    return np.array([regions + [no_region] * (count - len(regions)) for regions in lists])

@@ -14,23 +14,23 @@ from kcgs.kernels.resampled import MARGIN
 from kcgs.kernels.tiles import TILE
 
 from .graph import FLOAT, Graph, Value
-from .groups import Group, Integers
+from .groups import Integers
 from .packing import pack_integers, pack_runs
 from .tiles import WINDOW, Tiles
-from .windows import pack_windows, split_groups, tile_ids
+from .windows import pack_windows, split_tiles, tile_ids
 
 
 class BlurredWindows:
-    """Windows of soft contours, blurred out of the labels around them; groups by their number.
+    """Windows of soft contours, blurred out of the labels around them; tiles by their number of regions.
 
-    A part of a window is what one region has by one width; parts are blurred at once, and summed group by group.
+    A part of a window is what one region has by one width; parts are blurred at once, and summed later.
     """
 
-    def __init__(self, g: Graph, regions: RegionMap, tiles: Tiles, groups: Mapping[int, Group]) -> None:
+    def __init__(self, g: Graph, regions: RegionMap, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> None:
         self.graph = g
         self.tiles = tiles
-        self.groups = groups
-        ids, (_, level) = tile_ids(groups), regions.tables.membership.levels
+        self.tiles_of = tiles_of
+        ids, (_, level) = tile_ids(tiles_of), regions.tables.membership.levels
         levels = np.zeros((len(ids), WINDOW, WINDOW), np.int64)
         if level is not None:
             levels = cut_windows(tiles, ids, level[0].cpu().numpy())
@@ -45,14 +45,13 @@ class BlurredWindows:
             blurred = blurred * g.Equal(self.levels[window], g.Unsqueeze(width, axes)).astype(FLOAT)
         self.parts = g.Concat(np.zeros((1, WINDOW, WINDOW), np.float32), blurred, axis=0)
 
-    def unfold(self, number: int) -> Value:
-        """Sum the parts of a group's windows over their widths, and normalise: (T, K, S, S)."""
-        g, group = self.graph, self.groups[number]
-        num_widths = max(self.places[tile].shape[1] for tile in group.tiles.tolist())
-        ids = np.zeros((len(group.tiles), group.regions, num_widths), np.int64)
-        for row, tile in zip(ids, group.tiles.tolist(), strict=True):
-            count, widths = self.places[tile].shape
-            row[:count, :widths] = self.places[tile]
+    def unfold(self, count: int) -> Value:
+        """Sum the parts of windows over their widths, and normalise: (T, K, S, S)."""
+        g, places = self.graph, [self.places[tile] for tile in self.tiles_of[count].tolist()]
+        num_widths = max(place.shape[1] for place in places)
+        ids = np.zeros((len(places), count, num_widths), np.int64)
+        for row, place in zip(ids, places, strict=True):
+            row[: place.shape[0], : place.shape[1]] = place
         windows = self.parts[pack_integers(g, ids if num_widths > 1 else ids[:, :, 0])]
         windows = g.ReduceSum(windows, [2], keepdims=0) if num_widths > 1 else windows
         # outside the map there is no label, and no membership
@@ -62,19 +61,19 @@ class BlurredWindows:
 class CrispWindows(BlurredWindows):
     """Blurred windows whose pixels are given to their own label, as :class:`kcgs.kernels.Crisp` has it."""
 
-    def __init__(self, g: Graph, regions: RegionMap, tiles: Tiles, groups: Mapping[int, Group]) -> None:
-        super().__init__(g, regions, tiles, groups)
-        index = cut_windows(tiles, tile_ids(groups), regions.tables.membership.index[0].cpu().numpy())
-        self.labels = split_groups(g, groups, pack_windows(g, index))
+    def __init__(self, g: Graph, regions: RegionMap, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> None:
+        super().__init__(g, regions, tiles, tiles_of)
+        index = cut_windows(tiles, tile_ids(tiles_of), regions.tables.membership.index[0].cpu().numpy())
+        self.labels = split_tiles(g, tiles_of, pack_windows(g, index))
 
-    def unfold(self, number: int) -> Value:
-        """Unfold the windows of a group, (T, K, S, S)."""
-        g, group, windows = self.graph, self.groups[number], super().unfold(number)
+    def unfold(self, count: int) -> Value:
+        """Unfold the windows of the tiles with K regions, (T, K, S, S)."""
+        g, tiles, windows = self.graph, self.tiles_of[count], super().unfold(count)
         best = g.ReduceMax(windows, [1], keepdims=1)
-        ids = np.full((len(group.tiles), group.regions, 1, 1), -1, np.int32)
-        for row, tile in zip(ids[..., 0, 0], group.tiles.tolist(), strict=True):
+        ids = np.full((len(tiles), count, 1, 1), -1, np.int32)
+        for row, tile in zip(ids[..., 0, 0], tiles.tolist(), strict=True):
             row[: len(self.tiles.regions[tile])] = self.tiles.regions[tile]
-        loses = g.And(g.Equal(g.Unsqueeze(self.labels[number], [1]), ids), g.Less(windows, best))
+        loses = g.And(g.Equal(g.Unsqueeze(self.labels[count], [1]), ids), g.Less(windows, best))
         return g.Where(loses, best + MARGIN, windows)
 
 

@@ -103,18 +103,16 @@ def _inputs(g: Graph, scene: Scene, interactive: bool) -> tuple[Axis, Axis, Valu
 def _crop(g: Graph, image: Value, down: Axis, across: Axis) -> Value:
     """Leave out pixels to spare, and reduce an image that was rendered larger than the output."""
 
-    def crop() -> list[Value]:
-        return [g.Slice(image, [0, 0], g.Concat(down.size, across.size, axis=0), [2, 3])]
+    def crop() -> Value:
+        return g.Slice(image, [0, 0], g.Concat(down.size, across.size, axis=0), [2, 3])
 
-    def crop_uneven() -> list[Value]:
+    def crop_uneven() -> Value:
         rows = g.Gather(image, down.places(), axis=2)
         columns = g.Gather(g.Transpose(rows, perm=[0, 1, 3, 2]), across.places(), axis=2)
-        return [g.Transpose(columns, perm=[0, 1, 3, 2])]
+        return g.Transpose(columns, perm=[0, 1, 3, 2])
 
-    def reduce() -> list[Value]:
-        smaller = g.body("smaller", lambda: [across.shrink(down.shrink(image, 2), 3)])
-        return [g.If(is_smaller, then_branch=smaller, else_branch=g.body("uneven", crop_uneven))]
+    def reduce() -> Value:
+        return g.choose(is_smaller, lambda: across.shrink(down.shrink(image, 2), 3), crop_uneven)
 
     is_smaller = g.Or(*(g.Less(axis.output, axis.size) for axis in (down, across)))
-    is_plain = g.And(g.And(down.is_even(), across.is_even()), g.Not(is_smaller))
-    return g.If(is_plain, then_branch=g.body("plain", crop), else_branch=g.body("reduced", reduce))
+    return g.choose(g.And(g.And(down.is_even(), across.is_even()), g.Not(is_smaller)), crop, reduce)

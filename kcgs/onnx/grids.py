@@ -11,7 +11,7 @@ import numpy as np
 from kcgs.kernels.tiles import TILE
 
 from .axis import NODES, Axis, Interpolator
-from .entries import Entries, Storage
+from .entries import Storage
 from .graph import FLOAT, INT32, Value
 from .packing import pack_runs
 from .tables import NodeTable
@@ -53,13 +53,15 @@ class CoarseGrids:
         columns = g.Reshape(columns, g.Concat([channels, -1, NODES], self.across.padded, axis=0))
         return g.Reshape(self.down_spline, [0, -1, NODES]) @ columns
 
-    def blocks(self, entries: Entries, regions: Value, slots: Value, row: Value, col: Value) -> Value:
-        """Sample the blocks of tiles with several regions, (T, K), to (T, blocks, K, C, P), column by column."""
-        g, group, channels = self.graph, entries.group, self.storage.channels
-        tile = g.Reshape(g.Expand(g.Unsqueeze(entries.tiles, [1]), g.Shape(regions)), [-1])
+    def blocks(self, count: int, regions: Value, slots: Value, row: Value, col: Value) -> Value:
+        """Sample the blocks of tiles with K regions, (T, K), to (T, blocks, K, C, P), column by column."""
+        g, channels = self.graph, self.storage.channels
+        tiles = [part.tiles for part in self.storage.entries if part.group.regions == count]
+        tile = g.Expand(g.Unsqueeze(g.Concat(*tiles, axis=0), [1]), g.Shape(regions))
         region = g.Min(g.Reshape(regions, [-1]), np.int32(self.table.nodes.no_region))
-        windows = g.Reshape(self._window(region, tile), [len(group.tiles), -1, NODES, NODES])
-        return self.places.blocks(windows[slots], row, col, (group.regions, channels))
+        windows = self._window(region, g.Reshape(tile, [-1]))
+        windows = g.Reshape(windows, g.Concat(g.Shape(regions, end=1), [-1, NODES, NODES], axis=0))
+        return self.places.blocks(windows[slots], row, col, (count, channels))
 
     def _window(self, region: Value, tile: Value) -> Value:
         """Return the nodes that tiles (n,) read, (n, C, column, row); those of hidden regions are zero."""

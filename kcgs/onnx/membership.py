@@ -13,9 +13,8 @@ from .axis import Axis, Interpolator
 from .blur import BlurredWindows, CrispWindows, cut_windows
 from .entries import Storage
 from .graph import FLOAT, Graph, Value
-from .groups import Group
 from .tiles import WINDOW
-from .windows import HardWindows, WideWindows, pack_windows, split_groups, tile_ids
+from .windows import HardWindows, WideWindows, pack_windows, split_tiles, tile_ids
 
 # pixels that a contour may reach where its blur is computed in the graph
 _FARTHEST = 16
@@ -32,60 +31,71 @@ def make_membership(
     blurred by the width of one, make contours as narrow as :class:`kcgs.kernels.Crisp` has them.
     """
     g, tiles, membership = storage.graph, storage.plan.tiles, regions.tables.membership
-    groups = {number: group for number, group in enumerate(storage.plan.groups) if group.regions > 1}
-    if not groups:
+    tiles_of = storage.plan.mixed_tiles
+    if not tiles_of:
         return None
     soft = regions.softness != 0.0
     places = Interpolator(down, across, down.sampling(soft), across.sampling(soft), WINDOW)
     pixel = down.step * across.step  # area of one of the output, in pixels of the scene
     q = g.Relu(1 - pixel)  # as the formula of `Resampled` has it
     if not soft:
-        return MembershipSampler(g, places, HardWindows(g, tiles, groups))
+        return MembershipSampler(g, places, HardWindows(g, tiles, tiles_of))
     if crisp:
         exponent = g.Max(2 / g.Sqrt(pixel), 1.0)
-        return SoftSampler(g, places, CrispWindows(g, regions, tiles, groups), exponent)
+        return CrispSampler(g, places, CrispWindows(g, regions, tiles, tiles_of), exponent)
     widths, level = membership.levels
     variance = np.array([widths[0] ** 2], np.float32)
     uniform = _sharpness(g, g.constant(variance), q) if level is None else None  # exponent of a map of one width
     wide = membership.radius > _FARTHEST
-    blurred = None if wide else BlurredWindows(g, regions, tiles, groups)
-    windows = blurred or WideWindows(g, tiles, groups)
+    blurred = None if wide else BlurredWindows(g, regions, tiles, tiles_of)
+    windows = blurred or WideWindows(g, tiles, tiles_of)
     if uniform is not None:
         return SoftSampler(g, places, windows, uniform)
     if blurred is not None and blurred.levels is not None:
         squares = g.constant(np.array(widths, np.float32) ** 2)[blurred.levels]
     else:
         steps = np.round(np.sqrt(membership.variances[0].cpu().numpy()) * _WIDTH_STEPS)
-        width = pack_windows(g, cut_windows(tiles, tile_ids(groups), steps)).astype(FLOAT) * (1 / _WIDTH_STEPS)
+        width = pack_windows(g, cut_windows(tiles, tile_ids(tiles_of), steps)).astype(FLOAT) * (1 / _WIDTH_STEPS)
         squares = width * width
-    return PairSampler(g, places, windows, split_groups(g, groups, squares), q)
+    return PairSampler(g, places, windows, split_tiles(g, tiles_of, squares), q)
 
 
 class Windows(Protocol):
-    """The windows of groups, by their number."""
+    """The windows of tiles with several regions."""
 
-    def unfold(self, number: int) -> Value:
-        """Unfold the windows of a group, (T, K, S, S)."""
+    def unfold(self, count: int) -> Value:
+        """Unfold the windows of the tiles with K regions, (T, K, S, S)."""
 
 
 class MembershipSampler:
-    """Memberships in a map of hard contours: a pixel is of the region with the largest sample."""
+    """Memberships in a map of hard contours: a pixel is of the region with the largest sample.
+
+    At the size of the scene, windows hold the memberships of its pixels, unless contours are crisp.
+    """
+
+    crisp = False
 
     def __init__(self, g: Graph, places: Interpolator, windows: Windows) -> None:
         self.graph = g
         self.places = places
         self.windows = windows
 
-    def blocks(self, number: int, group: Group, slots: Value, row: Value, col: Value) -> Value:
-        """Sample the memberships in the blocks of tiles of a group, (T, blocks, K, 1, P), column by column.
+    def blocks(self, count: int, slots: Value, row: Value, col: Value) -> Value:
+        """Sample the memberships in the blocks of tiles with K regions, (T, blocks, K, 1, P), column by column.
 
-        `slots`, (T,), are the places of the tiles in the group, `row` and `col`, (T,), those among rows and columns.
+        `slots`, (T,), are the places of the tiles among those, `row` and `col`, (T,), those among rows and columns.
         """
-        windows = self.windows.unfold(number)[slots]
-        samples = self.places.blocks(windows, row, col, (group.regions, 1))
-        return self._normalize(samples, number, slots, row, col)
+        g, places, windows = self.graph, self.places, self.windows.unfold(count)[slots]
 
-    def _normalize(self, samples: Value, number: int, slots: Value, row: Value, col: Value) -> Value:
+        def sample() -> Value:
+            return self._normalize(places.blocks(windows, row, col, (count, 1)), count, slots, row, col)
+
+        def cut() -> Value:
+            return g.Reshape(g.Slice(windows, [1, 1], [-1, -1], [2, 3]), [0, 1, count, 1, -1])
+
+        return sample() if self.crisp else g.choose(places.is_native, cut, sample)
+
+    def _normalize(self, samples: Value, count: int, slots: Value, row: Value, col: Value) -> Value:
         """Make memberships that sum to one."""
         return self.graph.Equal(samples, self.graph.ReduceMax(samples, [2], keepdims=1)).astype(FLOAT)
 
@@ -97,8 +107,14 @@ class SoftSampler(MembershipSampler):
         super().__init__(g, places, windows)
         self.exponent = exponent
 
-    def _normalize(self, samples: Value, number: int, slots: Value, row: Value, col: Value) -> Value:
+    def _normalize(self, samples: Value, count: int, slots: Value, row: Value, col: Value) -> Value:
         return _sharpen(self.graph, samples, self.exponent)
+
+
+class CrispSampler(SoftSampler):
+    """Memberships whose contours are narrower than those of the windows at every size."""
+
+    crisp = True
 
 
 class PairSampler(MembershipSampler):
@@ -106,12 +122,12 @@ class PairSampler(MembershipSampler):
 
     def __init__(self, g: Graph, places: Interpolator, windows: Windows, variances: dict[int, Value], q: Value) -> None:
         super().__init__(g, places, windows)
-        self.variances = variances  # of each group, (T, S, S), squares of widths
+        self.variances = variances  # (T, S, S), squares of widths
         self.q = q  # share of a pixel's blur that interpolation loses
 
-    def _normalize(self, samples: Value, number: int, slots: Value, row: Value, col: Value) -> Value:
+    def _normalize(self, samples: Value, count: int, slots: Value, row: Value, col: Value) -> Value:
         g = self.graph
-        variance = self.places.blocks(self.variances[number][slots], row, col, (1, 1))
+        variance = self.places.blocks(self.variances[count][slots], row, col, (1, 1))
         return _sharpen(g, samples, _sharpness(g, variance, self.q))
 
 

@@ -67,6 +67,13 @@ class DecoderPlan(NamedTuple):
         return len(self.tiles.regions) + (0 if self.nodes is None else len(self.nodes.place))
 
     @property
+    def mixed_tiles(self) -> dict[int, Integers]:
+        """Tiles with several regions, (T,), in the order of groups, by their number of regions."""
+        kinds = sorted({group.regions for group in self.groups} - {1})
+        parts = {kind: [group.tiles for group in self.groups if group.regions == kind] for kind in kinds}
+        return {kind: np.concatenate(tiles) for kind, tiles in parts.items()}
+
+    @property
     def pixel_groups(self) -> list[Group]:
         """The groups of tiles."""
         return [group for group in self.groups if not group.nodes]

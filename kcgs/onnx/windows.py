@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from .graph import FLOAT, Graph, Value
-from .groups import Group, Integers
+from .groups import Integers
 from .packing import pack_integers, pack_runs
 from .tiles import Tiles
 
@@ -16,35 +16,34 @@ _STEPS = (1 << 16) - 1
 
 
 class HardWindows:
-    """Windows of hard contours, stored as labels; groups by their number."""
+    """Windows of hard contours, stored as labels; tiles by their number of regions."""
 
-    def __init__(self, g: Graph, tiles: Tiles, groups: Mapping[int, Group]) -> None:
+    def __init__(self, g: Graph, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> None:
         self.graph = g
-        self.groups = groups
-        windows = np.stack([tiles.windows[tile].numpy() for tile in tile_ids(groups).tolist()])
-        self.labels = split_groups(g, groups, pack_windows(g, windows))
+        windows = np.stack([tiles.windows[tile].numpy() for tile in tile_ids(tiles_of).tolist()])
+        self.labels = split_tiles(g, tiles_of, pack_windows(g, windows))
 
-    def unfold(self, number: int) -> Value:
-        """Unfold the windows of a group, (T, K, S, S)."""
-        g, ids = self.graph, np.arange(self.groups[number].regions, dtype=np.int32)
-        return g.Equal(g.Unsqueeze(self.labels[number], [1]), ids[:, None, None]).astype(FLOAT)
+    def unfold(self, count: int) -> Value:
+        """Unfold the windows of the tiles with K regions, (T, K, S, S)."""
+        g, ids = self.graph, np.arange(count, dtype=np.int32)
+        return g.Equal(g.Unsqueeze(self.labels[count], [1]), ids[:, None, None]).astype(FLOAT)
 
 
 class WideWindows:
     """Windows of contours that are too wide to be blurred in the graph, stored as memberships."""
 
-    def __init__(self, g: Graph, tiles: Tiles, groups: Mapping[int, Group]) -> None:
+    def __init__(self, g: Graph, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> None:
         self.graph = g
         self.tiles = tiles
-        self.groups = groups
+        self.tiles_of = tiles_of
 
-    def unfold(self, number: int) -> Value:
-        """Unfold the windows of a group, (T, K, S, S): all but the last region's are stored; they sum to one."""
-        g, group = self.graph, self.groups[number]
-        windows = [self.tiles.windows[tile].numpy() for tile in group.tiles.tolist()]
+    def unfold(self, count: int) -> Value:
+        """Unfold the windows of tiles, (T, K, S, S): all but the last region's are stored; they sum to one."""
+        g = self.graph
+        windows = [self.tiles.windows[tile].numpy() for tile in self.tiles_of[count].tolist()]
         memberships = np.concatenate([window[:-1] for window in windows]).swapaxes(1, 2)
         counts = np.array([len(window) for window in windows])[:, None]
-        place = np.arange(group.regions)
+        place = np.arange(count)
         # place of a region's membership; the last place is that of zeros
         ids = np.where(place < counts - 1, np.cumsum(counts - 1)[:, None] - counts + 1 + place, len(memberships))
         masks = pack_integers(g, np.round(memberships * _STEPS).astype(np.int64)).astype(FLOAT)
@@ -55,15 +54,15 @@ class WideWindows:
         return weights + remainder * last
 
 
-def tile_ids(groups: Mapping[int, Group]) -> Integers:
-    """Tiles of all groups, (T,)."""
-    return np.concatenate([group.tiles for group in groups.values()])
+def tile_ids(tiles_of: Mapping[int, Integers]) -> Integers:
+    """Tiles with several regions, (T,)."""
+    return np.concatenate([*tiles_of.values()])
 
 
-def split_groups(g: Graph, groups: Mapping[int, Group], values: Value) -> dict[int, Value]:
-    """Cut values of all tiles, (T, ...), into those of each group."""
-    lengths = [len(group.tiles) for group in groups.values()]
-    return dict(zip(groups, g.split(values, lengths), strict=True))
+def split_tiles(g: Graph, tiles_of: Mapping[int, Integers], values: Value) -> dict[int, Value]:
+    """Cut values of all tiles, (T, ...), by the number of regions."""
+    lengths = [len(tiles) for tiles in tiles_of.values()]
+    return dict(zip(tiles_of, g.split(values, lengths), strict=True))
 
 
 def pack_windows(g: Graph, windows: Integers) -> Value:
