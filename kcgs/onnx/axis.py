@@ -100,8 +100,8 @@ class Axis:
         places = g.Range(0, g.Squeeze(self.padded), 1)
         return g.Compress(places, g.Reshape(is_pixel, [-1]), axis=0)
 
-    def shrink(self, image: Value, axis: int) -> Value:
-        """Reduce the rendered pixels to those of the output: each is the mean over its share of the length."""
+    def shrink(self, image: Value, places: Value, axis: int) -> Value:
+        """Reduce the rendered pixels, at `places`, to those of the output: means over their shares of the length."""
         g = self.graph
         begin = g.Unsqueeze(g.Range(0, g.Squeeze(self.output), 1) * self.size, [1])
         longest = (self.size + (self.output - 1)) // self.output + 1
@@ -111,7 +111,7 @@ class Axis:
         shares = g.Max(shares, 0).astype(FLOAT) / self.size.astype(FLOAT)
         if axis == 2:
             shares = g.Unsqueeze(shares, [2])
-        pixels = g.Gather(image, self.places()[g.Min(lines, self.size - 1)], axis=axis)
+        pixels = g.Gather(image, places[g.Min(lines, self.size - 1)], axis=axis)
         return g.ReduceSum(pixels * shares, [axis + 1], keepdims=0)
 
 
