@@ -16,6 +16,8 @@ NEIGHBORS = 16
 LEAST_OVERLAP = 0.05
 # twice the largest exponent that such a product may have
 _FAR = -2.0 * math.log(LEAST_OVERLAP)
+# largest square of a distance along x by the sum of variances; with room for rounding
+_MOST_X = 1.001 * _FAR
 # a neighbour's mean is at most so many of the Gaussian's standard deviations away: wider ones hardly overlap it
 _WINDOW = 4.0
 # added to the diagonal of the products of neighbours, of which two may be the same
@@ -53,6 +55,9 @@ def _nearest(rows, start, end, i, places, values):  # type: ignore[no-untyped-de
     for j in range(first, end):
         if rows[j, _Y] > a[_Y] + window:
             break
+        x = rows[j, _X] - a[_X]
+        if x * x > _MOST_X * (rows[j, _XX] + a[_XX]):
+            continue
         power, det = _exponent(a, rows[j])
         if j == i or power > _FAR * det:
             continue
