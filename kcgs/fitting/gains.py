@@ -6,8 +6,9 @@ import numpy as np
 from numba.extending import intrinsic
 
 from kcgs.kernels.compiled import Program, inner
+from kcgs.kernels.tasks import first_task, next_task
 
-program = Program("matching pursuit", __file__)
+program = Program("matching pursuit", __file__, "../kernels/tasks.py")
 
 
 @intrinsic
@@ -35,8 +36,8 @@ def _blur_row(plane, y, left, right, taps, line, blurred):  # type: ignore[no-un
 
 
 @program.entry
-def find_best_places(planes, numbers, taps, norm_taps, area, squares):  # type: ignore[no-untyped-def]
-    """Find the place of the largest gain in each square of pixels, in some rows of squares.
+def find_best_places(planes, taps, norm_taps, area, squares, tasks, counters):  # type: ignore[no-untyped-def]
+    """Find the place of the largest gain in each square of pixels; tasks are ranges of rows of squares.
 
     Planes, (R, C + 1, h, w), are the residual and the mask of regions. Squares, numbered by row through all regions,
     are gains, (R, H, W), -1 where there is none; places, y * w + x; and there <g, residual>, (R, H, W, C), and <g, g>.
@@ -48,30 +49,33 @@ def find_best_places(planes, numbers, taps, norm_taps, area, squares):  # type: 
     line, norm_line = np.zeros(width + len(taps), planes.dtype), np.zeros(width + len(norm_taps), planes.dtype)
     gain, norm = np.empty((side, width), planes.dtype), np.empty((side, width), planes.dtype)
     product = np.empty((channels, side, width), planes.dtype)
-    for number in numbers:
-        region, row = number // gains.shape[1], number % gains.shape[1]
-        for dy in range(side):
-            y = row * side + dy
-            gain[dy] = -1.0
-            left, right = _extent(planes[region, channels, y])
-            if left == right:
-                continue
-            for c in range(channels):
-                _blur_row(planes[region, c], y, left, right, taps, line, product[c, dy])
-            _blur_row(planes[region, channels], y, left, right, norm_taps, norm_line, norm[dy])
-            row_norm, row_gain = norm[dy, left:right], gain[dy, left:right]
-            _fill_gains(planes[region, channels, y, left:right], area, product[:, dy, left:right], row_norm, row_gain)
-        for col in range(gains.shape[2]):
-            best, best_dy, best_x = gain[0, col * side], 0, col * side
+    task = first_task(tasks, counters)
+    while task >= 0:
+        for number in range(tasks[task, 1], tasks[task, 2]):
+            region, square = number // gains.shape[1], number % gains.shape[1]
             for dy in range(side):
-                for x in range(col * side, (col + 1) * side):
-                    if gain[dy, x] > best:
-                        best, best_dy, best_x = gain[dy, x], dy, x
-            gains[region, row, col] = best
-            places[region, row, col] = (row * side + best_dy) * width + best_x
-            norms[region, row, col] = norm[best_dy, best_x]
-            for c in range(channels):
-                products[region, row, col, c] = product[c, best_dy, best_x]
+                y = square * side + dy
+                gain[dy] = -1.0
+                left, right = _extent(planes[region, channels, y])
+                if left == right:
+                    continue
+                for c in range(channels):
+                    _blur_row(planes[region, c], y, left, right, taps, line, product[c, dy])
+                _blur_row(planes[region, channels], y, left, right, norm_taps, norm_line, norm[dy])
+                row = slice(left, right)
+                _fill_gains(planes[region, channels, y, row], area, product[:, dy, row], norm[dy, row], gain[dy, row])
+            for col in range(gains.shape[2]):
+                best, best_dy, best_x = gain[0, col * side], 0, col * side
+                for dy in range(side):
+                    for x in range(col * side, (col + 1) * side):
+                        if gain[dy, x] > best:
+                            best, best_dy, best_x = gain[dy, x], dy, x
+                gains[region, square, col] = best
+                places[region, square, col] = (square * side + best_dy) * width + best_x
+                norms[region, square, col] = norm[best_dy, best_x]
+                for c in range(channels):
+                    products[region, square, col, c] = product[c, best_dy, best_x]
+        task = next_task(tasks, counters)
 
 
 @inner

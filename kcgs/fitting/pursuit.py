@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,6 +29,8 @@ _OVERLAP = 0.2
 _CUTOFF = 1e-4
 # pixels of crops that are searched at once
 _CROP_PIXELS = 1 << 16
+# pixels of a task of the search
+_TASK_PIXELS = 1 << 13
 # Standard deviations that are tried, in pixels. More of them cost time, and descent changes them anyway.
 SIGMAS = (0.7, 1.1, 1.8, 2.9, 4.7, 7.5)
 
@@ -151,7 +154,9 @@ def _best_of_squares(crops: _Crops, planes: Tensor, sigma: float, block: int, li
 
     `planes`, (R, C + 1, h, w), are the crops' planes, averaged over blocks. Gains are positive, and at least `least`.
     """
-    from .gains import find_best_places  # loads numba
+    from kcgs.kernels.tasks import ranges, run_tasks  # loads numba
+
+    from .gains import find_best_places
 
     side = 2 if block == 1 or sigma / block >= _SIGMA_PER_BLOCK * math.sqrt(2) else 1
     count, channels, height, width = planes.shape
@@ -162,7 +167,8 @@ def _best_of_squares(crops: _Crops, planes: Tensor, sigma: float, block: int, li
     )  # fmt: skip
     # g^2 is a Gaussian too, narrower by sqrt 2
     taps, norm_taps = (_window(width, values.dtype) for width in (sigma / block, sigma / block / math.sqrt(2)))
-    find_best_places(values, np.arange(count * shape[1]), taps, norm_taps, values.dtype.type(block**2), squares)
+    tasks = ranges(count * shape[1], max(1, _TASK_PIXELS // (side * width)))
+    run_tasks(partial(find_best_places, values, taps, norm_taps, values.dtype.type(block**2), squares), tasks)
     gains, places, products, norms = (part.reshape(-1, *part.shape[3:]) for part in squares)
     positive = np.flatnonzero((gains > 0) & (gains >= least))
     strongest = positive[_strongest(gains[positive], limit)]

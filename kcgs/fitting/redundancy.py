@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kcgs.kernels.compiled import Program, inner
+from kcgs.kernels.tasks import first_task, next_task, ranges, run_tasks
 
 # most neighbours that take over from a Gaussian
 NEIGHBORS = 16
@@ -30,7 +32,10 @@ _XY = 3
 _YY = 4
 _ROOT = 5
 
-program = Program("choice of Gaussians to remove", __file__)
+# Gaussians of a task
+_TASK_ROWS = 64
+
+program = Program("choice of Gaussians to remove", __file__, "../kernels/tasks.py")
 
 
 @inner
@@ -98,17 +103,19 @@ def _solve(matrix, count, x):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def score(rows, starts, residuals, neighbors, shares):  # type: ignore[no-untyped-def]
+def score(rows, spans, residuals, neighbors, shares, tasks, counters):  # type: ignore[no-untyped-def]
     """Fill, for every row: the share of its energy that its neighbours cannot explain, their places, their factors.
 
-    Rows are sorted by region, then y; region r has those from starts[r] to starts[r + 1]. All are of norm 1.
+    Rows, all of norm 1, are sorted by region, then y; spans, (N, 2), are the first row of each one's region and the
+    end. Tasks are ranges of rows.
     """
     values, matrix = np.empty(NEIGHBORS), np.empty((NEIGHBORS, NEIGHBORS))
-    for region in range(len(starts) - 1):
-        for i in range(starts[region], starts[region + 1]):
+    task = first_task(tasks, counters)
+    while task >= 0:
+        for i in range(tasks[task, 1], tasks[task, 2]):
             places, share = neighbors[i], shares[i]
             places[:] = -1
-            count = _nearest(rows, starts[region], starts[region + 1], i, places, values)
+            count = _nearest(rows, spans[i, 0], spans[i, 1], i, places, values)
             share[:count] = values[:count]
             for k in range(count):
                 matrix[k, k] = 1.0 + _RIDGE
@@ -116,6 +123,7 @@ def score(rows, starts, residuals, neighbors, shares):  # type: ignore[no-untype
                     power, det = _exponent(rows[places[k]], rows[places[m]])
                     matrix[k, m] = _overlap(rows[places[k]], rows[places[m]], power, det)
             residuals[i] = max(1.0 - _solve(matrix, count, share), 0.0)
+        task = next_task(tasks, counters)
 
 
 def lowest_impact(
@@ -148,10 +156,10 @@ def lowest_impact(
     table = np.stack([*means.astype(np.float64).T, l11**2, l11 * l21, yy, np.sqrt(l11 * l22)], -1)
     order = np.lexsort((table[:, _Y], region))
     rows, colors = table[order], colors[order].astype(np.float64)
-    starts = np.searchsorted(region[order], np.arange(region.max(initial=0) + 2))
+    spans = np.stack([np.searchsorted(region[order], region[order], side) for side in ("left", "right")], -1)
     residuals, neighbors = np.empty(len(rows)), np.empty((len(rows), NEIGHBORS), np.int64)
     shares = np.zeros(neighbors.shape)
-    score(rows, starts, residuals, neighbors, shares)
+    run_tasks(partial(score, rows, spans, residuals, neighbors, shares), ranges(len(rows), _TASK_ROWS))
     norm = math.sqrt(math.pi) * rows[:, _ROOT]
     colors *= norm[:, None]
     removed, needed = np.zeros(len(rows), np.bool_), np.zeros(len(rows), np.bool_)

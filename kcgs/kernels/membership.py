@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -17,6 +18,8 @@ T = TypeVar("T")
 
 # reach of a contour, in widths: the blur's kernel is cut there
 RADIUS_SIGMAS = 4.0
+# windows of a task
+_TASK_WINDOWS = 32
 
 
 class TileMembership(NamedTuple):
@@ -168,6 +171,7 @@ class Membership:
 
         Windows may reach beyond the image, where s_r has no meaning.
         """
+        from .tasks import ranges, run_tasks  # loads numba
         from .windows import fill_weights
 
         widths, level = self.levels
@@ -175,7 +179,8 @@ class Membership:
         taps = torch.stack([self._gaussian(offsets, width) if width else (offsets == 0).double() for width in widths])
         levels = np.empty((0, 0, 0), np.int32) if level is None else _array(level)
         weights = np.zeros((len(region), *span))
-        fill_weights(_array(self.index), levels, taps.numpy(), _array(place), _array(region), weights)
+        arguments = _array(self.index), levels, taps.numpy(), _array(place), _array(region), weights
+        run_tasks(partial(fill_weights, *arguments), ranges(len(region), _TASK_WINDOWS))
         return torch.from_numpy(weights).to(region.device)
 
     def read(self, pixels: Tensor, place: Tensor, span: Sequence[int]) -> Tensor:

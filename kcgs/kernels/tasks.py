@@ -33,6 +33,8 @@ START = 0  # tasks that must be done before
 _TAKEN = 0
 _DONE = 1
 
+_MOST_RANGES = 256
+
 # times that a thread yields before it sleeps, so that one that was interrupted finds a processor
 _YIELDS = 40
 _MICROSECONDS = 20  # of a sleep
@@ -65,6 +67,11 @@ def chunks(count: int, size: int, most: int) -> Any:
     parts = min(max(-(-count // size), 1), most)
     ends = np.arange(parts + 1) * count // parts
     return np.column_stack([ends[:-1], ends[1:]])
+
+
+def ranges(count: int, size: int) -> Any:
+    """Return tasks of one phase that are ranges of so many rows, each of at least about `size`: first and last + 1."""
+    return phases(chunks(count, size, _MOST_RANGES))
 
 
 @intrinsic

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from .compiled import Program, inner
+from .tasks import first_task, next_task
 
-program = Program("tables of label maps", __file__)
+program = Program("tables of label maps", __file__, "tasks.py")
 
 
 @program.entry
@@ -43,43 +44,46 @@ def list_regions(index, places, sides, reaches, num_regions):  # type: ignore[no
 
 
 @program.entry
-def fill_weights(index, levels, taps, places, regions, weights):  # type: ignore[no-untyped-def]
+def fill_weights(index, levels, taps, places, regions, weights, tasks, counters):  # type: ignore[no-untyped-def]
     """Fill the membership of regions, (P,), over windows, (P, h, w), that begin at places, (P, 3).
 
     Row k of taps is half of the blur for pixels of level k, its centre first, then zeros; `levels` is empty where one
-    blur is for all.
+    blur is for all. Tasks are ranges of windows.
     """
     height, width = weights.shape[1:]
     reach = taps.shape[1] - 1
     line, rows = np.empty(width + 2 * reach), np.empty((height + 2 * reach, width))
     is_empty, total = np.empty(len(rows), np.bool_), np.empty(width)
-    for p in range(len(places)):
-        image, top, left = places[p]
-        for k in range(len(taps)):
-            if len(levels) and not _has_level(levels[image], k, top, left, height, width):
-                continue
-            half = taps[k, : np.count_nonzero(taps[k])]
-            n = len(half) - 1
-            down = _sum_inside(half, top, height, index.shape[1])
-            across = _sum_inside(half, left, width, index.shape[2])
-            for y in range(height + 2 * n):
-                is_empty[y] = True
-                row = top + y - n
-                for x in range(width + 2 * n if 0 <= row < index.shape[1] else 0):
-                    col = left + x - n
-                    line[x] = 1.0 if 0 <= col < index.shape[2] and index[image, row, col] == regions[p] else 0.0
-                    is_empty[y] &= line[x] == 0.0
-                if not is_empty[y]:
-                    _blur(half, line, rows[y])
-            for y in range(height):
-                total[:] = 0.0
-                for t in range(2 * n + 1):
-                    if not is_empty[y + t]:
-                        for x in range(width):
-                            total[x] += half[abs(t - n)] * rows[y + t, x]
-                for x in range(width):
-                    if not len(levels) or _level(levels[image], top + y, left + x) == k:
-                        weights[p, y, x] = total[x] / max(down[y] * across[x], 1e-300)
+    task = first_task(tasks, counters)
+    while task >= 0:
+        for p in range(tasks[task, 1], tasks[task, 2]):
+            image, top, left = places[p]
+            for k in range(len(taps)):
+                if len(levels) and not _has_level(levels[image], k, top, left, height, width):
+                    continue
+                half = taps[k, : np.count_nonzero(taps[k])]
+                n = len(half) - 1
+                down = _sum_inside(half, top, height, index.shape[1])
+                across = _sum_inside(half, left, width, index.shape[2])
+                for y in range(height + 2 * n):
+                    is_empty[y] = True
+                    row = top + y - n
+                    for x in range(width + 2 * n if 0 <= row < index.shape[1] else 0):
+                        col = left + x - n
+                        line[x] = 1.0 if 0 <= col < index.shape[2] and index[image, row, col] == regions[p] else 0.0
+                        is_empty[y] &= line[x] == 0.0
+                    if not is_empty[y]:
+                        _blur(half, line, rows[y])
+                for y in range(height):
+                    total[:] = 0.0
+                    for t in range(2 * n + 1):
+                        if not is_empty[y + t]:
+                            for x in range(width):
+                                total[x] += half[abs(t - n)] * rows[y + t, x]
+                    for x in range(width):
+                        if not len(levels) or _level(levels[image], top + y, left + x) == k:
+                            weights[p, y, x] = total[x] / max(down[y] * across[x], 1e-300)
+        task = next_task(tasks, counters)
 
 
 @inner
