@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from ..compiled import inner
+from ..compiled import inline
 from ..whitened import Z_LIMIT
 from .layout import (
     CHANGE,
@@ -29,20 +29,20 @@ from .simd import SIDE
 _MARGIN = 1e-3
 
 
-@inner
+@inline
 def bounded(value):  # type: ignore[no-untyped-def]
     """Clamp a coefficient of z."""
     return min(max(value, -Z_LIMIT), Z_LIMIT)
 
 
-@inner
+@inline
 def _highest(along, across, peak, low, high, radius):  # type: ignore[no-untyped-def]
     """Return the largest along * u + across * sqrt(radius^2 - u^2), which peaks at u = peak, over [low, high]."""
     u = min(max(peak, low), high)
     return along * u + across * math.sqrt(max(radius * radius - u * u, 0.0))
 
 
-@inner
+@inline
 def tile_rows(g, height, width, radius):  # type: ignore[no-untyped-def]
     """Return the rows of tiles, first and last + 1, that the bounding box crosses; 0, 0: none."""
     reach, spread = g[SIGMA_Y] * radius + _MARGIN, g[L11] * radius + _MARGIN
@@ -53,7 +53,7 @@ def tile_rows(g, height, width, radius):  # type: ignore[no-untyped-def]
     return first // SIDE, last // SIDE + 1
 
 
-@inner
+@inline
 def tile_columns(g, row, height, width, radius):  # type: ignore[no-untyped-def]
     """Return the columns of tiles, first and last + 1, that the ellipse may cross in a row of tiles; 0, 0: none."""
     spread = g[L11] * radius + _MARGIN
@@ -72,7 +72,7 @@ def tile_columns(g, row, height, width, radius):  # type: ignore[no-untyped-def]
     return (first // SIDE, last // SIDE + 1) if first <= last else (0, 0)
 
 
-@inner
+@inline
 def block_rows(g, row, col, height, width, radius):  # type: ignore[no-untyped-def]
     """Return the rows of a block, first and last + 1, that the ellipse crosses; first >= last: none."""
     left = max((col * SIDE + 0.5 - _MARGIN - g[MEAN_X]) * g[INVERSE_L11], -radius)
@@ -87,7 +87,7 @@ def block_rows(g, row, col, height, width, radius):  # type: ignore[no-untyped-d
     return first - base, last + 1 - base
 
 
-@inner
+@inline
 def enter(g, row, col, shape):  # type: ignore[no-untyped-def]
     """Set `shape`, float32, to k of z1 = k0 + k1 x and z2 = k2 + k3 x + k4 y about the block's middle, and to CHANGE.
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..compiled import inner
+from ..compiled import inline, inner
 from ..tasks import first_task, next_task
 from ..whitened import MEAN_LIMIT, SCALE_LIMITS
 from .ellipse import block_rows, bounded, enter, tile_columns, tile_rows
@@ -210,7 +210,7 @@ def _place_visits(radius, blocks, places, lists, begin, end):  # type: ignore[no
             visit[RUN] = run
 
 
-@inner
+@inline
 def _fill(g, mean, cholesky, levels, spacing):  # type: ignore[no-untyped-def]
     """Fill in the columns of a Gaussian."""
     g[MEAN_X], g[MEAN_Y] = mean[0], mean[1]
@@ -226,7 +226,7 @@ def _fill(g, mean, cholesky, levels, spacing):  # type: ignore[no-untyped-def]
     g[CHANGE] = math.expm1(-g[SLOPE2_Y] * g[SLOPE2_Y] * _LOG_4)
 
 
-@inner
+@inline
 def _coarsen(g, spacing, levels):  # type: ignore[no-untyped-def]
     """Move a Gaussian to its level.
 
@@ -253,7 +253,7 @@ def _coarsen(g, spacing, levels):  # type: ignore[no-untyped-def]
     g[MEAN_X], g[MEAN_Y] = g[MEAN_X] / h + 1.5, g[MEAN_Y] / h + 1.5
 
 
-@inner
+@inline
 def find_block(num_regions, tile_start, regions, tile, region):  # type: ignore[no-untyped-def]
     """Return the position of a region's block in a tile, or -1; takes arrays, since to pass on a Table is slow."""
     if num_regions == 1:
