@@ -146,13 +146,8 @@ class MovingLabels:
 
     def sweep(self, reach: int) -> bool:
         """Give every free pixel near a contour its best label; True if one changed."""
-        neighborhood = disc(reach, self._stride)
-        return bool(
-            sweep(
-                self._labels, self._free, self._costs.table, self._pair, neighborhood, self._eight, self._anchor,
-                self._anchor_disc,
-            )
-        )  # fmt: skip
+        neighborhood, limit = disc(reach, self._stride), (self._anchor, self._anchor_disc)
+        return bool(sweep(self._labels, self._free, self._costs.table, self._pair, neighborhood, self._eight, limit))
 
     def _cost(self, pixels: Ints, labels: Labels, around: Labels) -> Floats:
         """Return the part of the energy that depends on each pixel's label, up to a constant."""

@@ -39,19 +39,20 @@ def _cost(costs, pixel, region):  # type: ignore[no-untyped-def]
 
 @inner
 def _has(labels, pixel, offsets, label):  # type: ignore[no-untyped-def]
-    found = False
+    count = 0
     for offset in offsets:
-        found |= labels[pixel + offset] == label
-    return found
+        count += labels[pixel + offset] == label
+    return count > 0
 
 
 @program.entry
-def sweep(labels, free, costs, pair_cost, neighborhood, eight, anchor, anchor_disc):  # type: ignore[no-untyped-def]
+def sweep(labels, free, costs, pair_cost, neighborhood, eight, limit):  # type: ignore[no-untyped-def]
     """Give every free pixel the best label of its neighborhood; True if one changed.
 
-    The map is flat and has a rim of -1. Neighborhoods are those before the sweep. Where there is a disc, a label must
-    be in it on the anchor.
+    The map is flat and has a rim of -1. Neighborhoods are those before the sweep. The limit is another map, of whose
+    labels within a disc a pixel may have any, and the offsets of the disc; without offsets any label will do.
     """
+    anchor, anchor_disc = limit
     before, changed = labels.copy(), False
     pixels = _list_near_contours(labels, free, costs.stride, neighborhood)
     for parity in range(4):  # neighbours differ in parity: pixels of one parity change at the same time
