@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 # weight of the squared error
 _SQUARED = 0.003
 # least mean of a scale, since the logarithm has no bound at 0
-MIN_SCORE = 0.2
+_MIN_SCORE = 0.2
 
 
 class MsSsimObjective:
@@ -82,7 +82,7 @@ class MsSsimObjective:
         from .similarity import Passes  # loads numba
 
         factors = [weight / self._norm * 0.25**level for level, (*_, weight) in enumerate(self._scales, 1)]
-        return Passes([[plane.numpy() for plane in planes] for *planes, _ in self._scales], factors)
+        return Passes([[plane.numpy() for plane in planes] for *planes, _ in self._scales], factors, _MIN_SCORE)
 
     def apply(self, difference: Tensor) -> Tensor:
         """Return half the gradient of E, (C, H, W), at a difference r, render - image, in whose memory it may be.
@@ -136,7 +136,7 @@ class MsSsimObjective:
                 luminance = (2.0 * mean * render_mean + K1**2) / means
                 luminance_slope = structure * (luminance * render_mean - mean) / means
             windows = (structure * luminance)[:, ::2, ::2]
-            score = windows.mean((1, 2)).clamp_min(MIN_SCORE)
+            score = windows.mean((1, 2)).clamp_min(_MIN_SCORE)
             total -= weight / self._norm * mean[0].numel() * score.log().mean()
             # of windows at even rows and columns, for all
             share = torch.zeros_like(plane)

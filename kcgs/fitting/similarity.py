@@ -1,339 +1,20 @@
-"""The passes of the objective `ms-ssim` on the CPU: compiled loops over the rows of its scales."""
+"""The objective `ms-ssim` on the CPU: what its compiled loops work on, and when."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kcgs.functional.metrics import K1, K2, window_taps
-from kcgs.kernels.compiled import Program, inner
-from kcgs.kernels.tasks import first_task, next_task, phases, run_tasks
+from kcgs.functional.metrics import window_taps
+from kcgs.kernels.tasks import phases, run_tasks
 
-from .objective import MIN_SCORE
+from .similarity_loops import CHANNEL, HALVE, HEIGHT, MARGIN, PADDING, SCALE, SCORE, SUM, WIDTH, Scales, run_phases
 
-# half the window of SSIM, in pixels
-MARGIN = 5
-# rows of zeros above and below padded planes
-_PADDING = 12
 # rows of the finest scale per task, a multiple of the blocks of the coarsest
 _ROWS = 64
-# columns of the table of scales
-_HEIGHT = 0
-_WIDTH = 1
-_START = 2  # pixels of finer scales
-_PADDED_START = 3  # elements of finer scales' padded planes
-_WINDOW_START = 4  # windows of finer scales
-# columns of tasks, after the first
-_PHASE = 1
-_SCALE = 2
-_CHANNEL = 3
-_FIRST = 4
-_LAST = 5  # row + 1
-# phases
-_HALVE = 0  # average blocks of the difference for the rows of all scales
-_SCORE = 1  # the score of a scale, and the gradient by its pixels without the factor of the mean score
-_SUM = 2  # the gradient by the pixels of the image
-
-program = Program("objective of MS-SSIM", __file__, "../kernels/tasks.py")
-
-
-class Scales(NamedTuple):
-    """All scales of an image, flat, finest first.
-
-    Windows lie at even rows and columns. `Padded` planes have the even columns of a row first, then the odd ones: the
-    pixels that the windows of a row share are neighbours in memory. Zeros lie around them: 5 rows above and 7 below, 2
-    elements before and after the even columns, 3 before and up to 3 after the odd ones.
-    """
-
-    table: Any  # [S, 5] int64
-    factors: Any  # [S] float64: weight of a window by the gradient's norm
-    taps: Any  # [6] of the window, its centre first
-    image: Any  # padded, C
-    inside: Any  # of windows: inverse of the part inside the image
-    mean: Any  # of windows, C, of the image
-    variance: Any  # of windows, C
-    render: Any  # padded, C, written to
-    planes: Any  # C: averages of the difference, then the gradient
-
-
-@inner
-def _taps(scales):  # type: ignore[no-untyped-def]
-    """Return the taps as numbers: in an array a store to another one might change them."""
-    taps = scales.taps
-    return taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
-
-
-@inner
-def _window(taps, a, b, c, d, e, f, g, h, i, j, k):  # type: ignore[no-untyped-def]
-    near = taps[0] * f + taps[1] * (e + g) + taps[2] * (d + h)
-    return near + taps[3] * (c + i) + taps[4] * (b + j) + taps[5] * (a + k)
-
-
-@inner
-def _down(plane, y, taps, upper, lower):  # type: ignore[no-untyped-def]
-    """Blur a padded plane along columns, at rows y and y + 2."""
-    for x in range(plane.shape[1]):
-        a, b, c, d = plane[y, x], plane[y + 1, x], plane[y + 2, x], plane[y + 3, x]
-        e, f, g, h = plane[y + 4, x], plane[y + 5, x], plane[y + 6, x], plane[y + 7, x]
-        i, j, k, m = plane[y + 8, x], plane[y + 9, x], plane[y + 10, x], plane[y + 11, x]
-        n = plane[y + 12, x]
-        upper[x] = _window(taps, a, b, c, d, e, f, g, h, i, j, k)
-        lower[x] = _window(taps, c, d, e, f, g, h, i, j, k, m, n)
-
-
-@inner
-def _down_product(p, q, y, taps, upper, lower):  # type: ignore[no-untyped-def]
-    """Blur the product of two padded planes along columns, at rows y and y + 2."""
-    for x in range(p.shape[1]):
-        a, b, c = p[y, x] * q[y, x], p[y + 1, x] * q[y + 1, x], p[y + 2, x] * q[y + 2, x]
-        d, e, f = p[y + 3, x] * q[y + 3, x], p[y + 4, x] * q[y + 4, x], p[y + 5, x] * q[y + 5, x]
-        g, h, i = p[y + 6, x] * q[y + 6, x], p[y + 7, x] * q[y + 7, x], p[y + 8, x] * q[y + 8, x]
-        j, k, m = p[y + 9, x] * q[y + 9, x], p[y + 10, x] * q[y + 10, x], p[y + 11, x] * q[y + 11, x]
-        n = p[y + 12, x] * q[y + 12, x]
-        upper[x] = _window(taps, a, b, c, d, e, f, g, h, i, j, k)
-        lower[x] = _window(taps, c, d, e, f, g, h, i, j, k, m, n)
-
-
-@inner
-def _across(row, taps, target):  # type: ignore[no-untyped-def]
-    """Blur a row of a padded plane, for the windows of a row."""
-    odd = row[len(target) + 4 :]
-    for x in range(len(target)):
-        even_part = taps[0] * row[x + 2] + taps[2] * (row[x + 1] + row[x + 3]) + taps[4] * (row[x] + row[x + 4])
-        odd_part = taps[1] * (odd[x + 2] + odd[x + 3]) + taps[3] * (odd[x + 1] + odd[x + 4])
-        target[x] = even_part + odd_part + taps[5] * (odd[x] + odd[x + 5])
-
-
-@inner
-def _up(slopes, k, taps, upper, lower):  # type: ignore[no-untyped-def]
-    """Spread windows along columns to the row of pixels of window row k + 2, and the next."""
-    for x in range(slopes.shape[1]):
-        a, b, c = slopes[k, x], slopes[k + 1, x], slopes[k + 2, x]
-        d, e, f = slopes[k + 3, x], slopes[k + 4, x], slopes[k + 5, x]
-        upper[x] = taps[0] * c + taps[2] * (b + d) + taps[4] * (a + e)
-        lower[x] = taps[1] * (c + d) + taps[3] * (b + e) + taps[5] * (a + f)
-
-
-@inner
-def _along(row, taps, even, odd):  # type: ignore[no-untyped-def]
-    """Spread windows along a row to its even and odd columns; three zeros lie on either side."""
-    for x in range(len(even)):
-        a, b, c, d, e, f = row[x + 1], row[x + 2], row[x + 3], row[x + 4], row[x + 5], row[x + 6]
-        even[x] = taps[0] * c + taps[2] * (b + d) + taps[4] * (a + e)
-        odd[x] = taps[1] * (c + d) + taps[3] * (b + e) + taps[5] * (a + f)
-
-
-@inner
-def _plane(flat, table, scale, index, count):  # type: ignore[no-untyped-def]
-    """Return one of `count` planes of a scale."""
-    height, width = table[scale, _HEIGHT], table[scale, _WIDTH]
-    start = count * table[scale, _START] + index * height * width
-    return flat[start : start + height * width].reshape(height, width)
-
-
-@inner
-def _padded(flat, table, scale, index, count):  # type: ignore[no-untyped-def]
-    """Return one of `count` padded planes of a scale."""
-    height, width = table[scale, _HEIGHT] + _PADDING, (table[scale, _WIDTH] + 1) // 2 * 2 + 9
-    start = count * table[scale, _PADDED_START] + index * height * width
-    return flat[start : start + height * width].reshape(height, width)
-
-
-@inner
-def _windows(flat, table, scale, index, count):  # type: ignore[no-untyped-def]
-    """Return a number of the windows of a scale, one of `count`."""
-    height, width = (table[scale, _HEIGHT] + 1) // 2, (table[scale, _WIDTH] + 1) // 2
-    start = count * table[scale, _WINDOW_START] + index * height * width
-    return flat[start : start + height * width].reshape(height, width)
-
-
-@inner
-def _halve(scales, difference, channel, first, last):  # type: ignore[no-untyped-def]
-    """Fill rows of all scales, those of the finest from first to last: averages of blocks, and the render."""
-    table, channels, quarter = scales.table, len(difference), np.float32(0.25)
-    for scale in range(len(table)):
-        target = _plane(scales.planes, table, scale, channel, channels)
-        image = _padded(scales.image, table, scale, channel, channels)
-        render = _padded(scales.render, table, scale, channel, channels)
-        source = difference[channel] if scale == 0 else _plane(scales.planes, table, scale - 1, channel, channels)
-        for y in range(first >> scale, last >> scale):
-            upper, lower, row = source[2 * y], source[2 * y + 1], target[y]
-            for x in range(len(row)):
-                row[x] = quarter * ((upper[2 * x] + lower[2 * x]) + (upper[2 * x + 1] + lower[2 * x + 1]))
-            image_row, render_row = image[y + MARGIN], render[y + MARGIN]
-            gap = (len(row) + 1) // 2 + 7
-            image_odd, render_odd = image_row[gap:], render_row[gap:]
-            for x in range(len(row) // 2):
-                render_row[x + 2] = image_row[x + 2] + row[2 * x]
-                render_odd[x] = image_odd[x] + row[2 * x + 1]
-            if len(row) % 2:
-                render_row[gap - 6] = image_row[gap - 6] + row[-1]
-
-
-@inner
-def _differentiate(rows, inside, mean, variance, scores, slopes):  # type: ignore[no-untyped-def]
-    """Fill a row of scores, and of their slopes by mean square, mean product and mean of the render."""
-    means, squares, products = rows[0], rows[1], rows[2]
-    by_square, by_product, by_mean = slopes
-    zero, two, c2 = np.float32(0.0), np.float32(2.0), np.float32(K2**2)
-    for x in range(len(scores)):
-        share, m = inside[x], inside[x] * means[x]
-        spread = share * squares[x] - m * m
-        inverse = np.float32(1.0) / ((spread if spread > zero else zero) + variance[x] + c2)
-        structure = (two * (share * products[x] - mean[x] * m) + c2) * inverse
-        slope = share * inverse
-        scores[x] = structure
-        by_product[x] = slope
-        by_square[x] = slope * structure
-        by_mean[x] = slope * mean[x] - slope * structure * m
-
-
-@inner
-def _brighten(means, inside, mean, scores, slopes):  # type: ignore[no-untyped-def]
-    """Multiply a row of scores by the luminance."""
-    by_square, by_product, by_mean = slopes
-    two, c1 = np.float32(2.0), np.float32(K1**2)
-    for x in range(len(scores)):
-        m = inside[x] * means[x]
-        both = mean[x] * mean[x] + m * m + c1
-        luminance = (two * mean[x] * m + c1) / both
-        slope = inside[x] * scores[x] * (luminance * m - mean[x]) / both
-        scores[x] *= luminance
-        by_square[x] *= luminance
-        by_product[x] *= luminance
-        by_mean[x] = by_mean[x] * luminance + slope
-
-
-@inner
-def _score(scales, scale, channel, first, last, channels, has_gradient):  # type: ignore[no-untyped-def]
-    """Fill rows of the gradient by the pixels of a scale, the first even; return the sum of the scores of windows."""
-    table, taps = scales.table, _taps(scales)
-    render = _padded(scales.render, table, scale, channel, channels)
-    image = _padded(scales.image, table, scale, channel, channels)
-    inside = _windows(scales.inside, table, scale, 0, 1)
-    mean = _windows(scales.mean, table, scale, channel, channels)
-    variance = _windows(scales.variance, table, scale, channel, channels)
-    height, width = inside.shape
-    columns = np.empty((3, 2, render.shape[1]), np.float32)
-    rows = np.empty((3, width), np.float32)
-    scores, totals = np.empty(width, np.float32), np.zeros(width)
-    first_window, last_window = first // 2, (last + 1) // 2
-    # with the windows above and below that the gradient depends on
-    above, below = (2, 3) if has_gradient else (0, 0)
-    slopes = np.zeros((3, last_window - first_window + 6, width + 6), np.float32)
-    end = min(last_window + below, height)
-    for top in range(max(first_window - above, 0), end, 2):
-        _down(render, 2 * top, taps, columns[0, 0], columns[0, 1])
-        _down_product(render, render, 2 * top, taps, columns[1, 0], columns[1, 1])
-        _down_product(render, image, 2 * top, taps, columns[2, 0], columns[2, 1])
-        for y in range(top, min(top + 2, end)):
-            for k in range(3):
-                _across(columns[k, y - top], taps, rows[k])
-            k = y - first_window + 2
-            by = slopes[0, k, 3:-3], slopes[1, k, 3:-3], slopes[2, k, 3:-3]
-            _differentiate(rows, inside[y], mean[y], variance[y], scores, by)
-            if scale == len(table) - 1:
-                _brighten(rows[0], inside[y], mean[y], scores, by)
-            if first_window <= y < last_window:
-                for x in range(width):
-                    totals[x] += scores[x]
-    if has_gradient:
-        _spread(scales, scale, channel, first, last, channels, slopes)
-    total = 0.0
-    for x in range(width):
-        total += totals[x]
-    return total
-
-
-@inner
-def _spread(scales, scale, channel, first, last, channels, slopes):  # type: ignore[no-untyped-def]
-    """Fill rows of the gradient by the pixels of a scale, from the slopes of the scores of windows."""
-    table, taps = scales.table, _taps(scales)
-    render = _padded(scales.render, table, scale, channel, channels)
-    image = _padded(scales.image, table, scale, channel, channels)
-    target = _plane(scales.planes, table, scale, channel, channels)
-    width = slopes.shape[2] - 6
-    columns = np.empty((3, 2, width + 6), np.float32)
-    even, odd = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
-    for top in range(first, last, 2):
-        for k in range(3):
-            _up(slopes[k], (top - first) // 2, taps, columns[k, 0], columns[k, 1])
-        for y in range(top, min(top + 2, last)):
-            for k in range(3):
-                _along(columns[k, y - top], taps, even[k], odd[k])
-            _combine(even, render[y + MARGIN, 2:], image[y + MARGIN, 2:])
-            _combine(odd, render[y + MARGIN, width + 7 :], image[y + MARGIN, width + 7 :])
-            row, even_row, odd_row = target[y], even[0], odd[0]
-            for x in range(len(row) // 2):
-                row[2 * x], row[2 * x + 1] = even_row[x], odd_row[x]
-            if len(row) % 2:
-                row[-1] = even_row[width - 1]
-
-
-@inner
-def _combine(rows, render, image):  # type: ignore[no-untyped-def]
-    """Set the first of three rows of slopes, by mean square, mean product and mean, to the gradient."""
-    by_square, by_product, by_mean = rows[0], rows[1], rows[2]
-    for x in range(min(len(render), len(by_square))):
-        by_square[x] = by_square[x] * render[x] - by_product[x] * image[x] + by_mean[x]
-
-
-@inner
-def _mean_score(scales, sums, tasks, scale, channel):  # type: ignore[no-untyped-def]
-    total = 0.0
-    for k in range(len(tasks)):
-        if tasks[k, _PHASE] == _SCORE and tasks[k, _SCALE] == scale and tasks[k, _CHANNEL] == channel:
-            total += sums[k]
-    windows = ((scales.table[scale, _HEIGHT] + 1) // 2) * ((scales.table[scale, _WIDTH] + 1) // 2)
-    return max(total / windows, MIN_SCORE)
-
-
-@inner
-def _add(row, factor, coarse):  # type: ignore[no-untyped-def]
-    """Multiply a row by a factor, and add to it what the blocks of a coarser one have."""
-    for x in range(len(coarse)):
-        row[2 * x] = row[2 * x] * factor + coarse[x]
-        row[2 * x + 1] = row[2 * x + 1] * factor + coarse[x]
-    for x in range(2 * len(coarse), len(row)):
-        row[x] *= factor
-
-
-@inner
-def _sum(scales, difference, squared, sums, tasks, k):  # type: ignore[no-untyped-def]
-    """Fill rows of the gradient by the image's pixels: the coarser scales' are added to the finer ones'."""
-    table, channels, channel = scales.table, len(difference), tasks[k, _CHANNEL]
-    first, last = tasks[k, _FIRST], tasks[k, _LAST]
-    nothing = np.empty(0, np.float32)
-    for scale in range(len(table) - 1, -1, -1):
-        factor = np.float32(scales.factors[scale] / _mean_score(scales, sums, tasks, scale, channel))
-        plane = _plane(scales.planes, table, scale, channel, channels)
-        has_coarse = scale + 1 < len(table)
-        coarse = _plane(scales.planes, table, scale + has_coarse, channel, channels)
-        rows = table[scale + 1, _HEIGHT] if has_coarse else 0
-        for y in range(first >> scale, last >> scale):
-            _add(plane[y], factor, coarse[y // 2] if y // 2 < rows else nothing)
-    plane = _plane(scales.planes, table, 0, channel, channels)
-    end = difference.shape[1] if last == len(plane) else 2 * last
-    for y in range(2 * first, end):
-        _add(difference[channel, y], np.float32(squared), plane[y // 2] if y // 2 < len(plane) else nothing)
-
-
-@program.entry
-def run_phases(scales, difference, squared, sums, has_gradient, tasks, counters):  # type: ignore[no-untyped-def]
-    """Fill the sums of scores, (T,) by task; with the last phase replace a difference by half the gradient."""
-    k = first_task(tasks, counters)
-    while k >= 0:
-        phase, scale, channel, first, last = tasks[k, 1], tasks[k, 2], tasks[k, 3], tasks[k, 4], tasks[k, 5]
-        if phase == _HALVE:
-            _halve(scales, difference, channel, first, last)
-        elif phase == _SCORE:
-            sums[k] = _score(scales, scale, channel, first, last, len(difference), has_gradient)
-        else:
-            _sum(scales, difference, squared, sums, tasks, k)
-        k = next_task(tasks, counters)
 
 
 class Passes:
@@ -343,13 +24,14 @@ class Passes:
         scales: of each scale the image, (C, h, w), the inverse of the window's part inside of it, (1, h, w), mean and
             variance under the window, (C, h, w).
         factors: weight of each scale, by the gradient's norm.
+        least: least mean score of a scale.
     """
 
-    def __init__(self, scales: Sequence[Sequence[NDArray[Any]]], factors: Sequence[float]) -> None:
+    def __init__(self, scales: Sequence[Sequence[NDArray[Any]]], factors: Sequence[float], least: float) -> None:
         self._channels = len(scales[0][0])
         sizes = np.array([scale[0].shape[1:] for scale in scales])
         halves = (sizes + 1) // 2
-        padded_sizes = np.column_stack([sizes[:, 0] + _PADDING, 2 * halves[:, 1] + 9])
+        padded_sizes = np.column_stack([sizes[:, 0] + PADDING, 2 * halves[:, 1] + 9])
         areas = np.column_stack([side.prod(1) for side in (sizes, padded_sizes, halves)])
         table, taps = np.column_stack([sizes, areas.cumsum(0) - areas]), np.array(window_taps(), np.float32)
         image = np.concatenate([_pad(scale[0]).ravel() for scale in scales])
@@ -359,16 +41,16 @@ class Passes:
         # the weight of a pixel is for windows at all pixels
         weights = np.array(factors) * areas[:, 0] / areas[:, 2]
         render, planes = np.zeros_like(image), np.empty(self._channels * areas[:, 0].sum(), np.float32)
-        self._scales = Scales(table, weights, taps, image, inside, mean, variance, render, planes)
+        self._scales = Scales(table, weights, least, taps, image, inside, mean, variance, render, planes)
         bands = self._bands(0)
         rows = np.concatenate([self._bands(scale) for scale in range(len(sizes))])
-        steps = [(_HALVE, bands), (_SCORE, rows), (_SUM, bands)]
+        steps = [(HALVE, bands), (SCORE, rows), (SUM, bands)]
         parts = [np.column_stack([np.full(len(part), phase), part]) for phase, part in steps]
         self._value_tasks, self._tasks = phases(*parts[:2]), phases(*parts)
 
     def _bands(self, scale: int) -> NDArray[np.int64]:
         """Return the tasks of a scale: scale, channel, first row, last + 1."""
-        height = int(self._scales.table[scale, _HEIGHT])
+        height = int(self._scales.table[scale, HEIGHT])
         firsts = range(0, height, _ROWS)
         return np.array([(scale, c, y, min(y + _ROWS, height)) for c in range(self._channels) for y in firsts])
 
@@ -376,9 +58,9 @@ class Passes:
         """Return what MS-SSIM lacks, as its weighted logarithm, summed over pixels and averaged over channels."""
         sums, table = self._run(difference, self._value_tasks), self._scales.table
         scores = np.zeros((len(table), self._channels))
-        np.add.at(scores, (self._value_tasks[:, _SCALE], self._value_tasks[:, _CHANNEL]), sums)
-        windows = ((table[:, [_HEIGHT, _WIDTH]] + 1) // 2).prod(1)
-        logs = np.log(np.maximum(scores / windows[:, None], MIN_SCORE)).mean(1)
+        np.add.at(scores, (self._value_tasks[:, SCALE], self._value_tasks[:, CHANNEL]), sums)
+        windows = ((table[:, [HEIGHT, WIDTH]] + 1) // 2).prod(1)
+        logs = np.log(np.maximum(scores / windows[:, None], self._scales.least)).mean(1)
         return -float((self._scales.factors * 4.0 ** np.arange(1, len(table) + 1) * windows * logs).sum())
 
     def differentiate(self, difference: NDArray[Any], squared: float) -> None:
@@ -395,7 +77,7 @@ class Passes:
 
 def _pad(planes: NDArray[Any]) -> NDArray[Any]:
     """Put the even columns of planes, (C, h, w), before the odd ones, with zeros around them: see `Scales`."""
-    above = (MARGIN, _PADDING - MARGIN)
+    above = (MARGIN, PADDING - MARGIN)
     even, odd = planes[:, :, ::2], planes[:, :, 1::2]
     parts = [(even, (2, 2)), (odd, (3, 2 + even.shape[2] - odd.shape[2]))]
     return np.concatenate([np.pad(part, ((0, 0), above, beside)) for part, beside in parts], 2)
