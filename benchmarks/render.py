@@ -117,6 +117,16 @@ def jobs(options: Options) -> list[Job]:
     return [{**job, "rounds": rounds} for job in listing]
 
 
+def cores_table(speedups: dict[str, float]) -> str:
+    """Tabulate what more cores would give, if the share of a step that two threads do not divide stayed as it is."""
+    lines = ["| image | 2 cores | share not divided | 8 cores, by Amdahl | 16 cores |", "|---|---|---|---|---|"]
+    for image, speedup in speedups.items():
+        share = min(max(2 / speedup - 1, 0.0), 1.0)
+        predicted = [1 / (share + (1 - share) / cores) for cores in (8, 16)]
+        lines.append(f"| {image} | {speedup:.2f} | {share:.2f} | {predicted[0]:.1f} | {predicted[1]:.1f} |")
+    return "\n".join(lines)
+
+
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
     timed = [row for row in rows if "both_ms" in row]
@@ -138,6 +148,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
     text = text.format(
         *(", ".join(f"{format_value('', r)} ({image})" for image, r in values.items()) for values in (ratios, cores))
     )
+    tables.append(cores_table(cores))
     slow = [f"{image}: {ratio:.2f}" for image, ratio in cores.items() if ratio < 1]
     losses = f"Two threads are slower than one, times as fast: {', '.join(slow)}." if slow else ""
     return Page("How fast and how exactly does each backend render?", METHOD, text, "render.png", tables, losses)

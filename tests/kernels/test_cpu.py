@@ -15,6 +15,7 @@ from torch import Tensor
 
 from kcgs import RegionMap
 from kcgs.functional import region_splat
+from kcgs.functional.splat import squared_error_gradients
 from kcgs.kernels.cpu import lists, loops
 from kcgs.kernels.cpu.simd import EXP2
 
@@ -56,6 +57,16 @@ def test_same_bits_for_any_number_of_threads(scene: tuple[Tensor, ...]) -> None:
         results.append(render(scene))
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@pytest.mark.parametrize("backend", ["cpu", "tiled"])
+def test_one_pass_of_squared_error(scene: tuple[Tensor, ...], backend: str) -> None:
+    regions, target = RegionMap.from_labels(scene[4], 0.7), torch.rand(3, 110, 150, generator=RANDOM)
+    leaves = [t.clone().requires_grad_() for t in scene[:3]]
+    image = region_splat(*leaves, scene[3], regions, backend=backend)
+    image.backward(image.detach() - target)
+    got = squared_error_gradients(target, *scene[:4], regions, cutoff=1e-4, backend=backend)  # type: ignore[misc]
+    assert all(torch.equal(a, b.grad) for a, b in zip(got, leaves, strict=True) if b.grad is not None)
 
 
 @pytest.mark.parametrize("channels", [1, 2, 4, 16])
