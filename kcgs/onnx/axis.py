@@ -49,7 +49,7 @@ class Axis:
     @property
     def padded(self) -> Value:
         """Pixels of all blocks, (1,)."""
-        return self.graph.Shape(self.tile) * self.pieces * self.side
+        return self.graph.Shape(self.runs) * self.pieces * self.side
 
     def sampling(self, soft: bool) -> Value:
         """Bilinear weights of a window, a tile and the pixels around it, (V, pieces, side, window).

@@ -110,6 +110,7 @@ class Scope(NamedTuple):
 
     tape: Tape
     inputs: list[ir.Value]
+    constants: dict[tuple[str, tuple[int, ...], bytes], Value]  # onnx.compose renames no others inside a body
 
 
 class Graph:
@@ -176,8 +177,7 @@ class Graph:
     Where = Operator(typed_by=1)
 
     def __init__(self) -> None:
-        self._scopes = [Scope(Tape(), [])]  # the graph, and the bodies that are being built in it
-        self._constants: dict[tuple[str, tuple[int, ...], bytes], Value] = {}  # bodies read those of the graph
+        self._scopes = [Scope(Tape(), [], {})]  # the graph, and the bodies that are being built in it
         self._names = 0
 
     def input(self, name: str, dtype: ir.DataType, shape: Sequence[int | str], doc: str | None = None) -> Value:
@@ -192,13 +192,13 @@ class Graph:
         if isinstance(array, Value):
             return array
         data = np.asarray(array, np.float32 if isinstance(array, float) else None).copy(order="C")
+        tape, _, constants = self._scopes[-1]
         key = (data.dtype.str, data.shape, data.tobytes())
-        if key not in self._constants:
+        if key not in constants:
             name = self._name("c")
             tensor = ir.tensor(data, name=name)
-            value = self._scopes[0].tape.initializer(tensor, name=name)
-            self._constants[key] = Value(self, value, tensor.dtype)
-        return self._constants[key]
+            constants[key] = Value(self, tape.initializer(tensor, name=name), tensor.dtype)
+        return constants[key]
 
     def add_node(
         self, operator: str, operands: Sequence[Value], dtypes: Sequence[ir.DataType], **attributes: object
@@ -234,7 +234,7 @@ class Graph:
 
     def body(self, name: str, build: Callable[[], Sequence[Value]]) -> ir.Graph:
         """Make the graph inside a Loop or an If: what `build` adds and returns; it may use values from outside."""
-        self._scopes.append(Scope(Tape(), []))
+        self._scopes.append(Scope(Tape(), [], {}))
         return self._pop(name, build(), {})
 
     def choose(self, condition: Value, first: Callable[[], Value], second: Callable[[], Value]) -> Value:
@@ -265,7 +265,7 @@ class Graph:
         return proto
 
     def _pop(self, name: str, outputs: Sequence[Value], opsets: dict[str, int]) -> ir.Graph:
-        tape, inputs = self._scopes.pop()
+        tape, inputs, _ = self._scopes.pop()
         return ir.Graph(
             inputs,
             [output.value for output in outputs],

@@ -100,7 +100,7 @@ class TestCases:
     def test_all_are_here_and_small(self) -> None:
         assert {path.stem for path in FOLDER.glob("*.npz")} == set(NAMES) == {p.stem for p in FOLDER.glob("*.onnx")}
         for name in NAMES:
-            assert sum((FOLDER / f"{name}{suffix}").stat().st_size for suffix in (".npz", ".onnx")) < 71_000
+            assert sum((FOLDER / f"{name}{suffix}").stat().st_size for suffix in (".npz", ".onnx")) < 75_000
 
     def test_cover_what_they_are_for(self, name: str, case: Arrays) -> None:
         size, enlarged, reduced = wholes(case)
