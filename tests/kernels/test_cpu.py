@@ -66,7 +66,7 @@ def test_one_pass_of_squared_error(scene: tuple[Tensor, ...], backend: str) -> N
     image = region_splat(*leaves, scene[3], regions, backend=backend)
     image.backward(image.detach() - target)
     got = squared_error_gradients(target, *scene[:4], regions, cutoff=1e-4, backend=backend)  # type: ignore[misc]
-    assert all(torch.equal(a, b.grad) for a, b in zip(got, leaves, strict=True) if b.grad is not None)
+    assert all(b.grad is not None and torch.equal(a, b.grad) for a, b in zip(got, leaves, strict=True))
 
 
 @pytest.mark.parametrize("channels", [1, 2, 4, 16])
