@@ -70,7 +70,8 @@ def _list_visits(batch: Batch, table: Table, order: Any, cutoff: float) -> Lists
         np.zeros(copies * (blocks - len(table.mask_rows) + 1), np.bool_), np.float32(math.exp(least)),
     )  # fmt: skip
     histogram, room = np.zeros((parts, copies * blocks), np.int32), np.empty((total, 3), np.int32)
-    run_tasks(partial(list_visits, batch, radius, spans, room, histogram, lists), listing)
+    # the phases of one range follow each other: another thread would only wait
+    run_tasks(partial(list_visits, batch, radius, spans, room, histogram, lists), listing, serial=parts == 1)
     return lists
 
 

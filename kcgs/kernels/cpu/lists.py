@@ -152,15 +152,14 @@ def list_visits(batch, radius, spans, blocks, histogram, lists, tasks, counters)
 @inner
 def _find_blocks(batch, radius, spans, blocks, histogram, lists, begin, end):  # type: ignore[no-untyped-def]
     table, per_image = lists.table, max(len(lists.order) // batch.num_images, 1)
-    grids, maps = table.grids, table.num_maps
+    grids = table.grids
     num_regions, tile_start, block_regions = table.num_regions, table.tile_start, table.regions
     for i in range(begin, end):
         g, n, place = lists.gaussians[i], lists.order[i], lists.first_terms[i]
         image, region = n // per_image, batch.regions[n] if len(batch.regions) > 0 else 0
         level = int(g[LEVEL])
         height, width, cols = grids[level, NODE_ROWS], grids[level, NODE_COLS], grids[level, TILE_COLS]
-        tile = grids[level, FIRST_TILE] + image % maps * grids[level, TILE_ROWS] * cols
-        head = image * len(block_regions) if maps == 1 else 0
+        tile, head = first_tile(table, level, image, 0), first_head(table, image)
         for row in range(spans[i, 0], spans[i, 1]):
             left, right = tile_columns(g, row, height, width, radius)
             for col in range(left, right):
@@ -274,6 +273,12 @@ def first_tile(table, level, image, row):  # type: ignore[no-untyped-def]
     """Return the number of the first tile of a row of tiles."""
     grid = table.grids[level]
     return grid[FIRST_TILE] + (image % table.num_maps * grid[TILE_ROWS] + row) * grid[TILE_COLS]
+
+
+@inner
+def first_head(table, image):  # type: ignore[no-untyped-def]
+    """Return the place in Lists.start of an image's first block; images that share a map have a copy each."""
+    return image * len(table.regions) if table.num_maps == 1 else 0
 
 
 @inner

@@ -9,13 +9,15 @@ an order of its own, so the result does not depend on the number of threads. A b
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ..compiled import inner
 from ..tasks import first_task, next_task
 from .gradients import sum_terms
 from .layout import FIRST, GAUSSIAN, LAST, RUN, SHAPE_COLUMNS, TERMS, TILE_COLS, program
-from .lists import first_node_block, first_tile
+from .lists import first_head, first_node_block, first_tile
 from .rows import add_rows, gather_rows
 from .schedule import ADDS, FIRST_FIELD, GATHERS, IMAGE, KIND, LEVEL_FIELD, ROW
 from .simd import SIDE, exchange_rows
@@ -62,9 +64,9 @@ def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, offsets, 
     level, b, row = task[LEVEL_FIELD], task[IMAGE], task[ROW]
     adds, gathers = (task[KIND] & ADDS) != 0, (task[KIND] & GATHERS) != 0
     channels = image.shape[1]
-    size, across = SIDE * SIDE * channels, SIDE * channels
+    size = SIDE * SIDE * channels
     tile, base = first_tile(table, level, b, row), first_node_block(table, b) - len(mask_rows)
-    head = b * len(parents) if table.num_maps == 1 else 0
+    head = first_head(table, b)
     values, gradients = (nodes, slopes) if level > 0 else (pixels, pixels)
     for col in range(table.grids[level, TILE_COLS]):
         first_block, end_block = tile_start[tile + col], tile_start[tile + col + 1]
@@ -75,15 +77,7 @@ def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, offsets, 
             weights, first, step = _mask(mask_rows, masks, ones, block, level)
             mask = first if step > 0 else -1
             if len(nodes) > 0 and _set_offsets(live, parents, block, base, size, offsets):
-                down, right = parity[block] >= 2, parity[block] % 2 == 1
-                if level > 0:
-                    add_refined(
-                        nodes, offsets, down, right, values, origin, across, SIDE, channels, weights, first, step
-                    )
-                else:
-                    add_sampled(
-                        nodes, offsets, down, right, values, origin, across, SIDE, channels, weights, first, step
-                    )
+                _add_spline(nodes, offsets, parity[block], level, values, origin, channels, weights, first, step)
             for v in range(start[head + block], start[head + block + 1]):
                 i = visits[v, GAUSSIAN]
                 add_rows(  # type: ignore[call-arg]
@@ -105,15 +99,25 @@ def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, offsets, 
                     mask, sums, terms, visits[v, TERMS] * terms.shape[1],
                 )  # fmt: skip
             if len(slopes) > 0 and _set_offsets(live, parents, block, base, size, offsets):
-                down, right = parity[block] >= 2, parity[block] % 2 == 1
-                if level > 0:
-                    gather_refined(
-                        slopes, offsets, down, right, gradients, origin, across, SIDE, channels, weights, first, step
-                    )
-                else:
-                    gather_sampled(
-                        slopes, offsets, down, right, gradients, origin, across, SIDE, channels, weights, first, step
-                    )
+                _gather_spline(slopes, offsets, parity[block], level, gradients, origin, channels, weights, first, step)
+
+
+def _make_spline(refine: Any, sample: Any) -> Any:
+    """Make the step between a block and its parents, by one function for nodes and another for pixels."""
+
+    @inner
+    def visit_spline(coarse, offsets, parity, level, fine, origin, channels, weights, first, step):  # type: ignore[no-untyped-def]
+        down, right, across = parity >= 2, parity % 2 == 1, SIDE * channels
+        if level > 0:
+            refine(coarse, offsets, down, right, fine, origin, across, SIDE, channels, weights, first, step)
+        else:
+            sample(coarse, offsets, down, right, fine, origin, across, SIDE, channels, weights, first, step)
+
+    return visit_spline
+
+
+_add_spline = _make_spline(add_refined, add_sampled)
+_gather_spline = _make_spline(gather_refined, gather_sampled)
 
 
 @inner

@@ -109,21 +109,9 @@ _ROW_TYPES = (types.int64,) * 4
 
 @intrinsic
 def add_rows(  # type: ignore[no-untyped-def]
-    typing_context,
-    pixels,
-    origin,
-    channels,
-    first,
-    last,
-    shapes,
-    shape_start,
-    run,
-    colors,
-    color_start,
-    cutoff,
-    masks,
+    typing_context, pixels, origin, channels, first, last, shapes, shape_start, run, colors, color_start, cutoff, masks,
     mask_start,
-):
+):  # fmt: skip
     """pixels[row, c, :] += weight[row, :] * colors[c] for rows first ... last - 1."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
