@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from llvmlite import ir
 from numba.core import cgutils
 
-from .simd import LONG, SIDE, apply, broadcast, constant, load, store, sum_columns
+from .simd import SIDE, apply, broadcast, constant, load, long, store, sum_columns
 
-# sums of v, v z2 and v z2 z2
+# sums over rows, of v, v z2 and v z2 z2, and what follows from them over columns
 _MOMENTS = 3
+_TERMS = 5
 
 
 class Channels:
@@ -24,11 +24,11 @@ class Channels:
         """Call emit(channel, pointer to its pixels), within a loop or for each of three."""
 
         def visit(channel: Any) -> None:
-            emit(channel, self.builder.gep(pixels, [self.builder.mul(channel, ir.Constant(LONG, SIDE))]))
+            emit(channel, self.builder.gep(pixels, [self.builder.mul(channel, long(SIDE))]))
 
         if self.is_rgb:
             for c in range(3):
-                visit(ir.Constant(LONG, c))
+                visit(long(c))
         else:
             with cgutils.for_range(self.builder, self.count) as loop:
                 visit(loop.index)
@@ -48,18 +48,26 @@ class Channels:
 
 
 class Sums:
-    """Sums over rows of 16: w g_c of each channel, then the moments of v = w sum_c g_c colors_c."""
+    """Sums over rows and columns: w g_c of each channel, then the moments of v = w sum_c g_c colors_c.
 
-    def __init__(self, channels: Channels, sums: Any) -> None:
+    `room` has a vector of lanes for each; three channels and the moments are summed in registers within a part.
+    """
+
+    def __init__(self, channels: Channels, room: Any) -> None:
         builder = self.builder = channels.builder
-        self.channels, self.sums = channels, sums
-        zero = constant(0.0)
+        self.channels, self.room = channels, room
         # variables, which LLVM keeps in registers
-        self.totals = [cgutils.alloca_once_value(builder, zero) for _ in range(3 if channels.is_rgb else 0)]
-        self.moments = [cgutils.alloca_once_value(builder, zero) for _ in range(_MOMENTS)]
-        if not self.totals:
-            with cgutils.for_range(builder, channels.count) as loop:
-                store(builder, zero, sums, loop.index)
+        zero = constant(0.0)
+        self.totals = [cgutils.alloca_once(builder, zero.type) for _ in range(3 if channels.is_rgb else 0)]
+        self.moments = [cgutils.alloca_once(builder, zero.type) for _ in range(_MOMENTS)]
+        self.count = builder.add(channels.count, long(_TERMS))
+        with cgutils.for_range(builder, self.count) as loop:
+            store(builder, zero, room, loop.index)
+
+    def begin(self) -> None:
+        """Begin a part of the rows."""
+        for total in (*self.totals, *self.moments):
+            self.builder.store(constant(0.0), total)
 
     def gather(self, weight: Any, pixels: Any, second: Any) -> None:
         """Add the terms of a row of pixels of that weight and z2."""
@@ -72,8 +80,8 @@ class Sums:
             if self.totals:
                 self._add(self.totals[channel.constant], weight, grad)
             else:
-                total = apply(builder, "fma", weight, grad, load(builder, self.sums, channel))
-                store(builder, total, self.sums, channel)
+                total = apply(builder, "fma", weight, grad, load(builder, self.room, channel))
+                store(builder, total, self.room, channel)
             self._add(product, grad, self.channels.color(channel))
 
         self.channels.each(gather_channel, pixels)
@@ -86,23 +94,22 @@ class Sums:
     def _add(self, total: Any, first: Any, second: Any) -> None:
         self.builder.store(apply(self.builder, "fma", first, second, self.builder.load(total)), total)
 
-    def finish(self, z1: Any, terms: Any) -> None:
-        """Store the sums over columns; z1, the same in every row of a block, multiplies the sums, not the terms."""
+    def end(self, z1: Any) -> None:
+        """End a part; z1, the same in every row, multiplies the sums, not the terms."""
         builder = self.builder
         value, along, square = (builder.load(total) for total in self.moments)
         first = builder.fmul(value, z1)
         moments = [first, along, builder.fmul(first, z1), builder.fmul(along, z1), square]
-        if self.totals:
-            self._store([*(builder.load(total) for total in self.totals), *moments], terms)
-            return
-        for k, moment in enumerate(moments):
-            store(builder, moment, self.sums, builder.add(self.channels.count, ir.Constant(LONG, k)))
-        eight = ir.Constant(LONG, 8)
-        end = builder.add(self.channels.count, ir.Constant(LONG, len(moments)))
-        with cgutils.for_range_slice(builder, ir.Constant(LONG, 0), end, eight) as (row, _):
-            rows = [load(builder, self.sums, builder.add(row, ir.Constant(LONG, k))) for k in range(8)]
-            self._store(rows, builder.gep(terms, [row]))
+        first_moment = builder.sub(self.count, long(_TERMS))
+        places = [long(k) for k in range(len(self.totals))]
+        places += [builder.add(first_moment, long(k)) for k in range(_TERMS)]
+        for place, total in zip(places, [*map(builder.load, self.totals), *moments], strict=True):
+            store(builder, builder.fadd(load(builder, self.room, place), total), self.room, place)
 
-    def _store(self, rows: list[Any], terms: Any) -> None:
-        total = sum_columns(self.builder, rows)
-        self.builder.store(total, self.builder.bitcast(terms, total.type.as_pointer()), align=4)
+    def finish(self, terms: Any) -> None:
+        """Store the sums over columns."""
+        builder = self.builder
+        with cgutils.for_range_slice(builder, long(0), self.count, long(8)) as (row, _):
+            rows = [load(builder, self.room, builder.add(row, long(k))) for k in range(8)]
+            total, place = sum_columns(builder, rows), builder.gep(terms, [row])
+            builder.store(total, builder.bitcast(place, total.type.as_pointer()), align=4)

@@ -17,7 +17,7 @@ from ..membership import Membership
 from ..tasks import chunks, phases, run_tasks
 from ..whitened import least_exponent, support_radius
 from .gradients import Backward
-from .layout import COLUMNS, SHAPE_COLUMNS, TILE_COLS, TILE_ROWS, VISIT_COLUMNS, Batch, Lists, Table
+from .layout import AHEAD, COLUMNS, SHAPE_COLUMNS, TILE_COLS, TILE_ROWS, VISIT_COLUMNS, Batch, Lists, Table
 from .lists import arrange, list_visits, measure
 from .loops import visit
 from .schedule import ADDS, GATHERS, order_tasks
@@ -65,11 +65,12 @@ def _list_visits(batch: Batch, table: Table, order: Any, cutoff: float) -> Lists
     np.cumsum(counts, out=first_terms[1:])
     total = int(first_terms[-1])
     lists = Lists(
-        order, gaussians, colors, np.empty(copies * blocks + 1, np.int64), np.empty((total, VISIT_COLUMNS), np.int32),
-        np.empty((total, SHAPE_COLUMNS), np.float32), first_terms, np.empty(count, np.int32), table,
+        order, gaussians, colors, np.empty(copies * blocks + 1, np.int64),
+        np.empty((total + AHEAD, VISIT_COLUMNS), np.int32), np.empty((total, SHAPE_COLUMNS), np.float32), first_terms,
+        np.empty(count, np.int32), table,
         np.zeros(copies * (blocks - len(table.mask_rows) + 1), np.bool_), np.float32(math.exp(least)),
     )  # fmt: skip
-    histogram, room = np.zeros((parts, copies * blocks), np.int32), np.empty((total, 3), np.int32)
+    histogram, room = np.zeros((parts, copies * blocks), np.int32), np.empty((total, 5), np.int32)
     # the phases of one range follow each other: another thread would only wait
     run_tasks(partial(list_visits, batch, radius, spans, room, histogram, lists), listing, serial=parts == 1)
     return lists

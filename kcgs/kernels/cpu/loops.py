@@ -16,11 +16,11 @@ import numpy as np
 from ..compiled import inner
 from ..tasks import first_task, next_task
 from .gradients import sum_terms
-from .layout import FIRST, GAUSSIAN, LAST, RUN, SHAPE_COLUMNS, TERMS, TILE_COLS, program
+from .layout import TILE_COLS, program
 from .lists import first_head, first_node_block, first_tile
 from .rows import add_rows, gather_rows
 from .schedule import ADDS, FIRST_FIELD, GATHERS, IMAGE, KIND, LEVEL_FIELD, ROW
-from .simd import SIDE, exchange_rows
+from .simd import LANES, SIDE, exchange_rows
 from .spline import add_refined, add_sampled, gather_refined, gather_sampled
 
 
@@ -44,7 +44,7 @@ def visit(lists, backward, image, nodes, slopes, terms, tasks, counters):  # typ
     # a vector that begins at a multiple of its size lies in one line of the cache
     room = np.zeros(SIDE * SIDE * channels + SIDE, np.float32)
     pixels = room[-(room.ctypes.data // 4) % SIDE :]
-    sums = np.zeros(max(terms.shape[1], 8) * SIDE, np.float32)
+    sums = np.zeros(max(terms.shape[1], 8) * LANES, np.float32)
     offsets, ones = np.empty(4, np.int64), np.ones(SIDE, np.float32)
     k = first_task(tasks, counters)
     while k >= 0:
@@ -79,12 +79,9 @@ def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, offsets, 
             if len(nodes) > 0 and _set_offsets(live, parents, block, base, size, offsets):
                 _add_spline(nodes, offsets, parity[block], level, values, origin, channels, weights, first, step)
             for v in range(start[head + block], start[head + block + 1]):
-                i = visits[v, GAUSSIAN]
                 add_rows(  # type: ignore[call-arg]
-                    values, origin, channels, visits[v, FIRST], visits[v, LAST], shapes,
-                    visits[v, TERMS] * SHAPE_COLUMNS, visits[v, RUN], lists.colors, i * channels, lists.cutoff, masks,
-                    mask,
-                )  # fmt: skip
+                    values, origin, channels, visits, v, shapes, lists.colors, lists.cutoff, masks, mask
+                )
         if level == 0:
             _exchange(image, pixels, b, row * SIDE, col * SIDE, adds, gathers)
         for block in range(first_block, end_block if gathers else first_block):
@@ -92,11 +89,9 @@ def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, offsets, 
             weights, first, step = _mask(mask_rows, masks, ones, block, level)
             mask = first if step > 0 else -1
             for v in range(start[head + block], start[head + block + 1]):
-                i = visits[v, GAUSSIAN]
                 gather_rows(  # type: ignore[call-arg]
-                    gradients, origin, channels, visits[v, FIRST], visits[v, LAST], shapes,
-                    visits[v, TERMS] * SHAPE_COLUMNS, visits[v, RUN], lists.colors, i * channels, lists.cutoff, masks,
-                    mask, sums, terms, visits[v, TERMS] * terms.shape[1],
+                    gradients, origin, channels, visits, v, shapes, lists.colors, lists.cutoff, masks, mask, sums,
+                    terms, terms.shape[1],
                 )  # fmt: skip
             if len(slopes) > 0 and _set_offsets(live, parents, block, base, size, offsets):
                 _gather_spline(slopes, offsets, parity[block], level, gradients, origin, channels, weights, first, step)

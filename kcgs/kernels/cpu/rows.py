@@ -3,17 +3,15 @@
 Along a column the weight follows from row to row by two products, w <- w g and g <- g c, since its exponent is a
 polynomial of degree two. What is stored is g - 1 and c - 1, which are small where a Gaussian is wide: so errors do not
 grow along a run. Exponentials begin a run of rows, which is so short that no weight within the ellipse underflows on
-the way; the rows of a thin Gaussian begin a run each.
+the way; the rows of a thin Gaussian begin a run each. The two halves of the columns follow each other, if the Gaussian
+touches both.
 
 Arguments in common:
 
 - pixels, origin: float32 array, and the first element of the block, [SIDE rows][channel][SIDE columns];
 - channels: their number;
-- first, last: rows to visit, last + 1;
-- shapes, shape_start: float32 array, and the first element of what ellipse.enter made;
-- run: rows from an exponential to the next;
-- colors, color_start: float32 array, and the Gaussian's first element;
-- cutoff: the least weight; smaller ones are zero;
+- visits, number: Lists.visits, and which of them;
+- shapes, colors, cutoff: see Lists;
 - masks, mask_start: float32 array of membership, and the block's first element, below 0 if there is none.
 """
 
@@ -29,7 +27,24 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from .channels import Channels, Sums
-from .simd import FLOAT, LONG, SIDE, VECTOR, ZERO, apply, broadcast, constant, exp2, if_else, load, pointer, ramp
+from .layout import AHEAD, END_PART, FIRST, FIRST_PART, GAUSSIAN, LAST, RUN, SHAPE_COLUMNS, TERMS, VISIT_COLUMNS
+from .simd import (
+    FLOAT,
+    LANES,
+    LONG,
+    SIDE,
+    VECTOR,
+    apply,
+    broadcast,
+    constant,
+    exp2,
+    if_else,
+    load,
+    long,
+    pointer,
+    prefetch,
+    ramp,
+)
 
 # exponents of 2 below which a weight is zero, and of which a ratio of weights is cut
 _LEAST = -126.0
@@ -40,20 +55,28 @@ class _Rows:
 
     def __init__(self, context: Any, builder: Any, argument_types: Any, arguments: Any) -> None:
         self.builder = builder
-        self.channels, self.first, self.last = arguments[2:5]
-        self.run = arguments[7]
-        self.pixels = pointer(context, builder, argument_types[0], arguments[0], arguments[1])
-        self.colors = pointer(context, builder, argument_types[8], arguments[8], arguments[9])
-        self.cutoff = broadcast(builder, arguments[10])
-        self.masks = pointer(context, builder, argument_types[11], arguments[11], arguments[12])
-        self.is_masked = builder.icmp_signed(">=", arguments[12], ZERO)
-        self.is_rgb = builder.icmp_signed("==", self.channels, ir.Constant(LONG, 3))
-        shape = pointer(context, builder, argument_types[5], arguments[5], arguments[6])
-        k = [broadcast(builder, builder.load(builder.gep(shape, [ir.Constant(LONG, i)]))) for i in range(6)]
-        self.z1 = apply(builder, "fma", k[1], ramp(), k[0])
-        self.negative = builder.fneg(builder.fmul(self.z1, self.z1))
-        self.base = apply(builder, "fma", k[3], ramp(), k[2])
-        self.slope, self.change = k[4:]
+        self.channels = arguments[2]
+        pixels, visits, shapes, colors, masks = (
+            pointer(context, builder, argument_types[k], arguments[k], offset)
+            for k, offset in ((0, arguments[1]), (3, long(0)), (5, long(0)), (6, long(0)), (8, arguments[9]))
+        )
+
+        def field(column: int, ahead: int = 0) -> Any:
+            place = builder.mul(builder.add(arguments[4], long(ahead)), long(VISIT_COLUMNS))
+            return builder.sext(builder.load(builder.gep(visits, [builder.add(place, long(column))])), LONG)
+
+        self.first, self.last, self.run = field(FIRST), field(LAST), field(RUN)
+        self.first_part, self.end_part = field(FIRST_PART), field(END_PART)
+        self.terms = field(TERMS)
+        self.pixels, self.masks = pixels, masks
+        self.colors = builder.gep(colors, [builder.mul(field(GAUSSIAN), self.channels)])
+        self.cutoff = broadcast(builder, arguments[7])
+        self.is_masked = builder.icmp_signed(">=", arguments[9], long(0))
+        self.is_rgb = builder.icmp_signed("==", self.channels, long(3))
+        prefetch(builder, builder.gep(shapes, [builder.mul(field(TERMS, AHEAD), long(SHAPE_COLUMNS))]))
+        shape = builder.gep(shapes, [builder.mul(self.terms, long(SHAPE_COLUMNS))])
+        self.shape = [broadcast(builder, builder.load(builder.gep(shape, [long(k)]))) for k in range(6)]
+        self.slope, self.change = self.shape[4:]
         self.ratio = builder.fadd(self.change, constant(1.0))
 
     def specialize(self, emit: Callable[[Channels, bool], None]) -> None:
@@ -66,24 +89,39 @@ class _Rows:
         if_else(self.builder, self.is_rgb, emit_channels)
 
     @contextmanager
-    def each_row(self, masked: bool) -> Iterator[tuple[Any, Any, Any]]:
-        """Emit a loop over the rows; yield z2, weight, and pointer to the pixels."""
+    def each_part(self) -> Iterator[Any]:
+        """Emit a loop over the parts of the rows; yield the part."""
+        builder = self.builder
+        with cgutils.for_range_slice(builder, self.first_part, self.end_part, long(1)) as (part, _):
+            k = self.shape
+            shift = broadcast(builder, builder.sitofp(builder.mul(part, long(LANES)), FLOAT))
+            columns = builder.fadd(ramp(), shift)
+            self.z1 = apply(builder, "fma", k[1], columns, k[0])
+            self.negative = builder.fneg(builder.fmul(self.z1, self.z1))
+            self.base = apply(builder, "fma", k[3], columns, k[2])
+            yield part
+
+    @contextmanager
+    def each_row(self, part: Any, masked: bool) -> Iterator[tuple[Any, Any, Any]]:
+        """Emit a loop over the rows of a part; yield z2, weight, and pointer to the pixels."""
         builder = self.builder
         y, weight, growth = (cgutils.alloca_once(builder, VECTOR) for _ in range(3))
         first = builder.fadd(builder.sitofp(self.first, FLOAT), ir.Constant(FLOAT, -(SIDE - 1) / 2))
         builder.store(broadcast(builder, first), y)
+        column = builder.mul(part, long(LANES))
         with cgutils.for_range_slice(builder, self.first, self.last, self.run) as (start, _):
             self._begin(self._second(builder.load(y)), weight, growth)
             end = builder.add(start, self.run)
             end = builder.select(builder.icmp_signed("<", end, self.last), end, self.last)
-            with cgutils.for_range_slice(builder, start, end, ir.Constant(LONG, 1)) as (row, _):
+            with cgutils.for_range_slice(builder, start, end, long(1)) as (row, _):
                 w, g = builder.load(weight), builder.load(growth)
                 value = builder.select(builder.fcmp_ordered(">=", w, self.cutoff), w, constant(0.0))
+                place = builder.mul(row, long(SIDE))
                 if masked:
-                    place = builder.gep(self.masks, [builder.mul(row, ir.Constant(LONG, SIDE))])
-                    value = builder.fmul(value, load(builder, place))
-                step = builder.mul(self.channels, ir.Constant(LONG, SIDE))
-                yield self._second(builder.load(y)), value, builder.gep(self.pixels, [builder.mul(row, step)])
+                    mask = builder.gep(self.masks, [builder.add(place, column)])
+                    value = builder.fmul(value, load(builder, mask))
+                place = builder.add(builder.mul(place, self.channels), column)
+                yield self._second(builder.load(y)), value, builder.gep(self.pixels, [place])
                 builder.store(builder.fadd(builder.load(y), constant(1.0)), y)
                 builder.store(apply(builder, "fma", w, g, w), weight)
                 builder.store(apply(builder, "fma", g, self.ratio, self.change), growth)
@@ -103,53 +141,53 @@ class _Rows:
         builder.store(exp2(builder, exponent, minus_one=True), growth)
 
 
-# types of origin, channels, first and last row
-_ROW_TYPES = (types.int64,) * 4
-
-
 @intrinsic
-def add_rows(  # type: ignore[no-untyped-def]
-    typing_context, pixels, origin, channels, first, last, shapes, shape_start, run, colors, color_start, cutoff, masks,
-    mask_start,
-):  # fmt: skip
-    """pixels[row, c, :] += weight[row, :] * colors[c] for rows first ... last - 1."""
+def add_rows(typing_context, pixels, origin, channels, visits, number, shapes, colors, cutoff, masks, mask_start):  # type: ignore[no-untyped-def]
+    """pixels[row, c, :] += weight[row, :] * colors[c] for the rows of a visit."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         rows = _Rows(context, builder, signature.args, arguments)
 
         def emit(channels: Channels, masked: bool) -> None:
-            with rows.each_row(masked) as (_, weight, pixels):
+            with rows.each_part() as part, rows.each_row(part, masked) as (_, weight, pixels):
                 channels.add(weight, pixels)
 
         rows.specialize(emit)
         return context.get_dummy_value()
 
-    long = types.int64
-    return types.void(pixels, *_ROW_TYPES, shapes, long, long, colors, long, types.float32, masks, long), generate
+    return types.void(*_types(pixels, visits, shapes, colors, masks)), generate
 
 
 @intrinsic
 def gather_rows(  # type: ignore[no-untyped-def]
-    typing_context, pixels, origin, channels, first, last, shapes, shape_start, run, colors, color_start, cutoff, masks,
-    mask_start, sums, terms, place,
+    typing_context, pixels, origin, channels, visits, number, shapes, colors, cutoff, masks, mask_start, sums, terms,
+    columns,
 ):  # fmt: skip
-    """Set the terms from `place` on to sums over rows and columns: w g_c for every channel c, then, with
-    v = w sum_c g_c colors_c, of v z1, v z2, v z1 z1, v z1 z2, v z2 z2; `sums`, float32, is room for them times SIDE."""  # noqa: D205, D209
+    """Set a visit's terms, of so many columns, to sums over its rows: w g_c for every channel c, then, with
+    v = w sum_c g_c colors_c, of v z1, v z2, v z1 z1, v z1 z2, v z2 z2; `sums`, float32, is room for as many vectors."""  # noqa: D205, D209
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         rows = _Rows(context, builder, signature.args, arguments)
-        room = pointer(context, builder, signature.args[13], arguments[13], ZERO)
-        target = pointer(context, builder, signature.args[14], *arguments[14:])
+        room = pointer(context, builder, signature.args[10], arguments[10], long(0))
+        target = pointer(context, builder, signature.args[11], arguments[11], builder.mul(rows.terms, arguments[12]))
 
         def emit(channels: Channels, masked: bool) -> None:
             total = Sums(channels, room)
-            with rows.each_row(masked) as (second, weight, pixels):
-                total.gather(weight, pixels, second)
-            total.finish(rows.z1, target)
+            with rows.each_part() as part:
+                total.begin()
+                with rows.each_row(part, masked) as (second, weight, pixels):
+                    total.gather(weight, pixels, second)
+                total.end(rows.z1)
+            total.finish(target)
 
         rows.specialize(emit)
         return context.get_dummy_value()
 
-    long = types.int64
-    kinds = pixels, *_ROW_TYPES, shapes, long, long, colors, long, types.float32, masks, long, sums, terms, long
-    return types.void(*kinds), generate
+    kinds = _types(pixels, visits, shapes, colors, masks)
+    return types.void(*kinds, sums, terms, types.int64), generate
+
+
+def _types(pixels: Any, visits: Any, shapes: Any, colors: Any, masks: Any) -> tuple[Any, ...]:
+    """Return the types of the arguments in common."""
+    number = types.int64
+    return pixels, number, number, visits, number, shapes, colors, types.float32, masks, number

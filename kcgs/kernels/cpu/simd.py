@@ -1,6 +1,7 @@
-"""Vectors of 16 float32, a row of a tile, in LLVM: what the code of `rows` and `spline` is written with.
+"""Vectors of 8 float32, half a row of a tile, in LLVM: what the code of `rows` and `spline` is written with.
 
-LLVM does not vectorise these loops by itself, but splits such vectors into those of the processor.
+LLVM does not vectorise these loops by itself. Of vectors as wide as a row, AVX2's sixteen registers would not hold what
+a loop needs.
 """
 
 from __future__ import annotations
@@ -14,14 +15,16 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-SIDE = 16  # of a tile, and elements of a vector
+SIDE = 16  # of a tile
+LANES = 8  # elements of a vector
+PARTS = SIDE // LANES  # vectors of a row
 FLOAT = ir.FloatType()
 _INT = ir.IntType(32)
 _BYTE = ir.IntType(8).as_pointer()
 LONG = ir.IntType(64)
-VECTOR = ir.VectorType(FLOAT, SIDE)
-_VECTOR_INT = ir.VectorType(_INT, SIDE)
-ZERO = ir.Constant(LONG, 0)
+_ZERO = ir.Constant(LONG, 0)
+VECTOR = ir.VectorType(FLOAT, LANES)
+_VECTOR_INT = ir.VectorType(_INT, LANES)
 UNDEFINED = ir.Constant(VECTOR, ir.Undefined)
 
 
@@ -35,15 +38,20 @@ def exp2_coefficients(degree: int = 6) -> list[float]:
 EXP2 = exp2_coefficients()
 
 
+def long(value: int) -> ir.Constant:
+    """Return an integer of 64 bits."""
+    return ir.Constant(LONG, value)
+
+
 def constant(value: float) -> ir.Constant:
     """Return a number in all elements of a vector."""
-    return ir.Constant(VECTOR, [ir.Constant(FLOAT, float(np.float32(value)))] * SIDE)
+    return ir.Constant(VECTOR, [ir.Constant(FLOAT, float(np.float32(value)))] * LANES)
 
 
 def apply(builder: Any, name: str, *arguments: Any) -> Any:
     """Call the LLVM function of this name on vectors."""
     function = cgutils.get_or_insert_function(
-        builder.module, ir.FunctionType(VECTOR, [VECTOR] * len(arguments)), f"llvm.{name}.v{SIDE}f32"
+        builder.module, ir.FunctionType(VECTOR, [VECTOR] * len(arguments)), f"llvm.{name}.v{LANES}f32"
     )
     return builder.call(function, arguments)
 
@@ -55,8 +63,8 @@ def broadcast(builder: Any, value: Any) -> Any:
 
 
 def ramp() -> ir.Constant:
-    """Return the columns of a vector, counted from its middle."""
-    return ir.Constant(VECTOR, [ir.Constant(FLOAT, column - (SIDE - 1) / 2) for column in range(SIDE)])
+    """Return the columns of the first vector of a row, counted from the middle of the row."""
+    return ir.Constant(VECTOR, [ir.Constant(FLOAT, column - (SIDE - 1) / 2) for column in range(LANES)])
 
 
 def exp2(builder: Any, exponent: Any, minus_one: bool = False) -> Any:
@@ -68,8 +76,8 @@ def exp2(builder: Any, exponent: Any, minus_one: bool = False) -> Any:
     for coefficient in reversed(EXP2[1:-1]):
         value = apply(builder, "fma", value, fraction, constant(coefficient))
     bits = builder.shl(
-        builder.add(builder.fptosi(whole, _VECTOR_INT), ir.Constant(_VECTOR_INT, [127] * SIDE)),
-        ir.Constant(_VECTOR_INT, [23] * SIDE),
+        builder.add(builder.fptosi(whole, _VECTOR_INT), ir.Constant(_VECTOR_INT, [127] * LANES)),
+        ir.Constant(_VECTOR_INT, [23] * LANES),
     )
     power = builder.bitcast(bits, VECTOR)
     if minus_one:  # the first term of the polynomial is 1
@@ -85,18 +93,26 @@ def pointer(context: Any, builder: Any, array_type: Any, array: Any, offset: Any
 
 def _row(builder: Any, pointer: Any, index: Any) -> Any:
     """Return the pointer to a vector `index` vectors further on."""
-    start = builder.gep(pointer, [builder.mul(index, ir.Constant(LONG, SIDE))])
+    start = builder.gep(pointer, [builder.mul(index, long(LANES))])
     return builder.bitcast(start, VECTOR.as_pointer())
 
 
-def load(builder: Any, pointer: Any, index: Any = ZERO) -> Any:
+def load(builder: Any, pointer: Any, index: Any = _ZERO) -> Any:
     """Load vector `index` from a pointer on."""
     return builder.load(_row(builder, pointer, index), align=4)
 
 
-def store(builder: Any, value: Any, pointer: Any, index: Any = ZERO) -> None:
+def store(builder: Any, value: Any, pointer: Any, index: Any = _ZERO) -> None:
     """Store vector `index` from a pointer on."""
     builder.store(value, _row(builder, pointer, index), align=4)
+
+
+def prefetch(builder: Any, pointer: Any, *, writes: bool = False) -> None:
+    """Ask for the line of the cache that holds an address, which will be read, or written."""
+    kind = ir.FunctionType(ir.VoidType(), [_BYTE, _INT, _INT, _INT])
+    function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+    hints = [ir.Constant(_INT, hint) for hint in (int(writes), 3, 1)]
+    builder.call(function, [builder.bitcast(pointer, _BYTE), *hints])
 
 
 def shuffle(builder: Any, first: Any, second: Any, places: Sequence[int]) -> Any:
@@ -120,18 +136,14 @@ def exchange_rows(  # type: ignore[no-untyped-def]
 ):
     """Copy a block to an image, from element `place` on, if it `adds`; from there if it `gathers`; if both, subtract.
 
-    The block has rows of 16 elements, [row][channel][column]; `rows` and `columns` are those within the image.
+    The block has rows of SIDE elements, [row][channel][column]; `rows` and `columns` are those within the image.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         image = pointer(context, builder, signature.args[0], *arguments[:2])
-        pixels = pointer(context, builder, signature.args[4], arguments[4], ZERO)
+        pixels = pointer(context, builder, signature.args[4], arguments[4], long(0))
         row_stride, channel_stride, channels, rows, columns, adds, gathers = (
             arguments[k] for k in (2, 3, *range(5, 10))
-        )
-
-        prefetch = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(ir.VoidType(), [_BYTE, _INT, _INT, _INT]), "llvm.prefetch.p0i8"
         )
 
         def exchange(inside: Any, outside: Any, subtracts: bool | None) -> None:
@@ -146,47 +158,46 @@ def exchange_rows(  # type: ignore[no-untyped-def]
         def emit(subtracts: bool | None) -> None:
             with cgutils.for_range(builder, rows) as row, cgutils.for_range(builder, channels) as channel:
                 first = builder.add(builder.mul(row.index, channels), channel.index)
-                inside = builder.gep(pixels, [builder.mul(first, ir.Constant(LONG, SIDE))])
+                inside = builder.gep(pixels, [builder.mul(first, long(SIDE))])
                 offset = builder.add(builder.mul(row.index, row_stride), builder.mul(channel.index, channel_stride))
                 outside = builder.gep(image, [offset])
                 # the end of the row of the next block, whose lines are too far apart for the processor to foresee
-                following = builder.bitcast(builder.gep(outside, [ir.Constant(LONG, 2 * SIDE - 1)]), _BYTE)
-                builder.call(prefetch, [following, *(ir.Constant(_INT, k) for k in (int(subtracts is None), 3, 1))])
+                prefetch(builder, builder.gep(outside, [long(2 * SIDE - 1)]), writes=subtracts is None)
 
                 def emit_row(is_whole: bool) -> None:
                     if is_whole:
-                        kind = VECTOR.as_pointer()
-                        exchange(builder.bitcast(inside, kind), builder.bitcast(outside, kind), subtracts)
+                        for part in map(long, range(PARTS)):
+                            exchange(_row(builder, inside, part), _row(builder, outside, part), subtracts)
                         return
                     with cgutils.for_range(builder, columns) as loop:
                         places = [loop.index]
                         exchange(builder.gep(inside, places), builder.gep(outside, places), subtracts)
 
-                if_else(builder, builder.icmp_signed("==", columns, ir.Constant(LONG, SIDE)), emit_row)
+                if_else(builder, builder.icmp_signed("==", columns, long(SIDE)), emit_row)
 
         if_else(builder, gathers, lambda g: if_else(builder, adds, emit) if g else emit(None))
         return context.get_dummy_value()
 
-    long, flag = types.int64, types.boolean
-    return types.void(image, long, long, long, pixels, long, long, long, flag, flag), generate
+    number, flag = types.int64, types.boolean
+    return types.void(image, *[number] * 3, pixels, *[number] * 3, flag, flag), generate
 
 
 def sum_columns(builder: Any, rows: Sequence[Any]) -> Any:
-    """Return the sums of the 16 columns of eight vectors, as a vector of eight, in a fixed order."""
+    """Return the sums of eight vectors, as a vector, in a fixed order."""
     rows = [rows[k] for k in (0, 4, 2, 6, 1, 5, 3, 7)]
-    # the halves of two rows are interleaved and added, until one row holds two columns of each
-    width = SIDE
+    # the halves of two rows are interleaved and added, until one row is left
+    width = LANES
     while len(rows) > 1:
         rows = [_fold(builder, rows[k], rows[k + 1], width) for k in range(0, len(rows), 2)]
         width //= 2
-    return builder.fadd(*(shuffle(builder, rows[0], UNDEFINED, range(k, SIDE, 2)) for k in (0, 1)))
+    return rows[0]
 
 
 def _fold(builder: Any, first: Any, second: Any, width: int) -> Any:
     """Add the halves of every group of `width` elements of two vectors, the first's and the second's in turn."""
     half = width // 2
     places = [
-        [SIDE * side + group + shift + k for group in range(0, SIDE, width) for side in (0, 1) for k in range(half)]
+        [LANES * side + group + shift + k for group in range(0, LANES, width) for side in (0, 1) for k in range(half)]
         for shift in (0, half)
     ]
     return builder.fadd(*(shuffle(builder, first, second, place) for place in places))

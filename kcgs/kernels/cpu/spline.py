@@ -6,16 +6,32 @@ the coarser one, which begins at a block's first node or in its middle. Blocks l
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from .simd import FLOAT, LONG, SIDE, UNDEFINED, VECTOR, ZERO, apply, constant, if_else, load, pointer, shuffle, store
+from .simd import (
+    FLOAT,
+    LANES,
+    PARTS,
+    SIDE,
+    UNDEFINED,
+    VECTOR,
+    apply,
+    constant,
+    if_else,
+    load,
+    long,
+    pointer,
+    shuffle,
+    store,
+)
 
 # weights of the four neighbours of values 2 i and 2 i + 1: the exact refinement of cubic B-splines
 _REFINE_EVEN = (0.5, 0.5, 0.0, 0.0)
@@ -28,26 +44,14 @@ _SAMPLE_ODD = (1 / 384, 121 / 384, 235 / 384, 27 / 384)
 _HALF = SIDE // 2
 # nodes of the coarser grid that a block reads, along an axis
 _WINDOW = _HALF + 3
-# elements of two vectors: the last half of the first and the first half of the second
-_MIDDLE = range(_HALF, _HALF + SIDE)
 
 
-def _long(value: int) -> ir.Constant:
-    return ir.Constant(LONG, value)
+def _multiply_add(builder: Any, factors: ir.Constant, value: Any, total: Any) -> Any:
+    return builder.fmul(factors, value) if total is None else apply(builder, "fma", factors, value, total)
 
 
-def _multiply_add(builder: Any, factor: float, value: Any, total: Any) -> Any:
-    if factor == 0.0:
-        return total
-    return (
-        builder.fmul(constant(factor), value)
-        if total is None
-        else apply(builder, "fma", constant(factor), value, total)
-    )
-
-
-def _alternating(even: float, odd: float) -> ir.Constant:
-    return ir.Constant(VECTOR, [ir.Constant(FLOAT, float(v)) for _ in range(_HALF) for v in (even, odd)])
+def _lanes(factors: Iterable[float]) -> ir.Constant:
+    return ir.Constant(VECTOR, [ir.Constant(FLOAT, float(np.float32(factor))) for factor in factors])
 
 
 class _Blocks:
@@ -56,33 +60,39 @@ class _Blocks:
     def __init__(self, context: Any, builder: Any, argument_types: Any, arguments: Any) -> None:
         self.builder = builder
         self.down, self.right = arguments[2:4]
-        table = pointer(context, builder, argument_types[1], arguments[1], ZERO)
-        offsets = [builder.load(builder.gep(table, [_long(k)])) for k in range(4)]
+        table = pointer(context, builder, argument_types[1], arguments[1], long(0))
+        offsets = [builder.load(builder.gep(table, [long(k)])) for k in range(4)]
         self.parents = [pointer(context, builder, argument_types[0], arguments[0], offset) for offset in offsets]
         self.fine = pointer(context, builder, argument_types[4], arguments[4], arguments[5])
         self.row_stride, self.channel_stride, self.channels = arguments[6:9]
         self.masks = pointer(context, builder, argument_types[9], arguments[9], arguments[10])
         self.mask_stride = arguments[11]
 
-    def fine_row(self, channel: Any, row: int) -> Any:
-        """Return the pointer to a row of the finer block."""
+    def fine_row(self, channel: Any, row: int, part: int) -> Any:
+        """Return the pointer to a part of a row of the finer block."""
         builder = self.builder
-        place = builder.mul(channel, self.channel_stride)
-        return builder.gep(self.fine, [builder.add(place, builder.mul(self.row_stride, _long(row)))])
+        place = builder.add(builder.mul(channel, self.channel_stride), long(part * LANES))
+        return builder.gep(self.fine, [builder.add(place, builder.mul(self.row_stride, long(row)))])
 
-    def mask(self, row: int) -> Any:
-        """Return the weights of a row."""
-        return load(self.builder, self.builder.gep(self.masks, [self.builder.mul(self.mask_stride, _long(row))]))
+    def mask(self, row: int, part: int) -> Any:
+        """Return the weights of a part of a row."""
+        place = self.builder.mul(self.mask_stride, long(row))
+        return load(self.builder, self.builder.gep(self.masks, [self.builder.add(place, long(part * LANES))]))
 
-    def window_row(self, channel: Any, row: int) -> tuple[Any, Any]:
-        """Return the pointers to a row of the window, in the left block and in the right one."""
+    def window_row(self, channel: Any, row: int, right: bool) -> Callable[[int], Any]:
+        """Return a function from a node of a row of the window to the pointer to it."""
         builder = self.builder
-        place = builder.add(_long(row), builder.select(self.down, _long(_HALF), _long(0)))
-        below = builder.icmp_signed(">=", place, _long(SIDE))
-        within = builder.select(below, builder.sub(place, _long(SIDE)), place)
-        offset = builder.mul(builder.add(builder.mul(within, self.channels), channel), _long(SIDE))
-        left, right = (builder.select(below, self.parents[k + 2], self.parents[k]) for k in (0, 1))
-        return builder.gep(left, [offset]), builder.gep(right, [offset])
+        place = builder.add(long(row), builder.select(self.down, long(_HALF), long(0)))
+        below = builder.icmp_signed(">=", place, long(SIDE))
+        within = builder.select(below, builder.sub(place, long(SIDE)), place)
+        offset = builder.mul(builder.add(builder.mul(within, self.channels), channel), long(SIDE))
+        blocks = [builder.gep(builder.select(below, self.parents[k + 2], self.parents[k]), [offset]) for k in (0, 1)]
+
+        def find_node(node: int) -> Any:
+            place = node + (_HALF if right else 0)
+            return builder.gep(blocks[place // SIDE], [long(place % SIDE)])
+
+        return find_node
 
     def each(self, emit: Callable[[Any, bool], None]) -> None:
         """Emit a loop over channels, for windows that begin in the middle of the left block and for others."""
@@ -125,25 +135,31 @@ def _make_add(even: tuple[float, ...], odd: tuple[float, ...]) -> Any:
     def widen(builder: Any, window: Any) -> Any:
         total = None
         for k in neighbors:
-            spread = shuffle(builder, window, UNDEFINED, [j // 2 + k for j in range(SIDE)])
-            weights = _alternating(even[k], odd[k])
-            total = builder.fmul(weights, spread) if total is None else apply(builder, "fma", weights, spread, total)
+            spread = shuffle(builder, window, UNDEFINED, [j // 2 + k for j in range(LANES)])
+            total = _multiply_add(builder, _lanes([even[k], odd[k]] * (LANES // 2)), spread, total)
         return total
 
-    def emit(blocks: _Blocks, channel: Any, right: bool) -> None:
-        builder, rows = blocks.builder, []
+    def emit_part(blocks: _Blocks, channel: Any, right: bool, part: int) -> None:
+        builder, rows, first = blocks.builder, [], part * LANES // 2
         for n in range(_HALF + neighbors[-1]):
-            places = blocks.window_row(channel, n)
-            window = load(builder, places[0])
-            if right:
-                window = shuffle(builder, window, load(builder, places[1]), _MIDDLE)
+            find_node = blocks.window_row(channel, n, right)
+            if right and first > 0:  # the window's nodes are in two blocks
+                halves = load(builder, find_node(0)), load(builder, find_node(_HALF))
+                window = shuffle(builder, *halves, range(first, first + LANES))
+            else:
+                window = load(builder, find_node(first))
             rows.append(widen(builder, window))
         for row in range(SIDE):
             total = None
             for k in neighbors:
-                total = _multiply_add(builder, (even, odd)[row % 2][k], rows[row // 2 + k], total)
-            place, mask = blocks.fine_row(channel, row), blocks.mask(row)
+                if factor := (even, odd)[row % 2][k]:
+                    total = _multiply_add(builder, constant(factor), rows[row // 2 + k], total)
+            place, mask = blocks.fine_row(channel, row, part), blocks.mask(row, part)
             store(builder, apply(builder, "fma", total, mask, load(builder, place)), place)
+
+    def emit(blocks: _Blocks, channel: Any, right: bool) -> None:
+        for part in range(PARTS):
+            emit_part(blocks, channel, right, part)
 
     return _make_loop(emit)
 
@@ -152,30 +168,36 @@ def _make_gather(even: tuple[float, ...], odd: tuple[float, ...]) -> Any:
     """Make the transpose of `_make_add`: the gradient of mask * spline is added to the coarser grid."""
     neighbors = [k for k in range(4) if even[k] or odd[k]]
 
-    def narrow(builder: Any, row: Any) -> Any:
-        # value 2 i + j of the finer grid goes to place i + k; places out of range read zeros
+    def sum_rows(blocks: _Blocks, channel: Any, part: int) -> list[Any]:
+        rows: list[Any] = [None] * _WINDOW
+        for row in range(SIDE):
+            value = load(blocks.builder, blocks.fine_row(channel, row, part))
+            value = blocks.builder.fmul(value, blocks.mask(row, part))
+            for k in neighbors:
+                if factor := (even, odd)[row % 2][k]:
+                    rows[row // 2 + k] = _multiply_add(blocks.builder, constant(factor), value, rows[row // 2 + k])
+        return rows[: _HALF + neighbors[-1]]
+
+    def narrow(builder: Any, left: Any, right: Any, first: int) -> Any:
+        # value 2 i + j of the finer grid goes to node i + k
         total = None
         for k in neighbors:
-            for j, weight in enumerate((even[k], odd[k])):
-                places = [2 * (n - k) + j if 0 <= n - k < _HALF else SIDE for n in range(SIDE)]
-                if weight:
-                    total = _multiply_add(builder, weight, shuffle(builder, row, constant(0.0), places), total)
+            for j, factor in enumerate((even[k], odd[k])):
+                values = [2 * (first + n - k) + j for n in range(LANES)]
+                factors = [factor if 0 <= value < SIDE else 0.0 for value in values]
+                if any(factors):
+                    row = shuffle(builder, left, right, [min(max(value, 0), SIDE - 1) for value in values])
+                    total = _multiply_add(builder, _lanes(factors), row, total)
         return total
 
     def emit(blocks: _Blocks, channel: Any, right: bool) -> None:
         builder = blocks.builder
-        rows: list[Any] = [None] * _WINDOW
-        for row in range(SIDE):
-            value = builder.fmul(load(builder, blocks.fine_row(channel, row)), blocks.mask(row))
-            for k in neighbors:
-                rows[row // 2 + k] = _multiply_add(builder, (even, odd)[row % 2][k], value, rows[row // 2 + k])
-        for n, row in enumerate(rows[: _HALF + neighbors[-1]]):
-            total, zero = narrow(builder, row), constant(0.0)
-            parts = [total]
-            if right:
-                parts = [shuffle(builder, a, b, _MIDDLE) for a, b in ((zero, total), (total, zero))]
-            for part, place in zip(parts, blocks.window_row(channel, n), strict=False):
-                store(builder, builder.fadd(load(builder, place), part), place)
+        columns = [sum_rows(blocks, channel, part) for part in range(PARTS)]
+        for n, (first_half, second_half) in enumerate(zip(*columns, strict=True)):
+            find_node = blocks.window_row(channel, n, right)
+            for first in range(0, _WINDOW, LANES):
+                place, total = find_node(first), narrow(builder, first_half, second_half, first)
+                store(builder, builder.fadd(load(builder, place), total), place)
 
     return _make_loop(emit)
 
