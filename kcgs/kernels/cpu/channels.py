@@ -60,9 +60,11 @@ class Sums:
         zero = constant(0.0)
         self.totals = [cgutils.alloca_once(builder, zero.type) for _ in range(3 if channels.is_rgb else 0)]
         self.moments = [cgutils.alloca_once(builder, zero.type) for _ in range(_MOMENTS)]
-        self.count = builder.add(channels.count, long(_TERMS))
-        with cgutils.for_range(builder, self.count) as loop:
-            store(builder, zero, room, loop.index)
+        self.count = long(3 + _TERMS) if channels.is_rgb else builder.add(channels.count, long(_TERMS))
+        # in eights, as they are summed, and since LLVM would call memset for a loop over single ones
+        with cgutils.for_range_slice(builder, long(0), self.count, long(8)) as (first, _):
+            for k in range(8):
+                store(builder, zero, room, builder.add(first, long(k)))
 
     def begin(self) -> None:
         """Begin a part of the rows."""
@@ -100,9 +102,8 @@ class Sums:
         value, along, square = (builder.load(total) for total in self.moments)
         first = builder.fmul(value, z1)
         moments = [first, along, builder.fmul(first, z1), builder.fmul(along, z1), square]
-        first_moment = builder.sub(self.count, long(_TERMS))
         places = [long(k) for k in range(len(self.totals))]
-        places += [builder.add(first_moment, long(k)) for k in range(_TERMS)]
+        places += [builder.add(self.channels.count, long(k)) for k in range(_TERMS)]
         for place, total in zip(places, [*map(builder.load, self.totals), *moments], strict=True):
             store(builder, builder.fadd(load(builder, self.room, place), total), self.room, place)
 

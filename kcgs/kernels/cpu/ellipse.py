@@ -88,10 +88,10 @@ def block_rows(g, row, col, height, width, radius):  # type: ignore[no-untyped-d
 
 
 @inline
-def enter(g, row, col, shape):  # type: ignore[no-untyped-def]
-    """Set `shape`, float32, to k of z1 = k0 + k1 x and z2 = k2 + k3 x + k4 y about the block's middle, and to CHANGE.
+def enter(g, row, col, first, shape):  # type: ignore[no-untyped-def]
+    """Set `shape`, float32, to k of z1 = k0 + k1 x and z2 = k2 + k3 x + k4 y, to CHANGE, and to y of the first row.
 
-    z is times SCALE.
+    z is times SCALE; x and y are counted from the block's middle.
     """
     x, y = col * SIDE + SIDE / 2 - g[MEAN_X], row * SIDE + SIDE / 2 - g[MEAN_Y]
     shape[0] = bounded(g[SLOPE1_X] * x)
@@ -100,3 +100,4 @@ def enter(g, row, col, shape):  # type: ignore[no-untyped-def]
     shape[3] = g[SLOPE2_X]
     shape[4] = g[SLOPE2_Y]
     shape[5] = g[CHANGE]
+    shape[6] = first - (SIDE - 1) / 2

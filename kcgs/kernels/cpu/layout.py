@@ -52,7 +52,7 @@ FIRST_PART = 5  # of a row, vectors that the ellipse touches
 END_PART = 6  # the last one + 1
 VISIT_COLUMNS = 7
 AHEAD = 4  # visits before which a shape is asked for, since those of a block lie far apart
-SHAPE_COLUMNS = 6
+SHAPE_COLUMNS = 7
 
 
 class Table(NamedTuple):
@@ -90,7 +90,7 @@ class Lists(NamedTuple):
     colors: Any  # [N * C] float32, times COLOR_FACTOR
     start: Any  # [copies * K + 1] int64 into visits; images that share a map have a copy of its blocks each
     visits: Any  # [V, 7] int32, by block, then by Gaussian
-    shapes: Any  # [V, 6] float32, the Gaussian in the block, see ellipse.enter; in the order of sums
+    shapes: Any  # [V, 7] float32, the Gaussian in the block, see ellipse.enter; in the order of sums
     first_terms: Any  # [N + 1] int64, place of each Gaussian's first sums
     num_terms: Any  # [N] int32, blocks that each Gaussian touches
     table: Table

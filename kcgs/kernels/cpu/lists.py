@@ -172,7 +172,7 @@ def _find_blocks(batch, radius, spans, blocks, histogram, lists, begin, end):  #
                 if first < last:
                     blocks[place, 0], blocks[place, 1], blocks[place, 2] = head + block, first, last
                     blocks[place, 3], blocks[place, 4] = max(left - col * PARTS, 0), min(right - col * PARTS, PARTS)
-                    enter(g, row, col, lists.shapes[place])
+                    enter(g, row, col, first, lists.shapes[place])
                     histogram[head + block] += 1
                     place += 1
         lists.num_terms[i] = place - lists.first_terms[i]

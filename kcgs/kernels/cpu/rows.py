@@ -21,7 +21,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -29,7 +28,6 @@ from numba.extending import intrinsic
 from .channels import Channels, Sums
 from .layout import AHEAD, END_PART, FIRST, FIRST_PART, GAUSSIAN, LAST, RUN, SHAPE_COLUMNS, TERMS, VISIT_COLUMNS
 from .simd import (
-    FLOAT,
     LANES,
     LONG,
     SIDE,
@@ -75,8 +73,8 @@ class _Rows:
         self.is_rgb = builder.icmp_signed("==", self.channels, long(3))
         prefetch(builder, builder.gep(shapes, [builder.mul(field(TERMS, AHEAD), long(SHAPE_COLUMNS))]))
         shape = builder.gep(shapes, [builder.mul(self.terms, long(SHAPE_COLUMNS))])
-        self.shape = [broadcast(builder, builder.load(builder.gep(shape, [long(k)]))) for k in range(6)]
-        self.slope, self.change = self.shape[4:]
+        self.shape = [broadcast(builder, builder.load(builder.gep(shape, [long(k)]))) for k in range(SHAPE_COLUMNS)]
+        self.slope, self.change, self.first_y = self.shape[4:]
         self.ratio = builder.fadd(self.change, constant(1.0))
 
     def specialize(self, emit: Callable[[Channels, bool], None]) -> None:
@@ -94,8 +92,8 @@ class _Rows:
         builder = self.builder
         with cgutils.for_range_slice(builder, self.first_part, self.end_part, long(1)) as (part, _):
             k = self.shape
-            shift = broadcast(builder, builder.sitofp(builder.mul(part, long(LANES)), FLOAT))
-            columns = builder.fadd(ramp(), shift)
+            # no conversion from integers, which would wait for the register that it sets, of the loop before
+            columns = builder.select(builder.icmp_signed("==", part, long(0)), ramp(0), ramp(1))
             self.z1 = apply(builder, "fma", k[1], columns, k[0])
             self.negative = builder.fneg(builder.fmul(self.z1, self.z1))
             self.base = apply(builder, "fma", k[3], columns, k[2])
@@ -106,8 +104,7 @@ class _Rows:
         """Emit a loop over the rows of a part; yield z2, weight, and pointer to the pixels."""
         builder = self.builder
         y, weight, growth = (cgutils.alloca_once(builder, VECTOR) for _ in range(3))
-        first = builder.fadd(builder.sitofp(self.first, FLOAT), ir.Constant(FLOAT, -(SIDE - 1) / 2))
-        builder.store(broadcast(builder, first), y)
+        builder.store(self.first_y, y)
         column = builder.mul(part, long(LANES))
         with cgutils.for_range_slice(builder, self.first, self.last, self.run) as (start, _):
             self._begin(self._second(builder.load(y)), weight, growth)

@@ -62,9 +62,10 @@ def broadcast(builder: Any, value: Any) -> Any:
     return builder.shuffle_vector(single, UNDEFINED, ir.Constant(_VECTOR_INT, None))
 
 
-def ramp() -> ir.Constant:
-    """Return the columns of the first vector of a row, counted from the middle of the row."""
-    return ir.Constant(VECTOR, [ir.Constant(FLOAT, column - (SIDE - 1) / 2) for column in range(LANES)])
+def ramp(part: int) -> ir.Constant:
+    """Return the columns of a vector of a row, counted from the middle of the row."""
+    columns = range(part * LANES, part * LANES + LANES)
+    return ir.Constant(VECTOR, [ir.Constant(FLOAT, column - (SIDE - 1) / 2) for column in columns])
 
 
 def exp2(builder: Any, exponent: Any, minus_one: bool = False) -> Any:

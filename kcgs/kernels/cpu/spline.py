@@ -6,7 +6,7 @@ the coarser one, which begins at a block's first node or in its middle. Blocks l
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -50,7 +50,7 @@ def _multiply_add(builder: Any, factors: ir.Constant, value: Any, total: Any) ->
     return builder.fmul(factors, value) if total is None else apply(builder, "fma", factors, value, total)
 
 
-def _lanes(factors: Iterable[float]) -> ir.Constant:
+def _lanes(factors: Sequence[float]) -> ir.Constant:
     return ir.Constant(VECTOR, [ir.Constant(FLOAT, float(np.float32(factor))) for factor in factors])
 
 
@@ -178,25 +178,28 @@ def _make_gather(even: tuple[float, ...], odd: tuple[float, ...]) -> Any:
                     rows[row // 2 + k] = _multiply_add(blocks.builder, constant(factor), value, rows[row // 2 + k])
         return rows[: _HALF + neighbors[-1]]
 
-    def narrow(builder: Any, left: Any, right: Any, first: int) -> Any:
-        # value 2 i + j of the finer grid goes to node i + k
-        total = None
+    def narrow(builder: Any, left: Any, right: Any) -> list[Any]:
+        # values 2 i and 2 i + 1 of the finer grid go to nodes i + k: the terms of all i, then moved by k
+        pair = [shuffle(builder, left, right, range(j, SIDE, 2)) for j in (0, 1)]
+        nodes: list[Any] = [None, None]
         for k in neighbors:
-            for j, factor in enumerate((even[k], odd[k])):
-                values = [2 * (first + n - k) + j for n in range(LANES)]
-                factors = [factor if 0 <= value < SIDE else 0.0 for value in values]
-                if any(factors):
-                    row = shuffle(builder, left, right, [min(max(value, 0), SIDE - 1) for value in values])
-                    total = _multiply_add(builder, _lanes(factors), row, total)
-        return total
+            term = None
+            for values, factor in zip(pair, (even[k], odd[k]), strict=True):
+                if factor:
+                    term = _multiply_add(builder, constant(factor), values, term)
+            for part, places in enumerate((range(-k, LANES - k), range(LANES - k, SIDE - k))):
+                if any(0 <= place < LANES for place in places):
+                    moved = shuffle(builder, term, constant(0.0), [p if 0 <= p < LANES else LANES for p in places])
+                    nodes[part] = moved if nodes[part] is None else builder.fadd(nodes[part], moved)
+        return nodes
 
     def emit(blocks: _Blocks, channel: Any, right: bool) -> None:
         builder = blocks.builder
         columns = [sum_rows(blocks, channel, part) for part in range(PARTS)]
-        for n, (first_half, second_half) in enumerate(zip(*columns, strict=True)):
+        for n, parts in enumerate(zip(*columns, strict=True)):
             find_node = blocks.window_row(channel, n, right)
-            for first in range(0, _WINDOW, LANES):
-                place, total = find_node(first), narrow(builder, first_half, second_half, first)
+            for part, total in enumerate(narrow(builder, parts[0], parts[1])):
+                place = find_node(part * LANES)
                 store(builder, builder.fadd(load(builder, place), total), place)
 
     return _make_loop(emit)
