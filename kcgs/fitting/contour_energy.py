@@ -13,11 +13,10 @@ from kcgs.functional import RegionMap, region_splat
 from kcgs.functional.blur import blur, gaussian_taps
 from kcgs.scene import Scene
 
-from .contour_loops import CostTable, list_small_pieces, measure_depth, sweep
+from .contour_loops import CostTable, energy_change, list_small_pieces, measure_depth, piece_energy, sweep
 
 Ints = NDArray[np.int64]
 Labels = NDArray[np.int32]
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # sides of the boxes that are rendered, in pixels, are multiples of it
@@ -42,45 +41,32 @@ def bounding_boxes(index: Labels, count: int, margin: int) -> Ints:
     return boxes.clip(0, np.repeat(index.shape, 2))
 
 
-class RegionCosts:
-    """Blurred squared error of each region's Gaussians rendered alone, kept inside the region's box.
+def region_costs(scene: Scene, image: Tensor, boxes: Ints, pad: int, sigma: float, backend: str) -> CostTable:
+    """Return the blurred squared error of each region's Gaussians rendered alone, inside the region's box.
 
     Pixels are flat indices into the image with a rim of `pad`.
     """
-
-    def __init__(self, scene: Scene, image: Tensor, boxes: Ints, pad: int, sigma: float, backend: str) -> None:
-        field, regions = scene.field, scene.regions
-        assert regions is not None and field.region_ids is not None
-        owners, order = regions.index_of(field.region_ids).sort(stable=True)
-        first = torch.searchsorted(owners, torch.arange(len(boxes) + 1, device=owners.device))
-        gaussians = tuple(values[order] for values in (field.means, field.cholesky, field.merged_colors()))
-        starts, parts, end = np.zeros(len(boxes), np.int64), [], 0
-        margin = math.ceil(4 * sigma)
-        planes = torch.nn.functional.pad(
-            torch.cat([image, torch.ones_like(image[:1])]), [margin, margin + _BOX_UNIT] * 2
-        )
-        # boxes of about the same size are rendered as one batch
-        sizes = -(-(boxes[:, 1::2] - boxes[:, ::2]) // _BOX_UNIT) * _BOX_UNIT
-        for size in np.unique(sizes[sizes.all(1)], axis=0):
-            group = np.flatnonzero((sizes == size).all(1))
-            count = max(1, _BATCH_PIXELS // size.prod())
-            for members in np.split(group, range(count, len(group), count)):
-                corners = torch.from_numpy(boxes[members, ::2]).to(image.device)
-                batch = _pad_rows(gaussians, *(first[torch.from_numpy(members + k)] for k in (0, 1)))
-                parts.append(_region_errors(batch, planes, corners, size.tolist(), sigma, backend).cpu().numpy())
-                starts[members] = end + np.arange(len(members)) * size.prod()
-                end += parts[-1].size
-        values = np.concatenate([part.ravel() for part in parts])
-        self.table = CostTable(values, starts, boxes + pad, sizes[:, 1].copy(), image.shape[2] + 2 * pad)
-
-    def of(self, pixels: Ints, region: Labels) -> Floats:
-        """Return the costs of pixels in regions, infinite outside a region's box."""
-        values, starts, boxes, widths, stride = self.table
-        y, x = np.divmod(pixels, stride)
-        top, bottom, left, right = boxes[region].T
-        inside = (y >= top) & (y < bottom) & (x >= left) & (x < right)
-        place = starts[region] + (y - top) * widths[region] + (x - left)
-        return np.where(inside, values[np.where(inside, place, 0)].astype(np.float64), np.inf)
+    field, regions = scene.field, scene.regions
+    assert regions is not None and field.region_ids is not None
+    owners, order = regions.index_of(field.region_ids).sort(stable=True)
+    first = torch.searchsorted(owners, torch.arange(len(boxes) + 1, device=owners.device))
+    gaussians = tuple(values[order] for values in (field.means, field.cholesky, field.merged_colors()))
+    starts, parts, end = np.zeros(len(boxes), np.int64), [], 0
+    margin = math.ceil(4 * sigma)
+    planes = torch.nn.functional.pad(torch.cat([image, torch.ones_like(image[:1])]), [margin, margin + _BOX_UNIT] * 2)
+    # boxes of about the same size are rendered as one batch
+    sizes = -(-(boxes[:, 1::2] - boxes[:, ::2]) // _BOX_UNIT) * _BOX_UNIT
+    for size in np.unique(sizes[sizes.all(1)], axis=0):
+        group = np.flatnonzero((sizes == size).all(1))
+        count = max(1, _BATCH_PIXELS // size.prod())
+        for members in np.split(group, range(count, len(group), count)):
+            corners = torch.from_numpy(boxes[members, ::2]).to(image.device)
+            batch = _pad_rows(gaussians, *(first[torch.from_numpy(members + k)] for k in (0, 1)))
+            parts.append(_region_errors(batch, planes, corners, size.tolist(), sigma, backend).cpu().numpy())
+            starts[members] = end + np.arange(len(members)) * size.prod()
+            end += parts[-1].size
+    values = np.concatenate([part.ravel() for part in parts])
+    return CostTable(values, starts, boxes + pad, sizes[:, 1].copy(), image.shape[2] + 2 * pad)
 
 
 def _pad_rows(gaussians: tuple[Tensor, ...], first: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -113,20 +99,19 @@ def _region_errors(
 class MovingLabels:
     """A label map that changes, flat and with a rim of -1, so that the places of a pixel's neighbours are sums."""
 
-    def __init__(self, index: Labels, costs: RegionCosts, length_weight: float, pad: int, smallest: int) -> None:
+    def __init__(self, index: Labels, costs: CostTable, length_weight: float, pad: int, smallest: int) -> None:
         padded = np.pad(index, pad, constant_values=-1)
         self.map = padded[pad:-pad, pad:-pad]
         self._labels, self._before = padded.reshape(-1), padded.flatten()
-        self._costs, self._smallest, self._pad, self._stride = costs, smallest, pad, padded.shape[1]
-        self._pair = length_weight / 4  # two neighbours that differ count an eighth each
+        self._smallest, self._pad, self._stride = smallest, pad, padded.shape[1]
         self._sides = disc(1, self._stride)[1:]
-        self._eight = disc(1.5, self._stride)[1:]
+        # two neighbours that differ count an eighth each
+        self._energy_of = self._labels, costs, length_weight / 4, disc(1.5, self._stride)[1:]
         self._floor = np.minimum(np.bincount(index.ravel()), smallest)
         self._free = self._labels >= 0
         self._specks = np.zeros(padded.size, np.bool_)  # pixels of pieces that were small before any move
         self._specks[list_small_pieces(self._labels, self._stride, smallest)[0]] = True
-        self._anchor = np.zeros(0, np.int32)
-        self._anchor_disc = np.zeros(0, np.int64)  # empty: a pixel may take any label
+        self._limit = np.zeros(0, np.int32), np.zeros(0, np.int64)  # a pixel may take any label
 
     def fix_cores(self, rim: Mask, distance: int) -> None:
         """Fix the pixels that each region keeps, unless it has that many beyond the distance that contours move."""
@@ -141,26 +126,11 @@ class MovingLabels:
     def limit_moves(self, anchor: Labels, distance: float) -> None:
         """Allow a pixel only the labels that another map has within the distance."""
         # repeated beyond the border: a label across it is nearer still
-        self._anchor = np.pad(anchor, self._pad, mode="edge").reshape(-1)
-        self._anchor_disc = disc(distance, self._stride)
+        self._limit = np.pad(anchor, self._pad, mode="edge").reshape(-1), disc(distance, self._stride)
 
     def sweep(self, reach: int) -> bool:
         """Give every free pixel near a contour its best label; True if one changed."""
-        neighborhood, limit = disc(reach, self._stride), (self._anchor, self._anchor_disc)
-        return bool(sweep(self._labels, self._free, self._costs.table, self._pair, neighborhood, self._eight, limit))
-
-    def _cost(self, pixels: Ints, labels: Labels, around: Labels) -> Floats:
-        """Return the part of the energy that depends on each pixel's label, up to a constant."""
-        equal = np.count_nonzero(around == labels[:, None], axis=1)
-        return np.asarray(self._costs.of(pixels, labels) - self._pair * equal)
-
-    def _allowed(self, pixels: Ints, labels: Labels) -> Mask:
-        allowed = np.full(len(pixels), len(self._anchor_disc) == 0)
-        for start in range(0, len(self._anchor_disc), 32):  # the nearest first: most labels are near
-            rows = np.flatnonzero(~allowed)
-            anchors = self._anchor[pixels[rows, None] + self._anchor_disc[start : start + 32]]
-            allowed[rows] = (anchors == labels[rows, None]).any(axis=1)
-        return allowed
+        return bool(sweep(*self._energy_of, self._limit, self._free, disc(reach, self._stride)))
 
     def merge_pieces(self) -> bool:
         """Merge small pieces that moves have made into their neighbours, the smallest first; True if one was merged.
@@ -188,28 +158,14 @@ class MovingLabels:
         was_small = bool((self._specks[piece] & (self._before[piece] == present)).any())
         if was_small or areas[present] - len(piece) < self._floor[present]:
             return present
-        best, least = present, math.inf
-        around = self._labels[piece[:, None] + self._eight]
-        for target in np.unique(self._labels[piece[:, None] + self._sides]).tolist():
-            labels = np.full(len(piece), target, np.int32)
-            if target in (present, -1) or not self._allowed(piece, labels).all():
-                continue
-            cost = float(self._cost(piece, labels, around).sum())
-            if cost < least:
-                best, least = target, cost
-        return best
+        targets = set(self._labels[piece[:, None] + self._sides].ravel().tolist()) - {present, -1}
+        energies = {label: piece_energy(*self._energy_of, self._limit, piece, label) for label in sorted(targets)}
+        best = min(energies, key=lambda label: energies[label], default=present)
+        return best if energies.get(best, math.inf) < math.inf else present
 
     def energy_change(self) -> float:
         """Return the energy of the map, less that before all moves."""
-        changed = np.flatnonzero(self._labels != self._before)
-        data = self._costs.of(changed, self._labels[changed]) - self._costs.of(changed, self._before[changed])
-        around = changed[:, None] + self._eight
-        before, after = (
-            (labels[around] != labels[changed, None]) & (labels[around] >= 0) for labels in (self._before, self._labels)
-        )
-        # pairs of two pixels that changed come twice
-        share = np.where(self._labels[around] == self._before[around], 1.0, 0.5)
-        return float(data.sum()) + self._pair * float((share * after - share * before).sum())
+        return float(energy_change(self._before, *self._energy_of))
 
 
 def disc(radius: float, stride: int) -> Ints:

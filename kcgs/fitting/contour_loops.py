@@ -45,14 +45,19 @@ def _has(labels, pixel, offsets, label):  # type: ignore[no-untyped-def]
     return count > 0
 
 
+@inner
+def _allows(limit, pixel, label):  # type: ignore[no-untyped-def]
+    """True where a pixel may have a label: `limit` is a map, and offsets of a disc that holds it there, or none."""
+    anchor, disc = limit
+    return len(disc) == 0 or _has(anchor, pixel, disc, label)
+
+
 @program.entry
-def sweep(labels, free, costs, pair_cost, neighborhood, eight, limit):  # type: ignore[no-untyped-def]
+def sweep(labels, costs, pair_cost, eight, limit, free, neighborhood):  # type: ignore[no-untyped-def]
     """Give every free pixel the best label of its neighborhood; True if one changed.
 
-    The map is flat and has a rim of -1. Neighborhoods are those before the sweep. The limit is another map, of whose
-    labels within a disc a pixel may have any, and the offsets of the disc; without offsets any label will do.
+    The map is flat and has a rim of -1. Neighborhoods are those before the sweep.
     """
-    anchor, anchor_disc = limit
     before, changed = labels.copy(), False
     pixels = _list_near_contours(labels, free, costs.stride, neighborhood)
     for parity in range(4):  # neighbours differ in parity: pixels of one parity change at the same time
@@ -66,7 +71,7 @@ def sweep(labels, free, costs, pair_cost, neighborhood, eight, limit):  # type: 
                 if label == present or label == -1 or _has(before, pixel, neighborhood[:k], label):
                     continue
                 energy = _energy(labels, costs, pair_cost, eight, pixel, label)
-                if energy < least and (len(anchor_disc) == 0 or _has(anchor, pixel, anchor_disc, label)):
+                if energy < least and _allows(limit, pixel, label):
                     best, least = label, energy
             labels[pixel] = best
             changed |= best != present
@@ -97,6 +102,31 @@ def _energy(labels, costs, pair_cost, eight, pixel, label):  # type: ignore[no-u
     for offset in eight:
         equal += labels[pixel + offset] == label
     return _cost(costs, pixel, label) - pair_cost * equal
+
+
+@program.entry
+def piece_energy(labels, costs, pair_cost, eight, limit, piece, label):  # type: ignore[no-untyped-def]
+    """Return the energy of a piece under a label, up to a constant; infinite where a pixel may not have it."""
+    total = 0.0
+    for pixel in piece:
+        total += _energy(labels, costs, pair_cost, eight, pixel, label) if _allows(limit, pixel, label) else math.inf
+    return total
+
+
+@program.entry
+def energy_change(before, after, costs, pair_cost, eight):  # type: ignore[no-untyped-def]
+    """Return the energy of a flat map with a rim of -1, less that of another."""
+    change = 0.0
+    for pixel in range(len(after)):
+        if after[pixel] == before[pixel]:
+            continue
+        change += _cost(costs, pixel, after[pixel]) - _cost(costs, pixel, before[pixel])
+        for offset in eight:
+            old, new = before[pixel + offset], after[pixel + offset]
+            pairs = int(-1 != new != after[pixel]) - int(-1 != old != before[pixel])
+            # pairs of two pixels that changed come twice
+            change += pair_cost * pairs * (1.0 if new == old else 0.5)
+    return change
 
 
 @program.entry

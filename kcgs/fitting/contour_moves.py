@@ -37,7 +37,7 @@ def refine_contours(
 
     Source: Mumford and Shah's functional of 1989; Besag's iterated conditional modes of 1986.
     """
-    from .contour_energy import MovingLabels, RegionCosts, bounding_boxes, index_map  # loads numba
+    from .contour_energy import MovingLabels, bounding_boxes, index_map, region_costs  # loads numba
 
     regions = scene.regions
     assert regions is not None
@@ -49,7 +49,7 @@ def refine_contours(
     pad = 2 * math.ceil(max(reach, distance) / 2)  # even: with the rim, rows and columns keep their parity
     rim = edge_band(torch.from_numpy(index), 1).numpy()
     boxes = bounding_boxes(np.where(rim, index, -1), regions.num_regions, reach * sweeps + smallest)
-    costs = RegionCosts(scene, image, boxes, pad, blur, backend)
+    costs = region_costs(scene, image, boxes, pad, blur, backend)
     moving = MovingLabels(index, costs, length_weight, pad, smallest)
     moving.fix_cores(rim, reach * sweeps)
     if max_distance is not None:

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, Scene, fit
 from kcgs.data import load_image, load_labels
-from kcgs.fitting.contour_energy import RegionCosts, bounding_boxes, index_map
+from kcgs.fitting.contour_energy import bounding_boxes, index_map, region_costs
+from kcgs.fitting.contour_loops import piece_energy
 from kcgs.fitting.contour_moves import refine_contours
 from kcgs.functional import edge_band, psnr, region_splat
 
@@ -74,8 +75,9 @@ def contour_energy(scene: Scene, image: Tensor, length_weight: float = 0.003, bl
     index = index_map(regions, regions.labels)
     boxes = bounding_boxes(index, regions.num_regions, 0)
     with torch.no_grad():
-        costs = RegionCosts(scene, image, boxes, 0, blur, "auto")
-    data = costs.of(np.arange(index.size), index.ravel()).sum()
+        costs = region_costs(scene, image, boxes, 0, blur, "auto")
+    alone = index.ravel(), costs, 0.0, np.zeros(0, np.int64), (np.zeros(0, np.int32), np.zeros(0, np.int64))
+    data = sum(piece_energy(*alone, np.flatnonzero(index == r), r) for r in range(regions.num_regions))
     height, width = index.shape
     pairs = sum(
         int(
