@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import product
 
 import numpy as np
@@ -28,7 +28,6 @@ class BlurredWindows:
 
     def __init__(self, g: Graph, regions: RegionMap, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> None:
         self.graph = g
-        self.tiles = tiles
         self.tiles_of = tiles_of
         ids, (_, level) = tile_ids(tiles_of), regions.tables.membership.levels
         levels = np.zeros((len(ids), WINDOW, WINDOW), np.int64)
@@ -58,23 +57,24 @@ class BlurredWindows:
         return windows / g.Max(g.ReduceSum(windows, [1], keepdims=1), 1e-30)
 
 
-class CrispWindows(BlurredWindows):
-    """Blurred windows whose pixels are given to their own label, as :class:`kcgs.kernels.Crisp` has it."""
+def crisp_windows(
+    g: Graph, regions: RegionMap, tiles: Tiles, tiles_of: Mapping[int, Integers]
+) -> Callable[[int], Value]:
+    """Make blurred windows whose pixels are given to their own label, as :class:`kcgs.kernels.Crisp` has it."""
+    blurred = BlurredWindows(g, regions, tiles, tiles_of)
+    index = cut_windows(tiles, tile_ids(tiles_of), regions.tables.membership.index[0].cpu().numpy())
+    labels = split_tiles(g, tiles_of, pack_windows(g, index))
 
-    def __init__(self, g: Graph, regions: RegionMap, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> None:
-        super().__init__(g, regions, tiles, tiles_of)
-        index = cut_windows(tiles, tile_ids(tiles_of), regions.tables.membership.index[0].cpu().numpy())
-        self.labels = split_tiles(g, tiles_of, pack_windows(g, index))
-
-    def unfold(self, count: int) -> Value:
-        """Unfold the windows of the tiles with K regions, (T, K, S, S)."""
-        g, tiles, windows = self.graph, self.tiles_of[count], super().unfold(count)
+    def unfold(count: int) -> Value:
+        numbers, windows = tiles_of[count], blurred.unfold(count)
         best = g.ReduceMax(windows, [1], keepdims=1)
-        ids = np.full((len(tiles), count, 1, 1), -1, np.int32)
-        for row, tile in zip(ids[..., 0, 0], tiles.tolist(), strict=True):
-            row[: len(self.tiles.regions[tile])] = self.tiles.regions[tile]
-        loses = g.And(g.Equal(g.Unsqueeze(self.labels[count], [1]), ids), g.Less(windows, best))
+        ids = np.full((len(numbers), count, 1, 1), -1, np.int32)
+        for row, tile in zip(ids[..., 0, 0], numbers.tolist(), strict=True):
+            row[: len(tiles.regions[tile])] = tiles.regions[tile]
+        loses = g.And(g.Equal(g.Unsqueeze(labels[count], [1]), ids), g.Less(windows, best))
         return g.Where(loses, best + MARGIN, windows)
+
+    return unfold
 
 
 def cut_windows(tiles: Tiles, ids: Integers, grid: Integers) -> Integers:

@@ -21,7 +21,29 @@ FLOAT = ir.DataType.FLOAT
 INT32 = ir.DataType.INT32
 INT64 = ir.DataType.INT64
 
+# results of operators that are not of the type of the first operand, or of the second after a condition
+_RESULTS = {
+    "Equal": BOOL,
+    "Greater": BOOL,
+    "Less": BOOL,
+    "LessOrEqual": BOOL,
+    "Shape": INT64,
+    "If": FLOAT,  # branches return images
+    "Loop": FLOAT,  # its turns return parts of an image
+}
+
 Array = NDArray[np.generic]
+
+
+def _arithmetic(operator: str, reflected: bool = False) -> Callable[[Value, Operand], Value]:
+    """Return the method of a value that applies an operator to it and an operand, or to the operand and it."""
+
+    def apply(self: Value, other: Operand) -> Value:
+        if isinstance(other, int | float):
+            other = np.asarray(other, self.dtype.numpy())
+        return self.graph.apply(operator, *((other, self) if reflected else (self, other)))
+
+    return apply
 
 
 class Value:
@@ -37,32 +59,15 @@ class Value:
         self.value = value
         self.dtype = dtype
 
-    def __add__(self, other: Operand) -> Value:
-        return self.graph.Add(self, self._operand(other))
-
-    def __sub__(self, other: Operand) -> Value:
-        return self.graph.Sub(self, self._operand(other))
-
-    def __rsub__(self, other: Operand) -> Value:
-        return self.graph.Sub(self._operand(other), self)
-
-    def __mul__(self, other: Operand) -> Value:
-        return self.graph.Mul(self, self._operand(other))
-
-    def __truediv__(self, other: Operand) -> Value:
-        return self.graph.Div(self, self._operand(other))
-
-    def __rtruediv__(self, other: Operand) -> Value:
-        return self.graph.Div(self._operand(other), self)
-
-    def __floordiv__(self, other: Operand) -> Value:
-        return self.graph.Div(self, self._operand(other))
-
-    def __mod__(self, other: Operand) -> Value:
-        return self.graph.Mod(self, self._operand(other))
-
-    def __matmul__(self, other: Operand) -> Value:
-        return self.graph.MatMul(self, self._operand(other))
+    __add__ = _arithmetic("Add")
+    __sub__ = _arithmetic("Sub")
+    __rsub__ = _arithmetic("Sub", reflected=True)
+    __mul__ = _arithmetic("Mul")
+    __truediv__ = _arithmetic("Div")
+    __rtruediv__ = _arithmetic("Div", reflected=True)
+    __floordiv__ = _arithmetic("Div")
+    __mod__ = _arithmetic("Mod")
+    __matmul__ = _arithmetic("MatMul")
 
     def __neg__(self) -> Value:
         return self.graph.Neg(self)
@@ -76,33 +81,9 @@ class Value:
             return self
         return Value(self.graph, self.graph.Cast(self, to=dtype).value, dtype)
 
-    def _operand(self, other: Operand) -> Operand:
-        """Give numbers of Python the type of this value."""
-        return np.asarray(other, self.dtype.numpy()) if isinstance(other, int | float) else other
-
 
 # what an operator takes: lists are int64, and so are Python's integers; its floats are float32
 Operand = Value | Array | np.generic | int | float | Sequence[int]
-
-
-class Operator:
-    """An operator of ONNX with one result, as a method of graphs that takes operands and attributes."""
-
-    def __init__(self, dtype: ir.DataType | None = None, *, typed_by: int = 0) -> None:
-        """Say the type of the result; None: that of the operand at position `typed_by`."""
-        self.dtype = dtype
-        self.typed_by = typed_by
-
-    def __set_name__(self, owner: type[Graph], name: str) -> None:
-        self.name = name
-
-    def __get__(self, graph: Graph, owner: type[Graph] | None = None) -> Callable[..., Value]:
-        return partial(self._apply, graph)
-
-    def _apply(self, graph: Graph, *operands: Operand, **attributes: object) -> Value:
-        values = [graph.constant(operand) for operand in operands]
-        dtype = self.dtype or values[self.typed_by].dtype
-        return graph.add_node(self.name, values, [dtype], **attributes)[0]
 
 
 class Scope(NamedTuple):
@@ -126,59 +107,21 @@ class Graph:
         ['Mul', 'ReduceProd']
     """
 
-    # the operators that decoders use, by their names in ONNX
-    Abs = Operator()
-    Add = Operator()
-    And = Operator()
-    Cast = Operator()
-    Clip = Operator()
-    Compress = Operator()
-    Concat = Operator()
-    CumSum = Operator()
-    Div = Operator()
-    Equal = Operator(BOOL)
-    Exp = Operator()
-    Expand = Operator()
-    Flatten = Operator()
-    Gather = Operator()
-    Greater = Operator(BOOL)
-    Identity = Operator()
-    If = Operator(FLOAT)  # branches return images
-    Less = Operator(BOOL)
-    LessOrEqual = Operator(BOOL)
-    Log = Operator()
-    Loop = Operator(FLOAT)  # its turns return parts of an image
-    MatMul = Operator()
-    Max = Operator()
-    Min = Operator()
-    Mod = Operator()
-    Mul = Operator()
-    Neg = Operator()
-    Not = Operator()
-    Or = Operator()
-    Pad = Operator()
-    Pow = Operator()
-    Range = Operator()
-    Reciprocal = Operator()
-    ReduceMax = Operator()
-    ReduceMin = Operator()
-    ReduceProd = Operator()
-    ReduceSum = Operator()
-    Relu = Operator()
-    Reshape = Operator()
-    Shape = Operator(INT64)
-    Slice = Operator()
-    Sqrt = Operator()
-    Squeeze = Operator()
-    Sub = Operator()
-    ThresholdedRelu = Operator()
-    Transpose = Operator()
-    Unsqueeze = Operator()
-    Where = Operator(typed_by=1)
-
     def __init__(self) -> None:
         self._scopes = [Scope(Tape(), [], {})]  # the graph, and the bodies that are being built in it
         self._names = 0
+
+    def __getattr__(self, operator: str) -> Callable[..., Value]:
+        """Return the operator of this name in ONNX, which has one result, as a method."""
+        if not onnx.defs.has(operator):
+            raise AttributeError(operator)
+        return partial(self.apply, operator)
+
+    def apply(self, operator: str, *operands: Operand, **attributes: object) -> Value:
+        """Apply an operator with one result."""
+        values = [self.constant(operand) for operand in operands]
+        dtype = _RESULTS.get(operator) or values[operator == "Where"].dtype
+        return self.add_node(operator, values, [dtype], **attributes)[0]
 
     def input(self, name: str, dtype: ir.DataType, shape: Sequence[int | str], doc: str | None = None) -> Value:
         """Declare an input; names stand for sizes that vary, `doc` says order, range and units."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -10,11 +11,11 @@ from kcgs.functional import RegionMap
 from kcgs.kernels.resampled import TINY
 
 from .axis import Axis, Interpolator
-from .blur import BlurredWindows, CrispWindows, cut_windows
+from .blur import BlurredWindows, crisp_windows, cut_windows
 from .entries import Storage
 from .graph import FLOAT, Graph, Value
 from .tiles import WINDOW
-from .windows import HardWindows, WideWindows, pack_windows, split_tiles, tile_ids
+from .windows import hard_windows, pack_windows, split_tiles, tile_ids, wide_windows
 
 # pixels that a contour may reach where its blur is computed in the graph
 _FARTHEST = 16
@@ -38,97 +39,75 @@ def make_membership(
     places = Interpolator(down, across, down.sampling(soft), across.sampling(soft), WINDOW)
     pixel = down.step * across.step  # area of one of the output, in pixels of the scene
     q = g.Relu(1 - pixel)  # as the formula of `Resampled` has it
+    sampler = partial(MembershipSampler, g, places)
     if not soft:
-        return MembershipSampler(g, places, HardWindows(g, tiles, tiles_of))
+        return sampler(hard_windows(g, tiles, tiles_of), None)
     if crisp:
-        exponent = g.Max(2 / g.Sqrt(pixel), 1.0)
-        return CrispSampler(g, places, CrispWindows(g, regions, tiles, tiles_of), exponent)
+        narrow = g.Max(2 / g.Sqrt(pixel), 1.0)
+        return sampler(crisp_windows(g, regions, tiles, tiles_of), lambda *_: narrow, crisp=True)
     widths, level = membership.levels
     variance = np.array([widths[0] ** 2], np.float32)
     uniform = _sharpness(g, g.constant(variance), q) if level is None else None  # exponent of a map of one width
-    wide = membership.radius > _FARTHEST
-    blurred = None if wide else BlurredWindows(g, regions, tiles, tiles_of)
-    windows = blurred or WideWindows(g, tiles, tiles_of)
+    blurred = None if membership.radius > _FARTHEST else BlurredWindows(g, regions, tiles, tiles_of)
+    windows = wide_windows(g, tiles, tiles_of) if blurred is None else blurred.unfold
     if uniform is not None:
-        return SoftSampler(g, places, windows, uniform)
+        return sampler(windows, lambda *_: uniform)
     if blurred is not None and blurred.levels is not None:
         squares = g.constant(np.array(widths, np.float32) ** 2)[blurred.levels]
     else:
         steps = np.round(np.sqrt(membership.variances[0].cpu().numpy()) * _WIDTH_STEPS)
         width = pack_windows(g, cut_windows(tiles, tile_ids(tiles_of), steps)).astype(FLOAT) * (1 / _WIDTH_STEPS)
         squares = width * width
-    return PairSampler(g, places, windows, split_tiles(g, tiles_of, squares), q)
+    variances = split_tiles(g, tiles_of, squares)
 
+    def exponent(count: int, slots: Value, row: Value, col: Value) -> Value:
+        return _sharpness(g, places.blocks(variances[count][slots], row, col, (1, 1)), q)
 
-class Windows(Protocol):
-    """The windows of tiles with several regions."""
-
-    def unfold(self, count: int) -> Value:
-        """Unfold the windows of the tiles with K regions, (T, K, S, S)."""
+    return sampler(windows, exponent)
 
 
 class MembershipSampler:
-    """Memberships in a map of hard contours: a pixel is of the region with the largest sample.
+    """Samples the memberships in the blocks of tiles with several regions.
 
     At the size of the scene, windows hold the memberships of its pixels, unless contours are crisp.
+
+    Args:
+        g: the graph.
+        places: interpolates windows.
+        windows: makes those of the tiles with K regions, (T, K, S, S).
+        exponent: of the samples in the blocks of tiles: it takes away the blur of pixels, or more of it. It may be
+            sampled, too, since pairs of regions have widths of their own. None: contours are hard, and a pixel is of
+            the region with the largest sample.
+        crisp: whether contours are narrower than those of the windows at every size.
     """
 
-    crisp = False
-
-    def __init__(self, g: Graph, places: Interpolator, windows: Windows) -> None:
-        self.graph = g
-        self.places = places
-        self.windows = windows
+    def __init__(
+        self,
+        g: Graph,
+        places: Interpolator,
+        windows: Callable[[int], Value],
+        exponent: Callable[[int, Value, Value, Value], Value] | None,
+        crisp: bool = False,
+    ) -> None:
+        self.graph, self.places, self.windows, self.exponent, self.crisp = g, places, windows, exponent, crisp
 
     def blocks(self, count: int, slots: Value, row: Value, col: Value) -> Value:
         """Sample the memberships in the blocks of tiles with K regions, (T, blocks, K, 1, P), column by column.
 
         `slots`, (T,), are the places of the tiles among those, `row` and `col`, (T,), those among rows and columns.
         """
-        g, places, windows = self.graph, self.places, self.windows.unfold(count)[slots]
+        g, places, windows = self.graph, self.places, self.windows(count)[slots]
 
         def sample() -> Value:
-            return self._normalize(places.blocks(windows, row, col, (count, 1)), count, slots, row, col)
+            samples = places.blocks(windows, row, col, (count, 1))
+            if self.exponent is None:
+                return g.Equal(samples, g.ReduceMax(samples, [2], keepdims=1)).astype(FLOAT)
+            return _sharpen(g, samples, self.exponent(count, slots, row, col))
 
         def cut() -> Value:
             return g.Reshape(g.Slice(windows, [1, 1], [-1, -1], [2, 3]), [0, 1, count, 1, -1])
 
         return sample() if self.crisp else g.choose(places.is_native, cut, sample)
-
-    def _normalize(self, samples: Value, count: int, slots: Value, row: Value, col: Value) -> Value:
-        """Make memberships that sum to one."""
-        return self.graph.Equal(samples, self.graph.ReduceMax(samples, [2], keepdims=1)).astype(FLOAT)
-
-
-class SoftSampler(MembershipSampler):
-    """Memberships in a map of one width: samples to a power, which takes the blur of pixels away, or more of it."""
-
-    def __init__(self, g: Graph, places: Interpolator, windows: Windows, exponent: Value) -> None:
-        super().__init__(g, places, windows)
-        self.exponent = exponent
-
-    def _normalize(self, samples: Value, count: int, slots: Value, row: Value, col: Value) -> Value:
-        return _sharpen(self.graph, samples, self.exponent)
-
-
-class CrispSampler(SoftSampler):
-    """Memberships whose contours are narrower than those of the windows at every size."""
-
-    crisp = True
-
-
-class PairSampler(MembershipSampler):
-    """Memberships in a map whose pairs of regions have widths of their own: exponents are sampled, too."""
-
-    def __init__(self, g: Graph, places: Interpolator, windows: Windows, variances: dict[int, Value], q: Value) -> None:
-        super().__init__(g, places, windows)
-        self.variances = variances  # (T, S, S), squares of widths
-        self.q = q  # share of a pixel's blur that interpolation loses
-
-    def _normalize(self, samples: Value, count: int, slots: Value, row: Value, col: Value) -> Value:
-        g = self.graph
-        variance = self.places.blocks(self.variances[count][slots], row, col, (1, 1))
-        return _sharpen(g, samples, _sharpness(g, variance, self.q))
 
 
 def _sharpness(g: Graph, variance: Value, q: Value) -> Value:

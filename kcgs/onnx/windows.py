@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -15,32 +15,26 @@ from .tiles import Tiles
 _STEPS = (1 << 16) - 1
 
 
-class HardWindows:
-    """Windows of hard contours, stored as labels; tiles by their number of regions."""
+def hard_windows(g: Graph, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> Callable[[int], Value]:
+    """Store windows of hard contours as labels; return what makes those of the tiles with K regions, (T, K, S, S)."""
+    windows = np.stack([tiles.windows[tile].numpy() for tile in tile_ids(tiles_of).tolist()])
+    labels = split_tiles(g, tiles_of, pack_windows(g, windows))
 
-    def __init__(self, g: Graph, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> None:
-        self.graph = g
-        windows = np.stack([tiles.windows[tile].numpy() for tile in tile_ids(tiles_of).tolist()])
-        self.labels = split_tiles(g, tiles_of, pack_windows(g, windows))
+    def unfold(count: int) -> Value:
+        ids = np.arange(count, dtype=np.int32)
+        return g.Equal(g.Unsqueeze(labels[count], [1]), ids[:, None, None]).astype(FLOAT)
 
-    def unfold(self, count: int) -> Value:
-        """Unfold the windows of the tiles with K regions, (T, K, S, S)."""
-        g, ids = self.graph, np.arange(count, dtype=np.int32)
-        return g.Equal(g.Unsqueeze(self.labels[count], [1]), ids[:, None, None]).astype(FLOAT)
+    return unfold
 
 
-class WideWindows:
-    """Windows of contours that are too wide to be blurred in the graph, stored as memberships."""
+def wide_windows(g: Graph, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> Callable[[int], Value]:
+    """Return what makes windows, (T, K, S, S), of contours that are too wide to be blurred in the graph.
 
-    def __init__(self, g: Graph, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> None:
-        self.graph = g
-        self.tiles = tiles
-        self.tiles_of = tiles_of
+    Memberships are stored, of all but the last region, since they sum to one.
+    """
 
-    def unfold(self, count: int) -> Value:
-        """Unfold the windows of tiles, (T, K, S, S): all but the last region's are stored; they sum to one."""
-        g = self.graph
-        windows = [self.tiles.windows[tile].numpy() for tile in self.tiles_of[count].tolist()]
+    def unfold(count: int) -> Value:
+        windows = [tiles.windows[tile].numpy() for tile in tiles_of[count].tolist()]
         memberships = np.concatenate([window[:-1] for window in windows]).swapaxes(1, 2)
         counts = np.array([len(window) for window in windows])[:, None]
         place = np.arange(count)
@@ -52,6 +46,8 @@ class WideWindows:
         remainder = 1 - g.ReduceSum(weights, [1], keepdims=1)
         last = g.constant((place == counts - 1)[:, :, None, None]).astype(FLOAT)
         return weights + remainder * last
+
+    return unfold
 
 
 def tile_ids(tiles_of: Mapping[int, Integers]) -> Integers:
