@@ -62,34 +62,21 @@ def _taps(scales):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _window(taps, a, b, c, d, e, f, g, h, i, j, k):  # type: ignore[no-untyped-def]
-    near = taps[0] * f + taps[1] * (e + g) + taps[2] * (d + h)
-    return near + taps[3] * (c + i) + taps[4] * (b + j) + taps[5] * (a + k)
+def _at(plane, other, y, x):  # type: ignore[no-untyped-def]
+    """Return a value of a plane, or of its product with another."""
+    return plane[y, x] if other is None else plane[y, x] * other[y, x]
 
 
 @inner
-def _down(plane, y, taps, upper, lower):  # type: ignore[no-untyped-def]
-    """Blur a padded plane along columns, at rows y and y + 2."""
+def _down(plane, other, y, taps, upper, lower):  # type: ignore[no-untyped-def]
+    """Blur a padded plane, or the product of two, along columns, at rows y and y + 2."""
     for x in range(plane.shape[1]):
-        a, b, c, d = plane[y, x], plane[y + 1, x], plane[y + 2, x], plane[y + 3, x]
-        e, f, g, h = plane[y + 4, x], plane[y + 5, x], plane[y + 6, x], plane[y + 7, x]
-        i, j, k, m = plane[y + 8, x], plane[y + 9, x], plane[y + 10, x], plane[y + 11, x]
-        n = plane[y + 12, x]
-        upper[x] = _window(taps, a, b, c, d, e, f, g, h, i, j, k)
-        lower[x] = _window(taps, c, d, e, f, g, h, i, j, k, m, n)
-
-
-@inner
-def _down_product(p, q, y, taps, upper, lower):  # type: ignore[no-untyped-def]
-    """Blur the product of two padded planes along columns, at rows y and y + 2."""
-    for x in range(p.shape[1]):
-        a, b, c = p[y, x] * q[y, x], p[y + 1, x] * q[y + 1, x], p[y + 2, x] * q[y + 2, x]
-        d, e, f = p[y + 3, x] * q[y + 3, x], p[y + 4, x] * q[y + 4, x], p[y + 5, x] * q[y + 5, x]
-        g, h, i = p[y + 6, x] * q[y + 6, x], p[y + 7, x] * q[y + 7, x], p[y + 8, x] * q[y + 8, x]
-        j, k, m = p[y + 9, x] * q[y + 9, x], p[y + 10, x] * q[y + 10, x], p[y + 11, x] * q[y + 11, x]
-        n = p[y + 12, x] * q[y + 12, x]
-        upper[x] = _window(taps, a, b, c, d, e, f, g, h, i, j, k)
-        lower[x] = _window(taps, c, d, e, f, g, h, i, j, k, m, n)
+        first, second = taps[0] * _at(plane, other, y + MARGIN, x), taps[0] * _at(plane, other, y + MARGIN + 2, x)
+        for k in range(1, MARGIN + 1):
+            above, below = y + MARGIN - k, y + MARGIN + k
+            first += taps[k] * (_at(plane, other, above, x) + _at(plane, other, below, x))
+            second += taps[k] * (_at(plane, other, above + 2, x) + _at(plane, other, below + 2, x))
+        upper[x], lower[x] = first, second
 
 
 @inner
@@ -221,9 +208,9 @@ def _score(scales, scale, channel, first, last, channels, has_gradient):  # type
     slopes = np.zeros((3, last_window - first_window + 6, width + 6), np.float32)
     end = min(last_window + below, height)
     for top in range(max(first_window - above, 0), end, 2):
-        _down(render, 2 * top, taps, columns[0, 0], columns[0, 1])
-        _down_product(render, render, 2 * top, taps, columns[1, 0], columns[1, 1])
-        _down_product(render, image, 2 * top, taps, columns[2, 0], columns[2, 1])
+        _down(render, None, 2 * top, taps, columns[0, 0], columns[0, 1])
+        _down(render, render, 2 * top, taps, columns[1, 0], columns[1, 1])
+        _down(render, image, 2 * top, taps, columns[2, 0], columns[2, 1])
         for y in range(top, min(top + 2, end)):
             for k in range(3):
                 _across(columns[k, y - top], taps, rows[k])
