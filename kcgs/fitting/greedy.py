@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kcgs.kernels.compiled import Program, inner
 
@@ -69,25 +67,3 @@ def choose(places, square, norm, share, gain, limits, picked):  # type: ignore[n
             gain[i] = -1.0 if overlap > max_overlap else total
         _refresh(gain, leaders, low, high)
     return len(picked)
-
-
-def pick(
-    places: NDArray[Any],
-    square: NDArray[Any],
-    norm: NDArray[Any],
-    share: NDArray[Any],
-    gain: NDArray[Any],
-    count: int,
-    *,
-    floor: float,
-    overlap: float,
-    reach: float,
-    longest: float,
-) -> NDArray[np.int64]:
-    """Return the positions of at most `count` candidates, the strongest first; arguments as in :func:`choose`."""
-    picked = np.zeros(min(count, len(gain)), np.int64)
-    if not len(picked):
-        return picked
-    columns = (np.ascontiguousarray(a, np.float64) for a in (places, square, norm))
-    share, gain = (np.array(a, np.float64) for a in (share, gain))
-    return picked[: choose(*columns, share, gain, (floor, overlap, reach, longest), picked)]

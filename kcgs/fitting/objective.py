@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -14,7 +13,7 @@ from kcgs.functional import RegionMap
 from kcgs.functional.metrics import K1, K2, SCALE_WEIGHTS, SSIM_SIGMA, SSIM_WINDOW, window_mean
 from kcgs.nn import GaussianField
 
-from .pursuit import SIGMAS, halve, propose
+from .pursuit import halve, propose
 
 if TYPE_CHECKING:
     from .similarity import Passes
@@ -73,16 +72,13 @@ class MsSsimObjective:
             _, inside, mean, _, weight = self._scales[-1]
             bright = _blur(inside * weight / self._norm / (2.0 * mean * mean + K1**2)).mean(0)
             self._bands.append((level, blocks + window, math.inf, bright))
-        self._passes = self._compile() if image.device.type == "cpu" and image.dtype == torch.float32 else None
+        self._passes: Passes | None = None
+        if self._scales and image.device.type == "cpu" and image.dtype == torch.float32:
+            from .similarity import Passes  # loads numba
 
-    def _compile(self) -> Passes | None:
-        """Return the compiled form of `_measure`; None where the image has no scale."""
-        if not self._scales:
-            return None
-        from .similarity import Passes  # loads numba
-
-        factors = [weight / self._norm * 0.25**level for level, (*_, weight) in enumerate(self._scales, 1)]
-        return Passes([[plane.numpy() for plane in planes] for *planes, _ in self._scales], factors, _MIN_SCORE)
+            factors = [weight / self._norm * 0.25**level for level, (*_, weight) in enumerate(self._scales, 1)]
+            scales = [[plane.numpy() for plane in planes] for *planes, _ in self._scales]
+            self._passes = Passes(scales, factors, _MIN_SCORE)  # the compiled form of `_measure`
 
     def apply(self, difference: Tensor) -> Tensor:
         """Return half the gradient of E, (C, H, W), at a difference r, render - image, in whose memory it may be.
@@ -168,16 +164,14 @@ def propose_gaussians(
     residual: Tensor,
     regions: RegionMap | None,
     count: int,
-    *,
-    sigmas: Sequence[float] = SIGMAS,
-    backend: str = "auto",
+    backend: str,
 ) -> GaussianField:
     """Find at most `count` Gaussians that lower the objective most, of a residual, image - render: see `propose`."""
     if objective is None:
-        return propose(residual, regions, count, sigmas=sigmas, backend=backend)
+        return propose(residual, regions, count, backend=backend)
     # a pixel's gradient by the root of what it counts: the square is what a Gaussian may gain
     root = objective.importance.sqrt()
-    added = propose(-objective.apply(-residual) / root, regions, count, sigmas=sigmas, backend=backend)
+    added = propose(-objective.apply(-residual) / root, regions, count, backend=backend)
     # in the filtered residual, what counts more is larger
     x, y = added.means.detach().long().unbind(-1)
     added.colors.data = added.colors.detach() / root[y, x, None]

@@ -202,17 +202,18 @@ def _pursue(candidates: _Candidates, count: int, floor: float) -> _Candidates:
     where that is more: in a region of one pixel all scales are the same. A candidate that overlaps too much with a
     picked one is dropped, since there the approximation ends.
     """
-    from .greedy import pick
+    from .greedy import choose  # loads numba
 
+    picked = np.zeros(min(count, len(candidates.gain)), np.int64)
+    if not len(picked):
+        return candidates.take(picked)
     share = candidates.inner / np.sqrt(candidates.norm)[:, None]  # [M, C], of normalised Gaussians
     # sorted by region, then y: those near a place are within one stretch
-    stride = 4.0 * (candidates.y.max(initial=0.0) + 1.0)
+    stride = 4.0 * (candidates.y.max() + 1.0)
     places = np.stack([candidates.x, candidates.y, candidates.region * stride + candidates.y], -1)
-    picked = pick(
-        places, candidates.sigma**2, candidates.norm, share, candidates.gain, count,
-        floor=floor, overlap=_OVERLAP, reach=_REACH, longest=stride / 4,
-    )  # fmt: skip
-    return candidates.take(picked)
+    columns = (places, candidates.sigma**2, candidates.norm, share, candidates.gain)
+    numbers = (np.array(column, np.float64, order="C") for column in columns)
+    return candidates.take(picked[: choose(*numbers, (floor, _OVERLAP, _REACH, stride / 4), picked)])
 
 
 def _place(

@@ -107,7 +107,7 @@ class FrameDescent:
         self.newton.velocity[mask], self.movable_rows = 0.0, self.movable_rows | mask
 
         residual = (image - self.target.render(self.splats._replace(colors=colors))) * self.changed_pixels
-        proposal = propose_gaussians(self.objective, residual, regions, int(mask.sum()), backend=backend)
+        proposal = propose_gaussians(self.objective, residual, regions, int(mask.sum()), backend)
         rows = mask.nonzero()[: len(proposal.means), 0]
         if region_ids is not None and proposal.region_ids is not None:
             region_ids = region_ids.index_copy(0, rows, proposal.region_ids)

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from kcgs import fit
-from kcgs.fitting.greedy import pick
+from kcgs.fitting.greedy import choose
 from kcgs.fitting.redundancy import NEIGHBORS, lowest_impact
 from kcgs.functional import psnr
 
@@ -89,8 +89,9 @@ def test_pursuit_picks_as_the_plain_loop_does() -> None:
     x, square, norm = rng.uniform(0, 60, count), rng.uniform(1, 9, count), rng.uniform(3, 20, count)
     share = rng.normal(size=(count, channels))
     gain = np.square(share).sum(1)
-    picked = pick(np.stack([x, y, y], -1), square, norm, share, gain, 100, **limits)
-    share, gain, expected = share.copy(), gain.copy(), []
+    picked, expected = np.zeros(100, np.int64), []
+    places = np.stack([x, y, y], -1)
+    picked = picked[: choose(places, square, norm, share.copy(), gain.copy(), tuple(limits.values()), picked)]
     while len(expected) < 100 and gain.max() > limits["floor"]:
         best = int(gain.argmax())
         expected.append(best)

@@ -86,7 +86,7 @@ class Densify:
         """Return the Gaussians to add."""
         problem, residual = state.problem, state.problem.image - render(state)
         regions, backend = state.scene.regions, problem.config.backend
-        return propose_gaussians(problem.objective, residual, regions, count, backend=backend)
+        return propose_gaussians(problem.objective, residual, regions, count, backend)
 
 
 @dataclass(frozen=True)
