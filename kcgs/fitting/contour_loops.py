@@ -181,9 +181,11 @@ def list_small_pieces(labels, stride, smallest):  # type: ignore[no-untyped-def]
                 if end + count > len(pixels):
                     more = np.empty(len(pixels) + count, np.int64)
                     pixels, first = np.append(pixels, more), np.append(first, more)
-                pixels[end : end + count] = queue[:count]
-                for k in range(count):
-                    first[end + k] = queue[:count].min()
+                least = seed
+                for k in range(count):  # a copy of a slice, or its least element, would take seconds more to compile
+                    pixels[end + k], least = queue[k], min(least, queue[k])
+                for k in range(end, end + count):
+                    first[k] = least
                 end += count
     return pixels[:end], first[:end]
 

@@ -116,7 +116,8 @@ def score(rows, spans, residuals, neighbors, shares, tasks, counters):  # type: 
             places, share = neighbors[i], shares[i]
             places[:] = -1
             count = _nearest(rows, spans[i, 0], spans[i, 1], i, places, values)
-            share[:count] = values[:count]
+            for k in range(count):
+                share[k] = values[k]
             for k in range(count):
                 matrix[k, k] = 1.0 + _RIDGE
                 for m in range(k):

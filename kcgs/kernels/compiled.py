@@ -4,7 +4,8 @@ To add one, write in the module that calls it:
 
 1. `program = Program("what the log calls it", __file__)`, with the names of the other files that its loops come from;
 2. `@program.entry` above a function that Python calls, with arrays in C order, numbers and named tuples of both;
-3. `@inner` above a function that only compiled functions call, `@inline` where it is small and called often.
+3. `@inner` above a function that only compiled functions call, `@inline` where it is small and called often,
+   `@part` where it is large and called once.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ _config: Any = config
 inner = cast(Any, numba.njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 # the same, of which every caller has a copy
 inline = cast(Any, numba.njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", forceinline=True)
+
+# of one caller, and part of its code from the first: compiled once, not alone and then again with it
+part = cast(Any, numba.njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", inline="always")
 
 
 class Program:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..compiled import inner
+from ..compiled import inner, part
 from ..tasks import first_task, next_task
 from .gradients import sum_terms
 from .layout import TILE_COLS, program
@@ -55,7 +55,7 @@ def visit(lists, backward, image, nodes, slopes, terms, tasks, counters):  # typ
         k = next_task(tasks, counters)
 
 
-@inner
+@part
 def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, offsets, ones):  # type: ignore[no-untyped-def]
     """Visit a row of blocks: add, gather, or both."""
     table, live, start, visits = lists.table, lists.live, lists.start, lists.visits
