@@ -60,9 +60,9 @@ class AdaptiveSymbol:
     def __init__(self, weights: Floats) -> None:
         self._weights = weights.copy()
 
-    def code(self, coder: Coder, count: int, values: Integers | None) -> Integers:
-        """Code `count` symbols, (count,)."""
-        symbols = coder.categorical(self._weights, count, values)
+    def code(self, coder: Coder, values: Integers) -> Integers:
+        """Code symbols, (n,)."""
+        symbols = coder.categorical(self._weights, values)
         np.add.at(self._weights, symbols, 1.0)
         return symbols
 
@@ -73,12 +73,11 @@ class AdaptiveNumber:
     def __init__(self, weights: Floats) -> None:
         self._length = AdaptiveSymbol(weights)
 
-    def code(self, coder: Coder, value: int | None) -> int:
+    def code(self, coder: Coder, value: int) -> int:
         """Code the number: its count of bits, then the remainder below its highest bit."""
-        length = int(self._length.code(coder, 1, None if value is None else np.array([value.bit_length()]))[0])
+        length = int(self._length.code(coder, np.array([value.bit_length()]))[0])
         highest = 1 << (length - 1) if length else 0
-        remainder = None if value is None else np.array([value - highest])
-        return highest + int(coder.uniform(np.array([max(highest, 1)]), remainder)[0])
+        return highest + int(coder.uniform(np.array([max(highest, 1)]), np.array([value - highest]))[0])
 
 
 class AdaptiveMagnitude:
@@ -90,17 +89,15 @@ class AdaptiveMagnitude:
     def __init__(self, shapes: Floats) -> None:
         self._shapes = shapes.copy()
 
-    def code(
-        self, coder: Coder, scales: Floats, level: Integers, context: Integers, values: Integers | None
-    ) -> Integers:
+    def code(self, coder: Coder, scales: Floats, level: Integers, context: Integers, values: Integers) -> Integers:
         """Code one magnitude for each entry of `level` [n], its index in `scales`, and of `context` [n]."""
         present, level = np.unique(level, return_inverse=True)
         present_scales = scales[present].tolist()
         tables = np.concatenate([self._tables(scale) for scale in present_scales])
-        bucket = None if values is None else np.searchsorted(_LOW, values, side="right") - 1
+        bucket = np.searchsorted(_LOW, values, side="right") - 1
         bucket = coder.mixed_categorical(tables, level * len(self._shapes) + context, bucket)
         width = _HIGH[bucket] - _LOW[bucket]
-        magnitudes = _LOW[bucket] + coder.uniform(width, None if values is None else values - _LOW[bucket])
+        magnitudes = _LOW[bucket] + coder.uniform(width, values - _LOW[bucket])
         parts = np.zeros(self._shapes.shape)
         for i, scale in enumerate(present_scales):
             index = level == i
@@ -146,21 +143,21 @@ class AdaptiveAngle:
     def __init__(self, weights: Floats) -> None:
         self._weights = weights.copy()
 
-    def code(self, coder: Coder, num_angles: Integers, values: Integers | None) -> Integers:
+    def code(self, coder: Coder, num_angles: Integers, values: Integers) -> Integers:
         """Code angles (n,), each below its entry of `num_angles` (n,); only entries of 16 or more have bins."""
         has_bin = num_angles >= _ANGLE_BINS
         # half a bin, so that angle 0 is in the middle of the first one
         shift = np.where(has_bin, num_angles // (2 * _ANGLE_BINS), 0)
-        shifted = None if values is None else (values + shift) % num_angles
+        shifted = (values + shift) % num_angles
         counts, row = np.unique(num_angles[has_bin], return_inverse=True)
         borders = np.arange(_ANGLE_BINS + 1) * counts[:, None] // _ANGLE_BINS
         bins = np.zeros(0, np.int64)
         if len(row):
-            symbols = None if shifted is None else (borders[row, 1:] <= shifted[has_bin, None]).sum(1)
+            symbols = (borders[row, 1:] <= shifted[has_bin, None]).sum(1)
             bins = coder.mixed_categorical(self._weights * np.diff(borders), row, symbols)
         low, sizes = np.zeros(len(num_angles), np.int64), num_angles.copy()
         low[has_bin] = borders[row, bins]
         sizes[has_bin] = borders[row, bins + 1] - low[has_bin]
-        angles = low + coder.uniform(sizes, None if shifted is None else shifted - low)
+        angles = low + coder.uniform(sizes, shifted - low)
         np.add.at(self._weights, bins, 1.0)
         return (angles - shift) % num_angles

@@ -25,7 +25,7 @@ class CodecError(ValueError):
 class Coder(ABC):
     """Either side of a stream: a writer takes values and returns them, a reader ignores them and returns its own.
 
-    So one procedure writes and reads; where it has nothing to write, values are None.
+    So one procedure writes and reads; a reader's values are any of the right shape.
     """
 
     is_reader = False
@@ -73,30 +73,29 @@ class Coder(ABC):
         """Code `count` numbers (count,) int32 below `size`, which is 2 to 2**24."""
         return self._code(values, self._models.Uniform(size), count=count)
 
-    def uniform(self, sizes: Integers, values: Integers | None) -> Integers:
+    def uniform(self, sizes: Integers, values: Integers) -> Integers:
         """Code values (n,), each below its entry of `sizes` (n,), which is 1 to 2**24 - 1."""
         coded = np.zeros(len(sizes), np.int64)
         index = np.flatnonzero(sizes > 1)  # constriction has no alphabet of one
         if len(index):
-            numbers = None if values is None else values[index].astype(np.int32)
-            coded[index] = self._code(numbers, self._models.Uniform(), sizes[index].astype(np.int32))
+            numbers, model = values[index].astype(np.int32), self._models.Uniform()
+            coded[index] = self._code(numbers, model, sizes[index].astype(np.int32))
         return coded
 
-    def categorical(self, weights: Floats, count: int, values: Integers | None) -> Integers:
-        """Code `count` values by one table of weights (A,)."""
-        if not count:
+    def categorical(self, weights: Floats, values: Integers) -> Integers:
+        """Code values (n,) by one table of weights (A,)."""
+        if not len(values):
             return np.zeros(0, np.int64)
-        symbols = None if values is None else values.astype(np.int32)
-        return np.asarray(self._code(symbols, self._categorical(weights), count=count), np.int64)
+        symbols = self._code(values.astype(np.int32), self._categorical(weights), count=len(values))
+        return np.asarray(symbols, np.int64)
 
-    def mixed_categorical(self, tables: Floats, rows: Integers, values: Integers | None) -> Integers:
+    def mixed_categorical(self, tables: Floats, rows: Integers, values: Integers) -> Integers:
         """Code values (n,), each by the row of `tables` (T, A) that its entry of `rows` (n,) names."""
         if len(tables) == 1:
-            return self.categorical(tables[0], len(rows), values)
+            return self.categorical(tables[0], values)
         # one by one: constriction would build a model for each value
         models = {row: self._categorical(tables[row]) for row in np.unique(rows).tolist()}
-        symbols = [None] * len(rows) if values is None else values.tolist()
-        pairs = zip(symbols, rows.tolist(), strict=True)
+        pairs = zip(values.tolist(), rows.tolist(), strict=True)
         return np.array([self._code(symbol, models[row]) for symbol, row in pairs], np.int64)
 
     def _categorical(self, weights: Floats) -> Any:
@@ -111,7 +110,6 @@ class Writer(Coder):
         self._encoder = self._queue.RangeEncoder()
 
     def _code(self, values: Any, model: Any, *parameters: Any, count: int | None = None) -> Any:
-        assert values is not None
         self._encoder.encode(values, model, *parameters)
         return values
 

@@ -41,7 +41,7 @@ def encode_region_map(regions: RegionMap) -> bytes:
     if len(palette) == 1:
         return head
     writer = Writer()
-    _code_palette(writer, len(units), len(palette), np.array([palette.index(unit) for unit in units]))
+    _code_palette(writer, len(palette), np.array([palette.index(unit) for unit in units]))
     return head + writer.finish()
 
 
@@ -61,7 +61,7 @@ def decode_region_map(data: bytes, size: tuple[int, int], num_regions: int) -> R
     if count > 1:
         pairs = sorted(touching_pairs(labels))
         stream = reader.take(len(data) - reader.position)
-        indices = _code_palette(Reader(stream), len(pairs), count, None).tolist()
+        indices = _code_palette(Reader(stream), count, np.zeros(len(pairs), np.int64)).tolist()
         softness = {pair: palette[index] for pair, index in zip(pairs, indices, strict=True)}
     elif reader.position != len(data):
         raise CodecError(f"the map must end after {reader.position} bytes; got {len(data)}")
@@ -71,10 +71,10 @@ def decode_region_map(data: bytes, size: tuple[int, int], num_regions: int) -> R
     return regions
 
 
-def _code_palette(coder: Coder, num_pairs: int, size: int, indices: Integers | None) -> Integers:
+def _code_palette(coder: Coder, size: int, indices: Integers) -> Integers:
     """Code the softness of each pair, as its index in the palette."""
-    model, coded = AdaptiveSymbol(np.ones(size)), np.zeros(num_pairs, np.int64)
-    for start in range(0, num_pairs, _GROUP):
+    model, coded = AdaptiveSymbol(np.ones(size)), np.zeros_like(indices)
+    for start in range(0, len(indices), _GROUP):
         group = slice(start, start + _GROUP)
-        coded[group] = model.code(coder, len(coded[group]), None if indices is None else indices[group])
+        coded[group] = model.code(coder, indices[group])
     return coded

@@ -17,7 +17,7 @@ from kcgs import RegionMap, Scene, load
 from kcgs.codec import CodecError, Decoded, decode, decode_labels, encode, encode_labels
 from kcgs.codec.exact import Integers
 from kcgs.codec.file import ByteReader, Header, pack, unpack
-from kcgs.codec.gaussians.layers import Group, GroupValues, LayerCoder
+from kcgs.codec.gaussians.layers import Group, LayerCoder
 from kcgs.codec.gaussians.occupancy import Grid, OccupancyCoder
 from kcgs.codec.gaussians.quantize import Classes, Quantizer
 from kcgs.codec.labels.ids import _code_count
@@ -226,9 +226,10 @@ class TestDamagedMaps:
 
 
 class Forger(Writer):
-    """Invents the numbers that it is to read, and writes them."""
+    """Invents the numbers that it is to read, and writes them, unless it is given some."""
 
     is_reader = True
+    invents = True
 
     def __init__(self, generator: np.random.Generator) -> None:
         super().__init__()
@@ -241,25 +242,28 @@ class Forger(Writer):
         return self._generator.integers(0, sizes)
 
     def uniform(self, sizes: Any, values: Any) -> Any:
-        return super().uniform(sizes, self._invent(sizes) if values is None else values)
+        return super().uniform(sizes, self._invent(sizes) if self.invents else values)
 
     def number(self, value: int, size: int) -> int:
         return super().number(int(self._generator.integers(size) * self._generator.integers(2)), size)
 
     def mixed_categorical(self, tables: Any, rows: Any, values: Any) -> Any:
-        values = self._invent(np.full(len(rows), tables.shape[1])) if values is None else values
-        return super().mixed_categorical(tables, rows, values)
+        return super().mixed_categorical(tables, rows, self._invent(np.full(len(rows), tables.shape[1])))
 
 
 class ForgedOccupancy(OccupancyCoder):
     """Invents the cells of as many Gaussians as the layer names."""
 
-    def code(self, coder: Any, size: int, count: int, cell: Any) -> Any:
-        grid, generator = Grid.for_count(self._size, count), coder._generator
+    def code(self, coder: Any, size: int, cell: Any) -> Any:
+        count, generator = len(cell), coder._generator
+        grid = Grid.for_count(self._size, count)
         margin = generator.choice([0, 1, grid.max_margin])
         corner, end = np.array([-margin, -margin]), np.array([grid.columns + margin, grid.rows + margin])
         cell = corner + (generator.random((count, 2)) ** generator.choice([1, 9]) * (end - corner)).astype(np.int64)
-        return super().code(coder, size, count, cell[np.lexsort(cell.T)])
+        coder.invents = False
+        coded = super().code(coder, size, cell[np.lexsort(cell.T)])
+        coder.invents = True
+        return coded
 
 
 class ForgedLayers(LayerCoder):
@@ -268,7 +272,10 @@ class ForgedLayers(LayerCoder):
     def _code_counts(self, coder: Any, sizes: Any) -> Any:
         counts = np.zeros(64, np.int64)
         counts[coder._generator.choice([0, 1, 20, 35, 36], 2)] = coder._generator.integers(1, 80, 2)
-        return super()._code_counts(coder, np.repeat(np.arange(64), counts) - 8)
+        coder.invents = False
+        coded = super()._code_counts(coder, np.repeat(np.arange(64), counts) - 8)
+        coder.invents = True
+        return coded
 
 
 def forge(header: Header, generator: np.random.Generator) -> bytes:
@@ -328,7 +335,7 @@ def test_an_empty_group() -> None:
 def test_a_ratio_beyond_all() -> None:
     writer, zero = write_counts(5, 1), np.zeros(1, np.int64)
     model = LayerCoder(Quantizer(-512, (9, 9)), 1, None)
-    model._occupancy.code(writer, -3, 1, np.zeros((1, 2), np.int64))
+    model._occupancy.code(writer, -3, np.zeros((1, 2), np.int64))
     model._ratio.code(writer, np.ones(1), zero, zero, zero + (1 << 23))
     refuse(writer, "a ratio must be at most 0 steps", qp=-512, energy=-24)
 
@@ -389,7 +396,7 @@ def test_too_many_gaussians() -> None:
     writer, quantizer = Writer(), Quantizer(0, (9, 9))
     model = LayerCoder(quantizer, 1, None)
     codes, ids = make_group(quantizer, 0)
-    model._code_group(writer, 0, GroupValues(*codes, ids), 5)
+    model._code_group(writer, 0, (codes, ids), 5)
     writer.number(1, 3)
     model._code_counts(writer, np.zeros(5000, np.int64))
     layer = writer.finish()
@@ -427,7 +434,7 @@ def test_wrong_numbers_of_gaussians_in_cells(margin: int, num_outside: int, bit:
         for number, value in zip(models, (margin, num_outside), strict=True)
     )
     with pytest.raises(CodecError, match=match):
-        model.code(writer, -3, 2, None)
+        model.code(writer, -3, np.zeros((2, 2), np.int64))
     refuse(writer, match)
 
 
@@ -435,17 +442,17 @@ def test_too_many_cells_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     size, writer, encoder = (9, 9), Writer(), OccupancyCoder((9, 9))
     far = np.full((1, 2), -Grid.for_count(size, 1).max_margin)
     for class_of_size in range(5):
-        encoder.code(writer, class_of_size, 1, far)
+        encoder.code(writer, class_of_size, far)
     reader, decoder = Reader(writer.finish()), OccupancyCoder(size)
     monkeypatch.setattr(f"{OccupancyCoder.__module__}._MAX_TOTAL_OUTSIDE", 4 << 17)
     monkeypatch.setattr(f"{OccupancyCoder.__module__}._MAX_OUTSIDE_EACH", 0)
     for class_of_size in range(4):
-        decoder.code(reader, class_of_size, 1, None)
+        decoder.code(reader, class_of_size, 0 * far)
     with pytest.raises(CodecError, match="at most 524288 cells outside; got 6"):
-        decoder.code(reader, 4, 1, None)
+        decoder.code(reader, 4, 0 * far)
     monkeypatch.setattr(f"{OccupancyCoder.__module__}._MAX_CLASSES", 4)
     with pytest.raises(CodecError, match="at most 4 classes of size; got more"):
-        decoder.code(reader, 4, 1, None)
+        decoder.code(reader, 4, 0 * far)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (5, 7), (1, 300), (64, 48)])
@@ -470,7 +477,7 @@ def write_cells(size: tuple[int, int], count: int) -> tuple[bytes, list[tuple[in
         column, row = ((generator.random(some) ** 2 * (n + 1)).astype(int) for n in (grid.columns, grid.rows))
         cell = np.stack([column, row], -1)
         classes.append((class_of_size, cell[np.lexsort(cell.T)]))
-        coder.code(writer, class_of_size, some, classes[-1][1])
+        coder.code(writer, class_of_size, classes[-1][1])
     return writer.finish(), classes
 
 
@@ -479,4 +486,4 @@ def test_cells_of_any_shape(size: tuple[int, int]) -> None:
     data, classes = write_cells(size, min(40_000, size[0] * size[1]))
     reader, decoder = Reader(data), OccupancyCoder(size)
     for class_of_size, cell in classes:
-        assert np.array_equal(decoder.code(reader, class_of_size, len(cell), None), cell)
+        assert np.array_equal(decoder.code(reader, class_of_size, 0 * cell), cell)

@@ -6,7 +6,7 @@ A layer has a group for each of its classes of energy: by class of size, how man
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,24 +40,10 @@ Group = tuple[Codes, Integers]
 """Gaussians of one energy, and the positions of their regions' ids."""
 
 
-class GroupValues(NamedTuple):
-    """What a writer codes of a group: `Codes`, and the positions of the regions' ids; of a reader all are None."""
-
-    energy: Integers | None = None
-    size: Integers | None = None
-    scale: Integers | None = None
-    ratio: Integers | None = None
-    angle: Integers | None = None
-    colors: Integers | None = None
-    cell: Integers | None = None
-    place: Integers | None = None
-    ids: Integers | None = None
-
-
 class LayerCoder:
     """Writes or reads layers one after another, by models that learn from all layers so far. The map is on the CPU.
 
-    One procedure does both, so that they agree: `_code` and what it calls take values, which are None to read.
+    One procedure does both, so that they agree: `_code` and what it calls take values, which a reader ignores.
     """
 
     def __init__(self, quantizer: Quantizer, channels: int, regions: RegionMap | None) -> None:
@@ -75,20 +61,17 @@ class LayerCoder:
 
     def read(self, reader: Reader, energy: int, max_count: int) -> list[tuple[Parameters, Integers]]:
         """Read the groups of a layer; `energy` is the class of the first, and more Gaussians an error."""
-        return self._code(reader, energy, None, max_count)
+        return self._code(reader, energy, [], max_count)
 
     def _code(
-        self, coder: Coder, energy: int, groups: list[Group] | None, max_count: int
+        self, coder: Coder, energy: int, groups: list[Group], max_count: int
     ) -> list[tuple[Parameters, Integers]]:
-        coded, remaining = [], None if groups is None else list(groups)
+        coded, remaining = [], list(groups)
         symbol = _PRESENT
         while symbol != _END:
             if symbol == _PRESENT:
-                values = GroupValues()
-                if remaining is not None:
-                    codes, ids = remaining.pop(0)
-                    values = GroupValues(*codes, ids)
-                coded.append(self._code_group(coder, energy, values, max_count))
+                group = remaining.pop(0) if remaining else self._placeholders(1)
+                coded.append(self._code_group(coder, energy, group, max_count))
                 max_count -= len(coded[-1][1])
             energy -= 1
             symbol = coder.number(_next_symbol(remaining, energy), 3)
@@ -96,59 +79,60 @@ class LayerCoder:
                 raise CodecError(f"a class of energy must be at least {ENERGIES[0]}; got {energy}")
         return coded
 
-    def _code_group(
-        self, coder: Coder, energy: int, values: GroupValues, max_count: int
-    ) -> tuple[Parameters, Integers]:
+    def _placeholders(self, count: int) -> Group:
+        """Return what a reader has in place of a group."""
+        one, two, colors = (np.broadcast_to(np.int64(0), (count, *row)) for row in ((), (2,), (self.channels,)))
+        return Codes(one, one, one, one, one, colors, two, two), one
+
+    def _code_group(self, coder: Coder, energy: int, group: Group, max_count: int) -> tuple[Parameters, Integers]:
         """Code at most `max_count` Gaussians of one energy."""
-        counts = self._code_counts(coder, values.size)
+        counts = self._code_counts(coder, group[0].size)
         if counts.sum() > max_count:
             raise CodecError(f"a layer must hold at most {max_count} Gaussians; got {counts.sum()}")
         if counts[SIZES[1] - SIZES[0] + 1 :].any():
             raise CodecError(f"a class of size must be at most {SIZES[1]}; got {np.flatnonzero(counts)[-1] + SIZES[0]}")
         if not counts.any():
             raise CodecError("a layer must hold Gaussians; got none")
+        codes, ids = self._placeholders(int(counts.sum())) if coder.is_reader else group
         cells, start = [], 0
         for size in np.flatnonzero(counts)[::-1].tolist():
             end = start + int(counts[size])
-            cell = None if values.cell is None else values.cell[start:end]
-            cells.append(self._occupancy.code(coder, size + SIZES[0], end - start, cell))
+            cells.append(self._occupancy.code(coder, size + SIZES[0], codes.cell[start:end]))
             start = end
         size = np.repeat(np.arange(_NUM_CLASSES)[::-1], counts[::-1]) + SIZES[0]
         classes = Classes(np.full(start, energy), size)
-        gaussians = self._code_parameters(coder, classes, np.concatenate(cells), values)
-        return gaussians, self._code_regions(coder, gaussians.means, values.ids)
+        gaussians = self._code_parameters(coder, classes, np.concatenate(cells), codes)
+        return gaussians, self._code_regions(coder, gaussians.means, ids)
 
-    def _code_counts(self, coder: Coder, sizes: Integers | None) -> Integers:
+    def _code_counts(self, coder: Coder, sizes: Integers) -> Integers:
         """Code the number of Gaussians of each class of size."""
-        counts = None if sizes is None else np.bincount(sizes - SIZES[0], minlength=_NUM_CLASSES)
-        present = None if counts is None else np.flatnonzero(counts)
-        first = int(coder.uniform(np.array([_NUM_CLASSES]), None if present is None else present[:1])[0])
-        span = None if present is None else present[-1:] - first
-        last = first + int(coder.uniform(np.array([_NUM_CLASSES - first]), span)[0])
+        counts = np.bincount(sizes - SIZES[0], minlength=_NUM_CLASSES)
+        present = np.flatnonzero(counts)
+        first = int(coder.uniform(np.array([_NUM_CLASSES]), present[:1])[0])
+        last = first + int(coder.uniform(np.array([_NUM_CLASSES - first]), present[-1:] - first)[0])
         coded = np.zeros(_NUM_CLASSES, np.int64)
         for size in range(first, last + 1):
-            coded[size] = self._count.code(coder, None if counts is None else int(counts[size]))
+            coded[size] = self._count.code(coder, int(counts[size]))
         return coded
 
-    def _code_parameters(self, coder: Coder, classes: Classes, cell: Integers, values: GroupValues) -> Parameters:
+    def _code_parameters(self, coder: Coder, classes: Classes, cell: Integers, codes: Codes) -> Parameters:
         """Code all numbers but the cells."""
         steps = self.quantizer.steps(classes)
-        scale = coder.uniform(steps.num_scales, values.scale)
-        ratio = self._code_ratios(coder, classes, float(steps.ratio[0]), values.ratio)
+        scale = coder.uniform(steps.num_scales, codes.scale)
+        ratio = self._code_ratios(coder, classes, float(steps.ratio[0]), codes.ratio)
         num_angles = steps.num_angles(ratio)
-        angle = self._angle.code(coder, num_angles, values.angle)
+        angle = self._angle.code(coder, num_angles, codes.angle)
         # the amplitude at this energy, in steps of colour, where the scale is in the middle of its class
         amplitude = math.ldexp(math.sqrt(math.pi / (12.0 * self.quantizer.distortion)), int(classes.energy[0]))
         amplitudes = amplitude * exp2(OCTAVES * (0.5 - (np.arange(_LEVELS) + 0.5) / _LEVELS))
         level = (_LEVELS * scale + _LEVELS // 2) // steps.num_scales
-        colors = self._code_colors(coder, amplitudes, level, values.colors)
+        colors = self._code_colors(coder, amplitudes, level, codes.colors)
         shape = steps.shape(scale, ratio, angle / num_angles)
-        places = []
-        for axis, num_places in enumerate(steps.num_places(shape).T):
-            places.append(coder.uniform(num_places, None if values.place is None else values.place[:, axis]))
+        axes = zip(steps.num_places(shape).T, codes.place.T, strict=True)
+        places = [coder.uniform(num_places, place) for num_places, place in axes]
         return steps.dequantize(Codes(*classes, scale, ratio, angle, colors, cell, np.stack(places, -1)), shape)
 
-    def _code_ratios(self, coder: Coder, classes: Classes, step: float, ratios: Integers | None) -> Integers:
+    def _code_ratios(self, coder: Coder, classes: Classes, step: float, ratios: Integers) -> Integers:
         """Code the ratios of scales; `step` is that of the group."""
         context = np.clip(classes.size - _FIRST_RATIO_SIZE, 0, len(SHAPES.ratio) - 1)
         level = np.zeros_like(context)
@@ -158,7 +142,7 @@ class LayerCoder:
             raise CodecError(f"a ratio must be at most {max_ratio} steps; got {ratio.max()}")
         return ratio
 
-    def _code_colors(self, coder: Coder, amplitudes: Floats, level: Integers, colors: Integers | None) -> Integers:
+    def _code_colors(self, coder: Coder, amplitudes: Floats, level: Integers, colors: Integers) -> Integers:
         """Code colours channel by channel; `level` [N] is the index of each Gaussian's amplitude."""
         channels: list[Integers] = []
         for channel in range(self.channels):
@@ -166,29 +150,28 @@ class LayerCoder:
             if channel:
                 last, amplitude = np.abs(channels[-1]), amplitudes[level]
                 context = (last > _MEDIUM * amplitude).astype(np.int64) + (last > _STRONG * amplitude)
-            values = None if colors is None else colors[:, channel]
-            model = self._colors[min(channel, len(self._colors) - 1)]
-            magnitude = model.code(coder, amplitudes, level, context, None if values is None else np.abs(values))
-            sign = coder.uniform(1 + (magnitude > 0), None if values is None else (values < 0).astype(np.int64))
+            model, values = self._colors[min(channel, len(self._colors) - 1)], colors[:, channel]
+            magnitude = model.code(coder, amplitudes, level, context, np.abs(values))
+            sign = coder.uniform(1 + (magnitude > 0), (values < 0).astype(np.int64))
             channels.append(np.where(sign == 1, -magnitude, magnitude))
         return np.stack(channels, -1)
 
-    def _code_regions(self, coder: Coder, means: NDArray[Any], ids: Integers | None) -> Integers:
+    def _code_regions(self, coder: Coder, means: NDArray[Any], ids: Integers) -> Integers:
         """Code the region of each Gaussian, as the position of its id: that under its centre, or another."""
         if self.regions is None:
             return np.zeros(len(means), np.int64)
         labels = lookup_regions(torch.from_numpy(means), self.regions.labels)
         coded = self.regions.index_of(labels).numpy().astype(np.int64)
-        strays = self._strays.code(coder, len(coded), None if ids is None else (ids != coded).astype(np.int64))
+        strays = self._strays.code(coder, (ids != coded).astype(np.int64))
         index = np.flatnonzero(strays)
         # a distance from the region under the centre, modulo the number of regions
-        distance = None if ids is None else (ids[index] - coded[index] - 1) % self.num_regions
+        distance = (ids[index] - coded[index] - 1) % self.num_regions
         distance = coder.uniform(np.full(len(index), self.num_regions - 1), distance)
         coded[index] = (coded[index] + 1 + distance) % self.num_regions
         return coded
 
 
-def _next_symbol(remaining: list[Group] | None, energy: int) -> int:
+def _next_symbol(remaining: list[Group], energy: int) -> int:
     """Return what an encoder writes after a group, before this energy; a decoder ignores it."""
     if not remaining:
         return _END

@@ -108,16 +108,17 @@ class OccupancyCoder:
         self._total_outside = 0  # cells of margins so far
         self._total = 0  # Gaussians so far
 
-    def code(self, coder: Coder, size: int, count: int, cell: Integers | None) -> Integers:
-        """Code the cells (N, 2) of `count` Gaussians of a class of size, sorted row by row; None: to read."""
+    def code(self, coder: Coder, size: int, cell: Integers) -> Integers:
+        """Code the cells (N, 2) of the Gaussians of a class of size, sorted row by row."""
+        count = len(cell)
         if len(self._classes) == _MAX_CLASSES:
             raise CodecError(f"groups must have at most {_MAX_CLASSES} classes of size; got more")
         grid = Grid.for_count(self._size, count)
         grid = grid._replace(margin=self._code_margin(coder, grid, cell))
-        inside, outside = (None, None) if cell is None else grid.split(cell)
+        inside, outside = grid.split(cell)
         num_outside = 0
         if grid.margin:
-            num_outside = self._num_outside.code(coder, None if outside is None else len(outside))
+            num_outside = self._num_outside.code(coder, len(outside))
             if num_outside > count:
                 raise CodecError(f"at most {count} Gaussians may lie outside; got {num_outside}")
         inside = self._code_inside(coder, grid, size, count - num_outside, inside)
@@ -126,17 +127,14 @@ class OccupancyCoder:
         self._classes.append((size, (2 * cell + 1) * grid.side))
         return cell
 
-    def _code_margin(self, coder: Coder, grid: Grid, cell: Integers | None) -> int:
-        margin = None
-        if cell is not None:
-            distances = [0, -cell.min(), (cell[:, 0] - grid.columns + 1).max(), (cell[:, 1] - grid.rows + 1).max()]
-            margin = int(max(distances))
-        margin = self._margin.code(coder, margin)
+    def _code_margin(self, coder: Coder, grid: Grid, cell: Integers) -> int:
+        distance = max(0, -cell.min(), (cell - [grid.columns, grid.rows]).max() + 1)
+        margin = self._margin.code(coder, int(distance))
         if margin > grid.max_margin:
             raise CodecError(f"a margin must be at most {grid.max_margin} cells; got {margin}")
         return margin
 
-    def _code_inside(self, coder: Coder, grid: Grid, size: int, count: int, index: Integers | None) -> Integers:
+    def _code_inside(self, coder: Coder, grid: Grid, size: int, count: int, index: Integers) -> Integers:
         """Code the cells inside: a cell is the likelier, the denser earlier Gaussians of about this size are."""
         shape, num_cells = (grid.rows, grid.columns), grid.rows * grid.columns
         cells = [middle // (2 * grid.side) for other, middle in self._classes if size <= other <= size + _DENSITY_SIZES]
@@ -153,7 +151,7 @@ class OccupancyCoder:
         total = base * num_cells + _WEIGHT_PARTS * _KERNEL_SUM * len(row)
         return _code_cells(coder, borders, weigh, total, count, index)
 
-    def _code_outside(self, coder: Coder, grid: Grid, count: int, num_outside: int, index: Integers | None) -> Integers:
+    def _code_outside(self, coder: Coder, grid: Grid, count: int, num_outside: int, index: Integers) -> Integers:
         """Code the cells outside, all equally likely."""
         num_cells = grid.num_outside
         self._total += count
@@ -195,7 +193,7 @@ def _code_cells(
     weigh: Callable[[int, int], Floats],
     total: float,
     count: int,
-    index: Integers | None,
+    index: Integers,
 ) -> Integers:
     """Code the cells of `count` Gaussians, in order, band by band; the weights of all cells add up to `total`."""
     remaining, parts = count, [np.zeros(0, np.int64)]
@@ -210,7 +208,7 @@ def _code_cells(
             rate = remaining * weight
             chances = np.clip(np.floor(ONE * rate / (rate + total)), _MIN_CHANCE, ONE - _MIN_CHANCE) / ONE
             total -= float(weight.sum())
-            part = None if index is None else index[slice(*np.searchsorted(index, [start, end]))] - start
+            part = index[slice(*np.searchsorted(index, [start, end]))] - start
             parts.append(start + _code_band(coder, chances, remaining, part))
             remaining -= len(parts[-1])
     if remaining:
@@ -218,13 +216,13 @@ def _code_cells(
     return np.concatenate(parts)
 
 
-def _code_band(coder: Coder, chances: Floats, max_count: int, index: Integers | None) -> Integers:
+def _code_band(coder: Coder, chances: Floats, max_count: int, index: Integers) -> Integers:
     """Code the cells of at most `max_count` Gaussians: a bit of its chance for each further one in a cell."""
     cells = np.arange(len(chances) if max_count else 0)
-    counts = None if index is None else np.bincount(index, minlength=len(chances))
+    counts = np.bincount(index, minlength=len(chances))
     rounds, total = [cells[:0]], 0
     while len(cells):
-        bits = None if counts is None else (counts[cells] > len(rounds) - 1).astype(np.int32)
+        bits = (counts[cells] > len(rounds) - 1).astype(np.int32)
         cells = cells[np.asarray(coder.bits(chances[cells], bits)) > 0]
         rounds.append(cells)
         total += len(cells)

@@ -29,7 +29,7 @@ def code_ids_of_file(coder: Coder, ids: list[int], max_count: int) -> list[int]:
     rising = list(range(count))
 
     def code_distance(distance: int) -> int:
-        bits = int(length.code(coder, 1, np.array([distance.bit_length()]))[0])
+        bits = int(length.code(coder, np.array([distance.bit_length()]))[0])
         return 1 << (bits - 1) | coder.plain_bits(distance, bits - 1) if bits else 0
 
     if coder.fair_bit(sorted(ids) != list(range(len(ids)))):
