@@ -13,7 +13,7 @@ from kcgs.functional import RegionMap, region_splat
 from kcgs.functional.blur import blur, gaussian_taps
 from kcgs.scene import Scene
 
-from .contour_loops import CostTable, energy_change, list_small_pieces, measure_depth, piece_energy, sweep
+from .contour_loops import CostTable, energy_change, list_small_pieces, piece_energy, sweep
 
 Ints = NDArray[np.int64]
 Labels = NDArray[np.int32]
@@ -115,7 +115,10 @@ class MovingLabels:
 
     def fix_cores(self, rim: Mask, distance: int) -> None:
         """Fix the pixels that each region keeps, unless it has that many beyond the distance that contours move."""
-        depth, deep = measure_depth(self.map, rim, self._floor, distance + 1)
+        from scipy.ndimage import distance_transform_cdt
+
+        depth = distance_transform_cdt(~rim, "chessboard").clip(max=distance + 1)
+        deep = np.bincount(self.map[depth > distance], minlength=len(self._floor))
         y, x = np.nonzero((deep < self._floor)[self.map])
         region = self.map[y, x]
         order = np.lexsort((-depth[y, x], region))

@@ -1,4 +1,4 @@
-"""Compiled loops of contour refinement: sweeps of single pixels, the depth of regions, and small pieces."""
+"""Compiled loops of contour refinement: sweeps of single pixels, energies, and small pieces."""
 
 from __future__ import annotations
 
@@ -127,38 +127,6 @@ def energy_change(before, after, costs, pair_cost, eight):  # type: ignore[no-un
             # pairs of two pixels that changed come twice
             change += pair_cost * pairs * (1.0 if new == old else 0.5)
     return change
-
-
-@program.entry
-def measure_depth(regions, rim, enough, most):  # type: ignore[no-untyped-def]
-    """Return the distance of pixels to the rim, at most `most` (rows or columns, whichever is more).
-
-    Regions with `enough` pixels of distance `most` are not measured further; also returns how many were found in each.
-    """
-    height, width = regions.shape
-    depth, count = np.zeros(regions.shape, np.int64), np.zeros(len(enough), np.int64)
-    for y in range(height):
-        for x in range(width):
-            region = regions[y, x]
-            if count[region] >= enough[region]:
-                continue
-            distance = 0
-            while distance < most and not _touches(rim, y, x, distance):
-                distance += 1
-            depth[y, x] = distance
-            count[region] += distance == most
-    return depth, count
-
-
-@inner
-def _touches(mask, y, x, distance):  # type: ignore[no-untyped-def]
-    """True where the square ring of this distance around a pixel meets the mask."""
-    for row in range(max(y - distance, 0), min(y + distance + 1, mask.shape[0])):
-        step = 1 if abs(row - y) == distance else 2 * distance
-        for col in range(x - distance, x + distance + 1, max(step, 1)):
-            if 0 <= col < mask.shape[1] and mask[row, col]:
-                return True
-    return False
 
 
 @program.entry
