@@ -41,7 +41,8 @@ class Passes:
         # the weight of a pixel is for windows at all pixels
         weights = np.array(factors) * areas[:, 0] / areas[:, 2]
         render, planes = np.zeros_like(image), np.empty(self._channels * areas[:, 0].sum(), np.float32)
-        self._scales = Scales(table, weights, least, taps, image, inside, mean, variance, render, planes)
+        settings = table, self._channels, weights, least, taps
+        self._scales = Scales(*settings, image, inside, mean, variance, render, planes)
         bands = self._bands(0)
         rows = np.concatenate([self._bands(scale) for scale in range(len(sizes))])
         steps = [(HALVE, bands), (SCORE, rows), (SUM, bands)]

@@ -43,6 +43,7 @@ class Scales(NamedTuple):
     """
 
     table: Any  # [S, 5] int64
+    channels: int  # C
     factors: Any  # [S] float64: weight of a window by the gradient's norm
     least: float  # least mean score of a scale
     taps: Any  # [6] of the window, its centre first
@@ -109,24 +110,27 @@ def _along(row, taps, even, odd):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _plane(flat, table, scale, index, count):  # type: ignore[no-untyped-def]
-    """Return one of `count` planes of a scale."""
+def _plane(scales, scale, channel):  # type: ignore[no-untyped-def]
+    """Return a plane of averages of the difference, or of the gradient."""
+    table = scales.table
     height, width = table[scale, HEIGHT], table[scale, WIDTH]
-    start = count * table[scale, START] + index * height * width
-    return flat[start : start + height * width].reshape(height, width)
+    start = scales.channels * table[scale, START] + channel * height * width
+    return scales.planes[start : start + height * width].reshape(height, width)
 
 
 @inner
-def _padded(flat, table, scale, index, count):  # type: ignore[no-untyped-def]
-    """Return one of `count` padded planes of a scale."""
+def _padded(flat, scales, scale, channel):  # type: ignore[no-untyped-def]
+    """Return a padded plane."""
+    table = scales.table
     height, width = table[scale, HEIGHT] + PADDING, (table[scale, WIDTH] + 1) // 2 * 2 + 9
-    start = count * table[scale, PADDED_START] + index * height * width
+    start = scales.channels * table[scale, PADDED_START] + channel * height * width
     return flat[start : start + height * width].reshape(height, width)
 
 
 @inner
-def _windows(flat, table, scale, index, count):  # type: ignore[no-untyped-def]
+def _windows(flat, scales, scale, index, count):  # type: ignore[no-untyped-def]
     """Return a number of the windows of a scale, one of `count`."""
+    table = scales.table
     height, width = (table[scale, HEIGHT] + 1) // 2, (table[scale, WIDTH] + 1) // 2
     start = count * table[scale, WINDOW_START] + index * height * width
     return flat[start : start + height * width].reshape(height, width)
@@ -135,12 +139,12 @@ def _windows(flat, table, scale, index, count):  # type: ignore[no-untyped-def]
 @inner
 def _halve(scales, difference, channel, first, last):  # type: ignore[no-untyped-def]
     """Fill rows of all scales, those of the finest from first to last: averages of blocks, and the render."""
-    table, channels, quarter = scales.table, len(difference), np.float32(0.25)
+    table, quarter = scales.table, np.float32(0.25)
     for scale in range(len(table)):
-        target = _plane(scales.planes, table, scale, channel, channels)
-        image = _padded(scales.image, table, scale, channel, channels)
-        render = _padded(scales.render, table, scale, channel, channels)
-        source = difference[channel] if scale == 0 else _plane(scales.planes, table, scale - 1, channel, channels)
+        target = _plane(scales, scale, channel)
+        image = _padded(scales.image, scales, scale, channel)
+        render = _padded(scales.render, scales, scale, channel)
+        source = difference[channel] if scale == 0 else _plane(scales, scale - 1, channel)
         for y in range(first >> scale, last >> scale):
             upper, lower, row = source[2 * y], source[2 * y + 1], target[y]
             for x in range(len(row)):
@@ -190,14 +194,14 @@ def _brighten(means, inside, mean, scores, slopes):  # type: ignore[no-untyped-d
 
 
 @inner
-def _score(scales, scale, channel, first, last, channels, has_gradient):  # type: ignore[no-untyped-def]
+def _score(scales, scale, channel, first, last, has_gradient):  # type: ignore[no-untyped-def]
     """Fill rows of the gradient by the pixels of a scale, the first even; return the sum of the scores of windows."""
-    table, taps = scales.table, _taps(scales)
-    render = _padded(scales.render, table, scale, channel, channels)
-    image = _padded(scales.image, table, scale, channel, channels)
-    inside = _windows(scales.inside, table, scale, 0, 1)
-    mean = _windows(scales.mean, table, scale, channel, channels)
-    variance = _windows(scales.variance, table, scale, channel, channels)
+    taps = _taps(scales)
+    render = _padded(scales.render, scales, scale, channel)
+    image = _padded(scales.image, scales, scale, channel)
+    inside = _windows(scales.inside, scales, scale, 0, 1)
+    mean = _windows(scales.mean, scales, scale, channel, scales.channels)
+    variance = _windows(scales.variance, scales, scale, channel, scales.channels)
     height, width = inside.shape
     columns = np.empty((3, 2, render.shape[1]), np.float32)
     rows = np.empty((3, width), np.float32)
@@ -217,13 +221,13 @@ def _score(scales, scale, channel, first, last, channels, has_gradient):  # type
             k = y - first_window + 2
             by = slopes[0, k, 3:-3], slopes[1, k, 3:-3], slopes[2, k, 3:-3]
             _differentiate(rows, inside[y], mean[y], variance[y], scores, by)
-            if scale == len(table) - 1:
+            if scale == len(scales.table) - 1:
                 _brighten(rows[0], inside[y], mean[y], scores, by)
             if first_window <= y < last_window:
                 for x in range(width):
                     totals[x] += scores[x]
     if has_gradient:
-        _spread(scales, scale, channel, first, last, channels, slopes)
+        _spread(scales, scale, channel, first, last, slopes)
     total = 0.0
     for x in range(width):
         total += totals[x]
@@ -231,12 +235,12 @@ def _score(scales, scale, channel, first, last, channels, has_gradient):  # type
 
 
 @inner
-def _spread(scales, scale, channel, first, last, channels, slopes):  # type: ignore[no-untyped-def]
+def _spread(scales, scale, channel, first, last, slopes):  # type: ignore[no-untyped-def]
     """Fill rows of the gradient by the pixels of a scale, from the slopes of the scores of windows."""
-    table, taps = scales.table, _taps(scales)
-    render = _padded(scales.render, table, scale, channel, channels)
-    image = _padded(scales.image, table, scale, channel, channels)
-    target = _plane(scales.planes, table, scale, channel, channels)
+    taps = _taps(scales)
+    render = _padded(scales.render, scales, scale, channel)
+    image = _padded(scales.image, scales, scale, channel)
+    target = _plane(scales, scale, channel)
     width = slopes.shape[2] - 6
     columns = np.empty((3, 2, width + 6), np.float32)
     even, odd = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
@@ -286,18 +290,18 @@ def _add(row, factor, coarse):  # type: ignore[no-untyped-def]
 @inner
 def _sum(scales, difference, squared, sums, tasks, k):  # type: ignore[no-untyped-def]
     """Fill rows of the gradient by the image's pixels: the coarser scales' are added to the finer ones'."""
-    table, channels, channel = scales.table, len(difference), tasks[k, CHANNEL]
+    table, channel = scales.table, tasks[k, CHANNEL]
     first, last = tasks[k, FIRST], tasks[k, LAST]
     nothing = np.empty(0, np.float32)
     for scale in range(len(table) - 1, -1, -1):
         factor = np.float32(scales.factors[scale] / _mean_score(scales, sums, tasks, scale, channel))
-        plane = _plane(scales.planes, table, scale, channel, channels)
+        plane = _plane(scales, scale, channel)
         has_coarse = scale + 1 < len(table)
-        coarse = _plane(scales.planes, table, scale + has_coarse, channel, channels)
+        coarse = _plane(scales, scale + has_coarse, channel)
         rows = table[scale + 1, HEIGHT] if has_coarse else 0
         for y in range(first >> scale, last >> scale):
             _add(plane[y], factor, coarse[y // 2] if y // 2 < rows else nothing)
-    plane = _plane(scales.planes, table, 0, channel, channels)
+    plane = _plane(scales, 0, channel)
     end = difference.shape[1] if last == len(plane) else 2 * last
     for y in range(2 * first, end):
         _add(difference[channel, y], np.float32(squared), plane[y // 2] if y // 2 < len(plane) else nothing)
@@ -312,7 +316,7 @@ def run_phases(scales, difference, squared, sums, has_gradient, tasks, counters)
         if phase == HALVE:
             _halve(scales, difference, channel, first, last)
         elif phase == SCORE:
-            sums[k] = _score(scales, scale, channel, first, last, len(difference), has_gradient)
+            sums[k] = _score(scales, scale, channel, first, last, has_gradient)
         else:
             _sum(scales, difference, squared, sums, tasks, k)
         k = next_task(tasks, counters)
