@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -22,30 +20,23 @@ def check_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
     """Refuse values that are not finite or out of range; on CUDA by assertions, without device synchronisation."""
     if means.numel() == 0:
         return
-    if means.device.type != "cpu":
-        _assert_values(means, cholesky, colors)
-        return
-    # the extremes of a tensor with NaN are NaN: one pass checks finiteness and range; comparisons with NaN must fail
-    low, high = (float(t) for t in torch.aminmax(means))
-    if not (low >= -MEAN_LIMIT and high <= MEAN_LIMIT):
-        raise _invalid("means", f"finite, within {MEAN_LIMIT:g} pixels", means, f"[{low:g}, {high:g}]")
-    smallest, largest = (float(t) for t in torch.aminmax(cholesky[..., ::2]))
-    low, high = (float(t) for t in torch.aminmax(cholesky[..., 1]))
-    least, most = SCALE_LIMITS
-    if not (smallest >= least * (1 - 1e-6) and max(largest, -low, high) <= most):
-        bounds = f"finite, l11 and l22 in [{least:g}, {most:g}] pixels and |l21| at most {most:g}"
-        extremes = f"l11 and l22 in [{smallest:g}, {largest:g}], l21 in [{low:g}, {high:g}]"
-        raise _invalid("cholesky", bounds, cholesky, extremes)
-    low, high = (float(t) for t in torch.aminmax(colors))
-    if not (low > -math.inf and high < math.inf):
-        raise _invalid("colors", "finite", colors, f"[{low:g}, {high:g}]")
+    (least, most), diagonal, l21 = SCALE_LIMITS, cholesky[..., ::2], cholesky[..., 1]
+    bounds = f"finite, l11 and l22 in [{least:g}, {most:g}] pixels and |l21| at most {most:g}"
+    # comparisons with NaN must fail
+    in_range = (diagonal >= least * (1 - 1e-6)) & (diagonal <= most)
+    _check("means", means, means.abs() <= MEAN_LIMIT, f"finite, within {MEAN_LIMIT:g} pixels")
+    _check("cholesky", diagonal, in_range, bounds, "l11 and l22 in ")
+    _check("cholesky", l21, l21.abs() <= most, bounds, "l21 in ")
+    _check("colors", colors, colors.isfinite(), "finite")
 
 
-def _invalid(name: str, expected: str, tensor: Tensor, extremes: str) -> InvalidArgument:
-    """Return the error of values that are not finite, or of their extremes."""
-    count = int((~tensor.isfinite()).sum())
-    received = f"{count} NaN or infinite values. {_NOT_FINITE}" if count else f"{extremes}. {_OUT_OF_RANGE}"
-    return InvalidArgument(name, expected, received)
+def _check(name: str, values: Tensor, valid: Tensor, expected: str, part: str = "") -> None:
+    if values.device.type != "cpu":
+        torch._assert_async(valid.all(), f"{name} must be {expected}")
+    elif not valid.all():
+        count, (low, high) = int((~values.isfinite()).sum()), torch.aminmax(values)
+        extremes = f"{part}[{float(low):g}, {float(high):g}]. {_OUT_OF_RANGE}"
+        raise InvalidArgument(name, expected, f"{count} NaN or infinite values. {_NOT_FINITE}" if count else extremes)
 
 
 def check_region_ids(region_ids: Tensor, index: Tensor, complete: bool) -> None:
@@ -64,15 +55,3 @@ def check_region_ids(region_ids: Tensor, index: Tensor, complete: bool) -> None:
             f"{len(foreign)} of {index.numel()} Gaussians paint nothing: regions does not hold their region ids, such "
             f"as {int(foreign[0])}; pass the map that they belong to, or call field.assign_regions(regions)"
         )
-
-
-def _assert_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
-    # comparisons with NaN must fail
-    diagonal = cholesky[..., ::2]
-    least, most = SCALE_LIMITS[0] * (1 - 1e-6), SCALE_LIMITS[1]
-    torch._assert_async((means.abs() <= MEAN_LIMIT).all(), f"means must be finite, within {MEAN_LIMIT:g} pixels")
-    torch._assert_async(
-        ((diagonal >= least) & (diagonal <= most)).all() & (cholesky[..., 1].abs() <= most).all(),
-        f"cholesky must have l11, l22 in [{SCALE_LIMITS[0]:g}, {most:g}] pixels and |l21| at most {most:g}",
-    )
-    torch._assert_async(torch.isfinite(colors).all(), "colors must be finite")
