@@ -138,12 +138,13 @@ class GaussianAdam(Optimizer):
             raise InvalidArgument("added", _layout(field), _layout(added), verb="have")
         min_sigma = self._group(field)["min_sigma"]
         means, cholesky = _bounded(added.means, added.cholesky, field.size, min_sigma)
-        for name, rows in (("means", means), ("cholesky", cholesky), ("colors", added.colors)):
-            self._replace(field, name, torch.cat([getattr(field, name), rows], -2))
-        if field.opacities is not None and added.opacities is not None:
-            self._replace(field, "opacities", torch.cat([field.opacities, added.opacities], -1))
+        parts = {"means": means, "cholesky": cholesky, "colors": added.colors, "opacities": added.opacities}
+        rows = means.ndim - 2
+        for name, part in parts.items():
+            if part is not None:
+                self._replace(field, name, torch.cat([getattr(field, name), part], rows))
         if field.region_ids is not None and added.region_ids is not None:
-            field.region_ids = torch.cat([field.region_ids, added.region_ids], -1)
+            field.region_ids = torch.cat([field.region_ids, added.region_ids], rows)
         for state in self._states(field):
             state.update({name: pad(average, (0, 0, 0, added.num_gaussians)) for name, average in state.items()})
 
@@ -161,14 +162,14 @@ class GaussianAdam(Optimizer):
         self._group(field)
         if mask.dtype != torch.bool or mask.shape != (field.num_gaussians,):
             raise InvalidArgument("mask", f"boolean, ({field.num_gaussians})", f"{mask.dtype}, {tuple(mask.shape)}")
-        for name in ("means", "cholesky", "colors"):
-            self._replace(field, name, getattr(field, name)[..., mask, :])
-        if field.opacities is not None:
-            self._replace(field, "opacities", field.opacities[..., mask])
+        rows, index = field.means.ndim - 2, mask.nonzero()[:, 0]
+        for name in ("means", "cholesky", "colors", "opacities"):
+            if (value := getattr(field, name)) is not None:
+                self._replace(field, name, value.index_select(rows, index))
         if field.region_ids is not None:
-            field.region_ids = field.region_ids[..., mask]
+            field.region_ids = field.region_ids.index_select(rows, index)
         for state in self._states(field):
-            state.update({name: average[..., mask, :] for name, average in state.items()})
+            state.update({name: average.index_select(rows, index) for name, average in state.items()})
 
     def _group(self, field: GaussianField) -> dict[str, Any]:
         """Return the group of a field's geometry; ValueError for a field that the optimizer was not made for."""
