@@ -48,25 +48,12 @@ def evaluate(scene: Scene, image: Any, labels: Any = None, *, visual: bool = Tru
     if tuple(target.shape) != tuple(render.shape):
         raise InvalidArgument("image", f"the scene's shape {tuple(render.shape)}", tuple(target.shape), verb="have")
     regions = scene.regions if labels is None else as_region_map(labels, "labels")
-    metrics = _compare(render, target.to(render.device), None if regions is None else regions.labels)
+    target = target.to(render.device)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # NaN says that a metric is not defined
+        metrics = {metric.__name__: float(metric(render, target)) for metric in (psnr, ssim, ms_ssim)}
+        for metric in (ef_psnr, ef_ssim):
+            metrics[metric.__name__] = math.nan if regions is None else float(metric(render, target, regions.labels))
     return {**metrics, "ssimulacra2": ssimulacra2(render, target)} if visual else metrics
-
-
-def _compare(render: Tensor, image: Tensor, labels: Tensor | None) -> dict[str, float]:
-    with warnings.catch_warnings():
-        # NaN says that a metric is not defined
-        warnings.simplefilter("ignore", RuntimeWarning)
-        metrics = {
-            "psnr": float(psnr(render, image)),
-            "ssim": float(ssim(render, image)),
-            "ms_ssim": float(ms_ssim(render, image)),
-            "ef_psnr": math.nan,
-            "ef_ssim": math.nan,
-        }
-        if labels is not None:
-            metrics["ef_psnr"] = float(ef_psnr(render, image, labels))
-            metrics["ef_ssim"] = float(ef_ssim(render, image, labels))
-    return metrics
 
 
 def ssimulacra2(render: Tensor, image: Tensor) -> float:

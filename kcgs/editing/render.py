@@ -52,10 +52,11 @@ def render_region(
     total = torch.stack([*memberships.values()]).sum(0)
     alpha = total.clamp_max(1.0).to(field.colors.dtype)
     colors = field.colors.new_zeros(field.colors.shape[-1], *render_size)
+    gaussians = *scaled_gaussians(field, render_size), field.merged_colors()
     for region, membership in memberships.items():
         # rendered without the map, which gives the colour itself: nothing is divided by a small alpha
-        part = _subset(field, field.region_ids == region, None)
-        region_image = region_splat(*scaled_gaussians(part, render_size), part.merged_colors(), size=render_size)
+        rows = field.region_ids == region
+        region_image = region_splat(*(t[rows] for t in gaussians), size=render_size)
         share = (membership / torch.where(total > 0, total, 1.0)).to(region_image.dtype)
         colors = colors + torch.where(alpha > 0, region_image * share, 0.0)
     if render_size != target:
@@ -93,15 +94,10 @@ def render_over(scene: Scene, region_ids: int | Iterable[int], image: Tensor) ->
     if image.ndim != 3 or image.shape[0] != channels:
         raise ValueError(f"image must have shape ({channels}, H, W); got {tuple(image.shape)}")
     target = (image.shape[-2], image.shape[-1])
-    others = _subset(field, ~selection.members, field.region_ids)
+    rows = ~selection.members
+    tensors = field.means, field.cholesky, field.merged_colors(), field.region_ids
+    others = GaussianField(*(t[rows] for t in tensors if t is not None), size=field.size)
     rendered: Tensor = RegionSplatRenderer()(others, selection.regions, target)
     regions = selection.regions.resize(rendered_size(scene.size, target))
     membership = regions.membership(selection.ids.tolist()).clamp_max(1.0).to(rendered.dtype)
     return rendered + area_mean(membership, target) * image.to(rendered)
-
-
-def _subset(field: GaussianField, mask: Tensor, region_ids: Tensor | None) -> GaussianField:
-    """Return the Gaussians that a mask selects, in the graph, as `GaussianField.subset` does without it."""
-    ids, opacities = (None if t is None else t[mask] for t in (region_ids, field.opacities))
-    means, cholesky, colors = (t[mask] for t in (field.means, field.cholesky, field.colors))
-    return GaussianField(means, cholesky, colors, ids, opacities, size=field.size)
