@@ -23,11 +23,7 @@ from .weights import monomials, weigh
 # what the monomials 1, x, y, xx, xy, yy at (x + a, y + b) have besides those at (x, y): place of the factor among 1, a,
 # b, aa, ab, bb, the monomial there, the monomial here, and how often
 _SHIFT = (
-    (1, 1, 0, 1),
-    (2, 2, 0, 1),
-    (3, 3, 0, 1),
-    (4, 4, 0, 1),
-    (5, 5, 0, 1),
+    *((k, k, 0, 1) for k in range(1, 6)),
     (1, 3, 1, 2),
     (2, 4, 1, 1),
     (1, 4, 2, 1),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -109,7 +110,7 @@ class Graph:
 
     def __init__(self) -> None:
         self._scopes = [Scope(Tape(), [], {})]  # the graph, and the bodies that are being built in it
-        self._names = 0
+        self._numbers = count(1)
 
     def __getattr__(self, operator: str) -> Callable[..., Value]:
         """Return the operator of this name in ONNX, which has one result, as a method."""
@@ -138,7 +139,7 @@ class Graph:
         tape, _, constants = self._scopes[-1]
         key = (data.dtype.str, data.shape, data.tobytes())
         if key not in constants:
-            name = self._name("c")
+            name = f"c{next(self._numbers)}"
             tensor = ir.tensor(data, name=name)
             constants[key] = Value(self, tape.initializer(tensor, name=name), tensor.dtype)
         return constants[key]
@@ -154,7 +155,7 @@ class Graph:
             num_outputs=len(dtypes),
         )
         for value in results:
-            value.name = self._name("v")
+            value.name = f"v{next(self._numbers)}"
         node = results[0].producer()
         assert node is not None
         node.name = ""  # names of nodes are optional, and weigh as much as the nodes
@@ -217,7 +218,3 @@ class Graph:
             opset_imports=opsets,
             name=name,
         )
-
-    def _name(self, prefix: str) -> str:
-        self._names += 1
-        return f"{prefix}{self._names}"
