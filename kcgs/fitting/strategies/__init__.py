@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from kcgs.fitting.adapt_contours import AdaptContours
 from kcgs.fitting.config import FitConfig
 from kcgs.fitting.state import FitState
 
+from .contours import AdaptContours, SettleContours
 from .densify import Densify, DensifyAtLargestError
 from .end_drafts import EndDrafts
-from .settle_contours import SettleContours
 from .warmup import Warmup
 
 __all__ = [

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from kcgs.fitting.adapt_contours import AdaptContours
 from kcgs.fitting.descent import render, squared_error
 from kcgs.fitting.initial import initial_sigma
 from kcgs.fitting.objective import propose_gaussians
@@ -16,6 +15,8 @@ from kcgs.fitting.sampling import sample_pixels
 from kcgs.fitting.state import FitState
 from kcgs.functional import lookup_regions
 from kcgs.nn import GaussianField
+
+from .contours import AdaptContours
 
 
 @dataclass(frozen=True)

@@ -1,20 +1,24 @@
-"""Contours that follow the image while Gaussians are added: the strategy `Densify` applies this."""
+"""Contours that follow the image while Gaussians are added, and after that."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
 
-from kcgs.functional import RegionMap, choose_softness
+import torch
 
-from .contour_moves import move_contours
-from .descent import squared_error
-from .state import FitState
+from kcgs.fitting.contour_moves import move_contours
+from kcgs.fitting.descent import squared_error
+from kcgs.fitting.state import FitState
+from kcgs.functional import RegionMap, choose_softness
 
 
 @dataclass(frozen=True)
 class AdaptContours:
-    """Move the contours before some of the additions of Gaussians, which then adapt to the new contours."""
+    """Move the contours before some of the additions of Gaussians, which then adapt to the new contours.
+
+    The strategy `Densify` applies this.
+    """
 
     max_rise: float = 1.5
     """Factor by which a move may raise the squared error about it."""
@@ -27,7 +31,7 @@ class AdaptContours:
         """Move the contours, and at times choose their softness, if that is due before this addition."""
         if state.num_additions % self.additions_per_move:
             return
-        move_contours_of(state, self.max_rise)
+        _move_contours(state, self.max_rise)
         regions, problem = state.scene.regions, state.problem
         is_turn = state.num_additions % self.additions_per_softness == self.additions_per_move
         if regions is not None and problem.chooses_softness and is_turn:
@@ -35,9 +39,31 @@ class AdaptContours:
             state.scene.regions = RegionMap.from_labels(regions.labels, softness)
 
 
-def move_contours_of(state: FitState, max_rise: float) -> None:
+def _move_contours(state: FitState, max_rise: float) -> None:
     """Move the contours where that raises the squared error about them by no more than a factor."""
     problem, scene = state.problem, state.scene
     if scene.regions is not None and state.anchor is not None:
         error, anchor = partial(squared_error, state), state.anchor.labels
         scene.regions = move_contours(scene, problem.image, anchor, problem.config, error, max_rise)
+
+
+@dataclass(frozen=True)
+class SettleContours:
+    """Move the contours a few times after densification, where that lowers the error at once."""
+
+    after: float
+    """Share of the fit at the end of densification."""
+    num_moves: int = 4
+    """How often contours move, evenly over the rest of the fit."""
+
+    def due(self, state: FitState) -> bool:
+        """True at the time of the next move."""
+        move = state.num_late_moves + 1
+        share = self.after + (1 - self.after) * move / (self.num_moves + 1)
+        return move <= self.num_moves and state.progress >= share
+
+    @torch.no_grad()
+    def apply(self, state: FitState) -> None:
+        """Move the contours."""
+        state.num_late_moves += 1
+        _move_contours(state, max_rise=1.0)
