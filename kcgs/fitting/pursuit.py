@@ -156,7 +156,7 @@ def _best_of_squares(crops: _Crops, planes: Tensor, sigma: float, block: int, li
     """
     from kcgs.kernels.tasks import ranges, run_tasks  # loads numba
 
-    from .gains import find_best_places
+    from .pursuit_loops import find_best_places
 
     side = 2 if block == 1 or sigma / block >= _SIGMA_PER_BLOCK * math.sqrt(2) else 1
     count, channels, height, width = planes.shape
@@ -202,7 +202,7 @@ def _pursue(candidates: _Candidates, count: int, floor: float) -> _Candidates:
     where that is more: in a region of one pixel all scales are the same. A candidate that overlaps too much with a
     picked one is dropped, since there the approximation ends.
     """
-    from .greedy import choose  # loads numba
+    from .pursuit_loops import choose  # loads numba
 
     picked = np.zeros(min(count, len(candidates.gain)), np.int64)
     if not len(picked):
@@ -233,9 +233,9 @@ def _place(
         # Gaussians overlap: steps of the best length make the fall of the error certain
         hard = regions is None or regions.softness == 0
         # under a soft contour regions mix: one length for all
-        index = torch.from_numpy(labels if hard else np.zeros_like(labels)).to(residual.device, torch.int64)
+        index = torch.from_numpy(labels * hard).to(residual.device, torch.int64)
         length = _best_lengths(rendered, residual, index)
-        part = torch.from_numpy(candidates.region if hard else np.zeros_like(candidates.region)).to(index)
+        part = torch.from_numpy(candidates.region * hard).to(index)
         field = GaussianField(means, cholesky, colors * length[part, None], ids, size=size)
         return field, rendered * length[index]
 

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from kcgs import fit
-from kcgs.fitting.greedy import choose
+from kcgs.fitting.pursuit_loops import choose
 from kcgs.fitting.redundancy import NEIGHBORS, lowest_impact
 from kcgs.functional import psnr
 
