@@ -10,7 +10,6 @@ from kcgs.functional.splat import squared_error_gradients
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
-from .problem import Problem
 from .state import FitState
 
 # weight of 1 - SSIM beside the mean absolute error, as in Image-GS
@@ -41,11 +40,12 @@ def squared_error(state: FitState, regions: RegionMap | None = None) -> Tensor:
 def backward(state: FitState, rendered: Tensor | None) -> None:
     """Leave half the gradient of the loss at the field; no optimizer here depends on the factor.
 
-    Without a render, (C, H, W), the scene is rendered and differentiated in one pass, if the loss is local.
+    Without a render, (C, H, W), the scene is rendered and differentiated in one pass, if the loss is the squared error
+    of the render as it is.
     """
     problem, field = state.problem, state.scene.field
     config, image = problem.config, problem.image
-    if rendered is None and _has_local_loss(problem):
+    if rendered is None and config.loss == "l2" and problem.objective is None and not problem.clamp:
         field.means.grad, field.cholesky.grad, field.colors.grad = squared_error_gradients(
             image, field.means, field.cholesky, field.colors, field.region_ids, state.scene.regions,
             cutoff=state.cutoff, backend=config.backend,
@@ -63,11 +63,6 @@ def backward(state: FitState, rendered: Tensor | None) -> None:
         (slope,) = torch.autograd.grad(ssim(leaf, image), leaf)
         sign -= _SSIM_WEIGHT * leaf.numel() * slope
     rendered.backward(sign)
-
-
-def _has_local_loss(problem: Problem) -> bool:
-    """True where the loss is the squared error of the render as it is."""
-    return problem.config.loss == "l2" and problem.objective is None and not problem.clamp
 
 
 def is_finite(field: GaussianField) -> bool:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 
 from kcgs.pruning import prune
@@ -32,6 +30,5 @@ def finish(state: FitState, reason: StopReason, seconds: float) -> FitResult:
     scene, num_pruned, prune_error = state.best, 0, 0.0
     if config.prune > 0:
         scene, num_pruned, prune_error = prune(scene, config.prune, cutoff=config.cutoff, backend=config.backend)
-    dropped: Literal["recipe"] | None = None if config.guidance else "recipe"
-    report = report_regions(problem.regions, scene, dropped=dropped)
+    report = report_regions(problem.regions, scene, dropped=None if config.guidance else "recipe")
     return FitResult(scene, state.history, reason, config, num_pruned, prune_error, report, seconds)

@@ -42,18 +42,13 @@ def make_optimizer(config: FitConfig, field: GaussianField, sigma: float) -> Gau
 
 def set_learning_rates(optimizer: GaussianOptimizer, config: FitConfig, progress: float) -> None:
     """Set the learning rates for when this share of the fit is over."""
-    factor = _decay(config.optimizer, progress)
+    factor = 1.0
+    if config.optimizer == "adan":
+        factor = 0.5 ** int(progress / _HALF_LIFE)
+    elif config.optimizer == "gaussian-adam":
+        factor = cosine_decay(progress)
     for group in optimizer.param_groups:
         group["lr"] = group["initial_lr"] * factor
-
-
-def _decay(name: str, progress: float) -> float:
-    """Return the factor on the initial learning rates."""
-    if name == "adan":
-        return 0.5 ** int(progress / _HALF_LIFE)
-    if name == "adam":
-        return 1.0
-    return cosine_decay(progress)
 
 
 def cosine_decay(progress: float) -> float:
