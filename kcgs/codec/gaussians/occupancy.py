@@ -181,9 +181,8 @@ def _sum_density(column: Integers, row: Integers, shape: tuple[int, int], first:
     above = _REACH - (first - top) if top == 0 else 0
     below = _REACH - (bottom - last) if bottom == shape[0] else 0
     density = np.pad(density, [(above, below), (_REACH, _REACH)], "symmetric")
-    for _ in range(2):
-        density = density[4:] + density[3:-1] + density[2:-2] + density[1:-3] + density[:-4]
-        density = density[:, 4:] + density[:, 3:-1] + density[:, 2:-2] + density[:, 1:-3] + density[:, :-4]
+    for _ in range(4):  # along columns and rows, twice
+        density = (density[4:] + density[3:-1] + density[2:-2] + density[1:-3] + density[:-4]).T
     return density.astype(np.float64)
 
 

@@ -153,26 +153,24 @@ def _find_pixels(scan):  # type: ignore[no-untyped-def]
         while seed < width + LEFT and seeds[j, seed - LEFT] == 0:
             seed += 1
         line.seed = seed
-        pixel = scan.pixels[state.num_pixels]
-        if not _is_still_quiet(labels, lines, y, x):
-            pixel.x = x
-            pixel.y = y
-            pixel.is_coded = 1
-            find_features(labels, pixel)
-            state.num_pixels += 1
-            state.num_coded += 1
-        elif x == seed:
-            pixel.x = x
-            pixel.y = y
-            pixel.is_coded = 0
-            pixel.first = labels[y, x - 1]
-            pixel.second = -1
-            pixel.label = 1 - pixel.first  # the other one of two regions; of more, the escape overwrites it
-            state.num_pixels += 1
-        else:
+        quiet = _is_still_quiet(labels, lines, y, x)
+        if quiet and x != seed:
             _fill_margins(labels, y, x, labels[y, x - 1])
             if y >= TOP + 2 and lines[y - 2].change < x:
                 line.wake = front + seed - x
+            continue
+        pixel = scan.pixels[state.num_pixels]
+        pixel.x = x
+        pixel.y = y
+        pixel.is_coded = not quiet
+        state.num_pixels += 1
+        if quiet:
+            pixel.first = labels[y, x - 1]
+            pixel.second = -1
+            pixel.label = 1 - pixel.first  # the other one of two regions; of more, the escape overwrites it
+        else:
+            find_features(labels, pixel)
+            state.num_coded += 1
 
 
 @inner
