@@ -64,12 +64,14 @@ def encode_labels(labels: Tensor | NDArray[Any]) -> bytes:
 
 def _encode_smallest(ids: Integers, index: NDArray[Any]) -> tuple[int, bytes]:
     """Write the stream of a map, turned so that it takes few bytes; return the turn, too."""
-    from .labels.stream import FILE_PROFILE, count_seeds, encode_stream  # loads numba
+    from .labels.stream import encode_stream  # loads numba
+    from .labels.wavefront import survey
 
-    seeds = [count_seeds(turned(index, turn), len(ids)) for turn in range(_TURNS)]
+    # the fewer seeds, the smaller the stream, as a rule
+    seeds = [int(survey(turned(index, turn), len(ids))[1].sum()) for turn in range(_TURNS)]
     fewest = sorted(range(_TURNS), key=seeds.__getitem__)[:_TRIED_TURNS]
     turns = [turn for turn in fewest if seeds[turn] <= min(seeds) + _SEED_MARGIN]
-    streams = [(turn, encode_stream(ids, turned(index, turn), FILE_PROFILE)) for turn in turns]
+    streams = [(turn, encode_stream(ids, turned(index, turn), is_file=True)) for turn in turns]
     return min(streams, key=lambda pair: len(pair[1]))
 
 
@@ -121,10 +123,10 @@ def decode_labels(data: bytes) -> Tensor:
     if height * width > MAX_LABELS:
         raise CodecError(f"a map must have at most {MAX_LABELS} pixels; got {height} x {width}")
     stream, size = reader.data[reader.position :], (width, height) if turn & 4 else (height, width)
-    from .labels.stream import FILE_PROFILE, decode_stream  # loads numba
+    from .labels.stream import decode_stream  # loads numba
 
     max_regions = min(MAX_REGIONS, max(_FREE_REGIONS, _REGIONS_PER_BYTE * len(stream)))
-    ids, numbers = decode_stream(stream, size, max_regions, FILE_PROFILE)
+    ids, numbers = decode_stream(stream, size, max_regions, is_file=True)
     dtype = _TYPES[type_index]
     max_id = 1 if dtype == "bool" else np.iinfo(dtype).max
     if ids.max() > max_id:

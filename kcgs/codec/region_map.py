@@ -15,7 +15,7 @@ from kcgs.functional.softness import MAX_SOFTNESS
 from .adaptive import AdaptiveSymbol
 from .exact import Integers
 from .file import MAX_LABELS, MAX_REGIONS, ByteReader, varint
-from .labels.stream import SCENE_PROFILE, decode_stream, encode_stream
+from .labels.stream import decode_stream, encode_stream
 from .rangecoder import CodecError, Coder, Reader, Writer
 
 _UNITS = 40  # of softness, per pixel
@@ -30,7 +30,7 @@ def encode_region_map(regions: RegionMap) -> bytes:
     check_count("number of labels", regions.labels.numel(), 1, MAX_LABELS)
     check_count("number of regions", regions.num_regions, 1, MAX_REGIONS)
     ids, index = compact(regions.labels.cpu())[:2]
-    labels = encode_stream(ids.numpy(), index.numpy(), SCENE_PROFILE)
+    labels = encode_stream(ids.numpy(), index.numpy(), is_file=False)
     softness = regions.softness
     if isinstance(softness, PairSoftness):
         units = [_round(softness.get(pair, 0.0)) for pair in sorted(touching_pairs(regions.labels))]
@@ -53,7 +53,7 @@ def decode_region_map(data: bytes, size: tuple[int, int], num_regions: int) -> R
     """Read a map of `num_regions` regions for an image of `size`."""
     reader = ByteReader(data)
     stream = reader.take(reader.varint("length of the labels", 1, len(data)))
-    ids, numbers = decode_stream(stream, size, num_regions, SCENE_PROFILE)
+    ids, numbers = decode_stream(stream, size, num_regions, is_file=False)
     labels = torch.from_numpy(ids[numbers])
     count = reader.varint("numbers of softness", 1, min(_MAX_UNITS + 1, len(data)))
     palette = [reader.varint("softness", 0, _MAX_UNITS) / _UNITS for _ in range(count)]

@@ -261,11 +261,8 @@ def scaled_gaussians(field: GaussianField, size: tuple[int, int]) -> tuple[Tenso
     means, cholesky = field.means, field.cholesky
     if is_equal(size[0], field.size[0]) and is_equal(size[1], field.size[1]):
         return means, cholesky
-    if not torch.compiler.is_compiling():
-        factors = torch.tensor([size[1] / field.size[1], size[0] / field.size[0]], dtype=torch.float64)
-    else:  # a graph of any size takes its sides as tensors only
-        factors = torch.stack([torch.full((), size[k], dtype=torch.float64) / field.size[k] for k in (1, 0)])
-    factors = factors.to(means)
+    # a graph of any size takes its sides as tensors only
+    factors = torch.stack([torch.full((), size[k], dtype=torch.float64) / field.size[k] for k in (1, 0)]).to(means)
     return means * factors, cholesky * factors[[0, 1, 1]]
 
 

@@ -15,18 +15,22 @@ _MASK_IDS = [0, 255]  # of many masks
 _LENGTH_WEIGHTS = np.array([8.0, *[1.0] * 16, *[0.125] * 47])
 
 
-def code_ids_of_scene(coder: Coder, ids: list[int], max_count: int) -> list[int]:
-    """Code the ids in the order in which wavefronts meet their regions; a reader's list is empty."""
+def code_ids(coder: Coder, ids: list[int], max_count: int, *, is_file: bool) -> list[int]:
+    """Code the ids in the order in which wavefronts meet their regions; a reader's list is empty.
+
+    Those of a file of its own take fewer bytes: 0 to R - 1, 0 and 255, or any; then whether they rise in their order;
+    the order.
+    """
     count = _code_count(coder, len(ids), max_count)
+    if is_file:
+        return _code_ids_of_file(coder, ids, count)
     if not coder.fair_bit(ids != list(range(len(ids)))):
         return list(range(count))
     return _code_order(coder, ids, _code_rising(coder, sorted(ids), count, coder.unbounded_number))
 
 
-def code_ids_of_file(coder: Coder, ids: list[int], max_count: int) -> list[int]:
-    """Code the ids in fewer bytes: 0 to R - 1, 0 and 255, or any; then whether they rise in their order; the order."""
-    count, length = _code_count(coder, len(ids), max_count), AdaptiveSymbol(_LENGTH_WEIGHTS)
-    rising = list(range(count))
+def _code_ids_of_file(coder: Coder, ids: list[int], count: int) -> list[int]:
+    length, rising = AdaptiveSymbol(_LENGTH_WEIGHTS), list(range(count))
 
     def code_distance(distance: int) -> int:
         bits = int(length.code(coder, np.array([distance.bit_length()]))[0])
