@@ -19,7 +19,7 @@ from kcgs.codec.exact import Integers
 from kcgs.codec.file import ByteReader, Header, pack, unpack
 from kcgs.codec.gaussians.layers import Group, LayerCoder
 from kcgs.codec.gaussians.occupancy import Grid, OccupancyCoder
-from kcgs.codec.gaussians.quantize import Classes, Quantizer
+from kcgs.codec.gaussians.quantize import Classes, Codes, Quantizer
 from kcgs.codec.labels.ids import _code_count
 from kcgs.codec.rangecoder import Reader, Writer
 from kcgs.codec.scenes import SceneWriter
@@ -226,29 +226,22 @@ class TestDamagedMaps:
 
 
 class Forger(Writer):
-    """Invents the numbers that it is to read, and writes them, unless it is given some."""
+    """Writes any numbers as such that a file can hold."""
 
     is_reader = True
-    invents = True
 
     def __init__(self, generator: np.random.Generator) -> None:
         super().__init__()
         self._generator = generator
 
-    def _invent(self, sizes: Any) -> Any:
-        kind = self._generator.integers(4)
-        if kind < 2:
-            return np.zeros_like(sizes) if kind else sizes - 1
-        return self._generator.integers(0, sizes)
-
     def uniform(self, sizes: Any, values: Any) -> Any:
-        return super().uniform(sizes, self._invent(sizes) if self.invents else values)
+        return super().uniform(sizes, values % sizes)
 
     def number(self, value: int, size: int) -> int:
         return super().number(int(self._generator.integers(size) * self._generator.integers(2)), size)
 
     def mixed_categorical(self, tables: Any, rows: Any, values: Any) -> Any:
-        return super().mixed_categorical(tables, rows, self._invent(np.full(len(rows), tables.shape[1])))
+        return super().mixed_categorical(tables, rows, values % tables.shape[1])
 
 
 class ForgedOccupancy(OccupancyCoder):
@@ -260,29 +253,30 @@ class ForgedOccupancy(OccupancyCoder):
         margin = generator.choice([0, 1, grid.max_margin])
         corner, end = np.array([-margin, -margin]), np.array([grid.columns + margin, grid.rows + margin])
         cell = corner + (generator.random((count, 2)) ** generator.choice([1, 9]) * (end - corner)).astype(np.int64)
-        coder.invents = False
-        coded = super().code(coder, size, cell[np.lexsort(cell.T)])
-        coder.invents = True
-        return coded
+        return super().code(coder, size, cell[np.lexsort(cell.T)])
 
 
 class ForgedLayers(LayerCoder):
-    """Names any classes of size, but few Gaussians of each."""
+    """Names any classes of size, but few Gaussians of each, which have any numbers."""
+
+    generator: np.random.Generator
 
     def _code_counts(self, coder: Any, sizes: Any) -> Any:
         counts = np.zeros(64, np.int64)
         counts[coder._generator.choice([0, 1, 20, 35, 36], 2)] = coder._generator.integers(1, 80, 2)
-        coder.invents = False
-        coded = super()._code_counts(coder, np.repeat(np.arange(64), counts) - 8)
-        coder.invents = True
-        return coded
+        return super()._code_counts(coder, np.repeat(np.arange(64), counts) - 8)
+
+    def _placeholders(self, count: int) -> Group:
+        codes, ids = super()._placeholders(count)
+        most = self.generator.choice([1, 2, 1 << 20], len(codes))
+        return Codes(*(self.generator.integers(-1, n, c.shape) for n, c in zip(most, codes, strict=True))), ids
 
 
 def forge(header: Header, generator: np.random.Generator) -> bytes:
     """Write layers of random numbers, up to one that even their writer refuses."""
     quantizer = Quantizer(header.qp, header.size)
     model, layers, energies = ForgedLayers(quantizer, header.channels, None), [], []
-    model._occupancy = ForgedOccupancy(header.size)
+    model._occupancy, model.generator = ForgedOccupancy(header.size), generator
     for energy, _ in header.layers:
         forger = Forger(generator)
         try:
@@ -395,8 +389,7 @@ def test_an_energy_below_all(energy: int, symbols: list[int]) -> None:
 def test_too_many_gaussians() -> None:
     writer, quantizer = Writer(), Quantizer(0, (9, 9))
     model = LayerCoder(quantizer, 1, None)
-    codes, ids = make_group(quantizer, 0)
-    model._code_group(writer, 0, (codes, ids), 5)
+    model._code_group(writer, 0, make_group(quantizer, 0), 5)
     writer.number(1, 3)
     model._code_counts(writer, np.zeros(5000, np.int64))
     layer = writer.finish()
@@ -447,12 +440,12 @@ def test_too_many_cells_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(f"{OccupancyCoder.__module__}._MAX_TOTAL_OUTSIDE", 4 << 17)
     monkeypatch.setattr(f"{OccupancyCoder.__module__}._MAX_OUTSIDE_EACH", 0)
     for class_of_size in range(4):
-        decoder.code(reader, class_of_size, 0 * far)
+        decoder.code(reader, class_of_size, far)
     with pytest.raises(CodecError, match="at most 524288 cells outside; got 6"):
-        decoder.code(reader, 4, 0 * far)
+        decoder.code(reader, 4, far)
     monkeypatch.setattr(f"{OccupancyCoder.__module__}._MAX_CLASSES", 4)
     with pytest.raises(CodecError, match="at most 4 classes of size; got more"):
-        decoder.code(reader, 4, 0 * far)
+        decoder.code(reader, 4, far)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (5, 7), (1, 300), (64, 48)])

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, Scene, fit
 from kcgs.data import load_image, load_labels
-from kcgs.fitting.contour_energy import bounding_boxes, index_map, region_costs
+from kcgs.fitting.contour_energy import bounding_boxes, disc, index_map, region_costs
 from kcgs.fitting.contour_loops import piece_energy
 from kcgs.fitting.contour_moves import refine_contours
 from kcgs.functional import edge_band, psnr, region_splat
@@ -75,19 +75,14 @@ def contour_energy(scene: Scene, image: Tensor, length_weight: float = 0.003, bl
     index = index_map(regions, regions.labels)
     boxes = bounding_boxes(index, regions.num_regions, 0)
     with torch.no_grad():
-        costs = region_costs(scene, image, boxes, 0, blur, "auto")
-    alone = index.ravel(), costs, 0.0, np.zeros(0, np.int64), (np.zeros(0, np.int32), np.zeros(0, np.int64))
-    data = sum(piece_energy(*alone, np.flatnonzero(index == r), r) for r in range(regions.num_regions))
+        costs = region_costs(scene, image, boxes, 1, blur, "auto")
+    labels, none = np.pad(index, 1, constant_values=-1), np.zeros(0, np.int32)
+    # each of eight neighbours of the same label saves half a pair
+    settings = labels.ravel(), costs, length_weight / 8, disc(1.5, labels.shape[1])[1:], (none, none)
+    energies = [piece_energy(*settings, np.flatnonzero(labels == r), r) for r in range(regions.num_regions)]
     height, width = index.shape
-    pairs = sum(
-        int(
-            (
-                index[: height - dy, max(0, -dx) : width - max(0, dx)] != index[dy:, max(0, dx) : width + min(0, dx)]
-            ).sum()
-        )
-        for dy, dx in ((0, 1), (1, -1), (1, 0), (1, 1))
-    )
-    return float(data) + length_weight / 4 * pairs
+    pairs = 4 * height * width - 3 * (height + width) + 2
+    return float(sum(energies)) + length_weight / 4 * pairs
 
 
 def small_pieces(labels: Tensor, smallest: int) -> int:
