@@ -50,7 +50,7 @@ class Channels:
 class Sums:
     """Sums over rows and columns: w g_c of each channel, then the moments of v = w sum_c g_c colors_c.
 
-    `room` has a vector of lanes for each; three channels and the moments are summed in registers within a part.
+    `room` has a vector for each; within half a row three channels and the moments are summed in registers.
     """
 
     def __init__(self, channels: Channels, room: Any) -> None:
@@ -67,7 +67,7 @@ class Sums:
                 store(builder, zero, room, builder.add(first, long(k)))
 
     def begin(self) -> None:
-        """Begin a part of the rows."""
+        """Begin half of the columns."""
         for total in (*self.totals, *self.moments):
             self.builder.store(constant(0.0), total)
 
@@ -97,7 +97,7 @@ class Sums:
         self.builder.store(apply(self.builder, "fma", first, second, self.builder.load(total)), total)
 
     def end(self, z1: Any) -> None:
-        """End a part; z1, the same in every row, multiplies the sums, not the terms."""
+        """End half of the columns; z1, the same in every row, multiplies the sums, not the terms."""
         builder = self.builder
         value, along, square = (builder.load(total) for total in self.moments)
         first = builder.fmul(value, z1)

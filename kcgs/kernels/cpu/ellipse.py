@@ -23,7 +23,7 @@ from .layout import (
     SLOPE2_X,
     SLOPE2_Y,
 )
-from .simd import LANES, SIDE
+from .simd import HALF, SIDE
 
 # pixels by which bounds in float64 exceed the support, so that they hold for weights in float32
 _MARGIN = 1e-3
@@ -54,12 +54,12 @@ def tile_rows(g, height, width, radius):  # type: ignore[no-untyped-def]
 
 
 @inline
-def row_parts(g, row, height, width, radius):  # type: ignore[no-untyped-def]
-    """Return the parts of LANES columns, first and last + 1, that the ellipse may cross in a row of tiles."""
+def row_halves(g, row, height, width, radius):  # type: ignore[no-untyped-def]
+    """Return the halves of tiles, first and last + 1, that the ellipse may cross in a row of tiles."""
     spread = g[L11] * radius + _MARGIN
     first, last = max(g[MEAN_X] - spread - 0.5, 0.0), min(g[MEAN_X] + spread - 0.5, width - 1.0)
     if last - first < SIDE:  # block_rows finds out more for less
-        return (int(first) // LANES, int(last) // LANES + 1) if first <= last else (0, 0)
+        return (int(first) // HALF, int(last) // HALF + 1) if first <= last else (0, 0)
     # by the factor of (y, x), whose first standard deviation is that along y
     sigma = g[SIGMA_Y]
     top = max((row * SIDE + 0.5 - _MARGIN - g[MEAN_Y]) / sigma, -radius)
@@ -69,7 +69,7 @@ def row_parts(g, row, height, width, radius):  # type: ignore[no-untyped-def]
     left = g[MEAN_X] - _highest(along, across, radius * g[PEAK], -bottom, -top, radius) - _MARGIN
     first = math.ceil(max(left - 0.5, 0.0))
     last = math.floor(min(right - 0.5, width - 1.0))
-    return (first // LANES, last // LANES + 1) if first <= last else (0, 0)
+    return (first // HALF, last // HALF + 1) if first <= last else (0, 0)
 
 
 @inline

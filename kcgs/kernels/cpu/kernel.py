@@ -105,10 +105,8 @@ def _table(membership: Membership | None, size: tuple[int, int]) -> Table:
     coarsest = blocks.grids[-1]
     num_tiles = coarsest.first_tile + num_maps * coarsest.rows * coarsest.cols
     tile_start = np.searchsorted(keys, np.arange(num_tiles + 1) * num_regions)
-    first_rows = np.cumsum([0, *(grid.rows for grid in blocks.grids[:-1])])
-    grids = np.column_stack([np.array(blocks.grids), first_rows])
     regions, parents, parity = keys % num_regions, blocks.parents.numpy(), blocks.parity.numpy()
-    return Table(num_regions, num_maps, grids, regions, tile_start, parents, parity, mask_rows, masks)
+    return Table(num_regions, num_maps, np.array(blocks.grids), regions, tile_start, parents, parity, mask_rows, masks)
 
 
 def render(lists: Lists, inputs: SplatInputs) -> Tensor:

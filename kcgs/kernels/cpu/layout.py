@@ -40,7 +40,6 @@ NODE_COLS = 1
 TILE_ROWS = 2
 TILE_COLS = 3
 FIRST_TILE = 4  # number of its first tile, through all levels
-FIRST_ROW = 5  # number of its first row of tiles, through all levels
 
 # columns of Lists.visits
 GAUSSIAN = 0
@@ -48,8 +47,8 @@ TERMS = 1  # place of its sums
 FIRST = 2  # row of the block to visit
 LAST = 3  # the last one + 1
 RUN = 4  # rows from an exponential to the next
-FIRST_PART = 5  # of a row, vectors that the ellipse touches
-END_PART = 6  # the last one + 1
+FIRST_HALF = 5  # of the columns, that the ellipse touches
+END_HALF = 6  # the last one + 1
 VISIT_COLUMNS = 7
 AHEAD = 4  # visits before which a shape is asked for, since those of a block lie far apart
 SHAPE_COLUMNS = 7
@@ -60,7 +59,7 @@ class Table(NamedTuple):
 
     num_regions: int
     num_maps: int  # 1, or as many as images
-    grids: Any  # [levels, 6] int64
+    grids: Any  # [levels, 5] int64
     regions: Any  # [K] int64, region of each block, in the order of tiles
     tile_start: Any  # [tiles + 1] int64 into blocks, all levels
     parents: Any  # [K, 4] int64, blocks of the next level that each is refined from; K: none

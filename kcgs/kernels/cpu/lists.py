@@ -9,13 +9,13 @@ import numpy as np
 from ..compiled import inline, inner
 from ..tasks import first_task, next_task
 from ..whitened import MEAN_LIMIT, SCALE_LIMITS
-from .ellipse import block_rows, bounded, enter, row_parts, tile_rows
+from .ellipse import block_rows, bounded, enter, row_halves, tile_rows
 from .layout import (
     CHANGE,
     COLOR_FACTOR,
-    END_PART,
+    END_HALF,
     FIRST,
-    FIRST_PART,
+    FIRST_HALF,
     FIRST_TILE,
     GAUSSIAN,
     INVERSE_L11,
@@ -40,7 +40,7 @@ from .layout import (
     TILE_ROWS,
     program,
 )
-from .simd import PARTS, SIDE
+from .simd import HALVES, SIDE
 
 _LOG_4 = math.log(4.0)
 # |z| at which a weight is 2^-126, the least normal number, and a little less
@@ -119,8 +119,8 @@ def measure(batch, table, radius, spacing, order, gaussians, colors, spans, coun
                 height, width = grids[level, NODE_ROWS], grids[level, NODE_COLS]
                 first, end = tile_rows(g, height, width, radius)
                 for row in range(first, end):
-                    left, right = row_parts(g, row, height, width, radius)
-                    count += (right + PARTS - 1) // PARTS - left // PARTS
+                    left, right = row_halves(g, row, height, width, radius)
+                    count += (right + HALVES - 1) // HALVES - left // HALVES
             spans[i, 0], spans[i, 1], counts[i] = first, end, count
         k = next_task(tasks, counters)
 
@@ -133,7 +133,7 @@ def list_visits(batch, radius, spans, blocks, histogram, lists, tasks, counters)
         batch: Batch.
         radius: the largest |z| of a weight.
         spans: as `measure` returns them.
-        blocks: (V, 5) int32, room for the block, rows and parts of each visit, by Gaussian.
+        blocks: (V, 5) int32, room for the block, rows and halves of each visit, by Gaussian.
         histogram: (T, copies * K) int32, zeros.
         lists: Lists, of which first_terms has the sums of `counts`.
         tasks: ranges of Gaussians, then the sum over all, then the ranges once more; see `tasks.py`.
@@ -163,15 +163,15 @@ def _find_blocks(batch, radius, spans, blocks, histogram, lists, begin, end):  #
         height, width, cols = grids[level, NODE_ROWS], grids[level, NODE_COLS], grids[level, TILE_COLS]
         tile, head = first_tile(table, level, image, 0), first_head(table, image)
         for row in range(spans[i, 0], spans[i, 1]):
-            left, right = row_parts(g, row, height, width, radius)
-            for col in range(left // PARTS, (right + PARTS - 1) // PARTS):
+            left, right = row_halves(g, row, height, width, radius)
+            for col in range(left // HALVES, (right + HALVES - 1) // HALVES):
                 block = find_block(num_regions, tile_start, block_regions, tile + row * cols + col, region)
                 if block < 0:
                     continue
                 first, last = block_rows(g, row, col, height, width, radius)
                 if first < last:
                     blocks[place, 0], blocks[place, 1], blocks[place, 2] = head + block, first, last
-                    blocks[place, 3], blocks[place, 4] = max(left - col * PARTS, 0), min(right - col * PARTS, PARTS)
+                    blocks[place, 3], blocks[place, 4] = max(left - col * HALVES, 0), min(right - col * HALVES, HALVES)
                     enter(g, row, col, first, lists.shapes[place])
                     histogram[head + block] += 1
                     place += 1
@@ -209,7 +209,7 @@ def _place_visits(radius, blocks, places, lists, begin, end):  # type: ignore[no
             visit = lists.visits[places[blocks[k, 0]]]
             places[blocks[k, 0]] += 1
             visit[GAUSSIAN], visit[TERMS], visit[FIRST], visit[LAST] = i, k, blocks[k, 1], blocks[k, 2]
-            visit[RUN], visit[FIRST_PART], visit[END_PART] = run, blocks[k, 3], blocks[k, 4]
+            visit[RUN], visit[FIRST_HALF], visit[END_HALF] = run, blocks[k, 3], blocks[k, 4]
 
 
 @inline

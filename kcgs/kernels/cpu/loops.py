@@ -20,7 +20,7 @@ from .layout import TILE_COLS, program
 from .lists import first_head, first_node_block, first_tile
 from .rows import add_rows, gather_rows
 from .schedule import ADDS, FIRST_FIELD, GATHERS, IMAGE, KIND, LEVEL_FIELD, ROW
-from .simd import LANES, SIDE, exchange_rows
+from .simd import HALF, SIDE, exchange_rows
 from .spline import add_refined, add_sampled, gather_refined, gather_sampled
 
 
@@ -44,7 +44,7 @@ def visit(lists, backward, image, nodes, slopes, terms, tasks, counters):  # typ
     # a vector that begins at a multiple of its size lies in one line of the cache
     room = np.zeros(SIDE * SIDE * channels + SIDE, np.float32)
     pixels = room[-(room.ctypes.data // 4) % SIDE :]
-    sums = np.zeros(max(terms.shape[1], 8) * LANES, np.float32)
+    sums = np.zeros(max(terms.shape[1], 8) * HALF, np.float32)
     offsets, ones = np.empty(4, np.int64), np.ones(SIDE, np.float32)
     k = first_task(tasks, counters)
     while k >= 0:

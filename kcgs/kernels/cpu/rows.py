@@ -26,9 +26,9 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from .channels import Channels, Sums
-from .layout import AHEAD, END_PART, FIRST, FIRST_PART, GAUSSIAN, LAST, RUN, SHAPE_COLUMNS, TERMS, VISIT_COLUMNS
+from .layout import AHEAD, END_HALF, FIRST, FIRST_HALF, GAUSSIAN, LAST, RUN, SHAPE_COLUMNS, TERMS, VISIT_COLUMNS
 from .simd import (
-    LANES,
+    HALF,
     LONG,
     SIDE,
     VECTOR,
@@ -64,7 +64,7 @@ class _Rows:
             return builder.sext(builder.load(builder.gep(visits, [builder.add(place, long(column))])), LONG)
 
         self.first, self.last, self.run = field(FIRST), field(LAST), field(RUN)
-        self.first_part, self.end_part = field(FIRST_PART), field(END_PART)
+        self.first_half, self.end_half = field(FIRST_HALF), field(END_HALF)
         self.terms = field(TERMS)
         self.pixels, self.masks = pixels, masks
         self.colors = builder.gep(colors, [builder.mul(field(GAUSSIAN), self.channels)])
@@ -87,25 +87,25 @@ class _Rows:
         if_else(self.builder, self.is_rgb, emit_channels)
 
     @contextmanager
-    def each_part(self) -> Iterator[Any]:
-        """Emit a loop over the parts of the rows; yield the part."""
+    def each_half(self) -> Iterator[Any]:
+        """Emit a loop over the halves of the columns; yield the half."""
         builder = self.builder
-        with cgutils.for_range_slice(builder, self.first_part, self.end_part, long(1)) as (part, _):
+        with cgutils.for_range_slice(builder, self.first_half, self.end_half, long(1)) as (half, _):
             k = self.shape
             # no conversion from integers, which would wait for the register that it sets, of the loop before
-            columns = builder.select(builder.icmp_signed("==", part, long(0)), ramp(0), ramp(1))
+            columns = builder.select(builder.icmp_signed("==", half, long(0)), ramp(0), ramp(1))
             self.z1 = apply(builder, "fma", k[1], columns, k[0])
             self.negative = builder.fneg(builder.fmul(self.z1, self.z1))
             self.base = apply(builder, "fma", k[3], columns, k[2])
-            yield part
+            yield half
 
     @contextmanager
-    def each_row(self, part: Any, masked: bool) -> Iterator[tuple[Any, Any, Any]]:
-        """Emit a loop over the rows of a part; yield z2, weight, and pointer to the pixels."""
+    def each_row(self, half: Any, masked: bool) -> Iterator[tuple[Any, Any, Any]]:
+        """Emit a loop over the rows of half of the columns; yield z2, weight, and pointer to the pixels."""
         builder = self.builder
         y, weight, growth = (cgutils.alloca_once(builder, VECTOR) for _ in range(3))
         builder.store(self.first_y, y)
-        column = builder.mul(part, long(LANES))
+        column = builder.mul(half, long(HALF))
         with cgutils.for_range_slice(builder, self.first, self.last, self.run) as (start, _):
             self._begin(self._second(builder.load(y)), weight, growth)
             end = builder.add(start, self.run)
@@ -146,7 +146,7 @@ def add_rows(typing_context, pixels, origin, channels, visits, number, shapes, c
         rows = _Rows(context, builder, signature.args, arguments)
 
         def emit(channels: Channels, masked: bool) -> None:
-            with rows.each_part() as part, rows.each_row(part, masked) as (_, weight, pixels):
+            with rows.each_half() as half, rows.each_row(half, masked) as (_, weight, pixels):
                 channels.add(weight, pixels)
 
         rows.specialize(emit)
@@ -170,9 +170,9 @@ def gather_rows(  # type: ignore[no-untyped-def]
 
         def emit(channels: Channels, masked: bool) -> None:
             total = Sums(channels, room)
-            with rows.each_part() as part:
+            with rows.each_half() as half:
                 total.begin()
-                with rows.each_row(part, masked) as (second, weight, pixels):
+                with rows.each_row(half, masked) as (second, weight, pixels):
                     total.gather(weight, pixels, second)
                 total.end(rows.z1)
             total.finish(target)

@@ -16,15 +16,15 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 SIDE = 16  # of a tile
-LANES = 8  # elements of a vector
-PARTS = SIDE // LANES  # vectors of a row
+HALF = SIDE // 2  # elements of a vector
+HALVES = 2
 FLOAT = ir.FloatType()
 _INT = ir.IntType(32)
 _BYTE = ir.IntType(8).as_pointer()
 LONG = ir.IntType(64)
 _ZERO = ir.Constant(LONG, 0)
-VECTOR = ir.VectorType(FLOAT, LANES)
-_VECTOR_INT = ir.VectorType(_INT, LANES)
+VECTOR = ir.VectorType(FLOAT, HALF)
+_VECTOR_INT = ir.VectorType(_INT, HALF)
 UNDEFINED = ir.Constant(VECTOR, ir.Undefined)
 
 
@@ -45,13 +45,13 @@ def long(value: int) -> ir.Constant:
 
 def constant(value: float) -> ir.Constant:
     """Return a number in all elements of a vector."""
-    return ir.Constant(VECTOR, [ir.Constant(FLOAT, float(np.float32(value)))] * LANES)
+    return ir.Constant(VECTOR, [ir.Constant(FLOAT, float(np.float32(value)))] * HALF)
 
 
 def apply(builder: Any, name: str, *arguments: Any) -> Any:
     """Call the LLVM function of this name on vectors."""
     function = cgutils.get_or_insert_function(
-        builder.module, ir.FunctionType(VECTOR, [VECTOR] * len(arguments)), f"llvm.{name}.v{LANES}f32"
+        builder.module, ir.FunctionType(VECTOR, [VECTOR] * len(arguments)), f"llvm.{name}.v{HALF}f32"
     )
     return builder.call(function, arguments)
 
@@ -62,9 +62,9 @@ def broadcast(builder: Any, value: Any) -> Any:
     return builder.shuffle_vector(single, UNDEFINED, ir.Constant(_VECTOR_INT, None))
 
 
-def ramp(part: int) -> ir.Constant:
+def ramp(half: int) -> ir.Constant:
     """Return the columns of a vector of a row, counted from the middle of the row."""
-    columns = range(part * LANES, part * LANES + LANES)
+    columns = range(half * HALF, half * HALF + HALF)
     return ir.Constant(VECTOR, [ir.Constant(FLOAT, column - (SIDE - 1) / 2) for column in columns])
 
 
@@ -77,8 +77,8 @@ def exp2(builder: Any, exponent: Any, minus_one: bool = False) -> Any:
     for coefficient in reversed(EXP2[1:-1]):
         value = apply(builder, "fma", value, fraction, constant(coefficient))
     bits = builder.shl(
-        builder.add(builder.fptosi(whole, _VECTOR_INT), ir.Constant(_VECTOR_INT, [127] * LANES)),
-        ir.Constant(_VECTOR_INT, [23] * LANES),
+        builder.add(builder.fptosi(whole, _VECTOR_INT), ir.Constant(_VECTOR_INT, [127] * HALF)),
+        ir.Constant(_VECTOR_INT, [23] * HALF),
     )
     power = builder.bitcast(bits, VECTOR)
     if minus_one:  # the first term of the polynomial is 1
@@ -94,7 +94,7 @@ def pointer(context: Any, builder: Any, array_type: Any, array: Any, offset: Any
 
 def _row(builder: Any, pointer: Any, index: Any) -> Any:
     """Return the pointer to a vector `index` vectors further on."""
-    start = builder.gep(pointer, [builder.mul(index, long(LANES))])
+    start = builder.gep(pointer, [builder.mul(index, long(HALF))])
     return builder.bitcast(start, VECTOR.as_pointer())
 
 
@@ -167,8 +167,8 @@ def exchange_rows(  # type: ignore[no-untyped-def]
 
                 def emit_row(is_whole: bool) -> None:
                     if is_whole:
-                        for part in map(long, range(PARTS)):
-                            exchange(_row(builder, inside, part), _row(builder, outside, part), subtracts)
+                        for half in map(long, range(HALVES)):
+                            exchange(_row(builder, inside, half), _row(builder, outside, half), subtracts)
                         return
                     with cgutils.for_range(builder, columns) as loop:
                         places = [loop.index]
@@ -187,7 +187,7 @@ def sum_columns(builder: Any, rows: Sequence[Any]) -> Any:
     """Return the sums of eight vectors, as a vector, in a fixed order."""
     rows = [rows[k] for k in (0, 4, 2, 6, 1, 5, 3, 7)]
     # the halves of two rows are interleaved and added, until one row is left
-    width = LANES
+    width = HALF
     while len(rows) > 1:
         rows = [_fold(builder, rows[k], rows[k + 1], width) for k in range(0, len(rows), 2)]
         width //= 2
@@ -198,7 +198,7 @@ def _fold(builder: Any, first: Any, second: Any, width: int) -> Any:
     """Add the halves of every group of `width` elements of two vectors, the first's and the second's in turn."""
     half = width // 2
     places = [
-        [LANES * side + group + shift + k for group in range(0, LANES, width) for side in (0, 1) for k in range(half)]
+        [HALF * side + group + shift + k for group in range(0, HALF, width) for side in (0, 1) for k in range(half)]
         for shift in (0, half)
     ]
     return builder.fadd(*(shuffle(builder, first, second, place) for place in places))

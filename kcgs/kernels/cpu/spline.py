@@ -18,8 +18,8 @@ from numba.extending import intrinsic
 
 from .simd import (
     FLOAT,
-    LANES,
-    PARTS,
+    HALF,
+    HALVES,
     SIDE,
     UNDEFINED,
     VECTOR,
@@ -40,17 +40,15 @@ _REFINE_ODD = (0.125, 0.75, 0.125, 0.0)
 _SAMPLE_EVEN = (27 / 384, 235 / 384, 121 / 384, 1 / 384)
 _SAMPLE_ODD = (1 / 384, 121 / 384, 235 / 384, 27 / 384)
 
-# nodes of the coarser grid within a block, along an axis
-_HALF = SIDE // 2
-# nodes of the coarser grid that a block reads, along an axis
-_WINDOW = _HALF + 3
+# nodes of the coarser grid that a block reads, along an axis: HALF are beneath it
+_WINDOW = HALF + 3
 
 
 def _multiply_add(builder: Any, factors: ir.Constant, value: Any, total: Any) -> Any:
     return builder.fmul(factors, value) if total is None else apply(builder, "fma", factors, value, total)
 
 
-def _lanes(factors: Sequence[float]) -> ir.Constant:
+def _vector(factors: Sequence[float]) -> ir.Constant:
     return ir.Constant(VECTOR, [ir.Constant(FLOAT, float(np.float32(factor))) for factor in factors])
 
 
@@ -68,28 +66,28 @@ class _Blocks:
         self.masks = pointer(context, builder, argument_types[9], arguments[9], arguments[10])
         self.mask_stride = arguments[11]
 
-    def fine_row(self, channel: Any, row: int, part: int) -> Any:
-        """Return the pointer to a part of a row of the finer block."""
+    def fine_row(self, channel: Any, row: int, half: int) -> Any:
+        """Return the pointer to half a row of the finer block."""
         builder = self.builder
-        place = builder.add(builder.mul(channel, self.channel_stride), long(part * LANES))
+        place = builder.add(builder.mul(channel, self.channel_stride), long(half * HALF))
         return builder.gep(self.fine, [builder.add(place, builder.mul(self.row_stride, long(row)))])
 
-    def mask(self, row: int, part: int) -> Any:
-        """Return the weights of a part of a row."""
+    def mask(self, row: int, half: int) -> Any:
+        """Return the weights of half a row."""
         place = self.builder.mul(self.mask_stride, long(row))
-        return load(self.builder, self.builder.gep(self.masks, [self.builder.add(place, long(part * LANES))]))
+        return load(self.builder, self.builder.gep(self.masks, [self.builder.add(place, long(half * HALF))]))
 
     def window_row(self, channel: Any, row: int, right: bool) -> Callable[[int], Any]:
         """Return a function from a node of a row of the window to the pointer to it."""
         builder = self.builder
-        place = builder.add(long(row), builder.select(self.down, long(_HALF), long(0)))
+        place = builder.add(long(row), builder.select(self.down, long(HALF), long(0)))
         below = builder.icmp_signed(">=", place, long(SIDE))
         within = builder.select(below, builder.sub(place, long(SIDE)), place)
         offset = builder.mul(builder.add(builder.mul(within, self.channels), channel), long(SIDE))
         blocks = [builder.gep(builder.select(below, self.parents[k + 2], self.parents[k]), [offset]) for k in (0, 1)]
 
         def find_node(node: int) -> Any:
-            place = node + (_HALF if right else 0)
+            place = node + (HALF if right else 0)
             return builder.gep(blocks[place // SIDE], [long(place % SIDE)])
 
         return find_node
@@ -135,17 +133,17 @@ def _make_add(even: tuple[float, ...], odd: tuple[float, ...]) -> Any:
     def widen(builder: Any, window: Any) -> Any:
         total = None
         for k in neighbors:
-            spread = shuffle(builder, window, UNDEFINED, [j // 2 + k for j in range(LANES)])
-            total = _multiply_add(builder, _lanes([even[k], odd[k]] * (LANES // 2)), spread, total)
+            spread = shuffle(builder, window, UNDEFINED, [j // 2 + k for j in range(HALF)])
+            total = _multiply_add(builder, _vector([even[k], odd[k]] * (HALF // 2)), spread, total)
         return total
 
-    def emit_part(blocks: _Blocks, channel: Any, right: bool, part: int) -> None:
-        builder, rows, first = blocks.builder, [], part * LANES // 2
-        for n in range(_HALF + neighbors[-1]):
+    def emit_half(blocks: _Blocks, channel: Any, right: bool, half: int) -> None:
+        builder, rows, first = blocks.builder, [], half * HALF // 2
+        for n in range(HALF + neighbors[-1]):
             find_node = blocks.window_row(channel, n, right)
             if right and first > 0:  # the window's nodes are in two blocks
-                halves = load(builder, find_node(0)), load(builder, find_node(_HALF))
-                window = shuffle(builder, *halves, range(first, first + LANES))
+                halves = load(builder, find_node(0)), load(builder, find_node(HALF))
+                window = shuffle(builder, *halves, range(first, first + HALF))
             else:
                 window = load(builder, find_node(first))
             rows.append(widen(builder, window))
@@ -154,12 +152,12 @@ def _make_add(even: tuple[float, ...], odd: tuple[float, ...]) -> Any:
             for k in neighbors:
                 if factor := (even, odd)[row % 2][k]:
                     total = _multiply_add(builder, constant(factor), rows[row // 2 + k], total)
-            place, mask = blocks.fine_row(channel, row, part), blocks.mask(row, part)
+            place, mask = blocks.fine_row(channel, row, half), blocks.mask(row, half)
             store(builder, apply(builder, "fma", total, mask, load(builder, place)), place)
 
     def emit(blocks: _Blocks, channel: Any, right: bool) -> None:
-        for part in range(PARTS):
-            emit_part(blocks, channel, right, part)
+        for half in range(HALVES):
+            emit_half(blocks, channel, right, half)
 
     return _make_loop(emit)
 
@@ -168,15 +166,15 @@ def _make_gather(even: tuple[float, ...], odd: tuple[float, ...]) -> Any:
     """Make the transpose of `_make_add`: the gradient of mask * spline is added to the coarser grid."""
     neighbors = [k for k in range(4) if even[k] or odd[k]]
 
-    def sum_rows(blocks: _Blocks, channel: Any, part: int) -> list[Any]:
+    def sum_rows(blocks: _Blocks, channel: Any, half: int) -> list[Any]:
         rows: list[Any] = [None] * _WINDOW
         for row in range(SIDE):
-            value = load(blocks.builder, blocks.fine_row(channel, row, part))
-            value = blocks.builder.fmul(value, blocks.mask(row, part))
+            value = load(blocks.builder, blocks.fine_row(channel, row, half))
+            value = blocks.builder.fmul(value, blocks.mask(row, half))
             for k in neighbors:
                 if factor := (even, odd)[row % 2][k]:
                     rows[row // 2 + k] = _multiply_add(blocks.builder, constant(factor), value, rows[row // 2 + k])
-        return rows[: _HALF + neighbors[-1]]
+        return rows[: HALF + neighbors[-1]]
 
     def narrow(builder: Any, left: Any, right: Any) -> list[Any]:
         # values 2 i and 2 i + 1 of the finer grid go to nodes i + k: the terms of all i, then moved by k
@@ -187,19 +185,19 @@ def _make_gather(even: tuple[float, ...], odd: tuple[float, ...]) -> Any:
             for values, factor in zip(pair, (even[k], odd[k]), strict=True):
                 if factor:
                     term = _multiply_add(builder, constant(factor), values, term)
-            for part, places in enumerate((range(-k, LANES - k), range(LANES - k, SIDE - k))):
-                if any(0 <= place < LANES for place in places):
-                    moved = shuffle(builder, term, constant(0.0), [p if 0 <= p < LANES else LANES for p in places])
-                    nodes[part] = moved if nodes[part] is None else builder.fadd(nodes[part], moved)
+            for half, places in enumerate((range(-k, HALF - k), range(HALF - k, SIDE - k))):
+                if any(0 <= place < HALF for place in places):
+                    moved = shuffle(builder, term, constant(0.0), [p if 0 <= p < HALF else HALF for p in places])
+                    nodes[half] = moved if nodes[half] is None else builder.fadd(nodes[half], moved)
         return nodes
 
     def emit(blocks: _Blocks, channel: Any, right: bool) -> None:
         builder = blocks.builder
-        columns = [sum_rows(blocks, channel, part) for part in range(PARTS)]
-        for n, parts in enumerate(zip(*columns, strict=True)):
+        columns = [sum_rows(blocks, channel, half) for half in range(HALVES)]
+        for n, halves in enumerate(zip(*columns, strict=True)):
             find_node = blocks.window_row(channel, n, right)
-            for part, total in enumerate(narrow(builder, parts[0], parts[1])):
-                place = find_node(part * LANES)
+            for half, total in enumerate(narrow(builder, halves[0], halves[1])):
+                place = find_node(half * HALF)
                 store(builder, builder.fadd(load(builder, place), total), place)
 
     return _make_loop(emit)
