@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
 from functools import partial
 from pathlib import Path
@@ -42,11 +43,17 @@ def render(scene: Scene, backend: str, cutoff: float) -> Tensor:
     )
 
 
+@functools.cache
+def smooth_gradient(shape: torch.Size, dtype: torch.dtype) -> Tensor:
+    """Make a gradient of both signs, once, since that takes as long as a render."""
+    return torch.cos(torch.linspace(-40, 40, shape.numel(), dtype=dtype)).view(shape)
+
+
 def differentiate(scene: Scene, backend: str, cutoff: float) -> tuple[Tensor, list[Tensor]]:
     """Return the image, and the gradients of means, cholesky and colors under a smooth gradient of both signs."""
     scene.zero_grad(set_to_none=True)
     image = render(scene, backend, cutoff)
-    image.backward(torch.cos(torch.linspace(-40, 40, image.numel(), dtype=image.dtype)).view_as(image))
+    image.backward(smooth_gradient(image.shape, image.dtype))
     field = scene.field
     return image.detach(), [p.grad for p in (field.means, field.cholesky, field.colors) if p.grad is not None]
 
