@@ -92,7 +92,7 @@ class _Rows:
         builder = self.builder
         with cgutils.for_range_slice(builder, self.first_half, self.end_half, long(1)) as (half, _):
             k = self.shape
-            # no conversion from integers, which would wait for the register that it sets, of the loop before
+            # not converted from integers: a conversion waits for the register that the loop before used last
             columns = builder.select(builder.icmp_signed("==", half, long(0)), ramp(0), ramp(1))
             self.z1 = apply(builder, "fma", k[1], columns, k[0])
             self.negative = builder.fneg(builder.fmul(self.z1, self.z1))

@@ -40,7 +40,7 @@ _REFINE_ODD = (0.125, 0.75, 0.125, 0.0)
 _SAMPLE_EVEN = (27 / 384, 235 / 384, 121 / 384, 1 / 384)
 _SAMPLE_ODD = (1 / 384, 121 / 384, 235 / 384, 27 / 384)
 
-# nodes of the coarser grid that a block reads, along an axis: HALF are beneath it
+# nodes of the coarser grid that a block reads, along an axis: the HALF that it covers, and three more
 _WINDOW = HALF + 3
 
 
