@@ -8,7 +8,7 @@ from .core.run import Options, run_experiment
 
 # modules of this package with `jobs`, `measure` and `page`
 EXPERIMENTS = (
-    "quality", "ablation", "convergence", "maps", "rate", "labels", "render", "decode", "enlarge", "fill",
+    "quality", "ablation", "convergence", "maps", "rate", "labels", "render", "decode", "enlarge", "fill", "pairs",
 )  # fmt: skip
 
 

@@ -6,9 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-import torch
-from PIL import Image
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -19,7 +16,7 @@ from .core.clocks import milliseconds
 from .core.compare import Comparison, differences_table, group_by, losses_table, means_table, summary
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS
-from .core.images import load_mapped, names
+from .core.images import load_mapped, names, resize
 from .core.run import Job, Options, Page, Row
 
 FACTORS = (2, 4)
@@ -63,11 +60,8 @@ def measure(image: str, group: str, factor: int, share: int, data: str, quick: b
 
 
 def enlarge(image: Callable[[], Tensor], size: tuple[int, int], resampling: str) -> Tensor:
-    """Make an image (C, H, W) and enlarge it by Pillow, in floats."""
-    planes = [
-        Image.fromarray(plane.numpy()).resize(size[::-1], Image.Resampling[resampling.upper()]) for plane in image()
-    ]
-    return torch.from_numpy(np.stack([np.asarray(plane) for plane in planes])).clamp(0, 1)
+    """Make an image and enlarge it."""
+    return resize(image(), size, resampling)
 
 
 def jobs(options: Options) -> list[Job]:

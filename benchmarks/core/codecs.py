@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from functools import lru_cache
 from io import BytesIO
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +15,11 @@ from PIL import Image, features
 from torch import Tensor
 
 from kcgs.functional import psnr
+
+from .images import resize
+
+# of each side of an image, for files below the least that a codec makes of all pixels
+REDUCTIONS = (1, 2, 3, 4)
 
 
 class Codec(NamedTuple):
@@ -35,6 +42,14 @@ CODECS = {
 }
 
 
+class ReducedFile(NamedTuple):
+    """A file of an image that may be reduced, and what is shown of it."""
+
+    name: str  # of the codec, and the reduction
+    data: bytes
+    render: Tensor  # (3, H, W), of the image's size
+
+
 def available_codecs() -> list[str]:
     """Name the codecs that this machine's Pillow has."""
     pillow_names = {"JPEG": "jpg", "WEBP": "webp", "AVIF": "avif"}
@@ -50,7 +65,7 @@ def decode_file(data: bytes) -> Tensor:
 
 def largest_file(codec: str, image: Tensor, max_bytes: int) -> bytes:
     """Make the largest file of at most `max_bytes`, or the smallest; of variants, the one with the higher PSNR."""
-    pixels = (image * 255).round().byte().permute(1, 2, 0).contiguous().numpy()
+    pixels = _pixels(image)
     size, qualities, files = (image.shape[2], image.shape[1]), CODECS[codec].qualities, []
     for variant in range(len(CODECS[codec].variants)):
         arguments = codec, variant, pixels.tobytes(), size
@@ -58,6 +73,38 @@ def largest_file(codec: str, image: Tensor, max_bytes: int) -> bytes:
         files.append(_encode(*arguments, qualities[index]))
     small = [file for file in files if len(file) <= max_bytes]
     return max(small, key=lambda file: float(psnr(decode_file(file), image))) if small else min(files, key=len)
+
+
+def best_file(codecs: Sequence[str], image: Tensor, max_bytes: int) -> ReducedFile | None:
+    """Make the file with the highest SSIMULACRA2 of at most `max_bytes`; None: no codec has one.
+
+    It is of the image, or of the image reduced to a half, a third or a quarter of each side and enlarged bicubically.
+    """
+    files, size = [], (image.shape[1], image.shape[2])
+    for codec, reduction in product(codecs, REDUCTIONS):
+        small_size = (round(size[0] / reduction), round(size[1] / reduction))
+        small = image if reduction == 1 else resize(image, small_size, "lanczos")
+        data = largest_file(codec, small, max_bytes)
+        if len(data) <= max_bytes:
+            name = codec if reduction == 1 else f"{codec} at 1/{reduction}"
+            files.append(ReducedFile(name, data, resize(decode_file(data), size, "bicubic")))
+    return max(files, key=lambda file: ssimulacra2(file.render, image), default=None)
+
+
+def ssimulacra2(render: Tensor, image: Tensor) -> float:
+    """Compare images (3, H, W) in 8 bits, as people see them."""
+    from ssimulacra2 import compute_ssimulacra2
+
+    files = []
+    for values in (image, render):
+        file = BytesIO()
+        Image.fromarray(_pixels(values)).save(file, "PPM")
+        files.append(file)
+    return float(compute_ssimulacra2(*files))
+
+
+def _pixels(image: Tensor) -> np.ndarray:
+    return (image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).contiguous().numpy()
 
 
 # searches for several sizes try the same qualities

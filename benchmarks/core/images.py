@@ -6,7 +6,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from kcgs.data import Davis, chart_2x3, chart_pie, load_image
@@ -42,6 +44,13 @@ def load_mapped(name: str, data: str | None = None, quick: bool = False) -> tupl
     """Read an image and its label map, or the map of `segment` where it has none."""
     image, labels = load(name, data, quick)
     return image, segment(image) if labels is None else labels
+
+
+def resize(image: Tensor, size: tuple[int, int], resampling: str) -> Tensor:
+    """Resize an image (C, H, W) by Pillow, in floats."""
+    filter = Image.Resampling[resampling.upper()]
+    planes = [np.asarray(Image.fromarray(plane.numpy()).resize(size[::-1], filter)) for plane in image]
+    return torch.from_numpy(np.stack(planes)).clamp(0, 1)
 
 
 def names(data: Path, group: str) -> list[str]:

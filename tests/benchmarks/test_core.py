@@ -31,6 +31,7 @@ from benchmarks.core.images import load, load_mapped, names
 from benchmarks.core.run import Job, Options, Page, Row, read_rows, run_experiment, write_rows
 from benchmarks.core.scenes import scene_of, size_of
 from benchmarks.labels import CODECS, region_numbers
+from benchmarks.pairs import read_answers
 from benchmarks.rate import bd_rate
 from kcgs.functional import psnr
 
@@ -212,6 +213,19 @@ class TestCodecs:
         index = region_numbers(ids[: len(ids) // 60 * 60].reshape(60, -1).numpy())
         decoded = CODECS[codec].decode(CODECS[codec].encode(index))
         assert (torch.as_tensor(decoded).reshape(index.shape).long() == torch.from_numpy(index).long()).all()
+
+
+def test_answers_of_viewers(tmp_path: Path) -> None:
+    ours, other = {"method": "kcgs"}, {"method": "AVIF"}
+    pair = {"comparison": "1000 bytes", "image": "kodim01"}
+    sides = [(ours, other), (other, ours), (other, other), (other, ours)]
+    entries: list[Row] = [{"sheet": sheet, **pair, "A": a, "B": b} for sheet, (a, b) in enumerate(sides, 1)]
+    text = "Sheets 1 to 4:\n01 B clearly: streaks, a face\n| 02 | slightly A | |\n**3**: no difference\nB 2, none 1\n"
+    (tmp_path / "one.txt").write_text(text)
+    assert [(row["sheet"], row["kind"], row["choice"], row["comment"]) for row in read_answers(tmp_path, entries)] == [
+        (1, "pair", "other clearly", "streaks, a face"), (2, "swapped", "other slightly", ""),
+        (3, "identical", "none", ""),
+    ]  # fmt: skip
 
 
 def test_clocks() -> None:
