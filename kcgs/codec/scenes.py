@@ -29,7 +29,9 @@ from .rangecoder import CodecError, Reader, Writer
 QUALITIES = (10.0, 90.0)  # least and largest
 DEFAULT_QUALITY = 46.0
 _MIN_DISTORTION = 1e-12  # squared error that a number adds
-_MIN_SHARE = 1 / 16  # of the Gaussians of a file, that a layer holds
+# of a layer: its length and checksum take about 6 bytes, and a few hundred bytes arrive at once
+_MIN_SHARE = 1 / 16  # of the Gaussians of a file
+_MIN_GAUSSIANS = 100
 _FREE_GAUSSIANS = 64  # of a layer, whose other Gaussians take a bit each at least
 
 
@@ -191,11 +193,12 @@ def _black_field(field: GaussianField, regions: RegionMap | None) -> GaussianFie
 
 
 def _join_groups(groups: list[slice], count: int) -> list[list[slice]]:
-    """Join groups into layers of at least a share of the `count` Gaussians, since a layer has overhead."""
+    """Join groups into layers of enough of the `count` Gaussians, since a layer has overhead."""
     layers: list[list[slice]] = []
+    least = max(_MIN_GAUSSIANS, _MIN_SHARE * count)
     for group in groups:
         first = layers[-1][0].start if layers else 0
-        if layers and min(group.start - first, count - group.start) < _MIN_SHARE * count:
+        if layers and min(group.start - first, count - group.start) < least:
             layers[-1].append(group)
         else:
             layers.append([group])

@@ -27,6 +27,8 @@ from .compress import compress
 
 # fixed-point iterations of the number of Gaussians, which the bits of one depend on
 _COUNT_ITERATIONS = 4
+# of a file of one Gaussian without a map
+_MIN_BYTES = 40
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,7 @@ def fit_bytes(
     Args:
         image: as in :func:`kcgs.fit`.
         regions: as there.
-        target_bytes: largest size of the file.
+        target_bytes: largest size of the file, at least 40.
         recipe: as there.
         seed: as there.
         on_step: as there, for the fit itself, not the trials.
@@ -139,7 +141,7 @@ def fit_bytes(
         The file, the scene that it decodes to, and the fit.
 
     Raises:
-        TypeError, ValueError: as :func:`kcgs.fit`; `target_bytes` too small for a Gaussian and the map.
+        TypeError, ValueError: as :func:`kcgs.fit`; `target_bytes` below 40, or too small for a map that is to be kept.
 
     Example:
         >>> import torch
@@ -150,7 +152,7 @@ def fit_bytes(
     """
     config = FitConfig.from_recipe(recipe, **settings)
     image, regions = check_image_and_regions(image, regions)
-    check_count("target_bytes", target_bytes)
+    check_count("target_bytes", target_bytes, _MIN_BYTES)
     if config.target_psnr is not None:
         raise InvalidArgument("target_psnr", "None with target_bytes", config.target_psnr)
     with Progress("trial fits", pulse=True, visible=progress):

@@ -91,8 +91,7 @@ class TestFitBytes:
         ("target", "settings", "error", "match"),
         [
             (1.5, {}, TypeError, "target_bytes must be an integer"),
-            (0, {}, ValueError, "target_bytes must be at least 1; got 0"),
-            (12, {"iterations": 20}, ValueError, "target_bytes must be at least"),
+            (39, {}, ValueError, "target_bytes must be at least 40; got 39"),
             (900, {"target_psnr": 30.0}, ValueError, "target_psnr must be None with target_bytes; got 30"),
         ],
     )
