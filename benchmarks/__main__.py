@@ -9,6 +9,7 @@ from .core.run import Options, run_experiment
 # modules of this package with `jobs`, `measure` and `page`
 EXPERIMENTS = (
     "quality", "ablation", "convergence", "maps", "rate", "labels", "render", "decode", "enlarge", "fill", "pairs",
+    "previews",
 )  # fmt: skip
 
 

@@ -18,9 +18,6 @@ from kcgs.functional import psnr
 
 from .images import resize
 
-# of each side of an image, for files below the least that a codec makes of all pixels
-REDUCTIONS = (1, 2, 3, 4)
-
 
 class Codec(NamedTuple):
     """A format of Pillow, its qualities, its fixed settings, and variants of which the better is taken."""
@@ -75,13 +72,15 @@ def largest_file(codec: str, image: Tensor, max_bytes: int) -> bytes:
     return max(small, key=lambda file: float(psnr(decode_file(file), image))) if small else min(files, key=len)
 
 
-def best_file(codecs: Sequence[str], image: Tensor, max_bytes: int) -> ReducedFile | None:
+def best_file(
+    codecs: Sequence[str], image: Tensor, max_bytes: int, reductions: Sequence[int] = (1, 2, 3, 4)
+) -> ReducedFile | None:
     """Make the file with the highest SSIMULACRA2 of at most `max_bytes`; None: no codec has one.
 
-    It is of the image, or of the image reduced to a half, a third or a quarter of each side and enlarged bicubically.
+    It is of the image, or of the image whose sides are reduced so many times; that is enlarged bicubically.
     """
     files, size = [], (image.shape[1], image.shape[2])
-    for codec, reduction in product(codecs, REDUCTIONS):
+    for codec, reduction in product(codecs, reductions):
         small_size = (round(size[0] / reduction), round(size[1] / reduction))
         small = image if reduction == 1 else resize(image, small_size, "lanczos")
         data = largest_file(codec, small, max_bytes)

@@ -38,6 +38,8 @@ COLUMNS = {
     "ms_ssim": Column("MS-SSIM", ".4f", 0.0001),
     "ef_psnr": Column("EF-PSNR", ".2f", 0.005),
     "ssimulacra2": Column("SSIMULACRA2", ".1f", 0.05),
+    "delta_e": Column("deltaE 2000", ".2f", 0.005, less_is_better=True),
+    "butteraugli": Column("butteraugli", ".1f", 0.05, less_is_better=True),
     "decoded_psnr": Column("PSNR decoded", ".2f", 0.005),
     "decoded_ef_psnr": Column("EF-PSNR decoded", ".2f", 0.005),
     "core_seconds": Column("core s", ".1f", 0.05, less_is_better=True),
