@@ -17,7 +17,7 @@ from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, FitResult, HistoryEntry, fit
 from kcgs.fitting.problem import check_image_and_regions
 from kcgs.fitting.region_report import report_regions
-from kcgs.functional import RegionMap, merge_regions
+from kcgs.functional import RegionMap, edge_band, merge_regions
 from kcgs.functional.labels import contour_edges
 from kcgs.functional.merging import pairs_to_merge
 from kcgs.kernels import image_threads_for_kernels
@@ -79,9 +79,6 @@ class FitBytesSettings:
     """Squared error after the whole fit, as a share of that after a trial. More: contours must save more error."""
     rate_exponent: float = 0.93
     """e in "squared error ~ bytes^-e", the slope of the rate-distortion curve. More: contours must save more error."""
-    contour_allowance: float = 1.023
-    """Factor of the squared error, 0.1 dB, by which a trial with contours may be worse, since sharp contours look
-    better. More: more files have a label map, at a lower PSNR."""
 
 
 # MS-SSIM suffers more from rounding than from fewer Gaussians
@@ -122,9 +119,9 @@ def fit_bytes(
 
     Convention: all bits save the same error at the margin. The number of Gaussians is that at which another Gaussian
     and finer rounding of all would save as much. A pixel of contour must save what its bits would save as Gaussians,
-    else it moves or its regions are merged. The map as a whole is used if a short fit with it is at most 0.1 dB worse
-    than one with Gaussians for its bytes. With ``merge_regions=False`` the whole map is used. ``result.regions``
-    reports the changes of the map.
+    else it moves or its regions are merged. The map as a whole is used if a short fit with it has less error than one
+    with Gaussians for its bytes, in the image and along the contours. With ``merge_regions=False`` the whole map is
+    used. ``result.regions`` reports the changes of the map.
 
     Args:
         image: as in :func:`kcgs.fit`.
@@ -186,15 +183,13 @@ def _choose_regions(
     iterations = min(_SETTINGS.trial_iterations, config.usual_iterations)
     trial = FitConfig.from_recipe(config, merge_regions=False, iterations=iterations, max_seconds=None)
 
-    def trial_error(regions: RegionMap | None, count: int) -> float:
-        history = _fit_share(_SETTINGS.fit_share, image, regions, count, trial, seed=seed).history
-        return float(10 ** (-max(entry.psnr for entry in history) / 10))
+    def trial_error(regions: RegionMap | None, count: int) -> Tensor:
+        scene = _fit_share(_SETTINGS.fit_share, image, regions, count, trial, seed=seed).scene
+        return (scene.render() - image).square().mean(0)
 
     plain_error = trial_error(None, choice.num_gaussians)
     # squared error, summed over pixels, that one more bit of Gaussians saves: the derivative of the power law
-    bit_value = (
-        _SETTINGS.rate_exponent * _SETTINGS.final_error_share * plain_error * image[0].numel() / (8 * target_bytes)
-    )
+    bit_value = _SETTINGS.rate_exponent * _SETTINGS.final_error_share * float(plain_error.sum()) / (8 * target_bytes)
     contour_cost = bit_value * (8 * map_bytes / max(len(contour_edges(regions.labels)[0]), 1))
     paying_regions = regions
     if regions.softness == 0.0:
@@ -205,9 +200,11 @@ def _choose_regions(
     if candidate is None or candidate.num_regions == 1:
         return choice
     count = num_gaussians(target_bytes - _map_bytes(candidate))
-    if count < candidate.num_regions or trial_error(candidate, count) >= _SETTINGS.contour_allowance * plain_error:
-        return choice._replace(changes={"dropped": "bytes"})
-    return choice._replace(regions=candidate, num_gaussians=count, contour_cost=contour_cost)
+    if count >= candidate.num_regions:
+        rise = trial_error(candidate, count) - plain_error
+        if rise.mean() < 0 and rise[edge_band(candidate.labels)].mean() < 0:
+            return choice._replace(regions=candidate, num_gaussians=count, contour_cost=contour_cost)
+    return choice._replace(changes={"dropped": "bytes"})
 
 
 def _map_bytes(regions: RegionMap) -> int:

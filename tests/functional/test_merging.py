@@ -23,6 +23,13 @@ class TestMergeRegions:
         assert merged.unique().tolist() == [0, 2]
         assert (merged[:, :60] == 0).all() and (merged[:, 60:] == 2).all()
 
+    @pytest.mark.parametrize(("rows", "count"), [(64, 2), (40, 1)])
+    def test_colors_must_differ_along_most_of_a_contour(self, rows: int, count: int) -> None:
+        image = 0.3 + 0.02 * noise(64, 96)
+        image[:, :rows, 48:] += 0.4
+        labels = (torch.arange(96) // 48).expand(64, 96)
+        assert len(merge_regions(image, labels).unique()) == count
+
     def test_one_region_where_the_image_needs_none(self) -> None:
         y, x = torch.meshgrid(torch.linspace(0, 1, 90), torch.linspace(0, 1, 120), indexing="ij")
         ramp = (0.5 * x + 0.3 * y).expand(3, -1, -1)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
+from kcgs import FitConfig, RegionMap
 from kcgs.codec import decode
-from kcgs.rate import fit_bytes
+from kcgs.functional import edge_band
+from kcgs.rate import budget, fit_bytes
 from kcgs.rate.budget import BUDGETS
 from tests.conftest import Clock
 
@@ -86,6 +89,21 @@ class TestFitBytes:
         assert report is not None and (report.num_before, report.num_after) == (len(labels.unique()), num_regions)
         if "move_contours" in settings:
             assert regions is not None and torch.equal(regions.labels, labels)
+
+    @pytest.mark.parametrize(("error", "is_used"), [(0.1, True), (0.25, False)])
+    def test_contours_lower_the_error_along_them(
+        self, photo: Photo, monkeypatch: pytest.MonkeyPatch, error: float, is_used: bool
+    ) -> None:
+        image, labels = disc(photo[0])
+        band = edge_band(labels)
+        trials = {True: image + 0.2, False: image + error * band}
+
+        def trial(share: float, image: Tensor, regions: RegionMap | None, *_: Any, **__: Any) -> Any:
+            return SimpleNamespace(scene=SimpleNamespace(render=lambda: trials[regions is None]))
+
+        monkeypatch.setattr(budget, "_fit_share", trial)
+        choice = budget._choose_regions(image, RegionMap.from_labels(labels), 900, FitConfig(), 0)
+        assert (choice.regions is not None) == is_used
 
     @pytest.mark.parametrize(
         ("target", "settings", "error", "match"),
