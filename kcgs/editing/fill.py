@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
@@ -16,42 +14,26 @@ from kcgs.nn.field import join
 from kcgs.optim import GaussianAdam
 from kcgs.scene import Scene
 
-from .inpainting import inpaint
-from .masks import FRINGE, dilate
+from .inpainting import inpaint_from_match
+from .masks import dilate
 from .weights import weight_sums
 
-
-@dataclass(frozen=True)
-class FillSettings:
-    """Which Gaussians of a hole are fitted, and how.
-
-    All fields are tuned on the photos of ``python -m benchmarks fill``, for values in [0, 1]: to tune one again, change
-    it and compare the steepest gradients and the values beyond [0, 1] in the holes.
-    """
-
-    free_share: float = 0.01
-    """A Gaussian with more than this share of its weight in the hole is fitted. More: fewer Gaussians change,
-    and more of those that stay show the object in the hole."""
-    removed_share: float = 0.5
-    """A Gaussian with more than this share of its weight in the hole is removed instead, and new ones replace it."""
-    max_added: int = 250
-    """Most Gaussians that are added: a large hole gets larger ones. More: larger files, and a finer fill."""
-    min_spacing: float = 3.0
-    """Least distance of Gaussians that are added, in pixels: a small hole gets fewer than `max_added`."""
-    sigma: float = 0.7
-    """Their standard deviation, in that distance. Less: gaps between them show. More: they are alike, and swing."""
-    known_weight: float = 4.0
-    """Weight of a known pixel in the fit, where that of a filled one is 1. More: what is visible already changes less,
-    and the hole follows it less smoothly."""
-    steps: int = 150
-    """Iterations of the fit. More: slower, and less error."""
-    rate: float = 0.07
-    """Learning rate of means and factors. More: Gaussians that are alike swing, and the hole shows ripples."""
-    color_rate: float = 0.015
-    """Learning rate of colours, likewise."""
-
-
-_SETTINGS = FillSettings()
+# pixels around a region that may have colours of it, as edges in photos are blurred and masks are not exact
+_FRINGE = 6
+# Gaussians with a larger share of their weight in the hole are fitted; with fewer of them, the object shows there
+_FITTED_SHARE = 0.05
+# those with a larger share are removed: fitted, they become dots
+_REMOVED_SHARE = 0.8
+# Gaussians that are added per pixel of a hole, where the scene around it has one
+_DENSITY = 2.0
+# least number of them
+_LEAST_ADDED = 16
+# their standard deviation, in the distance between them
+_SIGMA = 0.6
+_STEPS = 120
+# learning rates; with larger ones Gaussians that are alike swing, and the hole shows ripples
+_RATE = 0.07
+_COLOR_RATE = 0.015
 
 
 def fill_hole(scene: Scene, hole: Tensor, visible: Tensor) -> Scene:
@@ -73,19 +55,20 @@ def fill_hole(scene: Scene, hole: Tensor, visible: Tensor) -> Scene:
     if not fill_mask.any():
         return scene
     with threads_for_kernels(unknown.numel()), torch.no_grad():
-        target = inpaint(scene(), unknown)
+        target = inpaint_from_match(scene(), unknown)
         share = _share_in(scene.field, ids, regions, unknown)
-        fixed = scene.field.subset(share <= _SETTINGS.free_share)
-        free = scene.field.subset((share > _SETTINGS.free_share) & (share <= _SETTINGS.removed_share))
+        fixed = scene.field.subset(share <= _FITTED_SHARE)
+        fitted = scene.field.subset((share > _FITTED_SHARE) & (share <= _REMOVED_SHARE))
         target = target - Scene(fixed, regions)()
-        free = join(free, _spread(target - Scene(free, regions)(), fill_mask, regions))
-        weight = torch.where(unknown, fill_mask.to(target), _SETTINGS.known_weight)
-        return Scene(join(fixed, _fit(free, regions, target, weight)), regions, scene.metadata)
+        density = _DENSITY * scene.num_gaussians / float((~hole).sum())
+        fitted = join(fitted, _spread(target - Scene(fitted, regions)(), fill_mask, regions, density))
+        weight = (fill_mask | ~unknown).to(target)
+        return Scene(join(fixed, _fit(fitted, regions, target, weight)), regions, scene.metadata)
 
 
 def _fringe(mask: Tensor, labels: Tensor) -> Tensor:
     """Return the pixels near a mask, (H, W) bool, of the regions that are in it and go on farther away."""
-    near = dilate(mask, FRINGE)
+    near = dilate(mask, _FRINGE)
     return near & torch.isin(labels, labels[mask].unique()) & torch.isin(labels, labels[~near].unique())
 
 
@@ -96,15 +79,15 @@ def _share_in(field: GaussianField, ids: Tensor, regions: RegionMap, hole: Tenso
     return sums(hole.to(total)[None]) / sums(torch.ones_like(total)).clamp_min(1e-9)
 
 
-def _spread(residual: Tensor, mask: Tensor, regions: RegionMap) -> GaussianField:
+def _spread(residual: Tensor, mask: Tensor, regions: RegionMap, density: float) -> GaussianField:
     """Spread round Gaussians over a mask, whose sum is about the residual there."""
-    spacing = max(_SETTINGS.min_spacing, float(mask.sum() / _SETTINGS.max_added) ** 0.5)
+    spacing = max(1.0, max(density, _LEAST_ADDED / float(mask.sum())) ** -0.5)
     rows, cols = (torch.arange(min(spacing, n) / 2, n, spacing, device=mask.device).long() for n in mask.shape)
     grid = torch.zeros_like(mask)
     grid[rows[:, None], cols] = True
     y, x = (grid & mask).nonzero().T
     means, ids = torch.stack([x, y], -1).to(residual) + 0.5, regions.labels[y, x]
-    sigma = _SETTINGS.sigma * spacing
+    sigma = _SIGMA * spacing
     cholesky = residual.new_tensor([sigma, 0.0, sigma]).expand(len(x), 3)
     total = region_splat(means, cholesky, torch.ones_like(means[:, :1]), ids, regions)[:, y, x]
     return GaussianField(means, cholesky, (residual[:, y, x] / total).T, ids, size=regions.size)
@@ -116,10 +99,10 @@ def _fit(field: GaussianField, regions: RegionMap, target: Tensor, weight: Tenso
     geometry = field.means.detach(), field.cholesky.detach()
     field = GaussianField(*geometry, field.merged_colors().detach(), field.region_ids, size=field.size)
     # tensors, so that the schedule, too, is in the precision of the field
-    rate, color_rate = field.means.detach().new_tensor([_SETTINGS.rate, _SETTINGS.color_rate])
+    rate, color_rate = field.means.detach().new_tensor([_RATE, _COLOR_RATE])
     optimizer = GaussianAdam(field, rate, color_lr=color_rate)
-    schedule = LambdaLR(optimizer, lambda step: cosine_decay(step / _SETTINGS.steps))
-    for _ in range(_SETTINGS.steps):
+    schedule = LambdaLR(optimizer, lambda step: cosine_decay(step / _STEPS))
+    for _ in range(_STEPS):
         rendered = region_splat(field.means, field.cholesky, field.colors, field.region_ids, regions)
         rendered.backward((rendered.detach() - target) * weight)
         optimizer.step()

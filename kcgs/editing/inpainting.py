@@ -1,10 +1,17 @@
-"""Unknown pixels of an image, as means of what is around them."""
+"""Unknown pixels of an image, from what is around them or from a place with the same surroundings."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, pad
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
+
+# pixels around the unknown ones that another place must resemble, too
+_RING = 16
+# side of the blocks that are compared and copied, in pixels: their means have no fine texture
+_BLOCK = 2
+# squared error, summed over channels, from which on no place is better than a smooth continuation
+_LARGEST_ERROR = 0.2
 
 
 def inpaint(image: Tensor, unknown: Tensor) -> Tensor:
@@ -13,6 +20,42 @@ def inpaint(image: Tensor, unknown: Tensor) -> Tensor:
     Source: Gortler, Grzeszczuk, Szeliski and Cohen, "The Lumigraph", 1996: pull and push.
     """
     return torch.where(unknown, _pull_push(image, (~unknown).to(image)[None]), image)
+
+
+def inpaint_from_match(image: Tensor, unknown: Tensor) -> Tensor:
+    """Continue an image like `inpaint`, with the coarse forms of a place that looks alike, if there is one.
+
+    Unknown pixels are those of the place, without texture, and the smooth continuation of the difference around them.
+    """
+    height, width = unknown.shape
+    blocks = avg_pool2d(inpaint(image, unknown), _BLOCK, ceil_mode=True)
+    hole = max_pool2d(unknown[None].to(image), _BLOCK, ceil_mode=True)[0]
+    place = blocks.roll(_match(blocks, hole), (-2, -1))
+    place = interpolate(place[None], scale_factor=_BLOCK, mode="bilinear")[0, :, :height, :width]
+    lowest, highest = (limit[:, None, None] for limit in torch.aminmax(image[:, ~unknown], dim=1))
+    return torch.where(unknown, (place + inpaint(image - place, unknown)).clamp(lowest, highest), image)
+
+
+def _match(blocks: Tensor, hole: Tensor) -> tuple[int, int]:
+    """Return by how many rows and columns the place moves that differs least from a hole and its surroundings."""
+    reach = _RING // _BLOCK
+    compared = max_pool2d(hole[None], 2 * reach + 1, 1, reach)[0]
+    known, squares = 1 - hole, blocks.square().sum(0)
+    shape = [2 * n for n in hole.shape]
+
+    def correlation(a: Tensor, b: Tensor) -> Tensor:
+        spectrum = torch.fft.rfft2(a, s=shape).conj() * torch.fft.rfft2(b, s=shape)
+        sums: Tensor = torch.fft.irfft2(spectrum, s=shape)
+        return sums
+
+    # the sum of (blocks - place)^2 - _LARGEST_ERROR over known blocks of the place, for each offset
+    error = correlation(compared * squares, known) + correlation(compared, known * squares)
+    error -= 2 * correlation(compared * blocks, known * blocks).sum(0)
+    error -= _LARGEST_ERROR * correlation(compared, known)
+    # the place of the hole lies in the image
+    error[correlation(hole, torch.ones_like(hole)) < 0.999 * hole.sum()] = torch.inf
+    row, column = divmod(int(error.argmin()), shape[1])
+    return shape[0] - row, shape[1] - column
 
 
 def _pull_push(image: Tensor, weight: Tensor) -> Tensor:

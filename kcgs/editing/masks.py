@@ -12,8 +12,6 @@ from torch.nn.functional import max_pool2d, pad
 from kcgs._check import check_number
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 
-# pixels around a region that still have colours of it, since edges in photos are blurred: who fills its hole fills them
-FRINGE = 3
 # pixels; a larger offset is an error of the caller's
 _LARGEST_OFFSET = 1e8
 # pixels by which an offset may miss a whole number

@@ -8,10 +8,12 @@ import torch
 from torch import Tensor
 
 from kcgs.editing.inpainting import inpaint
-from kcgs.editing.masks import FRINGE, dilate, nearest_labels
+from kcgs.editing.masks import dilate, nearest_labels
 
 from .flow import sample
 
+# pixels around a region that still have colours of it, since edges in photos are blurred: they are filled, too
+_FRINGE = 3
 # pixels between a Gaussian and where a motion puts it, up to which it follows the motion
 _MAX_RESIDUAL = 1.0
 # samples of three rows: with more, the motion of most rows is found more surely
@@ -54,7 +56,7 @@ def restore_background(renders: Tensor, labels: Tensor, deleted: Tensor, motions
     Returns:
         The images and the labels.
     """
-    holes = [dilate(mask, FRINGE) for mask in deleted]
+    holes = [dilate(mask, _FRINGE) for mask in deleted]
     originals = [_Pixels(*pixels) for pixels in zip(renders, labels, holes, strict=True)]
     results: list[_Pixels] = []
     for t, original in enumerate(originals):
