@@ -1,4 +1,4 @@
-"""Unknown pixels of an image, from what is around them or from a place with the same surroundings."""
+"""Unknown pixels of an image, as means of what is around them or copies of another place."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
-# pixels around the unknown ones that another place must resemble, too
+# pixels around the unknown ones that are compared, too
 _RING = 16
-# side of the blocks that are compared and copied, in pixels: their means have no fine texture
+# side of the blocks that are compared and copied, in pixels
 _BLOCK = 2
-# squared error, summed over channels, from which on no place is better than a smooth continuation
+# mean squared error, summed over channels, from which on no place is copied
 _LARGEST_ERROR = 0.2
+# largest difference of image and copy that is continued; with more, an edge that only one of them has tints the hole
+_LARGEST_DIFFERENCE = 0.1
 
 
 def inpaint(image: Tensor, unknown: Tensor) -> Tensor:
@@ -23,17 +25,17 @@ def inpaint(image: Tensor, unknown: Tensor) -> Tensor:
 
 
 def inpaint_from_match(image: Tensor, unknown: Tensor) -> Tensor:
-    """Continue an image like `inpaint`, with the coarse forms of a place that looks alike, if there is one.
+    """Copy the place that looks most like the surroundings, at half the size, into unknown pixels.
 
-    Unknown pixels are those of the place, without texture, and the smooth continuation of the difference around them.
+    The copy is shifted by a smooth continuation of the difference around it. Without such a place it is `inpaint`.
     """
     height, width = unknown.shape
     blocks = avg_pool2d(inpaint(image, unknown), _BLOCK, ceil_mode=True)
     hole = max_pool2d(unknown[None].to(image), _BLOCK, ceil_mode=True)[0]
     place = blocks.roll(_match(blocks, hole), (-2, -1))
     place = interpolate(place[None], scale_factor=_BLOCK, mode="bilinear")[0, :, :height, :width]
-    lowest, highest = (limit[:, None, None] for limit in torch.aminmax(image[:, ~unknown], dim=1))
-    return torch.where(unknown, (place + inpaint(image - place, unknown)).clamp(lowest, highest), image)
+    difference = (image - place).clamp(-_LARGEST_DIFFERENCE, _LARGEST_DIFFERENCE)
+    return torch.where(unknown, place + inpaint(difference, unknown), image)
 
 
 def _match(blocks: Tensor, hole: Tensor) -> tuple[int, int]:

@@ -49,8 +49,8 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
         region_ids: an id in the map, or several, which move together.
         offset: (dx, dy) in pixels, whole.
         fill: True: the uncovered pixels, and 6 pixels around them, which have colours of the object, continue their
-            surroundings, with the coarse forms of the place that looks most alike, by Gaussians that are fitted there,
-            some of them new; other pixels change by a few hundredths. False: the uncovered pixels show what the
+            surroundings like the place of the image that looks most alike, by Gaussians that are fitted there, some of
+            them new; other pixels change by a few hundredths. False: the uncovered pixels show what the
             Gaussians of their new region paint there, streaks or black.
 
     Returns:
