@@ -115,7 +115,11 @@ def fit_and_save(
     elif is_compressed:
         result = fit(image, labels, request.num_gaussians, **settings)
         quality = quality_for(max(entry.psnr for entry in result.history)) if target_psnr is None else None
-        goal: Any = {"quality": quality, "target_psnr": target_psnr, "objective": config.objective}
+        goal: Any = {
+            "quality": quality,
+            "target_psnr": target_psnr,
+            "objective": "psnr" if config.objective == "auto" else config.objective,
+        }
         with Progress("writing the file", pulse=True, visible=progress):
             compressed = compress(result.scene, image, seed=request.seed, **goal)
         scene, num_bytes = compressed.scene, write_file(output, compressed.data)

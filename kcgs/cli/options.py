@@ -24,7 +24,10 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that
 ResizeRegions = Annotated[
     bool, typer.Option("--resize-regions", help="Resize a label map of another size to that of the image.")
 ]
-Objective = Annotated[Literal["psnr", "ms-ssim"] | None, typer.Option(help="What to maximize; default: psnr.")]
+Objective = Annotated[
+    Literal["auto", "psnr", "ms-ssim"] | None,
+    typer.Option(help="What to maximize; auto, the default: ms-ssim for a file of so many bytes, else psnr."),
+]
 
 
 class FitRequest(NamedTuple):

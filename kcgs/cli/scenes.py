@@ -178,7 +178,7 @@ def encode(
         if image is None:
             data = codec.encode(loaded, **goal)
         else:
-            data = compress(loaded, load_image(image), **goal, objective=objective or "psnr").data
+            data = compress(loaded, load_image(image), **goal, objective=objective or "auto").data
     write_file(output, data)
     rounded = codec.decode(data).scene
     report = {

@@ -15,7 +15,7 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.functional.softness import MAX_SOFTNESS
 from kcgs.kernels import BACKENDS
 
-Objective = Literal["psnr", "ms-ssim"]
+Objective = Literal["auto", "psnr", "ms-ssim"]
 _USUAL_ITERATIONS = 700
 
 
@@ -74,8 +74,9 @@ class FitConfig(BaseModel):
 
     # The descent
     objective: Objective = Field(
-        "psnr",
-        description="psnr: lower what `loss` says; ms-ssim: raise MS-SSIM, which needs loss l2",
+        "auto",
+        description="psnr: lower what `loss` says; ms-ssim: raise MS-SSIM, which needs loss l2; auto: ms-ssim for a "
+        "file of so many bytes, else psnr",
     )
     loss: Literal["l1", "l2", "l1+ssim"] = Field("l2", description="l1+ssim: L1 + 0.1 (1 - SSIM), as Image-GS")
     optimizer: Literal["gaussian-adam", "adan", "adam"] = Field(
@@ -84,6 +85,9 @@ class FitConfig(BaseModel):
         "has its own parameters and learning rates",
     )
     learning_rate_factor: float = Field(1.0, gt=0.0, description="factor on all learning rates of the optimizer")
+    min_sigma: float = Field(
+        0.5, ge=0.0, description="least standard deviation of a Gaussian in pixels, for the optimizer gaussian-adam"
+    )
     # The length
     iterations: int | None = Field(
         None,
@@ -103,7 +107,7 @@ class FitConfig(BaseModel):
         """Check what types do not express."""
         if self.backend not in BACKENDS:
             raise InvalidArgument("backend", f"one of {', '.join(BACKENDS)}", repr(self.backend))
-        if self.objective != "psnr" and self.loss != "l2":
+        if self.objective == "ms-ssim" and self.loss != "l2":
             raise InvalidArgument("objective", f"psnr with loss {self.loss!r}", repr(self.objective))
         if self.softness != "auto" and not 0.0 <= self.softness <= MAX_SOFTNESS:
             raise InvalidArgument("softness", f"'auto' or in [0, {MAX_SOFTNESS:g}] pixels", repr(self.softness))

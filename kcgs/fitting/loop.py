@@ -95,9 +95,20 @@ def fit(
         raise InvalidArgument("checkpoint", "a file to go on from, with resume", None)
     if config.target_psnr is not None and checkpoint is not None:
         raise InvalidArgument("checkpoint", "None with target_psnr, which takes several fits", repr(checkpoint))
-    prepare(config.backend, problem.image.device, problem.image.dtype, len(problem.image))
+    return fit_problem(problem, on_step, progress, checkpoint, resume)
+
+
+def fit_problem(
+    problem: Problem,
+    on_step: OnStep | None = None,
+    progress: bool = False,
+    checkpoint: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+) -> FitResult:
+    """Solve a problem whose arguments are checked: see `fit`, which brings autograd's modes."""
+    prepare(problem.config.backend, problem.image.device, problem.image.dtype, len(problem.image))
     _warn_of_regions(problem)
-    searches = config.target_psnr is not None
+    searches = problem.config.target_psnr is not None
     with Progress("fit", pulse=searches, visible=progress) as bar, threads_for_kernels(problem.image[0].numel()):
         if searches:
             return search(problem, lambda state: _run(state, Clock(), bar, on_step))

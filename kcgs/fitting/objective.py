@@ -40,6 +40,8 @@ class MsSsimObjective:
 
     Args:
         image: (C, H, W) in [0, 1].
+        finest_scale: position among the scales of MS-SSIM of the one that halves this image: 1, or more where the image
+            is a photo that was reduced.
 
     Example:
         >>> image = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(0))
@@ -48,10 +50,10 @@ class MsSsimObjective:
         True
     """
 
-    def __init__(self, image: Tensor) -> None:
+    def __init__(self, image: Tensor, finest_scale: int = 1) -> None:
         self._scales: list[tuple[Tensor, Tensor, Tensor, Tensor, float]] = []
         masks, plane = [], image
-        for weight in SCALE_WEIGHTS[1:]:
+        for weight in SCALE_WEIGHTS[finest_scale:]:
             plane = halve(plane)
             if not plane.numel():
                 break
@@ -154,9 +156,9 @@ class MsSsimObjective:
         return planes[0]
 
 
-def make_objective(name: str, image: Tensor) -> MsSsimObjective | None:
+def make_objective(name: str, image: Tensor, finest_scale: int = 1) -> MsSsimObjective | None:
     """Return the objective of a name, None where it is the squared error."""
-    return MsSsimObjective(image) if name == "ms-ssim" else None
+    return MsSsimObjective(image, finest_scale) if name == "ms-ssim" else None
 
 
 def propose_gaussians(

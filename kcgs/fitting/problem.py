@@ -34,6 +34,8 @@ class Problem:
     """N, the most that the result may have."""
     config: FitConfig
     seed: int
+    reduction: int = 1
+    """Factor by which the sides of a photo were reduced to those of the image."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -55,6 +57,11 @@ class Problem:
         return edge_band(self.regions.labels).nonzero().contiguous()
 
     @property
+    def finest_scale(self) -> int:
+        """The scale of MS-SSIM that halves the image."""
+        return self.reduction.bit_length()
+
+    @property
     def chooses_softness(self) -> bool:
         """True where the softness of contours is to be chosen, and the map came without."""
         return self.config.softness == "auto" and self.regions is not None and self.regions.softness == 0.0
@@ -62,7 +69,7 @@ class Problem:
     @cached_property
     def objective(self) -> MsSsimObjective | None:
         """What the descent lowers; None: what the setting `loss` says."""
-        return make_objective(self.config.objective, self.image)
+        return make_objective(self.config.objective, self.image, self.finest_scale)
 
 
 def make_problem(image: Any, regions: object, num_gaussians: object, config: FitConfig, seed: object) -> Problem:

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from .frame import local_gradient, move
+from .frame import local_gradient, move, widen
 
 # half the second derivatives of the squared error by a step in a Gaussian's frame, per energy of the Gaussian: two of
 # the centre, three of the factor (docs/format.md has the derivation)
@@ -52,11 +52,12 @@ class NewtonDescent:
     Args:
         gaussians: the start, for its shapes.
         exact: see :func:`kcgs.optim.frame.move`.
+        min_sigma: least standard deviation of a Gaussian after a step, in pixels.
     """
 
-    def __init__(self, gaussians: Gaussians, *, exact: bool = True) -> None:
+    def __init__(self, gaussians: Gaussians, *, exact: bool = True, min_sigma: float = 0.0) -> None:
         self.velocity = torch.zeros_like(torch.cat(gaussians, -1))  # [N, 5 + C]
-        self.exact = exact
+        self.exact, self.min_sigma = exact, min_sigma
 
     def step(
         self,
@@ -81,6 +82,8 @@ class NewtonDescent:
             self.velocity = torch.where(frozen, 0.0, self.velocity)
         step = rate * self.velocity
         means, cholesky = move(means, cholesky, step[:, :5].clamp(-_MAX_STEP, _MAX_STEP), exact=self.exact)
+        if self.min_sigma > 0.0:
+            cholesky = widen(cholesky, self.min_sigma)
         return Gaussians(means, cholesky, colors + step[:, 5:])
 
 

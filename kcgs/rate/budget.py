@@ -4,26 +4,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from kcgs._check import check_count
 from kcgs._progress import Progress
 from kcgs._repr import brief
+from kcgs.codec import decode
+from kcgs.codec.scenes import SceneWriter
 from kcgs.errors import InvalidArgument
-from kcgs.fitting import FitConfig, FitResult, HistoryEntry, fit
-from kcgs.fitting.problem import check_image_and_regions
+from kcgs.fitting import FitConfig, FitResult, HistoryEntry
+from kcgs.fitting.loop import fit_problem
+from kcgs.fitting.objective import make_objective
+from kcgs.fitting.problem import Problem, make_problem
 from kcgs.fitting.region_report import report_regions
 from kcgs.functional import RegionMap, edge_band, merge_regions
 from kcgs.functional.labels import contour_edges
 from kcgs.functional.merging import pairs_to_merge
-from kcgs.kernels import image_threads_for_kernels
+from kcgs.kernels import threads_for_kernels
+from kcgs.nn import GaussianField
+from kcgs.nn.field import scaled_gaussians
+from kcgs.nn.renderer import area_mean
 from kcgs.scene import Scene
 
-from .compress import compress
+from .compress import ITERATIONS, Compressor
 
 # fixed-point iterations of the number of Gaussians, which the bits of one depend on
 _COUNT_ITERATIONS = 4
@@ -46,10 +54,16 @@ class GaussianBudget:
     bits_per_doubling: float = 1.9
     """More bits per Gaussian for each doubling of their number. More: small files get more Gaussians, large ones
     fewer."""
-    min_bits_per_gaussian: float = 8.0
+    min_bits_per_gaussian: float = 26.0
     """Bits per Gaussian, however few there are."""
-    header_bytes: int = 60
+    header_bytes: int = 30
     """Bytes of a file beside Gaussians and map."""
+    least_spacing: float = math.inf
+    """Spacing of Gaussians, the root of pixels by number, above which they have a least width. More: sharper edges, and
+    more stray strokes."""
+    width_per_spacing: float = 0.12
+    """Least standard deviation by which a Gaussian is wider for each pixel of spacing above that. More: softer images,
+    and fewer stray strokes."""
 
     def num_gaussians(self, target_bytes: float, pixels: int) -> int:
         """Return the number of Gaussians, from 1 to `pixels`, of a file of at most `target_bytes` without a map."""
@@ -60,6 +74,10 @@ class GaussianBudget:
             bits_per_gaussian = self.bits_per_gaussian + self.bits_per_doubling * doublings
             count = bits / max(bits_per_gaussian, self.min_bits_per_gaussian)
         return min(max(1, round(count)), pixels)
+
+    def min_sigma(self, num_gaussians: int, pixels: int) -> float:
+        """Return the least standard deviation of a Gaussian in pixels: thin ones look like stray strokes."""
+        return self.width_per_spacing * max(0.0, math.sqrt(pixels / num_gaussians) - self.least_spacing)
 
 
 @dataclass(frozen=True)
@@ -79,16 +97,24 @@ class FitBytesSettings:
     """Squared error after the whole fit, as a share of that after a trial. More: contours must save more error."""
     rate_exponent: float = 0.93
     """e in "squared error ~ bytes^-e", the slope of the rate-distortion curve. More: contours must save more error."""
+    pixels_per_sigma: float = 1.5
+    """Pixels of a reduced photo in the least standard deviation of its Gaussians. More: slower, and finer details."""
 
 
-# MS-SSIM suffers more from rounding than from fewer Gaussians
-BUDGETS = {"psnr": GaussianBudget(), "ms-ssim": GaussianBudget(bits_per_gaussian=28.5)}
+# MS-SSIM suffers more from rounding than from fewer Gaussians, and people from stray strokes
+BUDGETS = {
+    "psnr": GaussianBudget(),
+    "ms-ssim": GaussianBudget(bits_per_gaussian=28.5, min_bits_per_gaussian=29.0, least_spacing=8.0),
+}
 _SETTINGS = FitBytesSettings()
 
 
 @brief
 class FitBytesResult(NamedTuple):
-    """A file, the scene that it decodes to, and the fit that it was made from, before rounding."""
+    """A file, the scene that it decodes to, and the fit that it was made from, before rounding.
+
+    Where the fit was one of a reduced photo, so is the PSNR of its history.
+    """
 
     data: bytes
     scene: Scene
@@ -104,6 +130,8 @@ class _RegionChoice(NamedTuple):
     changes: dict[str, Any]  # for the report on the regions
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def fit_bytes(
     image: Any,
     regions: Any,
@@ -122,6 +150,10 @@ def fit_bytes(
     else it moves or its regions are merged. The map as a whole is used if a short fit with it has less error than one
     with Gaussians for its bytes, in the image and along the contours. With ``merge_regions=False`` the whole map is
     used. ``result.regions`` reports the changes of the map.
+
+    With the objective ms-ssim, the default, no Gaussian is much thinner than the others are apart: thin ones look like
+    stray strokes. A file with few bytes for its pixels is fitted on a reduced photo, without a map unless
+    ``merge_regions=False``; its scene has the size of the photo.
 
     Args:
         image: as in :func:`kcgs.fit`.
@@ -148,28 +180,53 @@ def fit_bytes(
         (True, None)
     """
     config = FitConfig.from_recipe(recipe, **settings)
-    image, regions = check_image_and_regions(image, regions)
-    check_count("target_bytes", target_bytes, _MIN_BYTES)
+    if config.objective == "auto":
+        config = config.model_copy(update={"objective": "ms-ssim" if config.loss == "l2" else "psnr"})
     if config.target_psnr is not None:
         raise InvalidArgument("target_psnr", "None with target_bytes", config.target_psnr)
-    with Progress("trial fits", pulse=True, visible=progress):
-        choice = _choose_regions(image, regions, target_bytes, config, seed)
-    config = config.model_copy(update={"contour_cost": choice.contour_cost})
+    check_count("target_bytes", target_bytes, _MIN_BYTES)
+    problem = make_problem(image, regions, 1, config, seed)
+    with Progress("trial fits", pulse=True, visible=progress), threads_for_kernels(problem.image[0].numel()):
+        choice = _choose_regions(problem, target_bytes)
+    reduced = _reduce(problem, choice)
     share = _SETTINGS.fit_share if choice.regions is None else _SETTINGS.fit_share_with_regions
-    result = _fit_share(
-        share, image, choice.regions, choice.num_gaussians, config, on_step, seed=seed, progress=progress
-    )
-    report = report_regions(regions, result.scene, **choice.changes)
-    with Progress("writing the file", pulse=True, visible=progress):
-        data, scene = compress(result.scene, image, target_bytes=target_bytes, seed=seed, objective=config.objective)
-    return FitBytesResult(data, scene, result._replace(regions=report))
+    result = _fit_share(share, reduced, on_step, progress)
+    scene = _enlarge(result.scene, problem.size)
+    report = report_regions(problem.regions, scene, **choice.changes)
+    with Progress("writing the file", pulse=True, visible=progress), threads_for_kernels(reduced.image[0].numel()):
+        small = reduced.image.to("cpu", torch.float32)
+        objective = make_objective(config.objective, small, reduced.finest_scale)
+        min_sigma = reduced.config.min_sigma * reduced.reduction
+        compressor = Compressor(SceneWriter(scene), small, objective, ITERATIONS, seed, min_sigma)
+        data = compressor.search_bytes(target_bytes)
+    return FitBytesResult(data, decode(data).scene, result._replace(scene=scene, regions=report))
 
 
-@image_threads_for_kernels
-def _choose_regions(
-    image: Tensor, regions: RegionMap | None, target_bytes: int, config: FitConfig, seed: int
-) -> _RegionChoice:
+def _reduce(problem: Problem, choice: _RegionChoice) -> Problem:
+    """Return the problem of the fit: without a map, of a photo that is as small as the least width allows."""
+    config, (height, width) = problem.config, problem.size
+    budget = BUDGETS[config.objective]
+    min_sigma = max(config.min_sigma, budget.min_sigma(choice.num_gaussians, height * width))
+    reduction = max(1, int(min_sigma / _SETTINGS.pixels_per_sigma)) if choice.regions is None else 1
+    config = config.model_copy(update={"contour_cost": choice.contour_cost, "min_sigma": min_sigma / reduction})
+    return replace(
+        problem, image=area_mean(problem.image, (-(-height // reduction), -(-width // reduction))),
+        regions=choice.regions, num_gaussians=choice.num_gaussians, config=config, reduction=reduction,
+    )  # fmt: skip
+
+
+def _enlarge(scene: Scene, size: tuple[int, int]) -> Scene:
+    """Return the scene of a reduced photo at the size of the photo."""
+    if scene.size == size:
+        return scene
+    field = scene.field
+    means, cholesky = scaled_gaussians(field, size)
+    return Scene(GaussianField(means, cholesky, field.colors, field.region_ids, field.opacities, size=size))
+
+
+def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
     """Merge regions whose contours do not pay for their bytes, then drop the map if it does not pay as a whole."""
+    image, regions, config = problem.image, problem.regions, problem.config
     num_gaussians = partial(BUDGETS[config.objective].num_gaussians, pixels=image.shape[1] * image.shape[2])
     choice = _RegionChoice(None, num_gaussians(target_bytes), config.contour_cost, {})
     if not config.guidance:
@@ -179,12 +236,17 @@ def _choose_regions(
     map_bytes = _map_bytes(regions)
     if not config.merge_regions:
         return choice._replace(regions=regions, num_gaussians=num_gaussians(target_bytes - map_bytes))
+    if _reduce(problem, choice).reduction > 1:
+        return choice._replace(changes={"dropped": "bytes"})
     # by iterations, so that without a clock the same arguments give the same file
     iterations = min(_SETTINGS.trial_iterations, config.usual_iterations)
-    trial = FitConfig.from_recipe(config, merge_regions=False, iterations=iterations, max_seconds=None)
+    trial_config = FitConfig.from_recipe(
+        config, merge_regions=False, iterations=iterations, max_seconds=None, objective="psnr"
+    )
+    trial = replace(problem, config=trial_config)
 
     def trial_error(regions: RegionMap | None, count: int) -> Tensor:
-        scene = _fit_share(_SETTINGS.fit_share, image, regions, count, trial, seed=seed).scene
+        scene = _fit_share(_SETTINGS.fit_share, replace(trial, regions=regions, num_gaussians=count)).scene
         return (scene.render() - image).square().mean(0)
 
     plain_error = trial_error(None, choice.num_gaussians)
@@ -218,19 +280,17 @@ def _map_bytes(regions: RegionMap) -> int:
 
 def _fit_share(
     share: float,
-    image: Tensor,
-    regions: RegionMap | None,
-    num_gaussians: int,
-    config: FitConfig,
+    problem: Problem,
     on_step: Callable[[int, HistoryEntry], bool | None] | None = None,
-    **settings: Any,
+    progress: bool = False,
 ) -> FitResult:
     """Run the first share of a fit's schedule; all of it where a clock ends the fit."""
+    config = problem.config
     last = math.inf if config.max_seconds else math.ceil(share * config.usual_iterations)
 
     def stop(iteration: int, entry: HistoryEntry) -> bool:
         return (on_step is not None and bool(on_step(iteration, entry))) or iteration >= last
 
-    result = fit(image, regions, num_gaussians, recipe=config, on_step=stop, **settings)
+    result = fit_problem(problem, stop, progress)
     is_complete = result.history[-1].iteration >= last
     return result._replace(stop_reason="iterations") if is_complete else result

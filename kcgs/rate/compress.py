@@ -26,6 +26,8 @@ from kcgs.scene import Scene
 from .descent import RateDistortionDescent
 from .rounding import round_gradually
 
+# renders that descent and rounding take, unless the caller says otherwise
+ITERATIONS = 600
 # dB of `quality` above the scene's PSNR at which rounding adds about a 28th to the squared error, 0.15 dB; it adds more
 # where Gaussians are so few that rounding errors do not average out
 _QUALITY_MARGIN = 14.5
@@ -50,9 +52,9 @@ def compress(
     quality: float | None = None,
     target_bytes: int | None = None,
     target_psnr: float | None = None,
-    iterations: int = 600,
+    iterations: int = ITERATIONS,
     seed: int = 0,
-    objective: str = "psnr",
+    objective: str = "auto",
 ) -> Compressed:
     """Write a scene as a `.kcgs` file with the least error against its image.
 
@@ -70,7 +72,8 @@ def compress(
             the scene itself does not, a file that is nearly as good as the scene.
         iterations: renders that descent and rounding may take, at least 1.
         seed: of the order in which Gaussians are rounded.
-        objective: of the descent, psnr or ms-ssim, as in :class:`kcgs.FitConfig`.
+        objective: of the descent, psnr or ms-ssim, as in :class:`kcgs.FitConfig`; auto: psnr with `target_psnr`, else
+            ms-ssim.
 
     Returns:
         The file, and the scene that it decodes to.
@@ -100,10 +103,9 @@ def compress(
     check_count("iterations", iterations)
     if objective not in get_args(Objective):
         raise InvalidArgument("objective", f"one of {', '.join(get_args(Objective))}", repr(objective))
-    descent_iterations = int(_SCHEDULE.descent_share * iterations)
-    compressor = _Compressor(
-        writer, target, make_objective(objective, target), descent_iterations, iterations - descent_iterations, seed
-    )
+    if objective == "auto":
+        objective = "ms-ssim" if target_psnr is None else "psnr"
+    compressor = Compressor(writer, target, make_objective(objective, target), iterations, seed)
     with threads_for_kernels(target[0].numel()):
         if target_bytes is not None:
             data = compressor.search_bytes(target_bytes)
@@ -164,15 +166,25 @@ _SCHEDULE = CompressionSchedule()
 
 
 @dataclass(frozen=True)
-class _Compressor:
+class Compressor:
     """Rate-distortion descent and gradual rounding of one scene, at any quantization parameter (QP)."""
 
     writer: SceneWriter
-    image: Tensor  # [C, H, W]
+    image: Tensor  # [C, h, w], the scene's size, or smaller
     objective: MsSsimObjective | None
-    descent_iterations: int
-    rounding_iterations: int
+    iterations: int
     seed: int
+    min_sigma: float = 0.0
+
+    @property
+    def descent_iterations(self) -> int:
+        """Iterations before anything is rounded."""
+        return int(_SCHEDULE.descent_share * self.iterations)
+
+    @property
+    def rounding_iterations(self) -> int:
+        """Iterations while Gaussians are rounded."""
+        return self.iterations - self.descent_iterations
 
     def search_bytes(self, target_bytes: int) -> bytes:
         """Return a file of at most `target_bytes`, and nearly as many."""
@@ -248,4 +260,6 @@ class _Compressor:
         )  # fmt: skip
 
     def _new_descent(self, writer: SceneWriter) -> RateDistortionDescent:
-        return RateDistortionDescent(writer.gaussians, writer.ids, self.image, writer.regions, self.objective)
+        return RateDistortionDescent(
+            writer.gaussians, writer.ids, self.image, writer.regions, self.objective, writer.size, self.min_sigma
+        )

@@ -41,9 +41,11 @@ class RateDistortionDescent:
     Args:
         gaussians: the start.
         ids: region of each Gaussian, (N,), as a position in the map's ids.
-        image: (C, H, W), on the CPU.
+        image: (C, h, w), on the CPU: the photo, or without a map a reduced one.
         regions: the map, which stays.
         objective: the error; None: the squared error.
+        size: (H, W) of the photo.
+        min_sigma: least standard deviation of a Gaussian, in pixels of the photo.
     """
 
     def __init__(
@@ -53,12 +55,16 @@ class RateDistortionDescent:
         image: Tensor,
         regions: RegionMap | None,
         objective: MsSsimObjective | None,
+        size: tuple[int, int],
+        min_sigma: float = 0.0,
     ) -> None:
         self.ids, self.image, self.regions, self.objective = ids, image, regions, objective
+        self._scale = image.new_tensor([image.shape[2] / size[1], image.shape[1] / size[0]])
+        self._num_pixels = size[0] * size[1]
         self.gaussians = self._as_tensors(gaussians)
         # steps are so short that the first order of the shear is enough
-        self.newton = NewtonDescent(self.gaussians, exact=False)
-        self._error_weights = error_weights(self.gaussians, objective)
+        self.newton = NewtonDescent(self.gaussians, exact=False, min_sigma=min_sigma)
+        self._error_weights = error_weights(self._scaled(self.gaussians), objective)
         self._error_scale = float(self._error_weights.mean())
         self._bit_gradient: Gaussians | None = None
         self._num_steps = 0
@@ -112,7 +118,7 @@ class RateDistortionDescent:
         height, width = quantizer.size
         if self._bit_gradient is None or self._num_steps % _REUSE_STEPS == 0:
             self._bit_gradient = self._half_bit_gradient(gaussians, quantizer)
-            self._error_weights = error_weights(gaussians, self.objective)
+            self._error_weights = error_weights(self._scaled(gaussians), self.objective)
         self._num_steps += 1
         gradients = self._half_error_gradient(gaussians)
         gradients = Gaussians(*(error + bits for error, bits in zip(gradients, self._bit_gradient, strict=True)))
@@ -127,13 +133,23 @@ class RateDistortionDescent:
         return Gaussians(torch.zeros_like(gaussians.means), *torch.autograd.grad(bits, (cholesky, colors)))
 
     def _half_error_gradient(self, gaussians: Gaussians) -> Gaussians:
+        """Return half the gradient of the error, summed over the pixels of the photo."""
+        scaled = self._scaled(gaussians)
         if self.objective is not None:
-            return half_gradients(self._render, gaussians, self.image, self.objective)
-        ids = self._region_ids()
-        gradients = squared_error_gradients(
-            self.image, *gaussians, ids, self.regions, cutoff=DRAFT_CUTOFF, backend="auto"
-        )
-        return Gaussians(*gradients)
+            gradients = half_gradients(self._render, scaled, self.image, self.objective)
+        else:
+            ids = self._region_ids()
+            gradients = Gaussians(
+                *squared_error_gradients(self.image, *scaled, ids, self.regions, cutoff=DRAFT_CUTOFF, backend="auto")
+            )
+        # a pixel of the image stands for so many of the photo
+        gradients = Gaussians(*(gradient / self._scale.prod() for gradient in gradients))
+        return self._scaled(gradients)
+
+    def _scaled(self, gaussians: Gaussians) -> Gaussians:
+        """Return Gaussians, or gradients by those, as they are on the image."""
+        means, cholesky, colors = gaussians
+        return Gaussians(means * self._scale, cholesky * self._scale[[0, 1, 1]], colors)
 
     def _render(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
         size = self.image.shape[1], self.image.shape[2]
@@ -146,8 +162,8 @@ class RateDistortionDescent:
         """Return the error that each Gaussian saves, (N,), if no other overlaps it."""
         gaussians = Gaussians(*(numbers.double() for numbers in self.gaussians))
         l11, _, l22 = gaussians.cholesky.unbind(-1)
-        areas = (math.pi * l11 * l22).clamp_max(self.image[0].numel())
-        return error_weights(gaussians, self.objective) * (gaussians.colors.square().sum(-1) * areas)
+        areas = (math.pi * l11 * l22).clamp_max(self._num_pixels)
+        return error_weights(self._scaled(gaussians), self.objective) * (gaussians.colors.square().sum(-1) * areas)
 
     def _as_tensors(self, gaussians: Parameters) -> Gaussians:
         return Gaussians(*(torch.from_numpy(numbers).to(self.image) for numbers in gaussians))

@@ -9,9 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs import FitConfig, RegionMap
+from kcgs import FitConfig
 from kcgs.codec import decode
-from kcgs.functional import edge_band
+from kcgs.fitting.problem import Problem, make_problem
+from kcgs.functional import edge_band, ms_ssim
 from kcgs.rate import budget, fit_bytes
 from kcgs.rate.budget import BUDGETS
 from tests.conftest import Clock
@@ -45,12 +46,25 @@ class TestFitBytes:
         image, labels = photo
         psnrs = [10.0]
         for target in (500, 1500):
-            file = fit_bytes(image, labels, target, iterations=150)
+            file = fit_bytes(image, labels, target, iterations=150, objective="psnr")
             assert 0.93 * target < len(file.data) <= target
             assert torch.equal(decode(file.data).scene.field.means, file.scene.field.means)
             assert file.result.stop_reason == "iterations"
             psnrs.append(psnr(file.scene, image))
             assert psnrs[-1] > psnrs[-2] + 0.8
+
+    def test_least_width(self, photo: Photo) -> None:
+        """A small file is fitted on a reduced photo, has its size, no thin Gaussians, and fewer errors of MS-SSIM."""
+        image = photo[0]
+        files = [fit_bytes(image, None, 150, iterations=150, objective=name) for name in ("auto", "psnr")]
+        l11, l21, l22 = files[0].scene.field.cholesky.detach().unbind(-1)
+        factors = torch.stack([torch.stack([l11, torch.zeros_like(l11)], -1), torch.stack([l21, l22], -1)], -2)
+        least = torch.linalg.svdvals(factors)[:, 1].min()
+        spacing = (120 * 160 / BUDGETS["ms-ssim"].num_gaussians(150, 120 * 160)) ** 0.5
+        assert files[0].result.scene.size == files[0].scene.size == (120, 160)
+        assert least > 0.75 * 0.12 * (spacing - 8)
+        assert files[0].result.config.min_sigma < 0.7 * least
+        assert ms_ssim(files[0].scene.render(), image) > ms_ssim(files[1].scene.render(), image)
 
     def test_clock(self, photo: Photo, clock: Clock) -> None:
         """The clock is that of the fit."""
@@ -98,11 +112,12 @@ class TestFitBytes:
         band = edge_band(labels)
         trials = {True: image + 0.2, False: image + error * band}
 
-        def trial(share: float, image: Tensor, regions: RegionMap | None, *_: Any, **__: Any) -> Any:
-            return SimpleNamespace(scene=SimpleNamespace(render=lambda: trials[regions is None]))
+        def trial(share: float, problem: Problem) -> Any:
+            return SimpleNamespace(scene=SimpleNamespace(render=lambda: trials[problem.regions is None]))
 
         monkeypatch.setattr(budget, "_fit_share", trial)
-        choice = budget._choose_regions(image, RegionMap.from_labels(labels), 900, FitConfig(), 0)
+        config = FitConfig(objective="psnr")
+        choice = budget._choose_regions(make_problem(image, labels, 1, config, 0), 900)
         assert (choice.regions is not None) == is_used
 
     @pytest.mark.parametrize(

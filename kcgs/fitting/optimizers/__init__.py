@@ -34,7 +34,9 @@ def make_optimizer(config: FitConfig, field: GaussianField, sigma: float) -> Gau
         return GaussianImageAdan(field, sigma, config.usual_iterations, factor)
     if config.optimizer == "adam":
         return ImageGSAdam(field, factor)
-    optimizer = GaussianAdam(field, LEARNING_RATE * factor, color_lr=COLOR_LEARNING_RATE * factor)
+    optimizer = GaussianAdam(
+        field, LEARNING_RATE * factor, color_lr=COLOR_LEARNING_RATE * factor, min_sigma=config.min_sigma
+    )
     for group in optimizer.param_groups:
         group["initial_lr"] = group["lr"]
     return optimizer
