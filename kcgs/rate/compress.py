@@ -26,8 +26,6 @@ from kcgs.scene import Scene
 from .descent import RateDistortionDescent
 from .rounding import round_gradually
 
-# renders that descent and rounding take, unless the caller says otherwise
-ITERATIONS = 600
 # dB of `quality` above the scene's PSNR at which rounding adds about a 28th to the squared error, 0.15 dB; it adds more
 # where Gaussians are so few that rounding errors do not average out
 _QUALITY_MARGIN = 14.5
@@ -52,7 +50,7 @@ def compress(
     quality: float | None = None,
     target_bytes: int | None = None,
     target_psnr: float | None = None,
-    iterations: int = ITERATIONS,
+    iterations: int = 600,
     seed: int = 0,
     objective: str = "auto",
 ) -> Compressed:

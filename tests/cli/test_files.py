@@ -20,7 +20,11 @@ SIZE = (32, 48)
 @pytest.fixture(autouse=True)
 def _files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    scene = make_scene(40, SIZE)
+    save_scene(40)
+
+
+def save_scene(num_gaussians: int) -> None:
+    scene = make_scene(num_gaussians, SIZE)
     save("scene.safetensors", scene)
     save_image("photo.png", scene.render())
 
@@ -37,7 +41,7 @@ class TestEncode:
 
     def test_with_the_image(self, kcgs: Kcgs) -> None:
         files = []
-        for options in ([], ["--image", "photo.png"], ["--image", "photo.png", "--objective", "ms-ssim"]):
+        for options in ([], ["--image", "photo.png"], ["--image", "photo.png", "--objective", "psnr"]):
             arguments = ["encode", "scene.safetensors", "-o", "a.kcgs", "--target-bytes", 300, *options]
             assert kcgs(*arguments).code == 0
             files.append(Path("a.kcgs").read_bytes())
@@ -57,6 +61,11 @@ class TestEncode:
 
 
 class TestDecode:
+    @pytest.fixture(autouse=True)
+    def _layers(self, _files: None) -> None:
+        """Replace the scene by one whose file has several layers."""
+        save_scene(400)
+
     def test_whole_and_first_bytes(self, kcgs: Kcgs) -> None:
         kcgs("encode", "scene.safetensors", "-o", "a.kcgs")
         report = json.loads(kcgs("decode", "a.kcgs", "-o", "whole.png", "--json").out)

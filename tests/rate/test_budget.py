@@ -11,8 +11,9 @@ from torch import Tensor
 
 from kcgs import FitConfig
 from kcgs.codec import decode
+from kcgs.fitting.objective import MsSsimObjective
 from kcgs.fitting.problem import Problem, make_problem
-from kcgs.functional import edge_band, ms_ssim
+from kcgs.functional import edge_band
 from kcgs.rate import budget, fit_bytes
 from kcgs.rate.budget import BUDGETS
 from tests.conftest import Clock
@@ -56,15 +57,16 @@ class TestFitBytes:
     def test_least_width(self, photo: Photo) -> None:
         """A small file is fitted on a reduced photo, has its size, no thin Gaussians, and fewer errors of MS-SSIM."""
         image = photo[0]
-        files = [fit_bytes(image, None, 150, iterations=150, objective=name) for name in ("auto", "psnr")]
+        files = [fit_bytes(image, None, 80, iterations=150, objective=name) for name in ("auto", "psnr")]
         l11, l21, l22 = files[0].scene.field.cholesky.detach().unbind(-1)
         factors = torch.stack([torch.stack([l11, torch.zeros_like(l11)], -1), torch.stack([l21, l22], -1)], -2)
         least = torch.linalg.svdvals(factors)[:, 1].min()
-        spacing = (120 * 160 / BUDGETS["ms-ssim"].num_gaussians(150, 120 * 160)) ** 0.5
+        spacing = (120 * 160 / BUDGETS["ms-ssim"].num_gaussians(80, 120 * 160)) ** 0.5
         assert files[0].result.scene.size == files[0].scene.size == (120, 160)
-        assert least > 0.75 * 0.12 * (spacing - 8)
+        assert least > 0.6 * 0.12 * (spacing - 8)
         assert files[0].result.config.min_sigma < 0.7 * least
-        assert ms_ssim(files[0].scene.render(), image) > ms_ssim(files[1].scene.render(), image)
+        error = MsSsimObjective(image)
+        assert error.value(files[0].scene.render() - image) < error.value(files[1].scene.render() - image)
 
     def test_clock(self, photo: Photo, clock: Clock) -> None:
         """The clock is that of the fit."""
