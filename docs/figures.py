@@ -76,14 +76,16 @@ def objectives(path: Path) -> None:
 
 
 def contours(path: Path) -> None:
-    """Show a part of a scene, enlarged six times, with contours of both kinds."""
+    """Show a part of a scene, enlarged six times: its pixels, and the scene itself."""
     scene = load(find("zoo:coffee-1500"))
     size = (6 * scene.size[0], 6 * scene.size[1])
     rows, columns = (slice(6 * begin, 6 * end) for begin, end in PART)
     figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
-    for axis, kind in zip(axes, ("scaled", "crisp"), strict=True):
-        axis.imshow(scene.render(size, kind)[:, rows, columns].permute(1, 2, 0))
-        axis.set_title(f'contours="{kind}"', fontsize=10)
+    pixels = torch.nn.functional.interpolate(scene.render()[None], size, mode="bicubic")[0].clamp(0, 1)
+    images = {"its pixels, enlarged (bicubic)": pixels, "rendered at that size": scene.render(size)}
+    for axis, (title, image) in zip(axes, images.items(), strict=True):
+        axis.imshow(image[:, rows, columns].permute(1, 2, 0))
+        axis.set_title(title, fontsize=10)
         axis.set_axis_off()
     figure.savefig(path, dpi=110, pil_kwargs={"quality": 85})
     plt.close(figure)

@@ -20,7 +20,6 @@ from kcgs._suffixes import SCENE_FORMATS
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.functional.regions import as_region_map
-from kcgs.functional.softness import CONTOURS, check_contours
 from kcgs.nn import GaussianField, RegionSplatRenderer
 from kcgs.nn.renderer import rendered_size
 
@@ -31,7 +30,7 @@ _MAP_BYTES = 42
 # pixels of the longer side of a scene's image in a notebook
 _NOTEBOOK_SIDE = 1024
 
-_RENDERERS = {contours: RegionSplatRenderer(contours=contours) for contours in CONTOURS}
+_RENDERER = RegionSplatRenderer()
 
 
 class Scene(nn.Module):
@@ -80,31 +79,29 @@ class Scene(nn.Module):
         """Number of Gaussians per image."""
         return self.field.num_gaussians
 
-    def forward(self, size: tuple[int, int] | None = None, contours: str = "scaled") -> Tensor:
+    def forward(self, size: tuple[int, int] | None = None) -> Tensor:
         """Render, differentiably and not clipped. :class:`kcgs.RegionSplatRenderer` has more settings.
 
         Args:
             size: (height, width); None: the scene's own.
-            contours: "scaled", as wide as they were fitted, and wider in a larger image; "crisp", about one pixel at
-                any size.
 
         Returns:
             Image, :math:`(C, H, W)`, or :math:`(B, C, H, W)` for a batch.
 
         Raises:
-            TypeError, ValueError: as :func:`kcgs.functional.region_splat`; a map without region ids; other contours.
+            TypeError, ValueError: as :func:`kcgs.functional.region_splat`; a map without region ids.
         """
-        image: Tensor = _RENDERERS[check_contours(contours)](self.field, self.regions, size)
+        image: Tensor = _RENDERER(self.field, self.regions, size)
         return image
 
-    def render(self, size: tuple[int, int] | None = None, contours: str = "scaled") -> Tensor:
+    def render(self, size: tuple[int, int] | None = None) -> Tensor:
         """Render an image to show or save: as :meth:`forward`, but clipped to [0, 1] and without a graph.
 
         On the CPU, a size that needs more memory than is free is a ValueError, which says how much.
         """
         check_render_memory(self, size)
         with torch.no_grad():
-            image: Tensor = self(size, contours)
+            image: Tensor = self(size)
             return image.clamp(0.0, 1.0)
 
     def __len__(self) -> int:

@@ -46,8 +46,6 @@ def serialize(scene: Scene) -> bytes:
     if field.region_ids is not None:
         tensors["region_ids"] = _narrow(field.region_ids.cpu())
     if regions is not None:
-        if regions.contours == "crisp":
-            raise ValueError('regions must have scaled contours; got crisp ones: render(contours="crisp") makes them')
         header["softness"] = softness = regions.softness
         if isinstance(softness, PairSoftness):
             header["softness"] = [[*pair, width] for pair, width in softness.items()]

@@ -12,7 +12,7 @@ from kcgs._atomic import write_file
 from .commands import app
 from .common import Json, SceneFile, check_output, print_report
 from .fit import describe_scene
-from .options import Contours, exclude
+from .options import exclude
 
 
 @app.command()
@@ -23,7 +23,6 @@ def export(
         bool,
         typer.Option("--interactive", help="Of ONNX: add inputs for a view and for the visibility of each region."),
     ] = False,
-    contours: Contours = "scaled",
     as_json: Json = False,
 ) -> None:
     """Write a scene's decoder as ONNX, or the scene as one web page: neither needs torch or kcgs."""
@@ -38,10 +37,10 @@ def export(
         exclude("a page", interactive=interactive or None)
         # a compressed file goes into the page as it is
         data = web_bytes(scene.read_bytes() if scene.suffix == ".kcgs" else loaded)
-        size = write_file(output, scene_page(data, title=output.stem, contours=contours))
+        size = write_file(output, scene_page(data, title=output.stem))
         print_report({**describe_scene(loaded), "scene_bytes": len(data), "bytes": size}, as_json, str(output))
         return
-    model = scene_decoder(loaded, interactive=interactive, contours=contours)
+    model = scene_decoder(loaded, interactive=interactive)
     report = {**describe_decoder(model), "bytes": write_file(output, model.SerializeToString())}
     print_report(report, as_json, str(output))
 
@@ -49,7 +48,6 @@ def export(
 @app.command()
 def view(
     scene: SceneFile,
-    contours: Contours = "scaled",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 0,
     browser: Annotated[bool, typer.Option(help="Open a browser window.")] = True,
 ) -> None:
@@ -61,7 +59,7 @@ def view(
 
     loaded = check_unbatched(load(scene))
     content = scene.read_bytes() if scene.suffix == ".kcgs" else loaded
-    page = scene_page(content, title=scene.stem, contours=contours)
+    page = scene_page(content, title=scene.stem)
     serve(page, port=port, browser=browser, say=typer.echo)
 
 

@@ -16,10 +16,6 @@ if TYPE_CHECKING:
 
 DEFAULT_GAUSSIANS = 1000
 
-Contours = Annotated[
-    Literal["scaled", "crisp"],
-    typer.Option(help="Width of contours: scaled with the image, or crisp, about a pixel of the image."),
-]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")]
 ResizeRegions = Annotated[
     bool, typer.Option("--resize-regions", help="Resize a label map of another size to that of the image.")

@@ -23,7 +23,7 @@ from .common import (
     print_report,
 )
 from .fit import describe_file, describe_scene, read_regions
-from .options import Contours, Objective, ResizeRegions, exclude, target_size
+from .options import Objective, ResizeRegions, exclude, target_size
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -42,7 +42,6 @@ def render(
     ],
     scale: Annotated[float | None, typer.Option(help="Magnification.")] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Width and height in pixels.")] = None,
-    contours: Contours = "scaled",
     frame_rate: Annotated[float | None, typer.Option(help="Of a batch: frames per second; default: its own.")] = None,
     frame: Annotated[
         float | None, typer.Option(help="Of a batch: this time alone, in frames from 0; 0.5 is halfway to the next.")
@@ -60,13 +59,13 @@ def render(
         from .video import render_batch
 
         target = target_size(loaded[0], scale, size)
-        num_frames = render_batch(loaded, output, target, contours, frame_rate, frame)
+        num_frames = render_batch(loaded, output, target, frame_rate, frame)
         print_report({"frames": num_frames, "height": target[0], "width": target[1]}, as_json, str(output))
         return
     exclude("a scene of one image", frame_rate=frame_rate, frame=frame)
     check_output(output, *WRITTEN_IMAGES)
     target = target_size(loaded, scale, size)
-    save_image(output, loaded.render(target, contours))
+    save_image(output, loaded.render(target))
     print_report(_describe_image(output, target), as_json, str(output))
 
 

@@ -99,7 +99,7 @@ def _save(scenes: Scene, output: Path) -> int:
 
 
 def render_batch(
-    scenes: Scene, output: Path, size: tuple[int, int], contours: str, frame_rate: float | None, frame: float | None
+    scenes: Scene, output: Path, size: tuple[int, int], frame_rate: float | None, frame: float | None
 ) -> int:
     """Write a batch as a video, as a folder of PNGs, or one time of it as an image; return the number of images."""
     from kcgs._check import check_number
@@ -110,7 +110,7 @@ def render_batch(
         options.exclude("--frame", frame_rate=frame_rate)
         check_output(output, *WRITTEN_IMAGES)
         check_number("frame", frame, 0.0, len(scenes) - 1.0, unit="frames")
-        save_image(output, interpolate(scenes, frame).render(size, contours))
+        save_image(output, interpolate(scenes, frame).render(size))
         return 1
     if output.suffix:  # none: a folder
         check_output(output, *VIDEOS)
@@ -118,5 +118,5 @@ def render_batch(
     rate = scene_rate if frame_rate is None else check_number("frame_rate", frame_rate, 0.0, 1000.0, above=True)
     count = 1 + math.floor((len(scenes) - 1) * rate / scene_rate + 1e-6)
     times = (min(number * scene_rate / rate, len(scenes) - 1.0) for number in range(count))
-    write_video(output, (interpolate(scenes, time).render(size, contours) for time in times), rate)
+    write_video(output, (interpolate(scenes, time).render(size) for time in times), rate)
     return count

@@ -15,7 +15,6 @@ from kcgs.kernels.whitened import least_exponent, support_radius
 
 from .arguments import SplatArguments
 from .map_windows import MapWindows
-from .softness import is_crisp
 
 _SIDE = 32  # pixels of a tile
 _HALF = (_SIDE - 1) / 2  # pixels from the middle of a tile to its outermost pixel centres
@@ -36,10 +35,6 @@ class _TileGaussians(NamedTuple):
 def decompose(*operands: Any) -> Tensor:
     """Render as `kcgs::region_splat` does, whose arguments these are; to be traced, and slow in eager mode."""
     arguments = SplatArguments(*operands)
-    if is_crisp(arguments.softness):
-        raise ValueError(
-            "contours must be scaled in graphs of torch.onnx.export; got crisp: kcgs.onnx.scene_decoder has both"
-        )
     if arguments.means.ndim == 2:
         return decompose(*(None if t is None else t[None] for t in operands[:4]), *operands[4:]).squeeze(0)
     # a graph that renders only: loops cannot all be differentiated
@@ -117,7 +112,7 @@ def _sum_regions(
     start = torch.zeros_like(gaussians.num_gaussians), black, torch.zeros_like(black[:1])
     loop = torch.ops.higher_order.while_loop
     _, total, weight = loop(has_region, add_region, start, (near, ids, *gaussians, *window))
-    image: Tensor = total / weight if windows.soft and windows.is_resized else total
+    image: Tensor = total / weight if windows.is_resized else total
     return image
 
 

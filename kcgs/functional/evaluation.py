@@ -110,7 +110,7 @@ def _prepare(arguments: SplatArguments, check: bool) -> tuple[SplatInputs, Steps
         # not read on CUDA: that would be a device synchronisation
         known = region_index.device.type == "cpu" and int(region_index.numpy().min(initial=0)) >= 0
         if check and not known:
-            check_region_ids(arguments.region_ids, region_index, tables.complete)
+            check_region_ids(arguments.region_ids, region_index)
         membership = tables.membership
         # one region covers everything: no map, but Gaussians of other ids still paint nothing
         if membership.num_regions == 1 and known:

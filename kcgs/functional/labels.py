@@ -11,7 +11,6 @@ from torch import Tensor
 from kcgs._check import check_floating
 from kcgs._labels import check_labels
 
-_OFFSETS = 1024  # places between two pixel centres at which hard contours are sampled
 _TABLE_IDS = 1 << 16  # up to this id a table is ten times faster than sorting every pixel
 
 
@@ -167,32 +166,9 @@ def compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     return ids, index.to(torch.int32), None
 
 
-def sample_places(new: int, old: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Place `new` pixels on a line of `old` labels: both neighbours, (2, n), and their shares."""
-    # in integers, so that any program that renders the map puts a pixel on the same side
-    points = (2 * torch.arange(new, device=device) + 1) * old + new  # from one label before the first: never negative
-    low = torch.div(points, 2 * new, rounding_mode="floor")
-    offset = (torch.div((points - 2 * new * low) * _OFFSETS, 2 * new, rounding_mode="floor") + 0.5) / _OFFSETS
-    ends = torch.stack([low - 1, low]).clamp(0, old - 1)
-    return ends, torch.stack([1 - offset, offset]).double()
-
-
 def sample_labels(labels: Tensor, height: int, width: int) -> Tensor:
-    """Sample a label map at another size: the label with the largest share among four neighbours; see `resize`."""
-    (rows, down), (cols, across) = (
-        sample_places(new, old, labels.device) for new, old in zip((height, width), labels.shape[-2:], strict=True)
-    )
-    corners = [labels.index_select(-2, r).index_select(-1, c) for r in rows for c in cols]
-    sampled = corners[0].clone()
-    # most pixels have four equal neighbours
-    mixed = (corners[1] != sampled).logical_or_(corners[2] != sampled).logical_or_(corners[3] != sampled)
-    places = mixed.nonzero(as_tuple=True)
-    weights = torch.stack([d[places[-2]] * a[places[-1]] for d in down for a in across])
-    sampled[places] = most_shared(torch.stack([corner[places] for corner in corners]), weights)
-    return sampled
-
-
-def most_shared(labels: Tensor, shares: Tensor) -> Tensor:
-    """Return the label with the largest sum of shares along the first dimension; of several the first."""
-    sums = torch.stack([torch.where(labels == label, shares, 0.0).sum(0) for label in labels])
-    return labels.gather(0, sums.argmax(0, keepdim=True))[0]
+    """Sample a label map at another size: each new pixel has the label of the one that its centre lies in."""
+    for dim, new in ((-2, height), (-1, width)):
+        places = (2 * torch.arange(new, device=labels.device) + 1) * labels.shape[dim] // (2 * new)
+        labels = labels.index_select(dim, places)
+    return labels

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcgs._labels import check_labels
-from kcgs.kernels import Crisp, Membership, Resampled
+from kcgs.kernels import Membership, Resampled
 
 from .labels import compact, sample_labels
-from .softness import CRISP_SOFTNESS, PairSoftness, check_softness, is_crisp, scaled_softness, softness_of
+from .softness import PairSoftness, check_softness, scaled_softness, softness_of
 
 _CACHED_VIEWS = 3  # of a map: a viewer renders at ever new sizes
 
@@ -21,7 +20,7 @@ class MapOperands(NamedTuple):
     """A map as the operator takes it."""
 
     labels: Tensor  # [H, W] or [B, H, W] int64, of the map at its own size; nobody writes to those of a RegionMap
-    softness: Tensor | None  # float64, as `softness_tensor` or `crisp_tensor` makes it; None: hard contours
+    softness: Tensor | None  # float64, as `softness_tensor` makes it; None: hard contours
     size: tuple[int, int]  # (height, width) that the map is sampled at
 
 
@@ -32,7 +31,6 @@ class MapTables(NamedTuple):
     positions: Tensor | None  # from id + 1 to its position among `ids`, -1 at both ends; None where ids are large
     softness: float | PairSoftness
     membership: Membership
-    complete: bool = True  # False: hard contours at another size, where small regions may be lost
 
     def to(self, device: torch.device) -> MapTables:
         """Return the same tables on `device`."""
@@ -51,14 +49,14 @@ class MapTables(NamedTuple):
 
 
 class TableCache:
-    """The tables of one map: at its own size, and of the views added last, which are other sizes or crisp contours.
+    """The tables of one map: at its own size, and at the other sizes added last.
 
     It is an attribute of the labels that a RegionMap owns, since the operator receives these and not the map.
     """
 
     def __init__(self, original: MapTables) -> None:
         self.original = original
-        self._views: dict[tuple[tuple[int, int], bool], MapTables] = {}
+        self._views: dict[tuple[int, int], MapTables] = {}
 
     @staticmethod
     def of(labels: Tensor) -> TableCache | None:
@@ -69,37 +67,34 @@ class TableCache:
         """Make this the cache of labels."""
         labels.kcgs_tables = self
 
-    def view(self, size: tuple[int, int], crisp: bool) -> MapTables | None:
-        """Return the tables of a view."""
-        return self._views.get((size, crisp))
+    def view(self, size: tuple[int, int]) -> MapTables | None:
+        """Return the tables at a size."""
+        return self._views.get(size)
 
-    def add(self, size: tuple[int, int], crisp: bool, tables: MapTables) -> None:
-        """Add a view, in place of the oldest where there are too many."""
+    def add(self, size: tuple[int, int], tables: MapTables) -> None:
+        """Add a size, in place of the oldest where there are too many."""
         # a new dict: another thread may read the present one
-        self._views = dict([*self._views.items(), ((size, crisp), tables)][-_CACHED_VIEWS:])
+        self._views = dict([*self._views.items(), (size, tables)][-_CACHED_VIEWS:])
 
 
 def tables_at(operands: MapOperands) -> MapTables:
     """Return the tables of a map at its size, cached where a RegionMap owns the labels."""
     labels, softness, size = operands
-    crisp, cache = is_crisp(softness), TableCache.of(labels)
+    cache = TableCache.of(labels)
     if cache is None:
         check_labels("regions", labels)
-        return _view(make_tables(labels, 0.0 if crisp else softness_of(softness)), operands)
-    tables = cache.view(size, crisp)
+        return _view(make_tables(labels, softness_of(softness)), operands)
+    tables = cache.view(size)
     if tables is None:
         tables = _view(cache.original, operands)
-        cache.add(size, crisp, tables)
+        cache.add(size, tables)
     return tables
 
 
 def _view(original: MapTables, operands: MapOperands) -> MapTables:
     """Return the tables of a map at a size for those at its own."""
-    labels, softness, size = operands
-    crisp = is_crisp(softness) and len(original.ids) > 1
-    if not crisp and size == labels.shape[-2:]:
-        return original
-    return resample(original, labels, size, crisp)[1]
+    labels, _, size = operands
+    return original if size == labels.shape[-2:] else resample(original, labels, size)[1]
 
 
 def make_tables(labels: Tensor, softness: object) -> MapTables:
@@ -116,13 +111,10 @@ def make_tables(labels: Tensor, softness: object) -> MapTables:
     return MapTables(ids, positions, softness, membership)
 
 
-def resample(tables: MapTables, labels: Tensor, size: tuple[int, int], crisp: bool) -> tuple[Tensor, MapTables]:
-    """Return the labels and the tables of a map at another size, or with crisp contours: see `RegionMap.resize`."""
+def resample(tables: MapTables, labels: Tensor, size: tuple[int, int]) -> tuple[Tensor, MapTables]:
+    """Return the labels and the tables of a map at another size: see `RegionMap.resize`."""
     sampled = sample_labels(labels, *size)
-    if not crisp and tables.softness == 0.0:
-        return sampled, make_tables(sampled, 0.0)._replace(complete=False)
     index = tables.index_of(sampled).to(torch.int32)
-    membership = (Crisp if crisp else Resampled)(index if index.ndim == 3 else index[None], tables.membership)
-    scale = math.sqrt(size[0] * size[1] / (labels.shape[-2] * labels.shape[-1]))
-    softness = CRISP_SOFTNESS if crisp else scaled_softness(tables.softness, scale)
+    membership = Resampled(index if index.ndim == 3 else index[None], tables.membership)
+    softness = scaled_softness(tables.softness, membership.ratio)
     return sampled, tables._replace(softness=softness, membership=membership)

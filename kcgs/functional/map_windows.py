@@ -11,14 +11,16 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcgs.kernels.resampled import sharpness
+from kcgs.kernels.antialiasing import antialias, shifted
+from kcgs.kernels.membership import RADIUS_SIGMAS
+from kcgs.kernels.resampled import LEAST_BLUR, sharpness
 
-from .labels import most_shared, sample_places
 from .map_tables import MapOperands
 from .sizes import is_equal
 
 _FAR = 1e12  # more than any squared distance
 _TINY = 1e-30  # less than any sum of a blur
+_LARGEST_EXPONENT = 64  # of memberships: float32 holds the powers
 
 
 class MapWindows:
@@ -32,40 +34,56 @@ class MapWindows:
         labels, softness, size = regions
         device = labels.device
         self.side, self.dtype = side, dtype
-        self.soft = softness is not None
-        self.pairs = softness is not None and softness.ndim == 2
-        self.reach = 0 if softness is None else softness.shape[-1] - (4 if self.pairs else 2)
-        # the nearest contour of a pixel of several regions is no farther away than this
-        self.search = math.ceil(math.sqrt(2) * self.reach)
-        self.halo = self.search + 1 if self.pairs else self.reach
         self.is_resized = not all(is_equal(new, old) for new, old in zip(size, labels.shape[-2:], strict=True))
-        axis = self._soft_axis if self.soft else self._hard_axis
-        down, across = (axis(size[k], labels.shape[k - 2], device) for k in (0, 1))
+        self.soft = softness is not None or self.is_resized
+        self.pairs = softness is not None and softness.ndim == 2
+        taps = 1 if softness is None else softness.shape[-1] - (3 if self.pairs else 1)
+        least = math.ceil(RADIUS_SIGMAS * LEAST_BLUR) if self.is_resized else 0
+        self.reach = max(taps - 1, least)
+        # distance at which a region around a pixel may be a part of it: antialiasing reaches one pixel farther
+        self.margin = self.reach + self.is_resized
+        # the nearest contour of a pixel of several regions is no farther away than this
+        self.search = math.ceil(math.sqrt(2) * self.margin)
+        self.halo = self.search if self.pairs else self.margin
+        down, across = (self._axis(size[k], labels.shape[k - 2], device) for k in (0, 1))
         self._tables_per_axis = len(down)
-        shape = (labels.shape[0] if labels.ndim == 3 else 1, *labels.shape[-2:])
-        numbers = torch.stack([torch.full((), n, dtype=torch.int64, device=device) for n in shape])
-        self.tables: tuple[Tensor, ...] = (numbers, labels.flatten(), *down, *across)
-        if softness is not None:
-            sides = [torch.full((), n, dtype=torch.float64, device=device) for n in (*labels.shape[-2:], *size)]
-            enlargement = (1 - sides[0] * sides[1] / (sides[2] * sides[3])).clamp_min(0).to(dtype)
-            self.tables = (*self.tables, enlargement, softness)
+        maps = labels if labels.ndim == 3 else labels[None]
+        numbers = torch.stack([torch.full((), n, dtype=torch.int64, device=device) for n in maps.shape])
+        images, self._widths = self._soft_tables(maps, softness, size) if self.soft else ((), ())
+        self.tables = (numbers, *down, *across, *(image.flatten() for image in (maps, *images)), *self._widths)
 
-    def _hard_axis(self, new: int, length: int, device: torch.device) -> tuple[Tensor, ...]:
-        """Return the pixels of the rows, or columns, of tiles: both neighbours and their shares where resized."""
-        count = (new + self.side - 1) // self.side
-        # the last pixel is repeated past the edge
-        pixels = torch.arange(count * self.side, device=device).clamp_max(new - 1)
-        if not self.is_resized:
-            return (pixels.reshape(count, -1),)
-        ends, shares = sample_places(new, length, device)
-        parts = (*ends, *shares.to(self.dtype))
-        return tuple(part.index_select(0, pixels).reshape(count, -1) for part in parts)
+    def _soft_tables(
+        self, maps: Tensor, softness: Tensor | None, size: Sequence[int]
+    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """Return what is read of pixels beside their labels; and widths of contours, their blurs, and the ratio."""
+        widths = torch.zeros(1, dtype=torch.float64, device=maps.device) if softness is None else softness[:1]
+        levels = torch.zeros_like(maps)
+        if softness is not None and self.pairs:
+            # a contour between regions that `softness` does not name is hard: one row beyond the last
+            widths = torch.nn.functional.pad(softness[:, 2], (0, 1))
+            levels = _touching_levels(maps, softness[:, :2].long())
+        images: tuple[Tensor, ...] = (levels,) if self.pairs else ()
+        blurs = widths
+        sides = [torch.full((), n, dtype=torch.float64, device=maps.device) for n in (*maps.shape[-2:], *size)]
+        ratio = torch.stack([sides[2] / sides[0], sides[3] / sides[1]])
+        if self.is_resized:
+            is_native = (ratio == 1).all()  # which a graph of any size may be
+            is_sharp = widths.index_select(0, levels.clamp_min(0).flatten()).reshape(levels.shape) < LEAST_BLUR
+            weight, other, other_weight = antialias(maps, is_sharp)
+            blurs = torch.where(is_native, widths, widths.clamp_min(LEAST_BLUR))
+            weight, other_weight = torch.where(is_native, 1.0, weight), torch.where(is_native, 0.0, other_weight)
+            images = (*images, weight.to(self.dtype), other, other_weight.to(self.dtype))
+        distance = torch.arange(self.reach + 1, device=maps.device)
+        taps = torch.exp(-0.5 * (distance / blurs.clamp_min(1e-9)[:, None]) ** 2)
+        taps = torch.where(distance <= (RADIUS_SIGMAS * blurs[:, None]).ceil(), taps, 0.0)
+        return images, (widths.square(), taps, ratio)
 
-    def _soft_axis(self, new: int, length: int, device: torch.device) -> tuple[Tensor, ...]:
+    def _axis(self, new: int, length: int, device: torch.device) -> tuple[Tensor, ...]:
         """Return the lines of the windows of tiles, and a matrix of interpolation for each where resized."""
         count = (new + self.side - 1) // self.side
         if not self.is_resized:
             return self._lines(torch.arange(count, device=device) * self.side, self.side, length)
+        # the last pixel is repeated past the edge
         pixels = torch.arange(count * self.side, device=device).clamp_max(new - 1)
         # between which pixels of the map each pixel lies, and how far
         place = ((2 * pixels + 1).double() * length - new) / (2 * new)
@@ -88,75 +106,62 @@ class MapWindows:
     def read_tile(self, tables: Sequence[Tensor], image: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, ...]:
         """Read the window of tile (row, column) of an image: its labels, sorted, and what `membership` takes."""
         maps, height, width = tables[0].unbind()
-        labels, first_row = tables[1], image % maps * height
+        first_row = image % maps * height
+        end = 1 + 2 * self._tables_per_axis
         down, across = (
-            [
-                table.index_select(0, place.reshape(1)).squeeze(0)
-                for table in tables[start : start + self._tables_per_axis]
-            ]
-            for place, start in ((row, 2), (column, 2 + self._tables_per_axis))
+            [table.index_select(0, place.reshape(1)).squeeze(0) for table in part]
+            for place, part in (
+                (row, tables[1 : 1 + self._tables_per_axis]),
+                (column, tables[1 + self._tables_per_axis : end]),
+            )
         )
-
-        def read(rows: Tensor, columns: Tensor) -> Tensor:
-            places = (first_row + rows)[:, None] * width + columns
-            return labels.index_select(0, places.flatten()).reshape(places.shape)
-
-        if not self.soft and self.is_resized:
-            shares = torch.stack([d[:, None] * a for d in down[2:] for a in across[2:]])
-            corners = torch.stack([read(rows, columns) for rows in down[:2] for columns in across[:2]])
-            window = most_shared(corners, shares)
-        else:
-            window = read(down[0], across[0])
+        places = (first_row + down[0])[:, None] * width + across[0]
+        window, *images = (
+            table.index_select(0, places.flatten()).reshape(places.shape)
+            for table in tables[end : len(tables) - len(self._widths)]
+        )
         # pixels beyond the reach of a blur say which contour is near, but are of no region here
-        ids = self._crop(window, self.halo - self.reach).flatten().sort()[0]
+        ids = self._crop(window, self.halo - self.margin).flatten().sort()[0]
         if not self.soft:
             return ids, window
-        enlargement, softness = tables[-2:]
-        blurs, variance = self._blurs(softness, ids, window, down[1], across[1])
-        taps = torch.arange(-self.reach, self.reach + 1, device=labels.device).abs()
-        operands = (window, down[1], across[1], blurs.to(self.dtype).index_select(1, taps))
+        variances, taps, ratio = tables[-len(self._widths) :]
+        level = torch.zeros_like(ids[:1])
+        if self.pairs:
+            # where there is one region, any blur is right
+            level = torch.ops.higher_order.cond(
+                ids[0] != ids[-1],
+                lambda *operands: self._nearest_levels(*operands),
+                lambda *operands: self._no_levels(*operands),
+                (images.pop(0), down[1], across[1]),
+            )[0]
+        mirrored = torch.arange(-self.reach, self.reach + 1, device=window.device).abs()
+        blurs = taps.to(self.dtype).index_select(0, level).index_select(1, mirrored)
+        operands = (window, down[1], across[1], blurs)
         if not self.is_resized:
             return ids, *operands
         sides = [n - 2 * self.halo for n in window.shape]
-        variances = variance.to(self.dtype).expand(sides[0] * sides[1]).reshape(sides)
-        exponent = sharpness(down[2] @ variances @ across[2].T, enlargement)
-        return ids, *operands, down[2], across[2], exponent
+        variance = variances.to(self.dtype).index_select(0, level).expand(sides[0] * sides[1]).reshape(sides)
+        exponent = sharpness(down[2] @ variance @ across[2].T, ratio.prod().to(self.dtype))
+        exponent = torch.where((ratio == 1).all(), 1.0, exponent.clamp_max(_LARGEST_EXPONENT))
+        return ids, *operands, *images, down[2], across[2], exponent
 
     def membership(self, operands: Sequence[Tensor], region: Tensor) -> Tensor:
         """Evaluate the membership of a tile's pixels in a region, (1,); `operands` are what `read_tile` found.
 
-        Of a soft map at another size they are to be divided by their sum over the regions.
+        Of a map at another size they are to be divided by their sum over the regions.
         """
         window, *soft = operands
+        inside = (window == region).to(self.dtype)
         if not soft:
-            return (window == region).to(self.dtype)
+            return inside
         rows_inside, columns_inside, blurs, *interpolation = soft
+        if interpolation:
+            weight, other, other_weight, rows, columns, exponent = interpolation
+            inside = inside * weight + (other == region).to(self.dtype) * other_weight
         margin = self.halo - self.reach
         down, across = (t[margin : t.shape[0] - margin] for t in (rows_inside, columns_inside))
-        inside = (self._crop(window, margin) == region).to(self.dtype) * down[:, None] * across
-        membership = self._blur(inside, blurs, down, across)
-        if not interpolation:
-            return membership
-        rows, columns, exponent = interpolation
-        return (rows @ membership @ columns.T).clamp_min(0) ** exponent
-
-    def _blurs(
-        self, softness: Tensor, ids: Tensor, window: Tensor, rows_inside: Tensor, columns_inside: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return half of the blur, (1, 1 + R), and its variance (1,); or those of each pixel inside of the halo."""
-        if not self.pairs:
-            return softness[None, 1:], softness[:1].square()
-        # where there is one region, any blur is right
-        level = torch.ops.higher_order.cond(
-            ids[0] != ids[-1],
-            lambda *operands: self._nearest_levels(*operands),
-            lambda *operands: self._no_levels(*operands),
-            (window, softness, rows_inside, columns_inside),
-        )[0]
-        hard = (torch.arange(self.reach + 1, device=window.device) == 0).to(softness.dtype)
-        blurs, variances = torch.cat([softness[:, 3:], hard[None]]), softness[:, 2].square()
-        variances = torch.cat([variances, torch.zeros_like(variances[:1])])
-        return blurs.index_select(0, level), variances.index_select(0, level)
+        membership = self._blur(self._crop(inside, margin) * down[:, None] * across, blurs, down, across)
+        return (rows @ membership @ columns.T).clamp_min(0) ** exponent if interpolation else membership
 
     def _crop(self, window: Tensor, margin: int) -> Tensor:
         return window[margin : window.shape[0] - margin, margin : window.shape[1] - margin]
@@ -177,25 +182,13 @@ class MapWindows:
         blurred = blurred.gather(2, rows.reshape(1, height, taps).expand(width, height, taps))
         return (blurred * kernels.permute(1, 0, 2)).sum(-1).T / total.clamp_min(_TINY)
 
-    def _no_levels(self, window: Tensor, *_: Tensor) -> tuple[Tensor]:
-        return (torch.zeros_like(self._crop(window, self.halo).flatten()),)
+    def _no_levels(self, levels: Tensor, *_: Tensor) -> tuple[Tensor]:
+        return (torch.zeros_like(self._crop(levels, self.halo).flatten()),)
 
-    def _nearest_levels(
-        self, window: Tensor, softness: Tensor, rows_inside: Tensor, columns_inside: Tensor
-    ) -> tuple[Tensor]:
-        """Return for each pixel inside of the halo the row of `softness` that is its nearest contour's.
-
-        A contour between regions that `softness` does not name is hard: one row beyond the last.
-        """
-        label = window[1:-1, 1:-1]
-        other = label
-        # the first of these that differs, so the last comes first
-        for neighbour in (window[2:, 1:-1], window[1:-1, 2:], window[1:-1, :-2], window[:-2, 1:-1]):
-            other = torch.where(neighbour != label, neighbour, other)
-        touches = (other != label) & (rows_inside[1:-1, None] * columns_inside[1:-1] > 0)
-        low, high = (torch.where(label < other, *ends).flatten() for ends in ((label, other), (other, label)))
-        level = _search_pairs(softness[:, :2].long(), low, high).reshape(label.shape)
-        return (self._nearest(touches, level).flatten(),)
+    def _nearest_levels(self, levels: Tensor, rows_inside: Tensor, columns_inside: Tensor) -> tuple[Tensor]:
+        """Return for each pixel inside of the halo the level of its nearest contour."""
+        touches = (levels >= 0) & (rows_inside[:, None] * columns_inside > 0)
+        return (self._nearest(touches, levels).flatten().clamp_min(0),)
 
     def _nearest(self, touches: Tensor, level: Tensor) -> Tensor:
         """Give each pixel inside of a halo of `search` the level of the nearest that touches a contour.
@@ -212,6 +205,17 @@ class MapWindows:
         level = level.gather(0, step + rows[:, :1])  # [height, width + halo]
         square = square.T.index_select(0, columns.flatten()).reshape(width, taps, height) + squares[:, None]
         return level.gather(1, square.argmin(1).T + columns[:, 0])
+
+
+def _touching_levels(labels: Tensor, pairs: Tensor) -> Tensor:
+    """Return the row of sorted pairs, (P, 2), that each pixel which touches a contour has, P if none; -1 for others."""
+    other = labels
+    # the first of these that differs, so the last comes first
+    for down, right in ((1, 0), (0, 1), (0, -1), (-1, 0)):
+        neighbour = shifted(labels, down, right)
+        other = torch.where(neighbour != labels, neighbour, other)
+    low, high = torch.minimum(labels, other).flatten(), torch.maximum(labels, other).flatten()
+    return torch.where(other != labels, _search_pairs(pairs, low, high).reshape(labels.shape), -1)
 
 
 def _search_pairs(pairs: Tensor, low: Tensor, high: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from kcgs._labels import check_labels, is_label_source
 
 from .labels import touching_pairs, union_find
 from .map_tables import MapOperands, MapTables, TableCache, make_tables, resample
-from .softness import PairSoftness, check_contours, crisp_tensor, is_crisp, merged_softness, softness_tensor
+from .softness import PairSoftness, merged_softness, softness_tensor
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,7 +44,7 @@ class RegionMap:
         if self._source is None:
             TableCache(self.tables).attach(self._labels)
         elif cache := TableCache.of(self._source._labels):
-            cache.add(self.size, is_crisp(self._softness), self.tables)
+            cache.add(self.size, self.tables)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the cache, an attribute of the labels."""
@@ -105,11 +105,6 @@ class RegionMap:
         return self.tables.softness
 
     @property
-    def contours(self) -> str:
-        """How contours were resized: "scaled" or "crisp"."""
-        return "crisp" if is_crisp(self._softness) else "scaled"
-
-    @property
     def num_maps(self) -> int | None:
         """Number of maps of a batch, B; None: one map without a batch."""
         return self._labels.shape[0] if self._labels.ndim == 3 else None
@@ -131,7 +126,7 @@ class RegionMap:
 
     @property
     def is_resampled(self) -> bool:
-        """True if `resize` made this map from soft contours, or made contours crisp: it interpolates another map."""
+        """True if `resize` made this map: it interpolates another one."""
         return self._source is not None
 
     def index_of(self, region_ids: Tensor) -> Tensor:
@@ -237,7 +232,7 @@ class RegionMap:
         if self.num_maps is None:
             raise ValueError("image needs a batch of maps; got one map")
         if self._source is not None:
-            return self._source.image(index).resize(self.size, self.contours)
+            return self._source.image(index).resize(self.size)
         return self._with_labels(self._labels[index], self.softness)
 
     def _with_labels(self, labels: Tensor, softness: float | Mapping[tuple[int, int], float]) -> RegionMap:
@@ -255,7 +250,7 @@ class RegionMap:
             {'labels': tensor([[1, 2]]), 'softness': 0.0, 'size': (1, 2)}
         """
         if self._source is not None:
-            return {**self._source.state(), "size": self.size, "contours": self.contours}
+            return {**self._source.state(), "size": self.size}
         softness = self.softness if isinstance(self.softness, float) else tuple(self.softness.items())
         return {"labels": self.labels, "softness": softness, "size": self.size}
 
@@ -269,44 +264,35 @@ class RegionMap:
         """
         pairs = state["softness"]
         softness = pairs if isinstance(pairs, float) else {tuple(pair): value for pair, value in pairs}
-        return cls.from_labels(state["labels"], softness).resize(state["size"], state.get("contours", "scaled"))
+        return cls.from_labels(state["labels"], softness).resize(state["size"])
 
-    def resize(self, size: tuple[int, int], contours: str = "scaled") -> RegionMap:
-        """Sample the map at another resolution; contours are smoothed, not stepped.
+    def resize(self, size: tuple[int, int]) -> RegionMap:
+        r"""Sample the map at another resolution; contours are smooth curves, not stairs.
 
-        Hard contours stay hard: between pixel centres a point has the label with the largest share among its four
-        neighbours (bilinear weights, of offsets rounded to odd multiples of 1/2048 pixel, so that no two labels tie).
-        Labels that have no pixel in the new map are no regions of it.
-
-        The softness of soft contours scales with the map: a point has the bilinear mean of its four neighbours'
-        memberships. A larger map raises them to a power that takes out the blur of pixels, and makes them sum to one.
-        All regions remain. The same size gives the same map. A smaller map takes no area means: the renderer takes them
-        of the image.
-
-        Crisp contours are about one pixel wide in the mean of both directions, at any size, the map's own too: a smooth
-        curve that leaves the centres of the map's pixels on their side. ``softness`` is then 0.5.
+        A contour is as wide as the fitted one, enlarged, without the blur of the map's pixels, and as one pixel of the
+        new map: sharp where it was sharp, soft where it was soft. ``softness`` says how wide. All regions remain, and
+        lines one pixel wide stay about that wide; ``labels`` are those of the nearest pixels. The same size gives the
+        same map. A smaller map takes no area means: the renderer takes them of the image. docs/concepts.md has the
+        formula.
 
         Args:
             size: (height, width).
-            contours: scaled or crisp.
 
         Raises:
-            TypeError, ValueError: not two positive integers; other contours.
+            TypeError, ValueError: not two positive integers.
 
         Example:
-            >>> RegionMap.from_labels(torch.eye(3).long()).resize((6, 6)).labels[0]
-            tensor([1, 1, 0, 0, 0, 0])
+            >>> large = RegionMap.from_labels(torch.eye(3).long()).resize((6, 6))
+            >>> large.labels[0], large.softness
+            (tensor([1, 1, 0, 0, 0, 0]), 0.5)
         """
         height, width = check_size("size", size)
-        crisp = check_contours(contours) == "crisp" and self.num_regions > 1
-        if crisp == (self.contours == "crisp") and (height, width) == self.size:
+        if (height, width) == self.size:
             return self
         if self._source is not None:
-            return self._source.resize((height, width), contours)
-        labels, tables = resample(self.tables, self._labels, (height, width), crisp)
-        if not crisp and self.softness == 0.0:  # a map of its own: hard contours are not interpolated
-            return RegionMap(labels, tables, None)
-        return RegionMap(labels, tables, crisp_tensor(labels.device) if crisp else self._softness, self)
+            return self._source.resize((height, width))
+        labels, tables = resample(self.tables, self._labels, (height, width))
+        return RegionMap(labels, tables, self._softness, self)
 
 
 def as_region_map(value: object, name: str = "regions") -> RegionMap | None:

@@ -10,10 +10,9 @@ from torch import Tensor
 
 from kcgs._check import check_number
 from kcgs.kernels.membership import RADIUS_SIGMAS
+from kcgs.kernels.resampled import contour_variance
 
 MAX_SOFTNESS = 64.0  # pixels: a wider blur is no contour
-CONTOURS = ("scaled", "crisp")
-CRISP_SOFTNESS = 0.5  # pixels of the image, at any size
 _PRINTED_PAIRS = 4  # of a repr
 
 
@@ -66,11 +65,16 @@ def check_softness(softness: object, ids: Tensor) -> float | PairSoftness:
     return PairSoftness(pixels) if len(distinct) > 1 else distinct.pop() if distinct else 0.0
 
 
-def scaled_softness(softness: float | PairSoftness, scale: float) -> float | PairSoftness:
-    """Return the softness of a map that is scaled, at most `MAX_SOFTNESS`."""
+def scaled_softness(softness: float | PairSoftness, ratio: float) -> float | PairSoftness:
+    """Return the softness of a map with so many new pixels per pixel, as rendered, at most `MAX_SOFTNESS`."""
     if not isinstance(softness, PairSoftness):
-        return min(softness * scale, MAX_SOFTNESS)
-    return PairSoftness({pair: min(value * scale, MAX_SOFTNESS) for pair, value in softness.items()})
+        return _scaled(softness, ratio)
+    return PairSoftness({pair: _scaled(value, ratio) for pair, value in softness.items()})
+
+
+def _scaled(softness: float, ratio: float) -> float:
+    variance = torch.tensor(softness, dtype=torch.float64).square()
+    return min(float(contour_variance(variance, ratio).sqrt()), MAX_SOFTNESS)
 
 
 def merged_softness(
@@ -85,13 +89,6 @@ def merged_softness(
         if low != high:
             parts.setdefault((low, high), []).append(value)
     return {pair: sum(values) / len(values) for pair, values in parts.items()}
-
-
-def check_contours(contours: str) -> str:
-    """Return `contours` if it says how contours are rendered."""
-    if contours not in CONTOURS:
-        raise ValueError(f"contours must be one of {', '.join(CONTOURS)}; got {contours!r}")
-    return contours
 
 
 # As a tensor, for the operator
@@ -113,16 +110,6 @@ def softness_tensor(softness: float | PairSoftness, device: torch.device) -> Ten
     if isinstance(softness, float):
         return rows[0].to(device)
     return torch.cat([torch.tensor(list(softness), dtype=torch.float64), rows], 1).to(device)
-
-
-def crisp_tensor(device: torch.device) -> Tensor:
-    """Return what the operator takes as softness where contours are crisp: one number below 0."""
-    return torch.full((1,), -1.0, dtype=torch.float64, device=device)
-
-
-def is_crisp(softness: Tensor | None) -> bool:
-    """True for what :func:`crisp_tensor` returns."""
-    return softness is not None and softness.shape == (1,)
 
 
 def softness_of(tensor: Tensor | None) -> float | PairSoftness:

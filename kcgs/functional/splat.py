@@ -14,7 +14,6 @@ from .evaluation import descend
 from .map_tables import MapOperands
 from .operator import splat_operator
 from .regions import RegionMap, map_operands
-from .softness import crisp_tensor
 from .torch_internals import register_decomposition
 
 # for torch.onnx.export alone: compilers and torch.export keep the operator
@@ -98,7 +97,6 @@ def splat_at(
     region_ids: Tensor | None = None,
     regions: MapOperands | None = None,
     *,
-    contours: str = "scaled",
     cutoff: float,
     backend: str,
 ) -> Tensor:
@@ -108,7 +106,7 @@ def splat_at(
     if regions is not None:
         region_ids, labels = check_ids("region_ids", region_ids, means, values=False), regions.labels
         _check_map(labels, means)
-        softness = crisp_tensor(labels.device) if contours == "crisp" else regions.softness
+        softness = regions.softness
     dtype = torch.float64 if torch.float64 in (means.dtype, cholesky.dtype, colors.dtype) else torch.float32
     gaussians = [t if t.dtype == dtype else t.to(dtype) for t in (means, cholesky, colors)]
     image: Tensor = splat_operator(

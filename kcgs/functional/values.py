@@ -39,10 +39,10 @@ def _check(name: str, values: Tensor, valid: Tensor, expected: str, part: str = 
         raise InvalidArgument(name, expected, f"{count} NaN or infinite values. {_NOT_FINITE}" if count else extremes)
 
 
-def check_region_ids(region_ids: Tensor, index: Tensor, complete: bool) -> None:
+def check_region_ids(region_ids: Tensor, index: Tensor) -> None:
     """Refuse negative ids, and warn of Gaussians whose id is not in the map: their `index`, (B, N), is negative.
 
-    No warning where a map that is not `complete` may have lost regions, and on CUDA: no device synchronisation.
+    No warning on CUDA: no device synchronisation.
     """
     if index.device.type != "cpu":
         torch._assert_async((region_ids >= 0).all(), "region_ids must be non-negative")
@@ -50,7 +50,7 @@ def check_region_ids(region_ids: Tensor, index: Tensor, complete: bool) -> None:
     if int(region_ids.min()) < 0:
         raise ValueError(f"region_ids must be non-negative; got {int(region_ids.min())}")
     foreign = region_ids.view_as(index)[index < 0]
-    if complete and len(foreign):
+    if len(foreign):
         warn_user(
             f"{len(foreign)} of {index.numel()} Gaussians paint nothing: regions does not hold their region ids, such "
             f"as {int(foreign[0])}; pass the map that they belong to, or call field.assign_regions(regions)"

@@ -14,10 +14,10 @@ All take the inputs of `interface`, with a `membership`, perhaps `resampled`, an
 from .interface import SplatInputs, Steps, with_autograd
 from .membership import Membership
 from .registry import BACKENDS, check_backend, prepare, resolve
-from .resampled import Crisp, Resampled
+from .resampled import Resampled
 from .threads import image_threads_for_kernels, threads_for_kernels
 
 __all__ = [
-    "BACKENDS", "Crisp", "Membership", "Resampled", "SplatInputs", "Steps", "check_backend",
+    "BACKENDS", "Membership", "Resampled", "SplatInputs", "Steps", "check_backend",
     "image_threads_for_kernels", "prepare", "resolve", "threads_for_kernels", "with_autograd",
 ]  # fmt: skip

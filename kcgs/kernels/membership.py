@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .antialiasing import SmoothLabels
+
 T = TypeVar("T")
 
 # reach of a contour, in widths: the blur's kernel is cut there
@@ -50,6 +52,8 @@ class Levels(NamedTuple):
 class Membership:
     """A label map and its contour widths, with tables for the kernels, made once and kept."""
 
+    margin = 0  # pixels that what is blurred reaches farther than the labels
+
     def __init__(
         self,
         index: Tensor,
@@ -75,9 +79,14 @@ class Membership:
         return self.derived("levels", _find_levels)
 
     @property
+    def smooth_labels(self) -> SmoothLabels | None:
+        """Labels to blur in place of those of the map."""
+        return None
+
+    @property
     def radius(self) -> int:
         """Reach of the softest contour in pixels."""
-        return math.ceil(RADIUS_SIGMAS * self.levels.widths[-1])
+        return self._reach(self.levels.widths[-1]) + self.margin
 
     def to(self, device: torch.device) -> Membership:
         """Return the same membership on `device`, without tables."""
@@ -85,13 +94,17 @@ class Membership:
 
     def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
         """Evaluate s_r of one region over one whole map, (H, W): the definition, without tables."""
-        inside = (self.index[batch] == region).to(torch.float64)
+        inside = self._inside(batch, region)
         widths, level = self.levels
         weights = torch.zeros_like(inside)
         for position, width in enumerate(widths):
             blurred = self._blur(inside, width)
             weights = blurred if level is None else torch.where(level[batch] == position, blurred, weights)
         return weights.to(dtype)
+
+    def _inside(self, batch: int, region: int) -> Tensor:
+        """Return what is blurred, (H, W) float64."""
+        return (self.index[batch] == region).to(torch.float64)
 
     def _blur(self, inside: Tensor, width: float) -> Tensor:
         if width == 0.0:
@@ -140,7 +153,7 @@ class Membership:
         place = torch.cartesian_prod(*[torch.arange(n, device=self.index.device) for n in counts])
         place[:, 1:] *= tile
         # the widest contour of a tile decides how far its pixels see
-        reaches = torch.tensor([self._reach(contour) for contour in widths], device=place.device)
+        reaches = torch.tensor([self._reach(contour) + self.margin for contour in widths], device=place.device)
         widest = torch.zeros(len(place), dtype=torch.int64, device=place.device)
         if level is not None:
             widest = torch.nn.functional.max_pool2d(level.float(), tile, ceil_mode=True).flatten().long()
@@ -179,7 +192,10 @@ class Membership:
         taps = torch.stack([self._gaussian(offsets, width) if width else (offsets == 0).double() for width in widths])
         levels = np.empty((0, 0, 0), np.int32) if level is None else _array(level)
         weights = np.zeros((len(region), *span))
-        arguments = _array(self.index), levels, taps.numpy(), _array(place), _array(region), weights
+        labels = self.smooth_labels
+        none = np.empty((0, 0, 0))
+        parts = (none, none.astype(np.int32), none) if labels is None else map(_array, labels)
+        arguments = _array(self.index), *parts, levels, taps.numpy(), _array(place), _array(region), weights
         run_tasks(partial(fill_weights, *arguments), ranges(len(region), _TASK_WINDOWS))
         return torch.from_numpy(weights).to(region.device)
 

@@ -1,23 +1,52 @@
-"""Membership of a map at another size: interpolated bilinearly, with contours as soft as the map's, or crisp."""
+"""Membership of a map at another size: of smooth contours, as soft as the map's, and one pixel of the new size."""
 
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from .membership import Membership, TileMembership
+from .antialiasing import SmoothLabels, antialias
+from .membership import Levels, Membership, TileMembership
 
 # pixels of windows and tiles that are evaluated at once: 16 MiB in float64
 _CHUNK_PIXELS = 1 << 21
-# least variance of a contour, in square pixels: exponents stay finite
-TINY = 1e-6
-# by which a crisp pixel's own label has a larger share than others: a line one pixel wide stays about that wide
-MARGIN = 0.25
+# least blur of antialiased labels, in pixels of the map
+LEAST_BLUR = 0.7
+# squared width of a pixel: its standard deviation is a half
+PIXEL = 1 / 4
+
+
+class SmoothMembership(Membership):
+    """Membership of antialiased labels: what is interpolated between the pixels of a map.
+
+    Labels are blurred by the softness of contours, but by `LEAST_BLUR` at least. Weights do not sum to one.
+    """
+
+    margin = 1
+
+    def __init__(self, source: Membership) -> None:
+        """Take the map at its own size."""
+        super().__init__(source.index, source.num_regions, source.softness)
+        self.source = source
+
+    @property
+    def levels(self) -> Levels:
+        """Widths of the blur of pixels."""
+        widths, level = self.source.levels
+        return Levels(tuple(max(width, LEAST_BLUR) for width in widths), level)
+
+    @property
+    def smooth_labels(self) -> SmoothLabels:
+        """The antialiased labels."""
+        return self.derived("labels", lambda _: antialias(self.index, self.source.variances < LEAST_BLUR**2))
+
+    def _inside(self, batch: int, region: int) -> Tensor:
+        weight, other, other_weight = (part[batch] for part in self.smooth_labels)
+        return super()._inside(batch, region) * weight + (other == region) * other_weight
 
 
 class _Axis(NamedTuple):
@@ -29,67 +58,45 @@ class _Axis(NamedTuple):
 
 
 class Resampled(Membership):
-    """Membership of a soft map at another size.
+    """Membership of a map at another size.
 
-    A point between the centres of four pixels has u_r, the bilinear mean of their memberships; beyond the outermost
-    centres the border repeats. In a larger image that is too soft: 1/12 of v, the variance of the blur, comes from the
-    map's pixels, v - 1/12 from the contour alone, and interpolation makes it v + 1/6. So s_r = u_r**e / (sum of all
-    u**e), with e**2 = (v + q / 6) / max(v - q / 12, q / 24) and q = 1 - old pixels / new pixels; v is interpolated as u
-    is. At the map's own size q = 0 and e = 1, which leaves the map as it is.
+    A point between the centres of four pixels has u_r, the bilinear mean of their weights in :class:`SmoothMembership`;
+    beyond the outermost centres the border repeats. Its membership is s_r = u_r**e / (sum of all u**e). With v, the
+    squared softness of contours, interpolated as u is, and s, the number of new pixels per pixel of the map,
+    e**2 = (max(v, LEAST_BLUR**2) + 1/4) s / (max(v - 1/4, 0) s + 1/4): the contour is as wide as the fitted one,
+    without the blur of the map's pixels, and as a pixel of the new size, half of which is a standard deviation.
     """
 
     def __init__(self, index: Tensor, source: Membership) -> None:
         """Take labels at the new size, (B, H, W), and the map at its own."""
         super().__init__(index, source.num_regions, source.softness)
-        self.source = source
+        self.original = source
+        self.source = source.derived("smooth", SmoothMembership)
         self.ratio = index.shape[1] * index.shape[2] / (source.index.shape[1] * source.index.shape[2])
 
     def to(self, device: torch.device) -> Resampled:
         """Return the same membership on `device`, without tables."""
-        return Resampled(self.index.to(device), self.source.to(device))
+        return Resampled(self.index.to(device), self.original.to(device))
 
     def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
         """Evaluate s_r of one region over one whole map, (H, W): the definition, without tables."""
-        mean = self._interpolated(batch, region)
-        if self._exponents() is None:
-            return mean.to(dtype)
         exponent, largest, total = self.derived(("sums", batch), lambda _: self._sums(batch))
-        return ((mean / largest) ** exponent / total).to(dtype)
+        return ((self._interpolated(batch, region) / largest) ** exponent / total).to(dtype)
 
-    def _sums(self, batch: int) -> tuple[float | Tensor, Tensor, Tensor]:
+    def _sums(self, batch: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return the exponents e of a map, the largest u of each pixel, and the sum of all (u / largest)**e."""
-        exponent = self._exponents()
-        assert exponent is not None
-        if isinstance(exponent, Tensor):
-            down, across = self._matrices(exponent.shape[1:])
-            exponent = sharpness(down @ exponent[batch] @ across.T, self._enlargement)
+        exponent = sharpness(self._interpolate(self.original.variances[batch]), self.ratio)
         regions = range(self.num_regions)
         largest = functools.reduce(torch.maximum, (self._interpolated(batch, r) for r in regions))
         powers = ((self._interpolated(batch, r) / largest) ** exponent for r in regions)
         return exponent, largest, functools.reduce(torch.add, powers)
 
     def _interpolated(self, batch: int, region: int) -> Tensor:
-        weights = self._source_weights(batch, region)
-        down, across = self._matrices(weights.shape)
-        return down @ weights @ across.T
+        return self._interpolate(self.source.weights(batch, region, torch.float64))
 
-    def _source_weights(self, batch: int, region: int) -> Tensor:
-        """Evaluate the weights that are interpolated, at the map's own size."""
-        return self.source.weights(batch, region, torch.float64)
-
-    @property
-    def _enlargement(self) -> float:
-        """The q of the class."""
-        return max(0.0, 1.0 - 1.0 / self.ratio)
-
-    def _exponents(self) -> float | Tensor | None:
-        """Return the exponent e, or, where contours have several widths, the variances of pixels; None: e is 1."""
-        widths, level = self.source.levels
-        if self._enlargement == 0.0:
-            return None
-        if level is not None:
-            return self.source.variances
-        return float(sharpness(torch.tensor(widths[0] ** 2, dtype=torch.float64), self._enlargement))
+    def _interpolate(self, pixels: Tensor) -> Tensor:
+        down, across = self._matrices(pixels.shape)
+        return down @ pixels @ across.T
 
     def _matrices(self, shape: Sequence[int]) -> Iterator[Tensor]:
         """Yield the matrices that interpolate columns and rows of a map of this shape."""
@@ -118,88 +125,36 @@ class Resampled(Membership):
         groups = tiles.unique(return_inverse=True)[1]
         masks = torch.zeros(len(keys), tile * tile, dtype=torch.float64, device=keys.device)
         length = max(1, _CHUNK_PIXELS // (spans[0] * spans[1] + tile * tile))
-        equal_chunks = torch.arange(len(keys), device=keys.device).split(length)
-        # exponents need all regions of a tile in one chunk
-        for chunk in equal_chunks if self._exponents() is None else _chunks(groups, length):
+        variances = self.original.variances
+        for chunk in _chunks(groups, length):  # all regions of a tile are in one
             t, y, x = tiles[chunk], row[tiles[chunk]], col[tiles[chunk]]
-            mean = down[y] @ self._windows(corners[t], region[chunk], groups[chunk], spans) @ across[x].mT
-            exponent = self._exponents()
-            if isinstance(exponent, Tensor):
-                exponent = sharpness(
-                    down[y] @ self.source.read(exponent, corners[t], spans) @ across[x].mT, self._enlargement
-                )
-            masks[chunk] = (mean if exponent is None else _sharpen(mean, groups[chunk], exponent)).flatten(1)
+            windows = self.source.window_weights(corners[t], region[chunk], spans)
+            variance = down[y] @ self.source.read(variances, corners[t], spans) @ across[x].mT
+            mean = down[y] @ windows @ across[x].mT
+            masks[chunk] = _sharpen(mean, groups[chunk], sharpness(variance, self.ratio)).flatten(1)
         is_present = (masks > 0).any(1)
         return TileMembership.assemble(single, keys[is_present], masks[is_present])
 
-    def _windows(self, place: Tensor, region: Tensor, group: Tensor, spans: Sequence[int]) -> Tensor:
-        """Evaluate the weights of the map's own pixels over windows, (P, *spans), at the same place within a group."""
-        return self.source.window_weights(place, region, spans)
+
+def contour_variance(variance: Tensor, ratio: float | Tensor) -> Tensor:
+    """Return the squared width, in pixels of the new size, for that in pixels of the map."""
+    return (variance - PIXEL).clamp_min(0) * ratio + PIXEL
 
 
-class Crisp(Resampled):
-    """Membership of contours that are about one pixel wide at any size: a smooth curve between the map's pixels.
-
-    Labels are blurred with a width of one pixel. Where another label then has a larger share of a pixel than its own,
-    its own is set to that share plus `MARGIN`. Interpolated bilinearly, the weights u_r give
-    s_r = u_r**e / (sum of all u**e) with e = 2 sqrt(new pixels / old pixels), 1 at least: across a straight contour, a
-    step with a standard deviation of half a pixel.
-    """
-
-    def __init__(self, index: Tensor, labels: Membership) -> None:
-        """Take labels at the new size, (B, H, W), and the map at its own, whatever its widths."""
-        super().__init__(index, labels.derived("smooth", _smooth))
-
-    def _exponents(self) -> float:
-        return max(1.0, 2.0 * math.sqrt(self.ratio))
-
-    def _source_weights(self, batch: int, region: int) -> Tensor:
-        largest = self.derived(("largest", batch), lambda _: self._largest(batch))
-        return _restore(super()._source_weights(batch, region), largest, self.source.index[batch] == region)
-
-    def _largest(self, batch: int) -> Tensor:
-        weights = (self.source.weights(batch, r, torch.float64) for r in range(self.num_regions))
-        return functools.reduce(torch.maximum, weights)
-
-    def _windows(self, place: Tensor, region: Tensor, group: Tensor, spans: Sequence[int]) -> Tensor:
-        weights = super()._windows(place, region, group, spans)
-        labels = self.source.read(self.source.index, place, spans)
-        return _restore(weights, _group_max(weights, group), labels == region[:, None, None])
-
-    def to(self, device: torch.device) -> Crisp:
-        """Return the same membership on `device`, without tables."""
-        return Crisp(self.index.to(device), self.source.to(device))
+def sharpness(variance: Tensor, ratio: float | Tensor) -> Tensor:
+    """Evaluate the exponent e of :class:`Resampled` for squared widths in pixels of the map; `ratio` is its s."""
+    blurred = variance.clamp_min(LEAST_BLUR**2) + PIXEL  # what antialiasing and interpolation add
+    return (blurred * ratio / contour_variance(variance, ratio)).sqrt()
 
 
-def _smooth(labels: Membership) -> Membership:
-    return Membership(labels.index, labels.num_regions, 1.0)
-
-
-def _restore(weights: Tensor, largest: Tensor, inside: Tensor) -> Tensor:
-    """Give pixels inside a region their largest weight there."""
-    return torch.where(inside & (weights < largest), largest + MARGIN, weights)
-
-
-def sharpness(variance: Tensor, enlargement: float | Tensor) -> Tensor:
-    """Evaluate the exponent e of :class:`Resampled` for variances; `enlargement` is its q."""
-    variance, least = variance.clamp_min(TINY), torch.as_tensor(enlargement).to(variance) / 24
-    return ((variance + enlargement / 6) / torch.maximum(variance - enlargement / 12, least)).sqrt()
-
-
-def _sharpen(weights: Tensor, group: Tensor, exponent: float | Tensor) -> Tensor:
+def _sharpen(weights: Tensor, group: Tensor, exponent: Tensor) -> Tensor:
     """Raise the weights of each group, (P, n, n), to a power, and let them sum to one."""
-    powers = (weights / _group_max(weights, group)) ** exponent
-    first = int(group[0])
-    total = torch.zeros(int(group[-1]) - first + 1, *weights.shape[1:], dtype=weights.dtype, device=weights.device)
-    return powers / total.index_add_(0, group - first, powers)[group - first]
-
-
-def _group_max(weights: Tensor, group: Tensor) -> Tensor:
-    """Return, for each row, the largest weights of its group; numbers of groups ascend."""
     position = group - group[0]
     largest = weights.new_zeros(int(position[-1]) + 1, *weights.shape[1:])
+    total = torch.zeros_like(largest)
     largest.scatter_reduce_(0, position.view(-1, 1, 1).expand_as(weights), weights, "amax")
-    return largest[position]
+    powers = (weights / largest[position]) ** exponent
+    return powers / total.index_add_(0, position, powers)[position]
 
 
 def _chunks(groups: Tensor, length: int) -> Iterator[Tensor]:

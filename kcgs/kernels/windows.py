@@ -44,9 +44,10 @@ def list_regions(index, places, sides, reaches, num_regions):  # type: ignore[no
 
 
 @program.entry
-def fill_weights(index, levels, taps, places, regions, weights, tasks, counters):  # type: ignore[no-untyped-def]
+def fill_weights(index, weight, other, other_weight, levels, taps, places, regions, weights, tasks, counters):  # type: ignore[no-untyped-def]
     """Fill the membership of regions, (P,), over windows, (P, h, w), that begin at places, (P, 3).
 
+    Labels are those of `index`, or, where `weight` is not empty, a `weight` of these and an `other_weight` of `other`.
     Row k of taps is half of the blur for pixels of level k, its centre first, then zeros; `levels` is empty where one
     blur is for all. Tasks are ranges of windows.
     """
@@ -69,8 +70,8 @@ def fill_weights(index, levels, taps, places, regions, weights, tasks, counters)
                     is_empty[y] = True
                     row = top + y - n
                     for x in range(width + 2 * n if 0 <= row < index.shape[1] else 0):
-                        col = left + x - n
-                        line[x] = 1.0 if 0 <= col < index.shape[2] and index[image, row, col] == regions[p] else 0.0
+                        place, is_inside = (image, row, left + x - n), 0 <= left + x - n < index.shape[2]
+                        line[x] = _part(index, weight, other, other_weight, place, regions[p]) if is_inside else 0.0
                         is_empty[y] &= line[x] == 0.0
                     if not is_empty[y]:
                         _blur(half, line, rows[y])
@@ -84,6 +85,14 @@ def fill_weights(index, levels, taps, places, regions, weights, tasks, counters)
                         if not len(levels) or _level(levels[image], top + y, left + x) == k:
                             weights[p, y, x] = total[x] / max(down[y] * across[x], 1e-300)
         task = next_task(tasks, counters)
+
+
+@inner
+def _part(index, weight, other, other_weight, place, region):  # type: ignore[no-untyped-def]
+    """Return how much of a pixel is of a region."""
+    if index[place] == region:
+        return weight[place] if len(weight) else 1.0
+    return other_weight[place] if len(weight) and other[place] == region else 0.0
 
 
 @inner

@@ -11,7 +11,6 @@ from kcgs._check import check_cutoff, check_size
 from kcgs.functional import RegionMap
 from kcgs.functional.regions import map_operands
 from kcgs.functional.sizes import is_equal
-from kcgs.functional.softness import check_contours
 from kcgs.functional.splat import splat_at
 
 from .field import GaussianField, scaled_gaussians
@@ -35,11 +34,9 @@ class RegionSplatRenderer(nn.Module):
         clamp: clip the image to [0, 1].
         backend: auto, reference, tiled, cpu or cuda.
         keepdim: give (C, H, W) for an unbatched field; False: always (B, C, H, W), as Kornia's modules take it.
-        contours: "scaled": as wide as the map says, and wider in a larger image; "crisp": about one pixel at any size,
-            whatever the map says.
 
     Raises:
-        ValueError: cutoff out of range; other contours.
+        ValueError: cutoff out of range.
 
     Example:
         >>> field = GaussianField.random(10, (32, 48), seed=0)
@@ -53,14 +50,12 @@ class RegionSplatRenderer(nn.Module):
         clamp: bool = False,
         backend: str = "auto",
         keepdim: bool = True,
-        contours: str = "scaled",
     ) -> None:
         super().__init__()
         self.cutoff = check_cutoff(cutoff)
         self.clamp = clamp
         self.backend = backend
         self.keepdim = keepdim
-        self.contours = check_contours(contours)
 
     def forward(
         self,
@@ -110,7 +105,7 @@ class RegionSplatRenderer(nn.Module):
         means, cholesky = scaled_gaussians(field, fine)
         image = splat_at(
             fine, means, cholesky, field.merged_colors(), field.region_ids, operands,
-            contours=self.contours, cutoff=self.cutoff, backend=self.backend,
+            cutoff=self.cutoff, backend=self.backend,
         )  # fmt: skip
         image = area_mean(image, size)
         if not self.keepdim and image.ndim == 3:
@@ -119,8 +114,7 @@ class RegionSplatRenderer(nn.Module):
 
     def extra_repr(self) -> str:
         """Show the settings."""
-        crisp = ", contours='crisp'" if self.contours == "crisp" else ""
-        return f"cutoff={self.cutoff:g}, clamp={self.clamp}, backend={self.backend!r}, keepdim={self.keepdim}{crisp}"
+        return f"cutoff={self.cutoff:g}, clamp={self.clamp}, backend={self.backend!r}, keepdim={self.keepdim}"
 
 
 def rendered_size(field_size: tuple[int, int], size: tuple[int, int]) -> tuple[int, int]:

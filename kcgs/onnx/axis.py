@@ -13,8 +13,6 @@ from .graph import FLOAT, INT64, Graph, Value
 
 # nodes, two pixels apart, that the cubic B-splines of a tile read
 NODES = TILE // 2 + 3
-# places between two pixel centres that hard contours are sampled at, as in `RegionMap.resize`
-_OFFSETS = 1024
 # integers per pixel: in these parts the ends of a view are rounded
 _PARTS = 1 << 20
 
@@ -37,6 +35,7 @@ class Axis:
     size: Value  # (1,) int64, pixels that are rendered
     parts: Value  # (1,) int64, integers of a place per pixel of the scene
     is_native: Value  # (1,) bool, whether the pixels are those of the scene, and a tile one block
+    is_aligned: Value  # (1,) bool, whether pixels are as large as those of the scene, and at their places
     step: Value  # (1,) float32, pixels of the scene per rendered pixel
     tile: Value  # (V,), tiles with a run, one after the other; a constant where all of the scene is rendered
     runs: Value  # (V,), pixels of each run
@@ -51,24 +50,14 @@ class Axis:
         """Pixels of all blocks, (1,)."""
         return self.graph.Shape(self.runs) * self.pieces * self.side
 
-    def sampling(self, soft: bool) -> Value:
-        """Bilinear weights of a window, a tile and the pixels around it, (V, pieces, side, window).
-
-        Where contours are hard, offsets are such that no two labels weigh the same.
-        """
+    def sampling(self) -> Value:
+        """Bilinear weights of a window, a tile and the pixels around it, (V, pieces, side, window)."""
         g = self.graph
-        local = g.Unsqueeze(self.local, [3])
-        if soft:
-            position = local.astype(FLOAT) / self.parts.astype(FLOAT) + 0.5
-            # a view may go beyond the scene, where the values of the border are held
-            first = g.Unsqueeze(1 - self.tile * TILE, [1, 2, 3])
-            for clip, end in ((g.Max, 0), (g.Min, self.length - 1)):
-                position = clip(position, (first + end).astype(FLOAT))
-        else:
-            # from the first pixel's centre, in halves of a part
-            offset = g.Max((local * 2 + self.parts) * (_OFFSETS // 2) // self.parts, 0)
-            offset = g.Min(offset, (TILE + 1) * _OFFSETS - 1)
-            position = (offset * 2 + 1).astype(FLOAT) / (2 * _OFFSETS)
+        position = g.Unsqueeze(self.local, [3]).astype(FLOAT) / self.parts.astype(FLOAT) + 0.5
+        # a view may go beyond the scene, where the values of the border are held
+        first = g.Unsqueeze(1 - self.tile * TILE, [1, 2, 3])
+        for clip, end in ((g.Max, 0), (g.Min, self.length - 1)):
+            position = clip(position, (first + end).astype(FLOAT))
         return g.Relu(1 - g.Abs(position - np.arange(TILE + 2, dtype=np.float32)))
 
     def spline(self) -> Value:
@@ -144,7 +133,8 @@ def make_axis(g: Graph, output: Value, length: int, ends: tuple[Value, Value] | 
     longest = g.ReduceMax(runs, keepdims=1)
     pieces = (longest + (TILE - 1)) // TILE
     side = (longest + (pieces - 1)) // pieces
-    is_native = g.And(g.And(g.Equal(start, 0), g.Equal(extent, size * _PARTS)), g.Equal(side, TILE))
+    is_aligned = g.And(g.Equal(start % _PARTS, 0), g.Equal(extent, size * _PARTS))
+    is_native = g.And(g.And(g.Equal(start, 0), is_aligned), g.Equal(side, TILE))
 
     within = g.Reshape(g.Range(0, g.Squeeze(pieces * side), 1), g.Concat([1], pieces, side, axis=0))
     axes = g.constant([1, 2])
@@ -153,7 +143,9 @@ def make_axis(g: Graph, output: Value, length: int, ends: tuple[Value, Value] | 
     middle = (side - 1).astype(FLOAT) * 0.5
     steps = (g.Range(0, g.Squeeze(side), 1).astype(FLOAT) - middle) * step
     origins = g.Gather(local, 0, axis=2).astype(FLOAT) / parts.astype(FLOAT) + (middle * step - TILE / 2)
-    return Axis(g, length, output, size, parts, is_native, step, tile, runs, pieces, side, local, steps, origins)
+    return Axis(
+        g, length, output, size, parts, is_native, is_aligned, step, tile, runs, pieces, side, local, steps, origins
+    )
 
 
 class Interpolator:
@@ -167,6 +159,7 @@ class Interpolator:
         self.side = side
         self.pixels = down.side * across.side  # P
         self.is_native = self.graph.And(down.is_native, across.is_native)
+        self.is_aligned = self.graph.And(down.is_aligned, across.is_aligned)
 
     def blocks(self, windows: Value, row: Value, col: Value, shape: tuple[int, int]) -> Value:
         """Interpolate windows, (T, K, n, n), in the blocks of tiles at `row` and `col`, (T,): (T, blocks, *shape, P).

@@ -1,80 +1,84 @@
-"""Windows of soft contours: the membership of their pixels, blurred out of labels. Made for `membership`."""
+"""Windows of memberships, blurred out of labels. Made for `membership`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import product
 
 import numpy as np
+import torch
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
-from kcgs.functional import RegionMap
 from kcgs.kernels.membership import RADIUS_SIGMAS, Membership
-from kcgs.kernels.resampled import MARGIN
 from kcgs.kernels.tiles import TILE
 
 from .graph import FLOAT, Graph, Value
 from .groups import Integers
 from .packing import pack_integers, pack_runs
 from .tiles import WINDOW, Tiles
-from .windows import pack_windows, split_tiles, tile_ids
+from .windows import pack_windows, tile_ids
 
 
 class BlurredWindows:
-    """Windows of soft contours, blurred out of the labels around them; tiles by their number of regions.
+    """Windows of memberships, blurred out of the labels around them; tiles by their number of regions.
 
     A part of a window is what one region has by one width; parts are blurred at once, and summed later.
     """
 
-    def __init__(self, g: Graph, regions: RegionMap, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> None:
+    def __init__(self, g: Graph, membership: Membership, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> None:
         self.graph = g
         self.tiles_of = tiles_of
-        ids, (_, level) = tile_ids(tiles_of), regions.tables.membership.levels
+        ids, (_, level) = tile_ids(tiles_of), membership.levels
         levels = np.zeros((len(ids), WINDOW, WINDOW), np.int64)
         if level is not None:
             levels = cut_windows(tiles, ids, level[0].cpu().numpy())
         parts, self.places = _list_parts(tiles, ids, levels)
         axes = g.constant([1, 2])
         window, region, width = (pack_runs(g, column) for column in parts)
-        inside = g.Equal(_label_windows(g, regions, tiles, ids)[window], g.Unsqueeze(region, axes))
-        kernels = _kernels(g, regions.tables.membership)[width]  # [parts, S, side]
-        blurred = kernels @ inside.astype(FLOAT) @ g.Transpose(kernels, perm=[0, 2, 1])
+        region = g.Unsqueeze(region, axes)
+        kernels = _kernels(g, membership)[width]  # [parts, S, side]
+
+        def blur(pixels: Value) -> Value:
+            return kernels @ pixels.astype(FLOAT) @ g.Transpose(kernels, perm=[0, 2, 1])
+
+        table, kinds = _list_kinds(membership)
+        pixels = _pixel_windows(g, tiles, ids, kinds, membership.radius, len(table) - 1)[window]
+        label, weight, other, other_weight = (column[:, 0] for column in np.split(table, 4, axis=1))
+        inside = g.Equal(g.constant(label.astype(np.int32))[pixels], region).astype(FLOAT)
+        if membership.smooth_labels is not None:
+            taken = g.Equal(g.constant(other.astype(np.int32))[pixels], region).astype(FLOAT)
+            weights = (g.constant(part.astype(np.float32))[pixels] for part in (weight, other_weight))
+            inside = inside * next(weights) + taken * next(weights)
+        # outside the map there is no label, and no membership
+        blurred = blur(inside) / g.Max(blur(g.Less(pixels, np.int32(len(table) - 1))), 1e-30)
         self.levels = None if level is None else pack_windows(g, levels)  # (T, S, S), place among the map's widths
         if self.levels is not None:
             blurred = blurred * g.Equal(self.levels[window], g.Unsqueeze(width, axes)).astype(FLOAT)
         self.parts = g.Concat(np.zeros((1, WINDOW, WINDOW), np.float32), blurred, axis=0)
 
     def unfold(self, count: int) -> Value:
-        """Sum the parts of windows over their widths, and normalise: (T, K, S, S)."""
+        """Sum the parts of windows over their widths: (T, K, S, S)."""
         g, places = self.graph, [self.places[tile] for tile in self.tiles_of[count].tolist()]
         num_widths = max(place.shape[1] for place in places)
         ids = np.zeros((len(places), count, num_widths), np.int64)
         for row, place in zip(ids, places, strict=True):
             row[: place.shape[0], : place.shape[1]] = place
         windows = self.parts[pack_integers(g, ids if num_widths > 1 else ids[:, :, 0])]
-        windows = g.ReduceSum(windows, [2], keepdims=0) if num_widths > 1 else windows
-        # outside the map there is no label, and no membership
-        return windows / g.Max(g.ReduceSum(windows, [1], keepdims=1), 1e-30)
+        return g.ReduceSum(windows, [2], keepdims=0) if num_widths > 1 else windows
 
 
-def crisp_windows(
-    g: Graph, regions: RegionMap, tiles: Tiles, tiles_of: Mapping[int, Integers]
-) -> Callable[[int], Value]:
-    """Make blurred windows whose pixels are given to their own label, as :class:`kcgs.kernels.Crisp` has it."""
-    blurred = BlurredWindows(g, regions, tiles, tiles_of)
-    index = cut_windows(tiles, tile_ids(tiles_of), regions.tables.membership.index[0].cpu().numpy())
-    labels = split_tiles(g, tiles_of, pack_windows(g, index))
+def _list_kinds(membership: Membership) -> tuple[NDArray[np.float64], Integers]:
+    """List labels, weights, other labels and their weights that pixels have, (kinds, 4), and the kind of each, (H, W).
 
-    def unfold(count: int) -> Value:
-        numbers, windows = tiles_of[count], blurred.unfold(count)
-        best = g.ReduceMax(windows, [1], keepdims=1)
-        ids = np.full((len(numbers), count, 1, 1), -1, np.int32)
-        for row, tile in zip(ids[..., 0, 0], numbers.tolist(), strict=True):
-            row[: len(tiles.regions[tile])] = tiles.regions[tile]
-        loses = g.And(g.Equal(g.Unsqueeze(labels[count], [1]), ids), g.Less(windows, best))
-        return g.Where(loses, best + MARGIN, windows)
-
-    return unfold
+    The last kind is that of pixels outside.
+    """
+    index, none = membership.index, torch.zeros_like(membership.index)
+    parts = (index, *(membership.smooth_labels or (none, none, none)))
+    rows = torch.stack([part[0].double().flatten() for part in parts], 1).cpu().numpy()
+    table, kinds = np.unique(rows, axis=0, return_inverse=True)
+    outside = [[membership.num_regions + 1, 0, 0, 0]]  # a label that no region has, nor what fills up lists of regions
+    return np.concatenate([table, outside]), kinds.reshape(index.shape[1:])
 
 
 def cut_windows(tiles: Tiles, ids: Integers, grid: Integers) -> Integers:
@@ -112,23 +116,23 @@ def _kernels(g: Graph, membership: Membership) -> Value:
     return kernels * g.LessOrEqual(distance, ends.astype(np.float32)[:, None, None]).astype(FLOAT)
 
 
-def _label_windows(g: Graph, regions: RegionMap, tiles: Tiles, ids: Integers) -> Value:
-    """Cut windows out of the label map with all that their blur reads, (T, side, side), column by column.
+def _pixel_windows(g: Graph, tiles: Tiles, ids: Integers, pixels: Integers, radius: int, outside: int) -> Value:
+    """Cut windows out of integers (H, W) with all that their blur reads, (T, side, side), column by column.
 
-    The map is stored in tiles, with some around it: those of one label by that label, the others by their pixels.
+    They are stored in tiles, with some `outside` around them: those of one number by that, the others by their pixels.
     """
-    rows, cols, radius = tiles.rows, tiles.cols, regions.tables.membership.radius
-    index = regions.tables.membership.index[0].cpu().numpy()
-    outside = regions.num_regions + 1  # a label that no region has, nor what lists of regions are filled up with
+    rows, cols = tiles.rows, tiles.cols
     rim = -(-(radius + 1) // TILE)  # tiles around the map
-    frame = [(rim * TILE, (rim + n) * TILE - length) for n, length in zip((rows, cols), index.shape, strict=True)]
-    grid = np.pad(index, frame, constant_values=outside).astype(np.int64)
+    frame = [(rim * TILE, (rim + n) * TILE - length) for n, length in zip((rows, cols), pixels.shape, strict=True)]
+    grid = np.pad(pixels, frame, constant_values=outside)
     down, across = rows + 2 * rim, cols + 2 * rim
     blocks = grid.reshape(down, TILE, across, TILE).transpose(0, 2, 3, 1).reshape(down * across, TILE * TILE)
     mixed = blocks.min(1) != blocks.max(1)
-    slots = np.where(mixed, outside + np.cumsum(mixed), blocks[:, 0])
-    flat = g.Expand(np.arange(outside + 1, dtype=np.int32)[:, None], [outside + 1, TILE**2])
-    labels = g.Concat(g.Reshape(flat, [-1]), pack_runs(g, blocks[mixed].ravel()), axis=0)
+    values, flat = np.unique(blocks[~mixed, 0], return_inverse=True)
+    slots = np.zeros(len(blocks), np.int64)
+    slots[~mixed], slots[mixed] = flat, len(values) + np.arange(mixed.sum())
+    plain = g.Expand(g.Unsqueeze(pack_integers(g, values), [1]), [len(values), TILE**2])
+    numbers = g.Concat(g.Reshape(plain, [-1]), pack_runs(g, blocks[mixed].ravel()), axis=0)
     # rows of a window: how many tiles from the window's, and where in their own; whole tiles along them
     first, side = -1 - radius, WINDOW + 2 * radius
     tile, pixel = np.divmod(np.arange(first, first + side, dtype=np.int32), TILE)
@@ -136,7 +140,7 @@ def _label_windows(g: Graph, regions: RegionMap, tiles: Tiles, ids: Integers) ->
     steps = np.arange(tile[0], tile[-1] + 1, dtype=np.int32) * np.int32(across)
     number = g.Unsqueeze(corner, [1, 2]) + (g.constant(tile[:, None]) + steps)
     place = pack_integers(g, slots)[number] * TILE + pixel[:, None]
-    windows = g.Reshape(labels, [-1, TILE])[place]  # [T, side, tiles, TILE]
+    windows = g.Reshape(numbers, [-1, TILE])[place]  # [T, side, tiles, TILE]
     windows = g.Reshape(windows, [0, side, -1])
     begin = first % TILE
     return g.Slice(windows, [begin], [begin + side], [2])

@@ -5,8 +5,6 @@ from __future__ import annotations
 import onnx
 
 from kcgs._check import check_cutoff
-from kcgs.functional import RegionMap
-from kcgs.functional.softness import check_contours
 from kcgs.scene import Scene, check_scene
 
 from .axis import Axis, make_axis
@@ -25,7 +23,6 @@ def scene_decoder(
     cutoff: float = 1e-4,
     clamp: bool = True,
     interactive: bool = False,
-    contours: str = "scaled",
 ) -> onnx.ModelProto:
     r"""Build the ONNX graph that renders one scene at any size.
 
@@ -40,7 +37,6 @@ def scene_decoder(
         interactive: two more inputs. ``view``, float32 (4,): left, top, right and bottom of the part of the scene that
             fills the image, in pixels of the scene. ``visible``, float32 (R,): a factor on the Gaussians of each
             region, in the order of the map's ids.
-        contours: "scaled" or "crisp", as :class:`kcgs.RegionSplatRenderer` takes them.
 
     Returns:
         A checked model, which `onnx.save` writes; :func:`describe_decoder` reads its metadata.
@@ -61,16 +57,13 @@ def scene_decoder(
     if regions is not None and regions.is_resampled:
         raise ValueError("scene must have the map itself; got one that was resized")
     cutoff = check_cutoff(cutoff)
-    crisp = check_contours(contours) == "crisp" and regions is not None
-    if crisp and regions is not None:  # what crisp contours are made of is as wide as one label
-        regions = RegionMap.from_labels(regions.labels, 1.0)
     plan = plan_decoder(scene.field, regions, cutoff)
 
     g = Graph()
     down, across, visible = _inputs(g, scene, interactive)
     storage = store_entries(g, plan, visible)
     blocks = BlockRenderer(storage, down, across, cutoff)
-    membership = None if regions is None else make_membership(storage, regions, down, across, crisp)
+    membership = None if regions is None else make_membership(storage, regions, down, across)
     grids = None if storage.table is None else CoarseGrids(storage, storage.table, down, across, cutoff)
     image = _crop(g, blocks.image(membership, grids), down, across)
     if clamp:
@@ -81,7 +74,7 @@ def scene_decoder(
         [1, storage.channels, "height", "width"],
         image_doc(storage.channels, clamp),
         graph_doc=f"Renders one image at any size: {scene.num_gaussians} Gaussians of a kcgs scene.",
-        metadata=scene_metadata(scene, cutoff=cutoff, clamp=clamp, crisp=crisp),
+        metadata=scene_metadata(scene, cutoff=cutoff, clamp=clamp),
     )
 
 

@@ -3,82 +3,60 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 
 from kcgs.functional import RegionMap
-from kcgs.kernels.resampled import TINY
+from kcgs.kernels.resampled import LEAST_BLUR, PIXEL
 
 from .axis import Axis, Interpolator
-from .blur import BlurredWindows, crisp_windows, cut_windows
+from .blur import BlurredWindows, cut_windows
 from .entries import Storage
-from .graph import FLOAT, Graph, Value
-from .tiles import WINDOW
-from .windows import hard_windows, pack_windows, split_tiles, tile_ids, wide_windows
+from .graph import Graph, Value
+from .tiles import WINDOW, smooth_membership
+from .windows import pack_windows, split_tiles, stored_windows, tile_ids
 
 # pixels that a contour may reach where its blur is computed in the graph
 _FARTHEST = 16
-# steps per pixel that widths are stored in
-_WIDTH_STEPS = 1 << 14
+# least weight of a region at a pixel: its logarithm is finite
+_TINY = 1e-6
 
 
-def make_membership(
-    storage: Storage, regions: RegionMap, down: Axis, across: Axis, crisp: bool
-) -> MembershipSampler | None:
-    """Store the windows of a map; None where no tile has several regions.
-
-    Samples lose the blur of pixels, as :class:`kcgs.kernels.Resampled` has it, or with `crisp`, of labels that are
-    blurred by the width of one, make contours as narrow as :class:`kcgs.kernels.Crisp` has them.
-    """
+def make_membership(storage: Storage, regions: RegionMap, down: Axis, across: Axis) -> MembershipSampler | None:
+    """Store the windows of a map; None where no tile has several regions."""
     g, tiles, membership = storage.graph, storage.plan.tiles, regions.tables.membership
     tiles_of = storage.plan.mixed_tiles
     if not tiles_of:
         return None
-    soft = regions.softness != 0.0
-    places = Interpolator(down, across, down.sampling(soft), across.sampling(soft), WINDOW)
-    pixel = down.step * across.step  # area of one of the output, in pixels of the scene
-    q = g.Relu(1 - pixel)  # as the formula of `Resampled` has it
-    sampler = partial(MembershipSampler, g, places)
-    if not soft:
-        return sampler(hard_windows(g, tiles, tiles_of), None)
-    if crisp:
-        narrow = g.Max(2 / g.Sqrt(pixel), 1.0)
-        return sampler(crisp_windows(g, regions, tiles, tiles_of), lambda *_: narrow, crisp=True)
-    widths, level = membership.levels
-    variance = np.array([widths[0] ** 2], np.float32)
-    uniform = _sharpness(g, g.constant(variance), q) if level is None else None  # exponent of a map of one width
-    blurred = None if membership.radius > _FARTHEST else BlurredWindows(g, regions, tiles, tiles_of)
-    windows = wide_windows(g, tiles, tiles_of) if blurred is None else blurred.unfold
-    if uniform is not None:
-        return sampler(windows, lambda *_: uniform)
-    if blurred is not None and blurred.levels is not None:
-        squares = g.constant(np.array(widths, np.float32) ** 2)[blurred.levels]
-    else:
-        steps = np.round(np.sqrt(membership.variances[0].cpu().numpy()) * _WIDTH_STEPS)
-        width = pack_windows(g, cut_windows(tiles, tile_ids(tiles_of), steps)).astype(FLOAT) * (1 / _WIDTH_STEPS)
-        squares = width * width
-    variances = split_tiles(g, tiles_of, squares)
+    places = Interpolator(down, across, down.sampling(), across.sampling(), WINDOW)
+    ratio = 1 / (down.step * across.step)
+    smooth, (widths, level) = smooth_membership(regions), membership.levels
+    stored = smooth.radius > _FARTHEST
+    windows, smooth_windows = (
+        stored_windows(g, m, tiles, tiles_of) if stored else BlurredWindows(g, m, tiles, tiles_of).unfold
+        for m in (membership, smooth)
+    )
+    if level is None:
+        exponent = _sharpness(g, g.constant(np.array([widths[0] ** 2], np.float32)), ratio)
+        return MembershipSampler(g, places, windows, smooth_windows, lambda *_: exponent)
+    levels = pack_windows(g, cut_windows(tiles, tile_ids(tiles_of), level[0].cpu().numpy()))
+    variances = split_tiles(g, tiles_of, g.constant(np.array(widths, np.float32) ** 2)[levels])
 
-    def exponent(count: int, slots: Value, row: Value, col: Value) -> Value:
-        return _sharpness(g, places.blocks(variances[count][slots], row, col, (1, 1)), q)
+    def sample(count: int, slots: Value, row: Value, col: Value) -> Value:
+        return _sharpness(g, places.blocks(variances[count][slots], row, col, (1, 1)), ratio)
 
-    return sampler(windows, exponent)
+    return MembershipSampler(g, places, windows, smooth_windows, sample)
 
 
 class MembershipSampler:
-    """Samples the memberships in the blocks of tiles with several regions.
-
-    At the size of the scene, windows hold the memberships of its pixels, unless contours are crisp.
+    """Samples the memberships in the blocks of tiles with several regions, as :class:`kcgs.kernels.Resampled` has it.
 
     Args:
         g: the graph.
         places: interpolates windows.
-        windows: makes those of the tiles with K regions, (T, K, S, S).
-        exponent: of the samples in the blocks of tiles: it takes away the blur of pixels, or more of it. It may be
-            sampled, too, since pairs of regions have widths of their own. None: contours are hard, and a pixel is of
-            the region with the largest sample.
-        crisp: whether contours are narrower than those of the windows at every size.
+        windows: makes those of the tiles with K regions, (T, K, S, S): the memberships at the size of the scene.
+        smooth_windows: makes the weights that are interpolated for other sizes.
+        exponent: of the samples in the blocks of tiles.
     """
 
     def __init__(
@@ -86,41 +64,42 @@ class MembershipSampler:
         g: Graph,
         places: Interpolator,
         windows: Callable[[int], Value],
-        exponent: Callable[[int, Value, Value, Value], Value] | None,
-        crisp: bool = False,
+        smooth_windows: Callable[[int], Value],
+        exponent: Callable[[int, Value, Value, Value], Value],
     ) -> None:
-        self.graph, self.places, self.windows, self.exponent, self.crisp = g, places, windows, exponent, crisp
+        self.graph, self.places, self.exponent = g, places, exponent
+        self.windows, self.smooth_windows = windows, smooth_windows
 
     def blocks(self, count: int, slots: Value, row: Value, col: Value) -> Value:
         """Sample the memberships in the blocks of tiles with K regions, (T, blocks, K, 1, P), column by column.
 
         `slots`, (T,), are the places of the tiles among those, `row` and `col`, (T,), those among rows and columns.
         """
-        g, places, windows = self.graph, self.places, self.windows(count)[slots]
+        g, places = self.graph, self.places
+        windows, smooth_windows = self.windows(count)[slots], self.smooth_windows(count)[slots]
+
+        def pan() -> Value:
+            return places.blocks(windows, row, col, (count, 1))
 
         def sample() -> Value:
-            samples = places.blocks(windows, row, col, (count, 1))
-            if self.exponent is None:
-                return g.Equal(samples, g.ReduceMax(samples, [2], keepdims=1)).astype(FLOAT)
+            samples = places.blocks(smooth_windows, row, col, (count, 1))
             return _sharpen(g, samples, self.exponent(count, slots, row, col))
 
         def cut() -> Value:
             return g.Reshape(g.Slice(windows, [1, 1], [-1, -1], [2, 3]), [0, 1, count, 1, -1])
 
-        return sample() if self.crisp else g.choose(places.is_native, cut, sample)
+        return g.choose(places.is_native, cut, lambda: g.choose(places.is_aligned, pan, sample))
 
 
-def _sharpness(g: Graph, variance: Value, q: Value) -> Value:
-    """Evaluate `kcgs.kernels.resampled.sharpness` by operators, since q is known only when the graph runs."""
-    variance = g.Max(variance, TINY)
-    interpolated = variance + q * (1 / 6)
-    contour = g.Max(variance - q * (1 / 12), q * (1 / 24))
-    return g.Sqrt(interpolated / contour)
+def _sharpness(g: Graph, variance: Value, ratio: Value) -> Value:
+    """Evaluate `kcgs.kernels.resampled.sharpness` by operators, since the ratio is known only when the graph runs."""
+    width = g.Max(variance - PIXEL, 0.0) * ratio + PIXEL
+    return g.Sqrt((g.Max(variance, LEAST_BLUR**2) + PIXEL) * ratio / width)
 
 
 def _sharpen(g: Graph, samples: Value, exponent: Value) -> Value:
     """Raise the samples of each pixel to a power, and let them sum to one."""
-    samples = g.Max(samples, TINY)  # the last region's is what is left of one, up to rounding
+    samples = g.Max(samples, _TINY)
     ratios = samples / g.ReduceMax(samples, [2], keepdims=1)
     powers = g.Exp(g.Log(ratios) * exponent)  # Pow takes four times as long
     return powers / g.ReduceSum(powers, [2], keepdims=1)

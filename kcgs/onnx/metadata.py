@@ -48,16 +48,11 @@ def decoder_metadata(kind: str, cutoff: float, clamp: bool) -> dict[str, str]:
     }
 
 
-def scene_metadata(scene: Scene, *, cutoff: float, clamp: bool, crisp: bool) -> dict[str, str]:
+def scene_metadata(scene: Scene, *, cutoff: float, clamp: bool) -> dict[str, str]:
     """Metadata of a scene's decoder."""
     field, regions = scene.field, scene.regions
     count = 1 if regions is None else regions.num_regions
-    if regions is None or count == 1:
-        contours = "none"
-    elif crisp:
-        contours = "crisp"
-    else:
-        contours = "hard" if regions.softness == 0.0 else "soft"
+    contours = "none" if regions is None or count == 1 else "hard" if regions.softness == 0.0 else "soft"
     return {
         **decoder_metadata("scene", cutoff, clamp),
         "recipe": scene.metadata.get("recipe", ""),

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from itertools import product
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap
+from kcgs.kernels.membership import Membership
+from kcgs.kernels.resampled import SmoothMembership
 from kcgs.kernels.tiles import TILE
 
 # side of a window: a tile and the pixels around it, those of the border of the scene repeated beyond it
@@ -21,9 +22,7 @@ class Tiles(NamedTuple):
     rows: int
     cols: int
     regions: list[list[int]]  # of each tile, positions in the map: those with any membership in its window
-    # by tile; hard contours: [WINDOW, WINDOW] positions in the tile's list of regions; soft ones: [K, WINDOW, WINDOW]
-    # memberships
-    windows: dict[int, Tensor]
+    windows: dict[int, Tensor]  # [K, WINDOW, WINDOW] weights of `SmoothMembership`, by tile
 
 
 def find_tiles(regions: RegionMap | None, size: tuple[int, int]) -> Tiles:
@@ -31,26 +30,7 @@ def find_tiles(regions: RegionMap | None, size: tuple[int, int]) -> Tiles:
     rows, cols = -(-size[0] // TILE), -(-size[1] // TILE)
     if regions is None or regions.num_regions == 1:
         return Tiles(rows, cols, [[0]] * (rows * cols), {})
-    return (_hard_tiles if regions.softness == 0.0 else _soft_tiles)(regions, rows, cols)
-
-
-def _hard_tiles(regions: RegionMap, rows: int, cols: int) -> Tiles:
-    index = regions.index[0].long().cpu()
-    down, across = (
-        (torch.arange(n)[:, None] * TILE + torch.arange(-1, TILE + 1)).clamp(0, length - 1)
-        for n, length in zip((rows, cols), index.shape, strict=True)
-    )
-    tiles = Tiles(rows, cols, [], {})
-    for y, x in product(down, across):
-        present, window = torch.unique(index[y[:, None], x], return_inverse=True)
-        if len(present) > 1:
-            tiles.windows[len(tiles.regions)] = window
-        tiles.regions.append(present.tolist())
-    return tiles
-
-
-def _soft_tiles(regions: RegionMap, rows: int, cols: int) -> Tiles:
-    membership, count = regions.tables.membership, regions.num_regions
+    membership, count = smooth_membership(regions), regions.num_regions
     keys = membership.tiles(TILE).keys.cpu()
     # a window reaches into the tiles around it
     steps = torch.arange(-1, 2)
@@ -60,7 +40,7 @@ def _soft_tiles(regions: RegionMap, rows: int, cols: int) -> Tiles:
     keys = ((y * cols + x) * count + (keys % count)[:, None, None])[inside].unique()
     tile, region = keys // count, keys % count
     mixed = torch.bincount(tile)[tile] > 1
-    windows = _membership_windows(regions, tile[mixed], cols, region[mixed])
+    windows = cut_memberships(membership, tile[mixed], cols, region[mixed])
     positive = windows.flatten(1).amax(1) > 0
     present = ~mixed
     present[mixed] = positive
@@ -71,13 +51,18 @@ def _soft_tiles(regions: RegionMap, rows: int, cols: int) -> Tiles:
     return Tiles(rows, cols, [part.tolist() for part in lists], several)
 
 
-def _membership_windows(regions: RegionMap, tile: Tensor, cols: int, region: Tensor) -> Tensor:
+def smooth_membership(regions: RegionMap) -> Membership:
+    """Return what is interpolated between the pixels of a map."""
+    return regions.tables.membership.derived("smooth", SmoothMembership)
+
+
+def cut_memberships(membership: Membership, tile: Tensor, cols: int, region: Tensor) -> Tensor:
     """Evaluate a region over the window of a tile, (P, WINDOW, WINDOW), for P pairs of both."""
     corners = tile // cols * TILE - 1, tile % cols * TILE - 1
     place = torch.stack([torch.zeros_like(region), *corners], 1)
-    weights = regions.tables.membership.window_weights(place, region, (WINDOW, WINDOW)).cpu()
+    weights = membership.window_weights(place, region, (WINDOW, WINDOW)).cpu()
     down, across = (
         (begin[:, None] + torch.arange(WINDOW)).clamp(0, length - 1) - begin[:, None]
-        for begin, length in zip(corners, regions.size, strict=True)
+        for begin, length in zip(corners, membership.index.shape[1:], strict=True)
     )
     return weights.gather(1, down[:, :, None].expand_as(weights)).gather(2, across[:, None, :].expand_as(weights))

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from kcgs.codec import decode, encode
 from kcgs.errors import InvalidArgument
-from kcgs.functional.softness import check_contours
 from kcgs.scene import Scene, check_scene
 
 # page.html, a template for `str.format`, and page.css are written by hand; page.js and the element are committed as
@@ -21,7 +20,7 @@ ELEMENT = _FOLDER / "kcgs-image.js"
 _QUALITY = 60.0
 
 
-def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "scaled") -> str:
+def scene_page(scene: Scene | bytes, *, title: str = "scene") -> str:
     r"""Write a scene as one HTML page that opens from disk, offline.
 
     Convention: the page zooms, pans, and hides regions. It holds the scene as a `.kcgs` file and loads nothing.
@@ -29,14 +28,13 @@ def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "s
     Args:
         scene: of one image, with 1, 3 or 4 channels; or the bytes of its `.kcgs` file, which the page holds unchanged.
         title: title of the page and alternative text of the image.
-        contours: "scaled" or "crisp", as :meth:`kcgs.Scene.render` takes them.
 
     Returns:
         The page, about 100 kB and 4/3 of the scene's file.
 
     Raises:
-        TypeError, ValueError: as :func:`kcgs.codec.encode` and :func:`kcgs.codec.decode`; other contours, another
-            number of channels.
+        TypeError, ValueError: as :func:`kcgs.codec.encode` and :func:`kcgs.codec.decode`; another number of
+            channels.
 
     Example:
         >>> from kcgs import GaussianField
@@ -52,7 +50,7 @@ def scene_page(scene: Scene | bytes, *, title: str = "scene", contours: str = "s
     )
     return template.format(
         policy=policy, title=html.escape(title), style=style, element=element, script=script,
-        contours=check_contours(contours), scene=base64.b64encode(web_bytes(scene)).decode(),
+        scene=base64.b64encode(web_bytes(scene)).decode(),
     )  # fmt: skip
 
 

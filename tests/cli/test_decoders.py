@@ -45,22 +45,21 @@ class TestExport:
         names = [i.name for i in onnxruntime.InferenceSession("a.onnx").get_inputs()]
         assert names == ["size", "view", "visible"]
 
-    def test_crisp(self, kcgs: Kcgs) -> None:
-        arguments = ("export", "scene.safetensors", "-o", "a.onnx", "--contours", "crisp", "--json")
-        assert json.loads(kcgs(*arguments).out)["contours"] == "crisp"
+    def test_larger(self, kcgs: Kcgs) -> None:
+        kcgs("export", "scene.safetensors", "-o", "a.onnx")
         (image,) = onnxruntime.InferenceSession("a.onnx").run(None, {"size": np.array([64, 96])})
-        expected = load("scene.safetensors").render((64, 96), "crisp")
+        expected = load("scene.safetensors").render((64, 96))
         assert np.abs(image[0] - expected.numpy()).max() < 1e-3
-        kcgs("render", "scene.safetensors", "-o", "crisp.png", "--scale", "2", "--contours", "crisp")
-        assert (load_image("crisp.png") - expected).abs().max() <= 0.5 / 255 + 1e-6
+        kcgs("render", "scene.safetensors", "-o", "large.png", "--scale", "2")
+        assert (load_image("large.png") - expected).abs().max() <= 0.5 / 255 + 1e-6
 
     def test_page(self, kcgs: Kcgs) -> None:
         """Its behaviour in a browser is tested in tests/export/test_element.py."""
-        arguments = ("export", "scene.safetensors", "-o", "a & b.html", "--contours", "crisp", "--json")
+        arguments = ("export", "scene.safetensors", "-o", "a & b.html", "--json")
         report, file = json.loads(kcgs(*arguments).out), Path("a & b.html")
         page = file.read_text(encoding="utf-8")
         assert report["bytes"] == file.stat().st_size and report["num_gaussians"] == 30
-        assert "<title>a &amp; b</title>" in page and 'contours="crisp"' in page
+        assert "<title>a &amp; b</title>" in page
         source = re.search(r'src="data:application/octet-stream;base64,([^"]+)"', page)
         assert source is not None
         data = base64.b64decode(source[1])
@@ -135,7 +134,7 @@ class TestView:
 
         monkeypatch.setattr("webbrowser.open", urls.append)
         monkeypatch.setattr("socketserver.BaseServer.serve_forever", interrupt)
-        code, out, _ = kcgs("view", f"scene.{suffix}", "--contours", "crisp")
+        code, out, _ = kcgs("view", f"scene.{suffix}")
         assert (code, out) == (130, f"{urls[0]} (Ctrl-C ends)\n")
 
     def test_a_decoder_is_no_scene(self, kcgs: Kcgs) -> None:

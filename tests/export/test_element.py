@@ -151,12 +151,6 @@ class TestPixels:
         for size in ((height, width), (height // 2, width // 2), (3 * height, 3 * width), (height - 13, 2 * width + 5)):
             check(page, scene.render(size))
 
-    @pytest.mark.parametrize("renderer", ["cpu", "webgl2"])
-    def test_crisp(self, page: Browser, site: tuple[Path, str], renderer: str) -> None:
-        scene = show(page, site, random_scene("pairs"), f'renderer="{renderer}" contours="crisp"')
-        for size in ((60, 90), (150, 225)):
-            check(page, scene.render(size, "crisp"))
-
     def test_alpha(self, page: Browser, site: tuple[Path, str]) -> None:
         scene = show(page, site, random_scene("soft", 4))
         expected = scene.render().numpy()

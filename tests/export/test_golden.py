@@ -18,6 +18,7 @@ import torch
 import kcgs
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.onnx import generic_decoder, scene_decoder
+from tests.functional.test_regions import stated_weights
 
 ROOT = Path(kcgs.__file__).resolve().parent.parent
 FOLDER = ROOT / "export" / "golden"
@@ -100,7 +101,7 @@ class TestCases:
     def test_all_are_here_and_small(self) -> None:
         assert {path.stem for path in FOLDER.glob("*.npz")} == set(NAMES) == {p.stem for p in FOLDER.glob("*.onnx")}
         for name in NAMES:
-            assert sum((FOLDER / f"{name}{suffix}").stat().st_size for suffix in (".npz", ".onnx")) < 75_000
+            assert sum((FOLDER / f"{name}{suffix}").stat().st_size for suffix in (".npz", ".onnx")) < 90_000
 
     def test_cover_what_they_are_for(self, name: str, case: Arrays) -> None:
         size, enlarged, reduced = wholes(case)
@@ -174,37 +175,28 @@ class Described:
         weight = np.exp(-(z1**2 + z2**2) / 2)
         weight[weight < self.case["cutoff"]] = 0
         if "labels" in self.case:
-            soft = self.case["softness"].ndim or self.case["softness"] > 0
-            weight *= (self.soft(x, y, max(0.0, 1 - across * down)) if soft else self.hard(x, y))[self.of]
+            weight *= self.memberships(x, y, 1 / (across * down))[self.of]
         colors = self.colors if factors is None else self.colors * factors[self.of][:, None]
         return np.einsum("nhw,nc->chw", weight, colors)
 
-    def hard(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        corners = []
-        for at, length in ((y, self.size[0]), (x, self.size[1])):
-            low = np.floor(at - 0.5)
-            offset = np.floor((at - 0.5 - low) * 1024) / 1024 + 1 / 2048
-            places = [(low + i).astype(int).clip(0, length - 1) for i in (0, 1)]
-            corners.append(list(zip(places, (1 - offset, offset), strict=True)))
-        scores = sum(
-            u[:, None] * v * (self.case["labels"][r[:, None], c] == self.ids[:, None, None])
-            for r, u in corners[0]
-            for c, v in corners[1]
-        )
-        return scores.argmax(0) == np.arange(len(self.ids))[:, None, None]
-
-    def soft(self, x: np.ndarray, y: np.ndarray, lost: float) -> np.ndarray:
-        widths = self.case.get("contour_width")
+    def memberships(self, x: np.ndarray, y: np.ndarray, ratio: float) -> np.ndarray:
+        labels, widths = self.case["labels"], self.case.get("contour_width")
         widths = np.full(self.size, self.case["softness"]) if widths is None else widths
-        inside = (self.case["labels"] == self.ids[:, None, None]).astype(float)
+        own = labels == self.ids[:, None, None]
+        is_native = all(np.all(np.mod(at, 1) == 0.5) for at in (x, y))
+        if is_native:
+            inside, blurs = own.astype(float), widths
+        else:
+            tensors = torch.from_numpy(labels.astype(np.int64)), torch.from_numpy(widths.astype(float))
+            inside, blurs = stated_weights(*tensors).numpy(), np.maximum(widths, 0.7)
         shares = np.empty_like(inside)
         for i, j in np.ndindex(*self.size):
-            width = float(widths[i, j])
+            width = float(blurs[i, j])
             dy, dx = np.arange(self.size[0])[:, None] - i, np.arange(self.size[1]) - j
             near = (np.maximum(np.abs(dy), np.abs(dx)) <= np.ceil(np.round(4 * width, 4))).astype(float)
             near *= np.exp(-(dy**2 + dx**2) / (2 * width**2)) if width else 1.0
             shares[:, i, j] = (inside * near).sum((1, 2)) / near.sum()
-        shares = np.concatenate([shares, np.maximum(widths.astype(float) ** 2, 1e-6)[None]])
+        shares = np.concatenate([shares, widths.astype(float)[None] ** 2])
         for axis, at in ((1, y), (2, x)):
             low = np.floor(at - 0.5).astype(int)
             last = shares.shape[axis] - 1
@@ -212,7 +204,8 @@ class Described:
             before, after = (shares.take((low + i).clip(0, last), axis) for i in (0, 1))
             shares = before * (1 - offset) + after * offset
         shares, variance = shares[:-1], shares[-1]
-        powers = shares ** np.sqrt((variance + lost / 6) / np.maximum(variance - lost / 12, lost / 24))
+        square = (np.maximum(variance, 0.49) + 0.25) * ratio / (np.maximum(variance - 0.25, 0) * ratio + 0.25)
+        powers = shares ** (1.0 if is_native else np.sqrt(square))
         return powers / powers.sum(0)
 
 

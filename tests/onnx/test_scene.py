@@ -145,10 +145,6 @@ class TestImage:
     def test_cutoffs(self, kind: str, cutoff: float) -> None:
         assert_as_rendered(with_regions(kind, 80, SIZE), [(74, 106), (20, 31)], cutoff)
 
-    @pytest.mark.parametrize("kind", ["none", "hard", "pairs"])
-    def test_crisp_contours(self, kind: str) -> None:
-        assert_as_rendered(with_regions(kind, 80, SIZE), [(74, 106), (20, 31)], contours="crisp")
-
     @pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing")
     @pytest.mark.parametrize(
         ("make", "size", "options"),
@@ -197,10 +193,10 @@ class TestImage:
 
 
 class TestInteractive:
-    @pytest.mark.parametrize("contours", ["scaled", "crisp"])
-    def test_view_and_visible(self, contours: str, grids: bool) -> None:
-        scene = with_regions("soft", 80, (80, 112), 5)
-        decoder, render = Interactive(scene, contours=contours), RegionSplatRenderer(contours=contours)
+    @pytest.mark.parametrize("kind", ["hard", "soft"])
+    def test_view_and_visible(self, kind: str, grids: bool) -> None:
+        scene = with_regions(kind, 80, (80, 112), 5)
+        decoder, render = Interactive(scene), RegionSplatRenderer()
         assert scene.regions is not None
         with torch.no_grad():
             large = render(scene.field, scene.regions, (320, 448))
@@ -269,16 +265,11 @@ class TestModel:
         assert stored and stored <= read
         assert all(read & {*node.output} for graph in graphs for node in graph.node)
 
-    @pytest.mark.parametrize(
-        ("kind", "options", "contours"),
-        [("none", {}, "none"), ("hard", {}, "hard"), ("soft", {}, "soft"), ("soft", {"contours": "crisp"}, "crisp")],
-    )
-    def test_metadata(self, kind: str, options: dict[str, str], contours: str) -> None:
+    @pytest.mark.parametrize("kind", ["none", "hard", "soft"])
+    def test_metadata(self, kind: str) -> None:
         scene = with_regions(kind, 30, (64, 96), 2)
-        metadata = describe_decoder(
-            scene_decoder(Scene(scene.field, scene.regions, {"recipe": "[mine] v2"}), **options)
-        )  # type: ignore[arg-type]
-        expected = {"format": "kcgs.decoder", "height": "64", "recipe": "[mine] v2", "contours": contours}
+        metadata = describe_decoder(scene_decoder(Scene(scene.field, scene.regions, {"recipe": "[mine] v2"})))
+        expected = {"format": "kcgs.decoder", "height": "64", "recipe": "[mine] v2", "contours": kind}
         assert metadata.items() >= (expected | {"region_ids": [0] if kind == "none" else [2, 5]}).items()
 
     def test_leaves_out_operators(self) -> None:
@@ -306,7 +297,7 @@ class TestModel:
         scene = with_regions("soft", 1250, (480, 854), 6)
         scene.field.cholesky.data *= 0.2
         stored = scene.save(f"{tmp_path}/s.safetensors")
-        assert len(scene_decoder(scene).SerializeToString()) < 2.2 * stored
+        assert len(scene_decoder(scene).SerializeToString()) < 2.7 * stored
 
 
 def batch() -> Scene:

@@ -1,7 +1,6 @@
 /** The custom element `<kcgs-image>`: an image from a `.kcgs` file. The README beside it says what it takes. */
 
 import type { Scene } from "../decoder/scene.ts";
-import type { Contours } from "../renderer/membership.ts";
 import type { Device } from "../renderer/painter.ts";
 import { listen, zoomAtMiddle } from "./gestures.ts";
 import type { Glide } from "./gestures.ts";
@@ -27,7 +26,7 @@ export interface RegionClick {
 }
 
 export class KcgsImage extends HTMLElement {
-  static readonly observedAttributes = ["src", "alt", "zoom", "regions", "contours", "renderer"];
+  static readonly observedAttributes = ["src", "alt", "zoom", "regions", "renderer"];
 
   private readonly stage: Stage;
   private readonly sizes = new CSSStyleSheet();
@@ -85,7 +84,6 @@ export class KcgsImage extends HTMLElement {
     } else if (name === "alt") this.describe();
     else if (name === "zoom") this.listenToGestures();
     else if (name === "regions") this.describe();
-    else if (name === "contours") this.setContours(value ?? "scaled");
     else if (name === "renderer") this.setDevice(value ?? "auto");
   }
 
@@ -232,11 +230,6 @@ export class KcgsImage extends HTMLElement {
       return position;
     };
     return new Set(Array.from(typeof ids === "number" ? [ids] : ids, find));
-  }
-
-  private setContours(value: string): void {
-    this.stage.contours = oneOf("contours", value, ["scaled", "crisp"] satisfies Contours[]);
-    if (this.current !== null) this.stage.show(this.current, this.hiddenRegions);
   }
 
   private setDevice(value: string): void {

@@ -1,11 +1,10 @@
 /** The canvas of an element: what it shows of a scene, and when it renders. */
 
 import type { Scene } from "../decoder/scene.ts";
-import type { Contours } from "../renderer/membership.ts";
 import { paint } from "../renderer/painter.ts";
 import type { Device } from "../renderer/painter.ts";
-import { prepare } from "../renderer/prepare.ts";
-import type { Prepared } from "../renderer/software.ts";
+import { PreparedScene } from "../renderer/prepare.ts";
+import type { View } from "../renderer/sampling.ts";
 import type { Viewport } from "./gestures.ts";
 import { anchorAt, clamp, fit, pan, visiblePart, zoomAbout } from "./view.ts";
 import type { Anchor, Size, Transform } from "./view.ts";
@@ -19,11 +18,10 @@ const MAX_DIVISOR = 8; // of the resolution, along each side, while the view mov
 
 export class Stage implements Viewport {
   transform: Transform = { x: 0, y: 0, scale: 1 };
-  contours: Contours = "scaled";
   device: Device = "auto";
   /** What rendered last: "webgl2 float32", "webgl2 float16", "cpu", or "" before anything did. */
   renderer = "";
-  private scene: Prepared | null = null;
+  private scene: PreparedScene | null = null;
   private visible = new Uint8Array(0);
   private measured = false; // whether the canvas has its size on the screen
   private fitted = true;
@@ -51,7 +49,7 @@ export class Stage implements Viewport {
   /** Show a scene; `hidden` are positions of regions that are not shown. */
   show(scene: Scene | null, hidden: ReadonlySet<number>): void {
     const first = this.scene === null;
-    this.scene = scene === null ? null : prepare(scene, this.contours);
+    this.scene = scene === null ? null : new PreparedScene(scene);
     this.hide(hidden, scene?.regions?.ids.length ?? 1);
     if (first && this.scene !== null) this.fit();
     else this.requestRender();
@@ -112,12 +110,12 @@ export class Stage implements Viewport {
   image(width: number, height: number): HTMLCanvasElement {
     if (this.scene === null) throw new Error("there is no scene yet");
     const canvas = Object.assign(document.createElement("canvas"), { width, height });
-    const view = { rect: [0, 0, this.scene.width, this.scene.height] as const, width, height };
+    const view: View = { rect: [0, 0, this.scene.width, this.scene.height], width, height };
     const context = canvas.getContext("2d")!;
     // a canvas that is too large keeps no pixels, without an error
     context.fillRect(0, 0, 1, 1);
     if (context.getImageData(0, 0, 1, 1).data[3] === 0) throw new Error(`no image of ${width} x ${height} can be made`);
-    paint(context, 0, 0, this.scene, { ...view, rect: [...view.rect] }, this.visible, this.device);
+    paint(context, 0, 0, this.scene.at(view), view, this.visible, this.device);
     return canvas;
   }
 
@@ -169,11 +167,11 @@ export class Stage implements Viewport {
     const start = performance.now();
     const before = this.renderer;
     try {
-      if (this.divisor === 1) this.renderer = paint(context, part.x, part.y, scene, view, this.visible, this.device);
+      if (this.divisor === 1) this.renderer = paint(context, part.x, part.y, scene.at(view), view, this.visible, this.device);
       else {
         this.scratch ??= document.createElement("canvas");
         Object.assign(this.scratch, { width, height });
-        this.renderer = paint(this.scratch.getContext("2d")!, 0, 0, scene, view, this.visible, this.device);
+        this.renderer = paint(this.scratch.getContext("2d")!, 0, 0, scene.at(view), view, this.visible, this.device);
         context.drawImage(this.scratch, part.x, part.y, part.width, part.height);
       }
     } catch (error) {

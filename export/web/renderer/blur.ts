@@ -1,5 +1,6 @@
 /** The blur of a label map at one pixel: how much of each region lies around it. */
 
+import type { SmoothLabels } from "./antialias.ts";
 import type { Levels } from "./levels.ts";
 
 const RADIUS_SIGMAS = 4;
@@ -59,9 +60,11 @@ export class Blur {
     private readonly height: number,
     regions: number,
     private readonly levels: Levels,
+    private readonly smooth: SmoothLabels | null,
   ) {
     this.kernels = levels.widths.map(kernelOf);
-    this.widest = Math.max(...this.kernels.map((kernel) => kernel.reach));
+    // antialiasing reaches one pixel farther
+    this.widest = Math.max(...this.kernels.map((kernel) => kernel.reach)) + Number(smooth !== null);
     this.pixel = new Tally(regions);
     this.node = new Tally(regions);
     this.runEnds = new Int32Array(labels.length);
@@ -119,6 +122,23 @@ export class Blur {
         into.add(region, factor * (sums[end - x + reach]! - sums[position - x + reach]!));
         position = end;
       }
+      if (this.smooth !== null) this.correct(this.smooth, into, row, x0, x1, (i) => factor * weights[Math.abs(i - x)]!);
+    }
+  }
+
+  /** Add what antialiased pixels of a row have more or less than their label. */
+  private correct(
+    { weight, other, otherWeight }: SmoothLabels,
+    into: Tally,
+    row: number,
+    from: number,
+    to: number,
+    factorOf: (x: number) => number,
+  ): void {
+    for (let x = from, position = row * this.width + from; x < to; x++, position++) {
+      if (weight[position] === 1) continue;
+      into.add(this.labels[position]!, factorOf(x) * (weight[position]! - 1));
+      if (otherWeight[position]! > 0) into.add(other[position]!, factorOf(x) * otherWeight[position]!);
     }
   }
 

@@ -1,8 +1,8 @@
 /** The regions of the pixels of an output, by rows: runs of pixels of one region, with weights along contours. */
 
-import { crispness, sharpness, SHARED } from "./membership.ts";
+import { sharpness, SHARED, WHOLE } from "./membership.ts";
 import type { Membership } from "./membership.ts";
-import { hardAxis, softAxis } from "./sampling.ts";
+import { placed } from "./sampling.ts";
 import type { Axis, FineAxis } from "./sampling.ts";
 
 /** Runs sorted by region, then by row, then along the row. */
@@ -18,7 +18,7 @@ export interface Runs {
 /** Find the runs of a render; `visible` says of each region whether it is wanted. */
 export function runsOf(membership: Membership, across: FineAxis, down: FineAxis, visible: Uint8Array): Runs {
   const writer = new RunWriter(visible, across.count);
-  const weigh = membership.hard ? hardPixels(membership, across, down) : softPixels(membership, across, down);
+  const weigh = weigher(membership, across, down);
   for (let y = 0; y < down.count; y++) {
     for (let x = 0; x < across.count; x++) weigh(x, y, writer);
     writer.endRow(y);
@@ -28,41 +28,16 @@ export function runsOf(membership: Membership, across: FineAxis, down: FineAxis,
 
 type Weigh = (x: number, y: number, writer: RunWriter) => void;
 
-/** A point has the label with the largest share among its four neighbours. */
-function hardPixels(membership: Membership, across: FineAxis, down: FineAxis): Weigh {
-  const { width, height, heads } = membership;
-  const columns = hardAxis(across, width);
-  const rows = hardAxis(down, height);
-  return (x, y, writer) => {
-    const [above, below] = [rows.low[y]! * width, rows.high[y]! * width];
-    const [left, right] = [columns.low[x]!, columns.high[x]!];
-    const four = [heads[above + left]!, heads[above + right]!, heads[below + left]!, heads[below + right]!] as const;
-    const alike = four[0] === four[1] && four[0] === four[2] && four[0] === four[3];
-    writer.pure(alike ? four[0] : largest(four, columns.share[x]!, rows.share[y]!), x);
-  };
-}
-
-function largest(labels: readonly [number, number, number, number], across: number, down: number): number {
-  const shares = [(1 - down) * (1 - across), (1 - down) * across, down * (1 - across), down * across];
-  let [best, peak] = [labels[0], -1];
-  for (const label of labels) {
-    let sum = 0;
-    for (let i = 0; i < 4; i++) if (labels[i] === label) sum += shares[i]!;
-    if (sum > peak) [best, peak] = [label, sum];
-  }
-  return best;
-}
-
-/** A point has the bilinear mean of its four neighbours, raised to the power that takes their blur out. */
-function softPixels(membership: Membership, across: FineAxis, down: FineAxis): Weigh {
-  const { width, height, heads, lists, whole, variances } = membership;
-  const columns = softAxis(across, width);
-  const rows = softAxis(down, height);
+/** A point has the bilinear mean of its four neighbours, raised to a power in an output of another size. */
+function weigher(membership: Membership, across: FineAxis, down: FineAxis): Weigh {
+  const { width, height, heads, lists, variances } = membership;
+  const columns = placed(across, width);
+  const rows = placed(down, height);
   const exponent = exponentOf(membership, across, down);
   const add = (writer: RunWriter, head: number, share: number): void => {
     if (head < SHARED) return writer.add(head, share);
     for (let entry = head - SHARED; lists[entry] !== 0; entry++) {
-      writer.add(lists[entry]! >>> 16, (share * (lists[entry]! & 0xffff)) / whole);
+      writer.add(lists[entry]! >>> 16, (share * (lists[entry]! & 0xffff)) / WHOLE);
     }
   };
   return (x, y, writer) => {
@@ -92,16 +67,8 @@ function interpolate(cells: Float32Array, columns: Axis, rows: Axis, x: number, 
 /** The exponent of weights between cells: a number, or one for each variance; null: weights stay as they are. */
 function exponentOf(m: Membership, across: FineAxis, down: FineAxis): number | null | ((variance: number) => number) {
   const ratio = 1 / (across.step * down.step);
-  if (m.crisp !== null) return crispness(m.crisp, ratio);
-  const lost = lostOf(across, down);
-  if (lost === 0) return null;
-  return m.variances === null ? sharpness(m.variance, lost) : (variance) => sharpness(variance, lost);
-}
-
-/** 1 - pixels of the scene / pixels of the output, none where the output is not larger. */
-export function lostOf(across: FineAxis, down: FineAxis): number {
-  const lost = 1 - across.step * down.step;
-  return lost < 1e-9 ? 0 : lost;
+  if (!m.smooth) return null;
+  return m.variances === null ? sharpness(m.variance, ratio) : (variance) => sharpness(variance, ratio);
 }
 
 interface Open {

@@ -19,29 +19,18 @@ export interface Axis {
   readonly share: Float32Array<ArrayBuffer>;
 }
 
-// places between two cells at which hard contours are sampled, as odd multiples of half of one
-const OFFSETS = 1024;
 // rounding errors of positions in float64
 const NOISE = 1e-9;
 
 /** Place the centres of a render's pixels between `cells` cells. */
-export function softAxis(fine: FineAxis, cells: number): Axis {
-  return axis(fine, cells, (part) => Math.max(0, part));
-}
-
-/** The same for hard contours. */
-export function hardAxis(fine: FineAxis, cells: number): Axis {
-  return axis(fine, cells, (part) => (Math.floor((part + NOISE) * OFFSETS) + 0.5) / OFFSETS);
-}
-
-function axis({ start, step, count }: FineAxis, cells: number, shareOf: (part: number) => number): Axis {
+export function placed({ start, step, count }: FineAxis, cells: number): Axis {
   const [low, high, share] = [new Int32Array(count), new Int32Array(count), new Float32Array(count)];
   for (let i = 0; i < count; i++) {
     const position = start + (i + 0.5) * step - 0.5;
     const first = Math.floor(position + NOISE);
     low[i] = Math.min(Math.max(first, 0), cells - 1);
     high[i] = Math.min(Math.max(first + 1, 0), cells - 1);
-    share[i] = shareOf(position - first);
+    share[i] = Math.max(0, position - first);
   }
   return { low, high, share };
 }
@@ -53,6 +42,14 @@ export interface FineAxis {
   readonly count: number;
   /** Each pixel of the output is the mean from `from + i * span` on over `span` fine ones; null: each is one. */
   readonly mean: { from: number; span: number } | null;
+}
+
+/** Whether the pixels of a render are those of the scene, or every so many of them. */
+export function isNative({ rect: [left, top, right, bottom], width, height }: View): boolean {
+  return [
+    [left, (right - left) / width],
+    [top, (bottom - top) / height],
+  ].every(([start, step]) => step! > 1 + NOISE || (step! > 1 - NOISE && Math.abs(start! - Math.round(start!)) < NOISE));
 }
 
 /** A scene that shrinks is rendered at its own size, of which area means are taken. */

@@ -1,5 +1,7 @@
 /** The three passes on a GPU: whose each pixel is, the sum of Gaussians, and what is shown of it. */
 
+import { LEAST_BLUR, PIXEL, WHOLE } from "./membership.ts";
+
 const HEAD = `#version 300 es
 precision highp float;
 precision highp int;
@@ -18,14 +20,14 @@ void main() {
 }`;
 
 /** Finds the regions of a pixel and their shares, as `contours.ts` does; columns and rows say where cells lie. */
-export function contourShader(layers: number, hard: boolean, pairs: boolean): string {
+export function contourShader(layers: number, pairs: boolean): string {
   const slots = layers * SLOTS_OF_A_LAYER;
   const outputs = Array.from({ length: layers }, (_, i) => `layout(location = ${i}) out uvec4 slots${i};`).join("\n");
   const written = Array.from({ length: layers }, (_, i) => `slots${i} = pack(${i * SLOTS_OF_A_LAYER});`).join("\n  ");
   return `${HEAD}
 uniform usampler2D heads, lists, visible;
 uniform sampler2D columns, rows, variances;
-uniform float whole, exponent, lost;
+uniform float uniformVariance, ratio; // pixels of the output per cell; 0: weights stay as they are
 ${outputs}
 uint regions[${slots}];
 float shares[${slots}];
@@ -60,7 +62,7 @@ uvec4 pack(int first) {
 
 uint read(vec2 cell) { return texelFetch(heads, ivec2(cell), 0).r; }
 
-${hard ? HARD : softPart(pairs)}
+${weighing(pairs)}
 
 void main() {
   weigh(ivec2(gl_FragCoord.xy));
@@ -68,35 +70,16 @@ void main() {
 }`;
 }
 
-const HARD = `
-void weigh(ivec2 pixel) {
-  vec3 column = texelFetch(columns, ivec2(pixel.x, 0), 0).xyz;
-  vec3 row = texelFetch(rows, ivec2(pixel.y, 0), 0).xyz;
-  uvec4 four = uvec4(read(vec2(column.x, row.x)), read(vec2(column.y, row.x)),
-                     read(vec2(column.x, row.y)), read(vec2(column.y, row.y)));
-  float i = column.z, j = row.z;
-  vec4 share = vec4((1.0 - j) * (1.0 - i), (1.0 - j) * i, j * (1.0 - i), j * i);
-  uint best = four.x;
-  float most = -1.0;
-  for (int k = 0; k < 4; k++) {
-    float sum = dot(share, vec4(equal(four, uvec4(four[k]))));
-    if (sum > most) { most = sum; best = four[k]; }
-  }
-  add(best, 1.0);
-}`;
-
-function softPart(pairs: boolean): string {
-  const power = pairs
-    ? `float power = exponent;
-  if (lost > 0.0) {
-    float upper = mix(texelFetch(variances, ivec2(column.x, row.x), 0).r,
-                      texelFetch(variances, ivec2(column.y, row.x), 0).r, column.z);
-    float lower = mix(texelFetch(variances, ivec2(column.x, row.y), 0).r,
-                      texelFetch(variances, ivec2(column.y, row.y), 0).r, column.z);
-    float variance = max(mix(upper, lower, row.z), 1e-6);
-    power = sqrt((variance + lost / 6.0) / max(variance - lost / 12.0, lost / 24.0));
-  }`
-    : "float power = exponent;";
+function weighing(pairs: boolean): string {
+  const variance = pairs
+    ? `float upper = mix(texelFetch(variances, ivec2(column.x, row.x), 0).r,
+                    texelFetch(variances, ivec2(column.y, row.x), 0).r, column.z);
+  float lower = mix(texelFetch(variances, ivec2(column.x, row.y), 0).r,
+                    texelFetch(variances, ivec2(column.y, row.y), 0).r, column.z);
+  float variance = mix(upper, lower, row.z);`
+    : "float variance = uniformVariance;";
+  const sharpness = `ratio == 0.0 ? 1.0
+    : sqrt((max(variance, ${LEAST_BLUR ** 2}) + ${PIXEL}) * ratio / (max(variance - ${PIXEL}, 0.0) * ratio + ${PIXEL}))`;
   return `
 void spread(uint head, float share) {
   if (share <= 0.0) return;
@@ -104,7 +87,7 @@ void spread(uint head, float share) {
   for (uint at = head & 0x7fffffffu; ; at++) {
     uint entry = texelFetch(lists, ivec2(int(at & 0xfffu), int(at >> 12)), 0).r;
     if (entry == 0u) break;
-    add(entry >> 16, share * float(entry & 0xffffu) / whole);
+    add(entry >> 16, share * float(entry & 0xffffu) / ${WHOLE}.0);
   }
 }
 void weigh(ivec2 pixel) {
@@ -118,7 +101,8 @@ void weigh(ivec2 pixel) {
   spread(four.y, i * (1.0 - j));
   spread(four.z, (1.0 - i) * j);
   spread(four.w, i * j);
-  ${power}
+  ${variance}
+  float power = ${sharpness};
   float most = 0.0, total = 0.0;
   for (int k = 0; k < count; k++) most = max(most, shares[k]);
   for (int k = 0; k < count; k++) {

@@ -1,10 +1,8 @@
 /** The renderer on a GPU, by WebGL2: one context for all scenes of a page. */
 
-import { crispness, sharpness } from "./membership.ts";
-import { lostOf } from "./contours.ts";
 import { linked, Recent, texture } from "./gl.ts";
 import type { Program } from "./gl.ts";
-import { hardAxis, fineAxis, softAxis } from "./sampling.ts";
+import { fineAxis, placed } from "./sampling.ts";
 import type { Axis, FineAxis, View } from "./sampling.ts";
 import { contourShader, FULLSCREEN, showShader, SPLAT_VERTEX, splatShader } from "./shaders.ts";
 import type { Prepared } from "./software.ts";
@@ -125,14 +123,11 @@ export class WebGl {
 
   private findContours({ membership }: Prepared, { across, down }: Part, map: MapTextures, target: Target): void {
     const { gl } = this;
-    const { hard, width, height, variances, variance, crisp, whole } = membership;
-    const kind = `contours ${map.layers} ${hard} ${variances !== null}`;
-    const program = this.program(kind, FULLSCREEN, () => contourShader(map.layers, hard, variances !== null));
+    const { width, height, variances, variance, smooth } = membership;
+    const kind = `contours ${map.layers} ${variances !== null}`;
+    const program = this.program(kind, FULLSCREEN, () => contourShader(map.layers, variances !== null));
     gl.useProgram(program.program);
-    const place = hard ? hardAxis : softAxis;
-    [place(across, width), place(down, height)].forEach((axis, i) => this.uploadAxis(this.axes[i]!, axis));
-    const lost = lostOf(across, down);
-    const ratio = 1 / (across.step * down.step);
+    [placed(across, width), placed(down, height)].forEach((axis, i) => this.uploadAxis(this.axes[i]!, axis));
     program.textures({
       heads: map.heads,
       lists: map.lists,
@@ -141,9 +136,8 @@ export class WebGl {
       rows: this.axes[1],
       variances: map.variances,
     });
-    program.float("whole", whole);
-    program.float("lost", lost);
-    program.float("exponent", crisp !== null ? crispness(crisp, ratio) : lost > 0 ? sharpness(variance, lost) : 1);
+    program.float("uniformVariance", variance);
+    program.float("ratio", smooth ? 1 / (across.step * down.step) : 0);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.slotBuffer);
     gl.viewport(0, 0, target.width, target.height);
     gl.disable(gl.BLEND);
