@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from io import BytesIO
 from itertools import product
 from typing import Any, NamedTuple
@@ -66,8 +66,11 @@ def largest_file(codec: str, image: Tensor, max_bytes: int) -> bytes:
     size, qualities, files = (image.shape[2], image.shape[1]), CODECS[codec].qualities, []
     for variant in range(len(CODECS[codec].variants)):
         arguments = codec, variant, pixels.tobytes(), size
-        index = bisect_right(qualities[1:], max_bytes, key=lambda quality: len(_encode(*arguments, quality)))
-        files.append(_encode(*arguments, qualities[index]))
+        encode = partial(_encode, *arguments)
+        # most reductions have no file as small: the first one says so
+        candidates = qualities[1:] if len(encode(qualities[0])) <= max_bytes else range(0)
+        index = bisect_right(candidates, max_bytes, key=lambda quality: len(encode(quality)))
+        files.append(encode(qualities[index]))
     small = [file for file in files if len(file) <= max_bytes]
     return max(small, key=lambda file: float(psnr(decode_file(file), image))) if small else min(files, key=len)
 
