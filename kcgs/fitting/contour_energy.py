@@ -106,7 +106,7 @@ class MovingLabels:
         self._smallest, self._pad, self._stride = smallest, pad, padded.shape[1]
         self._sides = disc(1, self._stride)[1:]
         # two neighbours that differ count an eighth each
-        self._energy_of = self._labels, costs, length_weight / 4, disc(1.5, self._stride)[1:]
+        self._energy_of = self._labels, costs, length_weight / 4, disc(2, self._stride)
         self._floor = np.minimum(np.bincount(index.ravel()), smallest)
         self._free = self._labels >= 0
         self._specks = np.zeros(padded.size, np.bool_)  # pixels of pieces that were small before any move

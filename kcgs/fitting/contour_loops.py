@@ -16,6 +16,8 @@ _UNKNOWN = 0
 _PENDING = 1
 _SMALL = 2
 _LARGE = 3
+# cost of a unit of curvature, in costs of two neighbours that differ
+_CURVATURE_COST = 1.2
 
 
 class CostTable(NamedTuple):
@@ -53,7 +55,7 @@ def _allows(limit, pixel, label):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def sweep(labels, costs, pair_cost, eight, limit, free, neighborhood):  # type: ignore[no-untyped-def]
+def sweep(labels, costs, pair_cost, disc, limit, free, neighborhood):  # type: ignore[no-untyped-def]
     """Give every free pixel the best label of its neighborhood; True if one changed.
 
     The map is flat and has a rim of -1. Neighborhoods are those before the sweep.
@@ -65,12 +67,12 @@ def sweep(labels, costs, pair_cost, eight, limit, free, neighborhood):  # type: 
             if pixel // costs.stride % 2 * 2 + pixel % costs.stride % 2 != parity:
                 continue
             present = before[pixel]
-            best, least = present, _energy(labels, costs, pair_cost, eight, pixel, present)
+            best, least = present, _curved_energy(labels, costs, pair_cost, disc, pixel, present)
             for k in range(1, len(neighborhood)):
                 label = before[pixel + neighborhood[k]]
                 if label == present or label == -1 or _has(before, pixel, neighborhood[:k], label):
                     continue
-                energy = _energy(labels, costs, pair_cost, eight, pixel, label)
+                energy = _curved_energy(labels, costs, pair_cost, disc, pixel, label)
                 if energy < least and _allows(limit, pixel, label):
                     best, least = label, energy
             labels[pixel] = best
@@ -96,32 +98,61 @@ def _list_near_contours(labels, free, stride, neighborhood):  # type: ignore[no-
 
 
 @inner
-def _energy(labels, costs, pair_cost, eight, pixel, label):  # type: ignore[no-untyped-def]
-    """Return the part of the energy that depends on a pixel's label, up to a constant."""
+def _energy(labels, costs, pair_cost, disc, pixel, label):  # type: ignore[no-untyped-def]
+    """Return the part of the energy that depends on a pixel's label, up to a constant, without curvature."""
     equal = 0
-    for offset in eight:
+    for offset in disc[1:9]:
         equal += labels[pixel + offset] == label
     return _cost(costs, pixel, label) - pair_cost * equal
 
 
+@inner
+def _curved_energy(labels, costs, pair_cost, disc, pixel, label):  # type: ignore[no-untyped-def]
+    """Return the part of the energy that depends on a pixel's label, up to a constant."""
+    present, curvature = labels[pixel], 0
+    labels[pixel] = label
+    for offset in disc:
+        curvature += _curvature(labels, disc, pixel + offset)
+    labels[pixel] = present
+    return _energy(labels, costs, pair_cost, disc, pixel, label) + _CURVATURE_COST * pair_cost * curvature
+
+
+@inner
+def _curvature(labels, disc, pixel):  # type: ignore[no-untyped-def]
+    """Return the square of how many more pixels around one differ from it than equal it; 0 if no more do."""
+    excess, center = 0, labels[pixel]
+    if center == -1:
+        return 0
+    for offset in disc[1:]:
+        label = labels[pixel + offset]
+        excess += int(-1 != label != center) - int(label == center)
+    return max(excess, 0) ** 2
+
+
 @program.entry
-def piece_energy(labels, costs, pair_cost, eight, limit, piece, label):  # type: ignore[no-untyped-def]
-    """Return the energy of a piece under a label, up to a constant; infinite where a pixel may not have it."""
+def piece_energy(labels, costs, pair_cost, disc, limit, piece, label):  # type: ignore[no-untyped-def]
+    """Return the energy of a piece under a label, up to a constant, without curvature; infinite where not allowed."""
     total = 0.0
     for pixel in piece:
-        total += _energy(labels, costs, pair_cost, eight, pixel, label) if _allows(limit, pixel, label) else math.inf
+        total += _energy(labels, costs, pair_cost, disc, pixel, label) if _allows(limit, pixel, label) else math.inf
     return total
 
 
 @program.entry
-def energy_change(before, after, costs, pair_cost, eight):  # type: ignore[no-untyped-def]
+def energy_change(before, after, costs, pair_cost, disc):  # type: ignore[no-untyped-def]
     """Return the energy of a flat map with a rim of -1, less that of another."""
-    change = 0.0
+    change, is_counted = 0.0, np.zeros(len(after), np.bool_)
     for pixel in range(len(after)):
         if after[pixel] == before[pixel]:
             continue
         change += _cost(costs, pixel, after[pixel]) - _cost(costs, pixel, before[pixel])
-        for offset in eight:
+        for offset in disc:
+            center = pixel + offset
+            if not is_counted[center]:
+                is_counted[center] = True
+                curvature = _curvature(after, disc, center) - _curvature(before, disc, center)
+                change += _CURVATURE_COST * pair_cost * curvature
+        for offset in disc[1:9]:
             old, new = before[pixel + offset], after[pixel + offset]
             pairs = int(-1 != new != after[pixel]) - int(-1 != old != before[pixel])
             # pairs of two pixels that changed come twice

@@ -46,7 +46,7 @@ def refine_contours(
         return regions
     index = index_map(regions, regions.labels)
     distance = min(1 if max_distance is None else max_distance, math.hypot(*index.shape))
-    pad = 2 * math.ceil(max(reach, distance) / 2)  # even: with the rim, rows and columns keep their parity
+    pad = 2 * math.ceil(max(reach, distance, 2) / 2)  # even: with the rim, rows and columns keep their parity
     rim = edge_band(torch.from_numpy(index), 1).numpy()
     boxes = bounding_boxes(np.where(rim, index, -1), regions.num_regions, reach * sweeps + smallest)
     costs = region_costs(scene, image, boxes, pad, blur, backend)

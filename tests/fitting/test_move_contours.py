@@ -66,7 +66,17 @@ def dense_energy(field: GaussianField, image: Tensor, regions: RegionMap, weight
                     weights, norm = weights + tap * error[v, u], norm + tap
             around = labels[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2]
             total += weights / norm + weight / 8 * int((around != region).sum())
-    return total
+    return total + weight * 0.3 * curvature(labels)
+
+
+def curvature(labels: Tensor) -> int:
+    """Squares of how many more of the 12 pixels around each one differ from it than equal it."""
+    excess, padded = torch.zeros_like(labels), torch.nn.functional.pad(labels, (2,) * 4, value=-1)
+    for y, x in np.ndindex(5, 5):
+        other = padded[y : y + len(labels), x : x + labels.shape[1]]
+        if 0 < (y - 2) ** 2 + (x - 2) ** 2 <= 4:
+            excess += (other != -1) * (1 - 2 * (other == labels).long())
+    return int(excess.clamp(min=0).square().sum())
 
 
 def contour_energy(scene: Scene, image: Tensor, length_weight: float = 0.003, blur: float = 0.7) -> float:
@@ -78,11 +88,11 @@ def contour_energy(scene: Scene, image: Tensor, length_weight: float = 0.003, bl
         costs = region_costs(scene, image, boxes, 1, blur, "auto")
     labels, none = np.pad(index, 1, constant_values=-1), np.zeros(0, np.int32)
     # each of eight neighbours of the same label saves half a pair
-    settings = labels.ravel(), costs, length_weight / 8, disc(1.5, labels.shape[1])[1:], (none, none)
+    settings = labels.ravel(), costs, length_weight / 8, disc(2, labels.shape[1]), (none, none)
     energies = [piece_energy(*settings, np.flatnonzero(labels == r), r) for r in range(regions.num_regions)]
     height, width = index.shape
     pairs = 4 * height * width - 3 * (height + width) + 2
-    return float(sum(energies)) + length_weight / 4 * pairs
+    return float(sum(energies)) + length_weight / 4 * pairs + length_weight * 0.3 * curvature(regions.labels)
 
 
 def small_pieces(labels: Tensor, smallest: int) -> int:
@@ -110,9 +120,8 @@ class TestEnergy:
         assert straight == pytest.approx((24 + 2 * 23) / 4)
         alone = torch.zeros(24, 40, dtype=torch.long)
         alone[5, 5] = 1
-        assert contour_energy(Scene(field, RegionMap.from_labels(alone)), image, length_weight=1.0) == pytest.approx(
-            2.0
-        )
+        energy = contour_energy(Scene(field, RegionMap.from_labels(alone)), image, length_weight=1.0)
+        assert energy == pytest.approx(2.0 + 0.3 * 12**2)
 
     @pytest.mark.parametrize("seed", range(24))
     def test_never_rises(self, seed: int) -> None:
@@ -286,6 +295,17 @@ class TestShape:
         lengths = [length(weight) for weight in (0.0, 0.3, 3.0)]
         assert lengths[0] > 1.5 * lengths[1] > 1.5 * lengths[2]
         assert lengths[2] < 1.2 * (24 + 2 * 23) / 4
+
+    def test_bumps_cost_and_thin_legs_do_not(self) -> None:
+        labels = step(12)
+        labels[:, 24:26], image = 0, 0.1 * step(12).float()[None]
+        image[..., 24:26] = 0.0
+        bumpy = image.clone()
+        bumpy[:, 3::6, 12] = 0.0
+        field = flat_field({0: [0.0], 1: [0.1]}, (24, 40))
+        for start in (image, bumpy):
+            regions = RegionMap.from_labels((start[0] > 0).long())
+            assert torch.equal(refine_contours(Scene(field, regions), bumpy, blur=0.0).labels, labels)
 
     def test_one_region_returns_the_map(self) -> None:
         regions = RegionMap.from_labels(torch.full((24, 40), 7))
