@@ -64,7 +64,8 @@ def fit_request(
         float | None, typer.Option(help="As few Gaussians as reach this PSNR in dB, at most --num-gaussians.")
     ] = None,
     target_bytes: Annotated[
-        int | None, typer.Option(min=1, help="The best .kcgs file that is not larger; chooses the number of Gaussians.")
+        int | None,
+        typer.Option(min=40, help="The best .kcgs file that is not larger; chooses the number of Gaussians."),
     ] = None,
     keep_contours: Annotated[
         bool,
