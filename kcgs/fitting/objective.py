@@ -18,8 +18,9 @@ from .pursuit import halve, propose
 if TYPE_CHECKING:
     from .similarity import Passes
 
-# weight of the squared error
+# weight of the squared error, and that on a reduced photo: few Gaussians, where MS-SSIM likes stray strokes
 _SQUARED = 0.003
+_SQUARED_REDUCED = 0.03
 # least mean of a scale, since the logarithm has no bound at 0
 _MIN_SCORE = 0.2
 
@@ -40,8 +41,8 @@ class MsSsimObjective:
 
     Args:
         image: (C, H, W) in [0, 1].
-        finest_scale: position among the scales of MS-SSIM of the one that halves this image: 1, or more where the image
-            is a photo that was reduced.
+        reduction: factor by which the sides of a photo were reduced to those of the image. Its scales keep their
+            weights, so the finest ones are left out; the squared error has ten times the weight.
 
     Example:
         >>> image = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(0))
@@ -50,10 +51,11 @@ class MsSsimObjective:
         True
     """
 
-    def __init__(self, image: Tensor, finest_scale: int = 1) -> None:
+    def __init__(self, image: Tensor, reduction: int = 1) -> None:
+        self._squared = _SQUARED if reduction == 1 else _SQUARED_REDUCED
         self._scales: list[tuple[Tensor, Tensor, Tensor, Tensor, float]] = []
         masks, plane = [], image
-        for weight in SCALE_WEIGHTS[finest_scale:]:
+        for weight in SCALE_WEIGHTS[reduction.bit_length() :]:
             plane = halve(plane)
             if not plane.numel():
                 break
@@ -63,7 +65,7 @@ class MsSsimObjective:
             self._scales.append((plane, inside, mean, variance, weight))
             masks.append(_blur(inside * weight / (2.0 * variance + K2**2)).mean(0))
         self._norm = sum(float(mask.mean()) for mask in masks)
-        masks = [torch.full_like(image[0], _SQUARED), *(mask / self._norm for mask in masks)]
+        masks = [torch.full_like(image[0], self._squared), *(mask / self._norm for mask in masks)]
         self.importance = self._sum_up([mask[None] * 0.25**level for level, mask in enumerate(masks)])[0]
         self._bands = [(0, 0.0, math.inf, masks[0])]
         for level, mask in enumerate(masks[1:], 1):
@@ -90,12 +92,12 @@ class MsSsimObjective:
         if self._passes is None:
             return self._measure(difference)[1]
         gradient = difference.contiguous()
-        self._passes.differentiate(gradient.numpy(), _SQUARED)
+        self._passes.differentiate(gradient.numpy(), self._squared)
         return gradient
 
     def value(self, difference: Tensor) -> float:
         """Return E, as a mean over pixels and channels."""
-        squared = _SQUARED * float(difference.square().mean())
+        squared = self._squared * float(difference.square().mean())
         if self._passes is None:
             return float(self._measure(difference)[0]) / difference[0].numel() + squared
         return self._passes.value(difference.contiguous().numpy()) / difference[0].numel() + squared
@@ -120,7 +122,7 @@ class MsSsimObjective:
 
     def _measure(self, difference: Tensor) -> tuple[Tensor, Tensor]:
         """Return E without the squared error, as a sum over pixels, and half the gradient of all of E."""
-        total, gradients, plane = difference.new_zeros(()), [_SQUARED * difference], difference
+        total, gradients, plane = difference.new_zeros(()), [self._squared * difference], difference
         for level, (image, inside, mean, variance, weight) in enumerate(self._scales, 1):
             plane = halve(plane)
             render = image + plane
@@ -156,9 +158,9 @@ class MsSsimObjective:
         return planes[0]
 
 
-def make_objective(name: str, image: Tensor, finest_scale: int = 1) -> MsSsimObjective | None:
+def make_objective(name: str, image: Tensor, reduction: int = 1) -> MsSsimObjective | None:
     """Return the objective of a name, None where it is the squared error."""
-    return MsSsimObjective(image, finest_scale) if name == "ms-ssim" else None
+    return MsSsimObjective(image, reduction) if name == "ms-ssim" else None
 
 
 def propose_gaussians(

@@ -57,11 +57,6 @@ class Problem:
         return edge_band(self.regions.labels).nonzero().contiguous()
 
     @property
-    def finest_scale(self) -> int:
-        """The scale of MS-SSIM that halves the image."""
-        return self.reduction.bit_length()
-
-    @property
     def chooses_softness(self) -> bool:
         """True where the softness of contours is to be chosen, and the map came without."""
         return self.config.softness == "auto" and self.regions is not None and self.regions.softness == 0.0
@@ -69,7 +64,7 @@ class Problem:
     @cached_property
     def objective(self) -> MsSsimObjective | None:
         """What the descent lowers; None: what the setting `loss` says."""
-        return make_objective(self.config.objective, self.image, self.finest_scale)
+        return make_objective(self.config.objective, self.image, self.reduction)
 
 
 def make_problem(image: Any, regions: object, num_gaussians: object, config: FitConfig, seed: object) -> Problem:

@@ -127,11 +127,11 @@ class Resampled(Membership):
         length = max(1, _CHUNK_PIXELS // (spans[0] * spans[1] + tile * tile))
         variances = self.original.variances
         for chunk in _chunks(groups, length):  # all regions of a tile are in one
-            t, y, x = tiles[chunk], row[tiles[chunk]], col[tiles[chunk]]
-            windows = self.source.window_weights(corners[t], region[chunk], spans)
-            variance = down[y] @ self.source.read(variances, corners[t], spans) @ across[x].mT
-            mean = down[y] @ windows @ across[x].mT
-            masks[chunk] = _sharpen(mean, groups[chunk], sharpness(variance, self.ratio)).flatten(1)
+            t, position = tiles[chunk].unique_consecutive(return_inverse=True)
+            y, x = down[row[t]], across[col[t]].mT
+            exponent = sharpness(y @ self.source.read(variances, corners[t], spans) @ x, self.ratio)
+            windows = self.source.window_weights(corners[t[position]], region[chunk], spans)
+            masks[chunk] = _sharpen(y[position] @ windows @ x[position], position, exponent[position]).flatten(1)
         is_present = (masks > 0).any(1)
         return TileMembership.assemble(single, keys[is_present], masks[is_present])
 
@@ -147,9 +147,8 @@ def sharpness(variance: Tensor, ratio: float | Tensor) -> Tensor:
     return (blurred * ratio / contour_variance(variance, ratio)).sqrt()
 
 
-def _sharpen(weights: Tensor, group: Tensor, exponent: Tensor) -> Tensor:
-    """Raise the weights of each group, (P, n, n), to a power, and let them sum to one."""
-    position = group - group[0]
+def _sharpen(weights: Tensor, position: Tensor, exponent: Tensor) -> Tensor:
+    """Raise the weights of each tile, (P, n, n), to a power, and let them sum to one; `position` counts the tiles."""
     largest = weights.new_zeros(int(position[-1]) + 1, *weights.shape[1:])
     total = torch.zeros_like(largest)
     largest.scatter_reduce_(0, position.view(-1, 1, 1).expand_as(weights), weights, "amax")

@@ -209,7 +209,7 @@ def fit_bytes(
     report = report_regions(problem.regions, scene, **choice.changes)
     with Progress("writing the file", pulse=True, visible=progress), threads_for_kernels(reduced.image[0].numel()):
         small = reduced.image.to("cpu", torch.float32)
-        objective = make_objective(config.objective, small, reduced.finest_scale)
+        objective = make_objective(config.objective, small, reduced.reduction)
         min_sigma = reduced.config.min_sigma * reduced.reduction
         iterations = _shorten(BUDGETS[config.objective].compress_iterations, reduced.reduction)
         compressor = Compressor(SceneWriter(scene), small, objective, iterations, seed, min_sigma)
