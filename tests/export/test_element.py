@@ -70,7 +70,7 @@ def zoo(name: str) -> Scene:
 @cache
 def layered_file() -> bytes:
     """A file of several layers."""
-    return encode(zoo("chelsea-500"))
+    return encode(zoo("coffee-1500"))
 
 
 def random_scene(kind: str, channels: int = 3) -> Scene:
