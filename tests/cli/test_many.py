@@ -176,8 +176,8 @@ class TestFailures:
             (("photos", "--engine", "slurm"), 2, "slurm"),
             (("empty",), 2, "must hold images"),
             (("nowhere",), 1, "kcgs: No such file or directory: nowhere"),
-            (("photos", "-n", "5", "--target-bytes", "9"), 2, "must be left out with --target-bytes"),
-            (("photos", "--suffix", ".safetensors", "--target-bytes", "9"), 2, "must be left out with --target-bytes"),
+            (("photos", "-n", "5", "--target-bytes", "90"), 2, "must be left out with --target-bytes"),
+            (("photos", "--suffix", ".safetensors", "--target-bytes", "90"), 2, "must be left out with --target-bytes"),
         ],
     )
     def test_refused_before_the_work(self, fit_many: Kcgs, arguments: tuple[str, ...], status: int, words: str) -> None:

@@ -23,8 +23,8 @@ def photo() -> Tensor:
     return (image + 0.06 * torch.sin(31 * x + 9 * y) * torch.cos(23 * y))[None].clamp(0, 1)
 
 
-@pytest.mark.parametrize("method", ["felzenszwalb", "auto"])
-def test_augment_segment_fit_draw_measure(photo: Tensor, method: str) -> None:
+@pytest.mark.parametrize(("method", "min_psnr", "min_ssim"), [("felzenszwalb", 32, 0.88), ("auto", 40, 0.94)])
+def test_augment_segment_fit_draw_measure(photo: Tensor, method: str, min_psnr: float, min_ssim: float) -> None:
     torch.manual_seed(0)
     augment = nn.Sequential(
         K.RandomHorizontalFlip(p=1.0),
@@ -40,8 +40,8 @@ def test_augment_segment_fit_draw_measure(photo: Tensor, method: str) -> None:
     render = scene.render()[None]
 
     quality = kornia.metrics.psnr(render, image, 1.0)
-    assert quality > 35
-    assert kornia.metrics.ssim(render, image, 5).mean() > 0.94
+    assert quality > min_psnr
+    assert kornia.metrics.ssim(render, image, 5).mean() > min_ssim
     torch.testing.assert_close(psnr(render, image).squeeze(), quality, rtol=1e-3, atol=1e-3)
     # the scene and its labels go on through the same augmentation as any image does
     flipped = K.RandomHorizontalFlip(p=1.0)(render)
