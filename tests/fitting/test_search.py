@@ -53,7 +53,7 @@ class TestFewest:
         plain = fit(*photo, 30, recipe=quick())
         assert result.stop_reason == "iterations"
         assert result.scene.num_gaussians == plain.scene.num_gaussians
-        assert measured(result, photo[0]) > measured(plain, photo[0]) - 0.5
+        assert measured(result, photo[0]) > measured(plain, photo[0]) - 1.0
 
     def test_one_is_enough(self) -> None:
         result = fit(torch.full((3, 24, 32), 0.5), None, 100, recipe=quick(target_psnr=20.0))
