@@ -210,7 +210,7 @@ def fit_bytes(
     with Progress("writing the file", pulse=True, visible=progress), threads_for_kernels(reduced.image[0].numel()):
         small = reduced.image.to("cpu", torch.float32)
         objective = make_objective(config.objective, small, reduced.reduction)
-        min_sigma = reduced.config.min_sigma * reduced.reduction
+        min_sigma = _min_sigma(problem, choice.num_gaussians)
         iterations = _shorten(BUDGETS[config.objective].compress_iterations, reduced.reduction)
         compressor = Compressor(SceneWriter(scene), small, objective, iterations, seed, min_sigma)
         data = compressor.search_bytes(target_bytes)
@@ -220,9 +220,8 @@ def fit_bytes(
 def _reduce(problem: Problem, choice: _RegionChoice) -> Problem:
     """Return the problem of the fit: without a map, of a photo that is as small as the least width allows."""
     config, (height, width) = problem.config, problem.size
-    budget = BUDGETS[config.objective]
-    min_sigma = max(config.min_sigma, budget.min_sigma(choice.num_gaussians, height * width))
-    reduction = max(1, int(min_sigma / _SETTINGS.pixels_per_sigma)) if choice.regions is None else 1
+    budget, min_sigma = BUDGETS[config.objective], _min_sigma(problem, choice.num_gaussians)
+    reduction = _reduction(min_sigma) if choice.regions is None else 1
     update: dict[str, Any] = {"contour_cost": choice.contour_cost, "min_sigma": min_sigma / reduction}
     if config.iterations is None and config.max_seconds is None:
         update["iterations"] = _shorten(budget.fit_iterations, reduction)
@@ -231,6 +230,17 @@ def _reduce(problem: Problem, choice: _RegionChoice) -> Problem:
         problem, image=area_mean(problem.image, (-(-height // reduction), -(-width // reduction))),
         regions=choice.regions, num_gaussians=choice.num_gaussians, config=config, reduction=reduction,
     )  # fmt: skip
+
+
+def _min_sigma(problem: Problem, num_gaussians: int) -> float:
+    """Return the least standard deviation of so many Gaussians, in pixels of the photo."""
+    config, pixels = problem.config, problem.size[0] * problem.size[1]
+    return max(config.min_sigma, BUDGETS[config.objective].min_sigma(num_gaussians, pixels))
+
+
+def _reduction(min_sigma: float) -> int:
+    """Return the factor by which a photo may be reduced that has no finer Gaussians."""
+    return max(1, int(min_sigma / _SETTINGS.pixels_per_sigma))
 
 
 def _shorten(iterations: int, reduction: int) -> int:
@@ -243,7 +253,7 @@ def _enlarge(scene: Scene, size: tuple[int, int]) -> Scene:
         return scene
     field = scene.field
     means, cholesky = scaled_gaussians(field, size)
-    return Scene(GaussianField(means, cholesky, field.colors, field.region_ids, field.opacities, size=size))
+    return Scene(GaussianField(means, cholesky, field.colors, opacities=field.opacities, size=size))
 
 
 def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
@@ -258,7 +268,7 @@ def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
     map_bytes = _map_bytes(regions)
     if not config.merge_regions:
         return choice._replace(regions=regions, num_gaussians=num_gaussians(target_bytes - map_bytes))
-    if _reduce(problem, choice).reduction > 1:
+    if _reduction(_min_sigma(problem, choice.num_gaussians)) > 1:
         return choice._replace(changes={"dropped": "bytes"})
     # by iterations, so that without a clock the same arguments give the same file
     iterations = min(_SETTINGS.trial_iterations, config.usual_iterations)

@@ -59,7 +59,8 @@ class RateDistortionDescent:
         min_sigma: float = 0.0,
     ) -> None:
         self.ids, self.image, self.regions, self.objective = ids, image, regions, objective
-        self._scale = image.new_tensor([image.shape[2] / size[1], image.shape[1] / size[0]])
+        scale = image.new_tensor([image.shape[2] / size[1], image.shape[1] / size[0]])
+        self._scale = Gaussians(scale, scale[[0, 1, 1]], torch.ones_like(scale[:1]))
         self._num_pixels = size[0] * size[1]
         self.gaussians = self._as_tensors(gaussians)
         # steps are so short that the first order of the shear is enough
@@ -143,13 +144,12 @@ class RateDistortionDescent:
                 *squared_error_gradients(self.image, *scaled, ids, self.regions, cutoff=DRAFT_CUTOFF, backend="auto")
             )
         # a pixel of the image stands for so many of the photo
-        gradients = Gaussians(*(gradient / self._scale.prod() for gradient in gradients))
-        return self._scaled(gradients)
+        pixels = self._num_pixels / self.image[0].numel()
+        return self._scaled(Gaussians(*(pixels * gradient for gradient in gradients)))
 
     def _scaled(self, gaussians: Gaussians) -> Gaussians:
         """Return Gaussians, or gradients by those, as they are on the image."""
-        means, cholesky, colors = gaussians
-        return Gaussians(means * self._scale, cholesky * self._scale[[0, 1, 1]], colors)
+        return Gaussians(*(numbers * scale for numbers, scale in zip(gaussians, self._scale, strict=True)))
 
     def _render(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
         size = self.image.shape[1], self.image.shape[2]
