@@ -231,7 +231,7 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
 
     Example:
         >>> from kcgs.codec import encode
-        >>> data = encode(Scene(GaussianField.random(200, (32, 48), seed=0)))
+        >>> data = encode(Scene(GaussianField.random(800, (32, 48), seed=0)))
         >>> whole, part = decode(data), decode(data, max_bytes=len(data) // 2)
         >>> whole.layers == whole.num_layers, part.scene.num_gaussians < whole.scene.num_gaussians
         (True, True)
