@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 from torch.optim.lr_scheduler import LambdaLR
 
 from kcgs.fitting.optimizers import cosine_decay
@@ -14,12 +15,14 @@ from kcgs.nn.field import join
 from kcgs.optim import GaussianAdam
 from kcgs.scene import Scene
 
-from .inpainting import inpaint_from_match
+from .inpainting import inpaint_from_matches
 from .masks import dilate
 from .weights import weight_sums
 
 # pixels around a region that may have colours of it, as edges in photos are blurred and masks are not exact
 _FRINGE = 6
+# half the width of gaps between such pixels that are filled, too
+_CLOSING = 8
 # Gaussians with a larger share of their weight in the hole are fitted; with fewer of them, the object shows there
 _FITTED_SHARE = 0.05
 # those with a larger share are removed: fitted, they become dots
@@ -55,7 +58,7 @@ def fill_hole(scene: Scene, hole: Tensor, visible: Tensor) -> Scene:
     if not fill_mask.any():
         return scene
     with threads_for_kernels(unknown.numel()), torch.no_grad():
-        target = inpaint_from_match(scene(), unknown)
+        target = inpaint_from_matches(scene(), unknown)
         share = _share_in(scene.field, ids, regions, unknown)
         fixed = scene.field.subset(share <= _FITTED_SHARE)
         fitted = scene.field.subset((share > _FITTED_SHARE) & (share <= _REMOVED_SHARE))
@@ -67,8 +70,10 @@ def fill_hole(scene: Scene, hole: Tensor, visible: Tensor) -> Scene:
 
 
 def _fringe(mask: Tensor, labels: Tensor) -> Tensor:
-    """Return the pixels near a mask, (H, W) bool, of the regions that are in it and go on farther away."""
-    near = dilate(mask, _FRINGE)
+    """Return the pixels near a mask and in its gaps, (H, W) bool, of the regions in it that go on farther away."""
+    margin = _FRINGE + _CLOSING
+    wide = dilate(pad(mask, (margin,) * 4), margin)
+    near = ~dilate(~wide, _CLOSING)[margin:-margin, margin:-margin]
     return near & torch.isin(labels, labels[mask].unique()) & torch.isin(labels, labels[~near].unique())
 
 

@@ -48,9 +48,9 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
         scene: unbatched, with a map of its own size, not a resized one.
         region_ids: an id in the map, or several, which move together.
         offset: (dx, dy) in pixels, whole.
-        fill: True: the uncovered pixels, and 6 pixels around them, which have colours of the object, continue their
-            surroundings like the place of the image that looks most alike, by Gaussians that are fitted there, some of
-            them new; other pixels change by a few hundredths. False: the uncovered pixels show what the
+        fill: True: the uncovered pixels, and 6 pixels and narrow gaps around them, which have colours of the object,
+            continue their surroundings like the places of the image that look most alike, by Gaussians that are fitted
+            there, some of them new; other pixels change by a few hundredths. False: the uncovered pixels show what the
             Gaussians of their new region paint there, streaks or black.
 
     Returns:

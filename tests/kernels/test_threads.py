@@ -49,8 +49,8 @@ class TestThreads:
     @pytest.mark.parametrize(
         ("name", "work"),
         [
-            ("kcgs.editing.fill.inpaint_from_match", lambda: delete_region(scene(), 1)),
-            ("kcgs.editing.fill.inpaint_from_match", lambda: move_region(scene(), 1, (-4, 0))),
+            ("kcgs.editing.fill.inpaint_from_matches", lambda: delete_region(scene(), 1)),
+            ("kcgs.editing.fill.inpaint_from_matches", lambda: move_region(scene(), 1, (-4, 0))),
             ("kcgs.segment.cleanup.merge_small", lambda: segment(torch.rand(3, *SIZE), "felzenszwalb")),
             ("kcgs.segment.methods.auto.clean", lambda: segment(torch.rand(3, *SIZE))),
             ("kcgs.rate.compress.psnr", lambda: compress(scene(), torch.rand(3, *SIZE), target_psnr=5.0)),

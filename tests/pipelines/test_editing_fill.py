@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, Scene, fit
 from kcgs.editing import delete_region, move_region
-from kcgs.editing.inpainting import inpaint, inpaint_from_match
+from kcgs.editing.inpainting import inpaint, inpaint_from_matches
 from kcgs.editing.masks import dilate
 
 SIZE = (48, 72)
@@ -151,9 +151,22 @@ def test_match_continues_an_edge_where_a_mean_blurs_it() -> None:
     image[:, :, 80:] = torch.rand(3, 64, 40, generator=torch.Generator().manual_seed(0))
     hole = torch.zeros(64, 120).bool()
     hole[20:44, 10:26] = True
-    fills = (fill(torch.where(hole, 0.0, image), hole)[:, hole] for fill in (inpaint, inpaint_from_match))
+    fills = (fill(torch.where(hole, 0.0, image), hole)[:, hole] for fill in (inpaint, inpaint_from_matches))
     blurred, sharp = ((pixels - image[:, hole]).abs().mean() for pixels in fills)
     assert blurred > 0.05 and sharp < 0.02
+
+
+def test_parts_of_a_hole_have_places_of_their_own() -> None:
+    """Upright stripes above level ones, shifted against each other in halves of the image: no place is like all."""
+    y, x = torch.meshgrid(torch.arange(96), torch.arange(192), indexing="ij")
+    period = torch.where(y < 48, x + 8 * (x >= 96), y)
+    image = 0.5 + 0.3 * torch.sin(2 * torch.pi * period / 16).expand(3, -1, -1)
+    image = torch.where((x > 96) & (y > 48), 0.9 - image, image)
+    hole = torch.zeros(96, 192).bool()
+    hole[8:88, 80:112] = True
+    smooth, copied = (fill(torch.where(hole, 0.0, image), hole)[:, hole] for fill in (inpaint, inpaint_from_matches))
+    blurred, sharp = ((pixels - image[:, hole]).abs().mean() for pixels in (smooth, copied))
+    assert sharp < 0.5 * blurred
 
 
 def test_hole_without_a_match_is_smooth() -> None:
@@ -162,5 +175,5 @@ def test_hole_without_a_match_is_smooth() -> None:
     image[:, :, 30:] = 0.9
     hole = torch.zeros(40, 60).bool()
     hole[4:36, 4:56] = True
-    difference = inpaint_from_match(image, hole) - inpaint(image, hole)
+    difference = inpaint_from_matches(image, hole) - inpaint(image, hole)
     assert difference.abs().max() < 0.05
