@@ -71,6 +71,7 @@ def fill_hole(scene: Scene, hole: Tensor, visible: Tensor) -> Scene:
 
 def _fringe(mask: Tensor, labels: Tensor) -> Tensor:
     """Return the pixels near a mask and in its gaps, (H, W) bool, of the regions in it that go on farther away."""
+    # with a margin, since gaps between the mask and the border of the image stay
     margin = _FRINGE + _CLOSING
     wide = dilate(pad(mask, (margin,) * 4), margin)
     near = ~dilate(~wide, _CLOSING)[margin:-margin, margin:-margin]
