@@ -41,6 +41,7 @@ notebooks: $(VENV)/.installed
 # The site, in docs/_build/html. Whatever Sphinx has to say against a page or a docstring is an error.
 docs: $(VENV)/.installed
 	$(BIN)/python -m sphinx -W --keep-going -q -d docs/_build/doctrees docs docs/_build/html
+	@echo docs/_build/html/index.html
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

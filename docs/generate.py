@@ -1,4 +1,4 @@
-"""Pages that the code itself can write: the reference, the commands, the recipes. conf.py calls `write`."""
+"""Pages that the code itself can write: the reference, commands, recipes, the gallery. conf.py calls `write`."""
 
 from __future__ import annotations
 
@@ -6,14 +6,21 @@ import importlib
 import importlib.util
 import inspect
 import re
+import shutil
 import typing
 from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from kcgs import load
+from kcgs.page import scene_page
+from kcgs.zoo import entries, find
+
 # What readers look for first heads its page; other modules follow in the order in which the package imports them.
 FIRST = ("kcgs.scene", "kcgs.functional.splat", "kcgs.functional.regions", "kcgs.segment.registry")
+# The scene that the front page shows first.
+FRONT = "coffee-1500"
 # What torch and pydantic call, not readers.
 PROTOCOL = "extra_repr, get_extra_state, set_extra_state, model_config, model_post_init"
 # Each public name is documented in the first of these packages that lists it in its `__all__`.
@@ -47,9 +54,12 @@ def write(folder: Path) -> None:
     for name in PACKAGES:
         pages[f"{name}.rst"] = reference(name, documented)
     pages |= gallery()
+    previews = {f"gallery-{entry.name}.jpg": find(entry.name).with_name("preview.jpg") for entry in entries()}
     folder.mkdir(exist_ok=True)
-    for stale in {path.name for path in folder.iterdir()} - pages.keys():
+    for stale in {path.name for path in folder.iterdir()} - pages.keys() - previews.keys():
         (folder / stale).unlink()
+    for name, path in previews.items():
+        shutil.copy2(path, folder / name)
     for name, text in pages.items():
         path = folder / name
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
@@ -161,12 +171,8 @@ def _cell(text: str) -> str:
 
 
 def gallery() -> dict[str, str]:
-    """Return a page for each scene of the zoo, and the Markdown that shows them all, by file name."""
-    from kcgs import load
-    from kcgs.page import scene_page
-    from kcgs.zoo import entries, find
-
-    pages, frames = {}, []
+    """Return a page for each scene of the zoo, and the HTML of the gallery and of the front page, by file name."""
+    pages, frames, thumbnails = {}, [], []
     for entry in sorted(entries(), key=lambda entry: entry.name.startswith("chart")):
         scene, name = load(find(entry.name)), f"gallery-{entry.name}.html"
         height, width = scene.size
@@ -176,7 +182,12 @@ def gallery() -> dict[str, str]:
             f'<iframe src="{name}" title="{entry.title}" loading="lazy" style="aspect-ratio: {width} / {height}">'
             f'</iframe>\n<p>{entry.title[0].upper()}{entry.title[1:]}. {facts}. <a href="{name}">In a window</a></p>'
         )
+        preview = f'<img src="gallery-{entry.name}.jpg" alt="{entry.title}" title="{entry.title}">'
+        thumbnails.append(f'<a href="{name}" target="scene">{preview}</a>')
     pages["gallery.md"] = "\n\n".join(frames) + "\n"
+    # a click on a preview opens its page in the frame
+    first = f'<iframe name="scene" class="front" src="gallery-{FRONT}.html" title="A scene of the gallery"></iframe>'
+    pages["front.md"] = "\n".join([first, '<div class="previews">', *thumbnails, "</div>"]) + "\n"
     return pages
 
 
