@@ -148,7 +148,7 @@ class TestPairSoftness:
 
 
 def stated_antialiasing(labels: Tensor, x: int, y: int) -> tuple[int, float]:
-    """Label and part of the neighbour that takes most of a pixel, by the definition in docs/concepts.md."""
+    """Label and part of the neighbour that takes most of a pixel, by the definition in docs/method.md."""
     height, width = labels.shape
 
     def read(i: int, j: int) -> int:
