@@ -156,7 +156,8 @@ def _command(name: str, command: Any) -> str:
     records = [param.get_help_record(context) for param in params]
     rows = [f"| `{_plain(written)}` | {_cell(text)} |" for written, text in filter(None, records)]
     table = "\n".join(["| argument | what it is |", "|---|---|", *rows]) if rows else ""
-    return "\n\n".join([f"## kcgs {name}", f"```text\n{usage}\n```", inspect.cleandoc(command.help or ""), table])
+    text = _mark_options(inspect.cleandoc(command.help or ""))
+    return "\n\n".join([f"## kcgs {name}", f"```text\n{usage}\n```", text, table])
 
 
 def _plain(text: str) -> str:
@@ -167,7 +168,11 @@ def _plain(text: str) -> str:
 
 def _cell(text: str) -> str:
     """Return the same with the options that it mentions set as code."""
-    return re.sub(r"(?<![\w`-])--[a-z][a-z-]+", r"`\g<0>`", _plain(text))
+    return _mark_options(_plain(text))
+
+
+def _mark_options(text: str) -> str:
+    return re.sub(r"(?<![\w`-])--[a-z][a-z-]+", r"`\g<0>`", text)
 
 
 def gallery() -> dict[str, str]:
@@ -177,16 +182,17 @@ def gallery() -> dict[str, str]:
         scene, name = load(find(entry.name)), f"gallery-{entry.name}.html"
         height, width = scene.size
         pages[name] = scene_page(scene, title=entry.title)
+        shape = f"aspect-ratio: {width} / {height + width // 10}"  # a tenth of the width for the buttons
         facts = f"{entry.num_gaussians} Gaussians, {entry.num_regions} regions; {entry.licence}"
         frames.append(
-            f'<iframe src="{name}" title="{entry.title}" loading="lazy" style="aspect-ratio: {width} / {height}">'
+            f'<iframe src="{name}" title="{entry.title}" loading="lazy" style="{shape}">'
             f'</iframe>\n<p>{entry.title[0].upper()}{entry.title[1:]}. {facts}. <a href="{name}">In a window</a></p>'
         )
         preview = f'<img src="gallery-{entry.name}.jpg" alt="{entry.title}" title="{entry.title}">'
         thumbnails.append(f'<a href="{name}" target="scene">{preview}</a>')
     pages["gallery.md"] = "\n\n".join(frames) + "\n"
     # a click on a preview opens its page in the frame
-    first = f'<iframe name="scene" class="front" src="gallery-{FRONT}.html" title="A scene of the gallery"></iframe>'
+    first = f'<iframe name="scene" src="gallery-{FRONT}.html" title="A scene" style="aspect-ratio: 4 / 3"></iframe>'
     pages["front.md"] = "\n".join([first, '<div class="previews">', *thumbnails, "</div>"]) + "\n"
     return pages
 
