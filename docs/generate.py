@@ -183,10 +183,10 @@ def gallery() -> dict[str, str]:
         height, width = scene.size
         pages[name] = scene_page(scene, title=entry.title)
         shape = f"aspect-ratio: {width} / {height + width // 10}"  # a tenth of the width for the buttons
-        facts = f"{entry.num_gaussians} Gaussians, {entry.num_regions} regions; {entry.licence}"
+        subject = entry.title.partition(",")[0].capitalize()  # the page has the numbers
         frames.append(
             f'<iframe src="{name}" title="{entry.title}" loading="lazy" style="{shape}">'
-            f'</iframe>\n<p>{entry.title[0].upper()}{entry.title[1:]}. {facts}. <a href="{name}">In a window</a></p>'
+            f'</iframe>\n<p>{subject}: {entry.licence}. <a href="{name}">In a window</a></p>'
         )
         preview = f'<img src="gallery-{entry.name}.jpg" alt="{entry.title}" title="{entry.title}">'
         thumbnails.append(f'<a href="{name}" target="scene">{preview}</a>')
