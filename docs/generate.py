@@ -135,7 +135,10 @@ def _line(module: ModuleType) -> Any:
 def _directive(package: str, name: str, thing: Any) -> str:
     if inspect.isclass(thing):
         return f".. autoclass:: {package}.{name}\n   :members:\n   :exclude-members: {PROTOCOL}"
-    return f".. {'autofunction' if callable(thing) else 'autodata'}:: {package}.{name}"
+    if callable(thing):
+        return f".. autofunction:: {package}.{name}"
+    # a path is that of the machine that builds the site
+    return f".. autodata:: {package}.{name}" + ("\n   :no-value:" if isinstance(thing, Path) else "")
 
 
 def commands() -> str:
