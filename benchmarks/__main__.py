@@ -8,8 +8,8 @@ from .core.run import Options, run_experiment
 
 # modules of this package with `jobs`, `measure` and `page`
 EXPERIMENTS = (
-    "quality", "ablation", "convergence", "maps", "rate", "labels", "render", "decode", "enlarge", "fill", "pairs",
-    "previews",
+    "quality", "convergence", "published", "ablation", "rate", "pairs", "previews", "maps", "labels", "enlarge", "fill",
+    "video", "render", "decode",
 )  # fmt: skip
 
 
@@ -22,7 +22,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--quick", action="store_true", help="a short form, which shows only that all of it runs")
     parser.add_argument("--only", type=lambda text: tuple(text.split(",")), default=(), help="images: a,b")
     parser.add_argument("--workers", type=int, default=1, help="processes; timings need one")
-    parser.add_argument("--seeds", type=int, default=1, help="fits of each image, in quality and ablation")
     parser.add_argument("--redraw", action="store_true", help="only write the report, from the results in the folder")
     values = vars(parser.parse_args(arguments))
     name, options = values.pop("name"), Options(**values)

@@ -1,74 +1,73 @@
-"""What does each part of the paper's method, and of ours, gain?"""
+"""What does each part of `best` gain?"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from .core.compare import Comparison, differences_table, group_by, losses_table, means_table, summary
-from .core.figures import Panel, save_lines
+from .core.compare import Comparison, at_equal_bits, differences, losses_table, mean_gain, means_table
+from .core.figures import save_differences
 from .core.fits import Method, measure_fit, plan
-from .core.images import names
+from .core.images import PHOTOS, names
 from .core.run import Job, Options, Page, Row
 
 COUNTS = (1_250, 7_500)
-PAPER_METHODS: dict[str, Method] = {
-    "gaussian-image-clamp": ("gaussian-image-clamp", {}),
-    "gaussian-image": ("gaussian-image", {}),
-    "guidance, clamp": ("paper", {"warmup": False, "clamp": True}),
-    "guidance + no clamp": ("paper", {"warmup": False}),
-    "guidance + warm-up, clamp": ("paper", {"clamp": True}),
-    "paper": ("paper", {}),
-}
+# N of more fits of `best`, between whose files those of the other rows are found
+CURVE = (1_000, 1_500, 6_000, 9_000)
 METHODS: dict[str, Method] = {
     "best": ("best", {}),
-    "best with random start": ("best", {"initializer": "random"}),
-    "best without densification": ("best", {"densify_from": 1.0}),
-    "best without soft contours": ("best", {"softness": 0.0}),
-    "best with L1 loss": ("best", {"loss": "l1"}),
-    "best with contours as given": ("best", {"move_contours": False, "merge_regions": False}),
-    "best-baseline": ("best-baseline", {}),
-}
-# what the paper prints over all of DAVIS at 50,000 iterations: PSNR and EF-PSNR by N
-PRINTED = {
-    "gaussian-image-clamp": {1_250: (27.10, 22.73), 7_500: (33.41, 30.33)},
-    "gaussian-image": {1_250: (27.29, 22.92), 7_500: (33.57, 30.48)},
-    "guidance, clamp": {1_250: (26.98, 22.72), 7_500: (33.25, 29.36)},
-    "guidance + no clamp": {1_250: (27.15, 22.92), 7_500: (33.20, 29.31)},
-    "guidance + warm-up, clamp": {1_250: (27.06, 23.09), 7_500: (33.28, 29.44)},
-    "paper": {1_250: (27.31, 23.41), 7_500: (33.44, 29.18)},
+    "random start": ("best", {"initializer": "random"}),
+    "no densification": ("best", {"densify_from": 1.0}),
+    "hard contours": ("best", {"softness": 0.0}),
+    "contours as given": ("best", {"move_contours": False, "merge_regions": False}),
+    "L1 loss": ("best", {"loss": "l1"}),
+    "Adam of Image-GS": ("best", {"optimizer": "adam"}),
+    "no regions": ("best-baseline", {}),
 }
 QUANTITIES = ("psnr", "ef_psnr")
-FIRST = next(iter(PAPER_METHODS))
-COMPARISONS = (
-    *(Comparison("best", name) for name in list(METHODS)[1:]),
-    *(Comparison(name, FIRST) for name in list(PAPER_METHODS)[1:]),
-)
-METHOD = """First frames of DAVIS with the given masks. Parts of `best` are taken away one by one; the paper's six rows
-differ from its clamped baseline. *Printed* figures are those of the paper, over all of DAVIS at 50,000 iterations;
-nobody measured them here. What the figures are: the report of `quality`."""
+DECODED = ("decoded_psnr", "decoded_ef_psnr")
+PARTS = tuple(Comparison(name, "best") for name in list(METHODS)[1:])
+EQUAL_BITS = tuple(Comparison(name, "best, equal bits") for name in list(METHODS)[1:])
+METHOD = """First frames of DAVIS with the given masks; each row is `best` with one part changed. Table: the change
+of PSNR / EF-PSNR in dB, at the same N and, of decoded files, at the same bytes; there `best` is interpolated between
+its own files of that image."""
 
 measure = measure_fit
 
 
 def jobs(options: Options) -> list[Job]:
-    """Fit every row, all images at the smaller N first."""
-    images = ["disc"] if options.quick else list(options.only) or names(options.folder(), "davis")
-    methods = {**METHODS, **PAPER_METHODS}
-    return [job for n in ((40,) if options.quick else COUNTS) for job in plan(images, (n,), methods, options)]
+    """Fit every row, all images at the smaller N first; without data, photos of scikit-image."""
+    images = ["disc"] if options.quick else list(PHOTOS) if options.data is None else names(options.data, "davis")
+    counts, curve = ((40,), (50,)) if options.quick else (COUNTS, CURVE)
+    listing = [job for n in counts for job in plan(images, (n,), METHODS, options)]
+    return listing + plan(images, curve, {"best": METHODS["best"]}, options)
 
 
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
-    for row in rows:
-        printed = PRINTED.get(row["method"], {}).get(row["n"])
-        row |= dict(zip(("printed PSNR", "printed EF-PSNR"), printed, strict=True)) if printed else {}
-    groups = group_by([row for row in rows if row["method"] in METHODS], ["n", "method"])
-    # a mean of fewer images is no point of the figure
-    ours = [row for (n, _), group in groups.items() if len(group) == len(groups[n, "best"]) for row in group]
-    save_lines(folder / "ablation.png", [Panel("", ours, "n", quantity) for quantity in QUANTITIES], "method", "n")
-    columns = ("iterations", *QUANTITIES, "printed PSNR", "printed EF-PSNR", "bytes", "core_seconds")
-    tables = [differences_table(rows, COMPARISONS, QUANTITIES, ["n"]), means_table(rows, ["n", "method"], columns)]
-    texts = [summary(rows, comparison, QUANTITIES, ["n"]) for comparison in COMPARISONS]
-    sentences = "\n".join(f"- {text}" for text in texts if text)
-    question = "What does each part of the method gain?"
-    return Page(question, METHOD, sentences, "ablation.png", tables, losses_table(rows, COMPARISONS, QUANTITIES, ["n"]))
+    counts = sorted({row["n"] for row in rows if row["method"] == "no regions"})
+    rows_of_parts = [row for row in rows if row["n"] in counts]
+    equal = list(rows)
+    for part in PARTS:
+        at_bytes = at_equal_bits(rows, part, DECODED, [])
+        equal += [row | {"method": "best, equal bits", "part": part.first} for row in at_bytes]
+    at_n = differences(rows_of_parts, PARTS, QUANTITIES, ["n"])
+    at_bits = []
+    for comparison in EQUAL_BITS:
+        own = [row for row in equal if row["method"] == comparison.first or row.get("part") == comparison.first]
+        at_bits += differences(own, [comparison], DECODED, ["n"])
+    lines = [{**row, "method": row["method"].removesuffix(" - best"), "case": f"at N = {row['n']:,}"} for row in at_n]
+    for row in at_bits:
+        values = {q: row[d] for q, d in zip(QUANTITIES, DECODED, strict=True) if d in row}
+        case = f"at its bytes, N = {row['n']:,}"
+        lines.append({"method": row["method"].removesuffix(" - best, equal bits"), "case": case, **values})
+    own_rows = [{**row, "method": row["method"].removesuffix(" - best")} for row in at_n]
+    save_differences(folder / "ablation.png", own_rows, QUANTITIES, "n")
+    worst = {}
+    for quantity in QUANTITIES:
+        gains = {part.first: mean_gain(rows_of_parts, part, quantity, ["n"]) for part in PARTS}
+        name = min(gains, key=gains.__getitem__)
+        worst[quantity] = f"{name}, by {-gains[name]:.2f} dB"
+    answer = f"The PSNR falls most with {worst['psnr']}. The EF-PSNR falls most with {worst['ef_psnr']}."
+    table = means_table(lines, ["method"], "case", QUANTITIES)
+    ahead = losses_table(rows_of_parts, [Comparison("best", part.first) for part in PARTS], QUANTITIES, ["n"])
+    return Page("What does each part of `best` gain?", answer, "ablation.png", table, ahead, METHOD, [*at_n, *at_bits])

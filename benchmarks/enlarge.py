@@ -13,7 +13,7 @@ from kcgs import fit
 from kcgs.functional import ef_psnr, psnr
 
 from .core.clocks import milliseconds
-from .core.compare import Comparison, differences_table, group_by, losses_table, means_table, summary
+from .core.compare import Comparison, differences, group_by, losses_table, mean_gain, means_table
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS
 from .core.images import load_mapped, names, resize
@@ -28,10 +28,10 @@ QUANTITIES = ("psnr", "ef_psnr")
 SCENE = "scene"
 COMPARISONS = (Comparison(SCENE, "own render, bicubic"), Comparison(SCENE, "own render, Lanczos"))
 METHOD = f"""Photos are reduced by the means of blocks of pixels, their label maps to the labels of the blocks'
-middles, and fitted by `best`. `scene` is `scene.render(size)` at the original size, `own render` the scene's render at
-the small size, enlarged by Pillow, and `small photo` all pixels of the reduced photo, enlarged. All are measured
-against the original; EF-PSNR is within {BAND} pixels of the small photo of contours, those of the given map on DAVIS,
-and on Kodak those found in the original."""
+middles, and fitted by `best`. `scene` is `scene.render(size)` at the original size, `own render` the scene's render
+at the small size, enlarged by Pillow, and `small photo` all pixels of the reduced photo, enlarged. All are measured
+against the original. Table: PSNR / EF-PSNR in dB; EF-PSNR is within {BAND} pixels of the small photo of contours,
+those of the given map on DAVIS, and on Kodak those found in the original."""
 
 
 def measure(image: str, group: str, factor: int, share: int, data: str, quick: bool) -> list[Row]:
@@ -87,10 +87,15 @@ def page(folder: Path, rows: list[Row]) -> Page:
         for (group, factor), group_rows in group_by(rows, ["group", "factor"]).items()
     ]
     save_lines(folder / "enlarge.png", panels, "method", "pixels per Gaussian")
-    tables = [
-        differences_table(rows, COMPARISONS, QUANTITIES, cases),
-        means_table(rows, [*cases, "method"], ("n", *QUANTITIES, "ms")),
-    ]
-    sentences = " ".join(summary(rows, comparison, QUANTITIES, cases) for comparison in COMPARISONS)
+    bicubic, lanczos = ([mean_gain(rows, pair, q, cases) for q in QUANTITIES] for pair in COMPARISONS)
+    photo = mean_gain(rows, Comparison("small photo, bicubic", SCENE), "psnr", cases)
+    answer = (
+        f"A scene that is rendered large has {bicubic[0]:+.2f} dB PSNR and {bicubic[1]:+.2f} dB EF-PSNR against its "
+        f"own small render, enlarged bicubically, and {lanczos[0]:+.2f} and {lanczos[1]:+.2f} dB by Lanczos. The small "
+        f"photo itself, with all of its pixels, has {photo:+.2f} dB against the scene."
+    )
+    table = means_table(rows, ["group", "factor", "method"], "pixels per Gaussian", QUANTITIES)
+    losses = losses_table(rows, COMPARISONS, QUANTITIES, cases)
+    gains = differences(rows, COMPARISONS, QUANTITIES, cases)
     question = "How good are scenes of small photos that are rendered large?"
-    return Page(question, METHOD, sentences, "enlarge.png", tables, losses_table(rows, COMPARISONS, QUANTITIES, cases))
+    return Page(question, answer, "enlarge.png", table, losses, METHOD, gains)

@@ -40,7 +40,6 @@ MIN_CHECKS = 2
 # of sheets, in pixels
 CAPTION_HEIGHT = 36
 GAP = 8
-CHOICES = ("kcgs clearly", "kcgs slightly", "none", "other slightly", "other clearly")
 # "07 B clearly: streaks", "| 7 | slightly A |", "07: none"
 ANSWER = re.compile(
     r"\W*(?:sheet\W*)?(?P<sheet>\d+)\W+(?P<before>(?:clear|slight)\w*\W+)?(?:prefer\w*\W+)?"
@@ -51,14 +50,15 @@ METHOD = f"""Files: `fit_bytes` with the map of `segment`, both with default set
 of the photo or of the photo reduced to a half, a third or a quarter of each side, enlarged bicubically: of all files
 of at most so many bytes the one with the highest SSIMULACRA2. Enlargement: the photo reduced {FACTOR} times by the
 means of blocks, fitted with a Gaussian per {SHARE} pixels and the map of `segment`, rendered at the photo's size,
-beside the render at the small size, enlarged bicubically. Photos are Kodak's with even numbers; those with odd numbers,
-which settings may be tuned on, are chosen by `--only`, as are comparisons: `--only 'kodim01,kodim03,1000 bytes'`.
+beside the render at the small size, enlarged bicubically. Photos are Kodak's with even numbers; those with odd
+numbers, which settings may be tuned on, are chosen by `--only`, as are comparisons: `--only 'kodim01,kodim03,1000
+bytes'`.
 
 A sheet shows the photo, A and B at their own pixels; its name is a number. A seed chooses the order of sheets and
-sides. Some pairs come again with sides swapped, some sheets show the same image twice. Sheets are made once:
-`sheets` is for viewers, `key.json` is not, and the hash of the key, in `key.sha256`, is published before anyone looks.
-Viewers know nothing but the sheets. Each one's answers, a line such as `07 B clearly: streaks` or `08 none` per sheet,
-go into `answers/NAME.txt`, and `--redraw` counts them."""
+sides. Some pairs come again with sides swapped, some sheets show the same image twice. Sheets are made once: `sheets`
+is for viewers, `key.json` is not, and the hash of the key, in `key.sha256`, is published before anyone looks. Viewers
+know nothing but the sheets. Each one's answers, a line such as `07 B clearly: streaks` or `08 none` per sheet, go
+into `answers/NAME.txt`, and `--redraw` counts them."""
 
 
 def measure(image: str, comparison: str, folder: str, data: str, quick: bool) -> list[Row]:
@@ -173,32 +173,22 @@ def page(folder: Path, rows: list[Row]) -> Page:
     )
     pairs = [row for row in answers if row["kind"] == "pair"]
     by_pair = group_by(pairs, ["comparison", "image"])
-    sentences, losses = [], []
+    sentences, lines, losses = [], [], []
     for (comparison,), group in group_by(pairs, ["comparison"]).items():
         balances = {image: sum(map(_sign, votes)) for (name, image), votes in by_pair.items() if name == comparison}
         won, lost = (sum(sign * balance > 0 for balance in balances.values()) for sign in (1, -1))
         signs = Counter(map(_sign, group))
-        sentences.append(
-            f"- {comparison}: most viewers prefer kcgs in {won} of {len(balances)} pairs, the other in {lost}. "
-            f"Of {len(group)} answers {signs[1]} are for kcgs, {signs[-1]} for the other, {signs[0]} for none."
-        )
+        sentences.append(f"{won} of {len(balances)} ({comparison})")
+        line = [str(comparison), f"{won} of {len(balances)}", str(lost), *(str(signs[sign]) for sign in (1, -1, 0))]
+        lines.append(line)
         losses += [(balance, str(comparison), str(image)) for image, balance in balances.items() if balance < 0]
-    counts = [
-        [str(comparison), str(viewer), *(str(sum(row["choice"] == choice for row in group)) for choice in CHOICES)]
-        for (comparison, viewer), group in group_by(pairs, ["comparison", "viewer"]).items()
-    ]
     checks = []
     for (viewer,), group in group_by(answers, ["viewer"]).items():
         signs_of_pairs = {(row["comparison"], row["image"]): _sign(row) for row in group if row["kind"] == "pair"}
         swapped, identical = ([row for row in group if row["kind"] == kind] for kind in ("swapped", "identical"))
         alike = sum(signs_of_pairs.get((row["comparison"], row["image"])) == _sign(row) for row in swapped)
         differences = sum(row["choice"] != "none" for row in identical)
-        cells = f"{alike} of {len(swapped)}", f"{differences} of {len(identical)}", f"{len(group)} of {len(entries)}"
-        checks.append([str(viewer), *cells])
-    tables = [
-        markdown(["comparison", "viewer", *CHOICES], counts),
-        markdown(["viewer", "same answer with sides swapped", "difference between equal images", "answered"], checks),
-    ]
+        checks.append(f"{viewer} {alike} of {len(swapped)} and {len(identical) - differences} of {len(identical)}")
     if answers:
         write_rows(folder / "answers.csv", answers)
     texts = [_loss(folder, by_pair[comparison, image]) for _, comparison, image in sorted(losses)]
@@ -208,20 +198,24 @@ def page(folder: Path, rows: list[Row]) -> Page:
     save_lines(folder / "pairs.png", panels, "method", "target_bytes")
     question = "Which of two images would people rather have in a photo's place?"
     published = f"The hash of the key is `{(folder / 'key.sha256').read_text().split()[0]}`."
-    text = "\n".join(sentences) or "Nobody has answered yet."
-    return Page(question, f"{METHOD} {published}", text, "pairs.png", tables if answers else [], "\n\n".join(texts))
+    answer = f"Most viewers prefer kcgs in {', '.join(sentences)} pairs." if answers else "Nobody has answered yet."
+    header = ["comparison", "kcgs preferred", "other preferred", "answers for kcgs", "for the other", "for none"]
+    checked = f"The same answer with sides swapped, and none for equal images: {'; '.join(checks)}." if checks else ""
+    losses_text = markdown(["comparison", "photo", "what viewers said", "sheet"], texts) if texts else ""
+    return Page(question, answer, "pairs.png", markdown(header, lines), losses_text, f"{METHOD} {published} {checked}")
 
 
 def _sign(answer: Row) -> int:
     return 0 if answer["choice"] == "none" else 1 if answer["choice"].startswith(OURS) else -1
 
 
-def _loss(folder: Path, answers: list[Row]) -> str:
+def _loss(folder: Path, answers: list[Row]) -> list[str]:
     """Describe a pair that is lost; its sheet is written at half its size, unless the sheets are gone."""
-    name = f"{answers[0]['sheet']:02}"
-    if (folder / "sheets" / f"{name}.png").exists():
+    path = f"losses/{answers[0]['sheet']:02}.jpg"
+    sheet_path = folder / "sheets" / f"{answers[0]['sheet']:02}.png"
+    if sheet_path.exists():
         (folder / "losses").mkdir(exist_ok=True)
-        with Image.open(folder / "sheets" / f"{name}.png") as sheet:
-            sheet.reduce(2).save(folder / "losses" / f"{name}.jpg", quality=70)
-    comments = "; ".join(f"{row['viewer']} {row['choice']}: {row['comment'] or '-'}" for row in answers)
-    return f"{answers[0]['comparison']}, {answers[0]['image']}. {comments}.\n\n![](losses/{name}.jpg)"
+        with Image.open(sheet_path) as sheet:
+            sheet.reduce(2).save(folder / path, quality=70)
+    comments = "; ".join(row["comment"] for row in answers if row["comment"])
+    return [answers[0]["comparison"], answers[0]["image"], comments, f"[photo, A, B]({path})"]

@@ -20,7 +20,7 @@ from kcgs.functional import psnr
 from kcgs.rate import fit_bytes
 
 from .core.codecs import best_file, ssimulacra2
-from .core.compare import Comparison, differences_table, group_by, losses_table, means_table, summary
+from .core.compare import Comparison, count_wins, differences, group_by, losses_table, mean_gain, means_table
 from .core.figures import save_rows
 from .core.fits import QUICK_ITERATIONS
 from .core.images import load, names, resize
@@ -42,13 +42,13 @@ FIGURE_HEIGHT = 170  # of a photo in it, about, in pixels
 GAP = 12  # between photos, in pixels
 METHOD = f"""Kodak's photos, reduced to {SIDE} pixels on the longer side. `kcgs` is `fit_bytes` with its default
 settings, without a map. WebP (method 6) and AVIF (speed 4) code the photo, or the photo reduced to one of
-{len(REDUCTIONS) - 1} sizes from a half to a sixteenth of each side and enlarged bicubically: of all files of at most so
-many bytes the one with the highest SSIMULACRA2. Where a codec has no file as small on some photos, *images* says on how
-many it has one; without a line, on none. ThumbHash has 21 to 25 bytes whatever the budget, and is enlarged
+{len(REDUCTIONS) - 1} sizes from a half to a sixteenth of each side and enlarged bicubically: of all files of at most
+so many bytes the one with the highest SSIMULACRA2. Where a codec has no file as small on some photos, *images* says
+on how many it has one; without a line, on none. ThumbHash has 21 to 25 bytes whatever the budget, and is enlarged
 bicubically from 32 pixels. deltaE 2000 is the mean over pixels. Butteraugli is its largest distance, by Debian's
 package of that name, of 2017; other versions have other scales. A file of the other codecs, at a size that wins,
-takes less than 0.5 s. The figure shows eight photos at {FIGURE_BYTES:,} bytes: the photo, kcgs, and WebP or
-AVIF, whichever has the higher SSIMULACRA2."""
+takes less than 0.5 s. Table: deltaE 2000 / SSIMULACRA2 / PSNR in dB. The figure shows eight photos at
+{FIGURE_BYTES:,} bytes: the photo, kcgs, and WebP or AVIF, whichever has the higher SSIMULACRA2."""
 
 
 def measure(image: str, method: str, target_bytes: int, folder: str, data: str, quick: bool) -> list[Row]:
@@ -132,11 +132,19 @@ def page(folder: Path, rows: list[Row]) -> Page:
     if figures:
         lines = [[image for figure in figures[i : i + 2] for image in figure] for i in range(0, len(figures), 2)]
         save_rows(folder / "previews.jpg", lines)
-    tables = [
-        means_table(rows, [*CASES, "method"], ("bytes", *QUANTITIES, "core_seconds")),
-        differences_table(rows, COMPARISONS, QUANTITIES, CASES),
-    ]
-    texts = [summary(rows, comparison, QUANTITIES, CASES) for comparison in COMPARISONS]
-    sentences = "\n".join(f"- {text}" for text in texts if text)
+    webp = COMPARISONS[0]
+    colors = {
+        size: f"{mean_gain(group, webp, 'delta_e'):+.2f} at {size:,} bytes"
+        for (size,), group in group_by(rows, CASES).items()
+        if webp.gains(group, "delta_e", [])
+    }
+    answer = (
+        "Beside the best WebP of so many bytes, previews have a lower colour difference in "
+        f"{count_wins(rows, webp, 'delta_e', CASES)} files, by deltaE {', '.join(colors.values())}. SSIMULACRA2 is "
+        f"higher in {count_wins(rows, webp, 'ssimulacra2', CASES)}."
+    )
+    table = means_table(rows, ["method"], "target_bytes", ("delta_e", "ssimulacra2", "psnr"))
     question = "How good are previews of a few hundred bytes, beside those of other codecs?"
-    return Page(question, METHOD, sentences, "previews.jpg", tables, losses_table(rows, COMPARISONS, QUANTITIES, CASES))
+    losses = losses_table(rows, COMPARISONS, QUANTITIES, CASES)
+    gains = differences(rows, COMPARISONS, QUANTITIES, CASES)
+    return Page(question, answer, "previews.jpg", table, losses, METHOD, gains)

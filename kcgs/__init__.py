@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .pruning import prune
     from .scene import Scene, load, save
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "FitConfig", "FitResult", "GaussianField", "InvalidArgument", "InvalidArgumentType", "RegionMap",

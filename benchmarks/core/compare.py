@@ -1,4 +1,4 @@
-"""Tables of means, of differences paired by image, and of the images on which a method is worse."""
+"""Means by method, differences paired by image with their intervals, and the images on which a method is worse."""
 
 from __future__ import annotations
 
@@ -43,6 +43,7 @@ COLUMNS = {
     "decoded_psnr": Column("PSNR decoded", ".2f", 0.005),
     "decoded_ef_psnr": Column("EF-PSNR decoded", ".2f", 0.005),
     "core_seconds": Column("core s", ".1f", 0.05, less_is_better=True),
+    "flicker": Column("flicker", ".2f", 0.005, less_is_better=True),
     "steep": Column("steep", "", less_is_better=True),
     "beyond [0, 1]": Column("beyond [0, 1]", "", less_is_better=True),
 }
@@ -51,7 +52,7 @@ _NUM_SAMPLES = 10_000
 # in the logarithm of bytes: how far a curve is continued beyond its ends, 5 %
 _CURVE_MARGIN = math.log(1.05)
 # images that a table of losses names
-_NUM_WORST = 5
+_NUM_WORST = 3
 
 
 class Gain(NamedTuple):
@@ -159,64 +160,74 @@ def markdown(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in [header, ["---"] * len(header), *lines])
 
 
-def means_table(rows: Sequence[Row], names: Sequence[str], columns: Sequence[str]) -> str:
-    """Lay out the means of columns, a line for each combination of names, with the number of images."""
-    lines, count = [], [] if "image" in names else ["images"]
+def means_table(rows: Sequence[Row], names: Sequence[str], along: str, quantities: Sequence[str]) -> str:
+    """Lay out means, a line for each combination of names, a column for each value along, quantities as "a / b"."""
+    values: list[Any] = list(group_by(rows, [along])) if along else [()]
+    lines = []
     for key, group in group_by(rows, names).items():
-        line = [*map(format_value, names, key), *(str(len(group_by(group, ["image"]))) for _ in count)]
-        for name in columns:
-            values = values_of(group, name)
-            line.append(format_value(name, fmean(values)) if values else "")
-        lines.append(line)
-    return markdown([*map(title, names), *count, *map(title, columns)], lines)
+        by_value = group_by(group, [along] if along else [])
+        cells = [_mean_cells(by_value.get(value, []), quantities) for value in values]
+        joined = [" / ".join(filter(None, cell)) for cell in cells] if along else cells[0]
+        lines.append([*map(format_value, names, key), *joined])
+    header = [f"{title(along)} {format_value(along, *value)}" for value in values] if along else map(title, quantities)
+    return markdown([*map(title, names), *header], lines)
 
 
-def differences_table(
+def _mean_cells(rows: Sequence[Row], quantities: Sequence[str]) -> list[str]:
+    return [format_value(name, fmean(values)) if (values := values_of(rows, name)) else "" for name in quantities]
+
+
+def differences(
     rows: Sequence[Row], comparisons: Sequence[Comparison], quantities: Sequence[str], cases: Sequence[str]
-) -> str:
-    """Lay out paired differences, a line for each comparison and case, above zero where the first is better."""
+) -> list[Row]:
+    """List paired differences by comparison and case, above zero where the first has more, with their intervals."""
     lines = []
     for comparison in comparisons:
         gains = {quantity: comparison.gains(rows, quantity, cases) for quantity in quantities}
         for case in dict.fromkeys(case for by_case in gains.values() for case in by_case):
-            line = [" - ".join(comparison), *map(format_value, cases, case)]
+            line = {"method": " - ".join(comparison), **dict(zip(cases, case, strict=True))}
             for quantity, by_case in gains.items():
-                line += _gain_cells(quantity, by_case[case]) if case in by_case else [""] * 3
+                if gain := by_case.get(case):
+                    line |= {quantity: gain.mean, f"{quantity} won": gain.num_wins, f"{quantity} of": len(gain.values)}
+                    line |= dict(zip((f"{quantity} low", f"{quantity} high"), gain.interval or (), strict=False))
             lines.append(line)
-    header = [cell for quantity in quantities for cell in (title(quantity), "95 %", "won-lost")]
-    return markdown(["difference", *map(title, cases), *header], lines)
-
-
-def _gain_cells(quantity: str, gain: Gain) -> list[str]:
-    interval = " to ".join(format_value(quantity, end, "+") for end in gain.interval or ())
-    return [format_value(quantity, gain.mean, "+"), interval, f"{gain.num_wins}-{len(gain.losses)}"]
+    return lines
 
 
 def losses_table(
     rows: Sequence[Row], comparisons: Sequence[Comparison], quantities: Sequence[str], cases: Sequence[str]
 ) -> str:
-    """Lay out the cases in which the first method loses, the worst images first."""
+    """Count the images on which the first method loses, over all cases, and name the worst."""
     lines = []
     for comparison in comparisons:
         for quantity in quantities:
-            for case, gain in comparison.gains(rows, quantity, cases).items():
-                images = [f"{i} {format_value(quantity, gain.values[i], '+')}" for i in gain.losses[:_NUM_WORST]]
-                if images:
-                    line = [" - ".join(comparison), *map(format_value, cases, case), title(quantity)]
-                    lines.append([*line, f"{len(gain.losses)} of {len(gain.values)}", ", ".join(images)])
-    return markdown(["difference", *map(title, cases), "in", "lost", "worst"], lines) if lines else ""
+            by_case = comparison.gains(rows, quantity, cases)
+            losses = [(gain, case, image) for case, gain in by_case.items() for image in gain.losses]
+            losses.sort(key=lambda loss: -abs(loss[0].values[loss[2]]))
+            worst = [
+                " ".join([image, *map(_case, cases, case), format_value(quantity, gain.values[image], "+")])
+                for gain, case, image in losses[:_NUM_WORST]
+            ]
+            if worst:
+                count = sum(len(gain.values) for gain in by_case.values())
+                lines.append([" - ".join(comparison), title(quantity), f"{len(losses)} of {count}", ", ".join(worst)])
+    return markdown(["difference", "in", "lost", "worst"], lines) if lines else ""
 
 
-def summary(rows: Sequence[Row], comparison: Comparison, quantities: Sequence[str], cases: Sequence[str]) -> str:
-    """Return a sentence on the gains of the first method over the second in all cases."""
-    parts = []
-    for quantity in quantities:
-        gains = list(comparison.gains(rows, quantity, cases).values())
-        if gains:
-            wins, count = sum(gain.num_wins for gain in gains), sum(len(gain.values) for gain in gains)
-            mean = format_value(quantity, fmean(value for gain in gains for value in gain.values.values()), "+")
-            parts.append(f"{title(quantity)} {mean} on average, better in {wins} of {count} pairs")
-    return f"`{comparison.first}` beside `{comparison.second}`: {'; '.join(parts)}." if parts else ""
+def _case(name: str, value: Any) -> str:
+    return value if isinstance(value, str) else f"({title(name)} {format_value(name, value)})"
+
+
+def mean_gain(rows: Sequence[Row], comparison: Comparison, quantity: str, cases: Sequence[str] = ()) -> float:
+    """Return the mean gain over all images and cases; NaN: there are no pairs."""
+    gains = comparison.gains(rows, quantity, cases).values()
+    return fmean([value for gain in gains for value in gain.values.values()] or [math.nan])
+
+
+def count_wins(rows: Sequence[Row], comparison: Comparison, quantity: str, cases: Sequence[str] = ()) -> str:
+    """Say in how many pairs the first method is better."""
+    gains = comparison.gains(rows, quantity, cases).values()
+    return f"{sum(gain.num_wins for gain in gains)} of {sum(len(gain.values) for gain in gains)}"
 
 
 def at_equal_bits(

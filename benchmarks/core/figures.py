@@ -37,7 +37,10 @@ class Panel(NamedTuple):
 
 
 def save_lines(path: Path, panels: Sequence[Panel], line: str, along: str, marker: bool = True) -> None:
-    """Plot y over x, a line for each name under `line`, through the means at each value under `along`."""
+    """Plot y over x, a line for each name under `line`, through the means at each value under `along`.
+
+    Rows with an interval, as `compare.differences` gives them, get error bars.
+    """
     height = (len(panels) + 1) // 2
     figure = Figure(figsize=(9.5, 0.6 + 3.3 * height), layout="constrained")
     handles: dict[object, Any] = {}
@@ -55,6 +58,10 @@ def save_lines(path: Path, panels: Sequence[Panel], line: str, along: str, marke
             style = {"marker": MARKERS[index % len(MARKERS)] if marker else None, "markersize": 4}
             x, y = zip(*points, strict=True)
             (handles[name],) = axes.plot(x, y, color=COLORS[index % len(COLORS)], **style)
+            bars = [group[0] for group in groups if f"{panel.y} low" in group[0]]
+            for bar in bars:
+                ends = [bar[f"{panel.y} low"], bar[f"{panel.y} high"]]
+                axes.plot([bar[panel.x]] * 2, ends, color=COLORS[index % len(COLORS)], linewidth=1)
         axes.set(xlabel=title(panel.x), ylabel=title(panel.y), title=panel.title)
         axes.set(xscale=panel.scales[0], yscale=panel.scales[1])
         axes.xaxis.set_major_formatter("{x:g}")
@@ -76,3 +83,25 @@ def save_rows(path: Path, rows: Sequence[Sequence[Tensor]]) -> None:
     width = max(row.shape[2] for row in joined)
     sheet = torch.cat([torch.nn.functional.pad(row, (0, width - row.shape[2]), value=1.0) for row in joined], 1)
     Image.fromarray((255 * sheet).round().byte().permute(1, 2, 0).numpy()).save(path, quality=70)
+
+
+def save_differences(path: Path, rows: Sequence[Row], quantities: Sequence[str], case: str) -> None:
+    """Plot differences as points with their intervals, a line for each method, a colour for each case."""
+    methods, cases = ([*group_by(rows, [name])] for name in ("method", case))
+    figure = Figure(figsize=(9.5, 1.0 + 0.4 * len(methods)), layout="constrained")
+    handles: dict[object, Any] = {}
+    with matplotlib.rc_context({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3}):
+        all_axes = np.ravel(figure.subplots(1, len(quantities), sharey=True, squeeze=False))
+    for axes, quantity in zip(all_axes, quantities, strict=True):
+        for row in rows:
+            index = cases.index((row[case],))
+            style = {"color": COLORS[index % len(COLORS)], "marker": MARKERS[index % len(MARKERS)], "linestyle": ""}
+            y = -methods.index((row["method"],)) - 0.15 * index
+            ends = [row.get(f"{quantity} {end}", row[quantity]) for end in ("low", "high")]
+            axes.plot(ends, [y, y], color=style["color"], linewidth=1)
+            (handles[f"{title(case)} = {row[case]:,}"],) = axes.plot(row[quantity], y, markersize=4, **style)
+        axes.axvline(0, color="#999999", linewidth=1)
+        axes.set(xlabel=title(quantity), yticks=[-index for index in range(len(methods))])
+        axes.set_yticklabels([str(method) for (method,) in methods])
+    figure.legend(handles.values(), [str(name) for name in handles], loc="outside upper center", ncols=len(handles))
+    figure.savefig(path, dpi=110)

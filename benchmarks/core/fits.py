@@ -11,7 +11,7 @@ from typing import Any
 
 from torch import Tensor
 
-from kcgs import FitConfig, evaluate, fit
+from kcgs import FitConfig, FitResult, evaluate, fit
 from kcgs.codec import decode, encode, encode_labels
 from kcgs.fitting import precompile
 from kcgs.functional import ef_psnr, ms_ssim, psnr
@@ -20,66 +20,82 @@ from kcgs.rate import quality_for
 from .images import load_mapped
 from .run import Job, Options, Row
 
-# recipes as published have 50,000 iterations, which take a quarter of an hour per photo on a processor core
-PUBLISHED = ("paper", "gaussian-image", "gaussian-image-clamp", "image-gs")
-PUBLISHED_ITERATIONS = 2_000
 QUICK_ITERATIONS = 10
+# of the short fit that tells how long an iteration takes
+TRIAL_ITERATIONS = 100
 # of reports, by the names that `kcgs.evaluate` gives them; those of contours begin with ef_
 METRICS: dict[str, Callable[..., Tensor]] = {"psnr": psnr, "ef_psnr": ef_psnr, "ms_ssim": ms_ssim}
 Method = tuple[str, dict[str, Any]]  # a recipe, and settings that differ from it
+# that are compared in as much time
+METHODS: dict[str, Method] = {
+    **{name: (name, {}) for name in ("best", "best-baseline", "paper", "gaussian-image", "gaussian-image-clamp")},
+    # SSIM in torch takes ten times as long as all else: with it there would be 20 iterations
+    "image-gs, L1 alone": ("image-gs", {"loss": "l1"}),
+}
 
 
-def plan(
-    images: Iterable[str],
-    counts: Sequence[int],
-    methods: dict[str, Method],
-    options: Options,
-    iterations: int = PUBLISHED_ITERATIONS,
-) -> list[Job]:
-    """List fits; `iterations` are those of the published recipes."""
+def plan(images: Iterable[str], counts: Sequence[int], methods: dict[str, Method], options: Options) -> list[Job]:
+    """List fits."""
     jobs = []
-    for image, n, (name, (recipe, settings)), seed in product(images, counts, methods.items(), range(options.seeds)):
-        length = {"iterations": iterations} if recipe in PUBLISHED else {}
-        length = {"iterations": QUICK_ITERATIONS} if options.quick else length
+    for image, n, (name, (recipe, settings)) in product(images, counts, methods.items()):
+        length = {"iterations": QUICK_ITERATIONS} if options.quick else {}
         job = {"image": image, "n": n, "method": name, "recipe": recipe, "settings": {**settings, **length}}
-        jobs.append({**job, "seed": seed, "data": str(options.data or ""), "quick": options.quick})
+        jobs.append({**job, **options.image_arguments()})
     return jobs
 
 
 def measure_fit(
-    image: str, n: int, method: str, recipe: str, settings: dict[str, Any], seed: int, data: str, quick: bool
+    image: str, n: int, method: str, recipe: str, settings: dict[str, Any], data: str, quick: bool
 ) -> list[Row]:
-    """Fit, encode, and measure both."""
+    """Fit and measure."""
     pixels, labels = load_mapped(image, data, quick)
-    config = FitConfig.from_recipe(recipe, **settings)
-    if not quick:
-        precompile(config)  # no clock counts compilation
+    result, seconds = timed_fit(pixels, labels, n, FitConfig.from_recipe(recipe, **settings))
+    return [{"image": image, "n": n, "method": method, **figures(result, seconds, pixels, labels)}]
+
+
+def timed_fit(image: Tensor, labels: Tensor, n: int, config: FitConfig) -> tuple[FitResult, float]:
+    """Fit, and return the processor time, too; compilation is not in it."""
+    precompile(config)
     start = time.process_time()
-    result = fit(pixels, labels, n, recipe=config, seed=seed)
-    seconds = time.process_time() - start
+    result = fit(image, labels, n, recipe=config)
+    return result, time.process_time() - start
+
+
+def seconds_per_iteration(image: Tensor, labels: Tensor, n: int, method: str) -> float:
+    """Time a short fit."""
+    return timed_fit(image, labels, n, config_of(method, TRIAL_ITERATIONS))[1] / TRIAL_ITERATIONS
+
+
+def config_of(method: str, iterations: int | None) -> FitConfig:
+    """Return the settings of one of METHODS for so many iterations, None: the recipe's own."""
+    recipe, settings = METHODS[method]
+    return FitConfig.from_recipe(recipe, **settings, **({} if iterations is None else {"iterations": iterations}))
+
+
+def figures(result: FitResult, seconds: float, image: Tensor, labels: Tensor) -> Row:
+    """Measure a fitted scene and its file."""
     scene, regions = result.scene, result.scene.regions
-    figures = evaluate(scene, pixels, labels)
-    file = encode(scene, quality=quality_for(figures["psnr"]))
-    decoded = evaluate(decode(file).scene, pixels, labels)
-    stored = None if regions is None or regions.num_regions == 1 else regions.labels
-    return [{
-        "image": image, "n": n, "method": method, "seed": seed, "iterations": result.history[-1].iteration,
-        **{name: figures[name] for name in METRICS}, "ssimulacra2": figures.get("ssimulacra2", math.nan),
-        "bytes": len(file), "map_bytes": 0 if stored is None else len(encode_labels(stored)),
-        "bpp": 8 * len(file) / pixels[0].numel(), "core_seconds": seconds,
-        **{f"decoded_{name}": decoded[name] for name in METRICS},
-    }]  # fmt: skip
+    own = evaluate(scene, image, labels)
+    file = encode(scene, quality=quality_for(own["psnr"]))
+    decoded = measure_render(decode(file).scene.render(), image, labels)
+    contours = None if regions is None or regions.num_regions == 1 else regions.labels
+    return {
+        "iterations": result.history[-1].iteration, "core_seconds": seconds, **{name: own[name] for name in METRICS},
+        "ssimulacra2": own.get("ssimulacra2", math.nan), "bytes": len(file), "bpp": 8 * len(file) / image[0].numel(),
+        "map_bytes": 0 if contours is None else len(encode_labels(contours)),
+        **{f"decoded_{name}": value for name, value in decoded.items()},
+    }  # fmt: skip
 
 
 def measure_render(render: Tensor, image: Tensor, labels: Tensor | None) -> Row:
     """Return the metrics of a render; those of contours where there are labels."""
-    figures: Row = {}
+    row: Row = {}
     with warnings.catch_warnings():
         # NaN: the image is too small for MS-SSIM
         warnings.simplefilter("ignore", RuntimeWarning)
         for name, metric in METRICS.items():
             if not name.startswith("ef_"):
-                figures[name] = float(metric(render, image))
+                row[name] = float(metric(render, image))
             elif labels is not None:
-                figures[name] = float(metric(render, image, labels))
-    return figures
+                row[name] = float(metric(render, image, labels))
+    return row

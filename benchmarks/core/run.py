@@ -8,6 +8,7 @@ import inspect
 import json
 import os
 import platform
+import subprocess
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from importlib.metadata import version
@@ -23,7 +24,8 @@ Row = dict[str, Any]
 Job = dict[str, Any]
 Measure = Callable[..., list[Row]]
 RESULTS_FILE = "results.csv"
-# the command, the machine and a note on what is missing
+DIFFERENCES_FILE = "differences.csv"
+# the command, the tree of kcgs, the machine and a note on what is missing
 RUN_FILE = "run.json"
 QUICK_NOTE = "This is the short form, with small images and few iterations: it only shows that all of it runs."
 
@@ -36,7 +38,6 @@ class Options(NamedTuple):
     quick: bool = False
     only: tuple[str, ...] = ()  # images, or scenes of the zoo
     workers: int = 1
-    seeds: int = 1
     redraw: bool = False
 
     def folder(self) -> Path:
@@ -54,11 +55,12 @@ class Page(NamedTuple):
     """A report."""
 
     question: str
-    method: str  # what is measured, and how
-    answer: str
+    answer: str  # in two sentences
     figure: str  # file beside the report
-    tables: Sequence[str]
+    table: str
     losses: str
+    method: str  # what is measured, and how
+    differences: Sequence[Row] = ()  # with their intervals
 
 
 def run_experiment(
@@ -93,11 +95,14 @@ def run_experiment(
                 if len(finished_paths) < len(paths)
                 else ""
             )
-            run = {"command": _command(name, options), "quick": options.quick, "machine": _machine(), "note": note}
+            run = {"command": _command(name, options), "quick": options.quick, "tree": _tree(), "machine": _machine()}
+            run["note"] = note
             (options.output / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
     run = json.loads((options.output / RUN_FILE).read_text(encoding="utf-8"))
-    report = _text(page(options.output, read_rows(options.output / RESULTS_FILE)), run)
-    (options.output / "report.md").write_text(report, encoding="utf-8")
+    report = page(options.output, read_rows(options.output / RESULTS_FILE))
+    if report.differences:
+        write_rows(options.output / DIFFERENCES_FILE, report.differences)
+    (options.output / "report.md").write_text(_text(report, run), encoding="utf-8")
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
@@ -165,8 +170,18 @@ def _command(name: str, options: Options) -> str:
     parts += ["--data DIR"] if options.data else []
     parts += ["--quick"] if options.quick else []
     parts += [f"--only {','.join(options.only)}"] if options.only else []
-    parts += [f"--{key} {getattr(options, key)}" for key in ("workers", "seeds") if getattr(options, key) > 1]
+    parts += [f"--workers {options.workers}"] if options.workers > 1 else []
     return " ".join(parts)
+
+
+def _tree() -> str:
+    """Return git's hash of the folder of kcgs."""
+    folder = Path(kcgs.__file__).parent
+    git = partial(subprocess.run, cwd=folder, capture_output=True, text=True, check=False)
+    tree, status = git(["git", "rev-parse", "HEAD:./"]), git(["git", "status", "--porcelain", "."])
+    if tree.returncode:
+        return "not under git"
+    return tree.stdout.strip() + (", changed" if status.stdout else "")
 
 
 def _machine() -> str:
@@ -181,11 +196,13 @@ def _machine() -> str:
 
 def _text(page: Page, run: dict[str, Any]) -> str:
     parts = [f"# {page.question}", QUICK_NOTE if run["quick"] else "", run["note"], page.answer]
-    parts += [f"![]({page.figure})", *page.tables, "## Losses", page.losses or "None.", "## How", page.method]
+    parts += [f"![]({page.figure})", page.table, "## Losses", page.losses or "None.", "## How", page.method]
+    intervals = f", differences with 95 % intervals: [{DIFFERENCES_FILE}]({DIFFERENCES_FILE})"
     facts = [
         f"- Command: `{run['command']}`",
+        f"- Tree of kcgs/: `{run['tree']}`",
         f"- Machine: {run['machine']}",
-        "- Every number: [results.csv](results.csv)",
+        f"- Every number: [{RESULTS_FILE}]({RESULTS_FILE}){intervals if page.differences else ''}",
     ]
     parts.append("\n".join(facts))
     return "\n\n".join(filter(None, parts)) + "\n"

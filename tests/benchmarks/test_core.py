@@ -19,12 +19,13 @@ from benchmarks.core.compare import (
     Comparison,
     Gain,
     at_equal_bits,
-    differences_table,
+    count_wins,
+    differences,
     format_value,
     group_by,
     losses_table,
+    mean_gain,
     means_table,
-    summary,
 )
 from benchmarks.core.fits import QUICK_ITERATIONS, plan
 from benchmarks.core.images import load, load_mapped, names
@@ -46,7 +47,8 @@ def measure_square(image: str, number: int, folder: str) -> list[Row]:
 
 
 def square_page(folder: Path, rows: list[Row]) -> Page:
-    return Page("How large?", "Multiplied.", f"Sum: {sum(r['value'] for r in rows):g}", "a.png", ["table"], "")
+    answer = f"Sum: {sum(row['value'] for row in rows):g}"
+    return Page("How large?", answer, "a.png", "table", "", "Multiplied.", [{"method": "a - b", "value low": 1.5}])
 
 
 class TestExperiment:
@@ -70,7 +72,8 @@ class TestExperiment:
         report = self.run(tmp_path, (1, 2, 3, 4))
         assert self.traces(tmp_path) == ["1", "2", "3", "4"]
         assert "Sum: 30" in report and "## Losses\n\nNone." in report
-        assert "- Command: `python -m benchmarks square -o DIR`" in report
+        assert "- Command: `python -m benchmarks square -o DIR`" in report and "- Tree of kcgs/: `" in report
+        assert (tmp_path / "out/differences.csv").read_text() == "method,value low\na - b,1.5\n"
         # names of images choose
         assert "Sum: 4" in self.run(tmp_path, only=("image2",))
         with pytest.raises(ValueError, match="only must name some of image1, image2, image3"):
@@ -87,8 +90,8 @@ class TestExperiment:
         assert self.traces(tmp_path) == ["-3", "1", "2", "4", "repaired"]
 
     def test_redraw_measures_nothing(self, tmp_path: Path) -> None:
-        report = self.run(tmp_path, quick=True, seeds=2)
-        assert "--quick --seeds 2`" in report and "short form" in report
+        report = self.run(tmp_path, quick=True)
+        assert "--quick`" in report and "short form" in report
         assert self.run(tmp_path, (7,), redraw=True) == report
 
     def test_rows(self, tmp_path: Path) -> None:
@@ -111,13 +114,14 @@ class TestCompare:
         (gain,) = self.comparison.gains(rows, "psnr", ["n"]).values()
         assert gain.mean == pytest.approx(0.2202) and gain.num_wins == 2 and gain.losses == ["d"]
         assert gain.interval is not None and gain.interval[0] < 0 < gain.mean < gain.interval[1]
-        assert "| ours - other | 5 | +0.22 | " in differences_table(rows, [self.comparison], ["psnr"], ["n"])
-        assert "| ours - other | 5 | PSNR | 1 of 5 | d -0.10 |" in losses_table(
-            rows, [self.comparison], ["psnr"], ["n"]
-        )
-        text = "`ours` beside `other`: PSNR +0.22 on average, better in 2 of 5 pairs."
-        assert summary(rows, self.comparison, ["psnr"], ["n"]) == text
-        assert summary(rows, Comparison("ours", "nobody"), ["psnr"], ["n"]) == ""
+        (row,) = differences(rows, [self.comparison], ["psnr"], ["n"])
+        assert row["method"] == "ours - other" and row["n"] == 5 and row["psnr"] == gain.mean
+        assert (row["psnr low"], row["psnr high"]) == gain.interval
+        text = losses_table(rows, [self.comparison], ["psnr"], ["n"])
+        assert "| ours - other | PSNR | 1 of 5 | d (N 5) -0.10 |" in text
+        assert mean_gain(rows, self.comparison, "psnr", ["n"]) == gain.mean
+        assert count_wins(rows, self.comparison, "psnr", ["n"]) == "2 of 5"
+        assert math.isnan(mean_gain(rows, Comparison("ours", "nobody"), "psnr"))
         assert losses_table(rows, [Comparison("other", "nobody")], ["psnr"], ["n"]) == ""
 
     def test_seeds_are_averaged_and_less_may_be_better(self) -> None:
@@ -138,8 +142,9 @@ class TestCompare:
 
     def test_means(self) -> None:
         rows = [{"image": i, "n": 1_250, "psnr": v, "speed": 10 * v} for i, v in (("a", 30.0), ("b", 31.0))]
-        assert means_table(rows, ["n"], ["psnr", "speed", "none"]).splitlines()[-1] == "| 1,250 | 2 | 30.50 | 305 |  |"
-        assert means_table(rows, ["image"], ["psnr"]).splitlines()[-1] == "| b | 31.00 |"
+        assert means_table(rows, ["n"], "", ["psnr", "speed", "none"]).splitlines()[-1] == "| 1,250 | 30.50 | 305 |  |"
+        table = means_table([*rows, {"image": "a", "n": 5, "psnr": 7.0}], ["image"], "n", ["psnr", "speed"])
+        assert table.splitlines()[2:] == ["| a | 30.00 / 300 | 7.00 |", "| b | 31.00 / 310 |  |"]
         assert (format_value("psnr", 1.0, "+"), format_value("", 0.01234), format_value("", None)) == (
             "+1.00",
             "0.0123",
@@ -183,9 +188,9 @@ class TestImages:
 
     def test_plan(self) -> None:
         methods: Any = {"best": ("best", {}), "paper": ("paper", {"clamp": True})}
-        jobs = plan(["a"], (5, 6), methods, Options(Path(), seeds=2))
-        assert len(jobs) == 8 and [job["seed"] for job in jobs[:3]] == [0, 1, 0]
-        assert jobs[0]["settings"] == {} and jobs[2]["settings"] == {"clamp": True, "iterations": 2_000}
+        jobs = plan(["a"], (5, 6), methods, Options(Path()))
+        assert [job["n"] for job in jobs] == [5, 5, 6, 6]
+        assert jobs[0]["settings"] == {} and jobs[1]["settings"] == {"clamp": True}
         quick = plan(["a"], (5,), methods, Options(Path(), quick=True))
         assert {job["settings"]["iterations"] for job in quick} == {QUICK_ITERATIONS}
 

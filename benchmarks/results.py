@@ -1,0 +1,66 @@
+"""The page of results: the question, the answer and the figure of every report."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from pathlib import Path
+
+from .core.run import RUN_FILE
+
+REPORTS = Path(__file__).parent / "reports"
+# as seen from docs/
+LINK = "../benchmarks/reports"
+HEAD = """# Results
+
+Each answer comes from a report of one page, with a table, what loses, and the command that measures it anew. All were
+measured with one tree of `kcgs/`, `{tree}`: `git rev-parse HEAD:kcgs` says which one you have.
+
+```sh
+python -m benchmarks quality -o report --data DATA --workers 2
+```
+
+`DATA` has the folders `DAVIS`, `bsds`, `kodak` and `cocostuff`; without it photos of scikit-image are measured. `--only`
+chooses images. What is measured is kept in `report/runs`, so the same command goes on where it was stopped.
+"""
+TAIL = """
+## How figures are taken
+
+- PSNR, MS-SSIM and SSIMULACRA2 are over the whole image. EF-PSNR is within 5 pixels of the contours of the given map, for
+  every method alike.
+- *Bytes* are those of the whole `.kcgs` file, map included. *At equal bits*, decoded files are compared with the other
+  method's at as many bytes of the same image; its curve is interpolated by monotone cubics over the logarithm of the bytes.
+- Differences are paired by image, above zero where the first has more. Intervals are 95 %, by bootstrap over images,
+  widened for their small number; they are in `differences.csv`, and in the figures.
+- Times are those of one processor core; compilation is not in them.
+- gsplat, GaussianImage and Image-GS need CUDA, so their own programs are in no table: the recipes of their papers run on the
+  renderer of kcgs.
+
+```{{toctree}}
+:hidden:
+:glob:
+
+benchmarks/reports/*/report
+```
+"""
+
+
+def page() -> str:
+    """Make the page from the committed reports."""
+    from .__main__ import EXPERIMENTS
+
+    runs = {name: json.loads((REPORTS / name / RUN_FILE).read_text(encoding="utf-8")) for name in EXPERIMENTS}
+    tree = Counter(run.get("tree", "") for run in runs.values()).most_common(1)[0][0]
+    sections = [HEAD.format(tree=tree)]
+    for name, run in runs.items():
+        text = (REPORTS / name / "report.md").read_text(encoding="utf-8")
+        question, answer = re.match(r"# (.*)\n\n(?:.*\n\n)??([^\n]+)\n\n!\[\]\(", text).groups()
+        other_tree = "" if run.get("tree") == tree else " (Measured with an earlier tree.)"
+        figure = re.search(r"!\[\]\((.*)\)", text)[1]
+        sections.append(f"## {question}\n\n{answer}{other_tree} [Report]({LINK}/{name}/report.md)\n\n![{question}]({LINK}/{name}/{figure})\n")
+    return "\n".join([*sections, TAIL.format().lstrip("\n")])
+
+
+if __name__ == "__main__":
+    (REPORTS.parent.parent / "docs/results.md").write_text(page(), encoding="utf-8")
