@@ -55,10 +55,12 @@ def page() -> str:
     sections = [HEAD.format(tree=tree)]
     for name, run in runs.items():
         text = (REPORTS / name / "report.md").read_text(encoding="utf-8")
-        question, answer = re.match(r"# (.*)\n\n(?:.*\n\n)??([^\n]+)\n\n!\[\]\(", text).groups()
-        other_tree = "" if run.get("tree") == tree else " (Measured with an earlier tree.)"
-        figure = re.search(r"!\[\]\((.*)\)", text)[1]
-        sections.append(f"## {question}\n\n{answer}{other_tree} [Report]({LINK}/{name}/report.md)\n\n![{question}]({LINK}/{name}/{figure})\n")
+        match = re.match(r"# (?P<question>.*)\n\n(.*\n\n)??(?P<answer>.+)\n\n!\[\]\((?P<figure>.*)\)", text)
+        assert match is not None, name
+        question, answer, figure = match["question"], match["answer"], match["figure"]
+        other_tree = "" if run.get("tree") == tree else "Measured with an earlier tree. "
+        link, image = f"[Report]({LINK}/{name}/report.md)", f"![{question}]({LINK}/{name}/{figure})"
+        sections.append(f"## {question}\n\n{answer} {other_tree}{link}\n\n{image}\n")
     return "\n".join([*sections, TAIL.format().lstrip("\n")])
 
 

@@ -13,6 +13,7 @@ import pytest
 import kcgs
 from benchmarks.__main__ import EXPERIMENTS, main
 from benchmarks.core.run import Options, read_rows
+from benchmarks.results import page
 
 REPORTS = Path(kcgs.__file__).resolve().parent.parent / "benchmarks/reports"
 
@@ -56,6 +57,11 @@ def test_committed_report_is_that_of_its_results(folder: Path, tmp_path: Path) -
     main([folder.name, "-o", str(tmp_path / folder.name), "--redraw"])
     hint = f"python -m benchmarks {folder.name} -o benchmarks/reports/{folder.name} --redraw"
     assert report.read_text(encoding="utf-8") == (folder / "report.md").read_text(encoding="utf-8"), hint
+
+
+def test_results_are_those_of_the_reports() -> None:
+    hint = "python -m benchmarks.results"
+    assert page() == (REPORTS.parent.parent / "docs/results.md").read_text(encoding="utf-8"), hint
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
