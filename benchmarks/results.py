@@ -21,21 +21,22 @@ measured with one tree of `kcgs/`, `{tree}`: `git rev-parse HEAD:kcgs` says whic
 python -m benchmarks quality -o report --data DATA --workers 2
 ```
 
-`DATA` has the folders `DAVIS`, `bsds`, `kodak` and `cocostuff`; without it photos of scikit-image are measured. `--only`
-chooses images. What is measured is kept in `report/runs`, so the same command goes on where it was stopped.
+`DATA` has the folders `DAVIS`, `bsds`, `kodak` and `cocostuff`; without it photos of scikit-image are measured.
+`--only` chooses images. What is measured is kept in `report/runs`, so the same command goes on where it was stopped.
 """
 TAIL = """
 ## How figures are taken
 
-- PSNR, MS-SSIM and SSIMULACRA2 are over the whole image. EF-PSNR is within 5 pixels of the contours of the given map, for
-  every method alike.
-- *Bytes* are those of the whole `.kcgs` file, map included. *At equal bits*, decoded files are compared with the other
-  method's at as many bytes of the same image; its curve is interpolated by monotone cubics over the logarithm of the bytes.
+- PSNR, MS-SSIM and SSIMULACRA2 are over the whole image. EF-PSNR is within 5 pixels of the contours of the given map,
+  for every method alike.
+- *Bytes* are those of the whole `.kcgs` file, map included. *At equal bits*, decoded files are compared with the
+  other method's at as many bytes of the same image; its curve is interpolated by monotone cubics over the logarithm
+  of the bytes.
 - Differences are paired by image, above zero where the first has more. Intervals are 95 %, by bootstrap over images,
   widened for their small number; they are in `differences.csv`, and in the figures.
 - Times are those of one processor core; compilation is not in them.
-- gsplat, GaussianImage and Image-GS need CUDA, so their own programs are in no table: the recipes of their papers run on the
-  renderer of kcgs.
+- gsplat, GaussianImage and Image-GS need CUDA, so their own programs are in no table: the recipes of their papers run
+  on the renderer of kcgs.
 
 ```{{toctree}}
 :hidden:
