@@ -7,10 +7,12 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import torch
+from PIL import Image, ImageDraw, ImageFont
 from skimage.data import coffee
 from torch import Tensor
 
-from kcgs import RegionMap, evaluate, load
+from kcgs import RegionMap, evaluate, fit, load
+from kcgs.editing import recolor_region
 from kcgs.functional import region_splat
 from kcgs.rate import fit_bytes
 from kcgs.segment import segment
@@ -21,6 +23,11 @@ SIZE = (160, 240)
 SOFTNESS = 6.0  # pixels
 NUM_BYTES = 6_000
 PART = ((50, 170), (120, 280))  # rows and columns of a scene
+COUNTS = (10, 20, 40, 80, 160, 320, 640)
+RED = ((200, 120), (280, 215), (225, 250))  # rows and columns of saucer, handle and cup
+FRAME_WIDTH = 900
+CAPTION_HEIGHT = 34
+FRAME_MILLISECONDS = 900
 
 
 def membership(path: Path) -> None:
@@ -91,7 +98,41 @@ def contours(path: Path) -> None:
     plt.close(figure)
 
 
+def growth(path: Path) -> None:
+    """Animate fits of more and more Gaussians, without regions and with, and at the end an edit."""
+    image = torch.from_numpy(coffee() / 255).permute(2, 0, 1).float()
+    labels = segment(image)
+    frames = []
+    for n in COUNTS:
+        scenes = [fit(image, None, n, recipe="best-baseline").scene, fit(image, labels, n).scene]
+        captions = (f"{n} Gaussians", f"{n} Gaussians, each in its region")
+        frames.append(_frame([scene.render() for scene in scenes], captions))
+    without, scene = scenes
+    ids = sorted({int(labels[pixel]) for pixel in RED})
+    for color in ("royalblue", "seagreen", "gold"):
+        edited = recolor_region(scene, ids, color=color)
+        frames.append(_frame([without.render(), edited.render()], (captions[0], "regions in another colour")))
+    frames[0].save(
+        path, save_all=True, append_images=frames[1:], duration=FRAME_MILLISECONDS, loop=0, quality=72, method=6
+    )
+
+
+def _frame(renders: list[Tensor], captions: tuple[str, str]) -> Image.Image:
+    """Put two renders side by side, each above its caption."""
+    values = (255 * torch.cat(renders, 2).clamp(0, 1)).round().byte().permute(1, 2, 0).numpy()
+    pair = Image.fromarray(values)
+    pair = pair.resize((FRAME_WIDTH, round(FRAME_WIDTH / pair.width * pair.height)), Image.Resampling.LANCZOS)
+    frame = Image.new("RGB", (pair.width, pair.height + CAPTION_HEIGHT), "white")
+    frame.paste(pair)
+    canvas, font = ImageDraw.Draw(frame), ImageFont.load_default(18)
+    for column, caption in zip((1, 3), captions, strict=True):
+        middle = (column * pair.width / 4, pair.height + CAPTION_HEIGHT / 2)
+        canvas.text(middle, caption, "black", font, anchor="mm")
+    return frame
+
+
 if __name__ == "__main__":
+    growth(IMAGES / "growth.webp")
     contours(IMAGES / "contours.jpg")
     objectives(IMAGES / "objectives.jpg")
     membership(IMAGES / "membership.png")
