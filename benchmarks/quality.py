@@ -20,7 +20,7 @@ from .core.images import PHOTOS, load_mapped, names
 from .core.run import Job, Options, Page, Row
 
 PUBLISHED = [*METHODS][2:]
-COUNTS = {"DAVIS": (500, 1_250, 2_500, 5_000, 7_500, 10_000), "Kodak": (1_250, 5_000, 10_000), "photos": (500, 1_250)}
+COUNTS = {"DAVIS": (500, 1_250, 2_500, 5_000, 7_500, 10_000), "Kodak": (1_250, 10_000), "photos": (500, 1_250)}
 QUANTITIES = ("psnr", "ef_psnr")
 DECODED = ("decoded_psnr", "decoded_ef_psnr")
 CASES = ["group", "n"]

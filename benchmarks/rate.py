@@ -34,6 +34,8 @@ PSNR, REGIONS, EYE = "kcgs, psnr, no regions", "kcgs, psnr", "kcgs"
 OURS = {PSNR: (False, "psnr"), REGIONS: (True, "psnr"), EYE: (True, "ms-ssim")}
 # 0.08, 0.15, 0.3, 0.5 and 0.8 bits per pixel of Kodak
 BYTES = (3_932, 7_372, 14_745, 24_576, 39_321)
+# of files for the eye on Kodak
+EYE_BYTES = BYTES[1:4]
 QUICK_BYTES = (450, 900)
 QUANTITIES = (*METRICS, "ssimulacra2")
 AVIF_PSNR = "AVIF, tune=psnr"
@@ -94,8 +96,9 @@ def jobs(options: Options) -> list[Job]:
         for group, images in groups.items()
         for size in BYTES
         for image in images
-        # found maps for PSNR: the report of `maps`
-        for method in (*(OURS if group == "DAVIS" else (PSNR, EYE)), *codecs)
+        for method in (*OURS, *codecs)
+        # found maps for PSNR are in the report of `maps`
+        if group != "Kodak" or method not in (REGIONS, EYE) or (method == EYE and size in EYE_BYTES)
     ]
 
 

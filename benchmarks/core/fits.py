@@ -22,7 +22,7 @@ from .run import Job, Options, Row
 
 QUICK_ITERATIONS = 10
 # of the short fit that tells how long an iteration takes
-TRIAL_ITERATIONS = 100
+TRIAL_ITERATIONS = 50
 # of reports, by the names that `kcgs.evaluate` gives them; those of contours begin with ef_
 METRICS: dict[str, Callable[..., Tensor]] = {"psnr": psnr, "ef_psnr": ef_psnr, "ms_ssim": ms_ssim}
 Method = tuple[str, dict[str, Any]]  # a recipe, and settings that differ from it

@@ -14,9 +14,10 @@ import torch
 
 from kcgs import GaussianField, RegionMap, Scene, codec, load
 from kcgs.codec import encode
-from kcgs.codec.file import pack, unpack
+from kcgs.codec.file import unpack
 from kcgs.functional.labels import touching_pairs
 
+from ..codec.damage import damaged, damaged_inside
 from .browser import WEB, Browser, check_npm, compile_decoder, serving
 from .decoding import Node, Page, Reader, check_same
 
@@ -111,57 +112,13 @@ def check_scenes(reader: Reader, seeds: range) -> None:
         assert check_same(reader, encode(random_scene(seed), quality=float(20 + seed % 5 * 15))), seed
 
 
-def damaged(data: bytes, other: bytes, generator: random.Random) -> bytes:
-    """Bits flipped, bytes lost, added or repeated, the end cut off, or that of another file put there."""
-    content = bytearray(data)
-    start, kind = generator.randrange(len(content)), generator.randrange(6)
-    if kind == 0:
-        for _ in range(generator.randint(1, 4)):
-            content[generator.randrange(len(content))] ^= 1 << generator.randrange(8)
-    elif kind == 1:
-        del content[start : start + generator.randint(1, 9)]
-    elif kind == 2:
-        content[start:start] = generator.randbytes(generator.randint(1, 9))
-    elif kind == 3:
-        content[start : start + 8] = generator.randbytes(8)
-    elif kind == 4:
-        del content[start:]
-    else:
-        content[start:] = other[generator.randrange(len(other)) :]
-    return bytes(content)
-
-
-def hostile(data: bytes, other: bytes, generator: random.Random) -> bytes:
-    """Damage with right checksums, which no checksum finds."""
-    header, region_map, layers = unpack(data)
-    layers, kind = list(layers), generator.randrange(4)
-    if kind == 0 and region_map:
-        region_map = damaged(region_map, other, generator) or b"\0"
-    elif kind == 1:
-        sizes = [(1, 1), (7, 9), (300, 400), (1 << 20, 1), (1, 1 << 20), (1 << 20, 1 << 20)]
-        header = header._replace(size=generator.choice(sizes))
-    elif kind == 2:
-        options = [
-            ("channels", [1, 2, 4, 900]),
-            ("qp", [-512, 0, 1023]),
-            ("regions", [1, 2, 4, 70000]),
-        ]
-        name, values = generator.choice(options)
-        header = header._replace(**{name: generator.choice(values)})
-    else:
-        number = generator.randrange(len(layers))
-        layers[number] = damaged(layers[number], other, generator) or b"\0"
-    header = header._replace(layers=tuple((e, len(x)) for (e, _), x in zip(header.layers, layers, strict=True)))
-    return pack(header, region_map, layers)
-
-
 def attack(reader: Reader, count: int, seed: int) -> None:
     generator = random.Random(seed)
     files = [encode(random_scene(seed + n), quality=40.0) for n in range(min(max(count // 20, 5), 40))]
     whole = 0
     for n in range(count):
         data, other = generator.sample(files, 2)
-        content = (hostile if n % 2 else damaged)(data, other, generator)
+        content = (damaged_inside if n % 2 else damaged)(data, generator, other)
         whole += check_same(reader, content)
     assert 0 < whole < count  # some are scenes still
     assert reader.do("scene", files[0]).get("memory", 0) < MEMORY  # a browser does not say
