@@ -178,7 +178,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
         balances = {image: sum(map(_sign, votes)) for (name, image), votes in by_pair.items() if name == comparison}
         won, lost = (sum(sign * balance > 0 for balance in balances.values()) for sign in (1, -1))
         signs = Counter(map(_sign, group))
-        sentences.append(f"{won} of {len(balances)} ({comparison})")
+        sentences.append(f"{comparison} {won} of {len(balances)}")
         line = [str(comparison), f"{won} of {len(balances)}", str(lost), *(str(signs[sign]) for sign in (1, -1, 0))]
         lines.append(line)
         losses += [(balance, str(comparison), str(image)) for image, balance in balances.items() if balance < 0]
@@ -198,7 +198,11 @@ def page(folder: Path, rows: list[Row]) -> Page:
     save_lines(folder / "pairs.png", panels, "method", "target_bytes")
     question = "Which of two images would people rather have in a photo's place?"
     published = f"The hash of the key is `{(folder / 'key.sha256').read_text().split()[0]}`."
-    answer = f"Most viewers prefer kcgs in {', '.join(sentences)} pairs." if answers else "Nobody has answered yet."
+    answer = (
+        f"Most viewers prefer kcgs to the other in these pairs: {', '.join(sentences)}."
+        if answers
+        else "Nobody has answered yet."
+    )
     header = ["comparison", "kcgs preferred", "other preferred", "answers for kcgs", "for the other", "for none"]
     checked = f"The same answer with sides swapped, and none for equal images: {'; '.join(checks)}." if checks else ""
     losses_text = markdown(["comparison", "photo", "what viewers said", "sheet"], texts) if texts else ""

@@ -160,21 +160,27 @@ def markdown(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in [header, ["---"] * len(header), *lines])
 
 
-def means_table(rows: Sequence[Row], names: Sequence[str], along: str, quantities: Sequence[str]) -> str:
+def means_table(
+    rows: Sequence[Row], names: Sequence[str], along: str, quantities: Sequence[str], sign: str = ""
+) -> str:
     """Lay out means, a line for each combination of names, a column for each value along, quantities as "a / b"."""
     values: list[Any] = list(group_by(rows, [along])) if along else [()]
     lines = []
     for key, group in group_by(rows, names).items():
         by_value = group_by(group, [along] if along else [])
-        cells = [_mean_cells(by_value.get(value, []), quantities) for value in values]
+        cells = [_mean_cells(by_value.get(value, []), quantities, sign) for value in values]
         joined = [" / ".join(filter(None, cell)) for cell in cells] if along else cells[0]
         lines.append([*map(format_value, names, key), *joined])
-    header = [f"{title(along)} {format_value(along, *value)}" for value in values] if along else map(title, quantities)
+    header = [_column_header(along, *value) for value in values] if along else map(title, quantities)
     return markdown([*map(title, names), *header], lines)
 
 
-def _mean_cells(rows: Sequence[Row], quantities: Sequence[str]) -> list[str]:
-    return [format_value(name, fmean(values)) if (values := values_of(rows, name)) else "" for name in quantities]
+def _column_header(name: str, value: Any) -> str:
+    return value if isinstance(value, str) else f"{title(name)} = {format_value(name, value)}"
+
+
+def _mean_cells(rows: Sequence[Row], quantities: Sequence[str], sign: str) -> list[str]:
+    return [format_value(name, fmean(values), sign) if (values := values_of(rows, name)) else "" for name in quantities]
 
 
 def differences(
@@ -215,7 +221,7 @@ def losses_table(
 
 
 def _case(name: str, value: Any) -> str:
-    return value if isinstance(value, str) else f"({title(name)} {format_value(name, value)})"
+    return value if isinstance(value, str) else f"({title(name)} = {format_value(name, value)})"
 
 
 def mean_gain(rows: Sequence[Row], comparison: Comparison, quantity: str, cases: Sequence[str] = ()) -> float:

@@ -101,7 +101,7 @@ def save_differences(path: Path, rows: Sequence[Row], quantities: Sequence[str],
             axes.plot(ends, [y, y], color=style["color"], linewidth=1)
             (handles[f"{title(case)} = {row[case]:,}"],) = axes.plot(row[quantity], y, markersize=4, **style)
         axes.axvline(0, color="#999999", linewidth=1)
-        axes.set(xlabel=title(quantity), yticks=[-index for index in range(len(methods))])
+        axes.set(xlabel=f"change of {title(quantity)}", yticks=[-index for index in range(len(methods))])
         axes.set_yticklabels([str(method) for (method,) in methods])
     figure.legend(handles.values(), [str(name) for name in handles], loc="outside upper center", ncols=len(handles))
     figure.savefig(path, dpi=110)

@@ -118,7 +118,7 @@ class TestCompare:
         assert row["method"] == "ours - other" and row["n"] == 5 and row["psnr"] == gain.mean
         assert (row["psnr low"], row["psnr high"]) == gain.interval
         text = losses_table(rows, [self.comparison], ["psnr"], ["n"])
-        assert "| ours - other | PSNR | 1 of 5 | d (N 5) -0.10 |" in text
+        assert "| ours - other | PSNR | 1 of 5 | d (N = 5) -0.10 |" in text
         assert mean_gain(rows, self.comparison, "psnr", ["n"]) == gain.mean
         assert count_wins(rows, self.comparison, "psnr", ["n"]) == "2 of 5"
         assert math.isnan(mean_gain(rows, Comparison("ours", "nobody"), "psnr"))
