@@ -102,7 +102,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
     answer = (
         f"In filled holes {steep[0]:.2f} % of the pixels are steeper than their surroundings, in holes that are left "
         f"{steep[1]:.2f} %; filling takes {fmean(values_of(filled, 'core_seconds')):.1f} seconds of a core. No value "
-        "goes far beyond [0, 1], but people who look for a hole find it, mostly by shadows outside the mask."
+        "goes far beyond [0, 1], but viewers who look for a hole find it, mostly by shadows outside the mask."
     )
     columns = ("pixels", *QUANTITIES, "steepest", "core_seconds", "added")
     table = means_table(rows, ["edit", "method"], "", columns)

@@ -1,4 +1,4 @@
-"""Which of two images would people rather have in a photo's place?"""
+"""Which of two images would viewers rather have in a photo's place?"""
 
 from __future__ import annotations
 
@@ -57,8 +57,9 @@ bytes'`.
 A sheet shows the photo, A and B at their own pixels; its name is a number. A seed chooses the order of sheets and
 sides. Some pairs come again with sides swapped, some sheets show the same image twice. Sheets are made once: `sheets`
 is for viewers, `key.json` is not, and the hash of the key, in `key.sha256`, is published before anyone looks. Viewers
-know nothing but the sheets. Each one's answers, a line such as `07 B clearly: streaks` or `08 none` per sheet, go
-into `answers/NAME.txt`, and `--redraw` counts them."""
+know nothing but the sheets. Those of the committed report are three vision-language models that were asked to answer
+as ordinary people would; nobody has asked people yet. Each one's answers, a line such as `07 B clearly: streaks` or
+`08 none` per sheet, go into `answers/NAME.txt`, and `--redraw` counts them."""
 
 
 def measure(image: str, comparison: str, folder: str, data: str, quick: bool) -> list[Row]:
@@ -196,7 +197,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
         Panel("files", [row for row in rows if "bytes" in row], "target_bytes", y) for y in ("psnr", "ssimulacra2")
     ]
     save_lines(folder / "pairs.png", panels, "method", "target_bytes")
-    question = "Which of two images would people rather have in a photo's place?"
+    question = "Which of two images would viewers rather have in a photo's place?"
     published = f"The hash of the key is `{(folder / 'key.sha256').read_text().split()[0]}`."
     answer = (
         f"Most viewers prefer kcgs to the other in these pairs: {', '.join(sentences)}."

@@ -151,7 +151,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
         f"Files of kcgs for PSNR have {own:.2f} dB in {size:,} bytes on {group}, and need {webp} against WebP "
         f"and {avif} against AVIF tuned for PSNR. Files for the eye have a SSIMULACRA2 "
         f"{mean_gain(in_group, eye, 'ssimulacra2', CASES):+.1f} against AVIF with as many bytes, better in "
-        f"{count_wins(in_group, eye, 'ssimulacra2', CASES)} files; what people prefer is in the report of `pairs`."
+        f"{count_wins(in_group, eye, 'ssimulacra2', CASES)} files; what viewers prefer is in the report of `pairs`."
     )
     printed = [
         {"group": "Kodak, as printed", "method": method, "target_bytes": size, "psnr": psnr}
