@@ -25,7 +25,7 @@ wheel: $(VENV)/.installed
 demo: $(VENV)/.installed
 	$(BIN)/kcgs demo
 
-# What contours gain on the two charts, in a few minutes. Photos need data and hours: docs/results.md.
+# What regions gain on four photos of scikit-image, in some ten minutes. More photos need data and hours: docs/results.md.
 report: $(VENV)/.installed
 	$(BIN)/python -m benchmarks quality -o report
 
