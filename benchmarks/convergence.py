@@ -6,7 +6,7 @@ from pathlib import Path
 
 from .core.compare import Comparison, differences, losses_table, mean_gain, means_table
 from .core.figures import Panel, save_lines
-from .core.fits import METHODS, QUICK_ITERATIONS, config_of, figures, seconds_per_iteration, timed_fit
+from .core.fits import METHODS, QUICK_ITERATIONS, config_of, figures, fit_for, timed_fit
 from .core.images import PHOTOS, load_mapped, names
 from .core.run import Job, Options, Page, Row
 
@@ -18,18 +18,19 @@ QUANTITIES = ("psnr", "ef_psnr")
 CASES = ["budget"]
 COMPARISONS = tuple(Comparison("best", other) for other in OTHERS)
 METHOD = f"""First frames of DAVIS with the given masks, N = {NUM_GAUSSIANS:,}. Each point is a fit of its own, which
-is planned for that time on one core: a short fit tells how long an iteration takes, and schedules are shortened by
+is planned for that time on one core: two short fits tell how long an iteration takes, and schedules are shortened by
 the recipes' own rule. Compilation is not in the times. Table: PSNR / EF-PSNR in dB."""
 
 
 def measure(image: str, method: str, n: int, data: str, quick: bool) -> list[Row]:
     """Fit in each budget."""
     pixels, labels = load_mapped(image, data, quick)
-    step = 1.0 if quick else seconds_per_iteration(pixels, labels, n, method)
     rows = []
     for budget in BUDGETS:
-        iterations = QUICK_ITERATIONS + budget if quick else max(1, round(budget / step))
-        result, seconds = timed_fit(pixels, labels, n, config_of(method, iterations))
+        if quick:
+            result, seconds = timed_fit(pixels, labels, n, config_of(method, QUICK_ITERATIONS + budget))
+        else:
+            result, seconds = fit_for(budget, pixels, labels, n, method)
         row = {"image": image, "method": method, "budget": budget}
         rows.append(row | figures(result, seconds, pixels, labels))
     return rows

@@ -134,6 +134,10 @@ def page(folder: Path, rows: list[Row]) -> Page:
         f"at the default cutoff is {error:.1g}."
     )
     slower = {key: ratio for key, ratio in ratios.items() if ratio > 1}
-    worst = ", ".join(max(slower, key=slower.__getitem__, default=()))
-    losses = f"`onnxruntime` is slower in {len(slower)} of {len(ratios)} cases; most in {worst}." if slower else ""
+    worst = [" ".join(key) for key, ratio in slower.items() if ratio == max(slower.values())]
+    losses = (
+        f"`onnxruntime` is slower in {len(slower)} of {len(ratios)} cases; most in {', '.join(worst)}."
+        if slower
+        else ""
+    )
     return Page("How fast and how exactly do decoders render?", answer, "decode.png", table, losses, METHOD)

@@ -15,7 +15,7 @@ from .core.compare import (
     means_table,
 )
 from .core.figures import Panel, save_lines
-from .core.fits import METHODS, QUICK_ITERATIONS, config_of, figures, seconds_per_iteration, timed_fit
+from .core.fits import METHODS, QUICK_ITERATIONS, config_of, figures, fit_for, timed_fit
 from .core.images import PHOTOS, load_mapped, names
 from .core.run import Job, Options, Page, Row
 
@@ -28,7 +28,7 @@ PAIR = Comparison("best", "best-baseline")
 EQUAL_BITS = Comparison("best", "best-baseline, equal bits")
 COMPARISONS = (PAIR, *(Comparison("best", other) for other in PUBLISHED))
 METHOD = """First frames of DAVIS with the given masks, photos of Kodak with the maps that `segment` finds. All
-methods run as long as `best` takes for its 700 iterations, on one core: a short fit of each tells how many iterations
+methods run as long as `best` takes for its 700 iterations, on one core: two short fits of each tell how many iterations
 that are, and schedules are shortened by the recipes' own rule. `best-baseline` is `best` without regions;
 `gaussian-image` is the paper's baseline, with `clamp` as published; `image-gs, L1 alone` is Image-GS on our renderer
 without its SSIM term, with which it would have 20 iterations in that time. Table: PSNR / EF-PSNR in dB; EF-PSNR is
@@ -41,10 +41,11 @@ def measure(image: str, group: str, n: int, data: str, quick: bool) -> list[Row]
     pixels, labels = load_mapped(image, data, quick)
     rows: list[Row] = []
     for method in METHODS:
-        iterations = QUICK_ITERATIONS if quick else None
         if rows and not quick:
-            iterations = max(1, round(rows[0]["core_seconds"] / seconds_per_iteration(pixels, labels, n, method)))
-        result, seconds = timed_fit(pixels, labels, n, config_of(method, iterations))
+            result, seconds = fit_for(rows[0]["core_seconds"], pixels, labels, n, method)
+        else:
+            config = config_of(method, QUICK_ITERATIONS if quick else None)
+            result, seconds = timed_fit(pixels, labels, n, config)
         row = {"image": image, "group": group, "n": n, "method": method}
         rows.append(row | figures(result, seconds, pixels, labels))
     return rows

@@ -21,8 +21,10 @@ from .images import load_mapped
 from .run import Job, Options, Row
 
 QUICK_ITERATIONS = 10
-# of the short fit that tells how long an iteration takes
-TRIAL_ITERATIONS = 50
+# of the short fits that tell how long an iteration takes
+TRIAL_ITERATIONS = (50, 200)
+# share of the time by which a fit may miss it
+TOLERANCE = 0.12
 # of reports, by the names that `kcgs.evaluate` gives them; those of contours begin with ef_
 METRICS: dict[str, Callable[..., Tensor]] = {"psnr": psnr, "ef_psnr": ef_psnr, "ms_ssim": ms_ssim}
 Method = tuple[str, dict[str, Any]]  # a recipe, and settings that differ from it
@@ -61,9 +63,15 @@ def timed_fit(image: Tensor, labels: Tensor, n: int, config: FitConfig) -> tuple
     return result, time.process_time() - start
 
 
-def seconds_per_iteration(image: Tensor, labels: Tensor, n: int, method: str) -> float:
-    """Time a short fit."""
-    return timed_fit(image, labels, n, config_of(method, TRIAL_ITERATIONS))[1] / TRIAL_ITERATIONS
+def fit_for(seconds: float, image: Tensor, labels: Tensor, n: int, method: str) -> tuple[FitResult, float]:
+    """Fit for so many seconds of a core: two short fits tell how many iterations that are; a miss is corrected once."""
+    short, long = (timed_fit(image, labels, n, config_of(method, count))[1] for count in TRIAL_ITERATIONS)
+    per_iteration = max(long - short, 1e-3) / (TRIAL_ITERATIONS[1] - TRIAL_ITERATIONS[0])
+    iterations = max(1, round(TRIAL_ITERATIONS[0] + (seconds - short) / per_iteration))
+    result, needed = timed_fit(image, labels, n, config_of(method, iterations))
+    if abs(needed / seconds - 1) > TOLERANCE:
+        result, needed = timed_fit(image, labels, n, config_of(method, max(1, round(iterations * seconds / needed))))
+    return result, needed
 
 
 def config_of(method: str, iterations: int | None) -> FitConfig:
