@@ -51,7 +51,8 @@ def page() -> str:
     """Make the page from the committed reports."""
     from .__main__ import EXPERIMENTS
 
-    runs = {name: json.loads((REPORTS / name / RUN_FILE).read_text(encoding="utf-8")) for name in EXPERIMENTS}
+    paths = {name: REPORTS / name / RUN_FILE for name in EXPERIMENTS}
+    runs = {name: json.loads(path.read_text(encoding="utf-8")) for name, path in paths.items() if path.exists()}
     tree = Counter(run.get("tree", "") for run in runs.values()).most_common(1)[0][0]
     sections = [HEAD.format(tree=tree)]
     for name, run in runs.items():
