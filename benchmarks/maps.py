@@ -8,7 +8,7 @@ from pathlib import Path
 from kcgs import FitConfig
 from kcgs.segment import segment
 
-from .core.compare import Comparison, at_equal_bits, differences, losses_table, mean_gain, means_table
+from .core.compare import Comparison, at_equal_bits, differences, join_tables, losses_table, mean_gain, means_table
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS, figures, timed_fit
 from .core.images import PHOTOS, load, names
@@ -71,6 +71,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
     for row in lines:
         row |= {q: row[d] for q, d in zip(QUANTITIES, DECODED, strict=True) if d in row}
     table = means_table([*paired, *lines], ["method"], "n", QUANTITIES)
-    losses = [losses_table(paired, [SAME_N], QUANTITIES, ["n"]), losses_table(equal, [EQUAL_BITS], DECODED, ["n"])]
+    losses = losses_table(paired, [SAME_N], QUANTITIES, ["n"])
+    losses_at_bits = losses_table(equal, [EQUAL_BITS], DECODED, ["n"])
     question = "When do label maps pay that are found in the image itself?"
-    return Page(question, answer, "maps.png", table, "\n\n".join(filter(None, losses)), METHOD, gains)
+    return Page(question, answer, "maps.png", table, join_tables(losses, losses_at_bits), METHOD, gains)

@@ -10,6 +10,7 @@ from .core.compare import (
     count_wins,
     differences,
     group_by,
+    join_tables,
     losses_table,
     mean_gain,
     means_table,
@@ -90,13 +91,14 @@ def page(folder: Path, rows: list[Row]) -> Page:
         f"{at_bits[1]:+.2f} dB. The published method that comes closest, `{closest}`, is {behind[closest]:.2f} dB "
         f"behind `best`, which is better in {count_wins(rows, Comparison('best', closest), 'psnr', CASES)} pairs."
     )
-    losses = [losses_table(rows, COMPARISONS, QUANTITIES, CASES), losses_table(equal, [EQUAL_BITS], DECODED, CASES)]
+    losses = losses_table(rows, COMPARISONS, QUANTITIES, CASES)
+    losses_at_bits = losses_table(equal, [EQUAL_BITS], DECODED, CASES)
     return Page(
         "What do regions gain with the same number of Gaussians, in the same time?",
         answer,
         "quality.png",
         means_table(rows, ["group", "method"], "n", QUANTITIES),
-        "\n\n".join(filter(None, losses)),
+        join_tables(losses, losses_at_bits),
         METHOD,
         gains,
     )

@@ -220,6 +220,11 @@ def losses_table(
     return markdown(["difference", "in", "lost", "worst"], lines) if lines else ""
 
 
+def join_tables(first: str, second: str) -> str:
+    """Put the lines of a table under those of another with the same columns; either may be empty."""
+    return "\n".join([first, *second.splitlines()[2:]]) if first else second
+
+
 def _case(name: str, value: Any) -> str:
     return value if isinstance(value, str) else f"({title(name)} = {format_value(name, value)})"
 
