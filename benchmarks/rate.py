@@ -61,44 +61,44 @@ progressive, 4:2:0 or 4:4:4, WebP with method 6, AVIF with speed 4. Table: PSNR 
 bytes). Losses are at equal bits: the other's quality is interpolated between its own files of that image."""
 
 
-def measure(image: str, group: str, method: str, target_bytes: int, data: str, quick: bool) -> list[Row]:
-    """Make a file and measure it."""
+def measure(image: str, group: str, method: str, sizes: list[int], data: str, quick: bool) -> list[Row]:
+    """Make files and measure them; searches of a codec for several sizes share what they try."""
     pixels, labels = load(image, data, quick)
-    start = time.process_time()
-    if method in OURS:
-        with_map, objective = OURS[method]
-        regions = load_mapped(image, data, quick)[1] if with_map else None
-        iterations = QUICK_ITERATIONS if quick else None
-        result = fit_bytes(pixels, regions, target_bytes, objective=objective, iterations=iterations)
-        size, render = len(result.data), result.scene.render()
-    else:
-        file = largest_file(method, pixels, target_bytes)
-        size, render = len(file), decode_file(file)
-    row = {"group": group, "image": image, "method": method, "target_bytes": target_bytes, "bytes": size}
-    row |= {"bpp": 8 * size / pixels[0].numel(), "core_seconds": time.process_time() - start}
-    return [row | measure_render(render, pixels, labels) | {"ssimulacra2": ssimulacra2(render, pixels)}]
+    rows = []
+    for target_bytes in sizes:
+        start = time.process_time()
+        if method in OURS:
+            with_map, objective = OURS[method]
+            regions = load_mapped(image, data, quick)[1] if with_map else None
+            iterations = QUICK_ITERATIONS if quick else None
+            result = fit_bytes(pixels, regions, target_bytes, objective=objective, iterations=iterations)
+            size, render = len(result.data), result.scene.render()
+        else:
+            file = largest_file(method, pixels, target_bytes)
+            size, render = len(file), decode_file(file)
+        row = {"group": group, "image": image, "method": method, "target_bytes": target_bytes, "bytes": size}
+        row |= {"bpp": 8 * size / pixels[0].numel(), "core_seconds": time.process_time() - start}
+        rows.append(row | measure_render(render, pixels, labels) | {"ssimulacra2": ssimulacra2(render, pixels)})
+    return rows
 
 
 def jobs(options: Options) -> list[Job]:
     """Make files of DAVIS and Kodak; without data, of photos of scikit-image."""
     arguments, codecs = options.image_arguments(), available_codecs()
     if options.quick:
-        return [
-            {"group": "disc", "image": "disc", "method": method, "target_bytes": size, **arguments}
-            for size in QUICK_BYTES
-            for method in (PSNR, EYE, *codecs)
-        ]
+        methods = (PSNR, EYE, *codecs)
+        return [{"group": "disc", "image": "disc", "method": m, "sizes": QUICK_BYTES, **arguments} for m in methods]
     groups = {"photos": [*PHOTOS]}
     if options.data is not None:
         groups = {group: names(options.data, group.lower()) for group in ("DAVIS", "Kodak")}
     return [
-        {"group": group, "image": image, "method": method, "target_bytes": size, **arguments}
+        {"group": group, "image": image, "method": method, "sizes": EYE_BYTES if eye else BYTES, **arguments}
         for group, images in groups.items()
-        for size in BYTES
         for image in images
         for method in (*OURS, *codecs)
         # found maps for PSNR are in the report of `maps`
-        if group != "Kodak" or method not in (REGIONS, EYE) or (method == EYE and size in EYE_BYTES)
+        if (group, method) != ("Kodak", REGIONS)
+        for eye in [(group, method) == ("Kodak", EYE)]
     ]
 
 
@@ -133,6 +133,7 @@ def mean_bd_rate(rows: list[Row], ours: str, other: str) -> str:
 
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
+    rows = sorted(rows, key=lambda row: row["target_bytes"])
     equal = list(rows)
     for comparison in COMPARISONS:
         equal += at_equal_bits(rows, comparison, QUANTITIES, ["group"])

@@ -32,6 +32,7 @@ COLUMNS = {
     "bytes": Column("bytes", ",.0f", 0.5, less_is_better=True),
     "map_bytes": Column("of these map", ",.0f", 0.5),
     "regions": Column("regions", ".1f"),
+    "budget": Column("seconds", ",.0f"),
     "iterations": Column("iterations", ",.0f"),
     "bpp": Column("bits per pixel", ".3f", 0.0005),
     "psnr": Column("PSNR", ".2f", 0.005),
