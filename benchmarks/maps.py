@@ -67,7 +67,8 @@ def page(folder: Path, rows: list[Row]) -> Page:
         f"N = {fewest:,} and by {at_many} dB at N = {most:,}. With as many bytes the change is {at_bits} dB: they buy "
         "sharp contours and regions to edit, not PSNR."
     )
-    lines = [row | {"method": row["method"].replace(f"{MAP} - {NO_MAP}", "same N: the map's gain")} for row in gains]
+    titles = {" - ".join(SAME_N): "gain at the same N", " - ".join(EQUAL_BITS): "gain at the same bytes"}
+    lines = [row | {"method": titles[row["method"]]} for row in gains]
     for row in lines:
         row |= {q: row[d] for q, d in zip(QUANTITIES, DECODED, strict=True) if d in row}
     table = means_table([*paired, *lines], ["method"], "n", QUANTITIES)

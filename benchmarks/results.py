@@ -14,8 +14,9 @@ REPORTS = Path(__file__).parent / "reports"
 LINK = "../benchmarks/reports"
 HEAD = """# Results
 
-Each answer comes from a report of one page, with a table, what loses, and the command that measures it anew. All were
-measured with one tree of `kcgs/`, `{tree}`: `git rev-parse HEAD:kcgs` says which one you have.
+Each answer comes from a report of one page, with a table, what loses, and the command that measures it anew. All but
+those that say so were measured with one tree of `kcgs/`, `{tree}`: `git rev-parse HEAD:kcgs` says
+which one you have.
 
 ```sh
 python -m benchmarks quality -o report --data DATA --workers 2
@@ -60,9 +61,10 @@ def page() -> str:
         match = re.match(r"# (?P<question>.*)\n\n(.*\n\n)??(?P<answer>.+)\n\n!\[\]\((?P<figure>.*)\)", text)
         assert match is not None, name
         question, answer, figure = match["question"], match["answer"], match["figure"]
-        other_tree = "" if run.get("tree") == tree else "Measured with an earlier tree. "
+        note = "" if run.get("tree") == tree else "Measured with an earlier tree. "
+        note += f"{run['note']} " if run["note"] else ""
         link, image = f"[Report]({LINK}/{name}/report.md)", f"![{question}]({LINK}/{name}/{figure})"
-        sections.append(f"## {question}\n\n{answer} {other_tree}{link}\n\n{image}\n")
+        sections.append(f"## {question}\n\n{answer} {note}{link}\n\n{image}\n")
     return "\n".join([*sections, TAIL.format().lstrip("\n")])
 
 
