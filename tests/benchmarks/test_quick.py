@@ -37,7 +37,7 @@ def test_quick_form(name: str, tmp_path: Path) -> None:
 def test_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, words in {
         ("none-such",): "invalid choice: 'none-such'",
-        ("maps",): "data must be a folder with images; got None",
+        ("video",): "data must be a folder with images; got None",
         ("fill", "--data", str(tmp_path)): "data must have a folder with davis in it",
         ("render", "--quick", "--only", "W9"): "only must name some of W3, needles 1",
         ("zoo", "--only", "chart-3x2"): "only must name scenes of the zoo, chart-2x3",
