@@ -7,7 +7,7 @@ from pathlib import Path
 from .core.compare import Comparison, at_equal_bits, differences, losses_table, mean_gain, means_table
 from .core.figures import save_differences
 from .core.fits import Method, measure_fit, plan
-from .core.images import PHOTOS, names
+from .core.images import choose
 from .core.run import Job, Options, Page, Row
 
 COUNTS = (1_250, 7_500)
@@ -36,7 +36,7 @@ measure = measure_fit
 
 def jobs(options: Options) -> list[Job]:
     """Fit every row, all images at the smaller N first; without data, photos of scikit-image."""
-    images = ["disc"] if options.quick else list(PHOTOS) if options.data is None else names(options.data, "davis")
+    images = choose(options, "davis")
     counts, curve = ((40,), (50,)) if options.quick else (COUNTS, CURVE)
     listing = [job for n in counts for job in plan(images, (n,), METHODS, options)]
     return listing + plan(images, curve, {"best": METHODS["best"]}, options)

@@ -7,7 +7,7 @@ from pathlib import Path
 from .core.compare import Comparison, differences, losses_table, mean_gain, means_table
 from .core.figures import Panel, save_lines
 from .core.fits import METHODS, QUICK_ITERATIONS, config_of, figures, fit_for, timed_fit
-from .core.images import PHOTOS, load_mapped, names
+from .core.images import choose, load_mapped
 from .core.run import Job, Options, Page, Row
 
 OTHERS = [*METHODS][1:]
@@ -38,7 +38,7 @@ def measure(image: str, method: str, n: int, data: str, quick: bool) -> list[Row
 
 def jobs(options: Options) -> list[Job]:
     """Fit frames of DAVIS; without data, photos of scikit-image."""
-    images = ["disc"] if options.quick else list(PHOTOS) if options.data is None else names(options.data, "davis")
+    images = choose(options, "davis")
     n = 40 if options.quick else NUM_GAUSSIANS
     return [{"image": i, "method": m, "n": n, **options.image_arguments()} for i in images for m in METHODS]
 

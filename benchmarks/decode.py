@@ -124,14 +124,14 @@ def page(folder: Path, rows: list[Row]) -> Page:
     times = {(r["image"], r["size"], r["method"]): r["ms"] for r in one_thread}
     ratios = {key[:2]: ms / times[*key[:2], "torch, cpu"] for key, ms in times.items() if key[2] == "onnxruntime"}
     spans = [
-        f"{min(values):.2g} to {max(values):.2g} times at {'its own size' if size == 'native' else '3,840 pixels wide'}"
+        f"{min(values):.2g} to {max(values):.2g} times as long as `torch, cpu` at {'its own size' if size == 'native' else '3,840 pixels wide'}"
         for size in SIZES
         if (values := [ratio for (_, name), ratio in ratios.items() if name == size])
     ]
     error = max(values_of((row for row in one_thread if row["method"] == "onnxruntime"), "error"))
     answer = (
-        f"On one core `onnxruntime` takes longer than `torch, cpu` for a scene: {', '.join(spans)}. Its largest error "
-        f"at the default cutoff is {error:.1g}."
+        f"On one core `onnxruntime` takes {' and '.join(spans)}. Its largest error at the default cutoff is "
+        f"{error:.1g}."
     )
     slower = {key: ratio for key, ratio in ratios.items() if ratio > 1}
     worst = [" ".join(key) for key, ratio in slower.items() if ratio == max(slower.values())]

@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -152,9 +152,13 @@ def page(folder: Path, rows: list[Row]) -> Page:
     sums = {str(name): sum(values_of(group, "bytes")) for (name,), group in group_by(rows, ["method"]).items()}
     closest = min(sums.keys() - {"kcgs"}, key=sums.__getitem__)
     wins = count_wins(rows, Comparison("kcgs", closest), "bytes", ["group"])
+    speeds = {
+        str(name): fmean(values_of(group, "decode_speed")) for (name,), group in group_by(rows, ["method"]).items()
+    }
+    slower = sum(speed < speeds["kcgs"] for speed in speeds.values())
     answer = (
         f"All maps together take {100 * sums['kcgs'] / sums[closest]:.0f} % of the bytes of {closest}, the smallest of "
-        f"the others, and {wins} maps are smaller. Most other codecs are faster."
+        f"the others, and {wins} maps are smaller. {slower} of {len(speeds) - 1} other codecs decode more slowly."
     )
     table = means_table(rows, ["group", "method"], "", ("bytes", "bytes to WebP, %", "encode_speed", "decode_speed"))
     question = "How small are label maps as files, beside other lossless codecs?"

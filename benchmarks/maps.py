@@ -63,9 +63,8 @@ def page(folder: Path, rows: list[Row]) -> Page:
     at_few, at_many = (" / ".join(f"{mean_gain(part, SAME_N, q):+.2f}" for q in QUANTITIES) for part in (few, many))
     at_bits = " / ".join(f"{mean_gain(equal, EQUAL_BITS, quantity, ['n']):+.2f}" for quantity in DECODED)
     answer = (
-        f"Found maps pay where Gaussians are few: with as many Gaussians they change PSNR / EF-PSNR by {at_few} dB at "
-        f"N = {fewest:,} and by {at_many} dB at N = {most:,}. With as many bytes the change is {at_bits} dB: they buy "
-        "sharp contours and regions to edit, not PSNR."
+        f"With as many Gaussians, found maps change PSNR / EF-PSNR by {at_few} dB at N = {fewest:,} and by {at_many} "
+        f"dB at N = {most:,}. With as many bytes, map included, the change is {at_bits} dB."
     )
     titles = {" - ".join(SAME_N): "gain at the same N", " - ".join(EQUAL_BITS): "gain at the same bytes"}
     lines = [row | {"method": titles[row["method"]]} for row in gains]

@@ -164,13 +164,21 @@ def markdown(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
 def means_table(
     rows: Sequence[Row], names: Sequence[str], along: str, quantities: Sequence[str], sign: str = ""
 ) -> str:
-    """Lay out means, a line for each combination of names, a column for each value along, quantities as "a / b"."""
+    """Lay out means, a line for each combination of names, a column for each value along, quantities as "a / b".
+
+    A mean of fewer images than others of its line has their number behind it.
+    """
     values: list[Any] = list(group_by(rows, [along])) if along else [()]
     lines = []
     for key, group in group_by(rows, names).items():
         by_value = group_by(group, [along] if along else [])
         cells = [_mean_cells(by_value.get(value, []), quantities, sign) for value in values]
-        joined = [" / ".join(filter(None, cell)) for cell in cells] if along else cells[0]
+        counts = [len(group_by(by_value.get(value, []), ["image"])) for value in values]
+        joined = [
+            " / ".join(filter(None, cell)) + (f" ({count})" if 0 < count < max(counts) else "")
+            for cell, count in zip(cells, counts, strict=True)
+        ]
+        joined = joined if along else cells[0]
         lines.append([*map(format_value, names, key), *joined])
     header = [_column_header(along, *value) for value in values] if along else map(title, quantities)
     return markdown([*map(title, names), *header], lines)

@@ -14,6 +14,8 @@ from torch import Tensor
 from kcgs.data import Davis, chart_2x3, chart_pie, load_image
 from kcgs.segment import segment
 
+from .run import Options
+
 CHARTS = ("2x3", "pie")
 # first frames of DAVIS
 FRAMES = ("blackswan", "breakdance", "car-turn", "dance-jump", "dog", "train")
@@ -63,6 +65,11 @@ def names(data: Path, group: str) -> list[str]:
     if not images:
         raise ValueError(f"data must have a folder with {group} in it; got {str(data)!r}")
     return images
+
+
+def choose(options: Options, group: str) -> list[str]:
+    """List the images of a group; without data, photos of scikit-image; in the quick form a disc."""
+    return ["disc"] if options.quick else list(PHOTOS) if options.data is None else names(options.data, group)
 
 
 def _read(name: str, data: Path) -> tuple[Tensor, Tensor | None]:

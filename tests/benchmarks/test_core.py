@@ -31,6 +31,7 @@ from benchmarks.core.fits import QUICK_ITERATIONS, plan
 from benchmarks.core.images import load, load_mapped, names
 from benchmarks.core.run import Job, Options, Page, Row, read_rows, run_experiment, write_rows
 from benchmarks.core.scenes import scene_of, size_of
+from benchmarks.labels import CODECS, region_numbers
 from benchmarks.pairs import read_answers
 from benchmarks.rate import bd_rate
 from kcgs.functional import psnr
@@ -203,6 +204,20 @@ class TestCodecs:
         assert psnr(decode_file(files[0]), image) < psnr(decode_file(files[1]), image)
         # no file is as small
         assert len(largest_file(codec, image, 10)) > 10
+
+    @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools
+    @pytest.mark.parametrize("codec", CODECS)
+    @pytest.mark.parametrize("most", [5, 400, 70_000])
+    def test_label_maps(self, codec: str, most: int) -> None:
+        pytest.importorskip(CODECS[codec].package, reason="needs pip install 'kcgs[bench]'")
+        if codec == "RLE" and most > 5:
+            pytest.skip("a mask for each region")
+        if codec in ("PNG", "JPEG XL") and most > 65_535:
+            pytest.skip("16 bits hold no more")
+        ids = torch.arange(most + 1).repeat_interleave(max(1, 6_000 // (most + 1)))
+        index = region_numbers(ids[: len(ids) // 60 * 60].reshape(60, -1).numpy())
+        decoded = CODECS[codec].decode(CODECS[codec].encode(index))
+        assert (torch.as_tensor(decoded).reshape(index.shape).long() == torch.from_numpy(index).long()).all()
 
 
 def test_answers_of_viewers(tmp_path: Path) -> None:
