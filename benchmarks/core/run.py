@@ -135,7 +135,7 @@ def _number(text: str) -> float | int | str:
 def _path(folder: Path, measure: Measure, job: Job) -> Path:
     parts = [measure.__module__, inspect.getsource(measure), job, _sources()]
     key = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
-    return folder / f"{job['image']}-{key[:20]}.json"
+    return folder / f"{str(job['image']).replace('/', '-')}-{key[:20]}.json"
 
 
 @cache

@@ -9,11 +9,13 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+import torch
 
 import kcgs
 from benchmarks.__main__ import EXPERIMENTS, main
 from benchmarks.core.run import Options, read_rows
 from benchmarks.results import page
+from kcgs.data import save_labels
 
 REPORTS = Path(kcgs.__file__).resolve().parent.parent / "benchmarks/reports"
 
@@ -32,6 +34,15 @@ def test_quick_form(name: str, tmp_path: Path) -> None:
     # other codecs cannot go as low
     files = [row for row in rows if "target_bytes" in row and row["method"].startswith("kcgs")]
     assert all(row["bytes"] <= row["target_bytes"] for row in files)
+
+
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools
+def test_images_in_folders(tmp_path: Path) -> None:
+    file = tmp_path / "data/DAVIS/Annotations/480p/dog/00000.png"
+    file.parent.mkdir(parents=True)
+    save_labels(file, torch.eye(16, dtype=torch.int64))
+    main(["labels", "-o", str(tmp_path / "out"), "--data", str(tmp_path / "data")])
+    assert {row["image"] for row in read_rows(tmp_path / "out/results.csv")} == {"DAVIS/Annotations/480p/dog/00000.png"}
 
 
 def test_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
