@@ -13,7 +13,7 @@ from kcgs import fit
 from kcgs.functional import ef_psnr, psnr
 
 from .core.clocks import milliseconds
-from .core.compare import Comparison, differences, group_by, losses_table, mean_gain, means_table
+from .core.compare import Comparison, count_wins, differences, group_by, losses_table, mean_gain, means_table
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS
 from .core.images import load_mapped, names, resize
@@ -87,12 +87,18 @@ def page(folder: Path, rows: list[Row]) -> Page:
         for (group, factor), group_rows in group_by(rows, ["group", "factor"]).items()
     ]
     save_lines(folder / "enlarge.png", panels, "method", "pixels per Gaussian")
-    bicubic, lanczos = ([mean_gain(rows, pair, q, cases) for q in QUANTITIES] for pair in COMPARISONS)
+    lanczos = COMPARISONS[1]
+    changes = [
+        " / ".join(f"{mean_gain(group_rows, lanczos, quantity, cases):+.2f}" for quantity in QUANTITIES)
+        + f" dB on {group}"
+        for (group,), group_rows in group_by(rows, ["group"]).items()
+    ]
+    wins = [count_wins(rows, lanczos, quantity, cases) for quantity in QUANTITIES]
     photo = mean_gain(rows, Comparison("small photo, bicubic", SCENE), "psnr", cases)
     answer = (
-        f"A scene that is rendered large has {bicubic[0]:+.2f} dB PSNR and {bicubic[1]:+.2f} dB EF-PSNR against its "
-        f"own small render, enlarged bicubically, and {lanczos[0]:+.2f} and {lanczos[1]:+.2f} dB by Lanczos. The small "
-        f"photo itself, with all of its pixels, has {photo:+.2f} dB against the scene."
+        f"The PSNR / EF-PSNR of a scene that is rendered large is {', '.join(changes)}, against its own small render, "
+        f"enlarged by Lanczos; it is higher in {wins[0]} and {wins[1]} cases. The small photo itself, with all of its "
+        f"pixels, has {photo:+.2f} dB against the scene."
     )
     table = means_table(rows, ["group", "factor", "method"], "pixels per Gaussian", QUANTITIES)
     losses = losses_table(rows, COMPARISONS, QUANTITIES, cases)

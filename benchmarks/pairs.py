@@ -23,7 +23,7 @@ from kcgs.segment import segment
 
 from .core.codecs import best_file, ssimulacra2
 from .core.compare import group_by, markdown
-from .core.figures import Panel, save_lines
+from .core.figures import save_shares
 from .core.fits import QUICK_ITERATIONS
 from .core.images import load, names, resize
 from .core.run import Job, Options, Page, Row, write_rows
@@ -179,7 +179,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
         balances = {image: sum(map(_sign, votes)) for (name, image), votes in by_pair.items() if name == comparison}
         won, lost = (sum(sign * balance > 0 for balance in balances.values()) for sign in (1, -1))
         signs = Counter(map(_sign, group))
-        sentences.append(f"{comparison} {won} of {len(balances)}")
+        sentences.append(f"{won} of {len(balances)} ({comparison})")
         line = [str(comparison), f"{won} of {len(balances)}", str(lost), *(str(signs[sign]) for sign in (1, -1, 0))]
         lines.append(line)
         losses += [(balance, str(comparison), str(image)) for image, balance in balances.items() if balance < 0]
@@ -193,14 +193,12 @@ def page(folder: Path, rows: list[Row]) -> Page:
     if answers:
         write_rows(folder / "answers.csv", answers)
     texts = [_loss(folder, by_pair[comparison, image]) for _, comparison, image in sorted(losses)]
-    panels = [
-        Panel("files", [row for row in rows if "bytes" in row], "target_bytes", y) for y in ("psnr", "ssimulacra2")
-    ]
-    save_lines(folder / "pairs.png", panels, "method", "target_bytes")
+    shares = {line[0]: [int(count) for count in line[3:]] for line in lines}
+    save_shares(folder / "pairs.png", ("for kcgs", "for the other", "for none"), shares, "answers")
     question = "Which of two images would viewers rather have in a photo's place?"
     published = f"The hash of the key is `{(folder / 'key.sha256').read_text().split()[0]}`."
     answer = (
-        f"Most viewers prefer kcgs to the other in these pairs: {', '.join(sentences)}."
+        f"Of the photos, most viewers preferred kcgs to the other on {', '.join(sentences)}."
         if answers
         else "Nobody has answered yet."
     )

@@ -87,13 +87,14 @@ def page(folder: Path, rows: list[Row]) -> Page:
     panels = [Panel("", rows, "frame", quantity, ("linear", "linear")) for quantity in ("psnr", "ef_psnr")]
     save_lines(folder / "video.png", panels, "method", "frame", marker=False)
     gains = {quantity: mean_gain(rows, COMPARISON, quantity) for quantity in QUANTITIES}
-    times = [
-        fmean(values_of((row for row in rows if row["method"] == name), "core_seconds")) for name in COMPARISON[::-1]
-    ]
+    times, flickers = (
+        [fmean(values_of((row for row in rows if row["method"] == name), quantity)) for name in COMPARISON[::-1]]
+        for quantity in ("core_seconds", "flicker")
+    )
     answer = (
         f"The fit of a video has {gains['psnr']:+.2f} dB PSNR and {gains['ef_psnr']:+.2f} dB EF-PSNR against fits of "
-        f"its frames alone, flickers by {gains['flicker']:+.2f} levels, and is {times[0] / times[1]:.1f} times as "
-        "fast. Only its Gaussians can be followed from frame to frame."
+        f"its frames alone, and is {times[0] / times[1]:.1f} times as fast. It flickers by {flickers[1]:.2f} levels, "
+        f"those by {flickers[0]:.2f}. Only its Gaussians can be followed from frame to frame."
     )
     table = means_table(rows, ["image", "method"], "", QUANTITIES)
     losses = losses_table(rows, [COMPARISON], QUANTITIES, [])

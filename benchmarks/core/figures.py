@@ -77,6 +77,21 @@ def save_lines(path: Path, panels: Sequence[Panel], line: str, along: str, marke
     figure.savefig(path, dpi=110)
 
 
+def save_shares(path: Path, parts: Sequence[str], counts: dict[str, list[int]], title: str) -> None:
+    """Plot a bar for each name, of its counts of each part, one behind the other."""
+    figure = Figure(figsize=(9.5, 1.2 + 0.4 * len(counts)), layout="constrained")
+    axes = figure.subplots()
+    for index, part in enumerate(parts):
+        widths, starts = (
+            [sum(values[first:stop]) for values in counts.values()] for first, stop in ((index, index + 1), (0, index))
+        )
+        axes.barh([*counts], widths, left=starts, color=COLORS[index], label=part)
+    axes.invert_yaxis()
+    axes.set(xlabel=title)
+    figure.legend(loc="outside upper center", ncols=len(parts))
+    figure.savefig(path, dpi=110)
+
+
 def save_rows(path: Path, rows: Sequence[Sequence[Tensor]]) -> None:
     """Write rows of images (3, H, W) of one height each as a sheet."""
     joined = [torch.cat([image.clamp(0, 1) for image in row], 2) for row in rows]
