@@ -9,7 +9,7 @@ from .core.run import Options, run_experiment
 # modules of this package with `jobs`, `measure` and `page`
 EXPERIMENTS = (
     "quality", "convergence", "published", "ablation", "rate", "pairs", "previews", "maps", "labels", "enlarge", "fill",
-    "video", "render", "decode",
+    "video", "render", "gpu", "decode",
 )  # fmt: skip
 
 

@@ -15,8 +15,8 @@ LINK = "../benchmarks/reports"
 HEAD = """# Results
 
 Each answer comes from a report of one page, with a table, what loses, and the command that measures it anew. All but
-those that say so were measured with one tree of `kcgs/`, `{tree}`: `git rev-parse HEAD:kcgs` says
-which one you have.
+those that say so were measured with one tree of `kcgs/`, `{tree}`. Later changes concern GPUs
+alone: on a CPU, results are the same bits.
 
 ```sh
 python -m benchmarks quality -o report --data DATA --workers 2
@@ -35,7 +35,7 @@ TAIL = """
   of the bytes.
 - Differences are paired by image, above zero where the first has more. Intervals are 95 %, by bootstrap over images,
   widened for their small number; they are in `differences.csv`, and in the figures.
-- Times are those of one processor core; compilation is not in them.
+- Times are those of one processor core, where a report does not say otherwise; compilation is not in them.
 - gsplat, GaussianImage and Image-GS need CUDA, so their own programs are in no table: the recipes of their papers run
   on the renderer of kcgs.
 

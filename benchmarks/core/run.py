@@ -15,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
 from rich.progress import track
 
 import kcgs
@@ -190,6 +191,7 @@ def _machine() -> str:
     names = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
     versions = ", ".join(f"{name} {version(name)}" for name in ("torch", "numba", "numpy", "kornia", "onnxruntime"))
     processor = names[0] if names else platform.processor()
+    processor = f"{torch.cuda.get_device_name()}; {processor}" if torch.cuda.is_available() else processor
     python = f"Python {platform.python_version()}"
     return f"{processor}, {os.cpu_count()} cores; {python}; kcgs {kcgs.__version__}, {versions}"
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import functools
 from importlib import import_module
+from importlib.util import find_spec
 
 import torch
 
-from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
 
 from .interface import SplatInputs, Steps
@@ -41,18 +41,14 @@ def prepare(backend: str, device: torch.device, dtype: torch.dtype, channels: in
 def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
     if check_backend(backend) != "auto":
         return backend
-    if device.type == "cuda" and dtype == torch.float32:
-        _warn_about_cuda()
-    return "cpu" if device.type == "cpu" and dtype == torch.float32 else "tiled"
+    if dtype == torch.float32 and (device.type == "cpu" or (device.type == "cuda" and _has_triton())):
+        return device.type
+    return "tiled"
 
 
 @functools.cache
-def _warn_about_cuda() -> None:
-    # until a report of a GPU shows that the Triton kernel is right
-    warn_user(
-        "backend 'auto' takes 'tiled' on CUDA, since the Triton kernel is untested on GPUs: compare a render with "
-        "backend='cuda' to this one, and pass backend='cuda' if they agree; pass backend='tiled' to hide this warning"
-    )
+def _has_triton() -> bool:
+    return find_spec("triton") is not None
 
 
 def check_backend(backend: str) -> str:

@@ -119,7 +119,12 @@ class RegionSplatRenderer(nn.Module):
 
 def rendered_size(field_size: tuple[int, int], size: tuple[int, int]) -> tuple[int, int]:
     """Return the size at which a field is rendered for an image of `size`: neither side below the field's."""
-    return torch.sym_max(field_size[0], size[0]), torch.sym_max(field_size[1], size[1])
+    return _larger(field_size[0], size[0]), _larger(field_size[1], size[1])
+
+
+def _larger(a: int, b: int) -> int:
+    # torch.compile sees int in a size of its own, torch.export does not, and max would fix the size there
+    return max(a, b) if isinstance(a, int) and isinstance(b, int) else torch.sym_max(a, b)
 
 
 def area_mean(image: Tensor, size: tuple[int, int]) -> Tensor:

@@ -23,6 +23,8 @@ REPORTS = Path(kcgs.__file__).resolve().parent.parent / "benchmarks/reports"
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_quick_form(name: str, tmp_path: Path) -> None:
+    if name == "gpu" and not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
     main([name, "-o", str(tmp_path), "--quick"])
     rows = read_rows(tmp_path / "results.csv")
     assert rows and all(row.keys() > {"image", "method"} for row in rows)
@@ -43,6 +45,13 @@ def test_images_in_folders(tmp_path: Path) -> None:
     save_labels(file, torch.eye(16, dtype=torch.int64))
     main(["labels", "-o", str(tmp_path / "out"), "--data", str(tmp_path / "data")])
     assert {row["image"] for row in read_rows(tmp_path / "out/results.csv")} == {"DAVIS/Annotations/480p/dog/00000.png"}
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_no_gpu(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["gpu", "-o", str(tmp_path)])
+    assert "benchmark gpu needs a CUDA device" in capsys.readouterr().err
 
 
 def test_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
