@@ -21,7 +21,7 @@ def check_memory(name: str, size: tuple[int, int], per_pixel: float) -> None:
 
 
 def free_memory() -> float:
-    """Return the bytes that this process may still take, swap included; infinite where the system does not say."""
+    """Return the bytes that are free, swap included, at most all that a container has; infinite where unknown."""
     limits = [math.inf]
     with suppress(OSError):
         facts = dict(re.findall(r"(\w+): +(\d+) kB", Path("/proc/meminfo").read_text()))

@@ -22,7 +22,7 @@ ResizeRegions = Annotated[
 ]
 Objective = Annotated[
     Literal["auto", "psnr", "ms-ssim"] | None,
-    typer.Option(help="What to maximize; auto, the default: ms-ssim for a file of so many bytes, else psnr."),
+    typer.Option(help="What to maximize; auto, the default: ms-ssim for a compressed file, else psnr."),
 ]
 
 

@@ -23,7 +23,7 @@ from .weights import weight_sums
 _FRINGE = 6
 # half the width of gaps between such pixels that are filled, too
 _CLOSING = 8
-# Gaussians with a larger share of their weight in the hole are fitted; with fewer of them, the object shows there
+# Gaussians with a larger share of their weight in the hole are fitted; a higher threshold leaves traces of the object
 _FITTED_SHARE = 0.05
 # those with a larger share are removed: fitted, they become dots
 _REMOVED_SHARE = 0.8

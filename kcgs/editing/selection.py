@@ -48,7 +48,8 @@ def select_removable_regions(scene: Scene, region_ids: object) -> Selection:
     if selection.regions.is_resampled:
         raise ValueError("scene must not have a resized map: edit the map at its own size, then resize it")
     if selection.regions.num_regions == len(selection.ids):
-        raise ValueError(f"region_ids must leave a region that takes over pixels; got all {len(selection.ids)} regions")
+        received = f"all {len(selection.ids)} regions"
+        raise InvalidArgument("region_ids", "a region that takes over pixels", received, verb="leave")
     return selection
 
 

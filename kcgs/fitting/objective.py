@@ -87,7 +87,7 @@ class MsSsimObjective:
     def apply(self, difference: Tensor) -> Tensor:
         """Return half the gradient of E, (C, H, W), at a difference r, render - image, in whose memory it may be.
 
-        Where the mean of a scale is below 0.2, E takes it as 0.2, and the slope is that of the mean by 0.2.
+        Where the mean of a scale is below 0.2, E takes it as 0.2, and the slope of its logarithm is 1 / 0.2.
         """
         if self._passes is None:
             return self._measure(difference)[1]

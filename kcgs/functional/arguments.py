@@ -10,7 +10,7 @@ from .map_tables import MapOperands
 
 
 class SplatArguments(NamedTuple):
-    """SplatArguments of the operator, in order; floating tensors share one dtype, float32 or float64.
+    """The arguments of the operator, in order; floating tensors share one dtype, float32 or float64.
 
     For one image B may be left out of means, cholesky, colors and region_ids together, and so of the image.
     """

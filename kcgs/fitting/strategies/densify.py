@@ -37,7 +37,7 @@ class Densify:
     end: float = 0.4
     """Share of the fit when the number of Gaussians is largest for the first time."""
     surplus: float = 0.2
-    """Largest number of Gaussians over N, less 1; 0 where all exist from the start."""
+    """Gaussians beyond N at the peak, as a share of N; 0 where all exist from the start."""
     settled: float = 0.8
     """Share of the fit from which on there are N."""
     cycle: int = 100
